@@ -1,0 +1,71 @@
+"""The allowed range of a number: how it is checked, and how it is freed for a fit."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+
+class Domain(NamedTuple):
+    """An interval of the real line, open unless an end is said to belong to it.
+
+    Attributes:
+        low, high: the ends; may be infinite.
+        low_allowed, high_allowed: whether the end itself is a legal value.
+    """
+
+    low: float = -np.inf
+    high: float = np.inf
+    low_allowed: bool = False
+    high_allowed: bool = False
+
+    def __str__(self) -> str:
+        left = "[" if self.low_allowed else "("
+        right = "]" if self.high_allowed else ")"
+        return f"{left}{self.low:g}, {self.high:g}{right}"
+
+    def check(self, name: str, value: ArrayLike, advice: str = "") -> None:
+        """Raise ValueError if a value lies outside; values that are being traced pass unseen.
+
+        Args:
+            name: what the value is called where the caller gave it.
+            value: any shape; every element is checked.
+            advice: what to do about it.
+        """
+        if isinstance(value, jax.core.Tracer):
+            return
+        try:
+            numbers = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name} must be a number in {self}, got {value!r}. {advice}") from None
+        above = numbers >= self.low if self.low_allowed else numbers > self.low
+        below = numbers <= self.high if self.high_allowed else numbers < self.high
+        wrong = ~(above & below & np.isfinite(numbers))
+        if np.any(wrong):
+            raise ValueError(f"{name} must lie in {self}, got {numbers[wrong].flat[0]:g}. {advice}")
+
+    def to_free(self, value: ArrayLike) -> Float[Array, "..."]:
+        """Map the interior one-to-one onto the whole real line: log, logit, or nothing."""
+        value = jnp.asarray(value)
+        if np.isinf(self.low) and np.isinf(self.high):
+            return value
+        if np.isinf(self.high):
+            return jnp.log(value - self.low)
+        return jnp.log(value - self.low) - jnp.log(self.high - value)
+
+    def from_free(self, free: ArrayLike) -> Float[Array, "..."]:
+        """The inverse of `to_free`."""
+        free = jnp.asarray(free)
+        if np.isinf(self.low) and np.isinf(self.high):
+            return free
+        if np.isinf(self.high):
+            return self.low + jnp.exp(free)
+        return self.low + (self.high - self.low) * jax.nn.sigmoid(free)
+
+
+POSITIVE = Domain(low=0.0)
+NOT_NEGATIVE = Domain(low=0.0, low_allowed=True)
+FRACTION = Domain(low=0.0, high=1.0, low_allowed=True, high_allowed=True)
+ANY = Domain()
