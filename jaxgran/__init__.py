@@ -1,0 +1,36 @@
+"""jaxgran: differentiable granular gases in JAX."""
+
+from jaxgran.contact import Impact, contact_force, elastic_constant, impact
+from jaxgran.cooling import cool
+from jaxgran.curve import CoolingCurve, read_curve, read_gas, write_curve
+from jaxgran.gas import Gas, sphere_mass
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.restitution import (
+    ConstantRestitution,
+    ReducedLaw,
+    RestitutionLaw,
+    RestitutionSeries,
+    Viscoelastic,
+    viscoelastic_restitution,
+)
+
+__all__ = [
+    "ConstantRestitution",
+    "CoolingCurve",
+    "Gas",
+    "Impact",
+    "KineticTheory",
+    "ReducedLaw",
+    "RestitutionLaw",
+    "RestitutionSeries",
+    "Viscoelastic",
+    "contact_force",
+    "cool",
+    "elastic_constant",
+    "impact",
+    "read_curve",
+    "read_gas",
+    "sphere_mass",
+    "viscoelastic_restitution",
+    "write_curve",
+]

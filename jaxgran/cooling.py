@@ -1,0 +1,59 @@
+"""The one verb: cool a gas."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from jaxgran.curve import CoolingCurve
+from jaxgran.gas import Gas
+from jaxgran.models.kinetic_theory import KineticTheory
+
+Model = KineticTheory
+
+
+def cool(
+    gas: Gas, times: Float[ArrayLike, "times"], *, model: Model | None = None
+) -> CoolingCurve:
+    """How the gas cools and spreads from its initial temperature at t = 0.
+
+    Args:
+        gas: the scene; its floats may be traced, differentiated and batched with `jax.vmap`.
+        times: t, s, increasing and >= 0, shape (times,); need not start at 0.
+        model: how closely to look; `jaxgran.KineticTheory()` by default.
+
+    Returns:
+        `CoolingCurve` at those times.
+
+    Raises:
+        ValueError: for times that are negative, unsorted, not finite or not a list.
+        RuntimeError: if the solver needs more steps than the model allows.
+    """
+    if not isinstance(gas, Gas):
+        raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
+    times = _checked_times(times)
+    return _cool(gas, times, KineticTheory() if model is None else model)
+
+
+@eqx.filter_jit
+def _cool(gas: Gas, times: jax.Array, model: Model) -> CoolingCurve:
+    return model.cool(gas, times)
+
+
+def _checked_times(times) -> jax.Array:
+    if not isinstance(times, jax.core.Tracer):
+        numbers = np.asarray(times, dtype=float)
+        if numbers.ndim != 1 or numbers.size == 0:
+            raise ValueError(f"times must be a list of numbers, got shape {numbers.shape}")
+        if not np.all(np.isfinite(numbers)) or numbers[0] < 0:
+            raise ValueError(
+                f"times must be finite and not negative, got {numbers.min():g} at the least; "
+                "the gas starts at t = 0"
+            )
+        if np.any(np.diff(numbers) <= 0):
+            i = int(np.argmax(np.diff(numbers) <= 0)) + 1
+            raise ValueError(
+                f"times must increase, got {numbers[i]:g} after {numbers[i - 1]:g}; sort them"
+            )
+    return jnp.asarray(times, dtype=jnp.result_type(float))

@@ -1,0 +1,1 @@
+"""The models of a cooling gas, cheapest first."""
