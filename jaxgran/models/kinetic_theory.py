@@ -65,6 +65,18 @@ class KineticTheory(eqx.Module):
         if self.averages not in ("exact", "paper"):
             raise ValueError(f'averages must be "exact" or "paper", got {self.averages!r}')
 
+    @property
+    def accuracy(self) -> float:
+        """Relative error of the gas's clock, the collision rate times the loss a collision.
+
+        For scenes inside the model's reach; measured against particle simulation at phi = .05.
+        """
+        return 0.015
+
+    def displacement_accuracy(self, dimension: int) -> float:
+        """Relative error of <dr^2>: what the first Sonine order leaves out of D."""
+        return {2: 0.024, 3: 0.017}[dimension]
+
     def cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them."""
         unit_time = gas.path_length / gas.impact_speed

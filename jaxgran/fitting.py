@@ -1,0 +1,324 @@
+"""Fit floats of a gas to a measured cooling curve: estimate, error, and whether to believe it."""
+
+import warnings
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxgran import kinetics
+from jaxgran.cooling import Model
+from jaxgran.curve import CoolingCurve
+from jaxgran.gas import Gas
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.restitution import ConstantRestitution, Viscoelastic
+
+SIGNIFICANCE = 0.01
+"""A model is said not to explain a curve if chance alone would misfit as badly less often."""
+
+
+class Fit(eqx.Module):
+    """What a fit found. p is the number of free parameters; under `jax.vmap` all fields batch.
+
+    Attributes:
+        names: the free parameters.
+        estimate: their values, SI, shape (p,).
+        standard_error: one standard deviation of each, SI, shape (p,): the measurement errors
+            carried through; if the model does not explain the curve, times sqrt(reduced chi^2).
+        model_error: by how much each would move if the model's clock were wrong by its known
+            accuracy (`model.accuracy`), SI, shape (p,). Not part of `standard_error`.
+        covariance: of the estimates, SI, shape (p, p), scaled alike.
+        sensitivity: derivative of the weighted residuals in the parameters' free scale (their
+            logarithm, for positive ones), shape (residuals, p).
+        start: the values the search began with, SI, shape (p,).
+        gas: the fitted gas.
+        curve: its cooling curve at the measured times.
+        residuals: (ln T_measured - ln T_model) over its error; 0 where a point carries no weight.
+        displacement_residuals: the same of <dr^2>; None if it was not used.
+        chi2, degrees_of_freedom, reduced_chi2, p_value: of the weighted residuals; p_value is nan
+            if the curve carries no errors (then errors are scaled so that reduced chi^2 is 1).
+        iterations: of the least-squares or quasi-Newton search.
+        converged: whether the search ended at its tolerance.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    estimate: Float[Array, "p"]
+    standard_error: Float[Array, "p"]
+    model_error: Float[Array, "p"]
+    covariance: Float[Array, "p p"]
+    sensitivity: Float[Array, "residuals p"]
+    start: Float[Array, "p"]
+    gas: Gas
+    curve: CoolingCurve
+    residuals: Float[Array, "times"]
+    displacement_residuals: Float[Array, "times"] | None
+    chi2: Float[Array, ""]
+    degrees_of_freedom: Int[Array, ""]
+    reduced_chi2: Float[Array, ""]
+    p_value: Float[Array, ""]
+    iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+    def value(self, name: str) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Estimate and standard error of one parameter."""
+        if name not in self.names:
+            raise ValueError(f"{name!r} was not free; free were {', '.join(self.names)}")
+        i = self.names.index(name)
+        return self.estimate[..., i], self.standard_error[..., i]
+
+    def undetermined(self, accuracy: float) -> tuple[str, ...]:
+        """Parameters that the curve cannot tell apart; empty if it can.
+
+        Some change of them together must alter the curve less than `accuracy` (the model's) times
+        as much as the best determined change does, or be left open by more than a factor e.
+        """
+        _, singular, rotation = jnp.linalg.svd(self.sensitivity, full_matrices=False)
+        open_ended = singular[-1] < max(1.0, accuracy * float(singular[0]))
+        if len(self.names) < 2 or not open_ended:
+            return ()
+        share = jnp.abs(rotation[-1])
+        return tuple(n for n, x in zip(self.names, share, strict=True) if x > 0.05 * share.max())
+
+
+def fit(
+    gas: Gas,
+    curve: CoolingCurve,
+    *,
+    model: Model | None = None,
+    free: tuple[str, ...] = ("dissipative_constant",),
+    start: Gas | None = None,
+    num_particles: int | None = None,
+    method: Literal["levenberg-marquardt", "lbfgs"] = "levenberg-marquardt",
+    max_steps: int = 100,
+) -> Fit:
+    """Find the floats of a gas that make its cooling curve the measured one.
+
+    Minimises ``chi^2 = sum [(ln T_measured - ln T_model) / (T_err/T)]^2``, and with <dr^2> where
+    the curve has it and its error is known, over the free floats in a scale without bounds
+    (logarithms of positive ones). Points whose error is 0 (a prepared state at t = 0) carry no
+    weight. <dr^2> is compared up to a common factor, itself known to within the accuracy of kinetic
+    theory (1.7 % in 3D). Works under `jax.vmap` and `jax.jit`.
+
+    Args:
+        gas: the scene; its values of free parameters are not looked at where the data can start
+            the search (A, T_0, a constant restitution), and start it where they cannot.
+        curve: what was measured; relative errors of T are taken equal and their size from the
+            scatter if it carries none.
+        model: `jaxgran.KineticTheory()` by default.
+        free: names of floats of the gas or its law, such as "temperature" (T_0), "packing_fraction".
+        start: begin at the values of this gas instead.
+        num_particles: over how many particles <dr^2> is a mean; gives its error,
+            ``sqrt(2 / (d N))``, where the curve has none; without either <dr^2> is not used.
+        method: Levenberg-Marquardt of optimistix, or the quasi-Newton of optax by reverse mode.
+        max_steps: the most iterations.
+
+    Returns:
+        `Fit`; `jaxgran.diagnose` says in words what it means.
+
+    Raises:
+        ValueError: for an unknown parameter or method, a curve that cannot be one (see
+            `CoolingCurve.check`), or fewer points than parameters.
+    """
+    curve.check()
+    if isinstance(free, str) or not free or len(set(free)) < len(free):
+        raise ValueError(f"free must be a tuple of different names, got {free!r}")
+    for name in free:
+        gas.value(name)
+    if method not in ("levenberg-marquardt", "lbfgs"):
+        raise ValueError(f'method must be "levenberg-marquardt" or "lbfgs", got {method!r}')
+    if curve.times.shape[-1] <= len(free):
+        raise ValueError(
+            f"{curve.times.shape[-1]} points cannot fix {len(free)} parameters; free fewer of them"
+        )
+    model = KineticTheory() if model is None else model
+    start = start_from_data(gas, curve, free) if start is None else start
+    result = _fit(gas, curve, model, tuple(free), start, num_particles, method, max_steps)
+    if not isinstance(result.chi2, jax.core.Tracer):
+        if result.chi2.dtype == jnp.float32:
+            warnings.warn(
+                "fitting in float32: errors below 1e-4 are noise; "
+                'jax.config.update("jax_enable_x64", True) first',
+                stacklevel=2,
+            )
+        group = result.undetermined(model.accuracy)
+        if group:
+            warnings.warn(
+                f"the curve cannot tell {' and '.join(group)} apart: only a combination of them is "
+                "determined (in a hard gas A and Y enter as A Y^(2/5) alone); free one of them",
+                stacklevel=2,
+            )
+    return result
+
+
+def start_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
+    """First values of A (or e) and T_0 from the measured curve, by scaling alone.
+
+    ``T^(-3/5)`` (``T^(-1/2)`` for constant restitution) of a cooling gas is a straight line in
+    time, whose value at 0 is T_0 and whose slope is 1/tau_0, proportional to A (to 1 - e^2).
+    Other parameters keep the values of the gas.
+    """
+    haff = isinstance(gas.law, ConstantRestitution)
+    power = 1 / 2 if haff else 3 / 5
+    scale = curve.temperature[0]
+    line = (curve.temperature / scale) ** -power
+    weight = 1 / line  # equal relative errors
+    if "temperature" in free:
+        design = jnp.stack([weight, weight * curve.times], axis=1)
+        size = jnp.linalg.norm(design, axis=0)
+        origin, slope = jnp.linalg.lstsq(design / size, weight * line)[0] / size
+        origin = jnp.maximum(origin, 0.1 * line.min())
+        gas = gas.replace(temperature=scale * origin ** (-1 / power))
+    else:
+        origin = (gas.temperature / scale) ** -power
+        slope = jnp.sum(weight**2 * (line - origin) * curve.times)
+        slope = slope / jnp.sum((weight * curve.times) ** 2)
+    rate = jnp.maximum(slope / origin, 1e-9 / curve.times[-1]) * gas.mean_free_time
+    if haff and "coefficient" in free:
+        loss = jnp.clip(2 * gas.dimension * rate, 1e-6, 0.99)
+        gas = gas.replace(coefficient=jnp.sqrt(1 - loss))
+    if isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free:
+        delta = rate / kinetics.COOLING_RATE[gas.dimension]
+        # Beyond the first order in delta cooling is slower: delta (1 - q delta / 2) is what shows.
+        delta = delta / (1 - jnp.minimum(0.5 * kinetics.TWO_TERM * delta, 0.7))
+        gas = gas.replace(dissipative_constant=delta / (gas.alpha**0.4 * gas.temperature**0.1))
+    return gas
+
+
+def _weights(values: Array, error: Array) -> Array:
+    """One over the relative error; 0 where the error is 0, a value that was set, not measured."""
+    known = (values > 0) & (error > 0)
+    return jnp.where(known, values / jnp.where(known, error, 1.0), 0.0)
+
+
+def _log_ratio(measured: Array, computed: Array) -> Array:
+    positive = (measured > 0) & (computed > 0)
+    safe = jnp.where(positive, measured, 1.0), jnp.where(positive, computed, 1.0)
+    return jnp.log(safe[0]) - jnp.log(safe[1])
+
+
+@eqx.filter_jit
+def _fit(gas, curve, model, names, start, num_particles, method, max_steps) -> Fit:
+    domains = [gas.domains[name] for name in names]
+    first = [domain.to_free(start.value(n)) for n, domain in zip(names, domains, strict=True)]
+    use_displacement = (
+        curve.displacement is not None
+        and curve.temperature_error is not None
+        and (curve.displacement_error is not None or num_particles is not None)
+    )
+    equal_errors = curve.temperature
+    weights = [
+        _weights(
+            curve.temperature,
+            equal_errors if curve.temperature_error is None else curve.temperature_error,
+        )
+    ]
+    if use_displacement:
+        accuracy = model.displacement_accuracy(gas.dimension)
+        sampling = (2 / (gas.dimension * (num_particles or 1))) ** 0.5 * curve.displacement
+        error = sampling if curve.displacement_error is None else curve.displacement_error
+        error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
+        weights.append(_weights(curve.displacement, error))
+        first.append(jnp.zeros(()))  # ln of the common factor of <dr^2>
+    flat_first, unravel = ravel_pytree(first)
+
+    def values(flat):
+        pairs = zip(names, domains, unravel(flat), strict=False)
+        return {name: domain.from_free(free) for name, domain, free in pairs}
+
+    def compare(flat, clock=1.0):
+        computed = model.cool(gas.replace(**values(flat)), curve.times * clock)
+        parts = [weights[0] * _log_ratio(curve.temperature, computed.temperature)]
+        if use_displacement:
+            # Kinetic theory's <dr^2> may be off by a common factor as well as point by point.
+            ratio = _log_ratio(curve.displacement, computed.displacement) - flat[-1]
+            parts += [weights[1] * ratio, flat[-1:] / accuracy]
+        residuals = jnp.concatenate(parts)
+        return residuals, (residuals, computed)
+
+    def residuals(flat):
+        return compare(flat)[0]
+
+    search = _least_squares if method == "levenberg-marquardt" else _quasi_newton
+    flat, iterations, converged = search(residuals, flat_first, max_steps)
+
+    derivatives = jax.jacfwd(compare, argnums=(0, 1), has_aux=True)
+    (jacobian, clock_slope), (all_residuals, computed) = derivatives(flat, jnp.ones(()))
+    num_used = sum(jnp.sum(w > 0) for w in weights) + (1 if use_displacement else 0)
+    degrees_of_freedom = num_used - flat.size
+    chi2 = jnp.sum(all_residuals**2)
+    reduced = chi2 / degrees_of_freedom
+    if curve.temperature_error is None:
+        inflation, p_value = reduced, jnp.full((), jnp.nan)
+    else:
+        p_value = jax.scipy.stats.chi2.sf(chi2, degrees_of_freedom)
+        inflation = jnp.where(p_value < SIGNIFICANCE, jnp.maximum(reduced, 1.0), 1.0)
+
+    def estimates(flat):
+        return jnp.concatenate([jnp.ravel(value) for value in values(flat).values()])
+
+    _, singular, rotation = jnp.linalg.svd(jacobian, full_matrices=False)
+    spread = rotation.T / jnp.maximum(singular, jnp.finfo(flat.dtype).tiny ** 0.5)
+    root = jax.jacfwd(estimates)(flat) @ spread
+    covariance = inflation * root @ root.T
+    model_error = model.accuracy * jnp.abs(root @ (spread.T @ (jacobian.T @ clock_slope)))
+    num_times = curve.times.size
+    return Fit(
+        names=names,
+        estimate=estimates(flat),
+        standard_error=jnp.sqrt(jnp.diag(covariance)),
+        model_error=model_error,
+        covariance=covariance,
+        sensitivity=jacobian[:, : jacobian.shape[1] - use_displacement],
+        start=estimates(flat_first),
+        gas=gas.replace(**values(flat)),
+        curve=computed,
+        residuals=all_residuals[:num_times],
+        displacement_residuals=all_residuals[num_times:-1] if use_displacement else None,
+        chi2=chi2,
+        degrees_of_freedom=degrees_of_freedom,
+        reduced_chi2=reduced,
+        p_value=p_value,
+        iterations=iterations,
+        converged=converged,
+    )
+
+
+def _least_squares(residuals, first, max_steps):
+    solution = optx.least_squares(
+        lambda flat, _: residuals(flat),
+        optx.LevenbergMarquardt(rtol=1e-7, atol=1e-7),
+        first,
+        max_steps=max_steps,
+        throw=False,
+    )
+    converged = solution.result == optx.RESULTS.successful
+    return solution.value, solution.stats["num_steps"], converged
+
+
+def _quasi_newton(residuals, first, max_steps):
+    def objective(flat):
+        return 0.5 * jnp.sum(residuals(flat) ** 2)
+
+    solver = optax.lbfgs()
+    value_and_grad = optax.value_and_grad_from_state(objective)
+
+    def step(carry):
+        flat, state, num_steps, _ = carry
+        value, grad = value_and_grad(flat, state=state)
+        updates, state = solver.update(
+            grad, state, flat, value=value, grad=grad, value_fn=objective
+        )
+        return optax.apply_updates(flat, updates), state, num_steps + 1, jnp.max(jnp.abs(updates))
+
+    def unfinished(carry):
+        _, _, num_steps, moved = carry
+        return (num_steps < max_steps) & (moved > 1e-9)
+
+    carry = first, solver.init(first), jnp.zeros((), int), jnp.full((), jnp.inf)
+    flat, _, num_steps, moved = jax.lax.while_loop(unfinished, step, carry)
+    return flat, num_steps, moved <= 1e-9
