@@ -3,6 +3,8 @@
 from jaxgran.contact import Impact, contact_force, elastic_constant, impact
 from jaxgran.cooling import cool
 from jaxgran.curve import CoolingCurve, read_curve, read_gas, write_curve
+from jaxgran.diagnosis import Diagnosis, diagnose
+from jaxgran.fitting import Fit, fit
 from jaxgran.gas import Gas, sphere_mass
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.restitution import (
@@ -17,6 +19,8 @@ from jaxgran.restitution import (
 __all__ = [
     "ConstantRestitution",
     "CoolingCurve",
+    "Diagnosis",
+    "Fit",
     "Gas",
     "Impact",
     "KineticTheory",
@@ -26,7 +30,9 @@ __all__ = [
     "Viscoelastic",
     "contact_force",
     "cool",
+    "diagnose",
     "elastic_constant",
+    "fit",
     "impact",
     "read_curve",
     "read_gas",

@@ -203,7 +203,7 @@ def read_gas(header: dict[str, str]) -> Gas:
             f"the header lacks {', '.join(missing)}; add lines such as '# {missing[0]}: VALUE' "
             f"(needed: {', '.join(GAS_KEYS)}; SI units)"
         )
-    values = {key: _header_number(header, key) for key in GAS_KEYS}
+    values = {key: header_number(header, key) for key in GAS_KEYS}
     law = Viscoelastic(values["Y"], values["nu"], 0.0)
     return Gas(
         law,
@@ -211,11 +211,12 @@ def read_gas(header: dict[str, str]) -> Gas:
         mass=sphere_mass(values["diameter"], values["density"]),
         packing_fraction=values["eta"],
         temperature=values["T0"],
-        dimension=int(_header_number(header, "dimension")) if "dimension" in header else 3,
+        dimension=int(header_number(header, "dimension")) if "dimension" in header else 3,
     )
 
 
-def _header_number(header: dict[str, str], key: str) -> float:
+def header_number(header: dict[str, str], key: str) -> float:
+    """The number under a key of a curve's header; ValueError if it is not one."""
     try:
         return float(header[key])
     except ValueError:
@@ -226,7 +227,7 @@ def num_particles(header: dict[str, str]) -> int | None:
     """N of a curve's header, a positive whole number; None if it is not given."""
     if "N" not in header:
         return None
-    number = _header_number(header, "N")
+    number = header_number(header, "N")
     if not (number >= 1 and number == int(number)):
         raise ValueError(f"header line N: must be a positive whole number, got {header['N']!r}")
     return int(number)

@@ -101,8 +101,8 @@ def fit(
     Minimises ``chi^2 = sum [(ln T_measured - ln T_model) / (T_err/T)]^2``, and with <dr^2> where
     the curve has it and its error is known, over the free floats in a scale without bounds
     (logarithms of positive ones). Points whose error is 0 (a prepared state at t = 0) carry no
-    weight. <dr^2> is compared up to a common factor, itself known to within the accuracy of kinetic
-    theory (1.7 % in 3D). Works under `jax.vmap` and `jax.jit`.
+    weight. <dr^2> is compared to within the accuracy of kinetic theory (1.7 % in 3D), both point by
+    point and as a common factor of its diffusive part. Works under `jax.vmap` and `jax.jit`.
 
     Args:
         gas: the scene; its values of free parameters are not looked at where the data can start
@@ -223,7 +223,7 @@ def _fit(gas, curve, model, names, start, num_particles, method, max_steps) -> F
         error = sampling if curve.displacement_error is None else curve.displacement_error
         error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
         weights.append(_weights(curve.displacement, error))
-        first.append(jnp.zeros(()))  # ln of the common factor of <dr^2>
+        first.append(jnp.zeros(()))  # ln of the common factor of D
     flat_first, unravel = ravel_pytree(first)
 
     def values(flat):
@@ -234,8 +234,9 @@ def _fit(gas, curve, model, names, start, num_particles, method, max_steps) -> F
         computed = model.cool(gas.replace(**values(flat)), curve.times * clock)
         parts = [weights[0] * _log_ratio(curve.temperature, computed.temperature)]
         if use_displacement:
-            # Kinetic theory's <dr^2> may be off by a common factor as well as point by point.
-            ratio = _log_ratio(curve.displacement, computed.displacement) - flat[-1]
+            # D may be off by a common factor; ballistic flight, before collisions, is not.
+            diffusive = computed.collisions / (1 + computed.collisions)
+            ratio = _log_ratio(curve.displacement, computed.displacement) - flat[-1] * diffusive
             parts += [weights[1] * ratio, flat[-1:] / accuracy]
         residuals = jnp.concatenate(parts)
         return residuals, (residuals, computed)

@@ -1,0 +1,195 @@
+"""Which dissipative constant A made this gas cool as it did?
+
+    python experiments/fit_cooling_curve.py [CURVE.csv] [--free A T0] [--set Y=6e7] [--out DIR]
+
+CURVE.csv holds header lines `# key: value` (N, eta, diameter, density, Y, nu, T0; SI units), a line
+of column names and rows: t,T and, where measured, T_err, msd, msd_err. A header line A is never
+used in the fit, only compared with at the end. Prints a table and one JSON line, and writes a
+picture and a JSON file.
+"""
+
+import argparse
+import json
+import platform
+import sys
+import time
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+
+started = time.perf_counter()
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+
+import jaxgran  # noqa: E402
+from jaxgran.curve import GAS_KEYS, header_number, num_particles  # noqa: E402
+from jaxgran.plotting import plot_fit  # noqa: E402
+
+HERE = Path(__file__).parent
+DEFAULT_CURVE = HERE / "data" / "lammps_cooling_dilute.csv"
+MODELS = {"kinetic-theory": jaxgran.KineticTheory}
+PARAMETERS = {
+    "A": ("dissipative_constant", "s"),
+    "T0": ("temperature", "m^2/s^2"),
+    "Y": ("youngs_modulus", "Pa"),
+    "nu": ("poisson_ratio", ""),
+    "eta": ("packing_fraction", ""),
+    "diameter": ("diameter", "m"),
+}
+
+
+def main() -> int:
+    options = parse()
+    jax.config.update("jax_enable_x64", True)
+    try:
+        run(options)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("curve", nargs="?", type=Path, default=DEFAULT_CURVE)
+    parser.add_argument("--model", choices=MODELS, default="kinetic-theory")
+    parser.add_argument(
+        "--free", nargs="+", choices=PARAMETERS, default=["A"], help="what to fit (default: A)"
+    )
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        default=[],
+        metavar="KEY=VALUE",
+        help="header values to use instead of the file's",
+    )
+    parser.add_argument("--out", type=Path, help="folder for the picture and the JSON file")
+    parser.add_argument("--overwrite", action="store_true", help="replace files in --out")
+    return parser.parse_args()
+
+
+def run(options: argparse.Namespace) -> None:
+    curve, header = jaxgran.read_curve(options.curve)
+    header |= settings(options.set)
+    gas = jaxgran.read_gas(header)
+    picture, record = outputs(options)
+    n = num_particles(header)
+    replicas = int(header_number(header, "replicas")) if "replicas" in header else 1
+    model = MODELS[options.model]()
+    free = tuple(PARAMETERS[key][0] for key in options.free)
+    imported = time.perf_counter() - started
+
+    def fit():
+        begin = time.perf_counter()
+        total = n * replicas if n is not None else None
+        result = jaxgran.fit(gas, curve, model=model, free=free, num_particles=total)
+        jax.block_until_ready(result.chi2)
+        return result, time.perf_counter() - begin
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # said again, in words, by the diagnosis
+        result, first_seconds = fit()
+        result, fit_seconds = fit()
+    diagnosis = jaxgran.diagnose(result, curve, n)
+
+    rows = []
+    for key, name in zip(options.free, free, strict=True):
+        estimate, statistical = (float(x) for x in result.value(name))
+        statistical *= diagnosis.correlation_factor
+        model_error = float(result.model_error[free.index(name)])
+        rows.append(
+            {
+                "parameter": key,
+                "unit": PARAMETERS[key][1],
+                "estimate": estimate,
+                "std_err": float(np.hypot(statistical, model_error)),
+                "statistical": statistical,
+                "model": model_error,
+                "header": header_number(header, key) if key in header else None,
+            }
+        )
+    theta = np.asarray(curve.temperature)
+    print(f"curve    {options.curve.name}: {theta.size} points, t = 0 .. {curve.times[-1]:.3g} s,")
+    print(f"         T falls to {theta[-1] / theta[0]:.3g} of its first value")
+    print(
+        f"gas      phi = {float(gas.packing_fraction):.3g}, tau_c = "
+        f"{float(gas.mean_free_time):.3g} s, t_c/tau_c = {float(gas.contact_fraction):.2g}, "
+        f"beta_T0 = {float(result.gas.thermal_beta):.3g} (fitted)"
+    )
+    print(f"model    {options.model}, {int(result.iterations)} steps of least squares\n")
+    print(f"{'':10}{'estimate':>13} {'+-':>10} {'statistical':>12} {'model':>10}  header's")
+    for row in rows:
+        print(f"{row['parameter']:4}{row['unit']:6}{row['estimate']:13.5g} ", end="")
+        print(f"{row['std_err']:10.2g} {row['statistical']:12.2g} {row['model']:10.2g}", end="")
+        if row["header"]:
+            print(f"  {row['header']:.5g} ({100 * (row['estimate'] / row['header'] - 1):+.2f} %)")
+        else:
+            print()
+    print(f"\n{diagnosis.verdict}")
+    for reason in diagnosis.reasons:
+        print(f"  - {reason}")
+    head = rows[0]
+    title = (
+        f"{options.curve.stem}: {head['parameter']} = {head['estimate']:.4g} "
+        f"± {head['std_err']:.2g} {head['unit']}\n{diagnosis.verdict}"
+    )
+    plot_fit(result, curve, title, picture)
+    summary = {
+        **{row["parameter"]: row["estimate"] for row in rows},
+        **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},
+        "model": options.model,
+        "reduced_chi2": round(float(result.reduced_chi2), 4),
+        "converged": bool(result.converged),
+        "explains": diagnosis.explains,
+        "seconds": round(time.perf_counter() - started, 2),
+        "compile_seconds": round(first_seconds - fit_seconds, 2),
+        "fit_seconds": round(fit_seconds, 4),
+    }
+    details = {
+        "curve": options.curve.name,
+        "header": header,
+        "parameters": rows,
+        "covariance": np.asarray(result.covariance).tolist(),
+        "diagnosis": {"verdict": diagnosis.verdict, "reasons": diagnosis.reasons},
+        "import_seconds": round(imported, 2),
+        "versions": {name: version(name) for name in ("jaxgran", "jax", "diffrax", "optimistix")},
+        "python": platform.python_version(),
+        "device": jax.devices()[0].device_kind,
+    }
+    record.write_text(json.dumps(summary | details, indent=2) + "\n", encoding="utf-8")
+    print(f"\nwritten  {picture}\n         {record}\n")
+    print(json.dumps(summary))
+
+
+def settings(pairs: list[str]) -> dict[str, str]:
+    known = (*GAS_KEYS, "N", "A", "dimension", "replicas")
+    values = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals or key not in known:
+            raise ValueError(f"--set {pair}: give KEY=VALUE with KEY one of {', '.join(known)}")
+        values[key] = value
+    return values
+
+
+def outputs(options: argparse.Namespace) -> tuple[Path, Path]:
+    """Where to write; a new folder unless one is named, and nothing is written over unasked."""
+    stem = f"{options.curve.stem}-{options.model}"
+    folder = options.out
+    if folder is None:
+        folder, i = Path("results") / stem, 2
+        while folder.exists():
+            folder, i = Path("results") / f"{stem}-{i}", i + 1
+    folder.mkdir(parents=True, exist_ok=True)
+    files = folder / f"{stem}.png", folder / f"{stem}.json"
+    for file in files:
+        if file.exists() and not options.overwrite:
+            raise ValueError(f"{file} exists; name another --out or say --overwrite")
+    return files
+
+
+if __name__ == "__main__":
+    sys.exit(main())
