@@ -140,7 +140,7 @@ def paper_averages(
     slowing = 2 * _moment(2) - C1 * _moment(2.2) * beta + 3 / 5 * C1**2 * _moment(2.4) * beta**2
     column = jnp.stack([cooling, jnp.zeros_like(beta), slowing / dimension])
     maxwellian = jnp.asarray([1.0, 0.0, 0.0], beta.dtype)
-    return sphere_surface(dimension) / sqrt(8 * pi) * column[:, None] * maxwellian
+    return sphere_surface(dimension) / sqrt(8 * pi) * jnp.outer(column, maxwellian)
 
 
 _NODES, _SCAN = 32, 16
@@ -186,7 +186,8 @@ class RateTable(eqx.Module):
         loss = jax.lax.stop_gradient(jax.vmap(averages)(speeds)[:, 0, 0])
         rate = jnp.maximum(2.2 / dimension * loss * speeds, jnp.finfo(bound.dtype).tiny)
         soonest = jnp.cumsum(-jnp.diff(scan) / jnp.maximum(rate[1:], rate[:-1]))
-        lowest = jnp.min(jnp.where(soonest < duration, scan[:-1] + scan[1], scan[1]))
+        passed = jnp.min(jnp.where(soonest < duration, scan[1:], 0.0))
+        lowest = passed + scan[1]
         lowest = jnp.minimum(jnp.maximum(lowest, bound), -1e-3)
         log_theta = lowest * (1 - jnp.asarray(np.cos(_NODE_ANGLES), lowest.dtype)) / 2
         values = jax.vmap(averages)(jnp.exp(log_theta / 2))

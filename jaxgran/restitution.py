@@ -115,8 +115,7 @@ def viscoelastic_restitution(
 
     Returns:
         eps, in (0, 1], with relative error against `contact.impact` below 1e-9 for every beta up
-        to 3e4 (clipped), 1e-7 for every beta up to 40 (unclipped); beyond, below 1e-5 as the
-        power law takes over. Derivatives are finite and right down to beta = 0.
+        to 1e4 (clipped), 1e-7 for every beta up to 40 (unclipped); beyond, below 3e-5. Derivatives are finite and right down to beta = 0.
     """
     beta = jnp.asarray(beta, dtype=jnp.result_type(float, beta))
     fit = _CLIPPED if clipped else _UNCLIPPED
@@ -132,7 +131,7 @@ def number(value: ArrayLike) -> Array:
     """A strongly typed array, so that two Python floats do not make two compilations."""
     try:
         return jnp.asarray(value, dtype=jnp.result_type(float))
-    except TypeError:
+    except (TypeError, ValueError):
         raise ValueError(f"expected a number or an array of numbers, got {value!r}") from None
 
 
@@ -305,5 +304,5 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
         return RestitutionSeries(self.coefficients * speed**self.exponents, self.exponents)
 
     def restitution(self, normal_speed):
-        powers = normal_speed[..., None] ** self.exponents
-        return 1 + jnp.sum(self.coefficients * powers, axis=-1)
+        terms = zip(self.coefficients, self.exponents, strict=True)
+        return 1 + sum(c * normal_speed**gamma for c, gamma in terms)
