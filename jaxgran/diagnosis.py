@@ -110,7 +110,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         reasons.append("the search did not converge: more max_steps or fewer free parameters")
     group = result.undetermined(0.015)
     if group:
-        reasons.append(f"{' and '.join(group)} cannot be told apart by this curve")
+        reasons.append(f"this curve does not determine {' and '.join(group)}")
 
     explains = not misfit and not contacts and bool(result.converged)
     if explains and not space:

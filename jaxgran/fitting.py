@@ -72,17 +72,19 @@ class Fit(eqx.Module):
         return self.estimate[..., i], self.standard_error[..., i]
 
     def undetermined(self, accuracy: float) -> tuple[str, ...]:
-        """Parameters that the curve cannot tell apart; empty if it can.
+        """Parameters that the curve does not determine, alone or apart; empty if it does.
 
-        Some change of them together must alter the curve less than `accuracy` (the model's) times
-        as much as the best determined change does, or be left open by more than a factor e.
+        Some change of them together must be left open by more than a factor e, or alter the curve
+        less than `accuracy` (the model's) times as much as the best determined change does.
         """
         _, singular, rotation = jnp.linalg.svd(self.sensitivity, full_matrices=False)
-        open_ended = singular[-1] < max(1.0, accuracy * float(singular[0]))
-        if len(self.names) < 2 or not open_ended:
+        apart = float(singular[-1]) >= accuracy * float(singular[0])
+        if float(singular[-1]) > 1.0 and apart:
             return ()
-        share = jnp.abs(rotation[-1])
-        return tuple(n for n, x in zip(self.names, share, strict=True) if x > 0.05 * share.max())
+        share = [abs(float(x)) for x in rotation[-1]]
+        sized = [n for n in self.names for _ in range(self.gas.value(n).size)]
+        open_ended = {n: 0 for n, x in zip(sized, share, strict=True) if x > 0.05 * max(share)}
+        return tuple(open_ended)
 
 
 def fit(
@@ -111,7 +113,7 @@ def fit(
             scatter if it carries none.
         model: `jaxgran.KineticTheory()` by default.
         free: names of floats of the gas or its law, such as "temperature" (T_0), "packing_fraction".
-        start: begin at the values of this gas instead.
+        start: begin at the values of this gas, unless those from the data fit better.
         num_particles: over how many particles <dr^2> is a mean; gives its error,
             ``sqrt(2 / (d N))``, where the curve has none; without either <dr^2> is not used.
         method: Levenberg-Marquardt of optimistix, or the quasi-Newton of optax by reverse mode.
@@ -136,8 +138,8 @@ def fit(
             f"{curve.times.shape[-1]} points cannot fix {len(free)} parameters; free fewer of them"
         )
     model = KineticTheory() if model is None else model
-    start = start_from_data(gas, curve, free) if start is None else start
-    result = _fit(gas, curve, model, tuple(free), start, num_particles, method, max_steps)
+    starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])
+    result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, max_steps)
     if not isinstance(result.chi2, jax.core.Tracer):
         if result.chi2.dtype == jnp.float32:
             warnings.warn(
@@ -148,8 +150,8 @@ def fit(
         group = result.undetermined(model.accuracy)
         if group:
             warnings.warn(
-                f"the curve cannot tell {' and '.join(group)} apart: only a combination of them is "
-                "determined (in a hard gas A and Y enter as A Y^(2/5) alone); free one of them",
+                f"the curve does not determine {' and '.join(group)}: only some combination of "
+                "them shows in it (in a hard gas A and Y enter as A Y^(2/5) alone); free fewer",
                 stacklevel=2,
             )
     return result
@@ -170,7 +172,7 @@ def start_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
     if "temperature" in free:
         design = jnp.stack([weight, weight * curve.times], axis=1)
         size = jnp.linalg.norm(design, axis=0)
-        origin, slope = jnp.linalg.lstsq(design / size, weight * line)[0] / size
+        origin, slope = jnp.linalg.lstsq(design / size[None], weight * line)[0] / size
         origin = jnp.maximum(origin, 0.1 * line.min())
         gas = gas.replace(temperature=scale * origin ** (-1 / power))
     else:
@@ -202,9 +204,12 @@ def _log_ratio(measured: Array, computed: Array) -> Array:
 
 
 @eqx.filter_jit
-def _fit(gas, curve, model, names, start, num_particles, method, max_steps) -> Fit:
+def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> Fit:
     domains = [gas.domains[name] for name in names]
-    first = [domain.to_free(start.value(n)) for n, domain in zip(names, domains, strict=True)]
+    firsts = [
+        [domain.to_free(start.value(name)) for name, domain in zip(names, domains, strict=True)]
+        for start in starts
+    ]
     use_displacement = (
         curve.displacement is not None
         and curve.temperature_error is not None
@@ -223,8 +228,9 @@ def _fit(gas, curve, model, names, start, num_particles, method, max_steps) -> F
         error = sampling if curve.displacement_error is None else curve.displacement_error
         error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
         weights.append(_weights(curve.displacement, error))
-        first.append(jnp.zeros(()))  # ln of the common factor of D
-    flat_first, unravel = ravel_pytree(first)
+        firsts = [[*first, jnp.zeros(())] for first in firsts]  # ln of the common factor of D
+    _, unravel = ravel_pytree(firsts[0])
+    candidates = jnp.stack([ravel_pytree(first)[0] for first in firsts])
 
     def values(flat):
         pairs = zip(names, domains, unravel(flat), strict=False)
@@ -244,6 +250,8 @@ def _fit(gas, curve, model, names, start, num_particles, method, max_steps) -> F
     def residuals(flat):
         return compare(flat)[0]
 
+    costs = jnp.stack([jnp.sum(residuals(candidate) ** 2) for candidate in candidates])
+    flat_first = candidates[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
     search = _least_squares if method == "levenberg-marquardt" else _quasi_newton
     flat, iterations, converged = search(residuals, flat_first, max_steps)
 
@@ -263,7 +271,7 @@ def _fit(gas, curve, model, names, start, num_particles, method, max_steps) -> F
         return jnp.concatenate([jnp.ravel(value) for value in values(flat).values()])
 
     _, singular, rotation = jnp.linalg.svd(jacobian, full_matrices=False)
-    spread = rotation.T / jnp.maximum(singular, jnp.finfo(flat.dtype).tiny ** 0.5)
+    spread = rotation.T / jnp.maximum(singular, jnp.finfo(flat.dtype).tiny ** 0.5)[None]
     root = jax.jacfwd(estimates)(flat) @ spread
     covariance = inflation * root @ root.T
     model_error = model.accuracy * jnp.abs(root @ (spread.T @ (jacobian.T @ clock_slope)))

@@ -1,0 +1,128 @@
+"""Every route to a derivative of a curve agrees with every other, in every float of the gas."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import jaxgran
+
+TAUS = jnp.array([0.3, 3.0, 30.0, 300.0])
+
+
+def gases(dimension):
+    scene = dict(
+        diameter=0.002, mass=1e-5, packing_fraction=0.1, temperature=0.01, dimension=dimension
+    )
+    return {
+        "viscoelastic": jaxgran.Gas(jaxgran.Viscoelastic(5e7, 0.22, 3e-6), **scene),
+        "constant": jaxgran.Gas(jaxgran.ConstantRestitution(0.9), **scene),
+        "series": jaxgran.Gas(jaxgran.RestitutionSeries([-0.2, 0.05], [0.2, 0.4]), **scene),
+    }
+
+
+def logs(gas, times):
+    curve = jaxgran.cool(gas, times)
+    return jnp.log(jnp.stack([curve.temperature, curve.displacement, curve.collisions]))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("law", ["viscoelastic", "constant", "series"])
+def test_all_routes_agree(law, dimension):
+    gas = gases(dimension)[law]
+    times = TAUS * gas.mean_free_time
+    values = {name: gas.value(name) for name in gas.domains}
+    flat, unravel = ravel_pytree(values)
+
+    @jax.jit
+    def of(log_scale):
+        scaled = unravel(flat * jnp.exp(log_scale))
+        return logs(gas.replace(**scaled), times)
+
+    zero = jnp.zeros_like(flat)
+    forward, reverse = jax.jacfwd(of)(zero), jax.jacrev(of)(zero)
+    # Five-point difference: the solver's noise of 1e-9 over h and a fifth derivative of order
+    # ten times h^4 balance near h = 5e-3, with an error of some 1e-6.
+    h = 5e-3 * jnp.eye(flat.size)
+    difference = [(8 * (of(x) - of(-x)) - (of(2 * x) - of(-2 * x))) / (12 * 5e-3) for x in h]
+    np.testing.assert_allclose(forward, jnp.stack(difference, -1), rtol=1e-5, atol=3e-6)
+    # Forward and reverse share their Jacobian: round-off.
+    np.testing.assert_allclose(reverse, forward, rtol=1e-10, atol=1e-13)
+    assert jnp.all(jnp.any(forward != 0, axis=(0, 1)) == expected_to_matter(values))
+
+
+def expected_to_matter(values):
+    # The mass of hard spheres is the one float that no curve depends on.
+    soft = "youngs_modulus" in values
+    names = [n for n, v in sorted(values.items()) for _ in range(v.size)]
+    return jnp.array([soft or n != "mass" for n in names])
+
+
+def test_derivative_in_time_is_the_rate():
+    gas = gases(3)["viscoelastic"]
+    times = TAUS * gas.mean_free_time
+
+    def at(shift):
+        return jaxgran.cool(gas, times * (1 + shift)).temperature
+
+    _, tangent = jax.jvp(at, (0.0,), (1.0,))
+    h = 1e-4
+    difference = (at(h) - at(-h)) / (2 * h)
+    np.testing.assert_allclose(tangent, difference, rtol=1e-5)  # h^2 and noise/h: 1e-6 or below
+
+
+def test_batches_of_derivatives():
+    gas = gases(3)["viscoelastic"]
+    times = TAUS * gas.mean_free_time
+
+    def loss(a):
+        return jnp.sum(logs(gas.replace(dissipative_constant=a), times)[0])
+
+    a = jnp.geomspace(1e-7, 1e-5, 5)
+    vmap_of_grad = jax.vmap(jax.grad(loss))(a)
+    grad_of_vmap = jax.grad(lambda a: jnp.sum(jax.vmap(loss)(a)))(a)
+    single = jnp.stack([jax.grad(loss)(x) for x in a])
+    np.testing.assert_allclose(vmap_of_grad, single, rtol=1e-9)
+    np.testing.assert_allclose(grad_of_vmap, single, rtol=1e-9)
+
+
+def test_second_derivative():
+    gas = gases(3)["viscoelastic"]
+    times = TAUS * gas.mean_free_time
+
+    def loss(log_a):
+        return jnp.sum(logs(gas.replace(dissipative_constant=jnp.exp(log_a)), times)[0])
+
+    x, h = jnp.log(3e-6), 1e-3
+    hessian = jax.jacfwd(jax.grad(loss))(x)
+    difference = (jax.grad(loss)(x + h) - jax.grad(loss)(x - h)) / (2 * h)
+    np.testing.assert_allclose(hessian, difference, rtol=1e-4)
+
+
+def test_elastic_limit():
+    # A = 0 is a legal gas, and its derivative exists: d ln T/dA is finite and negative.
+    gas = gases(3)["viscoelastic"]
+    times = TAUS * gas.mean_free_time
+
+    def log_temperature(a):
+        return logs(gas.replace(dissipative_constant=a), times)[0]
+
+    slope = jax.jacfwd(log_temperature)(0.0)
+    assert jnp.all(jnp.isfinite(slope)) and jnp.all(slope < 0)
+    # The slope at a gas so nearly elastic that its curvature (3e-5 of A's effect) is no matter.
+    np.testing.assert_allclose(slope, log_temperature(3e-12) / 3e-12 - log_temperature(0.0) / 3e-12, rtol=2e-3)
+
+
+def test_haff_sensitivity_in_closed_form():
+    gas = gases(3)["constant"]
+    times = TAUS * gas.mean_free_time
+    model = jaxgran.KineticTheory(sonine=False)
+
+    def log_temperature(e):
+        return jnp.log(jaxgran.cool(gas.replace(coefficient=e), times, model=model).temperature)
+
+    e = 0.9
+    gamma = (1 - e**2) / 6
+    exact = 2 * TAUS / (1 + gamma * TAUS) * e / 3
+    np.testing.assert_allclose(jax.jacfwd(log_temperature)(e), exact, rtol=1e-7)  # rtol of the solver
