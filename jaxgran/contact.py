@@ -35,7 +35,7 @@ def elastic_constant(
 def stress(
     overlap: ArrayLike, overlap_rate: ArrayLike, relaxation_time: ArrayLike
 ) -> Float[Array, "..."]:
-    """Force over ``rho sqrt(xi)``: ``xi + (3/2) A xi_dot``; its zero is the physical end of contact.
+    """Force over ``rho sqrt(xi)``: ``xi + (3/2) A xi_dot``; its zero is the end of contact.
 
     Args:
         overlap: xi = sigma - r, positive in contact.
@@ -106,7 +106,7 @@ def _overlap_left(state, beta):
 
 
 def _stress_left(state, beta):
-    # sqrt(xi) - sqrt(-beta w) vanishes with the stress xi + beta w, but is a simple root at any beta.
+    # sqrt(xi) - sqrt(-beta w) vanishes with the stress xi + beta w; its root is always simple.
     y, w, _ = state
     pull = jnp.maximum(-beta * w, 0.0)
     pulling = pull > 0

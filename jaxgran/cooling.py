@@ -1,10 +1,13 @@
 """The one verb: cool a gas."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jax.core import Tracer
+from jaxtyping import ArrayLike
 
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
@@ -14,7 +17,7 @@ Model = KineticTheory
 
 
 def cool(
-    gas: Gas, times: Float[ArrayLike, "times"], *, model: Model | None = None
+    gas: Gas, times: ArrayLike | Sequence[float], *, model: Model | None = None
 ) -> CoolingCurve:
     """How the gas cools and spreads from its initial temperature at t = 0.
 
@@ -42,7 +45,7 @@ def _cool(gas: Gas, times: jax.Array, model: Model) -> CoolingCurve:
 
 
 def _checked_times(times) -> jax.Array:
-    if not isinstance(times, jax.core.Tracer):
+    if not isinstance(times, Tracer):
         numbers = np.asarray(times, dtype=float)
         if numbers.ndim != 1 or numbers.size == 0:
             raise ValueError(f"times must be a list of numbers, got shape {numbers.shape}")

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxgran.gas import Gas, sphere_mass
@@ -57,7 +57,7 @@ class CoolingCurve(eqx.Module):
         Args:
             place: names a point, given its index.
         """
-        if isinstance(self.times, jax.core.Tracer) or isinstance(self.temperature, jax.core.Tracer):
+        if isinstance(self.times, Tracer) or isinstance(self.temperature, Tracer):
             return
         times = np.asarray(self.times)
         if times.ndim != 1 or times.size < MIN_POINTS:
@@ -67,7 +67,7 @@ class CoolingCurve(eqx.Module):
             )
         fields = {column: getattr(self, field) for column, field in COLUMNS.items()}
         for column, values in fields.items():
-            if values is None or isinstance(values, jax.core.Tracer):
+            if values is None or isinstance(values, Tracer):
                 continue
             if np.shape(values) != times.shape:
                 raise ValueError(
@@ -147,7 +147,7 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
         elif line:
             rows.append(_row(path, i, line, names))
             lines.append(i)
-    columns = np.array(rows, dtype=float).reshape(len(rows), len(names)).T
+    columns = jnp.asarray(np.array(rows, dtype=float).reshape(len(rows), len(names)).T)
     fields = {COLUMNS[name]: column for name, column in zip(names, columns, strict=True)}
     if len(rows) < MIN_POINTS:
         raise ValueError(
@@ -156,7 +156,7 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
         )
     curve = CoolingCurve(**fields)
     curve.check(lambda i: f"{path}, line {lines[i]}")
-    return jax.tree.map(jnp.asarray, curve), header
+    return curve, header
 
 
 def _column_names(path: Path, i: int, line: str) -> list[str]:

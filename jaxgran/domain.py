@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 
@@ -34,12 +35,14 @@ class Domain(NamedTuple):
             value: any shape; every element is checked.
             advice: what to do about it.
         """
-        if isinstance(value, jax.core.Tracer):
+        if isinstance(value, Tracer):
             return
         try:
             numbers = np.asarray(value, dtype=float)
         except (TypeError, ValueError):
-            raise ValueError(f"{name} must be a number in {self}, got {value!r}. {advice}") from None
+            raise ValueError(
+                f"{name} must be a number in {self}, got {value!r}. {advice}"
+            ) from None
         above = numbers >= self.low if self.low_allowed else numbers > self.low
         below = numbers <= self.high if self.high_allowed else numbers < self.high
         wrong = ~(above & below & np.isfinite(numbers))

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 import optimistix as optx
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
@@ -112,7 +113,7 @@ def fit(
         curve: what was measured; relative errors of T are taken equal and their size from the
             scatter if it carries none.
         model: `jaxgran.KineticTheory()` by default.
-        free: names of floats of the gas or its law, such as "temperature" (T_0), "packing_fraction".
+        free: names of floats of the gas or its law, such as "temperature" (which is T_0).
         start: begin at the values of this gas, unless those from the data fit better.
         num_particles: over how many particles <dr^2> is a mean; gives its error,
             ``sqrt(2 / (d N))``, where the curve has none; without either <dr^2> is not used.
@@ -140,7 +141,7 @@ def fit(
     model = KineticTheory() if model is None else model
     starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])
     result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, max_steps)
-    if not isinstance(result.chi2, jax.core.Tracer):
+    if not isinstance(result.chi2, Tracer):
         if result.chi2.dtype == jnp.float32:
             warnings.warn(
                 "fitting in float32: errors below 1e-4 are noise; "
@@ -223,6 +224,7 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
         )
     ]
     if use_displacement:
+        assert curve.displacement is not None
         accuracy = model.displacement_accuracy(gas.dimension)
         sampling = (2 / (gas.dimension * (num_particles or 1))) ** 0.5 * curve.displacement
         error = sampling if curve.displacement_error is None else curve.displacement_error
@@ -250,14 +252,16 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
     def residuals(flat):
         return compare(flat)[0]
 
-    costs = jnp.stack([jnp.sum(residuals(candidate) ** 2) for candidate in candidates])
-    flat_first = candidates[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
+    flat_first = candidates[0]
+    if len(starts) > 1:
+        costs = jnp.stack([jnp.sum(residuals(candidate) ** 2) for candidate in candidates])
+        flat_first = candidates[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
     search = _least_squares if method == "levenberg-marquardt" else _quasi_newton
     flat, iterations, converged = search(residuals, flat_first, max_steps)
 
     derivatives = jax.jacfwd(compare, argnums=(0, 1), has_aux=True)
     (jacobian, clock_slope), (all_residuals, computed) = derivatives(flat, jnp.ones(()))
-    num_used = sum(jnp.sum(w > 0) for w in weights) + (1 if use_displacement else 0)
+    num_used = jnp.sum(jnp.concatenate(weights) > 0) + int(use_displacement)
     degrees_of_freedom = num_used - flat.size
     chi2 = jnp.sum(all_residuals**2)
     reduced = chi2 / degrees_of_freedom
@@ -322,7 +326,7 @@ def _quasi_newton(residuals, first, max_steps):
         updates, state = solver.update(
             grad, state, flat, value=value, grad=grad, value_fn=objective
         )
-        return optax.apply_updates(flat, updates), state, num_steps + 1, jnp.max(jnp.abs(updates))
+        return optax.apply_updates(flat, updates), state, num_steps + 1, optax.tree.norm(updates)
 
     def unfinished(carry):
         _, _, num_steps, moved = carry

@@ -115,7 +115,9 @@ class Gas(eqx.Module):
     @property
     def number_density(self) -> Float[Array, ""]:
         """n, 1/m^d."""
-        ball = sphere_surface(self.dimension) / self.dimension * (self.diameter / 2) ** self.dimension
+        ball = (
+            sphere_surface(self.dimension) / self.dimension * (self.diameter / 2) ** self.dimension
+        )
         return self.packing_fraction / ball
 
     @property
@@ -129,7 +131,9 @@ class Gas(eqx.Module):
     @property
     def path_length(self) -> Float[Array, ""]:
         """``1 / (n g_2 sigma^(d-1))``, m: the mean free path but for a number; unit of <dr^2>."""
-        return 1 / (self.number_density * self.contact_value * self.diameter ** (self.dimension - 1))
+        return 1 / (
+            self.number_density * self.contact_value * self.diameter ** (self.dimension - 1)
+        )
 
     @property
     def impact_speed(self) -> Float[Array, ""]:
@@ -138,9 +142,10 @@ class Gas(eqx.Module):
 
     @property
     def collision_frequency(self) -> Float[Array, ""]:
-        """Collisions per particle per second at t = 0, ``nu_0 = n g_2 sigma^(d-1) S_d sqrt(T_0/pi)``.
+        """Collisions per particle per second at t = 0.
 
-        A collision counts once for each of its two particles.
+        ``nu_0 = n g_2 sigma^(d-1) S_d sqrt(T_0/pi)``. A collision counts once for each of its two
+        particles.
         """
         return sphere_surface(self.dimension) * jnp.sqrt(self.temperature / pi) / self.path_length
 
@@ -163,7 +168,8 @@ class Gas(eqx.Module):
     def _viscoelastic(self, quantity: str) -> Viscoelastic:
         if not isinstance(self.law, Viscoelastic):
             raise ValueError(
-                f"{quantity} belongs to the Viscoelastic law; this gas has {type(self.law).__name__}"
+                f"{quantity} belongs to the Viscoelastic law; "
+                f"this gas has {type(self.law).__name__}"
             )
         return self.law
 
@@ -180,7 +186,7 @@ class Gas(eqx.Module):
 
     @property
     def thermal_beta(self) -> Float[Array, ""]:
-        """``beta_T0 = (3/2) A alpha^(2/5) (2 T_0)^(1/10)``, dissipation of an impact at sqrt(2 T_0)."""
+        """``beta_T0 = (3/2) A alpha^(2/5) (2 T_0)^(1/10)``: beta of an impact at sqrt(2 T_0)."""
         return 1.5 * 2**0.1 * self.delta
 
     @property
@@ -210,8 +216,8 @@ class Gas(eqx.Module):
     def critical_box(self) -> Float[Array, ""]:
         """``L_c = 2 pi / k_c``, m: the gas stays homogeneous only in boxes shorter than this.
 
-        ``k_c sigma = n sigma^3 sqrt((32 pi / 15) (1 - eps^2))`` (3D), ``n sigma^2 sqrt(pi (1 - eps^2))``
-        (2D), of a dilute gas, with eps at `impact_speed`; infinite for elastic spheres.
+        ``k_c sigma = n sigma^3 sqrt((32 pi / 15) (1 - eps^2))`` (3D) or
+        ``n sigma^2 sqrt(pi (1 - eps^2))`` (2D), of a dilute gas, with eps at `impact_speed`; infinite for elastic spheres.
         """
         eps = self.reduced_law.restitution(jnp.ones_like(self.temperature))
         strength = 32 * pi / 15 if self.dimension == 3 else pi

@@ -5,6 +5,7 @@ Units: the impact speed sqrt(2 T_0) and the path length 1 / (n g_2 sigma^(d-1)),
 """
 
 from collections.abc import Callable
+from functools import cache
 from math import gamma, pi, sqrt
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ SOFTNESS = {2: 0.970, 3: 1.937}
 
 
 def _quadrature(num_nodes: int, top: float) -> tuple[np.ndarray, np.ndarray]:
-    # Gauss-Legendre in sqrt(g): laws are smooth in a small power of g, and exp(-top^2/2) is nothing.
+    # Gauss-Legendre in sqrt(g): laws are smooth in small powers of g; exp(-top^2/2) is nothing.
     x, w = np.polynomial.legendre.leggauss(num_nodes)
     root = (x + 1) / 2
     g = top * root**2
@@ -87,7 +88,9 @@ def _weights(dimension: int) -> np.ndarray:
     samples = np.linspace(0, 2, 5)
     values = np.stack([_integrands(1 - x, _G, dimension) for x in samples], axis=-2)
     inverse = np.linalg.inv(np.vander(samples, increasing=True))
-    return sphere_surface(dimension) / sqrt(8 * pi) * np.einsum("ps,absn->abpn", inverse, values) * _W
+    return (
+        sphere_surface(dimension) / sqrt(8 * pi) * np.einsum("ps,absn->abpn", inverse, values) * _W
+    )
 
 
 _WEIGHTS = {d: _weights(d) for d in (2, 3)}
@@ -117,9 +120,7 @@ def _moment(power: float) -> float:
     return 2 ** (power / 2) * gamma(1 + power / 2)
 
 
-def paper_averages(
-    law: ReducedLaw, speed: Float[Array, ""], dimension: int
-) -> Float[Array, "3 3"]:
+def paper_averages(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[Array, "3 3"]:
     """The paper's own truncated averages: Maxwellian, two terms of the restitution series.
 
     ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)`` and ``1/tau_v`` to order delta^2.
@@ -143,10 +144,16 @@ def paper_averages(
     return sphere_surface(dimension) / sqrt(8 * pi) * jnp.outer(column, maxwellian)
 
 
-_NODES, _SCAN = 32, 16
-_NODE_ANGLES = (np.arange(_NODES) + 0.5) * pi / _NODES
-_TO_CHEBYSHEV = 2 / _NODES * np.cos(np.outer(np.arange(_NODES), _NODE_ANGLES))
-_TO_CHEBYSHEV[0] /= 2
+_SCAN = 16
+
+
+@cache
+def _chebyshev(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes in [-1, 1] and the matrix from values there to coefficients."""
+    angles = (np.arange(num_nodes) + 0.5) * pi / num_nodes
+    matrix = 2 / num_nodes * np.cos(np.outer(np.arange(num_nodes), angles))
+    matrix[0] /= 2
+    return np.cos(angles), matrix
 
 
 class RateTable(eqx.Module):
@@ -155,7 +162,7 @@ class RateTable(eqx.Module):
     Laws are smooth in ln T, so a few quadratures at the start replace one in every solver stage.
 
     Attributes:
-        coefficients: of mu_2, mu_4, nu_v and their factors of a_2, shape (32, 3, 3).
+        coefficients: of mu_2, mu_4, nu_v and their factors of a_2, shape (nodes, 3, 3).
         lowest: the lowest ln(T/T_0) of the table; the highest is 0.
     """
 
@@ -168,6 +175,7 @@ class RateTable(eqx.Module):
         averages: Callable[[Float[Array, ""]], Float[Array, "3 3"]],
         duration: Float[Array, ""],
         dimension: int,
+        num_nodes: int,
     ) -> "RateTable":
         """Tabulate over all that a gas can cool in a time.
 
@@ -176,6 +184,7 @@ class RateTable(eqx.Module):
             duration: reduced time; the table ends below the lowest temperature the gas can reach
                 in it, bounded by plastic spheres (Haff, e = 0) and by the law's own loss.
             dimension: d.
+            num_nodes: terms of the series; see `ReducedLaw.num_nodes`.
         """
         duration = jax.lax.stop_gradient(duration)
         share = sphere_surface(dimension) / sqrt(2 * pi)
@@ -189,9 +198,9 @@ class RateTable(eqx.Module):
         passed = jnp.min(jnp.where(soonest < duration, scan[1:], 0.0))
         lowest = passed + scan[1]
         lowest = jnp.minimum(jnp.maximum(lowest, bound), -1e-3)
-        log_theta = lowest * (1 - jnp.asarray(np.cos(_NODE_ANGLES), lowest.dtype)) / 2
-        values = jax.vmap(averages)(jnp.exp(log_theta / 2))
-        return cls(jnp.tensordot(jnp.asarray(_TO_CHEBYSHEV, lowest.dtype), values, 1), lowest)
+        nodes, to_coefficients = (jnp.asarray(x, lowest.dtype) for x in _chebyshev(num_nodes))
+        values = jax.vmap(averages)(jnp.exp(lowest * (1 - nodes) / 4))
+        return cls(jnp.tensordot(to_coefficients, values, 1), lowest)
 
     def __call__(self, log_theta: Float[Array, ""]) -> Float[Array, "3 3"]:
         """The averages at ln(T/T_0), as `averages` returns them."""
@@ -202,9 +211,7 @@ class RateTable(eqx.Module):
         return self.coefficients[0] + x * ahead - behind
 
 
-def softness_factor(
-    law: ReducedLaw, speed: Float[Array, ""], dimension: int
-) -> Float[Array, ""]:
+def softness_factor(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[Array, ""]:
     """``1 - c X_T/sigma``, by which soft contacts slow the cooling; X_T at the speed sqrt(2 T).
 
     Valid to first order in the overlap; measured against soft-sphere simulation it removes an
@@ -262,7 +269,7 @@ def paper_temperature(
     second = q**2 * (
         3.7 * u**-2.0 - 2.5 * u ** (-8 / 3) + 3.2 * u ** (-11 / 3) - 4.4 * u ** (-17 / 6)
     ) - 2.5 * r * (u**-2.0 - u ** (-8 / 3))
-    return (
+    return jnp.asarray(
         u ** (-5 / 3)
         + 2 * q * delta * (u ** (-11 / 6) - u ** (-8 / 3))
         + 20 / 9 * p * delta**1.5 * (u ** (-23 / 12) - u ** (-8 / 3))
@@ -286,8 +293,8 @@ EXPANSION_R = _relative(3.0, 2 * 0.522882568 + 2 * C1 * 3 / 5 * C1**2)
 def two_term_time(theta: ArrayLike, delta: ArrayLike) -> Float[Array, "..."]:
     """Exact solution tau(T/T_0) of the paper's two-term cooling equation, in 3D.
 
-    With ``x = (T/T_0)^(1/10)`` and ``k = q delta`` the equation ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)``
-    integrates to ``tau = 6/(c delta) [sum_{j<6} k^j (x^(j-6) - 1)/(6 - j) - k^6 ln x
+    With ``x = (T/T_0)^(1/10)`` and ``k = q delta`` the equation
+    ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)`` integrates to ``tau = 6/(c delta) [sum_{j<6} k^j (x^(j-6) - 1)/(6 - j) - k^6 ln x
     + k^6 ln((1 - k x)/(1 - k))]``, c = 0.83193.
 
     Args:
@@ -308,4 +315,4 @@ def two_term_time(theta: ArrayLike, delta: ArrayLike) -> Float[Array, "..."]:
     x, k = jnp.asarray(theta) ** 0.1, TWO_TERM * jnp.asarray(delta)
     powers = sum(k**j * (x ** (j - 6) - 1) / (6 - j) for j in range(6))
     logs = k**6 * (jnp.log1p(-k * x) - jnp.log1p(-k) - jnp.log(x))
-    return 6 / (COOLING_RATE[3] * delta) * (powers + logs)
+    return jnp.asarray(6 / (COOLING_RATE[3] * jnp.asarray(delta)) * (powers + logs))

@@ -40,13 +40,16 @@ def test_elastic_impact():
 
 def test_heavy_damping_limits():
     # Leading powers; the clipped one is approached as beta^(-5/3): 2e-4 at 1e3.
-    np.testing.assert_allclose(solve(1e3).restitution, (3 / 2) ** (2 / 3) * 1e3 ** (-5 / 3), rtol=2e-4)
+    np.testing.assert_allclose(
+        solve(1e3).restitution, (3 / 2) ** (2 / 3) * 1e3 ** (-5 / 3), rtol=2e-4
+    )
     result = solve(100.0, clipped=False).restitution
     np.testing.assert_allclose(result, 5.15838170427e-10, rtol=1e-10)
 
 
 @pytest.mark.parametrize(
-    "beta, slope", [(0.01, -1.13698828), (0.1, -0.991601507), (0.5, -0.548253884), (1.0, -0.291955441)]
+    "beta, slope",
+    [(0.01, -1.13698828), (0.1, -0.991601507), (0.5, -0.548253884), (1.0, -0.291955441)],
 )
 def test_derivative_of_restitution(beta, slope):
     result = jax.jacfwd(lambda b: solve(b).restitution)(beta)
@@ -89,7 +92,9 @@ def test_force_has_finite_derivatives_at_touch():
 
 def test_elastic_constant_of_steel_balls():
     # 2 Y sqrt(sigma/4) / (3 (1 - nu^2)) by hand: Y = 2e11, nu = 0.3, sigma = 0.01.
-    np.testing.assert_allclose(elastic_constant(2e11, 0.3, 0.01), 2e11 * 0.1 / (3 * 0.91), rtol=1e-12)
+    np.testing.assert_allclose(
+        elastic_constant(2e11, 0.3, 0.01), 2e11 * 0.1 / (3 * 0.91), rtol=1e-12
+    )
 
 
 def test_negative_beta_is_refused():

@@ -64,7 +64,10 @@ def test_nothing_is_written_over(write):
         ("time,T\n1,2\n", "missing: t; not known: time"),
         ("t,T,T\n1,2,3\n", "each once"),
         ("t,T,err\n1,2,3\n", "not known: err"),
-        (HEADER + "t,T\n0,1\n1,x\n2,.1\n3,.05\n", r"line 9: expected 2 finite numbers .* got '1,x'"),
+        (
+            HEADER + "t,T\n0,1\n1,x\n2,.1\n3,.05\n",
+            r"line 9: expected 2 finite numbers .* got '1,x'",
+        ),
         (HEADER + "t,T\n0,1\n1,nan\n2,.1\n3,.05\n", "line 9: expected 2 finite numbers"),
         (HEADER + "t,T\n0,1\n1\n2,.1\n3,.05\n", "line 9: expected 2 finite"),
         ("t,T\n0,1\n1,.5\n1,.3\n", r"line 4: t is 1 after 1; times must increase: sort the rows"),
@@ -109,7 +112,14 @@ def test_missing_files_are_refused(tmp_path):
     ],
 )
 def test_bad_headers_are_refused(change, message):
-    header = {"eta": ".05", "diameter": ".002", "density": "2500", "Y": "5e7", "nu": ".2", "T0": ".01"}
+    header = {
+        "eta": ".05",
+        "diameter": ".002",
+        "density": "2500",
+        "Y": "5e7",
+        "nu": ".2",
+        "T0": ".01",
+    }
     header = {k: v for k, v in (header | change).items() if v is not None}
     with pytest.raises(ValueError, match=message):
         jaxgran.read_gas(header)
@@ -134,7 +144,9 @@ def test_any_rows_are_read_or_refused_with_a_reason(rows):
     if good:
         t, x, e = np.array(rows).T
         first = e[0] > 0 or (t[0] == 0 and e[0] == 0)
-        good = t[0] >= 0 and np.all(np.diff(t) > 0) and np.all(x > 0) and first and np.all(e[1:] > 0)
+        good = (
+            t[0] >= 0 and np.all(np.diff(t) > 0) and np.all(x > 0) and first and np.all(e[1:] > 0)
+        )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "curve.csv"
         path.write_text(text)

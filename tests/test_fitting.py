@@ -19,6 +19,7 @@ def synthetic(gas, key, num_points=40, relative_error=RELATIVE_ERROR, displaceme
     exact = jaxgran.cool(gas, times)
     noise = jax.random.normal(key, (2, num_points)) * relative_error
     measured = exact.temperature * jnp.exp(noise[0])
+    assert exact.displacement is not None
     msd = exact.displacement * jnp.exp(noise[1]) if displacement else None
     return jaxgran.CoolingCurve(
         times=times,
@@ -152,7 +153,9 @@ def test_parameters_that_cannot_be_told_apart_are_named():
     free = ("dissipative_constant", "youngs_modulus")
     hard = jaxgran.KineticTheory(softness=False)
     for model in (hard, jaxgran.KineticTheory()):
-        with pytest.warns(UserWarning, match="does not determine dissipative_constant and youngs_modulus"):
+        with pytest.warns(
+            UserWarning, match="does not determine dissipative_constant and youngs_modulus"
+        ):
             result = jaxgran.fit(gas, curve, free=free, model=model)
     diagnosis = jaxgran.diagnose(result, curve)
     assert any("does not determine" in reason for reason in diagnosis.reasons)
@@ -199,7 +202,9 @@ def measured(name):
     return gas, curve, float(header["A"]), int(header["N"]), int(header["replicas"])
 
 
-@pytest.mark.parametrize("free", [("dissipative_constant",), ("dissipative_constant", "temperature")])
+@pytest.mark.parametrize(
+    "free", [("dissipative_constant",), ("dissipative_constant", "temperature")]
+)
 def test_dilute_measured_curve(free):
     gas, curve, a_true, n, replicas = measured("dilute")
     for particles in (None, n * replicas):
@@ -248,7 +253,9 @@ def test_fit_under_vmap_over_a_float_of_the_gas():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(12))
     packings = jnp.array([0.045, 0.05, 0.055])
-    batch = jax.vmap(lambda p: jaxgran.fit(gas.replace(packing_fraction=p), curve).estimate[0])(packings)
+    batch = jax.vmap(lambda p: jaxgran.fit(gas.replace(packing_fraction=p), curve).estimate[0])(
+        packings
+    )
     single = [jaxgran.fit(gas.replace(packing_fraction=p), curve).estimate[0] for p in packings]
     np.testing.assert_allclose(batch, jnp.stack(single), rtol=1e-6)
     assert jnp.all(jnp.diff(batch) < 0)  # a denser gas collides more: less A explains the same

@@ -157,7 +157,9 @@ def test_replace_knows_names_and_ranges(beads):
     gas = beads(0.15)
     assert gas.replace(temperature=0.5).temperature == 0.5
     assert gas.replace(poisson_ratio=0.1).law.poisson_ratio == 0.1
-    with pytest.raises(ValueError, match="no float 'temprature' in this gas; it has youngs_modulus"):
+    with pytest.raises(
+        ValueError, match="no float 'temprature' in this gas; it has youngs_modulus"
+    ):
         gas.replace(temprature=1.0)
     with pytest.raises(ValueError, match="packing_fraction must lie in"):
         gas.replace(packing_fraction=0.9)

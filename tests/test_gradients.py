@@ -111,7 +111,9 @@ def test_elastic_limit():
     slope = jax.jacfwd(log_temperature)(0.0)
     assert jnp.all(jnp.isfinite(slope)) and jnp.all(slope < 0)
     # The slope at a gas so nearly elastic that its curvature (3e-5 of A's effect) is no matter.
-    np.testing.assert_allclose(slope, log_temperature(3e-12) / 3e-12 - log_temperature(0.0) / 3e-12, rtol=2e-3)
+    np.testing.assert_allclose(
+        slope, log_temperature(3e-12) / 3e-12 - log_temperature(0.0) / 3e-12, rtol=2e-3
+    )
 
 
 def test_haff_sensitivity_in_closed_form():
@@ -125,4 +127,6 @@ def test_haff_sensitivity_in_closed_form():
     e = 0.9
     gamma = (1 - e**2) / 6
     exact = 2 * TAUS / (1 + gamma * TAUS) * e / 3
-    np.testing.assert_allclose(jax.jacfwd(log_temperature)(e), exact, rtol=1e-7)  # rtol of the solver
+    np.testing.assert_allclose(
+        jax.jacfwd(log_temperature)(e), exact, rtol=1e-7
+    )  # rtol of the solver

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
+from jaxgran import kinetics
 from jaxgran.cooling import _cool
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
@@ -97,7 +98,11 @@ def test_constant_restitution_diffusion():
     # Quasi-steady D nu / T = (d/2) 4/(1+e)^2 of the Maxwellian gas.
     e = 0.8
     gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(e), diameter=1.0, mass=1.0, packing_fraction=0.1, temperature=1.0
+        jaxgran.ConstantRestitution(e),
+        diameter=1.0,
+        mass=1.0,
+        packing_fraction=0.1,
+        temperature=1.0,
     )
     times = jnp.array([3e3]) * gas.mean_free_time
     curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(sonine=False))
@@ -122,7 +127,7 @@ def test_stiff_solver_for_nearly_elastic_gases(beads):
     times = jnp.geomspace(1.0, 1e9, 20) * gas.mean_free_time
     model = jaxgran.KineticTheory(solver=diffrax.Kvaerno5(), rtol=1e-7)
     curve = jaxgran.cool(gas, times, model=model)
-    formula = jaxgran.kinetics.paper_temperature(times / gas.mean_free_time, gas.delta)
+    formula = kinetics.paper_temperature(times / gas.mean_free_time, gas.delta)
     # The expansion is right to delta here; softness 0.8 % of the rate, a_2 less.
     np.testing.assert_allclose(curve.temperature / gas.temperature, formula, rtol=0.03)
 

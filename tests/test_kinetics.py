@@ -19,7 +19,7 @@ def test_constants_of_the_expansion():
 
 
 def test_averages_of_constant_restitution():
-    # Closed forms for a_2 = 0: mu_2 = S_d (1 - e^2) / (2 sqrt(2 pi)), nu_v = S_d (1+e) 2/(2d sqrt(2 pi)).
+    # Closed forms for a_2 = 0, in share = S_d / sqrt(2 pi): share (1 - e^2)/2, share (1 + e)/d.
     for d in (2, 3):
         e = 0.7
         law = jaxgran.ConstantRestitution(e)
@@ -42,9 +42,10 @@ def test_averages_agree_with_sampled_impacts():
     np.testing.assert_allclose(rates.cooling, sampled, rtol=4e-3)
 
 
-# a_2 of the homogeneous cooling state, from stochastic simulation (statistical errors 2e-4 to 4e-4).
+# a_2 of the homogeneous cooling state, from stochastic simulation (errors 2e-4 to 4e-4).
 @pytest.mark.parametrize(
-    "d, e, a2", [(3, 0.5, 0.0476), (3, 0.8, -0.0145), (3, 0.9, -0.0152), (2, 0.5, 0.0733), (2, 0.9, -0.0301)]
+    "d, e, a2",
+    [(3, 0.5, 0.0476), (3, 0.8, -0.0145), (3, 0.9, -0.0152), (2, 0.5, 0.0733), (2, 0.9, -0.0301)],
 )
 def test_stationary_kurtosis(d, e, a2):
     gas = jaxgran.Gas(
@@ -67,18 +68,19 @@ def test_rate_table_is_exact_over_decades(beads):
         beads(2.0).reduced_law,
         jaxgran.ConstantRestitution(0.5),
         jaxgran.RestitutionSeries([-0.2], [0.5]),
+        jaxgran.RestitutionSeries([-0.1], [1.0]),
     ]
+    # Over five decades the series are exact to 1e-11; over twelve, to 1e-7 where least so.
     for law in laws:
-        for duration in (1e-3, 1.0, 1e5, 1e12):
+        for duration, tolerance in ((1e-3, 1e-11), (1.0, 1e-11), (1e5, 1e-11), (1e12, 1e-7)):
 
             def direct(speed, law=law):
                 return kinetics.averages(law, speed, 3)
 
-            table = kinetics.RateTable.of(direct, jnp.asarray(duration), 3)
+            table = kinetics.RateTable.of(direct, jnp.asarray(duration), 3, law.num_nodes)
             x = jnp.linspace(table.lowest, 0.0, 300)
             error = jax.vmap(table)(x)[:, 0, 0] / jax.vmap(direct)(jnp.exp(x / 2))[:, 0, 0] - 1
-            # Chebyshev's error falls below 1e-11 for laws up to the square root of the speed.
-            assert jnp.max(jnp.abs(error)) < 1e-10
+            assert jnp.max(jnp.abs(error)) < tolerance
 
 
 def test_no_gas_leaves_its_rate_table(beads):
@@ -88,7 +90,7 @@ def test_no_gas_leaves_its_rate_table(beads):
         gas = gas.replace(dissipative_constant=gas.value("dissipative_constant") * beta)
         law, duration = gas.reduced_law, tau / gas.collision_frequency
         duration = duration * gas.impact_speed / gas.path_length
-        table = kinetics.RateTable.of(lambda v: kinetics.averages(law, v, 3), duration, 3)
+        table = kinetics.RateTable.of(lambda v: kinetics.averages(law, v, 3), duration, 3, 20)
         times = tau[None] * gas.mean_free_time
         curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False))
         return table.lowest, jnp.log(curve.temperature[0] / gas.temperature)
@@ -102,7 +104,11 @@ def test_no_gas_leaves_its_rate_table(beads):
 @pytest.mark.parametrize("e", [0.99, 0.9, 0.5, 0.0])
 def test_haff(e):
     gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(e), diameter=1.0, mass=1.0, packing_fraction=0.1, temperature=1.0
+        jaxgran.ConstantRestitution(e),
+        diameter=1.0,
+        mass=1.0,
+        packing_fraction=0.1,
+        temperature=1.0,
     )
     tau = jnp.geomspace(1e-3, 1e8, 100)
     curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=jaxgran.KineticTheory(sonine=False))
@@ -129,7 +135,9 @@ def test_expansion_is_right_to_its_order(beads):
         for delta in (1e-3, 1e-2):
             gas = beads(0.15)
             scale = delta / gas.delta
-            law = jaxgran.Viscoelastic(5e7, 0.22, gas.value("dissipative_constant") * scale, clipped)
+            law = jaxgran.Viscoelastic(
+                5e7, 0.22, gas.value("dissipative_constant") * scale, clipped
+            )
             gas = jaxgran.Gas(
                 law,
                 diameter=gas.diameter,
@@ -165,7 +173,7 @@ def test_paper_averages_are_the_first_two_terms(beads):
 
 
 def test_velocity_relaxation_as_printed(beads):
-    # The paper's Eq. (30), with its own coefficients: 1 - 3/4 Gamma(21/10) C1 A alpha^.4 (4T)^.1 + ...
+    # The paper's Eq. (30) with its own coefficients: 1 - 3/4 Gamma(21/10) C1 delta 4^.1 + ...
     from math import gamma
 
     from jaxgran.restitution import C1

@@ -93,9 +93,7 @@ def test_series_of_viscoelastic_spheres(beads):
         gas.law, diameter=gas.diameter, mass=gas.mass, num_terms=5
     )
     v = jnp.array([0.01, 0.1, 0.5])
-    exact = jaxgran.viscoelastic_restitution(
-        0.02 * (v / gas.impact_speed) ** 0.2, clipped=False
-    )
+    exact = jaxgran.viscoelastic_restitution(0.02 * (v / gas.impact_speed) ** 0.2, clipped=False)
     np.testing.assert_allclose(law.restitution(v), exact, atol=1e-7)  # sixth term: .155 beta^6
     assert law.coefficients.shape == (5,)
 

@@ -29,9 +29,10 @@ class _State(NamedTuple):
 class KineticTheory(eqx.Module):
     """The homogeneous cooling gas, by Maxwell-Sonine kinetic theory; integrated with diffrax.
 
-    ``dT/dt = -(2/d) mu_2 T (1 - c X_T/sigma)``, ``da_2/dt = (4/d) mu_2 (1 + a_2) - 4 mu_4/(d(d+2))``,
-    ``dD/dt = T - nu_v D``, ``d<dr^2>/dt = 2 d D``, ``dN/dt = nu`` from ``a_2 = D = <dr^2> = N = 0``,
-    with averages exact in eps(v) (`jaxgran.kinetics.rates`). Leaves out correlations, clustering
+    ``dT/dt = -(2/d) mu_2 T (1 - c X_T/sigma)``,
+    ``da_2/dt = (4/d) mu_2 (1 + a_2) - 4 mu_4/(d(d+2))``,
+    ``dD/dt = T - nu_v D``, ``d<dr^2>/dt = 2 d D``, ``dN/dt = nu``, all but T from 0,
+    with averages exact in eps(v) (`jaxgran.kinetics.averages`). Leaves out correlations, clustering
     and three-body contacts: right for dilute gases in boxes below L_c whose contacts are short.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
@@ -92,10 +93,9 @@ class KineticTheory(eqx.Module):
 
         @solve.defjvp
         def solve_jvp(at, along):
-            state, velocity, jacobian = self._solve(*at[:1], unravel, *at[1:], gas.dimension)
-            return state, jax.tree.map(
-                lambda v, j: v * along[1] + along[0] @ j, velocity, jacobian
-            )
+            parameters, times = at
+            state, velocity, jacobian = self._solve(parameters, unravel, times, gas.dimension)
+            return state, jax.tree.map(lambda v, j: v * along[1] + along[0] @ j, velocity, jacobian)
 
         state = solve(parameters, times / unit_time)
         theta = jnp.exp(state.log_temperature)
@@ -112,7 +112,7 @@ class KineticTheory(eqx.Module):
     def _table(self, law: ReducedLaw, duration: Array, dimension: int) -> kinetics.RateTable:
         averages = kinetics.averages if self.averages == "exact" else kinetics.paper_averages
         return kinetics.RateTable.of(
-            lambda speed: averages(law, speed, dimension), duration, dimension
+            lambda speed: averages(law, speed, dimension), duration, dimension, law.num_nodes
         )
 
     def _velocity(self, state: Array, averages: Array, law: ReducedLaw, dimension: int) -> Array:
@@ -153,29 +153,23 @@ class KineticTheory(eqx.Module):
             return self._velocity(state, averages, unravel(parameters), dimension)
 
         table, table_along = jax.linearize(tabulate, parameters)
-        # One series for the averages and, beside them, their derivatives in the parameters.
         along = jax.vmap(lambda x: table_along(x).coefficients, out_axes=1)(directions)
-        tables = kinetics.RateTable(
-            jnp.concatenate([table.coefficients[:, None], along], axis=1), table.lowest
-        )
+        tables_along = kinetics.RateTable(along, table.lowest)
 
         def rows_velocity(s, rows, args):
             # s = ln(1 + t): a power law of time takes the same number of steps each decade.
             # Row 0 is the state; the others, its tangents, obey the linearised equation.
             state, state_tangents = rows[0], rows[1:]
             log_theta, ones = state[0], jnp.ones((), times.dtype)
-            averages, slopes = jax.jvp(tables, (log_theta,), (ones,))
+            averages, slope = jax.jvp(table, (log_theta,), (ones,))
 
             def along(tangent, averages_along, direction):
-                averages_along = averages_along + slopes[0] * tangent[0]
-                return jax.jvp(
-                    velocity,
-                    (state, averages[0], parameters),
-                    (tangent, averages_along, direction),
-                )[1]
+                averages_along = averages_along + slope * tangent[0]
+                at = (state, averages, parameters)
+                return jax.jvp(velocity, at, (tangent, averages_along, direction))[1]
 
-            rate = velocity(state, averages[0], parameters)
-            rates_along = jax.vmap(along)(state_tangents, averages[1:], directions)
+            rate = velocity(state, averages, parameters)
+            rates_along = jax.vmap(along)(state_tangents, tables_along(log_theta), directions)
             return jnp.concatenate([rate[None], rates_along]) * jnp.exp(s)
 
         s = jnp.log1p(times)

@@ -1,0 +1,78 @@
+"""The scripts a person runs, run as a person would."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXPERIMENTS = Path(__file__).parent.parent / "experiments"
+DENSE = EXPERIMENTS / "data" / "lammps_cooling_dense.csv"
+
+
+def run(script, *arguments, cwd):
+    command = [sys.executable, str(EXPERIMENTS / script), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
+
+
+def test_main_job_without_arguments(tmp_path):
+    done = run("fit_cooling_curve.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout.splitlines()[-1])
+    assert abs(summary["A"] / 3e-6 - 1) < 0.02
+    assert abs(summary["A"] - 3e-6) < 2 * summary["A_std_err"]
+    assert summary["converged"] and summary["explains"] and summary["model"] == "kinetic-theory"
+    assert 0.5 < summary["reduced_chi2"] < 1.5
+    assert "Kinetic theory explains this curve." in done.stdout
+    folder = tmp_path / "results" / "lammps_cooling_dilute-kinetic-theory"
+    picture, record = sorted(folder.iterdir(), reverse=True)
+    assert picture.suffix == ".png" and picture.stat().st_size > 20_000
+    assert json.loads(record.read_text())["parameters"][0]["parameter"] == "A"
+
+
+def test_main_job_says_what_it_cannot_explain(tmp_path):
+    done = run("fit_cooling_curve.py", DENSE, "--free", "A", "T0", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "This scene needs soft spheres" in done.stdout
+    assert not json.loads(done.stdout.splitlines()[-1])["explains"]
+    # Nothing is written over unless asked.
+    before = {path: path.read_bytes() for path in (tmp_path / "here").iterdir()}
+    again = run("fit_cooling_curve.py", DENSE, "--out", "here", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "exists; name another --out or say --overwrite" in again.stderr
+    assert {path: path.read_bytes() for path in (tmp_path / "here").iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["nowhere.csv"], "no such file"),
+        (["--set", "Y=-1"], "youngs_modulus must lie in"),
+        (["--set", "youngs=1"], "give KEY=VALUE with KEY one of eta"),
+        (["--set", "N=many"], "header line N"),
+        (["bare.csv"], "the header lacks eta, diameter"),
+    ],
+)
+def test_main_job_refuses_bad_input(arguments, message, tmp_path):
+    (tmp_path / "bare.csv").write_text("t,T\n1,3\n2,2\n3,1\n")
+    done = run("fit_cooling_curve.py", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ") and message in done.stderr
+    assert not (tmp_path / "results").exists()
+
+
+def test_main_job_reads_the_header_a_not(tmp_path):
+    # A header's A is only compared with: another one changes no estimate.
+    text = DENSE.read_text().replace("# A: 8e-05", "# A: 1")
+    (tmp_path / "other.csv").write_text(text)
+    done = run("fit_cooling_curve.py", "other.csv", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert 6.0e-5 < json.loads(done.stdout.splitlines()[-1])["A"] < 6.8e-5
+
+
+def test_benchmark_runs(tmp_path):
+    done = run("benchmark_kinetic_theory.py", "--smoke", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    row = json.loads(done.stdout.splitlines()[-1])
+    assert row["vmap_error"] < 1e-6 and row["scipy_error"] < 1e-6  # the same physics, twice
