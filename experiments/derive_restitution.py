@@ -4,7 +4,8 @@
 
 Solves the impact ODE for some 200 beta, fits ``ln eps + decay ln(1 + kappa beta)`` by
 ``beta P(z) / Q(z)``, z = sqrt(beta), in the least-maximum sense (Lawson's reweighting of
-a linearised least-squares fit), and prints the coefficients that stand in ``jaxgran/restitution.py``.
+a linearised least-squares fit), and prints the coefficients that stand in
+``jaxgran/restitution.py``.
 """
 
 import jax

@@ -217,7 +217,8 @@ class Gas(eqx.Module):
         """``L_c = 2 pi / k_c``, m: the gas stays homogeneous only in boxes shorter than this.
 
         ``k_c sigma = n sigma^3 sqrt((32 pi / 15) (1 - eps^2))`` (3D) or
-        ``n sigma^2 sqrt(pi (1 - eps^2))`` (2D), of a dilute gas, with eps at `impact_speed`; infinite for elastic spheres.
+        ``n sigma^2 sqrt(pi (1 - eps^2))`` (2D), of a dilute gas, with eps at
+        `impact_speed`; infinite for elastic spheres.
         """
         eps = self.reduced_law.restitution(jnp.ones_like(self.temperature))
         strength = 32 * pi / 15 if self.dimension == 3 else pi

@@ -294,8 +294,8 @@ def two_term_time(theta: ArrayLike, delta: ArrayLike) -> Float[Array, "..."]:
     """Exact solution tau(T/T_0) of the paper's two-term cooling equation, in 3D.
 
     With ``x = (T/T_0)^(1/10)`` and ``k = q delta`` the equation
-    ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)`` integrates to ``tau = 6/(c delta) [sum_{j<6} k^j (x^(j-6) - 1)/(6 - j) - k^6 ln x
-    + k^6 ln((1 - k x)/(1 - k))]``, c = 0.83193.
+    ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)`` integrates to ``tau = 6/(c delta) [
+    sum_{j<6} k^j (x^(j-6) - 1)/(6 - j) - k^6 ln x + k^6 ln((1 - k x)/(1 - k))]``, c = 0.83193.
 
     Args:
         theta: T/T_0, in (0, 1], any shape.

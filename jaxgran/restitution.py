@@ -114,8 +114,8 @@ def viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[
 
     Returns:
         eps, in (0, 1], with relative error against `contact.impact` below 1e-9 for every beta up
-        to 1e4 (clipped), 1e-7 for every beta up to 40 (unclipped); beyond, below 3e-5. Derivatives are
-        finite and right down to beta = 0.
+        to 1e4 (clipped), 1e-7 for every beta up to 40 (unclipped); beyond, below 3e-5.
+        Derivatives are finite and right down to beta = 0.
     """
     beta = jnp.asarray(beta, dtype=jnp.result_type(float, beta))
     fit = _CLIPPED if clipped else _UNCLIPPED
