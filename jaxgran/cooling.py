@@ -30,13 +30,26 @@ def cool(
         `CoolingCurve` at those times.
 
     Raises:
-        ValueError: for times that are negative, unsorted, not finite or not a list.
+        ValueError: for times that are negative, unsorted, not finite or not a list, or a law that
+            heats the gas.
         RuntimeError: if the solver needs more steps than the model allows.
     """
     if not isinstance(gas, Gas):
         raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
     times = _checked_times(times)
-    return _cool(gas, times, KineticTheory() if model is None else model)
+    model = KineticTheory() if model is None else model
+    first_rate = _first_cooling_rate(gas, model)
+    if not isinstance(first_rate, Tracer) and np.any(np.asarray(first_rate) < 0):
+        raise ValueError(
+            "the law of restitution makes this gas heat up: averaged over its impacts, eps is "
+            "above 1 (a truncated series beyond its range); lower T_0 or A, or use another law"
+        )
+    return _cool(gas, times, model)
+
+
+@eqx.filter_jit
+def _first_cooling_rate(gas: Gas, model: Model) -> jax.Array:
+    return model.cooling_rate(gas)
 
 
 @eqx.filter_jit

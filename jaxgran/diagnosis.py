@@ -108,7 +108,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     reasons += contacts + space
     if not bool(result.converged):
         reasons.append("the search did not converge: more max_steps or fewer free parameters")
-    group = result.undetermined(0.015)
+    group = result.undetermined()
     if group:
         reasons.append(f"this curve does not determine {' and '.join(group)}")
 

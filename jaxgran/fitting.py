@@ -28,11 +28,12 @@ class Fit(eqx.Module):
 
     Attributes:
         names: the free parameters.
+        accuracy: of the model's clock, relative.
         estimate: their values, SI, shape (p,).
         standard_error: one standard deviation of each, SI, shape (p,): the measurement errors
             carried through; if the model does not explain the curve, times sqrt(reduced chi^2).
         model_error: by how much each would move if the model's clock were wrong by its known
-            accuracy (`model.accuracy`), SI, shape (p,). Not part of `standard_error`.
+            accuracy, SI, shape (p,). Not part of `standard_error`.
         covariance: of the estimates, SI, shape (p, p), scaled alike.
         sensitivity: derivative of the weighted residuals in the parameters' free scale (their
             logarithm, for positive ones), shape (residuals, p).
@@ -48,6 +49,7 @@ class Fit(eqx.Module):
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
+    accuracy: float = eqx.field(static=True)
     estimate: Float[Array, "p"]
     standard_error: Float[Array, "p"]
     model_error: Float[Array, "p"]
@@ -72,14 +74,14 @@ class Fit(eqx.Module):
         i = self.names.index(name)
         return self.estimate[..., i], self.standard_error[..., i]
 
-    def undetermined(self, accuracy: float) -> tuple[str, ...]:
+    def undetermined(self) -> tuple[str, ...]:
         """Parameters that the curve does not determine, alone or apart; empty if it does.
 
         Some change of them together must be left open by more than a factor e, or alter the curve
-        less than `accuracy` (the model's) times as much as the best determined change does.
+        less than the model's `accuracy` times as much as the best determined change does.
         """
         _, singular, rotation = jnp.linalg.svd(self.sensitivity, full_matrices=False)
-        apart = float(singular[-1]) >= accuracy * float(singular[0])
+        apart = float(singular[-1]) >= self.accuracy * float(singular[0])
         if float(singular[-1]) > 1.0 and apart:
             return ()
         share = [abs(float(x)) for x in rotation[-1]]
@@ -148,7 +150,7 @@ def fit(
                 'jax.config.update("jax_enable_x64", True) first',
                 stacklevel=2,
             )
-        group = result.undetermined(model.accuracy)
+        group = result.undetermined()
         if group:
             warnings.warn(
                 f"the curve does not determine {' and '.join(group)}: only some combination of "
@@ -282,6 +284,7 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
     num_times = curve.times.size
     return Fit(
         names=names,
+        accuracy=model.accuracy,
         estimate=estimates(flat),
         standard_error=jnp.sqrt(jnp.diag(covariance)),
         model_error=model_error,

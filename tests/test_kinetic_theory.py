@@ -177,6 +177,18 @@ def test_times_are_ordered_or_refused(times):
             jaxgran.cool(glass_beads(), times)
 
 
+def test_a_law_that_heats_is_refused(beads):
+    hot = jaxgran.RestitutionSeries([0.1], [0.2])
+    gas = jaxgran.Gas(hot, diameter=1.0, mass=1.0, packing_fraction=0.1, temperature=1.0)
+    with pytest.raises(ValueError, match="makes this gas heat up"):
+        jaxgran.cool(gas, [1.0])
+    # The paper's two terms do the same once delta > 1/q = 0.434.
+    paper = jaxgran.KineticTheory(averages="paper")
+    jaxgran.cool(beads(0.69), [1.0], model=paper)
+    with pytest.raises(ValueError, match="truncated series beyond its range"):
+        jaxgran.cool(beads(0.71), [1.0], model=paper)
+
+
 def test_bad_options_are_refused(beads):
     with pytest.raises(ValueError, match='averages must be "exact" or "paper", got \'printed\''):
         jaxgran.KineticTheory(averages="printed")

@@ -1,6 +1,7 @@
 """Kinetic theory: the homogeneous gas as five ordinary differential equations."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import diffrax
@@ -78,6 +79,12 @@ class KineticTheory(eqx.Module):
         """Relative error of <dr^2>: what the first Sonine order leaves out of D."""
         return {2: 0.024, 3: 0.017}[dimension]
 
+    def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
+        """``-d ln T/dt`` at t = 0, 1/s, of the Maxwellian gas; negative if the law heats it."""
+        speed = jnp.ones_like(gas.temperature)
+        mu_2 = self._averages(gas.reduced_law, speed, gas.dimension)[0, 0]
+        return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
+
     def cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them."""
         unit_time = gas.path_length / gas.impact_speed
@@ -109,11 +116,9 @@ class KineticTheory(eqx.Module):
             displacement=state.displacement * length**2,
         )
 
-    def _table(self, law: ReducedLaw, duration: Array, dimension: int) -> kinetics.RateTable:
-        averages = kinetics.averages if self.averages == "exact" else kinetics.paper_averages
-        return kinetics.RateTable.of(
-            lambda speed: averages(law, speed, dimension), duration, dimension, law.num_nodes
-        )
+    def _averages(self, law: ReducedLaw, speed: Array, dimension: int) -> Array:
+        of = kinetics.averages if self.averages == "exact" else kinetics.paper_averages
+        return of(law, speed, dimension)
 
     def _velocity(self, state: Array, averages: Array, law: ReducedLaw, dimension: int) -> Array:
         """Time derivative of the state, in reduced time."""
@@ -147,7 +152,9 @@ class KineticTheory(eqx.Module):
         directions = jnp.eye(parameters.size, dtype=times.dtype)[: None if tangents else 0]
 
         def tabulate(parameters):
-            return self._table(unravel(parameters), times[-1], dimension)
+            law = unravel(parameters)
+            averages = partial(self._averages, law, dimension=dimension)
+            return kinetics.RateTable.of(averages, times[-1], dimension, law.num_nodes)
 
         def velocity(state, averages, parameters):
             return self._velocity(state, averages, unravel(parameters), dimension)
