@@ -75,9 +75,9 @@ def run(options: argparse.Namespace) -> None:
     curve, header = jaxgran.read_curve(options.curve)
     header |= settings(options.set)
     gas = jaxgran.read_gas(header)
-    picture, record = outputs(options)
     n = num_particles(header)
     replicas = int(header_number(header, "replicas")) if "replicas" in header else 1
+    picture, record = outputs(options)
     model = MODELS[options.model]()
     free = tuple(PARAMETERS[key][0] for key in options.free)
     imported = time.perf_counter() - started
@@ -136,6 +136,7 @@ def run(options: argparse.Namespace) -> None:
         f"{options.curve.stem}: {head['parameter']} = {head['estimate']:.4g} "
         f"± {head['std_err']:.2g} {head['unit']}\n{diagnosis.verdict}"
     )
+    picture.parent.mkdir(parents=True, exist_ok=True)
     plot_fit(result, curve, title, picture)
     summary = {
         **{row["parameter"]: row["estimate"] for row in rows},
@@ -183,7 +184,6 @@ def outputs(options: argparse.Namespace) -> tuple[Path, Path]:
         folder, i = Path("results") / stem, 2
         while folder.exists():
             folder, i = Path("results") / f"{stem}-{i}", i + 1
-    folder.mkdir(parents=True, exist_ok=True)
     files = folder / f"{stem}.png", folder / f"{stem}.json"
     for file in files:
         if file.exists() and not options.overwrite:
