@@ -167,7 +167,8 @@ def impact(
             Derivatives (forward mode) need beta > 0.
         clipped: whether contact ends where the force vanishes (default) or where the overlap does.
         rtol: relative tolerance of the adaptive eighth-order solver.
-        max_steps: the most steps of either half of the impact.
+        max_steps: the most steps of either half of the impact; the default serves beta <= 1e4
+            (clipped) and beta <= 1e3 (unclipped, whose rebound creeps: seconds there).
 
     Returns:
         `Impact` with restitution, duration in X/v and largest overlap in X.
