@@ -2,11 +2,12 @@
 
 from jaxgran.contact import Impact, contact_force, elastic_constant, impact
 from jaxgran.cooling import cool
-from jaxgran.curve import CoolingCurve, read_curve, read_gas, write_curve
+from jaxgran.curve import CoolingCurve, Particles, read_curve, read_gas, write_curve
 from jaxgran.diagnosis import Diagnosis, diagnose
 from jaxgran.fitting import Fit, fit
 from jaxgran.gas import Gas, sphere_mass
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.restitution import (
     ConstantRestitution,
     ReducedLaw,
@@ -24,9 +25,11 @@ __all__ = [
     "Gas",
     "Impact",
     "KineticTheory",
+    "Particles",
     "ReducedLaw",
     "RestitutionLaw",
     "RestitutionSeries",
+    "SoftSpheres",
     "Viscoelastic",
     "contact_force",
     "cool",

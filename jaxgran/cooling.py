@@ -12,8 +12,10 @@ from jaxtyping import ArrayLike
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.soft_spheres import SoftSpheres
+from jaxgran.restitution import Viscoelastic
 
-Model = KineticTheory
+Model = KineticTheory | SoftSpheres
 
 
 def cool(
@@ -38,23 +40,19 @@ def cool(
         raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
     times = _checked_times(times)
     model = KineticTheory() if model is None else model
-    first_rate = _first_cooling_rate(gas, model)
-    if not isinstance(first_rate, Tracer) and np.any(np.asarray(first_rate) < 0):
-        raise ValueError(
-            "the law of restitution makes this gas heat up: averaged over its impacts, eps is "
-            "above 1 (a truncated series beyond its range); lower T_0 or A, or use another law"
-        )
-    return _cool(gas, times, model)
-
-
-@eqx.filter_jit
-def _first_cooling_rate(gas: Gas, model: Model) -> jax.Array:
-    return model.cooling_rate(gas)
-
-
-@eqx.filter_jit
-def _cool(gas: Gas, times: jax.Array, model: Model) -> CoolingCurve:
+    if not isinstance(gas.law, Viscoelastic):  # whose eps is never above 1
+        first_rate = _first_cooling_rate(gas)
+        if not isinstance(first_rate, Tracer) and np.any(np.asarray(first_rate) < 0):
+            raise ValueError(
+                "the law of restitution makes this gas heat up: averaged over its impacts, eps is "
+                "above 1 (a truncated series beyond its range); lower T_0 or A, or use another law"
+            )
     return model.cool(gas, times)
+
+
+@eqx.filter_jit
+def _first_cooling_rate(gas: Gas) -> jax.Array:
+    return KineticTheory().cooling_rate(gas)
 
 
 def _checked_times(times) -> jax.Array:

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxgran.gas import Gas, sphere_mass
 from jaxgran.restitution import Viscoelastic
@@ -26,6 +27,20 @@ GAS_KEYS = ("eta", "diameter", "density", "Y", "nu", "T0")
 """Header keys, beside N, without which a file does not tell the gas."""
 
 
+class Particles(NamedTuple):
+    """Every particle of every replica at one time, SI.
+
+    Attributes:
+        position: in [0, box_side), m, shape (replicas, N, d).
+        velocity: m/s, same shape.
+        box_side: of the periodic cube (square), m.
+    """
+
+    position: Float[Array, "replicas N d"]
+    velocity: Float[Array, "replicas N d"]
+    box_side: Float[Array, ""]
+
+
 class CoolingCurve(eqx.Module):
     """How a gas cooled and spread, measured or computed. All arrays have the shape of `times`.
 
@@ -38,6 +53,13 @@ class CoolingCurve(eqx.Module):
         diffusion: self-diffusion coefficient D(t), m^2/s; None if unknown.
         temperature_error: standard error of T, of a measured or stochastic curve.
         displacement_error: standard error of <dr^2>.
+        velocity_correlation: <v(0) . v(t)>/d, m^2/s^2, of particle models.
+        elastic_energy, dissipated_energy: per particle, J; with (d/2) m T they add up to the
+            energy at the start. Of models that resolve contacts.
+        replicas: the same curve of each replica, all arrays of shape (replicas, times).
+        particles: the last state of a particle model.
+        status: 0, or what went wrong under `jax.jit` or `jax.vmap`, where nothing can be raised
+            (values are then nan); `jaxgran.status.explain` says it in words.
     """
 
     times: Float[Array, "times"]
@@ -48,6 +70,12 @@ class CoolingCurve(eqx.Module):
     diffusion: Float[Array, "times"] | None = None
     temperature_error: Float[Array, "times"] | None = None
     displacement_error: Float[Array, "times"] | None = None
+    velocity_correlation: Float[Array, "times"] | None = None
+    elastic_energy: Float[Array, "times"] | None = None
+    dissipated_energy: Float[Array, "times"] | None = None
+    replicas: "CoolingCurve | None" = None
+    particles: Particles | None = None
+    status: Int[Array, ""] | None = None
 
     def check(self, place: Callable[[int], str] = "point {}".format) -> None:
         """Raise ValueError if this cannot be a measured curve. Traced values pass unseen.

@@ -85,6 +85,7 @@ class KineticTheory(eqx.Module):
         mu_2 = self._averages(gas.reduced_law, speed, gas.dimension)[0, 0]
         return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
 
+    @eqx.filter_jit
     def cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them."""
         unit_time = gas.path_length / gas.impact_speed

@@ -1,0 +1,343 @@
+"""Soft spheres in blocks of time steps: who may touch, the steps of those, free flight of the rest.
+
+Units here: diameter, mass and first temperature are 1.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from jaxgran import neighbours, status
+from jaxgran.contact import contact_force, midpoint_rate
+from jaxgran.neighbours import Pairs
+
+EXCHANGE_TOLERANCE = 0.1
+"""Energy that a block may gain or lose by its steps, over the work done in its contacts."""
+
+
+class Scene(NamedTuple):
+    """The gas in units of its diameter, mass and first temperature."""
+
+    side: Array  # of the box
+    alpha: Array
+    dissipative_constant: Array
+    contact_duration: Array  # mean, elastic, at T = 1
+    collision_frequency: Array  # at T = 1
+
+
+class State(NamedTuple):
+    """All particles of all replicas, replica after replica (n = replicas * N)."""
+
+    time: Float[Array, ""]
+    position: Float[Array, "n d"]  # since the last list build, not wrapped
+    velocity: Float[Array, "n d"]
+    image: Int[Array, "n d"]  # whole box sides to add
+    origin: Float[Array, "n d"]  # at t = 0
+    first_velocity: Float[Array, "n d"]
+    elastic: Float[Array, "replicas"]  # energy in contacts
+    dissipated: Float[Array, "replicas"]
+    contacts: Int[Array, "replicas"]  # begun, each pair once
+    skin: Float[Array, ""]  # reach of the neighbour list beyond contact
+    refine: Float[Array, ""]  # steps are shorter than asked by this factor
+
+
+def at_start(position, velocity, scene: Scene, skin: ArrayLike, replicas: int) -> State:
+    """Particles at t = 0. Their elastic energy is counted by the first `advance`."""
+    zeros = jnp.zeros(replicas, position.dtype)
+    return State(
+        time=jnp.zeros((), position.dtype),
+        position=neighbours.wrap(scene.side, position),
+        velocity=velocity,
+        image=jnp.zeros(position.shape, jnp.int32),
+        origin=neighbours.wrap(scene.side, position),
+        first_velocity=velocity,
+        elastic=zeros,
+        dissipated=zeros,
+        contacts=jnp.zeros(replicas, jnp.result_type(int)),
+        skin=jnp.asarray(skin, position.dtype),
+        refine=jnp.ones((), position.dtype),
+    )
+
+
+def rewrapped(state: State, side: ArrayLike) -> State:
+    """The same state with every position moved into the box; the list must then be built anew."""
+    inside = neighbours.wrap(side, state.position)
+    image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
+    return state._replace(position=inside, image=image)
+
+
+class Room(NamedTuple):
+    """How many rows the arrays of a compiled run have."""
+
+    pairs: int
+    near: int
+    contacts: int
+    members: int
+
+
+class _Selection(NamedTuple):
+    """The pairs that may touch in a block, and their particles."""
+
+    members: Int[Array, "members"]  # particle of a slot; n where the slot is empty
+    a: Int[Array, "contacts"]  # slots
+    b: Int[Array, "contacts"]
+    offset: Float[Array, "contacts d"]
+    replica: Int[Array, "contacts"]
+    expected: Bool[Array, "contacts"]  # both partners' neighbours are looked at too
+    needed: Room  # how many rows there would have to be
+
+
+def _rows(mask: Array, size: int) -> tuple[Array, Array]:
+    """Indices where a mask holds, filled up with its length, and how many there are."""
+    ranks = jnp.cumsum(mask, dtype=jnp.int32)
+    places = jnp.where(mask, ranks - 1, size)
+    indices = jnp.arange(mask.size, dtype=jnp.int32)
+    rows = jnp.full(size, mask.size, jnp.int32).at[places].set(indices, mode="drop")
+    return rows, ranks[-1]
+
+
+def _select(state, pairs: Pairs, duration, margin, extra, replicas: int, room: Room):
+    x, v = state.position, state.velocity
+    n = len(x)
+
+    def relative(i, j, offset):
+        r, u = x[i] - x[j] - offset, v[i] - v[j]
+        return jnp.sum(r * r, -1), jnp.sum(r * u, -1), jnp.sum(u * u, -1)
+
+    apart = x[pairs.i] - x[pairs.j] - pairs.offset
+    near = jnp.sum(apart * apart, -1) < (1 + margin) ** 2
+    near &= jnp.arange(near.size) < pairs.count
+    rows, num_near = _rows(near, room.near)
+    real = jnp.arange(room.near) < num_near
+    i, j, offset = pairs.i[rows], pairs.j[rows], pairs.offset[rows]
+
+    # Who would touch in free flight, who is near to those, and whoever is near to these.
+    distance2, approach, speed2 = relative(i, j, offset)
+    closest = jnp.clip(-approach / jnp.where(speed2 > 0, speed2, 1.0), 0.0, duration)
+    touch = real & (distance2 + (2 * approach + speed2 * closest) * closest < 1.0)
+
+    def spread(active, mask):
+        ends = jnp.where(mask[None], jnp.stack([i, j]), n)
+        return active.at[ends].set(True, mode="drop")
+
+    active = spread(extra, touch)
+    active = spread(active, real & (active[i] | active[j]))
+    chosen = real & (active[i] | active[j])
+    present = spread(jnp.zeros(n, bool), chosen)
+    rows, num_contacts = _rows(chosen, room.contacts)
+    real = jnp.arange(room.contacts) < num_contacts
+    rows = jnp.where(real, rows, 0)
+    i, j, offset = i[rows], j[rows], offset[rows]
+    members, num_members = _rows(present, room.members)
+    slot = jnp.cumsum(present, dtype=jnp.int32) - 1
+    return _Selection(
+        members=members,
+        a=jnp.where(real, slot[i], 0),
+        b=jnp.where(real, slot[j], 0),
+        offset=jnp.where(real[:, None], offset, 2.0),  # an empty row is a pair too far apart
+        replica=i // (n // replicas),
+        expected=active[i] & active[j],
+        needed=Room(pairs.count, num_near, num_contacts, num_members),
+    )
+
+
+class _Work(NamedTuple):
+    """What the contacts of a block did, one row a pair."""
+
+    dissipated: Array
+    exchanged: Array  # work done against and by the elastic force
+    begun: Array
+    touching: Array
+
+
+def _contacts(x, v, scene: Scene, chosen: _Selection, duration, num_steps, clipped):
+    """Positions and velocities of the members after `num_steps` drift-kick-drift steps."""
+    rho, dt = 0.5 * scene.alpha, duration / num_steps
+    a, b, offset = chosen.a, chosen.b, chosen.offset
+
+    def overlap(x):
+        r = x[a] - x[b] - offset
+        distance2 = jnp.sum(r * r, -1)
+        touching = distance2 < 1
+        distance = jnp.sqrt(jnp.where(touching, distance2, 1.0))
+        return 1 - distance, r / distance[:, None], touching
+
+    def step(carry, _):
+        x, v, work = carry
+        xi, normal, touching = overlap(x)
+        xi_dot = -jnp.sum((v[a] - v[b]) * normal, -1)
+        rate = midpoint_rate(xi, xi_dot, scene.alpha, scene.dissipative_constant, dt)
+        force = contact_force(xi, rate, rho, scene.dissipative_constant, clipped=clipped)
+        elastic = contact_force(xi, 0.0, rho, 0.0)
+        kick = (dt * force)[:, None] * normal
+        v = v.at[a].add(kick).at[b].add(-kick)
+        # The midpoint sum of sqrt(xi) xi_dot^2 errs to the other side of the trapezoidal one.
+        mean = xi_dot - dt * force
+        viscous = contact_force(xi, 1.0, rho, scene.dissipative_constant) - elastic
+        lost = (force - elastic) * mean + 0.5 * viscous * (dt * force) ** 2
+        work = _Work(
+            dissipated=work.dissipated + dt * lost,
+            exchanged=work.exchanged + dt * elastic * jnp.abs(mean),
+            begun=work.begun + (touching & ~work.touching),
+            touching=touching,
+        )
+        return (x + dt * v, v, work), None
+
+    zeros = jnp.zeros(len(a), x.dtype)
+    work = _Work(zeros, zeros, jnp.zeros(len(a), jnp.int32), overlap(x)[2])
+    begun_before = work.touching
+    (x, v, work), _ = jax.lax.scan(step, (x + 0.5 * dt * v, v, work), length=num_steps)
+    x = x - 0.5 * dt * v
+    xi = overlap(x)[0]
+    stored = 0.4 * rho * jnp.where(xi > 0, xi, 0.0) ** 2.5
+    return x, v, work, stored, (work.begun > 0) | begun_before
+
+
+def _elastic_energy(
+    x: Array, scene: Scene, pairs: Pairs, replicas: int
+) -> Float[Array, "replicas"]:
+    """``(2/5) rho xi^(5/2)`` of all contacts, by replica."""
+    r = x[pairs.i] - x[pairs.j] - pairs.offset
+    distance2 = jnp.sum(r * r, -1)
+    touching = (distance2 < 1) & (jnp.arange(len(r)) < pairs.count)
+    xi = 1 - jnp.sqrt(jnp.where(touching, distance2, 1.0))
+    replica = pairs.i // (len(x) // replicas)
+    return jnp.zeros(replicas, x.dtype).at[replica].add(0.2 * scene.alpha * xi**2.5)
+
+
+class Progress(NamedTuple):
+    state: State
+    extra: Array  # particles found to take part only when the block had been stepped
+    widen: Array
+    stale: Array  # the neighbour list must be built anew
+    status: Array
+    needed: Array  # the most rows of each of Room
+    num_blocks: Array
+    num_failed: Array
+
+
+@partial(
+    jax.jit,
+    static_argnames=(
+        "replicas",
+        "steps_per_contact",
+        "steps_per_block",
+        "room",
+        "clipped",
+        "max_blocks",
+    ),
+)
+def advance(
+    state: State,
+    pairs: Pairs,
+    scene: Scene,
+    end: ArrayLike,
+    *,
+    replicas: int,
+    steps_per_contact: int,
+    steps_per_block: int,
+    room: Room,
+    clipped: bool,
+    max_blocks: int = 1_000_000,
+) -> Progress:
+    """Step until `end`, or until the pair list is used up, or something goes wrong.
+
+    The gas moves in blocks of `steps_per_block` steps. In a block only particles that may touch are
+    stepped; all others fly freely, which is exact.
+    """
+    reference = state.position
+
+    def kinetic(v):
+        return 0.5 * jnp.sum(v.reshape(replicas, -1) ** 2, axis=-1)
+
+    def thermal(v):
+        boxes = v.reshape(replicas, -1, v.shape[-1])
+        centred = boxes - jnp.mean(boxes, axis=1, keepdims=True)
+        return jnp.mean(centred**2, axis=(1, 2))
+
+    def block(now: Progress) -> Progress:
+        state = now.state
+        x, v = state.position, state.velocity
+        hottest = jnp.max(thermal(v))
+        longest_step = scene.contact_duration * hottest**-0.1 / (steps_per_contact * state.refine)
+        longest = steps_per_block * longest_step
+        left = end - state.time
+        num_left = jnp.maximum(jnp.ceil(left / longest * (1 - 1e-9)), 1.0)
+        duration = left / num_left
+        fastest = jnp.sqrt(jnp.max(jnp.sum(v * v, -1)))
+        reach = 1.5 * fastest * duration * now.widen
+        chosen = _select(state, pairs, duration, 2 * reach, now.extra, replicas, room)
+        before = x.at[chosen.members].get(mode="fill", fill_value=0.0)
+        v_before = v.at[chosen.members].get(mode="fill", fill_value=0.0)
+        after, v_after, work, stored, touched = _contacts(
+            before, v_before, scene, chosen, duration, steps_per_block, clipped
+        )
+
+        def by_replica(values):
+            zeros = jnp.zeros(replicas, values.dtype)
+            return zeros.at[chosen.replica].add(values)
+
+        new = state._replace(
+            time=jnp.where(num_left > 1, state.time + duration, end),
+            position=(x + v * duration).at[chosen.members].set(after, mode="drop"),
+            velocity=v.at[chosen.members].set(v_after, mode="drop"),
+            dissipated=state.dissipated + by_replica(work.dissipated),
+            contacts=state.contacts + by_replica(work.begun),
+            elastic=by_replica(stored),
+        )
+
+        # A sphere outside the chosen ones was hit, or one went farther than was looked.
+        surprise = touched & ~chosen.expected
+        hit = jnp.where(
+            surprise[:, None], chosen.members[jnp.stack([chosen.a, chosen.b], 1)], len(x)
+        )
+        extra = now.extra.at[hit].set(True, mode="drop")
+        too_far = jnp.max(jnp.sum((after - before) ** 2, -1)) > reach**2
+        again = jnp.any(surprise) | too_far
+
+        moved = jnp.sqrt(jnp.max(jnp.sum((new.position - reference) ** 2, -1)))
+        gain = kinetic(new.velocity) - kinetic(v) + new.elastic - state.elastic
+        gain = gain + by_replica(work.dissipated)
+        worked = by_replica(work.exchanged)
+        wrong = jnp.any(jnp.abs(gain) > EXCHANGE_TOLERANCE * worked + 1e-6 * kinetic(v))
+        finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
+        full = jnp.stack(chosen.needed) > jnp.array(room)
+        trouble = (
+            status.flag(status.LIST_FULL, full[0])
+            | status.flag(status.CONTACTS_FULL, jnp.any(full[1:]))
+            | status.flag(status.NOT_FINITE, ~finite)
+            | status.flag(status.STEP_TOO_LARGE, wrong & finite)
+            | status.flag(status.SKIN_OUTRUN, (moved > 0.5 * state.skin) & finite)
+        )
+        done = (trouble == status.OK) & ~again
+        state = jax.tree.map(lambda new, old: jnp.where(done, new, old), new, state)
+        return Progress(
+            state=state,
+            extra=jnp.where(done, False, extra),
+            widen=jnp.where(done, 1.0, jnp.where(too_far, 2 * now.widen, now.widen)),
+            stale=done & (moved + 2 * fastest * duration > 0.5 * state.skin),
+            status=jnp.where(again & (trouble == status.OK), status.OK, trouble),
+            needed=jnp.maximum(now.needed, jnp.stack(chosen.needed)),
+            num_blocks=now.num_blocks + 1,
+            num_failed=now.num_failed + ~done,
+        )
+
+    def unfinished(now: Progress):
+        going = (now.state.time < end) & ~now.stale & (now.status == status.OK)
+        return going & (now.num_blocks < max_blocks)
+
+    zero = jnp.zeros((), jnp.int32)
+    first = Progress(
+        state=state._replace(elastic=_elastic_energy(state.position, scene, pairs, replicas)),
+        extra=jnp.zeros(len(state.position), bool),
+        widen=jnp.ones((), state.position.dtype),
+        stale=jnp.zeros((), bool),
+        status=zero,
+        needed=jnp.zeros(len(room), jnp.int32),
+        num_blocks=zero,
+        num_failed=zero,
+    )
+    return jax.lax.while_loop(unfinished, block, first)

@@ -1,0 +1,178 @@
+"""Periodic box and lists of pairs that may meet; the only file that imports jax_md.
+
+jax_md is imported when a box is first made, since that takes seconds that a user of kinetic theory
+alone need not wait.
+"""
+
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float, Int
+from vesin import NeighborList
+
+ENGINES = ("auto", "vesin", "jax-md")
+"""Who finds the pairs: vesin on the host (fastest on a CPU), jax-md on the device (for GPUs)."""
+
+
+class Pairs(NamedTuple):
+    """Pairs of particles closer than a cutoff, each once.
+
+    Attributes:
+        i, j: indices into the particles of all replicas; rows past `count` are (0, 0).
+        offset: whole box sides that the pair is apart: ``x_i - x_j - offset`` is its shortest
+            displacement, and stays so while particles move on without being wrapped.
+        count: how many pairs there are; more than there is room for means that some are missing.
+    """
+
+    i: Int[Array, "pairs"]
+    j: Int[Array, "pairs"]
+    offset: Float[Array, "pairs d"]
+    count: Int[Array, ""]
+
+
+def displacement(side: ArrayLike, a: Float[Array, "... d"], b: Float[Array, "... d"]):
+    """Shortest ``a - b`` in a periodic cube (square) of the given side, through jax-md."""
+    from jax_md import space
+
+    shortest, _ = space.periodic(jnp.asarray(side))
+    return jnp.vectorize(shortest, signature="(d),(d)->(d)")(a, b)
+
+
+def wrap(side: ArrayLike, position: Float[Array, "... d"]) -> Float[Array, "... d"]:
+    """Positions moved by whole sides into [0, side), through jax-md."""
+    from jax_md import space
+
+    _, shift = space.periodic(jnp.asarray(side))
+    inside = shift(position, jnp.zeros_like(position))
+    return jnp.where(inside >= side, 0.0, inside)  # rounding may land on the far edge
+
+
+def engine(name: str = "auto") -> str:
+    """The list builder to use: `name`, or for "auto" vesin on a CPU and jax-md elsewhere."""
+    if name not in ENGINES:
+        raise ValueError(f"neighbours must be one of {', '.join(ENGINES)}, got {name!r}")
+    if name == "auto":
+        return "vesin" if jax.default_backend() == "cpu" else "jax-md"
+    return name
+
+
+def find_pairs(
+    position: Float[Array, "particles d"],
+    side: ArrayLike,
+    cutoff: ArrayLike,
+    *,
+    replicas: int = 1,
+    room: int,
+    by: str = "vesin",
+) -> Pairs:
+    """All pairs closer than a cutoff, in each of several equal periodic boxes.
+
+    Carries no derivatives. With vesin it works under `jax.jit` and `jax.vmap`, by a call to the
+    host; jax-md sizes its cells from the numbers, so `position`, `side` and `cutoff` must be known.
+
+    Args:
+        position: of all particles, replica after replica, in [0, side).
+        side: of the boxes.
+        cutoff: in the same unit, > 0 and at most half a side.
+        replicas: number of boxes; their particles do not see each other.
+        room: how many pairs can be returned.
+        by: "vesin" or "jax-md"; both return the same pairs.
+    """
+    position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
+    search = {"vesin": _vesin_pairs, "jax-md": _jax_md_pairs}[by]
+    i, j, count = search(position, side, cutoff, replicas, room)
+    return Pairs(i, j, _whole_sides(position, jnp.asarray(side), i, j), count)
+
+
+@jax.jit
+def _whole_sides(position, side, i, j):
+    apart = position[i] - position[j]
+    return side * jnp.round((apart - displacement(side, position[i], position[j])) / side)
+
+
+def _vesin_pairs(position, side, cutoff, replicas, room):
+    def host(position, side, cutoff):
+        return vesin_search(np.asarray(position), float(side), float(cutoff), replicas, room)
+
+    if not any(isinstance(x, Tracer) for x in (position, side, cutoff)):
+        return jax.tree.map(jnp.asarray, host(position, side, cutoff))
+    index = jax.ShapeDtypeStruct((room,), jnp.int32)
+    shapes = index, index, jax.ShapeDtypeStruct((), jnp.int32)
+    return jax.pure_callback(host, shapes, position, side, cutoff, vmap_method="sequential")
+
+
+def vesin_search(position: np.ndarray, side: float, cutoff: float, replicas: int, room: int):
+    """`find_pairs` on the host, without offsets: i, j, count as NumPy arrays."""
+    pairs, count = np.zeros((2, room), np.int32), 0
+    if np.all(np.isfinite(position)):
+        boxes = position.reshape(replicas, -1, position.shape[-1]).astype(np.float64)
+        planar = boxes.shape[-1] == 2
+        if planar:
+            boxes = np.concatenate([boxes, np.zeros_like(boxes[..., :1])], axis=-1)
+        cell = np.diag([side, side, 1.0 if planar else side])
+        search = NeighborList(cutoff=cutoff, full_list=False)
+        for first, points in zip(range(0, len(position), boxes.shape[1]), boxes, strict=True):
+            found = search.compute(points, cell, (True, True, not planar), "ij", copy=False)
+            end = min(count + len(found[0]), room)
+            for row, indices in zip(pairs, found, strict=True):
+                row[count:end] = indices[: end - count]
+            pairs[:, count:end] += first
+            count += len(found[0])
+            if count > room:
+                break
+    return pairs[0], pairs[1], np.int32(count)
+
+
+def _jax_md_pairs(position, side, cutoff, replicas, room):
+    boxes = position.reshape(replicas, -1, position.shape[-1])
+    multiplier = 1.5
+    while True:
+        allocated, update = _jax_md_list(boxes.shape, float(side), float(cutoff), multiplier)
+        lists = update(boxes, allocated(boxes[0]))
+        if not bool(jnp.any(lists.did_buffer_overflow)):
+            break
+        multiplier *= 1.5
+    return _flatten(lists.idx, boxes.shape[1], room)
+
+
+@lru_cache(maxsize=8)
+def _jax_md_list(shape: tuple[int, ...], side: float, cutoff: float, multiplier: float):
+    # jax-md's functions are closures: kept, or they would be compiled anew at every call.
+    from jax_md import partition, space
+
+    shortest, _ = space.periodic(side)
+    functions = partition.neighbor_list(
+        shortest,
+        side,
+        cutoff,
+        capacity_multiplier=multiplier,
+        format=partition.NeighborListFormat.OrderedSparse,
+    )
+    allocated = _once(functions.allocate)
+    return allocated, jax.jit(jax.vmap(functions.update, in_axes=(0, None)))
+
+
+def _once(allocate):
+    kept = []
+
+    def allocated(position):
+        if not kept:
+            kept.append(allocate(position))
+        return kept[0]
+
+    return allocated
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _flatten(index, num_particles, room):
+    first = num_particles * jnp.arange(len(index), dtype=jnp.int32)[:, None]
+    there = jnp.ravel(index[:, 0] < num_particles)
+    (rows,) = jnp.nonzero(there, size=room, fill_value=0)
+    count = jnp.sum(there, dtype=jnp.int32)
+    real = jnp.arange(room) < count
+    i, j = (jnp.where(real, jnp.ravel(index[:, k] + first)[rows], 0) for k in (0, 1))
+    return i.astype(jnp.int32), j.astype(jnp.int32), count

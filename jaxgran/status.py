@@ -1,0 +1,71 @@
+"""What can go wrong in compiled code, as data, with the advice that goes with it."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Int
+
+
+class Fault(NamedTuple):
+    """One bit of a status.
+
+    Attributes:
+        bit: a power of two.
+        meaning: what happened.
+        advice: what to do if the run could not repair it by itself.
+    """
+
+    bit: int
+    meaning: str
+    advice: str
+
+
+OK = 0
+LIST_FULL = Fault(
+    1,
+    "the neighbour list is full",
+    "lower the packing fraction, or raise the model's growth limit; the gas may have clustered "
+    "into one dense clump",
+)
+CONTACTS_FULL = Fault(
+    2,
+    "more spheres are about to touch than there is room for",
+    "as for a full neighbour list",
+)
+SKIN_OUTRUN = Fault(
+    4,
+    "a sphere crossed the skin of its neighbour list within one block of steps",
+    "use a larger skin or more steps per contact, or a smaller starting velocity",
+)
+STEP_TOO_LARGE = Fault(
+    8,
+    "energy appeared from nowhere: the time step is too large",
+    "raise steps_per_contact",
+)
+NOT_FINITE = Fault(
+    16,
+    "a position or velocity is not a finite number",
+    "look for coincident spheres or values out of range in the starting state",
+)
+STALLED = Fault(
+    32,
+    "the run makes no progress",
+    "the gas may have collapsed into lasting contacts; end the run earlier",
+)
+FAULTS = (LIST_FULL, CONTACTS_FULL, SKIN_OUTRUN, STEP_TOO_LARGE, NOT_FINITE, STALLED)
+
+
+def flag(fault: Fault, when: ArrayLike) -> Int[Array, "..."]:
+    """The fault's bit where `when` holds, else 0; combine several with `|`."""
+    return jnp.where(jnp.asarray(when), fault.bit, OK).astype(jnp.int32)
+
+
+def has(status: ArrayLike, fault: Fault) -> Bool[Array, "..."]:
+    """Whether a status carries a fault."""
+    return (jnp.asarray(status) & fault.bit) != 0
+
+
+def explain(status: int) -> str:
+    """A status in words, with what to do; "ok" for 0."""
+    faults = [fault for fault in FAULTS if int(status) & fault.bit]
+    return "; ".join(f"{f.meaning}: {f.advice}" for f in faults) or "ok"
