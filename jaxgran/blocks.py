@@ -3,8 +3,9 @@
 Units here: diameter, mass and first temperature are 1.
 """
 
+from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxgran import neighbours, status
 from jaxgran.contact import contact_force, midpoint_rate
 from jaxgran.neighbours import Pairs
+
+MAX_REFINE = 64.0
+"""How much shorter than asked a step may become before the run gives up."""
 
 EXCHANGE_TOLERANCE = 0.1
 """Energy that a block may gain or lose by its steps, over the work done in its contacts."""
@@ -77,6 +81,22 @@ class Room(NamedTuple):
     contacts: int
     members: int
 
+    def grown(self, needed: Sequence[int]) -> "Room":
+        """With more rows than needed where there are fewer."""
+        return Room(
+            *(r if n <= r else int(1.3 * n) + 32 for r, n in zip(self, needed, strict=True))
+        )
+
+
+class Plan(NamedTuple):
+    """What is fixed when a run is compiled."""
+
+    replicas: int
+    steps_per_contact: int
+    steps_per_block: int
+    clipped: bool
+    room: Room
+
 
 class _Selection(NamedTuple):
     """The pairs that may touch in a block, and their particles."""
@@ -87,7 +107,7 @@ class _Selection(NamedTuple):
     offset: Float[Array, "contacts d"]
     replica: Int[Array, "contacts"]
     expected: Bool[Array, "contacts"]  # both partners' neighbours are looked at too
-    needed: Room  # how many rows there would have to be
+    needed: Int[Array, "kinds"]  # how many rows of each of Room there would have to be
 
 
 def _rows(mask: Array, size: int) -> tuple[Array, Array]:
@@ -140,7 +160,7 @@ def _select(state, pairs: Pairs, duration, margin, extra, replicas: int, room: R
         offset=jnp.where(real[:, None], offset, 2.0),  # an empty row is a pair too far apart
         replica=i // (n // replicas),
         expected=active[i] & active[j],
-        needed=Room(pairs.count, num_near, num_contacts, num_members),
+        needed=jnp.stack([pairs.count, num_near, num_contacts, num_members]),
     )
 
 
@@ -219,28 +239,13 @@ class Progress(NamedTuple):
     num_failed: Array
 
 
-@partial(
-    jax.jit,
-    static_argnames=(
-        "replicas",
-        "steps_per_contact",
-        "steps_per_block",
-        "room",
-        "clipped",
-        "max_blocks",
-    ),
-)
+@partial(jax.jit, static_argnames=("plan", "max_blocks"))
 def advance(
     state: State,
     pairs: Pairs,
     scene: Scene,
     end: ArrayLike,
-    *,
-    replicas: int,
-    steps_per_contact: int,
-    steps_per_block: int,
-    room: Room,
-    clipped: bool,
+    plan: Plan,
     max_blocks: int = 1_000_000,
 ) -> Progress:
     """Step until `end`, or until the pair list is used up, or something goes wrong.
@@ -248,7 +253,7 @@ def advance(
     The gas moves in blocks of `steps_per_block` steps. In a block only particles that may touch are
     stepped; all others fly freely, which is exact.
     """
-    reference = state.position
+    reference, replicas = state.position, plan.replicas
 
     def kinetic(v):
         return 0.5 * jnp.sum(v.reshape(replicas, -1) ** 2, axis=-1)
@@ -262,18 +267,20 @@ def advance(
         state = now.state
         x, v = state.position, state.velocity
         hottest = jnp.max(thermal(v))
-        longest_step = scene.contact_duration * hottest**-0.1 / (steps_per_contact * state.refine)
-        longest = steps_per_block * longest_step
+        longest_step = (
+            scene.contact_duration * hottest**-0.1 / (plan.steps_per_contact * state.refine)
+        )
+        longest = plan.steps_per_block * longest_step
         left = end - state.time
         num_left = jnp.maximum(jnp.ceil(left / longest * (1 - 1e-9)), 1.0)
         duration = left / num_left
         fastest = jnp.sqrt(jnp.max(jnp.sum(v * v, -1)))
         reach = 1.5 * fastest * duration * now.widen
-        chosen = _select(state, pairs, duration, 2 * reach, now.extra, replicas, room)
+        chosen = _select(state, pairs, duration, 2 * reach, now.extra, replicas, plan.room)
         before = x.at[chosen.members].get(mode="fill", fill_value=0.0)
         v_before = v.at[chosen.members].get(mode="fill", fill_value=0.0)
         after, v_after, work, stored, touched = _contacts(
-            before, v_before, scene, chosen, duration, steps_per_block, clipped
+            before, v_before, scene, chosen, duration, plan.steps_per_block, plan.clipped
         )
 
         def by_replica(values):
@@ -303,15 +310,14 @@ def advance(
         gain = gain + by_replica(work.dissipated)
         worked = by_replica(work.exchanged)
         wrong = jnp.any(jnp.abs(gain) > EXCHANGE_TOLERANCE * worked + 1e-6 * kinetic(v))
+        full = chosen.needed > jnp.array(plan.room)
+        no_room = status.flag(status.LIST_FULL, full[0])
+        no_room |= status.flag(status.CONTACTS_FULL, jnp.any(full[1:]))
         finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
-        full = jnp.stack(chosen.needed) > jnp.array(room)
-        trouble = (
-            status.flag(status.LIST_FULL, full[0])
-            | status.flag(status.CONTACTS_FULL, jnp.any(full[1:]))
-            | status.flag(status.NOT_FINITE, ~finite)
-            | status.flag(status.STEP_TOO_LARGE, wrong & finite)
-            | status.flag(status.SKIN_OUTRUN, (moved > 0.5 * state.skin) & finite)
-        )
+        outrun = status.flag(status.SKIN_OUTRUN, moved > 0.5 * state.skin)
+        trouble = jnp.where(finite, outrun, status.NOT_FINITE.bit)
+        trouble |= status.flag(status.STEP_TOO_LARGE, wrong & finite)
+        trouble = jnp.where(no_room > 0, no_room, trouble)  # a block without room is no block
         done = (trouble == status.OK) & ~again
         state = jax.tree.map(lambda new, old: jnp.where(done, new, old), new, state)
         return Progress(
@@ -320,7 +326,7 @@ def advance(
             widen=jnp.where(done, 1.0, jnp.where(too_far, 2 * now.widen, now.widen)),
             stale=done & (moved + 2 * fastest * duration > 0.5 * state.skin),
             status=jnp.where(again & (trouble == status.OK), status.OK, trouble),
-            needed=jnp.maximum(now.needed, jnp.stack(chosen.needed)),
+            needed=jnp.maximum(now.needed, chosen.needed),
             num_blocks=now.num_blocks + 1,
             num_failed=now.num_failed + ~done,
         )
@@ -336,8 +342,52 @@ def advance(
         widen=jnp.ones((), state.position.dtype),
         stale=jnp.zeros((), bool),
         status=zero,
-        needed=jnp.zeros(len(room), jnp.int32),
+        needed=jnp.zeros(len(plan.room), jnp.int32),
         num_blocks=zero,
         num_failed=zero,
     )
     return jax.lax.while_loop(unfinished, block, first)
+
+
+def stretch(
+    state: State, scene: Scene, end: ArrayLike, plan: Plan, neighbours_by: str = "vesin"
+) -> Progress:
+    """A fresh list of pairs, blocks until it is used up, and what can be mended of a failure.
+
+    A step too large is halved and an outrun skin lengthened; the state is then the last good one
+    and the status ok. A status that is not ok is beyond this: rows are missing, or a number is
+    not finite, or a step cannot become shorter.
+    """
+    began = rewrapped(state, scene.side)
+    pairs = neighbours.find_pairs(
+        began.position,
+        scene.side,
+        1 + began.skin,
+        replicas=plan.replicas,
+        room=plan.room.pairs,
+        by=neighbours_by,
+    )
+    now = advance(began, pairs, scene, end, plan)
+    return now._replace(**_mended(now, began, scene))
+
+
+def _mended(now: Progress, began: State, scene: Scene) -> dict[str, Any]:
+    state = now.state
+    longest = longest_skin(scene.side)
+    fresh = state.time == began.time  # else a new list is all that an outrun skin needs
+    outrun = status.has(now.status, status.SKIN_OUTRUN) & fresh
+    shorten = status.has(now.status, status.STEP_TOO_LARGE) | (outrun & (state.skin >= longest))
+    hopeless = shorten & (state.refine >= MAX_REFINE)
+    beyond = status.LIST_FULL.bit | status.CONTACTS_FULL.bit | status.NOT_FINITE.bit
+    return {
+        "state": state._replace(
+            refine=jnp.where(shorten & ~hopeless, 2 * state.refine, state.refine),
+            skin=jnp.where(outrun, jnp.minimum(1.5 * state.skin, longest), state.skin),
+        ),
+        "status": jnp.where(hopeless, now.status, now.status & beyond),
+    }
+
+
+def longest_skin(side: ArrayLike) -> Float[Array, ""]:
+    """The longest skin, in diameters, in whose reach a sphere meets no sphere and its image."""
+    return 0.5 * jnp.asarray(side) * (1 - 1e-6) - 1

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 FORMAT = 1
@@ -21,9 +22,7 @@ def fingerprint(*trees: Any) -> str:
         leaves, structure = jax.tree.flatten(tree)
         digest.update(str(structure).encode())
         for leaf in leaves:
-            if isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(
-                leaf.dtype, jax.dtypes.prng_key
-            ):
+            if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
                 leaf = jax.random.key_data(leaf)
             array = np.asarray(leaf)
             digest.update(f"{array.dtype}{array.shape}".encode())
@@ -60,8 +59,9 @@ def save(path: str | Path, scene: str, tree: Any) -> None:
     """Write the arrays of a pytree, with the fingerprint of the scene they belong to."""
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
     arrays = {f"leaf_{i}": leaf for i, leaf in enumerate(leaves)}
-    head = {"format": FORMAT, "version": version("jaxgran"), "scene": scene}
-    write_whole(path, lambda f: np.savez(f, **head, **arrays))
+    head = {"format": str(FORMAT), "version": version("jaxgran"), "scene": scene}
+    arrays |= {name: np.asarray(text) for name, text in head.items()}
+    write_whole(path, lambda f: np.savez(f, allow_pickle=False, **arrays))
 
 
 def load(path: str | Path, scene: str, like: Any) -> Any:

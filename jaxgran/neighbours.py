@@ -144,10 +144,10 @@ def _jax_md_list(shape: tuple[int, ...], side: float, cutoff: float, multiplier:
     # jax-md's functions are closures: kept, or they would be compiled anew at every call.
     from jax_md import partition, space
 
-    shortest, _ = space.periodic(side)
+    shortest, _ = space.periodic(jnp.asarray(side))
     functions = partition.neighbor_list(
         shortest,
-        side,
+        jnp.asarray(side),
         cutoff,
         capacity_multiplier=multiplier,
         format=partition.NeighborListFormat.OrderedSparse,

@@ -1,5 +1,8 @@
 """Soft spheres: every contact resolved in time, in a periodic box."""
 
+import dataclasses
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -26,8 +29,8 @@ MELT_COLLISIONS = 10.0
 PAIRS_PER_PARTICLE = 3.0
 """How many pairs beyond contact a neighbour list should hold for each particle."""
 
-MAX_REFINE = 64.0
-"""How much shorter than asked a step may become before the run gives up."""
+MOST_PAIRS = 100
+"""Pairs per particle beyond which a list is taken to have gone wrong."""
 
 _FASTEST = 4.8  # speed of the fastest of some thousand spheres, in sqrt(T)
 
@@ -54,6 +57,7 @@ class SoftSpheres(eqx.Module):
         progress: show a progress bar on a terminal.
         checkpoint: a file to save the run to each minute and to resume it from. The resumed run
             gives the same numbers bit for bit.
+        plan: sizes of arrays, see `sized_for`.
 
     Raises:
         ValueError: for numbers out of range.
@@ -67,6 +71,7 @@ class SoftSpheres(eqx.Module):
     neighbours: str = eqx.field(static=True, default="auto")
     progress: bool = eqx.field(static=True, default=True)
     checkpoint: str | Path | None = eqx.field(static=True, default=None)
+    plan: blocks.Plan | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         for name, least in (("num_particles", 2), ("steps_per_contact", 10), ("replicas", 1)):
@@ -82,7 +87,8 @@ class SoftSpheres(eqx.Module):
             ValueError: if the gas is not viscoelastic, too dense, or its box too small.
             RuntimeError: if the run fails beyond repair, with what to do.
         """
-        self._check(gas)
+        with jax.ensure_compile_time_eval():
+            self._check(gas)
         scene = reduced_scene(gas, self.num_particles)
         unit_time = gas.diameter / jnp.sqrt(gas.temperature)
         inputs = gas, times, self.start, self.key
@@ -131,28 +137,36 @@ class SoftSpheres(eqx.Module):
         inside = gas.packing_fraction * 2 ** (d - 1)  # pairs per particle within contact, were g 1
         skin = (1 + PAIRS_PER_PARTICLE / inside) ** (1 / d) - 1
         side = gas.box_side(self.num_particles) / gas.diameter
-        return jnp.minimum(skin, side / 2 * (1 - 1e-6) - 1)
+        return jnp.minimum(skin, blocks.longest_skin(side))
 
-    def _steps_per_block(self, gas: Gas) -> int:
-        """At most a contact long; shorter where spheres go far in that time."""
-        flight = _FASTEST * gas.contact_duration * jnp.sqrt(gas.temperature) / gas.diameter
-        steps = self.steps_per_contact * min(1.0, 0.08 / float(flight))
-        return max(round(steps), 8)
+    def sized_for(self, gas: Gas, spare: float = 1.4) -> "SoftSpheres":
+        """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
 
-    def _room(self, gas: Gas, spare: float = 1.4) -> blocks.Room:
-        """First guess of how many pairs there will be, for a fluid at its hottest."""
-        n, d = self.replicas * self.num_particles, gas.dimension
-        phi, g_2 = float(gas.packing_fraction), float(gas.contact_value)
-        inside = phi * 2 ** (d - 1)
+        Outside of jit they follow from the gas and grow where they must. Inside, they are fixed,
+        and a run that outgrows them ends in nan and a status.
+
+        Args:
+            gas: with known numbers, alike the gases to come: the hottest and softest of them.
+            spare: room over the expected need.
+        """
+        return dataclasses.replace(self, plan=self._sized(gas, spare))
+
+    def _sized(self, gas: Gas, spare: float = 1.4) -> blocks.Plan:
+        d = gas.dimension
+        flight = _FASTEST * float(gas.contact_duration * jnp.sqrt(gas.temperature) / gas.diameter)
+        # A block is at most a contact long, and shorter where spheres go far in that time.
+        steps = max(round(self.steps_per_contact * min(1.0, 0.08 / flight)), 8)
+        flight *= steps / self.steps_per_contact
+        inside = float(gas.packing_fraction) * 2 ** (d - 1)
         listed = inside * (1 + float(self._skin(gas))) ** d
-        busy = float(gas.contact_fraction)
-        flight = float(gas.contact_duration * jnp.sqrt(gas.temperature) / gas.diameter)
-        flight *= self._steps_per_block(gas) / self.steps_per_contact
-        near = min(d * inside * g_2 * 3 * _FASTEST * flight, listed)
-        touching = min(2 * busy * (1 + 6 * near), near)
-        counts = [listed, near, touching, min(2 * touching, 1.0)]
-        rooms = [spare * n * x + 5 * (n * x) ** 0.5 + 32 for x in counts]
-        return blocks.Room(*(int(room) for room in rooms[:3]), members=min(int(rooms[3]), n))
+        near = min(inside * float(gas.contact_value) * ((1 + 3 * flight) ** d - 1), listed)
+        touching = min(float(gas.contact_fraction) * (1 + 6 * near), near)
+        n = self.replicas * self.num_particles
+        counts = [n * share for share in (listed, near, touching, 2 * touching)]
+        rooms = [int(spare * count + 5 * count**0.5) + 32 for count in counts]
+        room = blocks.Room(*rooms[:3], members=min(rooms[3], n))
+        assert isinstance(gas.law, Viscoelastic)
+        return blocks.Plan(self.replicas, self.steps_per_contact, steps, gas.law.clipped, room)
 
     def _initial(self, gas: Gas, scene: Scene) -> State:
         d = gas.dimension
@@ -171,50 +185,82 @@ class SoftSpheres(eqx.Module):
         return blocks.at_start(state.position, velocity, scene, state.skin, self.replicas)
 
     def _driven(self, gas: Gas, scene: Scene, times: Array) -> tuple[State, dict[str, Array]]:
-        """Run by a loop on the host, which repairs what can be repaired."""
+        """Run by a loop on the host, which makes room as it is needed."""
         state = self._initial(gas, scene)
-        observe = jax.jit(self._observe)
+        observe = partial(_observe, scene=scene, replicas=self.replicas)
         if self.start is None:
-            melt = _Driver(self, scene._replace(dissipative_constant=0.0 * scene.alpha), gas)
+            melt = self._driver(gas, scene._replace(dissipative_constant=0.0 * scene.alpha))
             end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
-            state, _ = simulate(
-                state, end, melt, lambda s: observe(scene, s), progress=self.progress, label="melt"
-            )
+            state, _ = simulate(state, end, melt, observe, progress=self.progress, label="melt")
             state = self._melted(state, scene)
-        driver = _Driver(self, scene, gas)
-        state = driver(state, 0.0)  # counts the energy in contacts
+        advance = self._driver(gas, scene)
+        state = advance(state, 0.0)  # counts the energy in contacts
         state, records = simulate(
             state,
             np.asarray(times),
-            driver,
-            lambda s: observe(scene, s),
+            advance,
+            observe,
             scene=fingerprint(gas, times, state, self.steps_per_contact, self.neighbours),
             progress=self.progress,
             path=self.checkpoint,
         )
         return state, {name: jnp.asarray(value) for name, value in records.items()}
 
+    def _driver(self, gas: Gas, scene: Scene) -> Callable[[State, float], State]:
+        plan = self.plan or self._sized(gas)
+        by = neighbours.engine(self.neighbours)
+
+        def advance(state: State, end: float) -> State:
+            nonlocal plan
+            while True:
+                now = blocks.stretch(state, scene, end, plan, by)
+                state, fault = now.state, int(now.status)
+                if fault == status.OK:
+                    return state
+                needed = [int(x) for x in now.needed]
+                missing = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
+                if not missing or max(needed) > MOST_PAIRS * len(state.position):
+                    at = float(jnp.mean(state.velocity**2))
+                    raise RuntimeError(f"stopped at T/T_0 = {at:.3g}: {status.explain(fault)}")
+                plan = plan._replace(room=plan.room.grown(needed))
+
+        return advance
+
     def _traced(self, gas: Gas, scene: Scene, times: Array):
-        """The same inside `jax.jit`, `jax.vmap` or a derivative: one loop, room fixed at first."""
-        raise NotImplementedError
+        """The same inside `jax.jit`, `jax.vmap` or a derivative: room is fixed beforehand."""
+        try:
+            with jax.ensure_compile_time_eval():
+                plan = self.plan or self._sized(gas)
+        except jax.errors.ConcretizationTypeError:
+            raise ValueError(
+                "inside jax.jit the sizes of arrays must be known: give SoftSpheres(...)"
+                ".sized_for(gas), made outside with a gas of known numbers"
+            ) from None
 
-    def _observe(self, scene: Scene, state: State) -> dict[str, Array]:
-        def centred(x):
-            boxes = x.reshape(self.replicas, self.num_particles, -1)
-            return boxes - jnp.mean(boxes, axis=1, keepdims=True)
+        def run(carry, scene, end):
+            def further(carry):
+                now = blocks.stretch(carry[0], scene, end, plan)
+                return now.state, now.status
 
-        velocity = centred(state.velocity)
-        travelled = centred(state.position - state.origin + scene.side * state.image)
-        first = centred(state.first_velocity)
-        return {
-            "temperature": observables.temperature(velocity),
-            "sonine": observables.sonine(velocity),
-            "displacement": observables.mean_square_displacement(travelled),
-            "velocity_correlation": observables.velocity_correlation(first, velocity),
-            "elastic_energy": state.elastic / self.num_particles,
-            "dissipated_energy": state.dissipated / self.num_particles,
-            "collisions": 2 / self.num_particles * state.contacts,
-        }
+            def unfinished(carry):
+                return (carry[0].time < end) & (carry[1] == status.OK)
+
+            return jax.lax.while_loop(unfinished, further, carry)
+
+        state, fault = self._initial(gas, scene), jnp.zeros((), jnp.int32)
+        if self.start is None:
+            elastic = scene._replace(dissipative_constant=0.0 * scene.alpha)
+            state, fault = run((state, fault), elastic, MELT_COLLISIONS / scene.collision_frequency)
+            state = self._melted(state, scene)
+
+        def to(carry, end):
+            state, fault = run(carry, scene, end)
+            records = _observe(state, scene=scene, replicas=self.replicas)
+            bad = fault != status.OK
+            return (state, fault), jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), records)
+
+        (state, fault), records = jax.lax.scan(to, (state, fault), times)
+        return state, records, fault
 
     def _curve(self, gas, times, scene, state, records, fault) -> CoolingCurve:
         energy = gas.mass * gas.temperature
@@ -265,71 +311,22 @@ def reduced_scene(gas: Gas, num_particles: int) -> Scene:
     )
 
 
-class _Driver:
-    """Advances a state on the host: builds lists, and repairs runs that fail."""
+@partial(jax.jit, static_argnames="replicas")
+def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
+    def centred(x):
+        boxes = x.reshape(replicas, -1, x.shape[-1])
+        return boxes - jnp.mean(boxes, axis=1, keepdims=True)
 
-    def __init__(self, model: SoftSpheres, scene: Scene, gas: Gas):
-        assert isinstance(gas.law, Viscoelastic)
-        self.model, self.scene = model, scene
-        self.room = model._room(gas)
-        self.steps_per_block = model._steps_per_block(gas)
-        self.clipped = gas.law.clipped
-        self.most = float(scene.side) / 2 * (1 - 1e-6) - 1
-        self.engine = neighbours.engine(model.neighbours)
-
-    def __call__(self, state: State, end: float) -> State:
-        while True:
-            state = blocks.rewrapped(state, self.scene.side)
-            pairs = neighbours.find_pairs(
-                state.position,
-                self.scene.side,
-                1 + state.skin,
-                replicas=self.model.replicas,
-                room=self.room.pairs,
-                by=self.engine,
-            )
-            now = blocks.advance(
-                state,
-                pairs,
-                self.scene,
-                end,
-                replicas=self.model.replicas,
-                steps_per_contact=self.model.steps_per_contact,
-                steps_per_block=self.steps_per_block,
-                room=self.room,
-                clipped=self.clipped,
-            )
-            fault = int(now.status)
-            if fault == status.OK:
-                return now.state
-            fresh = float(now.state.time) == float(state.time)
-            state = self._repaired(now.state, now, fault, fresh)
-
-    def _repaired(self, state: State, now: blocks.Progress, fault: int, fresh: bool) -> State:
-        """The last good state, with what was too small made larger; raises if nothing helps."""
-
-        def give_up():
-            where = f"at T/T_0 = {float(jnp.mean(state.velocity**2)):.3g}"
-            raise RuntimeError(f"the run stopped {where}: {status.explain(fault)}")
-
-        if fault & status.NOT_FINITE.bit:
-            give_up()
-        if fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit):
-            needed = [int(x) for x in now.needed]
-            grown = [
-                int(1.3 * need) + 32 if need > room else room
-                for room, need in zip(self.room, needed, strict=True)
-            ]
-            self.room = blocks.Room(*grown)
-            return state
-        if fault & status.STEP_TOO_LARGE.bit:
-            if float(state.refine) >= MAX_REFINE:
-                give_up()
-            return state._replace(refine=2 * state.refine)
-        if fresh:  # else a fresh list is all it needs
-            if float(state.skin) >= self.most:
-                if float(state.refine) >= MAX_REFINE:
-                    give_up()
-                return state._replace(refine=2 * state.refine)
-            return state._replace(skin=jnp.minimum(1.5 * state.skin, self.most))
-        return state
+    num_particles = len(state.position) // replicas
+    velocity = centred(state.velocity)
+    travelled = centred(state.position - state.origin + scene.side * state.image)
+    first = centred(state.first_velocity)
+    return {
+        "temperature": observables.temperature(velocity),
+        "sonine": observables.sonine(velocity),
+        "displacement": observables.mean_square_displacement(travelled),
+        "velocity_correlation": observables.velocity_correlation(first, velocity),
+        "elastic_energy": state.elastic / num_particles,
+        "dissipated_energy": state.dissipated / num_particles,
+        "collisions": 2 / num_particles * state.contacts,
+    }
