@@ -115,6 +115,7 @@ def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:
         jax.block_until_ready(curve.temperature)
         seconds.append(time.perf_counter() - begin)
     run = statistics.median(seconds[1:])
+    assert curve.collisions is not None
     collisions = float(curve.collisions[-1]) * size / 2
     dt = float(gas.contact_duration) / STEPS_PER_CONTACT
     steps = round(COLLISION_TIMES * tau / dt)

@@ -16,6 +16,7 @@ from jaxgran.restitution import (
     Viscoelastic,
     viscoelastic_restitution,
 )
+from jaxgran.status import explain as explain_status
 
 __all__ = [
     "ConstantRestitution",
@@ -35,6 +36,7 @@ __all__ = [
     "cool",
     "diagnose",
     "elastic_constant",
+    "explain_status",
     "fit",
     "impact",
     "read_curve",
