@@ -130,12 +130,13 @@ def vesin_search(position: np.ndarray, side: float, cutoff: float, replicas: int
 def _jax_md_pairs(position, side, cutoff, replicas, room):
     boxes = position.reshape(replicas, -1, position.shape[-1])
     multiplier = 1.5
-    while True:
-        allocated, update = _jax_md_list(boxes.shape, float(side), float(cutoff), multiplier)
-        lists = update(boxes, allocated(boxes[0]))
-        if not bool(jnp.any(lists.did_buffer_overflow)):
-            break
-        multiplier *= 1.5
+    with jax.numpy_rank_promotion("allow"):  # jax-md relies on it
+        while True:
+            allocated, update = _jax_md_list(boxes.shape, float(side), float(cutoff), multiplier)
+            lists = update(boxes, allocated(boxes[0]))
+            if not bool(jnp.any(lists.did_buffer_overflow)):
+                break
+            multiplier *= 1.5
     return _flatten(lists.idx, boxes.shape[1], room)
 
 
