@@ -76,3 +76,20 @@ def test_benchmark_runs(tmp_path):
     assert done.returncode == 0, done.stderr
     row = json.loads(done.stdout.splitlines()[-1])
     assert row["vmap_error"] < 1e-6 and row["scipy_error"] < 1e-6  # the same physics, twice
+
+
+def test_particle_benchmark_runs(tmp_path):
+    done = run("benchmark_particles.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    assert row["collisions_per_s"] > 0 and 0.5 < row["temperature_ratio"] < 1
+    for lammps in row["lammps"].values():  # where it is installed
+        assert lammps["temperature_ratio"] == pytest.approx(row["temperature_ratio"], rel=0.01)
+
+
+def test_comparison_with_lammps_runs(tmp_path):
+    done = run("compare_lammps.py", "--smoke", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "here" / "compare_lammps.png").stat().st_size > 20_000
+    record = json.loads((tmp_path / "here" / "compare_lammps.json").read_text())
+    assert set(record["curves"]) == {"dilute", "dense"}

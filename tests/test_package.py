@@ -7,12 +7,12 @@ import jaxgran
 
 ROOT = Path(__file__).parent.parent
 FLOORS = [
-    ["domain"],
-    ["contact"],
-    ["restitution"],
+    ["domain", "status", "checkpoint"],
+    ["contact", "neighbours", "simulation"],
+    ["restitution", "observables", "initial", "blocks"],
     ["gas"],
     ["kinetics", "curve"],
-    ["models.kinetic_theory"],
+    ["models.kinetic_theory", "models.soft_spheres"],
     ["cooling"],
     ["fitting"],
     ["diagnosis"],

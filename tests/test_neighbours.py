@@ -1,0 +1,229 @@
+import itertools
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxgran.neighbours import displacement, engine, find_pairs, wrap
+
+# In boxes of less than three cutoffs jax-md itself warns about its integers.
+jax_md_warns = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")
+
+
+def brute_force(position, side, cutoff, replicas=1):
+    """Shortest x_i - x_j of every pair i < j closer than the cutoff."""
+    found = {}
+    n = len(position) // replicas
+    for first in range(0, len(position), n):
+        for i, j in itertools.combinations(range(first, first + n), 2):
+            apart = position[i] - position[j]
+            apart = apart - side * np.round(apart / side)
+            if np.sqrt(np.sum(apart**2)) < cutoff:
+                found[i, j] = apart
+    return found
+
+
+def listed(pairs):
+    count = int(pairs.count)
+    return list(zip(pairs.i[:count].tolist(), pairs.j[:count].tolist(), strict=True))
+
+
+def awkward(dimension, replicas, side, n=30):
+    """Random points, points on faces and corners of the box, and points on top of each other."""
+    rng = np.random.default_rng(dimension)
+    last = np.nextafter(side, 0)
+    boxes = side * rng.random((replicas, n, dimension))
+    corners = np.array(list(itertools.product([0.0, last], repeat=dimension)))
+    boxes[:, : len(corners)] = corners
+    boxes[:, 10, 0], boxes[:, 11, 0], boxes[:, 12, -1], boxes[:, 13, -1] = 0.0, last, 0.0, last
+    boxes[:, 15] = boxes[:, 14]
+    boxes[:, 17:19] = 0.0
+    return boxes.reshape(-1, dimension)
+
+
+def compare(dimension, replicas, side, cutoff, by):
+    position = awkward(dimension, replicas, side)
+    expected = brute_force(position, side, cutoff, replicas)
+    room = len(expected) + 7
+    pairs = find_pairs(jnp.asarray(position), side, cutoff, replicas=replicas, room=room, by=by)
+    found = listed(pairs)
+    assert int(pairs.count) == len(expected)  # each once
+    assert set(found) == set(expected)  # and with i < j
+    assert pairs.i.dtype == pairs.j.dtype == jnp.int32 and pairs.i.shape == (room,)
+    assert not np.any(pairs.i[-7:]) and not np.any(pairs.j[-7:])
+    offset = np.asarray(pairs.offset)[: len(found)]
+    np.testing.assert_array_equal(offset, side * np.round(offset / side))
+    i, j = np.array(found).T
+    # Not component by component, as half a box has two shortest ways. Round-off of the side.
+    np.testing.assert_allclose(
+        np.linalg.norm(position[i] - position[j] - offset, axis=1),
+        [np.linalg.norm(expected[pair]) for pair in found],
+        atol=1e-14 * side,
+    )
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("replicas", [1, 3])
+@pytest.mark.parametrize("fraction", [0.15, 1 / 3, 0.4999, 0.5])
+def test_vesin_finds_what_brute_force_finds(dimension, replicas, fraction):
+    compare(dimension, replicas, 3.7, 3.7 * fraction, "vesin")
+
+
+@jax_md_warns
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("replicas, fraction", [(1, 0.4999), (2, 0.15)])
+def test_jax_md_finds_what_brute_force_finds(dimension, replicas, fraction):
+    compare(dimension, replicas, 3.7, 3.7 * fraction, "jax-md")
+
+
+@given(
+    st.lists(st.tuples(*3 * [st.integers(0, 7)]), min_size=2, max_size=12),
+    st.sampled_from([2, 3]),
+    st.sampled_from([0.07, 0.3, 0.49]),  # no distance of grid points
+)
+@settings(max_examples=40, deadline=None)
+def test_points_of_a_grid(points, dimension, cutoff):
+    position = np.array(points, float)[:, :dimension] / 8
+    expected = brute_force(position, 1.0, cutoff)
+    pairs = find_pairs(jnp.asarray(position), 1.0, cutoff, room=66)
+    assert sorted(listed(pairs)) == sorted(expected)
+    for i, j, offset in zip(pairs.i, pairs.j, pairs.offset, strict=True):
+        if i != j:  # else a row past the last
+            apart = position[i] - position[j] - np.asarray(offset)
+            np.testing.assert_array_equal(apart, expected[int(i), int(j)])  # eighths are exact
+
+
+def test_coincident_particles_are_pairs():
+    position = jnp.stack([jnp.array([1.0, 2.0, 3.0])] * 3 + [jnp.array([3.0, 0.0, 1.0])])
+    pairs = find_pairs(position, 4.0, 1e-3, room=8)
+    assert sorted(listed(pairs)) == [(0, 1), (0, 2), (1, 2)]
+    assert not np.any(pairs.offset)
+
+
+def test_pairs_across_the_faces():
+    position = jnp.array([[0.1, 2.0], [3.9, 2.0], [0.0, 0.0], [3.95, 3.95]])
+    pairs = find_pairs(position, 4.0, 0.5, room=8)
+    offset = dict(zip(listed(pairs), np.asarray(pairs.offset).tolist(), strict=False))
+    assert offset == {(0, 1): [-4.0, 0.0], (2, 3): [-4.0, -4.0]}
+
+
+def test_offset_outlasts_motion_without_wrapping():
+    rng = np.random.default_rng(1)
+    side = 3.7
+    position = side * rng.random((60, 3))
+    pairs = find_pairs(jnp.asarray(position), side, 0.8, room=400)
+    assert 0 < pairs.count <= 400
+    k = slice(int(pairs.count))
+    i, j = pairs.i[k], pairs.j[k]
+    moved = jnp.asarray(position + 0.2 * rng.uniform(-1, 1, position.shape))
+    inside = wrap(side, moved)
+    assert np.any(inside != moved)
+    np.testing.assert_allclose(
+        moved[i] - moved[j] - pairs.offset[k],
+        displacement(side, inside[i], inside[j]),
+        atol=1e-14 * side,  # round-off
+    )
+
+
+def test_too_little_room_is_told():
+    position = awkward(2, 2, 3.7)
+    cutoff = 3.7 * 0.15
+    expected = brute_force(position, 3.7, cutoff, 2)
+    for by in ("vesin", "jax-md"):
+        search = partial(find_pairs, jnp.asarray(position), 3.7, cutoff, replicas=2, by=by)
+        for room in (1, len(expected) // 4, len(expected) - 1):
+            pairs = search(room=room)
+            assert pairs.count > room
+            assert pairs.i.shape == pairs.j.shape == pairs.offset.shape[:1] == (room,)
+            assert set(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)) < set(expected)
+        assert search(room=len(expected)).count == len(expected)
+
+
+def test_lists_of_jax_md_grow_with_the_gas():
+    # A gas that has clumped since has the same shape, so the list kept for it is too small.
+    rng = np.random.default_rng(2)
+    side, cutoff = 2.0, 0.3
+    sparse = side * rng.random((30, 2))
+    for position in (sparse, 0.2 * sparse, sparse):
+        pairs = find_pairs(jnp.asarray(position), side, cutoff, room=500, by="jax-md")
+        assert set(listed(pairs)) == set(brute_force(position, side, cutoff))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_jit_and_vmap(dimension):
+    rng = np.random.default_rng(3)
+    batch = jnp.asarray(rng.random((3, 40, dimension)))
+    search = partial(find_pairs, replicas=2, room=120)
+    compiled = jax.jit(search)(2 * batch[0], 2.0, 0.4)
+    jax.tree.map(np.testing.assert_array_equal, compiled, search(2 * batch[0], 2.0, 0.4))
+    sides = jnp.array([1.0, 2.0, 4.0])
+    scaled = batch * sides[:, None, None]
+    together = jax.jit(jax.vmap(search))(scaled, sides, 0.2 * sides)
+    for k in range(3):
+        alone = search(scaled[k], sides[k], 0.2 * sides[k])
+        assert 0 < alone.count <= 120
+        for all_three, one in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(all_three[k], one)
+
+
+def test_pairs_carry_no_derivatives():
+    position = jnp.array([[0.1, 2.0], [3.9, 2.5], [2.0, 2.0]])
+
+    def square(position):
+        pairs = find_pairs(position, 4.0, 1.0, room=1)
+        return jnp.sum((position[pairs.i] - position[pairs.j] - pairs.offset) ** 2)
+
+    for gradient in (jax.grad(square)(position), jax.jit(jax.grad(square))(position)):
+        # d/dx of 0.2^2 + 0.5^2, rounded.
+        np.testing.assert_allclose(gradient, [[0.4, -1.0], [-0.4, 1.0], [0.0, 0.0]], atol=1e-14)
+
+
+def test_numbers_that_are_not_finite_have_no_pairs():
+    for bad in (jnp.nan, jnp.inf):
+        position = jnp.ones((4, 3)).at[2, 1].set(bad)
+        assert find_pairs(position, 4.0, 1.0, room=3).count == 0
+
+
+def test_one_particle_has_no_pairs():
+    assert find_pairs(jnp.ones((1, 3)), 4.0, 1.0, room=3).count == 0
+
+
+@pytest.mark.parametrize("side", [1.0, 3.7])
+def test_wrap_lands_inside(side):
+    edges = [0.0, -1e-20, -1e-300, side, -side, 7 * side, np.nextafter(side, 0), 1.5 * side]
+    random = np.random.default_rng(4).uniform(-20, 20, 90)
+    position = np.append(edges, random)[:, None] * np.ones((1, 2))
+    inside = np.asarray(wrap(side, jnp.asarray(position)))
+    assert np.all(inside >= 0) and np.all(inside < side)
+    sides = np.round((position - inside) / side)
+    # Coordinates of up to 26 are rounded at 4e-15.
+    np.testing.assert_allclose(inside + sides * side, position, atol=1e-14)
+    np.testing.assert_array_equal(wrap(side, jnp.asarray(inside)), inside)
+
+
+def test_displacement_is_the_shortest():
+    rng = np.random.default_rng(5)
+    a, b = 3.7 * rng.random((2, 50, 3))
+    images = np.array(list(itertools.product([-3.7, 0.0, 3.7], repeat=3)))
+    lengths = np.linalg.norm((a - b)[:, None] + images[None], axis=-1)
+    apart = displacement(3.7, jnp.asarray(a), jnp.asarray(b))
+    # Round-off.
+    np.testing.assert_allclose(np.linalg.norm(apart, axis=-1), lengths.min(axis=1), rtol=1e-13)
+    sides = (apart - (a - b)) / 3.7
+    np.testing.assert_allclose(sides, np.round(sides), atol=1e-14)
+
+
+def test_engine_follows_the_device(monkeypatch):
+    assert engine("vesin") == "vesin" and engine("jax-md") == "jax-md"
+    for device, name in (("cpu", "vesin"), ("gpu", "jax-md"), ("tpu", "jax-md")):
+        monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
+        assert engine() == engine("auto") == name
+
+
+def test_unknown_engines_are_refused():
+    with pytest.raises(ValueError, match="neighbours must be one of auto, vesin, jax-md, got 'kd'"):
+        engine("kd")
