@@ -226,6 +226,10 @@ def test_fingerprints_tell_everything_apart():
         [1.0, np.arange(3)],
         0.0,
         -0.0,
+        0,  # the bits of 0.0
+        np.zeros(2),
+        np.zeros(2, np.int64),
+        np.zeros(2, np.uint64),
         "abc",
         "abd",
         None,
