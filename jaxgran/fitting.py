@@ -141,6 +141,12 @@ def fit(
             f"{curve.times.shape[-1]} points cannot fix {len(free)} parameters; free fewer of them"
         )
     model = KineticTheory() if model is None else model
+    if not isinstance(model, KineticTheory):
+        raise ValueError(
+            f"fit works with jaxgran.KineticTheory so far, not with {type(model).__name__}, whose "
+            "plain derivatives grow without bound in a chaotic gas; run it at the fitted A with "
+            "jaxgran.cool to see whether it explains the curve"
+        )
     starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])
     result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, max_steps)
     if not isinstance(result.chi2, Tracer):
