@@ -47,9 +47,11 @@ def write_whole(path: str | Path, write: Callable[[Any], None]) -> None:
             f.flush()
             os.fsync(f.fileno())
         os.replace(name, path)
-    except OSError as error:
+    except BaseException as error:
         if name is not None:
             Path(name).unlink(missing_ok=True)
+        if not isinstance(error, OSError):
+            raise
         raise OSError(
             error.errno, f"cannot write ({error.strerror}); any earlier file is unharmed", str(path)
         ) from error
@@ -71,7 +73,7 @@ def load(path: str | Path, scene: str, like: Any) -> Any:
         ValueError: if the file is no checkpoint, is of another format, or of another scene.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
             saved = dict(file)
         head = {name: str(saved.pop(name)) for name in ("format", "version", "scene")}
     except (OSError, ValueError, KeyError, EOFError) as error:

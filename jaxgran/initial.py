@@ -76,7 +76,8 @@ class _Untangle(NamedTuple):
     def __call__(self, uniform, side):
         uniform, side = np.asarray(uniform), float(side)
         boxes = uniform.reshape(self.replicas, -1, uniform.shape[-1]).astype(float) * side
-        return np.concatenate([self._box(x, side) for x in boxes]).astype(uniform.dtype)
+        x = np.concatenate([self._box(x, side) for x in boxes]).astype(uniform.dtype)
+        return np.where(x >= uniform.dtype.type(side), uniform.dtype.type(0), x)
 
     def _box(self, x: np.ndarray, side: float) -> np.ndarray:
         n, d = x.shape

@@ -38,7 +38,7 @@ def displacement(side: ArrayLike, a: Float[Array, "... d"], b: Float[Array, "...
     """Shortest ``a - b`` in a periodic cube (square) of the given side, through jax-md."""
     from jax_md import space
 
-    shortest, _ = space.periodic(jnp.asarray(side))
+    shortest, _ = space.periodic(jnp.asarray(side, jnp.result_type(float)))
     return jnp.vectorize(shortest, signature="(d),(d)->(d)")(a, b)
 
 
@@ -83,6 +83,8 @@ def find_pairs(
         by: "vesin" or "jax-md"; both return the same pairs.
     """
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
+    if by not in ENGINES[1:]:
+        raise ValueError(f"by must be one of {', '.join(ENGINES[1:])}, got {by!r}")
     search = {"vesin": _vesin_pairs, "jax-md": _jax_md_pairs}[by]
     i, j, count = search(position, side, cutoff, replicas, room)
     return Pairs(i, j, _whole_sides(position, jnp.asarray(side), i, j), count)
@@ -129,13 +131,17 @@ def vesin_search(position: np.ndarray, side: float, cutoff: float, replicas: int
 
 def _jax_md_pairs(position, side, cutoff, replicas, room):
     boxes = position.reshape(replicas, -1, position.shape[-1])
-    multiplier = 1.5
+    multiplier, most = 1.5, 100.0
     with jax.numpy_rank_promotion("allow"):  # jax-md relies on it
         while True:
             allocated, update = _jax_md_list(boxes.shape, float(side), float(cutoff), multiplier)
             lists = update(boxes, allocated(boxes[0]))
             if not bool(jnp.any(lists.did_buffer_overflow)):
                 break
+            if multiplier > most:
+                raise RuntimeError(
+                    "jax-md's neighbour list keeps overflowing; use neighbours='vesin'"
+                )
             multiplier *= 1.5
     return _flatten(lists.idx, boxes.shape[1], room)
 
@@ -162,7 +168,7 @@ def _once(allocate):
 
     def allocated(position):
         if not kept:
-            kept.append(allocate(position))
+            kept.append(allocate(position, extra_capacity=1))  # a first list may be empty
         return kept[0]
 
     return allocated
