@@ -13,7 +13,6 @@ from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
-from jaxgran.restitution import Viscoelastic
 
 Model = KineticTheory | SoftSpheres
 
@@ -40,8 +39,9 @@ def cool(
         raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
     times = _checked_times(times)
     model = KineticTheory() if model is None else model
-    if not isinstance(gas.law, Viscoelastic):  # whose eps is never above 1
-        first_rate = _first_cooling_rate(gas)
+    # Contacts resolved in time cannot heat a gas; a law of restitution, or averages of it, can.
+    if isinstance(model, KineticTheory):
+        first_rate = _first_cooling_rate(gas, model)
         if not isinstance(first_rate, Tracer) and np.any(np.asarray(first_rate) < 0):
             raise ValueError(
                 "the law of restitution makes this gas heat up: averaged over its impacts, eps is "
@@ -51,8 +51,8 @@ def cool(
 
 
 @eqx.filter_jit
-def _first_cooling_rate(gas: Gas) -> jax.Array:
-    return KineticTheory().cooling_rate(gas)
+def _first_cooling_rate(gas: Gas, model: KineticTheory) -> jax.Array:
+    return model.cooling_rate(gas)
 
 
 def _checked_times(times) -> jax.Array:
