@@ -23,3 +23,10 @@ def glass_beads(beta: float = 0.15, dimension: int = 3, **values) -> jaxgran.Gas
 @pytest.fixture
 def beads():
     return glass_beads
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_compiled_code():
+    # Thousands of compiled functions in one process exhaust its memory maps.
+    yield
+    jax.clear_caches()

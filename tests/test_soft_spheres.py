@@ -181,7 +181,9 @@ def test_cools_as_kinetic_theory_with_softness_says(beads, dimension):
     assert np.all(miss < 0.015 + 2 * curve.temperature_error / curve.temperature)
     # Softness weakens impacts by 3 % here, the first Sonine order leaves out 2 %: D has both.
     assert np.all(np.abs(curve.displacement / theory.displacement - 1) < 0.1)
-    np.testing.assert_allclose(curve.collisions, theory.collisions, rtol=0.03)
+    # Contacts that last take 2 % of the time there is for others; counts scatter as 1/sqrt.
+    scatter = 1 / np.sqrt(curve.collisions * n * replicas / 2)
+    assert np.all(np.abs(curve.collisions / theory.collisions - 1) < 0.03 + 2 * scatter)
 
 
 def test_clusters_above_the_critical_box_only(beads):
