@@ -1,4 +1,4 @@
-"""Soft spheres in blocks of time steps: who may touch, the steps of those, free flight of the rest.
+"""Soft spheres in blocks of time steps: those that may touch are stepped, the rest flies freely.
 
 Units here: diameter, mass and first temperature are 1.
 """
@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxgran import neighbours, status
-from jaxgran.contact import contact_force, midpoint_rate
+from jaxgran import encounters, neighbours, status, tangents
+from jaxgran.encounters import Encounters, Work
 from jaxgran.neighbours import Pairs
+from jaxgran.tangents import Tangents
 
 MAX_REFINE = 64.0
 """How much shorter than asked a step may become before the run gives up."""
@@ -49,6 +50,7 @@ class State(NamedTuple):
     contacts: Int[Array, "replicas"]  # begun, each pair once
     skin: Float[Array, ""]  # reach of the neighbour list beyond contact
     refine: Float[Array, ""]  # steps are shorter than asked by this factor
+    tangents: Tangents | None = None  # of position and velocity, where they are followed
 
 
 def at_start(position, velocity, scene: Scene, skin: ArrayLike, replicas: int) -> State:
@@ -101,138 +103,6 @@ class Plan(NamedTuple):
     room: Room
 
 
-class _Selection(NamedTuple):
-    """The pairs that may touch in a block, and their particles."""
-
-    members: Int[Array, "members"]  # particle of a slot; n where the slot is empty
-    a: Int[Array, "contacts"]  # slots
-    b: Int[Array, "contacts"]
-    offset: Float[Array, "contacts d"]
-    replica: Int[Array, "contacts"]
-    expected: Bool[Array, "contacts"]  # both partners' neighbours are looked at too
-    needed: Int[Array, "kinds"]  # how many rows of each of Room there would have to be
-
-
-def _rows(mask: Array, size: int) -> tuple[Array, Array]:
-    """Indices where a mask holds, filled up with its length, and how many there are."""
-    ranks = jnp.cumsum(mask, dtype=jnp.int32)
-    places = jnp.where(mask, ranks - 1, size)
-    indices = jnp.arange(mask.size, dtype=jnp.int32)
-    rows = jnp.full(size, mask.size, jnp.int32).at[places].set(indices, mode="drop")
-    return rows, ranks[-1]
-
-
-def _select(state, pairs: Pairs, duration, margin, extra, replicas: int, room: Room):
-    x, v = state.position, state.velocity
-    n = len(x)
-
-    def relative(i, j, offset):
-        r, u = x[i] - x[j] - offset, v[i] - v[j]
-        return jnp.sum(r * r, -1), jnp.sum(r * u, -1), jnp.sum(u * u, -1)
-
-    apart = x[pairs.i] - x[pairs.j] - pairs.offset
-    near = jnp.sum(apart * apart, -1) < (1 + margin) ** 2
-    near &= jnp.arange(near.size) < pairs.count
-    rows, num_near = _rows(near, room.near)
-    real = jnp.arange(room.near) < num_near
-    i, j, offset = pairs.i[rows], pairs.j[rows], pairs.offset[rows]
-
-    # Who would touch in free flight, who is near to those, and whoever is near to these.
-    distance2, approach, speed2 = relative(i, j, offset)
-    closest = jnp.clip(-approach / jnp.where(speed2 > 0, speed2, 1.0), 0.0, duration)
-    touch = real & (distance2 + (2 * approach + speed2 * closest) * closest < 1.0)
-
-    def spread(active, mask):
-        ends = jnp.where(mask[None], jnp.stack([i, j]), n)
-        return active.at[ends].set(True, mode="drop")
-
-    active = spread(extra, touch)
-    active = spread(active, real & (active[i] | active[j]))
-    chosen = real & (active[i] | active[j])
-    present = spread(jnp.zeros(n, bool), chosen)
-    rows, num_contacts = _rows(chosen, room.contacts)
-    real = jnp.arange(room.contacts) < num_contacts
-    rows = jnp.where(real, rows, 0)
-    i, j, offset = i[rows], j[rows], offset[rows]
-    members, num_members = _rows(present, room.members)
-    slot = jnp.cumsum(present, dtype=jnp.int32) - 1
-    return _Selection(
-        members=members,
-        a=jnp.where(real, slot[i], 0),
-        b=jnp.where(real, slot[j], 0),
-        offset=jnp.where(real[:, None], offset, 2.0),  # an empty row is a pair too far apart
-        replica=i // (n // replicas),
-        expected=active[i] & active[j],
-        needed=jnp.stack([pairs.count, num_near, num_contacts, num_members]),
-    )
-
-
-class _Work(NamedTuple):
-    """What the contacts of a block did, one row a pair."""
-
-    dissipated: Array
-    exchanged: Array  # work done against and by the elastic force
-    begun: Array
-    touching: Array
-
-
-def _contacts(x, v, scene: Scene, chosen: _Selection, duration, num_steps, clipped):
-    """Positions and velocities of the members after `num_steps` drift-kick-drift steps."""
-    rho, dt = 0.5 * scene.alpha, duration / num_steps
-    a, b, offset = chosen.a, chosen.b, chosen.offset
-
-    def overlap(x):
-        r = x[a] - x[b] - offset
-        distance2 = jnp.sum(r * r, -1)
-        touching = distance2 < 1
-        distance = jnp.sqrt(jnp.where(touching, distance2, 1.0))
-        return 1 - distance, r / distance[:, None], touching
-
-    def step(carry, _):
-        x, v, work = carry
-        xi, normal, touching = overlap(x)
-        xi_dot = -jnp.sum((v[a] - v[b]) * normal, -1)
-        rate = midpoint_rate(xi, xi_dot, scene.alpha, scene.dissipative_constant, dt)
-        force = contact_force(xi, rate, rho, scene.dissipative_constant, clipped=clipped)
-        elastic = contact_force(xi, 0.0, rho, 0.0)
-        kick = (dt * force)[:, None] * normal
-        v = v.at[a].add(kick).at[b].add(-kick)
-        # The midpoint sum of sqrt(xi) xi_dot^2 errs to the other side of the trapezoidal one.
-        mean = xi_dot - dt * force
-        viscous = contact_force(xi, 1.0, rho, scene.dissipative_constant) - elastic
-        lost = (force - elastic) * mean + 0.5 * viscous * (dt * force) ** 2
-        work = _Work(
-            dissipated=work.dissipated + dt * lost,
-            exchanged=work.exchanged + dt * elastic * jnp.abs(mean),
-            begun=work.begun + (touching & ~work.touching),
-            touching=touching,
-        )
-        return (x + dt * v, v, work), None
-
-    zeros = jnp.zeros(len(a), x.dtype)
-    work = _Work(zeros, zeros, jnp.zeros(len(a), jnp.int32), overlap(x)[2])
-    begun_before = work.touching
-    (x, v, work), _ = jax.lax.scan(step, (x + 0.5 * dt * v, v, work), length=num_steps)
-    x = x - 0.5 * dt * v
-    touched = (work.begun > 0) | begun_before
-    xi, _, touching = overlap(x)
-    work = work._replace(begun=work.begun + (touching & ~work.touching))  # after the last kick
-    stored = 0.4 * rho * jnp.where(touching, xi, 0.0) ** 2.5
-    return x, v, work, stored, touched
-
-
-def _elastic_energy(
-    x: Array, scene: Scene, pairs: Pairs, replicas: int
-) -> Float[Array, "replicas"]:
-    """``(2/5) rho xi^(5/2)`` of all contacts, by replica."""
-    r = x[pairs.i] - x[pairs.j] - pairs.offset
-    distance2 = jnp.sum(r * r, -1)
-    touching = (distance2 < 1) & (jnp.arange(len(r)) < pairs.count)
-    xi = 1 - jnp.sqrt(jnp.where(touching, distance2, 1.0))
-    replica = pairs.i // (len(x) // replicas)
-    return jnp.zeros(replicas, x.dtype).at[replica].add(0.2 * scene.alpha * xi**2.5)
-
-
 class Progress(NamedTuple):
     state: State
     extra: Array  # particles found to take part only when the block had been stepped
@@ -241,18 +111,10 @@ class Progress(NamedTuple):
     status: Array
     needed: Array  # the most rows of each of Room
     num_blocks: Array
-    num_failed: Array
 
 
-@partial(jax.jit, static_argnames=("plan", "max_blocks"))
-def advance(
-    state: State,
-    pairs: Pairs,
-    scene: Scene,
-    end: ArrayLike,
-    plan: Plan,
-    max_blocks: int = 1_000_000,
-) -> Progress:
+@partial(jax.jit, static_argnames="plan")
+def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan) -> Progress:
     """Step until `end`, or until the pair list is used up, or something goes wrong.
 
     The gas moves in blocks of `steps_per_block` steps. In a block only particles that may touch are
@@ -268,6 +130,27 @@ def advance(
         centred = boxes - jnp.mean(boxes, axis=1, keepdims=True)
         return jnp.mean(centred**2, axis=(1, 2))
 
+    def carried(along: Tangents, new: State, chosen, work: Work, duration, by_replica) -> Tangents:
+        """The tangents after a block, projected where it is time to."""
+        partners = chosen.members[jnp.stack([chosen.a, chosen.b], 1)]
+        ends = jnp.where(work.touching[:, None], partners, len(new.position))
+        temperature = thermal(new.velocity)
+        along = along._replace(
+            free=jnp.ones_like(along.free).at[ends].set(False, mode="drop"),
+            rates=tangents.remembered(
+                along.rates,
+                lost=by_replica(work.dissipated),
+                met=2 * replicas / len(new.position) * by_replica(work.begun),
+                energy=kinetic(new.velocity) + new.elastic,
+                temperature=temperature,
+                duration=duration,
+                collision_frequency=scene.collision_frequency,
+            ),
+        )
+        passed = (new.time - along.since) * jnp.sqrt(jnp.mean(temperature))
+        due = passed * scene.collision_frequency >= along.interval
+        return tangents.project(along, new.velocity, new.time, due)
+
     def block(now: Progress) -> Progress:
         state = now.state
         x, v = state.position, state.velocity
@@ -282,12 +165,19 @@ def advance(
         duration = left / num_left
         fastest = jnp.sqrt(jnp.max(jnp.sum(v * v, -1)))
         reach = 1.5 * fastest * duration * now.widen
-        chosen = _select(state, pairs, duration, 2 * reach, now.extra, replicas, plan.room)
+        chosen = encounters.select(
+            x, v, pairs, duration, 2 * reach, now.extra, replicas, plan.room[1:]
+        )
         before = x.at[chosen.members].get(mode="fill", fill_value=0.0)
         v_before = v.at[chosen.members].get(mode="fill", fill_value=0.0)
-        after, v_after, work, stored, touched = _contacts(
-            before, v_before, scene, chosen, duration, plan.steps_per_block, plan.clipped
+        follow = partial(
+            encounters.follow,
+            chosen=chosen,
+            duration=duration,
+            num_steps=plan.steps_per_block,
+            clipped=plan.clipped,
         )
+        after, v_after, work, along = _followed(follow, before, v_before, scene, chosen, state)
 
         def by_replica(values):
             zeros = jnp.zeros(replicas, values.dtype)
@@ -299,11 +189,13 @@ def advance(
             velocity=v.at[chosen.members].set(v_after, mode="drop"),
             dissipated=state.dissipated + by_replica(work.dissipated),
             contacts=state.contacts + by_replica(work.begun),
-            elastic=by_replica(stored),
+            elastic=by_replica(work.stored),
         )
+        if along is not None:
+            new = new._replace(tangents=carried(along, new, chosen, work, duration, by_replica))
 
         # A sphere outside the chosen ones was hit, or one went farther than was looked.
-        surprise = touched & ~chosen.expected
+        surprise = work.touched & ~chosen.expected
         hit = jnp.where(
             surprise[:, None], chosen.members[jnp.stack([chosen.a, chosen.b], 1)], len(x)
         )
@@ -334,25 +226,56 @@ def advance(
             status=jnp.where(again & (trouble == status.OK), status.OK, trouble),
             needed=jnp.maximum(now.needed, chosen.needed),
             num_blocks=now.num_blocks + 1,
-            num_failed=now.num_failed + ~done,
         )
 
     def unfinished(now: Progress):
-        going = (now.state.time < end) & ~now.stale & (now.status == status.OK)
-        return going & (now.num_blocks < max_blocks)
+        return (now.state.time < end) & ~now.stale & (now.status == status.OK)
 
     zero = jnp.zeros((), jnp.int32)
+    xi, _, touching = encounters.overlap(state.position, pairs.i, pairs.j, pairs.offset)
+    touching &= jnp.arange(len(xi)) < pairs.count
+    stored = encounters.elastic_energy(jnp.where(touching, xi, 0.0), scene.alpha)
+    replica = pairs.i // (len(state.position) // replicas)
     first = Progress(
-        state=state._replace(elastic=_elastic_energy(state.position, scene, pairs, replicas)),
+        state=state._replace(elastic=jnp.zeros_like(state.elastic).at[replica].add(stored)),
         extra=jnp.zeros(len(state.position), bool),
         widen=jnp.ones((), state.position.dtype),
         stale=jnp.zeros((), bool),
         status=zero,
         needed=jnp.zeros(len(plan.room), jnp.int32),
         num_blocks=zero,
-        num_failed=zero,
     )
     return jax.lax.while_loop(unfinished, block, first)
+
+
+def _followed(follow, x, v, scene: Scene, chosen: Encounters, state: State):
+    """The members after the block's steps, and the tangents of all particles with them."""
+    along = state.tangents
+    alpha, constant = scene.alpha, scene.dissipative_constant
+    if along is None or len(along.alpha) == 0:
+        return *follow(x, v, alpha, constant), along
+    one = jnp.ones(len(chosen.a), x.dtype)
+    at = x, v, alpha * one, constant * one
+    rows = jax.vmap(lambda rest: rest.at[chosen.members].get(mode="fill", fill_value=0.0))
+    material = (tangent[:, chosen.replica] for tangent in along.material(alpha, constant))
+
+    def push(*tangent):
+        def followed(*at):
+            x, v, work = follow(*at)
+            return (x, v), work
+
+        return jax.jvp(followed, at, tangent, has_aux=True)
+
+    (x, v), (dx, dv), work = jax.vmap(push, out_axes=(None, 0, None))(
+        rows(along.position), rows(along.velocity), *material
+    )
+    duration = follow.keywords["duration"]
+    put = jax.vmap(lambda rest, new: rest.at[chosen.members].set(new, mode="drop"))
+    along = along._replace(
+        position=put(along.position + duration * along.velocity, dx),
+        velocity=put(along.velocity, dv),
+    )
+    return x, v, work, along
 
 
 def stretch(

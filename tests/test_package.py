@@ -7,9 +7,10 @@ import jaxgran
 
 ROOT = Path(__file__).parent.parent
 FLOORS = [
-    ["domain", "status", "checkpoint"],
+    ["domain", "status", "checkpoint", "tangents"],
     ["contact", "neighbours", "simulation"],
-    ["restitution", "observables", "initial", "blocks"],
+    ["restitution", "observables", "initial", "encounters"],
+    ["blocks"],
     ["gas"],
     ["kinetics", "curve"],
     ["models.kinetic_theory", "models.soft_spheres"],

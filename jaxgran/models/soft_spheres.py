@@ -1,8 +1,8 @@
 """Soft spheres: every contact resolved in time, in a periodic box."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
+from math import pi
 from pathlib import Path
 
 import equinox as eqx
@@ -12,13 +12,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxgran import blocks, initial, neighbours, observables, status
-from jaxgran.blocks import Scene, State
+from jaxgran import blocks, initial, neighbours, observables, status, tangents
+from jaxgran.blocks import Plan, Scene, State
 from jaxgran.checkpoint import fingerprint
 from jaxgran.curve import CoolingCurve, Particles
-from jaxgran.gas import Gas
+from jaxgran.gas import Gas, sphere_surface
 from jaxgran.restitution import Viscoelastic
 from jaxgran.simulation import simulate
+from jaxgran.tangents import Inputs, Outputs
 
 SMALLEST_BOX = 2.1
 """Box side in diameters below which a sphere could touch another and its image at once."""
@@ -31,6 +32,9 @@ PAIRS_PER_PARTICLE = 3.0
 
 MOST_PAIRS = 100
 """Pairs per particle beyond which a list is taken to have gone wrong."""
+
+PROJECTION = 0.5
+"""Mean free times between thermal projections of a derivative."""
 
 _FASTEST = 4.8  # speed of the fastest of some thousand spheres, in sqrt(T)
 
@@ -71,6 +75,7 @@ class SoftSpheres(eqx.Module):
     neighbours: str = eqx.field(static=True, default="auto")
     progress: bool = eqx.field(static=True, default=True)
     checkpoint: str | Path | None = eqx.field(static=True, default=None)
+    projection: float | None = eqx.field(static=True, default=PROJECTION)
     plan: blocks.Plan | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -88,25 +93,35 @@ class SoftSpheres(eqx.Module):
             RuntimeError: if the run fails beyond repair, with what to do.
         """
         with jax.ensure_compile_time_eval():
-            self._check(gas)
-        scene = reduced_scene(gas, self.num_particles)
-        unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-        inputs = gas, times, self.start, self.key
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs)):
-            state, records, fault = self._traced(gas, scene, times / unit_time)
-        else:
-            state, records = self._driven(gas, scene, times / unit_time)
-            fault = jnp.zeros((), jnp.int32)
-        return self._curve(gas, times, scene, state, records, fault)
+            law = self._check(gas)
+        inputs = Inputs(
+            scene=reduced_scene(gas, self.num_particles),
+            times=times * jnp.sqrt(gas.temperature) / gas.diameter,
+            start=self._reduced_start(gas),
+            key=self.key,
+        )
+        run = partial(self._run, dimension=gas.dimension, clipped=law.clipped)
+        if self.projection is not None:
+            run = tangents.differentiable(run)
+        return self._curve(gas, times, inputs.scene, run(inputs))
 
-    def _check(self, gas: Gas) -> None:
+    def _reduced_start(self, gas: Gas) -> tuple[Array, Array] | None:
+        if self.start is None:
+            return None
+        # The same start in units of any other gas.
+        units = gas.diameter, jnp.sqrt(gas.temperature)
+        length, speed = units if self.projection is None else jax.lax.stop_gradient(units)
+        position, velocity = self.start.position / length, self.start.velocity / speed
+        return position.reshape(-1, gas.dimension), velocity.reshape(-1, gas.dimension)
+
+    def _check(self, gas: Gas) -> Viscoelastic:
         if not isinstance(gas.law, Viscoelastic):
             raise ValueError(
                 "SoftSpheres needs the Viscoelastic law, which has a force; this gas has "
                 f"{type(gas.law).__name__}: use a model of instant impacts"
             )
         if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
-            return
+            return gas.law
         limit, phi = initial.PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
         if phi > limit and self.start is None:
             raise ValueError(
@@ -130,16 +145,9 @@ class SoftSpheres(eqx.Module):
                     f"start.box_side is {given:.7g} diameters, the gas fills {side:.7g}: change "
                     "packing_fraction or the start"
                 )
+        return gas.law
 
-    def _skin(self, gas: Gas) -> Float[Array, ""]:
-        """Reach of the neighbour list beyond contact, in diameters."""
-        d = gas.dimension
-        inside = gas.packing_fraction * 2 ** (d - 1)  # pairs per particle within contact, were g 1
-        skin = (1 + PAIRS_PER_PARTICLE / inside) ** (1 / d) - 1
-        side = gas.box_side(self.num_particles) / gas.diameter
-        return jnp.minimum(skin, blocks.longest_skin(side))
-
-    def sized_for(self, gas: Gas, spare: float = 1.4) -> "SoftSpheres":
+    def sized_for(self, gas: Gas, spare: float = 2.0) -> "SoftSpheres":
         """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
 
         Outside of jit they follow from the gas and grow where they must. Inside, they are fixed,
@@ -149,71 +157,91 @@ class SoftSpheres(eqx.Module):
             gas: with known numbers, alike the gases to come: the hottest and softest of them.
             spare: room over the expected need.
         """
-        return dataclasses.replace(self, plan=self._sized(gas, spare))
+        law, scene = self._check(gas), reduced_scene(gas, self.num_particles)
+        plan = self._sized(scene, gas.dimension, law.clipped, spare)
+        return dataclasses.replace(self, plan=plan)
 
-    def _sized(self, gas: Gas, spare: float = 1.4) -> blocks.Plan:
-        d = gas.dimension
-        flight = _FASTEST * float(gas.contact_duration * jnp.sqrt(gas.temperature) / gas.diameter)
+    def _pairs_in_contact(self, scene: Scene, d: int) -> Array:
+        """Pairs a particle within contact, were the pair correlation 1."""
+        return self.num_particles * sphere_surface(d) / (2 * d) / scene.side**d
+
+    def _skin(self, scene: Scene, d: int) -> Array:
+        """Reach of the neighbour list beyond contact, in diameters."""
+        skin = (1 + PAIRS_PER_PARTICLE / self._pairs_in_contact(scene, d)) ** (1 / d) - 1
+        return jnp.minimum(skin, blocks.longest_skin(scene.side))
+
+    def _sized(self, scene: Scene, d: int, clipped: bool, spare: float = 1.4) -> Plan:
+        flight = _FASTEST * float(scene.contact_duration)
         # A block is at most a contact long, and shorter where spheres go far in that time.
         steps = max(round(self.steps_per_contact * min(1.0, 0.08 / flight)), 8)
         flight *= steps / self.steps_per_contact
-        inside = float(gas.packing_fraction) * 2 ** (d - 1)
-        listed = inside * (1 + float(self._skin(gas))) ** d
-        near = min(inside * float(gas.contact_value) * ((1 + 3 * flight) ** d - 1), listed)
-        touching = min(float(gas.contact_fraction) * (1 + 6 * near), near)
+        inside = float(self._pairs_in_contact(scene, d))
+        listed = inside * (1 + float(self._skin(scene, d))) ** d
+        dilute = sphere_surface(d) / pi**0.5 * self.num_particles / float(scene.side) ** d
+        contact_value = float(scene.collision_frequency) / dilute
+        near = min(inside * contact_value * ((1 + 5 * flight) ** d - 1), listed)
+        contact_fraction = float(scene.contact_duration * scene.collision_frequency)
+        touching = min(contact_fraction * (2 + 6 * near), near)
         n = self.replicas * self.num_particles
         counts = [n * share for share in (listed, near, touching, 2 * touching)]
         rooms = [int(spare * count + 5 * count**0.5) + 32 for count in counts]
         room = blocks.Room(*rooms[:3], members=min(rooms[3], n))
-        assert isinstance(gas.law, Viscoelastic)
-        return blocks.Plan(self.replicas, self.steps_per_contact, steps, gas.law.clipped, room)
+        return Plan(self.replicas, self.steps_per_contact, steps, clipped, room)
 
-    def _initial(self, gas: Gas, scene: Scene) -> State:
-        d = gas.dimension
-        if self.start is None:
-            keys = jax.random.split(jax.random.key(0) if self.key is None else self.key)
-            size = self.replicas, self.num_particles, d
+    def _run(
+        self,
+        inputs: Inputs,
+        dimension: int,
+        clipped: bool,
+        directions: tuple[Array, Array] | None = None,
+    ) -> Outputs:
+        """Melt, then cool; and with it the tangents along directions in (alpha, A)."""
+        traced = _is_traced(inputs)
+        try:
+            with jax.ensure_compile_time_eval():
+                plan = self.plan or self._sized(inputs.scene, dimension, clipped)
+        except jax.errors.ConcretizationTypeError:
+            raise ValueError(
+                "inside jax.jit the sizes of arrays must be known: give SoftSpheres(...)"
+                ".sized_for(gas), made outside with a gas of known numbers"
+            ) from None
+        scene, replicas = inputs.scene, self.replicas
+        if inputs.start is None:
+            keys = jax.random.split(jax.random.key(0) if inputs.key is None else inputs.key)
+            size = replicas, self.num_particles, dimension
             position = initial.positions(keys[0], scene.side, *size)
             velocity = initial.velocities(keys[1], *size)
         else:
-            position = (self.start.position / gas.diameter).reshape(-1, d)
-            velocity = (self.start.velocity / jnp.sqrt(gas.temperature)).reshape(-1, d)
-        return blocks.at_start(position, velocity, scene, self._skin(gas), self.replicas)
+            position, velocity = inputs.start
+        skin = self._skin(scene, dimension)
+        state = blocks.at_start(position, velocity, scene, skin, replicas)
 
-    def _melted(self, state: State, scene: Scene) -> State:
-        velocity = initial.settle(state.velocity, self.replicas)
-        return blocks.at_start(state.position, velocity, scene, state.skin, self.replicas)
+        def begun(melted: State) -> State:
+            velocity = melted.velocity
+            if inputs.start is None:
+                velocity = initial.settle(velocity, replicas)
+            state = blocks.at_start(melted.position, velocity, scene, melted.skin, replicas)
+            if directions is None:
+                return state
+            assert self.projection is not None
+            along = tangents.at_start(*directions, velocity, replicas, self.projection)
+            return state._replace(tangents=along)
 
-    def _driven(self, gas: Gas, scene: Scene, times: Array) -> tuple[State, dict[str, Array]]:
+        run = self._traced if traced else self._driven
+        state, records, fault = run(inputs, plan, state, begun)
+        position = neighbours.wrap(scene.side, state.position)
+        return Outputs(position, state.velocity, records, fault)
+
+    def _driven(self, inputs: Inputs, plan: Plan, state: State, begun):
         """Run by a loop on the host, which makes room as it is needed."""
-        state = self._initial(gas, scene)
+        scene, times = inputs.scene, np.asarray(inputs.times)
         observe = partial(_observe, scene=scene, replicas=self.replicas)
-        if self.start is None:
-            melt = self._driver(gas, scene._replace(dissipative_constant=0.0 * scene.alpha))
-            end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
-            state, _ = simulate(state, end, melt, observe, progress=self.progress, label="melt")
-            state = self._melted(state, scene)
-        advance = self._driver(gas, scene)
-        state = advance(state, 0.0)  # counts the energy in contacts
-        state, records = simulate(
-            state,
-            np.asarray(times),
-            advance,
-            observe,
-            scene=fingerprint(gas, times, state, self.steps_per_contact, self.neighbours),
-            progress=self.progress,
-            path=self.checkpoint,
-        )
-        return state, {name: jnp.asarray(value) for name, value in records.items()}
+        engine = neighbours.engine(self.neighbours)
 
-    def _driver(self, gas: Gas, scene: Scene) -> Callable[[State, float], State]:
-        plan = self.plan or self._sized(gas)
-        by = neighbours.engine(self.neighbours)
-
-        def advance(state: State, end: float) -> State:
+        def advance(state: State, end: float, scene: Scene) -> State:
             nonlocal plan
             while True:
-                now = blocks.stretch(state, scene, end, plan, by)
+                now = blocks.stretch(state, scene, end, plan, engine)
                 state, fault = now.state, int(now.status)
                 if fault == status.OK:
                     return state
@@ -224,18 +252,28 @@ class SoftSpheres(eqx.Module):
                     raise RuntimeError(f"stopped at T/T_0 = {at:.3g}: {status.explain(fault)}")
                 plan = plan._replace(room=plan.room.grown(needed))
 
-        return advance
+        # A run to be resumed has been melted.
+        if inputs.start is None and not (self.checkpoint and Path(self.checkpoint).exists()):
+            melt = partial(advance, scene=_elastic(scene))
+            end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
+            state, _ = simulate(state, end, melt, observe, progress=self.progress, label="melt")
+        cool = partial(advance, scene=scene)
+        state = cool(begun(state), 0.0)  # counts the energy in contacts
+        size = self.num_particles, self.replicas, self.steps_per_contact, self.neighbours
+        state, records = simulate(
+            state,
+            times,
+            cool,
+            observe,
+            scene=fingerprint(inputs, state.tangents, size),
+            progress=self.progress,
+            path=self.checkpoint,
+        )
+        records = {name: jnp.asarray(value) for name, value in records.items()}
+        return state, records, jnp.zeros((), jnp.int32)
 
-    def _traced(self, gas: Gas, scene: Scene, times: Array):
+    def _traced(self, inputs: Inputs, plan: Plan, state: State, begun):
         """The same inside `jax.jit`, `jax.vmap` or a derivative: room is fixed beforehand."""
-        try:
-            with jax.ensure_compile_time_eval():
-                plan = self.plan or self._sized(gas)
-        except jax.errors.ConcretizationTypeError:
-            raise ValueError(
-                "inside jax.jit the sizes of arrays must be known: give SoftSpheres(...)"
-                ".sized_for(gas), made outside with a gas of known numbers"
-            ) from None
 
         def run(carry, scene, end):
             def further(carry):
@@ -247,11 +285,10 @@ class SoftSpheres(eqx.Module):
 
             return jax.lax.while_loop(unfinished, further, carry)
 
-        state, fault = self._initial(gas, scene), jnp.zeros((), jnp.int32)
-        if self.start is None:
-            elastic = scene._replace(dissipative_constant=0.0 * scene.alpha)
-            state, fault = run((state, fault), elastic, MELT_COLLISIONS / scene.collision_frequency)
-            state = self._melted(state, scene)
+        scene, fault = inputs.scene, jnp.zeros((), jnp.int32)
+        if inputs.start is None:
+            end = MELT_COLLISIONS / scene.collision_frequency
+            state, fault = run((state, fault), _elastic(scene), end)
 
         def to(carry, end):
             state, fault = run(carry, scene, end)
@@ -259,10 +296,10 @@ class SoftSpheres(eqx.Module):
             bad = fault != status.OK
             return (state, fault), jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), records)
 
-        (state, fault), records = jax.lax.scan(to, (state, fault), times)
+        (state, fault), records = jax.lax.scan(to, (begun(state), fault), inputs.times)
         return state, records, fault
 
-    def _curve(self, gas, times, scene, state, records, fault) -> CoolingCurve:
+    def _curve(self, gas: Gas, times: Array, scene: Scene, run: Outputs) -> CoolingCurve:
         energy = gas.mass * gas.temperature
         units = {
             "temperature": gas.temperature,
@@ -273,7 +310,7 @@ class SoftSpheres(eqx.Module):
             "dissipated_energy": energy,
             "collisions": 1.0,
         }
-        each = {name: records[name].T * unit for name, unit in units.items()}
+        each = {name: run.records[name].T * unit for name, unit in units.items()}
         mean = {name: jnp.mean(values, axis=0) for name, values in each.items()}
         errors = {}
         if self.replicas > 1:
@@ -281,10 +318,9 @@ class SoftSpheres(eqx.Module):
                 deviation = jnp.std(each[name], axis=0, ddof=1)
                 errors[f"{name}_error"] = deviation / self.replicas**0.5
         shape = self.replicas, self.num_particles, gas.dimension
-        position = neighbours.wrap(scene.side, state.position)
         particles = Particles(
-            position=position.reshape(shape) * gas.diameter,
-            velocity=state.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
+            position=run.position.reshape(shape) * gas.diameter,
+            velocity=run.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
             box_side=scene.side * gas.diameter,
         )
         return CoolingCurve(
@@ -293,8 +329,16 @@ class SoftSpheres(eqx.Module):
             **errors,
             replicas=CoolingCurve(times=times, **each),
             particles=particles,
-            status=fault,
+            status=run.status,
         )
+
+
+def _is_traced(tree) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def _elastic(scene: Scene) -> Scene:
+    return scene._replace(dissipative_constant=0.0 * scene.alpha)
 
 
 def reduced_scene(gas: Gas, num_particles: int) -> Scene:
@@ -313,15 +357,18 @@ def reduced_scene(gas: Gas, num_particles: int) -> Scene:
 
 @partial(jax.jit, static_argnames="replicas")
 def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
+    """The records of a state, and if tangents are followed, x.along and x.rate for each record x:
+    its derivatives along the directions at this time, and in time."""
+
     def centred(x):
         boxes = x.reshape(replicas, -1, x.shape[-1])
         return boxes - jnp.mean(boxes, axis=1, keepdims=True)
 
-    num_particles = len(state.position) // replicas
+    num_particles, d = len(state.position) // replicas, state.position.shape[-1]
     velocity = centred(state.velocity)
     travelled = centred(state.position - state.origin + scene.side * state.image)
     first = centred(state.first_velocity)
-    return {
+    records = {
         "temperature": observables.temperature(velocity),
         "sonine": observables.sonine(velocity),
         "displacement": observables.mean_square_displacement(travelled),
@@ -330,3 +377,25 @@ def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
         "dissipated_energy": state.dissipated / num_particles,
         "collisions": 2 / num_particles * state.contacts,
     }
+    along = state.tangents
+    if along is None:
+        return records
+    T, C, U = (records[n] for n in ("temperature", "velocity_correlation", "elastic_energy"))
+    cooling, meeting = along.rates.cooling(T), along.rates.collision(T)
+    c, clock = tangents.projected(along, state.velocity, state.time)
+    stiffer = (along.alpha / scene.alpha)[:, None]
+    # At a fixed place in the sequence of collisions the paths are the same; contacts are not.
+    kept = {"temperature": c * T, "velocity_correlation": 0.5 * c * C}
+    kept["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U
+    rates = {
+        "temperature": -cooling * T,
+        "displacement": 2 * jnp.mean(jnp.sum(travelled * velocity, -1), axis=1),
+        "velocity_correlation": -2 / d * meeting * C,
+        "elastic_energy": -1.4 * cooling * U,
+        "collisions": meeting,
+    }
+    for name in list(records):
+        rate = rates.get(name, jnp.zeros_like(T))
+        records[f"{name}.rate"] = rate
+        records[f"{name}.along"] = kept.get(name, 0.0) - rate * clock
+    return records
