@@ -1,5 +1,6 @@
 """Whether a fit is to be believed, in words."""
 
+import re
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -83,7 +84,8 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     correlation = _neighbour_correlation(residuals)
     factor = np.sqrt((1 + correlation) / (1 - correlation)) if correlation > 0 else 1.0
     reduced, p_value = float(result.reduced_chi2), float(result.p_value)
-    contacts, space = regime(result.gas, num_particles)
+    theory = result.model == "KineticTheory"
+    contacts, space = regime(result.gas, num_particles) if theory else ([], [])
     has_errors = not np.isnan(p_value)
     misfit = has_errors and p_value < SIGNIFICANCE
 
@@ -108,12 +110,23 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     reasons += contacts + space
     if not bool(result.converged):
         reasons.append("the search did not converge: more max_steps or fewer free parameters")
+    if result.simulation_error is not None:
+        share = np.asarray(result.simulation_error / result.standard_error)
+        reasons.append(
+            f"{int(result.iterations)} simulations were run; their own noise is "
+            f"{100 * float(np.max(share)):.0f} % of the error bar at most"
+        )
     group = result.undetermined()
     if group:
         reasons.append(f"this curve does not determine {' and '.join(group)}")
 
     explains = not misfit and not contacts and bool(result.converged)
-    if explains and not space:
+    if not theory:
+        name = words(result.model)
+        verdict = f"{name} explain this curve."
+        if not explains:
+            verdict = f"{name} do not explain this curve: do not trust their estimates."
+    elif explains and not space:
         verdict = "Kinetic theory explains this curve."
     elif explains:
         verdict = "Kinetic theory fits this curve, but the scene is at the edge of its reach."
@@ -126,6 +139,11 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         elif space:
             verdict += " This scene needs particles with positions."
     return Diagnosis(explains, verdict, tuple(reasons), correlation, float(factor))
+
+
+def words(model: str) -> str:
+    """The name of a model as it begins a sentence: "SoftSpheres" as "Soft spheres"."""
+    return re.sub(r"(?<=[a-z])([A-Z])", lambda m: f" {m[1].lower()}", model)
 
 
 def _neighbour_correlation(residuals: np.ndarray) -> float:

@@ -6,8 +6,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
-import optimistix as optx
+import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
@@ -17,7 +16,9 @@ from jaxgran.cooling import Model
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.restitution import ConstantRestitution, Viscoelastic
+from jaxgran.search import by_simulation, least_squares, quasi_newton
 
 SIGNIFICANCE = 0.01
 """A model is said not to explain a curve if chance alone would misfit as badly less often."""
@@ -28,10 +29,12 @@ class Fit(eqx.Module):
 
     Attributes:
         names: the free parameters.
+        model: the name of the model.
         accuracy: of the model's clock, relative.
         estimate: their values, SI, shape (p,).
         standard_error: one standard deviation of each, SI, shape (p,): the measurement errors
-            carried through; if the model does not explain the curve, times sqrt(reduced chi^2).
+            carried through, and a simulation's own noise; if the model does not explain the curve,
+            times sqrt(reduced chi^2).
         model_error: by how much each would move if the model's clock were wrong by its known
             accuracy, SI, shape (p,). Not part of `standard_error`.
         covariance: of the estimates, SI, shape (p, p), scaled alike.
@@ -44,11 +47,14 @@ class Fit(eqx.Module):
         displacement_residuals: the same of <dr^2>; None if it was not used.
         chi2, degrees_of_freedom, reduced_chi2, p_value: of the weighted residuals; p_value is nan
             if the curve carries no errors (then errors are scaled so that reduced chi^2 is 1).
-        iterations: of the least-squares or quasi-Newton search.
+        iterations: of the least-squares or quasi-Newton search; runs of a particle model.
         converged: whether the search ended at its tolerance.
+        simulation_error: the part of `standard_error` that is a particle model's own noise, by its
+            replicas, shape (p,); None for kinetic theory, which has none.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
+    model: str = eqx.field(static=True)
     accuracy: float = eqx.field(static=True)
     estimate: Float[Array, "p"]
     standard_error: Float[Array, "p"]
@@ -66,6 +72,7 @@ class Fit(eqx.Module):
     p_value: Float[Array, ""]
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
+    simulation_error: Float[Array, "p"] | None = None
 
     def value(self, name: str) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Estimate and standard error of one parameter."""
@@ -99,7 +106,7 @@ def fit(
     start: Gas | None = None,
     num_particles: int | None = None,
     method: Literal["levenberg-marquardt", "lbfgs"] = "levenberg-marquardt",
-    max_steps: int = 100,
+    max_steps: int | None = None,
 ) -> Fit:
     """Find the floats of a gas that make its cooling curve the measured one.
 
@@ -109,18 +116,25 @@ def fit(
     weight. <dr^2> is compared to within the accuracy of kinetic theory (1.7 % in 3D), both point by
     point and as a common factor of its diffusive part. Works under `jax.vmap` and `jax.jit`.
 
+    Through a particle model the same is done by Gauss-Newton steps on its projected tangents, one
+    run a step, with T alone, from where kinetic theory's fit ends (or from `start`). Errors then
+    hold the simulation's own noise too, told by its replicas. Projection may bias a derivative by
+    some per cent: that slows the search and tilts the error bar, but the answer is where the
+    residuals vanish, which it does not move.
+
     Args:
         gas: the scene; its values of free parameters are not looked at where the data can start
             the search (A, T_0, a constant restitution), and start it where they cannot.
         curve: what was measured; relative errors of T are taken equal and their size from the
             scatter if it carries none.
-        model: `jaxgran.KineticTheory()` by default.
+        model: `jaxgran.KineticTheory()` by default; or a particle model with two or more replicas.
         free: names of floats of the gas or its law, such as "temperature" (which is T_0).
         start: begin at the values of this gas, unless those from the data fit better.
         num_particles: over how many particles <dr^2> is a mean; gives its error,
             ``sqrt(2 / (d N))``, where the curve has none; without either <dr^2> is not used.
-        method: Levenberg-Marquardt of optimistix, or the quasi-Newton of optax by reverse mode.
-        max_steps: the most iterations.
+        method: Levenberg-Marquardt of optimistix, or the quasi-Newton of optax by reverse mode
+            (kinetic theory only).
+        max_steps: the most iterations, 100 by default; the most runs of a particle model, 8.
 
     Returns:
         `Fit`; `jaxgran.diagnose` says in words what it means.
@@ -141,14 +155,12 @@ def fit(
             f"{curve.times.shape[-1]} points cannot fix {len(free)} parameters; free fewer of them"
         )
     model = KineticTheory() if model is None else model
-    if not isinstance(model, KineticTheory):
-        raise ValueError(
-            f"fit works with jaxgran.KineticTheory so far, not with {type(model).__name__}, whose "
-            "plain derivatives grow without bound in a chaotic gas; run it at the fitted A with "
-            "jaxgran.cool to see whether it explains the curve"
-        )
-    starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])
-    result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, max_steps)
+    if isinstance(model, KineticTheory):
+        starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])
+        max_steps = max_steps or 100
+        result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, max_steps)
+    else:
+        result = _fit_by_simulation(gas, curve, model, tuple(free), start, method, max_steps or 8)
     if not isinstance(result.chi2, Tracer):
         if result.chi2.dtype == jnp.float32:
             warnings.warn(
@@ -264,7 +276,7 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
     if len(starts) > 1:
         costs = jnp.stack([jnp.sum(residuals(candidate) ** 2) for candidate in candidates])
         flat_first = candidates[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
-    search = _least_squares if method == "levenberg-marquardt" else _quasi_newton
+    search = least_squares if method == "levenberg-marquardt" else quasi_newton
     flat, iterations, converged = search(residuals, flat_first, max_steps)
 
     derivatives = jax.jacfwd(compare, argnums=(0, 1), has_aux=True)
@@ -290,6 +302,7 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
     num_times = curve.times.size
     return Fit(
         names=names,
+        model=type(model).__name__,
         accuracy=model.accuracy,
         estimate=estimates(flat),
         standard_error=jnp.sqrt(jnp.diag(covariance)),
@@ -310,37 +323,96 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
     )
 
 
-def _least_squares(residuals, first, max_steps):
-    solution = optx.least_squares(
-        lambda flat, _: residuals(flat),
-        optx.LevenbergMarquardt(rtol=1e-7, atol=1e-7),
-        first,
-        max_steps=max_steps,
-        throw=False,
-    )
-    converged = solution.result == optx.RESULTS.successful
-    return solution.value, solution.stats["num_steps"], converged
-
-
-def _quasi_newton(residuals, first, max_steps):
-    def objective(flat):
-        return 0.5 * jnp.sum(residuals(flat) ** 2)
-
-    solver = optax.lbfgs()
-    value_and_grad = optax.value_and_grad_from_state(objective)
-
-    def step(carry):
-        flat, state, num_steps, _ = carry
-        value, grad = value_and_grad(flat, state=state)
-        updates, state = solver.update(
-            grad, state, flat, value=value, grad=grad, value_fn=objective
+def _fit_by_simulation(
+    gas: Gas,
+    curve: CoolingCurve,
+    model: SoftSpheres,
+    names: tuple[str, ...],
+    start: Gas | None,
+    method: str,
+    max_runs: int,
+) -> Fit:
+    if method != "levenberg-marquardt":
+        raise ValueError(f"a particle model is fitted by least squares, not by {method!r}")
+    if model.replicas < 2 or model.projection is None:
+        raise ValueError(
+            f"a fit through {type(model).__name__} needs replicas >= 2, whose scatter is its "
+            f"noise, and a projection; got replicas={model.replicas}, projection={model.projection}"
         )
-        return optax.apply_updates(flat, updates), state, num_steps + 1, optax.tree.norm(updates)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, curve, start))):
+        raise ValueError(
+            "a fit through particles cannot run inside jax.jit or jax.vmap: fit one curve at a time"
+        )
+    start = _kinetic_start(gas, curve, names) if start is None else start
+    domains = [gas.domains[name] for name in names]
+    first, unravel = ravel_pytree(
+        [domain.to_free(start.value(name)) for name, domain in zip(names, domains, strict=True)]
+    )
 
-    def unfinished(carry):
-        _, _, num_steps, moved = carry
-        return (num_steps < max_steps) & (moved > 1e-9)
+    def values(flat):
+        frees = zip(names, domains, unravel(flat), strict=True)
+        return {name: domain.from_free(free) for name, domain, free in frees}
 
-    carry = first, solver.init(first), jnp.zeros((), int), jnp.full((), jnp.inf)
-    flat, _, num_steps, moved = jax.lax.while_loop(unfinished, step, carry)
-    return flat, num_steps, moved <= 1e-9
+    def estimates(flat):
+        return jnp.concatenate([jnp.ravel(value) for value in values(flat).values()])
+
+    def log_temperature(flat):
+        computed = model.cool(gas.replace(**values(flat)), curve.times)
+        return jnp.log(computed.temperature), computed
+
+    T = np.asarray(curve.temperature)
+    error = np.zeros_like(T) if curve.temperature_error is None else curve.temperature_error / T
+    used = np.ones(T.shape, bool) if curve.temperature_error is None else np.asarray(error) > 0
+    found = by_simulation(
+        log_temperature,
+        np.asarray(first),
+        np.log(T),
+        np.asarray(error),
+        used & (np.asarray(curve.times) > 0),
+        resolution=model.accuracy,
+        max_runs=max_runs,
+        progress=model.progress,
+    )
+    flat = jnp.asarray(found.flat)
+    degrees_of_freedom = int(np.sum(found.residuals != 0)) - flat.size
+    chi2 = jnp.asarray(np.sum(found.residuals**2))
+    reduced = chi2 / degrees_of_freedom
+    if curve.temperature_error is None:
+        inflation, p_value = reduced, jnp.full((), jnp.nan)
+    else:
+        p_value = jax.scipy.stats.chi2.sf(chi2, degrees_of_freedom)
+        inflation = jnp.where(p_value < SIGNIFICANCE, jnp.maximum(reduced, 1.0), 1.0)
+    scale = jax.jacfwd(estimates)(flat)
+    noise = scale @ found.noise_covariance @ scale.T
+    covariance = inflation * (scale @ found.error_covariance @ scale.T + noise)
+    return Fit(
+        names=names,
+        model=type(model).__name__,
+        accuracy=model.accuracy,
+        estimate=estimates(flat),
+        standard_error=jnp.sqrt(jnp.diag(covariance)),
+        model_error=jnp.zeros(flat.shape),
+        covariance=covariance,
+        sensitivity=jnp.asarray(found.sensitivity),
+        start=estimates(first),
+        gas=gas.replace(**values(flat)),
+        curve=found.computed,
+        residuals=jnp.asarray(found.residuals),
+        displacement_residuals=None,
+        chi2=chi2,
+        degrees_of_freedom=jnp.asarray(degrees_of_freedom),
+        reduced_chi2=reduced,
+        p_value=p_value,
+        iterations=jnp.asarray(found.num_runs),
+        converged=jnp.asarray(found.converged),
+        simulation_error=jnp.sqrt(jnp.diag(noise)),
+    )
+
+
+def _kinetic_start(gas: Gas, curve: CoolingCurve, names: tuple[str, ...]) -> Gas:
+    """Where kinetic theory's fit ends, of those parameters it can tell apart."""
+    known = tuple(n for n in names if n in ("dissipative_constant", "coefficient", "temperature"))
+    if not known:
+        return gas
+    starts = [start_from_data(gas, curve, known)]
+    return _fit(gas, curve, KineticTheory(), known, starts, None, "levenberg-marquardt", 100).gas

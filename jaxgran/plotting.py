@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxgran.curve import CoolingCurve
+from jaxgran.diagnosis import words
 from jaxgran.fitting import Fit
 
 try:
@@ -39,12 +40,13 @@ def plot_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
     t = np.asarray(curve.times)
     shown = t > 0
     t = t[shown]
+    fitted = f"{words(result.model).lower()}, fitted"
 
     def column(top, bottom, measured, error, computed, residuals, name):
         measured, computed = np.asarray(measured)[shown], np.asarray(computed)[shown]
         error = None if error is None else np.asarray(error)[shown]
         top.errorbar(t, measured, error, fmt="o", ms=3.5, color=DATA, label="measured", zorder=2)
-        top.plot(t, computed, color=MODEL, lw=1.6, label="kinetic theory, fitted", zorder=3)
+        top.plot(t, computed, color=MODEL, lw=1.6, label=fitted, zorder=3)
         top.set(xscale="log", yscale="log", ylabel=name)
         bottom.axhspan(-1, 1, color=GUIDE, alpha=0.25, lw=0)
         bottom.axhline(0, color=MODEL, lw=1)

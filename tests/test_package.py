@@ -7,7 +7,7 @@ import jaxgran
 
 ROOT = Path(__file__).parent.parent
 FLOORS = [
-    ["domain", "status", "checkpoint", "tangents"],
+    ["domain", "status", "checkpoint", "tangents", "search"],
     ["contact", "neighbours", "simulation"],
     ["restitution", "observables", "initial", "encounters"],
     ["blocks"],

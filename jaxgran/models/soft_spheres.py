@@ -61,7 +61,16 @@ class SoftSpheres(eqx.Module):
         progress: show a progress bar on a terminal.
         checkpoint: a file to save the run to each minute and to resume it from. The resumed run
             gives the same numbers bit for bit.
+        projection: mean free times between thermal projections of a derivative, 0.1 to 2 (see
+            `jaxgran.tangents`); None for the plain derivative, which is exact, and useless after
+            3 to 5 collisions a particle.
         plan: sizes of arrays, see `sized_for`.
+
+    Derivatives of T, collisions, <dr^2> and the energies are taken in every float of the gas,
+    forward and reverse alike: a gas depends on (alpha, A), its collision frequency and the times
+    only. The first two are followed by tangents, exact but for the projection; the density acts by
+    the Enskog frequency of collisions; a_2 is taken as constant, the velocity correlation as
+    decaying at 2/d of the collision rate. The last particles carry no derivative.
 
     Raises:
         ValueError: for numbers out of range.
@@ -84,6 +93,11 @@ class SoftSpheres(eqx.Module):
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
         neighbours.engine(self.neighbours)
+
+    @property
+    def accuracy(self) -> float:
+        """Relative error of a projected derivative: what differs by less is not told apart."""
+        return 0.02
 
     def cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them.

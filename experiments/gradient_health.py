@@ -1,0 +1,223 @@
+"""Is the derivative of a chaotic gas's cooling curve right, and for how long?
+
+    python experiments/gradient_health.py [--scenes dilute dense clustering] [--smoke] [--out DIR]
+
+d ln T / d ln A of three gases at 1, 3, 10, 30 and 100 collisions a particle, by finite differences
+(many replicas, the same random starts on both sides, corrected for their step by kinetic theory),
+by plain forward mode, by thermally projected forward and reverse mode, and by kinetic theory; and
+how the projected derivative depends on the interval between projections. Standard errors are over
+replicas. Prints tables, draws a picture, writes JSON.
+"""
+
+import argparse
+import json
+import platform
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from tqdm import tqdm  # noqa: E402
+
+import jaxgran  # noqa: E402
+
+COLLISIONS = (1.0, 3.0, 10.0, 30.0, 100.0)
+INTERVALS = (0.1, 0.25, 0.5, 1.0, 2.0)
+STEP = 0.3  # of ln A, to either side
+# packing fraction, beta_T0, contact duration over mean free time
+SCENES = {
+    "dilute": (0.05, 0.1, 0.01),
+    "dense": (0.25, 0.05, 0.05),
+    "clustering": (0.2, 0.5, 0.17),
+}
+NUM_PARTICLES, REPLICAS, FEW_REPLICAS = 1000, 24, 4
+INTERVAL_REPLICAS = 8
+STEPS_PER_CONTACT = 25
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--smoke", action="store_true", help="few particles, early times only")
+    parser.add_argument("--out", type=Path, default=Path("results") / "gradient_health")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    options.out.mkdir(parents=True, exist_ok=True)
+    begin = time.perf_counter()
+    results = {}
+    for name in tqdm(options.scenes, disable=options.smoke):
+        results[name] = examine(name, options.smoke)
+    draw(results, options.out / "gradient_health.png")
+    record = {
+        "scenes": results,
+        "seconds": time.perf_counter() - begin,
+        "step_of_ln_A": STEP,
+        "steps_per_contact": STEPS_PER_CONTACT,
+        "key": 0,
+        "versions": {name: version(name) for name in ("jaxgran", "jax", "jax-md", "vesin")},
+        "python": platform.python_version(),
+        "device": jax.devices()[0].device_kind,
+    }
+    (options.out / "gradient_health.json").write_text(json.dumps(record, indent=2) + "\n")
+    print(f"{record['seconds']:.0f} s; written to {options.out}")
+
+
+def scene(name: str) -> jaxgran.Gas:
+    packing, beta, fraction = SCENES[name]
+    gas = jaxgran.Gas(
+        jaxgran.Viscoelastic(1e7, 0.22, 1e-6),
+        diameter=2e-3,
+        mass=jaxgran.sphere_mass(2e-3, 2500.0),
+        packing_fraction=packing,
+        temperature=0.01,
+    )
+    stiffer = (float(gas.contact_fraction) / fraction) ** 2.5
+    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
+    return gas.replace(dissipative_constant=1e-6 * beta / gas.thermal_beta)
+
+
+def times_of(gas: jaxgran.Gas, collisions) -> np.ndarray:
+    """When a particle has collided so often, by kinetic theory."""
+    t = float(gas.mean_free_time) * np.geomspace(0.1, 1e6, 400)
+    counts = np.asarray(jaxgran.cool(gas, t).collisions)
+    return np.exp(np.interp(np.log(collisions), np.log(counts), np.log(t)))
+
+
+def examine(name: str, smoke: bool) -> dict:
+    gas = scene(name)
+    collisions = COLLISIONS[:2] if smoke else COLLISIONS
+    size, many, few = (50, 2, 2) if smoke else (NUM_PARTICLES, REPLICAS, FEW_REPLICAS)
+    times = times_of(gas, collisions)
+    constant = gas.value("dissipative_constant")
+
+    def log_temperatures(log_scale, model):
+        curve = jaxgran.cool(
+            gas.replace(dissipative_constant=constant * jnp.exp(log_scale)), times, model=model
+        )
+        each = curve.temperature[None] if curve.replicas is None else curve.replicas.temperature
+        return jnp.log(each), curve.collisions  # shape (replicas, times)
+
+    def forward(model):
+        begin = time.perf_counter()
+        zero = jnp.zeros(())
+        _, slope, counts = jax.jvp(
+            lambda x: log_temperatures(x, model), (zero,), (jnp.ones(()),), has_aux=True
+        )
+        return np.asarray(slope), np.asarray(counts), time.perf_counter() - begin
+
+    def spheres(replicas, **settings):
+        return jaxgran.SoftSpheres(
+            size,
+            replicas=replicas,
+            steps_per_contact=STEPS_PER_CONTACT,
+            progress=not smoke,
+            **settings,
+        )
+
+    columns = {}
+    theory = jaxgran.KineticTheory()
+    exact = forward(theory)[0][0]
+    ends = [np.asarray(log_temperatures(s * STEP, theory)[0][0]) for s in (1, -1)]
+    too_long_step = (ends[0] - ends[1]) / (2 * STEP) - exact
+    columns["kinetic theory"] = (exact, 0 * exact)
+    ends = [np.asarray(log_temperatures(s * STEP, spheres(many))[0]) for s in (1, -1)]
+    columns["differences"] = over_replicas((ends[0] - ends[1]) / (2 * STEP) - too_long_step)
+    slopes, counts, seconds = forward(spheres(many))
+    columns["projected"] = over_replicas(slopes)
+    # Reverse mode: the gradient of the last mean of ln T, beside forward mode of the same run.
+    model = spheres(few)
+    slopes = forward(model)[0]
+    last = jax.grad(lambda x: jnp.mean(log_temperatures(x, model)[0][:, -1]))(0.0)
+    disagreement = abs(float(last) - slopes[:, -1].mean())
+    slopes = forward(spheres(few, projection=None))[0]
+    columns["plain"] = over_replicas(slopes)
+    by_interval = {}
+    for interval in INTERVALS[:2] if smoke else INTERVALS:
+        slopes = forward(spheres(few if smoke else INTERVAL_REPLICAS, projection=interval))[0]
+        by_interval[interval] = over_replicas(slopes)
+
+    print(f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name]}, N = {size}, {many} replicas")
+    print(f"box {float(gas.box_side(size) / gas.diameter):.3g} diameters, ", end="")
+    print(f"L_c {float(gas.critical_box / gas.diameter):.3g}")
+    print(f"{'collisions':>11}" + "".join(f"{column:>24}" for column in columns))
+    for i in range(len(times)):
+        print(f"{counts[i]:11.1f}", end="")
+        print("".join(f"{m[i]:+14.4g} ± {e[i]:7.2g}" for m, e in columns.values()))
+    bias = columns["projected"][0] / columns["differences"][0] - 1
+    spread = np.hypot(columns["projected"][1], columns["differences"][1])
+    spread /= np.abs(columns["differences"][0])
+    print("projected over differences: ", end="")
+    print(", ".join(f"{100 * b:+.1f} ± {100 * e:.1f} %" for b, e in zip(bias, spread, strict=True)))
+    print(f"reverse minus forward, last point: {disagreement:.1e}; one tangent run {seconds:.0f} s")
+    print("interval between projections, in mean free times:")
+    for interval, (mean, error) in by_interval.items():
+        print(f"{interval:11.2g}", end="")
+        print("".join(f"{m:+14.4g} ± {e:7.2g}" for m, e in zip(mean, error, strict=True)))
+    return {
+        "collisions": counts.tolist(),
+        "d_ln_T_d_ln_A": {n: [m.tolist(), e.tolist()] for n, (m, e) in columns.items()},
+        "projected_over_differences": [bias.tolist(), spread.tolist()],
+        "reverse_minus_forward": disagreement,
+        "by_interval": {str(k): [m.tolist(), e.tolist()] for k, (m, e) in by_interval.items()},
+        "num_particles": size,
+        "replicas": many,
+        "tangent_seconds": seconds,
+    }
+
+
+def over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard error over the first axis."""
+    return values.mean(0), values.std(0, ddof=1) / len(values) ** 0.5
+
+
+def draw(results: dict, path: Path) -> None:
+    figure, axes = plt.subplots(2, len(results), figsize=(4.2 * len(results), 7), squeeze=False)
+    styles = {
+        "differences": ("o", "finite differences"),
+        "plain": ("x", "plain forward mode"),
+        "projected": ("s", "projected"),
+        "kinetic theory": ("", "kinetic theory"),
+    }
+    for (name, result), (top, bottom) in zip(results.items(), axes.T, strict=True):
+        n = np.asarray(result["collisions"])
+        for shift, (column, (marker, label)) in enumerate(styles.items()):
+            mean, error = (np.asarray(x) for x in result["d_ln_T_d_ln_A"][column])
+            if column == "kinetic theory":
+                top.plot(n, mean, "k--", lw=1, label=label)
+                continue
+            top.errorbar(n * 1.06 ** (shift - 1), mean, error, fmt=marker, ms=5, label=label)
+        top.set(xscale="log", title=name, xlabel="collisions a particle", ylim=(-2.2, 0.7))
+        reference = np.asarray(result["d_ln_T_d_ln_A"]["differences"][0])
+        for i, count in enumerate(n):
+            x = [float(k) for k in result["by_interval"]]
+            y, e = zip(*((m[i], s[i]) for m, s in result["by_interval"].values()), strict=True)
+            ratio = np.asarray(y) / reference[i] - 1
+            bottom.errorbar(
+                np.asarray(x) * 1.03**i,
+                100 * ratio,
+                100 * np.abs(np.asarray(e) / reference[i]),
+                fmt="o-",
+                ms=3,
+                label=f"{count:.0f}",
+            )
+        bottom.axhspan(-5, 5, color="0.9", zorder=0)
+        bottom.set(xscale="log", xlabel="mean free times between projections", ylim=(-30, 30))
+    axes[0, 0].set_ylabel("d ln T / d ln A")
+    axes[0, 0].legend(fontsize=8)
+    axes[1, 0].set_ylabel("projected over differences, %")
+    axes[1, 0].legend(title="collisions", fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+
+
+if __name__ == "__main__":
+    main()
