@@ -29,7 +29,7 @@ from tqdm import tqdm  # noqa: E402
 import jaxgran  # noqa: E402
 
 COLLISIONS = (1.0, 3.0, 10.0, 30.0, 100.0)
-INTERVALS = (0.1, 0.25, 0.5, 1.0, 2.0)
+INTERVALS = (0.03, 0.1, 0.3, 1.0)
 STEP = 0.3  # of ln A, to either side
 # packing fraction, beta_T0, contact duration over mean free time
 SCENES = {
@@ -37,8 +37,7 @@ SCENES = {
     "dense": (0.25, 0.05, 0.05),
     "clustering": (0.2, 0.5, 0.17),
 }
-NUM_PARTICLES, REPLICAS, FEW_REPLICAS = 1000, 24, 4
-INTERVAL_REPLICAS = 8
+NUM_PARTICLES, REPLICAS, FEW_REPLICAS = 1000, 12, 4
 STEPS_PER_CONTACT = 25
 
 
@@ -142,7 +141,7 @@ def examine(name: str, smoke: bool) -> dict:
     columns["plain"] = over_replicas(slopes)
     by_interval = {}
     for interval in INTERVALS[:2] if smoke else INTERVALS:
-        slopes = forward(spheres(few if smoke else INTERVAL_REPLICAS, projection=interval))[0]
+        slopes = forward(spheres(few, projection=interval))[0]
         by_interval[interval] = over_replicas(slopes)
 
     print(f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name]}, N = {size}, {many} replicas")

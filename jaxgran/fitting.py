@@ -1,5 +1,6 @@
 """Fit floats of a gas to a measured cooling curve: estimate, error, and whether to believe it."""
 
+import dataclasses
 import warnings
 from typing import Literal
 
@@ -356,15 +357,17 @@ def _fit_by_simulation(
     def estimates(flat):
         return jnp.concatenate([jnp.ravel(value) for value in values(flat).values()])
 
-    def log_temperature(flat):
-        computed = model.cool(gas.replace(**values(flat)), curve.times)
-        return jnp.log(computed.temperature), computed
+    key = jax.random.key(0) if model.key is None else model.key
+
+    def simulate(flat, run):
+        fresh = dataclasses.replace(model, key=jax.random.fold_in(key, run))
+        return fresh.cool(gas.replace(**values(flat)), curve.times)
 
     T = np.asarray(curve.temperature)
     error = np.zeros_like(T) if curve.temperature_error is None else curve.temperature_error / T
     used = np.ones(T.shape, bool) if curve.temperature_error is None else np.asarray(error) > 0
     found = by_simulation(
-        log_temperature,
+        simulate,
         np.asarray(first),
         np.log(T),
         np.asarray(error),

@@ -1,7 +1,7 @@
 """How a fit looks for its answer: on exact residuals, or on those of a simulation with noise."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,16 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
+from jaxgran.curve import CoolingCurve
+
 LONGEST_STEP = 0.7
 """Of a parameter in its free scale (a factor of two), in one run of a simulation."""
 
-SHORTEST_STEP = 0.25
-"""Of all parameters, in standard errors, below which a search through simulations ends."""
+NEAR = 0.1
+"""Runs within this of the last, in every parameter's free scale, count for the answer."""
+
+QUIET = 0.5
+"""A search through simulations ends when their noise is so much of the standard error."""
 
 NOISE_WINDOW = 9
 """Neighbouring times over which the variance between replicas is averaged."""
@@ -67,8 +72,8 @@ class Simulated(NamedTuple):
     """Where a search through simulations ended. p parameters in their free scale."""
 
     flat: Float[np.ndarray, "p"]
-    computed: Any  # the curve of the last run
-    residuals: Float[np.ndarray, "times"]  # at `flat`, by the last run's tangent
+    computed: CoolingCurve  # the curve of the last run
+    residuals: Float[np.ndarray, "times"]  # at `flat`, by the tangents
     sensitivity: Float[np.ndarray, "times p"]  # of the residuals
     error_covariance: Float[np.ndarray, "p p"]  # of `flat`, by the measured errors
     noise_covariance: Float[np.ndarray, "p p"]  # and by the simulation's own noise
@@ -76,8 +81,17 @@ class Simulated(NamedTuple):
     converged: bool
 
 
+class _Run(NamedTuple):
+    """One simulation at some parameters, at the times that are used."""
+
+    flat: np.ndarray
+    log_temperature: np.ndarray
+    slope: np.ndarray
+    deviation: np.ndarray  # of each replica from their mean
+
+
 def by_simulation(
-    log_temperature: Callable[[Array], tuple[Array, Any]],
+    simulate: Callable[[Array, int], CoolingCurve],
     first: Float[np.ndarray, "p"],
     measured: Float[np.ndarray, "times"],
     error: Float[np.ndarray, "times"],
@@ -89,13 +103,16 @@ def by_simulation(
 ) -> Simulated:
     """Gauss-Newton steps, each on one run of a simulation with its tangents.
 
-    Residuals are weighted by the measured error and the simulation's own, from its replicas. A
-    derivative that is wrong by some per cent slows the search and tilts the error bar by as much,
-    but does not move its end, which is where the residuals say so. The noise of the answer is what
-    the replicas, taken one by one, would have moved it by.
+    Every run has random numbers of its own, and those that began near its end say independently
+    where the end is: the answer is their mean. Residuals are weighted by the measured error and the
+    noise of the mean; that noise is told by what the replicas, one by one, would have moved the
+    answer by. The search goes on until it adds little to the measured error.
+
+    A derivative that is wrong by some per cent slows the search and tilts the error bar by as much,
+    but does not move the end, which is where the residuals say.
 
     Args:
-        log_temperature: of the parameters: ln T at all times, and the curve with its replicas.
+        simulate: the cooling curve, with replicas, of the parameters and the number of the run.
         first: where to begin.
         measured, error: ln T and its standard error; if that is 0 everywhere it is not known.
         used: the times that carry weight.
@@ -104,50 +121,58 @@ def by_simulation(
         max_runs: the most runs.
         progress: show a bar.
     """
+    runs: list[_Run] = []
+    flat, measured, error = np.asarray(first, float), measured[used], error[used]
+    known = bool(error.any())
 
-    def with_value(flat):
-        value, curve = log_temperature(flat)
+    def log_temperature(flat):
+        curve = simulate(flat, len(runs))
+        value = jnp.log(curve.temperature)
         return value, (value, curve)
 
-    derivative = jax.jacfwd(with_value, has_aux=True)
-    flat = np.asarray(first, float)
+    derivative = jax.jacfwd(log_temperature, has_aux=True)
     bar = tqdm(total=max_runs, disable=None if progress else True, desc="fit", unit="run")
-    converged, num_runs = False, 0
     with bar:
         while True:
-            slope, (computed_log, computed) = derivative(jnp.asarray(flat))
-            num_runs += 1
-            each = np.log(np.asarray(computed.replicas.temperature))
-            deviation = each - each.mean(axis=0)
-            sigma = np.hypot(error, _noise(deviation))[used]
-            sensitivity = np.asarray(slope)[used] / sigma[:, None]
-            residuals = (measured - np.asarray(computed_log))[used] / sigma
-            inverse = np.linalg.pinv(sensitivity, rcond=resolution)
-            by_replica = (deviation[:, used] / sigma) @ inverse.T
-            replicas = len(each)
-            noise = by_replica.T @ by_replica / (replicas * (replicas - 1))
-            share = error[used] / sigma if error.any() else np.ones(len(sigma))
-            errors = (inverse * share) @ (inverse * share).T
-            step = inverse @ residuals
+            slope, (value, curve) = derivative(jnp.asarray(flat))
+            each = np.log(np.asarray(curve.replicas.temperature))[:, used]
+            value, slope = np.asarray(value)[used], np.asarray(slope)[used]
+            runs.append(_Run(flat, value, slope, each - each.mean(axis=0)))
+            near = [run for run in runs if np.abs(run.flat - flat).max() < NEAR]
+            noise = np.sqrt(np.mean([_variance(run.deviation) for run in near], axis=0) / len(near))
+            sigma = np.hypot(error, noise)
+            ends, scatter = [], []
+            for run in near:
+                sensitivity = run.slope / sigma[:, None]
+                inverse = np.linalg.pinv(sensitivity, rcond=resolution)
+                ends.append(run.flat + inverse @ ((measured - run.log_temperature) / sigma))
+                replicas = len(run.deviation)
+                moved = (run.deviation / sigma) @ inverse.T / (replicas * (replicas - 1)) ** 0.5
+                scatter.append(moved.T @ moved)
+            share = inverse * (error / sigma if known else np.ones_like(sigma))
+            errors, noises = share @ share.T, np.mean(scatter, axis=0) / len(near)
+            step = np.mean(ends, axis=0) - flat
             step *= min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-300))
+            settled = bool(np.abs(step).max() < NEAR)
             flat = flat + step
-            spread = np.sqrt(np.diag(errors + noise))
-            converged = bool(np.all(np.abs(step) <= SHORTEST_STEP * spread + 1e-9))
+            spread = np.sqrt(np.diag(errors + noises))
+            quiet = np.all(np.diag(noises) <= QUIET**2 * np.diag(errors + noises))
             bar.update()
             bar.set_postfix_str(f"last step {np.abs(step / spread).max():.2g} standard errors")
-            if converged or num_runs == max_runs:
+            if len(runs) == max_runs or (settled and len(near) > 1 and (quiet or not known)):
                 break
-    full = np.zeros((len(measured), len(flat)))
-    left = np.zeros(len(measured))
-    full[used], left[used] = sensitivity, residuals - sensitivity @ step
-    return Simulated(flat, computed, left, full, errors, noise, num_runs, converged)
+    residuals = [measured - run.log_temperature - run.slope @ (flat - run.flat) for run in near]
+    slope = np.mean([run.slope for run in near], axis=0)
+    all_residuals, sensitivity = np.zeros(len(used)), np.zeros((len(used), len(flat)))
+    all_residuals[used] = np.mean(residuals, axis=0) / sigma
+    sensitivity[used] = slope / sigma[:, None]
+    return Simulated(flat, curve, all_residuals, sensitivity, errors, noises, len(runs), settled)
 
 
-def _noise(deviation: Float[np.ndarray, "replicas times"]) -> Float[np.ndarray, "times"]:
-    """Standard error of the mean, its variance averaged over neighbouring times."""
+def _variance(deviation: Float[np.ndarray, "replicas times"]) -> Float[np.ndarray, "times"]:
+    """Of the mean over replicas, averaged over neighbouring times."""
     replicas, num_times = deviation.shape
     variance = np.sum(deviation**2, axis=0) / (replicas * (replicas - 1))
     window = np.ones(min(NOISE_WINDOW, num_times))
-    return np.sqrt(
-        np.convolve(variance, window, "same") / np.convolve(np.ones(num_times), window, "same")
-    )
+    parts = np.convolve(np.ones(num_times), window, "same")
+    return np.convolve(variance, window, "same") / parts

@@ -35,16 +35,25 @@ _DENSITY_POWER = {"displacement": -2.0, "elastic_energy": 1.0}
 
 
 class Rates(NamedTuple):
-    """Sums that forget, by replica: what happened, over what would at rates of 1 where T is 1."""
+    """Sums that forget, by replica: what happened, over what would at rates of 1."""
 
     lost: Float[Array, "replicas"]
     could_lose: Float[Array, "replicas"]
     met: Float[Array, "replicas"]
     could_meet: Float[Array, "replicas"]
 
+    damping: Float[Array, ""]
+
     def cooling(self, temperature: Array) -> Array:
-        """``-d ln T/dt``, following ``T^(3/5)``."""
-        return _ratio(self.lost, self.could_lose) * temperature**0.6
+        """``-d ln T/dt``, following `trend`."""
+        return _ratio(self.lost, self.could_lose) * self.trend(temperature)
+
+    def trend(self, temperature: Array) -> Array:
+        """How the cooling rate depends on T: ``T^(3/5)`` of weak dissipation, bent as that grows.
+
+        ``T^(3/5) / (1 + q delta T^(1/10))`` has the two first terms in delta.
+        """
+        return temperature**0.6 / (1 + self.damping * temperature**0.1)
 
     def collision(self, temperature: Array) -> Array:
         """Collisions a particle and time, following ``T^(1/2)``."""
@@ -78,8 +87,12 @@ def at_start(
     velocity: Float[Array, "n d"],
     replicas: int,
     interval: ArrayLike,
+    damping: ArrayLike,
 ) -> Tangents:
-    """A state that does not depend on the parameters, along directions in (alpha, A)."""
+    """A state that does not depend on the parameters, along directions in (alpha, A).
+
+    `interval` is that of projections, in mean free times; `damping` the ``q delta`` of `Rates`.
+    """
     p, dtype = len(alpha), velocity.dtype
     zeros = jnp.zeros((p, replicas), dtype)
     nothing = jnp.zeros((p, *velocity.shape), dtype)
@@ -94,7 +107,7 @@ def at_start(
         free=jnp.ones(len(velocity), bool),
         since=jnp.zeros((), dtype),
         interval=jnp.asarray(interval, dtype),
-        rates=Rates(none, none, none, none),
+        rates=Rates(none, none, none, none, jnp.asarray(damping, dtype)),
     )
 
 
@@ -105,7 +118,7 @@ def projected(
     c = tangents.log_temperature
     replicas = c.shape[1]
     v = jnp.where(tangents.free[:, None], velocity, 0.0).reshape(replicas, -1)
-    rest = tangents.velocity.reshape(len(c), replicas, -1)
+    rest = tangents.velocity.reshape(len(c), *v.shape)
     gain = _ratio(2 * jnp.sum(rest * v[None], -1), jnp.sum(v * v, -1)[None])
     return c + gain, tangents.clock - 0.5 * (c + 0.5 * gain) * (time - tangents.since)
 
@@ -143,9 +156,10 @@ def remembered(
     old = jnp.exp(-passed * collision_frequency / MEMORY)
     return Rates(
         lost=old * rates.lost + lost,
-        could_lose=old * rates.could_lose + energy * temperature**0.6 * duration,
+        could_lose=old * rates.could_lose + energy * rates.trend(temperature) * duration,
         met=old * rates.met + met,
         could_meet=old * rates.could_meet + passed,
+        damping=rates.damping,
     )
 
 

@@ -7,12 +7,13 @@ import jaxgran
 
 ROOT = Path(__file__).parent.parent
 FLOORS = [
-    ["domain", "status", "checkpoint", "tangents", "search"],
+    ["domain", "status", "checkpoint", "tangents"],
     ["contact", "neighbours", "simulation"],
     ["restitution", "observables", "initial", "encounters"],
     ["blocks"],
     ["gas"],
     ["kinetics", "curve"],
+    ["search"],
     ["models.kinetic_theory", "models.soft_spheres"],
     ["cooling"],
     ["fitting"],

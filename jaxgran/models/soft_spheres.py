@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxgran import blocks, initial, neighbours, observables, status, tangents
+from jaxgran import blocks, initial, kinetics, neighbours, observables, status, tangents
 from jaxgran.blocks import Plan, Scene, State
 from jaxgran.checkpoint import fingerprint
 from jaxgran.curve import CoolingCurve, Particles
@@ -33,7 +33,7 @@ PAIRS_PER_PARTICLE = 3.0
 MOST_PAIRS = 100
 """Pairs per particle beyond which a list is taken to have gone wrong."""
 
-PROJECTION = 0.5
+PROJECTION = 0.1
 """Mean free times between thermal projections of a derivative."""
 
 _FASTEST = 4.8  # speed of the fastest of some thousand spheres, in sqrt(T)
@@ -61,16 +61,19 @@ class SoftSpheres(eqx.Module):
         progress: show a progress bar on a terminal.
         checkpoint: a file to save the run to each minute and to resume it from. The resumed run
             gives the same numbers bit for bit.
-        projection: mean free times between thermal projections of a derivative, 0.1 to 2 (see
+        projection: mean free times between thermal projections of a derivative, 0.02 to 0.5 (see
             `jaxgran.tangents`); None for the plain derivative, which is exact, and useless after
             3 to 5 collisions a particle.
         plan: sizes of arrays, see `sized_for`.
 
     Derivatives of T, collisions, <dr^2> and the energies are taken in every float of the gas,
     forward and reverse alike: a gas depends on (alpha, A), its collision frequency and the times
-    only. The first two are followed by tangents, exact but for the projection; the density acts by
-    the Enskog frequency of collisions; a_2 is taken as constant, the velocity correlation as
-    decaying at 2/d of the collision rate. The last particles carry no derivative.
+    only. The first two are followed by tangents; the density acts by
+    the Enskog frequency of collisions. T is followed exactly but for the projection, the rest is
+    estimated from it: a_2 and the paths are taken as the same at the same number of collisions (so
+    that d ln<dr^2>/d ln A is up to 0.2 too low: dissipation makes velocities last longer), the
+    velocity correlation as decaying at 2/d of the collision rate. The last particles carry no
+    derivative.
 
     Raises:
         ValueError: for numbers out of range.
@@ -238,7 +241,8 @@ class SoftSpheres(eqx.Module):
             if directions is None:
                 return state
             assert self.projection is not None
-            along = tangents.at_start(*directions, velocity, replicas, self.projection)
+            damping = kinetics.TWO_TERM * scene.dissipative_constant * scene.alpha**0.4
+            along = tangents.at_start(*directions, velocity, replicas, self.projection, damping)
             return state._replace(tangents=along)
 
         run = self._traced if traced else self._driven
@@ -399,8 +403,8 @@ def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
     c, clock = tangents.projected(along, state.velocity, state.time)
     stiffer = (along.alpha / scene.alpha)[:, None]
     # At a fixed place in the sequence of collisions the paths are the same; contacts are not.
-    kept = {"temperature": c * T, "velocity_correlation": 0.5 * c * C}
-    kept["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U
+    kept = {"temperature": c * T[None], "velocity_correlation": 0.5 * c * C[None]}
+    kept["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
     rates = {
         "temperature": -cooling * T,
         "displacement": 2 * jnp.mean(jnp.sum(travelled * velocity, -1), axis=1),
@@ -411,5 +415,5 @@ def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
     for name in list(records):
         rate = rates.get(name, jnp.zeros_like(T))
         records[f"{name}.rate"] = rate
-        records[f"{name}.along"] = kept.get(name, 0.0) - rate * clock
+        records[f"{name}.along"] = kept.get(name, 0.0) - rate[None] * clock
     return records
