@@ -93,3 +93,14 @@ def test_comparison_with_lammps_runs(tmp_path):
     assert (tmp_path / "here" / "compare_lammps.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / "compare_lammps.json").read_text())
     assert set(record["curves"]) == {"dilute", "dense"}
+
+
+def test_soft_sphere_accuracy_runs(tmp_path):
+    done = run("soft_sphere_accuracy.py", "--smoke", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "here" / "soft_sphere_accuracy.png").stat().st_size > 20_000
+    record = json.loads((tmp_path / "here" / "soft_sphere_accuracy.json").read_text())
+    for impact in record["impact"].values():
+        assert 1.8 < impact["order"]["bias"] < 2.4  # second order; 2.17 and 2.09 at 25 and 50 steps
+    assert record["ledger"]["rows"][1]["worst"] < 2e-4  # 5e-5 at 40 steps
+    assert record["trajectory"]["finest_to_lammps"] < 1e-3  # 3e-4 at 200 steps
