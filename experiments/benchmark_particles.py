@@ -171,7 +171,7 @@ def measure_sweep(size: int, num_gases: int, repeats: int) -> dict:
         seconds = []
         for _ in range(repeats + 1):
             begin = time.perf_counter()
-            jax.block_until_ready(way())
+            assert np.all(np.isfinite(jax.block_until_ready(way()))), name
             seconds.append(time.perf_counter() - begin)
         took[name] = statistics.median(seconds[1:])
     ratio = took["vmap"] / took["loop"]

@@ -198,10 +198,11 @@ class SoftSpheres(eqx.Module):
         contact_value = float(scene.collision_frequency) / dilute
         near = min(inside * contact_value * ((1 + 5 * flight) ** d - 1), listed)
         contact_fraction = float(scene.contact_duration * scene.collision_frequency)
-        touching = min(contact_fraction * (2 + 6 * near), near)
+        touching = min(contact_fraction * (4 + 6 * near), near)
         n = self.replicas * self.num_particles
         counts = [n * share for share in (listed, near, touching, 2 * touching)]
-        rooms = [int(spare * count + 5 * count**0.5) + 32 for count in counts]
+        spares = min(spare, 1.4), spare, spare, spare  # of all, pairs listed vary least
+        rooms = [int(s * x + 5 * x**0.5) + 32 for s, x in zip(spares, counts, strict=True)]
         room = blocks.Room(*rooms[:3], members=min(rooms[3], n))
         return Plan(self.replicas, self.steps_per_contact, steps, clipped, room)
 
