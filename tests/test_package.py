@@ -12,7 +12,7 @@ FLOORS = [
     ["restitution", "observables", "initial", "blocks"],
     ["gas"],
     ["kinetics", "curve"],
-    ["models.kinetic_theory", "models.soft_spheres"],
+    ["models.kinetic_theory", "models.dsmc", "models.soft_spheres"],
     ["cooling"],
     ["fitting"],
     ["diagnosis"],
