@@ -11,7 +11,7 @@ FLOORS = [
     ["contact", "neighbours", "simulation"],
     ["restitution", "observables", "initial", "blocks"],
     ["gas"],
-    ["kinetics", "curve"],
+    ["kinetics", "curve", "collisions"],
     ["models.kinetic_theory", "models.dsmc", "models.soft_spheres"],
     ["cooling"],
     ["fitting"],
