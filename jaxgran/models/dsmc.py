@@ -190,9 +190,10 @@ class DSMC(eqx.Module):
 
     def _driven(self, law: ReducedLaw, times: Array, key: Array, scheme: Scheme) -> dict:
         """Run by a loop on the host, which shows progress and writes checkpoints."""
+        start = _start(key, self.replicas, scheme, 0)
+        scene = fingerprint(law, times, start, key, scheme)
         pairs = self.replicas * (scheme.first + scheme.second)
         scheme = scheme._replace(max_steps=max(_CHUNK // pairs, 16))
-        start = _start(key, self.replicas, scheme, 0)
         first = start.particles[..., : scheme.dimension]
 
         def advance(state: State, end: float) -> State:
@@ -203,7 +204,7 @@ class DSMC(eqx.Module):
             np.asarray(times),
             advance,
             partial(_observe, first=first, law=law, key=key, scheme=scheme),
-            scene=fingerprint(law, times, start, key, scheme),
+            scene=scene,
             progress=self.progress,
             path=self.checkpoint,
         )
