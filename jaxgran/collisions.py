@@ -59,7 +59,6 @@ class Scheme(NamedTuple):
     num_particles: int
     first: int
     second: int
-    max_steps: int | None = None
 
     @classmethod
     def of(cls, dimension: int, num_particles: int, step: float) -> "Scheme":
@@ -261,8 +260,17 @@ def step(
 
 
 @partial(jax.jit, static_argnames=("scheme", "tangents"))
-def advance(state: State, end, law, key, *, scheme: Scheme, tangents: bool = False) -> State:
-    """Whole steps towards `end`, each replica up to its last that ends before it."""
+def advance(
+    state: State,
+    end: Array,
+    law: ReducedLaw,
+    key: Array,
+    max_steps: Array,
+    *,
+    scheme: Scheme,
+    tangents: bool = False,
+) -> State:
+    """Whole steps towards `end`, each replica up to its last one that ends before it."""
 
     def due(state):
         return state.clock + scheme.own_step / jnp.sqrt(state.temperature) <= end
@@ -274,10 +282,8 @@ def advance(state: State, end, law, key, *, scheme: Scheme, tangents: bool = Fal
     def further(carry):
         state, left = carry
         share = due(state).astype(state.clock.dtype)
-        less = 0 if scheme.max_steps is None else 1
-        return step(state, key, share, law, scheme, tangents), left - less
+        return step(state, key, share, law, scheme, tangents), left - 1
 
-    most = 1 if scheme.max_steps is None else scheme.max_steps
-    state, _ = jax.lax.while_loop(unfinished, further, (state, jnp.asarray(most, jnp.int32)))
+    state, _ = jax.lax.while_loop(unfinished, further, (state, max_steps))
     time = jnp.where(jnp.any(due(state)), jnp.min(state.clock), end)
     return state._replace(time=jnp.maximum(time, state.time))

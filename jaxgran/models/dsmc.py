@@ -87,6 +87,7 @@ def _observe(state: State, first, law, key, *, scheme: Scheme, tangents: bool = 
     return {"values": values, "rates": per_time, "along": shifted}
 
 
+@partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
 def _start(key: Array, replicas: int, scheme: Scheme, num_parameters: int) -> State:
     d = scheme.dimension
     key = jax.random.fold_in(jax.random.wrap_key_data(key), 2**32 - 1)
@@ -111,9 +112,10 @@ def _run(law: ReducedLaw, times, key, *, replicas: int, scheme: Scheme, tangents
     num_parameters = ravel_pytree(law)[0].size if tangents else 0
     state = _start(key, replicas, scheme, num_parameters)
     first = state.particles[..., : scheme.dimension]
+    forever = jnp.asarray(2**31 - 1, jnp.int32)
 
     def to(state, end):
-        state = collisions.advance(state, end, law, key, scheme=scheme, tangents=tangents)
+        state = collisions.advance(state, end, law, key, forever, scheme=scheme, tangents=tangents)
         return state, _observe(state, first, law, key, scheme=scheme, tangents=tangents)
 
     return jax.lax.scan(to, state, times)[1]
@@ -193,11 +195,12 @@ class DSMC(eqx.Module):
         start = _start(key, self.replicas, scheme, 0)
         scene = fingerprint(law, times, start, key, scheme)
         pairs = self.replicas * (scheme.first + scheme.second)
-        scheme = scheme._replace(max_steps=max(_CHUNK // pairs, 16))
+        max_steps = jnp.asarray(max(_CHUNK // pairs, 16), jnp.int32)
         first = start.particles[..., : scheme.dimension]
 
         def advance(state: State, end: float) -> State:
-            return collisions.advance(state, jnp.asarray(end, times.dtype), law, key, scheme=scheme)
+            end_array = jnp.asarray(end, times.dtype)
+            return collisions.advance(state, end_array, law, key, max_steps, scheme=scheme)
 
         _, records = simulate(
             start,
