@@ -243,17 +243,17 @@ def _carry_tangents(state: State, sums: _Impacts, dt: Array, ds: Array, energy: 
     return state._replace(mobility=mobility, tangents=tangents)
 
 
-def _replica_keys(key: Array, replicas: int) -> Array:
-    return jax.vmap(jax.random.fold_in, (None, 0))(
-        jax.random.wrap_key_data(key), jnp.arange(replicas, dtype=jnp.uint32)
-    )
+def wrapped(words: Array) -> Array:
+    """Two 32-bit words as a key; threefry, whose numbers do not change under `jax.vmap`."""
+    return jax.random.wrap_key_data(words, impl="threefry2x32")
 
 
 def step(
     state: State, key: Array, share: Array, law: ReducedLaw, scheme: Scheme, tangents: bool
 ) -> State:
     """A share, 0 to 1, of the next step of each replica; shape (replicas,)."""
-    keys = _replica_keys(key, len(state.clock))
+    replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(wrapped(key), replicas)
     one = partial(_step, law=law, scheme=scheme, tangents=tangents)
     axes = jax.tree.map(lambda _: 0, state)._replace(time=None)
     return jax.vmap(one, (axes, 0, 0), axes)(state, keys, share)

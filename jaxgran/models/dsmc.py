@@ -90,7 +90,7 @@ def _observe(state: State, first, law, key, *, scheme: Scheme, tangents: bool = 
 @partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
 def _start(key: Array, replicas: int, scheme: Scheme, num_parameters: int) -> State:
     d = scheme.dimension
-    key = jax.random.fold_in(jax.random.wrap_key_data(key), 2**32 - 1)
+    key = jax.random.fold_in(collisions.wrapped(key), 2**32 - 1)
     v = initial.velocities(key, replicas, scheme.num_particles, d).reshape(replicas, -1, d)
     each, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
     return State(
@@ -182,7 +182,8 @@ class DSMC(eqx.Module):
         """
         scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
         law = gas.reduced_law
-        key = jax.random.key_data(jax.random.key(0) if self.key is None else self.key)
+        # Of any kind of key, two words for the kind that is used here.
+        key = jax.random.bits(jax.random.key(0) if self.key is None else self.key, (2,), jnp.uint32)
         reduced = times * gas.impact_speed / gas.path_length
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, times, key))):
             records = self._traced(law, reduced, key, scheme)
