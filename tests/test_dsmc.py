@@ -1,4 +1,5 @@
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +58,7 @@ SCENES = [(0.05, 3), (0.15, 3), (0.15, 2)]
 
 @pytest.mark.parametrize("beta, dimension", SCENES)
 def test_cools_and_spreads_as_kinetic_theory_says(beads, beta, dimension):
-    n = 40_000
+    n = 20_000
     compare_with_theory(beads(beta, dimension), n, 0.002 + 3 * T_SCATTER / n**0.5)
 
 
@@ -94,10 +95,10 @@ def test_sonine_coefficient_of_constant_restitution(eps, dimension, a2, error):
 
 
 def test_elastic_gas_keeps_its_energy_and_its_maxwellian():
-    gas, n = constant(1.0), 200_000
+    gas, n = constant(1.0), 100_000
     times = np.array([1.0, 10.0, 20.0]) * float(gas.mean_free_time)
     curve = jaxgran.cool(gas, times, model=quiet(n))
-    np.testing.assert_allclose(curve.temperature, 3.0, rtol=1e-12)  # 4e6 rounded kicks
+    np.testing.assert_allclose(curve.temperature, 3.0, rtol=1e-12)  # 1e6 rounded kicks
     assert np.all(np.abs(curve.sonine) < 3 * SONINE_SCATTER / n**0.5)
     theory = jaxgran.cool(gas, times, model=THEORY)
     # Second Sonine orders: D is 1.018 of the first one's, reached after some collisions.
@@ -158,7 +159,7 @@ def test_every_pair_is_equally_likely(n):
 
 def test_the_step_is_second_order(monkeypatch):
     # Memory of the first velocity, 2/3 (1 + eps)/2 per collision, feels the step most.
-    gas, n = constant(0.6), 400_000
+    gas, n = constant(0.6), 200_000
     times = [1.0 * float(gas.mean_free_time)]
 
     def memory(step):
@@ -175,7 +176,7 @@ def test_the_step_is_second_order(monkeypatch):
     monkeypatch.setattr(Scheme, "of", staticmethod(disjoint))
     first_order = memory(0.1)
     # Measured over 3e6 particles: +.0009(6) at .1, -.0144(7) when pairs are only disjoint.
-    noise = 1.5 / n**0.5 / fine
+    noise = 1.6 / n**0.5  # of the ratio of two runs; 1.1 / sqrt(N) each was measured
     assert abs(np.log(coarse / fine)) < 2.5 * noise
     assert -0.0144 - 2.5 * noise < np.log(first_order / fine) < -0.0144 + 2.5 * noise
 
@@ -266,40 +267,47 @@ def test_jit_and_vmap_give_the_same_numbers(beads):
         np.testing.assert_allclose(swept[1][i], alone[1], rtol=1e-9)
 
 
-def test_derivatives(beads):
-    gas, n = beads(0.15), 20_000
-    taus = jnp.array(list(SENSITIVITY))
-    times = taus * gas.mean_free_time
-    names = ("dissipative_constant", "temperature", "packing_fraction")
+NAMES = "dissipative_constant", "temperature", "packing_fraction"
 
-    def logs(scale, model):
-        scaled = {name: gas.value(name) * jnp.exp(x) for name, x in zip(names, scale, strict=True)}
-        curve = jaxgran.cool(gas.replace(**scaled), times, model=model)
-        rows = curve.temperature, curve.displacement, curve.collisions, curve.velocity_correlation
-        return jnp.log(jnp.stack(rows)) if model is not THEORY else jnp.log(jnp.stack(rows[:3]))
 
-    zero, model = jnp.zeros(3), quiet(n, replicas=2)
-    at = jax.jit(lambda x: logs(x, model))
-    forward = np.array(jax.jit(jax.jacfwd(at))(zero))
-    reverse = jax.jit(jax.jacrev(at))(zero)
-    late = np.asarray(taus) > 20  # <v(0).v> is then noise: its logarithm is nothing
-    forward[3, late], reverse = 0.0, np.where(late[:, None], 0.0, reverse[3])
-    np.testing.assert_allclose(reverse, forward[3], rtol=1e-12, atol=1e-12)
-    theory = jax.jit(jax.jacfwd(lambda x: logs(x, THEORY)))(zero)
+def logs(scale, gas, taus, model):
+    """Logarithms of T, <dr^2> and the collision count, of a gas with scaled floats."""
+    scaled = {name: gas.value(name) * jnp.exp(x) for name, x in zip(NAMES, scale, strict=True)}
+    times = jnp.asarray(taus) * gas.mean_free_time
+    curve = jaxgran.cool(gas.replace(**scaled), times, model=model)
+    return jnp.log(jnp.stack([curve.temperature, curve.displacement, curve.collisions]))
+
+
+def test_derivatives_are_those_of_kinetic_theory(beads):
+    gas, zero = beads(0.15), jnp.zeros(3)
+    ours, theory = (
+        jax.jit(jax.jacfwd(lambda x, m=model: logs(x, gas, list(SENSITIVITY), m)))(zero)
+        for model in (quiet(20_000), THEORY)
+    )
     # 1 % at N = 4e4; the clock's part is theory's, to a_2's noise.
-    np.testing.assert_allclose(forward[0, :, 0], list(SENSITIVITY.values()), rtol=0.03)
-    np.testing.assert_allclose(forward[0], theory[0], rtol=0.03, atol=0.003)
-    np.testing.assert_allclose(forward[2], theory[2], rtol=0.03, atol=0.003)
-    # <dr.v> of 4e4 particles scatters by 2 %, and D is 2 % beyond the first Sonine order.
-    np.testing.assert_allclose(forward[1], theory[1], rtol=0.05, atol=0.01)
+    np.testing.assert_allclose(ours[0, :, 0], list(SENSITIVITY.values()), rtol=0.03)
+    np.testing.assert_allclose(ours[0], theory[0], rtol=0.03, atol=0.003)
+    np.testing.assert_allclose(ours[2], theory[2], rtol=0.03, atol=0.003)
+    # <dr.v> of 2e4 particles scatters by 3 %, and D is 2 % beyond the first Sonine order.
+    np.testing.assert_allclose(ours[1], theory[1], rtol=0.06, atol=0.015)
+
+
+def test_derivatives_are_those_of_the_runs(beads):
+    gas, zero, taus, n = beads(0.15), jnp.zeros(3), [1.0, 5.0], 20_000
+    at = partial(logs, gas=gas, taus=taus, model=quiet(n))
+    forward = jax.jit(jax.jacfwd(at))(zero)
+    reverse = jax.jit(jax.jacrev(at))(zero)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-12)  # one linear rule
     # The same random numbers on both sides; runs drift apart, which leaves sqrt(2) T_SCATTER.
-    h = 0.2
-    up, down = (np.asarray(at(jnp.array([x, 0.0, 0.0]))) for x in (h, -h))
-    difference = (up - down)[:3] / (2 * h)
-    noise = 2**0.5 * T_SCATTER / (2 * n) ** 0.5 / (2 * h)
-    np.testing.assert_allclose(forward[0, :, 0], difference[0], rtol=0.01, atol=2.5 * noise)
-    noise *= MSD_SCATTER / T_SCATTER
-    np.testing.assert_allclose(forward[1, :, 0], difference[1], rtol=0.01, atol=2.5 * noise)
+    h = 0.3  # d^3 ln T / d (ln A)^3 is below one: h^2/6
+    plain = jax.jit(at)
+    up, down = (plain(jnp.array([x, 0.0, 0.0])) for x in (h, -h))
+    difference = (up - down) / (2 * h)
+    noise = 2.5 * 2**0.5 / n**0.5 / (2 * h)
+    np.testing.assert_allclose(
+        forward[0, :, 0], difference[0], rtol=0.02, atol=noise * T_SCATTER + h**2 / 60
+    )
+    np.testing.assert_allclose(forward[1, :, 0], difference[1], rtol=0.02, atol=noise * MSD_SCATTER)
 
 
 @pytest.mark.parametrize("law", ["constant", "series"])
@@ -310,14 +318,14 @@ def test_derivatives_of_other_laws(law):
         gas = dataclasses.replace(gas, law=series)
     times = jnp.array([0.0, 1.0, 10.0]) * gas.mean_free_time
 
-    def logs(gas, times, model):
+    def log_temperature(gas, times, model):
         return jnp.log(jaxgran.cool(gas, times, model=model).temperature)
 
     def along(model):
         ones = jax.tree.map(jnp.ones_like, (gas, times))
-        return jax.jit(lambda g, t: jax.jvp(lambda *x: logs(*x, model), (g, t), ones)[1])(
-            gas, times
-        )
+        return jax.jit(
+            lambda g, t: jax.jvp(lambda *x: log_temperature(*x, model), (g, t), ones)[1]
+        )(gas, times)
 
     ours, theory = along(quiet(20_000)), along(THEORY)
     assert np.all(np.isfinite(ours))
@@ -338,7 +346,7 @@ def test_gradient_of_error_bars_does_not_spoil_that_of_values(beads):
 
 def test_single_precision(beads):
     gas = beads(0.15)
-    times = np.array([1.0, 30.0]) * float(gas.mean_free_time)
+    times = np.array([1.0, 10.0]) * float(gas.mean_free_time)
     fine = jaxgran.cool(gas, times, model=quiet(5000))
     with jax.enable_x64(False):
         single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), gas)
@@ -354,7 +362,7 @@ def test_single_precision(beads):
 def test_says_when_impacts_are_too_fast(beads, monkeypatch):
     gas = beads(0.15)
     times = jnp.array([3.0]) * gas.mean_free_time
-    monkeypatch.setattr(dsmc, "MISSED", -1.0)
+    monkeypatch.setattr(collisions, "CEILING", 2.0)  # many pairs are faster
     with pytest.raises(RuntimeError, match="faster than the ceiling"):
         jaxgran.cool(gas, times, model=quiet(1000, replicas=2))
     curve = jax.jit(lambda t: jaxgran.cool(gas, t, model=quiet(1000, replicas=2)))(times)
