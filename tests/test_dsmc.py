@@ -80,7 +80,7 @@ def test_a_million_particles_cool_as_kinetic_theory_says(beads, beta, dimension)
     ],
 )
 def test_sonine_coefficient_of_constant_restitution(eps, dimension, a2, error):
-    gas, n = constant(eps, dimension), 40_000
+    gas, n = constant(eps, dimension), 100_000
     cooling = (1 - eps**2) / dimension
     taus = np.arange(10.0, 50.0, 1.0)
     u = np.expm1(cooling * taus / 2) / (cooling / 2)  # t of tau collisions per particle
