@@ -6,6 +6,7 @@ from jaxgran.curve import CoolingCurve, Particles, read_curve, read_gas, write_c
 from jaxgran.diagnosis import Diagnosis, diagnose
 from jaxgran.fitting import Fit, fit
 from jaxgran.gas import Gas, sphere_mass
+from jaxgran.models.dsmc import DSMC
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.restitution import (
@@ -19,6 +20,7 @@ from jaxgran.restitution import (
 from jaxgran.status import explain as explain_status
 
 __all__ = [
+    "DSMC",
     "ConstantRestitution",
     "CoolingCurve",
     "Diagnosis",

@@ -11,10 +11,11 @@ from jaxtyping import ArrayLike
 
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
+from jaxgran.models.dsmc import DSMC
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 
-Model = KineticTheory | SoftSpheres
+Model = KineticTheory | DSMC | SoftSpheres
 
 
 def cool(
@@ -40,8 +41,9 @@ def cool(
     times = _checked_times(times)
     model = KineticTheory() if model is None else model
     # Contacts resolved in time cannot heat a gas; a law of restitution, or averages of it, can.
-    if isinstance(model, KineticTheory):
-        first_rate = _first_cooling_rate(gas, model)
+    if not isinstance(model, SoftSpheres):
+        theory = model if isinstance(model, KineticTheory) else KineticTheory()
+        first_rate = _first_cooling_rate(gas, theory)
         if not isinstance(first_rate, Tracer) and np.any(np.asarray(first_rate) < 0):
             raise ValueError(
                 "the law of restitution makes this gas heat up: averaged over its impacts, eps is "

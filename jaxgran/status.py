@@ -52,7 +52,13 @@ STALLED = Fault(
     "the run makes no progress",
     "the gas may have collapsed into lasting contacts; end the run earlier",
 )
-FAULTS = (LIST_FULL, CONTACTS_FULL, SKIN_OUTRUN, STEP_TOO_LARGE, NOT_FINITE, STALLED)
+TOO_FAST = Fault(
+    64,
+    "many pairs meet faster than the ceiling of the collision rate",
+    "the velocities have grown a tail of fast particles; look whether the law of restitution "
+    "heats impacts at some speed",
+)
+FAULTS = (LIST_FULL, CONTACTS_FULL, SKIN_OUTRUN, STEP_TOO_LARGE, NOT_FINITE, STALLED, TOO_FAST)
 
 
 def flag(fault: Fault, when: ArrayLike) -> Int[Array, "..."]:

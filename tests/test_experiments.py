@@ -87,6 +87,13 @@ def test_particle_benchmark_runs(tmp_path):
         assert lammps["temperature_ratio"] == pytest.approx(row["temperature_ratio"], rel=0.01)
 
 
+def test_stochastic_benchmark_runs(tmp_path):
+    done = run("benchmark_dsmc.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    assert row["collisions_per_s"] > 0 and 0.05 < row["temperature_ratio"] < 0.9
+
+
 def test_comparison_with_lammps_runs(tmp_path):
     done = run("compare_lammps.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

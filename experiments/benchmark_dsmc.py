@@ -1,0 +1,131 @@
+"""How many collisions a second does stochastic simulation do, and what does a derivative cost?
+
+    python experiments/benchmark_dsmc.py [--sizes 10000 100000 1000000] [--smoke] [--out FILE]
+
+A homogeneous gas of viscoelastic spheres cools for some collisions per particle. Compilation is
+timed apart; medians of repeats. The derivative is forward mode, of the whole curve in A, and both
+its run and the plain one it is compared with are compiled as one. For comparison an event-driven
+code with positions, DynamO, is quoted from an earlier measurement; it is not run here.
+"""
+
+import argparse
+import json
+import platform
+import resource
+import statistics
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxgran
+
+SIZES = (10_000, 100_000, 1_000_000)
+BETA = 0.15
+COLLISIONS = 2e6  # per run, or one per particle where that is more
+REPEATS = 3
+DYNAMO = {"N=4000": 81_000, "N=32000": 52_000}
+"""Collisions a second of DynamO, one core, phi = .1: quoted, measured on a two-core machine."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sizes", nargs="+", type=int, default=SIZES)
+    parser.add_argument("--dimension", type=int, choices=(2, 3), default=3)
+    parser.add_argument("--precision", choices=("float64", "float32"), default="float64")
+    parser.add_argument("--smoke", action="store_true", help="a run of seconds")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", options.precision == "float64")
+    sizes, collisions, repeats = options.sizes, COLLISIONS, REPEATS
+    if options.smoke:
+        sizes, collisions, repeats = (1000,), 1e4, 1
+    print(f"{jax.devices()[0].device_kind}, {options.precision}, d = {options.dimension}")
+    print(f"{'N':>9}{'compile s':>11}{'run s':>8}{'coll/s':>11}{'derivative / run':>18}")
+    rows = []
+    for size in sizes:
+        row = measure(size, options.dimension, collisions, repeats)
+        rows.append(row)
+        print(
+            f"{size:9d}{row['compile_s']:11.1f}{row['run_s']:8.2f}{row['collisions_per_s']:11.0f}"
+            f"{row['derivative_ratio']:18.2f}",
+            flush=True,
+        )
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"peak memory {peak:.2f} GiB")
+    print("DynamO, quoted: " + ", ".join(f"{n} {rate} coll/s" for n, rate in DYNAMO.items()))
+    if options.out:
+        record = {
+            "rows": rows,
+            "peak_memory_GiB": peak,
+            "dynamo_quoted_collisions_per_s": DYNAMO,
+            "precision": options.precision,
+            "dimension": options.dimension,
+            "device": jax.devices()[0].device_kind,
+            "python": platform.python_version(),
+            "versions": {name: version(name) for name in ("jaxgran", "jax")},
+        }
+        options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+
+
+def scene(dimension: int) -> jaxgran.Gas:
+    gas = jaxgran.Gas(
+        jaxgran.Viscoelastic(1e7, 0.22, 1e-6),
+        diameter=2e-3,
+        mass=jaxgran.sphere_mass(2e-3, 2500.0),
+        packing_fraction=0.1,
+        temperature=0.01,
+        dimension=dimension,
+    )
+    return gas.replace(dissipative_constant=1e-6 * BETA / gas.thermal_beta)
+
+
+def seconds(run, repeats: int) -> tuple[float, float]:
+    """Of compilation, and of a run without it."""
+    took = []
+    for _ in range(repeats + 1):
+        begin = time.perf_counter()
+        jax.block_until_ready(run())
+        took.append(time.perf_counter() - begin)
+    median = statistics.median(took[1:])
+    return took[0] - median, median
+
+
+def measure(size: int, dimension: int, collisions: float, repeats: int) -> dict:
+    gas = scene(dimension)
+    model = jaxgran.DSMC(size, progress=False)
+    # In the gas's own time, each particle collides so many times.
+    each = max(2 * collisions / size, 2.0)
+    trial = np.geomspace(0.1, 1e6, 400) * float(gas.mean_free_time)
+    theory = jaxgran.cool(gas, trial)
+    assert theory.collisions is not None
+    times = jnp.asarray([np.interp(each, np.asarray(theory.collisions), trial)])
+
+    def temperature(a):
+        return jaxgran.cool(gas.replace(dissipative_constant=a), times, model=model).temperature
+
+    a = gas.value("dissipative_constant")
+    compile_s, run_s = seconds(lambda: jaxgran.cool(gas, times, model=model).temperature, repeats)
+    plain, derivative = jax.jit(temperature), jax.jit(jax.jacfwd(temperature))
+    _, plain_s = seconds(lambda: plain(a), repeats)
+    _, derivative_s = seconds(lambda: derivative(a), repeats)
+    curve = jaxgran.cool(gas, times, model=model)
+    assert curve.collisions is not None
+    return {
+        "num_particles": size,
+        "compile_s": compile_s,
+        "run_s": run_s,
+        "collisions_per_s": float(curve.collisions[-1]) * size / 2 / run_s,
+        "derivative_run_s": derivative_s,
+        "derivative_ratio": derivative_s / plain_s,
+        "temperature_ratio": float(curve.temperature[-1] / gas.temperature),
+    }
+
+
+if __name__ == "__main__":
+    main()
