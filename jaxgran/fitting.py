@@ -16,6 +16,7 @@ from jaxgran import kinetics
 from jaxgran.cooling import Model
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
+from jaxgran.models.dsmc import DSMC
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.restitution import ConstantRestitution, Viscoelastic
@@ -327,7 +328,7 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
 def _fit_by_simulation(
     gas: Gas,
     curve: CoolingCurve,
-    model: SoftSpheres,
+    model: DSMC | SoftSpheres,
     names: tuple[str, ...],
     start: Gas | None,
     method: str,
@@ -335,11 +336,13 @@ def _fit_by_simulation(
 ) -> Fit:
     if method != "levenberg-marquardt":
         raise ValueError(f"a particle model is fitted by least squares, not by {method!r}")
-    if model.replicas < 2 or model.projection is None:
+    if model.replicas < 2:
         raise ValueError(
             f"a fit through {type(model).__name__} needs replicas >= 2, whose scatter is its "
-            f"noise, and a projection; got replicas={model.replicas}, projection={model.projection}"
+            f"noise; got {model.replicas}"
         )
+    if isinstance(model, SoftSpheres) and model.projection is None:
+        raise ValueError("a fit needs projected derivatives: give SoftSpheres a projection")
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, curve, start))):
         raise ValueError(
             "a fit through particles cannot run inside jax.jit or jax.vmap: fit one curve at a time"

@@ -174,6 +174,11 @@ class DSMC(eqx.Module):
                 "a particle collides at most twice in a step"
             )
 
+    @property
+    def accuracy(self) -> float:
+        """Relative error of a derivative: what differs by less is not told apart."""
+        return 0.01
+
     def cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them.
 
