@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -259,3 +261,57 @@ def test_fit_under_vmap_over_a_float_of_the_gas():
     single = [jaxgran.fit(gas.replace(packing_fraction=p), curve).estimate[0] for p in packings]
     np.testing.assert_allclose(batch, jnp.stack(single), rtol=1e-6)
     assert jnp.all(jnp.diff(batch) < 0)  # a denser gas collides more: less A explains the same
+
+
+def test_fit_through_dsmc_agrees_with_kinetic_theory(beads):
+    gas = beads(0.15)
+    times = jnp.geomspace(0.3, 30.0, 20) * gas.mean_free_time
+    exact = jaxgran.cool(gas, times).temperature
+    curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
+    model = jaxgran.DSMC(5000, replicas=3, progress=False)
+    result = jaxgran.fit(gas, curve, model=model)
+    estimate, error = result.value("dissipative_constant")
+    true = gas.value("dissipative_constant")
+    # Kinetic theory and DSMC differ by 0.2 % in T, which is some 0.4 % in A.
+    assert abs(estimate / true - 1) < 2 * error / true + 0.004
+    assert error < 0.02 * true
+    assert 0 < result.simulation_error[0] < error
+    assert "DSMC" in jaxgran.diagnose(result, curve).verdict
+
+
+def test_fit_through_particles_refuses_what_it_cannot_do(beads):
+    gas = beads(0.15)
+    times = jnp.geomspace(0.3, 30.0, 20) * gas.mean_free_time
+    curve = jaxgran.CoolingCurve(times=times, temperature=jaxgran.cool(gas, times).temperature)
+    with pytest.raises(ValueError, match="replicas >= 2"):
+        jaxgran.fit(gas, curve, model=jaxgran.SoftSpheres(100))
+    with pytest.raises(ValueError, match="projection"):
+        jaxgran.fit(gas, curve, model=jaxgran.SoftSpheres(100, replicas=2, projection=None))
+    with pytest.raises(ValueError, match="least squares"):
+        jaxgran.fit(gas, curve, model=jaxgran.SoftSpheres(100, replicas=2), method="lbfgs")
+    with pytest.raises(ValueError, match="one curve at a time"):
+        jax.jit(lambda g: jaxgran.fit(g, curve, model=jaxgran.SoftSpheres(9, replicas=2)).chi2)(gas)
+
+
+def test_fit_through_soft_spheres_finds_what_made_the_curve(beads):
+    gas = beads(0.3, packing_fraction=0.2)
+    stiff = (float(gas.contact_fraction) / 0.1) ** 2.5
+    gas = gas.replace(youngs_modulus=stiff * gas.value("youngs_modulus"))
+    gas = gas.replace(
+        dissipative_constant=gas.value("dissipative_constant") * 0.3 / gas.thermal_beta
+    )
+    times = jnp.geomspace(0.3, 12.0, 12) * gas.mean_free_time
+    model = jaxgran.SoftSpheres(300, replicas=4, steps_per_contact=20, progress=False)
+    other = dataclasses.replace(model, key=jax.random.key(7))
+    curve = jaxgran.cool(gas, times, model=other)
+    curve = jaxgran.CoolingCurve(
+        times=times, temperature=curve.temperature, temperature_error=0.015 * curve.temperature
+    )
+    result = jaxgran.fit(gas, curve, model=model, max_steps=5)
+    estimate, error = result.value("dissipative_constant")
+    true = float(gas.value("dissipative_constant"))
+    # The measured curve is a run of 1200 spheres itself, whose noise its 1.5 % stand for.
+    assert abs(float(estimate) / true - 1) < 3 * float(error) / true
+    assert float(error) < 0.1 * true and bool(result.converged)
+    theory = jaxgran.fit(gas, curve)
+    assert abs(theory.estimate[0] / true - 1) > abs(estimate / true - 1)
