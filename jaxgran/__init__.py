@@ -6,6 +6,7 @@ from jaxgran.curve import CoolingCurve, Particles, read_curve, read_gas, write_c
 from jaxgran.diagnosis import Diagnosis, diagnose
 from jaxgran.fitting import Fit, fit
 from jaxgran.gas import Gas, sphere_mass
+from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.restitution import (
@@ -24,6 +25,7 @@ __all__ = [
     "Diagnosis",
     "Fit",
     "Gas",
+    "HardSpheres",
     "Impact",
     "KineticTheory",
     "Particles",

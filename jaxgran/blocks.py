@@ -113,7 +113,7 @@ class _Selection(NamedTuple):
     needed: Int[Array, "kinds"]  # how many rows of each of Room there would have to be
 
 
-def _rows(mask: Array, size: int) -> tuple[Array, Array]:
+def rows_where(mask: Array, size: int) -> tuple[Array, Array]:
     """Indices where a mask holds, filled up with its length, and how many there are."""
     ranks = jnp.cumsum(mask, dtype=jnp.int32)
     places = jnp.where(mask, ranks - 1, size)
@@ -133,7 +133,7 @@ def _select(state, pairs: Pairs, duration, margin, extra, replicas: int, room: R
     apart = x[pairs.i] - x[pairs.j] - pairs.offset
     near = jnp.sum(apart * apart, -1) < (1 + margin) ** 2
     near &= jnp.arange(near.size) < pairs.count
-    rows, num_near = _rows(near, room.near)
+    rows, num_near = rows_where(near, room.near)
     real = jnp.arange(room.near) < num_near
     i, j, offset = pairs.i[rows], pairs.j[rows], pairs.offset[rows]
 
@@ -150,11 +150,11 @@ def _select(state, pairs: Pairs, duration, margin, extra, replicas: int, room: R
     active = spread(active, real & (active[i] | active[j]))
     chosen = real & (active[i] | active[j])
     present = spread(jnp.zeros(n, bool), chosen)
-    rows, num_contacts = _rows(chosen, room.contacts)
+    rows, num_contacts = rows_where(chosen, room.contacts)
     real = jnp.arange(room.contacts) < num_contacts
     rows = jnp.where(real, rows, 0)
     i, j, offset = i[rows], j[rows], offset[rows]
-    members, num_members = _rows(present, room.members)
+    members, num_members = rows_where(present, room.members)
     slot = jnp.cumsum(present, dtype=jnp.int32) - 1
     return _Selection(
         members=members,

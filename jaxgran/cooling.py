@@ -11,10 +11,11 @@ from jaxtyping import ArrayLike
 
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
+from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 
-Model = KineticTheory | SoftSpheres
+Model = KineticTheory | HardSpheres | SoftSpheres
 
 
 def cool(
