@@ -189,11 +189,11 @@ def _select(x, v, pairs: Pairs, duration, bound, plan: Plan) -> _Selection:
     speed = jnp.sqrt(jnp.sum(v * v, -1))
     slots = _Slots(x, v, jnp.zeros(n, x.dtype))
 
+    fast, s_i, s_j = bound[pairs.i // size], speed[pairs.i], speed[pairs.j]
+
     def in_reach(until):
         i, j = until[pairs.i], until[pairs.j]
         early, late = jnp.minimum(i, j), jnp.maximum(i, j)
-        fast = bound[pairs.i // size]
-        s_i, s_j = speed[pairs.i], speed[pairs.j]
         reach = (s_i + s_j) * early + (fast + jnp.where(i < j, s_j, s_i)) * (late - early)
         near = gap < reach + 2 * fast * (duration - late)
         return near, jnp.sum(near, dtype=jnp.int32)
@@ -217,7 +217,8 @@ def _select(x, v, pairs: Pairs, duration, bound, plan: Plan) -> _Selection:
         _, _, count, wider = carry
         return (wider > count) & (wider <= room.near)
 
-    near, count = in_reach(jnp.full(n, duration))
+    near = gap < (s_i + s_j) * duration
+    count = jnp.sum(near, dtype=jnp.int32)
     index, no = jnp.zeros(room.near, jnp.int32), jnp.zeros(room.near, bool)
     nothing = jnp.zeros(room.near, x.dtype)
     rows = _Rows(index, index, jnp.zeros((room.near, x.shape[1]), x.dtype), nothing, no)
