@@ -100,9 +100,11 @@ class HardSpheres(eqx.Module):
         Raises:
             ValueError: if the gas is too dense, its box too small, or the start not of this gas.
             RuntimeError: if the run fails beyond repair, with what to do.
+            NotImplementedError: under a derivative with respect to the gas or the times.
         """
         with jax.ensure_compile_time_eval():
             self._check(gas)
+        gas, times = jax.tree.map(_constant, (gas, times))
         scene = reduced_scene(gas, self.num_particles, self.contact_time)
         unit_time = gas.diameter / jnp.sqrt(gas.temperature)
         inputs = gas, times, self.start, self.key
@@ -186,7 +188,8 @@ class HardSpheres(eqx.Module):
         near, chosen, members = (min(factor * share, listed) for factor in (4.0, 1.7, 2.0))
         counts = [n * number for number in (listed / 1.3, near, chosen, members)]
         rooms = [int(spare * count + 5 * count**0.5) + 64 for count in counts]
-        room = Room(*rooms[:3], members=min(rooms[3], n))
+        rooms[1:3] = [max(rows, min(rooms[0], 512)) for rows in rooms[1:3]]  # spare small runs
+        room = Room(*rooms[:3], members=min(max(rooms[3], 512), n))
         return events.Plan(self.replicas, share, room)
 
     def _initial(self, gas: Gas, scene: Scene, plan: events.Plan) -> State:
@@ -208,18 +211,19 @@ class HardSpheres(eqx.Module):
     def _driven(self, gas: Gas, scene: Scene, times: Array) -> tuple[State, dict[str, Array]]:
         """Run by a loop on the host, which makes room as it is needed."""
         plan = self.plan or self._sized(gas)
+        drive = self._driver(plan)
         state = self._initial(gas, scene, plan)
         observe = partial(_observe, scene=scene, replicas=self.replicas)
         if self.start is None:
             elastic = scene._replace(elastic=jnp.array(True))
             end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
-            melt = self._driver(elastic, plan)
+            melt = partial(drive, elastic)
             state, _ = simulate(state, end, melt, observe, progress=self.progress, label="melt")
             state = self._melted(state, scene, plan)
         state, records = simulate(
             state,
             np.asarray(times),
-            self._driver(scene, plan),
+            partial(drive, scene),
             observe,
             scene=fingerprint(gas, times, state, self.contact_time, self.neighbours),
             progress=self.progress,
@@ -227,10 +231,10 @@ class HardSpheres(eqx.Module):
         )
         return state, {name: jnp.asarray(value) for name, value in records.items()}
 
-    def _driver(self, scene: Scene, plan: events.Plan) -> Callable[[State, float], State]:
+    def _driver(self, plan: events.Plan) -> Callable[[Scene, State, float], State]:
         by = neighbours.engine(self.neighbours)
 
-        def advance(state: State, end: float) -> State:
+        def advance(scene: Scene, state: State, end: float) -> State:
             nonlocal plan
             while True:
                 now = events.stretch(state, scene, end, plan, by)
@@ -314,6 +318,20 @@ class HardSpheres(eqx.Module):
             particles=particles,
             status=fault,
         )
+
+
+@jax.custom_jvp
+def _constant(x: Array) -> Array:
+    return x
+
+
+@_constant.defjvp
+def _no_tangent(primals, tangents):
+    # What comes out of differentiating each impact grows e^2 to e^5 an impact: better none.
+    raise NotImplementedError(
+        "HardSpheres has no derivatives with respect to the gas or the times yet; use "
+        "jaxgran.KineticTheory for them, or finite differences over several replicas"
+    )
 
 
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Scene:
