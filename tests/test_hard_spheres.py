@@ -305,7 +305,7 @@ def test_refuses_what_it_cannot_do():
     with pytest.raises(ValueError, match="start.box_side"):
         jaxgran.cool(gas.replace(packing_fraction=0.09), [1.0], model=quiet(2, start=start))
     apart = start._replace(
-        position=start.position.at[0, 1, 0].set(2.5),
+        position=start.position.at[0, 1, 0].set(2.1),
         velocity=start.velocity.at[0, 0, 0].set(jnp.nan),
     )
     with pytest.raises(RuntimeError, match="not a finite number"):
@@ -337,5 +337,12 @@ def test_lammps_curve():
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     gas = jaxgran.read_gas(header).replace(dissipative_constant=float(header["A"]))
     ours = jaxgran.cool(gas, curve.times, model=quiet(4000, replicas=4))
-    # Contacts of finite duration, .006 of the mean free time, cool more slowly by 1 %.
-    assert np.all(np.abs(ours.temperature / curve.temperature - 1) < 0.015)
+    # LAMMPS resolves contacts, whose softness slows the cooling by 0.5 %.
+    soft, hard = (
+        jaxgran.cool(gas, curve.times, model=jaxgran.KineticTheory(softness=yes)).temperature
+        for yes in (True, False)
+    )
+    miss = np.abs(ours.temperature * soft / hard / curve.temperature - 1)
+    error = np.hypot(ours.temperature_error, curve.temperature_error) / curve.temperature
+    # Errors of three and four replicas are themselves uncertain by half.
+    assert np.all(miss < 0.005 + 3 * error)
