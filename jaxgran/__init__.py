@@ -7,6 +7,7 @@ from jaxgran.diagnosis import Diagnosis, diagnose
 from jaxgran.fitting import Fit, fit
 from jaxgran.gas import Gas, sphere_mass
 from jaxgran.models.dsmc import DSMC
+from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.restitution import (
@@ -26,6 +27,7 @@ __all__ = [
     "Diagnosis",
     "Fit",
     "Gas",
+    "HardSpheres",
     "Impact",
     "KineticTheory",
     "Particles",

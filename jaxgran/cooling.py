@@ -12,10 +12,11 @@ from jaxtyping import ArrayLike
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
 from jaxgran.models.dsmc import DSMC
+from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 
-Model = KineticTheory | DSMC | SoftSpheres
+Model = KineticTheory | DSMC | HardSpheres | SoftSpheres
 
 
 def cool(

@@ -56,6 +56,8 @@ class CoolingCurve(eqx.Module):
         velocity_correlation: <v(0) . v(t)>/d, m^2/s^2, of particle models.
         elastic_energy, dissipated_energy: per particle, J; with (d/2) m T they add up to the
             energy at the start. Of models that resolve contacts.
+        regularised: collisions per particle that were made elastic lest the gas collapse; of hard
+            spheres.
         replicas: the same curve of each replica, all arrays of shape (replicas, times).
         particles: the last state of a particle model.
         status: 0, or what went wrong under `jax.jit` or `jax.vmap`, where nothing can be raised
@@ -73,6 +75,7 @@ class CoolingCurve(eqx.Module):
     velocity_correlation: Float[Array, "times"] | None = None
     elastic_energy: Float[Array, "times"] | None = None
     dissipated_energy: Float[Array, "times"] | None = None
+    regularised: Float[Array, "times"] | None = None
     replicas: "CoolingCurve | None" = None
     particles: Particles | None = None
     status: Int[Array, ""] | None = None

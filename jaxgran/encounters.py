@@ -25,7 +25,7 @@ class Encounters(NamedTuple):
     needed: Int[Array, "kinds"]  # listed pairs, near pairs, contacts, members there are
 
 
-def _rows(mask: Array, size: int) -> tuple[Array, Array]:
+def rows_where(mask: Array, size: int) -> tuple[Array, Array]:
     """Indices where a mask holds, filled up with its length, and how many there are."""
     ranks = jnp.cumsum(mask, dtype=jnp.int32)
     places = jnp.where(mask, ranks - 1, size)
@@ -62,7 +62,7 @@ def select(
     apart = x[pairs.i] - x[pairs.j] - pairs.offset
     near = jnp.sum(apart * apart, -1) < (1 + margin) ** 2
     near &= jnp.arange(near.size) < pairs.count
-    rows, num_near = _rows(near, room_near)
+    rows, num_near = rows_where(near, room_near)
     real = jnp.arange(room_near) < num_near
     i, j, offset = pairs.i[rows], pairs.j[rows], pairs.offset[rows]
 
@@ -80,11 +80,11 @@ def select(
     active = spread(active, real & (active[i] | active[j]))
     chosen = real & (active[i] | active[j])
     present = spread(jnp.zeros(n, bool), chosen)
-    rows, num_contacts = _rows(chosen, room_contacts)
+    rows, num_contacts = rows_where(chosen, room_contacts)
     real = jnp.arange(room_contacts) < num_contacts
     rows = jnp.where(real, rows, 0)
     i, j, offset = i[rows], j[rows], offset[rows]
-    members, num_members = _rows(present, room_members)
+    members, num_members = rows_where(present, room_members)
     slot = jnp.cumsum(present, dtype=jnp.int32) - 1
     return Encounters(
         members=members,

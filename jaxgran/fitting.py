@@ -17,6 +17,7 @@ from jaxgran.cooling import Model
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
 from jaxgran.models.dsmc import DSMC
+from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.restitution import ConstantRestitution, Viscoelastic
@@ -161,6 +162,11 @@ def fit(
         starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])
         max_steps = max_steps or 100
         result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, max_steps)
+    elif isinstance(model, HardSpheres):
+        raise ValueError(
+            "fit has no derivatives through HardSpheres yet: fit through DSMC (dilute, homogeneous) "
+            "or SoftSpheres"
+        )
     else:
         result = _fit_by_simulation(gas, curve, model, tuple(free), start, method, max_steps or 8)
     if not isinstance(result.chi2, Tracer):

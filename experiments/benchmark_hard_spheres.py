@@ -1,0 +1,104 @@
+"""How many collisions a second do hard spheres resolve?
+
+    python experiments/benchmark_hard_spheres.py [--sizes 1000 4096] [--smoke] [--out FILE]
+
+A gas of constant restitution cools for some mean free times in a periodic box, in three and in two
+dimensions, from a melted start. Compilation and the start are timed apart; medians of repeats.
+"""
+
+import argparse
+import json
+import platform
+import resource
+import statistics
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+
+import jaxgran
+
+PACKINGS = {3: 0.1, 2: 0.2}
+RESTITUTION = 0.9
+SIZES = (1000, 4096, 16384, 50000)
+COLLISION_TIMES = 4.0
+REPEATS = 3
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sizes", nargs="+", type=int, default=SIZES)
+    parser.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=(3, 2))
+    parser.add_argument("--collision-times", type=float, default=COLLISION_TIMES)
+    parser.add_argument("--smoke", action="store_true", help="a run of seconds")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    sizes, repeats = options.sizes, REPEATS
+    if options.smoke:
+        sizes, repeats = (216,), 1
+    print(f"{jax.devices()[0].device_kind}, float64, restitution {RESTITUTION}")
+    head = f"{'d':>2}{'phi':>6}{'N':>8} {'first run s':>12} {'run s':>8} {'CPU s':>8}"
+    print(head + f" {'coll/s':>8} {'T/T_0':>7}")
+    rows = []
+    for dimension in options.dimensions:
+        for size in sizes:
+            row = measure(size, dimension, options.collision_times, repeats)
+            rows.append(row)
+            line = f"{dimension:2d}{row['packing_fraction']:6.2f}{size:8d} {row['first_s']:12.1f} "
+            line += f"{row['run_s']:8.2f} {row['cpu_s']:8.2f} {row['collisions_per_s']:8.0f} "
+            print(line + f"{row['temperature_ratio']:7.3f}", flush=True)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"peak memory {peak:.2f} GiB")
+    if options.out:
+        record = {
+            "rows": rows,
+            "peak_memory_GiB": peak,
+            "device": jax.devices()[0].device_kind,
+            "python": platform.python_version(),
+            "versions": {name: version(name) for name in ("jaxgran", "jax", "jax-md", "vesin")},
+        }
+        options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+
+
+def measure(size: int, dimension: int, collision_times: float, repeats: int) -> dict:
+    gas = jaxgran.Gas(
+        jaxgran.ConstantRestitution(RESTITUTION),
+        diameter=2e-3,
+        mass=jaxgran.sphere_mass(2e-3, 2500.0),
+        packing_fraction=PACKINGS[dimension],
+        temperature=0.01,
+        dimension=dimension,
+    )
+    begin = time.perf_counter()
+    start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(size)).particles
+    model = jaxgran.HardSpheres(size, start=start)
+    times = [collision_times * float(gas.mean_free_time)]
+    curve = jaxgran.cool(gas, times, model=model)
+    first = time.perf_counter() - begin
+    seconds, processor = [], []
+    for _ in range(repeats):
+        begin, began = time.perf_counter(), time.process_time()
+        curve = jaxgran.cool(gas, times, model=model)
+        jax.block_until_ready(curve.temperature)
+        seconds.append(time.perf_counter() - begin)
+        processor.append(time.process_time() - began)
+    assert curve.collisions is not None
+    run = statistics.median(seconds)
+    return {
+        "dimension": dimension,
+        "packing_fraction": PACKINGS[dimension],
+        "num_particles": size,
+        "first_s": first,
+        "run_s": run,
+        "cpu_s": statistics.median(processor),
+        "collisions_per_s": float(curve.collisions[-1]) * size / 2 / run,
+        "temperature_ratio": float(curve.temperature[-1] / gas.temperature),
+    }
+
+
+if __name__ == "__main__":
+    main()
