@@ -164,8 +164,8 @@ def fit(
         result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, max_steps)
     elif isinstance(model, HardSpheres):
         raise ValueError(
-            "fit has no derivatives through HardSpheres yet: fit through DSMC (dilute, homogeneous) "
-            "or SoftSpheres"
+            "HardSpheres has no derivatives yet, which a fit needs: use DSMC (dilute homogeneous "
+            "gases) or SoftSpheres"
         )
     else:
         result = _fit_by_simulation(gas, curve, model, tuple(free), start, method, max_steps or 8)
