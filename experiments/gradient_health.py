@@ -31,13 +31,13 @@ import jaxgran  # noqa: E402
 COLLISIONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 INTERVALS = (0.03, 0.1, 0.3, 1.0)
 STEP = 0.3  # of ln A, to either side
-# packing fraction, beta_T0, contact duration over mean free time
+# packing fraction, beta_T0, contact duration over mean free time, particles in a box
 SCENES = {
-    "dilute": (0.05, 0.1, 0.01),
-    "dense": (0.25, 0.05, 0.05),
-    "clustering": (0.2, 0.5, 0.17),
+    "dilute": (0.05, 0.1, 0.01, 500),
+    "dense": (0.25, 0.05, 0.05, 500),
+    "clustering": (0.2, 0.5, 0.17, 1000),
 }
-NUM_PARTICLES, REPLICAS, FEW_REPLICAS = 1000, 12, 4
+REPLICAS, FEW_REPLICAS = 16, 4
 STEPS_PER_CONTACT = 25
 
 
@@ -71,7 +71,7 @@ def main() -> None:
 
 
 def scene(name: str) -> jaxgran.Gas:
-    packing, beta, fraction = SCENES[name]
+    packing, beta, fraction, _ = SCENES[name]
     gas = jaxgran.Gas(
         jaxgran.Viscoelastic(1e7, 0.22, 1e-6),
         diameter=2e-3,
@@ -94,7 +94,7 @@ def times_of(gas: jaxgran.Gas, collisions) -> np.ndarray:
 def examine(name: str, smoke: bool) -> dict:
     gas = scene(name)
     collisions = COLLISIONS[:2] if smoke else COLLISIONS
-    size, many, few = (50, 2, 2) if smoke else (NUM_PARTICLES, REPLICAS, FEW_REPLICAS)
+    size, many, few = (50, 2, 2) if smoke else (SCENES[name][3], REPLICAS, FEW_REPLICAS)
     times = times_of(gas, collisions)
     constant = gas.value("dissipative_constant")
 
@@ -144,7 +144,7 @@ def examine(name: str, smoke: bool) -> dict:
         slopes = forward(spheres(few, projection=interval))[0]
         by_interval[interval] = over_replicas(slopes)
 
-    print(f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name]}, N = {size}, {many} replicas")
+    print(f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name][:3]}, N = {size}, {many} replicas")
     print(f"box {float(gas.box_side(size) / gas.diameter):.3g} diameters, ", end="")
     print(f"L_c {float(gas.critical_box / gas.diameter):.3g}")
     print(f"{'collisions':>11}" + "".join(f"{column:>24}" for column in columns))
