@@ -6,7 +6,8 @@ d ln T / d ln A of three gases at 1, 3, 10, 30 and 100 collisions a particle, by
 (many replicas, the same random starts on both sides, corrected for their step by kinetic theory),
 by plain forward mode, by thermally projected forward and reverse mode, and by kinetic theory; and
 how the projected derivative depends on the interval between projections. Standard errors are over
-replicas. Prints tables, draws a picture, writes JSON.
+replicas. Prints tables, draws a picture, writes JSON; scenes that are in the JSON file already are
+kept in both unless asked for.
 """
 
 import argparse
@@ -52,14 +53,19 @@ def main() -> None:
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     options.out.mkdir(parents=True, exist_ok=True)
-    begin = time.perf_counter()
-    results = {}
+    file, results = options.out / "gradient_health.json", {}
+    if file.exists():  # scenes not asked for again
+        results = json.loads(file.read_text())["scenes"]
     for name in tqdm(options.scenes, disable=options.smoke):
         results[name] = examine(name, options.smoke)
-    draw(results, options.out / "gradient_health.png")
+        write(results, file)
+    draw({name: results[name] for name in SCENES if name in results}, file.with_suffix(".png"))
+    print(f"written to {options.out}")
+
+
+def write(results: dict, file: Path) -> None:
     record = {
         "scenes": results,
-        "seconds": time.perf_counter() - begin,
         "step_of_ln_A": STEP,
         "steps_per_contact": STEPS_PER_CONTACT,
         "key": 0,
@@ -67,8 +73,7 @@ def main() -> None:
         "python": platform.python_version(),
         "device": jax.devices()[0].device_kind,
     }
-    (options.out / "gradient_health.json").write_text(json.dumps(record, indent=2) + "\n")
-    print(f"{record['seconds']:.0f} s; written to {options.out}")
+    file.write_text(json.dumps(record, indent=2) + "\n")
 
 
 def scene(name: str) -> jaxgran.Gas:
@@ -93,7 +98,7 @@ def times_of(gas: jaxgran.Gas, collisions) -> np.ndarray:
 
 
 def examine(name: str, smoke: bool) -> dict:
-    gas = scene(name)
+    begin, gas = time.perf_counter(), scene(name)
     collisions = COLLISIONS[:2] if smoke else COLLISIONS
     size, many, few = (50, 2, 2) if smoke else (SCENES[name][3], REPLICAS, FEW_REPLICAS)
     times = times_of(gas, collisions)
@@ -171,6 +176,7 @@ def examine(name: str, smoke: bool) -> dict:
         "num_particles": size,
         "replicas": many,
         "tangent_seconds": seconds,
+        "seconds": time.perf_counter() - begin,
     }
 
 
