@@ -143,6 +143,7 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
                 met=2 * replicas / len(new.position) * by_replica(work.begun),
                 energy=kinetic(new.velocity) + new.elastic,
                 temperature=temperature,
+                trend=along.trend(temperature),
                 duration=duration,
                 collision_frequency=scene.collision_frequency,
             ),

@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran import neighbours, status
+from jaxgran import kinetics, neighbours, status, tangents
 from jaxgran.blocks import Room
 from jaxgran.encounters import rows_where
 from jaxgran.neighbours import Pairs
 from jaxgran.restitution import ReducedLaw
+from jaxgran.tangents import ImpactTangents
 
 MAX_ROUNDS = 100_000
 """Rounds of simultaneous impacts in one window before the run counts as stalled."""
@@ -52,6 +53,7 @@ class State(NamedTuple):
     regularised: Int[Array, "replicas"]  # of them, elastic because they came too soon
     window: Float[Array, ""]  # length to try next
     skin: Float[Array, ""]  # reach of the neighbour list beyond contact
+    tangents: ImpactTangents | None = None  # where they are followed
 
 
 class Plan(NamedTuple):
@@ -251,9 +253,18 @@ class _Work(NamedTuple):
     fastest: Array  # square of the speed, at most
     pending: Array
     num_rounds: Array
+    gains: Float[Array, "changes rows"] | None  # of energy, see `ImpactTangents`
 
 
-def _impacts(slots: _Slots, listed, chosen: _Selection, scene: Scene, duration, shortest) -> _Work:
+def _impacts(
+    slots: _Slots,
+    listed,
+    chosen: _Selection,
+    scene: Scene,
+    duration,
+    shortest,
+    along: ImpactTangents | None,
+) -> _Work:
     """All impacts of a window, round by round.
 
     A round executes every impact that is the first of both its spheres and cannot be forestalled:
@@ -285,6 +296,11 @@ def _impacts(slots: _Slots, listed, chosen: _Selection, scene: Scene, duration, 
         eps = jnp.where(soon | scene.elastic, 1.0, eps)
         kick = (0.5 * (1 + eps) * speed)[:, None] * normal
         lost = 0.125 * (1 - eps * eps) * speed**2
+        gains = work.gains
+        if along is not None:
+            # The law's unit of speed is sqrt(2).
+            gained = 2 * along.gains(scene.law, speed * 0.5**0.5)
+            gains += jnp.where((safe & ~soon & ~scene.elastic)[None], gained, 0.0)
 
         row = jnp.minimum(row, num_rows - 1)
         hit = safe[row] & ((a[row] == own) | (b[row] == own))
@@ -302,13 +318,17 @@ def _impacts(slots: _Slots, listed, chosen: _Selection, scene: Scene, duration, 
             fastest=jnp.maximum(work.fastest, jnp.sum(v * v, -1)),
             pending=jnp.any(safe),
             num_rounds=work.num_rounds + 1,
+            gains=gains,
         )
 
     def going(work: _Work):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
     count, zeros = jnp.zeros(num_slots, jnp.int32), jnp.zeros(num_slots, slots.x.dtype)
-    work = _Work(slots, zeros, count, count, zeros, zeros, jnp.array(True), jnp.int32(0))
+    gains = None
+    if along is not None:
+        gains = jnp.zeros((len(along.log_temperature) + 1, num_rows), zeros.dtype)
+    work = _Work(slots, zeros, count, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains)
     return jax.lax.while_loop(going, one_round, work)
 
 
@@ -330,6 +350,17 @@ def _fastest(v, replicas):
 def _temperature(v, replicas):
     boxes = v.reshape(replicas, -1, v.shape[-1])
     return jnp.mean((boxes - jnp.mean(boxes, axis=1, keepdims=True)) ** 2, axis=(1, 2))
+
+
+def cooling_trend(
+    law: ReducedLaw, temperature: Float[Array, "replicas"], dimension: int
+) -> Float[Array, "replicas"]:
+    """How the cooling rate of a Maxwellian depends on T, in some unit."""
+
+    def rate(speed):
+        return kinetics.averages(law, speed, dimension)[0, 0] * speed
+
+    return jax.vmap(rate)(jnp.sqrt(temperature))
 
 
 @partial(jax.jit, static_argnames=("plan", "max_windows"))
@@ -356,6 +387,28 @@ def advance(
     replicas, n = plan.replicas, len(state.position)
     target = max(0.5 * plan.share * n, LEAST_IMPACTS)
 
+    def carried(
+        along: ImpactTangents, velocity, chosen: _Selection, work: _Work, lost, impacts, duration
+    ) -> ImpactTangents:
+        """The tangents after a window."""
+        d = velocity.shape[1]
+        temperature = _temperature(velocity, replicas)
+        energy = 0.5 * d * n / replicas * temperature
+        replica = chosen.replica[chosen.rows.a]
+        gains = jnp.zeros((len(work.gains), replicas), energy.dtype)
+        rates = tangents.remembered(
+            along.rates,
+            lost=lost,
+            met=2 * replicas / n * impacts,
+            energy=energy,
+            temperature=temperature,
+            trend=cooling_trend(scene.law, temperature, d),
+            duration=duration,
+            collision_frequency=scene.collision_frequency,
+        )
+        gains = gains.at[:, replica].add(work.gains, mode="drop")
+        return along.after(gains, energy + 0.5 * lost, duration, rates)
+
     def window(now: Progress) -> Progress:
         state = now.state
         x, v = state.position, state.velocity
@@ -371,13 +424,15 @@ def advance(
             return values.at[chosen.members].get(mode="fill", fill_value=0.0)
 
         slots = _Slots(of_members(x), of_members(v), -of_members(state.age))
-        work = _impacts(slots, of_members(listed), chosen, scene, duration, shortest)
+        work = _impacts(
+            slots, of_members(listed), chosen, scene, duration, shortest, state.tangents
+        )
         slots = work.slots
 
         def by_replica(values):  # an empty slot is of no replica
             return jnp.zeros(replicas, values.dtype).at[chosen.replica].add(values, mode="drop")
 
-        impacts = by_replica(work.impacts) // 2
+        impacts, lost = by_replica(work.impacts) // 2, by_replica(work.dissipated)
         ratio = jnp.clip(target / jnp.maximum(jnp.sum(impacts), 1), 0.5, 1.5)
         most = bound[jnp.minimum(chosen.replica, replicas - 1)]
         too_fast = jnp.any(work.fastest > most**2)
@@ -390,12 +445,15 @@ def advance(
             position=to_members(x + v * duration, slots.x + slots.v * duration),
             velocity=to_members(v, slots.v),
             age=to_members(state.age + duration, duration - slots.last),
-            dissipated=state.dissipated + by_replica(work.dissipated),
+            dissipated=state.dissipated + lost,
             impacts=state.impacts + impacts,
             regularised=state.regularised + by_replica(work.regularised) // 2,
             # The last, short window before an end tells nothing.
             window=jnp.where(duration > 0.5 * state.window, duration * ratio, state.window),
         )
+        if state.tangents is not None:
+            along = carried(state.tangents, new.velocity, chosen, work, lost, impacts, duration)
+            new = new._replace(tangents=along)
         away = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
         outrun = jnp.maximum(away, jnp.max(work.moved)) > (0.5 * state.skin) ** 2
         full = chosen.needed > jnp.array(plan.room)

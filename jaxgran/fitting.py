@@ -162,11 +162,6 @@ def fit(
         starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])
         max_steps = max_steps or 100
         result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, max_steps)
-    elif isinstance(model, HardSpheres):
-        raise ValueError(
-            "HardSpheres has no derivatives yet, which a fit needs: use DSMC (dilute homogeneous "
-            "gases) or SoftSpheres"
-        )
     else:
         result = _fit_by_simulation(gas, curve, model, tuple(free), start, method, max_steps or 8)
     if not isinstance(result.chi2, Tracer):
@@ -334,7 +329,7 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
 def _fit_by_simulation(
     gas: Gas,
     curve: CoolingCurve,
-    model: DSMC | SoftSpheres,
+    model: DSMC | HardSpheres | SoftSpheres,
     names: tuple[str, ...],
     start: Gas | None,
     method: str,

@@ -1,7 +1,6 @@
 """Hard spheres: instantaneous impacts in a periodic box, resolved event by event."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -12,13 +11,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxgran import events, initial, neighbours, observables, status
+from jaxgran import events, initial, neighbours, observables, status, tangents
 from jaxgran.blocks import Room, longest_skin
 from jaxgran.checkpoint import fingerprint
 from jaxgran.curve import CoolingCurve, Particles
-from jaxgran.events import Scene, State
-from jaxgran.gas import Gas
+from jaxgran.events import Plan, Scene, State
+from jaxgran.gas import Gas, sphere_surface
+from jaxgran.restitution import ReducedLaw
 from jaxgran.simulation import simulate
+from jaxgran.tangents import ImpactTangents, Inputs, Outputs
 
 SMALLEST_BOX = 2.1
 """Box side in diameters below which a sphere could touch another and its image at once."""
@@ -68,6 +69,15 @@ class HardSpheres(eqx.Module):
             gives the same numbers bit for bit.
         plan: sizes of arrays, see `sized_for`.
 
+    Derivatives of T, collisions, <dr^2> and the dissipated energy are taken in every float of the
+    gas and in the times, forward and reverse alike, whatever the law. They are thermally projected
+    at every impact (see `jaxgran.tangents`): the gas is taken to remember its temperature alone,
+    and to cool on at the rate of its last 5 mean free times. a_2 and the paths are taken as the
+    same at the same number of collisions (so that d ln<dr^2>/d ln A is up to 0.2 too low:
+    dissipation makes velocities last longer), the velocity correlation as decaying at 2/d of the
+    collision rate. The density acts by the Enskog frequency of collisions. The last particles carry
+    no derivative.
+
     Raises:
         ValueError: for numbers out of range.
     """
@@ -80,7 +90,7 @@ class HardSpheres(eqx.Module):
     neighbours: str = eqx.field(static=True, default="auto")
     progress: bool = eqx.field(static=True, default=True)
     checkpoint: str | Path | None = eqx.field(static=True, default=None)
-    plan: events.Plan | None = eqx.field(static=True, default=None)
+    plan: Plan | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         for name, least in (("num_particles", 2), ("replicas", 1)):
@@ -100,20 +110,31 @@ class HardSpheres(eqx.Module):
         Raises:
             ValueError: if the gas is too dense, its box too small, or the start not of this gas.
             RuntimeError: if the run fails beyond repair, with what to do.
-            NotImplementedError: under a derivative with respect to the gas or the times.
         """
         with jax.ensure_compile_time_eval():
             self._check(gas)
-        gas, times = jax.tree.map(_constant, (gas, times))
-        scene = reduced_scene(gas, self.num_particles, self.contact_time)
-        unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-        inputs = gas, times, self.start, self.key
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs)):
-            state, records, fault = self._traced(gas, scene, times / unit_time)
-        else:
-            state, records = self._driven(gas, scene, times / unit_time)
-            fault = jnp.zeros((), jnp.int32)
-        return self._curve(gas, times, scene, state, records, fault)
+        inputs = Inputs(
+            scene=reduced_scene(gas, self.num_particles, self.contact_time),
+            times=times * jnp.sqrt(gas.temperature) / gas.diameter,
+            start=self._reduced_start(gas),
+            key=self.key,
+        )
+        run = partial(self._run, dimension=gas.dimension)
+        run = tangents.differentiable(run, lambda scene: scene.law)
+        return self._curve(gas, times, inputs.scene, run(inputs))
+
+    @property
+    def accuracy(self) -> float:
+        """Relative error of a projected derivative: what differs by less is not told apart."""
+        return 0.02
+
+    def _reduced_start(self, gas: Gas) -> tuple[Array, Array] | None:
+        if self.start is None:
+            return None
+        # The same start in units of any other gas.
+        length, speed = jax.lax.stop_gradient((gas.diameter, jnp.sqrt(gas.temperature)))
+        position, velocity = self.start.position / length, self.start.velocity / speed
+        return position.reshape(-1, gas.dimension), velocity.reshape(-1, gas.dimension)
 
     def _check(self, gas: Gas) -> None:
         if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
@@ -159,13 +180,14 @@ class HardSpheres(eqx.Module):
                 "not overlap; move them apart, or leave start out for a random one"
             )
 
-    def _skin(self, gas: Gas) -> Float[Array, ""]:
+    def _pairs_in_contact(self, scene: Scene, d: int) -> Array:
+        """Pairs a particle within contact, were the pair correlation 1."""
+        return self.num_particles * sphere_surface(d) / (2 * d) / scene.side**d
+
+    def _skin(self, scene: Scene, d: int) -> Array:
         """Reach of the neighbour list beyond contact, in diameters."""
-        d = gas.dimension
-        inside = gas.packing_fraction * 2 ** (d - 1)  # pairs per particle within contact, were g 1
-        skin = (1 + PAIRS_PER_PARTICLE / inside) ** (1 / d) - 1
-        side = gas.box_side(self.num_particles) / gas.diameter
-        return jnp.minimum(skin, longest_skin(side))
+        skin = (1 + PAIRS_PER_PARTICLE / self._pairs_in_contact(scene, d)) ** (1 / d) - 1
+        return jnp.minimum(skin, longest_skin(scene.side))
 
     def sized_for(self, gas: Gas, spare: float = 1.4) -> "HardSpheres":
         """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
@@ -177,67 +199,67 @@ class HardSpheres(eqx.Module):
             gas: with known numbers, alike the gases to come: the densest of them.
             spare: room over the expected need.
         """
-        return dataclasses.replace(self, plan=self._sized(gas, spare))
+        scene = reduced_scene(gas, self.num_particles, self.contact_time)
+        return dataclasses.replace(self, plan=self._sized(scene, gas.dimension, spare))
 
-    def _sized(self, gas: Gas, spare: float = 1.4) -> events.Plan:
+    def _sized(self, scene: Scene, d: int, spare: float = 1.4) -> Plan:
         n = self.replicas * self.num_particles
         share = max(WINDOW_SHARE, 2 * events.LEAST_IMPACTS / n)
-        inside = float(gas.packing_fraction) * 2 ** (gas.dimension - 1)
-        listed = inside * (1 + float(self._skin(gas))) ** gas.dimension
+        inside = float(self._pairs_in_contact(scene, d))
+        listed = inside * (1 + float(self._skin(scene, d))) ** d
         # As measured; a list changes its length little, windows differ more.
         near, chosen, members = (min(factor * share, listed) for factor in (4.0, 1.7, 2.0))
         counts = [n * number for number in (listed / 1.3, near, chosen, members)]
         rooms = [int(spare * count + 5 * count**0.5) + 64 for count in counts]
         rooms[1:3] = [max(rows, min(rooms[0], 512)) for rows in rooms[1:3]]  # spare small runs
         room = Room(*rooms[:3], members=min(max(rooms[3], 512), n))
-        return events.Plan(self.replicas, share, room)
+        return Plan(self.replicas, share, room)
 
-    def _initial(self, gas: Gas, scene: Scene, plan: events.Plan) -> State:
-        d = gas.dimension
-        if self.start is None:
-            keys = jax.random.split(jax.random.key(0) if self.key is None else self.key)
-            size = self.replicas, self.num_particles, d
+    def _run(self, inputs: Inputs, dimension: int, directions: ReducedLaw | None = None) -> Outputs:
+        """Melt, then cool; and with it the tangents along directions in the law."""
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs))
+        try:
+            with jax.ensure_compile_time_eval():
+                plan = self.plan or self._sized(inputs.scene, dimension)
+        except jax.errors.ConcretizationTypeError:
+            raise ValueError(
+                "inside jax.jit the sizes of arrays must be known: give HardSpheres(...)"
+                ".sized_for(gas), made outside with a gas of known numbers"
+            ) from None
+        scene, replicas = inputs.scene, self.replicas
+        if inputs.start is None:
+            keys = jax.random.split(jax.random.key(0) if inputs.key is None else inputs.key)
+            size = replicas, self.num_particles, dimension
             position = initial.positions(keys[0], scene.side, *size)
             velocity = initial.velocities(keys[1], *size)
         else:
-            position = (self.start.position / gas.diameter).reshape(-1, d)
-            velocity = (self.start.velocity / jnp.sqrt(gas.temperature)).reshape(-1, d)
-        return events.at_start(position, velocity, scene, self._skin(gas), plan)
+            position, velocity = inputs.start
+        state = events.at_start(position, velocity, scene, self._skin(scene, dimension), plan)
 
-    def _melted(self, state: State, scene: Scene, plan: events.Plan) -> State:
-        velocity = initial.settle(state.velocity, self.replicas)
-        return events.at_start(state.position, velocity, scene, state.skin, plan)
+        def begun(melted: State) -> State:
+            velocity = melted.velocity
+            if inputs.start is None:
+                velocity = initial.settle(velocity, replicas)
+            state = events.at_start(melted.position, velocity, scene, melted.skin, plan)
+            if directions is None:
+                return state
+            along = ImpactTangents.at_start(directions, replicas, velocity.dtype)
+            return state._replace(tangents=along)
 
-    def _driven(self, gas: Gas, scene: Scene, times: Array) -> tuple[State, dict[str, Array]]:
+        run = self._traced if traced else self._driven
+        state, records, fault = run(inputs, plan, state, begun)
+        return Outputs(neighbours.wrap(scene.side, state.position), state.velocity, records, fault)
+
+    def _driven(self, inputs: Inputs, plan: Plan, state: State, begun):
         """Run by a loop on the host, which makes room as it is needed."""
-        plan = self.plan or self._sized(gas)
-        drive = self._driver(plan)
-        state = self._initial(gas, scene, plan)
+        scene = inputs.scene
         observe = partial(_observe, scene=scene, replicas=self.replicas)
-        if self.start is None:
-            elastic = scene._replace(elastic=jnp.array(True))
-            end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
-            melt = partial(drive, elastic)
-            state, _ = simulate(state, end, melt, observe, progress=self.progress, label="melt")
-            state = self._melted(state, scene, plan)
-        state, records = simulate(
-            state,
-            np.asarray(times),
-            partial(drive, scene),
-            observe,
-            scene=fingerprint(gas, times, state, self.contact_time, self.neighbours),
-            progress=self.progress,
-            path=self.checkpoint,
-        )
-        return state, {name: jnp.asarray(value) for name, value in records.items()}
+        engine = neighbours.engine(self.neighbours)
 
-    def _driver(self, plan: events.Plan) -> Callable[[Scene, State, float], State]:
-        by = neighbours.engine(self.neighbours)
-
-        def advance(scene: Scene, state: State, end: float) -> State:
+        def advance(state: State, end: float, scene: Scene) -> State:
             nonlocal plan
             while True:
-                now = events.stretch(state, scene, end, plan, by)
+                now = events.stretch(state, scene, end, plan, engine)
                 state, fault = now.state, int(now.status)
                 if fault == status.OK:
                     return state
@@ -248,18 +270,27 @@ class HardSpheres(eqx.Module):
                     raise RuntimeError(f"stopped at T/T_0 = {at:.3g}: {status.explain(fault)}")
                 plan = plan._replace(room=plan.room.grown(needed))
 
-        return advance
+        # A run to be resumed has been melted.
+        if inputs.start is None and not (self.checkpoint and Path(self.checkpoint).exists()):
+            melt = partial(advance, scene=scene._replace(elastic=jnp.array(True)))
+            end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
+            state, _ = simulate(state, end, melt, observe, progress=self.progress, label="melt")
+        state = begun(state)
+        size = self.num_particles, self.replicas, self.neighbours
+        state, records = simulate(
+            state,
+            np.asarray(inputs.times),
+            partial(advance, scene=scene),
+            observe,
+            scene=fingerprint(inputs, state.tangents, size),
+            progress=self.progress,
+            path=self.checkpoint,
+        )
+        records = {name: jnp.asarray(value) for name, value in records.items()}
+        return state, records, jnp.zeros((), jnp.int32)
 
-    def _traced(self, gas: Gas, scene: Scene, times: Array):
-        """The same inside `jax.jit`, `jax.vmap` or a derivative: room is fixed beforehand."""
-        try:
-            with jax.ensure_compile_time_eval():
-                plan = self.plan or self._sized(gas)
-        except jax.errors.ConcretizationTypeError:
-            raise ValueError(
-                "inside jax.jit the sizes of arrays must be known: give HardSpheres(...)"
-                ".sized_for(gas), made outside with a gas of known numbers"
-            ) from None
+    def _traced(self, inputs: Inputs, plan: Plan, state: State, begun):
+        """The same inside `jax.jit` or `jax.vmap`: room is fixed beforehand."""
 
         def run(carry, scene, end):
             def further(carry):
@@ -271,11 +302,10 @@ class HardSpheres(eqx.Module):
 
             return jax.lax.while_loop(unfinished, further, carry)
 
-        state, fault = self._initial(gas, scene, plan), jnp.zeros((), jnp.int32)
-        if self.start is None:
+        scene, fault = inputs.scene, jnp.zeros((), jnp.int32)
+        if inputs.start is None:
             elastic = scene._replace(elastic=jnp.array(True))
             state, fault = run((state, fault), elastic, MELT_COLLISIONS / scene.collision_frequency)
-            state = self._melted(state, scene, plan)
 
         def to(carry, end):
             state, fault = run(carry, scene, end)
@@ -283,10 +313,10 @@ class HardSpheres(eqx.Module):
             bad = fault != status.OK
             return (state, fault), jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), records)
 
-        (state, fault), records = jax.lax.scan(to, (state, fault), times)
+        (state, fault), records = jax.lax.scan(to, (begun(state), fault), inputs.times)
         return state, records, fault
 
-    def _curve(self, gas, times, scene, state, records, fault) -> CoolingCurve:
+    def _curve(self, gas: Gas, times: Array, scene: Scene, run: Outputs) -> CoolingCurve:
         units = {
             "temperature": gas.temperature,
             "sonine": 1.0,
@@ -296,18 +326,18 @@ class HardSpheres(eqx.Module):
             "collisions": 1.0,
             "regularised": 1.0,
         }
-        each = {name: records[name].T * unit for name, unit in units.items()}
+        each = {name: run.records[name].T * unit for name, unit in units.items()}
         mean = {name: jnp.mean(values, axis=0) for name, values in each.items()}
         errors = {}
         if self.replicas > 1:
             for name in ("temperature", "displacement"):
-                deviation = jnp.std(each[name], axis=0, ddof=1)
+                # Where all replicas agree, at t = 0, a root has no derivative.
+                deviation = jnp.std(jax.lax.stop_gradient(each[name]), axis=0, ddof=1)
                 errors[f"{name}_error"] = deviation / self.replicas**0.5
         shape = self.replicas, self.num_particles, gas.dimension
-        position = neighbours.wrap(scene.side, state.position)
         particles = Particles(
-            position=position.reshape(shape) * gas.diameter,
-            velocity=state.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
+            position=run.position.reshape(shape) * gas.diameter,
+            velocity=run.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
             box_side=scene.side * gas.diameter,
         )
         return CoolingCurve(
@@ -316,22 +346,8 @@ class HardSpheres(eqx.Module):
             **errors,
             replicas=CoolingCurve(times=times, **each),
             particles=particles,
-            status=fault,
+            status=run.status,
         )
-
-
-@jax.custom_jvp
-def _constant(x: Array) -> Array:
-    return x
-
-
-@_constant.defjvp
-def _no_tangent(primals, tangents):
-    # What comes out of differentiating each impact grows e^2 to e^5 an impact: better none.
-    raise NotImplementedError(
-        "HardSpheres has no derivatives with respect to the gas or the times yet; use "
-        "jaxgran.KineticTheory for them, or finite differences over several replicas"
-    )
 
 
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Scene:
@@ -348,15 +364,17 @@ def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Sc
 
 @partial(jax.jit, static_argnames="replicas")
 def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
+    """The records of a state, with their derivatives if tangents are followed."""
+
     def centred(x):
         boxes = x.reshape(replicas, -1, x.shape[-1])
         return boxes - jnp.mean(boxes, axis=1, keepdims=True)
 
-    num_particles = len(state.position) // replicas
+    num_particles, d = len(state.position) // replicas, state.position.shape[-1]
     velocity = centred(state.velocity)
     travelled = centred(state.position - state.origin + scene.side * state.image)
     first = centred(state.first_velocity)
-    return {
+    records = {
         "temperature": observables.temperature(velocity),
         "sonine": observables.sonine(velocity),
         "displacement": observables.mean_square_displacement(travelled),
@@ -365,3 +383,18 @@ def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
         "collisions": 2 / num_particles * state.impacts,
         "regularised": 2 / num_particles * state.regularised,
     }
+    along = state.tangents
+    if along is None:
+        return records
+    T, C = records["temperature"], records["velocity_correlation"]
+    cooling = along.rates.cooling(events.cooling_trend(scene.law, T, d))
+    meeting, c = along.rates.collision(T), along.log_temperature
+    # At a fixed place in the sequence of collisions the paths are the same.
+    kept = {"temperature": c * T[None], "velocity_correlation": 0.5 * c * C[None]}
+    rates = {
+        "temperature": -cooling * T,
+        "displacement": 2 * jnp.mean(jnp.sum(travelled * velocity, -1), axis=1),
+        "velocity_correlation": -2 / d * meeting * C,
+        "collisions": meeting,
+    }
+    return tangents.with_tangents(records, kept, rates, along.clock)

@@ -119,7 +119,7 @@ class SoftSpheres(eqx.Module):
         )
         run = partial(self._run, dimension=gas.dimension, clipped=law.clipped)
         if self.projection is not None:
-            run = tangents.differentiable(run)
+            run = tangents.differentiable(run, lambda s: (s.alpha, s.dissipative_constant))
         return self._curve(gas, times, inputs.scene, run(inputs))
 
     def _reduced_start(self, gas: Gas) -> tuple[Array, Array] | None:
@@ -400,7 +400,7 @@ def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
     if along is None:
         return records
     T, C, U = (records[n] for n in ("temperature", "velocity_correlation", "elastic_energy"))
-    cooling, meeting = along.rates.cooling(T), along.rates.collision(T)
+    cooling, meeting = along.rates.cooling(along.trend(T)), along.rates.collision(T)
     c, clock = tangents.projected(along, state.velocity, state.time)
     stiffer = (along.alpha / scene.alpha)[:, None]
     # At a fixed place in the sequence of collisions the paths are the same; contacts are not.
@@ -413,8 +413,4 @@ def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
         "elastic_energy": -1.4 * cooling * U,
         "collisions": meeting,
     }
-    for name in list(records):
-        rate = rates.get(name, jnp.zeros_like(T))
-        records[f"{name}.rate"] = rate
-        records[f"{name}.along"] = kept.get(name, 0.0) - rate[None] * clock
-    return records
+    return tangents.with_tangents(records, kept, rates, clock)
