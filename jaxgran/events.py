@@ -253,7 +253,7 @@ class _Work(NamedTuple):
     fastest: Array  # square of the speed, at most
     pending: Array
     num_rounds: Array
-    gains: Float[Array, "changes rows"] | None  # of energy, see `ImpactTangents`
+    gains: Float[Array, "changes rows"]  # of energy, see `ImpactTangents`; if none, no rows
 
 
 def _impacts(
@@ -325,9 +325,8 @@ def _impacts(
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
     count, zeros = jnp.zeros(num_slots, jnp.int32), jnp.zeros(num_slots, slots.x.dtype)
-    gains = None
-    if along is not None:
-        gains = jnp.zeros((len(along.log_temperature) + 1, num_rows), zeros.dtype)
+    size = (0, 0) if along is None else (len(along.log_temperature) + 1, num_rows)
+    gains = jnp.zeros(size, zeros.dtype)
     work = _Work(slots, zeros, count, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains)
     return jax.lax.while_loop(going, one_round, work)
 

@@ -298,9 +298,10 @@ def differentiable(
         numbers, structure = jax.tree.flatten(material(scene))
         changes = structure.flatten_up_to(material(change.scene))
         followed = [given(tangent) for tangent in changes]
-        along = [jnp.ravel(x) for x, yes in zip(changes, followed, strict=True) if yes]
-        size = jnp.concatenate([jnp.zeros(0, dtype), *along])
-        rows = iter(jnp.split(jnp.eye(len(size), dtype=dtype), _ends(along), axis=1))
+        parts = [jnp.ravel(x) for x, yes in zip(changes, followed, strict=True) if yes]
+        size = jnp.concatenate([jnp.zeros(0, dtype), *parts])
+        ends = list(accumulate(len(part) for part in parts))[:-1]
+        rows = iter(jnp.split(jnp.eye(len(size), dtype=dtype), ends, axis=1))
         directions = [
             next(rows).reshape(-1, *x.shape) if yes else jnp.zeros((len(size), *x.shape), dtype)
             for x, yes in zip(numbers, followed, strict=True)
@@ -328,11 +329,6 @@ def differentiable(
         )
 
     return outputs
-
-
-def _ends(parts: list[Array]) -> list[int]:
-    """Where to split what these were joined to."""
-    return list(accumulate(len(part) for part in parts))[:-1]
 
 
 def _is_zero(leaf) -> bool:

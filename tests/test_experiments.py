@@ -94,6 +94,15 @@ def test_stochastic_benchmark_runs(tmp_path):
     assert row["collisions_per_s"] > 0 and 0.05 < row["temperature_ratio"] < 0.9
 
 
+def test_hard_sphere_benchmark_runs(tmp_path):
+    arguments = "--smoke", "--dimensions", 3, "--out", "figures.json"
+    done = run("benchmark_hard_spheres.py", *arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    # Four collisions a sphere at e = 0.9: Haff's law says 0.79.
+    assert row["collisions_per_s"] > 0 and 0.7 < row["temperature_ratio"] < 0.9
+
+
 def test_comparison_with_lammps_runs(tmp_path):
     done = run("compare_lammps.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

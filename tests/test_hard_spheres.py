@@ -312,18 +312,6 @@ def test_refuses_what_it_cannot_do():
         jaxgran.cool(gas, [1e-3], model=quiet(2, start=apart))
 
 
-def test_a_derivative_is_refused_rather_than_wrong():
-    gas = hard_gas(0.8, 0.1)
-    model = quiet(40).sized_for(gas)
-
-    def temperature(eps):
-        return jaxgran.cool(gas.replace(coefficient=eps), [1.0], model=model).temperature[0]
-
-    for derivative in (jax.grad, jax.jacfwd, lambda f: jax.grad(jax.jit(f))):
-        with pytest.raises(NotImplementedError, match="no derivatives"):
-            derivative(temperature)(jnp.asarray(0.8))
-
-
 def test_scene_is_in_reduced_units(beads):
     gas = beads(packing_fraction=0.1)
     scene = reduced_scene(gas, 100)

@@ -91,7 +91,8 @@ def test_fit_finds_what_made_the_curve():
     # Temperature too, which makes this the program of the test before.
     free = "dissipative_constant", "temperature"
     model = dilute_model(gas, key=jax.random.key(3))
-    result = jaxgran.fit(gas, curve, model=model, free=free, max_steps=4)
+    wrong = gas.replace(dissipative_constant=1.3 * gas.value("dissipative_constant"))
+    result = jaxgran.fit(gas, curve, model=model, free=free, start=wrong, max_steps=4)
     for name, slack in (("dissipative_constant", 0.02), ("temperature", 0.0)):
         estimate, error = result.value(name)
         true = float(gas.value(name))
