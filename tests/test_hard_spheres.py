@@ -110,13 +110,13 @@ def closest(particles) -> float:
 def test_spheres_stay_apart_and_the_ledger_closes(dimension, packing_fraction, eps):
     gas = hard_gas(eps, packing_fraction, dimension)
     start = None
-    for _ in range(3):
+    for _ in range(2):
         times = np.array([1.0, 5.0]) * float(gas.mean_free_time)
-        curve = jaxgran.cool(gas, times, model=quiet(300, replicas=2, start=start))
+        curve = jaxgran.cool(gas, times, model=quiet(100, replicas=2, start=start))
         assert closest(curve.particles) > 1 - 1e-9
         before = 1.0 if start is None else np.mean(np.asarray(start.velocity) ** 2)
         total = dimension / 2 * curve.temperature + curve.dissipated_energy
-        # Some thousand impacts, each with a round-off of 1e-16 of the energy.
+        # Some hundred impacts, each with a round-off of 1e-16 of the energy.
         np.testing.assert_allclose(total, dimension / 2 * before, rtol=1e-12)
         momentum = np.mean(curve.particles.velocity, axis=1)
         np.testing.assert_allclose(momentum, 0.0, atol=1e-13)
@@ -132,9 +132,9 @@ def measured_rate(gas, num_particles, replicas, mean_free_times):
 
 @pytest.mark.parametrize("dimension, packing_fraction", [(2, 0.3), (3, 0.2)])
 def test_impacts_come_as_often_as_enskog_says(dimension, packing_fraction):
-    # 40 000 impacts scatter by 0.5 % at most: they are less random than independent ones.
-    rate = measured_rate(hard_gas(1.0, packing_fraction, dimension), 1000, 1, 80)
-    assert rate == pytest.approx(1.0, abs=0.012)
+    # 12 500 impacts scatter by 0.9 % at most: they are less random than independent ones.
+    rate = measured_rate(hard_gas(1.0, packing_fraction, dimension), 500, 2, 25)
+    assert rate == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.slow
