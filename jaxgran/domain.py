@@ -1,5 +1,6 @@
 """The allowed range of a number or of times: how it is checked, and freed for a fit."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -74,7 +75,7 @@ FRACTION = Domain(low=0.0, high=1.0, low_allowed=True, high_allowed=True)
 ANY = Domain()
 
 
-def checked_times(times: ArrayLike) -> Float[Array, "times"]:
+def checked_times(times: ArrayLike | Sequence[float]) -> Float[Array, "times"]:
     """Times as an array; ValueError unless they increase from t >= 0. Traced ones pass unseen."""
     if not isinstance(times, Tracer):
         numbers = np.asarray(times, dtype=float)
