@@ -205,6 +205,7 @@ def _course(gas: Gas, end: jax.Array) -> dict[str, jax.Array]:
     grid = jnp.linspace(0, jnp.log1p(end / gas.mean_free_time), 65)
     t = jnp.expm1(grid) * gas.mean_free_time
     curve = KineticTheory().cool(gas, t)
+    assert curve.sonine is not None and curve.collisions is not None
 
     def scales(temperature):
         now = gas.replace(temperature=temperature)

@@ -180,7 +180,7 @@ def test_cool_chooses(beads):
 def test_cool_chooses_particles():
     gas = hard_gas(0.05, 0.01)
     times = over(gas, 10)
-    chosen = jaxgran.cool(gas, times, model="auto", tolerance=0.018)
+    chosen = jaxgran.cool(gas, times, model="auto", tolerance=0.013)
     dsmc = jaxgran.cool(gas, times, model=jaxgran.DSMC(4000, progress=False))
     np.testing.assert_array_equal(chosen.temperature, dsmc.temperature)
 
@@ -198,7 +198,7 @@ def test_bad_requests_are_refused(beads):
         jaxgran.choose_model("gas", [1.0])
     with pytest.raises(ValueError, match='go with model="auto"'):
         jaxgran.cool(gas, [1.0], tolerance=0.1)
-    with pytest.raises(ValueError, match='must be a model or "auto", got 'best''):
+    with pytest.raises(ValueError, match='must be a model or "auto"'):
         jaxgran.cool(gas, [1.0], model="best")
     with pytest.raises(ValueError, match="call choose_model outside"):
         jax.jit(lambda g: jaxgran.cool(g, [1.0], model="auto").temperature)(gas)
