@@ -6,7 +6,8 @@
 One run of soft spheres from particles already melted, and one of stochastic simulation: plain, with
 a forward tangent in A, in reverse mode in A, and with the Jacobian in A and Y. The function is ln T
 at the end. All in one process, turn by turn; medians of repeats, compilation apart (of each way,
-what those above it have not compiled yet). Then by how much reverse mode through soft spheres
+what those above it have not compiled yet). The ratio of CPU seconds is told too: it is the one to
+believe where others use the same cores. Then by how much reverse mode through soft spheres
 raises the peak memory of a process that has already compiled it, for longer and longer runs, beside
 what it would take to store one state a block (on Linux).
 """
@@ -14,7 +15,6 @@ what it would take to store one state a block (on Linux).
 import argparse
 import json
 import platform
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -60,7 +60,8 @@ def main() -> None:
     if options.smoke:
         fractions, repeats, blocks, soft, stochastic = (0.1,), 1, (4,), 100, 1000
     print(f"{jax.devices()[0].device_kind}, float64; a run is {FREE_TIMES:g} mean free times")
-    print(f"{'':42}{'compile s':>10}{'run s':>8}{'over plain':>12}{'at most':>9}")
+    head = f"{'':42}{'compile s':>10}{'run s':>8}{'CPU s':>8}"
+    print(f"{head}{'over plain':>12}{'of CPU':>8}{'at most':>9}")
     rows = []
     for fraction in fractions:
         gas = scene(fraction)
@@ -136,33 +137,39 @@ def measure(title: str, gas: jaxgran.Gas, model, repeats: int, compiled: bool) -
     jax.clear_caches()
     first, seconds = {}, {name: [] for name in ways}
     for name, way in ways.items():
-        first[name] = timed(way, at)
+        first[name], _ = timed(way, at)
     for _ in range(repeats):
         for name, way in ways.items():
             seconds[name].append(timed(way, at))
-    median = {name: statistics.median(took) for name, took in seconds.items()}
+    median = {name: np.median(took, axis=0) for name, took in seconds.items()}
     print(title)
     row = {"title": title, "ways": {}}
-    for name, run in median.items():
-        ratio = run / median["plain"]
+    for name, (run, cpu) in median.items():
+        ratios = median[name] / median["plain"]
         row["ways"][name] = {
-            "compile_s": first[name] - run,
-            "run_s": run,
-            "ratio": ratio,
+            "compile_s": float(first[name] - run),
+            "run_s": float(run),
+            "cpu_s": float(cpu),
+            "ratio": float(ratios[0]),
+            "cpu_ratio": float(ratios[1]),
             "all_s": seconds[name],
         }
-        limit = f"{LIMITS[name]:9g}" if name in LIMITS else ""
-        print(f"    {name:38}{first[name] - run:10.1f}{run:8.2f}{ratio:12.2f}{limit}", flush=True)
+        print(
+            f"    {name:38}{first[name] - run:10.1f}{run:8.2f}{cpu:8.2f}{ratios[0]:12.2f}"
+            f"{ratios[1]:8.2f}" + (f"{LIMITS[name]:9g}" if name in LIMITS else ""),
+            flush=True,
+        )
     _, forward = ways["forward, A"](*at)
     _, reverse = ways["reverse, A"](*at)
     row["reverse_over_forward"] = float(reverse / forward)
     return row
 
 
-def timed(way, at) -> float:
-    begin = time.perf_counter()
+def timed(way, at) -> tuple[float, float]:
+    """Seconds, and those of all cores in use."""
+    begin, cpu = time.perf_counter(), time.process_time()
     jax.block_until_ready(way(*at))
-    return time.perf_counter() - begin
+    return time.perf_counter() - begin, time.process_time() - cpu
 
 
 def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict | None:

@@ -97,9 +97,9 @@ class Compilation:
 
     seconds = 0.0
 
-    def hear(self, event: str, duration: float, **_) -> None:
+    def hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event == "/jax/core/compile/backend_compile_duration":
-            self.seconds += duration
+            self.seconds += duration_secs
 
 
 COMPILATION = Compilation()
