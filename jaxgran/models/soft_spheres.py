@@ -246,8 +246,12 @@ class SoftSpheres(eqx.Module):
             along = tangents.at_start(*directions, velocity, replicas, self.projection, damping)
             return state._replace(tangents=along)
 
-        run = self._traced if traced else self._driven
-        state, records, fault = run(inputs, plan, state, begun)
+        if traced:
+            state, records, fault = self._traced(inputs, plan, state, begun)
+        else:
+            # Under jax.grad every call of a compiled function would be traced again.
+            with jax.core.eval_context():
+                state, records, fault = self._driven(inputs, plan, state, begun)
         position = neighbours.wrap(scene.side, state.position)
         return Outputs(position, state.velocity, records, fault)
 
