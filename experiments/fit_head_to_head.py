@@ -15,8 +15,9 @@ values, and their seconds without compilation. A simulation with tangents counts
 
 - stochastic: DSMC of the dense gas, and a curve made by the same with other random numbers. Its
   noise is far below 2 %.
-- soft-spheres: the curve measured in LAMMPS, until 24 mean free times. Its own noise and that of
-  soft spheres so few are about as large as 2 %, which is said beside the table.
+- soft-spheres: the curve measured in LAMMPS, until 24 mean free times. By the scatter of 24 boxes
+  of 1000, one simulation's noise leaves A open by 3 % and the LAMMPS curve's own by nearly 2 %, so
+  that whether one search with fixed random numbers ends within 2 % is partly luck.
 """
 
 import argparse
