@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import Tracer, eval_context
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxgran import blocks, initial, kinetics, neighbours, observables, status, tangents
@@ -250,7 +250,7 @@ class SoftSpheres(eqx.Module):
             state, records, fault = self._traced(inputs, plan, state, begun)
         else:
             # Under jax.grad every call of a compiled function would be traced again.
-            with jax.core.eval_context():
+            with eval_context():
                 state, records, fault = self._driven(inputs, plan, state, begun)
         position = neighbours.wrap(scene.side, state.position)
         return Outputs(position, state.velocity, records, fault)
