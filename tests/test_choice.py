@@ -81,6 +81,7 @@ def test_estimates_bound_what_was_measured(beads, scene):
     assert estimate["KineticTheory"] < 2.5 * (deviation + error)
 
 
+@pytest.mark.slow
 def test_estimates_bound_what_is_measured_now(beads):
     gas = stiff(beads(0.15, packing_fraction=0.2), 0.3)
     times = over(gas, 8)

@@ -113,6 +113,7 @@ def test_soft_sphere_accuracy_runs(tmp_path):
     assert record["trajectory"]["finest_to_lammps"] < 1e-3  # 3e-4 at 200 steps
 
 
+@pytest.mark.slow
 def test_benchmark_of_derivatives_runs(tmp_path):
     done = run("benchmark_derivatives.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
