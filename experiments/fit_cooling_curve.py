@@ -1,15 +1,17 @@
 """Which dissipative constant A made this gas cool as it did?
 
     python experiments/fit_cooling_curve.py [CURVE.csv] [--free A T0] [--set Y=6e7] [--out DIR]
-        [--model soft-spheres [--particles N] [--replicas R]]
+        [--model soft-spheres [--particles N] [--replicas R]] [--model auto [--tolerance 0.02]]
 
 CURVE.csv holds header lines `# key: value` (N, eta, diameter, density, Y, nu, T0; SI units), a line
 of column names and rows: t,T and, where measured, T_err, msd, msd_err. A header line A is never
-used in the fit, only compared with at the end. Prints a table and one JSON line, and writes a
-picture and a JSON file.
+used in the fit, only compared with at the end. --model auto takes the cheapest model whose error,
+estimated for the gas that kinetic theory fits, is under the tolerance, and says why. Prints a table
+and one JSON line, and writes a picture and a JSON file.
 """
 
 import argparse
+import dataclasses
 import json
 import platform
 import sys
@@ -24,12 +26,13 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxgran  # noqa: E402
+from jaxgran.choice import words  # noqa: E402
 from jaxgran.curve import GAS_KEYS, header_number, num_particles  # noqa: E402
 from jaxgran.plotting import plot_fit  # noqa: E402
 
 HERE = Path(__file__).parent
 DEFAULT_CURVE = HERE / "data" / "lammps_cooling_dilute.csv"
-MODELS = ("kinetic-theory", "soft-spheres")
+MODELS = ("kinetic-theory", "soft-spheres", "auto")
 PARAMETERS = {
     "A": ("dissipative_constant", "s"),
     "T0": ("temperature", "m^2/s^2"),
@@ -58,6 +61,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument("curve", nargs="?", type=Path, default=DEFAULT_CURVE)
     parser.add_argument("--model", choices=MODELS, default="kinetic-theory")
     parser.add_argument(
+        "--tolerance", type=float, default=0.02, help="of T, for --model auto (default: 0.02)"
+    )
+    parser.add_argument(
         "--particles", type=int, help="of a particle model, in each replica (default: the file's N)"
     )
     parser.add_argument("--replicas", type=int, default=3, help="of a particle model (default: 3)")
@@ -84,8 +90,9 @@ def run(options: argparse.Namespace) -> None:
     n = num_particles(header)
     replicas = int(header_number(header, "replicas")) if "replicas" in header else 1
     picture, record = outputs(options)
-    model = model_of(options, n)
     free = tuple(PARAMETERS[key][0] for key in options.free)
+    model, reasons = model_of(options, gas, curve, free, n)
+    model_name = words(type(model).__name__).lower().replace(" ", "-")
     imported = time.perf_counter() - started
 
     def fit():
@@ -99,7 +106,7 @@ def run(options: argparse.Namespace) -> None:
         warnings.simplefilter("ignore", UserWarning)  # said again, in words, by the diagnosis
         result, first_seconds = fit()
         fit_seconds = first_seconds
-        if options.model == "kinetic-theory":  # the second time without compilation
+        if isinstance(model, jaxgran.KineticTheory):  # the second time without compilation
             result, fit_seconds = fit()
     diagnosis = jaxgran.diagnose(result, curve, n)
 
@@ -128,7 +135,10 @@ def run(options: argparse.Namespace) -> None:
         f"beta_T0 = {float(result.gas.thermal_beta):.3g} (fitted)"
     )
     steps = "simulations" if result.simulation_error is not None else "steps of least squares"
-    print(f"model    {options.model}, {int(result.iterations)} {steps}\n")
+    print(f"model    {model_name}, {int(result.iterations)} {steps}")
+    if reasons:
+        print("chosen", "\n".join(f"         - {reason}" for reason in reasons).lstrip())
+    print()
     print(f"{'':10}{'estimate':>13} {'+-':>10} {'statistical':>12} {'model':>10}  header's")
     for row in rows:
         print(f"{row['parameter']:4}{row['unit']:6}{row['estimate']:13.5g} ", end="")
@@ -150,7 +160,7 @@ def run(options: argparse.Namespace) -> None:
     summary = {
         **{row["parameter"]: row["estimate"] for row in rows},
         **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},
-        "model": options.model,
+        "model": model_name,
         "reduced_chi2": round(float(result.reduced_chi2), 4),
         "converged": bool(result.converged),
         "explains": diagnosis.explains,
@@ -160,6 +170,7 @@ def run(options: argparse.Namespace) -> None:
     }
     details = {
         "curve": options.curve.name,
+        "chosen": reasons,
         "header": header,
         "parameters": rows,
         "covariance": np.asarray(result.covariance).tolist(),
@@ -174,13 +185,29 @@ def run(options: argparse.Namespace) -> None:
     print(json.dumps(summary))
 
 
-def model_of(options: argparse.Namespace, num_particles: int | None):
+def model_of(options: argparse.Namespace, gas, curve, free, num_particles: int | None):
+    """The model, and why it was chosen if it was."""
     if options.model == "kinetic-theory":
-        return jaxgran.KineticTheory()
-    size = options.particles or num_particles
-    if size is None:
-        raise ValueError(f"{options.curve} does not say N: give --particles")
-    return jaxgran.SoftSpheres(size, replicas=options.replicas, key=jax.random.key(options.key))
+        return jaxgran.KineticTheory(), ()
+    key, size = jax.random.key(options.key), options.particles or num_particles
+    if options.model == "soft-spheres":
+        if size is None:
+            raise ValueError(f"{options.curve} does not say N: give --particles")
+        return jaxgran.SoftSpheres(size, replicas=options.replicas, key=key), ()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # said of the last fit by the diagnosis
+        first = jaxgran.fit(gas, curve, free=free)
+    choice = jaxgran.choose_model(
+        first.gas,
+        curve.times,
+        options.tolerance,
+        size,
+        replicas=options.replicas,
+        derivatives=True,
+    )
+    if isinstance(choice.model, jaxgran.KineticTheory):
+        return choice.model, choice.reasons
+    return dataclasses.replace(choice.model, key=key), choice.reasons
 
 
 def settings(pairs: list[str]) -> dict[str, str]:

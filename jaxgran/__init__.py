@@ -1,5 +1,6 @@
 """jaxgran: differentiable granular gases in JAX."""
 
+from jaxgran.choice import Choice, choose_model
 from jaxgran.contact import Impact, contact_force, elastic_constant, impact
 from jaxgran.cooling import cool
 from jaxgran.curve import CoolingCurve, Particles, read_curve, read_gas, write_curve
@@ -22,6 +23,7 @@ from jaxgran.status import explain as explain_status
 
 __all__ = [
     "DSMC",
+    "Choice",
     "ConstantRestitution",
     "CoolingCurve",
     "Diagnosis",
@@ -36,6 +38,7 @@ __all__ = [
     "RestitutionSeries",
     "SoftSpheres",
     "Viscoelastic",
+    "choose_model",
     "contact_force",
     "cool",
     "diagnose",

@@ -1,46 +1,60 @@
 """The one verb: cool a gas."""
 
+import warnings
 from collections.abc import Sequence
+from typing import Literal
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
+from jaxgran.choice import Model, choose_model
 from jaxgran.curve import CoolingCurve
+from jaxgran.domain import checked_times
 from jaxgran.gas import Gas
-from jaxgran.models.dsmc import DSMC
-from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 
-Model = KineticTheory | DSMC | HardSpheres | SoftSpheres
-
 
 def cool(
-    gas: Gas, times: ArrayLike | Sequence[float], *, model: Model | None = None
+    gas: Gas,
+    times: ArrayLike | Sequence[float],
+    *,
+    model: Model | Literal["auto"] | None = None,
+    tolerance: float | None = None,
+    num_particles: int | None = None,
 ) -> CoolingCurve:
     """How the gas cools and spreads from its initial temperature at t = 0.
 
     Args:
         gas: the scene; its floats may be traced, differentiated and batched with `jax.vmap`.
         times: t, s, increasing and >= 0, shape (times,); need not start at 0.
-        model: how closely to look; `jaxgran.KineticTheory()` by default.
+        model: how closely to look; `jaxgran.KineticTheory()` by default. "auto" takes the cheapest
+            whose estimated error is small enough; `jaxgran.choose_model` tells which, and why.
+        tolerance: for "auto" only, relative error of T allowed; 0.02 by default.
+        num_particles: for "auto" only, N of the gas, if known.
 
     Returns:
         `CoolingCurve` at those times.
 
     Raises:
-        ValueError: for times that are negative, unsorted, not finite or not a list, or a law that
-            heats the gas.
+        ValueError: for times that are negative, unsorted, not finite or not a list, a law that
+            heats the gas, or options of "auto" with another model.
         RuntimeError: if the solver needs more steps than the model allows.
     """
     if not isinstance(gas, Gas):
         raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
-    times = _checked_times(times)
+    times = checked_times(times)
     model = KineticTheory() if model is None else model
+    if isinstance(model, str) and model != "auto":
+        raise ValueError(f'model must be a model or "auto", got {model!r}; try KineticTheory()')
+    if model != "auto" and not (tolerance is None and num_particles is None):
+        raise ValueError(
+            'tolerance and num_particles go with model="auto"; give them to the model instead, as '
+            "in SoftSpheres(num_particles), or leave them out"
+        )
     # Contacts resolved in time cannot heat a gas; a law of restitution, or averages of it, can.
     if not isinstance(model, SoftSpheres):
         theory = model if isinstance(model, KineticTheory) else KineticTheory()
@@ -50,27 +64,15 @@ def cool(
                 "the law of restitution makes this gas heat up: averaged over its impacts, eps is "
                 "above 1 (a truncated series beyond its range); lower T_0 or A, or use another law"
             )
+    if isinstance(model, str):
+        tolerance = 0.02 if tolerance is None else tolerance
+        choice = choose_model(gas, times, tolerance, num_particles)
+        if choice.error > tolerance:
+            warnings.warn(choice.reasons[0], stacklevel=2)
+        model = choice.model
     return model.cool(gas, times)
 
 
 @eqx.filter_jit
 def _first_cooling_rate(gas: Gas, model: KineticTheory) -> jax.Array:
     return model.cooling_rate(gas)
-
-
-def _checked_times(times) -> jax.Array:
-    if not isinstance(times, Tracer):
-        numbers = np.asarray(times, dtype=float)
-        if numbers.ndim != 1 or numbers.size == 0:
-            raise ValueError(f"times must be a list of numbers, got shape {numbers.shape}")
-        if not np.all(np.isfinite(numbers)) or numbers[0] < 0:
-            raise ValueError(
-                f"times must be finite and not negative, got {numbers.min():g} at the least; "
-                "the gas starts at t = 0"
-            )
-        if np.any(np.diff(numbers) <= 0):
-            i = int(np.argmax(np.diff(numbers) <= 0)) + 1
-            raise ValueError(
-                f"times must increase, got {numbers[i]:g} after {numbers[i - 1]:g}; sort them"
-            )
-    return jnp.asarray(times, dtype=jnp.result_type(float))

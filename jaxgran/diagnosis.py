@@ -1,11 +1,11 @@
 """Whether a fit is to be believed, in words."""
 
-import re
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxgran.choice import words
 from jaxgran.curve import CoolingCurve
 from jaxgran.fitting import SIGNIFICANCE, Fit
 from jaxgran.gas import Gas
@@ -139,11 +139,6 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         elif space:
             verdict += " This scene needs particles with positions."
     return Diagnosis(explains, verdict, tuple(reasons), correlation, float(factor))
-
-
-def words(model: str) -> str:
-    """The name of a model as it begins a sentence: "SoftSpheres" as "Soft spheres"."""
-    return re.sub(r"(?<=[a-z])([A-Z])", lambda m: f" {m[1].lower()}", model)
 
 
 def _neighbour_correlation(residuals: np.ndarray) -> float:

@@ -1,5 +1,6 @@
-"""The allowed range of a number: how it is checked, and how it is freed for a fit."""
+"""The allowed range of a number or of times: how it is checked, and freed for a fit."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -72,3 +73,22 @@ POSITIVE = Domain(low=0.0)
 NOT_NEGATIVE = Domain(low=0.0, low_allowed=True)
 FRACTION = Domain(low=0.0, high=1.0, low_allowed=True, high_allowed=True)
 ANY = Domain()
+
+
+def checked_times(times: ArrayLike | Sequence[float]) -> Float[Array, "times"]:
+    """Times as an array; ValueError unless they increase from t >= 0. Traced ones pass unseen."""
+    if not isinstance(times, Tracer):
+        numbers = np.asarray(times, dtype=float)
+        if numbers.ndim != 1 or numbers.size == 0:
+            raise ValueError(f"times must be a list of numbers, got shape {numbers.shape}")
+        if not np.all(np.isfinite(numbers)) or numbers[0] < 0:
+            raise ValueError(
+                f"times must be finite and not negative, got {numbers.min():g} at the least; "
+                "the gas starts at t = 0"
+            )
+        if np.any(np.diff(numbers) <= 0):
+            i = int(np.argmax(np.diff(numbers) <= 0)) + 1
+            raise ValueError(
+                f"times must increase, got {numbers[i]:g} after {numbers[i - 1]:g}; sort them"
+            )
+    return jnp.asarray(times, dtype=jnp.result_type(float))

@@ -158,6 +158,11 @@ def fit(
             f"{curve.times.shape[-1]} points cannot fix {len(free)} parameters; free fewer of them"
         )
     model = KineticTheory() if model is None else model
+    if isinstance(model, str):
+        raise ValueError(
+            f"model must be a model, got {model!r}; choose_model(fit(gas, curve).gas, curve.times, "
+            "num_particles=N, replicas=3, derivatives=True).model is the one this curve needs"
+        )
     if isinstance(model, KineticTheory):
         starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])
         max_steps = max_steps or 100

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxgran.choice import words
 from jaxgran.curve import CoolingCurve
-from jaxgran.diagnosis import words
 from jaxgran.fitting import Fit
 
 try:

@@ -120,3 +120,24 @@ def test_soft_sphere_accuracy_runs(tmp_path):
         assert 1.8 < impact["order"]["bias"] < 2.4  # second order; 2.17 and 2.09 at 25 and 50 steps
     assert record["ledger"]["rows"][1]["worst"] < 2e-4  # 5e-5 at 40 steps
     assert record["trajectory"]["finest_to_lammps"] < 1e-3  # 3e-4 at 200 steps
+
+
+@pytest.mark.slow
+def test_benchmark_of_derivatives_runs(tmp_path):
+    done = run("benchmark_derivatives.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    assert len(rows) == 2  # soft spheres and stochastic simulation
+    for row in rows:  # the same linear rule, read in both directions
+        assert row["reverse_over_forward"] == pytest.approx(1.0, abs=1e-9)
+        assert all(way["run_s"] > 0 for way in row["ways"].values())
+
+
+def test_fits_head_to_head_run(tmp_path):
+    done = run("fit_head_to_head.py", "--smoke", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "here" / "fit_head_to_head.json").read_text())["rows"]
+    for row in rows:
+        assert len(row["guesses"]) == row["all_simulations"] > 0
+        if row["search"] == "jaxgran.fit":  # 1000 spheres leave A open by some per cent
+            assert abs(row["last_error"][0]) < 0.15

@@ -15,6 +15,7 @@ FLOORS = [
     ["kinetics", "curve", "collisions", "events"],
     ["search"],
     ["models.kinetic_theory", "models.dsmc", "models.hard_spheres", "models.soft_spheres"],
+    ["choice"],
     ["cooling"],
     ["fitting"],
     ["diagnosis"],

@@ -264,6 +264,7 @@ def test_float32(beads):
     np.testing.assert_allclose(np.mean(single, 0), np.mean(double, 0), rtol=0.15)
 
 
+@pytest.mark.slow
 def test_four_decades_of_cooling(beads):
     gas = soft_beads(beads, 0.02, 0.5, packing_fraction=0.05)
     times = np.geomspace(1, 3000, 8) * float(gas.mean_free_time)

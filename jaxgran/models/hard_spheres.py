@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import Tracer, eval_context
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxgran import events, initial, neighbours, observables, status, tangents
@@ -246,8 +246,12 @@ class HardSpheres(eqx.Module):
             along = ImpactTangents.at_start(directions, replicas, velocity.dtype)
             return state._replace(tangents=along)
 
-        run = self._traced if traced else self._driven
-        state, records, fault = run(inputs, plan, state, begun)
+        if traced:
+            state, records, fault = self._traced(inputs, plan, state, begun)
+        else:
+            # Under jax.grad every call of a compiled function would be traced again.
+            with eval_context():
+                state, records, fault = self._driven(inputs, plan, state, begun)
         return Outputs(neighbours.wrap(scene.side, state.position), state.velocity, records, fault)
 
     def _driven(self, inputs: Inputs, plan: Plan, state: State, begun):

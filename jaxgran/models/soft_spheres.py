@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import Tracer, eval_context
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxgran import blocks, initial, kinetics, neighbours, observables, status, tangents
@@ -246,8 +246,12 @@ class SoftSpheres(eqx.Module):
             along = tangents.at_start(*directions, velocity, replicas, self.projection, damping)
             return state._replace(tangents=along)
 
-        run = self._traced if traced else self._driven
-        state, records, fault = run(inputs, plan, state, begun)
+        if traced:
+            state, records, fault = self._traced(inputs, plan, state, begun)
+        else:
+            # Under jax.grad every call of a compiled function would be traced again.
+            with eval_context():
+                state, records, fault = self._driven(inputs, plan, state, begun)
         position = neighbours.wrap(scene.side, state.position)
         return Outputs(position, state.velocity, records, fault)
 

@@ -1,0 +1,228 @@
+"""What does a derivative through particles cost, in time and in memory?
+
+    python experiments/benchmark_derivatives.py [--fractions .01 .1] [--repeats 5] [--smoke]
+        [--out FILE]
+
+One run of soft spheres from particles already melted, and one of stochastic simulation: plain, with
+a forward tangent in A, in reverse mode in A, and with the Jacobian in A and Y. The function is ln T
+at the end. All in one process, turn by turn; medians of repeats, compilation apart (of each way,
+what those above it have not compiled yet). The ratio of CPU seconds is told too: it is the one to
+believe where others use the same cores. Then by how much reverse mode through soft spheres
+raises the peak memory of a process that has already compiled it, for longer and longer runs, beside
+what it would take to store one state a block (on Linux).
+"""
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxgran
+from jaxgran.curve import Particles
+
+PACKING = 0.1
+BETA = 0.15
+STEPS_PER_CONTACT = 30
+CONTACT_FRACTIONS = (0.01, 0.1)
+SOFT_SIZE, STOCHASTIC_SIZE = 4096, 100_000
+FREE_TIMES = 3.0  # mean free times at T_0 in a run
+BLOCKS = (1, 10, 100, 1000)
+REPEATS = 5
+STATUS = Path("/proc/self/status")
+LIMITS = {"forward, A": 3.0, "reverse, A": 5.0}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--fractions", nargs="+", type=float, default=CONTACT_FRACTIONS)
+    parser.add_argument("--repeats", type=int, default=REPEATS)
+    parser.add_argument("--smoke", action="store_true", help="a run of seconds")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    parser.add_argument("--memory-worker", nargs=2, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    if options.memory_worker:
+        memory_worker(Path(options.memory_worker[0]), float(options.memory_worker[1]))
+        return
+    fractions, repeats, blocks = options.fractions, options.repeats, BLOCKS
+    soft, stochastic = SOFT_SIZE, STOCHASTIC_SIZE
+    if options.smoke:
+        fractions, repeats, blocks, soft, stochastic = (0.1,), 1, (4,), 100, 1000
+    print(f"{jax.devices()[0].device_kind}, float64; a run is {FREE_TIMES:g} mean free times")
+    head = f"{'':42}{'compile s':>10}{'run s':>8}{'CPU s':>8}"
+    print(f"{head}{'over plain':>12}{'of CPU':>8}{'at most':>9}")
+    rows = []
+    for fraction in fractions:
+        gas = scene(fraction)
+        model = melted(gas, soft)
+        title = f"SoftSpheres, N={soft}, t_c/tau_c={fraction:g}"
+        rows.append(measure(title, gas, model, repeats, compiled=False))
+    gas = scene(fractions[0])
+    model = jaxgran.DSMC(stochastic, progress=False)
+    rows.append(measure(f"DSMC, N={stochastic}", gas, model, repeats, compiled=True))
+    memory = measure_memory(fractions[0], soft, blocks)
+    if options.out:
+        record = {
+            "rows": rows,
+            "memory": memory,
+            "device": jax.devices()[0].device_kind,
+            "python": platform.python_version(),
+            "versions": {name: version(name) for name in ("jaxgran", "jax", "jax-md", "vesin")},
+        }
+        options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+
+
+def scene(fraction: float) -> jaxgran.Gas:
+    """Glass-like beads whose contacts last a given part of the mean free time."""
+    gas = jaxgran.Gas(
+        jaxgran.Viscoelastic(1e7, 0.22, 1e-6),
+        diameter=2e-3,
+        mass=jaxgran.sphere_mass(2e-3, 2500.0),
+        packing_fraction=PACKING,
+        temperature=0.01,
+    )
+    stiffer = (float(gas.contact_fraction) / fraction) ** 2.5
+    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
+    return gas.replace(dissipative_constant=1e-6 * BETA / gas.thermal_beta)
+
+
+def soft_spheres(start: Particles | None, size: int) -> jaxgran.SoftSpheres:
+    return jaxgran.SoftSpheres(
+        size, steps_per_contact=STEPS_PER_CONTACT, start=start, progress=False
+    )
+
+
+def melted(gas: jaxgran.Gas, size: int) -> jaxgran.SoftSpheres:
+    """A model that begins with the last particles of an elastic run."""
+    elastic = gas.replace(dissipative_constant=0.0)
+    end = [0.5 * float(gas.mean_free_time)]
+    return soft_spheres(jaxgran.cool(elastic, end, model=soft_spheres(None, size)).particles, size)
+
+
+def log_temperature(gas: jaxgran.Gas, model, t: float):
+    """ln T at the time t, of A and Y."""
+    times = jnp.asarray([t])
+
+    def function(constant, modulus):
+        changed = gas.replace(dissipative_constant=constant, youngs_modulus=modulus)
+        return jnp.log(jaxgran.cool(changed, times, model=model).temperature[-1])
+
+    return function
+
+
+def measure(title: str, gas: jaxgran.Gas, model, repeats: int, compiled: bool) -> dict:
+    """Seconds of each way. DSMC is compiled as one; soft spheres are driven from the host."""
+    function = log_temperature(gas, model, FREE_TIMES * float(gas.mean_free_time))
+    at = gas.value("dissipative_constant"), gas.value("youngs_modulus")
+    one = jnp.ones(())
+    ways = {
+        "plain": function,
+        "forward, A": lambda a, y: jax.jvp(lambda x: function(x, y), (a,), (one,)),
+        "reverse, A": jax.value_and_grad(function),
+        "forward, A and Y": jax.jacfwd(function, argnums=(0, 1)),
+    }
+    if compiled:
+        ways = {name: jax.jit(way) for name, way in ways.items()}
+    jax.clear_caches()
+    first, seconds = {}, {name: [] for name in ways}
+    for name, way in ways.items():
+        first[name], _ = timed(way, at)
+    for _ in range(repeats):
+        for name, way in ways.items():
+            seconds[name].append(timed(way, at))
+    median = {name: np.median(took, axis=0) for name, took in seconds.items()}
+    print(title)
+    row = {"title": title, "ways": {}}
+    for name, (run, cpu) in median.items():
+        ratios = median[name] / median["plain"]
+        row["ways"][name] = {
+            "compile_s": float(first[name] - run),
+            "run_s": float(run),
+            "cpu_s": float(cpu),
+            "ratio": float(ratios[0]),
+            "cpu_ratio": float(ratios[1]),
+            "all_s": seconds[name],
+        }
+        print(
+            f"    {name:38}{first[name] - run:10.1f}{run:8.2f}{cpu:8.2f}{ratios[0]:12.2f}"
+            f"{ratios[1]:8.2f}" + (f"{LIMITS[name]:9g}" if name in LIMITS else ""),
+            flush=True,
+        )
+    _, forward = ways["forward, A"](*at)
+    _, reverse = ways["reverse, A"](*at)
+    row["reverse_over_forward"] = float(reverse / forward)
+    return row
+
+
+def timed(way, at) -> tuple[float, float]:
+    """Seconds, and those of all cores in use."""
+    begin, cpu = time.perf_counter(), time.process_time()
+    jax.block_until_ready(way(*at))
+    return time.perf_counter() - begin, time.process_time() - cpu
+
+
+def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict | None:
+    """Peak memory of reverse mode. A block of steps is a mean contact long, at this stiffness."""
+    if not STATUS.exists():
+        print("no /proc here: peak memory is not measured")
+        return None
+    gas = scene(fraction)
+    start = melted(gas, size).start
+    assert start is not None
+    state = 2 * np.asarray(start.position).nbytes / 2**20  # positions and velocities, MiB
+    print(f"\nreverse mode, SoftSpheres, N={size}, t_c/tau_c={fraction:g}")
+    print(f"{'blocks':>8}{'before, MiB':>13}{'peak':>8}{'growth':>8}{'a state a block':>17}")
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "start.npz"
+        np.savez(file, fraction=fraction, **start._asdict())
+        for count in blocks:
+            command = [sys.executable, __file__, "--memory-worker", str(file), str(count)]
+            out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+            row = {"blocks": count, **json.loads(out.splitlines()[-1])}
+            before, peak = row["before_MiB"], row["peak_MiB"]
+            print(
+                f"{count:8d}{before:13.0f}{peak:8.0f}{peak - before:+8.0f}{count * state:17.1f}",
+                flush=True,
+            )
+            rows.append(row)
+    return {"num_particles": size, "state_MiB": state, "rows": rows}
+
+
+def memory_worker(file: Path, blocks: float) -> None:
+    stored = dict(np.load(file))
+    gas = scene(float(stored.pop("fraction")))
+    start = Particles(**{name: jnp.asarray(x) for name, x in stored.items()})
+    model = soft_spheres(start, start.position.shape[1])
+    at = gas.value("dissipative_constant"), gas.value("youngs_modulus")
+
+    def reverse(count: float) -> None:
+        function = log_temperature(gas, model, count * float(gas.contact_duration))
+        jax.block_until_ready(jax.grad(function)(*at))
+
+    reverse(2.0)  # compiles
+    Path("/proc/self/clear_refs").write_text("5")  # begins a new peak
+    before = memory("VmRSS")
+    reverse(blocks)
+    print(json.dumps({"before_MiB": before, "peak_MiB": memory("VmHWM")}))
+
+
+def memory(name: str) -> float:
+    """Of this process, MiB. Not by getrusage, which a child inherits from its parent."""
+    (line,) = (x for x in STATUS.read_text().splitlines() if x.startswith(f"{name}:"))
+    return int(line.split()[1]) / 2**10
+
+
+if __name__ == "__main__":
+    main()
