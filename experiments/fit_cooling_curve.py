@@ -198,12 +198,7 @@ def model_of(options: argparse.Namespace, gas, curve, free, num_particles: int |
         warnings.simplefilter("ignore", UserWarning)  # said of the last fit by the diagnosis
         first = jaxgran.fit(gas, curve, free=free)
     choice = jaxgran.choose_model(
-        first.gas,
-        curve.times,
-        options.tolerance,
-        size,
-        replicas=options.replicas,
-        derivatives=True,
+        first.gas, curve.times, options.tolerance, size, replicas=options.replicas
     )
     if isinstance(choice.model, jaxgran.KineticTheory):
         return choice.model, choice.reasons

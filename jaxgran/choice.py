@@ -102,7 +102,6 @@ def choose_model(
     num_particles: int | None = None,
     *,
     replicas: int = 1,
-    derivatives: bool = False,
 ) -> Choice:
     """The cheapest model whose estimated error of T is under a tolerance.
 
@@ -120,7 +119,6 @@ def choose_model(
         num_particles: N of the gas, if known: tells the box, and how many a particle model follows
             (4000 if not). Without it the gas is taken to stay homogeneous.
         replicas: of a particle model.
-        derivatives: whether derivatives are needed, which `HardSpheres` does not have.
 
     Returns:
         `Choice`: the model, reasons in words, estimated errors. If no model is accurate enough,
@@ -167,7 +165,7 @@ def choose_model(
         "HardSpheres": sqrt(hard**2 + noise**2),
         "SoftSpheres": sqrt(INTEGRATION**2 + noise**2),
     }
-    unfit = _unfit(gas, size, derivatives)
+    unfit = _unfit(gas, size)
     errors = {name: min(error, 1.0) for name, error in errors.items() if name not in unfit}
     good = [name for name, error in errors.items() if error <= tolerance]
     name = good[0] if good else min(errors, key=lambda name: errors[name])
@@ -271,11 +269,9 @@ def _flow(gas: Gas, course: dict[str, np.ndarray], num_particles: int) -> np.nda
     return np.minimum(flow, 1.0)
 
 
-def _unfit(gas: Gas, size: int, derivatives: bool) -> dict[str, str]:
+def _unfit(gas: Gas, size: int) -> dict[str, str]:
     """Models that cannot run this scene, and why not."""
     unfit = {}
-    if derivatives:
-        unfit["HardSpheres"] = "Hard spheres have no derivatives yet."
     if not isinstance(gas.law, Viscoelastic):
         unfit["SoftSpheres"] = (
             f"Soft spheres need the Viscoelastic law; this gas has {type(gas.law).__name__}."

@@ -161,7 +161,7 @@ def fit(
     if isinstance(model, str):
         raise ValueError(
             f"model must be a model, got {model!r}; choose_model(fit(gas, curve).gas, curve.times, "
-            "num_particles=N, replicas=3, derivatives=True).model is the one this curve needs"
+            "num_particles=N, replicas=3).model is the one this curve needs"
         )
     if isinstance(model, KineticTheory):
         starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])

@@ -38,7 +38,7 @@ def over(gas, collision_times):
 )
 def test_measured_curves(name, model, fitted):
     gas, curve, a_true, n, replicas = measured(name)
-    options = {"num_particles": n, "replicas": replicas, "derivatives": True}
+    options = {"num_particles": n, "replicas": replicas}
     # Nothing is known at first but the A that kinetic theory fits, 24 % low on the dense curve.
     first = gas.replace(dissipative_constant=fitted * a_true)
     choice = jaxgran.choose_model(first, curve.times, **options)
@@ -123,9 +123,6 @@ def test_each_model_has_its_scene(beads):
     choice = jaxgran.choose_model(*request, num_particles=4000)
     assert isinstance(choice.model, jaxgran.HardSpheres)
     assert "L_c" in " ".join(choice.reasons)
-    choice = jaxgran.choose_model(*request, num_particles=4000, derivatives=True)
-    assert isinstance(choice.model, jaxgran.SoftSpheres)
-    assert "no derivatives" in choice.reasons[-1]
 
     soft = stiff(clustering, 0.2, 0.6)
     choice = jaxgran.choose_model(soft, over(soft, 40), num_particles=4000)
@@ -204,5 +201,5 @@ def test_bad_requests_are_refused(beads):
     with pytest.raises(ValueError, match="call choose_model outside"):
         jax.jit(lambda g: jaxgran.cool(g, [1.0], model="auto").temperature)(gas)
     curve = jaxgran.cool(gas, over(gas, 10))
-    with pytest.raises(ValueError, match="derivatives=True"):
+    with pytest.raises(ValueError, match="replicas=3"):
         jaxgran.fit(gas, curve, model="auto")
