@@ -1,0 +1,49 @@
+"""How experiments take times and keep what they found."""
+
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import jax
+
+PACKAGES = ("jaxgran", "jax", "jax-md", "diffrax", "optimistix", "vesin", "numpy", "scipy")
+
+
+def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
+    """Of compilation (the first call less a later one), and the median of later calls."""
+    took = []
+    for _ in range(repeats + 1):
+        begin = time.perf_counter()
+        jax.block_until_ready(run())
+        took.append(time.perf_counter() - begin)
+    run_time = statistics.median(took[1:])
+    return max(took[0] - run_time, 0.0), run_time
+
+
+def save(path: Path, **figures) -> None:
+    """Writes figures as JSON, with the versions and the device that made them.
+
+    Either the whole file is written or an older one stays as it was.
+    """
+    made_by = {
+        "versions": {name: found for name in PACKAGES if (found := _version(name))},
+        "python": platform.python_version(),
+        "device": jax.devices()[0].device_kind,
+        "cores": os.cpu_count(),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f"{path.name}.part")
+    unfinished.write_text(json.dumps(figures | made_by, indent=2) + "\n", encoding="utf-8")
+    unfinished.replace(path)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
