@@ -14,17 +14,17 @@ what it would take to store one state a block (on Linux).
 
 import argparse
 import json
-import platform
 import subprocess
 import sys
 import tempfile
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from record import save
+from scenes import beads
 
 import jaxgran
 from jaxgran.curve import Particles
@@ -64,37 +64,20 @@ def main() -> None:
     print(f"{head}{'over plain':>12}{'of CPU':>8}{'at most':>9}")
     rows = []
     for fraction in fractions:
-        gas = scene(fraction)
+        gas = beads(PACKING, BETA, fraction)
         model = melted(gas, soft)
         title = f"SoftSpheres, N={soft}, t_c/tau_c={fraction:g}"
         rows.append(measure(title, gas, model, repeats, compiled=False))
-    gas = scene(fractions[0])
+    gas = beads(PACKING, BETA, fractions[0])
     model = jaxgran.DSMC(stochastic, progress=False)
     rows.append(measure(f"DSMC, N={stochastic}", gas, model, repeats, compiled=True))
     memory = measure_memory(fractions[0], soft, blocks)
     if options.out:
-        record = {
-            "rows": rows,
-            "memory": memory,
-            "device": jax.devices()[0].device_kind,
-            "python": platform.python_version(),
-            "versions": {name: version(name) for name in ("jaxgran", "jax", "jax-md", "vesin")},
-        }
-        options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-
-
-def scene(fraction: float) -> jaxgran.Gas:
-    """Glass-like beads whose contacts last a given part of the mean free time."""
-    gas = jaxgran.Gas(
-        jaxgran.Viscoelastic(1e7, 0.22, 1e-6),
-        diameter=2e-3,
-        mass=jaxgran.sphere_mass(2e-3, 2500.0),
-        packing_fraction=PACKING,
-        temperature=0.01,
-    )
-    stiffer = (float(gas.contact_fraction) / fraction) ** 2.5
-    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
-    return gas.replace(dissipative_constant=1e-6 * BETA / gas.thermal_beta)
+        save(
+            options.out,
+            rows=rows,
+            memory=memory,
+        )
 
 
 def soft_spheres(start: Particles | None, size: int) -> jaxgran.SoftSpheres:
@@ -177,7 +160,7 @@ def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict 
     if not STATUS.exists():
         print("no /proc here: peak memory is not measured")
         return None
-    gas = scene(fraction)
+    gas = beads(PACKING, BETA, fraction)
     start = melted(gas, size).start
     assert start is not None
     state = 2 * np.asarray(start.position).nbytes / 2**20  # positions and velocities, MiB
@@ -202,7 +185,7 @@ def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict 
 
 def memory_worker(file: Path, blocks: float) -> None:
     stored = dict(np.load(file))
-    gas = scene(float(stored.pop("fraction")))
+    gas = beads(PACKING, BETA, float(stored.pop("fraction")))
     start = Particles(**{name: jnp.asarray(x) for name, x in stored.items()})
     model = soft_spheres(start, start.position.shape[1])
     at = gas.value("dissipative_constant"), gas.value("youngs_modulus")

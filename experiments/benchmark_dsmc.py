@@ -9,17 +9,14 @@ code with positions, DynamO, is quoted from an earlier measurement; it is not ru
 """
 
 import argparse
-import json
-import platform
 import resource
-import statistics
-import time
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from record import save, seconds
+from scenes import beads
 
 import jaxgran
 
@@ -60,44 +57,18 @@ def main() -> None:
     print(f"peak memory {peak:.2f} GiB")
     print("DynamO, quoted: " + ", ".join(f"{n} {rate} coll/s" for n, rate in DYNAMO.items()))
     if options.out:
-        record = {
-            "rows": rows,
-            "peak_memory_GiB": peak,
-            "dynamo_quoted_collisions_per_s": DYNAMO,
-            "precision": options.precision,
-            "dimension": options.dimension,
-            "device": jax.devices()[0].device_kind,
-            "python": platform.python_version(),
-            "versions": {name: version(name) for name in ("jaxgran", "jax")},
-        }
-        options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-
-
-def scene(dimension: int) -> jaxgran.Gas:
-    gas = jaxgran.Gas(
-        jaxgran.Viscoelastic(1e7, 0.22, 1e-6),
-        diameter=2e-3,
-        mass=jaxgran.sphere_mass(2e-3, 2500.0),
-        packing_fraction=0.1,
-        temperature=0.01,
-        dimension=dimension,
-    )
-    return gas.replace(dissipative_constant=1e-6 * BETA / gas.thermal_beta)
-
-
-def seconds(run, repeats: int) -> tuple[float, float]:
-    """Of compilation, and of a run without it."""
-    took = []
-    for _ in range(repeats + 1):
-        begin = time.perf_counter()
-        jax.block_until_ready(run())
-        took.append(time.perf_counter() - begin)
-    median = statistics.median(took[1:])
-    return took[0] - median, median
+        save(
+            options.out,
+            rows=rows,
+            peak_memory_GiB=peak,
+            dynamo_quoted_collisions_per_s=DYNAMO,
+            precision=options.precision,
+            dimension=options.dimension,
+        )
 
 
 def measure(size: int, dimension: int, collisions: float, repeats: int) -> dict:
-    gas = scene(dimension)
+    gas = beads(0.1, BETA, dimension=dimension)
     model = jaxgran.DSMC(size, progress=False)
     # In the gas's own time, each particle collides so many times.
     each = max(2 * collisions / size, 2.0)

@@ -7,15 +7,14 @@ dimensions, from a melted start. Compilation and the start are timed apart; medi
 """
 
 import argparse
-import json
-import platform
 import resource
 import statistics
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
+from record import save
+from scenes import hard_beads
 
 import jaxgran
 
@@ -54,25 +53,15 @@ def main() -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GiB")
     if options.out:
-        record = {
-            "rows": rows,
-            "peak_memory_GiB": peak,
-            "device": jax.devices()[0].device_kind,
-            "python": platform.python_version(),
-            "versions": {name: version(name) for name in ("jaxgran", "jax", "jax-md", "vesin")},
-        }
-        options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        save(
+            options.out,
+            rows=rows,
+            peak_memory_GiB=peak,
+        )
 
 
 def measure(size: int, dimension: int, collision_times: float, repeats: int) -> dict:
-    gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(RESTITUTION),
-        diameter=2e-3,
-        mass=jaxgran.sphere_mass(2e-3, 2500.0),
-        packing_fraction=PACKINGS[dimension],
-        temperature=0.01,
-        dimension=dimension,
-    )
+    gas = hard_beads(PACKINGS[dimension], RESTITUTION, dimension)
     begin = time.perf_counter()
     start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(size)).particles
     model = jaxgran.HardSpheres(size, start=start)

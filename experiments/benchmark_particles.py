@@ -14,7 +14,6 @@ import argparse
 import ctypes
 import importlib.util
 import json
-import platform
 import resource
 import shutil
 import statistics
@@ -22,11 +21,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
 import numpy as np
+from record import save
+from scenes import beads
 
 import jaxgran
 
@@ -83,34 +83,17 @@ def main() -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GiB")
     if options.out:
-        record = {
-            "rows": rows,
-            "sweep": sweep,
-            "peak_memory_GiB": peak,
-            "precision": options.precision,
-            "device": jax.devices()[0].device_kind,
-            "python": platform.python_version(),
-            "versions": {name: version(name) for name in ("jaxgran", "jax", "jax-md", "vesin")},
-        }
-        options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-
-
-def scene(fraction: float) -> jaxgran.Gas:
-    """Glass-like beads whose contacts last a given part of the mean free time."""
-    gas = jaxgran.Gas(
-        jaxgran.Viscoelastic(1e7, 0.22, 1e-6),
-        diameter=2e-3,
-        mass=jaxgran.sphere_mass(2e-3, 2500.0),
-        packing_fraction=PACKING,
-        temperature=0.01,
-    )
-    stiffer = (float(gas.contact_fraction) / fraction) ** 2.5
-    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
-    return gas.replace(dissipative_constant=1e-6 * BETA / gas.thermal_beta)
+        save(
+            options.out,
+            rows=rows,
+            sweep=sweep,
+            peak_memory_GiB=peak,
+            precision=options.precision,
+        )
 
 
 def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:
-    gas = scene(fraction)
+    gas = beads(PACKING, BETA, fraction)
     tau = float(gas.mean_free_time)
     elastic = gas.replace(dissipative_constant=0.0)
     model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT)
@@ -153,7 +136,7 @@ def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:
 
 def measure_sweep(size: int, num_gases: int, repeats: int) -> dict:
     """Gases that differ in A: by vmap, and one after another."""
-    gas = scene(CONTACT_FRACTIONS[0] if size > 100 else 0.03)
+    gas = beads(PACKING, BETA, CONTACT_FRACTIONS[0] if size > 100 else 0.03)
     times = [COLLISION_TIMES * float(gas.mean_free_time)]
     model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT).sized_for(gas)
     constants = gas.value("dissipative_constant") * jax.numpy.linspace(0.5, 1.5, num_gases)

@@ -8,10 +8,7 @@ and a JSON file.
 """
 
 import argparse
-import json
-import platform
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -21,6 +18,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+from record import save  # noqa: E402
 
 import jaxgran  # noqa: E402
 from jaxgran.curve import header_number  # noqa: E402
@@ -46,16 +44,13 @@ def main() -> None:
         curves[name] = compare(name, options, column)
     figure.tight_layout()
     figure.savefig(options.out / "compare_lammps.png", dpi=150)
-    record = {
-        "curves": curves,
-        "replicas": options.replicas,
-        "steps_per_contact": STEPS_PER_CONTACT,
-        "key": 0,
-        "versions": {name: version(name) for name in ("jaxgran", "jax", "jax-md", "vesin")},
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-    }
-    (options.out / "compare_lammps.json").write_text(json.dumps(record, indent=2) + "\n")
+    save(
+        options.out / "compare_lammps.json",
+        curves=curves,
+        replicas=options.replicas,
+        steps_per_contact=STEPS_PER_CONTACT,
+        key=0,
+    )
     print(f"written to {options.out}")
 
 

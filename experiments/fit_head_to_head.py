@@ -22,11 +22,8 @@ values, and their seconds without compilation. A simulation with tangents counts
 
 import argparse
 import dataclasses
-import json
-import platform
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +31,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
+from record import save
 
 import jaxgran
 from jaxgran.curve import header_number
@@ -82,15 +80,9 @@ def main() -> None:
         problem = PROBLEMS[scene](options)
         for count in (1, 2):
             rows += compare(scene, problem, count, options.smoke)
-    record = {
-        "rows": rows,
-        "seconds": time.perf_counter() - begin,
-        "versions": {name: version(name) for name in ("jaxgran", "jax", "scipy")},
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-    }
-    (options.out / "fit_head_to_head.json").write_text(json.dumps(record, indent=2) + "\n")
-    print(f"{record['seconds']:.0f} s in all; written to {options.out}")
+    took = time.perf_counter() - begin
+    save(options.out / "fit_head_to_head.json", rows=rows, seconds=took)
+    print(f"{took:.0f} s in all; written to {options.out}")
 
 
 class Compilation:

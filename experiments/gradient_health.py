@@ -12,9 +12,7 @@ kept in both unless asked for.
 
 import argparse
 import json
-import platform
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -25,6 +23,8 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+from record import save  # noqa: E402
+from scenes import beads  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
 import jaxgran  # noqa: E402
@@ -58,36 +58,9 @@ def main() -> None:
         results = json.loads(file.read_text())["scenes"]
     for name in tqdm(options.scenes, disable=options.smoke):
         results[name] = examine(name, options.smoke)
-        write(results, file)
+        save(file, scenes=results, step_of_ln_A=STEP, steps_per_contact=STEPS_PER_CONTACT, key=0)
     draw({name: results[name] for name in SCENES if name in results}, file.with_suffix(".png"))
     print(f"written to {options.out}")
-
-
-def write(results: dict, file: Path) -> None:
-    record = {
-        "scenes": results,
-        "step_of_ln_A": STEP,
-        "steps_per_contact": STEPS_PER_CONTACT,
-        "key": 0,
-        "versions": {name: version(name) for name in ("jaxgran", "jax", "jax-md", "vesin")},
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-    }
-    file.write_text(json.dumps(record, indent=2) + "\n")
-
-
-def scene(name: str) -> jaxgran.Gas:
-    packing, beta, fraction, _ = SCENES[name]
-    gas = jaxgran.Gas(
-        jaxgran.Viscoelastic(1e7, 0.22, 1e-6),
-        diameter=2e-3,
-        mass=jaxgran.sphere_mass(2e-3, 2500.0),
-        packing_fraction=packing,
-        temperature=0.01,
-    )
-    stiffer = (float(gas.contact_fraction) / fraction) ** 2.5
-    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
-    return gas.replace(dissipative_constant=1e-6 * beta / gas.thermal_beta)
 
 
 def times_of(gas: jaxgran.Gas, collisions) -> np.ndarray:
@@ -98,7 +71,7 @@ def times_of(gas: jaxgran.Gas, collisions) -> np.ndarray:
 
 
 def examine(name: str, smoke: bool) -> dict:
-    begin, gas = time.perf_counter(), scene(name)
+    begin, gas = time.perf_counter(), beads(*SCENES[name][:3])
     collisions = COLLISIONS[:2] if smoke else COLLISIONS
     size, many, few = (50, 2, 2) if smoke else (SCENES[name][3], REPLICAS, FEW_REPLICAS)
     times = times_of(gas, collisions)

@@ -10,10 +10,7 @@ error, the slope of its logarithm over that of the step. Writes a picture and a 
 
 import argparse
 import dataclasses
-import json
-import platform
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -22,9 +19,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+from record import save
+from scenes import beads
 
 import jaxgran
-from jaxgran import blocks
+from jaxgran import boxes
 from jaxgran.plotting import DATA, GUIDE, INK, MODEL
 
 TRAJECTORY = Path(__file__).parent / "data" / "lammps_trajectory_n64.npz"
@@ -63,34 +62,18 @@ def main() -> None:
     }
     seconds = time.perf_counter() - begin
     draw(results, options.out / "soft_sphere_accuracy.png")
-    record = {
+    save(
+        options.out / "soft_sphere_accuracy.json",
         **results,
-        "phases": phases,
-        "ledger_scene": ledger,
-        "elastic_scene": elastic,
-        "contact_fraction": CONTACT_FRACTION,
-        "packing_fraction": PACKING,
-        "key": 0,
-        "seconds": seconds,
-        "versions": {name: version(name) for name in ("jaxgran", "jax", "jax-md", "vesin")},
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-    }
-    (options.out / "soft_sphere_accuracy.json").write_text(json.dumps(record, indent=2) + "\n")
-    print(f"{seconds:.0f} s; written to {options.out}")
-
-
-def beads(contact_fraction: float, packing_fraction: float) -> jaxgran.Gas:
-    """Elastic beads of 2 mm whose contacts last a given part of the mean free time."""
-    gas = jaxgran.Gas(
-        jaxgran.Viscoelastic(5e7, 0.22, 0.0),
-        diameter=2e-3,
-        mass=jaxgran.sphere_mass(2e-3, 2500.0),
-        packing_fraction=packing_fraction,
-        temperature=0.01,
+        phases=phases,
+        ledger_scene=ledger,
+        elastic_scene=elastic,
+        contact_fraction=CONTACT_FRACTION,
+        packing_fraction=PACKING,
+        key=0,
+        seconds=seconds,
     )
-    stiffer = (float(gas.contact_fraction) / contact_fraction) ** 2.5
-    return gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
+    print(f"{seconds:.0f} s; written to {options.out}")
 
 
 def follow_lammps(steps_per_contact, finest: int) -> dict:
@@ -136,7 +119,7 @@ def follow_lammps(steps_per_contact, finest: int) -> dict:
 def impacts(steps_per_contact, phases: int) -> dict:
     """Errors of eps over all phases of a step at first touch: one replica a phase."""
     # So stiff that spheres do not turn about each other while in contact.
-    gas = beads(1e-8, 0.02)
+    gas = beads(0.02, 0.0, 1e-8)
     side, sigma, contact = (float(x) for x in (gas.box_side(2), gas.diameter, gas.contact_duration))
     speed = float(jnp.sqrt(12 * gas.temperature))  # two spheres that close so fast are as hot
     gas = gas.replace(dissipative_constant=BETA / (1.5 * gas.alpha**0.4 * speed**0.2))
@@ -161,7 +144,7 @@ def impacts(steps_per_contact, phases: int) -> dict:
             model = jaxgran.SoftSpheres(2, replicas=phases, steps_per_contact=steps, start=start)
             plan = model.sized_for(gas).plan
             assert plan is not None
-            room = blocks.Room(phases, phases, phases, 2 * phases)  # all collide at once
+            room = boxes.Room(phases, phases, phases, 2 * phases)  # all collide at once
             model = dataclasses.replace(model, plan=plan._replace(room=room))
             end = jaxgran.cool(gas, [2 * contact], model=model)
             assert end.particles is not None and end.replicas is not None
@@ -190,7 +173,7 @@ def balance(
     replicas: int,
 ) -> dict:
     """How far kinetic, elastic and dissipated energy together stray from the first energy."""
-    gas = beads(CONTACT_FRACTION, PACKING)
+    gas = beads(PACKING, 0.0, CONTACT_FRACTION)
     gas = gas.replace(dissipative_constant=beta / (1.5 * 2**0.1 * gas.alpha**0.4 * 0.01**0.1))
     times = np.linspace(0, collision_times, 41) * float(gas.mean_free_time)
     melted = jaxgran.cool(gas, [0.0], model=jaxgran.SoftSpheres(num_particles, replicas=replicas))

@@ -5,7 +5,8 @@ from jaxgran.contact import Impact, contact_force, elastic_constant, impact
 from jaxgran.cooling import cool
 from jaxgran.curve import CoolingCurve, Particles, read_curve, read_gas, write_curve
 from jaxgran.diagnosis import Diagnosis, diagnose
-from jaxgran.fitting import Fit, fit
+from jaxgran.estimate import Fit
+from jaxgran.fitting import fit
 from jaxgran.gas import Gas, sphere_mass
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.hard_spheres import HardSpheres

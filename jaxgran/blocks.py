@@ -3,7 +3,6 @@
 Units here: diameter, mass and first temperature are 1.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxgran import encounters, neighbours, status, tangents
+from jaxgran.boxes import Room, longest_skin
 from jaxgran.encounters import Encounters, Work
 from jaxgran.neighbours import Pairs
 from jaxgran.tangents import Tangents
@@ -76,21 +76,6 @@ def rewrapped(state: State, side: ArrayLike) -> State:
     inside = neighbours.wrap(side, state.position)
     image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
     return state._replace(position=inside, image=image)
-
-
-class Room(NamedTuple):
-    """How many rows the arrays of a compiled run have."""
-
-    pairs: int
-    near: int
-    contacts: int
-    members: int
-
-    def grown(self, needed: Sequence[int]) -> "Room":
-        """With more rows than needed where there are fewer."""
-        return Room(
-            *(r if n <= r else int(1.3 * n) + 32 for r, n in zip(self, needed, strict=True))
-        )
 
 
 class Plan(NamedTuple):
@@ -233,6 +218,7 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
         return (now.state.time < end) & ~now.stale & (now.status == status.OK)
 
     zero = jnp.zeros((), jnp.int32)
+    full = pairs.count > plan.room.pairs
     xi, _, touching = encounters.overlap(state.position, pairs.i, pairs.j, pairs.offset)
     touching &= jnp.arange(len(xi)) < pairs.count
     stored = encounters.elastic_energy(jnp.where(touching, xi, 0.0), scene.alpha)
@@ -242,8 +228,8 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
         extra=jnp.zeros(len(state.position), bool),
         widen=jnp.ones((), state.position.dtype),
         stale=jnp.zeros((), bool),
-        status=zero,
-        needed=jnp.zeros(len(plan.room), jnp.int32),
+        status=status.flag(status.LIST_FULL, full),
+        needed=jnp.zeros(len(plan.room), jnp.int32).at[0].set(pairs.count),
         num_blocks=zero,
     )
     return jax.lax.while_loop(unfinished, block, first)
@@ -316,8 +302,3 @@ def _mended(now: Progress, began: State, scene: Scene) -> dict[str, Any]:
         ),
         "status": jnp.where(hopeless, now.status, now.status & beyond),
     }
-
-
-def longest_skin(side: ArrayLike) -> Float[Array, ""]:
-    """The longest skin, in diameters, in whose reach a sphere meets no sphere and its image."""
-    return 0.5 * jnp.asarray(side) * (1 - 1e-6) - 1

@@ -13,10 +13,11 @@ from jax.core import Tracer
 from jaxtyping import ArrayLike
 
 from jaxgran import initial, kinetics
+from jaxgran.boxes import SMALLEST_BOX
 from jaxgran.domain import checked_times
 from jaxgran.gas import Gas
 from jaxgran.models.dsmc import DSMC
-from jaxgran.models.hard_spheres import SMALLEST_BOX, HardSpheres
+from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.restitution import Viscoelastic

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -79,6 +80,18 @@ class CoolingCurve(eqx.Module):
     replicas: "CoolingCurve | None" = None
     particles: Particles | None = None
     status: Int[Array, ""] | None = None
+
+    @classmethod
+    def of_replicas(cls, times: Array, values: dict[str, Any], **others: Any) -> "CoolingCurve":
+        """The mean over replicas, with its standard error if there are two or more."""
+        found: dict[str, Any] = {name: jnp.mean(each, axis=0) for name, each in values.items()}
+        num_replicas = len(values["temperature"])
+        if num_replicas > 1:
+            for name in ("temperature", "displacement"):
+                # Where all replicas agree, at t = 0, a root has no derivative.
+                deviation = jnp.std(jax.lax.stop_gradient(values[name]), axis=0, ddof=1)
+                found[f"{name}_error"] = deviation / num_replicas**0.5
+        return cls(times=times, **found, replicas=cls(times=times, **values), **others)
 
     def check(self, place: Callable[[int], str] = "point {}".format) -> None:
         """Raise ValueError if this cannot be a measured curve. Traced values pass unseen.

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxgran.choice import words
 from jaxgran.curve import CoolingCurve
-from jaxgran.fitting import SIGNIFICANCE, Fit
+from jaxgran.estimate import SIGNIFICANCE, Fit
 from jaxgran.gas import Gas
 
 CONTACT_LIMIT = 0.03

@@ -1,4 +1,4 @@
-"""Fit floats of a gas to a measured cooling curve: estimate, error, and whether to believe it."""
+"""Fit floats of a gas to a measured cooling curve."""
 
 import dataclasses
 import warnings
@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array
 
 from jaxgran import kinetics
 from jaxgran.cooling import Model
 from jaxgran.curve import CoolingCurve
+from jaxgran.estimate import Fit, Parameters, misfit
 from jaxgran.gas import Gas
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.hard_spheres import HardSpheres
@@ -22,82 +22,6 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.restitution import ConstantRestitution, Viscoelastic
 from jaxgran.search import by_simulation, least_squares, quasi_newton
-
-SIGNIFICANCE = 0.01
-"""A model is said not to explain a curve if chance alone would misfit as badly less often."""
-
-
-class Fit(eqx.Module):
-    """What a fit found. p is the number of free parameters; under `jax.vmap` all fields batch.
-
-    Attributes:
-        names: the free parameters.
-        model: the name of the model.
-        accuracy: of the model's clock, relative.
-        estimate: their values, SI, shape (p,).
-        standard_error: one standard deviation of each, SI, shape (p,): the measurement errors
-            carried through, and a simulation's own noise; if the model does not explain the curve,
-            times sqrt(reduced chi^2).
-        model_error: by how much each would move if the model's clock were wrong by its known
-            accuracy, SI, shape (p,). Not part of `standard_error`.
-        covariance: of the estimates, SI, shape (p, p), scaled alike.
-        sensitivity: derivative of the weighted residuals in the parameters' free scale (their
-            logarithm, for positive ones), shape (residuals, p).
-        start: the values the search began with, SI, shape (p,).
-        gas: the fitted gas.
-        curve: its cooling curve at the measured times.
-        residuals: (ln T_measured - ln T_model) over its error; 0 where a point carries no weight.
-        displacement_residuals: the same of <dr^2>; None if it was not used.
-        chi2, degrees_of_freedom, reduced_chi2, p_value: of the weighted residuals; p_value is nan
-            if the curve carries no errors (then errors are scaled so that reduced chi^2 is 1).
-        iterations: of the least-squares or quasi-Newton search; runs of a particle model.
-        converged: whether the search ended at its tolerance.
-        simulation_error: the part of `standard_error` that is a particle model's own noise, by its
-            replicas, shape (p,); None for kinetic theory, which has none.
-    """
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    model: str = eqx.field(static=True)
-    accuracy: float = eqx.field(static=True)
-    estimate: Float[Array, "p"]
-    standard_error: Float[Array, "p"]
-    model_error: Float[Array, "p"]
-    covariance: Float[Array, "p p"]
-    sensitivity: Float[Array, "residuals p"]
-    start: Float[Array, "p"]
-    gas: Gas
-    curve: CoolingCurve
-    residuals: Float[Array, "times"]
-    displacement_residuals: Float[Array, "times"] | None
-    chi2: Float[Array, ""]
-    degrees_of_freedom: Int[Array, ""]
-    reduced_chi2: Float[Array, ""]
-    p_value: Float[Array, ""]
-    iterations: Int[Array, ""]
-    converged: Bool[Array, ""]
-    simulation_error: Float[Array, "p"] | None = None
-
-    def value(self, name: str) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Estimate and standard error of one parameter."""
-        if name not in self.names:
-            raise ValueError(f"{name!r} was not free; free were {', '.join(self.names)}")
-        i = self.names.index(name)
-        return self.estimate[..., i], self.standard_error[..., i]
-
-    def undetermined(self) -> tuple[str, ...]:
-        """Parameters that the curve does not determine, alone or apart; empty if it does.
-
-        Some change of them together must be left open by more than a factor e, or alter the curve
-        less than the model's `accuracy` times as much as the best determined change does.
-        """
-        _, singular, rotation = jnp.linalg.svd(self.sensitivity, full_matrices=False)
-        apart = float(singular[-1]) >= self.accuracy * float(singular[0])
-        if float(singular[-1]) > 1.0 and apart:
-            return ()
-        share = [abs(float(x)) for x in rotation[-1]]
-        sized = [n for n in self.names for _ in range(self.gas.value(n).size)]
-        open_ended = {n: 0 for n, x in zip(sized, share, strict=True) if x > 0.05 * max(share)}
-        return tuple(open_ended)
 
 
 def fit(
@@ -234,11 +158,8 @@ def _log_ratio(measured: Array, computed: Array) -> Array:
 
 @eqx.filter_jit
 def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> Fit:
-    domains = [gas.domains[name] for name in names]
-    firsts = [
-        [domain.to_free(start.value(name)) for name, domain in zip(names, domains, strict=True)]
-        for start in starts
-    ]
+    parameters = Parameters(gas, names)
+    candidates = jnp.stack([parameters.flat(start) for start in starts])
     use_displacement = (
         curve.displacement is not None
         and curve.temperature_error is not None
@@ -258,16 +179,14 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
         error = sampling if curve.displacement_error is None else curve.displacement_error
         error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
         weights.append(_weights(curve.displacement, error))
-        firsts = [[*first, jnp.zeros(())] for first in firsts]  # ln of the common factor of D
-    _, unravel = ravel_pytree(firsts[0])
-    candidates = jnp.stack([ravel_pytree(first)[0] for first in firsts])
+        candidates = jnp.pad(candidates, ((0, 0), (0, 1)))  # ln of the common factor of D
+    num_free = candidates.shape[1] - use_displacement
 
-    def values(flat):
-        pairs = zip(names, domains, unravel(flat), strict=False)
-        return {name: domain.from_free(free) for name, domain, free in pairs}
+    def estimates(flat):
+        return parameters.estimates(flat[:num_free])
 
     def compare(flat, clock=1.0):
-        computed = model.cool(gas.replace(**values(flat)), curve.times * clock)
+        computed = model.cool(parameters.gas(flat[:num_free]), curve.times * clock)
         parts = [weights[0] * _log_ratio(curve.temperature, computed.temperature)]
         if use_displacement:
             # D may be off by a common factor; ballistic flight, before collisions, is not.
@@ -291,21 +210,12 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
     (jacobian, clock_slope), (all_residuals, computed) = derivatives(flat, jnp.ones(()))
     num_used = jnp.sum(jnp.concatenate(weights) > 0) + int(use_displacement)
     degrees_of_freedom = num_used - flat.size
-    chi2 = jnp.sum(all_residuals**2)
-    reduced = chi2 / degrees_of_freedom
-    if curve.temperature_error is None:
-        inflation, p_value = reduced, jnp.full((), jnp.nan)
-    else:
-        p_value = jax.scipy.stats.chi2.sf(chi2, degrees_of_freedom)
-        inflation = jnp.where(p_value < SIGNIFICANCE, jnp.maximum(reduced, 1.0), 1.0)
-
-    def estimates(flat):
-        return jnp.concatenate([jnp.ravel(value) for value in values(flat).values()])
-
+    errors_known = curve.temperature_error is not None
+    chance = misfit(all_residuals, degrees_of_freedom, errors_known=errors_known)
     _, singular, rotation = jnp.linalg.svd(jacobian, full_matrices=False)
     spread = rotation.T / jnp.maximum(singular, jnp.finfo(flat.dtype).tiny ** 0.5)[None]
     root = jax.jacfwd(estimates)(flat) @ spread
-    covariance = inflation * root @ root.T
+    covariance = chance.inflation * root @ root.T
     model_error = model.accuracy * jnp.abs(root @ (spread.T @ (jacobian.T @ clock_slope)))
     num_times = curve.times.size
     return Fit(
@@ -316,16 +226,16 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
         standard_error=jnp.sqrt(jnp.diag(covariance)),
         model_error=model_error,
         covariance=covariance,
-        sensitivity=jacobian[:, : jacobian.shape[1] - use_displacement],
+        sensitivity=jacobian[:, :num_free],
         start=estimates(flat_first),
-        gas=gas.replace(**values(flat)),
+        gas=parameters.gas(flat[:num_free]),
         curve=computed,
         residuals=all_residuals[:num_times],
         displacement_residuals=all_residuals[num_times:-1] if use_displacement else None,
-        chi2=chi2,
+        chi2=chance.chi2,
         degrees_of_freedom=degrees_of_freedom,
-        reduced_chi2=reduced,
-        p_value=p_value,
+        reduced_chi2=chance.reduced,
+        p_value=chance.p_value,
         iterations=iterations,
         converged=converged,
     )
@@ -354,23 +264,13 @@ def _fit_by_simulation(
             "a fit through particles cannot run inside jax.jit or jax.vmap: fit one curve at a time"
         )
     start = _kinetic_start(gas, curve, names) if start is None else start
-    domains = [gas.domains[name] for name in names]
-    first, unravel = ravel_pytree(
-        [domain.to_free(start.value(name)) for name, domain in zip(names, domains, strict=True)]
-    )
-
-    def values(flat):
-        frees = zip(names, domains, unravel(flat), strict=True)
-        return {name: domain.from_free(free) for name, domain, free in frees}
-
-    def estimates(flat):
-        return jnp.concatenate([jnp.ravel(value) for value in values(flat).values()])
-
+    parameters = Parameters(gas, names)
+    first, estimates = parameters.flat(start), parameters.estimates
     key = jax.random.key(0) if model.key is None else model.key
 
     def simulate(flat, run):
         fresh = dataclasses.replace(model, key=jax.random.fold_in(key, run))
-        return fresh.cool(gas.replace(**values(flat)), curve.times)
+        return fresh.cool(parameters.gas(flat), curve.times)
 
     T = np.asarray(curve.temperature)
     error = np.zeros_like(T) if curve.temperature_error is None else curve.temperature_error / T
@@ -387,16 +287,11 @@ def _fit_by_simulation(
     )
     flat = jnp.asarray(found.flat)
     degrees_of_freedom = int(np.sum(found.residuals != 0)) - flat.size
-    chi2 = jnp.asarray(np.sum(found.residuals**2))
-    reduced = chi2 / degrees_of_freedom
-    if curve.temperature_error is None:
-        inflation, p_value = reduced, jnp.full((), jnp.nan)
-    else:
-        p_value = jax.scipy.stats.chi2.sf(chi2, degrees_of_freedom)
-        inflation = jnp.where(p_value < SIGNIFICANCE, jnp.maximum(reduced, 1.0), 1.0)
+    errors_known = curve.temperature_error is not None
+    chance = misfit(found.residuals, degrees_of_freedom, errors_known=errors_known)
     scale = jax.jacfwd(estimates)(flat)
     noise = scale @ found.noise_covariance @ scale.T
-    covariance = inflation * (scale @ found.error_covariance @ scale.T + noise)
+    covariance = chance.inflation * (scale @ found.error_covariance @ scale.T + noise)
     return Fit(
         names=names,
         model=type(model).__name__,
@@ -407,14 +302,14 @@ def _fit_by_simulation(
         covariance=covariance,
         sensitivity=jnp.asarray(found.sensitivity),
         start=estimates(first),
-        gas=gas.replace(**values(flat)),
+        gas=parameters.gas(flat),
         curve=found.computed,
         residuals=jnp.asarray(found.residuals),
         displacement_residuals=None,
-        chi2=chi2,
+        chi2=chance.chi2,
         degrees_of_freedom=jnp.asarray(degrees_of_freedom),
-        reduced_chi2=reduced,
-        p_value=p_value,
+        reduced_chi2=chance.reduced,
+        p_value=chance.p_value,
         iterations=jnp.asarray(found.num_runs),
         converged=jnp.asarray(found.converged),
         simulation_error=jnp.sqrt(jnp.diag(noise)),

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxgran.choice import words
 from jaxgran.curve import CoolingCurve
-from jaxgran.fitting import Fit
+from jaxgran.estimate import Fit
 
 try:
     from matplotlib.figure import Figure

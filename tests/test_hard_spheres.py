@@ -7,7 +7,7 @@ import pytest
 
 import jaxgran
 from jaxgran import events, simulation
-from jaxgran.blocks import Room
+from jaxgran.boxes import Room
 from jaxgran.models.hard_spheres import HardSpheres, reduced_scene
 from jaxgran.neighbours import find_pairs
 

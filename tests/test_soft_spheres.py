@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran import blocks, simulation
+from jaxgran import blocks, boxes, simulation
 from jaxgran.models.soft_spheres import SoftSpheres, reduced_scene
 from jaxgran.observables import structure_factor
 
@@ -205,7 +205,7 @@ def test_what_is_too_small_is_grown_without_a_trace(beads):
     model = quiet(200)
     reference = jaxgran.cool(gas, times, model=model)
     plan = model.sized_for(gas).plan
-    tiny = plan._replace(room=blocks.Room(*(room // 10 for room in plan.room)))
+    tiny = plan._replace(room=boxes.Room(*(room // 10 for room in plan.room)))
     small = jaxgran.cool(gas, times, model=quiet(200, plan=tiny))
     np.testing.assert_array_equal(small.temperature, reference.temperature)
     np.testing.assert_array_equal(small.particles.position, reference.particles.position)
@@ -283,7 +283,7 @@ def test_jit_and_vmap_give_the_same_numbers(beads):
 def test_jit_flags_what_it_cannot_grow(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     model = quiet(100).sized_for(gas)
-    room = blocks.Room(*(max(r // 10, 1) for r in model.plan.room))
+    room = boxes.Room(*(max(r // 10, 1) for r in model.plan.room))
     model = quiet(100, plan=model.plan._replace(room=room))
     times = jnp.array([1.0]) * gas.mean_free_time
     curve = jax.jit(lambda t: jaxgran.cool(gas, t, model=model))(times)

@@ -258,17 +258,4 @@ class DSMC(eqx.Module):
             name: jnp.where(fault == status.OK, records[name], jnp.nan).T * unit
             for name, unit in units.items()
         }
-        mean = {name: jnp.mean(values, axis=0) for name, values in each.items()}
-        errors = {}
-        if self.replicas > 1:
-            for name in ("temperature", "displacement"):
-                # Where all replicas agree, at t = 0, a root has no derivative.
-                deviation = jnp.std(jax.lax.stop_gradient(each[name]), axis=0, ddof=1)
-                errors[f"{name}_error"] = deviation / self.replicas**0.5
-        return CoolingCurve(
-            times=times,
-            **mean,
-            **errors,
-            replicas=CoolingCurve(times=times, **each),
-            status=jnp.bitwise_or.reduce(fault, axis=None),
-        )
+        return CoolingCurve.of_replicas(times, each, status=jnp.bitwise_or.reduce(fault, axis=None))

@@ -8,30 +8,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer, eval_context
+from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxgran import events, initial, neighbours, observables, status, tangents
-from jaxgran.blocks import Room, longest_skin
-from jaxgran.checkpoint import fingerprint
+from jaxgran import boxes, events, neighbours, tangents
+from jaxgran.blocks import Room
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.events import Plan, Scene, State
-from jaxgran.gas import Gas, sphere_surface
+from jaxgran.gas import Gas
 from jaxgran.restitution import ReducedLaw
-from jaxgran.simulation import simulate
 from jaxgran.tangents import ImpactTangents, Inputs, Outputs
-
-SMALLEST_BOX = 2.1
-"""Box side in diameters below which a sphere could touch another and its image at once."""
-
-MELT_COLLISIONS = 10.0
-"""Mean free times of elastic motion before t = 0."""
 
 PAIRS_PER_PARTICLE = 7.0
 """How many pairs beyond contact a neighbour list should hold for each particle."""
-
-MOST_PAIRS = 100
-"""Pairs per particle beyond which a list is taken to have gone wrong."""
 
 WINDOW_SHARE = 0.1
 """Share of the particles that collide in a window."""
@@ -93,16 +82,12 @@ class HardSpheres(eqx.Module):
     plan: Plan | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        for name, least in (("num_particles", 2), ("replicas", 1)):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+        boxes.check_counts(self)
         if not 0 <= self.contact_time <= 0.1:
             raise ValueError(
                 f"contact_time must lie in [0, 0.1] mean free times, got {self.contact_time!r}; it "
                 "only keeps clusters from collapsing, so leave it small"
             )
-        neighbours.engine(self.neighbours)
 
     def cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them.
@@ -116,55 +101,23 @@ class HardSpheres(eqx.Module):
         inputs = Inputs(
             scene=reduced_scene(gas, self.num_particles, self.contact_time),
             times=times * jnp.sqrt(gas.temperature) / gas.diameter,
-            start=self._reduced_start(gas),
+            start=boxes.reduced_start(self, gas),
             key=self.key,
         )
         run = partial(self._run, dimension=gas.dimension)
         run = tangents.differentiable(run, lambda scene: scene.law)
-        return self._curve(gas, times, inputs.scene, run(inputs))
+        return boxes.curve(gas, times, self, inputs.scene.side, run(inputs))
 
     @property
     def accuracy(self) -> float:
         """Relative error of a projected derivative: what differs by less is not told apart."""
         return 0.02
 
-    def _reduced_start(self, gas: Gas) -> tuple[Array, Array] | None:
-        if self.start is None:
-            return None
-        # The same start in units of any other gas.
-        length, speed = jax.lax.stop_gradient((gas.diameter, jnp.sqrt(gas.temperature)))
-        position, velocity = self.start.position / length, self.start.velocity / speed
-        return position.reshape(-1, gas.dimension), velocity.reshape(-1, gas.dimension)
-
     def _check(self, gas: Gas) -> None:
-        if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
+        boxes.check_box(self, gas)
+        if self.start is None or isinstance(gas.diameter, Tracer):
             return
-        limit, phi = initial.PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
-        if phi > limit and self.start is None:
-            raise ValueError(
-                f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g}; "
-                "lower it, or give your own start"
-            )
-        side = float(jnp.min(gas.box_side(self.num_particles) / gas.diameter))
-        if side < SMALLEST_BOX:
-            raise ValueError(
-                f"the box is {side:.3g} diameters long, at least {SMALLEST_BOX} are needed to tell "
-                "a sphere from its image; use more particles or a lower packing_fraction"
-            )
-        if self.start is not None:
-            self._check_start(self.start, gas, side)
-
-    def _check_start(self, start: Particles, gas: Gas, side: float) -> None:
-        shape = (self.replicas, self.num_particles, gas.dimension)
-        for name, values in zip(start._fields[:2], start[:2], strict=True):
-            if np.shape(values) != shape:
-                raise ValueError(f"start.{name} has shape {np.shape(values)}, not {shape}")
-        given = float(start.box_side / gas.diameter)
-        if not abs(given / side - 1) < 1e-6:
-            raise ValueError(
-                f"start.box_side is {given:.7g} diameters, the gas fills {side:.7g}: change "
-                "packing_fraction or the start"
-            )
+        start, side = self.start, float(self.start.box_side / gas.diameter)
         if isinstance(start.position, Tracer):
             return
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
@@ -180,14 +133,8 @@ class HardSpheres(eqx.Module):
                 "not overlap; move them apart, or leave start out for a random one"
             )
 
-    def _pairs_in_contact(self, scene: Scene, d: int) -> Array:
-        """Pairs a particle within contact, were the pair correlation 1."""
-        return self.num_particles * sphere_surface(d) / (2 * d) / scene.side**d
-
     def _skin(self, scene: Scene, d: int) -> Array:
-        """Reach of the neighbour list beyond contact, in diameters."""
-        skin = (1 + PAIRS_PER_PARTICLE / self._pairs_in_contact(scene, d)) ** (1 / d) - 1
-        return jnp.minimum(skin, longest_skin(scene.side))
+        return boxes.skin_with(PAIRS_PER_PARTICLE, self.num_particles, scene.side, d)
 
     def sized_for(self, gas: Gas, spare: float = 1.4) -> "HardSpheres":
         """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
@@ -205,7 +152,7 @@ class HardSpheres(eqx.Module):
     def _sized(self, scene: Scene, d: int, spare: float = 1.4) -> Plan:
         n = self.replicas * self.num_particles
         share = max(WINDOW_SHARE, 2 * events.LEAST_IMPACTS / n)
-        inside = float(self._pairs_in_contact(scene, d))
+        inside = float(boxes.pairs_in_contact(self.num_particles, scene.side, d))
         listed = inside * (1 + float(self._skin(scene, d))) ** d
         # As measured; a list changes its length little, windows differ more.
         near, chosen, members = (min(factor * share, listed) for factor in (4.0, 1.7, 2.0))
@@ -217,141 +164,23 @@ class HardSpheres(eqx.Module):
 
     def _run(self, inputs: Inputs, dimension: int, directions: ReducedLaw | None = None) -> Outputs:
         """Melt, then cool; and with it the tangents along directions in the law."""
-        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs))
-        try:
-            with jax.ensure_compile_time_eval():
-                plan = self.plan or self._sized(inputs.scene, dimension)
-        except jax.errors.ConcretizationTypeError:
-            raise ValueError(
-                "inside jax.jit the sizes of arrays must be known: give HardSpheres(...)"
-                ".sized_for(gas), made outside with a gas of known numbers"
-            ) from None
         scene, replicas = inputs.scene, self.replicas
-        if inputs.start is None:
-            keys = jax.random.split(jax.random.key(0) if inputs.key is None else inputs.key)
-            size = replicas, self.num_particles, dimension
-            position = initial.positions(keys[0], scene.side, *size)
-            velocity = initial.velocities(keys[1], *size)
-        else:
-            position, velocity = inputs.start
-        state = events.at_start(position, velocity, scene, self._skin(scene, dimension), plan)
+        plan = boxes.settled_plan(self, lambda: self._sized(scene, dimension))
 
-        def begun(melted: State) -> State:
-            velocity = melted.velocity
-            if inputs.start is None:
-                velocity = initial.settle(velocity, replicas)
-            state = events.at_start(melted.position, velocity, scene, melted.skin, plan)
+        def followed(state: State) -> State:
             if directions is None:
                 return state
-            along = ImpactTangents.at_start(directions, replicas, velocity.dtype)
+            along = ImpactTangents.at_start(directions, replicas, state.velocity.dtype)
             return state._replace(tangents=along)
 
-        if traced:
-            state, records, fault = self._traced(inputs, plan, state, begun)
-        else:
-            # Under jax.grad every call of a compiled function would be traced again.
-            with eval_context():
-                state, records, fault = self._driven(inputs, plan, state, begun)
-        return Outputs(neighbours.wrap(scene.side, state.position), state.velocity, records, fault)
-
-    def _driven(self, inputs: Inputs, plan: Plan, state: State, begun):
-        """Run by a loop on the host, which makes room as it is needed."""
-        scene = inputs.scene
-        observe = partial(_observe, scene=scene, replicas=self.replicas)
-        engine = neighbours.engine(self.neighbours)
-
-        def advance(state: State, end: float, scene: Scene) -> State:
-            nonlocal plan
-            while True:
-                now = events.stretch(state, scene, end, plan, engine)
-                state, fault = now.state, int(now.status)
-                if fault == status.OK:
-                    return state
-                needed = [int(x) for x in now.needed]
-                missing = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
-                if not missing or max(needed) > MOST_PAIRS * len(state.position):
-                    at = float(jnp.mean(state.velocity**2))
-                    raise RuntimeError(f"stopped at T/T_0 = {at:.3g}: {status.explain(fault)}")
-                plan = plan._replace(room=plan.room.grown(needed))
-
-        # A run to be resumed has been melted.
-        if inputs.start is None and not (self.checkpoint and Path(self.checkpoint).exists()):
-            melt = partial(advance, scene=scene._replace(elastic=jnp.array(True)))
-            end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
-            state, _ = simulate(state, end, melt, observe, progress=self.progress, label="melt")
-        state = begun(state)
-        size = self.num_particles, self.replicas, self.neighbours
-        state, records = simulate(
-            state,
-            np.asarray(inputs.times),
-            partial(advance, scene=scene),
-            observe,
-            scene=fingerprint(inputs, state.tangents, size),
-            progress=self.progress,
-            path=self.checkpoint,
+        kind = boxes.Kind(
+            at_start=lambda x, v, skin: events.at_start(x, v, scene, skin, plan),
+            stretch=events.stretch,
+            observe=partial(_observe, scene=scene, replicas=replicas),
+            elastic=lambda scene: scene._replace(elastic=jnp.array(True)),
+            followed=followed,
         )
-        records = {name: jnp.asarray(value) for name, value in records.items()}
-        return state, records, jnp.zeros((), jnp.int32)
-
-    def _traced(self, inputs: Inputs, plan: Plan, state: State, begun):
-        """The same inside `jax.jit` or `jax.vmap`: room is fixed beforehand."""
-
-        def run(carry, scene, end):
-            def further(carry):
-                now = events.stretch(carry[0], scene, end, plan)
-                return now.state, now.status
-
-            def unfinished(carry):
-                return (carry[0].time < end) & (carry[1] == status.OK)
-
-            return jax.lax.while_loop(unfinished, further, carry)
-
-        scene, fault = inputs.scene, jnp.zeros((), jnp.int32)
-        if inputs.start is None:
-            elastic = scene._replace(elastic=jnp.array(True))
-            state, fault = run((state, fault), elastic, MELT_COLLISIONS / scene.collision_frequency)
-
-        def to(carry, end):
-            state, fault = run(carry, scene, end)
-            records = _observe(state, scene=scene, replicas=self.replicas)
-            bad = fault != status.OK
-            return (state, fault), jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), records)
-
-        (state, fault), records = jax.lax.scan(to, (begun(state), fault), inputs.times)
-        return state, records, fault
-
-    def _curve(self, gas: Gas, times: Array, scene: Scene, run: Outputs) -> CoolingCurve:
-        units = {
-            "temperature": gas.temperature,
-            "sonine": 1.0,
-            "displacement": gas.diameter**2,
-            "velocity_correlation": gas.temperature,
-            "dissipated_energy": gas.mass * gas.temperature,
-            "collisions": 1.0,
-            "regularised": 1.0,
-        }
-        each = {name: run.records[name].T * unit for name, unit in units.items()}
-        mean = {name: jnp.mean(values, axis=0) for name, values in each.items()}
-        errors = {}
-        if self.replicas > 1:
-            for name in ("temperature", "displacement"):
-                # Where all replicas agree, at t = 0, a root has no derivative.
-                deviation = jnp.std(jax.lax.stop_gradient(each[name]), axis=0, ddof=1)
-                errors[f"{name}_error"] = deviation / self.replicas**0.5
-        shape = self.replicas, self.num_particles, gas.dimension
-        particles = Particles(
-            position=run.position.reshape(shape) * gas.diameter,
-            velocity=run.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
-            box_side=scene.side * gas.diameter,
-        )
-        return CoolingCurve(
-            times=times,
-            **mean,
-            **errors,
-            replicas=CoolingCurve(times=times, **each),
-            particles=particles,
-            status=run.status,
-        )
+        return boxes.run(self, inputs, kind, plan, self._skin(scene, dimension), dimension)
 
 
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Scene:
@@ -370,19 +199,9 @@ def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Sc
 def _observe(state: State, *, scene: Scene, replicas: int) -> dict[str, Array]:
     """The records of a state, with their derivatives if tangents are followed."""
 
-    def centred(x):
-        boxes = x.reshape(replicas, -1, x.shape[-1])
-        return boxes - jnp.mean(boxes, axis=1, keepdims=True)
-
-    num_particles, d = len(state.position) // replicas, state.position.shape[-1]
-    velocity = centred(state.velocity)
-    travelled = centred(state.position - state.origin + scene.side * state.image)
-    first = centred(state.first_velocity)
-    records = {
-        "temperature": observables.temperature(velocity),
-        "sonine": observables.sonine(velocity),
-        "displacement": observables.mean_square_displacement(travelled),
-        "velocity_correlation": observables.velocity_correlation(first, velocity),
+    records, travelled, velocity = boxes.observed(state, scene.side, replicas)
+    num_particles, d = velocity.shape[1:]
+    records |= {
         "dissipated_energy": state.dissipated / num_particles,
         "collisions": 2 / num_particles * state.impacts,
         "regularised": 2 / num_particles * state.regularised,

@@ -1,0 +1,329 @@
+"""Boxes of spheres, soft or hard: what is asked of them, how they start, melt and cool."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer, eval_context
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+
+from jaxgran import initial, neighbours, observables, status
+from jaxgran.checkpoint import fingerprint
+from jaxgran.curve import CoolingCurve, Particles
+from jaxgran.gas import Gas, sphere_surface
+from jaxgran.simulation import simulate
+from jaxgran.tangents import Inputs, Outputs
+
+SMALLEST_BOX = 2.1
+"""Box side in diameters below which a sphere could touch another and its image at once."""
+
+MELT_COLLISIONS = 10.0
+"""Mean free times of elastic motion before t = 0."""
+
+MOST_PAIRS = 100
+"""Pairs per particle beyond which a list is taken to have gone wrong."""
+
+
+class Model(Protocol):
+    """What models of spheres in boxes have in common."""
+
+    @property
+    def num_particles(self) -> int: ...
+    @property
+    def replicas(self) -> int: ...
+    @property
+    def key(self) -> PRNGKeyArray | None: ...
+    @property
+    def start(self) -> Particles | None: ...
+    @property
+    def neighbours(self) -> str: ...
+    @property
+    def progress(self) -> bool: ...
+    @property
+    def checkpoint(self) -> str | Path | None: ...
+    @property
+    def plan(self) -> Any: ...
+
+
+class Room(NamedTuple):
+    """How many rows the arrays of a compiled run have."""
+
+    pairs: int
+    near: int
+    contacts: int
+    members: int
+
+    def grown(self, needed: Sequence[int]) -> "Room":
+        """With more rows than needed where there are fewer."""
+        return Room(
+            *(r if n <= r else int(1.3 * n) + 32 for r, n in zip(self, needed, strict=True))
+        )
+
+
+class Kind(NamedTuple):
+    """How one kind of spheres moves; its states and scenes are its own.
+
+    Attributes:
+        at_start: the state at t = 0 of positions and velocities and the skin of the list.
+        stretch: a state taken further towards an end, with the status and the rows needed.
+        observe: the records of a state.
+        elastic: the scene in which no energy is lost.
+        followed: a state with the tangents at t = 0, or as it is.
+    """
+
+    at_start: Callable[[Array, Array, ArrayLike], Any]
+    stretch: Callable[..., Any]
+    observe: Callable[[Any], dict[str, Array]]
+    elastic: Callable[[Any], Any]
+    followed: Callable[[Any], Any]
+
+
+def check_counts(model: Model, **least: int) -> None:
+    """Raises ValueError where a whole number of the model is less than it must be."""
+    for name, lowest in ({"num_particles": 2, "replicas": 1} | least).items():
+        value = getattr(model, name)
+        if not isinstance(value, int) or value < lowest:
+            raise ValueError(f"{name} must be a whole number >= {lowest}, got {value!r}")
+    neighbours.engine(model.neighbours)
+
+
+def check_box(model: Model, gas: Gas) -> None:
+    """Raises ValueError for a gas too dense, a box too small, or a start not of this gas."""
+    if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
+        return
+    limit, phi = initial.PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
+    if phi > limit and model.start is None:
+        raise ValueError(
+            f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g}; "
+            "lower it, or give your own start"
+        )
+    side = float(jnp.min(gas.box_side(model.num_particles) / gas.diameter))
+    if side < SMALLEST_BOX:
+        raise ValueError(
+            f"the box is {side:.3g} diameters long, at least {SMALLEST_BOX} are needed to tell "
+            "a sphere from its image; use more particles or a lower packing_fraction"
+        )
+    if model.start is None:
+        return
+    shape = (model.replicas, model.num_particles, gas.dimension)
+    for name, values in zip(model.start._fields[:2], model.start[:2], strict=True):
+        if np.shape(values) != shape:
+            raise ValueError(f"start.{name} has shape {np.shape(values)}, not {shape}")
+    given = float(model.start.box_side / gas.diameter)
+    if not abs(given / side - 1) < 1e-6:
+        raise ValueError(
+            f"start.box_side is {given:.7g} diameters, the gas fills {side:.7g}: change "
+            "packing_fraction or the start"
+        )
+
+
+def reduced_start(
+    model: Model, gas: Gas, *, differentiable: bool = False
+) -> tuple[Array, Array] | None:
+    """The given positions and velocities in units of the gas, replica after replica.
+
+    Args:
+        model, gas: as given by the user.
+        differentiable: whether a derivative is to see those units; else the start is the same in
+            units of any other gas.
+    """
+    if model.start is None:
+        return None
+    units = gas.diameter, jnp.sqrt(gas.temperature)
+    length, speed = units if differentiable else jax.lax.stop_gradient(units)
+    position, velocity = model.start.position / length, model.start.velocity / speed
+    return position.reshape(-1, gas.dimension), velocity.reshape(-1, gas.dimension)
+
+
+def pairs_in_contact(num_particles: int, side: ArrayLike, dimension: int) -> Array:
+    """Pairs a particle within contact, were the pair correlation 1."""
+    return (
+        num_particles * sphere_surface(dimension) / (2 * dimension) / jnp.asarray(side**dimension)
+    )
+
+
+def skin_with(more: float, num_particles: int, side: ArrayLike, dimension: int) -> Array:
+    """Reach beyond contact, in diameters, in which so many more pairs a particle are listed."""
+    inside = pairs_in_contact(num_particles, side, dimension)
+    return jnp.minimum((1 + more / inside) ** (1 / dimension) - 1, longest_skin(side))
+
+
+def longest_skin(side: ArrayLike) -> Float[Array, ""]:
+    """The longest skin, in diameters, in whose reach a sphere meets no sphere and its image."""
+    return 0.5 * jnp.asarray(side) * (1 - 1e-6) - 1
+
+
+def settled_plan(model: Model, size: Callable[[], Any]) -> Any:
+    """The model's plan, or one that is sized now, if all that it depends on is known."""
+    try:
+        with jax.ensure_compile_time_eval():
+            return model.plan or size()
+    except jax.errors.ConcretizationTypeError:
+        raise ValueError(
+            f"inside jax.jit the sizes of arrays must be known: give {type(model).__name__}(...)"
+            ".sized_for(gas), made outside with a gas of known numbers"
+        ) from None
+
+
+def run(
+    model: Model,
+    inputs: Inputs,
+    kind: Kind,
+    plan: Any,
+    skin: ArrayLike,
+    dimension: int,
+    settings: tuple = (),
+) -> Outputs:
+    """Melt, then cool.
+
+    Args:
+        model: N, replicas, progress and so on.
+        inputs: the scene, times, start and key.
+        kind: how these spheres move.
+        plan: sizes of arrays, with a field `room`.
+        skin: of the neighbour list.
+        dimension: d.
+        settings: what else of the model fixes the result.
+    """
+    scene, replicas = inputs.scene, model.replicas
+    if inputs.start is None:
+        keys = jax.random.split(jax.random.key(0) if inputs.key is None else inputs.key)
+        size = replicas, model.num_particles, dimension
+        position = initial.positions(keys[0], scene.side, *size)
+        velocity = initial.velocities(keys[1], *size)
+    else:
+        position, velocity = inputs.start
+    state = kind.at_start(position, velocity, skin)
+
+    def begun(melted):
+        velocity = melted.velocity
+        if inputs.start is None:
+            velocity = initial.settle(velocity, replicas)
+        return kind.followed(kind.at_start(melted.position, velocity, melted.skin))
+
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs)):
+        state, records, fault = _traced(inputs, kind, plan, state, begun)
+    else:
+        # Under jax.grad every call of a compiled function would be traced again.
+        with eval_context():
+            state, records, fault = _driven(model, inputs, kind, plan, state, begun, settings)
+    return Outputs(neighbours.wrap(scene.side, state.position), state.velocity, records, fault)
+
+
+def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settings):
+    """Run by a loop on the host, which makes room as it is needed."""
+    scene, engine = inputs.scene, neighbours.engine(model.neighbours)
+
+    def advance(state, end: float, scene=scene):
+        nonlocal plan
+        while True:
+            now = kind.stretch(state, scene, end, plan, engine)
+            state, fault = now.state, int(now.status)
+            if fault == status.OK:
+                return state
+            needed = [int(x) for x in now.needed]
+            missing = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
+            if not missing or max(needed) > MOST_PAIRS * len(state.position):
+                at = float(jnp.mean(state.velocity**2))
+                raise RuntimeError(f"stopped at T/T_0 = {at:.3g}: {status.explain(fault)}")
+            plan = plan._replace(room=plan.room.grown(needed))
+
+    # A run to be resumed has been melted.
+    if inputs.start is None and not (model.checkpoint and Path(model.checkpoint).exists()):
+        melt = partial(advance, scene=kind.elastic(scene))
+        end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
+        state, _ = simulate(state, end, melt, kind.observe, progress=model.progress, label="melt")
+    state = advance(begun(state), 0.0)  # counts the energy in contacts
+    size = model.num_particles, model.replicas, *settings, model.neighbours
+    state, records = simulate(
+        state,
+        np.asarray(inputs.times),
+        advance,
+        kind.observe,
+        scene=fingerprint(inputs, state.tangents, size),
+        progress=model.progress,
+        path=model.checkpoint,
+    )
+    records = {name: jnp.asarray(value) for name, value in records.items()}
+    return state, records, jnp.zeros((), jnp.int32)
+
+
+def _traced(inputs: Inputs, kind: Kind, plan, state, begun):
+    """The same inside `jax.jit`, `jax.vmap` or a derivative: room is fixed beforehand."""
+
+    def further(carry, scene, end):
+        now = kind.stretch(carry[0], scene, end, plan)
+        return now.state, now.status
+
+    def until(carry, scene, end):
+        def unfinished(carry):
+            return (carry[0].time < end) & (carry[1] == status.OK)
+
+        return jax.lax.while_loop(unfinished, partial(further, scene=scene, end=end), carry)
+
+    scene, fault = inputs.scene, jnp.zeros((), jnp.int32)
+    if inputs.start is None:
+        end = MELT_COLLISIONS / scene.collision_frequency
+        state, fault = until((state, fault), kind.elastic(scene), end)
+    state, counted = further((begun(state), fault), scene, jnp.zeros_like(state.time))
+
+    def to(carry, end):
+        state, fault = until(carry, scene, end)
+        records, bad = kind.observe(state), fault != status.OK
+        return (state, fault), jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), records)
+
+    (state, fault), records = jax.lax.scan(to, (state, fault | counted), inputs.times)
+    return state, records, fault
+
+
+def observed(
+    state: Any, side: Array, replicas: int
+) -> tuple[dict[str, Array], Float[Array, "replicas N d"], Float[Array, "replicas N d"]]:
+    """The records of every kind of spheres, and their paths and velocities in the frame at rest."""
+
+    def centred(x):
+        each = x.reshape(replicas, -1, x.shape[-1])
+        return each - jnp.mean(each, axis=1, keepdims=True)
+
+    velocity = centred(state.velocity)
+    travelled = centred(state.position - state.origin + side * state.image)
+    records = {
+        "temperature": observables.temperature(velocity),
+        "sonine": observables.sonine(velocity),
+        "displacement": observables.mean_square_displacement(travelled),
+        "velocity_correlation": observables.velocity_correlation(
+            centred(state.first_velocity), velocity
+        ),
+    }
+    return records, travelled, velocity
+
+
+def curve(gas: Gas, times: Array, model: Model, side: Array, run: Outputs) -> CoolingCurve:
+    """The curve in SI units, of records in units of diameter, mass and first temperature."""
+    energy = gas.mass * gas.temperature
+    units = {
+        "temperature": gas.temperature,
+        "sonine": 1.0,
+        "displacement": gas.diameter**2,
+        "velocity_correlation": gas.temperature,
+        "elastic_energy": energy,
+        "dissipated_energy": energy,
+        "collisions": 1.0,
+        "regularised": 1.0,
+    }
+    each = {name: values.T * units[name] for name, values in run.records.items()}
+    shape = model.replicas, model.num_particles, gas.dimension
+    return CoolingCurve.of_replicas(
+        times,
+        each,
+        particles=Particles(
+            position=run.position.reshape(shape) * gas.diameter,
+            velocity=run.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
+            box_side=side * gas.diameter,
+        ),
+        status=run.status,
+    )
