@@ -2,13 +2,13 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scenes import beads
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 import jaxgran
 
@@ -18,6 +18,15 @@ PER_CELL = 20
 SPARE = 4.0
 """Room for pairs over the need of a homogeneous gas."""
 
+FACTORS = (1.05, 1.1, 1.2, 2.0)
+"""By which T is above that of kinetic theory where a gas departs from it."""
+
+UNEVEN = (1.5, 2.0)
+"""By which the unevenness is above that of the elastic fluid."""
+
+SLOPE_OVER = 6
+"""Stretches that a slope of ln T is taken over."""
+
 
 def viscoelastic_like(gas: jaxgran.Gas) -> jaxgran.Gas:
     """Viscoelastic disks that begin to cool at the same rate, -d ln T/dt of a Maxwellian gas."""
@@ -26,8 +35,10 @@ def viscoelastic_like(gas: jaxgran.Gas) -> jaxgran.Gas:
     def alike(beta: float) -> jaxgran.Gas:
         return beads(float(gas.packing_fraction), beta, dimension=gas.dimension)
 
-    wanted = float(theory.cooling_rate(gas))
-    return alike(brentq(lambda x: float(theory.cooling_rate(alike(x))) - wanted, 1e-3, 3.0))
+    def excess(beta: float) -> float:
+        return float(theory.cooling_rate(alike(beta)) - theory.cooling_rate(gas))
+
+    return alike(root_scalar(excess, bracket=(1e-3, 3.0)).root)
 
 
 def dissipation(gas: jaxgran.Gas) -> float:
@@ -64,6 +75,7 @@ def follow(
     plan = melt.sized_for(gas, spare=SPARE).plan
     melt = dataclasses.replace(melt, plan=plan)
     now = jaxgran.cool(gas, [0.0], model=melt).particles
+    assert now is not None
     started = time.perf_counter()
     rows, positions = [[0.0, 0.0, float(gas.temperature), *clusters(now), 0.0]], {}
     pace = 1.0  # homogeneous mean free times that a collision takes
@@ -75,7 +87,9 @@ def follow(
         duration = stretch * pace * float(here.mean_free_time)
         model = jaxgran.HardSpheres(num_particles, start=now, progress=False, plan=plan)
         curve = jaxgran.cool(here, [duration], model=model)
+        assert curve.collisions is not None and curve.regularised is not None
         now, done = curve.particles, float(curve.collisions[-1])
+        assert now is not None
         pace *= float(np.clip(stretch / done, 0.5, 2.0))
         rows.append(
             [
@@ -133,7 +147,35 @@ def crossing(x: np.ndarray, y: np.ndarray, level: float) -> float:
     return float(x[i - 1] + (level - y[i - 1]) / (y[i] - y[i - 1]) * (x[i] - x[i - 1]))
 
 
-def mean_error(values: Collection[float]) -> list[float]:
-    """Mean and standard error."""
-    values = np.asarray(list(values))
-    return [float(values.mean()), float(values.std(ddof=1) / len(values) ** 0.5)]
+def slope(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """dy/dx by straight lines through neighbouring points."""
+    half = SLOPE_OVER // 2
+    ends = [(max(i - half, 0), min(i + half, len(x) - 1) + 1) for i in range(len(x))]
+    return np.array([np.polyfit(x[a:b], y[a:b], 1)[0] for a, b in ends])
+
+
+def departures(run: dict, elastic: float) -> dict[str, dict[str, float]]:
+    """Collisions, T_0/T and nu_0 t at which a run departs, by each definition."""
+    x = run["collisions"]
+    at = {f"T over theory's of N by {c:g}": crossing(x, run["excess"], np.log(c)) for c in FACTORS}
+    for c in FACTORS:
+        at[f"T over theory's of t by {c:g}"] = crossing(x, run["excess_in_time"], np.log(c))
+    share = run["slope"] / run["theory_slope"]
+    at["ln T falls half as fast"] = crossing(x, -share, -0.5)
+    for c in UNEVEN:
+        at[f"unevenness over elastic by {c:g}"] = crossing(x, run["unevenness"], c * elastic)
+
+    def there(collisions, name):
+        if not np.isfinite(collisions):
+            return float("nan")
+        return float(np.exp(np.interp(collisions, x[1:], np.log(run[name][1:]))))
+
+    return {
+        name: {"N": n, "T": 1 / there(n, "clock"), "tau": there(n, "tau")} for name, n in at.items()
+    }
+
+
+def mean_error(values: Iterable[float]) -> list[float]:
+    """Mean and standard error; nan if one value is."""
+    every = np.asarray(list(values))
+    return [float(every.mean()), float(every.std(ddof=1) / len(every) ** 0.5)]
