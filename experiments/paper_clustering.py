@@ -64,7 +64,7 @@ class Config:
     seeds: tuple[int, ...] = (0, 1, 2)
     scenes: tuple[Scene, ...] = (
         Scene(0.245, 0.9, (110.0, 110.0), (70.0, 0.0031)),
-        Scene(0.05, 0.6, (32.0, 40.0), (23.0, 0.0027)),
+        Scene(0.05, 0.6, (28.0, 32.0), (23.0, 0.0027)),
     )
     fields: tuple[float, ...] = (20.0, 60.0, 85.0, 108.0)  # collisions, of the first scene
 
@@ -142,13 +142,12 @@ def analyse(config: Config, runs: dict) -> dict:
             found[law] = {
                 "gamma_0": each[0]["gamma_0"],
                 "departures": {
-                    name: {
-                        clock: mean_error(x[name][clock] for x in left) for clock in left[0][name]
-                    }
-                    for name in left[0]
+                    name: {clock: found_in_all(x[name][clock] for x in left) for clock in row}
+                    for name, row in left[0].items()
                 },
                 "T_at_the_papers_N": mean_error(
-                    1 / np.interp(n_c, run["collisions"], run["clock"]) for run in reached
+                    np.exp(-np.interp(n_c, run["collisions"], np.log(run["clock"])))
+                    for run in reached
                 )
                 if len(reached) > 1
                 else None,
@@ -159,12 +158,7 @@ def analyse(config: Config, runs: dict) -> dict:
                 "last_flow": mean_error(run["flow"][-1] for run in each),
                 "seconds": [[run["start_s"], run["run_s"]] for run in each],
                 "collisions": grid.tolist(),
-                "curves": {
-                    name: np.mean(
-                        [np.interp(grid, r["collisions"], r[name]) for r in each], 0
-                    ).tolist()
-                    for name in names
-                },
+                "curves": {name: mean_curve(each, grid, name) for name in names},
             }
         scenes[scene.name] = found | {
             "elastic_unevenness": mean_error(start),

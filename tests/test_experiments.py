@@ -162,6 +162,8 @@ def test_clusters_dissolve(tmp_path):
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / "dissolves.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / "dissolves.json").read_text())
-    # L_c of 300 disks passes the box early; the flow that they had by then decays.
-    assert record["viscoelastic"]["temperature"][-1] < record["viscoelastic"]["temperature"][0]
-    assert record["critical_box_passes_at"]
+    # A box of 300 disks is as long as L_c at the start: no clusters, T as in kinetic theory; seen
+    # 0.08 +- 0.05 above it after 60 collisions, at T/T_0 = 6e-6.
+    gas = record["viscoelastic"]
+    assert gas["temperature"][-1] < 2e-5 * gas["temperature"][0]
+    assert abs(gas["excess"][-1]) < 0.4 and abs(gas["flow"][-1]) < 0.1
