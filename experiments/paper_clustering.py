@@ -269,18 +269,20 @@ def draw_fields(config: Config, runs: dict, path: Path) -> None:
     figure, axes = plt.subplots(
         2, len(config.fields), figsize=(2.6 * len(config.fields) + 0.8, 5.6), layout="constrained"
     )
-    shown = ScalarMappable(Normalize(0.0, 2.5), cmap="magma")
+    shown = ScalarMappable(Normalize(0.0, 2.5), cmap=plt.get_cmap("magma", 25))
     for law, row in zip(LAWS, axes, strict=True):
         run = runs[scene.name, law, seed]
         for mark, axis in zip(config.fields, row, strict=True):
             place = run["positions"][mark]
-            pixels = int(2 * len(place) ** 0.5)  # two a mean distance
+            pixels = int(len(place) ** 0.5)  # one a mean distance
             number = np.histogram2d(*place.T % 1.0, bins=pixels, range=[[0, 1], [0, 1]])[0]
-            density = gaussian_filter(number, 3.0, mode="wrap") / number.mean()
-            axis.imshow(density.T, norm=shown.norm, cmap=shown.cmap, origin="lower")
+            density = gaussian_filter(number, 1.5, mode="wrap") / number.mean()
+            axis.imshow(
+                density.T, norm=shown.norm, cmap=shown.cmap, origin="lower", interpolation="nearest"
+            )
             temperature = 1 / np.interp(mark, run["collisions"], run["clock"])
             axis.set(xticks=[], yticks=[])
-            axis.set_title(f"N = {mark:g},  $T/T_0$ = {temperature:.1e}", fontsize=9)
+            axis.set_title(f"$N$ = {mark:g},  $T/T_0$ = {temperature:.1e}", fontsize=9)
         row[0].set_ylabel(
             f"$\\varepsilon$ = {scene.restitution:g}" if law == "constant" else "viscoelastic"
         )

@@ -45,8 +45,8 @@ class Config:
     restitution: float = 0.6
     num_particles: int = 2000
     seeds: tuple[int, ...] = (0, 1, 2)
-    until: tuple[float, float] = (40.0, 800.0)  # collisions per particle, of each law
-    fields: tuple[float, ...] = (5.0, 50.0, 200.0, 800.0)
+    until: tuple[float, float] = (40.0, 600.0)  # collisions per particle, of each law
+    fields: tuple[float, ...] = (5.0, 30.0, 150.0, 600.0)
 
 
 SMOKE = Config(num_particles=300, seeds=(0, 1), until=(8.0, 60.0), fields=(4.0, 60.0))
