@@ -115,10 +115,15 @@ def vesin_search(position: np.ndarray, side: float, cutoff: float, replicas: int
         planar = boxes.shape[-1] == 2
         if planar:
             boxes = np.concatenate([boxes, np.zeros_like(boxes[..., :1])], axis=-1)
-        cell = np.diag([side, side, 1.0 if planar else side])
+        # vesin makes at most 10^5 cells, alike in shape to the box, and dies where a direction is
+        # left with less than one. A wide plane gets more layers, empty but for the first; only
+        # along a periodic direction does vesin go by the height of the box.
+        layers = int(side / (300 * cutoff)) if planar else 0
+        cell = np.diag([side, side, (layers + 1.5) * cutoff if planar else side])
+        periodic = True, True, not planar or layers > 0
         search = NeighborList(cutoff=cutoff, full_list=False)
         for first, points in zip(range(0, len(position), boxes.shape[1]), boxes, strict=True):
-            found = search.compute(points, cell, (True, True, not planar), "ij", copy=False)
+            found = search.compute(points, cell, periodic, "ij", copy=False)
             end = min(count + len(found[0]), room)
             for row, indices in zip(pairs, found, strict=True):
                 row[count:end] = indices[: end - count]

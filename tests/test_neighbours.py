@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from jaxgran.neighbours import displacement, engine, find_pairs, wrap
 
@@ -71,6 +72,15 @@ def compare(dimension, replicas, side, cutoff, by):
 @pytest.mark.parametrize("fraction", [0.15, 1 / 3, 0.4999, 0.5])
 def test_vesin_finds_what_brute_force_finds(dimension, replicas, fraction):
     compare(dimension, replicas, 3.7, 3.7 * fraction, "vesin")
+
+
+def test_vesin_survives_wide_planes():
+    # vesin's limit of 10^5 cells used to leave none across the plane: a division by zero.
+    for side in (300.0, 560.0, 2500.0):
+        position = side * np.random.default_rng(0).random((20_000, 2))
+        pairs = find_pairs(jnp.asarray(position), side, 1.0, room=20_000)
+        expected = cKDTree(position, boxsize=side).query_pairs(1.0)
+        assert set(listed(pairs)) == expected and int(pairs.count) == len(expected) > 10
 
 
 @jax_md_warns
