@@ -20,6 +20,12 @@ from jaxgran.tangents import ImpactTangents
 LEAST_IMPACTS = 8
 """Impacts that a window should have at least, in all replicas together."""
 
+CROWDED = 20.0
+"""Listed pairs per particle from which on the skin is shortened: clusters fill a long reach."""
+
+SHORTEST_SKIN = 0.2
+"""In diameters, below which crowding is borne."""
+
 SPEED_MARGIN = 1.15
 """How much faster than the fastest sphere one may become within a window."""
 
@@ -272,9 +278,15 @@ def _mended(now: Progress, began: State) -> dict[str, Any]:
     state = now.state
     fresh = state.time == began.time  # else a new list is all that an outrun skin needs
     shorten = status.has(now.status, status.SKIN_OUTRUN) & fresh
+    # Only after a stretch that had room, lest it depend on how much a resumed run has.
+    crowded = (now.needed[0] > CROWDED * len(state.position)) & (now.status == status.OK)
+    shorter = jnp.maximum(0.8 * state.skin, jnp.minimum(state.skin, SHORTEST_SKIN))
     beyond = status.LIST_FULL.bit | status.CONTACTS_FULL.bit
     beyond |= status.NOT_FINITE.bit | status.STALLED.bit
     return {
-        "state": state._replace(window=jnp.where(shorten, 0.5 * state.window, state.window)),
+        "state": state._replace(
+            window=jnp.where(shorten, 0.5 * state.window, state.window),
+            skin=jnp.where(crowded, shorter, state.skin),
+        ),
         "status": now.status & beyond,
     }
