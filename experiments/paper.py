@@ -56,6 +56,19 @@ def write(figure: Figure, folder: Path, name: str, config: Any, clock: Clock, **
     print(f"{folder / name}.png and .json, {sum(clock.times.values()):.0f} s")
 
 
+def figure(title: str, panels: int) -> Figure:
+    """Panels in a row under one sentence; `Figure.axes` are the panels."""
+    made = Figure(figsize=(4.6 * panels, 4.4), layout="constrained")
+    made.suptitle(title, color=INK)
+    made.subplots(1, panels)
+    return made
+
+
+def key(seed: int) -> jax.Array:
+    """The random key of a seed."""
+    return jax.random.key(seed)
+
+
 def slope(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where, and d ln y / d ln x there: between neighbouring points along the last axis."""
     x, y = np.log(x), np.log(y)
@@ -87,3 +100,9 @@ def caption(axes: Axes, title: str, **settings: Any) -> None:
 def listed(values: Iterable[Any]) -> list[float]:
     """Plain floats, for JSON."""
     return [float(x) for x in values]
+
+
+def alike(gas: jaxgran.Gas) -> float:
+    """The constant restitution with which a Maxwellian gas begins to cool as fast as this one."""
+    rate = jaxgran.KineticTheory().cooling_rate(gas) / gas.collision_frequency
+    return float((1 - gas.dimension * rate) ** 0.5)

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import paper
-from matplotlib.figure import Figure
 
 from jaxgran.contact import impact
 from jaxgran.restitution import C1, C2, C_CLIP, UNCLIPPED_SERIES, viscoelastic_restitution
@@ -30,10 +29,10 @@ class Config:
     lowest: float = 1e-3
     highest: float = 2.0
     fit_top: float = 0.3  # the series are fitted to impacts up to this beta
-    fit_degree: int = 12  # in beta, or in its root where contact is clipped
+    fit_degree: int = 16  # in beta, or in its root where contact is clipped
 
 
-SMOKE = Config(num_impacts=25)
+SMOKE = Config(num_impacts=16, fit_degree=12)
 
 
 def restitutions(betas: np.ndarray, clipped: bool, rtol: float) -> np.ndarray:
@@ -73,11 +72,11 @@ def main() -> None:
     coefficients = recovered(config)
     two = series(betas, (-C1, C2))
 
-    figure = Figure(figsize=(10, 4.6), layout="constrained")
-    figure.suptitle(
-        "The paper's two terms of ε hold to 1 % up to β = 0.25, whichever way contact ends"
+    figure = paper.figure(
+        "The paper's two terms of ε hold to 1 % up to β = 0.25, whichever way contact ends",
+        panels=2,
     )
-    left, right = figure.subplots(1, 2)
+    left, right = figure.axes
     left.plot(betas, clipped, color=paper.INK, label="equation of motion, ends at F = 0")
     left.plot(betas, unclipped, "--", color=paper.ELASTIC, label="same, ends at ξ = 0 (paper)")
     left.plot(betas, two, color=paper.VISCOELASTIC, label="paper, Eq. (1): two terms")
