@@ -56,17 +56,19 @@ def write(figure: Figure, folder: Path, name: str, config: Any, clock: Clock, **
     print(f"{folder / name}.png and .json, {sum(clock.times.values()):.0f} s")
 
 
-def figure(title: str, panels: int) -> Figure:
-    """Panels in a row under one sentence; `Figure.axes` are the panels."""
-    made = Figure(figsize=(4.6 * panels, 4.4), layout="constrained")
+def figure(title: str, columns: int, rows: int = 1) -> Figure:
+    """Panels under one sentence; `Figure.axes` are the panels, row by row."""
+    made = Figure(figsize=(4.6 * columns, 0.4 + 4.0 * rows), layout="constrained")
     made.suptitle(title, color=INK)
-    made.subplots(1, panels)
+    made.subplots(rows, columns)
     return made
 
 
-def key(seed: int) -> jax.Array:
-    """The random key of a seed."""
-    return jax.random.key(seed)
+def from_here(inside: np.ndarray, x: np.ndarray) -> float:
+    """The first x from which on all are inside; nan if the last is not."""
+    outside = np.flatnonzero(~inside)
+    start = outside[-1] + 1 if outside.size else 0
+    return float(x[start]) if start < x.size else float("nan")
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

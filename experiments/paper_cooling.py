@@ -8,6 +8,7 @@ theory, and the paper's closed forms, Eqs. (10), (38) and (44), as printed and a
 
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import paper
@@ -47,12 +48,12 @@ def main() -> None:
     labels["constant"] = f"constant ε = {e:.3f}"
     tau = np.geomspace(0.1, config.last_theory, 133)
     measured = np.geomspace(0.1, config.last, config.points)
-    model = jaxgran.DSMC(config.num_particles, config.replicas, key=paper.key(config.seed))
+    model = jaxgran.DSMC(config.num_particles, config.replicas, key=jax.random.key(config.seed))
 
     figure = paper.figure(
         "Viscoelastic spheres cool as t$^{-5/3}$, spheres of constant ε as t$^{-2}$:"
         " both of the paper's laws hold, late",
-        panels=3,
+        columns=3,
     )
     left, middle, right = figure.axes
     found = {}
@@ -86,7 +87,7 @@ def main() -> None:
         }
         if name == "viscoelastic":
             late = np.abs(local - slopes[name]) < 0.01 * abs(slopes[name])
-            found["exponent_within_1_per_cent_from"] = float(where[late][0])
+            found["exponent_within_1_per_cent_from"] = paper.from_here(late, where)
             found["closed_forms"] = closed_forms(right, tau, theta, float(gas.delta))
         else:
             haff = np.asarray(kinetics.haff(tau, e))

@@ -74,7 +74,7 @@ def main() -> None:
 
     figure = paper.figure(
         "The paper's two terms of ε hold to 1 % up to β = 0.25, whichever way contact ends",
-        panels=2,
+        columns=2,
     )
     left, right = figure.axes
     left.plot(betas, clipped, color=paper.INK, label="equation of motion, ends at F = 0")
