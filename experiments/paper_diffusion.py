@@ -178,6 +178,7 @@ def cooling_window(delta: float, tau: np.ndarray, axes) -> dict:
         "paper_from": first,
         "paper_to": last,
         "exponent_at_paper_to": _at(last, middle, local),
+        "lost_per_collision_at_start": float(lost[0]),
         "lost_per_collision_at_paper_to": _at(last, middle, lost),
         "exponent_within_10_per_cent_from": paper.from_here(np.abs(6 * local - 1) < 0.1, middle),
         "t_tau_v_within_5_per_cent_from": paper.from_here(

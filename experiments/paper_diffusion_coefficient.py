@@ -103,8 +103,10 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio)
     """D of one gas, drawn and returned, in units of T tau_E."""
     start, tau_c = float(gas.temperature), float(gas.mean_free_time)
     unit = 9 * start * tau_c**2  # of <dr^2> per collision at D = T tau_E
-    tau = np.geomspace(0.5, config.last, config.points)
-    fine = np.geomspace(0.02, config.last, 400)
+    # Elastic spheres go on colliding as at first, and are at their D after a few collisions.
+    last = config.last if name != "elastic" else min(config.last, 30.0)
+    tau = np.geomspace(0.5, last, config.points)
+    fine = np.geomspace(0.02, last, 400)
     of = jaxgran.cool(gas, fine * tau_c, model=jaxgran.KineticTheory(softness=False))
     theta = np.asarray(of.temperature) / start
     size = config.correlation

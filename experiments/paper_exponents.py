@@ -64,7 +64,7 @@ def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarra
     ``d ln T/d tau = -<1 - eps^2> sqrt(T/T_0)/3`` with the mean over ``g^3 exp(-g^2/2)`` by a fine
     sum: `jaxgran.KineticTheory` takes laws to be smooth, which that of ice is not.
     """
-    theta = np.geomspace(1.0, 1e-5, 1500)
+    theta = np.geomspace(1.0, 1e-7, 1500)
     g = (np.arange(4000) + 0.5) / 400
     weight = g**3 * np.exp(-(g**2) / 2)
     eps = np.asarray(gas.reduced_law.restitution(jnp.asarray(g * np.sqrt(theta)[:, None])))
