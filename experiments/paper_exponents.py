@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import paper
 from jaxtyping import Array, Float
+from matplotlib.ticker import NullFormatter
 from scenes import beads
 
 import jaxgran
@@ -187,6 +188,7 @@ def main() -> None:
         f"Ice: elastic below {found['ice']['threshold_cm_per_s']:.3f} cm/s; time runs to the left"
     )
     paper.caption(ice, title, xscale="log", ylim=(-2.1, 0.05), **labels)
+    ice.xaxis.set_minor_formatter(NullFormatter())
     paper.write(figure, options.out, NAME, config, clock, **found)
 
 
