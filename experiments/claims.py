@@ -38,13 +38,13 @@ class Table:
         return json.loads(path.read_text())["found"] if path.exists() else None
 
     def markdown(self) -> str:
-        head = "| Eq. | the paper | here | checked by | verdict | why |\n|" + "---|" * 6
-        lines = [
-            f"| {r.equation} | {r.claim} | {r.ours} | {r.checked} | "
-            f"{r.verdict if r.holds else 'DOES NOT HOLD'} | {r.why} |"
-            for r in self.rows
-        ]
-        return "\n".join([head, *lines]) + "\n"
+        lines = ["| Eq. | the paper | here | checked by | verdict | why |", "|" + "---|" * 6]
+        for r in self.rows:
+            verdict = r.verdict if r.holds else "DOES NOT HOLD"
+            cells = (r.equation, r.claim, r.ours, r.checked, verdict, r.why)
+            # A bar would end the cell.
+            lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        return "\n".join(lines) + "\n"
 
 
 def cooled(delta: float, u, **options) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:

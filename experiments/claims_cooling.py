@@ -89,7 +89,7 @@ def series(table: Table, gas: jaxgran.Gas) -> None:
     table.add(
         "32",
         f"1/τ_v = (1 − {kinetics.SLOWING:.4f} δ θ^{{1/10}} + {second:.4f} δ² θ^{{1/5}})/τ_E",
-        f"first coefficient {c:.4f} at δ = 10⁻⁴; two terms are {100 * _two_terms_off(0.1):.2f} % "
+        f"first coefficient {c:.4f} at δ = 10⁻⁴; two terms are {100 * _two_terms_off(0.1):.1g} % "
         f"off at δ = 0.1, {100 * _two_terms_off(0.3):.0f} % at 0.3",
         "exact average of ε(v)",
         "agree",

@@ -26,9 +26,9 @@ class Clock:
         self.begin, self.compile_s = time.perf_counter(), 0.0
         jax.monitoring.register_event_duration_secs_listener(self._hear)
 
-    def _hear(self, event: str, duration: float, **_: Any) -> None:
+    def _hear(self, event: str, duration_secs: float, **_: str | int) -> None:
         if event.endswith(("backend_compile_duration", "jaxpr_to_mlir_module_duration")):
-            self.compile_s += duration
+            self.compile_s += duration_secs
 
     @property
     def times(self) -> dict[str, float]:

@@ -80,7 +80,7 @@ def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def gas_of(gamma: float, config: Config) -> jaxgran.Gas:
     """Beads with 1 - eps = loss (v/sqrt(2 T_0))^gamma."""
     scene = beads(config.packing_fraction, 0.1)
-    coefficient = -config.loss / scene.impact_speed**gamma
+    coefficient = -config.loss / float(scene.impact_speed) ** gamma
     return eqx.tree_at(
         lambda gas: gas.law, scene, jaxgran.RestitutionSeries([coefficient], [gamma])
     )

@@ -41,7 +41,7 @@ def restitutions(betas: np.ndarray, clipped: bool, rtol: float) -> np.ndarray:
 
 
 def series(betas: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    return 1 + sum(c * betas ** (k + 1) for k, c in enumerate(coefficients))
+    return 1 + betas[:, None] ** np.arange(1, len(coefficients) + 1) @ np.array(coefficients)
 
 
 def recovered(config: Config) -> dict[str, list[float]]:

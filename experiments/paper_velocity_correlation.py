@@ -6,12 +6,13 @@ The velocity autocorrelation <v(t').v(t)> of elastic spheres, of constant and of
 restitution, by stochastic simulation and by hard spheres: its decay, and its relaxation time tau_v
 against the elastic Enskog time tau_E (paper, Eqs. (24), (31), (32)).
 
-Stochastic simulation starts a gas at T(t'), Maxwellian, for every t'; hard spheres go on from
-the state they had reached at t', elastic ones excepted, which do not age.
+Stochastic simulation starts Maxwellian at T(t'); hard spheres go on from the state they had
+reached at t', elastic ones excepted, which do not age.
 """
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -113,8 +114,9 @@ def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray, temperature: float) -
 
 def hard(gas: jaxgran.Gas, config: Config, ages: bool) -> dict:
     """The same in boxes of hard spheres, from t' on; and D by the slope of <dr^2> until t'."""
-    size = {"num_particles": config.num_spheres, "replicas": config.boxes}
-    model = jaxgran.HardSpheres(**size, key=jax.random.key(config.seed))
+    model = jaxgran.HardSpheres(
+        config.num_spheres, replicas=config.boxes, key=jax.random.key(config.seed)
+    )
     age = config.age * float(gas.mean_free_time)
     grown = jaxgran.cool(gas, [age / 2, age] if ages else [age / 100], model=model)
     temperature = float(grown.temperature[-1])
@@ -125,17 +127,19 @@ def hard(gas: jaxgran.Gas, config: Config, ages: bool) -> dict:
     row = summary(curve, lags, temperature)
     # From 4 tau_E on the start is forgotten, whatever the age.
     i = int(np.searchsorted(lags, 4.0))
-    row["slope"], row["slope_error"] = diffusion(curve, aged, slice(i, None, len(lags) - 1 - i))
+    (slope,), (error,) = diffusion(curve, aged, slice(i, None, len(lags) - 1 - i))
+    row |= {"slope": float(slope), "slope_error": float(error)}
     return row | {"temperature": temperature / float(gas.temperature)}
 
 
-def diffusion(curve: jaxgran.CoolingCurve, gas: jaxgran.Gas, which: slice):
-    """D/(T tau_E) between two times, d<dr^2>/(6 T tau_E dt), with T tau_E dt ~ sqrt(T) dt ~ dN."""
+def diffusion(
+    curve: jaxgran.CoolingCurve, gas: jaxgran.Gas, which: slice
+) -> tuple[np.ndarray, np.ndarray]:
+    """D/(T tau_E) between times, d<dr^2>/(6 T tau_E dt), with T tau_E dt ~ sqrt(T) dt ~ dN."""
     spread = paper.replicas_of(curve, "displacement")[:, which]
     collisions = paper.replicas_of(curve, "collisions")[:, which]
     unit = 9 * float(gas.temperature * gas.mean_free_time**2)
-    mean, error = paper.mean_and_error(np.diff(spread) / np.diff(collisions) / unit)
-    return (float(mean[0]), float(error[0])) if mean.size == 1 else (mean, error)
+    return paper.mean_and_error(np.diff(spread) / np.diff(collisions) / unit)
 
 
 def main() -> None:
@@ -156,13 +160,10 @@ def main() -> None:
         columns=3,
     )
     decay, counted, times = figure.axes
-    found = {}
-    lags = np.linspace(0, config.longest, 601)
+    found, lags = {}, np.linspace(0, config.longest, 601)
     for name, (gas, color, label) in gases.items():
         expected, collisions = theory(gas, lags)
-        row = {
-            "dsmc": stochastic(gas, config),
-        }
+        row: dict[str, Any] = {"dsmc": stochastic(gas, config)}
         row["paper_relaxation"] = float(printed_relaxation(gas))
         row["exact_relaxation"] = float(exact_relaxation(gas))
         if config.boxes:
