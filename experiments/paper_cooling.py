@@ -2,7 +2,7 @@
 
     python experiments/paper_cooling.py [--smoke] [--out DIR]
 
-Two gases that begin to cool alike, through six decades of time: stochastic simulation, kinetic
+Two gases that begin to cool alike, through seven decades of time: stochastic simulation, kinetic
 theory, and the paper's closed forms, Eqs. (10), (38) and (44), as printed and as corrected.
 """
 

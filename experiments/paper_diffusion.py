@@ -34,7 +34,7 @@ class Config:
     deltas: tuple[float, ...] = (0.1, 0.03, 0.01)  # whose windows are tabulated
 
 
-SMOKE = Config(num_particles=1000, replicas=2, last=1e3, points=9, deltas=(0.1,))
+SMOKE = Config(num_particles=1000, replicas=2, last=1e3, points=9, last_theory=1e10, deltas=(0.1,))
 
 
 def main() -> None:
