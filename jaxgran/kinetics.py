@@ -130,7 +130,7 @@ def paper_averages(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> 
     Raises:
         ValueError: for another law.
 
-    Reference: Brilliantov & Poeschel, Eqs. (30) and (35).
+    Reference: Brilliantov & Poeschel, Eqs. (32) and (36).
     """
     if not isinstance(law, ReducedViscoelastic):
         raise ValueError(
@@ -221,12 +221,20 @@ def softness_factor(law: ReducedLaw, speed: Float[Array, ""], dimension: int) ->
 
 
 # Closed forms. Times are in mean free times of the start, tau = nu_0 t; temperatures in T_0.
+# Equations are numbered as LaTeX numbers the authors' preprint.
 
 COOLING_RATE = {d: 9 / 5 / d * 2**0.2 * C1 * gamma(2.1) for d in (2, 3)}
-"""``tau_c(0) / (tau_0 delta)``: 0.83193 in 3D, the paper's Eq. (37)."""
+"""``tau_c(0) / (tau_0 delta)``: 0.83193 in 3D, the paper's Eq. (39)."""
 
 TWO_TERM = 33 / 20 * 2**0.2 * C1 * gamma(2.2) / gamma(2.1)
 """q, the paper's b_2 over b_1 at T_0 and delta = 1: 2.3018."""
+
+
+SLOWING = 3 / 4 * gamma(2.1) * C1 * 4**0.1
+"""c, by how much impacts lengthen tau_v: ``tau_E/tau_v = 1 - c delta``, 1.03992; Eq. (32)."""
+
+SONINE = 3 / 20 * C1 * _moment(2.2) * 1.5 * 2**0.1
+"""s in ``a_2 = -s delta (T/T_0)^(1/10)``, the excess kurtosis to first order in 3D: 0.62395."""
 
 
 def haff(tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3) -> Float[Array, "..."]:
@@ -237,10 +245,43 @@ def haff(tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3) -> Float[Ar
         coefficient: constant restitution e.
         dimension: d.
 
-    Reference: Brilliantov & Poeschel, Eq. (42); Maxwellian (a_2 = 0).
+    Reference: Brilliantov & Poeschel, Eq. (44); Maxwellian (a_2 = 0).
     """
     loss = (1 - jnp.asarray(coefficient) ** 2) / (2 * dimension)
     return (1 + loss * jnp.asarray(tau)) ** -2.0
+
+
+def haff_collisions(
+    tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3
+) -> Float[Array, "..."]:
+    """Collisions per particle under Haff's law, ``N = ln(1 + gamma_0 tau) / gamma_0``.
+
+    Args, validity: as `haff`; e in [0, 1).
+    """
+    loss = (1 - jnp.asarray(coefficient) ** 2) / (2 * dimension)
+    return jnp.log1p(loss * jnp.asarray(tau)) / loss
+
+
+def constant_displacement(
+    collisions: ArrayLike, coefficient: ArrayLike, dimension: int = 3
+) -> Float[Array, "..."]:
+    """<dr^2> of a gas of constant restitution, in units of ``T_0 tau_c(0)^2``; ballistic start too.
+
+    ``<dr^2> = (2 d / k) (N - (1 - exp(-k N)) / k)``, ``k = (1 + e)^2 / (2 d)``: linear in the
+    collisions per particle, hence logarithmic in time. Solves ``dD/dt = T - D/tau_v`` with
+    ``1/tau_v = nu (1 + e)/d``; Maxwellian, first Sonine order of D.
+
+    Args:
+        collisions: N per particle, any shape; see `haff_collisions`.
+        coefficient: e, in [0, 1].
+        dimension: d.
+
+    Reference: Brilliantov & Poeschel, Eqs. (45) and (46); their ``D = T tau_v``, Eq. (34), forgets
+    the cooling during tau_v and has ``k = (1 + e) / d``.
+    """
+    k = (1 + jnp.asarray(coefficient)) ** 2 / (2 * dimension)
+    n = jnp.asarray(collisions)
+    return 2 * dimension / k * (n + jnp.expm1(-k * n) / k)
 
 
 def paper_temperature(
@@ -258,7 +299,7 @@ def paper_temperature(
             coefficient of delta^2 is left out: no two-term equation can give it.
         clipped: include the delta^(3/2) term of contacts that end at zero force.
 
-    Reference: Brilliantov & Poeschel, Eq. (36), corrected.
+    Reference: Brilliantov & Poeschel, Eq. (38), corrected.
     """
     u = 1 + COOLING_RATE[3] * jnp.asarray(delta) * jnp.asarray(tau)
     q = TWO_TERM
@@ -275,6 +316,37 @@ def paper_temperature(
         + 20 / 9 * p * delta**1.5 * (u ** (-23 / 12) - u ** (-8 / 3))
         + delta**2 * second
     )
+
+
+def paper_displacement(
+    tau: ArrayLike, delta: ArrayLike, *, corrected: bool = True
+) -> Float[Array, "..."]:
+    """<dr^2> of viscoelastic spheres to order delta, in 3D, in units of ``T_0 tau_c(0)^2``.
+
+    ``6 D_0 tau_0 {6 (u^(1/6) - 1) + delta [a_3 ln u - (6/5) (q' (1 - u^(-5/6)) + c)]}`` for times
+    beyond tau_v, with ``D_0 = T_0 tau_E(0) = 3/2``, ``a_3 = q' + (c + 3 s/16) + c = 4.648`` and
+    ``q' = q + 0.24 s``: of cooling, of slower relaxation, of cooling during the relaxation (the
+    memory, which also takes the last c), each with the a_2 that is of the same order.
+
+    Args:
+        tau: ``nu_0 t``, any shape.
+        delta: ``A alpha^(2/5) T_0^(1/10)``.
+        corrected: False gives the paper's D integrated from 0: ``a_3 = q + c = 3.342``, without
+            memory, a_2 and the terms that keep T(0) = T_0.
+
+    Reference: Brilliantov & Poeschel, Eqs. (40) and (42), corrected: (41) prints 1/tau_E in place
+    of D_0, and (42) leaves out the factor 6 of u^(1/6) and the constant, which hides the power law
+    until u = 2e6.
+    """
+    rate = COOLING_RATE[3] * jnp.asarray(delta)
+    u = 1 + rate * jnp.asarray(tau)
+    if corrected:
+        cooling = TWO_TERM + 0.24 * SONINE
+        first = (cooling + 2 * SLOWING + 3 / 16 * SONINE) * jnp.log(u)
+        first -= 6 / 5 * (cooling * (1 - u ** (-5 / 6)) + SLOWING)
+    else:
+        first = (TWO_TERM + SLOWING) * jnp.log(u)
+    return 9 / rate * (6 * (u ** (1 / 6) - 1) + delta * first)
 
 
 def _relative(power: float, coefficient: float) -> float:
@@ -307,7 +379,7 @@ def two_term_time(theta: ArrayLike, delta: ArrayLike) -> Float[Array, "..."]:
     Raises:
         ValueError: for delta >= 1/q.
 
-    Reference: Brilliantov & Poeschel, Eq. (35), integrated by partial fractions.
+    Reference: Brilliantov & Poeschel, Eq. (36), integrated by partial fractions.
     """
     limit = 1 / TWO_TERM
     if np.any(np.asarray(delta) >= limit):

@@ -150,29 +150,3 @@ def test_fits_head_to_head_run(tmp_path):
         assert len(row["guesses"]) == row["all_simulations"] > 0
         if row["search"] == "jaxgran.fit":  # 1000 spheres leave A open by some per cent
             assert abs(row["last_error"][0]) < 0.15
-
-
-def test_clustering_leaves_haffs_law(tmp_path):
-    done = run("paper_clustering.py", "--smoke", "--out", "here", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    for name in ("paper_clustering.png", "paper_clustering_fields.png"):
-        assert (tmp_path / "here" / name).stat().st_size > 20_000
-    record = json.loads((tmp_path / "here" / "paper_clustering.json").read_text())
-    (scene,) = record["scenes"].values()
-    assert scene["viscoelastic"]["gamma_0"] == pytest.approx(scene["constant"]["gamma_0"])
-    # At e = .6 even 500 disks leave Haff's law, 10 % above it after 4.3 +- 0.9 collisions.
-    left = scene["constant"]["departures"]["T over theory's of N by 1.1"]
-    assert 2 < left["N"][0] < 9 and 0.1 < left["T"][0] < 0.6
-    assert scene["constant"]["last_flow"][0] > 0.1  # and move together
-
-
-def test_clusters_dissolve(tmp_path):
-    done = run("paper_clustering_dissolves.py", "--smoke", "--out", "here", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "here" / "dissolves.png").stat().st_size > 20_000
-    record = json.loads((tmp_path / "here" / "dissolves.json").read_text())
-    # A box of 300 disks is as long as L_c at the start: no clusters, T as in kinetic theory; seen
-    # 0.08 +- 0.05 above it after 60 collisions, at T/T_0 = 6e-6.
-    gas = record["viscoelastic"]
-    assert gas["temperature"][-1] < 2e-5 * gas["temperature"][0]
-    assert abs(gas["excess"][-1]) < 0.4 and abs(gas["flow"][-1]) < 0.1

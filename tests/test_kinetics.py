@@ -173,7 +173,7 @@ def test_paper_averages_are_the_first_two_terms(beads):
 
 
 def test_velocity_relaxation_as_printed(beads):
-    # The paper's Eq. (30) with its own coefficients: 1 - 3/4 Gamma(21/10) C1 delta 4^.1 + ...
+    # The paper's Eq. (32) with its own coefficients: 1 - 3/4 Gamma(21/10) C1 delta 4^.1 + ...
     from math import gamma
 
     from jaxgran.restitution import C1
@@ -184,3 +184,43 @@ def test_velocity_relaxation_as_printed(beads):
     small = float(gas.delta) * 4**0.1
     printed = 1 - 0.75 * gamma(2.1) * C1 * small + 27 / 40 * gamma(2.2) * C1**2 * small**2
     np.testing.assert_allclose(paper / elastic, printed, rtol=1e-12)
+
+
+def test_displacement_of_constant_restitution():
+    for d, e in ((3, 0.6), (2, 0.9)):
+        gas = jaxgran.Gas(
+            jaxgran.ConstantRestitution(e),
+            diameter=1.0,
+            mass=1.0,
+            packing_fraction=0.1,
+            temperature=1.0,
+            dimension=d,
+        )
+        tau = jnp.geomspace(0.01, 1e6, 50)
+        model = jaxgran.KineticTheory(sonine=False)
+        curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
+        collisions = kinetics.haff_collisions(tau, e, d)
+        formula = kinetics.constant_displacement(collisions, e, d) * gas.mean_free_time**2
+        # The solver's rtol is 1e-9, its atol too: of the ballistic start it sees less.
+        np.testing.assert_allclose(curve.collisions, collisions, rtol=1e-7)
+        np.testing.assert_allclose(curve.displacement, formula, rtol=1e-6)
+
+
+def test_first_order_of_viscoelastic_gas(beads):
+    # Over six decades of u: T, a_2 and <dr^2> less their leading terms, over delta, tend to the
+    # closed forms' coefficients as sqrt(delta), the order of the clipped contact's first trace.
+    u = jnp.asarray([10.0, 1e2, 1e4, 1e6])
+    for delta in (1e-4, 1e-3):
+        gas = beads(1.5 * 2**0.1 * delta)
+        tau = (u - 1) / (kinetics.COOLING_RATE[3] * delta)
+        model = jaxgran.KineticTheory(softness=False, rtol=1e-11)
+        curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
+        leading = 54 / (kinetics.COOLING_RATE[3] * delta) * (u ** (1 / 6) - 1)
+        unit = gas.temperature * gas.mean_free_time**2
+        exact = curve.displacement / unit - leading
+        formula = kinetics.paper_displacement(tau, delta) - leading
+        np.testing.assert_allclose(exact, formula, rtol=0.3 * delta**0.5)
+        kurtosis = -kinetics.SONINE * delta * (curve.temperature / gas.temperature) ** 0.1
+        np.testing.assert_allclose(curve.sonine, kurtosis, rtol=2 * delta**0.5)
+        printed = kinetics.paper_displacement(tau, delta, corrected=False) - leading
+        assert jnp.all(jnp.abs(printed / exact - 1) > 0.1)
