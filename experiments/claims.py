@@ -34,8 +34,12 @@ class Table:
         self.rows.append(Row(equation, claim, ours, checked, verdict, bool(holds), why))
 
     def found(self, name: str) -> dict | None:
-        path = self.results / name / f"{name}.json"
-        return json.loads(path.read_text())["found"] if path.exists() else None
+        whole = self.whole(name, f"{name}.json")
+        return whole["found"] if whole else None
+
+    def whole(self, folder: str, file: str) -> dict | None:
+        path = self.results / folder / file
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     def markdown(self) -> str:
         lines = ["| Eq. | the paper | here | checked by | verdict | why |", "|" + "---|" * 6]

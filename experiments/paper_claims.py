@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import paper
 from claims import Row, Table
+from claims_clustering import clustering
 from claims_cooling import cooling
 from claims_diffusion import diffusion, equilibrium, memory
 from record import save
@@ -102,18 +103,6 @@ def remarks(table: Table) -> None:
         "with the corrections above; ⟨Δr²⟩ is larger by 1.7 % of higher Sonine orders, the rest "
         "correlations at this density",
     )
-    quoted = ((70, 0.9), (23, 0.6))  # collisions per particle and restitution
-    haff = {d: [float(jnp.exp(-(1 - e**2) / d * n)) for n, e in quoted] for d in (2, 3)}
-    table.add(
-        "text",
-        "𝒯_c ≈ 0.0031 (ε = .9, N = 70) and 0.0027 (ε = .6, N = 23) at the onset of clusters",
-        f"Haff's law at these N: {haff[3][0]:.4f} and {haff[3][1]:.4f} in 3D, {haff[2][0]:.4f} and "
-        f"{haff[2][1]:.4f} in 2D",
-        "closed form; `paper_clustering.py` measures",
-        "quoted",
-        True,
-        "not values of the homogeneous gas, hence to be measured",
-    )
 
 
 def main() -> None:
@@ -126,7 +115,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     clock = paper.Clock()
     table = Table(options.results)
-    for part in (restitution, equilibrium, cooling, memory, diffusion, remarks):
+    for part in (restitution, equilibrium, cooling, memory, diffusion, remarks, clustering):
         part(table)
     table.rows.sort(key=_place)
     options.out.mkdir(parents=True, exist_ok=True)
