@@ -58,7 +58,22 @@ TOO_FAST = Fault(
     "the velocities have grown a tail of fast particles; look whether the law of restitution "
     "heats impacts at some speed",
 )
-FAULTS = (LIST_FULL, CONTACTS_FULL, SKIN_OUTRUN, STEP_TOO_LARGE, NOT_FINITE, STALLED, TOO_FAST)
+STEPS_SPENT = Fault(
+    128,
+    "the solver reached its largest number of steps before the last time",
+    "for a nearly elastic gas over many decades of time use KineticTheory(solver=diffrax.Kvaerno5"
+    "()); else raise max_steps, or end earlier",
+)
+FAULTS = (
+    LIST_FULL,
+    CONTACTS_FULL,
+    SKIN_OUTRUN,
+    STEP_TOO_LARGE,
+    NOT_FINITE,
+    STALLED,
+    TOO_FAST,
+    STEPS_SPENT,
+)
 
 
 def flag(fault: Fault, when: ArrayLike) -> Int[Array, "..."]:
