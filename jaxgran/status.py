@@ -64,6 +64,11 @@ STEPS_SPENT = Fault(
     "for a nearly elastic gas over many decades of time use KineticTheory(solver=diffrax.Kvaerno5"
     "()); else raise max_steps, or end earlier",
 )
+OVERLAPPING = Fault(
+    256,
+    "two spheres of the start overlap, which hard spheres must not",
+    "move them apart, or leave start out for a random one",
+)
 FAULTS = (
     LIST_FULL,
     CONTACTS_FULL,
@@ -73,6 +78,7 @@ FAULTS = (
     STALLED,
     TOO_FAST,
     STEPS_SPENT,
+    OVERLAPPING,
 )
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer, eval_context
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from jaxgran import events, initial, neighbours, observables, status, tangents
 from jaxgran.blocks import Room, longest_skin
@@ -168,12 +168,8 @@ class HardSpheres(eqx.Module):
         if isinstance(start.position, Tracer):
             return
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
-        room = 8 * len(position)
-        pairs = neighbours.find_pairs(position, side, 1.0, replicas=self.replicas, room=room)
-        apart = position[pairs.i] - position[pairs.j] - pairs.offset
-        distance = np.linalg.norm(apart, axis=-1)[: int(pairs.count)]
-        closest = float(np.min(distance, initial=1.0))
-        tolerance = max(OVERLAP, 10 * side * float(jnp.finfo(position.dtype).eps))
+        closest = float(_closest(position, side, self.replicas, 8 * len(position)))
+        tolerance = _overlap_allowed(position, side)
         if closest < 1 - tolerance:
             raise ValueError(
                 f"two spheres of the start are {closest:.9g} diameters apart, hard spheres must "
@@ -310,6 +306,10 @@ class HardSpheres(eqx.Module):
         if inputs.start is None:
             elastic = scene._replace(elastic=jnp.array(True))
             state, fault = run((state, fault), elastic, MELT_COLLISIONS / scene.collision_frequency)
+        else:
+            closest = _closest(state.position, scene.side, self.replicas, plan.room.pairs)
+            overlap = closest < 1 - _overlap_allowed(state.position, scene.side)
+            fault = status.flag(status.OVERLAPPING, overlap)
 
         def to(carry, end):
             state, fault = run(carry, scene, end)
@@ -352,6 +352,19 @@ class HardSpheres(eqx.Module):
             particles=particles,
             status=run.status,
         )
+
+
+def _closest(position: Array, side: ArrayLike, replicas: int, room: int) -> Array:
+    """The least distance between two spheres, in diameters; 1 if none are closer."""
+    pairs = neighbours.find_pairs(position, side, 1.0, replicas=replicas, room=room)
+    apart = position[pairs.i] - position[pairs.j] - pairs.offset
+    square = jnp.where(jnp.arange(room) < pairs.count, jnp.sum(apart * apart, -1), 1.0)
+    return jnp.sqrt(jnp.min(square, initial=1.0))
+
+
+def _overlap_allowed(position: Array, side: ArrayLike) -> Array:
+    """What round-off of places may make of two spheres that touch."""
+    return jnp.maximum(OVERLAP, 10 * side * jnp.finfo(position.dtype).eps)
 
 
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Scene:

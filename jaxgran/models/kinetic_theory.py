@@ -91,8 +91,8 @@ class KineticTheory(eqx.Module):
         """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them.
 
         Raises:
-            RuntimeError: if the solver fails, with what to do. Under `jax.jit` and `jax.vmap`, where
-                nothing can be raised, the curve of that gas is nan and carries a status.
+            RuntimeError: if the solver fails, with what to do. Under `jax.jit` and `jax.vmap`,
+                where nothing can be raised, the curve of that gas is nan and carries a status.
         """
         curve = self._cool(gas, times)
         if not isinstance(curve.status, Tracer) and int(np.asarray(curve.status)) != status.OK:

@@ -1,0 +1,104 @@
+"""Where do the numbers break, and do ours?
+
+    python experiments/hard_cases.py [--only WORDS] [--heavy] [--smoke] [--out DIR]
+
+Runs the hard cases of the modules beside it (impacts, gases, runs) and prints one table: case, what
+goes wrong elsewhere, what jaxgran does, and for every model and precision the error of a value and
+of a derivative beside what is allowed, and the status. Writes the table as markdown and as JSON.
+Ends with 1 if any row fails. A row's tolerance has its reason beside it in its case.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+import jax
+from hard_cases_gases import GASES
+from hard_cases_impacts import IMPACTS
+from hard_cases_rows import Case, Row
+from hard_cases_runs import RUNS
+from record import save
+
+CASES = [*IMPACTS, *GASES, *RUNS]
+SMOKE = "order flips"
+
+COLUMNS = (
+    "case",
+    "what goes wrong elsewhere",
+    "what jaxgran does",
+    "model",
+    "precision",
+    "error of value",
+    "error of derivative",
+    "status",
+)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", default="", help="cases whose name holds these words")
+    parser.add_argument("--heavy", action="store_true", help="the cases of minutes too")
+    parser.add_argument("--smoke", action="store_true", help="one case, in seconds")
+    parser.add_argument("--out", type=Path, default=Path("results/hard_cases"))
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    only = SMOKE if options.smoke else options.only
+    cases = [c for c in CASES if only in c.name and (options.heavy or not c.heavy)]
+    if not cases:
+        parser.error(
+            f"no case's name holds {only!r}; there are: {', '.join(c.name for c in CASES)}"
+        )
+    table, records = HEAD, []
+    for case in cases:
+        print(f"{case.name}\n    elsewhere: {case.elsewhere}\n    jaxgran: {case.here}")
+        begin = time.perf_counter()
+        rows = case.run()
+        seconds = time.perf_counter() - begin
+        for row in rows:
+            words = f"{row.model}, {row.precision}"
+            print(f"    {words:50} {_error(row):22} {_slope(row):22} {_status(row)}", flush=True)
+            table += _line(case, row)
+        described = {"case": case.name, "elsewhere": case.elsewhere, "here": case.here}
+        each = [row._asdict() | {"passed": row.passed} for row in rows]
+        records.append(described | {"seconds": round(seconds, 1), "rows": each})
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "hard_cases.md").write_text(table, encoding="utf-8")
+    save(options.out / "hard_cases.json", cases=records)
+    failed = sum(not row["passed"] for record in records for row in record["rows"])
+    print(f"\n{sum(len(r['rows']) for r in records)} rows, {failed} failed; {options.out}")
+    return int(failed > 0)
+
+
+def _error(row: Row) -> str:
+    return f"{float(row.error):.1e} <= {row.allowed:.0e}"
+
+
+def _slope(row: Row) -> str:
+    if row.slope_error is None:
+        return ""
+    if not row.slope_allowed:
+        return "finite" if row.slope_error == 0 else "not finite"
+    return f"{float(row.slope_error):.1e} <= {row.slope_allowed:.0e}"
+
+
+def _status(row: Row) -> str:
+    words = row.status if len(row.status) < 90 else row.status[:87] + "..."
+    return words if row.passed else f"FAILED: {words}"
+
+
+def _line(case: Case, row: Row) -> str:
+    cells = [case.name, case.elsewhere, case.here, row.model, row.precision]
+    cells += [_error(row), _slope(row), _status(row)]
+    return _cells(cell.replace("|", "/").replace("<=", "≤") for cell in cells)
+
+
+def _cells(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cells) + " |\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
