@@ -52,7 +52,7 @@ def main() -> int:
         parser.error(
             f"no case's name holds {only!r}; there are: {', '.join(c.name for c in CASES)}"
         )
-    table, records = HEAD, []
+    table, records = _cells(COLUMNS) + _cells(["---"] * len(COLUMNS)), []
     for case in cases:
         print(f"{case.name}\n    elsewhere: {case.elsewhere}\n    jaxgran: {case.here}")
         begin = time.perf_counter()

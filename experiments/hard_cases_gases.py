@@ -205,7 +205,8 @@ def two_particles() -> list[Row]:
         with precision(name):
             gas = beads(0.02, 0.1, 0.05)
             times = _taus(gas, 0.0, 3.0)
-            for model in (DSMC, HARD, SOFT):
+            # In float32 hard and soft pairs are met in the smallest box.
+            for model in (DSMC, HARD, SOFT) if name == "float64" else (DSMC,):
                 value, _ = _run(quiet(model, 2), gas, times)
                 # Two particles lose at most all, and gain nothing.
                 wrong = np.max(value) - 1 if np.min(value) > 0 else np.nan
@@ -267,6 +268,7 @@ def deep_cold() -> list[Row]:
                 assert value[0] < 1e-6 or model is HARD
                 # a_2 = .048 makes Haff's clock 1 % slow; DSMC's 4000 and 50 spheres in one small
                 # box scatter. Late, T goes as 1/clock^2.
+                # Its slope is what two ten times larger ones leave: 2 % of T are 20 % of it.
                 told = float(kinetics.haff(2e3 / gamma, e))
                 rows.append(
                     Row(
@@ -275,7 +277,7 @@ def deep_cold() -> list[Row]:
                         abs(float(np.log(value[0] / told))),
                         noise,
                         None if slope is None else worst(slope[0], along_of(e, 2e3 / gamma)),
-                        None if slope is None else noise,
+                        None if slope is None else 0.3,
                     )
                 )
     gas = beads(0.05, 0.9, 0.05)
@@ -283,7 +285,9 @@ def deep_cold() -> list[Row]:
     end = _taus(gas, 0.0, tau)
     curve = jaxgran.cool(gas, end, model=quiet(SOFT, 50, steps_per_contact=20))
     theta = np.asarray(curve.temperature) / float(gas.temperature)
-    held = curve.dissipated_energy / (1.5 * gas.mass * gas.temperature)  # pyright: ignore
+    assert curve.elastic_energy is not None and curve.dissipated_energy is not None
+    held = curve.elastic_energy + curve.dissipated_energy
+    held = held / (1.5 * gas.mass * gas.temperature)
     told = float(jnp.exp(theory(gas, jnp.asarray(end), "diameter")[0][1]))
     ledger = abs(float(theta[1] + held[1] - theta[0] - held[0]))
     rows.append(Row("SoftSpheres, ledger", "float64", ledger, 5e-3))  # 20 steps a contact

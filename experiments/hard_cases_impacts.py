@@ -26,6 +26,7 @@ from scipy.integrate import solve_ivp
 
 import jaxgran
 from jaxgran import blocks, contact
+from jaxgran.models.soft_spheres import SMALLEST_BOX
 from jaxgran.restitution import C1, viscoelastic_restitution
 
 HARD, SOFT = jaxgran.HardSpheres, jaxgran.SoftSpheres
@@ -338,7 +339,7 @@ def _coincident_soft():
 def smallest_box() -> list[Row]:
     """Two spheres that meet each other and each other's images in the smallest box allowed."""
     rows = []
-    smallest = jaxgran.models.soft_spheres.SMALLEST_BOX
+    smallest = SMALLEST_BOX
     phi = float(2 * np.pi / 6 / (smallest * (1 + 1e-6)) ** 3)
     for name in PRECISIONS:
         with precision(name):

@@ -116,6 +116,7 @@ def steps_and_lists() -> list[Row]:
     curve = jaxgran.cool(
         gas, [1e-9, times[0]], model=quiet(SOFT, 100, start=start, steps_per_contact=10)
     )
+    assert curve.elastic_energy is not None and curve.dissipated_energy is not None
     held = np.asarray(
         1.5 * gas.mass * curve.temperature + curve.elastic_energy + curve.dissipated_energy
     )
@@ -277,14 +278,14 @@ def one_of_a_batch_fails() -> list[Row]:
         if model is not DSMC:
             sized = sized.sized_for(gas, spare=2.0)
 
-        def cooled(x, sized=sized):
+        def simulated(x, sized=sized):
             curve = jaxgran.cool(gas.replace(**{FREE: x}), times, model=sized)
             return curve.temperature, curve.status
 
         some = gas.value(FREE) * jnp.array([1.0, jnp.nan, 0.5])
-        values, codes = jax.jit(jax.vmap(cooled))(some)
+        values, codes = jax.jit(jax.vmap(simulated))(some)
         rows.append(flagged(model.__name__, "float64", values, codes, 1, "not a finite"))
-        alone = [cooled(x)[0] for x in some[::2]]
+        alone = [simulated(x)[0] for x in some[::2]]
         # Round-off through the melt's ten impacts; one run of 50 spheres differs by that.
         error = worst(values[::2], np.asarray(alone))
         rows.append(
@@ -347,13 +348,14 @@ def faults_on_the_way() -> list[Row]:
         said = done.stdout.strip().splitlines()
         right = len(said) == 2 and all("unharmed" in line and path.name in line for line in said)
         right = right and path.read_bytes() == whole and os.listdir(folder) == [path.name]
-        rows.append(_faultless("no room on the disk", right, said[0] if said else done.stderr))
+        words = (said[0] if said else done.stderr).replace(f"{folder}/", "")
+        rows.append(_faultless("no room on the disk", right, words))
         nowhere = Path(folder) / "not there" / "run.npz"
         for what, write in (
             ("checkpoint", lambda: checkpoint.save(nowhere, "scene", like)),
             ("curve", lambda: _write_curve(nowhere)),
         ):
-            asked = r"cannot write .*not there.*run\.npz"
+            asked = r"cannot write .*run\.npz"
             rows.append(refusal(f"{what}, no such folder", "float64", write, asked))
         gas = unit_gas(jaxgran.ConstantRestitution(0.9), 0.05)
         times = [float(gas.mean_free_time)]
@@ -364,7 +366,7 @@ def faults_on_the_way() -> list[Row]:
         call = lambda: jaxgran.cool(other, times, model=run)  # noqa: E731
         rows.append(refusal("another scene", "float64", call, "belongs to another scene"))
         saved = dict(np.load(file))
-        np.savez(file, **(saved | {"version": np.asarray("0.0.1")}))
+        np.savez(file, allow_pickle=False, **(saved | {"version": np.asarray("0.0.1")}))
         call = lambda: jaxgran.cool(gas, times, model=run)  # noqa: E731
         rows.append(refusal("another version", "float64", call, "written by jaxgran 0.0.1"))
     return rows
@@ -375,7 +377,7 @@ def _faultless(case: str, right: bool, status: str) -> Row:
 
 
 def _write_curve(path):
-    values = np.arange(1.0, 4.0)
+    values = jnp.arange(1.0, 4.0)
     jaxgran.write_curve(path, jaxgran.CoolingCurve(times=values, temperature=values), {})
 
 

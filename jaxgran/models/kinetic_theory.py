@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -120,7 +120,8 @@ class KineticTheory(eqx.Module):
             solution = self._solve(parameters, unravel, times, gas.dimension)
             state, velocity, jacobian, fault = solution
             moved = jax.tree.map(lambda v, j: v * along[1] + along[0] @ j, velocity, jacobian)
-            return (state, fault), (moved, np.zeros(fault.shape, jax.dtypes.float0))
+            no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of a whole number
+            return (state, fault), (moved, no_tangent)
 
         state, fault = solve(parameters, times / unit_time)
         theta = jnp.exp(state.log_temperature)
