@@ -4,11 +4,12 @@
 
 Runs the hard cases of the modules beside it (impacts, gases, runs) and prints one table: case, what
 goes wrong elsewhere, what jaxgran does, and for every model and precision the error of a value and
-of a derivative beside what is allowed, and the status. Writes the table as markdown and as JSON.
-Ends with 1 if any row fails. A row's tolerance has its reason beside it in its case.
+of a derivative beside what is allowed, and the status. Writes the table as markdown and as JSON after
+every case; cases found there and not run again are kept. Ends with 1 if any row fails. A row's tolerance has its reason beside it in its case.
 """
 
 import argparse
+import json
 import sys
 import time
 from collections.abc import Iterable
@@ -17,12 +18,15 @@ from pathlib import Path
 import jax
 from hard_cases_gases import GASES
 from hard_cases_impacts import IMPACTS
-from hard_cases_rows import Case, Row
+from hard_cases_rows import Row
 from hard_cases_runs import RUNS
 from record import save
 
+from jaxgran.checkpoint import write_whole
+
 CASES = [*IMPACTS, *GASES, *RUNS]
 SMOKE = "order flips"
+NUMBERS = ("error", "allowed", "slope_error", "slope_allowed")
 
 COLUMNS = (
     "case",
@@ -52,25 +56,44 @@ def main() -> int:
         parser.error(
             f"no case's name holds {only!r}; there are: {', '.join(c.name for c in CASES)}"
         )
-    table, records = _cells(COLUMNS) + _cells(["---"] * len(COLUMNS)), []
+    record = options.out / "hard_cases.json"
+    kept = json.loads(record.read_text(encoding="utf-8"))["cases"] if record.exists() else []
+    records = {case["case"]: case for case in kept}
+    failed = 0
     for case in cases:
-        print(f"{case.name}\n    elsewhere: {case.elsewhere}\n    jaxgran: {case.here}")
+        print(f"{case.name}\n    elsewhere: {case.elsewhere}\n    jaxgran: {case.here}", flush=True)
         begin = time.perf_counter()
         rows = case.run()
-        seconds = time.perf_counter() - begin
+        seconds = round(time.perf_counter() - begin, 1)
         for row in rows:
             words = f"{row.model}, {row.precision}"
             print(f"    {words:50} {_error(row):22} {_slope(row):22} {_status(row)}", flush=True)
-            table += _line(case, row)
+        failed += sum(not row.passed for row in rows)
         described = {"case": case.name, "elsewhere": case.elsewhere, "here": case.here}
-        each = [row._asdict() | {"passed": row.passed} for row in rows]
-        records.append(described | {"seconds": round(seconds, 1), "rows": each})
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "hard_cases.md").write_text(table, encoding="utf-8")
-    save(options.out / "hard_cases.json", cases=records)
-    failed = sum(not row["passed"] for record in records for row in record["rows"])
-    print(f"\n{sum(len(r['rows']) for r in records)} rows, {failed} failed; {options.out}")
+        each = [_plain(row) for row in rows]
+        records[case.name] = described | {"seconds": seconds, "rows": each}
+        in_order = [records[c.name] for c in CASES if c.name in records]
+        save(record, cases=in_order)
+        text = _table(in_order)
+        write_whole(options.out / "hard_cases.md", lambda f, text=text: f.write(text.encode()))
+    print(f"\n{failed} rows failed; {options.out}")
     return int(failed > 0)
+
+
+def _plain(row: Row) -> dict:
+    numbers = {k: None if v is None else float(v) for k, v in row._asdict().items() if k in NUMBERS}
+    return row._asdict() | numbers
+
+
+def _table(records: list[dict]) -> str:
+    lines = [_cells(COLUMNS), _cells(["---"] * len(COLUMNS))]
+    for record in records:
+        described = [record[name] for name in ("case", "elsewhere", "here")]
+        for row in (Row(**row) for row in record["rows"]):
+            cells = [*described, row.model, row.precision, _error(row), _slope(row), _status(row)]
+            lines.append(_cells(c.replace("|", "/").replace("<=", "≤") for c in cells))
+            described = ["", "", ""]
+    return "".join(lines)
 
 
 def _error(row: Row) -> str:
@@ -88,12 +111,6 @@ def _slope(row: Row) -> str:
 def _status(row: Row) -> str:
     words = row.status if len(row.status) < 90 else row.status[:87] + "..."
     return words if row.passed else f"FAILED: {words}"
-
-
-def _line(case: Case, row: Row) -> str:
-    cells = [case.name, case.elsewhere, case.here, row.model, row.precision]
-    cells += [_error(row), _slope(row), _status(row)]
-    return _cells(cell.replace("|", "/").replace("<=", "≤") for cell in cells)
 
 
 def _cells(cells: Iterable[str]) -> str:

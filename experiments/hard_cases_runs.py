@@ -254,8 +254,10 @@ def one_of_a_batch_fails() -> list[Row]:
             a = gas.value(FREE)
             times = jnp.geomspace(1.0, 1e9, 3) * gas.mean_free_time
 
-            def cooled(x, gas=gas, times=times):
-                curve = jaxgran.cool(gas.replace(**{FREE: x}), times, model=HARD_THEORY)
+            few_steps = jaxgran.KineticTheory(softness=False, max_steps=3000)
+
+            def cooled(x, gas=gas, times=times, model=few_steps):
+                curve = jaxgran.cool(gas.replace(**{FREE: x}), times, model=model)
                 return curve.temperature, curve.status
 
             some = a * jnp.array([1.0, 1e-6, 0.5])
@@ -266,9 +268,10 @@ def one_of_a_batch_fails() -> list[Row]:
             rows.append(
                 Row("KineticTheory, others", name, error, 1e-8 if name == "float64" else 1e-4)
             )
-            slope = jax.vmap(jax.jacfwd(lambda x: cooled(x)[0]))(some)
-            ok = np.all(np.isfinite(slope[::2])) and np.all(np.isnan(slope[1]))
-            rows.append(Row("KineticTheory, slopes", name, 0.0 if ok else np.inf, 0.0))
+            if name == "float64":
+                slope = jax.vmap(lambda x: jax.jvp(lambda y: cooled(y)[0], (x,), (x,))[1])(some)
+                ok = np.all(np.isfinite(slope[::2])) and np.all(np.isnan(slope[1]))
+                rows.append(Row("KineticTheory, slopes", name, 0.0 if ok else np.inf, 0.0))
             values, codes = jax.vmap(cooled)(a * jnp.array([1.0, jnp.nan, 0.5]))
             rows.append(flagged("KineticTheory, nan", name, values, codes, 1, "not a finite"))
     gas = beads(0.05, 0.15, 0.05)

@@ -126,13 +126,15 @@ class KineticTheory(eqx.Module):
         state, fault = solve(parameters, times / unit_time)
         theta = jnp.exp(state.log_temperature)
         length = gas.path_length
+        # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
+        spoilt = jnp.where(fault == status.OK, 0.0, jnp.nan).astype(theta.dtype)
         return CoolingCurve(
             times=times,
-            temperature=gas.temperature * theta,
-            sonine=state.sonine,
-            collisions=state.collisions,
-            diffusion=state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed,
-            displacement=state.displacement * length**2,
+            temperature=gas.temperature * theta + spoilt,
+            sonine=state.sonine + spoilt,
+            collisions=state.collisions + spoilt,
+            diffusion=state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed + spoilt,
+            displacement=state.displacement * length**2 + spoilt,
             status=fault,
         )
 
@@ -200,8 +202,12 @@ class KineticTheory(eqx.Module):
 
             rate = velocity(state, averages, parameters)
             rates_along = jax.vmap(along)(state_tangents, tables_along(log_theta), directions)
-            return jnp.concatenate([rate[None], rates_along]) * jnp.exp(s)
+            rates = jnp.concatenate([rate[None], rates_along]) * jnp.exp(s)
+            return jnp.where(known, rates, 0.0)
 
+        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
+        # A gas of nan stands still, lest its solver try ever shorter steps; its curve is nan.
+        times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=times.dtype))
         s = jnp.log1p(times)
         rtol = self.rtol or (1e-9 if times.dtype == jnp.float64 else 1e-5)
         # Steps follow the state alone: its tangents are then those of the discrete solution.
@@ -226,7 +232,7 @@ class KineticTheory(eqx.Module):
         )
         assert solution.ys is not None
         ended = solution.result == diffrax.RESULTS.successful
-        finite = jnp.all(jnp.isfinite(solution.ys))
+        finite = known & jnp.all(jnp.isfinite(solution.ys))
         spent = solution.result == diffrax.RESULTS.max_steps_reached
         fault = status.flag(status.STEPS_SPENT, spent)
         fault |= status.flag(status.NOT_FINITE, ~spent & ~(ended & finite))
