@@ -210,7 +210,7 @@ def fits() -> list[Row]:
             rows.append(
                 Row("unidentifiable", name, 0.0 if named else np.inf, 0.0, status="named, warned")
             )
-            wrong = curve.temperature * jnp.where(jnp.arange(40) % 13 == 5, 1.2, 1.0)
+            wrong = curve.temperature * jnp.where(jnp.arange(40) % 20 == 5, 1.2, 1.0)
             rows.append(_told("outliers", name, gas, curve, wrong, truth, "far outliers at t ="))
             boast = jaxgran.CoolingCurve(
                 times=curve.times,

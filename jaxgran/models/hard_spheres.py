@@ -159,14 +159,14 @@ class HardSpheres(eqx.Module):
         for name, values in zip(start._fields[:2], start[:2], strict=True):
             if np.shape(values) != shape:
                 raise ValueError(f"start.{name} has shape {np.shape(values)}, not {shape}")
+        if any(isinstance(leaf, Tracer) for leaf in start):
+            return
         given = float(start.box_side / gas.diameter)
         if not abs(given / side - 1) < 1e-6:
             raise ValueError(
                 f"start.box_side is {given:.7g} diameters, the gas fills {side:.7g}: change "
                 "packing_fraction or the start"
             )
-        if isinstance(start.position, Tracer):
-            return
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
         closest = float(_closest(position, side, self.replicas, 8 * len(position)))
         tolerance = _overlap_allowed(position, side)
