@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
-from jaxgran.neighbours import displacement, engine, find_pairs, wrap
+from jaxgran.neighbours import displacement, engine, find_pairs, vesin_search, wrap
 
 # In boxes of less than three cutoffs jax-md itself warns about its integers.
 jax_md_warns = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")
@@ -227,3 +228,13 @@ def test_engine_follows_the_device(monkeypatch):
 def test_unknown_engines_are_refused():
     with pytest.raises(ValueError, match="neighbours must be one of auto, vesin, jax-md, got 'kd'"):
         engine("kd")
+
+
+@pytest.mark.parametrize("side, n", [(500.0, 20_000), (5000.0, 2000)])
+def test_wide_planes(side, n):
+    # More cells than vesin allows: a layer of them alone would end the process.
+    position = np.random.default_rng(0).uniform(0, side, (n, 2))
+    i, j, count = vesin_search(position, side, 1.4, 1, 2 * n)
+    found = np.sort(np.stack([i[:count], j[:count]], axis=1), axis=1)
+    expected = cKDTree(position, boxsize=side).query_pairs(1.4)
+    assert set(map(tuple, found.tolist())) == expected
