@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxgran.neighbours import displacement, engine, find_pairs, vesin_search, wrap
 
@@ -236,5 +236,5 @@ def test_wide_planes(side, n):
     position = np.random.default_rng(0).uniform(0, side, (n, 2))
     i, j, count = vesin_search(position, side, 1.4, 1, 2 * n)
     found = np.sort(np.stack([i[:count], j[:count]], axis=1), axis=1)
-    expected = cKDTree(position, boxsize=side).query_pairs(1.4)
+    expected = KDTree(position, boxsize=side).query_pairs(1.4)
     assert set(map(tuple, found.tolist())) == expected
