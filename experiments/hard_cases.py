@@ -103,7 +103,7 @@ def _table(records: list[dict]) -> str:
 
 
 def _error(row: Row) -> str:
-    return f"{float(row.error):.1e} <= {row.allowed:.0e}"
+    return f"{float(row.error):.1e} <= {row.allowed:.2g}"
 
 
 def _slope(row: Row) -> str:
@@ -111,7 +111,7 @@ def _slope(row: Row) -> str:
         return ""
     if not row.slope_allowed:
         return "finite" if row.slope_error == 0 else "not finite"
-    return f"{float(row.slope_error):.1e} <= {row.slope_allowed:.0e}"
+    return f"{float(row.slope_error):.1e} <= {row.slope_allowed:.2g}"
 
 
 def _status(row: Row) -> str:
