@@ -26,6 +26,7 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxgran  # noqa: E402
+from jaxgran.checkpoint import write_whole  # noqa: E402
 from jaxgran.choice import words  # noqa: E402
 from jaxgran.curve import GAS_KEYS, header_number, num_particles  # noqa: E402
 from jaxgran.plotting import plot_fit  # noqa: E402
@@ -180,7 +181,8 @@ def run(options: argparse.Namespace) -> None:
         "python": platform.python_version(),
         "device": jax.devices()[0].device_kind,
     }
-    record.write_text(json.dumps(summary | details, indent=2) + "\n", encoding="utf-8")
+    text = json.dumps(summary | details, indent=2) + "\n"
+    write_whole(record, lambda f: f.write(text.encode()))
     print(f"\nwritten  {picture}\n         {record}\n")
     print(json.dumps(summary))
 

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import jax
 
+from jaxgran.checkpoint import write_whole
+
 PACKAGES = ("jaxgran", "jax", "jax-md", "diffrax", "optimistix", "vesin", "numpy", "scipy")
 
 
@@ -28,7 +30,7 @@ def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
 def save(path: Path, **figures) -> None:
     """Writes figures as JSON, with the versions and the device that made them.
 
-    Either the whole file is written or an older one stays as it was.
+    Either the whole file is written, or an older one stays as it was and an error names the path.
     """
     made_by = {
         "versions": {name: found for name in PACKAGES if (found := _version(name))},
@@ -37,9 +39,8 @@ def save(path: Path, **figures) -> None:
         "cores": os.cpu_count(),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.part")
-    unfinished.write_text(json.dumps(figures | made_by, indent=2) + "\n", encoding="utf-8")
-    unfinished.replace(path)
+    text = json.dumps(figures | made_by, indent=2) + "\n"
+    write_whole(path, lambda f: f.write(text.encode()))
 
 
 def _version(package: str) -> str | None:

@@ -73,6 +73,7 @@ class Kind(NamedTuple):
         observe: the records of a state.
         elastic: the scene in which no energy is lost.
         followed: a state with the tangents at t = 0, or as it is.
+        fault: the status of a given start, where it could not be checked before.
     """
 
     at_start: Callable[[Array, Array, ArrayLike], Any]
@@ -80,6 +81,7 @@ class Kind(NamedTuple):
     observe: Callable[[Any], dict[str, Array]]
     elastic: Callable[[Any], Any]
     followed: Callable[[Any], Any]
+    fault: Callable[[Any], Array] = lambda state: jnp.zeros((), jnp.int32)
 
 
 def check_counts(model: Model, **least: int) -> None:
@@ -113,6 +115,8 @@ def check_box(model: Model, gas: Gas) -> None:
     for name, values in zip(model.start._fields[:2], model.start[:2], strict=True):
         if np.shape(values) != shape:
             raise ValueError(f"start.{name} has shape {np.shape(values)}, not {shape}")
+    if isinstance(model.start.box_side, Tracer):
+        return
     given = float(model.start.box_side / gas.diameter)
     if not abs(given / side - 1) < 1e-6:
         raise ValueError(
@@ -269,6 +273,8 @@ def _traced(inputs: Inputs, kind: Kind, plan, state, begun):
     if inputs.start is None:
         end = MELT_COLLISIONS / scene.collision_frequency
         state, fault = until((state, fault), kind.elastic(scene), end)
+    else:
+        fault = kind.fault(state)
     state, counted = further((begun(state), fault), scene, jnp.zeros_like(state.time))
 
     def to(carry, end):

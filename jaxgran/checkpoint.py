@@ -70,7 +70,7 @@ def load(path: str | Path, scene: str, like: Any) -> Any:
     """Read what `save` wrote into the structure of `like`.
 
     Raises:
-        ValueError: if the file is no checkpoint, is of another format, or of another scene.
+        ValueError: if the file is no checkpoint, or one of another version, format or scene.
     """
     try:
         with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
@@ -86,6 +86,11 @@ def load(path: str | Path, scene: str, like: Any) -> Any:
         raise ValueError(
             f"{path} was written by jaxgran {head['version']} in checkpoint format "
             f"{head['format']}, this is format {FORMAT}; finish the run with that version"
+        )
+    if head["version"] != version("jaxgran"):
+        raise ValueError(
+            f"{path} was written by jaxgran {head['version']}, this is {version('jaxgran')}, which "
+            "may step otherwise; finish the run with that version, or remove the file"
         )
     leaves, structure = jax.tree.flatten(like)
     if head["scene"] != scene or len(saved) != len(leaves):

@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
-from jaxgran import initial, kinetics
+from jaxgran import initial, kinetics, status
 from jaxgran.boxes import SMALLEST_BOX
 from jaxgran.domain import checked_times
 from jaxgran.gas import Gas
@@ -127,6 +127,7 @@ def choose_model(
 
     Raises:
         ValueError: for values out of range or being traced.
+        RuntimeError: if kinetic theory, which tells them apart, cannot follow the gas so far.
     """
     if not isinstance(gas, Gas):
         raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
@@ -147,6 +148,9 @@ def choose_model(
 
     end = float(checked_times(times)[-1])
     course = _course(gas, jnp.asarray(end))
+    fault = int(course.pop("status"))
+    if fault != status.OK:
+        raise RuntimeError(f"kinetic theory, which tells the models apart: {status.explain(fault)}")
     course = {name: np.asarray(values, float) for name, values in course.items()}
     flow = np.zeros_like(course["time"])
     if num_particles is not None:
@@ -215,6 +219,7 @@ def _course(gas: Gas, end: jax.Array) -> dict[str, jax.Array]:
 
     contact, overlap, softness, critical = jax.vmap(scales)(curve.temperature)
     return {
+        "status": jnp.asarray(curve.status),
         "time": t,
         "log_temperature": jnp.log(curve.temperature / gas.temperature),
         "collisions": curve.collisions,

@@ -19,6 +19,13 @@ CEILING = 5.0
 A Maxwellian misses 2e-6 of its collisions, 1e-5 of its losses. What a run misses is counted.
 """
 
+RECOUNTED = 32
+"""Steps after which T is taken from the velocities anew.
+
+Between, losses are subtracted from it. Their round-off stays while T falls, and in float32 would
+be all that is left of T at 1e-7 of its start.
+"""
+
 
 class Tangents(NamedTuple):
     """Derivatives at fixed own time s (ds = sqrt(T/T_0) dt) in P parameters of the law.
@@ -40,7 +47,7 @@ class State(NamedTuple):
 
     time: Array  # to which every replica has come
     clock: Array  # (R,) start of the step that reaches beyond `time`
-    temperature: Array  # (R,) T/T_0, kept by the losses
+    temperature: Array  # (R,) T/T_0, kept by the losses and recounted now and then
     particles: Array  # (R, N, 2d): v, and x - v t, which changes in collisions alone
     collisions: Array  # (R,) pairs
     missed: Array  # (R,) pairs beyond the ceiling
@@ -256,7 +263,16 @@ def step(
     keys = jax.vmap(jax.random.fold_in, (None, 0))(wrapped(key), replicas)
     one = partial(_step, law=law, scheme=scheme, tangents=tangents)
     axes = jax.tree.map(lambda _: 0, state)._replace(time=None)
-    return jax.vmap(one, (axes, 0, 0), axes)(state, keys, share)
+    state = jax.vmap(one, (axes, 0, 0), axes)(state, keys, share)
+    due = state.steps % RECOUNTED == 0
+
+    def recounted(temperature):
+        velocity = state.particles[..., : scheme.dimension]
+        counted = 2 * jnp.mean(velocity**2, axis=(1, 2))
+        return jnp.where(due, counted, temperature)
+
+    temperature = jax.lax.cond(jnp.any(due), recounted, lambda x: x, state.temperature)
+    return state._replace(temperature=temperature)
 
 
 @partial(jax.jit, static_argnames=("scheme", "tangents"))

@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from jaxgran.checkpoint import write_whole
 from jaxgran.gas import Gas, sphere_mass
 from jaxgran.restitution import Viscoelastic
 
@@ -290,6 +291,7 @@ def write_curve(
 
     Raises:
         ValueError: if the file exists and `overwrite` is False.
+        OSError: naming the path, if it cannot be written; an earlier file is then kept.
     """
     path = Path(path)
     if path.exists() and not overwrite:
@@ -299,4 +301,5 @@ def write_curve(
     lines = [f"# {key}: {value}" for key, value in header.items()]
     lines.append(",".join(present))
     lines += [",".join(f"{x:.17g}" for x in row) for row in zip(*present.values(), strict=True)]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    text = "\n".join(lines) + "\n"
+    write_whole(path, lambda f: f.write(text.encode()))

@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from jaxgran import kinetics
+from jaxgran import kinetics, status
 from jaxgran.cooling import Model
 from jaxgran.curve import CoolingCurve
 from jaxgran.estimate import Fit, Parameters, misfit
@@ -69,6 +69,9 @@ def fit(
     Raises:
         ValueError: for an unknown parameter or method, a curve that cannot be one (see
             `CoolingCurve.check`), or fewer points than parameters.
+        RuntimeError: if the model cannot compute the curve where the search ends. Under `jax.vmap`,
+            where nothing can be raised, chi2 and the errors of that fit are nan, `converged` is
+            False and `curve.status` tells why.
     """
     curve.check()
     if isinstance(free, str) or not free or len(set(free)) < len(free):
@@ -94,6 +97,7 @@ def fit(
     else:
         result = _fit_by_simulation(gas, curve, model, tuple(free), start, method, max_steps or 8)
     if not isinstance(result.chi2, Tracer):
+        _check_computed(result)
         if result.chi2.dtype == jnp.float32:
             warnings.warn(
                 "fitting in float32: errors below 1e-4 are noise; "
@@ -108,6 +112,17 @@ def fit(
                 stacklevel=2,
             )
     return result
+
+
+def _check_computed(result: Fit) -> None:
+    fault = status.OK if result.curve.status is None else int(result.curve.status)
+    if fault != status.OK:
+        values = zip(result.names, np.asarray(result.estimate), strict=False)
+        at = ", ".join(f"{name} = {value:.3g}" for name, value in values)
+        raise RuntimeError(
+            f"{result.model} could not compute the curve at {at}, where the search ended: "
+            f"{status.explain(fault)}"
+        )
 
 
 def start_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
@@ -151,7 +166,8 @@ def _weights(values: Array, error: Array) -> Array:
 
 
 def _log_ratio(measured: Array, computed: Array) -> Array:
-    positive = (measured > 0) & (computed > 0)
+    # Not `computed > 0`: a curve that could not be computed, nan, must not pass for a perfect fit.
+    positive = (measured > 0) & ~(computed <= 0)
     safe = jnp.where(positive, measured, 1.0), jnp.where(positive, computed, 1.0)
     return jnp.log(safe[0]) - jnp.log(safe[1])
 
@@ -212,6 +228,7 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
     degrees_of_freedom = num_used - flat.size
     errors_known = curve.temperature_error is not None
     chance = misfit(all_residuals, degrees_of_freedom, errors_known=errors_known)
+    converged = converged & jnp.isfinite(chance.chi2)
     _, singular, rotation = jnp.linalg.svd(jacobian, full_matrices=False)
     spread = rotation.T / jnp.maximum(singular, jnp.finfo(flat.dtype).tiny ** 0.5)[None]
     root = jax.jacfwd(estimates)(flat) @ spread

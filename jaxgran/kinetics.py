@@ -110,7 +110,7 @@ def averages(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[
     Returns:
         Row by row mu_2, mu_4, nu_v; column by column the factors of 1, a_2, a_2^2.
     """
-    lost = 1 - law.restitution(jnp.asarray(_G, speed.dtype) * speed)
+    lost = law.loss(jnp.asarray(_G, speed.dtype) * speed)
     powers = jnp.stack([jnp.ones_like(lost), lost, lost**2, lost**3, lost**4])
     return jnp.tensordot(jnp.asarray(_WEIGHTS[dimension], speed.dtype), powers, 2)
 

@@ -14,6 +14,9 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 from vesin import NeighborList
 
+VESIN_CELLS = 1e5
+"""The most cells of vesin's search."""
+
 ENGINES = ("auto", "vesin", "jax-md")
 """Who finds the pairs: vesin on the host (fastest on a CPU), jax-md on the device (for GPUs)."""
 
@@ -115,15 +118,14 @@ def vesin_search(position: np.ndarray, side: float, cutoff: float, replicas: int
         planar = boxes.shape[-1] == 2
         if planar:
             boxes = np.concatenate([boxes, np.zeros_like(boxes[..., :1])], axis=-1)
-        # vesin makes at most 10^5 cells, alike in shape to the box, and dies where a direction is
-        # left with less than one. A wide plane gets more layers, empty but for the first; only
-        # along a periodic direction does vesin go by the height of the box.
-        layers = int(side / (300 * cutoff)) if planar else 0
-        cell = np.diag([side, side, (layers + 1.5) * cutoff if planar else side])
-        periodic = True, True, not planar or layers > 0
+        # vesin has 1e5 cells at most: where there would be more it makes all three numbers of them
+        # smaller alike, and a plane's one layer would become none, which ends the process. So a
+        # plane has empty layers above it, so many that its own images are not near.
+        layers = 2.1 + 2 * side / cutoff / VESIN_CELLS**0.5
+        cell = np.diag([side, side, layers * cutoff if planar else side])
         search = NeighborList(cutoff=cutoff, full_list=False)
         for first, points in zip(range(0, len(position), boxes.shape[1]), boxes, strict=True):
-            found = search.compute(points, cell, periodic, "ij", copy=False)
+            found = search.compute(points, cell, (True, True, True), "ij", copy=False)
             end = min(count + len(found[0]), room)
             for row, indices in zip(pairs, found, strict=True):
                 row[count:end] = indices[: end - count]

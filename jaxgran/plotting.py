@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxgran.checkpoint import write_whole
 from jaxgran.choice import words
 from jaxgran.curve import CoolingCurve
 from jaxgran.estimate import Fit
@@ -84,4 +85,5 @@ def plot_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
         axes[0, 1].legend(frameon=False, loc="upper left")
     for axis in axes.flat:
         axis.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)
+    picture_format = Path(path).suffix.lstrip(".") or "png"
+    write_whole(path, lambda f: figure.savefig(f, dpi=150, format=picture_format))

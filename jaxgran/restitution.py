@@ -117,6 +117,10 @@ def viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[
         to 1e4 (clipped), 1e-7 for every beta up to 40 (unclipped); beyond, below 3e-5.
         Derivatives are finite and right down to beta = 0.
     """
+    return jnp.exp(_log_restitution(beta, clipped))
+
+
+def _log_restitution(beta: ArrayLike, clipped: bool) -> Float[Array, "..."]:
     beta = jnp.asarray(beta, dtype=jnp.result_type(float, beta))
     fit = _CLIPPED if clipped else _UNCLIPPED
     positive = beta > 0
@@ -124,7 +128,7 @@ def viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[
     x = root if fit.in_roots else beta
     p = (fit.decay * fit.kappa - C1) + beta * _horner(fit.p, x)
     q = 1 + beta * _horner(fit.q, x)
-    return jnp.exp(beta * p / q - fit.decay * jnp.log1p(fit.kappa * beta))
+    return beta * p / q - fit.decay * jnp.log1p(fit.kappa * beta)
 
 
 def number(value: ArrayLike | Sequence[float]) -> Array:
@@ -164,6 +168,10 @@ class ReducedLaw(eqx.Module):
     def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """eps at a normal approach speed > 0, in units of the reference speed."""
 
+    def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """1 - eps; a law that knows it without cancellation keeps the digits of weak losses."""
+        return 1 - self.restitution(normal_speed)
+
     def impact_length(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """X = (v^2/alpha)^(2/5), the length over which an impact is stopped, in diameters.
 
@@ -187,6 +195,9 @@ class ReducedViscoelastic(ReducedLaw):
 
     def restitution(self, normal_speed):
         return viscoelastic_restitution(self.beta * normal_speed**0.2, clipped=self.clipped)
+
+    def loss(self, normal_speed):
+        return -jnp.expm1(_log_restitution(self.beta * normal_speed**0.2, self.clipped))
 
     def impact_length(self, normal_speed):
         return self.length * normal_speed**0.8
@@ -309,5 +320,8 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
         return RestitutionSeries(self.coefficients * speed**self.exponents, self.exponents)
 
     def restitution(self, normal_speed):
+        return 1 - self.loss(normal_speed)
+
+    def loss(self, normal_speed):
         terms = zip(self.coefficients, self.exponents, strict=True)
-        return 1 + sum(c * normal_speed**gamma for c, gamma in terms)
+        return jnp.asarray(-sum(c * normal_speed**gamma for c, gamma in terms))

@@ -58,7 +58,28 @@ TOO_FAST = Fault(
     "the velocities have grown a tail of fast particles; look whether the law of restitution "
     "heats impacts at some speed",
 )
-FAULTS = (LIST_FULL, CONTACTS_FULL, SKIN_OUTRUN, STEP_TOO_LARGE, NOT_FINITE, STALLED, TOO_FAST)
+STEPS_SPENT = Fault(
+    128,
+    "the solver reached its largest number of steps before the last time",
+    "for a nearly elastic gas over many decades of time use KineticTheory(solver=diffrax.Kvaerno5"
+    "()); else raise max_steps, or end earlier",
+)
+OVERLAPPING = Fault(
+    256,
+    "two spheres of the start overlap, which hard spheres must not",
+    "move them apart, or leave start out for a random one",
+)
+FAULTS = (
+    LIST_FULL,
+    CONTACTS_FULL,
+    SKIN_OUTRUN,
+    STEP_TOO_LARGE,
+    NOT_FINITE,
+    STALLED,
+    TOO_FAST,
+    STEPS_SPENT,
+    OVERLAPPING,
+)
 
 
 def flag(fault: Fault, when: ArrayLike) -> Int[Array, "..."]:

@@ -7,11 +7,10 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from jaxgran import boxes, events, neighbours, tangents
+from jaxgran import boxes, events, neighbours, status, tangents
 from jaxgran.blocks import Room
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.events import Plan, Scene, State
@@ -115,18 +114,14 @@ class HardSpheres(eqx.Module):
 
     def _check(self, gas: Gas) -> None:
         boxes.check_box(self, gas)
-        if self.start is None or isinstance(gas.diameter, Tracer):
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, self.start))):
+            return  # looked at when it runs
+        if self.start is None:
             return
-        start, side = self.start, float(self.start.box_side / gas.diameter)
-        if isinstance(start.position, Tracer):
-            return
+        start, side = self.start, self.start.box_side / gas.diameter
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
-        room = 8 * len(position)
-        pairs = neighbours.find_pairs(position, side, 1.0, replicas=self.replicas, room=room)
-        apart = position[pairs.i] - position[pairs.j] - pairs.offset
-        distance = np.linalg.norm(apart, axis=-1)[: int(pairs.count)]
-        closest = float(np.min(distance, initial=1.0))
-        tolerance = max(OVERLAP, 10 * side * float(jnp.finfo(position.dtype).eps))
+        closest = float(_closest(position, side, self.replicas, 8 * len(position)))
+        tolerance = _overlap_allowed(position, side)
         if closest < 1 - tolerance:
             raise ValueError(
                 f"two spheres of the start are {closest:.9g} diameters apart, hard spheres must "
@@ -173,14 +168,33 @@ class HardSpheres(eqx.Module):
             along = ImpactTangents.at_start(directions, replicas, state.velocity.dtype)
             return state._replace(tangents=along)
 
+        def fault(state: State) -> Array:
+            closest = _closest(state.position, scene.side, replicas, plan.room.pairs)
+            overlap = closest < 1 - _overlap_allowed(state.position, scene.side)
+            return status.flag(status.OVERLAPPING, overlap)
+
         kind = boxes.Kind(
             at_start=lambda x, v, skin: events.at_start(x, v, scene, skin, plan),
             stretch=events.stretch,
             observe=partial(_observe, scene=scene, replicas=replicas),
             elastic=lambda scene: scene._replace(elastic=jnp.array(True)),
             followed=followed,
+            fault=fault,
         )
         return boxes.run(self, inputs, kind, plan, self._skin(scene, dimension), dimension)
+
+
+def _closest(position: Array, side: ArrayLike, replicas: int, room: int) -> Array:
+    """The least distance between two spheres, in diameters; 1 if none are closer."""
+    pairs = neighbours.find_pairs(position, side, 1.0, replicas=replicas, room=room)
+    apart = position[pairs.i] - position[pairs.j] - pairs.offset
+    square = jnp.where(jnp.arange(room) < pairs.count, jnp.sum(apart * apart, -1), 1.0)
+    return jnp.sqrt(jnp.min(square, initial=1.0))
+
+
+def _overlap_allowed(position: Array, side: ArrayLike) -> Array:
+    """What round-off of places may make of two spheres that touch."""
+    return jnp.maximum(OVERLAP, 10 * side * jnp.finfo(position.dtype).eps)
 
 
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Scene:

@@ -2,17 +2,19 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from jaxgran import kinetics
+from jaxgran import kinetics, status
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
 from jaxgran.restitution import ReducedLaw
@@ -85,9 +87,20 @@ class KineticTheory(eqx.Module):
         mu_2 = self._averages(gas.reduced_law, speed, gas.dimension)[0, 0]
         return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
 
-    @eqx.filter_jit
     def cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
-        """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them."""
+        """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them.
+
+        Raises:
+            RuntimeError: if the solver fails, with what to do. Under `jax.jit` and `jax.vmap`,
+                where nothing can be raised, the curve of that gas is nan and carries a status.
+        """
+        curve = self._cool(gas, times)
+        if not isinstance(curve.status, Tracer) and int(np.asarray(curve.status)) != status.OK:
+            raise RuntimeError(status.explain(int(np.asarray(curve.status))))
+        return curve
+
+    @eqx.filter_jit
+    def _cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
         law = gas.reduced_law
         parameters, unravel = ravel_pytree(law)
@@ -96,25 +109,33 @@ class KineticTheory(eqx.Module):
         # the state costs little, and one linear rule then serves forward and reverse mode alike.
         @jax.custom_jvp
         def solve(parameters, times):
-            state, _, _ = self._solve(parameters, unravel, times, gas.dimension, tangents=False)
-            return state
+            state, _, _, fault = self._solve(
+                parameters, unravel, times, gas.dimension, tangents=False
+            )
+            return state, fault
 
         @solve.defjvp
         def solve_jvp(at, along):
             parameters, times = at
-            state, velocity, jacobian = self._solve(parameters, unravel, times, gas.dimension)
-            return state, jax.tree.map(lambda v, j: v * along[1] + along[0] @ j, velocity, jacobian)
+            solution = self._solve(parameters, unravel, times, gas.dimension)
+            state, velocity, jacobian, fault = solution
+            moved = jax.tree.map(lambda v, j: v * along[1] + along[0] @ j, velocity, jacobian)
+            no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of a whole number
+            return (state, fault), (moved, no_tangent)
 
-        state = solve(parameters, times / unit_time)
+        state, fault = solve(parameters, times / unit_time)
         theta = jnp.exp(state.log_temperature)
         length = gas.path_length
+        # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
+        spoilt = jnp.where(fault == status.OK, 0.0, jnp.nan).astype(theta.dtype)
         return CoolingCurve(
             times=times,
-            temperature=gas.temperature * theta,
-            sonine=state.sonine,
-            collisions=state.collisions,
-            diffusion=state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed,
-            displacement=state.displacement * length**2,
+            temperature=gas.temperature * theta + spoilt,
+            sonine=state.sonine + spoilt,
+            collisions=state.collisions + spoilt,
+            diffusion=state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed + spoilt,
+            displacement=state.displacement * length**2 + spoilt,
+            status=fault,
         )
 
     def _averages(self, law: ReducedLaw, speed: Array, dimension: int) -> Array:
@@ -148,8 +169,11 @@ class KineticTheory(eqx.Module):
         times: Array,
         dimension: int,
         tangents: bool = True,
-    ) -> tuple[_State, _State, _State]:
-        """States, their time derivatives and their derivatives in the parameters of the law."""
+    ) -> tuple[_State, _State, _State, Int[Array, ""]]:
+        """States, their time derivatives and their derivatives in the parameters of the law.
+
+        Last, a status; unless it is ok all of them are nan.
+        """
         directions = jnp.eye(parameters.size, dtype=times.dtype)[: None if tangents else 0]
 
         def tabulate(parameters):
@@ -178,8 +202,12 @@ class KineticTheory(eqx.Module):
 
             rate = velocity(state, averages, parameters)
             rates_along = jax.vmap(along)(state_tangents, tables_along(log_theta), directions)
-            return jnp.concatenate([rate[None], rates_along]) * jnp.exp(s)
+            rates = jnp.concatenate([rate[None], rates_along]) * jnp.exp(s)
+            return jnp.where(known, rates, 0.0)
 
+        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
+        # A gas of nan stands still, lest its solver try ever shorter steps; its curve is nan.
+        times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=times.dtype))
         s = jnp.log1p(times)
         rtol = self.rtol or (1e-9 if times.dtype == jnp.float64 else 1e-5)
         # Steps follow the state alone: its tangents are then those of the discrete solution.
@@ -200,9 +228,17 @@ class KineticTheory(eqx.Module):
             stepsize_controller=controller,
             adjoint=diffrax.ForwardMode(),
             max_steps=self.max_steps,
+            throw=False,  # one gas of a batch must not end the others
         )
         assert solution.ys is not None
-        states = solution.ys[:, 0]
+        ended = solution.result == diffrax.RESULTS.successful
+        finite = known & jnp.all(jnp.isfinite(solution.ys))
+        spent = solution.result == diffrax.RESULTS.max_steps_reached
+        fault = status.flag(status.STEPS_SPENT, spent)
+        fault |= status.flag(status.NOT_FINITE, ~spent & ~(ended & finite))
+        rows = jnp.where(fault == status.OK, solution.ys, jnp.nan)
+        states = rows[:, 0]
         velocities = jax.vmap(lambda x: velocity(x, table(x[0]), parameters))(states)
-        jacobian = jnp.moveaxis(solution.ys[:, 1:], 2, 0)
-        return _State(*states.T), _State(*velocities.T), _State(*jnp.swapaxes(jacobian, 1, 2))
+        jacobian = jnp.moveaxis(rows[:, 1:], 2, 0)
+        jacobian = jnp.swapaxes(jacobian, 1, 2)
+        return _State(*states.T), _State(*velocities.T), _State(*jacobian), fault

@@ -1,0 +1,157 @@
+"""What every hard case shares: its rows, two precisions, and values with their derivatives."""
+
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxgran
+
+PRECISIONS = ("float64", "float32")
+
+HARD_THEORY = jaxgran.KineticTheory(softness=False)
+
+
+class Row(NamedTuple):
+    """What one model did in one case, in one precision.
+
+    Attributes:
+        model: its name, with the part of the case where there are several.
+        precision: float64 or float32.
+        error: of the value; relative unless the case says otherwise.
+        allowed: largest error; why so much stands beside it in the case.
+        slope_error, slope_allowed: of a derivative; None where there is none.
+        status: "ok", or the error or status that the case asks for.
+    """
+
+    model: str
+    precision: str
+    error: float
+    allowed: float
+    slope_error: float | None = None
+    slope_allowed: float | None = None
+    status: str = "ok"
+
+    @property
+    def passed(self) -> bool:
+        """Whether all errors are allowed ones; nan never is."""
+        slope = self.slope_error is None or self.slope_error <= (self.slope_allowed or 0.0)
+        return bool(self.error <= self.allowed and slope)
+
+
+class Case(NamedTuple):
+    """One hard case.
+
+    Attributes:
+        name: what is hard.
+        elsewhere: what goes wrong in simulations that do not take care.
+        here: what jaxgran does, and where its limit lies.
+        run: makes the rows.
+        heavy: takes a minute or more.
+    """
+
+    name: str
+    elsewhere: str
+    here: str
+    run: Callable[[], list[Row]]
+    heavy: bool = False
+
+
+@contextmanager
+def precision(name: str) -> Iterator[None]:
+    """Numbers made inside are of this precision."""
+    with jax.enable_x64(name == "float64"):
+        yield
+
+
+def worst(found, exact) -> float:
+    """Largest relative difference; nan if any number is not finite."""
+    found, exact = np.asarray(found, np.float64), np.asarray(exact, np.float64)
+    size = np.where(exact == 0, 1.0, np.abs(exact))
+    return float(np.max(np.abs(found - exact) / size))
+
+
+def finite(*values) -> float:
+    """0 if all numbers are finite, else nan: for derivatives that are only estimates."""
+    return 0.0 if all(np.all(np.isfinite(value)) for value in values) else np.nan
+
+
+def refusal(model: str, name: str, call: Callable, asked: str) -> Row:
+    """A row that passes if the call raises an error whose words match `asked`."""
+    try:
+        with precision(name), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            call()
+    except (ValueError, RuntimeError, OSError) as error:
+        words = re.sub(r"/\S*/", "", " ".join(str(error).split()))  # folders differ each time
+        found = re.search(asked, words)
+        return Row(model, name, 0.0 if found else np.inf, 0.0, status=f"error: {words}")
+    return Row(model, name, np.inf, 0.0, status="no error")
+
+
+def flagged(model: str, name: str, values, codes, bad: int, asked: str) -> Row:
+    """A row of a batch of which one member must be nan with a status, the others finite and ok."""
+    values, codes = np.asarray(values), np.asarray(codes)
+    words = jaxgran.explain_status(int(codes[bad]))
+    others = np.delete(np.arange(len(codes)), bad)
+    right = np.all(np.isnan(values[bad])) and re.search(asked, words)
+    right = right and np.all(codes[others] == 0) and np.all(np.isfinite(values[others]))
+    return Row(model, name, 0.0 if right else np.inf, 0.0, status=f"member {bad}: {words}")
+
+
+@eqx.filter_jit
+def theory(gas: jaxgran.Gas, times, free: str, model=HARD_THEORY) -> tuple:
+    """Kinetic theory's ln(T/T_0) and its derivative in a float of the gas."""
+
+    def log_ratio(value):
+        changed = gas.replace(**{free: value})
+        return jnp.log(model.cool(changed, times).temperature / gas.temperature)
+
+    return jax.jvp(log_ratio, (gas.value(free),), (jnp.ones_like(gas.value(free)),))
+
+
+def slope_of(run: Callable, at) -> tuple:
+    """A particle model's curve at a number, and the derivative of its T."""
+    at = jnp.asarray(at, jnp.result_type(float))
+
+    def temperature(x):
+        curve = run(x)
+        return curve.temperature, jax.lax.stop_gradient(curve.temperature)
+
+    _, slope, value = jax.jvp(temperature, (at,), (jnp.ones_like(at),), has_aux=True)
+    return np.asarray(value), np.asarray(slope)
+
+
+def unit_gas(law, packing_fraction: float, dimension: int = 3) -> jaxgran.Gas:
+    """A gas of diameter, mass and temperature 1."""
+    return jaxgran.Gas(
+        law,
+        diameter=1.0,
+        mass=1.0,
+        packing_fraction=packing_fraction,
+        temperature=1.0,
+        dimension=dimension,
+    )
+
+
+def spheres(position, velocity, side) -> jaxgran.Particles:
+    """One replica of given particles."""
+    arrays = (np.asarray(x, float)[None] for x in (position, velocity))
+    place, speed = map(jnp.asarray, arrays)
+    return jaxgran.Particles(place, speed, jnp.asarray(float(side)))
+
+
+def box(gas: jaxgran.Gas, num_particles: int) -> float:
+    """Side of the box."""
+    return float(gas.box_side(num_particles))
+
+
+def quiet(model: type, num_particles: int, **settings):
+    """A particle model without a progress bar."""
+    return model(num_particles, progress=False, **settings)

@@ -1,0 +1,32 @@
+"""The hard cases, one test each.
+
+Their tolerances, with the reasons, stand beside them in experiments/hard_cases_*.py.
+"""
+
+import jax
+import pytest
+from hard_cases import CASES
+from hard_cases_rows import Row
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.heavy else [])
+        for case in CASES
+    ],
+)
+def test_hard_case(case):
+    with jax.numpy_rank_promotion("raise"):
+        rows = case.run()
+    failed = [str(row) for row in rows if not row.passed]
+    assert rows and not failed, "\n".join(failed)
+
+
+def test_a_row_without_numbers_fails():
+    nan = float("nan")
+    assert Row("model", "float64", 1e-3, 1e-2).passed
+    assert not Row("model", "float64", 1e-1, 1e-2).passed
+    assert not Row("model", "float64", nan, 1.0).passed
+    assert not Row("model", "float64", 0.0, 1.0, nan, 1.0).passed
+    assert not Row("model", "float64", 0.0, 1.0, 2.0, 1.0).passed
