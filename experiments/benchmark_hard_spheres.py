@@ -1,9 +1,11 @@
-"""How many collisions a second do hard spheres resolve?
+"""How many collisions a second do hard spheres resolve, beside LAMMPS in the same run?
 
     python experiments/benchmark_hard_spheres.py [--sizes 1000 4096] [--smoke] [--out FILE]
 
-A gas of constant restitution cools for some mean free times in a periodic box, in three and in two
-dimensions, from a melted start. Compilation and the start are timed apart; medians of repeats.
+A gas cools for some mean free times in a periodic box from a melted start: viscoelastic beads in
+three dimensions, from the same start in LAMMPS too, where their contacts last .01 of the mean free
+time and take 30 steps; disks of constant restitution in two. Compilation and the start are timed
+apart; medians of repeats.
 """
 
 import argparse
@@ -13,13 +15,15 @@ import time
 from pathlib import Path
 
 import jax
+from benchmark_particles import STEPS_PER_CONTACT, lammps_ranks, time_lammps
 from record import save
-from scenes import hard_beads
+from scenes import beads, hard_beads
 
 import jaxgran
 
 PACKINGS = {3: 0.1, 2: 0.2}
-RESTITUTION = 0.9
+BETA, CONTACT_FRACTION = 0.15, 0.01  # in three dimensions
+RESTITUTION = 0.9  # in two
 SIZES = (1000, 4096, 16384, 50000)
 COLLISION_TIMES = 4.0
 REPEATS = 3
@@ -39,17 +43,21 @@ def main() -> None:
     sizes, repeats = options.sizes, REPEATS
     if options.smoke:
         sizes, repeats = (216,), 1
-    print(f"{jax.devices()[0].device_kind}, float64, restitution {RESTITUTION}")
+    ranks = lammps_ranks()[:1]
+    print(f"{jax.devices()[0].device_kind}, float64")
     head = f"{'d':>2}{'phi':>6}{'N':>8} {'first run s':>12} {'run s':>8} {'CPU s':>8}"
-    print(head + f" {'coll/s':>8} {'T/T_0':>7}")
+    print(head + f" {'coll/s':>8} {'T/T_0':>7} {'LAMMPS, one core: coll/s':>26} {'ratio':>6}")
     rows = []
     for dimension in options.dimensions:
         for size in sizes:
-            row = measure(size, dimension, options.collision_times, repeats)
+            row = measure(size, dimension, options.collision_times, repeats, ranks)
             rows.append(row)
             line = f"{dimension:2d}{row['packing_fraction']:6.2f}{size:8d} {row['first_s']:12.1f} "
             line += f"{row['run_s']:8.2f} {row['cpu_s']:8.2f} {row['collisions_per_s']:8.0f} "
-            print(line + f"{row['temperature_ratio']:7.3f}", flush=True)
+            line += f"{row['temperature_ratio']:7.3f}"
+            if row["lammps"]:
+                line += f"{row['lammps']['collisions_per_s']:27.0f} {row['lammps']['ratio']:6.2f}"
+            print(line, flush=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GiB")
     if options.out:
@@ -60,8 +68,13 @@ def main() -> None:
         )
 
 
-def measure(size: int, dimension: int, collision_times: float, repeats: int) -> dict:
-    gas = hard_beads(PACKINGS[dimension], RESTITUTION, dimension)
+def measure(
+    size: int, dimension: int, collision_times: float, repeats: int, ranks: list[int]
+) -> dict:
+    if dimension == 3:
+        gas = beads(PACKINGS[3], BETA, CONTACT_FRACTION)
+    else:
+        gas = hard_beads(PACKINGS[2], RESTITUTION, 2)
     begin = time.perf_counter()
     start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(size)).particles
     model = jaxgran.HardSpheres(size, start=start)
@@ -77,6 +90,12 @@ def measure(size: int, dimension: int, collision_times: float, repeats: int) -> 
         processor.append(time.process_time() - began)
     assert curve.collisions is not None
     run = statistics.median(seconds)
+    collisions = float(curve.collisions[-1]) * size / 2
+    lammps = {}
+    if dimension == 3 and ranks:
+        dt = float(gas.contact_duration) / STEPS_PER_CONTACT
+        took, _ = time_lammps(gas, start, dt, round(times[0] / dt), repeats, ranks[0])
+        lammps = {"run_s": took, "collisions_per_s": collisions / took, "ratio": took / run}
     return {
         "dimension": dimension,
         "packing_fraction": PACKINGS[dimension],
@@ -84,8 +103,9 @@ def measure(size: int, dimension: int, collision_times: float, repeats: int) -> 
         "first_s": first,
         "run_s": run,
         "cpu_s": statistics.median(processor),
-        "collisions_per_s": float(curve.collisions[-1]) * size / 2 / run,
+        "collisions_per_s": collisions / run,
         "temperature_ratio": float(curve.temperature[-1] / gas.temperature),
+        "lammps": lammps,
     }
 
 

@@ -8,14 +8,15 @@ import pytest
 from hard_cases import CASES
 from hard_cases_rows import Row
 
+LONG = ("impact speeds", "phi from", "fits:", "times:", "one member", "stiff and")
+"""Cases that take half a minute each, on two quiet cores, besides the heavy ones."""
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.heavy else [])
-        for case in CASES
-    ],
-)
+
+def marks(case):
+    return [pytest.mark.slow] if case.heavy or case.name.startswith(LONG) else []
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, id=c.name, marks=marks(c)) for c in CASES])
 def test_hard_case(case):
     with jax.numpy_rank_promotion("raise"):
         rows = case.run()

@@ -22,6 +22,7 @@ def test_clustering_leaves_haffs_law(tmp_path):
     assert scene["constant"]["last_flow"][0] > 0.1  # and move together
 
 
+@pytest.mark.slow
 def test_clusters_dissolve(tmp_path):
     done = run("paper_clustering_dissolves.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -79,8 +80,14 @@ def exponents_follow_gamma(found):
     [
         ("paper_restitution", series_is_that_of_impacts),
         ("paper_cooling", cools_as_theory),
-        ("paper_velocity_correlation", dissipation_lengthens_the_memory),
-        ("paper_diffusion_coefficient", diffusion_is_not_that_of_the_paper),
+        pytest.param(
+            "paper_velocity_correlation", dissipation_lengthens_the_memory, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "paper_diffusion_coefficient",
+            diffusion_is_not_that_of_the_paper,
+            marks=pytest.mark.slow,
+        ),
         ("paper_diffusion", spreads_as_theory),
         ("paper_exponents", exponents_follow_gamma),
     ],

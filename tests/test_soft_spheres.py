@@ -179,8 +179,10 @@ def test_cools_as_kinetic_theory_with_softness_says(beads, dimension):
     curve = jaxgran.cool(gas, times, model=quiet(n, replicas=replicas, steps_per_contact=30))
     miss = np.abs(curve.temperature / theory.temperature - 1)
     assert np.all(miss < 0.015 + 2 * curve.temperature_error / curve.temperature)
-    # Softness weakens impacts by 3 % here, the first Sonine order leaves out 2 %: D has both.
-    assert np.all(np.abs(curve.displacement / theory.displacement - 1) < 0.1)
+    # Softness weakens impacts by 3 % here, the first Sonine order leaves out 2 %, correlations 4 %
+    # at such densities: D has all of them, and the noise of the paths.
+    noise = curve.displacement_error / curve.displacement
+    assert np.all(np.abs(curve.displacement / theory.displacement - 1) < 0.09 + 2 * noise)
     # Contacts that last take 2 % of the time there is for others; counts scatter as 1/sqrt.
     scatter = 1 / np.sqrt(curve.collisions * n * replicas / 2)
     assert np.all(np.abs(curve.collisions / theory.collisions - 1) < 0.03 + 2 * scatter)

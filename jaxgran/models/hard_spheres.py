@@ -11,7 +11,6 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from jaxgran import boxes, events, neighbours, status, tangents
-from jaxgran.blocks import Room
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.events import Plan, Scene, State
 from jaxgran.gas import Gas

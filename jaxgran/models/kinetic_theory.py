@@ -37,6 +37,9 @@ class KineticTheory(eqx.Module):
     ``dD/dt = T - nu_v D``, ``d<dr^2>/dt = 2 d D``, ``dN/dt = nu``, all but T from 0,
     with averages exact in eps(v) (`jaxgran.kinetics.averages`). Leaves out correlations, clustering
     and three-body contacts: right for dilute gases in boxes below L_c whose contacts are short.
+    The averages take eps(v) to be smooth: for a law of your own with a kink, such as an eps capped
+    at 1, use `jaxgran.DSMC`; ice that ends elastic is 3 % off after some 1e5 mean free times, and
+    ever more.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
 
