@@ -153,7 +153,7 @@ class HardSpheres(eqx.Module):
         counts = [n * number for number in (listed / 1.3, near, chosen, members)]
         rooms = [int(spare * count + 5 * count**0.5) + 64 for count in counts]
         rooms[1:3] = [max(rows, min(rooms[0], 512)) for rows in rooms[1:3]]  # spare small runs
-        room = Room(*rooms[:3], members=min(max(rooms[3], 512), n))
+        room = boxes.Room(*rooms[:3], members=min(max(rooms[3], 512), n))
         return Plan(self.replicas, share, room)
 
     def _run(self, inputs: Inputs, dimension: int, directions: ReducedLaw | None = None) -> Outputs:
