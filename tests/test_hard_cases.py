@@ -8,8 +8,19 @@ import pytest
 from hard_cases import CASES
 from hard_cases_rows import Row
 
-LONG = ("impact speeds", "phi from", "fits:", "times:", "one member", "stiff and")
-"""Cases that take half a minute each, on two quiet cores, besides the heavy ones."""
+LONG = (
+    "impact speeds",
+    "touching",
+    "constant eps",
+    "phi from",
+    "T/T_0",
+    "times:",
+    "step 5",
+    "stiff and",
+    "fits:",
+    "one member",
+)
+"""Cases that take longest, besides the heavy ones."""
 
 
 def marks(case):
