@@ -233,7 +233,7 @@ def advance(
         widen=jnp.ones((), state.position.dtype),
         stale=jnp.zeros((), bool),
         status=zero,
-        needed=jnp.zeros(len(plan.room), jnp.int32),
+        needed=jnp.zeros(len(plan.room), jnp.int32).at[0].set(pairs.count),
         num_windows=zero,
         num_failed=zero,
         num_rounds=zero,

@@ -334,3 +334,24 @@ def test_lammps_curve():
     error = np.hypot(ours.temperature_error, curve.temperature_error) / curve.temperature
     # Errors of three and four replicas are themselves uncertain by half.
     assert np.all(miss < 0.005 + 3 * error)
+
+
+def test_a_skin_full_of_spheres_is_shortened(monkeypatch):
+    # A clump in a wide box: by the mean density the skin would hold seven pairs a disk, not 31.
+    size, gas = 64, hard_gas(0.9, 0.01, 2)
+    side = float(gas.box_side(size))
+    place = 1.3 * np.stack(np.meshgrid(np.arange(8), np.arange(8)), -1).reshape(1, size, 2)
+    velocity = np.asarray(np.random.default_rng(3).normal(size=(1, size, 2)))
+    start = jaxgran.Particles(*map(jnp.asarray, (place + 0.2 * side, velocity, side)))
+    skins, stretch = [], events.stretch
+
+    def watched(state, *others):
+        skins.append(float(state.skin))
+        return stretch(state, *others)
+
+    monkeypatch.setattr(events, "stretch", watched)
+    end = 2.0
+    curve = jaxgran.cool(gas, [end], model=quiet(size, start=start))
+    assert skins[-1] < skins[0] and min(skins) >= events.SHORTEST_SKIN
+    _, _, counts, _ = serial(gas, start, end)
+    assert counts.sum() > 50 and round(float(curve.collisions[0]) * size) == counts.sum()
