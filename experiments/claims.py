@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from scenes import beads
 
 import jaxgran
-from jaxgran import kinetics
+from jaxgran import closed_forms
 
 SMALL = 1e-4
 """delta at which first-order coefficients are taken."""
@@ -54,6 +54,6 @@ class Table:
 def cooled(delta: float, u, **options) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
     """Dilute viscoelastic beads of a delta, at given u = 1 + t/tau_0."""
     gas = beads(0.05, 1.5 * 2**0.1 * delta)
-    tau = (jnp.asarray(u) - 1) / (kinetics.COOLING_RATE[3] * delta)
+    tau = (jnp.asarray(u) - 1) / (closed_forms.COOLING_RATE[3] * delta)
     model = jaxgran.KineticTheory(softness=False, rtol=1e-11, **options)
     return gas, jaxgran.cool(gas, tau * gas.mean_free_time, model=model)

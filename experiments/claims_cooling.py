@@ -9,7 +9,7 @@ from claims import SMALL, Table, cooled
 from scenes import beads
 
 import jaxgran
-from jaxgran import kinetics
+from jaxgran import closed_forms, kinetics
 from jaxgran.restitution import C1
 
 
@@ -73,27 +73,27 @@ def cooling(table: Table) -> None:
         )
     series(table, gas)
     sonine(table, early)
-    closed_forms(table)
+    formulas(table)
 
 
 def series(table: Table, gas: jaxgran.Gas) -> None:
     """The coefficients of Eqs. (32) and (36)."""
-    q, s = kinetics.TWO_TERM, kinetics.SONINE
+    q, s = closed_forms.TWO_TERM, closed_forms.SONINE
     rates = jnp.asarray([kinetics.averages(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)])
     paper_rates = jnp.asarray(
-        [kinetics.paper_averages(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)]
+        [closed_forms.paper_averages(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)]
     )
     elastic = 2 / 3 * float(kinetics.collision_rate(0.0, 3))
     c = float((1 - rates[1] / elastic) / SMALL)
     second = 27 / 40 * gamma(2.2) * C1**2 * 4**0.2
     table.add(
         "32",
-        f"1/τ_v = (1 − {kinetics.SLOWING:.4f} δ θ^{{1/10}} + {second:.4f} δ² θ^{{1/5}})/τ_E",
+        f"1/τ_v = (1 − {closed_forms.SLOWING:.4f} δ θ^{{1/10}} + {second:.4f} δ² θ^{{1/5}})/τ_E",
         f"first coefficient {c:.4f} at δ = 10⁻⁴; two terms are {100 * _two_terms_off(0.1):.1g} % "
         f"off at δ = 0.1, {100 * _two_terms_off(0.3):.0f} % at 0.3",
         "exact average of ε(v)",
         "agree",
-        abs(c / kinetics.SLOWING - 1) < 1e-3,
+        abs(c / closed_forms.SLOWING - 1) < 1e-3,
         "of a Maxwellian gas",
     )
     table.add(
@@ -110,7 +110,7 @@ def series(table: Table, gas: jaxgran.Gas) -> None:
 
 def sonine(table: Table, early: jaxgran.CoolingCurve) -> None:
     """How far from Maxwellian."""
-    s = kinetics.SONINE
+    s = closed_forms.SONINE
     assert early.sonine is not None
     a_2 = float(early.sonine[1]) / SMALL / 10 ** (-1 / 6)
     table.add(
@@ -124,15 +124,15 @@ def sonine(table: Table, early: jaxgran.CoolingCurve) -> None:
     )
 
 
-def closed_forms(table: Table) -> None:
+def formulas(table: Table) -> None:
     """The formulas of T(t)."""
-    q, s = kinetics.TWO_TERM, kinetics.SONINE
-    first = float(kinetics.paper_temperature(0.0, 0.093, corrected=False))
+    q, s = closed_forms.TWO_TERM, closed_forms.SONINE
+    first = float(closed_forms.paper_temperature(0.0, 0.093, corrected=False))
     run = table.found("paper_cooling")
     u = np.geomspace(1.01, 1e9, 50)
     gas, curve = cooled(0.093, u)
-    tau = jnp.asarray(u - 1) / (kinetics.COOLING_RATE[3] * 0.093)
-    formula = kinetics.paper_temperature(tau, 0.093)
+    tau = jnp.asarray(u - 1) / (closed_forms.COOLING_RATE[3] * 0.093)
+    formula = closed_forms.paper_temperature(tau, 0.093)
     off = float(jnp.abs(formula * gas.temperature / curve.temperature - 1).max())
     table.add(
         "38",
@@ -144,7 +144,7 @@ def closed_forms(table: Table) -> None:
         "the homogeneous solution −2qδu^{−8/3} is missing; a₂ and a₁ change with the Sonine a₂, "
         f"which makes a₁ {2 * (q + 0.24 * s):.3f}",
     )
-    rate = kinetics.COOLING_RATE[3]
+    rate = closed_forms.COOLING_RATE[3]
     table.add(
         "39",
         "τ_c(0)/(δτ₀) = 0.831928",
@@ -173,5 +173,8 @@ def _two_terms_off(delta: float) -> float:
     law = beads(0.05, 1.5 * 2**0.1 * delta).reduced_law
     one = jnp.ones(())
     return float(
-        abs(kinetics.paper_averages(law, one, 3)[2, 0] / kinetics.averages(law, one, 3)[2, 0] - 1)
+        abs(
+            closed_forms.paper_averages(law, one, 3)[2, 0] / kinetics.averages(law, one, 3)[2, 0]
+            - 1
+        )
     )

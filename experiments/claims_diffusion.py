@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from claims import SMALL, Table, cooled
 
-from jaxgran import kinetics
+from jaxgran import closed_forms
 
 
 def equilibrium(table: Table) -> None:
@@ -86,7 +86,7 @@ def diffusion(table: Table) -> None:
     gas, curve = cooled(SMALL, [1e4, 1e6])
     u, d_0 = np.array([1e4, 1e6]), 1.5 * float(gas.temperature * gas.mean_free_time)
     a_3 = (np.asarray(curve.diffusion) / d_0 - u ** (-5 / 6)) * u / SMALL
-    q, c, s = kinetics.TWO_TERM, kinetics.SLOWING, kinetics.SONINE
+    q, c, s = closed_forms.TWO_TERM, closed_forms.SLOWING, closed_forms.SONINE
     ours = q + 0.24 * s + 2 * c + 3 / 16 * s
     table.add(
         "40",
@@ -110,8 +110,8 @@ def diffusion(table: Table) -> None:
         "inverted",
     )
     exact = np.asarray(curve.displacement) / float(gas.temperature * gas.mean_free_time**2)
-    tau = jnp.asarray(u - 1) / (kinetics.COOLING_RATE[3] * SMALL)
-    off = float(np.abs(np.asarray(kinetics.paper_displacement(tau, SMALL)) / exact - 1).max())
+    tau = jnp.asarray(u - 1) / (closed_forms.COOLING_RATE[3] * SMALL)
+    off = float(np.abs(np.asarray(closed_forms.paper_displacement(tau, SMALL)) / exact - 1).max())
     run = table.found("paper_diffusion")
     if run:
         row = run["viscoelastic"]
@@ -152,7 +152,7 @@ def diffusion(table: Table) -> None:
         )
     gas, curve = cooled(0.093, [1e2, 1e6, 1e12])
     theta = np.asarray(curve.temperature / gas.temperature)
-    leading = 54 / (kinetics.COOLING_RATE[3] * 0.093) * (theta**-0.1 - 1)
+    leading = 54 / (closed_forms.COOLING_RATE[3] * 0.093) * (theta**-0.1 - 1)
     ratio = (
         leading * float(gas.temperature * gas.mean_free_time**2) / np.asarray(curve.displacement)
     )

@@ -12,6 +12,9 @@ from scipy.optimize import root_scalar
 
 import jaxgran
 
+LAWS = ("constant", "viscoelastic")
+COLOURS = ("#20639b", "#d1495b")
+
 PER_CELL = 20
 """Disks in a cell that counts and flow are taken over: a cell is smaller than a cluster."""
 

@@ -19,7 +19,7 @@ from hard_cases_rows import (
 from scenes import beads
 
 import jaxgran
-from jaxgran import kinetics
+from jaxgran import closed_forms
 from jaxgran.neighbours import find_pairs
 
 DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
@@ -49,7 +49,7 @@ def elastic_limit() -> list[Row]:
             gas = beads(0.05, 0.1)
             times = jnp.asarray(_taus(gas, 0.1, 1.0, 10.0))
             tau = np.asarray(times) / float(gas.mean_free_time)
-            per_delta = -5 / 3 * kinetics.COOLING_RATE[3] * tau
+            per_delta = -5 / 3 * closed_forms.COOLING_RATE[3] * tau
             exact = per_delta * float(gas.delta) / float(gas.value(free))
             value, slope = theory(gas.replace(**{free: 0.0}), times, free)
             # Solver 1e-9 or 1e-5; in float32 times as large and small as these carry 1e-6.
@@ -77,7 +77,7 @@ def elastic_limit() -> list[Row]:
     gas = beads(0.05, 0.1)
     times = _taus(gas, 1.0)
     still, slope = gas.replace(**{free: 0.0}), 0.0
-    exact = -5 / 3 * kinetics.COOLING_RATE[3] * float(gas.delta) / float(gas.value(free))
+    exact = -5 / 3 * closed_forms.COOLING_RATE[3] * float(gas.delta) / float(gas.value(free))
     # T keeps to round-off. The slope counts impacts: 2000 of them scatter by 2 %, 50 by 14 %.
     for model, noise in ((DSMC, 0.1), (HARD, 0.5)):
         some = quiet(model, {DSMC: 4000, HARD: 100}[model])
@@ -105,7 +105,7 @@ def plastic_and_elastic() -> list[Row]:
                 tau = np.asarray(times / gas.mean_free_time, float)
                 value, slope = theory(gas, times, free, MAXWELLIAN)
                 along = 4 * e / 6 * tau / (1 + (1 - e * e) / 6 * tau)
-                exact = np.log(np.asarray(kinetics.haff(tau, e)))
+                exact = np.log(np.asarray(closed_forms.haff(tau, e)))
                 errors.append(
                     [np.max(np.abs(value - exact)), worst(np.asarray(slope) + 1, along + 1)]
                 )
@@ -116,7 +116,7 @@ def plastic_and_elastic() -> list[Row]:
     for e in (0.0, 1.0):
         gas = unit_gas(jaxgran.ConstantRestitution(e), 0.05)
         times = _taus(gas, 5.0)
-        haff = float(kinetics.haff(5.0, e))
+        haff = float(closed_forms.haff(5.0, e))
         # At e = 0 a_2 is near .1 and kinetic theory's second order leaves some per cent; 100
         # spheres' losses scatter by 10 %.
         for model, size, noise in ((DSMC, 4000, 0.05), (HARD, 100, 0.4)):
@@ -172,7 +172,7 @@ def thin_and_dense() -> list[Row]:
                     times = jnp.asarray(_taus(gas, 0.1, 10.0, 1000.0))
                     values.append(theory(gas, times, free, MAXWELLIAN))
             value, slope = (np.asarray([v[k] for v in values]) for k in (0, 1))
-            exact = np.log(np.asarray(kinetics.haff(np.array([0.1, 10.0, 1000.0]), 0.8, d)))
+            exact = np.log(np.asarray(closed_forms.haff(np.array([0.1, 10.0, 1000.0]), 0.8, d)))
             allowed = 1e-8 if name == "float64" else 2e-4
             errors = float(np.max(np.abs(value - exact))), allowed
             rows.append(
@@ -183,7 +183,7 @@ def thin_and_dense() -> list[Row]:
             curve = jaxgran.cool(gas, _taus(gas, 5.0), model=quiet(HARD, 100))
             assert curve.collisions is not None and curve.dissipated_energy is not None
             ledger = abs(float(d / 2 * curve.temperature[0] + curve.dissipated_energy[0]) - d / 2)
-            told = kinetics.haff(5.0, 0.9, d)
+            told = closed_forms.haff(5.0, 0.9, d)
             # 250 impacts scatter by 6 %; a dense inelastic gas meets oftener than Enskog says.
             error = worst(curve.temperature[0], told)
             rows.append(Row(f"HardSpheres, {d}D, phi = {phi:g}", "float64", error, 0.15))
@@ -255,7 +255,7 @@ def deep_cold() -> list[Row]:
             times = jnp.asarray(_taus(gas, 1.0, 1e3, 1.01e6 / gamma))
             value, slope = theory(gas, times, free, MAXWELLIAN)
             tau = np.asarray(times / gas.mean_free_time, float)
-            exact = np.log(np.asarray(kinetics.haff(tau, e)))
+            exact = np.log(np.asarray(closed_forms.haff(tau, e)))
             assert exact[-1] < np.log(1e-12)
             allowed = (
                 1e-7 if name == "float64" else 3e-3
@@ -270,7 +270,7 @@ def deep_cold() -> list[Row]:
                 # a_2 = .048 makes Haff's clock 1 % slow; DSMC's 4000 and 50 spheres in one small
                 # box scatter. Late, T goes as 1/clock^2.
                 # Its slope is what two ten times larger ones leave: 2 % of T are 20 % of it.
-                told = float(kinetics.haff(2e3 / gamma, e))
+                told = float(closed_forms.haff(2e3 / gamma, e))
                 rows.append(
                     Row(
                         f"{model.__name__}, {told:.0e}",

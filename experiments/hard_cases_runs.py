@@ -29,7 +29,7 @@ from hard_cases_rows import (
 from scenes import beads
 
 import jaxgran
-from jaxgran import blocks, checkpoint, kinetics
+from jaxgran import blocks, checkpoint, closed_forms
 
 DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
 FREE = "dissipative_constant"
@@ -148,7 +148,7 @@ def solver_ends() -> list[Row]:
     weak = beads(0.05, 1e-6)
     late = jnp.geomspace(1.0, 1e9, 3) * weak.mean_free_time
     value, slope = theory(weak, late, FREE, stiff)
-    told = jnp.log(kinetics.paper_temperature(late / weak.mean_free_time, weak.delta))
+    told = jnp.log(closed_forms.paper_temperature(late / weak.mean_free_time, weak.delta))
     # The expansion is right to delta; a_2, of order delta, is left out of it, and is as small.
     error = float(np.max(np.abs(np.asarray(value) - np.asarray(told))))
     rows.append(Row("Kvaerno5, 1e9 collisions", "float64", error, 1e-5))

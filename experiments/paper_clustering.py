@@ -26,7 +26,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from clustering import (  # noqa: E402
+    COLOURS,
     FACTORS,
+    LAWS,
     departures,
     dissipation,
     follow,
@@ -41,9 +43,6 @@ from record import save  # noqa: E402
 from scenes import hard_beads  # noqa: E402
 from scipy.ndimage import gaussian_filter  # noqa: E402
 from tqdm import tqdm  # noqa: E402
-
-LAWS = ("constant", "viscoelastic")
-COLOURS = ("#20639b", "#d1495b")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,6 +21,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from clustering import (  # noqa: E402
+    COLOURS,
+    LAWS,
     PER_CELL,
     dissipation,
     follow,
@@ -34,9 +36,6 @@ from scenes import hard_beads  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
 import jaxgran  # noqa: E402
-
-LAWS = ("constant", "viscoelastic")
-COLOURS = ("#20639b", "#d1495b")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ import paper
 from scenes import beads, hard_beads
 
 import jaxgran
-from jaxgran import kinetics
+from jaxgran import closed_forms
 
 NAME = "paper_cooling"
 
@@ -88,9 +88,9 @@ def main() -> None:
         if name == "viscoelastic":
             late = np.abs(local - slopes[name]) < 0.01 * abs(slopes[name])
             found["exponent_within_1_per_cent_from"] = paper.from_here(late, where)
-            found["closed_forms"] = closed_forms(right, tau, theta, float(gas.delta))
+            found["closed_forms"] = formulas(right, tau, theta, float(gas.delta))
         else:
-            haff = np.asarray(kinetics.haff(tau, e))
+            haff = np.asarray(closed_forms.haff(tau, e))
             right.plot(tau, haff / theta - 1, color=colors[name], label="Haff, Eq. (44)")
             found["haff"] = paper.listed(haff[::12] / theta[::12] - 1)
     paper.caption(
@@ -133,17 +133,17 @@ def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
     return float(np.interp(np.log(x), np.log(where), values))
 
 
-def closed_forms(axes, tau: np.ndarray, theta: np.ndarray, delta: float) -> dict:
+def formulas(axes, tau: np.ndarray, theta: np.ndarray, delta: float) -> dict:
     """The paper's forms of T(t) less the exact one, drawn and at some times."""
-    u = 1 + kinetics.COOLING_RATE[3] * delta * tau
+    u = 1 + closed_forms.COOLING_RATE[3] * delta * tau
     t = jnp.asarray(tau)
     forms = {
         "Eq. (10): u$^{-5/3}$": (u ** (-5 / 3), ":"),
         "Eq. (38) as printed, to order δ": (
-            kinetics.paper_temperature(t, delta, corrected=False),
+            closed_forms.paper_temperature(t, delta, corrected=False),
             "--",
         ),
-        "Eq. (38) corrected, to order δ$^2$": (kinetics.paper_temperature(t, delta), "-"),
+        "Eq. (38) corrected, to order δ$^2$": (closed_forms.paper_temperature(t, delta), "-"),
     }
     rows = {}
     for label, (values, style) in forms.items():

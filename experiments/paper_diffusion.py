@@ -16,7 +16,7 @@ import paper
 from scenes import beads, hard_beads
 
 import jaxgran
-from jaxgran import kinetics
+from jaxgran import closed_forms
 
 NAME = "paper_diffusion"
 
@@ -100,8 +100,8 @@ def main() -> None:
         if name == "viscoelastic":
             near = np.abs(local - 1 / 6) < 1 / 60
             found["exponent_within_10_per_cent_from"] = paper.from_here(near, where)
-            found["closed_forms"] = closed_forms(forms, tau, spread, delta)
-            scale = 54 / (kinetics.COOLING_RATE[3] * delta)
+            found["closed_forms"] = formulas(forms, tau, spread, delta)
+            scale = 54 / (closed_forms.COOLING_RATE[3] * delta)
             guide = 1 / theta[far]
             leading = scale * (guide**0.1 - 1)
             in_temperature.plot(
@@ -137,14 +137,14 @@ def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
     return float(np.interp(np.log(x), np.log(where), values))
 
 
-def closed_forms(axes, tau: np.ndarray, spread: np.ndarray, delta: float) -> dict:
+def formulas(axes, tau: np.ndarray, spread: np.ndarray, delta: float) -> dict:
     """The paper's <dr^2>(t) and the corrected one less the exact, drawn and at some times."""
-    rate = kinetics.COOLING_RATE[3] * delta
+    rate = closed_forms.COOLING_RATE[3] * delta
     u, t = 1 + rate * tau, jnp.asarray(tau)
     of = {
         "leading: u$^{1/6}$ − 1": (54 / rate * (u ** (1 / 6) - 1), ":"),
-        "Eq. (40) integrated": (kinetics.paper_displacement(t, delta, corrected=False), "--"),
-        "corrected, to order δ": (kinetics.paper_displacement(t, delta), "-"),
+        "Eq. (40) integrated": (closed_forms.paper_displacement(t, delta, corrected=False), "--"),
+        "corrected, to order δ": (closed_forms.paper_displacement(t, delta), "-"),
     }
     rows = {}
     shown = tau > 3
@@ -164,10 +164,10 @@ def cooling_window(delta: float, tau: np.ndarray, axes) -> dict:
     middle, local = paper.slope(tau, spread)
     # tau_c |dT/dt| / T is the share of T lost in a collision, -d ln T/dN.
     lost = -np.diff(np.log(theta)) / np.diff(collisions)
-    rate = kinetics.COOLING_RATE[3] * delta
+    rate = closed_forms.COOLING_RATE[3] * delta
     printed = rate * (1 + rate * tau) ** (5 / 6)
     relaxed = np.asarray(curve.diffusion) / (1.5 * unit / float(gas.mean_free_time))
-    averages = jax.vmap(lambda x: kinetics.paper_averages(gas.reduced_law, x, 3)[2, 0])
+    averages = jax.vmap(lambda x: closed_forms.paper_averages(gas.reduced_law, x, 3)[2, 0])
     slowing = np.asarray(averages(jnp.sqrt(jnp.asarray(theta))))
     t_tau_v = np.sqrt(theta) * float(np.sqrt(32 * np.pi) / 3) / slowing
     first, last = 1 / delta, delta ** (-11 / 5)

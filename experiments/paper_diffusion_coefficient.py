@@ -17,7 +17,7 @@ from paper_velocity_correlation import diffusion, hard, printed_relaxation, stoc
 from scenes import beads, hard_beads
 
 import jaxgran
-from jaxgran import kinetics
+from jaxgran import closed_forms
 
 NAME = "paper_diffusion_coefficient"
 
@@ -60,8 +60,8 @@ def main() -> None:
     }
     tau = np.geomspace(0.3, config.last, 200)
     delta = float(viscoelastic.delta)
-    u = 1 + kinetics.COOLING_RATE[3] * delta * tau
-    a_3 = kinetics.TWO_TERM + kinetics.SLOWING
+    u = 1 + closed_forms.COOLING_RATE[3] * delta * tau
+    a_3 = closed_forms.TWO_TERM + closed_forms.SLOWING
     printed = u ** (-5 / 6) + a_3 * delta / u
     fall.plot(tau, printed, "--", lw=1, color=paper.VISCOELASTIC, label="Eq. (40), to order δ")
     paper.caption(

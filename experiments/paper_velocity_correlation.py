@@ -22,7 +22,7 @@ from scenes import beads, hard_beads
 from scipy.integrate import simpson
 
 import jaxgran
-from jaxgran import kinetics
+from jaxgran import closed_forms, kinetics
 
 NAME = "paper_velocity_correlation"
 
@@ -208,7 +208,7 @@ def printed_relaxation(gas: jaxgran.Gas) -> jax.Array:
     if isinstance(gas.law, jaxgran.ConstantRestitution):
         return 2 / (1 + gas.law.coefficient)
     one = jnp.ones(())
-    nu = kinetics.paper_averages(gas.reduced_law, one, gas.dimension)[2, 0]
+    nu = closed_forms.paper_averages(gas.reduced_law, one, gas.dimension)[2, 0]
     return 2 / 3 * kinetics.collision_rate(0.0, gas.dimension) / nu
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from jaxgran import kinetics, status
+from jaxgran import closed_forms, status
 from jaxgran.cooling import Model
 from jaxgran.curve import CoolingCurve
 from jaxgran.estimate import Fit, Parameters, misfit
@@ -152,9 +152,9 @@ def start_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         loss = jnp.clip(2 * gas.dimension * rate, 1e-6, 0.99)
         gas = gas.replace(coefficient=jnp.sqrt(1 - loss))
     if isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free:
-        delta = rate / kinetics.COOLING_RATE[gas.dimension]
+        delta = rate / closed_forms.COOLING_RATE[gas.dimension]
         # Beyond the first order in delta cooling is slower: delta (1 - q delta / 2) is what shows.
-        delta = delta / (1 - jnp.minimum(0.5 * kinetics.TWO_TERM * delta, 0.7))
+        delta = delta / (1 - jnp.minimum(0.5 * closed_forms.TWO_TERM * delta, 0.7))
         gas = gas.replace(dissipative_constant=delta / (gas.alpha**0.4 * gas.temperature**0.1))
     return gas
 
@@ -190,7 +190,7 @@ def _fit(gas, curve, model, names, starts, num_particles, method, max_steps) -> 
     ]
     if use_displacement:
         assert curve.displacement is not None
-        accuracy = model.displacement_accuracy(gas.dimension)
+        accuracy = model.displacement_accuracy(gas)
         sampling = (2 / (gas.dimension * (num_particles or 1))) ** 0.5 * curve.displacement
         error = sampling if curve.displacement_error is None else curve.displacement_error
         error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
-from jaxgran import kinetics
+from jaxgran import closed_forms
 from jaxgran.models.kinetic_theory import KineticTheory
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
@@ -127,7 +127,7 @@ def test_stiff_solver_for_nearly_elastic_gases(beads):
     times = jnp.geomspace(1.0, 1e9, 20) * gas.mean_free_time
     model = jaxgran.KineticTheory(solver=diffrax.Kvaerno5(), rtol=1e-7)
     curve = jaxgran.cool(gas, times, model=model)
-    formula = kinetics.paper_temperature(times / gas.mean_free_time, gas.delta)
+    formula = closed_forms.paper_temperature(times / gas.mean_free_time, gas.delta)
     # The expansion is right to delta here; softness 0.8 % of the rate, a_2 less.
     np.testing.assert_allclose(curve.temperature / gas.temperature, formula, rtol=0.03)
 

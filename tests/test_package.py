@@ -11,7 +11,7 @@ FLOORS = [
     ["contact", "simulation", "observables", "initial"],
     ["restitution", "encounters"],
     ["gas", "tangents"],
-    ["kinetics", "curve", "collisions"],
+    ["kinetics", "closed_forms", "curve", "collisions"],
     ["boxes", "estimate"],
     ["blocks", "impacts", "search"],
     ["events"],

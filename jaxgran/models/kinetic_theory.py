@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from jaxgran import kinetics, status
+from jaxgran import closed_forms, kinetics, status
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
 from jaxgran.restitution import ReducedLaw
@@ -58,7 +58,9 @@ class KineticTheory(eqx.Module):
         ValueError: for an unknown `averages`.
 
     Reference: van Noije & Ernst 1998 for the averages; Brilliantov & Poeschel for the gas. D is
-    the first Sonine approximation: 1.7 % (3D), 2.4 % (2D) below the exact elastic value.
+    the first Sonine approximation: 1.7 % (3D), 2.4 % (2D) below the exact elastic value of a
+    dilute gas; at packing fraction phi collisions are correlated, and D is greater by another
+    0.85 phi.
     """
 
     sonine: bool = eqx.field(static=True, default=True)
@@ -80,9 +82,14 @@ class KineticTheory(eqx.Module):
         """
         return 0.015
 
-    def displacement_accuracy(self, dimension: int) -> float:
-        """Relative error of <dr^2>: what the first Sonine order leaves out of D."""
-        return {2: 0.024, 3: 0.017}[dimension]
+    def displacement_accuracy(self, gas: Gas) -> Float[Array, ""]:
+        """Relative error of <dr^2>: of the first Sonine order, and of free flights forgotten.
+
+        Spheres that have met meet again, which kinetic theory leaves out: hard spheres diffuse
+        faster than Enskog's by 0.85 phi, up to phi = .2 (Speedy, Mol. Phys. 62 (1987) 509).
+        """
+        correlation = 0.85 * jnp.minimum(gas.packing_fraction, 0.2)
+        return jnp.hypot({2: 0.024, 3: 0.017}[gas.dimension], correlation)
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """``-d ln T/dt`` at t = 0, 1/s, of the Maxwellian gas; negative if the law heats it."""
@@ -142,7 +149,7 @@ class KineticTheory(eqx.Module):
         )
 
     def _averages(self, law: ReducedLaw, speed: Array, dimension: int) -> Array:
-        of = kinetics.averages if self.averages == "exact" else kinetics.paper_averages
+        of = kinetics.averages if self.averages == "exact" else closed_forms.paper_averages
         return of(law, speed, dimension)
 
     def _velocity(self, state: Array, averages: Array, law: ReducedLaw, dimension: int) -> Array:

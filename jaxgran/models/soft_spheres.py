@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxgran import blocks, boxes, kinetics, tangents
+from jaxgran import blocks, boxes, closed_forms, tangents
 from jaxgran.blocks import Plan, Scene, State
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.gas import Gas, sphere_surface
@@ -164,7 +164,7 @@ class SoftSpheres(eqx.Module):
             if directions is None:
                 return state
             assert self.projection is not None
-            damping = kinetics.TWO_TERM * scene.dissipative_constant * scene.alpha**0.4
+            damping = closed_forms.TWO_TERM * scene.dissipative_constant * scene.alpha**0.4
             interval = self.projection
             along = tangents.at_start(*directions, state.velocity, replicas, interval, damping)
             return state._replace(tangents=along)
