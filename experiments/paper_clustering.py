@@ -62,10 +62,10 @@ class Config:
     num_particles: int = 20_000
     seeds: tuple[int, ...] = (0, 1, 2)
     scenes: tuple[Scene, ...] = (
-        Scene(0.245, 0.9, (110.0, 110.0), (70.0, 0.0031)),
-        Scene(0.05, 0.6, (28.0, 32.0), (23.0, 0.0027)),
+        Scene(0.245, 0.9, (130.0, 170.0), (70.0, 0.0031)),
+        Scene(0.05, 0.6, (36.0, 60.0), (23.0, 0.0027)),
     )
-    fields: tuple[float, ...] = (20.0, 60.0, 85.0, 108.0)  # collisions, of the first scene
+    fields: tuple[float, ...] = (20.0, 60.0, 95.0, 128.0)  # collisions, of the first scene
 
 
 SMOKE = Config(
