@@ -1,11 +1,13 @@
 """How many collisions a second do hard spheres resolve, beside LAMMPS in the same run?
 
     python experiments/benchmark_hard_spheres.py [--sizes 1000 4096] [--smoke] [--out FILE]
+    python experiments/benchmark_hard_spheres.py --until 100
 
 A gas cools for some mean free times in a periodic box from a melted start: viscoelastic beads in
 three dimensions, from the same start in LAMMPS too, where their contacts last .01 of the mean free
 time and take 30 steps; disks of constant restitution in two. Compilation and the start are timed
-apart; medians of repeats.
+apart; medians of repeats. With `--until`, instead, 50 000 disks (or the last of `--sizes`) are
+followed into their clusters, until they have collided so often each.
 """
 
 import argparse
@@ -15,9 +17,12 @@ import time
 from pathlib import Path
 
 import jax
+import numpy as np
 from benchmark_particles import STEPS_PER_CONTACT, lammps_ranks, time_lammps
+from clustering import follow
 from record import save
 from scenes import beads, hard_beads
+from tqdm import tqdm
 
 import jaxgran
 
@@ -33,14 +38,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--sizes", nargs="+", type=int, default=SIZES)
+    parser.add_argument("--sizes", nargs="+", type=int)
     parser.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=(3, 2))
     parser.add_argument("--collision-times", type=float, default=COLLISION_TIMES)
+    parser.add_argument("--until", type=float, help="collisions of each of 50 000 disks")
     parser.add_argument("--smoke", action="store_true", help="a run of seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    sizes, repeats = options.sizes, REPEATS
+    if options.until:
+        follow_disks((options.sizes or SIZES)[-1], options.until, options.out)
+        return
+    sizes, repeats = options.sizes or SIZES, REPEATS
     if options.smoke:
         sizes, repeats = (216,), 1
     ranks = lammps_ranks()[:1]
@@ -65,6 +74,30 @@ def main() -> None:
             options.out,
             rows=rows,
             peak_memory_GiB=peak,
+        )
+
+
+def follow_disks(size: int, until: float, out: Path | None) -> None:
+    gas = hard_beads(PACKINGS[2], RESTITUTION, 2)
+    with tqdm(total=until, unit="collisions", delay=1) as bar:
+        run = follow(
+            gas, 0, size, until, progress=lambda done: bar.update(min(done, until) - bar.n)
+        )
+    stretches = np.searchsorted(run["collisions"], np.linspace(0.1, 1, 10) * until)
+    print(f"{size} disks, phi = {PACKINGS[2]:g}, e = {RESTITUTION:g}")
+    print(f"{'collisions each':>16}{'T/T_0':>10}{'unevenness':>12}{'flow':>7}")
+    for i in np.minimum(stretches, len(run["t"]) - 1):
+        theta = run["temperature"][i] / float(gas.temperature)
+        print(f"{run['collisions'][i]:16.1f}{theta:10.2e}{run['unevenness'][i]:12.2f}", end="")
+        print(f"{run['flow'][i]:7.3f}")
+    total = run["collisions"][-1] * size / 2
+    print(f"start {run['start_s']:.0f} s, run {run['run_s']:.0f} s with compilation, ", end="")
+    print(f"{total / run['run_s']:.0f} collisions/s; regularised {run['regularised'][-1]:.2g} each")
+    if out:
+        save(
+            out,
+            size=size,
+            **{name: np.asarray(x).tolist() for name, x in run.items() if name != "positions"},
         )
 
 
