@@ -4,7 +4,7 @@
 
 D(t) of a cooling gas by three routes: the integral of the velocity autocorrelation, Eq. (9) from
 t' on, the slope of <dr^2>, Eq. (14), and theory: Eqs. (34) and (40) as printed, and with memory,
-dD/dt = T - D/tau_v. Stochastic simulation, and hard spheres at one age.
+dD/dt = T - D/tau_v. Stochastic simulation, and hard and soft spheres at one age.
 """
 
 from dataclasses import dataclass, field, replace
@@ -12,8 +12,15 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 import paper
+from paper_velocity_correlation import (
+    MARKERS,
+    SPHERES,
+    diffusion,
+    in_boxes,
+    printed_relaxation,
+    stochastic,
+)
 from paper_velocity_correlation import Config as Correlation
-from paper_velocity_correlation import diffusion, hard, printed_relaxation, stochastic
 from scenes import beads, hard_beads
 
 import jaxgran
@@ -76,7 +83,7 @@ def main() -> None:
     paper.caption(
         ratio,
         "— theory with memory, - - Eq. (34): D = T τ$_v$\n"
-        "● ■ slope of ⟨Δr²⟩, ◇ □ ∫⟨v(t′)·v(t)⟩dt: DSMC, hard spheres",
+        "● ■ ▲ slope of ⟨Δr²⟩, ◇ □ △ ∫⟨v(t′)·v(t)⟩dt: DSMC, hard, soft spheres",
         xlabel="T(t′) / T$_0$",
         ylabel="D / (T τ$_E$)",
         xscale="log",
@@ -90,9 +97,10 @@ def main() -> None:
             f"integral {row['by_integral'][-1]:.3f} +- {row['by_integral_error'][-1]:.3f}, T tau_v "
             f"{row['paper'][-1]:.3f}"
         )
-        if (of := row["hard_spheres"]) is not None:
+        for kind in [kind for kind in SPHERES if kind in row]:
+            of = row[kind]
             print(
-                f"    hard spheres, T/T_0 = {of['temperature']:.3f}: by the slope {of['slope']:.3f}"
+                f"    {kind}, T/T_0 = {of['temperature']:.3f}: by the slope {of['slope']:.3f}"
                 f" +- {of['slope_error']:.3f}, by the integral {of['integral']:.3f} +- "
                 f"{of['integral_error']:.3f}"
             )
@@ -123,7 +131,7 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio)
     waits = config.waits if name == "viscoelastic" else (1.0,)
     runs = [stochastic(gas.replace(temperature=start * wait), size) for wait in waits]
     printed = [float(printed_relaxation(gas.replace(temperature=start * x))) for x in theta[::8]]
-    spheres = hard(gas, size, ages=name != "elastic") if size.boxes else None
+    boxes = in_boxes(gas, size, ages=name != "elastic")
     row = {
         "temperature": paper.listed(middle),
         "by_slope": paper.listed(slopes),
@@ -133,7 +141,7 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio)
         "by_integral": [run["integral"] for run in runs],
         "by_integral_error": [run["integral_error"] for run in runs],
         "paper": [float(printed_relaxation(gas.replace(temperature=start * w))) for w in waits],
-        "hard_spheres": spheres,
+        **boxes,
     }
     d_0 = 1.5 * start * tau_c
     if name != "elastic":
@@ -151,10 +159,10 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio)
     ratio.errorbar(middle, slopes, errors, fmt="o", ms=4, color=color)
     hollow = {"ms": 6, "mfc": "none", "color": color}
     ratio.errorbar(waits, row["by_integral"], row["by_integral_error"], fmt="D", **hollow)
-    if spheres is not None:
-        at = spheres["temperature"]
-        ratio.errorbar(at, spheres["integral"], spheres["integral_error"], fmt="s", **hollow)
-        ratio.errorbar(at, spheres["slope"], spheres["slope_error"], fmt="s", ms=5, color=color)
+    for kind, of in boxes.items():
+        at, marker = of["temperature"], MARKERS[kind][0]
+        ratio.errorbar(at, of["integral"], of["integral_error"], fmt=marker, **hollow)
+        ratio.errorbar(at, of["slope"], of["slope_error"], fmt=marker, ms=5, color=color)
     return row
 
 

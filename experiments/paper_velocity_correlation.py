@@ -3,11 +3,11 @@
     python experiments/paper_velocity_correlation.py [--smoke] [--out DIR]
 
 The velocity autocorrelation <v(t').v(t)> of elastic spheres, of constant and of viscoelastic
-restitution, by stochastic simulation and by hard spheres: its decay, and its relaxation time tau_v
-against the elastic Enskog time tau_E (paper, Eqs. (24), (31), (32)).
+restitution, by stochastic simulation and by hard and soft spheres: its decay, and its relaxation
+time tau_v against the elastic Enskog time tau_E (paper, Eqs. (24), (31), (32)).
 
-Stochastic simulation starts Maxwellian at T(t'); hard spheres go on from the state they had
-reached at t', elastic ones excepted, which do not age.
+Stochastic simulation starts Maxwellian at T(t'); spheres go on from the state they had reached at
+t', elastic ones excepted, which do not age. Soft spheres have the viscoelastic law only.
 """
 
 from dataclasses import dataclass, replace
@@ -25,6 +25,8 @@ import jaxgran
 from jaxgran import closed_forms, kinetics
 
 NAME = "paper_velocity_correlation"
+SPHERES = {"hard_spheres": jaxgran.HardSpheres, "soft_spheres": jaxgran.SoftSpheres}
+MARKERS = {"dsmc": ("o", 3), "hard_spheres": ("s", 1), "soft_spheres": ("^", 1)}  # every so many
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,9 @@ class Config:
     longest: float = 12.0  # in tau_E(t')
     restitutions: tuple[float, ...] = (1.0, 0.8, 0.6, 0.4, 0.2)
     betas: tuple[float, ...] = (0.05, 0.15, 0.3, 0.6, 1.0)
-    num_spheres: int = 2000  # hard spheres in a box
+    num_spheres: int = 2000  # in a box
     boxes: int = 4
-    age: float = 6.0  # t' of hard spheres, in tau_c(0)
+    age: float = 6.0  # t' of spheres, in tau_c(0)
     sphere_lags: int = 25
 
 
@@ -112,11 +114,21 @@ def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray, temperature: float) -
     return row
 
 
-def hard(gas: jaxgran.Gas, config: Config, ages: bool) -> dict:
-    """The same in boxes of hard spheres, from t' on; and D by the slope of <dr^2> until t'."""
-    model = jaxgran.HardSpheres(
-        config.num_spheres, replicas=config.boxes, key=jax.random.key(config.seed)
-    )
+def in_boxes(gas: jaxgran.Gas, config: Config, ages: bool) -> dict[str, dict]:
+    """The same by every model of spheres that the gas has; none without boxes."""
+    kinds = SPHERES if isinstance(gas.law, jaxgran.Viscoelastic) else ["hard_spheres"]
+    key = jax.random.key(config.seed)
+    return {
+        kind: spheres(
+            SPHERES[kind](config.num_spheres, replicas=config.boxes, key=key), gas, config, ages
+        )
+        for kind in kinds
+        if config.boxes
+    }
+
+
+def spheres(model, gas: jaxgran.Gas, config: Config, ages: bool) -> dict:
+    """The same in boxes of spheres, from t' on; and D by the slope of <dr^2> until t'."""
     age = config.age * float(gas.mean_free_time)
     grown = jaxgran.cool(gas, [age / 2, age] if ages else [age / 100], model=model)
     temperature = float(grown.temperature[-1])
@@ -166,31 +178,32 @@ def main() -> None:
         row: dict[str, Any] = {"dsmc": stochastic(gas, config)}
         row["paper_relaxation"] = float(printed_relaxation(gas))
         row["exact_relaxation"] = float(exact_relaxation(gas))
-        if config.boxes:
-            row["hard_spheres"] = hard(gas, config, name != "elastic")
+        row |= in_boxes(gas, config, ages=name != "elastic")
         decay.plot(lags, expected, color=color, label=f"{label}: theory")
         decay.plot(lags, np.exp(-lags / row["paper_relaxation"]), "--", color=color, lw=0.9)
         counted.plot(collisions, expected, color=color, label=f"{label}: theory")
-        for kind in row.keys() & {"dsmc", "hard_spheres"}:
-            marker, every = {"dsmc": ("o", 3), "hard_spheres": ("s", 1)}[kind]
+        for kind in [kind for kind in MARKERS if kind in row]:
+            marker, every = MARKERS[kind]
             of = {k: np.array(v)[::every] for k, v in row[kind].items() if isinstance(v, list)}
             seen = of["correlation"] > 4 * of["error"]
             style = {"fmt": marker, "ms": 3.5, "color": color}
-            style |= {"mfc": "none"} if kind == "hard_spheres" else {}
+            style |= {"mfc": "none"} if kind in SPHERES else {}
             for axes, x in ((decay, of["lags"]), (counted, of["collisions"])):
                 axes.errorbar(x[seen], of["correlation"][seen], of["error"][seen], **style)
         found[name] = row
     shared = {"yscale": "log", "ylim": (2e-3, 1.2), "ylabel": "⟨v(t′)·v(t)⟩ / ⟨v(t′)²⟩"}
-    title = "In time: slower than exp(−(t−t′)/τ$_v$(t′)), dashed\n● DSMC, □ hard spheres, — theory"
+    kinds = "● DSMC, □ hard, △ soft spheres, — theory"
+    title = f"In time: slower than exp(−(t−t′)/τ$_v$(t′)), dashed\n{kinds}"
     paper.caption(decay, title, xlabel="(t − t′) / τ$_E$(t′)", xlim=(0, 9), **shared)
-    title = "In collisions: exponential\n● DSMC, □ hard spheres, — theory"
+    title = f"In collisions: exponential\n{kinds}"
     paper.caption(counted, title, xlabel="collisions per particle since t′", xlim=(0, 9), **shared)
     found["relaxation"] = relaxation_times(times, config)
     for name in gases:
         row = found[name]
         measured = [
             f"{row[kind]['relaxation']:.3f} +- {row[kind]['relaxation_error']:.3f} ({kind})"
-            for kind in row.keys() & {"dsmc", "hard_spheres"}
+            for kind in MARKERS
+            if kind in row
         ]
         printed = row["paper_relaxation"]
         print(f"{name}: tau_v/tau_E {', '.join(measured)}, paper {printed:.3f}")

@@ -38,7 +38,7 @@ COLOURS = {
 SIZES = {
     "dilute": (500, 2000, 8000),
     "dense": (500, 2000, 8000),
-    "clustering": (1000, 5000, 20_000),
+    "clustering": (1000, 3000, 12_000),
 }
 REPLICAS = 4
 DSMC_SIZES = (1000, 10_000, 100_000)
@@ -101,7 +101,7 @@ def measured(name: str, smoke: bool) -> Scene:
 
 
 def clustering() -> Scene:
-    """A box of many L_c, and soft spheres in it by finer steps."""
+    """A box of four L_c, and soft spheres in it by finer steps."""
     gas = beads(*CLUSTERING)
     size, times = SIZES["clustering"][-1], CLUSTERING_TIMES * float(gas.mean_free_time)
     key = jax.random.key(KEY + 1)
