@@ -74,6 +74,19 @@ def times_of_every_kind() -> list[Row]:
     return rows
 
 
+def many_times() -> list[Row]:
+    """1e5 output times through particles, beside one."""
+    gas = beads(0.05, 0.15, 0.02)
+    tau, rows = float(gas.mean_free_time), []
+    for model in (DSMC, HARD, SOFT):
+        many = jaxgran.cool(gas, np.linspace(1e-5, 1.0, 100_000) * tau, model=quiet(model, 50))
+        one = jaxgran.cool(gas, [tau], model=quiet(model, 50))
+        error = worst(one.temperature[-1], many.temperature[-1])
+        loose = 3e-2 if model is SOFT else 1e-6  # as in `times_of_every_kind`
+        rows.append(Row(f"{model.__name__}, 1 and 1e5", "float64", error, loose))
+    return rows
+
+
 def _scaled(times, gas, tau):
     return times * float(gas.mean_free_time) / tau
 
@@ -392,6 +405,13 @@ RUNS = [
         "output times move the result; late starts lose the beginning",
         "the run begins at 0 whatever is asked; particles pay milliseconds a time",
         times_of_every_kind,
+    ),
+    Case(
+        "1e5 times through particles",
+        "output every so many fixed steps; memory of every state",
+        "right, at 1 to 2 ms a time",
+        many_times,
+        heavy=True,
     ),
     Case(
         "step 5 times too large, list 10 times too small",
