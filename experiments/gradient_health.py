@@ -39,6 +39,7 @@ SCENES = {
     "clustering": (0.2, 0.5, 0.17, 1000),
 }
 REPLICAS, FEW_REPLICAS = 16, 4
+EARLY, EARLY_REPLICAS = 2, 64  # the first of the times, whose slopes are small, have more
 PLAIN_HORIZON = 3  # of the times; the plain derivative overflows at the last
 STEPS_PER_CONTACT = 25
 
@@ -73,7 +74,9 @@ def times_of(gas: jaxgran.Gas, collisions) -> np.ndarray:
 def examine(name: str, smoke: bool) -> dict:
     begin, gas = time.perf_counter(), beads(*SCENES[name][:3])
     collisions = COLLISIONS[:2] if smoke else COLLISIONS
-    size, many, few = (50, 2, 2) if smoke else (SCENES[name][3], REPLICAS, FEW_REPLICAS)
+    size, many, few, most = SCENES[name][3], REPLICAS, FEW_REPLICAS, EARLY_REPLICAS
+    if smoke:
+        size, many, few, most = 50, 2, 2, 4
     times = times_of(gas, collisions)
     constant = gas.value("dissipative_constant")
 
@@ -107,10 +110,20 @@ def examine(name: str, smoke: bool) -> dict:
     ends = [np.asarray(log_temperatures(s * STEP, theory)[0][0]) for s in (1, -1)]
     too_long_step = (ends[0] - ends[1]) / (2 * STEP) - exact
     columns["kinetic theory"] = (exact, 0 * exact)
-    ends = [np.asarray(log_temperatures(s * STEP, spheres(many))[0]) for s in (1, -1)]
-    columns["differences"] = over_replicas((ends[0] - ends[1]) / (2 * STEP) - too_long_step)
-    slopes, counts, seconds = forward(spheres(many))
-    columns["projected"] = over_replicas(slopes)
+
+    def both(model, times):
+        ends = [np.asarray(log_temperatures(s * STEP, model, times)[0]) for s in (1, -1)]
+        differences = (ends[0] - ends[1]) / (2 * STEP) - too_long_step[: len(times)]
+        slopes, counts, seconds = forward(model, times)
+        return over_replicas(differences), over_replicas(slopes), counts, seconds
+
+    early = both(spheres(most), times[:EARLY])
+    late = both(spheres(many), times)
+    counts, seconds = late[2:]
+    columns["differences"], columns["projected"] = (
+        tuple(np.concatenate([x[:EARLY], y[EARLY:]]) for x, y in zip(a, b, strict=True))
+        for a, b in zip(early[:2], late[:2], strict=True)
+    )
     # Reverse mode: the gradient of the last mean of ln T, beside forward mode of the same run.
     model = spheres(few)
     slopes = forward(model)[0]
@@ -124,7 +137,10 @@ def examine(name: str, smoke: bool) -> dict:
         slopes = forward(spheres(few, projection=interval))[0]
         by_interval[interval] = over_replicas(slopes)
 
-    print(f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name][:3]}, N = {size}, {many} replicas")
+    print(
+        f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name][:3]}, N = {size}, {many} replicas", end=""
+    )
+    print(f" ({most} at the first {EARLY} times)")
     print(f"box {float(gas.box_side(size) / gas.diameter):.3g} diameters, ", end="")
     print(f"L_c {float(gas.critical_box / gas.diameter):.3g}")
     print(f"{'collisions':>11}" + "".join(f"{column:>24}" for column in columns))
@@ -149,6 +165,7 @@ def examine(name: str, smoke: bool) -> dict:
         "by_interval": {str(k): [m.tolist(), e.tolist()] for k, (m, e) in by_interval.items()},
         "num_particles": size,
         "replicas": many,
+        "early_replicas": most,
         "tangent_seconds": seconds,
         "seconds": time.perf_counter() - begin,
     }
