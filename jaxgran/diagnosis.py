@@ -91,9 +91,10 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
 
     reasons = []
     if has_errors:
+        chance = f"{100 * p_value:.2g}" if p_value < 0.99 else "over 99"
         reasons.append(
             f"reduced chi^2 is {reduced:.3g} for {int(result.degrees_of_freedom)} degrees of "
-            f"freedom (chance alone: {100 * p_value:.2g} %)"
+            f"freedom (chance alone: {chance} %)"
         )
     else:
         scatter = 100 * np.sqrt(reduced)
