@@ -218,9 +218,18 @@ def run(
     return Outputs(neighbours.wrap(scene.side, state.position), state.velocity, records, fault)
 
 
+_NEEDED: dict[Any, Room] = {}
+
+
 def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settings):
-    """Run by a loop on the host, which makes room as it is needed."""
+    """Run by a loop on the host, which makes room as it is needed.
+
+    The room that a plan came to need is remembered: a run that goes on from another, or the next
+    of a fit, neither fails on the way to it nor compiles again. Results do not depend on it.
+    """
     scene, engine = inputs.scene, neighbours.engine(model.neighbours)
+    planned = plan
+    plan = plan._replace(room=_NEEDED.get(planned, plan.room))
 
     def advance(state, end: float, scene=scene):
         nonlocal plan
@@ -235,6 +244,7 @@ def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settin
                 at = float(jnp.mean(state.velocity**2))
                 raise RuntimeError(f"stopped at T/T_0 = {at:.3g}: {status.explain(fault)}")
             plan = plan._replace(room=plan.room.grown(needed))
+            _NEEDED[planned] = plan.room
 
     # A run to be resumed has been melted.
     if inputs.start is None and not (model.checkpoint and Path(model.checkpoint).exists()):
