@@ -80,9 +80,11 @@ def main() -> None:
 def follow_disks(size: int, until: float, out: Path | None) -> None:
     gas = hard_beads(PACKINGS[2], RESTITUTION, 2)
     with tqdm(total=until, unit="collisions", delay=1) as bar:
-        run = follow(
-            gas, 0, size, until, progress=lambda done: bar.update(min(done, until) - bar.n)
-        )
+
+        def show(done: float) -> None:
+            bar.update(min(done, until) - bar.n)
+
+        run = follow(gas, 0, size, until, progress=show)
     stretches = np.searchsorted(run["collisions"], np.linspace(0.1, 1, 10) * until)
     print(f"{size} disks, phi = {PACKINGS[2]:g}, e = {RESTITUTION:g}")
     print(f"{'collisions each':>16}{'T/T_0':>10}{'unevenness':>12}{'flow':>7}")
