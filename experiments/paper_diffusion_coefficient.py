@@ -83,7 +83,7 @@ def main() -> None:
     paper.caption(
         ratio,
         "— theory with memory, - - Eq. (34): D = T τ$_v$\n"
-        "● ■ ▲ ⟨Δr²⟩, ◇ □ △ ∫⟨v(t′)·v(t)⟩dt: DSMC, hard, soft spheres",
+        "● ■ ▲ ⟨Δr²⟩, ◇ □ △ ∫⟨v(t′)·v(t)⟩dt: DSMC, hard, soft",
         xlabel="T(t′) / T$_0$",
         ylabel="D / (T τ$_E$)",
         xscale="log",
