@@ -141,7 +141,7 @@ def examine(name: str, smoke: bool) -> dict:
     last = jax.grad(lambda x: jnp.mean(log_temperatures(x, model)[0][:, -1]))(0.0)
     disagreement = abs(float(last) - slopes[:, -1].mean())
     # A plain derivative is traced, and arrays do not grow in it.
-    plain = spheres(few, projection=None).sized_for(gas, spare=5.0)
+    plain = spheres(few, projection=None).sized_for(gas)
     columns["plain"] = over_replicas(forward(plain, times[:PLAIN_HORIZON])[0])
     by_interval = {}
     for interval in INTERVALS[:2] if smoke else INTERVALS:

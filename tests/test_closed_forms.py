@@ -1,4 +1,4 @@
-"""Averages and closed forms, each against an independent number."""
+"""Closed forms, each against an independent number or the equations it solves."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,6 +6,11 @@ import pytest
 
 import jaxgran
 from jaxgran import closed_forms, kinetics
+
+
+def hard_gas(e: float, dimension: int = 3) -> jaxgran.Gas:
+    law, one = jaxgran.ConstantRestitution(e), {"diameter": 1.0, "mass": 1.0, "temperature": 1.0}
+    return jaxgran.Gas(law, packing_fraction=0.1, dimension=dimension, **one)
 
 
 def test_constants_of_the_expansion():
@@ -18,13 +23,7 @@ def test_constants_of_the_expansion():
 
 @pytest.mark.parametrize("e", [0.99, 0.9, 0.5, 0.0])
 def test_haff(e):
-    gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(e),
-        diameter=1.0,
-        mass=1.0,
-        packing_fraction=0.1,
-        temperature=1.0,
-    )
+    gas = hard_gas(e)
     tau = jnp.geomspace(1e-3, 1e8, 100)
     curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=jaxgran.KineticTheory(sonine=False))
     # Asked: 1e-8. The solver's rtol is 1e-9 and its error adds up over eleven decades.
@@ -103,14 +102,7 @@ def test_velocity_relaxation_as_printed(beads):
 
 def test_displacement_of_constant_restitution():
     for d, e in ((3, 0.6), (2, 0.9)):
-        gas = jaxgran.Gas(
-            jaxgran.ConstantRestitution(e),
-            diameter=1.0,
-            mass=1.0,
-            packing_fraction=0.1,
-            temperature=1.0,
-            dimension=d,
-        )
+        gas = hard_gas(e, d)
         tau = jnp.geomspace(0.01, 1e6, 50)
         model = jaxgran.KineticTheory(sonine=False)
         curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)

@@ -239,3 +239,11 @@ def test_float32(beads):
         assert single.temperature.dtype == jnp.float32
         # The solver's rtol is 1e-5 here, float32 carries 1e-7 and ln T down to -15.
         np.testing.assert_allclose(single.temperature, exact.temperature, rtol=3e-4)
+
+
+def test_displacement_accuracy_covers_dense_hard_spheres(beads):
+    # Speedy's D over Enskog's first Sonine order, evaluated apart; rounded, so 15 % of the excess.
+    for phi, excess in ((0.05, 0.0407), (0.1, 0.0844), (0.2, 0.1883)):
+        accuracy = KineticTheory().displacement_accuracy(beads(0.1, packing_fraction=phi))
+        np.testing.assert_allclose(np.sqrt(accuracy**2 - 0.017**2), excess, rtol=0.15)
+    assert KineticTheory().displacement_accuracy(beads(0.1, packing_fraction=1e-6)) < 0.0171

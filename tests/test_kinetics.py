@@ -1,4 +1,4 @@
-"""Averages and closed forms, each against an independent number."""
+"""Averages over impacts and their tables, each against an independent number."""
 
 import jax
 import jax.numpy as jnp

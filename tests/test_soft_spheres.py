@@ -362,6 +362,14 @@ def test_refuses_what_it_cannot_do(beads):
         jaxgran.cool(gas, [1e-3], model=quiet(100, start=broken))
 
 
+@pytest.mark.parametrize("packing_fraction", [0.25, 0.3])
+def test_settled_room_is_enough_for_a_dense_gas(beads, packing_fraction, monkeypatch):
+    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=packing_fraction)
+    monkeypatch.setattr(boxes.Room, "grown", lambda *args: pytest.fail("room had to be made"))
+    model = quiet(500, replicas=4, steps_per_contact=25).sized_for(gas)
+    jaxgran.cool(gas, [float(gas.mean_free_time)], model=model)
+
+
 def test_scene_is_in_reduced_units(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     scene = reduced_scene(gas, 100)

@@ -86,7 +86,8 @@ class KineticTheory(eqx.Module):
         """Relative error of <dr^2>: of the first Sonine order, and of free flights forgotten.
 
         Spheres that have met meet again, which kinetic theory leaves out: hard spheres diffuse
-        faster than Enskog's by 0.85 phi, up to phi = .2 (Speedy, Mol. Phys. 62 (1987) 509).
+        faster than Enskog's by 0.85 phi up to phi = .2, as Speedy's fit says, Mol. Phys. 62 (1987)
+        509; disks are taken alike.
         """
         correlation = 0.85 * jnp.minimum(gas.packing_fraction, 0.2)
         return jnp.hypot({2: 0.024, 3: 0.017}[gas.dimension], correlation)

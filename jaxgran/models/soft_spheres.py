@@ -142,6 +142,7 @@ class SoftSpheres(eqx.Module):
         contact_value = float(scene.collision_frequency) / dilute
         near = min(inside * contact_value * ((1 + 5 * flight) ** d - 1), listed)
         contact_fraction = float(scene.contact_duration * scene.collision_frequency)
+        # Not derived: the square is what gases of phi = .25 and .3 were seen to need besides.
         touching = min(contact_fraction * (4 + 6 * near + 4 * near**2), near)
         n = self.replicas * self.num_particles
         counts = [n * share for share in (listed, near, touching, 2 * touching)]
