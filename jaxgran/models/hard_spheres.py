@@ -1,6 +1,7 @@
 """Hard spheres: instantaneous impacts in a periodic box, resolved event by event."""
 
 import dataclasses
+import math
 from functools import partial
 from pathlib import Path
 
@@ -14,13 +15,14 @@ from jaxgran import boxes, events, neighbours, status, tangents
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.events import Plan, Scene, State
 from jaxgran.gas import Gas
+from jaxgran.impacts import NEAR_PART
 from jaxgran.restitution import ReducedLaw
 from jaxgran.tangents import ImpactTangents, Inputs, Outputs
 
 PAIRS_PER_PARTICLE = 7.0
 """How many pairs beyond contact a neighbour list should hold for each particle."""
 
-WINDOW_SHARE = 0.1
+WINDOW_SHARE = 0.05
 """Share of the particles that collide in a window."""
 
 OVERLAP = 1e-9
@@ -148,8 +150,12 @@ class HardSpheres(eqx.Module):
         share = max(WINDOW_SHARE, 2 * events.LEAST_IMPACTS / n)
         inside = float(boxes.pairs_in_contact(self.num_particles, scene.side, d))
         listed = inside * (1 + float(self._skin(scene, d))) ** d
+        fastest = events.SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
+        reach = 2 * fastest * share / float(scene.collision_frequency)
+        reachable = min(1.15 * inside * ((1 + reach) ** d - 1), listed)
         # As measured; a list changes its length little, windows differ more.
         near, chosen, members = (min(factor * share, listed) for factor in (4.0, 1.7, 2.0))
+        near = max(reachable, NEAR_PART * near)
         counts = [n * number for number in (listed / 1.3, near, chosen, members)]
         rooms = [int(spare * count + 5 * count**0.5) + 64 for count in counts]
         rooms[1:3] = [max(rows, min(rooms[0], 512)) for rows in rooms[1:3]]  # spare small runs
