@@ -218,37 +218,36 @@ def run(
     return Outputs(neighbours.wrap(scene.side, state.position), state.velocity, records, fault)
 
 
-_NEEDED: dict[Any, Room] = {}
+_NEEDED: dict[tuple[Any, str], Room] = {}
 
 
 def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settings):
     """Run by a loop on the host, which makes room as it is needed.
 
     The room that a plan came to need is remembered: a run that goes on from another, or the next
-    of a fit, neither fails on the way to it nor compiles again. Results do not depend on it.
+    of a fit, neither fails on the way to it nor compiles again. Results do not depend on it. A melt
+    begins with many spheres near contact, and its needs are its own.
     """
     scene, engine = inputs.scene, neighbours.engine(model.neighbours)
-    planned = plan
-    plan = plan._replace(room=_NEEDED.get(planned, plan.room))
 
-    def advance(state, end: float, scene=scene):
-        nonlocal plan
+    def advance(state, end: float, scene=scene, stage: str = "run"):
         while True:
-            now = kind.stretch(state, scene, end, plan, engine)
-            state, fault = now.state, int(now.status)
+            room = _NEEDED.get((plan, stage), plan.room)
+            now = kind.stretch(state, scene, end, plan._replace(room=room), engine)
+            fault = int(now.status)
             if fault == status.OK:
-                return state
+                return now.state
             needed = [int(x) for x in now.needed]
             missing = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
             if not missing or max(needed) > MOST_PAIRS * len(state.position):
-                at = float(jnp.mean(state.velocity**2))
+                at = float(jnp.mean(now.state.velocity**2))
                 raise RuntimeError(f"stopped at T/T_0 = {at:.3g}: {status.explain(fault)}")
-            plan = plan._replace(room=plan.room.grown(needed))
-            _NEEDED[planned] = plan.room
+            # The stretch is made again as a whole: a list made on the way would have another order.
+            _NEEDED[plan, stage] = room.grown(needed)
 
     # A run to be resumed has been melted.
     if inputs.start is None and not (model.checkpoint and Path(model.checkpoint).exists()):
-        melt = partial(advance, scene=kind.elastic(scene))
+        melt = partial(advance, scene=kind.elastic(scene), stage="melt")
         end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
         state, _ = simulate(state, end, melt, kind.observe, progress=model.progress, label="melt")
     state = advance(begun(state), 0.0)  # counts the energy in contacts

@@ -72,7 +72,8 @@ def at_start(position, velocity, scene: Scene, skin: ArrayLike, plan: Plan) -> S
         dissipated=jnp.zeros(replicas, dtype),
         impacts=counts,
         regularised=counts,
-        window=jnp.asarray(plan.share / scene.collision_frequency, dtype),
+        # Short at first: in random places many spheres are near contact.
+        window=jnp.asarray(plan.share / (8 * scene.collision_frequency), dtype),
         skin=jnp.asarray(skin, dtype),
     )
 

@@ -152,9 +152,10 @@ class HardSpheres(eqx.Module):
         listed = inside * (1 + float(self._skin(scene, d))) ** d
         fastest = events.SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         reach = 2 * fastest * share / float(scene.collision_frequency)
-        reachable = min(1.15 * inside * ((1 + reach) ** d - 1), listed)
+        reachable = min(1.5 * inside * ((1 + reach) ** d - 1), listed)
         # As measured; a list changes its length little, windows differ more.
-        near, chosen, members = (min(factor * share, listed) for factor in (4.0, 1.7, 2.0))
+        factors = (4.0, 3.4, 4.0) if reachable == listed else (4.0, 1.7, 2.0)
+        near, chosen, members = (min(factor * share, listed) for factor in factors)
         near = max(reachable, NEAR_PART * near)
         counts = [n * number for number in (listed / 1.3, near, chosen, members)]
         rooms = [int(spare * count + 5 * count**0.5) + 64 for count in counts]
