@@ -23,6 +23,8 @@ def onset(table: Table, run: dict, haff: list) -> None:
     scenes = [scene["constant"] for scene in run["scenes"].values()]
     cooler = [scene["T_at_the_papers_N"] for scene in scenes]
     found = {name: [scene["departures"][name] for scene in scenes] for name in (BY_NUMBER, BY_TIME)}
+    early = [scene["departures"]["T over theory's of t by 1.1"]["N"][0] for scene in scenes]
+    off = [100 * (q / T[0] - 1) for T, (_, _, q) in zip(cooler, QUOTED, strict=True)]
     clocks = run["first_scene_over_second"]
 
     def numbers(name: str) -> str:
@@ -39,7 +41,8 @@ def onset(table: Table, run: dict, haff: list) -> None:
             abs(left["N"][0] / n - 1) < 0.05
             for left, (n, _, _) in zip(found[BY_TIME], QUOTED, strict=True)
         ),
-        "N_c is a matter of definition: 10 % above Haff's law comes at 27 and 7",
+        "N_c is a matter of definition: 10 % above Haff's law of the same time comes at "
+        f"{early[0]:.0f} and {early[1]:.0f}",
     )
     table.add(
         "text",
@@ -52,7 +55,7 @@ def onset(table: Table, run: dict, haff: list) -> None:
             abs(T[0] / quoted - 1) < abs(law / quoted - 1)
             for T, law, (_, _, quoted) in zip(cooler, haff, QUOTED, strict=True)
         ),
-        "10 % below and 27 % above what is measured, far from the homogeneous gas",
+        f"{off[0]:+.0f} % and {off[1]:+.0f} % off what is measured, far from the homogeneous gas",
     )
     ratio = clocks[BY_TIME], clocks[BY_NUMBER], clocks[BY_DENSITY]
     table.add(
@@ -75,7 +78,7 @@ def onset(table: Table, run: dict, haff: list) -> None:
         "hard disks, 20 000, 3 seeds",
         "agree",
         all(x["N"][0] - 3 * x["N"][1] > 1 for x in later),
-        "in every clock; T there is lower by .55",
+        f"in every clock; T there is {_of(later[0]['T'])} and {_of(later[1]['T'])} of the other's",
     )
 
 

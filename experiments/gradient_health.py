@@ -205,7 +205,7 @@ def draw(results: dict, path: Path) -> None:
             top.errorbar(at, mean, error, fmt=marker, ms=5, label=label)
         top.set(xscale="log", title=name, xlabel="collisions a particle", ylim=(-2.2, 0.7))
         reference = np.asarray(result["d_ln_T_d_ln_A"]["differences"][0])
-        for i, count in enumerate(n):
+        for i, goal in enumerate(COLLISIONS[: len(n)]):
             x = [float(k) for k in result["by_interval"]]
             y, e = zip(*((m[i], s[i]) for m, s in result["by_interval"].values()), strict=True)
             ratio = np.asarray(y) / reference[i] - 1
@@ -215,10 +215,10 @@ def draw(results: dict, path: Path) -> None:
                 100 * np.abs(np.asarray(e) / reference[i]),
                 fmt="o-",
                 ms=3,
-                label=f"{count:.0f}",
+                label=f"{goal:.0f}",
             )
         bottom.axhspan(-5, 5, color="0.9", zorder=0)
-        bottom.set(xscale="log", xlabel="mean free times between projections", ylim=(-30, 30))
+        bottom.set(xscale="log", xlabel="mean free times between projections", ylim=(-30, 70))
     axes[0, 0].set_ylabel("d ln T / d ln A")
     axes[0, 0].legend(fontsize=8)
     axes[1, 0].set_ylabel("projected over differences, %")
