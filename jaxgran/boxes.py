@@ -232,7 +232,7 @@ def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settin
 
     def advance(state, end: float, scene=scene, stage: str = "run"):
         while True:
-            room = _NEEDED.get((plan, stage), plan.room)
+            room: Room = _NEEDED.get((plan, stage)) or plan.room
             now = kind.stretch(state, scene, end, plan._replace(room=room), engine)
             fault = int(now.status)
             if fault == status.OK:
