@@ -19,7 +19,6 @@ from jaxgran.tangents import ImpactTangents
 MAX_ROUNDS = 100_000
 """Rounds of simultaneous impacts in one window before the run counts as stalled."""
 
-
 NEAR_PART = 3
 """How many times fewer pairs are near than can be reached by the fastest."""
 
