@@ -1,13 +1,15 @@
 """Is the derivative of a chaotic gas's cooling curve right, and for how long?
 
-    python experiments/gradient_health.py [--scenes dilute dense clustering] [--smoke] [--out DIR]
+    python experiments/gradient_health.py [--scenes dilute dense clustering] [--late-differences]
+                                          [--smoke] [--out DIR]
 
 d ln T / d ln A of three gases at 1, 3, 10, 30 and 100 collisions a particle, by finite differences
 (many replicas, the same random starts on both sides, corrected for their step by kinetic theory),
 by plain forward mode, by thermally projected forward and reverse mode, and by kinetic theory; and
 how the projected derivative depends on the interval between projections. Standard errors are over
 replicas. Prints tables, draws a picture, writes JSON; scenes that are in the JSON file already are
-kept in both unless asked for.
+kept in both unless asked for, and with --late-differences all of them is kept but the differences
+of the late times.
 """
 
 import argparse
@@ -38,6 +40,8 @@ SCENES = {
     "dense": (0.25, 0.05, 0.05, 500, 16),
     "clustering": (0.3, 0.2, 0.05, 1000, 8),
 }
+# So many sets of boxes for differences, which scatter more than tangents.
+SETS = {"dilute": 1, "dense": 1, "clustering": 4}
 FEW_REPLICAS = 4
 EARLY, EARLY_REPLICAS = 2, 64  # the first of the times, whose slopes are small, have more
 PLAIN_HORIZON = 3  # of the times; the plain derivative overflows at the last
@@ -49,6 +53,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--late-differences", action="store_true", help="only these, anew")
     parser.add_argument("--smoke", action="store_true", help="few particles, early times only")
     parser.add_argument("--out", type=Path, default=Path("results") / "gradient_health")
     options = parser.parse_args()
@@ -58,7 +63,8 @@ def main() -> None:
     if file.exists():  # scenes not asked for again
         results = json.loads(file.read_text())["scenes"]
     for name in tqdm(options.scenes, disable=options.smoke):
-        results[name] = examine(name, options.smoke)
+        before = results.get(name) if options.late_differences else None
+        results[name] = examine(name, options.smoke, before)
         save(file, scenes=results, step_of_ln_A=STEP, steps_per_contact=STEPS_PER_CONTACT, key=0)
     draw({name: results[name] for name in SCENES if name in results}, file.with_suffix(".png"))
     print(f"written to {options.out}")
@@ -82,7 +88,8 @@ def times_of(gas: jaxgran.Gas, collisions, size: int) -> np.ndarray:
     return times(model, np.geomspace(0.1 * tau_c, found[-1], 60))
 
 
-def examine(name: str, smoke: bool) -> dict:
+def examine(name: str, smoke: bool, before: dict | None) -> dict:
+    """All that is told of a scene; if told before, with its late differences made anew."""
     begin, gas = time.perf_counter(), beads(*SCENES[name][:3])
     collisions = COLLISIONS[:2] if smoke else COLLISIONS
     (size, many), few, most = SCENES[name][3:], FEW_REPLICAS, EARLY_REPLICAS
@@ -115,42 +122,52 @@ def examine(name: str, smoke: bool) -> dict:
             **settings,
         )
 
-    columns = {}
     theory = jaxgran.KineticTheory()
     exact = forward(theory)[0][0]
     ends = [np.asarray(log_temperatures(s * STEP, theory)[0][0]) for s in (1, -1)]
     too_long_step = (ends[0] - ends[1]) / (2 * STEP) - exact
-    columns["kinetic theory"] = (exact, 0 * exact)
 
-    def both(model, times):
+    def differences(model, times):
         ends = [np.asarray(log_temperatures(s * STEP, model, times)[0]) for s in (1, -1)]
-        differences = (ends[0] - ends[1]) / (2 * STEP) - too_long_step[: len(times)]
-        slopes, counts, seconds = forward(model, times)
-        return over_replicas(differences), over_replicas(slopes), counts, seconds
+        return (ends[0] - ends[1]) / (2 * STEP) - too_long_step[: len(times)]
 
-    early = both(spheres(most), times[:EARLY])
-    late = both(spheres(many), times)
-    counts, seconds = late[2:]
-    columns["differences"], columns["projected"] = (
-        tuple(np.concatenate([x[:EARLY], y[EARLY:]]) for x, y in zip(a, b, strict=True))
-        for a, b in zip(early[:2], late[:2], strict=True)
-    )
-    # A plain derivative is traced, and arrays do not grow in it.
-    plain = spheres(few, projection=None).sized_for(gas)
-    columns["plain"] = over_replicas(forward(plain, times[:PLAIN_HORIZON])[0])
-    by_interval = {}
-    for interval in INTERVALS[:2] if smoke else INTERVALS:
-        slopes = forward(spheres(few, projection=interval))[0]
-        by_interval[interval] = over_replicas(slopes)
-    # Reverse mode: the gradient of the last mean of ln T, beside forward mode of the same run.
-    model = spheres(few, projection=INTERVALS[1])
-    last = jax.grad(lambda x: jnp.mean(log_temperatures(x, model)[0][:, -1]))(0.0)
-    disagreement = abs(float(last) - by_interval[INTERVALS[1]][0][-1])
+    def joined(early, late):
+        pairs = zip(over_replicas(early), over_replicas(late), strict=True)
+        return tuple(np.concatenate([a[:EARLY], b[EARLY:]]) for a, b in pairs)
 
-    print(
-        f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name][:3]}, N = {size}, {many} replicas", end=""
+    sets = 1 if smoke else SETS[name]
+    late = np.concatenate(
+        [differences(spheres(many, key=jax.random.key(k)), times) for k in range(sets)]
     )
-    print(f" ({most} at the first {EARLY} times)")
+    if before is None:
+        early = spheres(most), times[:EARLY]
+        slopes, counts, seconds = forward(spheres(many))
+        columns = {
+            "kinetic theory": (exact, 0 * exact),
+            "differences": joined(differences(*early), late),
+            "projected": joined(forward(*early)[0], slopes),
+        }
+        # A plain derivative is traced, and arrays do not grow in it.
+        plain = spheres(few, projection=None).sized_for(gas)
+        columns["plain"] = over_replicas(forward(plain, times[:PLAIN_HORIZON])[0])
+        by_interval = {}
+        for interval in INTERVALS[:2] if smoke else INTERVALS:
+            slopes = forward(spheres(few, projection=interval))[0]
+            by_interval[interval] = over_replicas(slopes)
+        # Reverse mode: the gradient of the last mean of ln T, beside forward mode of the same run.
+        model = spheres(few, projection=INTERVALS[1])
+        last = jax.grad(lambda x: jnp.mean(log_temperatures(x, model)[0][:, -1]))(0.0)
+        disagreement = abs(float(last) - by_interval[INTERVALS[1]][0][-1])
+    else:
+        counts, seconds = np.asarray(before["collisions"]), before["tangent_seconds"]
+        columns = arrays(before["d_ln_T_d_ln_A"])
+        for kept, new in zip(columns["differences"], over_replicas(late), strict=True):
+            kept[EARLY:] = new[EARLY:]
+        by_interval = {float(k): v for k, v in arrays(before["by_interval"]).items()}
+        disagreement = before["reverse_minus_forward"]
+
+    print(f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name][:3]}, N = {size}, ", end="")
+    print(f"{many} replicas ({most} at the first {EARLY} times, {len(late)} for late differences)")
     print(f"box {float(gas.box_side(size) / gas.diameter):.3g} diameters, ", end="")
     print(f"L_c {float(gas.critical_box / gas.diameter):.3g}")
     print(f"{'collisions':>11}" + "".join(f"{column:>24}" for column in columns))
@@ -176,9 +193,15 @@ def examine(name: str, smoke: bool) -> dict:
         "num_particles": size,
         "replicas": many,
         "early_replicas": most,
+        "late_differences": late.tolist(),  # of each replica
         "tangent_seconds": seconds,
         "seconds": time.perf_counter() - begin,
     }
+
+
+def arrays(columns: dict) -> dict[str, tuple[np.ndarray, ...]]:
+    """Means and standard errors out of a JSON file."""
+    return {name: tuple(map(np.asarray, values)) for name, values in columns.items()}
 
 
 def over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -218,7 +241,9 @@ def draw(results: dict, path: Path) -> None:
                 label=f"{goal:.0f}",
             )
         bottom.axhspan(-5, 5, color="0.9", zorder=0)
-        bottom.set(xscale="log", xlabel="mean free times between projections", ylim=(-30, 70))
+        bottom.set(xscale="log", xlabel="mean free times between projections")
+        low, high = bottom.get_ylim()
+        bottom.set_ylim(min(low, -30), max(high, 70))
     axes[0, 0].set_ylabel("d ln T / d ln A")
     axes[0, 0].legend(fontsize=8)
     axes[1, 0].set_ylabel("projected over differences, %")

@@ -74,6 +74,7 @@ class Kind(NamedTuple):
         elastic: the scene in which no energy is lost.
         followed: a state with the tangents at t = 0, or as it is.
         fault: the status of a given start, where it could not be checked before.
+        melting: the room of a melt that cannot grow, from that of the run.
     """
 
     at_start: Callable[[Array, Array, ArrayLike], Any]
@@ -82,6 +83,7 @@ class Kind(NamedTuple):
     elastic: Callable[[Any], Any]
     followed: Callable[[Any], Any]
     fault: Callable[[Any], Array] = lambda state: jnp.zeros((), jnp.int32)
+    melting: Callable[[Room], Room] = lambda room: room
 
 
 def check_counts(model: Model, **least: int) -> None:
@@ -268,20 +270,22 @@ def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settin
 def _traced(inputs: Inputs, kind: Kind, plan, state, begun):
     """The same inside `jax.jit`, `jax.vmap` or a derivative: room is fixed beforehand."""
 
-    def further(carry, scene, end):
+    def further(carry, scene, end, plan=plan):
         now = kind.stretch(carry[0], scene, end, plan)
         return now.state, now.status
 
-    def until(carry, scene, end):
+    def until(carry, scene, end, plan=plan):
         def unfinished(carry):
             return (carry[0].time < end) & (carry[1] == status.OK)
 
-        return jax.lax.while_loop(unfinished, partial(further, scene=scene, end=end), carry)
+        step = partial(further, scene=scene, end=end, plan=plan)
+        return jax.lax.while_loop(unfinished, step, carry)
 
     scene, fault = inputs.scene, jnp.zeros((), jnp.int32)
     if inputs.start is None:
         end = MELT_COLLISIONS / scene.collision_frequency
-        state, fault = until((state, fault), kind.elastic(scene), end)
+        melting = plan._replace(room=kind.melting(plan.room))
+        state, fault = until((state, fault), kind.elastic(scene), end, melting)
     else:
         fault = kind.fault(state)
     state, counted = further((begun(state), fault), scene, jnp.zeros_like(state.time))

@@ -293,6 +293,20 @@ def test_jit_and_vmap_give_the_same_numbers():
         np.testing.assert_allclose(swept[i], temperature(coefficients[i])[0], rtol=1e-9)
 
 
+@pytest.mark.parametrize(("dimension", "packing_fraction"), [(3, 0.05), (3, 0.4), (2, 0.6)])
+def test_a_random_start_melts_under_jit(dimension, packing_fraction):
+    """Many spheres begin near contact there; the room for a run would not do."""
+    gas = hard_gas(0.8, packing_fraction, dimension)
+    model = quiet(500).sized_for(gas)
+    times = [float(gas.mean_free_time)]
+    curve = jax.jit(lambda key: jaxgran.cool(gas, times, model=quiet(500, plan=model.plan, key=key)))(
+        jax.random.key(1)
+    )
+    assert curve.status == 0
+    theory = jaxgran.cool(gas, times)
+    np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.05)
+
+
 def test_jit_flags_what_it_cannot_grow():
     gas = hard_gas(0.8, 0.1)
     plan = quiet(100).sized_for(gas).plan

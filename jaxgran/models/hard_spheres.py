@@ -179,6 +179,11 @@ class HardSpheres(eqx.Module):
             overlap = closest < 1 - _overlap_allowed(state.position, scene.side)
             return status.flag(status.OVERLAPPING, overlap)
 
+        def melting(room: boxes.Room) -> boxes.Room:
+            """For all that is listed: random places begin with many spheres at contact."""
+            n = replicas * self.num_particles
+            return boxes.Room(room.pairs, NEAR_PART * room.pairs, room.pairs, n)
+
         kind = boxes.Kind(
             at_start=lambda x, v, skin: events.at_start(x, v, scene, skin, plan),
             stretch=events.stretch,
@@ -186,6 +191,7 @@ class HardSpheres(eqx.Module):
             elastic=lambda scene: scene._replace(elastic=jnp.array(True)),
             followed=followed,
             fault=fault,
+            melting=melting,
         )
         return boxes.run(self, inputs, kind, plan, self._skin(scene, dimension), dimension)
 
