@@ -26,6 +26,9 @@ CROWDED = 20.0
 SHORTEST_SKIN = 0.2
 """In diameters, below which crowding is borne."""
 
+WINDOW_GAIN = 0.3
+"""Power of a window's impacts that the next one's length follows, as they scatter."""
+
 SPEED_MARGIN = 1.15
 """How much faster than the fastest sphere one may become within a window."""
 
@@ -177,7 +180,8 @@ def advance(
             return jnp.zeros(replicas, values.dtype).at[chosen.replica].add(values, mode="drop")
 
         impacts, lost = by_replica(work.impacts) // 2, by_replica(work.dissipated)
-        ratio = jnp.clip(target / jnp.maximum(jnp.sum(impacts), 1), 0.5, 1.5)
+        ratio = (target / jnp.maximum(jnp.sum(impacts), 1)) ** WINDOW_GAIN
+        ratio = jnp.clip(ratio, 0.5, 1.5)
         most = bound[jnp.minimum(chosen.replica, replicas - 1)]
         too_fast = jnp.any(work.fastest > most**2)
 
@@ -275,6 +279,7 @@ def _prepared(state: State, side, end, plan: Plan):
     return began, listed, jnp.where(life < left, state.time + life, end)
 
 
+@jax.jit
 def _mended(now: Progress, began: State) -> dict[str, Any]:
     state = now.state
     fresh = state.time == began.time  # else a new list is all that an outrun skin needs

@@ -19,9 +19,6 @@ from jaxgran.tangents import ImpactTangents
 MAX_ROUNDS = 100_000
 """Rounds of simultaneous impacts in one window before the run counts as stalled."""
 
-NEAR_PART = 3
-"""How many times fewer pairs are near than can be reached by the fastest."""
-
 
 class Scene(NamedTuple):
     """The gas in units of its diameter, mass and first temperature."""
@@ -152,62 +149,29 @@ def select(
     apart = x[pairs.i] - x[pairs.j] - pairs.offset
     gap = jnp.sqrt(jnp.sum(apart * apart, -1)) - 1
     gap = jnp.where(jnp.arange(gap.size) < pairs.count, gap, jnp.inf)
-    speed = jnp.sqrt(jnp.sum(v * v, -1))
     slots = Slots(x, v, jnp.zeros(n, x.dtype))
 
     # No others can touch, and these are a small part of the list.
-    reachable, num_reachable = rows_where(gap < 2 * bound[pairs.i // size] * duration, room.near)
-    real = jnp.arange(room.near) < num_reachable
+    reachable, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, room.near)
+    real = jnp.arange(room.near) < num_near
     reachable = jnp.where(real, reachable, 0)
-    pair_i, pair_j, offset = pairs.i[reachable], pairs.j[reachable], pairs.offset[reachable]
-    gap = jnp.where(real, gap[reachable], jnp.inf)
-    fast, s_i, s_j = bound[pair_i // size], speed[pair_i], speed[pair_j]
-    most = room.near // NEAR_PART
-
-    def in_reach(until):
-        i, j = until[pair_i], until[pair_j]
-        early, late = jnp.minimum(i, j), jnp.maximum(i, j)
-        reach = (s_i + s_j) * early + (fast + jnp.where(i < j, s_j, s_i)) * (late - early)
-        near = gap < reach + 2 * fast * (duration - late)
-        return near, jnp.sum(near, dtype=jnp.int32)
-
-    def spread(carry):
-        _, near, _, _ = carry
-        picked, count = rows_where(near, most)
-        real = jnp.arange(most) < count
-        picked = jnp.where(real, picked, 0)
-        i, j = pair_i[picked], pair_j[picked]
-        rows = Rows(i, j, offset[picked], fast[picked], real)
-        _, _, motion, times, _, until = firstimpacts(slots, rows, duration)
-        until = jnp.minimum(until, duration)
-        disturbed = jnp.minimum(until[i], until[j])
-        closer = motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
-        near, wider = in_reach(until)
-        found = rows, real & (jnp.isfinite(times) | closer)
-        return found, near, count, wider
-
-    def grows(carry):
-        _, _, count, wider = carry
-        return (wider > count) & (wider <= most)
-
-    near = gap < (s_i + s_j) * duration
-    count = jnp.sum(near, dtype=jnp.int32)
-    index, no = jnp.zeros(most, jnp.int32), jnp.zeros(most, bool)
-    rows = Rows(index, index, offset[:most], fast[:most], no)
-    nobody = (rows, no), near, jnp.int32(-1), count
-    (rows, chosen), _, _, num_near = jax.lax.while_loop(grows, spread, nobody)
+    i, j = pairs.i[reachable], pairs.j[reachable]
+    rows = Rows(i, j, pairs.offset[reachable], bound[i // size], real)
+    _, _, motion, times, _, until = firstimpacts(slots, rows, duration)
+    disturbed = jnp.minimum(jnp.minimum(until[i], until[j]), duration)
+    closer = motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
+    chosen = real & (jnp.isfinite(times) | closer)
 
     picked, num_chosen = rows_where(chosen, room.contacts)
     real = jnp.arange(room.contacts) < num_chosen
     picked = jnp.where(real, picked, 0)
-    i, j = rows.a[picked], rows.b[picked]
+    i, j = i[picked], j[picked]
     ends = jnp.where(real[None], jnp.stack([i, j]), n)
     present = jnp.zeros(n, bool).at[ends].set(True, mode="drop")
     members, num_members = rows_where(present, room.members)
     slot = jnp.cumsum(present, dtype=jnp.int32) - 1
     a, b = (jnp.where(real, slot[k], 0) for k in (i, j))
     rows = Rows(a, b, rows.offset[picked], rows.bound[picked], real)
-    num_near = jnp.maximum(num_reachable, NEAR_PART * num_near)
     needed = jnp.stack([pairs.count, num_near, num_chosen, num_members])
     return Selection(members, rows, members // size, needed)
 

@@ -299,9 +299,11 @@ def test_a_random_start_melts_under_jit(dimension, packing_fraction):
     gas = hard_gas(0.8, packing_fraction, dimension)
     model = quiet(500).sized_for(gas)
     times = [float(gas.mean_free_time)]
-    curve = jax.jit(lambda key: jaxgran.cool(gas, times, model=quiet(500, plan=model.plan, key=key)))(
-        jax.random.key(1)
-    )
+
+    def cooled(key):
+        return jaxgran.cool(gas, times, model=quiet(500, plan=model.plan, key=key))
+
+    curve = jax.jit(cooled)(jax.random.key(1))
     assert curve.status == 0
     theory = jaxgran.cool(gas, times)
     np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.05)

@@ -15,7 +15,6 @@ from jaxgran import boxes, events, neighbours, status, tangents
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.events import Plan, Scene, State
 from jaxgran.gas import Gas
-from jaxgran.impacts import NEAR_PART
 from jaxgran.restitution import ReducedLaw
 from jaxgran.tangents import ImpactTangents, Inputs, Outputs
 
@@ -152,12 +151,11 @@ class HardSpheres(eqx.Module):
         listed = inside * (1 + float(self._skin(scene, d))) ** d
         fastest = events.SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         reach = 2 * fastest * share / float(scene.collision_frequency)
-        reachable = min(1.5 * inside * ((1 + reach) ** d - 1), listed)
+        reachable = min(1.1 * inside * ((1 + reach) ** d - 1), listed)
         # As measured; a list changes its length little, windows differ more.
-        factors = (4.0, 3.4, 4.0) if reachable == listed else (4.0, 1.7, 2.0)
-        near, chosen, members = (min(factor * share, listed) for factor in factors)
-        near = max(reachable, NEAR_PART * near)
-        counts = [n * number for number in (listed / 1.3, near, chosen, members)]
+        factors = (3.4, 4.0) if reachable == listed else (1.7, 2.0)
+        chosen, members = (min(factor * share, listed) for factor in factors)
+        counts = [n * number for number in (listed / 1.3, reachable, chosen, members)]
         rooms = [int(spare * count + 5 * count**0.5) + 64 for count in counts]
         rooms[1:3] = [max(rows, min(rooms[0], 512)) for rows in rooms[1:3]]  # spare small runs
         room = boxes.Room(*rooms[:3], members=min(max(rooms[3], 512), n))
@@ -182,7 +180,7 @@ class HardSpheres(eqx.Module):
         def melting(room: boxes.Room) -> boxes.Room:
             """For all that is listed: random places begin with many spheres at contact."""
             n = replicas * self.num_particles
-            return boxes.Room(room.pairs, NEAR_PART * room.pairs, room.pairs, n)
+            return boxes.Room(room.pairs, room.pairs, room.pairs, n)
 
         kind = boxes.Kind(
             at_start=lambda x, v, skin: events.at_start(x, v, scene, skin, plan),
