@@ -41,7 +41,7 @@ SCENES = {
     "clustering": (0.3, 0.2, 0.05, 1000, 8),
 }
 # So many sets of boxes for differences, which scatter more than tangents.
-SETS = {"dilute": 1, "dense": 1, "clustering": 4}
+SETS = {"dilute": 1, "dense": 1, "clustering": 6}
 FEW_REPLICAS = 4
 EARLY, EARLY_REPLICAS = 2, 64  # the first of the times, whose slopes are small, have more
 PLAIN_HORIZON = 3  # of the times; the plain derivative overflows at the last

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from math import pi
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -150,6 +151,11 @@ def pairs_in_contact(num_particles: int, side: ArrayLike, dimension: int) -> Arr
     return (
         num_particles * sphere_surface(dimension) / (2 * dimension) / jnp.asarray(side**dimension)
     )
+
+
+def contact_value(collision_frequency: Array, inside: float, dimension: int) -> float:
+    """Pair correlation at contact, from the collisions of a particle at T = 1."""
+    return float(collision_frequency) * pi**0.5 / (2 * dimension * inside)
 
 
 def skin_with(more: float, num_particles: int, side: ArrayLike, dimension: int) -> Array:

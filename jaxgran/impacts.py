@@ -169,7 +169,8 @@ def select(
     ends = jnp.where(real[None], jnp.stack([i, j]), n)
     present = jnp.zeros(n, bool).at[ends].set(True, mode="drop")
     members, num_members = rows_where(present, room.members)
-    slot = jnp.cumsum(present, dtype=jnp.int32) - 1
+    own = jnp.arange(room.members, dtype=jnp.int32)
+    slot = jnp.zeros(n, jnp.int32).at[members].set(own, mode="drop")
     a, b = (jnp.where(real, slot[k], 0) for k in (i, j))
     rows = Rows(a, b, rows.offset[picked], rows.bound[picked], real)
     needed = jnp.stack([pairs.count, num_near, num_chosen, num_members])

@@ -151,9 +151,10 @@ class HardSpheres(eqx.Module):
         listed = inside * (1 + float(self._skin(scene, d))) ** d
         fastest = events.SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         reach = 2 * fastest * share / float(scene.collision_frequency)
-        reachable = min(1.1 * inside * ((1 + reach) ** d - 1), listed)
-        # As measured; a list changes its length little, windows differ more.
-        factors = (3.4, 4.0) if reachable == listed else (1.7, 2.0)
+        more = boxes.contact_value(scene.collision_frequency, inside, d)
+        # As measured, here and below; a list changes its length little, windows differ more.
+        reachable = min(0.9 * more * inside * ((1 + reach) ** d - 1), listed)
+        factors = (3.7, 2.0) if reachable == listed else (1.3, 1.8)
         chosen, members = (min(factor * share, listed) for factor in factors)
         counts = [n * number for number in (listed / 1.3, reachable, chosen, members)]
         rooms = [int(spare * count + 5 * count**0.5) + 64 for count in counts]

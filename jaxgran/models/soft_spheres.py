@@ -2,7 +2,6 @@
 
 import dataclasses
 from functools import partial
-from math import pi
 from pathlib import Path
 
 import equinox as eqx
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxgran import blocks, boxes, closed_forms, tangents
 from jaxgran.blocks import Plan, Scene, State
 from jaxgran.curve import CoolingCurve, Particles
-from jaxgran.gas import Gas, sphere_surface
+from jaxgran.gas import Gas
 from jaxgran.restitution import Viscoelastic
 from jaxgran.tangents import Inputs, Outputs
 
@@ -138,9 +137,8 @@ class SoftSpheres(eqx.Module):
         flight *= steps / self.steps_per_contact
         inside = float(boxes.pairs_in_contact(self.num_particles, scene.side, d))
         listed = inside * (1 + float(self._skin(scene, d))) ** d
-        dilute = sphere_surface(d) / pi**0.5 * self.num_particles / float(scene.side) ** d
-        contact_value = float(scene.collision_frequency) / dilute
-        near = min(inside * contact_value * ((1 + 5 * flight) ** d - 1), listed)
+        more = boxes.contact_value(scene.collision_frequency, inside, d)
+        near = min(inside * more * ((1 + 5 * flight) ** d - 1), listed)
         contact_fraction = float(scene.contact_duration * scene.collision_frequency)
         # Not derived: the square is what gases of phi = .25 and .3 were seen to need besides.
         touching = min(contact_fraction * (4 + 6 * near + 4 * near**2), near)
