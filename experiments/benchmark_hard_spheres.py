@@ -6,8 +6,9 @@
 A gas cools for some mean free times in a periodic box from a melted start: viscoelastic beads in
 three dimensions, from the same start in LAMMPS too, where their contacts last .01 of the mean free
 time and take 30 steps; disks of constant restitution in two. Compilation is timed apart, and so is
-what comes before the first step, which the rates leave out on both sides; medians of repeats. With `--until`, instead, 50 000 disks (or the last of `--sizes`) are
-followed into their clusters, until they have collided so often each.
+what comes before the first step, which the rates leave out on both sides; medians of repeats. With
+`--until`, instead, 50 000 disks (or the last of `--sizes`) are followed into their clusters, until
+they have collided so often each.
 """
 
 import argparse
