@@ -102,6 +102,7 @@ def test_negative_beta_is_refused():
         impact(-0.1)
 
 
+@pytest.mark.slow
 def test_batches():
     betas = jnp.array([0.01, 0.1, 1.0])
     batch = jax.vmap(impact)(betas)

@@ -71,6 +71,7 @@ def test_main_job_reads_the_header_a_not(tmp_path):
     assert 6.0e-5 < json.loads(done.stdout.splitlines()[-1])["A"] < 6.8e-5
 
 
+@pytest.mark.slow
 def test_benchmark_runs(tmp_path):
     done = run("benchmark_kinetic_theory.py", "--smoke", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -78,6 +79,7 @@ def test_benchmark_runs(tmp_path):
     assert row["vmap_error"] < 1e-6 and row["scipy_error"] < 1e-6  # the same physics, twice
 
 
+@pytest.mark.slow
 def test_particle_benchmark_runs(tmp_path):
     done = run("benchmark_particles.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -87,6 +89,7 @@ def test_particle_benchmark_runs(tmp_path):
         assert lammps["temperature_ratio"] == pytest.approx(row["temperature_ratio"], rel=0.01)
 
 
+@pytest.mark.slow
 def test_stochastic_benchmark_runs(tmp_path):
     done = run("benchmark_dsmc.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -94,6 +97,7 @@ def test_stochastic_benchmark_runs(tmp_path):
     assert row["collisions_per_s"] > 0 and 0.05 < row["temperature_ratio"] < 0.9
 
 
+@pytest.mark.slow
 def test_hard_sphere_benchmark_runs(tmp_path):
     arguments = "--smoke", "--dimensions", 3, "--out", "figures.json"
     done = run("benchmark_hard_spheres.py", *arguments, cwd=tmp_path)
@@ -103,6 +107,7 @@ def test_hard_sphere_benchmark_runs(tmp_path):
     assert row["collisions_per_s"] > 0 and 0.55 < row["temperature_ratio"] < 0.85
 
 
+@pytest.mark.slow
 def test_comparison_with_lammps_runs(tmp_path):
     done = run("compare_lammps.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -111,6 +116,7 @@ def test_comparison_with_lammps_runs(tmp_path):
     assert set(record["curves"]) == {"dilute", "dense"}
 
 
+@pytest.mark.slow
 def test_soft_sphere_accuracy_runs(tmp_path):
     done = run("soft_sphere_accuracy.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -122,6 +128,7 @@ def test_soft_sphere_accuracy_runs(tmp_path):
     assert record["trajectory"]["finest_to_lammps"] < 1e-3  # 3e-4 at 200 steps
 
 
+@pytest.mark.slow
 def test_speed_against_error_runs(tmp_path):
     done = run("speed_vs_error.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -142,6 +149,7 @@ def test_benchmark_of_derivatives_runs(tmp_path):
         assert all(way["run_s"] > 0 for way in row["ways"].values())
 
 
+@pytest.mark.slow
 def test_fits_head_to_head_run(tmp_path):
     done = run("fit_head_to_head.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -152,6 +160,7 @@ def test_fits_head_to_head_run(tmp_path):
             assert abs(row["last_error"][0]) < 0.15
 
 
+@pytest.mark.slow
 def test_hard_cases_run(tmp_path):
     done = run("hard_cases.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

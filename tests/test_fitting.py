@@ -77,6 +77,7 @@ def test_starts_far_away_reach_the_same_answer():
         np.testing.assert_allclose(result.estimate, best.estimate, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth():
     # 500 noisy curves: a 95 % interval must cover in 93 to 97 % (2 standard errors of 500 trials).
     gas = glass_beads(0.15)
@@ -263,6 +264,7 @@ def test_fit_under_vmap_over_a_float_of_the_gas():
     assert jnp.all(jnp.diff(batch) < 0)  # a denser gas collides more: less A explains the same
 
 
+@pytest.mark.slow
 def test_fit_through_dsmc_agrees_with_kinetic_theory(beads):
     gas = beads(0.15)
     times = jnp.geomspace(0.3, 30.0, 20) * gas.mean_free_time

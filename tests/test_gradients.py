@@ -72,6 +72,7 @@ def test_derivative_in_time_is_the_rate():
     np.testing.assert_allclose(tangent, difference, rtol=1e-5)  # h^2 and noise/h: 1e-6 or below
 
 
+@pytest.mark.slow
 def test_batches_of_derivatives():
     gas = gases(3)["viscoelastic"]
     times = TAUS * gas.mean_free_time

@@ -9,6 +9,13 @@ from hard_cases import CASES
 from hard_cases_rows import Row
 
 LONG = (
+    "A = 0",
+    "SI values",
+    "sqrt(xi)",
+    "head-on",
+    "beta from",
+    "own image",
+    "inelastic",
     "impact speeds",
     "touching",
     "constant eps",

@@ -55,6 +55,7 @@ def test_gains_are_slopes_of_the_loss(law):
     np.testing.assert_allclose(along.gains(law, g), jnp.stack(expected), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_slopes_in_every_float_are_those_of_kinetic_theory():
     gas = glass_beads(**DILUTE)
     times = np.array([2.0, 8.0]) * float(gas.mean_free_time)

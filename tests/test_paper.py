@@ -8,6 +8,7 @@ from jaxgran.restitution import C1, C2
 from tests.test_experiments import run
 
 
+@pytest.mark.slow
 def test_clustering_leaves_haffs_law(tmp_path):
     done = run("paper_clustering.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -174,6 +174,7 @@ def test_the_ledger_closes_in_the_tangent_too(beads):
     np.testing.assert_allclose(total, 0.0, atol=1e-12 * float(jnp.max(jnp.abs(kinetic))))
 
 
+@pytest.mark.slow
 def test_slope_with_respect_to_times_is_the_cooling_rate(beads):
     gas = soft_beads(beads, 0.01, 0.2, packing_fraction=0.05)
     times = np.array([4.0, 8.0]) * float(gas.mean_free_time)
@@ -251,6 +252,7 @@ def test_touching_two_and_three_bodies_have_finite_slopes(beads):
         assert float(slope(partial(f, interval=interval))) == pytest.approx(float(plain), rel=0.3)
 
 
+@pytest.mark.slow
 def test_float32(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     times = np.array([0.5, 2.0]) * float(gas.mean_free_time)
