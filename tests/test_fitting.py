@@ -66,6 +66,7 @@ def test_start_uses_the_data_not_the_gas():
     assert 0.7 < values[0] / truth < 1.4
 
 
+@pytest.mark.slow
 def test_starts_far_away_reach_the_same_answer():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(3))

@@ -15,6 +15,7 @@ LONG = (
     "head-on",
     "beta from",
     "own image",
+    "three and four",
     "inelastic",
     "impact speeds",
     "touching",

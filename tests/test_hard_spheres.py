@@ -150,7 +150,7 @@ def test_impacts_come_as_often_as_enskog_says_closely(dimension, packing_fractio
     "packing_fraction, size, replicas, begin",
     [
         pytest.param(0.1, 500, 32, 20, marks=pytest.mark.slow),
-        (0.2, 500, 32, 20),
+        pytest.param(0.2, 500, 32, 20, marks=pytest.mark.slow),
         pytest.param(0.3, 500, 32, 20, marks=pytest.mark.slow),
         # The memory of velocities dies out later in a larger box.
         pytest.param(0.3, 4096, 8, 60, marks=pytest.mark.slow),

@@ -206,6 +206,7 @@ def test_values_do_not_recompile(beads):
             checked(HARD, gas, times * t0)
 
 
+@pytest.mark.slow
 def test_vmap_over_any_float(beads):
     gas = beads(0.15)
     times = jnp.array([0.1, 1.0])
