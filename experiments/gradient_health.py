@@ -58,14 +58,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results") / "gradient_health")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    options.out.mkdir(parents=True, exist_ok=True)
     file, results = options.out / "gradient_health.json", {}
     if file.exists():  # scenes not asked for again
         results = json.loads(file.read_text())["scenes"]
+    if options.late_differences and (missing := set(options.scenes) - set(results)):
+        parser.error(
+            f"--late-differences needs all the rest from before, and {file} has none of "
+            f"{', '.join(sorted(missing))}: run these scenes without it first"
+        )
+    options.out.mkdir(parents=True, exist_ok=True)
     for name in tqdm(options.scenes, disable=options.smoke):
         before = results.get(name) if options.late_differences else None
         results[name] = examine(name, options.smoke, before)
-        save(file, scenes=results, step_of_ln_A=STEP, steps_per_contact=STEPS_PER_CONTACT, key=0)
+        settings = {"step_of_ln_A": STEP, "steps_per_contact": STEPS_PER_CONTACT}
+        save(file, scenes=results, **settings, key="0; differences of set k of late replicas: k")
     draw({name: results[name] for name in SCENES if name in results}, file.with_suffix(".png"))
     print(f"written to {options.out}")
 

@@ -25,9 +25,10 @@ from scenes import beads
 from scipy.integrate import solve_ivp
 
 import jaxgran
-from jaxgran import blocks, contact
+from jaxgran import contact
 from jaxgran.boxes import SMALLEST_BOX
 from jaxgran.restitution import C1, viscoelastic_restitution
+from jaxgran.room import Room
 
 HARD, SOFT = jaxgran.HardSpheres, jaxgran.SoftSpheres
 
@@ -214,7 +215,7 @@ def _phases(steps: int, count: int = 32):
     model = quiet(SOFT, 2, projection=None, **settings).sized_for(gas)
     assert model.plan is not None
     # A gas has few pairs in contact at a time; here all are.
-    plan = model.plan._replace(room=blocks.Room(*[4 * count] * 4))
+    plan = model.plan._replace(room=Room(*[4 * count] * 4))
     model = dataclasses.replace(model, plan=plan)
     times = [6 * float(gas.contact_duration)]
     a = gas.value("dissipative_constant")

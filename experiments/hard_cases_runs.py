@@ -30,6 +30,7 @@ from scenes import beads
 
 import jaxgran
 from jaxgran import blocks, checkpoint, closed_forms
+from jaxgran.room import Room
 
 DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
 FREE = "dissipative_constant"
@@ -105,7 +106,7 @@ def steps_and_lists() -> list[Row]:
     for model in (HARD, SOFT):
         usual = quiet(model, 100)
         plan = usual.sized_for(gas).plan
-        tiny = plan._replace(room=blocks.Room(*(max(rows // 10, 1) for rows in plan.room)))
+        tiny = plan._replace(room=Room(*(max(rows // 10, 1) for rows in plan.room)))
         grown, enough = (
             jaxgran.cool(gas, times, model=quiet(model, 100, plan=p)) for p in (tiny, None)
         )

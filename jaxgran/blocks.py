@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxgran import encounters, neighbours, status, tangents
-from jaxgran.boxes import Room, longest_skin
 from jaxgran.encounters import Encounters, Work
 from jaxgran.neighbours import Pairs
+from jaxgran.room import Room, longest_skin
 from jaxgran.tangents import Tangents
 
 MAX_REFINE = 64.0

@@ -1,8 +1,7 @@
 """Boxes of spheres, soft or hard: what is asked of them, how they start, melt and cool."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from math import pi
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -15,7 +14,8 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from jaxgran import initial, neighbours, observables, status
 from jaxgran.checkpoint import fingerprint
 from jaxgran.curve import CoolingCurve, Particles
-from jaxgran.gas import Gas, sphere_surface
+from jaxgran.gas import Gas
+from jaxgran.room import Room
 from jaxgran.simulation import simulate
 from jaxgran.tangents import Inputs, Outputs
 
@@ -48,21 +48,6 @@ class Model(Protocol):
     def checkpoint(self) -> str | Path | None: ...
     @property
     def plan(self) -> Any: ...
-
-
-class Room(NamedTuple):
-    """How many rows the arrays of a compiled run have."""
-
-    pairs: int
-    near: int
-    contacts: int
-    members: int
-
-    def grown(self, needed: Sequence[int]) -> "Room":
-        """With more rows than needed where there are fewer."""
-        return Room(
-            *(r if n <= r else int(1.3 * n) + 32 for r, n in zip(self, needed, strict=True))
-        )
 
 
 class Kind(NamedTuple):
@@ -144,29 +129,6 @@ def reduced_start(
     length, speed = units if differentiable else jax.lax.stop_gradient(units)
     position, velocity = model.start.position / length, model.start.velocity / speed
     return position.reshape(-1, gas.dimension), velocity.reshape(-1, gas.dimension)
-
-
-def pairs_in_contact(num_particles: int, side: ArrayLike, dimension: int) -> Array:
-    """Pairs a particle within contact, were the pair correlation 1."""
-    return (
-        num_particles * sphere_surface(dimension) / (2 * dimension) / jnp.asarray(side**dimension)
-    )
-
-
-def contact_value(collision_frequency: Array, inside: float, dimension: int) -> float:
-    """Pair correlation at contact, from the collisions of a particle at T = 1."""
-    return float(collision_frequency) * pi**0.5 / (2 * dimension * inside)
-
-
-def skin_with(more: float, num_particles: int, side: ArrayLike, dimension: int) -> Array:
-    """Reach beyond contact, in diameters, in which so many more pairs a particle are listed."""
-    inside = pairs_in_contact(num_particles, side, dimension)
-    return jnp.minimum((1 + more / inside) ** (1 / dimension) - 1, longest_skin(side))
-
-
-def longest_skin(side: ArrayLike) -> Float[Array, ""]:
-    """The longest skin, in diameters, in whose reach a sphere meets no sphere and its image."""
-    return 0.5 * jnp.asarray(side) * (1 - 1e-6) - 1
 
 
 def settled_plan(model: Model, size: Callable[[], Any]) -> Any:

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxgran import kinetics, neighbours, status, tangents
-from jaxgran.boxes import Room
 from jaxgran.impacts import MAX_ROUNDS, Scene, Selection, Slots, Work, resolve, select
 from jaxgran.neighbours import Pairs
 from jaxgran.restitution import ReducedLaw
+from jaxgran.room import Room
 from jaxgran.tangents import ImpactTangents
 
 LEAST_IMPACTS = 8

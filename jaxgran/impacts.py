@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.boxes import Room
 from jaxgran.encounters import rows_where
 from jaxgran.neighbours import Pairs
 from jaxgran.restitution import ReducedLaw
+from jaxgran.room import Room
 from jaxgran.tangents import ImpactTangents
 
 MAX_ROUNDS = 100_000

@@ -7,9 +7,9 @@ import pytest
 
 import jaxgran
 from jaxgran import events, simulation
-from jaxgran.boxes import Room
 from jaxgran.models.hard_spheres import HardSpheres, reduced_scene
 from jaxgran.neighbours import find_pairs
+from jaxgran.room import Room
 
 DATA = Path(__file__).parent.parent / "experiments" / "data"
 
@@ -308,6 +308,7 @@ def test_a_random_start_melts_under_jit(dimension, packing_fraction, size):
     curve = jax.jit(cooled)(jax.random.key(1))
     assert curve.status == 0
     theory = jaxgran.cool(gas, times)
+    # T has fallen by 11 to 16 %; that of one box scatters by 1.2 %.
     np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.05)
 
 

@@ -11,7 +11,7 @@ FLOORS = [
     ["contact", "simulation", "observables", "initial"],
     ["restitution", "encounters"],
     ["gas", "tangents"],
-    ["kinetics", "closed_forms", "curve", "collisions"],
+    ["kinetics", "closed_forms", "curve", "collisions", "room"],
     ["boxes", "estimate"],
     ["blocks", "impacts", "search"],
     ["events"],

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran import blocks, boxes, simulation
+from jaxgran import blocks, simulation
 from jaxgran.models.soft_spheres import SoftSpheres, reduced_scene
 from jaxgran.observables import structure_factor
+from jaxgran.room import Room
 
 DATA = Path(__file__).parent.parent / "experiments" / "data"
 
@@ -207,7 +208,7 @@ def test_what_is_too_small_is_grown_without_a_trace(beads):
     model = quiet(200)
     reference = jaxgran.cool(gas, times, model=model)
     plan = model.sized_for(gas).plan
-    tiny = plan._replace(room=boxes.Room(*(room // 10 for room in plan.room)))
+    tiny = plan._replace(room=Room(*(room // 10 for room in plan.room)))
     small = jaxgran.cool(gas, times, model=quiet(200, plan=tiny))
     np.testing.assert_array_equal(small.temperature, reference.temperature)
     np.testing.assert_array_equal(small.particles.position, reference.particles.position)
@@ -285,7 +286,7 @@ def test_jit_and_vmap_give_the_same_numbers(beads):
 def test_jit_flags_what_it_cannot_grow(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     model = quiet(100).sized_for(gas)
-    room = boxes.Room(*(max(r // 10, 1) for r in model.plan.room))
+    room = Room(*(max(r // 10, 1) for r in model.plan.room))
     model = quiet(100, plan=model.plan._replace(room=room))
     times = jnp.array([1.0]) * gas.mean_free_time
     curve = jax.jit(lambda t: jaxgran.cool(gas, t, model=model))(times)
@@ -365,7 +366,7 @@ def test_refuses_what_it_cannot_do(beads):
 @pytest.mark.parametrize("packing_fraction", [0.25, 0.3])
 def test_settled_room_is_enough_for_a_dense_gas(beads, packing_fraction, monkeypatch):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=packing_fraction)
-    monkeypatch.setattr(boxes.Room, "grown", lambda *args: pytest.fail("room had to be made"))
+    monkeypatch.setattr(Room, "grown", lambda *args: pytest.fail("room had to be made"))
     model = quiet(500, replicas=4, steps_per_contact=25).sized_for(gas)
     jaxgran.cool(gas, [float(gas.mean_free_time)], model=model)
 

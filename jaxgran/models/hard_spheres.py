@@ -16,6 +16,7 @@ from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.events import Plan, Scene, State
 from jaxgran.gas import Gas
 from jaxgran.restitution import ReducedLaw
+from jaxgran.room import Room, contact_value, pairs_in_contact, skin_with
 from jaxgran.tangents import ImpactTangents, Inputs, Outputs
 
 PAIRS_PER_PARTICLE = 7.0
@@ -129,7 +130,7 @@ class HardSpheres(eqx.Module):
             )
 
     def _skin(self, scene: Scene, d: int) -> Array:
-        return boxes.skin_with(PAIRS_PER_PARTICLE, self.num_particles, scene.side, d)
+        return skin_with(PAIRS_PER_PARTICLE, self.num_particles, scene.side, d)
 
     def sized_for(self, gas: Gas, spare: float = 1.4) -> "HardSpheres":
         """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
@@ -147,19 +148,19 @@ class HardSpheres(eqx.Module):
     def _sized(self, scene: Scene, d: int, spare: float = 1.4) -> Plan:
         n = self.replicas * self.num_particles
         share = max(WINDOW_SHARE, 2 * events.LEAST_IMPACTS / n)
-        inside = float(boxes.pairs_in_contact(self.num_particles, scene.side, d))
+        inside = float(pairs_in_contact(self.num_particles, scene.side, d))
         listed = inside * (1 + float(self._skin(scene, d))) ** d
         fastest = events.SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         reach = 2 * fastest * share / float(scene.collision_frequency)
-        more = boxes.contact_value(scene.collision_frequency, inside, d)
+        at_contact = contact_value(scene.collision_frequency, inside, d)
         # As measured, here and below; a list changes its length little, windows differ more.
-        reachable = min(0.9 * more * inside * ((1 + reach) ** d - 1), listed)
+        reachable = min(0.9 * at_contact * inside * ((1 + reach) ** d - 1), listed)
         factors = (3.7, 2.0) if reachable == listed else (1.3, 1.8)
         chosen, members = (min(factor * share, listed) for factor in factors)
         counts = [n * number for number in (listed / 1.3, reachable, chosen, members)]
         rooms = [int(spare * count + 5 * count**0.5) + 64 for count in counts]
         rooms[1:3] = [max(rows, min(rooms[0], 512)) for rows in rooms[1:3]]  # spare small runs
-        room = boxes.Room(*rooms[:3], members=min(max(rooms[3], 512), n))
+        room = Room(*rooms[:3], members=min(max(rooms[3], 512), n))
         return Plan(self.replicas, share, room)
 
     def _run(self, inputs: Inputs, dimension: int, directions: ReducedLaw | None = None) -> Outputs:
@@ -178,10 +179,10 @@ class HardSpheres(eqx.Module):
             overlap = closest < 1 - _overlap_allowed(state.position, scene.side)
             return status.flag(status.OVERLAPPING, overlap)
 
-        def melting(room: boxes.Room) -> boxes.Room:
+        def melting(room: Room) -> Room:
             """For all that is listed: random places begin with many spheres at contact."""
             n = replicas * self.num_particles
-            return boxes.Room(room.pairs, room.pairs, room.pairs, n)
+            return Room(room.pairs, room.pairs, room.pairs, n)
 
         kind = boxes.Kind(
             at_start=lambda x, v, skin: events.at_start(x, v, scene, skin, plan),

@@ -14,6 +14,7 @@ from jaxgran.blocks import Plan, Scene, State
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.gas import Gas
 from jaxgran.restitution import Viscoelastic
+from jaxgran.room import Room, contact_value, pairs_in_contact, skin_with
 from jaxgran.tangents import Inputs, Outputs
 
 PAIRS_PER_PARTICLE = 3.0
@@ -128,17 +129,17 @@ class SoftSpheres(eqx.Module):
         return dataclasses.replace(self, plan=plan)
 
     def _skin(self, scene: Scene, d: int) -> Array:
-        return boxes.skin_with(PAIRS_PER_PARTICLE, self.num_particles, scene.side, d)
+        return skin_with(PAIRS_PER_PARTICLE, self.num_particles, scene.side, d)
 
     def _sized(self, scene: Scene, d: int, clipped: bool, spare: float = 1.4) -> Plan:
         flight = _FASTEST * float(scene.contact_duration)
         # A block is at most a contact long, and shorter where spheres go far in that time.
         steps = max(round(self.steps_per_contact * min(1.0, 0.08 / flight)), 8)
         flight *= steps / self.steps_per_contact
-        inside = float(boxes.pairs_in_contact(self.num_particles, scene.side, d))
+        inside = float(pairs_in_contact(self.num_particles, scene.side, d))
         listed = inside * (1 + float(self._skin(scene, d))) ** d
-        more = boxes.contact_value(scene.collision_frequency, inside, d)
-        near = min(inside * more * ((1 + 5 * flight) ** d - 1), listed)
+        at_contact = contact_value(scene.collision_frequency, inside, d)
+        near = min(inside * at_contact * ((1 + 5 * flight) ** d - 1), listed)
         contact_fraction = float(scene.contact_duration * scene.collision_frequency)
         # Not derived: the square is what gases of phi = .25 and .3 were seen to need besides.
         touching = min(contact_fraction * (4 + 6 * near + 4 * near**2), near)
@@ -146,7 +147,7 @@ class SoftSpheres(eqx.Module):
         counts = [n * share for share in (listed, near, touching, 2 * touching)]
         spares = min(spare, 1.4), spare, spare, spare  # of all, pairs listed vary least
         rooms = [int(s * x + 5 * x**0.5) + 32 for s, x in zip(spares, counts, strict=True)]
-        room = boxes.Room(*rooms[:3], members=min(rooms[3], n))
+        room = Room(*rooms[:3], members=min(rooms[3], n))
         return Plan(self.replicas, self.steps_per_contact, steps, clipped, room)
 
     def _run(

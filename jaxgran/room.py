@@ -1,0 +1,48 @@
+"""How many pairs of spheres there are within some reach, and the room that arrays of them need."""
+
+from collections.abc import Sequence
+from math import pi
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran.gas import sphere_surface
+
+
+class Room(NamedTuple):
+    """How many rows the arrays of a compiled run have."""
+
+    pairs: int
+    near: int
+    contacts: int
+    members: int
+
+    def grown(self, needed: Sequence[int]) -> "Room":
+        """With more rows than needed where there are fewer."""
+        return Room(
+            *(r if n <= r else int(1.3 * n) + 32 for r, n in zip(self, needed, strict=True))
+        )
+
+
+def pairs_in_contact(num_particles: int, side: ArrayLike, dimension: int) -> Array:
+    """Pairs a particle within contact, were the pair correlation 1."""
+    return (
+        num_particles * sphere_surface(dimension) / (2 * dimension) / jnp.asarray(side**dimension)
+    )
+
+
+def contact_value(collision_frequency: Array, inside: float, dimension: int) -> float:
+    """Pair correlation at contact, from the collisions of a particle at T = 1."""
+    return float(collision_frequency) * pi**0.5 / (2 * dimension * inside)
+
+
+def skin_with(more: float, num_particles: int, side: ArrayLike, dimension: int) -> Array:
+    """Reach beyond contact, in diameters, in which so many more pairs a particle are listed."""
+    inside = pairs_in_contact(num_particles, side, dimension)
+    return jnp.minimum((1 + more / inside) ** (1 / dimension) - 1, longest_skin(side))
+
+
+def longest_skin(side: ArrayLike) -> Float[Array, ""]:
+    """The longest skin, in diameters, in whose reach a sphere meets no sphere and its image."""
+    return 0.5 * jnp.asarray(side) * (1 - 1e-6) - 1
