@@ -6,7 +6,8 @@
 A gas cools for some mean free times in a periodic box from a melted start: viscoelastic beads in
 three dimensions, from the same start in LAMMPS too, where their contacts last .01 of the mean free
 time and take 30 steps; disks of constant restitution in two. Compilation is timed apart, and so is
-what comes before the first step, which the rates leave out on both sides; medians of repeats. With
+what comes before the first step, which the rates leave out on both sides; medians of repeats, in
+which the two take turns, since machines are not always equally fast. With
 `--until`, instead, 50 000 disks (or the last of `--sizes`) are followed into their clusters, until
 they have collided so often each.
 """
@@ -32,7 +33,7 @@ BETA, CONTACT_FRACTION = 0.15, 0.01  # in three dimensions
 RESTITUTION = 0.9  # in two
 SIZES = (1000, 4096, 16384, 50000)
 COLLISION_TIMES = 4.0
-REPEATS = 5
+REPEATS = 7
 
 
 def main() -> None:
@@ -117,22 +118,29 @@ def measure(
     times = [collision_times * float(gas.mean_free_time)]
     curve = jaxgran.cool(gas, times, model=model)
     first = time.perf_counter() - begin
-    seconds = {0.0: [], times[0]: []}
+    seconds, beside = {0.0: [], times[0]: []}, []
     for _ in range(repeats):
         for end, took in seconds.items():
             begin = time.perf_counter()
             curve = jaxgran.cool(gas, [end], model=model)
             jax.block_until_ready(curve.temperature)
             took.append(time.perf_counter() - begin)
+        if dimension == 3 and ranks:
+            dt = float(gas.contact_duration) / STEPS_PER_CONTACT
+            beside.append(time_lammps(gas, start, dt, round(times[0] / dt), 1, ranks[0])[0])
     assert curve.collisions is not None
     set_up, run = (statistics.median(took) for took in seconds.values())
     steps = run - set_up
     collisions = float(curve.collisions[-1]) * size / 2
     lammps = {}
-    if dimension == 3 and ranks:
-        dt = float(gas.contact_duration) / STEPS_PER_CONTACT
-        took, _ = time_lammps(gas, start, dt, round(times[0] / dt), repeats, ranks[0])
-        lammps = {"run_s": took, "collisions_per_s": collisions / took, "ratio": took / steps}
+    if beside:
+        ratios = [a / (b - set_up) for a, b in zip(beside, seconds[times[0]], strict=True)]
+        lammps = {
+            "run_s": statistics.median(beside),
+            "collisions_per_s": collisions / statistics.median(beside),
+            "ratio": statistics.median(ratios),
+            "ratios": ratios,
+        }
     return {
         "dimension": dimension,
         "packing_fraction": PACKINGS[dimension],
