@@ -1,11 +1,12 @@
 """How fast and how wrong is each model? Run time against the error of T(t), every knob swept.
 
-    python experiments/speed_vs_error.py [--scenes dilute dense clustering] [--smoke] [--out DIR]
+    python experiments/speed_vs_error.py [--scenes dilute dense clustering]
+        [--models KineticTheory DSMC HardSpheres SoftSpheres] [--smoke] [--out DIR]
 
 The error is the largest relative difference of T from an independent reference over the whole
 curve: LAMMPS for the dilute and the dense gas, for the clustering one soft spheres in four boxes
 with twice the steps and all its particles. Each row is run twice, so that compilation can be told
-apart. Scenes not asked for keep the rows of an older run in the same folder.
+apart. Scenes and models not asked for keep the rows of an older run in the same folder.
 """
 
 import argparse
@@ -62,6 +63,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", nargs="+", choices=SIZES, default=list(SIZES))
+    parser.add_argument("--models", nargs="+", choices=COLOURS, default=list(COLOURS))
     parser.add_argument("--smoke", action="store_true", help="a row a model, early times only")
     parser.add_argument("--out", type=Path, default=Path("results") / "speed_vs_error")
     options = parser.parse_args()
@@ -71,10 +73,13 @@ def main() -> None:
         found = json.loads(file.read_text(encoding="utf-8"))["scenes"]
     for name in ("dense",) if options.smoke else options.scenes:
         scene = clustering() if name == "clustering" else measured(name, options.smoke)
-        found[name] = {
-            "reference": scene.reference,
-            "rows": rows_of(scene, SIZES[name], options.smoke),
-        }
+        before = found[name]["rows"] if name in found else []
+        kept = [row for row in before if row["model"] not in options.models]
+        runs = few_runs(scene.gas) if options.smoke else all_runs(scene.gas, SIZES[name])
+        runs = [run for run in runs if type(run.model).__name__ in options.models]
+        rows = [measure(scene, run) for run in tqdm(runs, disable=True if options.smoke else None)]
+        rows = sorted(kept + rows, key=lambda row: list(COLOURS).index(row["model"]))
+        found[name] = {"reference": scene.reference, "rows": rows}
         print(table(name, found[name]))
         save(file, scenes=found, key=KEY, replicas=REPLICAS)
     found = {name: found[name] for name in SIZES if name in found}
@@ -119,11 +124,6 @@ class Run(NamedTuple):
     model: jaxgran.KineticTheory | jaxgran.DSMC | jaxgran.HardSpheres | jaxgran.SoftSpheres
     gas: jaxgran.Gas
     double: bool = True
-
-
-def rows_of(scene: Scene, sizes: tuple[int, ...], smoke: bool) -> list[dict]:
-    runs = few_runs(scene.gas) if smoke else all_runs(scene.gas, sizes)
-    return [measure(scene, run) for run in tqdm(runs, disable=True if smoke else None)]
 
 
 def few_runs(gas: jaxgran.Gas) -> list[Run]:
