@@ -91,7 +91,7 @@ def dissolution(table: Table, gas: dict) -> None:
         f"density fluctuations {uneven[peak]:.1f} times the elastic fluid's at N = {N[peak]:.0f}, "
         f"{uneven[-1]:.2f} ± {gas['unevenness_error'][-1]:.2f} at N = {N[-1]:.0f}; the flow still "
         f"holds {flow[-1]:.2f} ± {gas['flow_error'][-1]:.2f} of the energy",
-        "hard disks, 2000, φ = .05, 3 seeds",
+        "hard disks, 2000, φ = .05, 6 seeds",
         "agree",
         uneven[-1] < 0.3 * uneven[peak],
         "seen in a box of some L_c; larger ones take longer, as the number of disks",

@@ -43,7 +43,7 @@ class Config:
     packing_fraction: float = 0.05
     restitution: float = 0.6
     num_particles: int = 2000
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     until: tuple[float, float] = (26.0, 400.0)  # collisions per particle, of each law
     fields: tuple[float, ...] = (5.0, 50.0, 120.0, 400.0)
 
