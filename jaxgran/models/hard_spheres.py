@@ -66,8 +66,8 @@ class HardSpheres(eqx.Module):
     free times where flows have begun to hold energy (phi = .2, beta = .3, 1.2 L_c). a_2 and the
     paths are taken as the same at the same number of collisions (so that d ln<dr^2>/d ln A is up to
     0.2 too low: dissipation makes velocities last longer), the velocity correlation as decaying at
-    2/d of the collision rate. The density acts by the Enskog frequency of collisions. The last particles carry
-    no derivative.
+    2/d of the collision rate. The density acts by the Enskog frequency of collisions. The last
+    particles carry no derivative.
 
     Raises:
         ValueError: for numbers out of range.
