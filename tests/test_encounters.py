@@ -6,7 +6,7 @@ from jaxgran.encounters import rows_where
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 1.0])
-@pytest.mark.parametrize("length", [1, 31, 32, 33, 64, 1000])
+@pytest.mark.parametrize("length", [1, 32, 33, 1000])
 def test_rows_where_a_mask_holds(length, share):
     for seed, size in enumerate((1, 7, length, length + 40)):
         mask = np.random.default_rng(seed).random(length) < share

@@ -31,6 +31,7 @@ def test_main_job_without_arguments(tmp_path):
     assert json.loads(record.read_text())["parameters"][0]["parameter"] == "A"
 
 
+@pytest.mark.slow
 def test_main_job_says_what_it_cannot_explain(tmp_path):
     done = run("fit_cooling_curve.py", DENSE, "--free", "A", "T0", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -62,6 +63,7 @@ def test_main_job_refuses_bad_input(arguments, message, tmp_path):
     assert not (tmp_path / "results").exists()
 
 
+@pytest.mark.slow
 def test_main_job_reads_the_header_a_not(tmp_path):
     # A header's A is only compared with: another one changes no estimate.
     text = DENSE.read_text().replace("# A: 8e-05", "# A: 1")

@@ -142,6 +142,7 @@ def test_constant_restitution_is_fitted_too():
     assert abs(e - 0.85) < 3 * error < 0.01
 
 
+@pytest.mark.slow
 def test_series_coefficients_are_fitted_together():
     law = jaxgran.RestitutionSeries([-0.2], [0.2])
     gas = jaxgran.Gas(law, diameter=1.0, mass=1.0, packing_fraction=0.05, temperature=1.0)
@@ -165,6 +166,7 @@ def test_parameters_that_cannot_be_told_apart_are_named():
     assert any("does not determine" in reason for reason in diagnosis.reasons)
 
 
+@pytest.mark.slow
 def test_float32_warns():
     with jax.enable_x64(False):
         gas = glass_beads(0.15)
@@ -207,7 +209,11 @@ def measured(name):
 
 
 @pytest.mark.parametrize(
-    "free", [("dissipative_constant",), ("dissipative_constant", "temperature")]
+    "free",
+    [
+        ("dissipative_constant",),
+        pytest.param(("dissipative_constant", "temperature"), marks=pytest.mark.slow),
+    ],
 )
 def test_dilute_measured_curve(free):
     gas, curve, a_true, n, replicas = measured("dilute")
@@ -253,6 +259,7 @@ def test_wrong_error_bars_widen_the_error():
     assert not jaxgran.diagnose(result, boast).explains
 
 
+@pytest.mark.slow
 def test_fit_under_vmap_over_a_float_of_the_gas():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(12))

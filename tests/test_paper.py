@@ -89,8 +89,8 @@ def exponents_follow_gamma(found):
             diffusion_is_not_that_of_the_paper,
             marks=pytest.mark.slow,
         ),
-        ("paper_diffusion", spreads_as_theory),
-        ("paper_exponents", exponents_follow_gamma),
+        pytest.param("paper_diffusion", spreads_as_theory, marks=pytest.mark.slow),
+        pytest.param("paper_exponents", exponents_follow_gamma, marks=pytest.mark.slow),
     ],
 )
 def test_paper_is_reproduced(name, holds, tmp_path):

@@ -165,7 +165,7 @@ def test_replicas_are_the_runs_they_stand_for(beads):
         np.testing.assert_allclose(alone.temperature[0], pair.replicas.temperature[k], rtol=1e-3)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_cools_as_kinetic_theory_with_softness_says(beads, dimension):
     # Box below L_c, so that the gas stays homogeneous.
     gas = soft_beads(beads, 0.02, 0.25, dimension, packing_fraction={2: 0.05, 3: 0.04}[dimension])
@@ -189,6 +189,7 @@ def test_cools_as_kinetic_theory_with_softness_says(beads, dimension):
     assert np.all(np.abs(curve.collisions / theory.collisions - 1) < 0.03 + 2 * scatter)
 
 
+@pytest.mark.slow
 def test_clusters_above_the_critical_box_only(beads):
     gas = soft_beads(beads, 0.03, 0.5, dimension=2, packing_fraction=0.2)
     end = [40 * float(gas.mean_free_time)]
@@ -214,6 +215,7 @@ def test_what_is_too_small_is_grown_without_a_trace(beads):
     np.testing.assert_array_equal(small.particles.position, reference.particles.position)
 
 
+@pytest.mark.slow
 def test_a_fast_sphere_outruns_no_list(beads):
     gas = soft_beads(beads, 0.02, 0.1, packing_fraction=0.3)
     still = jaxgran.cool(gas, [0.0], model=quiet(64)).particles

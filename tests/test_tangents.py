@@ -136,6 +136,7 @@ FLOATS = (
 )
 
 
+@pytest.mark.slow
 def test_slopes_in_every_float_are_those_of_kinetic_theory(beads):
     gas = soft_beads(beads, 0.005, 0.3, packing_fraction=0.03)
     times = np.array([2.0, 8.0]) * float(gas.mean_free_time)
@@ -198,6 +199,7 @@ def test_slope_does_not_depend_on_the_interval(beads, interval):
     np.testing.assert_allclose(np.mean(slope(f)), np.mean(slope(g)), rtol=0.06)
 
 
+@pytest.mark.slow
 def test_elastic_limit(beads):
     # d T / d A at A = 0 is finite and joins on to that of a small A.
     gas = soft_beads(beads, 0.02, 0.1, packing_fraction=0.1)
