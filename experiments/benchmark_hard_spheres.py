@@ -126,6 +126,7 @@ def measure(
             jax.block_until_ready(curve.temperature)
             took.append(time.perf_counter() - begin)
         if dimension == 3 and ranks:
+            # The better of two skins each time, which favours LAMMPS a little.
             dt = float(gas.contact_duration) / STEPS_PER_CONTACT
             beside.append(time_lammps(gas, start, dt, round(times[0] / dt), 1, ranks[0])[0])
     assert curve.collisions is not None

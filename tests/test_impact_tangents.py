@@ -169,11 +169,22 @@ def test_a_start_has_no_projected_slope():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "beta, packing, bias", [(0.2, 0.02, 0.0), (0.1, 0.2, 0.03), (0.3, 0.2, 0.145)]
+    "beta, packing",
+    [
+        (0.2, 0.02),
+        (0.1, 0.2),
+        pytest.param(
+            0.3,
+            0.2,
+            marks=pytest.mark.xfail(
+                strict=True,
+                reason="1.2 L_c: flows keep T 4 to 9 % above kinetic theory's, and how that depends "
+                "on A is lost to a memory of T alone",
+            ),
+        ),
+    ],
 )
-def test_projected_slope_against_differences(beads, beta, packing, bias):
-    """In the last gas, in a box of 1.2 L_c, flows keep T 4 to 9 % above kinetic theory's; how that
-    depends on A is lost to a memory of T alone."""
+def test_projected_slope_against_differences(beads, beta, packing):
     gas = beads(beta, packing_fraction=packing)
     times = np.array([10.0, 30.0]) * float(gas.mean_free_time)
     model, h = quiet(500, replicas=32), 0.3
@@ -182,6 +193,7 @@ def test_projected_slope_against_differences(beads, beta, packing, bias):
     got = jax.jvp(f, (0.0,), (1.0,))[1]
     error = np.hypot(*(np.std(x, axis=0, ddof=1) / 32**0.5 for x in (difference, got)))
     mean = np.mean(difference, axis=0)
+    bias, spread = np.mean(got, axis=0) / mean - 1, error / np.abs(mean)
+    print(f"\nphi {packing:g}, beta {beta:g}: projected over differences {bias} +- {spread}")
     # The difference itself bends by 2 % of h^2 at this step.
-    allowed = np.maximum(0.05 * np.abs(mean), 2 * error)
-    assert np.all(np.abs(np.mean(got, axis=0) - (1 + bias) * mean) < allowed)
+    assert np.all(np.abs(bias) < np.maximum(0.05, 2 * spread))
