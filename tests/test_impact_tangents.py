@@ -178,7 +178,7 @@ def test_a_start_has_no_projected_slope():
             0.2,
             marks=pytest.mark.xfail(
                 strict=True,
-                reason="1.2 L_c: flows keep T 4 to 9 % above kinetic theory's, and how that depends "
+                reason="in 1.2 L_c flows keep T 4 to 9 % above kinetic theory's; how that depends "
                 "on A is lost to a memory of T alone",
             ),
         ),
