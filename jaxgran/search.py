@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +23,9 @@ NEAR = 0.1
 QUIET = 0.5
 """A search through simulations ends when their noise is so much of the standard error."""
 
+AT_REST = 1e-4
+"""Standard errors that a least-squares answer may be from where its next step would lead."""
+
 NOISE_WINDOW = 9
 """Neighbouring times over which the variance between replicas is averaged."""
 
@@ -29,11 +33,35 @@ Residuals = Callable[[Float[Array, "p"]], Float[Array, "residuals"]]
 Found = tuple[Float[Array, "p"], Int[Array, ""], Bool[Array, ""]]
 
 
+def at_rest(residuals: Float[Array, "n"], jacobian: Float[Array, "n p"]) -> Bool[Array, ""]:
+    """Whether the Gauss-Newton step from here is nothing beside the standard errors.
+
+    In standard errors, the step's parts along the singular vectors of the Jacobian are those of the
+    residuals along the left ones, over the residuals' scatter.
+    """
+    left, *_ = jnp.linalg.svd(jacobian, full_matrices=False)
+    return jnp.max(jnp.abs(residuals @ left)) < AT_REST * jnp.sqrt(jnp.mean(residuals**2))
+
+
+class _TrustRegion(optx.ClassicalTrustRegion):
+    """Whose steps are taken where the search is at rest.
+
+    There they raise the sum by round-off as often as not; refused, the search would go on in vain.
+    """
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        step_size, accept, *rest = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
+        assert isinstance(f_info, optx.FunctionInfo.ResidualJac)
+        accept |= at_rest(f_info.residual, f_info.jac.as_matrix())
+        return step_size, accept, *rest
+
+
 def least_squares(residuals: Residuals, first: Float[Array, "p"], max_steps: int) -> Found:
     """Where the sum of squares is least, after how many steps, and whether at the tolerance."""
+    solver = optx.LevenbergMarquardt(rtol=1e-7, atol=1e-7)
     solution = optx.least_squares(
         lambda flat, _: residuals(flat),
-        optx.LevenbergMarquardt(rtol=1e-7, atol=1e-7),
+        eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion()),
         first,
         max_steps=max_steps,
         throw=False,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.search import by_simulation
+from jaxgran.search import at_rest, by_simulation, least_squares
 
 TIMES = np.geomspace(0.1, 100, 40)
 TRUTH = np.array([0.3, -0.2])
@@ -52,6 +52,34 @@ def search(simulate, measured, first=(0.0, 0.0), max_runs=8, **settings):
         max_runs=max_runs,
         **settings,
     )
+
+
+@pytest.mark.parametrize("off, expected", [(0.0, True), (1e-5, True), (1e-3, False), (1.0, False)])
+def test_rest_is_told_in_standard_errors(off, expected):
+    rng = np.random.default_rng(0)
+    for scale in (1.0, 1e-6):  # of a parameter beside the other
+        jacobian = rng.normal(size=(40, 2)) * [1.0, scale]
+        residuals = 0.3 * rng.normal(size=40)
+        best, *_ = np.linalg.lstsq(jacobian, residuals, rcond=None)
+        standard_error = 0.3 * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+        moved = residuals - jacobian @ (best + off * standard_error)
+        assert bool(at_rest(jnp.asarray(moved), jnp.asarray(jacobian))) == expected
+
+
+def test_least_squares_end_in_rough_sums():
+    # Sums of squares as an adaptive solver makes them: rough by 1e-8, which no derivative knows.
+    def found(key):
+        noise = 0.01 * jax.random.normal(key, TIMES.shape)
+
+        def residuals(flat):
+            rough = 1e-8 * jnp.sin(1e13 * jax.lax.stop_gradient(flat[0]) + jnp.arange(TIMES.size))
+            return (exact(jnp.asarray(TRUTH)) + noise - exact(flat)) / 0.01 + rough
+
+        return least_squares(residuals, jnp.zeros(2), 100)
+
+    flat, num_steps, converged = jax.vmap(found)(jax.random.split(jax.random.key(0), 100))
+    assert jnp.all(converged) and jnp.max(num_steps) <= 8
+    np.testing.assert_allclose(jnp.mean(flat, axis=0), TRUTH, atol=0.003)
 
 
 @pytest.mark.parametrize("bias", [0.8, 1.0, 1.2])
