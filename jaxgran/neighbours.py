@@ -95,8 +95,7 @@ def find_pairs(
 
 @jax.jit
 def _whole_sides(position, side, i, j):
-    apart = position[i] - position[j]
-    return side * jnp.round((apart - displacement(side, position[i], position[j])) / side)
+    return side * jnp.round((position[i] - position[j]) / side)
 
 
 def _vesin_pairs(position, side, cutoff, replicas, room):
