@@ -28,7 +28,7 @@ import numpy as np  # noqa: E402
 import jaxgran  # noqa: E402
 from jaxgran.checkpoint import write_whole  # noqa: E402
 from jaxgran.choice import words  # noqa: E402
-from jaxgran.curve import GAS_KEYS, header_number, num_particles  # noqa: E402
+from jaxgran.curve import GAS_KEYS, header_count, header_number  # noqa: E402
 from jaxgran.plotting import plot_fit  # noqa: E402
 
 HERE = Path(__file__).parent
@@ -88,8 +88,8 @@ def run(options: argparse.Namespace) -> None:
     curve, header = jaxgran.read_curve(options.curve)
     header |= settings(options.set)
     gas = jaxgran.read_gas(header)
-    n = num_particles(header)
-    replicas = int(header_number(header, "replicas")) if "replicas" in header else 1
+    n = header_count(header, "N")
+    replicas = header_count(header, "replicas") or 1
     picture, record = outputs(options)
     free = tuple(PARAMETERS[key][0] for key in options.free)
     model, reasons = model_of(options, gas, curve, free, n)

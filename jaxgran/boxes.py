@@ -131,8 +131,20 @@ def reduced_start(
     return position.reshape(-1, gas.dimension), velocity.reshape(-1, gas.dimension)
 
 
-def settled_plan(model: Model, size: Callable[[], Any]) -> Any:
-    """The model's plan, or one that is sized now, if all that it depends on is known."""
+def settled_plan(model: Model, size: Callable[[], Any], **fixed: Any) -> Any:
+    """The model's plan, or one that is sized now, if all that it depends on is known.
+
+    Args:
+        model: the model, whose plan, if it has one, was made by its `sized_for`.
+        size: makes a plan.
+        fixed: what a plan fixes besides sizes, as the model and its gas have it now.
+    """
+    for name, value in fixed.items():
+        if model.plan is not None and getattr(model.plan, name) != value:
+            raise ValueError(
+                f"this {type(model).__name__} was sized for {name} = "
+                f"{getattr(model.plan, name)!r}, and now has {value!r}: call sized_for(gas) again"
+            )
     try:
         with jax.ensure_compile_time_eval():
             return model.plan or size()
@@ -180,6 +192,11 @@ def run(
         return kind.followed(kind.at_start(melted.position, velocity, melted.skin))
 
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs)):
+        if model.neighbours == "jax-md":
+            raise ValueError(
+                'inside jax.jit or jax.vmap pairs are found by vesin, not by neighbours="jax-md", '
+                "which sizes its cells from known numbers: leave neighbours out"
+            )
         state, records, fault = _traced(inputs, kind, plan, state, begun)
     else:
         # Under jax.grad every call of a compiled function would be traced again.

@@ -94,7 +94,10 @@ def _draw(bits: Array, scheme: Scheme) -> tuple[Array, Array, Array]:
     """Indices of the particles of the first pairs, and of the fresh ones of the second pairs.
 
     Labels carry no physics, so that evenly spread ones will do as long as any two particles are
-    equally likely to meet: particles a + s l for random a and s, the partners j places further on.
+    about equally likely to meet: particles a + s l for random a and s, the partners j places
+    further on. Each particle is drawn as often as any other. Pairs are, too, if N is prime; else
+    those whose distance shares a large divisor with N, one in a hundred at N = 1000, are up to 1.7
+    times as likely, and the likelihoods scatter by 6 % (14 % at N = 64).
     """
     n, first, second = scheme.num_particles, scheme.first, scheme.second
     strides = jnp.asarray(_strides(n))
@@ -105,8 +108,8 @@ def _draw(bits: Array, scheme: Scheme) -> tuple[Array, Array, Array]:
         return ((bits[2] % n + stride * place) % n).astype(jnp.int32)
 
     place = jnp.arange(first, dtype=jnp.uint32)
-    # Backwards, or the second partners of a stride would all stand at one distance.
-    fresh = jnp.arange(first + second - 1, first - 1, -1, dtype=jnp.uint32)
+    # The fresh ones stand between, also at a random distance.
+    fresh = first + bits[3] % (apart - (first + second) + 1) + jnp.arange(second, dtype=jnp.uint32)
     return particle(place), particle(place + apart), particle(fresh)
 
 

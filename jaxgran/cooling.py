@@ -6,10 +6,12 @@ from typing import Literal
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
+from jaxgran import kinetics
 from jaxgran.choice import Model, choose_model
 from jaxgran.curve import CoolingCurve
 from jaxgran.domain import checked_times
@@ -41,7 +43,8 @@ def cool(
 
     Raises:
         ValueError: for times that are negative, unsorted, not finite or not a list, a law that
-            heats the gas, or options of "auto" with another model.
+            heats the gas, contacts too soft for kinetic theory, or options of "auto" with another
+            model.
         RuntimeError: if the solver needs more steps than the model allows.
     """
     if not isinstance(gas, Gas):
@@ -58,8 +61,15 @@ def cool(
     # Contacts resolved in time cannot heat a gas; a law of restitution, or averages of it, can.
     if not isinstance(model, SoftSpheres):
         theory = model if isinstance(model, KineticTheory) else KineticTheory()
-        first_rate = _first_cooling_rate(gas, theory)
-        if not isinstance(first_rate, Tracer) and np.any(np.asarray(first_rate) < 0):
+        first_rate, softness = _at_start(gas, theory)
+        known = not isinstance(first_rate, Tracer)
+        if known and theory is model and theory.softness and np.any(np.asarray(softness) <= 0):
+            raise ValueError(
+                f"spheres overlap by {float(np.max(gas.mean_overlap)):.2g} diameters at T_0, where "
+                "the softness correction has no meaning; is youngs_modulus in Pa? If so use "
+                "SoftSpheres, or KineticTheory(softness=False)"
+            )
+        if known and np.any(np.asarray(first_rate) < 0):
             raise ValueError(
                 "the law of restitution makes this gas heat up: averaged over its impacts, eps is "
                 "above 1 (a truncated series beyond its range); lower T_0 or A, or use another law"
@@ -74,5 +84,8 @@ def cool(
 
 
 @eqx.filter_jit
-def _first_cooling_rate(gas: Gas, model: KineticTheory) -> jax.Array:
-    return model.cooling_rate(gas)
+def _at_start(gas: Gas, model: KineticTheory) -> tuple[jax.Array, jax.Array]:
+    """The first cooling rate, 1/s, and the factor by which soft contacts change it."""
+    at_start = jnp.ones_like(gas.temperature)
+    factor = kinetics.softness_factor(gas.reduced_law, at_start, gas.dimension)
+    return model.cooling_rate(gas), factor

@@ -256,7 +256,7 @@ def read_gas(header: dict[str, str]) -> Gas:
         mass=sphere_mass(values["diameter"], values["density"]),
         packing_fraction=values["eta"],
         temperature=values["T0"],
-        dimension=int(header_number(header, "dimension")) if "dimension" in header else 3,
+        dimension=header_count(header, "dimension") or 3,
     )
 
 
@@ -268,13 +268,13 @@ def header_number(header: dict[str, str], key: str) -> float:
         raise ValueError(f"header line {key}: {header[key]!r} is not a number") from None
 
 
-def num_particles(header: dict[str, str]) -> int | None:
-    """N of a curve's header, a positive whole number; None if it is not given."""
-    if "N" not in header:
+def header_count(header: dict[str, str], key: str) -> int | None:
+    """A positive whole number of a curve's header, such as N; None if it is not given."""
+    if key not in header:
         return None
-    number = header_number(header, "N")
+    number = header_number(header, key)
     if not (number >= 1 and number == int(number)):
-        raise ValueError(f"header line N: must be a positive whole number, got {header['N']!r}")
+        raise ValueError(f"header line {key}: must be a positive whole number, got {header[key]!r}")
     return int(number)
 
 

@@ -36,24 +36,31 @@ class Diagnosis(NamedTuple):
     correlation_factor: float
 
 
-def regime(gas: Gas, num_particles: int | None = None) -> tuple[list[str], list[str]]:
-    """What kinetic theory leaves out of this scene, in words: of the contacts, of the space.
+def regime(
+    gas: Gas, num_particles: int | None = None, model: str = "KineticTheory"
+) -> tuple[list[str], list[str]]:
+    """What a model leaves out of this scene, in words: of the contacts, of the space.
 
     Args:
         gas: the scene.
         num_particles: N, if known: tells the box.
+        model: the name of the model. Hard spheres leave out contacts only, soft spheres nothing.
     """
     contacts, space = [], []
+    if model == "SoftSpheres":
+        return contacts, space
     duration, overlap = float(gas.contact_fraction), float(gas.mean_overlap)
     if duration > CONTACT_LIMIT:
         contacts.append(
             f"contacts last {duration:.2g} of the mean free time, so spheres meet three at a time"
         )
     if overlap > OVERLAP_LIMIT:
-        contacts.append(
-            f"spheres overlap by {100 * overlap:.2g} % of a diameter, beyond the first-order "
-            "softness correction"
-        )
+        beyond = "which impacts of no duration leave out"
+        if model == "KineticTheory":
+            beyond = "beyond the first-order softness correction"
+        contacts.append(f"spheres overlap by {100 * overlap:.2g} % of a diameter, {beyond}")
+    if model == "HardSpheres":
+        return contacts, space
     limit = PACKING_LIMIT[gas.dimension]
     if float(gas.packing_fraction) > limit:
         space.append(
@@ -84,8 +91,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     correlation = _neighbour_correlation(residuals)
     factor = np.sqrt((1 + correlation) / (1 - correlation)) if correlation > 0 else 1.0
     reduced, p_value = float(result.reduced_chi2), float(result.p_value)
-    theory = result.model == "KineticTheory"
-    contacts, space = regime(result.gas, num_particles) if theory else ([], [])
+    contacts, space = regime(result.gas, num_particles, result.model)
     has_errors = not np.isnan(p_value)
     misfit = has_errors and p_value < SIGNIFICANCE
 
@@ -110,7 +116,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         reasons.append(f"far outliers at {at}: look at their error bars")
     reasons += contacts + space
     if not bool(result.converged):
-        reasons.append("the search did not converge: more max_steps or fewer free parameters")
+        reasons.append("the search stopped early: more max_steps or fewer free parameters")
     if result.simulation_error is not None:
         share = np.asarray(result.simulation_error / result.standard_error)
         reasons.append(
@@ -122,19 +128,19 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         reasons.append(f"this curve does not determine {' and '.join(group)}")
 
     explains = not misfit and not contacts and bool(result.converged)
-    if not theory:
-        name = words(result.model)
-        verdict = f"{name} explain this curve."
-        if not explains:
-            verdict = f"{name} do not explain this curve: do not trust their estimates."
+    name = words(result.model)
+    s = "" if name.endswith("spheres") else "s"
+    if not bool(result.converged):
+        verdict = "The search did not converge: do not trust its estimates."
     elif explains and not space:
-        verdict = "Kinetic theory explains this curve."
+        verdict = f"{name} explain{s} this curve."
     elif explains:
-        verdict = "Kinetic theory fits this curve, but the scene is at the edge of its reach."
+        verdict = f"{name} fit{s} this curve, but the scene is at the edge of what it holds for."
     else:
-        verdict = "Kinetic theory does not explain this curve: do not trust its estimates."
+        do, its = ("does", "its") if s else ("do", "their")
+        verdict = f"{name} {do} not explain this curve: do not trust {its} estimates."
         if not misfit and contacts:
-            verdict = "Kinetic theory cannot be trusted in this scene, though the curve fits."
+            verdict = f"{name} cannot be trusted in this scene, though the curve fits."
         if contacts:
             verdict += " This scene needs soft spheres, which resolve every contact in time."
         elif space:

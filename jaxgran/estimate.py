@@ -21,25 +21,28 @@ class Fit(eqx.Module):
     Attributes:
         names: the free parameters.
         model: the name of the model.
-        accuracy: of the model's clock, relative.
+        accuracy: relative, of kinetic theory's clock, or of a particle model's derivatives.
         estimate: their values, SI, shape (p,).
         standard_error: one standard deviation of each, SI, shape (p,): the measurement errors
             carried through, and a simulation's own noise; if the model does not explain the curve,
             times sqrt(reduced chi^2).
         model_error: by how much each would move if the model's clock were wrong by its known
-            accuracy, SI, shape (p,). Not part of `standard_error`.
+            accuracy, SI, shape (p,); 0 for a particle model, of which `jaxgran.diagnose` says in
+            words what it leaves out. Not part of `standard_error`.
         covariance: of the estimates, SI, shape (p, p), scaled alike.
         sensitivity: derivative of the weighted residuals in the parameters' free scale (their
             logarithm, for positive ones), shape (residuals, p).
         start: the values the search began with, SI, shape (p,).
         gas: the fitted gas.
-        curve: its cooling curve at the measured times.
+        curve: its cooling curve at the measured times; of a particle model, that of its last run,
+            one step before the estimate.
         residuals: (ln T_measured - ln T_model) over its error; 0 where a point carries no weight.
         displacement_residuals: the same of <dr^2>; None if it was not used.
         chi2, degrees_of_freedom, reduced_chi2, p_value: of the weighted residuals; p_value is nan
             if the curve carries no errors (then errors are scaled so that reduced chi^2 is 1).
         iterations: of the least-squares or quasi-Newton search; runs of a particle model.
-        converged: whether the search ended at its tolerance.
+        converged: whether the search ended at its tolerance; through a particle model, whether its
+            last step was under 0.1 in the parameters' free scale.
         simulation_error: the part of `standard_error` that is a particle model's own noise, by its
             replicas, shape (p,); None for kinetic theory, which has none.
     """
@@ -78,9 +81,11 @@ class Fit(eqx.Module):
         Some change of them together must be left open by more than a factor e, or alter the curve
         less than the model's `accuracy` times as much as the best determined change does.
         """
+        known = not bool(jnp.isnan(self.p_value))
+        error = 1.0 if known else float(self.reduced_chi2) ** 0.5
         _, singular, rotation = jnp.linalg.svd(self.sensitivity, full_matrices=False)
         apart = float(singular[-1]) >= self.accuracy * float(singular[0])
-        if float(singular[-1]) > 1.0 and apart:
+        if float(singular[-1]) > error and apart:
             return ()
         share = [abs(float(x)) for x in rotation[-1]]
         sized = [n for n in self.names for _ in range(self.gas.value(n).size)]

@@ -58,17 +58,19 @@ def fit(
         free: names of floats of the gas or its law, such as "temperature" (which is T_0).
         start: begin at the values of this gas, unless those from the data fit better.
         num_particles: over how many particles <dr^2> is a mean; gives its error,
-            ``sqrt(2 / (d N))``, where the curve has none; without either <dr^2> is not used.
+            ``sqrt(2 / (d N))``, where the curve has none; without either <dr^2> is not used, nor
+            where T has no errors beside which to weigh it, nor by particle models.
         method: Levenberg-Marquardt of optimistix, or the quasi-Newton of optax by reverse mode
             (kinetic theory only).
-        max_steps: the most iterations, 100 by default; the most runs of a particle model, 8.
+        max_steps: the most iterations, >= 1, 100 by default; the most runs of a particle model, 8.
 
     Returns:
         `Fit`; `jaxgran.diagnose` says in words what it means.
 
     Raises:
         ValueError: for an unknown parameter or method, a curve that cannot be one (see
-            `CoolingCurve.check`), or fewer points than parameters.
+            `CoolingCurve.check`), no more points with a weight than parameters, or a particle model
+            that keeps a checkpoint.
         RuntimeError: if the model cannot compute the curve where the search ends. Under `jax.vmap`,
             where nothing can be raised, chi2 and the errors of that fit are nan, `converged` is
             False and `curve.status` tells why.
@@ -80,9 +82,16 @@ def fit(
         gas.value(name)
     if method not in ("levenberg-marquardt", "lbfgs"):
         raise ValueError(f'method must be "levenberg-marquardt" or "lbfgs", got {method!r}')
-    if curve.times.shape[-1] <= len(free):
+    for name, number in (("max_steps", max_steps), ("num_particles", num_particles)):
+        if number is not None and not (isinstance(number, int | np.integer) and number >= 1):
+            raise ValueError(f"{name} must be a whole number >= 1, or None, got {number!r}")
+    size, points = sum(gas.value(name).size for name in free), curve.times.shape[-1]
+    if curve.temperature_error is not None and not isinstance(curve.temperature_error, Tracer):
+        points = int(np.sum(np.asarray(curve.temperature_error) > 0))
+    if points <= size:
         raise ValueError(
-            f"{curve.times.shape[-1]} points cannot fix {len(free)} parameters; free fewer of them"
+            f"{points} points (those with an error of 0 not counted) cannot fix {size} parameters; "
+            "free fewer of them"
         )
     model = KineticTheory() if model is None else model
     if isinstance(model, str):
@@ -92,10 +101,11 @@ def fit(
         )
     if isinstance(model, KineticTheory):
         starts = [start_from_data(gas, curve, free)] + ([] if start is None else [start])
-        max_steps = max_steps or 100
-        result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, max_steps)
+        steps = 100 if max_steps is None else max_steps
+        result = _fit(gas, curve, model, tuple(free), starts, num_particles, method, steps)
     else:
-        result = _fit_by_simulation(gas, curve, model, tuple(free), start, method, max_steps or 8)
+        steps = 8 if max_steps is None else max_steps
+        result = _fit_by_simulation(gas, curve, model, tuple(free), start, method, steps)
     if not isinstance(result.chi2, Tracer):
         _check_computed(result)
         if result.chi2.dtype == jnp.float32:
@@ -276,6 +286,11 @@ def _fit_by_simulation(
         )
     if isinstance(model, SoftSpheres) and model.projection is None:
         raise ValueError("a fit needs projected derivatives: give SoftSpheres a projection")
+    if model.checkpoint is not None:
+        raise ValueError(
+            f"a fit makes many runs and a checkpoint is of one: {type(model).__name__} must have "
+            f"checkpoint=None here, got {str(model.checkpoint)!r}"
+        )
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, curve, start))):
         raise ValueError(
             "a fit through particles cannot run inside jax.jit or jax.vmap: fit one curve at a time"
@@ -283,6 +298,12 @@ def _fit_by_simulation(
     start = _kinetic_start(gas, curve, names) if start is None else start
     parameters = Parameters(gas, names)
     first, estimates = parameters.flat(start), parameters.estimates
+    if not np.all(np.isfinite(first)):
+        at = ", ".join(f"{name} = {start.value(name)}" for name in names)
+        raise ValueError(
+            f"a fit cannot start at {at}: positive parameters are fitted in their logarithm; give "
+            "a start inside their ranges, or leave it out"
+        )
     key = jax.random.key(0) if model.key is None else model.key
 
     def simulate(flat, run):
@@ -308,7 +329,7 @@ def _fit_by_simulation(
     chance = misfit(found.residuals, degrees_of_freedom, errors_known=errors_known)
     scale = jax.jacfwd(estimates)(flat)
     noise = scale @ found.noise_covariance @ scale.T
-    covariance = chance.inflation * (scale @ found.error_covariance @ scale.T + noise)
+    covariance = chance.inflation * (scale @ found.error_covariance @ scale.T) + noise
     return Fit(
         names=names,
         model=type(model).__name__,

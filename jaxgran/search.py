@@ -23,8 +23,8 @@ NEAR = 0.1
 QUIET = 0.5
 """A search through simulations ends when their noise is so much of the standard error."""
 
-AT_REST = 1e-4
-"""Standard errors that a least-squares answer may be from where its next step would lead."""
+AT_REST = 0.01
+"""Standard errors to go at which a least-squares search takes its last step."""
 
 NOISE_WINDOW = 9
 """Neighbouring times over which the variance between replicas is averaged."""
@@ -36,24 +36,27 @@ Found = tuple[Float[Array, "p"], Int[Array, ""], Bool[Array, ""]]
 def at_rest(residuals: Float[Array, "n"], jacobian: Float[Array, "n p"]) -> Bool[Array, ""]:
     """Whether the Gauss-Newton step from here is nothing beside the standard errors.
 
-    In standard errors, the step's parts along the singular vectors of the Jacobian are those of the
-    residuals along the left ones, over the residuals' scatter.
+    In standard errors, as the scatter of the residuals tells them, the step's parts along the
+    singular vectors of the Jacobian are those of the residuals along the left ones. Changes that
+    alter the residuals by round-off only do not count.
     """
-    left, *_ = jnp.linalg.svd(jacobian, full_matrices=False)
-    return jnp.max(jnp.abs(residuals @ left)) < AT_REST * jnp.sqrt(jnp.mean(residuals**2))
+    left, singular, _ = jnp.linalg.svd(jacobian, full_matrices=False)
+    known = singular > jnp.finfo(singular.dtype).eps ** 0.5 * singular[0]
+    step = jnp.max(jnp.where(known, jnp.abs(residuals @ left), 0.0))
+    return step < AT_REST * jnp.sqrt(jnp.mean(residuals**2))
 
 
 class _TrustRegion(optx.ClassicalTrustRegion):
-    """Whose steps are taken where the search is at rest.
+    """That ends a search where it is at rest: there the next step is taken, and the one after is 0.
 
-    There they raise the sum by round-off as often as not; refused, the search would go on in vain.
+    Steps there raise the sum by round-off as often as not; refused, the search would go on in vain.
     """
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
         step_size, accept, *rest = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
         assert isinstance(f_info, optx.FunctionInfo.ResidualJac)
-        accept |= at_rest(f_info.residual, f_info.jac.as_matrix())
-        return step_size, accept, *rest
+        ended = at_rest(f_info.residual, f_info.jac.as_matrix())
+        return jnp.where(ended, 0.0, step_size), accept | ended, *rest
 
 
 def least_squares(residuals: Residuals, first: Float[Array, "p"], max_steps: int) -> Found:

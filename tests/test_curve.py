@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
-from jaxgran.curve import num_particles
+from jaxgran.curve import header_count
 
 DATA = Path(__file__).parent.parent / "experiments" / "data"
 HEADER = "# eta: 0.05\n# diameter: 0.002\n# density: 2500\n# Y: 5e7\n# nu: 0.22\n# T0: 0.01\n"
@@ -26,7 +26,7 @@ def write(tmp_path):
 def test_measured_curves_are_read():
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     assert curve.times.shape == curve.temperature.shape == curve.displacement.shape == (61,)  # pyright: ignore
-    assert header["N"] == "4000" and num_particles(header) == 4000
+    assert header["N"] == "4000" and header_count(header, "N") == 4000
     gas = jaxgran.read_gas(header)
     assert float(gas.packing_fraction) == 0.05
     assert float(gas.value("dissipative_constant")) == 0.0  # A is for the fit to find
@@ -109,6 +109,7 @@ def test_missing_files_are_refused(tmp_path):
         ({"density": "0"}, "density must lie in"),
         ({"T0": "-3"}, "temperature must lie in"),
         ({"dimension": "4"}, "dimension must be 2 or 3"),
+        ({"dimension": "2.9"}, "dimension: must be a positive whole number, got '2.9'"),
     ],
 )
 def test_bad_headers_are_refused(change, message):
@@ -128,7 +129,7 @@ def test_bad_headers_are_refused(change, message):
 @pytest.mark.parametrize("n", ["0", "-5", "3.5", "many"])
 def test_bad_particle_numbers_are_refused(n):
     with pytest.raises(ValueError, match="header line N"):
-        num_particles({"N": n})
+        header_count({"N": n}, "N")
 
 
 number = st.floats(allow_nan=True, allow_infinity=True) | st.floats(1e-6, 1e6)

@@ -111,6 +111,16 @@ def test_errors_from_the_scatter():
     assert "no errors" in jaxgran.diagnose(without, bare).reasons[0]
 
 
+def test_a_short_curve_without_errors_determines_what_its_scatter_lets_it():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(6), relative_error=0.003, num_points=10)
+    early = curve.times < 5 * gas.mean_free_time
+    bare = jaxgran.CoolingCurve(times=curve.times[early], temperature=curve.temperature[early])
+    result = jaxgran.fit(gas, bare)
+    a, error = result.value("dissipative_constant")
+    assert 0 < error < 0.2 * a and result.undetermined() == ()
+
+
 def test_displacement_adds_information():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(6), relative_error=0.2, displacement=True)
@@ -185,6 +195,8 @@ def test_float32_warns():
         ({"free": "temperature"}, "free must be a tuple"),
         ({"free": ("temperature", "temperature")}, "different names"),
         ({"method": "simplex"}, 'method must be "levenberg-marquardt" or "lbfgs"'),
+        ({"max_steps": 0}, "max_steps must be a whole number >= 1, or None, got 0"),
+        ({"num_particles": -5}, "num_particles must be a whole number >= 1, or None, got -5"),
     ],
 )
 def test_bad_requests_are_refused(options, message):
@@ -196,8 +208,15 @@ def test_bad_requests_are_refused(options, message):
 def test_too_few_points_are_refused():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(0), num_points=3)
-    with pytest.raises(ValueError, match="3 points cannot fix 3 parameters; free fewer"):
+    with pytest.raises(ValueError, match="3 points .* cannot fix 3 parameters; free fewer"):
         jaxgran.fit(gas, curve, free=("dissipative_constant", "temperature", "packing_fraction"))
+    prepared = jaxgran.CoolingCurve(
+        times=curve.times.at[0].set(0.0),
+        temperature=curve.temperature,
+        temperature_error=curve.temperature_error.at[0].set(0.0),
+    )
+    with pytest.raises(ValueError, match="2 points .* cannot fix 2 parameters"):
+        jaxgran.fit(gas, prepared, free=("dissipative_constant", "temperature"))
     with pytest.raises(ValueError, match="was not free; free were dissipative_constant"):
         jaxgran.fit(gas, curve).value("temperature")
 
@@ -227,6 +246,15 @@ def test_dilute_measured_curve(free):
         assert diagnosis.verdict == "Kinetic theory explains this curve."
 
 
+def test_a_search_that_was_cut_short_is_said_to_be():
+    gas, curve, *_ = measured("dilute")
+    result = jaxgran.fit(gas, curve, max_steps=1)
+    assert not bool(result.converged)
+    diagnosis = jaxgran.diagnose(result, curve)
+    assert not diagnosis.explains and "did not converge" in diagnosis.verdict
+    assert any("more max_steps" in reason for reason in diagnosis.reasons)
+
+
 def test_dense_measured_curve_is_not_explained():
     gas, curve, a_true, n, _ = measured("dense")
     result = jaxgran.fit(gas, curve)
@@ -242,6 +270,17 @@ def test_dense_measured_curve_is_not_explained():
 
 def test_regime_of_a_good_scene_is_empty():
     assert regime(glass_beads(0.09), 4000) == ([], [])
+
+
+def test_every_model_has_its_regime():
+    gas, _, a, n, _ = measured("dense")
+    gas = gas.replace(dissipative_constant=a)
+    contacts, space = regime(gas, n)
+    assert len(contacts) == 2 and space and "softness correction" in contacts[1]
+    for model, of_space in (("DSMC", space), ("HardSpheres", [])):
+        found, rest = regime(gas, n, model)
+        assert rest == of_space and len(found) == 2 and "no duration" in found[1]
+    assert regime(gas, n, "SoftSpheres") == ([], [])
 
 
 def test_wrong_error_bars_widen_the_error():
@@ -299,6 +338,11 @@ def test_fit_through_particles_refuses_what_it_cannot_do(beads):
         jaxgran.fit(gas, curve, model=jaxgran.SoftSpheres(100, replicas=2, projection=None))
     with pytest.raises(ValueError, match="least squares"):
         jaxgran.fit(gas, curve, model=jaxgran.SoftSpheres(100, replicas=2), method="lbfgs")
+    with pytest.raises(ValueError, match="checkpoint=None here, got 'run.npz'"):
+        jaxgran.fit(gas, curve, model=jaxgran.DSMC(100, replicas=2, checkpoint="run.npz"))
+    still = gas.replace(dissipative_constant=0.0)
+    with pytest.raises(ValueError, match="cannot start at dissipative_constant = 0.0"):
+        jaxgran.fit(gas, curve, model=jaxgran.DSMC(100, replicas=2), start=still)
     with pytest.raises(ValueError, match="one curve at a time"):
         jax.jit(lambda g: jaxgran.fit(g, curve, model=jaxgran.SoftSpheres(9, replicas=2)).chi2)(gas)
 

@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -347,6 +348,9 @@ def test_refuses_what_it_cannot_do():
     ):
         with pytest.raises(ValueError, match=message):
             HardSpheres(**settings)
+    more = dataclasses.replace(quiet(100).sized_for(gas), replicas=3)
+    with pytest.raises(ValueError, match="sized for replicas = 1, and now has 3"):
+        jaxgran.cool(gas, [1.0], model=more)
     with pytest.raises(ValueError, match="use more particles"):
         jaxgran.cool(gas.replace(packing_fraction=0.3), [1.0], model=quiet(4))
     with pytest.raises(ValueError, match="too dense for a fluid"):

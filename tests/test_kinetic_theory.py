@@ -189,6 +189,14 @@ def test_a_law_that_heats_is_refused(beads):
         jaxgran.cool(beads(0.71), [1.0], model=paper)
 
 
+def test_a_gas_as_soft_as_air_is_refused(beads):
+    gas = beads(0.1)
+    gas = gas.replace(youngs_modulus=1e-9 * gas.value("youngs_modulus"))  # GPa taken for Pa
+    with pytest.raises(ValueError, match="is youngs_modulus in Pa"):
+        jaxgran.cool(gas, [1.0])
+    assert jaxgran.cool(gas, [1.0], model=KineticTheory(softness=False)).temperature[0] > 0
+
+
 def test_bad_options_are_refused(beads):
     with pytest.raises(ValueError, match='averages must be "exact" or "paper", got \'printed\''):
         jaxgran.KineticTheory(averages="printed")

@@ -54,7 +54,7 @@ def search(simulate, measured, first=(0.0, 0.0), max_runs=8, **settings):
     )
 
 
-@pytest.mark.parametrize("off, expected", [(0.0, True), (1e-5, True), (1e-3, False), (1.0, False)])
+@pytest.mark.parametrize("off, expected", [(0.0, True), (1e-3, True), (0.1, False), (1.0, False)])
 def test_rest_is_told_in_standard_errors(off, expected):
     rng = np.random.default_rng(0)
     for scale in (1.0, 1e-6):  # of a parameter beside the other
@@ -67,12 +67,12 @@ def test_rest_is_told_in_standard_errors(off, expected):
 
 
 def test_least_squares_end_in_rough_sums():
-    # Sums of squares as an adaptive solver makes them: rough by 1e-8, which no derivative knows.
+    # Residuals of curves by an adaptive solver over small errors: rough, as no derivative knows.
     def found(key):
         noise = 0.01 * jax.random.normal(key, TIMES.shape)
 
         def residuals(flat):
-            rough = 1e-8 * jnp.sin(1e13 * jax.lax.stop_gradient(flat[0]) + jnp.arange(TIMES.size))
+            rough = 1e-6 * jnp.sin(1e13 * jax.lax.stop_gradient(flat[0]) + jnp.arange(TIMES.size))
             return (exact(jnp.asarray(TRUTH)) + noise - exact(flat)) / 0.01 + rough
 
         return least_squares(residuals, jnp.zeros(2), 100)

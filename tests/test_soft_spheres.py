@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -328,6 +329,23 @@ def test_single_precision(beads):
     np.testing.assert_allclose(coarse.temperature, fine.temperature, rtol=1e-3)
 
 
+def test_a_plan_is_of_its_model_and_law(beads):
+    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
+    sized = quiet(100).sized_for(gas)
+    law = jaxgran.Viscoelastic(5e7, 0.2, 3e-6, clipped=not sized.plan.clipped)
+    clipped = dataclasses.replace(gas, law=law)
+    for model, scene, name in (
+        (dataclasses.replace(sized, steps_per_contact=80), gas, "steps_per_contact"),
+        (dataclasses.replace(sized, replicas=2), gas, "replicas"),
+        (sized, clipped, "clipped"),
+    ):
+        with pytest.raises(ValueError, match=f"sized for {name} = .* sized_for.gas. again"):
+            jaxgran.cool(scene, [1.0], model=model)
+    elsewhere = dataclasses.replace(sized, neighbours="jax-md")
+    with pytest.raises(ValueError, match="leave neighbours out"):
+        jax.jit(lambda t: jaxgran.cool(gas, t, model=elsewhere).temperature)(jnp.array([1e-3]))
+
+
 def test_refuses_what_it_cannot_do(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     for settings, message in (
@@ -336,6 +354,7 @@ def test_refuses_what_it_cannot_do(beads):
         ({"num_particles": 10, "steps_per_contact": 5}, "steps_per_contact"),
         ({"num_particles": 10, "replicas": 0}, "replicas"),
         ({"num_particles": 10, "neighbours": "best"}, "neighbours must be one of"),
+        ({"num_particles": 10, "projection": 0.0}, "projection must be a number"),
     ):
         with pytest.raises(ValueError, match=message):
             SoftSpheres(**settings)

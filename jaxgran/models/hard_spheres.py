@@ -52,7 +52,8 @@ class HardSpheres(eqx.Module):
         key: of the random start; `jax.random.key(0)` by default.
         start: positions and velocities to begin with instead of random ones; their box must be
             that of the gas, and no spheres may overlap.
-        neighbours: "vesin" (host), "jax-md" (device), or "auto" for the faster one here.
+        neighbours: "vesin" (host), "jax-md" (device), or "auto" for the faster one here; inside
+            `jax.jit` it is vesin.
         progress: show a progress bar on a terminal.
         checkpoint: a file to save the run to each minute and to resume it from. The resumed run
             gives the same numbers bit for bit.
@@ -168,7 +169,7 @@ class HardSpheres(eqx.Module):
     def _run(self, inputs: Inputs, dimension: int, directions: ReducedLaw | None = None) -> Outputs:
         """Melt, then cool; and with it the tangents along directions in the law."""
         scene, replicas = inputs.scene, self.replicas
-        plan = boxes.settled_plan(self, lambda: self._sized(scene, dimension))
+        plan = boxes.settled_plan(self, lambda: self._sized(scene, dimension), replicas=replicas)
 
         def followed(state: State) -> State:
             if directions is None:

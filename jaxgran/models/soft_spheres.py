@@ -1,6 +1,7 @@
 """Soft spheres: every contact resolved in time, in a periodic box."""
 
 import dataclasses
+import math
 from functools import partial
 from pathlib import Path
 
@@ -31,8 +32,8 @@ class SoftSpheres(eqx.Module):
 
     ``m dv_i/dt = sum_j n_ij F(xi_ij, xi_dot_ij)`` with the force of `jaxgran.contact_force`,
     by drift-kick-drift steps whose kick is an implicit midpoint rule solved in closed form.
-    Second order in the step: at 40 steps a contact eps is good to 2e-5 on average, with a scatter
-    of 1e-4 that comes from the square root at first touch and falls as dt^(3/2).
+    Second order in the step: at 40 steps a contact eps is good to 3e-5 on average, with a scatter
+    of 2e-4 that comes from the square root at first touch and falls as dt^(3/2).
 
     The gas starts from random positions and Maxwellian velocities of exactly T_0 and no momentum,
     after an elastic melt of 10 mean free times. Steps lengthen as it cools.
@@ -44,13 +45,14 @@ class SoftSpheres(eqx.Module):
         key: of the random start; `jax.random.key(0)` by default.
         start: positions and velocities to begin with instead of random ones; their box must be
             that of the gas.
-        neighbours: "vesin" (host), "jax-md" (device), or "auto" for the faster one here.
+        neighbours: "vesin" (host), "jax-md" (device), or "auto" for the faster one here; inside
+            `jax.jit` it is vesin.
         progress: show a progress bar on a terminal.
         checkpoint: a file to save the run to each minute and to resume it from. The resumed run
             gives the same numbers bit for bit.
-        projection: mean free times between thermal projections of a derivative, 0.02 to 0.5 (see
-            `jaxgran.tangents`); None for the plain derivative, which is exact, and useless after
-            3 to 5 collisions a particle.
+        projection: mean free times between thermal projections of a derivative, > 0; from 0.02 to
+            0.5 they agree (see `jaxgran.tangents`). None for the plain derivative, which is exact,
+            and useless after 3 to 5 collisions a particle.
         plan: sizes of arrays, see `sized_for`.
 
     Derivatives of T, collisions, <dr^2> and the energies are taken in every float of the gas,
@@ -79,6 +81,11 @@ class SoftSpheres(eqx.Module):
 
     def __check_init__(self):
         boxes.check_counts(self, steps_per_contact=10)
+        if self.projection is not None and not 0 < self.projection < math.inf:
+            raise ValueError(
+                f"projection must be a number of mean free times > 0, got {self.projection!r}; "
+                f"take {PROJECTION}, or None for the plain derivative"
+            )
 
     @property
     def accuracy(self) -> float:
@@ -176,7 +183,13 @@ class SoftSpheres(eqx.Module):
             elastic=lambda scene: scene._replace(dissipative_constant=0.0 * scene.alpha),
             followed=followed,
         )
-        plan = boxes.settled_plan(self, lambda: self._sized(scene, dimension, clipped))
+        plan = boxes.settled_plan(
+            self,
+            lambda: self._sized(scene, dimension, clipped),
+            replicas=replicas,
+            steps_per_contact=self.steps_per_contact,
+            clipped=clipped,
+        )
         skin, settings = self._skin(scene, dimension), (self.steps_per_contact,)
         return boxes.run(self, inputs, kind, plan, skin, dimension, settings)
 
