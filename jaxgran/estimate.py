@@ -24,8 +24,8 @@ class Fit(eqx.Module):
         accuracy: relative, of kinetic theory's clock, or of a particle model's derivatives.
         estimate: their values, SI, shape (p,).
         standard_error: one standard deviation of each, SI, shape (p,): the measurement errors
-            carried through, and a simulation's own noise; if the model does not explain the curve,
-            times sqrt(reduced chi^2).
+            carried through, times sqrt(reduced chi^2) if the model does not explain the curve or
+            the curve has no errors; and a simulation's own noise.
         model_error: by how much each would move if the model's clock were wrong by its known
             accuracy, SI, shape (p,); 0 for a particle model, of which `jaxgran.diagnose` says in
             words what it leaves out. Not part of `standard_error`.

@@ -136,8 +136,9 @@ def by_simulation(
 
     Every run has random numbers of its own, and those that began near its end say independently
     where the end is: the answer is their mean. Residuals are weighted by the measured error and the
-    noise of the mean; that noise is told by what the replicas, one by one, would have moved the
-    answer by. The search goes on until it adds little to the measured error.
+    noise of the mean, alike if no error is known; that noise is told by what the replicas, one by
+    one, would have moved the answer by. The search goes on until it adds little to the measured
+    error.
 
     A derivative that is wrong by some per cent slows the search and tilts the error bar by as much,
     but does not move the end, which is where the residuals say.
@@ -171,7 +172,7 @@ def by_simulation(
             runs.append(_Run(flat, value, slope, each - each.mean(axis=0)))
             near = [run for run in runs if np.abs(run.flat - flat).max() < NEAR]
             noise = np.sqrt(np.mean([_variance(run.deviation) for run in near], axis=0) / len(near))
-            sigma = np.hypot(error, noise)
+            sigma = np.hypot(error, noise) if known else np.ones_like(error)
             ends, scatter = [], []
             for run in near:
                 sensitivity = run.slope / sigma[:, None]

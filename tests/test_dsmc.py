@@ -11,6 +11,7 @@ from jaxgran import collisions, simulation
 from jaxgran.collisions import Scheme
 from jaxgran.models import dsmc
 from jaxgran.models.dsmc import DSMC
+from tests.conftest import glass_beads
 
 # Hard spheres: kinetic theory without the correction for soft contacts.
 THEORY = jaxgran.KineticTheory(softness=False)
@@ -37,20 +38,24 @@ def constant(eps, dimension=3) -> jaxgran.Gas:
     )
 
 
-def compare_with_theory(gas, n, t_tolerance, **settings):
-    taus = np.concatenate([[1.0, 10.0], np.arange(20.0, 101.0, 2.0)])
-    times = taus * float(gas.mean_free_time)
-    theory, curve = (jaxgran.cool(gas, times, model=m) for m in (THEORY, quiet(n, **settings)))
-    assert np.all(np.abs(curve.temperature / theory.temperature - 1) < t_tolerance)
+TAUS = np.concatenate([[1.0, 10.0], np.arange(20.0, 101.0, 2.0)])
+
+
+def theory_and_dsmc(gas, n, **settings):
+    times = TAUS * float(gas.mean_free_time)
+    return tuple(jaxgran.cool(gas, times, model=m) for m in (THEORY, quiet(n, **settings)))
+
+
+def compare_all_but_temperature(theory, curve, n, tolerance):
     # Elastic D is 1.8 % (2D 2.4 %) above the first Sonine order, less with dissipation.
     excess = np.asarray(curve.displacement / theory.displacement - 1)
     assert np.all(np.abs(excess - 0.005) < 0.015 + 3 * MSD_SCATTER / n**0.5)
     # a_2 forgets in some 2.5 mean free times: the mean over 80 errs by 1/4 of one value.
-    late = taus >= 20
+    late = TAUS >= 20
     a2, expected = np.mean(curve.sonine[late]), np.mean(theory.sonine[late])
     assert abs(a2 - expected) < 0.15 * abs(expected) + 2 * SONINE_SCATTER / n**0.5 / 4
     # Collisions in the gas's own clock: as good as ln T.
-    assert np.all(np.abs(curve.collisions / theory.collisions - 1)[1:] < t_tolerance)
+    assert np.all(np.abs(curve.collisions / theory.collisions - 1)[1:] < tolerance)
 
 
 SCENES = [(0.05, 3), (0.15, 3), (0.15, 2)]
@@ -59,18 +64,36 @@ SCENES = [(0.05, 3), (0.15, 3), (0.15, 2)]
 @pytest.mark.parametrize("beta, dimension", SCENES)
 def test_cools_and_spreads_as_kinetic_theory_says(beads, beta, dimension):
     n = 20_000
-    compare_with_theory(beads(beta, dimension), n, 0.002 + 3 * T_SCATTER / n**0.5)
+    theory, curve = theory_and_dsmc(beads(beta, dimension), n)
+    tolerance = 0.002 + 3 * T_SCATTER / n**0.5
+    assert np.all(np.abs(curve.temperature / theory.temperature - 1) < tolerance)
+    compare_all_but_temperature(theory, curve, n, tolerance)
+
+
+@pytest.fixture(scope="module", params=SCENES, ids=str)
+def million(request):
+    return request.param, theory_and_dsmc(glass_beads(*request.param), 10**6, replicas=12)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("beta, dimension", SCENES)
-def test_a_million_particles_cool_as_kinetic_theory_says(beads, beta, dimension):
-    # Within .2 % as twelve replicas tell it, whose mean scatters by .016 %. In 2D all of it is
-    # needed: theory, which neglects a_3, is .21 +- .01 % low after 50 to 100 mean free times, by
-    # 16 replicas at steps of .05 and 12 of .02.
-    n, replicas = 10**6, 12
-    error = T_SCATTER / (n * replicas) ** 0.5
-    compare_with_theory(beads(beta, dimension), n, 0.002 + 2 * error, replicas=replicas)
+def test_a_million_particles_cool_as_kinetic_theory_says(million, request):
+    (beta, dimension), (theory, curve) = million
+    if dimension == 2:
+        reason = "theory without a_3 is .2 % low after 50 to 100 mean free times, whatever the step"
+        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+    off = np.asarray(curve.temperature / theory.temperature - 1)
+    error = np.asarray(curve.temperature_error / curve.temperature)
+    for tau in (10.0, 50.0, 100.0):
+        at = tau == TAUS
+        print(f"\nbeta {beta}, {dimension}D, {tau:g} mean free times: T over theory", end=" ")
+        print(f"{100 * off[at].item():+.3f} +- {100 * error[at].item():.3f} %", end="")
+    print(f"; at most {100 * np.abs(off).max():.3f} %")
+    assert np.all(np.abs(off) < 0.002)
+
+
+@pytest.mark.slow
+def test_a_million_particles_spread_as_kinetic_theory_says(million):
+    compare_all_but_temperature(*million[1], 10**6, 0.002)
 
 
 # Tables of stochastic simulation, with their errors.

@@ -7,7 +7,7 @@ import pytest
 
 import jaxgran
 from jaxgran.diagnosis import regime
-from jaxgran.fitting import start_from_data
+from jaxgran.start import start_from_data
 
 from .conftest import glass_beads
 from .test_curve import DATA
@@ -326,6 +326,19 @@ def test_fit_through_dsmc_agrees_with_kinetic_theory(beads):
     assert error < 0.02 * true
     assert 0 < result.simulation_error[0] < error
     assert "DSMC" in jaxgran.diagnose(result, curve).verdict
+
+
+@pytest.mark.slow
+def test_noise_of_a_simulation_is_counted_once_without_error_bars(beads):
+    # Measured with a scatter of 3 %, simulated with a noise of 1 %: told the scatter, or left to
+    # find it in the residuals, the same error, to the 11 % that 40 points tell it and as much again
+    # that the weights differ by (and three times the noise if it were inflated).
+    gas = beads(0.15)
+    curve = synthetic(gas, jax.random.key(13), relative_error=0.03)
+    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature)
+    model = jaxgran.DSMC(1000, replicas=3, progress=False)
+    told, left = (jaxgran.fit(gas, c, model=model, max_steps=6) for c in (curve, bare))
+    np.testing.assert_allclose(left.standard_error, told.standard_error, rtol=0.35)
 
 
 def test_fit_through_particles_refuses_what_it_cannot_do(beads):
