@@ -13,7 +13,7 @@ FLOORS = [
     ["gas", "tangents"],
     ["kinetics", "closed_forms", "curve", "collisions", "room"],
     ["boxes", "estimate"],
-    ["blocks", "impacts", "search"],
+    ["blocks", "impacts", "search", "start"],
     ["events"],
     ["models.kinetic_theory", "models.dsmc", "models.hard_spheres", "models.soft_spheres"],
     ["choice"],
