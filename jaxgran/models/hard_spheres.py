@@ -135,7 +135,7 @@ class HardSpheres(eqx.Module):
     def _skin(self, scene: Scene, d: int) -> Array:
         return skin_with(PAIRS_PER_PARTICLE, self.num_particles, scene.side, d)
 
-    def sized_for(self, gas: Gas, spare: float = 1.4) -> "HardSpheres":
+    def sized_for(self, gas: Gas, spare: float = 2.0) -> "HardSpheres":
         """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
 
         Outside of jit they follow from the gas and grow where they must. Inside, they are fixed,
@@ -148,7 +148,7 @@ class HardSpheres(eqx.Module):
         scene = reduced_scene(gas, self.num_particles, self.contact_time)
         return dataclasses.replace(self, plan=self._sized(scene, gas.dimension, spare))
 
-    def _sized(self, scene: Scene, d: int, spare: float = 1.4) -> Plan:
+    def _sized(self, scene: Scene, d: int, spare: float = 1.15) -> Plan:
         n = self.replicas * self.num_particles
         share = max(WINDOW_SHARE, 2 * events.LEAST_IMPACTS / n)
         inside = float(pairs_in_contact(self.num_particles, scene.side, d))
@@ -156,14 +156,14 @@ class HardSpheres(eqx.Module):
         fastest = events.SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         reach = 2 * fastest * share / float(scene.collision_frequency)
         at_contact = contact_value(scene.collision_frequency, inside, d)
-        # As measured, here and below; a list changes its length little, windows differ more.
-        reachable = min(0.9 * at_contact * inside * ((1 + reach) ** d - 1), listed)
-        factors = (3.7, 2.0) if reachable == listed else (1.3, 1.8)
-        chosen, members = (min(factor * share, listed) for factor in factors)
-        counts = [n * number for number in (listed / 1.3, reachable, chosen, members)]
-        rooms = [int(spare * count + 5 * count**0.5) + 64 for count in counts]
-        rooms[1:3] = [max(rows, min(rooms[0], 512)) for rows in rooms[1:3]]  # spare small runs
-        room = Room(*rooms[:3], members=min(max(rooms[3], 512), n))
+        # As measured in gases of phi = .001 to .4 (disks: to .6), N = 125 to 50 000.
+        packed = 0.9 + 0.45 * inside / 2 ** (d - 1)
+        reachable = min(packed * at_contact * inside * ((1 + reach) ** d - 1), listed)
+        chosen = min((0.65 + 0.35 * reachable) * share, listed)
+        counts = [n * number for number in (listed, reachable, chosen, 1.25 * share)]
+        spares = spare**0.5, spare, spare, spare  # of all, pairs listed vary least
+        rooms = [int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)]
+        room = Room(*rooms[:3], members=min(rooms[3], n))
         return Plan(self.replicas, share, room)
 
     def _run(self, inputs: Inputs, dimension: int, directions: ReducedLaw | None = None) -> Outputs:
