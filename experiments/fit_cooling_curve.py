@@ -200,11 +200,12 @@ def model_of(options: argparse.Namespace, gas, curve, free, num_particles: int |
         warnings.simplefilter("ignore", UserWarning)  # said of the last fit by the diagnosis
         first = jaxgran.fit(gas, curve, free=free)
     choice = jaxgran.choose_model(
-        first.gas, curve.times, options.tolerance, size, replicas=options.replicas
+        first.gas, curve.times, options.tolerance, num_particles or size, replicas=options.replicas
     )
     if isinstance(choice.model, jaxgran.KineticTheory):
         return choice.model, choice.reasons
-    return dataclasses.replace(choice.model, key=key), choice.reasons
+    followed = options.particles or choice.model.num_particles  # the box is that of the file's N
+    return dataclasses.replace(choice.model, key=key, num_particles=followed), choice.reasons
 
 
 def settings(pairs: list[str]) -> dict[str, str]:

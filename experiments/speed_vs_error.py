@@ -68,10 +68,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results") / "speed_vs_error")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    file, found = options.out / "speed_vs_error.json", {}
+    stem = "speed_vs_error_smoke" if options.smoke else "speed_vs_error"
+    file, found = options.out / f"{stem}.json", {}
     if file.exists():
         found = json.loads(file.read_text(encoding="utf-8"))["scenes"]
     for name in ("dense",) if options.smoke else options.scenes:
+        jax.clear_caches()  # every scene compiles anew
         scene = clustering() if name == "clustering" else measured(name, options.smoke)
         before = found[name]["rows"] if name in found else []
         kept = [row for row in before if row["model"] not in options.models]
@@ -79,7 +81,10 @@ def main() -> None:
         runs = [run for run in runs if type(run.model).__name__ in options.models]
         rows = [measure(scene, run) for run in tqdm(runs, disable=True if options.smoke else None)]
         rows = sorted(kept + rows, key=lambda row: list(COLOURS).index(row["model"]))
-        found[name] = {"reference": scene.reference, "rows": rows}
+        estimates = jaxgran.choose_model(
+            scene.gas, scene.times, num_particles=SIZES[name][-1], replicas=REPLICAS
+        ).errors
+        found[name] = {"reference": scene.reference, "estimates": estimates, "rows": rows}
         print(table(name, found[name]))
         save(file, scenes=found, key=KEY, replicas=REPLICAS)
     found = {name: found[name] for name in SIZES if name in found}
@@ -110,10 +115,10 @@ def clustering() -> Scene:
     gas = beads(*CLUSTERING)
     size, times = SIZES["clustering"][-1], CLUSTERING_TIMES * float(gas.mean_free_time)
     key = jax.random.key(KEY + 1)
-    model = jaxgran.SoftSpheres(size, replicas=REPLICAS, steps_per_contact=80, key=key)
+    model = jaxgran.SoftSpheres(size, replicas=3 * REPLICAS, steps_per_contact=80, key=key)
     curve = jaxgran.cool(gas, times, model=model)
     assert curve.temperature_error is not None
-    label = f"soft spheres, N = {size}, {REPLICAS} replicas, 80 steps a contact"
+    label = f"soft spheres, N = {size}, {3 * REPLICAS} replicas, 80 steps a contact"
     return Scene(
         gas, times, np.asarray(curve.temperature), np.asarray(curve.temperature_error), label
     )
@@ -206,6 +211,8 @@ def table(name: str, results: dict) -> str:
             f"| {words(row['model'])} | {row['knob']} | {row['compile_s']:.1f} | "
             f"{row['run_s']:.3g} | {error} | {row['worst_at']:.3g} |"
         )
+    said = (f"{words(model).lower()} {100 * x:.2g} %" for model, x in results["estimates"].items())
+    lines += ["", f"`choose_model` estimates, for the most particles: {', '.join(said)}."]
     return "\n".join(lines)
 
 

@@ -22,6 +22,9 @@ from jaxgran.tangents import Inputs, Outputs
 SMALLEST_BOX = 2.1
 """Box side in diameters below which a sphere could touch another and its image at once."""
 
+SAME_BOX = 1e-6
+"""Relative difference up to which the box of a start is that of the gas."""
+
 MELT_COLLISIONS = 10.0
 """Mean free times of elastic motion before t = 0."""
 
@@ -77,12 +80,17 @@ def check_counts(model: Model, **least: int) -> None:
     for name, lowest in ({"num_particles": 2, "replicas": 1} | least).items():
         value = getattr(model, name)
         if not isinstance(value, int) or value < lowest:
-            raise ValueError(f"{name} must be a whole number >= {lowest}, got {value!r}")
+            raise ValueError(f"{name} must be a whole number >= {lowest}, an int, got {value!r}")
     neighbours.engine(model.neighbours)
 
 
 def check_box(model: Model, gas: Gas) -> None:
     """Raises ValueError for a gas too dense, a box too small, or a start not of this gas."""
+    if model.start is not None:
+        shape = (model.replicas, model.num_particles, gas.dimension)
+        for name, values in zip(model.start._fields[:2], model.start[:2], strict=True):
+            if np.shape(values) != shape:
+                raise ValueError(f"start.{name} has shape {np.shape(values)}, not {shape}")
     if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
         return
     limit, phi = initial.PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
@@ -99,18 +107,21 @@ def check_box(model: Model, gas: Gas) -> None:
         )
     if model.start is None:
         return
-    shape = (model.replicas, model.num_particles, gas.dimension)
-    for name, values in zip(model.start._fields[:2], model.start[:2], strict=True):
-        if np.shape(values) != shape:
-            raise ValueError(f"start.{name} has shape {np.shape(values)}, not {shape}")
     if isinstance(model.start.box_side, Tracer):
         return
     given = float(model.start.box_side / gas.diameter)
-    if not abs(given / side - 1) < 1e-6:
+    if not abs(given / side - 1) < SAME_BOX:
         raise ValueError(
             f"start.box_side is {given:.7g} diameters, the gas fills {side:.7g}: change "
             "packing_fraction or the start"
         )
+
+
+def with_start(model: Model, gas: Gas) -> Gas:
+    """The gas as derivatives see it: beside a given start T_0 is a unit of speed and no more."""
+    if model.start is None:
+        return gas
+    return gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
 
 
 def reduced_start(
@@ -120,15 +131,24 @@ def reduced_start(
 
     Args:
         model, gas: as given by the user.
-        differentiable: whether a derivative is to see those units; else the start is the same in
-            units of any other gas.
+        differentiable: whether a derivative is to see the unit of length; else the start is the
+            same in diameters of any other gas.
     """
     if model.start is None:
         return None
-    units = gas.diameter, jnp.sqrt(gas.temperature)
-    length, speed = units if differentiable else jax.lax.stop_gradient(units)
-    position, velocity = model.start.position / length, model.start.velocity / speed
+    length = gas.diameter if differentiable else jax.lax.stop_gradient(gas.diameter)
+    position = model.start.position / length
+    velocity = model.start.velocity / jnp.sqrt(gas.temperature)
     return position.reshape(-1, gas.dimension), velocity.reshape(-1, gas.dimension)
+
+
+def refuse_checkpoint(model: Any) -> None:
+    """Raises ValueError where a model that keeps a checkpoint runs in compiled code."""
+    if model.checkpoint is not None:
+        raise ValueError(
+            f"inside jax.jit, jax.vmap and derivatives {type(model).__name__} keeps no checkpoint: "
+            f"leave checkpoint out, got {str(model.checkpoint)!r}"
+        )
 
 
 def settled_plan(model: Model, size: Callable[[], Any], **fixed: Any) -> Any:
@@ -192,6 +212,7 @@ def run(
         return kind.followed(kind.at_start(melted.position, velocity, melted.skin))
 
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs)):
+        refuse_checkpoint(model)
         if model.neighbours == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap pairs are found by vesin, not by neighbours="jax-md", '
@@ -320,6 +341,12 @@ def curve(gas: Gas, times: Array, model: Model, side: Array, run: Outputs) -> Co
         "regularised": 1.0,
     }
     each = {name: values.T * units[name] for name, values in run.records.items()}
+    fault = run.status
+    if model.start is not None:  # where it could not be checked before
+        ratio = jax.lax.stop_gradient(model.start.box_side / (side * gas.diameter))
+        other = ~(jnp.abs(ratio - 1) < SAME_BOX + 10 * jnp.finfo(ratio.dtype).eps)
+        fault |= status.flag(status.OTHER_BOX, other)
+        each = {name: jnp.where(other, jnp.nan, values) for name, values in each.items()}
     shape = model.replicas, model.num_particles, gas.dimension
     return CoolingCurve.of_replicas(
         times,
@@ -329,5 +356,5 @@ def curve(gas: Gas, times: Array, model: Model, side: Array, run: Outputs) -> Co
             velocity=run.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
             box_side=side * gas.diameter,
         ),
-        status=run.status,
+        status=fault,
     )

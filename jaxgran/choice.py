@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from math import sqrt
+from numbers import Real
 from typing import NamedTuple
 
 import equinox as eqx
@@ -126,7 +127,8 @@ def choose_model(
         the most accurate one; the first reason says so.
 
     Raises:
-        ValueError: for values out of range or being traced.
+        ValueError: for values out of range or being traced, or a gas so soft that kinetic theory
+            says nothing of it.
         RuntimeError: if kinetic theory, which tells them apart, cannot follow the gas so far.
     """
     if not isinstance(gas, Gas):
@@ -136,7 +138,7 @@ def choose_model(
             "a model cannot be chosen for values being traced by jax.jit, jax.grad or jax.vmap: "
             "call choose_model outside, and give its model to cool"
         )
-    if not (isinstance(tolerance, float | int) and 0 < tolerance < np.inf):
+    if not (isinstance(tolerance, Real) and 0 < tolerance < np.inf):
         raise ValueError(
             f"tolerance must be a number > 0, got {tolerance!r}; 0.02 allows T to err by 2 %"
         )
@@ -148,6 +150,7 @@ def choose_model(
 
     end = float(checked_times(times)[-1])
     course = _course(gas, jnp.asarray(end))
+    check_softness(gas, 1 - course["softness"][0])
     fault = int(course.pop("status"))
     if fault != status.OK:
         raise RuntimeError(f"kinetic theory, which tells the models apart: {status.explain(fault)}")
@@ -158,7 +161,8 @@ def choose_model(
     # The rate of cooling goes as T^(8/5): heat that is missing is missing so many times.
     space = ENSKOG[0] + ENSKOG[1] * float(gas.packing_fraction) + 1.6 * flow
     contacts, softness = CONTACT * course["contact"], course["softness"]
-    noise = NOISE * np.sqrt(np.minimum(1, -course["log_temperature"].min()) / (size * replicas))
+    cooled = min(1.0, max(0.0, -course["log_temperature"].min()))
+    noise = NOISE * sqrt(cooled / (size * replicas))
     homogeneous = space + contacts + SOFTNESS_SQUARED * softness**2
     theory = _largest_error(course, homogeneous + SONINE * course["sonine"] ** 2)
     dsmc = _largest_error(course, space + contacts + softness)
@@ -202,6 +206,16 @@ def choose_model(
     return Choice(by_name[name], tuple(reasons), errors)
 
 
+def check_softness(gas: Gas, factor: ArrayLike) -> None:
+    """Raises ValueError where the factor by which soft contacts change cooling is not positive."""
+    if np.any(np.asarray(factor) <= 0):
+        raise ValueError(
+            f"spheres overlap by {float(np.max(gas.mean_overlap)):.2g} diameters at T_0, where "
+            "the softness correction has no meaning; is youngs_modulus in Pa? If so use "
+            "SoftSpheres, or KineticTheory(softness=False)"
+        )
+
+
 @eqx.filter_jit
 def _course(gas: Gas, end: jax.Array) -> dict[str, jax.Array]:
     """How the gas goes, by kinetic theory, on a grid of times from 0 to the end."""
@@ -234,6 +248,8 @@ def _course(gas: Gas, end: jax.Array) -> dict[str, jax.Array]:
 def _largest_error(course: dict[str, np.ndarray], clock: np.ndarray) -> float:
     """Of ln T, for a clock that errs by so much at each time."""
     t, log_T = course["time"], course["log_temperature"]
+    if t[-1] == 0:
+        return 0.0
     total = np.concatenate([[0], np.cumsum((clock[1:] + clock[:-1]) / 2 * np.diff(t))])
     return float(np.max(np.abs(np.gradient(log_T, t)) * total))
 

@@ -168,7 +168,9 @@ def _impacts(
         eps, pull = jax.vjp(restitution, law, zero)
         weights = [jnp.where(hit, x * normal_speed**2, 0.0) for x in (eps, (1 + eps) / 2)]
         in_law, along_speed = jax.vmap(pull)(jnp.stack(weights))
-        along = jax.vmap(lambda x: ravel_pytree(x)[0])(in_law)
+        along = jnp.zeros((2, 0), dtype)
+        if jax.tree.leaves(in_law):  # a law may have no floats
+            along = jax.vmap(lambda x: ravel_pytree(x)[0])(in_law)
     else:
         eps, along, along_speed = restitution(law, zero), jnp.zeros((2, 0), dtype), zero
     square = jnp.where(hit, normal_speed**2, 0.0)

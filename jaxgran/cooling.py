@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import ArrayLike
 
 from jaxgran import kinetics
-from jaxgran.choice import Model, choose_model
+from jaxgran.choice import Model, check_softness, choose_model
 from jaxgran.curve import CoolingCurve
 from jaxgran.domain import checked_times
 from jaxgran.gas import Gas
@@ -63,12 +63,8 @@ def cool(
         theory = model if isinstance(model, KineticTheory) else KineticTheory()
         first_rate, softness = _at_start(gas, theory)
         known = not isinstance(first_rate, Tracer)
-        if known and theory is model and theory.softness and np.any(np.asarray(softness) <= 0):
-            raise ValueError(
-                f"spheres overlap by {float(np.max(gas.mean_overlap)):.2g} diameters at T_0, where "
-                "the softness correction has no meaning; is youngs_modulus in Pa? If so use "
-                "SoftSpheres, or KineticTheory(softness=False)"
-            )
+        if known and theory is model and theory.softness:
+            check_softness(gas, softness)
         if known and np.any(np.asarray(first_rate) < 0):
             raise ValueError(
                 "the law of restitution makes this gas heat up: averaged over its impacts, eps is "

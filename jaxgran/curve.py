@@ -57,7 +57,7 @@ class CoolingCurve(eqx.Module):
         displacement_error: standard error of <dr^2>.
         velocity_correlation: <v(0) . v(t)>/d, m^2/s^2, of particle models.
         elastic_energy, dissipated_energy: per particle, J; with (d/2) m T they add up to the
-            energy at the start. Of models that resolve contacts.
+            energy at the start. Of soft spheres; of hard ones the dissipated energy.
         regularised: collisions per particle that were made elastic lest the gas collapse; of hard
             spheres.
         replicas: the same curve of each replica, all arrays of shape (replicas, times).

@@ -252,6 +252,12 @@ def _fit_by_simulation(
         )
     if isinstance(model, SoftSpheres) and model.projection is None:
         raise ValueError("a fit needs projected derivatives: give SoftSpheres a projection")
+    fixed = [name for name in ("temperature", "diameter", "packing_fraction") if name in names]
+    if not isinstance(model, DSMC) and model.start is not None and fixed:
+        raise ValueError(
+            f"{' and '.join(fixed)} cannot be fitted from a given start, which has its own: leave "
+            f"start out of {type(model).__name__}, or free other parameters"
+        )
     if model.checkpoint is not None:
         raise ValueError(
             f"a fit makes many runs and a checkpoint is of one: {type(model).__name__} must have "

@@ -69,6 +69,11 @@ OVERLAPPING = Fault(
     "two spheres of the start overlap, which hard spheres must not",
     "move them apart, or leave start out for a random one",
 )
+OTHER_BOX = Fault(
+    512,
+    "the start's box is not that of the gas",
+    "change packing_fraction or the start",
+)
 FAULTS = (
     LIST_FULL,
     CONTACTS_FULL,
@@ -79,6 +84,7 @@ FAULTS = (
     TOO_FAST,
     STEPS_SPENT,
     OVERLAPPING,
+    OTHER_BOX,
 )
 
 

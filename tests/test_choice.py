@@ -1,9 +1,12 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.choice import INTEGRATION
 
 from .test_fitting import measured
 
@@ -149,6 +152,21 @@ def test_no_energy_lost_no_error():
     assert errors["KineticTheory"] < 1e-6 and errors["HardSpheres"] < 1e-6  # rounding of T
 
 
+def test_the_beginning_needs_the_cheapest(beads):
+    choice = jaxgran.choose_model(beads(0.15), [0.0])
+    assert choice.errors == {**dict.fromkeys(choice.errors, 0.0), "SoftSpheres": INTEGRATION}
+    assert isinstance(choice.model, jaxgran.KineticTheory)
+    assert "4000 particles have a noise of 0 % in T." in choice.reasons
+
+
+def test_a_gas_as_soft_as_air_is_refused(beads):
+    gas = beads(0.1)
+    gas = gas.replace(youngs_modulus=1e-9 * gas.value("youngs_modulus"))
+    for ask in (jaxgran.choose_model, partial(jaxgran.cool, model="auto")):
+        with pytest.raises(ValueError, match="is youngs_modulus in Pa"):
+            ask(gas, [1.0])
+
+
 def test_nothing_accurate_enough_is_said():
     gas = hard_gas(0.7, 0.3)
     choice = jaxgran.choose_model(gas, over(gas, 30), 1e-6, num_particles=1000)
@@ -188,7 +206,8 @@ def test_bad_requests_are_refused(beads):
     for tolerance in (0, -0.1, float("nan"), "2 %"):
         with pytest.raises(ValueError, match="tolerance must be a number > 0"):
             jaxgran.choose_model(gas, [1.0], tolerance)
-    with pytest.raises(ValueError, match="num_particles must be a whole number >= 2, got 1"):
+    jaxgran.choose_model(gas, [1.0], np.float32(0.02), 1000)
+    with pytest.raises(ValueError, match="num_particles must be a whole number >= 2, an int"):
         jaxgran.choose_model(gas, [1.0], num_particles=1)
     with pytest.raises(ValueError, match="times must increase"):
         jaxgran.choose_model(gas, [2.0, 1.0])

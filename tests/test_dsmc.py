@@ -1,5 +1,6 @@
 import dataclasses
 from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -107,14 +108,18 @@ def test_a_million_particles_spread_as_kinetic_theory_says(million):
         (0.9, 2, -0.0301, 3e-4),
     ],
 )
-def test_sonine_coefficient_of_constant_restitution(eps, dimension, a2, error):
-    gas, n = constant(eps, dimension), 100_000
+@pytest.mark.parametrize("replicas", [1, pytest.param(16, marks=pytest.mark.slow)])
+def test_sonine_coefficient_of_constant_restitution(eps, dimension, a2, error, replicas):
+    gas, size = constant(eps, dimension), 100_000
+    n = size * replicas
     cooling = (1 - eps**2) / dimension
     taus = np.arange(10.0, 50.0, 1.0)
     u = np.expm1(cooling * taus / 2) / (cooling / 2)  # t of tau collisions per particle
-    curve = jaxgran.cool(gas, u * float(gas.mean_free_time), model=quiet(n))
+    curve = jaxgran.cool(gas, u * float(gas.mean_free_time), model=quiet(size, replicas=replicas))
     scatter = 1.5 * SONINE_SCATTER / n**0.5  # the tail of eps = .5 makes the scatter larger
-    assert abs(np.mean(curve.sonine) - a2) < 2 * error + 3 * scatter / 3
+    found = float(np.mean(curve.sonine))
+    print(f"\neps {eps}, {dimension}D, {n} particles: a_2 = {found:.5f}, {a2} +- {error} known")
+    assert abs(found - a2) < 2 * error + 3 * scatter / 3
     # Haff's law in collisions: d ln T / d tau = -(1 - eps^2)/d (1 + 3 a_2/16 + a_2/16).
     slope = np.polyfit(curve.collisions, np.log(curve.temperature), 1)[0]
     # The table's own moments give the factor; noise of ln T over 40 collision times.
@@ -211,6 +216,43 @@ def test_the_step_is_second_order(monkeypatch):
     noise = 1.6 / n**0.5  # of the ratio of two runs; 1.1 / sqrt(N) each was measured
     assert abs(np.log(coarse / fine)) < 2.5 * noise
     assert -0.0144 - 2.5 * noise < np.log(first_order / fine) < -0.0144 + 2.5 * noise
+
+
+@pytest.mark.slow
+def test_the_order_of_the_step(monkeypatch):
+    # The same memory, of 6.4 million particles at each step: pairs that may share a particle make
+    # a step second order; with half of them, or none, it would be first order.
+    gas, n, replicas = constant(0.6), 400_000, 16
+    times = [1.0 * float(gas.mean_free_time)]
+    of = Scheme.of
+
+    def memory(step, shared, seed):
+        def scheme(*arguments):
+            made = of(*arguments)
+            second = round(shared * made.second)
+            return made._replace(first=made.first + made.second - second, second=second)
+
+        monkeypatch.setattr(Scheme, "of", staticmethod(scheme))
+        model = quiet(n, replicas=replicas, step=step, key=jax.random.key(seed))
+        each = np.asarray(jaxgran.cool(gas, times, model=model).replicas.velocity_correlation)
+        return np.log(each[:, 0] / 3.0)
+
+    fine = memory(0.0125, 1.0, 0)
+    miss = {}
+    for shared in (1.0, 0.5, 0.0):
+        for step in (0.1, 0.05):
+            own = memory(step, shared, 1)
+            error = np.hypot(*(np.std(x, ddof=1) / replicas**0.5 for x in (own, fine)))
+            off = np.mean(own) - np.mean(fine)
+            miss[shared, step] = off, error
+            print(f"\nshared {shared}, step {step}: off by {off:+.5f} +- {error:.5f}")
+    for step in (0.1, 0.05):
+        off, error = miss[1.0, step]
+        assert abs(off) < 0.1 * step**2 + 3 * error  # .001 at .1
+    for shared, slope in ((0.5, -0.07), (0.0, -0.144)):
+        for step in (0.1, 0.05):
+            off, error = miss[shared, step]
+            assert off == pytest.approx(slope * step, abs=0.2 * abs(slope) * step + 3 * error)
 
 
 def test_other_times_change_nothing(beads):
@@ -405,7 +447,7 @@ def test_says_when_impacts_are_too_fast(beads, monkeypatch):
 @pytest.mark.parametrize(
     "settings, message",
     [
-        ({"num_particles": 1}, "num_particles must be a whole number >= 2, got 1"),
+        ({"num_particles": 1}, "num_particles must be a whole number >= 2, an int, got 1"),
         ({"num_particles": 10.0}, "num_particles"),
         ({"num_particles": 10, "replicas": 0}, "replicas must be a whole number >= 1"),
         ({"num_particles": 10, "step": 0.0}, r"step must lie in \(0, 0.1\]"),
@@ -416,6 +458,41 @@ def test_says_when_impacts_are_too_fast(beads, monkeypatch):
 def test_refuses_what_it_cannot_do(settings, message):
     with pytest.raises(ValueError, match=message):
         DSMC(**settings)
+
+
+class Step(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
+    """A law of one's own, with no floats in it."""
+
+    domains: ClassVar = {}
+
+    def reduced(self, *, diameter, mass, speed):
+        return self
+
+    def restitution(self, v):
+        return jnp.full_like(v, 0.6)
+
+
+def test_a_law_without_floats_has_derivatives():
+    gas = constant(0.6)
+    times = jnp.array([1.0, 3.0]) * gas.mean_free_time
+    for model in (quiet(1000), THEORY):
+
+        def f(temperature, law, model=model):
+            changed = dataclasses.replace(gas.replace(temperature=temperature), law=law)
+            return jaxgran.cool(changed, times, model=model).temperature
+
+        ours, known = (jax.jvp(partial(f, law=law), (3.0,), (1.0,)) for law in (Step(), gas.law))
+        np.testing.assert_allclose(ours, known, rtol=1e-9)
+
+
+def test_keeps_no_checkpoint_in_compiled_code():
+    model = quiet(100, checkpoint="run.npz")
+
+    def f(eps):
+        return jaxgran.cool(constant(eps), [1.0], model=model).temperature[0]
+
+    with pytest.raises(ValueError, match="DSMC keeps no checkpoint: leave checkpoint out"):
+        jax.grad(f)(0.6)
 
 
 def test_refuses_a_law_that_heats():

@@ -134,8 +134,10 @@ def test_soft_sphere_accuracy_runs(tmp_path):
 def test_speed_against_error_runs(tmp_path):
     done = run("speed_vs_error.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "here" / "speed_vs_error.png").stat().st_size > 20_000
-    rows = json.loads((tmp_path / "here" / "speed_vs_error.json").read_text())["scenes"]["dense"]
+    assert (tmp_path / "here" / "speed_vs_error_smoke.png").stat().st_size > 20_000
+    rows = json.loads((tmp_path / "here" / "speed_vs_error_smoke.json").read_text())["scenes"][
+        "dense"
+    ]
     for row in rows["rows"]:  # at early times all models agree to the noise of 200 particles
         assert row["run_s"] > 0 and row["error"] < 0.01 + 4 * row["standard_error"]
 

@@ -1,5 +1,6 @@
 """Derivatives through hard spheres: projected at every impact."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -132,8 +133,8 @@ def test_constant_restitution_has_the_slopes_of_haff(constant):
     np.testing.assert_allclose(slopes[:, 0], 4 * e / (1 - e**2) * cooled, rtol=0.02)
     # The rate is a mean over the run: 240 impacts up to the first time, 2400 to the last.
     np.testing.assert_allclose(slopes[:, 1], -2 * cooled, rtol=0.04)
-    # Speeds are a unit: T(t) = T_0 f(t sqrt(T_0)).
-    np.testing.assert_allclose(slopes[:, 2], 1 + slopes[:, 1] / 2, rtol=1e-12)
+    # The start brings its own speeds.
+    np.testing.assert_array_equal(slopes[:, 2], 0.0)
 
 
 def test_forward_and_reverse_and_jit_agree(constant):
@@ -165,6 +166,19 @@ def test_a_start_has_no_projected_slope():
     for derivative in (jax.grad, jax.jacfwd):
         with pytest.raises(ValueError, match="chaos"):
             derivative(f)(1.0)
+
+
+def test_speed_is_a_unit_of_random_starts_and_not_of_given_ones(constant):
+    f, at, model, _ = constant
+    random = dataclasses.replace(model, start=None)
+
+    def both(model):
+        return jax.jacfwd(lambda x: f(at.at[1:].set(x), model=model))(jnp.zeros(2))
+
+    slopes = both(random)  # T(t) = T_0 f(t sqrt(T_0))
+    np.testing.assert_allclose(slopes[:, 1], 1 + slopes[:, 0] / 2, rtol=1e-12)
+    hotter = f(at.at[2].set(0.1), model=model)
+    np.testing.assert_allclose(hotter, f(at, model=model), rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

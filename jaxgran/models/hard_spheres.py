@@ -68,7 +68,8 @@ class HardSpheres(eqx.Module):
     paths are taken as the same at the same number of collisions (so that d ln<dr^2>/d ln A is up to
     0.2 too low: dissipation makes velocities last longer), the velocity correlation as decaying at
     2/d of the collision rate. The density acts by the Enskog frequency of collisions. The last
-    particles carry no derivative.
+    particles carry no derivative. Beside a given start T_0 is a unit alone, and its derivative 0;
+    the start takes part in a change of the diameter.
 
     Raises:
         ValueError: for numbers out of range.
@@ -86,7 +87,7 @@ class HardSpheres(eqx.Module):
 
     def __check_init__(self):
         boxes.check_counts(self)
-        if not 0 <= self.contact_time <= 0.1:
+        if not isinstance(self.contact_time, float | int) or not 0 <= self.contact_time <= 0.1:
             raise ValueError(
                 f"contact_time must lie in [0, 0.1] mean free times, got {self.contact_time!r}; it "
                 "only keeps clusters from collapsing, so leave it small"
@@ -101,6 +102,7 @@ class HardSpheres(eqx.Module):
         """
         with jax.ensure_compile_time_eval():
             self._check(gas)
+        gas = boxes.with_start(self, gas)
         inputs = Inputs(
             scene=reduced_scene(gas, self.num_particles, self.contact_time),
             times=times * jnp.sqrt(gas.temperature) / gas.diameter,

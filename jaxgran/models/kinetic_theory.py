@@ -115,6 +115,8 @@ class KineticTheory(eqx.Module):
         unit_time = gas.path_length / gas.impact_speed
         law = gas.reduced_law
         parameters, unravel = ravel_pytree(law)
+        if parameters.size == 0:  # a law of no floats: jax gives none of them a type of its own
+            parameters, unravel = jnp.zeros(0, times.dtype), lambda _: law
 
         # In reduced units the gas has one or two parameters: following all their tangents beside
         # the state costs little, and one linear rule then serves forward and reverse mode alike.

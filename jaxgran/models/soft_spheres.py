@@ -101,6 +101,7 @@ class SoftSpheres(eqx.Module):
         """
         with jax.ensure_compile_time_eval():
             law = self._check(gas)
+        gas = boxes.with_start(self, gas)
         inputs = Inputs(
             scene=reduced_scene(gas, self.num_particles),
             times=times * jnp.sqrt(gas.temperature) / gas.diameter,
