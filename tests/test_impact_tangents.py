@@ -12,6 +12,7 @@ import jaxgran
 from jaxgran.restitution import ConstantRestitution, ReducedViscoelastic, RestitutionSeries
 from jaxgran.tangents import ImpactTangents
 from tests.conftest import glass_beads
+from tests.test_dsmc import SENSITIVITY
 from tests.test_hard_spheres import hard_gas, quiet
 from tests.test_tangents import FLOATS, log_temperature
 
@@ -83,6 +84,19 @@ def test_slopes_in_every_float_are_those_of_kinetic_theory():
     # scatter, 1 % is left.
     share = particles[0][:, 0] / np.log(ratio)
     np.testing.assert_allclose(share, theory[0][:, 0] / np.log(expected), rtol=0.025)
+
+
+@pytest.mark.slow
+def test_slope_is_that_of_the_sensitivity_table(beads):
+    gas, n, replicas = beads(0.15, packing_fraction=0.01), 1000, 8
+    assert gas.box_side(n) < gas.critical_box
+    times = np.array(list(SENSITIVITY)) * float(gas.mean_free_time)
+    f = log_temperature(gas, times, quiet(n, replicas=replicas))
+    slopes = np.asarray(jax.jvp(f, (0.0,), (1.0,))[1])
+    mean, error = slopes.mean(axis=0), slopes.std(axis=0, ddof=1) / replicas**0.5
+    ratio, spread = mean / np.array(list(SENSITIVITY.values())), error / np.abs(mean)
+    print(f"\nslopes over those of the table: {ratio} +- {spread}")
+    assert np.all(np.abs(ratio - 1) < 0.01 + 3 * spread)
 
 
 def test_fit_finds_what_made_the_curve():
