@@ -86,6 +86,7 @@ class Plan(NamedTuple):
     steps_per_block: int
     clipped: bool
     room: Room
+    melting: Room
 
 
 class Progress(NamedTuple):

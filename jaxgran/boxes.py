@@ -63,7 +63,6 @@ class Kind(NamedTuple):
         elastic: the scene in which no energy is lost.
         followed: a state with the tangents at t = 0, or as it is.
         fault: the status of a given start, where it could not be checked before.
-        melting: the room of a melt that cannot grow, from that of the run.
     """
 
     at_start: Callable[[Array, Array, ArrayLike], Any]
@@ -72,7 +71,6 @@ class Kind(NamedTuple):
     elastic: Callable[[Any], Any]
     followed: Callable[[Any], Any]
     fault: Callable[[Any], Array] = lambda state: jnp.zeros((), jnp.int32)
-    melting: Callable[[Room], Room] = lambda room: room
 
 
 def check_counts(model: Model, **least: int) -> None:
@@ -190,7 +188,7 @@ def run(
         model: N, replicas, progress and so on.
         inputs: the scene, times, start and key.
         kind: how these spheres move.
-        plan: sizes of arrays, with a field `room`.
+        plan: sizes of arrays, with the fields `room` and, for the melt, `melting`.
         skin: of the neighbour list.
         dimension: d.
         settings: what else of the model fixes the result.
@@ -237,10 +235,11 @@ def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settin
     begins with many spheres near contact, and its needs are its own.
     """
     scene, engine = inputs.scene, neighbours.engine(model.neighbours)
+    rooms = {"melt": plan.melting, "run": plan.room}
 
     def advance(state, end: float, scene=scene, stage: str = "run"):
         while True:
-            room: Room = _NEEDED.get((plan, stage)) or plan.room
+            room: Room = _NEEDED.get((plan, stage)) or rooms[stage]
             now = kind.stretch(state, scene, end, plan._replace(room=room), engine)
             fault = int(now.status)
             if fault == status.OK:
@@ -290,7 +289,7 @@ def _traced(inputs: Inputs, kind: Kind, plan, state, begun):
     scene, fault = inputs.scene, jnp.zeros((), jnp.int32)
     if inputs.start is None:
         end = MELT_COLLISIONS / scene.collision_frequency
-        melting = plan._replace(room=kind.melting(plan.room))
+        melting = plan._replace(room=plan.melting)
         state, fault = until((state, fault), kind.elastic(scene), end, melting)
     else:
         fault = kind.fault(state)

@@ -57,6 +57,7 @@ class Plan(NamedTuple):
     replicas: int
     share: float  # impacts in a window, per particle
     room: Room
+    melting: Room
 
 
 def at_start(position, velocity, scene: Scene, skin: ArrayLike, plan: Plan) -> State:

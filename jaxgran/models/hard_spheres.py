@@ -166,7 +166,10 @@ class HardSpheres(eqx.Module):
         spares = spare**0.5, spare, spare, spare  # of all, pairs listed vary least
         rooms = [int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)]
         room = Room(*rooms[:3], members=min(rooms[3], n))
-        return Plan(self.replicas, share, room)
+        more = int(1.3 * n * max(inside - 0.4, 0.0))  # in random places more spheres are in reach
+        rooms[1:3] = [min(rows + more, rooms[0]) for rows in rooms[1:3]]
+        melting = Room(*rooms[:3], members=min(rooms[3] + 2 * more, n))
+        return Plan(self.replicas, share, room, melting)
 
     def _run(self, inputs: Inputs, dimension: int, directions: ReducedLaw | None = None) -> Outputs:
         """Melt, then cool; and with it the tangents along directions in the law."""
@@ -184,11 +187,6 @@ class HardSpheres(eqx.Module):
             overlap = closest < 1 - _overlap_allowed(state.position, scene.side)
             return status.flag(status.OVERLAPPING, overlap)
 
-        def melting(room: Room) -> Room:
-            """For all that is listed: random places begin with many spheres at contact."""
-            n = replicas * self.num_particles
-            return Room(room.pairs, room.pairs, room.pairs, n)
-
         kind = boxes.Kind(
             at_start=lambda x, v, skin: events.at_start(x, v, scene, skin, plan),
             stretch=events.stretch,
@@ -196,7 +194,6 @@ class HardSpheres(eqx.Module):
             elastic=lambda scene: scene._replace(elastic=jnp.array(True)),
             followed=followed,
             fault=fault,
-            melting=melting,
         )
         return boxes.run(self, inputs, kind, plan, self._skin(scene, dimension), dimension)
 

@@ -139,7 +139,7 @@ class SoftSpheres(eqx.Module):
     def _skin(self, scene: Scene, d: int) -> Array:
         return skin_with(PAIRS_PER_PARTICLE, self.num_particles, scene.side, d)
 
-    def _sized(self, scene: Scene, d: int, clipped: bool, spare: float = 1.4) -> Plan:
+    def _sized(self, scene: Scene, d: int, clipped: bool, spare: float = 1.2) -> Plan:
         flight = _FASTEST * float(scene.contact_duration)
         # A block is at most a contact long, and shorter where spheres go far in that time.
         steps = max(round(self.steps_per_contact * min(1.0, 0.08 / flight)), 8)
@@ -147,16 +147,22 @@ class SoftSpheres(eqx.Module):
         inside = float(pairs_in_contact(self.num_particles, scene.side, d))
         listed = inside * (1 + float(self._skin(scene, d))) ** d
         at_contact = contact_value(scene.collision_frequency, inside, d)
-        near = min(inside * at_contact * ((1 + 5 * flight) ** d - 1), listed)
+        # As measured, here and below: phi = .01 to .4 (disks: to .5), t_c/tau_c = .003 to .3.
+        near = 0.75 * inside * at_contact * ((1 + 5 * flight) ** d - 1)
+        near = near * listed / (near + listed)
+        # Contacts that there are and that begin in a block, and the pairs near them.
         contact_fraction = float(scene.contact_duration * scene.collision_frequency)
-        # Not derived: the square is what gases of phi = .25 and .3 were seen to need besides.
-        touching = min(contact_fraction * (4 + 6 * near + 4 * near**2), near)
+        contact_fraction *= (1 + steps / self.steps_per_contact) / 2
+        touching = min(contact_fraction * (2.2 + 4 * near), near)
         n = self.replicas * self.num_particles
-        counts = [n * share for share in (listed, near, touching, 2 * touching)]
-        spares = min(spare, 1.4), spare, spare, spare  # of all, pairs listed vary least
+        counts = [n * x for x in (listed, near, touching, 2 * touching / (1 + touching))]
+        spares = spare**0.5, spare, spare, spare  # of all, pairs listed vary least
         rooms = [int(s * x + 5 * x**0.5) + 32 for s, x in zip(spares, counts, strict=True)]
         room = Room(*rooms[:3], members=min(rooms[3], n))
-        return Plan(self.replicas, self.steps_per_contact, steps, clipped, room)
+        more = int(1.3 * n * inside)  # where places are random, so many pairs touch besides
+        rooms[1:3] = [min(rows + more, rooms[0]) for rows in rooms[1:3]]
+        melting = Room(*rooms[:3], members=min(rooms[3] + 2 * more, n))
+        return Plan(self.replicas, self.steps_per_contact, steps, clipped, room, melting)
 
     def _run(
         self,
