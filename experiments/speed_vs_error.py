@@ -211,7 +211,7 @@ def table(name: str, results: dict) -> str:
             f"| {words(row['model'])} | {row['knob']} | {row['compile_s']:.1f} | "
             f"{row['run_s']:.3g} | {error} | {row['worst_at']:.3g} |"
         )
-    said = (f"{words(model).lower()} {100 * x:.2g} %" for model, x in results["estimates"].items())
+    said = (f"{words(model)} {100 * x:.2g} %" for model, x in results["estimates"].items())
     lines += ["", f"`choose_model` estimates, for the most particles: {', '.join(said)}."]
     return "\n".join(lines)
 

@@ -28,6 +28,9 @@ SAME_BOX = 1e-6
 MELT_COLLISIONS = 10.0
 """Mean free times of elastic motion before t = 0."""
 
+SETTLED = 2.0
+"""Mean free times of it after which the room of a run will do."""
+
 MOST_PAIRS = 100
 """Pairs per particle beyond which a list is taken to have gone wrong."""
 
@@ -254,7 +257,11 @@ def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settin
 
     # A run to be resumed has been melted.
     if inputs.start is None and not (model.checkpoint and Path(model.checkpoint).exists()):
-        melt = partial(advance, scene=kind.elastic(scene), stage="melt")
+        elastic, settled = kind.elastic(scene), float(SETTLED / scene.collision_frequency)
+
+        def melt(state, end: float):
+            return advance(state, end, elastic, "melt" if state.time < settled else "run")
+
         end = np.asarray([MELT_COLLISIONS / scene.collision_frequency])
         state, _ = simulate(state, end, melt, kind.observe, progress=model.progress, label="melt")
     state = advance(begun(state), 0.0)  # counts the energy in contacts
