@@ -337,6 +337,28 @@ def test_a_random_start_melts_under_jit(dimension, packing_fraction, size):
     np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.05)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("dimension", "packing_fraction"), [(3, 0.01), (3, 0.1), (3, 0.3), (2, 0.1), (2, 0.5)]
+)
+def test_arrays_fit_what_they_hold(dimension, packing_fraction, monkeypatch):
+    # Rows cost time whether they are used or not.
+    used, stretch = [], events.stretch
+
+    def watched(state, scene, end, plan, *others):
+        now = stretch(state, scene, end, plan, *others)
+        if not scene.elastic:
+            used.append(np.asarray(now.needed) / np.array(plan.room))
+        return now
+
+    monkeypatch.setattr(events, "stretch", watched)
+    gas = hard_gas(0.9, packing_fraction, dimension)
+    jaxgran.cool(gas, [5 * float(gas.mean_free_time)], model=quiet(4000))
+    fullest = np.max(used, axis=0)
+    print(f"\nphi {packing_fraction}, {dimension}D: {fullest} of the room for {Room._fields}")
+    assert np.all(fullest <= 1) and np.all(fullest > 0.4)
+
+
 def test_jit_flags_the_start_of_another_gas():
     gas = hard_gas(0.8, 0.1)
     start = jaxgran.cool(gas, [0.0], model=quiet(100)).particles
