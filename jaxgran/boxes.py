@@ -11,8 +11,7 @@ import numpy as np
 from jax.core import Tracer, eval_context
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from jaxgran import initial, neighbours, observables, status
-from jaxgran.checkpoint import fingerprint
+from jaxgran import checkpoint, given, initial, neighbours, observables, status
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.gas import Gas
 from jaxgran.room import Room
@@ -21,9 +20,6 @@ from jaxgran.tangents import Inputs, Outputs
 
 SMALLEST_BOX = 2.1
 """Box side in diameters below which a sphere could touch another and its image at once."""
-
-SAME_BOX = 1e-6
-"""Relative difference up to which the box of a start is that of the gas."""
 
 MELT_COLLISIONS = 10.0
 """Mean free times of elastic motion before t = 0."""
@@ -87,11 +83,7 @@ def check_counts(model: Model, **least: int) -> None:
 
 def check_box(model: Model, gas: Gas) -> None:
     """Raises ValueError for a gas too dense, a box too small, or a start not of this gas."""
-    if model.start is not None:
-        shape = (model.replicas, model.num_particles, gas.dimension)
-        for name, values in zip(model.start._fields[:2], model.start[:2], strict=True):
-            if np.shape(values) != shape:
-                raise ValueError(f"start.{name} has shape {np.shape(values)}, not {shape}")
+    given.check(model, gas)
     if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
         return
     limit, phi = initial.PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
@@ -105,50 +97,6 @@ def check_box(model: Model, gas: Gas) -> None:
         raise ValueError(
             f"the box is {side:.3g} diameters long, at least {SMALLEST_BOX} are needed to tell "
             "a sphere from its image; use more particles or a lower packing_fraction"
-        )
-    if model.start is None:
-        return
-    if isinstance(model.start.box_side, Tracer):
-        return
-    given = float(model.start.box_side / gas.diameter)
-    if not abs(given / side - 1) < SAME_BOX:
-        raise ValueError(
-            f"start.box_side is {given:.7g} diameters, the gas fills {side:.7g}: change "
-            "packing_fraction or the start"
-        )
-
-
-def with_start(model: Model, gas: Gas) -> Gas:
-    """The gas as derivatives see it: beside a given start T_0 is a unit of speed and no more."""
-    if model.start is None:
-        return gas
-    return gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
-
-
-def reduced_start(
-    model: Model, gas: Gas, *, differentiable: bool = False
-) -> tuple[Array, Array] | None:
-    """The given positions and velocities in units of the gas, replica after replica.
-
-    Args:
-        model, gas: as given by the user.
-        differentiable: whether a derivative is to see the unit of length; else the start is the
-            same in diameters of any other gas.
-    """
-    if model.start is None:
-        return None
-    length = gas.diameter if differentiable else jax.lax.stop_gradient(gas.diameter)
-    position = model.start.position / length
-    velocity = model.start.velocity / jnp.sqrt(gas.temperature)
-    return position.reshape(-1, gas.dimension), velocity.reshape(-1, gas.dimension)
-
-
-def refuse_checkpoint(model: Any) -> None:
-    """Raises ValueError where a model that keeps a checkpoint runs in compiled code."""
-    if model.checkpoint is not None:
-        raise ValueError(
-            f"inside jax.jit, jax.vmap and derivatives {type(model).__name__} keeps no checkpoint: "
-            f"leave checkpoint out, got {str(model.checkpoint)!r}"
         )
 
 
@@ -213,7 +161,7 @@ def run(
         return kind.followed(kind.at_start(melted.position, velocity, melted.skin))
 
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs)):
-        refuse_checkpoint(model)
+        checkpoint.refuse(model.checkpoint, type(model).__name__)
         if model.neighbours == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap pairs are found by vesin, not by neighbours="jax-md", '
@@ -271,7 +219,7 @@ def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settin
         np.asarray(inputs.times),
         advance,
         kind.observe,
-        scene=fingerprint(inputs, state.tangents, size),
+        scene=checkpoint.fingerprint(inputs, state.tangents, size),
         progress=model.progress,
         path=model.checkpoint,
     )
@@ -347,12 +295,8 @@ def curve(gas: Gas, times: Array, model: Model, side: Array, run: Outputs) -> Co
         "regularised": 1.0,
     }
     each = {name: values.T * units[name] for name, values in run.records.items()}
-    fault = run.status
-    if model.start is not None:  # where it could not be checked before
-        ratio = jax.lax.stop_gradient(model.start.box_side / (side * gas.diameter))
-        other = ~(jnp.abs(ratio - 1) < SAME_BOX + 10 * jnp.finfo(ratio.dtype).eps)
-        fault |= status.flag(status.OTHER_BOX, other)
-        each = {name: jnp.where(other, jnp.nan, values) for name, values in each.items()}
+    other = given.of_other_box(model, gas)  # where it could not be checked before
+    each = {name: jnp.where(other, jnp.nan, values) for name, values in each.items()}
     shape = model.replicas, model.num_particles, gas.dimension
     return CoolingCurve.of_replicas(
         times,
@@ -362,5 +306,5 @@ def curve(gas: Gas, times: Array, model: Model, side: Array, run: Outputs) -> Co
             velocity=run.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
             box_side=side * gas.diameter,
         ),
-        status=fault,
+        status=run.status | status.flag(status.OTHER_BOX, other),
     )

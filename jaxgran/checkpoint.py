@@ -30,6 +30,15 @@ def fingerprint(*trees: Any) -> str:
     return digest.hexdigest()
 
 
+def refuse(path: str | Path | None, model: str) -> None:
+    """Raises ValueError if there is a path: compiled code, whose run this is, keeps no file."""
+    if path is not None:
+        raise ValueError(
+            f"inside jax.jit, jax.vmap and derivatives {model} keeps no checkpoint: leave "
+            f"checkpoint out, got {str(path)!r}"
+        )
+
+
 def write_whole(path: str | Path, write: Callable[[Any], None]) -> None:
     """Call `write` on a new binary file that replaces `path` only once it is complete.
 

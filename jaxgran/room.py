@@ -25,6 +25,29 @@ class Room(NamedTuple):
         )
 
 
+def rooms(
+    expected: Sequence[float], spare: float, more: float, num_particles: int
+) -> tuple[Room, Room]:
+    """Room of a run, and of its melt as that begins.
+
+    Args:
+        expected: rows a particle of each kind.
+        spare: room over that; its root for the pairs listed, which vary least.
+        more: rows a particle besides, of pairs near each other, in random places.
+        num_particles: of all replicas; no more can be members.
+    """
+    counts, spares = [num_particles * x for x in expected], (spare**0.5, spare, spare, spare)
+    pairs, near, contacts, members = (
+        int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
+    )
+    extra = int(num_particles * more)
+    near_too, contacts_too = (min(rows + extra, pairs) for rows in (near, contacts))
+    return (
+        Room(pairs, near, contacts, min(members, num_particles)),
+        Room(pairs, near_too, contacts_too, min(members + 2 * extra, num_particles)),
+    )
+
+
 def pairs_in_contact(num_particles: int, side: ArrayLike, dimension: int) -> Array:
     """Pairs a particle within contact, were the pair correlation 1."""
     return (

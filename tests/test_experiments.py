@@ -1,11 +1,15 @@
 """The scripts a person runs, run as a person would."""
 
+import argparse
 import json
 import subprocess
 import sys
 from pathlib import Path
 
+import fit_cooling_curve
 import pytest
+
+import jaxgran
 
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 DENSE = EXPERIMENTS / "data" / "lammps_cooling_dense.csv"
@@ -43,6 +47,28 @@ def test_main_job_says_what_it_cannot_explain(tmp_path):
     assert again.returncode == 2
     assert "exists; name another --out or say --overwrite" in again.stderr
     assert {path: path.read_bytes() for path in (tmp_path / "here").iterdir()} == before
+
+
+def test_auto_judges_the_box_that_was_measured():
+    curve, header = jaxgran.read_curve(DENSE)
+    gas, size = jaxgran.read_gas(header), int(header["N"])
+    free = ("dissipative_constant",)
+    fitted = jaxgran.fit(gas, curve, free=free).gas
+    ratio = float(fitted.box_side(size) / fitted.critical_box)
+    for particles in (None, 300):
+        options = argparse.Namespace(
+            model="auto", tolerance=0.02, particles=particles, replicas=3, key=0
+        )
+        model, reasons = fit_cooling_curve.model_of(options, gas, curve, free, size)
+        assert isinstance(model, jaxgran.SoftSpheres)
+        assert model.num_particles == (particles or size)
+        assert f"in a box of {ratio:.2g} L_c" in " ".join(reasons)
+
+
+def test_auto_takes_kinetic_theory_where_it_will_do(tmp_path):
+    done = run("fit_cooling_curve.py", "--model", "auto", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Kinetic theory: the cheapest model whose estimated error of T" in done.stdout
 
 
 @pytest.mark.parametrize(

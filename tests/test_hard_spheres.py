@@ -210,12 +210,13 @@ def test_dilute_gas_is_that_of_dsmc(beads):
     stochastic = jaxgran.DSMC(n, replicas=4 * replicas, progress=False)
     ours = jaxgran.cool(gas, times, model=quiet(n, replicas=replicas))
     dsmc = jaxgran.cool(gas, times, model=stochastic)
+    # Spheres meet again: their clock is off by a tenth of phi, their paths by 0.85 phi.
     for name, slack in (
-        ("temperature", 0.002),
-        ("displacement", 0.01),  # 0.85 phi, as correlations make it
-        ("collisions", 0.003),
+        ("temperature", 0.002),  # |d ln T/d ln t| is under 2
+        ("displacement", 0.0085),
+        ("collisions", 0.001),
         ("sonine", 0.0),
-        ("velocity_correlation", 0.01),
+        ("velocity_correlation", 0.0085),
     ):
         each = [np.asarray(getattr(curve.replicas, name)) for curve in (ours, dsmc)]
         mean, other = (x.mean(axis=0) for x in each)

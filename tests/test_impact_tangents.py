@@ -96,7 +96,8 @@ def test_slope_is_that_of_the_sensitivity_table(beads):
     mean, error = slopes.mean(axis=0), slopes.std(axis=0, ddof=1) / replicas**0.5
     ratio, spread = mean / np.array(list(SENSITIVITY.values())), error / np.abs(mean)
     print(f"\nslopes over those of the table: {ratio} +- {spread}")
-    assert np.all(np.abs(ratio - 1) < 0.01 + 3 * spread)
+    # Enskog's clock, on which the table is, is off by .5 % and a tenth of the packing fraction.
+    assert np.all(np.abs(ratio - 1) < 0.006 + 3 * spread)
 
 
 def test_fit_finds_what_made_the_curve():

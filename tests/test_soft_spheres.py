@@ -286,6 +286,39 @@ def test_jit_and_vmap_give_the_same_numbers(beads):
         np.testing.assert_allclose(swept[i], temperature(constants[i])[0], rtol=1e-5)
 
 
+def test_a_dense_random_start_melts_under_jit(beads):
+    # As it begins six tenths of the spheres touch; in the run it is one in twenty.
+    gas = soft_beads(beads, 0.02, 0.1, packing_fraction=0.2)
+    model, times = quiet(500).sized_for(gas), [float(gas.mean_free_time)]
+
+    def cooled(key):
+        return jaxgran.cool(gas, times, model=quiet(500, plan=model.plan, key=key))
+
+    curve = jax.jit(cooled)(jax.random.key(1))
+    assert curve.status == 0 and np.isfinite(curve.temperature[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("packing, fraction", [(0.05, 0.02), (0.2, 0.02), (0.2, 0.1), (0.3, 0.1)])
+def test_arrays_fit_what_they_hold(beads, packing, fraction, monkeypatch):
+    # Rows cost time whether they are used or not.
+    used, stretch = [], blocks.stretch
+
+    def watched(state, scene, end, plan, *others):
+        now = stretch(state, scene, end, plan, *others)
+        if scene.dissipative_constant > 0:
+            used.append(np.asarray(now.needed) / np.array(plan.room))
+        return now
+
+    monkeypatch.setattr(blocks, "stretch", watched)
+    gas = soft_beads(beads, fraction, 0.15, packing_fraction=packing)
+    times = [3 * float(gas.mean_free_time)]
+    jaxgran.cool(gas, times, model=quiet(8000, steps_per_contact=40))
+    fullest = np.max(used, axis=0)
+    print(f"\nphi {packing}, t_c/tau_c {fraction}: {fullest} of the room for {Room._fields}")
+    assert np.all(fullest <= 1) and np.all(fullest > 0.4)
+
+
 def test_jit_flags_what_it_cannot_grow(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     model = quiet(100).sized_for(gas)

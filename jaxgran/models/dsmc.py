@@ -12,8 +12,8 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxgran import boxes, collisions, initial, kinetics, observables, status
-from jaxgran.checkpoint import fingerprint
+from jaxgran import collisions, initial, kinetics, observables, status
+from jaxgran.checkpoint import fingerprint, refuse
 from jaxgran.collisions import Scheme, State, Tangents
 from jaxgran.curve import CoolingCurve
 from jaxgran.gas import Gas
@@ -144,8 +144,8 @@ class DSMC(eqx.Module):
         num_particles: N, >= 2.
         replicas: independent gases run side by side; two or more give error bars.
         key: of the random numbers; `jax.random.key(0)` by default.
-        step: collisions per particle in one step, in (0, 0.1]; one pair at least, 0.5/N, so that
-            with less than ten particles steps are longer than 0.1, and T is off by up to 10 %.
+        step: collisions per particle in one step, in (0, 0.1]; one pair at least, 0.5/N, which
+            in a gas of some ten particles is longer than asked.
         progress: show a progress bar on a terminal.
         checkpoint: a file to save the run to each minute and to resume it from. The resumed run
             gives the same numbers bit for bit.
@@ -225,7 +225,7 @@ class DSMC(eqx.Module):
 
     def _traced(self, law: ReducedLaw, times: Array, key: Array, scheme: Scheme) -> dict:
         """The same inside `jax.jit`, `jax.vmap` or a derivative."""
-        boxes.refuse_checkpoint(self)
+        refuse(self.checkpoint, "DSMC")
         parameters, unravel = ravel_pytree(law)
         run = partial(_run, replicas=self.replicas, scheme=scheme)
 

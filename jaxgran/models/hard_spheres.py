@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from jaxgran import boxes, events, neighbours, status, tangents
+from jaxgran import boxes, events, given, neighbours, status, tangents
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.events import Plan, Scene, State
 from jaxgran.gas import Gas
 from jaxgran.restitution import ReducedLaw
-from jaxgran.room import Room, contact_value, pairs_in_contact, skin_with
+from jaxgran.room import contact_value, pairs_in_contact, rooms, skin_with
 from jaxgran.tangents import ImpactTangents, Inputs, Outputs
 
 PAIRS_PER_PARTICLE = 7.0
@@ -102,11 +102,11 @@ class HardSpheres(eqx.Module):
         """
         with jax.ensure_compile_time_eval():
             self._check(gas)
-        gas = boxes.with_start(self, gas)
+        gas = given.unit_temperature(self, gas)
         inputs = Inputs(
             scene=reduced_scene(gas, self.num_particles, self.contact_time),
             times=times * jnp.sqrt(gas.temperature) / gas.diameter,
-            start=boxes.reduced_start(self, gas),
+            start=given.reduced(self, gas),
             key=self.key,
         )
         run = partial(self._run, dimension=gas.dimension)
@@ -162,14 +162,9 @@ class HardSpheres(eqx.Module):
         packed = 0.9 + 0.45 * inside / 2 ** (d - 1)
         reachable = min(packed * at_contact * inside * ((1 + reach) ** d - 1), listed)
         chosen = min((0.65 + 0.35 * reachable) * share, listed)
-        counts = [n * number for number in (listed, reachable, chosen, 1.25 * share)]
-        spares = spare**0.5, spare, spare, spare  # of all, pairs listed vary least
-        rooms = [int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)]
-        room = Room(*rooms[:3], members=min(rooms[3], n))
-        more = int(1.3 * n * max(inside - 0.4, 0.0))  # in random places more spheres are in reach
-        rooms[1:3] = [min(rows + more, rooms[0]) for rows in rooms[1:3]]
-        melting = Room(*rooms[:3], members=min(rooms[3] + 2 * more, n))
-        return Plan(self.replicas, share, room, melting)
+        expected = listed, reachable, chosen, 1.25 * share
+        more = 1.3 * max(inside - 0.4, 0.0)  # in random places more spheres are in reach
+        return Plan(self.replicas, share, *rooms(expected, spare, more, n))
 
     def _run(self, inputs: Inputs, dimension: int, directions: ReducedLaw | None = None) -> Outputs:
         """Melt, then cool; and with it the tangents along directions in the law."""

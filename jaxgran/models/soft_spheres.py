@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxgran import blocks, boxes, closed_forms, tangents
+from jaxgran import blocks, boxes, closed_forms, given, tangents
 from jaxgran.blocks import Plan, Scene, State
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.gas import Gas
 from jaxgran.restitution import Viscoelastic
-from jaxgran.room import Room, contact_value, pairs_in_contact, skin_with
+from jaxgran.room import contact_value, pairs_in_contact, rooms, skin_with
 from jaxgran.tangents import Inputs, Outputs
 
 PAIRS_PER_PARTICLE = 3.0
@@ -62,7 +62,7 @@ class SoftSpheres(eqx.Module):
     estimated from it: a_2 and the paths are taken as the same at the same number of collisions (so
     that d ln<dr^2>/d ln A is up to 0.2 too low: dissipation makes velocities last longer), the
     velocity correlation as decaying at 2/d of the collision rate. The last particles carry no
-    derivative.
+    derivative. Beside a given start T_0 is a unit alone, and its derivative 0.
 
     Raises:
         ValueError: for numbers out of range.
@@ -101,11 +101,11 @@ class SoftSpheres(eqx.Module):
         """
         with jax.ensure_compile_time_eval():
             law = self._check(gas)
-        gas = boxes.with_start(self, gas)
+        gas = given.unit_temperature(self, gas)
         inputs = Inputs(
             scene=reduced_scene(gas, self.num_particles),
             times=times * jnp.sqrt(gas.temperature) / gas.diameter,
-            start=boxes.reduced_start(self, gas, differentiable=self.projection is None),
+            start=given.reduced(self, gas, differentiable=self.projection is None),
             key=self.key,
         )
         run = partial(self._run, dimension=gas.dimension, clipped=law.clipped)
@@ -155,14 +155,10 @@ class SoftSpheres(eqx.Module):
         contact_fraction *= (1 + steps / self.steps_per_contact) / 2
         touching = min(contact_fraction * (2.2 + 4 * near), near)
         n = self.replicas * self.num_particles
-        counts = [n * x for x in (listed, near, touching, 2 * touching / (1 + touching))]
-        spares = spare**0.5, spare, spare, spare  # of all, pairs listed vary least
-        rooms = [int(s * x + 5 * x**0.5) + 32 for s, x in zip(spares, counts, strict=True)]
-        room = Room(*rooms[:3], members=min(rooms[3], n))
-        more = int(1.3 * n * inside)  # where places are random, so many pairs touch besides
-        rooms[1:3] = [min(rows + more, rooms[0]) for rows in rooms[1:3]]
-        melting = Room(*rooms[:3], members=min(rooms[3] + 2 * more, n))
-        return Plan(self.replicas, self.steps_per_contact, steps, clipped, room, melting)
+        expected = listed, near, touching, 2 * touching / (1 + touching)
+        # Where places are random, about as many pairs touch besides as would at no correlation.
+        found = rooms(expected, spare, 1.3 * inside, n)
+        return Plan(self.replicas, self.steps_per_contact, steps, clipped, *found)
 
     def _run(
         self,
