@@ -100,6 +100,44 @@ def test_estimates_bound_what_is_measured_now(beads):
     assert choice.errors["KineticTheory"] < 2 * np.max(deviation + noise)
 
 
+# Scatter of ln T between runs of hard spheres, of N = 1000 (48 of them) and 4000 (16):
+# phi, beta_T0, N, mean free times, scatter.
+SCATTER = [
+    (0.2, 0.5, 1000, 1.2, 0.0173),
+    (0.2, 0.5, 1000, 60, 0.0460),
+    (0.2, 0.5, 4000, 60, 0.0272),
+    (0.2, 0.3, 1000, 40, 0.0235),
+    (0.2, 0.3, 4000, 40, 0.0169),
+    (0.1, 0.4, 1000, 1.3, 0.0132),
+    (0.1, 0.4, 1000, 100, 0.0277),
+    (0.1, 0.4, 4000, 100, 0.0170),
+]
+
+
+@pytest.mark.parametrize("phi, beta, n, duration, scatter", SCATTER)
+def test_noise_is_that_of_runs(beads, phi, beta, n, duration, scatter):
+    gas = stiff(beads(0.15, packing_fraction=phi), 1e-4, beta)
+    times = [duration * float(gas.mean_free_time)]
+
+    def noise(replicas):
+        errors = jaxgran.choose_model(gas, times, num_particles=n, replicas=replicas).errors
+        return (errors["SoftSpheres"] ** 2 - INTEGRATION**2) ** 0.5
+
+    # So many runs tell it to 10 % (N = 1000) and 18 %; shot noise differs by as much.
+    assert noise(1) == pytest.approx(scatter, rel=0.3)
+    assert noise(4) == pytest.approx(noise(1) / 2)
+
+
+def test_only_a_flow_makes_noise_besides():
+    still, flowing = hard_gas(0.9), hard_gas(0.6, 0.3)
+    for gas, more in ((still, False), (flowing, True)):
+        choice = jaxgran.choose_model(gas, over(gas, 30), num_particles=4000)
+        assert ("strong by chance" in " ".join(choice.reasons)) is more
+        unknown = jaxgran.choose_model(gas, over(gas, 30))
+        assert "strong by chance" not in " ".join(unknown.reasons)
+        assert (choice.errors["HardSpheres"] > 1.5 * unknown.errors["HardSpheres"]) is more
+
+
 def test_noise_of_dsmc():
     gas = hard_gas(0.9)
     times = over(gas, 10)
@@ -195,8 +233,8 @@ def test_cool_chooses(beads):
 
 def test_cool_chooses_particles():
     gas = hard_gas(0.05, 0.01)
-    times = over(gas, 10)
-    chosen = jaxgran.cool(gas, times, model="auto", tolerance=0.013)
+    times = over(gas, 30)
+    chosen = jaxgran.cool(gas, times, model="auto", tolerance=0.02)
     dsmc = jaxgran.cool(gas, times, model=jaxgran.DSMC(4000, progress=False))
     np.testing.assert_array_equal(chosen.temperature, dsmc.temperature)
 

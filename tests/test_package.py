@@ -11,7 +11,7 @@ FLOORS = [
     ["contact", "simulation", "observables", "initial"],
     ["restitution", "encounters"],
     ["gas", "tangents"],
-    ["kinetics", "closed_forms", "curve", "collisions", "room"],
+    ["kinetics", "closed_forms", "curve", "collisions", "flow", "room"],
     ["estimate", "given"],
     ["boxes"],
     ["blocks", "impacts", "search", "start"],
