@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxgran import encounters, neighbours, status, tangents
 from jaxgran.encounters import Encounters, Work
-from jaxgran.neighbours import Pairs
+from jaxgran.neighbours import Found, Pairs
 from jaxgran.room import Room, longest_skin
 from jaxgran.tangents import Tangents
 
@@ -71,6 +71,7 @@ def at_start(position, velocity, scene: Scene, skin: ArrayLike, replicas: int) -
     )
 
 
+@jax.jit
 def rewrapped(state: State, side: ArrayLike) -> State:
     """The same state with every position moved into the box; the list must then be built anew."""
     inside = neighbours.wrap(side, state.position)
@@ -276,7 +277,7 @@ def stretch(
     not finite, or a step cannot become shorter.
     """
     began = rewrapped(state, scene.side)
-    pairs = neighbours.find_pairs(
+    found = neighbours.search(
         began.position,
         scene.side,
         1 + began.skin,
@@ -284,6 +285,12 @@ def stretch(
         room=plan.room.pairs,
         by=neighbours_by,
     )
+    return _used_up(began, found, scene, end, plan)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _used_up(began: State, found: Found, scene: Scene, end: ArrayLike, plan: Plan) -> Progress:
+    pairs = neighbours.with_offsets(began.position, scene.side, found)
     now = advance(began, pairs, scene, end, plan)
     return now._replace(**_mended(now, began, scene))
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxgran import kinetics, neighbours, status, tangents
 from jaxgran.impacts import MAX_ROUNDS, Scene, Selection, Slots, Work, resolve, select
-from jaxgran.neighbours import Pairs
+from jaxgran.neighbours import Found, Pairs
 from jaxgran.restitution import ReducedLaw
 from jaxgran.room import Room
 from jaxgran.tangents import ImpactTangents
@@ -256,7 +256,7 @@ def stretch(
     doubles that. An outrun skin ends it; if it was fresh, the window is shortened.
     """
     began, listed, until = _prepared(state, scene.side, end, plan)
-    pairs = neighbours.find_pairs(
+    found = neighbours.search(
         listed,
         scene.side,
         1 + began.skin,
@@ -264,6 +264,12 @@ def stretch(
         room=plan.room.pairs,
         by=neighbours_by,
     )
+    return _used_up(began, listed, found, scene, until, plan)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _used_up(began: State, listed, found: Found, scene: Scene, until, plan: Plan) -> Progress:
+    pairs = neighbours.with_offsets(listed, scene.side, found)
     now = advance(began, listed, pairs, scene, until, plan)
     return now._replace(**_mended(now, began))
 
@@ -280,7 +286,6 @@ def _prepared(state: State, side, end, plan: Plan):
     return began, listed, jnp.where(life < left, state.time + life, end)
 
 
-@jax.jit
 def _mended(now: Progress, began: State) -> dict[str, Any]:
     state = now.state
     fresh = state.time == began.time  # else a new list is all that an outrun skin needs

@@ -109,10 +109,9 @@ def firstimpacts(slots: Slots, rows: Rows, end):
 
     def lower(carry):
         until, _ = carry
-        at_a, at_b = until[a], until[b]
-        new = until.at[b].min(arrival(at_a, last[1], closing[1]))
-        new = new.at[a].min(arrival(at_b, last[0], closing[0]))
-        return new, jnp.any(new < until)
+        new = until.at[b].min(arrival(until[a], last[1], closing[1]))
+        new = new.at[a].min(arrival(new[b], last[0], closing[0]))
+        return new, jnp.any(new < jnp.minimum(until, end))  # later than the end is never
 
     until, _ = jax.lax.while_loop(lambda carry: carry[1], lower, (first, jnp.array(True)))
     return r, w, motion, times, first, until

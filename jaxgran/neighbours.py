@@ -5,7 +5,7 @@ alone need not wait.
 """
 
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -85,17 +85,37 @@ def find_pairs(
         room: how many pairs can be returned.
         by: "vesin" or "jax-md"; both return the same pairs.
     """
+    found = search(position, side, cutoff, replicas=replicas, room=room, by=by)
+    return with_offsets(position, side, found)
+
+
+Found = tuple[Int[Any, "pairs"], Int[Any, "pairs"], Int[Any, ""]]
+"""i, j and count of `Pairs`, as NumPy arrays where they come from the host."""
+
+
+def search(
+    position: Float[Array, "particles d"],
+    side: ArrayLike,
+    cutoff: ArrayLike,
+    *,
+    replicas: int = 1,
+    room: int,
+    by: str = "vesin",
+) -> Found:
+    """`find_pairs` without offsets, for compiled code to add by `with_offsets`."""
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
     if by not in ENGINES[1:]:
         raise ValueError(f"by must be one of {', '.join(ENGINES[1:])}, got {by!r}")
-    search = {"vesin": _vesin_pairs, "jax-md": _jax_md_pairs}[by]
-    i, j, count = search(position, side, cutoff, replicas, room)
-    return Pairs(i, j, _whole_sides(position, jnp.asarray(side), i, j), count)
+    engine = {"vesin": _vesin_pairs, "jax-md": _jax_md_pairs}[by]
+    return engine(position, side, cutoff, replicas, room)
 
 
 @jax.jit
-def _whole_sides(position, side, i, j):
-    return side * jnp.round((position[i] - position[j]) / side)
+def with_offsets(position: Float[Array, "particles d"], side: ArrayLike, found: Found) -> Pairs:
+    """The pairs found for such positions."""
+    position, side = jax.lax.stop_gradient((position, jnp.asarray(side)))
+    i, j, count = found
+    return Pairs(i, j, side * jnp.round((position[i] - position[j]) / side), count)
 
 
 def _vesin_pairs(position, side, cutoff, replicas, room):
@@ -103,7 +123,7 @@ def _vesin_pairs(position, side, cutoff, replicas, room):
         return vesin_search(np.asarray(position), float(side), float(cutoff), replicas, room)
 
     if not any(isinstance(x, Tracer) for x in (position, side, cutoff)):
-        return jax.tree.map(jnp.asarray, host(position, side, cutoff))
+        return host(position, side, cutoff)
     index = jax.ShapeDtypeStruct((room,), jnp.int32)
     shapes = index, index, jax.ShapeDtypeStruct((), jnp.int32)
     return jax.pure_callback(host, shapes, position, side, cutoff, vmap_method="sequential")
