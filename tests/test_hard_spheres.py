@@ -155,7 +155,7 @@ def test_impacts_come_as_often_as_enskog_says_closely(dimension, packing_fractio
         pytest.param(0.2, 500, 32, 20, marks=pytest.mark.slow),
         pytest.param(0.3, 500, 32, 20, marks=pytest.mark.slow),
         # The memory of velocities dies out later in a larger box.
-        pytest.param(0.3, 4096, 8, 60, marks=pytest.mark.slow),
+        pytest.param(0.3, 4096, 16, 60, marks=pytest.mark.slow),
     ],
 )
 def test_diffuses_as_published(packing_fraction, size, replicas, begin):

@@ -153,9 +153,9 @@ class SoftSpheres(eqx.Module):
         # Contacts that there are and that begin in a block, and the pairs near them.
         contact_fraction = float(scene.contact_duration * scene.collision_frequency)
         contact_fraction *= (1 + steps / self.steps_per_contact) / 2
-        touching = min(contact_fraction * (2.2 + 4 * near), near)
+        touching = min(contact_fraction * (2.2 + 3 * near**2), near)
         n = self.replicas * self.num_particles
-        expected = listed, near, touching, 2 * touching / (1 + touching)
+        expected = listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # Where places are random, about as many pairs touch besides as would at no correlation.
         found = rooms(expected, spare, 1.3 * inside, n)
         return Plan(self.replicas, self.steps_per_contact, steps, clipped, *found)
