@@ -87,7 +87,7 @@ def firstimpacts(slots: Slots, rows: Rows, end):
     Last, until when each particle surely keeps to its path. It does until its first impact with an
     undisturbed particle, or until one that was disturbed before, and is by then as fast as any may
     be, has had the time to come. Disturbances go from pair to pair; these times fall until they
-    are consistent.
+    are consistent, those before `end`.
     """
     a, b = rows.a, rows.b
     r, w = slots.x[a] - slots.x[b] - rows.offset, slots.v[a] - slots.v[b]
