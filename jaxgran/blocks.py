@@ -277,14 +277,8 @@ def stretch(
     not finite, or a step cannot become shorter.
     """
     began = rewrapped(state, scene.side)
-    found = neighbours.search(
-        began.position,
-        scene.side,
-        1 + began.skin,
-        replicas=plan.replicas,
-        room=plan.room.pairs,
-        by=neighbours_by,
-    )
+    reach, room = 1 + began.skin, plan.room.pairs
+    found = neighbours.search(began.position, scene.side, reach, plan.replicas, room, neighbours_by)
     return _used_up(began, found, scene, end, plan)
 
 

@@ -31,17 +31,11 @@ MOST_PAIRS = 100
 """Pairs per particle beyond which a list is taken to have gone wrong."""
 
 
-class Model(Protocol):
+class Model(given.Model, Protocol):
     """What models of spheres in boxes have in common."""
 
     @property
-    def num_particles(self) -> int: ...
-    @property
-    def replicas(self) -> int: ...
-    @property
     def key(self) -> PRNGKeyArray | None: ...
-    @property
-    def start(self) -> Particles | None: ...
     @property
     def neighbours(self) -> str: ...
     @property

@@ -65,6 +65,9 @@ Measured: hard spheres, N = 1000 (48 replicas) and 4000 (16), phi = .1 and .2, b
 to 5 mean free times: .6 to 1.1, .82 in the mean.
 """
 
+MISSING_HEAT = 1.6
+"""Relative error of the clock over the share of heat that is missing: cooling goes as T^(8/5)."""
+
 INTEGRATION = 0.001
 """Relative error of T of particles followed in time steps: eps good to 1e-4."""
 
@@ -150,13 +153,12 @@ def choose_model(
         flow, scatter = flow_share(
             gas, course["log_temperature"], course["critical_box"], num_particles
         )
-    # The rate of cooling goes as T^(8/5): heat that is missing is missing so many times.
-    space = ENSKOG[0] + ENSKOG[1] * float(gas.packing_fraction) + 1.6 * flow
+    space = ENSKOG[0] + ENSKOG[1] * float(gas.packing_fraction) + MISSING_HEAT * flow
     contacts, softness = CONTACT * course["contact"], course["softness"]
     cooled = min(1.0, max(0.0, -course["log_temperature"].min()))
     noise = NOISE * sqrt(cooled / (size * replicas))
     # A flow that has grown is of a few waves, strong by chance.
-    flowing = _largest_error(course, 1.6 * scatter) / sqrt(replicas)
+    flowing = _largest_error(course, MISSING_HEAT * scatter) / sqrt(replicas)
     homogeneous = space + contacts + SOFTNESS_SQUARED * softness**2
     theory = _largest_error(course, homogeneous + SONINE * course["sonine"] ** 2)
     dsmc = _largest_error(course, space + contacts + softness)

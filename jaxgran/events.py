@@ -256,14 +256,8 @@ def stretch(
     doubles that. An outrun skin ends it; if it was fresh, the window is shortened.
     """
     began, listed, until = _prepared(state, scene.side, end, plan)
-    found = neighbours.search(
-        listed,
-        scene.side,
-        1 + began.skin,
-        replicas=plan.replicas,
-        room=plan.room.pairs,
-        by=neighbours_by,
-    )
+    reach, room = 1 + began.skin, plan.room.pairs
+    found = neighbours.search(listed, scene.side, reach, plan.replicas, room, neighbours_by)
     return _used_up(began, listed, found, scene, until, plan)
 
 

@@ -48,7 +48,8 @@ def flow_share(
     q_of_longest = (critical_box / float(gas.box_side(num_particles))) ** 2 / dense
     longest = sqrt(1 / q_of_longest.min())
     if longest * sqrt(FLOW_CUT) < 1:
-        return np.zeros_like(q_of_longest), np.zeros_like(q_of_longest)
+        none = np.zeros_like(q_of_longest)
+        return none, none
     # In a large box there are more waves, but as many to a particle: a smaller one has them all.
     smaller = max(1.0, longest / LARGEST)
     most = int(sqrt(FLOW_CUT) * longest / smaller)

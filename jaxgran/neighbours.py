@@ -85,23 +85,14 @@ def find_pairs(
         room: how many pairs can be returned.
         by: "vesin" or "jax-md"; both return the same pairs.
     """
-    found = search(position, side, cutoff, replicas=replicas, room=room, by=by)
-    return with_offsets(position, side, found)
+    return with_offsets(position, side, search(position, side, cutoff, replicas, room, by))
 
 
 Found = tuple[Int[Any, "pairs"], Int[Any, "pairs"], Int[Any, ""]]
 """i, j and count of `Pairs`, as NumPy arrays where they come from the host."""
 
 
-def search(
-    position: Float[Array, "particles d"],
-    side: ArrayLike,
-    cutoff: ArrayLike,
-    *,
-    replicas: int = 1,
-    room: int,
-    by: str = "vesin",
-) -> Found:
+def search(position, side, cutoff, replicas: int, room: int, by: str) -> Found:
     """`find_pairs` without offsets, for compiled code to add by `with_offsets`."""
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
     if by not in ENGINES[1:]:

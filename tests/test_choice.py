@@ -135,6 +135,7 @@ def test_only_a_flow_makes_noise_besides():
         assert ("strong by chance" in " ".join(choice.reasons)) is more
         unknown = jaxgran.choose_model(gas, over(gas, 30))
         assert "strong by chance" not in " ".join(unknown.reasons)
+        # Where a flow grows its noise is more than that of shots alone, and the larger part.
         assert (choice.errors["HardSpheres"] > 1.5 * unknown.errors["HardSpheres"]) is more
 
 

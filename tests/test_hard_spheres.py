@@ -343,7 +343,8 @@ def test_a_random_start_melts_under_jit(dimension, packing_fraction, size):
     ("dimension", "packing_fraction"), [(3, 0.1), (3, 0.3), (2, 0.1), (2, 0.5)]
 )
 def test_arrays_fit_what_they_hold(dimension, packing_fraction, monkeypatch):
-    # Rows cost time whether they are used or not. At phi = .01 one kind is 2.6 times too long.
+    # Rows cost time whether they are used or not. A seventh is spare, and estimates of so different
+    # gases by one formula are up to twice what is needed; one kind at phi = .01 is 2.6 times that.
     used, stretch = [], events.stretch
 
     def watched(state, scene, end, plan, *others):

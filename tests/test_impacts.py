@@ -22,7 +22,7 @@ def test_disturbances_go_from_sphere_to_sphere_as_far_as_they_can():
     start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(n, progress=False)).particles
     x, v = start.position.reshape(n, 3), start.velocity.reshape(n, 3)
     pairs = find_pairs(x, start.box_side, 2.0, room=10 * n)
-    real, bound, end = jnp.arange(10 * n) < pairs.count, 5.0, 0.1
+    real, bound, end = jnp.arange(10 * n) < pairs.count, 5.0, 0.05
     rows = Rows(pairs.i, pairs.j, pairs.offset, jnp.full(10 * n, bound), real)
     *_, until = firstimpacts(Slots(x, v, jnp.zeros(n)), rows, end)
 
@@ -54,5 +54,7 @@ def test_disturbances_go_from_sphere_to_sphere_as_far_as_they_can():
                 heapq.heappush(queue, (there, other, hops + 1))
     assert max(sent_by.values()) >= 4  # a way that one sweep does not go
     disturbed = expected < end
+    assert 0.5 < np.mean(disturbed) < 0.9  # and some are left in peace
     np.testing.assert_array_equal(np.asarray(until) < end, disturbed)
-    np.testing.assert_allclose(np.asarray(until)[disturbed], expected[disturbed], rtol=1e-9)
+    # Round-off of times of impact, 4e-15 in this gas.
+    np.testing.assert_allclose(np.asarray(until)[disturbed], expected[disturbed], rtol=1e-13)

@@ -301,7 +301,8 @@ def test_a_dense_random_start_melts_under_jit(beads):
 @pytest.mark.slow
 @pytest.mark.parametrize("packing, fraction", [(0.05, 0.02), (0.2, 0.02), (0.2, 0.1), (0.3, 0.1)])
 def test_arrays_fit_what_they_hold(beads, packing, fraction, monkeypatch):
-    # Rows cost time whether they are used or not.
+    # Rows cost time whether they are used or not. A fifth is spare, and estimates of so different
+    # gases by one formula are up to twice what is needed.
     used, stretch = [], blocks.stretch
 
     def watched(state, scene, end, plan, *others):
