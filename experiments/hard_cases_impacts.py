@@ -215,7 +215,7 @@ def _phases(steps: int, count: int = 32):
     model = quiet(SOFT, 2, projection=None, **settings).sized_for(gas)
     assert model.plan is not None
     # A gas has few pairs in contact at a time; here all are.
-    plan = model.plan._replace(room=Room(*[4 * count] * 4))
+    plan = model.plan._replace(room=Room(*[4 * count] * 5))
     model = dataclasses.replace(model, plan=plan)
     times = [6 * float(gas.contact_duration)]
     a = gas.value("dissipative_constant")

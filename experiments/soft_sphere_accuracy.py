@@ -144,7 +144,7 @@ def impacts(steps_per_contact, phases: int) -> dict:
             model = jaxgran.SoftSpheres(2, replicas=phases, steps_per_contact=steps, start=start)
             plan = model.sized_for(gas).plan
             assert plan is not None
-            room = Room(phases, phases, phases, 2 * phases)  # all collide at once
+            room = Room(phases, 2, phases, phases, 2 * phases)  # all collide at once
             model = dataclasses.replace(model, plan=plan._replace(room=room))
             end = jaxgran.cool(gas, [2 * contact], model=model)
             assert end.particles is not None and end.replicas is not None

@@ -154,7 +154,7 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
         fastest = jnp.sqrt(jnp.max(jnp.sum(v * v, -1)))
         reach = 1.5 * fastest * duration * now.widen
         chosen = encounters.select(
-            x, v, pairs, duration, 2 * reach, now.extra, replicas, plan.room[1:]
+            x, v, pairs, duration, 2 * reach, now.extra, replicas, plan.room[2:]
         )
         before = x.at[chosen.members].get(mode="fill", fill_value=0.0)
         v_before = v.at[chosen.members].get(mode="fill", fill_value=0.0)
@@ -197,8 +197,8 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
         worked, held = by_replica(work.exchanged), kinetic(v) + state.elastic
         wrong = jnp.any(jnp.abs(gain) > EXCHANGE_TOLERANCE * worked + START_TOLERANCE * held)
         full = chosen.needed > jnp.array(plan.room)
-        no_room = status.flag(status.LIST_FULL, full[0])
-        no_room |= status.flag(status.CONTACTS_FULL, jnp.any(full[1:]))
+        no_room = status.flag(status.LIST_FULL, jnp.any(full[:2]))
+        no_room |= status.flag(status.CONTACTS_FULL, jnp.any(full[2:]))
         finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
         outrun = status.flag(status.SKIN_OUTRUN, moved > 0.5 * state.skin)
         trouble = jnp.where(finite, outrun, status.NOT_FINITE.bit)
@@ -220,7 +220,7 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
         return (now.state.time < end) & ~now.stale & (now.status == status.OK)
 
     zero = jnp.zeros((), jnp.int32)
-    full = pairs.count > plan.room.pairs
+    full = (pairs.count > plan.room.pairs) | (pairs.ahead > plan.room.ahead)
     xi, _, touching = encounters.overlap(state.position, pairs.i, pairs.j, pairs.offset)
     touching &= jnp.arange(len(xi)) < pairs.count
     stored = encounters.elastic_energy(jnp.where(touching, xi, 0.0), scene.alpha)
@@ -231,7 +231,7 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
         widen=jnp.ones((), state.position.dtype),
         stale=jnp.zeros((), bool),
         status=status.flag(status.LIST_FULL, full),
-        needed=jnp.zeros(len(plan.room), jnp.int32).at[0].set(pairs.count),
+        needed=jnp.stack([pairs.count, pairs.ahead, zero, zero, zero]),
         num_blocks=zero,
     )
     return jax.lax.while_loop(unfinished, block, first)
@@ -267,9 +267,7 @@ def _followed(follow, x, v, scene: Scene, chosen: Encounters, state: State):
     return x, v, work, along
 
 
-def stretch(
-    state: State, scene: Scene, end: ArrayLike, plan: Plan, neighbours_by: str = "vesin"
-) -> Progress:
+def stretch(state: State, scene: Scene, end: ArrayLike, plan: Plan, by: str = "sweep") -> Progress:
     """A fresh list of pairs, blocks until it is used up, and what can be mended of a failure.
 
     A step too large is halved and an outrun skin lengthened; the state is then the last good one
@@ -277,8 +275,8 @@ def stretch(
     not finite, or a step cannot become shorter.
     """
     began = rewrapped(state, scene.side)
-    reach, room = 1 + began.skin, plan.room.pairs
-    found = neighbours.search(began.position, scene.side, reach, plan.replicas, room, neighbours_by)
+    reach, room = 1 + began.skin, plan.room[:2]
+    found = neighbours.search(began.position, scene.side, reach, plan.replicas, room, by)
     return _used_up(began, found, scene, end, plan)
 
 

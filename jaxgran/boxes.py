@@ -1,7 +1,6 @@
 """Boxes of spheres, soft or hard: what is asked of them, how they start, melt and cool."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -15,7 +14,7 @@ from jaxgran import checkpoint, given, initial, neighbours, observables, status
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.gas import Gas
 from jaxgran.room import Room
-from jaxgran.simulation import simulate
+from jaxgran.simulation import forward, simulate, stretches
 from jaxgran.tangents import Inputs, Outputs
 
 SMALLEST_BOX = 2.1
@@ -158,10 +157,10 @@ def run(
         checkpoint.refuse(model.checkpoint, type(model).__name__)
         if model.neighbours == "jax-md":
             raise ValueError(
-                'inside jax.jit or jax.vmap pairs are found by vesin, not by neighbours="jax-md", '
-                "which sizes its cells from known numbers: leave neighbours out"
+                'inside jax.jit or jax.vmap neighbours="jax-md" cannot find the pairs, as it sizes '
+                "its cells from known numbers: leave neighbours out"
             )
-        state, records, fault = _traced(inputs, kind, plan, state, begun)
+        state, records, fault = _traced(model, inputs, kind, plan, state, begun)
     else:
         # Under jax.grad every call of a compiled function would be traced again.
         with eval_context():
@@ -179,22 +178,23 @@ def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settin
     of a fit, neither fails on the way to it nor compiles again. Results do not depend on it. A melt
     begins with many spheres near contact, and its needs are its own.
     """
-    scene, engine = inputs.scene, neighbours.engine(model.neighbours)
+    scene, engine = inputs.scene, neighbours.engine(model.neighbours, plan.room.ahead)
     rooms = {"melt": plan.melting, "run": plan.room}
 
     def advance(state, end: float, scene=scene, stage: str = "run"):
         while True:
             room: Room = _NEEDED.get((plan, stage)) or rooms[stage]
-            now = kind.stretch(state, scene, end, plan._replace(room=room), engine)
-            fault = int(now.status)
+            now = plan._replace(room=room)
+            state, fault, needed = forward(kind.stretch, state, scene, end, now, engine)
+            fault = int(fault)
             if fault == status.OK:
-                return now.state
-            needed = [int(x) for x in now.needed]
+                return state
+            needed = [int(x) for x in needed]
             missing = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
             if not missing or max(needed) > MOST_PAIRS * len(state.position):
-                at = float(jnp.mean(now.state.velocity**2))
+                at = float(jnp.mean(state.velocity**2))
                 raise RuntimeError(f"stopped at T/T_0 = {at:.3g}: {status.explain(fault)}")
-            # The stretch is made again as a whole: a list made on the way would have another order.
+            # That stretch is made again as a whole: a list made on the way has another order.
             _NEEDED[plan, stage] = room.grown(needed)
 
     # A run to be resumed has been melted.
@@ -221,35 +221,31 @@ def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settin
     return state, records, jnp.zeros((), jnp.int32)
 
 
-def _traced(inputs: Inputs, kind: Kind, plan, state, begun):
+def _traced(model: Model, inputs: Inputs, kind: Kind, plan, state, begun):
     """The same inside `jax.jit`, `jax.vmap` or a derivative: room is fixed beforehand."""
 
-    def further(carry, scene, end, plan=plan):
-        now = kind.stretch(carry[0], scene, end, plan)
-        return now.state, now.status
-
-    def until(carry, scene, end, plan=plan):
-        def unfinished(carry):
-            return (carry[0].time < end) & (carry[1] == status.OK)
-
-        step = partial(further, scene=scene, end=end, plan=plan)
-        return jax.lax.while_loop(unfinished, step, carry)
-
+    by = neighbours.engine(model.neighbours, plan.room.ahead, traced=True)
     scene, fault = inputs.scene, jnp.zeros((), jnp.int32)
+
+    def further(carry, scene, end, plan=plan, least=0, most=None):
+        state, fault = carry
+        return stretches(kind.stretch, state, scene, end, plan, by, least, most, fault)[:2]
+
     if inputs.start is None:
         end = MELT_COLLISIONS / scene.collision_frequency
         melting = plan._replace(room=plan.melting)
-        state, fault = until((state, fault), kind.elastic(scene), end, melting)
+        state, fault = further((state, fault), kind.elastic(scene), end, melting)
     else:
         fault = kind.fault(state)
-    state, counted = further((begun(state), fault), scene, jnp.zeros_like(state.time))
+    zero = jnp.zeros_like(state.time)
+    state, fault = further((begun(state), fault), scene, zero, least=1, most=1)
 
     def to(carry, end):
-        state, fault = until(carry, scene, end)
+        state, fault = further(carry, scene, end)
         records, bad = kind.observe(state), fault != status.OK
         return (state, fault), jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), records)
 
-    (state, fault), records = jax.lax.scan(to, (state, fault | counted), inputs.times)
+    (state, fault), records = jax.lax.scan(to, (state, fault), inputs.times)
     return state, records, fault
 
 

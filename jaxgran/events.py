@@ -206,8 +206,8 @@ def advance(
         away = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
         outrun = jnp.maximum(away, jnp.max(work.moved)) > (0.5 * state.skin) ** 2
         full = chosen.needed > jnp.array(plan.room)
-        no_room = status.flag(status.LIST_FULL, full[0])
-        no_room |= status.flag(status.CONTACTS_FULL, jnp.any(full[1:]))
+        no_room = status.flag(status.LIST_FULL, jnp.any(full[:2]))
+        no_room |= status.flag(status.CONTACTS_FULL, jnp.any(full[2:]))
         finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
         trouble = status.flag(status.SKIN_OUTRUN, outrun)
         trouble |= status.flag(status.STALLED, work.num_rounds >= MAX_ROUNDS)
@@ -239,7 +239,7 @@ def advance(
         widen=jnp.ones((), state.position.dtype),
         stale=jnp.zeros((), bool),
         status=zero,
-        needed=jnp.zeros(len(plan.room), jnp.int32).at[0].set(pairs.count),
+        needed=jnp.stack([pairs.count, pairs.ahead, zero, zero, zero]),
         num_windows=zero,
         num_failed=zero,
         num_rounds=zero,
@@ -247,17 +247,15 @@ def advance(
     return jax.lax.while_loop(unfinished, window, first)
 
 
-def stretch(
-    state: State, scene: Scene, end: ArrayLike, plan: Plan, neighbours_by: str = "vesin"
-) -> Progress:
+def stretch(state: State, scene: Scene, end: ArrayLike, plan: Plan, by: str = "sweep") -> Progress:
     """A fresh list of pairs, windows until it is used up, and what can be mended of a failure.
 
     The list is made for the places that free flight leads to at the middle of its life, which
     doubles that. An outrun skin ends it; if it was fresh, the window is shortened.
     """
     began, listed, until = _prepared(state, scene.side, end, plan)
-    reach, room = 1 + began.skin, plan.room.pairs
-    found = neighbours.search(listed, scene.side, reach, plan.replicas, room, neighbours_by)
+    reach, room = 1 + began.skin, plan.room[:2]
+    found = neighbours.search(listed, scene.side, reach, plan.replicas, room, by)
     return _used_up(began, listed, found, scene, until, plan)
 
 

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.encounters import rows_where
 from jaxgran.neighbours import Pairs
 from jaxgran.restitution import ReducedLaw
 from jaxgran.room import Room
+from jaxgran.rows import rows_where
 from jaxgran.tangents import ImpactTangents
 
 MAX_ROUNDS = 100_000
@@ -172,7 +172,7 @@ def select(
     slot = jnp.zeros(n, jnp.int32).at[members].set(own, mode="drop")
     a, b = (jnp.where(real, slot[k], 0) for k in (i, j))
     rows = Rows(a, b, rows.offset[picked], rows.bound[picked], real)
-    needed = jnp.stack([pairs.count, num_near, num_chosen, num_members])
+    needed = jnp.stack([pairs.count, pairs.ahead, num_near, num_chosen, num_members])
     return Selection(members, rows, members // size, needed)
 
 

@@ -14,11 +14,16 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 from vesin import NeighborList
 
+from jaxgran.sweep import sweep
+
 VESIN_CELLS = 1e5
 """The most cells of vesin's search."""
 
-ENGINES = ("auto", "vesin", "jax-md")
-"""Who finds the pairs: vesin on the host (fastest on a CPU), jax-md on the device (for GPUs)."""
+ENGINES = ("auto", "sweep", "vesin", "jax-md")
+"""Who finds the pairs: our sweep in compiled code, vesin on the host, jax-md on the device."""
+
+MOST_AHEAD = 1500
+"""Particles that a sweep may have to look ahead, beyond which vesin's cells are faster."""
 
 
 class Pairs(NamedTuple):
@@ -29,12 +34,14 @@ class Pairs(NamedTuple):
         offset: whole box sides that the pair is apart: ``x_i - x_j - offset`` is its shortest
             displacement, and stays so while particles move on without being wrapped.
         count: how many pairs there are; more than there is room for means that some are missing.
+        ahead: how far a sweep had to look; if that is farther than it could, some are missing.
     """
 
     i: Int[Array, "pairs"]
     j: Int[Array, "pairs"]
     offset: Float[Array, "pairs d"]
     count: Int[Array, ""]
+    ahead: Int[Array, ""]
 
 
 def displacement(side: ArrayLike, a: Float[Array, "... d"], b: Float[Array, "... d"]):
@@ -54,13 +61,18 @@ def wrap(side: ArrayLike, position: Float[Array, "... d"]) -> Float[Array, "... 
     return jnp.where(inside >= side, 0.0, inside)  # rounding may land on the far edge
 
 
-def engine(name: str = "auto") -> str:
-    """The list builder to use: `name`, or for "auto" vesin on a CPU and jax-md elsewhere."""
+def engine(name: str, ahead: int = 0, traced: bool = False) -> str:
+    """The list builder to use: `name`, or for "auto" the one that is fastest as measured.
+
+    That is jax-md on a GPU, where it can be, and on a CPU a sweep if it looks ahead a short way.
+    """
     if name not in ENGINES:
         raise ValueError(f"neighbours must be one of {', '.join(ENGINES)}, got {name!r}")
-    if name == "auto":
-        return "vesin" if jax.default_backend() == "cpu" else "jax-md"
-    return name
+    if name != "auto":
+        return name
+    if jax.default_backend() != "cpu" and not traced:
+        return "jax-md"
+    return "sweep" if ahead <= MOST_AHEAD else "vesin"
 
 
 def find_pairs(
@@ -74,8 +86,9 @@ def find_pairs(
 ) -> Pairs:
     """All pairs closer than a cutoff, in each of several equal periodic boxes.
 
-    Carries no derivatives. With vesin it works under `jax.jit` and `jax.vmap`, by a call to the
-    host; jax-md sizes its cells from the numbers, so `position`, `side` and `cutoff` must be known.
+    Carries no derivatives. A sweep is compiled; vesin works under `jax.jit` and `jax.vmap` too, by
+    a call to the host; jax-md sizes its cells from the numbers, so that `position`, `side` and
+    `cutoff` must be known.
 
     Args:
         position: of all particles, replica after replica, in [0, side).
@@ -83,30 +96,38 @@ def find_pairs(
         cutoff: in the same unit, > 0 and at most half a side.
         replicas: number of boxes; their particles do not see each other.
         room: how many pairs can be returned.
-        by: "vesin" or "jax-md"; both return the same pairs.
+        by: "vesin", "sweep" or "jax-md"; all return the same pairs.
     """
-    return with_offsets(position, side, search(position, side, cutoff, replicas, room, by))
+    n = len(position) // replicas
+    return with_offsets(position, side, search(position, side, cutoff, replicas, (room, n), by))
 
 
-Found = tuple[Int[Any, "pairs"], Int[Any, "pairs"], Int[Any, ""]]
-"""i, j and count of `Pairs`, as NumPy arrays where they come from the host."""
+Found = tuple[Int[Any, "pairs"], Int[Any, "pairs"], Int[Any, ""], Int[Any, ""]]
+"""i, j, count and ahead of `Pairs`, as NumPy arrays where they come from the host."""
 
 
-def search(position, side, cutoff, replicas: int, room: int, by: str) -> Found:
-    """`find_pairs` without offsets, for compiled code to add by `with_offsets`."""
+def search(position, side, cutoff, replicas: int, room: tuple[int, int], by: str) -> Found:
+    """`find_pairs` without offsets, for compiled code to add by `with_offsets`.
+
+    The room is that of the pairs, and how far a sweep may look ahead.
+    """
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
     if by not in ENGINES[1:]:
         raise ValueError(f"by must be one of {', '.join(ENGINES[1:])}, got {by!r}")
+    if by == "sweep":
+        return sweep(position, side, cutoff, replicas=replicas, room=room[0], ahead=room[1])
     engine = {"vesin": _vesin_pairs, "jax-md": _jax_md_pairs}[by]
-    return engine(position, side, cutoff, replicas, room)
+    i, j, count = engine(position, side, cutoff, replicas, room[0])
+    return i, j, count, np.int32(0)
 
 
 @jax.jit
 def with_offsets(position: Float[Array, "particles d"], side: ArrayLike, found: Found) -> Pairs:
     """The pairs found for such positions."""
     position, side = jax.lax.stop_gradient((position, jnp.asarray(side)))
-    i, j, count = found
-    return Pairs(i, j, side * jnp.round((position[i] - position[j]) / side), count)
+    i, j, count, ahead = found
+    offset = side * jnp.round((position[i] - position[j]) / side)
+    return Pairs(i, j, offset, count, ahead)
 
 
 def _vesin_pairs(position, side, cutoff, replicas, room):

@@ -14,6 +14,7 @@ class Room(NamedTuple):
     """How many rows the arrays of a compiled run have."""
 
     pairs: int
+    ahead: int  # particles, that a sweep can look
     near: int
     contacts: int
     members: int
@@ -26,12 +27,13 @@ class Room(NamedTuple):
 
 
 def rooms(
-    expected: Sequence[float], spare: float, more: float, num_particles: int
+    expected: Sequence[float], ahead: float, spare: float, more: float, num_particles: int
 ) -> tuple[Room, Room]:
     """Room of a run, and of its melt as that begins.
 
     Args:
-        expected: rows a particle of each kind.
+        expected: rows a particle of each kind: pairs, near ones, contacts, members.
+        ahead: particles of a box within reach along x.
         spare: room over that; its root for the pairs listed, which vary least.
         more: rows a particle besides, of pairs near each other, in random places.
         num_particles: of all replicas; no more can be members.
@@ -40,11 +42,12 @@ def rooms(
     pairs, near, contacts, members = (
         int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
     )
+    ahead = int(spare**0.5 * ahead + 5 * ahead**0.5) + 64
     extra = int(num_particles * more)
     near_too, contacts_too = (min(rows + extra, pairs) for rows in (near, contacts))
     return (
-        Room(pairs, near, contacts, min(members, num_particles)),
-        Room(pairs, near_too, contacts_too, min(members + 2 * extra, num_particles)),
+        Room(pairs, ahead, near, contacts, min(members, num_particles)),
+        Room(pairs, ahead, near_too, contacts_too, min(members + 2 * extra, num_particles)),
     )
 
 
@@ -64,6 +67,11 @@ def skin_with(more: float, num_particles: int, side: ArrayLike, dimension: int) 
     """Reach beyond contact, in diameters, in which so many more pairs a particle are listed."""
     inside = pairs_in_contact(num_particles, side, dimension)
     return jnp.minimum((1 + more / inside) ** (1 / dimension) - 1, longest_skin(side))
+
+
+def within_reach(num_particles: int, side: ArrayLike, skin: ArrayLike) -> float:
+    """Particles of an even gas that are within contact and a skin ahead along x."""
+    return float(num_particles * jnp.minimum((1 + jnp.asarray(skin)) / jnp.asarray(side), 0.5))
 
 
 def longest_skin(side: ArrayLike) -> Float[Array, ""]:

@@ -1,19 +1,25 @@
-"""Run a particle model from output time to output time: progress bar, checkpoints, interruption."""
+"""Run a particle model: from list to list, from output time to output time, with checkpoints."""
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike
 from tqdm import tqdm
 
-from jaxgran import checkpoint
+from jaxgran import checkpoint, status
 
 CHECKPOINT_SECONDS = 60.0
 """A checkpoint is written this often, and when the run is interrupted."""
+
+
+STRETCHES = 8
+"""Lists of pairs used up in one call to compiled code; between calls progress is shown."""
 
 
 class _Timed(Protocol):
@@ -93,3 +99,48 @@ def simulate(
     if path is not None:
         save()
     return state, records
+
+
+def stretches(
+    stretch: Callable[..., Any],
+    state: Any,
+    scene: Any,
+    end: ArrayLike,
+    plan: Any,
+    by: str,
+    least: int,
+    most: int | None = None,
+    fault: ArrayLike = status.OK,
+) -> tuple[Any, Array, Array]:
+    """Stretches until an end, at least and at most so many, or until one fails.
+
+    Returns the state after the last good one, the status of the last, and the most rows needed.
+    """
+
+    def unfinished(carry):
+        made, state, fault, _ = carry
+        going = (made < least) | (state.time < end)
+        if most is not None:
+            going &= made < most
+        return going & (fault == status.OK)
+
+    def further(carry):
+        made, state, _, needed = carry
+        now = stretch(state, scene, end, plan, by)
+        kept = jax.tree.map(partial(jnp.where, now.status == status.OK), now.state, state)
+        return made + 1, kept, now.status, jnp.maximum(needed, now.needed)
+
+    zero, needed = jnp.zeros((), jnp.int32), jnp.zeros(len(plan.room), jnp.int32)
+    begin = zero, state, jnp.asarray(fault, jnp.int32), needed
+    return jax.lax.while_loop(unfinished, further, begin)[1:]
+
+
+_compiled = jax.jit(stretches, static_argnames=("stretch", "plan", "by"))
+
+
+def forward(stretch: Callable[..., Any], state, scene, end: float, plan, engine: str):
+    """As `stretches`, some of them, of known numbers; for a list made on the host, one."""
+    if engine == "sweep":
+        return _compiled(stretch, state, scene, end, plan, engine, 1, STRETCHES)
+    now = stretch(state, scene, end, plan, engine)
+    return (now.state if int(now.status) == status.OK else state), now.status, now.needed

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran import events, simulation
+from jaxgran import boxes, events, simulation
 from jaxgran.models.hard_spheres import HardSpheres, reduced_scene
 from jaxgran.neighbours import find_pairs
 from jaxgran.room import Room
@@ -277,28 +277,30 @@ def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     jaxgran.cool(gas, times, model=quiet(100, plan=tiny))
 
 
-def test_resumes_bit_for_bit(tmp_path, monkeypatch):
+@pytest.mark.parametrize("by", ["sweep", "vesin"])
+def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
     gas = hard_gas(0.8, 0.1)
     times = np.array([0.3, 1.0, 2.0]) * float(gas.mean_free_time)
     file = tmp_path / "run.npz"
-    whole = jaxgran.cool(gas, times, model=quiet(100))
+    whole = jaxgran.cool(gas, times, model=quiet(100, neighbours=by))
     monkeypatch.setattr(simulation, "CHECKPOINT_SECONDS", 0.0)
-    stretch = events.stretch
+    monkeypatch.setattr(simulation, "STRETCHES", 1)
+    forward = boxes.forward
 
-    def dies(state, *args):
+    def dies(stretch, state, *args):
         if file.exists() and state.time > times[0]:
             raise MemoryError("killed")
-        return stretch(state, *args)
+        return forward(stretch, state, *args)
 
-    monkeypatch.setattr(events, "stretch", dies)
+    monkeypatch.setattr(boxes, "forward", dies)
     with pytest.raises(MemoryError):
-        jaxgran.cool(gas, times, model=quiet(100, checkpoint=file))
-    monkeypatch.setattr(events, "stretch", stretch)
-    resumed = jaxgran.cool(gas, times, model=quiet(100, checkpoint=file))
+        jaxgran.cool(gas, times, model=quiet(100, neighbours=by, checkpoint=file))
+    monkeypatch.setattr(boxes, "forward", forward)
+    resumed = jaxgran.cool(gas, times, model=quiet(100, neighbours=by, checkpoint=file))
     np.testing.assert_array_equal(resumed.temperature, whole.temperature)
     np.testing.assert_array_equal(resumed.particles.position, whole.particles.position)
     with pytest.raises(ValueError, match="another scene"):
-        jaxgran.cool(gas, 2 * times, model=quiet(100, checkpoint=file))
+        jaxgran.cool(gas, 2 * times, model=quiet(100, neighbours=by, checkpoint=file))
 
 
 def test_jit_and_vmap_give_the_same_numbers():
@@ -345,15 +347,15 @@ def test_a_random_start_melts_under_jit(dimension, packing_fraction, size):
 def test_arrays_fit_what_they_hold(dimension, packing_fraction, monkeypatch):
     # Rows cost time whether they are used or not. A seventh is spare, and estimates of so different
     # gases by one formula are up to twice what is needed; one kind at phi = .01 is 2.6 times that.
-    used, stretch = [], events.stretch
+    used, forward = [], boxes.forward
 
-    def watched(state, scene, end, plan, *others):
-        now = stretch(state, scene, end, plan, *others)
+    def watched(stretch, state, scene, end, plan, *others):
+        *now, needed = forward(stretch, state, scene, end, plan, *others)
         if not scene.elastic:
-            used.append(np.asarray(now.needed) / np.array(plan.room))
-        return now
+            used.append(np.asarray(needed) / np.array(plan.room))
+        return *now, needed
 
-    monkeypatch.setattr(events, "stretch", watched)
+    monkeypatch.setattr(boxes, "forward", watched)
     gas = hard_gas(0.9, packing_fraction, dimension)
     jaxgran.cool(gas, [5 * float(gas.mean_free_time)], model=quiet(4000))
     fullest = np.max(used, axis=0)
@@ -487,7 +489,7 @@ def test_a_skin_full_of_spheres_is_shortened(monkeypatch):
 
     monkeypatch.setattr(events, "stretch", watched)
     end = 2.0
-    curve = jaxgran.cool(gas, [end], model=quiet(size, start=start))
+    curve = jaxgran.cool(gas, [end], model=quiet(size, start=start, neighbours="vesin"))
     assert skins[-1] < skins[0] and min(skins) >= events.SHORTEST_SKIN
     _, _, counts, _ = serial(gas, start, end)
     assert counts.sum() > 50 and round(float(curve.collisions[0]) * size) == counts.sum()

@@ -9,7 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from jaxgran.neighbours import displacement, engine, find_pairs, vesin_search, wrap
+from jaxgran.neighbours import (
+    MOST_AHEAD,
+    displacement,
+    engine,
+    find_pairs,
+    vesin_search,
+    wrap,
+)
+from jaxgran.sweep import sweep
 
 # In boxes of less than three cutoffs jax-md itself warns about its integers.
 jax_md_warns = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")
@@ -70,8 +78,9 @@ def compare(dimension, replicas, side, cutoff, by):
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("replicas", [1, 3])
 @pytest.mark.parametrize("fraction", [0.15, 1 / 3, 0.4999, 0.5])
-def test_vesin_finds_what_brute_force_finds(dimension, replicas, fraction):
-    compare(dimension, replicas, 3.7, 3.7 * fraction, "vesin")
+@pytest.mark.parametrize("by", ["vesin", "sweep"])
+def test_pairs_are_those_of_brute_force(dimension, replicas, fraction, by):
+    compare(dimension, replicas, 3.7, 3.7 * fraction, by)
 
 
 @jax_md_warns
@@ -90,7 +99,12 @@ def test_jax_md_finds_what_brute_force_finds(dimension, replicas, fraction):
 def test_points_of_a_grid(points, dimension, cutoff):
     position = np.array(points, float)[:, :dimension] / 8
     expected = brute_force(position, 1.0, cutoff)
-    pairs = find_pairs(jnp.asarray(position), 1.0, cutoff, room=66)
+    for by in ("vesin", "sweep"):
+        on_a_grid(position, expected, cutoff, by)
+
+
+def on_a_grid(position, expected, cutoff, by):
+    pairs = find_pairs(jnp.asarray(position), 1.0, cutoff, room=66, by=by)
     assert sorted(listed(pairs)) == sorted(expected)
     for i, j, offset in zip(pairs.i, pairs.j, pairs.offset, strict=True):
         if i != j:  # else a row past the last
@@ -98,16 +112,21 @@ def test_points_of_a_grid(points, dimension, cutoff):
             np.testing.assert_array_equal(apart, expected[int(i), int(j)])  # eighths are exact
 
 
-def test_coincident_particles_are_pairs():
+COMPILED = pytest.mark.parametrize("by", ["vesin", "sweep"])
+
+
+@COMPILED
+def test_coincident_particles_are_pairs(by):
     position = jnp.stack([jnp.array([1.0, 2.0, 3.0])] * 3 + [jnp.array([3.0, 0.0, 1.0])])
-    pairs = find_pairs(position, 4.0, 1e-3, room=8)
+    pairs = find_pairs(position, 4.0, 1e-3, room=8, by=by)
     assert sorted(listed(pairs)) == [(0, 1), (0, 2), (1, 2)]
     assert not np.any(pairs.offset)
 
 
-def test_pairs_across_the_faces():
+@COMPILED
+def test_pairs_across_the_faces(by):
     position = jnp.array([[0.1, 2.0], [3.9, 2.0], [0.0, 0.0], [3.95, 3.95]])
-    pairs = find_pairs(position, 4.0, 0.5, room=8)
+    pairs = find_pairs(position, 4.0, 0.5, room=8, by=by)
     offset = dict(zip(listed(pairs), np.asarray(pairs.offset).tolist(), strict=False))
     assert offset == {(0, 1): [-4.0, 0.0], (2, 3): [-4.0, -4.0]}
 
@@ -134,7 +153,7 @@ def test_too_little_room_is_told():
     position = awkward(2, 2, 3.7)
     cutoff = 3.7 * 0.15
     expected = brute_force(position, 3.7, cutoff, 2)
-    for by in ("vesin", "jax-md"):
+    for by in ("vesin", "sweep", "jax-md"):
         search = partial(find_pairs, jnp.asarray(position), 3.7, cutoff, replicas=2, by=by)
         for room in (1, len(expected) // 4, len(expected) - 1):
             pairs = search(room=room)
@@ -154,11 +173,12 @@ def test_lists_of_jax_md_grow_with_the_gas():
         assert set(listed(pairs)) == set(brute_force(position, side, cutoff))
 
 
+@COMPILED
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_jit_and_vmap(dimension):
+def test_jit_and_vmap(dimension, by):
     rng = np.random.default_rng(3)
     batch = jnp.asarray(rng.random((3, 40, dimension)))
-    search = partial(find_pairs, replicas=2, room=120)
+    search = partial(find_pairs, replicas=2, room=120, by=by)
     compiled = jax.jit(search)(2 * batch[0], 2.0, 0.4)
     jax.tree.map(np.testing.assert_array_equal, compiled, search(2 * batch[0], 2.0, 0.4))
     sides = jnp.array([1.0, 2.0, 4.0])
@@ -183,14 +203,16 @@ def test_pairs_carry_no_derivatives():
         np.testing.assert_allclose(gradient, [[0.4, -1.0], [-0.4, 1.0], [0.0, 0.0]], atol=1e-14)
 
 
-def test_numbers_that_are_not_finite_have_no_pairs():
+@COMPILED
+def test_numbers_that_are_not_finite_have_no_pairs(by):
     for bad in (jnp.nan, jnp.inf):
         position = jnp.ones((4, 3)).at[2, 1].set(bad)
-        assert find_pairs(position, 4.0, 1.0, room=3).count == 0
+        assert find_pairs(position, 4.0, 1.0, room=3, by=by).count == 0
 
 
-def test_one_particle_has_no_pairs():
-    assert find_pairs(jnp.ones((1, 3)), 4.0, 1.0, room=3).count == 0
+@COMPILED
+def test_one_particle_has_no_pairs(by):
+    assert find_pairs(jnp.ones((1, 3)), 4.0, 1.0, room=3, by=by).count == 0
 
 
 @pytest.mark.parametrize("side", [1.0, 3.7])
@@ -218,15 +240,20 @@ def test_displacement_is_the_shortest():
     np.testing.assert_allclose(sides, np.round(sides), atol=1e-14)
 
 
-def test_engine_follows_the_device(monkeypatch):
-    assert engine("vesin") == "vesin" and engine("jax-md") == "jax-md"
-    for device, name in (("cpu", "vesin"), ("gpu", "jax-md"), ("tpu", "jax-md")):
+def test_engine_follows_the_device_and_the_gas(monkeypatch):
+    assert engine("vesin", 1) == "vesin" and engine("sweep", 10**6) == "sweep"
+    assert engine("jax-md") == "jax-md"
+    for device, dense, traced in (("cpu", "vesin", "vesin"), ("gpu", "jax-md", "vesin")):
         monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
-        assert engine() == engine("auto") == name
+        assert engine("auto", MOST_AHEAD + 1) == dense
+        assert engine("auto", MOST_AHEAD) == ("sweep" if device == "cpu" else "jax-md")
+        assert engine("auto", MOST_AHEAD, traced=True) == "sweep"
+        assert engine("auto", MOST_AHEAD + 1, traced=True) == traced
 
 
 def test_unknown_engines_are_refused():
-    with pytest.raises(ValueError, match="neighbours must be one of auto, vesin, jax-md, got 'kd'"):
+    message = "neighbours must be one of auto, sweep, vesin, jax-md, got 'kd'"
+    with pytest.raises(ValueError, match=message):
         engine("kd")
 
 
@@ -238,3 +265,37 @@ def test_wide_planes(side, n):
     found = np.sort(np.stack([i[:count], j[:count]], axis=1), axis=1)
     expected = KDTree(position, boxsize=side).query_pairs(1.4)
     assert set(map(tuple, found.tolist())) == expected
+    pairs = find_pairs(jnp.asarray(position), side, 1.4, room=2 * n, by="sweep")
+    assert set(listed(pairs)) == expected
+
+
+def test_a_sweep_looks_as_far_as_it_must():
+    # A gas, the same gas squeezed into a slab, and all of it in one plane across the sweep.
+    rng = np.random.default_rng(6)
+    side, n = 10.0, 1000
+    gas = side * rng.random((2, n, 3))
+    for squeezed, crowd in ((1.0, 1), (0.1, 10), (0.0, n)):
+        position = gas * np.array([squeezed, 1.0, 1.0])
+        trees = [KDTree(box, boxsize=side).query_pairs(1.0) for box in position]
+        expected = {(i + n * k, j + n * k) for k, tree in enumerate(trees) for i, j in tree}
+        flat = jnp.asarray(position.reshape(-1, 3))
+        look = partial(sweep, flat, side, 1.0, replicas=2, room=len(expected) + 9)
+        i, j, count, ahead = look(ahead=n)
+        found = list(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
+        assert set(found) == expected and len(found) == len(expected)
+        # Within .1 of the box, evenly: 100, and up to five standard errors more.
+        assert min(100 * crowd, n) <= ahead <= min(150 * crowd + 32, n + 31)
+        *_, short_count, told = look(ahead=int(ahead) - 32)
+        assert told == ahead and short_count <= count
+        *_, enough, told = look(ahead=int(ahead))
+        assert told == ahead and enough == count
+
+
+def test_a_sweep_in_single_precision_misses_nothing():
+    rng = np.random.default_rng(7)
+    position = (30 * rng.random((4000, 3))).astype(np.float32)
+    i, j, count, _ = sweep(jnp.asarray(position), 30.0, 1.5, replicas=1, room=20_000, ahead=4000)
+    found = set(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
+    tree = KDTree(position.astype(float), boxsize=30.0)
+    # As documented: 10^-6 of the cutoff and of the side.
+    assert tree.query_pairs(1.5) <= found <= tree.query_pairs(1.5 + 3.2e-5)

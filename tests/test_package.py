@@ -7,7 +7,9 @@ import jaxgran
 
 ROOT = Path(__file__).parent.parent
 FLOORS = [
-    ["domain", "status", "checkpoint", "neighbours"],
+    ["domain", "status", "checkpoint", "rows"],
+    ["sweep"],
+    ["neighbours"],
     ["contact", "simulation", "observables", "initial"],
     ["restitution", "encounters"],
     ["gas", "tangents"],

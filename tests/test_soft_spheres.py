@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran import blocks, simulation
+from jaxgran import boxes, simulation
 from jaxgran.models.soft_spheres import SoftSpheres, reduced_scene
 from jaxgran.observables import structure_factor
 from jaxgran.room import Room
@@ -250,18 +250,19 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
     file = tmp_path / "run.npz"
     whole = jaxgran.cool(gas, times, model=quiet(100))
     monkeypatch.setattr(simulation, "CHECKPOINT_SECONDS", 0.0)
-    stretch, left = blocks.stretch, [12]
+    monkeypatch.setattr(simulation, "STRETCHES", 1)
+    forward, left = boxes.forward, [12]
 
     def dies(*args):
         left[0] -= 1
         if left[0] < 0 and file.exists():
             raise MemoryError("killed")
-        return stretch(*args)
+        return forward(*args)
 
-    monkeypatch.setattr(blocks, "stretch", dies)
+    monkeypatch.setattr(boxes, "forward", dies)
     with pytest.raises(MemoryError):
         jaxgran.cool(gas, times, model=quiet(100, checkpoint=file))
-    monkeypatch.setattr(blocks, "stretch", stretch)
+    monkeypatch.setattr(boxes, "forward", forward)
     resumed = jaxgran.cool(gas, times, model=quiet(100, checkpoint=file))
     np.testing.assert_array_equal(resumed.temperature, whole.temperature)
     np.testing.assert_array_equal(resumed.particles.position, whole.particles.position)
@@ -303,15 +304,15 @@ def test_a_dense_random_start_melts_under_jit(beads):
 def test_arrays_fit_what_they_hold(beads, packing, fraction, monkeypatch):
     # Rows cost time whether they are used or not. A fifth is spare, and estimates of so different
     # gases by one formula are up to twice what is needed.
-    used, stretch = [], blocks.stretch
+    used, forward = [], boxes.forward
 
-    def watched(state, scene, end, plan, *others):
-        now = stretch(state, scene, end, plan, *others)
+    def watched(stretch, state, scene, end, plan, *others):
+        *now, needed = forward(stretch, state, scene, end, plan, *others)
         if scene.dissipative_constant > 0:
-            used.append(np.asarray(now.needed) / np.array(plan.room))
-        return now
+            used.append(np.asarray(needed) / np.array(plan.room))
+        return *now, needed
 
-    monkeypatch.setattr(blocks, "stretch", watched)
+    monkeypatch.setattr(boxes, "forward", watched)
     gas = soft_beads(beads, fraction, 0.15, packing_fraction=packing)
     times = [3 * float(gas.mean_free_time)]
     jaxgran.cool(gas, times, model=quiet(8000, steps_per_contact=40))
@@ -333,22 +334,24 @@ def test_jit_flags_what_it_cannot_grow(beads):
         jax.jit(lambda gas: jaxgran.cool(gas, times, model=quiet(100)).temperature)(gas)
 
 
-def test_lists_of_jax_md_give_the_same_run(beads):
+def test_whoever_finds_the_pairs_the_run_is_the_same(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     times = [0.5 * float(gas.mean_free_time)]
-    a, b = (
+    a, *others = (
         jaxgran.cool(gas, times, model=quiet(200, replicas=2, neighbours=by))
-        for by in ("vesin", "jax-md")
+        for by in ("vesin", "sweep", "jax-md")
     )
     # The order of pairs differs, and round-off with it; the melt has ten collisions, so only
     # what does not depend on the start is compared.
-    np.testing.assert_allclose(a.temperature, b.temperature, rtol=0.1)
+    for b in others:
+        np.testing.assert_allclose(a.temperature, b.temperature, rtol=0.1)
     start = a.particles
-    a, b = (
+    a, *others = (
         jaxgran.cool(gas, times, model=quiet(200, replicas=2, neighbours=by, start=start))
-        for by in ("vesin", "jax-md")
+        for by in ("vesin", "sweep", "jax-md")
     )
-    np.testing.assert_allclose(a.particles.velocity, b.particles.velocity, atol=1e-9)
+    for b in others:
+        np.testing.assert_allclose(a.particles.velocity, b.particles.velocity, atol=1e-9)
 
 
 def test_single_precision(beads):

@@ -16,7 +16,7 @@ from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.events import Plan, Scene, State
 from jaxgran.gas import Gas
 from jaxgran.restitution import ReducedLaw
-from jaxgran.room import contact_value, pairs_in_contact, rooms, skin_with
+from jaxgran.room import contact_value, pairs_in_contact, rooms, skin_with, within_reach
 from jaxgran.tangents import ImpactTangents, Inputs, Outputs
 
 PAIRS_PER_PARTICLE = 7.0
@@ -52,8 +52,8 @@ class HardSpheres(eqx.Module):
         key: of the random start; `jax.random.key(0)` by default.
         start: positions and velocities to begin with instead of random ones; their box must be
             that of the gas, and no spheres may overlap.
-        neighbours: "vesin" (host), "jax-md" (device), or "auto" for the faster one here; inside
-            `jax.jit` it is vesin.
+        neighbours: who finds the pairs: "sweep" (compiled with the rest), "vesin" (on the host),
+            "jax-md" (on the device, not inside `jax.jit`), or "auto" for the one fastest here.
         progress: show a progress bar on a terminal.
         checkpoint: a file to save the run to each minute and to resume it from. The resumed run
             gives the same numbers bit for bit.
@@ -154,7 +154,8 @@ class HardSpheres(eqx.Module):
         n = self.replicas * self.num_particles
         share = max(WINDOW_SHARE, 2 * events.LEAST_IMPACTS / n)
         inside = float(pairs_in_contact(self.num_particles, scene.side, d))
-        listed = inside * (1 + float(self._skin(scene, d))) ** d
+        skin = float(self._skin(scene, d))
+        listed = inside * (1 + skin) ** d
         fastest = events.SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         reach = 2 * fastest * share / float(scene.collision_frequency)
         at_contact = contact_value(scene.collision_frequency, inside, d)
@@ -164,7 +165,8 @@ class HardSpheres(eqx.Module):
         chosen = min((0.65 + 0.35 * reachable) * share, listed)
         expected = listed, reachable, chosen, 1.25 * share
         more = 1.3 * max(inside - 0.4, 0.0)  # in random places more spheres are in reach
-        return Plan(self.replicas, share, *rooms(expected, spare, more, n))
+        ahead = within_reach(self.num_particles, scene.side, skin)
+        return Plan(self.replicas, share, *rooms(expected, ahead, spare, more, n))
 
     def _run(self, inputs: Inputs, dimension: int, directions: ReducedLaw | None = None) -> Outputs:
         """Melt, then cool; and with it the tangents along directions in the law."""

@@ -15,7 +15,7 @@ from jaxgran.blocks import Plan, Scene, State
 from jaxgran.curve import CoolingCurve, Particles
 from jaxgran.gas import Gas
 from jaxgran.restitution import Viscoelastic
-from jaxgran.room import contact_value, pairs_in_contact, rooms, skin_with
+from jaxgran.room import contact_value, pairs_in_contact, rooms, skin_with, within_reach
 from jaxgran.tangents import Inputs, Outputs
 
 PAIRS_PER_PARTICLE = 3.0
@@ -45,8 +45,8 @@ class SoftSpheres(eqx.Module):
         key: of the random start; `jax.random.key(0)` by default.
         start: positions and velocities to begin with instead of random ones; their box must be
             that of the gas.
-        neighbours: "vesin" (host), "jax-md" (device), or "auto" for the faster one here; inside
-            `jax.jit` it is vesin.
+        neighbours: who finds the pairs: "sweep" (compiled with the rest), "vesin" (on the host),
+            "jax-md" (on the device, not inside `jax.jit`), or "auto" for the one fastest here.
         progress: show a progress bar on a terminal.
         checkpoint: a file to save the run to each minute and to resume it from. The resumed run
             gives the same numbers bit for bit.
@@ -145,7 +145,8 @@ class SoftSpheres(eqx.Module):
         steps = max(round(self.steps_per_contact * min(1.0, 0.08 / flight)), 8)
         flight *= steps / self.steps_per_contact
         inside = float(pairs_in_contact(self.num_particles, scene.side, d))
-        listed = inside * (1 + float(self._skin(scene, d))) ** d
+        skin = float(self._skin(scene, d))
+        listed = inside * (1 + skin) ** d
         at_contact = contact_value(scene.collision_frequency, inside, d)
         # As measured, here and below: phi = .01 to .4 (disks: to .5), t_c/tau_c = .003 to .3.
         near = 0.75 * inside * at_contact * ((1 + 5 * flight) ** d - 1)
@@ -157,7 +158,8 @@ class SoftSpheres(eqx.Module):
         n = self.replicas * self.num_particles
         expected = listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # Where places are random, about as many pairs touch besides as would at no correlation.
-        found = rooms(expected, spare, 1.3 * inside, n)
+        ahead = within_reach(self.num_particles, scene.side, skin)
+        found = rooms(expected, ahead, spare, 1.3 * inside, n)
         return Plan(self.replicas, self.steps_per_contact, steps, clipped, *found)
 
     def _run(

@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.encounters import rows_where
+from jaxgran.rows import rows_where
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 1.0])
