@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 from vesin import NeighborList
 
-from jaxgran.sweep import sweep
+from jaxgran.sweep_and_prune import sweep
 
 VESIN_CELLS = 1e5
 """The most cells of vesin's search."""

@@ -17,7 +17,7 @@ from jaxgran.neighbours import (
     vesin_search,
     wrap,
 )
-from jaxgran.sweep import sweep
+from jaxgran.sweep_and_prune import sweep
 
 # In boxes of less than three cutoffs jax-md itself warns about its integers.
 jax_md_warns = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")

@@ -8,7 +8,7 @@ import jaxgran
 ROOT = Path(__file__).parent.parent
 FLOORS = [
     ["domain", "status", "checkpoint", "rows"],
-    ["sweep"],
+    ["sweep_and_prune"],
     ["neighbours"],
     ["contact", "simulation", "observables", "initial"],
     ["restitution", "encounters"],

@@ -168,10 +168,10 @@ def test_replicas_are_the_runs_they_stand_for(beads):
 
 @pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_cools_as_kinetic_theory_with_softness_says(beads, dimension):
-    # Box below L_c, so that the gas stays homogeneous.
+    # Already in .8 L_c of two dimensions the waves of the flow keep T 3 to 4 % higher.
     gas = soft_beads(beads, 0.02, 0.25, dimension, packing_fraction={2: 0.05, 3: 0.04}[dimension])
-    n, replicas = {2: (300, 12), 3: (1000, 4)}[dimension]
-    assert gas.box_side(n) < 1.5 * gas.critical_box
+    n, replicas = {2: (100, 36), 3: (1000, 4)}[dimension]
+    assert gas.box_side(n) < 0.5 * gas.critical_box
     theory = jaxgran.cool(gas, np.geomspace(0.1, 1000, 200) * float(gas.mean_free_time))
     end = float(
         np.interp(-np.log(0.03), -np.log(theory.temperature / gas.temperature), theory.times)
