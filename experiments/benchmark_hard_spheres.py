@@ -7,9 +7,9 @@ A gas cools for some mean free times in a periodic box from a melted start: visc
 three dimensions, from the same start in LAMMPS too, where their contacts last .01 of the mean free
 time and take 30 steps; disks of constant restitution in two. Compilation is timed apart, and so is
 what comes before the first step, which the rates leave out on both sides; medians of repeats, in
-which the two take turns, since machines are not always equally fast. With
-`--until`, instead, 50 000 disks (or the last of `--sizes`) are followed into their clusters, until
-they have collided so often each.
+which the two take turns, since machines are not always equally fast. Small gases run several times
+in a row each time: one run is too short to be timed. With `--until`, instead, 50 000 disks (or the
+last of `--sizes`) are followed into their clusters, until they have collided so often each.
 """
 
 import argparse
@@ -34,6 +34,7 @@ RESTITUTION = 0.9  # in two
 SIZES = (1000, 4096, 16384, 50000)
 COLLISION_TIMES = 4.0
 REPEATS = 7
+TIMED = 10_000  # particles, at least, in the runs of one timing
 
 
 def main() -> None:
@@ -118,13 +119,15 @@ def measure(
     times = [collision_times * float(gas.mean_free_time)]
     curve = jaxgran.cool(gas, times, model=model)
     first = time.perf_counter() - begin
+    in_a_row = -(-TIMED // size)
     seconds, beside = {0.0: [], times[0]: []}, []
     for _ in range(repeats):
         for end, took in seconds.items():
             begin = time.perf_counter()
-            curve = jaxgran.cool(gas, [end], model=model)
-            jax.block_until_ready(curve.temperature)
-            took.append(time.perf_counter() - begin)
+            for _ in range(in_a_row):
+                curve = jaxgran.cool(gas, [end], model=model)
+                jax.block_until_ready(curve.temperature)
+            took.append((time.perf_counter() - begin) / in_a_row)
         if dimension == 3 and ranks:
             # The better of two skins each time, which favours LAMMPS a little.
             dt = float(gas.contact_duration) / STEPS_PER_CONTACT
