@@ -9,6 +9,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.gas import sphere_surface
 
+FEW = 128
+"""Rows that cost less than to compile once more."""
+
 
 class Room(NamedTuple):
     """How many rows the arrays of a compiled run have."""
@@ -45,10 +48,10 @@ def rooms(
     ahead = int(spare**0.5 * ahead + 5 * ahead**0.5) + 64
     extra = int(num_particles * more)
     near_too, contacts_too = (min(rows + extra, pairs) for rows in (near, contacts))
-    return (
-        Room(pairs, ahead, near, contacts, min(members, num_particles)),
-        Room(pairs, ahead, near_too, contacts_too, min(members + 2 * extra, num_particles)),
-    )
+    room = Room(pairs, ahead, near, contacts, min(members, num_particles))
+    members_too = min(members + 2 * extra, num_particles)
+    melting = Room(pairs, ahead, near_too, contacts_too, members_too)
+    return (melting if extra <= FEW else room), melting
 
 
 def pairs_in_contact(num_particles: int, side: ArrayLike, dimension: int) -> Array:
