@@ -184,8 +184,8 @@ def _driven(model: Model, inputs: Inputs, kind: Kind, plan, state, begun, settin
     def advance(state, end: float, scene=scene, stage: str = "run"):
         while True:
             room: Room = _NEEDED.get((plan, stage)) or rooms[stage]
-            now = plan._replace(room=room)
-            state, fault, needed = forward(kind.stretch, state, scene, end, now, engine)
+            roomy = plan._replace(room=room)
+            state, fault, needed = forward(kind.stretch, state, scene, end, roomy, engine)
             fault = int(fault)
             if fault == status.OK:
                 return state

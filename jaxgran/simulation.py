@@ -139,7 +139,7 @@ _compiled = jax.jit(stretches, static_argnames=("stretch", "plan", "by"))
 
 
 def forward(stretch: Callable[..., Any], state, scene, end: float, plan, engine: str):
-    """As `stretches`, some of them, of known numbers; for a list made on the host, one."""
+    """`stretches` outside of compiled code: some in one call, or one if the host makes the list."""
     if engine == "sweep":
         return _compiled(stretch, state, scene, end, plan, engine, 1, STRETCHES)
     now = stretch(state, scene, end, plan, engine)
