@@ -64,7 +64,6 @@ def sweep(
 
     reach = cutoff / side * _YZ + 8 + 4 * _YZ * jnp.finfo(position.dtype).eps  # for rounding
     square = jnp.minimum(reach * reach * (1 + 1e-6), (_YZ / 2) ** 2).astype(jnp.float32)
-    square = jnp.where(finite, square, 0.0)
     farthest = (reach * (_X / _YZ)).astype(jnp.int32) + 2 ** max(index_bits - 1, 1)
 
     def followers(array, first, count):

@@ -302,3 +302,22 @@ def test_a_sweep_in_single_precision_misses_nothing():
     tree = KDTree(position.astype(float), boxsize=30.0)
     # As documented: 10^-6 of the cutoff and of the side.
     assert tree.query_pairs(1.5) <= found <= tree.query_pairs(1.5 + 3.2e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_sweep_misses_no_pair_just_within_the_cutoff(dtype):
+    # Far apart, so that a whole number of steps of the side is many of the cutoff's round-off.
+    rng = np.random.default_rng(8)
+    side, n, cutoff = 1000.0, 20_000, 0.5
+    first = side * rng.random((n, 3))
+    way = rng.normal(size=(n, 3))
+    second = first + cutoff * way / np.linalg.norm(way, axis=1)[:, None]
+    position = (np.concatenate([first, second]) % side).astype(dtype)
+    position = np.where(position >= side, dtype(0), position)
+    apart = position[:n].astype(float) - position[n:]
+    apart -= side * np.round(apart / side)
+    within = np.flatnonzero(np.sum(apart**2, axis=1) < cutoff**2)
+    assert 0.3 * n < len(within) < 0.7 * n
+    i, j, count, _ = sweep(jnp.asarray(position), side, cutoff, replicas=1, room=3 * n, ahead=200)
+    found = set(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
+    assert {(k, k + n) for k in within.tolist()} <= found
