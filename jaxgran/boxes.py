@@ -225,7 +225,9 @@ def _traced(model: Model, inputs: Inputs, kind: Kind, plan, state, begun):
     """The same inside `jax.jit`, `jax.vmap` or a derivative: room is fixed beforehand."""
 
     by = neighbours.engine(model.neighbours, plan.room.ahead, traced=True)
-    scene, fault = inputs.scene, jnp.zeros((), jnp.int32)
+    scene = inputs.scene
+    # There a list has no time to be of use, and stretches would not end.
+    fault = status.flag(status.BOX_TOO_SMALL, scene.side < SMALLEST_BOX)
 
     def further(carry, scene, end, plan=plan, least=0, most=None):
         state, fault = carry
@@ -236,7 +238,7 @@ def _traced(model: Model, inputs: Inputs, kind: Kind, plan, state, begun):
         melting = plan._replace(room=plan.melting)
         state, fault = further((state, fault), kind.elastic(scene), end, melting)
     else:
-        fault = kind.fault(state)
+        fault |= kind.fault(state)
     zero = jnp.zeros_like(state.time)
     state, fault = further((begun(state), fault), scene, zero, least=1, most=1)
 

@@ -234,11 +234,12 @@ def advance(
         return going & (now.num_windows < max_windows)
 
     zero = jnp.zeros((), jnp.int32)
+    full = (pairs.count > plan.room.pairs) | (pairs.ahead > plan.room.ahead)
     first = Progress(
         state=state,
         widen=jnp.ones((), state.position.dtype),
         stale=jnp.zeros((), bool),
-        status=zero,
+        status=status.flag(status.LIST_FULL, full),
         needed=jnp.stack([pairs.count, pairs.ahead, zero, zero, zero]),
         num_windows=zero,
         num_failed=zero,

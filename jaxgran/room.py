@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.gas import sphere_surface
+from jaxgran.sweep_and_prune import unsorted
 
 FEW = 128
 """Rows that cost less than to compile once more."""
@@ -45,7 +46,7 @@ def rooms(
     pairs, near, contacts, members = (
         int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
     )
-    ahead = int(spare**0.5 * ahead + 5 * ahead**0.5) + 64
+    ahead = int(spare * ahead + 5 * ahead**0.5) + 64  # planes of a lattice need most
     extra = int(num_particles * more)
     near_too, contacts_too = (min(rows + extra, pairs) for rows in (near, contacts))
     room = Room(pairs, ahead, near, contacts, min(members, num_particles))
@@ -73,8 +74,9 @@ def skin_with(more: float, num_particles: int, side: ArrayLike, dimension: int) 
 
 
 def within_reach(num_particles: int, side: ArrayLike, skin: ArrayLike) -> float:
-    """Particles of an even gas that are within contact and a skin ahead along x."""
-    return float(num_particles * jnp.minimum((1 + jnp.asarray(skin)) / jnp.asarray(side), 0.5))
+    """Particles that a sweep over an even gas must look ahead, for contact and a skin."""
+    along_x = jnp.minimum((1 + jnp.asarray(skin)) / jnp.asarray(side), 0.5)
+    return float(num_particles * (along_x + 3 * unsorted(num_particles)))
 
 
 def longest_skin(side: ArrayLike) -> Float[Array, ""]:

@@ -24,8 +24,8 @@ OK = 0
 LIST_FULL = Fault(
     1,
     "the neighbour list is full",
-    "lower the packing fraction, or raise the model's growth limit; the gas may have clustered "
-    "into one dense clump",
+    "inside jax.jit give more room by sized_for(gas, spare=4); else lower the packing fraction, "
+    "the gas may have clustered into one dense clump",
 )
 CONTACTS_FULL = Fault(
     2,
@@ -35,7 +35,7 @@ CONTACTS_FULL = Fault(
 SKIN_OUTRUN = Fault(
     4,
     "a sphere crossed the skin of its neighbour list within one block of steps",
-    "use a larger skin or more steps per contact, or a smaller starting velocity",
+    "use more steps per contact, or a smaller starting velocity",
 )
 STEP_TOO_LARGE = Fault(
     8,
@@ -74,6 +74,11 @@ OTHER_BOX = Fault(
     "the start's box is not that of the gas",
     "change packing_fraction or the start",
 )
+BOX_TOO_SMALL = Fault(
+    1024,
+    "the box is too short to tell a sphere from its image",
+    "use more particles or a lower packing_fraction",
+)
 FAULTS = (
     LIST_FULL,
     CONTACTS_FULL,
@@ -85,6 +90,7 @@ FAULTS = (
     STEPS_SPENT,
     OVERLAPPING,
     OTHER_BOX,
+    BOX_TOO_SMALL,
 )
 
 

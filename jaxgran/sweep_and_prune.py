@@ -12,6 +12,15 @@ _WORD = 32
 _X, _YZ = 2.0**30, 2.0**32  # steps of a box side
 
 
+def unsorted(num_particles: int) -> float:
+    """The share of a box side within which particles are left in any order."""
+    return 2.0 ** (_index_bits(num_particles) - 31)
+
+
+def _index_bits(num_particles: int) -> int:
+    return max((num_particles - 1).bit_length(), 1)
+
+
 @partial(jax.jit, static_argnames=("replicas", "room", "ahead"))
 def sweep(
     position: Float[Array, "particles d"],
@@ -26,14 +35,15 @@ def sweep(
 
     Sweep and prune: with the particles of a box in order of x, the partners of each are among those
     that follow it, so many as there are within the cutoff along x: ``N cutoff / side`` in an even
-    gas. Coordinates are whole numbers of small steps, whose differences are periodic by themselves,
-    and one bit tells whether a pair is near. The work grows as ``N^(2 - 1/d)``: for boxes of up to
-    some ten thousand particles this is faster than cells, and there is no call to the host.
+    gas. Coordinates are whole numbers of small steps, whose differences are periodic by themselves
+    (along x by a second copy), and one bit tells whether a pair is near. The work grows as
+    ``N^(2 - 1/d)``: for boxes of up to some ten thousand particles this is faster than cells, and
+    there is no call to the host.
 
     Args:
         position: of all particles, replica after replica, in [0, side).
         side: of the boxes.
-        cutoff: in the same unit, > 0 and at most half a side.
+        cutoff: in the same unit, > 0 and, by a part in 10^6, less than half a side.
         replicas: number of boxes.
         room: how many pairs can be returned.
         ahead: how many that follow each particle can be looked at.
@@ -41,16 +51,24 @@ def sweep(
     Returns:
         i < j; how many pairs there are, of which those that there was room for come first; and how
         far ahead had to be looked: beyond `ahead` nothing was found. Pairs farther apart than the
-        cutoff may be among them, by at most a part in 10^6 (float32: and 10^-6 of a side).
+        cutoff may be among them, by at most a part in 10^6 and 10^-8 of a side (float32: 10^-6).
+
+    Raises:
+        ValueError: if there are too many particles, looking so far ahead, for 32-bit indices.
     """
     n, d = len(position) // replicas, position.shape[-1]
     num_words = max(-(-min(ahead, n) // _WORD), 1)
+    if num_words * replicas * n >= 2**31:
+        raise ValueError(
+            f"a sweep over {replicas * n} particles cannot look {ahead} ahead, as its indices have "
+            "32 bits: use neighbours='vesin' or 'jax-md'"
+        )
     unit = position.reshape(replicas, n, d) / side
     unit = jnp.where(unit >= 1, 0.0, unit)  # by rounding
     finite = jnp.all(jnp.isfinite(position))
 
     # One number holds the place, coarsely, and the index: such are sorted ten times as fast as two.
-    index_bits = max((n - 1).bit_length(), 1)
+    index_bits = _index_bits(n)
     coarse = (unit[..., 0] * 2.0 ** (31 - index_bits)).astype(jnp.int32) << index_bits
     order = jax.lax.sort(coarse | jnp.arange(n, dtype=jnp.int32)[None]) & (2**index_bits - 1)
     unit = jnp.take_along_axis(unit, order[..., None], axis=1)
@@ -99,4 +117,4 @@ def sweep(
     particle = (order + n * jnp.arange(replicas, dtype=jnp.int32)[:, None]).ravel()
     real = jnp.arange(room) < count
     i, j = (jnp.where(real, particle.at[k].get(mode="clip"), 0) for k in (here, there))
-    return jnp.minimum(i, j), jnp.maximum(i, j), count, _WORD * blocks
+    return jnp.minimum(i, j), jnp.maximum(i, j), count, jnp.minimum(_WORD * blocks, n - 1)

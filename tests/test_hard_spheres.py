@@ -392,6 +392,24 @@ def test_jit_flags_what_it_cannot_grow():
     assert "neighbour list is full" in jaxgran.explain_status(curve.status)
     with pytest.raises(ValueError, match="sized_for"):
         jax.jit(lambda gas: jaxgran.cool(gas, jnp.array([1.0]), model=quiet(100)).temperature)(gas)
+    # A list that is cut short is no list, though no window needs it.
+    start = jaxgran.cool(gas, [0.0], model=quiet(100)).particles
+    given = dataclasses.replace(model, start=start)
+    curve = jax.jit(lambda t: jaxgran.cool(gas, t, model=given))(jnp.array([0.0]))
+    assert "neighbour list is full" in jaxgran.explain_status(curve.status)
+
+
+@pytest.mark.parametrize("kind", [HardSpheres, jaxgran.SoftSpheres])
+def test_jit_flags_a_box_too_small(beads, kind):
+    def temperature(packing_fraction):
+        gas = beads(packing_fraction=packing_fraction)
+        curve = jaxgran.cool(gas, 0.1 * gas.mean_free_time[None], model=model)
+        return curve.temperature[0], curve.status
+
+    model = kind(2, progress=False).sized_for(beads(packing_fraction=0.1), spare=4.0)
+    value, status = jax.jit(jax.vmap(temperature))(jnp.array([0.05, 0.2]))
+    assert np.isfinite(value[0]) and np.isnan(value[1])
+    assert status[0] == 0 and "the box is too short" in jaxgran.explain_status(status[1])
 
 
 def test_single_precision():

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
+import jaxgran
 from jaxgran.neighbours import (
     MOST_AHEAD,
     displacement,
@@ -17,6 +18,7 @@ from jaxgran.neighbours import (
     vesin_search,
     wrap,
 )
+from jaxgran.room import within_reach
 from jaxgran.sweep_and_prune import sweep
 
 # In boxes of less than three cutoffs jax-md itself warns about its integers.
@@ -250,8 +252,8 @@ def test_engine_follows_the_device_and_the_gas(monkeypatch):
         monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
         assert engine("auto", MOST_AHEAD + 1) == dense
         assert engine("auto", MOST_AHEAD) == ("sweep" if device == "cpu" else "jax-md")
-        assert engine("auto", MOST_AHEAD, traced=True) == "sweep"
-        assert engine("auto", MOST_AHEAD + 1, traced=True) == traced
+        assert engine("auto", 2 * MOST_AHEAD, traced=True) == "sweep"
+        assert engine("auto", 2 * MOST_AHEAD + 1, traced=True) == traced
 
 
 def test_unknown_engines_are_refused():
@@ -287,7 +289,7 @@ def test_a_sweep_looks_as_far_as_it_must():
         found = list(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
         assert set(found) == expected and len(found) == len(expected)
         # Within .1 of the box, evenly: 100, and up to five standard errors more.
-        assert min(100 * crowd, n) <= ahead <= min(150 * crowd + 32, n + 31)
+        assert min(100 * crowd, n - 1) <= ahead <= min(150 * crowd + 32, n - 1)
         *_, short_count, told = look(ahead=int(ahead) // 2)
         assert told == ahead and short_count < count
         *_, enough, told = look(ahead=int(ahead))
@@ -321,3 +323,43 @@ def test_a_sweep_misses_no_pair_just_within_the_cutoff(dtype):
     i, j, count, _ = sweep(jnp.asarray(position), side, cutoff, replicas=1, room=3 * n, ahead=200)
     found = set(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
     assert {(k, k + n) for k in within.tolist()} <= found
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_sweep_over_few(n):
+    position = jnp.array([[0.1, 0.1], [9.9, 9.9], [5.0, 5.0]])[:n]
+    i, j, count, ahead = sweep(position, 10.0, 1.0, replicas=1, room=5, ahead=n)
+    assert (count, i[0], j[0]) == (1, 0, 1) and ahead < n
+
+
+def test_a_sweep_over_too_many_is_refused():
+    position = jax.ShapeDtypeStruct((2**26, 3), jnp.float32)
+    look = partial(sweep, side=1000.0, cutoff=1.0, replicas=1, room=9, ahead=2**10)
+    with pytest.raises(ValueError, match="cannot look 1024 ahead"):
+        jax.eval_shape(look, position)
+
+
+def test_planes_of_a_lattice_are_in_reach_under_jit(beads):
+    # 25 planes of 625, as far apart as is worst: all of one are told before those within reach.
+    points = np.stack(np.meshgrid(*3 * [np.arange(25)], indexing="ij"), -1).reshape(-1, 3)
+    gas = beads(packing_fraction=0.1)
+    room = jaxgran.HardSpheres(25**3).sized_for(gas).plan.room
+    side = float(gas.box_side(25**3) / gas.diameter)
+    cutoff = 1.01 * side / 25
+    *_, count, ahead = sweep(
+        jnp.asarray(points * side / 25), side, cutoff, replicas=1, room=room.pairs, ahead=room.ahead
+    )
+    assert count == 3 * 25**3 and 1200 < ahead <= room.ahead
+
+
+def test_very_many_disks_are_in_reach(beads):
+    # In order of x only by a coarse number, as the index takes most of its bits.
+    gas = beads(packing_fraction=0.1, dimension=2)
+    n = 600_000
+    side = float(gas.box_side(n) / gas.diameter)
+    rng = np.random.default_rng(9)
+    position = jnp.asarray(side * rng.random((n, 2)))
+    for skin in (0.2, 1.0):
+        reach = within_reach(n, side, skin)
+        *_, ahead = sweep(position, side, 1 + skin, replicas=1, room=9, ahead=int(reach))
+        assert 0.6 * reach < ahead < reach + 5 * reach**0.5  # the scatter of counts
