@@ -196,9 +196,7 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
         gain = gain + by_replica(work.dissipated)
         worked, held = by_replica(work.exchanged), kinetic(v) + state.elastic
         wrong = jnp.any(jnp.abs(gain) > EXCHANGE_TOLERANCE * worked + START_TOLERANCE * held)
-        full = chosen.needed > jnp.array(plan.room)
-        no_room = status.flag(status.LIST_FULL, jnp.any(full[:2]))
-        no_room |= status.flag(status.CONTACTS_FULL, jnp.any(full[2:]))
+        no_room = plan.room.outgrown_by(chosen.needed)
         finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
         outrun = status.flag(status.SKIN_OUTRUN, moved > 0.5 * state.skin)
         trouble = jnp.where(finite, outrun, status.NOT_FINITE.bit)
@@ -220,7 +218,7 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
         return (now.state.time < end) & ~now.stale & (now.status == status.OK)
 
     zero = jnp.zeros((), jnp.int32)
-    full = (pairs.count > plan.room.pairs) | (pairs.ahead > plan.room.ahead)
+    needed = jnp.stack([pairs.count, pairs.ahead, zero, zero, zero])
     xi, _, touching = encounters.overlap(state.position, pairs.i, pairs.j, pairs.offset)
     touching &= jnp.arange(len(xi)) < pairs.count
     stored = encounters.elastic_energy(jnp.where(touching, xi, 0.0), scene.alpha)
@@ -230,8 +228,8 @@ def advance(state: State, pairs: Pairs, scene: Scene, end: ArrayLike, plan: Plan
         extra=jnp.zeros(len(state.position), bool),
         widen=jnp.ones((), state.position.dtype),
         stale=jnp.zeros((), bool),
-        status=status.flag(status.LIST_FULL, full),
-        needed=jnp.stack([pairs.count, pairs.ahead, zero, zero, zero]),
+        status=plan.room.outgrown_by(needed),
+        needed=needed,
         num_blocks=zero,
     )
     return jax.lax.while_loop(unfinished, block, first)

@@ -205,9 +205,7 @@ def advance(
             new = new._replace(tangents=along)
         away = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
         outrun = jnp.maximum(away, jnp.max(work.moved)) > (0.5 * state.skin) ** 2
-        full = chosen.needed > jnp.array(plan.room)
-        no_room = status.flag(status.LIST_FULL, jnp.any(full[:2]))
-        no_room |= status.flag(status.CONTACTS_FULL, jnp.any(full[2:]))
+        no_room = plan.room.outgrown_by(chosen.needed)
         finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
         trouble = status.flag(status.SKIN_OUTRUN, outrun)
         trouble |= status.flag(status.STALLED, work.num_rounds >= MAX_ROUNDS)
@@ -234,13 +232,13 @@ def advance(
         return going & (now.num_windows < max_windows)
 
     zero = jnp.zeros((), jnp.int32)
-    full = (pairs.count > plan.room.pairs) | (pairs.ahead > plan.room.ahead)
+    needed = jnp.stack([pairs.count, pairs.ahead, zero, zero, zero])
     first = Progress(
         state=state,
         widen=jnp.ones((), state.position.dtype),
         stale=jnp.zeros((), bool),
-        status=status.flag(status.LIST_FULL, full),
-        needed=jnp.stack([pairs.count, pairs.ahead, zero, zero, zero]),
+        status=plan.room.outgrown_by(needed),
+        needed=needed,
         num_windows=zero,
         num_failed=zero,
         num_rounds=zero,

@@ -5,8 +5,9 @@ from math import pi
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
+from jaxgran import status
 from jaxgran.gas import sphere_surface
 from jaxgran.sweep_and_prune import unsorted
 
@@ -22,6 +23,12 @@ class Room(NamedTuple):
     near: int
     contacts: int
     members: int
+
+    def outgrown_by(self, needed: Int[Array, "kinds"]) -> Int[Array, ""]:
+        """The status of a run that needs so many rows of each."""
+        full = needed > jnp.array(self)
+        in_list = status.flag(status.LIST_FULL, jnp.any(full[:2]))
+        return in_list | status.flag(status.CONTACTS_FULL, jnp.any(full[2:]))
 
     def grown(self, needed: Sequence[int]) -> "Room":
         """With more rows than needed where there are fewer."""
