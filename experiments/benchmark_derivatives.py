@@ -1,15 +1,18 @@
-"""What does a derivative through particles cost, in time and in memory?
+"""What does a derivative through a particle simulation cost, in time and in memory?
 
     python experiments/benchmark_derivatives.py [--fractions .01 .1] [--repeats 5] [--smoke]
         [--out FILE]
 
-One run of soft spheres from particles already melted, and one of stochastic simulation: plain, with
-a forward tangent in A, in reverse mode in A, and with the Jacobian in A and Y. The function is ln T
-at the end. All in one process, turn by turn; medians of repeats, compilation apart (of each way,
-what those above it have not compiled yet). The ratio of CPU seconds is told too: it is the one to
-believe where others use the same cores. Then by how much reverse mode through soft spheres
-raises the peak memory of a process that has already compiled it, for longer and longer runs, beside
-what it would take to store one state a block (on Linux).
+ln T at the end of a run of soft spheres, which starts from melted particles, and of a DSMC run, is
+computed in four ways: without a derivative, with its derivative in A in forward mode, with the same
+in reverse mode, and with its Jacobian in A and Y. The four ways take turns in one process. The
+table shows the median run times without compilation; the compilation time of a way leaves out what
+the ways above it have already compiled. Where other processes use the same cores, the ratio of CPU
+seconds is the reliable one.
+
+The second table shows by how much reverse mode through soft spheres raises the peak memory of a
+process that has already compiled it, for runs of increasing length, and how much memory it would
+take to store the state after every block (Linux only).
 """
 
 import argparse
@@ -27,14 +30,14 @@ from record import save
 from scenes import beads
 
 import jaxgran
-from jaxgran.curve import Particles
+from jaxgran.data.curve import Particles
 
 PACKING = 0.1
 BETA = 0.15
 STEPS_PER_CONTACT = 30
 CONTACT_FRACTIONS = (0.01, 0.1)
 SOFT_SIZE, STOCHASTIC_SIZE = 4096, 100_000
-FREE_TIMES = 3.0  # mean free times at T_0 in a run
+FREE_TIMES = 3.0  # length of a run, in mean free times at T_0
 BLOCKS = (1, 10, 100, 1000)
 REPEATS = 5
 STATUS = Path("/proc/self/status")
@@ -47,7 +50,7 @@ def main() -> None:
     )
     parser.add_argument("--fractions", nargs="+", type=float, default=CONTACT_FRACTIONS)
     parser.add_argument("--repeats", type=int, default=REPEATS)
-    parser.add_argument("--smoke", action="store_true", help="a run of seconds")
+    parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     parser.add_argument("--memory-worker", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -61,7 +64,7 @@ def main() -> None:
         fractions, repeats, blocks, soft, stochastic = (0.1,), 1, (4,), 100, 1000
     print(f"{jax.devices()[0].device_kind}, float64; a run is {FREE_TIMES:g} mean free times")
     head = f"{'':42}{'compile s':>10}{'run s':>8}{'CPU s':>8}"
-    print(f"{head}{'over plain':>12}{'of CPU':>8}{'at most':>9}")
+    print(f"{head}{'ratio':>12}{'of CPU':>8}{'limit':>9}")
     rows = []
     for fraction in fractions:
         gas = beads(PACKING, BETA, fraction)
@@ -69,7 +72,7 @@ def main() -> None:
         title = f"SoftSpheres, N={soft}, t_c/tau_c={fraction:g}"
         rows.append(measure(title, gas, model, repeats, compiled=False))
     gas = beads(PACKING, BETA, fractions[0])
-    model = jaxgran.DSMC(stochastic, progress=False)
+    model = jaxgran.DSMC(stochastic)
     rows.append(measure(f"DSMC, N={stochastic}", gas, model, repeats, compiled=True))
     memory = measure_memory(fractions[0], soft, blocks)
     if options.out:
@@ -81,31 +84,34 @@ def main() -> None:
 
 
 def soft_spheres(start: Particles | None, size: int) -> jaxgran.SoftSpheres:
-    return jaxgran.SoftSpheres(
-        size, steps_per_contact=STEPS_PER_CONTACT, start=start, progress=False
-    )
+    return jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT, start=start)
 
 
 def melted(gas: jaxgran.Gas, size: int) -> jaxgran.SoftSpheres:
-    """A model that begins with the last particles of an elastic run."""
+    """A model that starts from the final particles of an elastic run."""
     elastic = gas.replace(dissipative_constant=0.0)
     end = [0.5 * float(gas.mean_free_time)]
-    return soft_spheres(jaxgran.cool(elastic, end, model=soft_spheres(None, size)).particles, size)
+    curve = jaxgran.cool(elastic, end, model=soft_spheres(None, size), progress=False)
+    return soft_spheres(curve.particles, size)
 
 
 def log_temperature(gas: jaxgran.Gas, model, t: float):
-    """ln T at the time t, of A and Y."""
+    """ln T at the time t, as a function of A and Y."""
     times = jnp.asarray([t])
 
     def function(constant, modulus):
         changed = gas.replace(dissipative_constant=constant, youngs_modulus=modulus)
-        return jnp.log(jaxgran.cool(changed, times, model=model).temperature[-1])
+        curve = jaxgran.cool(changed, times, model=model, progress=False)
+        return jnp.log(curve.temperature[-1])
 
     return function
 
 
 def measure(title: str, gas: jaxgran.Gas, model, repeats: int, compiled: bool) -> dict:
-    """Seconds of each way. DSMC is compiled as one; soft spheres are driven from the host."""
+    """Run times of each way; with `compiled` the whole run is one program, as of DSMC here.
+
+    Soft spheres are run by the host driver, which calls compiled functions.
+    """
     function = log_temperature(gas, model, FREE_TIMES * float(gas.mean_free_time))
     at = gas.value("dissipative_constant"), gas.value("youngs_modulus")
     one = jnp.ones(())
@@ -149,14 +155,14 @@ def measure(title: str, gas: jaxgran.Gas, model, repeats: int, compiled: bool) -
 
 
 def timed(way, at) -> tuple[float, float]:
-    """Seconds, and those of all cores in use."""
+    """Wall seconds of a call, and CPU seconds of all its threads."""
     begin, cpu = time.perf_counter(), time.process_time()
     jax.block_until_ready(way(*at))
     return time.perf_counter() - begin, time.process_time() - cpu
 
 
 def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict | None:
-    """Peak memory of reverse mode. A block of steps is a mean contact long, at this stiffness."""
+    """Peak memory of reverse mode by number of blocks; here a block lasts one contact duration."""
     if not STATUS.exists():
         print("no /proc here: peak memory is not measured")
         return None
@@ -165,7 +171,7 @@ def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict 
     assert start is not None
     state = 2 * np.asarray(start.position).nbytes / 2**20  # positions and velocities, MiB
     print(f"\nreverse mode, SoftSpheres, N={size}, t_c/tau_c={fraction:g}")
-    print(f"{'blocks':>8}{'before, MiB':>13}{'peak':>8}{'growth':>8}{'a state a block':>17}")
+    print(f"{'blocks':>8}{'before, MiB':>13}{'peak':>8}{'growth':>8}{'stored states':>17}")
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "start.npz"
@@ -195,14 +201,14 @@ def memory_worker(file: Path, blocks: float) -> None:
         jax.block_until_ready(jax.grad(function)(*at))
 
     reverse(2.0)  # compiles
-    Path("/proc/self/clear_refs").write_text("5")  # begins a new peak
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = memory("VmRSS")
     reverse(blocks)
     print(json.dumps({"before_MiB": before, "peak_MiB": memory("VmHWM")}))
 
 
 def memory(name: str) -> float:
-    """Of this process, MiB. Not by getrusage, which a child inherits from its parent."""
+    """Memory of this process, MiB; not from getrusage, whose peak a child takes from its parent."""
     (line,) = (x for x in STATUS.read_text().splitlines() if x.startswith(f"{name}:"))
     return int(line.split()[1]) / 2**10
 

@@ -1,11 +1,12 @@
-"""How many collisions a second does stochastic simulation do, and what does a derivative cost?
+"""How many collisions per second does DSMC make, and what does a derivative cost?
 
     python experiments/benchmark_dsmc.py [--sizes 10000 100000 1000000] [--smoke] [--out FILE]
 
-A homogeneous gas of viscoelastic spheres cools for some collisions per particle. Compilation is
-timed apart; medians of repeats. The derivative is forward mode, of the whole curve in A, and both
-its run and the plain one it is compared with are compiled as one. For comparison an event-driven
-code with positions, DynamO, is quoted from an earlier measurement; it is not run here.
+A homogeneous gas of viscoelastic spheres cools for some collisions per particle. Times are medians
+of repeated runs; compilation is timed separately. The derivative is that of the whole curve in A,
+by forward mode; it and the plain run it is compared with are each compiled as one program. For
+comparison the speed of DynamO, an event-driven code with positions, is quoted from an earlier
+measurement; DynamO is not run here.
 """
 
 import argparse
@@ -25,7 +26,7 @@ BETA = 0.15
 COLLISIONS = 2e6  # per run, or one per particle where that is more
 REPEATS = 3
 DYNAMO = {"N=4000": 81_000, "N=32000": 52_000}
-"""Collisions a second of DynamO, one core, phi = .1: quoted, measured on a two-core machine."""
+"""Collisions per second of DynamO on one core, phi = .1: quoted, measured on a two-core machine."""
 
 
 def main() -> None:
@@ -35,7 +36,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", type=int, default=SIZES)
     parser.add_argument("--dimension", type=int, choices=(2, 3), default=3)
     parser.add_argument("--precision", choices=("float64", "float32"), default="float64")
-    parser.add_argument("--smoke", action="store_true", help="a run of seconds")
+    parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", options.precision == "float64")
@@ -69,23 +70,26 @@ def main() -> None:
 
 def measure(size: int, dimension: int, collisions: float, repeats: int) -> dict:
     gas = beads(0.1, BETA, dimension=dimension)
-    model = jaxgran.DSMC(size, progress=False)
-    # In the gas's own time, each particle collides so many times.
+    model = jaxgran.DSMC(size)
+    # Kinetic theory tells at which time each particle has collided so often.
     each = max(2 * collisions / size, 2.0)
     trial = np.geomspace(0.1, 1e6, 400) * float(gas.mean_free_time)
     theory = jaxgran.cool(gas, trial)
     assert theory.collisions is not None
     times = jnp.asarray([np.interp(each, np.asarray(theory.collisions), trial)])
 
+    def cooled(gas):
+        return jaxgran.cool(gas, times, model=model, progress=False)
+
     def temperature(a):
-        return jaxgran.cool(gas.replace(dissipative_constant=a), times, model=model).temperature
+        return cooled(gas.replace(dissipative_constant=a)).temperature
 
     a = gas.value("dissipative_constant")
-    compile_s, run_s = seconds(lambda: jaxgran.cool(gas, times, model=model).temperature, repeats)
+    compile_s, run_s = seconds(lambda: cooled(gas).temperature, repeats)
     plain, derivative = jax.jit(temperature), jax.jit(jax.jacfwd(temperature))
     _, plain_s = seconds(lambda: plain(a), repeats)
     _, derivative_s = seconds(lambda: derivative(a), repeats)
-    curve = jaxgran.cool(gas, times, model=model)
+    curve = cooled(gas)
     assert curve.collisions is not None
     return {
         "num_particles": size,

@@ -1,15 +1,17 @@
-"""How many collisions a second do hard spheres resolve, beside LAMMPS in the same run?
+"""How many collisions per second do hard spheres resolve, compared with LAMMPS in the same run?
 
     python experiments/benchmark_hard_spheres.py [--sizes 1000 4096] [--smoke] [--out FILE]
     python experiments/benchmark_hard_spheres.py --until 100
 
-A gas cools for some mean free times in a periodic box from a melted start: viscoelastic beads in
-three dimensions, from the same start in LAMMPS too, where their contacts last .01 of the mean free
-time and take 30 steps; disks of constant restitution in two. Compilation is timed apart, and so is
-what comes before the first step, which the rates leave out on both sides; medians of repeats, in
-which the two take turns, since machines are not always equally fast. Small gases run several times
-in a row each time: one run is too short to be timed. With `--until`, instead, 50 000 disks (or the
-last of `--sizes`) are followed into their clusters, until they have collided so often each.
+A gas cools for some mean free times in a periodic box: viscoelastic beads in three dimensions,
+disks of constant restitution in two. The beads are also run in LAMMPS from the same melted
+particles; their contacts last .01 mean free times and take 30 steps there. Compilation and the
+set-up before the first step are timed separately and are left out of the rates of both codes.
+Times are medians of repeats in which the two codes take turns, since the speed of a machine varies.
+Small gases are run several times in each repeat, as a single run is too short to be timed.
+
+With `--until`, 50 000 disks (or the last of `--sizes`) are instead followed into the clustering
+state, until each has made so many collisions.
 """
 
 import argparse
@@ -34,7 +36,7 @@ RESTITUTION = 0.9  # in two
 SIZES = (1000, 4096, 16384, 50000)
 COLLISION_TIMES = 4.0
 REPEATS = 7
-TIMED = 10_000  # particles, at least, in the runs of one timing
+TIMED = 10_000  # one timing covers so many runs that they have at least this many particles
 
 
 def main() -> None:
@@ -45,7 +47,7 @@ def main() -> None:
     parser.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=(3, 2))
     parser.add_argument("--collision-times", type=float, default=COLLISION_TIMES)
     parser.add_argument("--until", type=float, help="collisions of each of 50 000 disks")
-    parser.add_argument("--smoke", action="store_true", help="a run of seconds")
+    parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -90,14 +92,15 @@ def follow_disks(size: int, until: float, out: Path | None) -> None:
         run = follow(gas, 0, size, until, progress=show)
     stretches = np.searchsorted(run["collisions"], np.linspace(0.1, 1, 10) * until)
     print(f"{size} disks, phi = {PACKINGS[2]:g}, e = {RESTITUTION:g}")
-    print(f"{'collisions each':>16}{'T/T_0':>10}{'unevenness':>12}{'flow':>7}")
+    print(f"{'collisions/disk':>16}{'T/T_0':>10}{'unevenness':>12}{'flow':>7}")
     for i in np.minimum(stretches, len(run["t"]) - 1):
         theta = run["temperature"][i] / float(gas.temperature)
         print(f"{run['collisions'][i]:16.1f}{theta:10.2e}{run['unevenness'][i]:12.2f}", end="")
         print(f"{run['flow'][i]:7.3f}")
     total = run["collisions"][-1] * size / 2
     print(f"start {run['start_s']:.0f} s, run {run['run_s']:.0f} s with compilation, ", end="")
-    print(f"{total / run['run_s']:.0f} collisions/s; regularised {run['regularised'][-1]:.2g} each")
+    regularised = run["regularised"][-1]
+    print(f"{total / run['run_s']:.0f} collisions/s; regularised {regularised:.2g} per disk")
     if out:
         save(
             out,
@@ -129,7 +132,7 @@ def measure(
                 jax.block_until_ready(curve.temperature)
             took.append((time.perf_counter() - begin) / in_a_row)
         if dimension == 3 and ranks:
-            # The better of two skins each time, which favours LAMMPS a little.
+            # The faster of two skins in every repeat, which slightly favours LAMMPS.
             dt = float(gas.contact_duration) / STEPS_PER_CONTACT
             beside.append(time_lammps(gas, start, dt, round(times[0] / dt), 1, ranks[0])[0])
     assert curve.collisions is not None

@@ -1,13 +1,14 @@
-"""How fast is kinetic theory? Ratios measured side by side in one run.
+"""How fast is kinetic theory? Ratios of times measured in one run.
 
     python experiments/benchmark_kinetic_theory.py [--smoke]
 
-1. 1000 cooling curves of five decades by `jax.vmap`, against a loop over SciPy's solve_ivp (LSODA)
-   on the same equations in NumPy at the same accuracy, both compared with a tight solution.
-2. One derivative (forward, reverse) against one forward solve.
-3. The time of `import jaxgran`, and of the main job from a cold process.
+1. 1000 cooling curves over five decades of time by `jax.vmap`, compared with a loop over SciPy's
+   solve_ivp (LSODA) on the same equations in NumPy at the same accuracy. The errors of both are
+   relative to a solution with a tighter tolerance.
+2. One derivative, in forward and in reverse mode, compared with one solution without it.
+3. The time of `import jaxgran`, and of a whole fit by `fit_cooling_curve.py` in a new process.
 
-Compile time is apart; run times are medians of repeats.
+Run times are medians of repeats, without compilation, which is given separately.
 """
 
 import argparse
@@ -25,13 +26,13 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import jaxgran
-from jaxgran import kinetics
-from jaxgran.gas import sphere_surface
+from jaxgran.scene.geometry import sphere_surface
+from jaxgran.theory.averages import _AVERAGING_MATRICES, _NODES, SOFTNESS
 
 NUM_CURVES = 1000
 NUM_TIMES = 50
 DECADES = 5
-RTOL = 1e-7  # reaches what LSODA does at
+RTOL = 1e-7  # gives the accuracy that LSODA reaches with SCIPY_RTOL
 SCIPY_RTOL = 1e-9
 REPEATS = 5
 
@@ -47,7 +48,7 @@ def scene() -> jaxgran.Gas:
 
 
 def median_seconds(run: Callable, repeats: int) -> tuple[float, float]:
-    """First call less a later one (compilation), and the median of later calls."""
+    """Seconds of compilation (the first call less a later one), and the median of later calls."""
     begin = time.perf_counter()
     jax.block_until_ready(run())
     first = time.perf_counter() - begin
@@ -60,10 +61,10 @@ def median_seconds(run: Callable, repeats: int) -> tuple[float, float]:
 
 
 def scipy_curve(gas: jaxgran.Gas, a: float, times: np.ndarray) -> np.ndarray:
-    """T of one gas as one would write it with NumPy and SciPy, quadrature in every rate."""
+    """T of one gas by NumPy and SciPy, with the averages computed by quadrature at every step."""
     law = gas.replace(dissipative_constant=a).reduced_law
     beta, length = float(law.beta), float(law.length)  # pyright: ignore
-    g, weights = kinetics._G, kinetics._WEIGHTS[3].reshape(9, -1)
+    g, weights = _NODES, _AVERAGING_MATRICES[3].reshape(9, -1)
     powers = np.arange(5)[:, None]
     share = sphere_surface(3) / np.sqrt(2 * np.pi)
 
@@ -75,7 +76,7 @@ def scipy_curve(gas: jaxgran.Gas, a: float, times: np.ndarray) -> np.ndarray:
         mu2, mu4, nu_v = averages @ np.array([1, a2, a2 * a2])
         cooling = 2 / 3 * mu2 * speed
         peaking = 2 * cooling * (1 + a2) - 4 / 15 * mu4 * speed
-        cooling *= 1 - kinetics.SOFTNESS[3] * length * speed**0.8
+        cooling *= 1 - SOFTNESS[3] * length * speed**0.8
         rates = [
             -cooling,
             peaking,
@@ -99,9 +100,9 @@ def scipy_curve(gas: jaxgran.Gas, a: float, times: np.ndarray) -> np.ndarray:
 
 
 def numpy_restitution(beta: np.ndarray) -> np.ndarray:
-    """The clipped fast law in NumPy."""
-    from jaxgran.restitution import _CLIPPED as fit
-    from jaxgran.restitution import C1
+    """The rational fit of the clipped restitution law, in NumPy."""
+    from jaxgran.scene.restitution_table import _CLIPPED as fit
+    from jaxgran.scene.restitution_table import C1
 
     z = np.sqrt(beta)
     p = fit.decay * fit.kappa - C1 + beta * np.polynomial.polynomial.polyval(z, fit.p)
@@ -186,7 +187,7 @@ def cold_starts() -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true", help="seconds instead of a minute")
+    parser.add_argument("--smoke", action="store_true", help="a run of seconds instead of a minute")
     smoke = parser.parse_args().smoke
     jax.config.update("jax_enable_x64", True)
     sweep = sweep_against_scipy(20 if smoke else NUM_CURVES, 2 if smoke else 50)

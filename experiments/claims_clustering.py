@@ -1,10 +1,10 @@
-"""Claims about the onset of clusters."""
+"""Rows of the table of claims: the onset and the dissolution of clusters."""
 
 import numpy as np
 from claims import Table
 
 QUOTED = ((70, 0.9, 0.0031), (23, 0.6, 0.0027))
-"""Collisions per particle at the onset, restitution, 1/T_c."""
+"""The paper's N_c (collisions per particle at the onset), coefficient of restitution, T_c/T_0."""
 BY_NUMBER, BY_TIME = "T over theory's of N by 2", "T over theory's of t by 2"
 BY_DENSITY = "unevenness over elastic by 2"
 
@@ -20,6 +20,7 @@ def clustering(table: Table) -> None:
 
 
 def onset(table: Table, run: dict, haff: list) -> None:
+    """When the gas leaves Haff's law, and which clock tells it."""
     scenes = [scene["constant"] for scene in run["scenes"].values()]
     cooler = [scene["T_at_the_papers_N"] for scene in scenes]
     found = {name: [scene["departures"][name] for scene in scenes] for name in (BY_NUMBER, BY_TIME)}
@@ -83,6 +84,7 @@ def onset(table: Table, run: dict, haff: list) -> None:
 
 
 def dissolution(table: Table, gas: dict) -> None:
+    """Whether clusters dissolve as the coefficient of restitution approaches 1."""
     uneven, flow, N = (np.asarray(gas[key]) for key in ("unevenness", "flow", "collisions"))
     peak = int(np.argmax(uneven))
     table.add(
@@ -99,6 +101,7 @@ def dissolution(table: Table, gas: dict) -> None:
 
 
 def _of(mean_and_error: list[float]) -> str:
+    """ "mean ± error", the error with two significant digits or rounded to units."""
     mean, error = mean_and_error
     digits = max(0, 1 - int(np.floor(np.log10(error))))
     return f"{mean:.{digits}f} ± {error:.{digits}f}"

@@ -1,4 +1,4 @@
-"""Rows of the table of claims: how a gas cools, and how fast velocities relax."""
+"""Rows of the table of claims: cooling laws, and the relaxation of the velocities."""
 
 from math import gamma
 
@@ -9,11 +9,13 @@ from claims import SMALL, Table, cooled
 from scenes import beads
 
 import jaxgran
-from jaxgran import closed_forms, kinetics
-from jaxgran.restitution import C1
+from jaxgran.scene.restitution_table import C1
+from jaxgran.theory import closed_forms
+from jaxgran.theory.averages import averages, collision_rate
 
 
 def cooling(table: Table) -> None:
+    """The power law of T, the collision frequency, and the times at which they hold."""
     run = table.found("paper_cooling")
     gas, early = cooled(SMALL, [1.0001, 10.0])
     if run:
@@ -78,22 +80,22 @@ def cooling(table: Table) -> None:
 
 def series(table: Table, gas: jaxgran.Gas) -> None:
     """The coefficients of Eqs. (32) and (36)."""
-    q, s = closed_forms.TWO_TERM, closed_forms.SONINE
-    rates = jnp.asarray([kinetics.averages(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)])
+    q, s = closed_forms.COOLING_CORRECTION, closed_forms.SONINE_COEFFICIENT
+    rates = jnp.asarray([averages(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)])
     paper_rates = jnp.asarray(
         [closed_forms.paper_averages(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)]
     )
-    elastic = 2 / 3 * float(kinetics.collision_rate(0.0, 3))
+    elastic = 2 / 3 * float(collision_rate(0.0, 3))
     c = float((1 - rates[1] / elastic) / SMALL)
-    second = 27 / 40 * gamma(2.2) * C1**2 * 4**0.2
+    first, second = closed_forms.RELAXATION_CORRECTION, 27 / 40 * gamma(2.2) * C1**2 * 4**0.2
     table.add(
         "32",
-        f"1/τ_v = (1 − {closed_forms.SLOWING:.4f} δ θ^{{1/10}} + {second:.4f} δ² θ^{{1/5}})/τ_E",
+        f"1/τ_v = (1 − {first:.4f} δ θ^{{1/10}} + {second:.4f} δ² θ^{{1/5}})/τ_E",
         f"first coefficient {c:.4f} at δ = 10⁻⁴; two terms are {100 * _two_terms_off(0.1):.1g} % "
         f"off at δ = 0.1, {100 * _two_terms_off(0.3):.0f} % at 0.3",
         "exact average of ε(v)",
         "agree",
-        abs(c / closed_forms.SLOWING - 1) < 1e-3,
+        abs(c / first - 1) < 1e-3,
         "of a Maxwellian gas",
     )
     table.add(
@@ -109,8 +111,8 @@ def series(table: Table, gas: jaxgran.Gas) -> None:
 
 
 def sonine(table: Table, early: jaxgran.CoolingCurve) -> None:
-    """How far from Maxwellian."""
-    s = closed_forms.SONINE
+    """The Sonine coefficient a_2, which the paper takes as zero."""
+    s = closed_forms.SONINE_COEFFICIENT
     assert early.sonine is not None
     a_2 = float(early.sonine[1]) / SMALL / 10 ** (-1 / 6)
     table.add(
@@ -125,8 +127,8 @@ def sonine(table: Table, early: jaxgran.CoolingCurve) -> None:
 
 
 def formulas(table: Table) -> None:
-    """The formulas of T(t)."""
-    q, s = closed_forms.TWO_TERM, closed_forms.SONINE
+    """The paper's closed forms of T(t)."""
+    q, s = closed_forms.COOLING_CORRECTION, closed_forms.SONINE_COEFFICIENT
     first = float(closed_forms.paper_temperature(0.0, 0.093, corrected=False))
     run = table.found("paper_cooling")
     u = np.geomspace(1.01, 1e9, 50)
@@ -170,11 +172,9 @@ def formulas(table: Table) -> None:
 
 
 def _two_terms_off(delta: float) -> float:
+    """Relative error of the relaxation rate by the two terms of Eq. (32)."""
     law = beads(0.05, 1.5 * 2**0.1 * delta).reduced_law
     one = jnp.ones(())
     return float(
-        abs(
-            closed_forms.paper_averages(law, one, 3)[2, 0] / kinetics.averages(law, one, 3)[2, 0]
-            - 1
-        )
+        abs(closed_forms.paper_averages(law, one, 3)[2, 0] / averages(law, one, 3)[2, 0] - 1)
     )

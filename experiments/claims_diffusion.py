@@ -1,4 +1,4 @@
-"""Rows of the table of claims: velocity correlation, D and <dr^2>."""
+"""Rows of the table of claims: velocity autocorrelation, self-diffusion D and <dr^2>."""
 
 from math import pi
 
@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from claims import SMALL, Table, cooled
 
-from jaxgran import closed_forms
+from jaxgran.theory import closed_forms
 
 
 def equilibrium(table: Table) -> None:
+    """D of elastic spheres."""
     routes = table.found("paper_diffusion_coefficient")
     if routes:
         row = routes["elastic"]
@@ -28,10 +29,11 @@ def equilibrium(table: Table) -> None:
 
 
 def memory(table: Table) -> None:
+    """The velocity autocorrelation of a cooling gas, and D from it."""
     run = table.found("paper_velocity_correlation")
     if run:
         row, e = run["constant"]["dsmc"], run["restitution"]
-        decay = (1 + e) / 3  # of the correlation in one collision
+        decay = (1 + e) / 3  # of ln of the correlation in one collision
         i = int(np.argmin(np.abs(np.array(row["lags"]) - 4.0)))
         table.add(
             "22, 24",
@@ -83,10 +85,15 @@ def memory(table: Table) -> None:
 
 
 def diffusion(table: Table) -> None:
+    """The laws of D(t) and <dr^2>(t)."""
     gas, curve = cooled(SMALL, [1e4, 1e6])
     u, d_0 = np.array([1e4, 1e6]), 1.5 * float(gas.temperature * gas.mean_free_time)
     a_3 = (np.asarray(curve.diffusion) / d_0 - u ** (-5 / 6)) * u / SMALL
-    q, c, s = closed_forms.TWO_TERM, closed_forms.SLOWING, closed_forms.SONINE
+    q, c, s = (
+        closed_forms.COOLING_CORRECTION,
+        closed_forms.RELAXATION_CORRECTION,
+        closed_forms.SONINE_COEFFICIENT,
+    )
     ours = q + 0.24 * s + 2 * c + 3 / 16 * s
     table.add(
         "40",

@@ -1,4 +1,4 @@
-"""Gases of disks followed beyond Haff's law, and what their clusters are measured by."""
+"""Gases of disks simulated beyond Haff's law, and the measures of their clusters."""
 
 import dataclasses
 import time
@@ -16,23 +16,25 @@ LAWS = ("constant", "viscoelastic")
 COLOURS = ("#20639b", "#d1495b")
 
 PER_CELL = 20
-"""Disks in a cell that counts and flow are taken over: a cell is smaller than a cluster."""
+"""Mean number of disks in the cells over which density and flow are measured.
+
+Such a cell is smaller than a cluster."""
 
 SPARE = 4.0
-"""Room for pairs over the need of a homogeneous gas."""
+"""Capacity for pairs over what a homogeneous gas needs: clusters have more."""
 
 FACTORS = (1.05, 1.1, 1.2, 2.0)
-"""By which T is above that of kinetic theory where a gas departs from it."""
+"""Ratios of T to that of kinetic theory at which a gas counts as departed from it."""
 
 UNEVEN = (1.5, 2.0)
-"""By which the unevenness is above that of the elastic fluid."""
+"""Ratios of the unevenness to that of the elastic fluid at which a gas counts as departed."""
 
 SLOPE_OVER = 6
-"""Stretches that a slope of ln T is taken over."""
+"""Number of intervals between stored points over which a slope of ln T is fitted."""
 
 
 def viscoelastic_like(gas: jaxgran.Gas) -> jaxgran.Gas:
-    """Viscoelastic disks that begin to cool at the same rate, -d ln T/dt of a Maxwellian gas."""
+    """Viscoelastic disks with the same initial cooling rate, -d ln T/dt of a Maxwellian gas."""
     theory = jaxgran.KineticTheory()
 
     def alike(beta: float) -> jaxgran.Gas:
@@ -45,7 +47,7 @@ def viscoelastic_like(gas: jaxgran.Gas) -> jaxgran.Gas:
 
 
 def dissipation(gas: jaxgran.Gas) -> float:
-    """gamma_0: half of what a collision per particle takes from ln T at the start."""
+    """gamma_0: half of the initial decrease of ln T per collision per particle."""
     return float(jaxgran.KineticTheory().cooling_rate(gas) / gas.collision_frequency) / 2
 
 
@@ -57,43 +59,45 @@ def follow(
     keep: Collection[float] = (),
     progress: Callable[[float], None] = lambda collisions: None,
 ) -> dict:
-    """Cool hard disks until each has met `until` others, in stretches of about one collision.
+    """Cool hard disks until each has made `until` collisions, in runs of about one collision.
 
-    Each stretch begins where the last one ended, at the temperature reached, so that it lasts about
-    as many collisions however slowly they have become.
+    Each run starts from the final particles of the one before and lasts about one collision per
+    particle, or 3 % of those made so far. Its duration follows from the temperature reached.
 
     Args:
-        seed: of the start, a melted elastic gas.
-        keep: collisions per particle at which positions are kept.
-        progress: called with the collisions per particle.
+        gas: the disks.
+        seed: of the random numbers of the initial state, a melted elastic gas.
+        num_particles: number of disks.
+        until: collisions per particle.
+        keep: collisions per particle at which positions are stored.
+        progress: called with the collisions per particle after every run.
 
     Returns:
-        At the end of every stretch the collisions per particle, t (s), T, the unevenness, the
-        flow's share of the energy and the regularised collisions; positions (in box sides) at
-        `keep`; seconds of the start and of the run.
+        At the end of every run the collisions per particle, t (s), T, the unevenness, the share of
+        the energy that is flow, and the regularised collisions per particle; positions in box sides
+        at `keep`; wall seconds of the initial state and of the run.
     """
     began = time.perf_counter()
-    melt = jaxgran.HardSpheres(num_particles, key=jax.random.key(seed), progress=False)
-    # Room for clusters from the start: what a stretch makes of it, the next does not know.
-    plan = melt.sized_for(gas, spare=SPARE).plan
-    melt = dataclasses.replace(melt, plan=plan)
-    now = jaxgran.cool(gas, [0.0], model=melt).particles
+    # All runs have the same capacity, large enough for clusters, so that they compile once.
+    sized = jaxgran.HardSpheres(num_particles).sized_for(gas, spare=SPARE)
+    key = jax.random.key(seed)
+    now = jaxgran.cool(gas, [0.0], model=sized, key=key, progress=False).particles
     assert now is not None
     started = time.perf_counter()
     rows, positions = [[0.0, 0.0, float(gas.temperature), *clusters(now), 0.0]], {}
-    pace = 1.0  # homogeneous mean free times that a collision takes
+    pace = 1.0  # mean time between collisions over the mean free time of a homogeneous gas
     while rows[-1][0] < until:
         collisions, t, temperature, *_, regularised = rows[-1]
         here = gas.replace(temperature=temperature)
         ahead = [x - collisions for x in (*keep, until) if x > collisions]
-        stretch = min(max(1.0, 0.03 * collisions), min(ahead) + 0.05)
-        duration = stretch * pace * float(here.mean_free_time)
-        model = jaxgran.HardSpheres(num_particles, start=now, progress=False, plan=plan)
-        curve = jaxgran.cool(here, [duration], model=model)
+        planned = min(max(1.0, 0.03 * collisions), min(ahead) + 0.05)
+        duration = planned * pace * float(here.mean_free_time)
+        model = dataclasses.replace(sized, start=now)
+        curve = jaxgran.cool(here, [duration], model=model, progress=False)
         assert curve.collisions is not None and curve.regularised is not None
         now, done = curve.particles, float(curve.collisions[-1])
         assert now is not None
-        pace *= float(np.clip(stretch / done, 0.5, 2.0))
+        pace *= float(np.clip(planned / done, 0.5, 2.0))
         rows.append(
             [
                 collisions + done,
@@ -114,11 +118,12 @@ def follow(
 
 
 def clusters(particles: jaxgran.Particles) -> tuple[float, float]:
-    """Unevenness of the density, and the share of the energy that flows.
+    """Unevenness of the density, and the share of the kinetic energy that is flow.
 
-    Over square cells of 20 disks on average: the variance of their number over its mean (1 of
-    independent points, less of a fluid), and the energy of the cells' mean velocities over all
-    energy, less what chance alone gives them.
+    Both are measured on square cells with `PER_CELL` disks on average. The unevenness is the
+    variance of the number of disks in a cell over its mean: 1 for independent points, less for a
+    fluid. The flow is the energy of the mean velocities of the cells over all kinetic energy, less
+    the value expected of independent velocities.
     """
     place = np.asarray(particles.position[0] / particles.box_side) % 1.0
     velocity = np.asarray(particles.velocity[0])
@@ -132,7 +137,7 @@ def clusters(particles: jaxgran.Particles) -> tuple[float, float]:
 
 
 def homogeneous(gas: jaxgran.Gas, run: dict) -> tuple[np.ndarray, np.ndarray]:
-    """ln T of kinetic theory (Enskog, with the Sonine a_2) at the collisions, and at the times."""
+    """ln T of kinetic theory at the collisions per particle of a run, and at its times."""
     tau = np.concatenate([[0.0], np.geomspace(1e-2, 1e13, 800)])
     theory = jaxgran.cool(gas, jnp.asarray(tau) * gas.mean_free_time)
     assert theory.collisions is not None
@@ -142,7 +147,7 @@ def homogeneous(gas: jaxgran.Gas, run: dict) -> tuple[np.ndarray, np.ndarray]:
 
 
 def crossing(x: np.ndarray, y: np.ndarray, level: float) -> float:
-    """The first x at which y rises to a level, between points on a straight line; nan if never."""
+    """The first x at which y reaches a level, by linear interpolation; nan if it never does."""
     above = np.flatnonzero(y >= level)
     if not above.size or above[0] == 0:
         return float("nan")
@@ -151,14 +156,14 @@ def crossing(x: np.ndarray, y: np.ndarray, level: float) -> float:
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """dy/dx by straight lines through neighbouring points."""
+    """dy/dx at each point, from a straight line fitted through it and its neighbours."""
     half = SLOPE_OVER // 2
     ends = [(max(i - half, 0), min(i + half, len(x) - 1) + 1) for i in range(len(x))]
     return np.array([np.polyfit(x[a:b], y[a:b], 1)[0] for a, b in ends])
 
 
 def departures(run: dict, elastic: float) -> dict[str, dict[str, float]]:
-    """Collisions, T_0/T and nu_0 t at which a run departs, by each definition."""
+    """Collisions, T/T_0 and nu_0 t where a run departs from kinetic theory, by each definition."""
     x = run["collisions"]
     at = {f"T over theory's of N by {c:g}": crossing(x, run["excess"], np.log(c)) for c in FACTORS}
     for c in FACTORS:

@@ -1,10 +1,10 @@
-"""Do soft spheres cool as LAMMPS says, from the same A, with nothing fitted?
+"""Do soft spheres cool as in LAMMPS, with the same A and without fitted parameters?
 
     python experiments/compare_lammps.py [--replicas 4] [--smoke] [--out DIR]
 
-Runs the scenes of both measured curves and prints, for some times, how far the temperature is from
-LAMMPS' and what both runs' replicas leave open; kinetic theory is set beside them. Writes a picture
-and a JSON file.
+Simulates the gases of both LAMMPS curves. Prints at some times the relative difference of T between
+soft spheres and LAMMPS with its standard error, from the replicas of both, and the difference
+between kinetic theory and LAMMPS. Writes a picture and a JSON file.
 """
 
 import argparse
@@ -21,7 +21,7 @@ import numpy as np  # noqa: E402
 from record import save  # noqa: E402
 
 import jaxgran  # noqa: E402
-from jaxgran.curve import header_number  # noqa: E402
+from jaxgran.data.curve_file import header_number  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 SCENES = ("dilute", "dense")

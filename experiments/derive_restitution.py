@@ -1,23 +1,24 @@
-"""Where the coefficients of the fast restitution law come from, and how well they hold.
+"""Where do the coefficients of the fitted restitution law come from, and how accurate is it?
 
     python experiments/derive_restitution.py
 
-Solves the impact ODE for some 200 beta, fits ``ln eps + decay ln(1 + kappa beta)`` by
-``beta P(z) / Q(z)``, z = sqrt(beta), in the least-maximum sense (Lawson's reweighting of
-a linearised least-squares fit), and prints the coefficients that stand in
-``jaxgran/restitution.py``.
+Solves the equation of motion of an impact for some 200 values of beta and fits
+``ln eps + decay ln(1 + kappa beta)`` by ``beta P(z) / Q(z)``, z = sqrt(beta). The fit minimises the
+largest error (Lawson's reweighting of a linearised least-squares fit). Prints the coefficients that
+``jaxgran/scene/restitution_table.py`` contains.
 """
 
 import jax
 import numpy as np
 
-from jaxgran.contact import impact
-from jaxgran.restitution import C1
+from jaxgran.scene.contact import impact
+from jaxgran.scene.restitution_table import C1
 
 ROUNDS = 300
 
 
 def samples(clipped: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Values of beta, and eps of an impact at each."""
     top = 3e4 if clipped else 40.0
     s = (1 - np.cos((np.arange(160) + 0.5) * np.pi / 160)) / 2
     beta = np.concatenate([s / (1 - s), np.geomspace(1, top, 50)])
@@ -33,7 +34,7 @@ def fit_rational(
     powers_p: list[int],
     powers_q: list[int],
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Largest error and the coefficients of P and Q beyond their constants, `slope` and 1."""
+    """The largest error, and the coefficients of P and Q without the constant ones, slope and 1."""
     z = np.sqrt(beta)[:, None]
     basis_p, basis_q = z ** np.array(powers_p), z ** np.array(powers_q)
     denominator, lawson = np.ones_like(beta), np.ones_like(beta)
@@ -57,7 +58,7 @@ def fit_rational(
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    # P and Q together reach the same power, so that their ratio tends to a constant.
+    # beta P and Q have the same degree, so that their ratio tends to a constant.
     shapes = {
         "clipped": (True, 0.7, 5 / 3, [2, *range(3, 9)], [2, *range(4, 11)]),
         "unclipped": (False, 0.7, 5.0, list(range(2, 21, 2)), list(range(2, 23, 2))),

@@ -26,9 +26,9 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxgran  # noqa: E402
-from jaxgran.checkpoint import write_whole  # noqa: E402
-from jaxgran.choice import words  # noqa: E402
-from jaxgran.curve import GAS_KEYS, header_count, header_number  # noqa: E402
+from jaxgran.data.curve_file import GAS_KEYS, header_count, header_number  # noqa: E402
+from jaxgran.data.files import write_whole  # noqa: E402
+from jaxgran.models.selection import words  # noqa: E402
 from jaxgran.plotting import plot_fit  # noqa: E402
 
 HERE = Path(__file__).parent

@@ -2,22 +2,22 @@
 
     python experiments/fit_head_to_head.py [--scenes stochastic soft-spheres] [--smoke] [--out DIR]
 
-Finds A, then A and T_0 together, from a cooling curve: by `jaxgran.fit`, whose simulations carry
-tangents, and by searches without derivatives: SciPy's bounded scalar search, Nelder-Mead and
-differential evolution, and CMA-ES where `pip install cma` has been done (it needs two parameters).
-All run the same simulator and weigh the same differences of ln T. All begin at half the true A and
-1.2 times the true T_0; searches that take a bracket get a factor 3 (1.5 of T_0) to either side of
-that. Searches without derivatives use the same random numbers in every simulation, so that they
-look at one and the same chi^2; `jaxgran.fit` draws new ones each time, as it always does.
+A, and then A and T_0 together, are estimated from a cooling curve: by `jaxgran.fit`, whose
+simulations carry tangents, and by searches without derivatives (SciPy's bounded scalar search,
+Nelder-Mead, differential evolution and, for two parameters and where the package cma is installed,
+CMA-ES). All searches run the same simulator and minimise the same chi^2 of ln T. All start from
+half the true A and 1.2 times the true T_0. Searches that need bounds get a factor 3 in A and 1.5 in
+T_0 to either side of the start. Searches without derivatives use the same random numbers in every
+simulation, so that chi^2 is a function of the parameters; `jaxgran.fit` draws new ones each time.
 
-Counted are the simulations after which a search's best guess so far stays within 2 % of the true
-values, and their seconds without compilation. A simulation with tangents counts as one.
+The table gives the number of simulations after which the best guess of a search stays within 2 % of
+the true values, and their run time without compilation. A simulation with tangents counts as one.
 
-- stochastic: DSMC of the dense gas, and a curve made by the same with other random numbers. Its
-  noise is far below 2 %.
-- soft-spheres: the curve measured in LAMMPS, until 24 mean free times. By the scatter of 24 boxes
-  of 1000, one simulation's noise leaves A open by 3 % and the LAMMPS curve's own by nearly 2 %, so
-  that whether one search with fixed random numbers ends within 2 % is partly luck.
+- stochastic: DSMC of the dense gas; the curve is a DSMC run with other random numbers. Its noise is
+  far below 2 %.
+- soft-spheres: the curve measured in LAMMPS, up to 24 mean free times. According to the scatter of
+  24 boxes of 1000 spheres, the noise of one simulation gives A an error of 3 %, that of the LAMMPS
+  curve nearly 2 %. Whether one search with fixed random numbers ends within 2 % is partly chance.
 """
 
 import argparse
@@ -25,7 +25,7 @@ import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ import scipy.optimize
 from record import save
 
 import jaxgran
-from jaxgran.curve import header_number
+from jaxgran.data.curve_file import header_number
 
 try:
     import cma  # type: ignore[import-not-found]
@@ -44,18 +44,25 @@ except ImportError:
 DENSE = Path(__file__).parent / "data" / "lammps_cooling_dense.csv"
 SCENES = ("stochastic", "soft-spheres")
 PARAMETERS = ("dissipative_constant", "temperature")
-OFF = np.log([0.5, 1.2])  # where all begin, from the true values, in logarithms
-REACH = np.log([3.0, 1.5])  # of the bracket, to either side
+OFF = np.log([0.5, 1.2])  # the first guess over the true values, in logarithms
+REACH = np.log([3.0, 1.5])  # of the bounds, to either side of the first guess
 WITHIN = np.log(1.02)
-TOLERANCE = 0.005  # of ln A and ln T_0, at which searches may end
-MOST = {1: 24, 2: 48}  # simulations of a search
-END = 24.0  # mean free times
-FAMILY = 6  # simulations in a generation of an evolutionary search, for each parameter
+TOLERANCE = 0.005  # of ln A and ln T_0, at which searches may stop
+MOST = {1: 24, 2: 48}  # simulations allowed, by number of parameters
+END = 24.0  # of the curve, in mean free times
+FAMILY = 6  # simulations per parameter in a generation of differential evolution
+KEY = 1  # of the random numbers of the searches
 
 
 @dataclasses.dataclass
 class Visit:
-    """One simulation: where, and when it and the search's thinking before it were over."""
+    """One simulation of a search.
+
+    Attributes:
+        point: its parameters, as logarithms of their ratios to the true ones.
+        chi2: nan if the search does not use it.
+        seconds: time from the start of the search to the end of this simulation.
+    """
 
     point: np.ndarray
     chi2: float
@@ -68,7 +75,7 @@ def main() -> None:
     )
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
     parser.add_argument("--replicas", type=int, default=4, help="of N = 1000 soft spheres")
-    parser.add_argument("--smoke", action="store_true", help="a run of seconds, stochastic only")
+    parser.add_argument("--smoke", action="store_true", help="a small run of seconds, DSMC only")
     parser.add_argument("--out", type=Path, default=Path("results") / "fit_head_to_head")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -86,7 +93,7 @@ def main() -> None:
 
 
 class Compilation:
-    """Seconds that JAX has spent on it."""
+    """Seconds that JAX has spent on compilation."""
 
     seconds = 0.0
 
@@ -99,7 +106,7 @@ COMPILATION = Compilation()
 
 
 class Clock:
-    """Seconds since it was made, without compilation."""
+    """Seconds since the clock was created, without compilation."""
 
     def __init__(self):
         self.begin, self.compiled = time.perf_counter(), COMPILATION.seconds
@@ -110,18 +117,33 @@ class Clock:
 
 @dataclasses.dataclass
 class Problem:
-    gas: jaxgran.Gas  # with the true values
+    """A curve to be fitted.
+
+    Attributes:
+        gas: with the true values.
+        curve: the measurement.
+        model: the simulator.
+        description: printed above the table.
+    """
+
+    gas: jaxgran.Gas
     curve: jaxgran.CoolingCurve
-    model: Any
-    words: str
+    model: jaxgran.AbstractModel
+    description: str
 
     def at(self, point: np.ndarray) -> jaxgran.Gas:
-        """The gas at ln of its parameters over the true ones."""
+        """The gas at a point: logarithms of the ratios of its parameters to the true ones."""
         names = PARAMETERS[: len(point)]
         factors = jnp.exp(jnp.asarray(point))
         return self.gas.replace(
             **{n: self.gas.value(n) * f for n, f in zip(names, factors, strict=True)}
         )
+
+    def simulated(self, point: np.ndarray) -> jaxgran.CoolingCurve:
+        """The curve at a point, always with the same random numbers."""
+        key = jax.random.key(KEY)
+        gas = self.at(point)
+        return jaxgran.cool(gas, self.curve.times, model=self.model, key=key, progress=False)
 
 
 def dense() -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
@@ -134,9 +156,9 @@ def dense() -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
 def stochastic(options: argparse.Namespace) -> Problem:
     gas, curve = dense()
     size = 1000 if options.smoke else 20_000
-    model = jaxgran.DSMC(size, replicas=2, key=jax.random.key(1), progress=False)
-    other = dataclasses.replace(model, replicas=8, key=jax.random.key(2))
-    made = jaxgran.cool(gas, curve.times, model=other)
+    model, other = (jaxgran.DSMC(size, replicas=replicas) for replicas in (2, 8))
+    key = jax.random.key(KEY + 1)
+    made = jaxgran.cool(gas, curve.times, model=other, key=key, progress=False)
     curve = jaxgran.CoolingCurve(
         made.times, made.temperature, temperature_error=made.temperature_error
     )
@@ -146,15 +168,10 @@ def stochastic(options: argparse.Namespace) -> Problem:
 def soft_spheres(options: argparse.Namespace) -> Problem:
     gas, curve = dense()
     hottest = gas.replace(temperature=gas.temperature * np.exp(OFF[1] + REACH[1]))
-    model = jaxgran.SoftSpheres(
-        1000,
-        replicas=options.replicas,
-        steps_per_contact=20,
-        key=jax.random.key(1),
-        progress=False,
-    ).sized_for(hottest)  # the same arrays for all, so that nothing is compiled on the way
-    words = f"soft spheres, N = 1000, {options.replicas} replicas; curve: LAMMPS, N = 4000, 3"
-    return Problem(gas, curve, model, words)
+    model = jaxgran.SoftSpheres(1000, replicas=options.replicas, steps_per_contact=20)
+    model = model.sized_for(hottest)  # one capacity for all parameters: nothing compiles again
+    description = f"soft spheres, N = 1000, {options.replicas} replicas; curve: LAMMPS, N = 4000, 3"
+    return Problem(gas, curve, model, description)
 
 
 PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
@@ -165,8 +182,8 @@ PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
 
 def compare(scene: str, problem: Problem, count: int, smoke: bool) -> list[dict]:
     first = OFF[:count]
-    # Warms up, and says how much the replicas scatter.
-    warm = jaxgran.cool(problem.at(first), problem.curve.times, model=problem.model)
+    # Compiles, and tells how much the replicas scatter.
+    warm = problem.simulated(first)
     assert warm.temperature_error is not None and problem.curve.temperature_error is not None
     scatter = np.asarray(warm.temperature_error / warm.temperature)[1:]
     error = np.asarray(problem.curve.temperature_error / problem.curve.temperature)[1:]
@@ -178,7 +195,7 @@ def compare(scene: str, problem: Problem, count: int, smoke: bool) -> list[dict]
             searches[name] = without(search, sigma)
     if count == 2 and cma is not None:
         searches["CMA-ES"] = without(evolution_strategy, sigma)
-    print(f"\n{problem.words}; free: {'A' if count == 1 else 'A and T_0'}")
+    print(f"\n{problem.description}; free: {'A' if count == 1 else 'A and T_0'}")
     errors = "".join(f"{f'error of {x}, %':>16}" for x in ("A", "T_0")[:count])
     print(f"{'':24}{'to within 2 %':>22}{'whole search':>22}")
     print(f"{'':24}" + 2 * f"{'simulations':>13}{'seconds':>9}" + errors)
@@ -208,34 +225,51 @@ def compare(scene: str, problem: Problem, count: int, smoke: bool) -> list[dict]
     return rows
 
 
-@dataclasses.dataclass
-class Watched:
-    """A model that writes down where and when it is run."""
+def watched(
+    model: jaxgran.AbstractModel, visit: Callable[[jaxgran.Gas], None]
+) -> jaxgran.AbstractModel:
+    """The same model, which calls `visit` with the gas before every run."""
 
-    model: Any
-    key: jax.Array
-    visits: list[tuple[float, np.ndarray]]
-    clock: Clock
-    replicas: int
-    accuracy: float
-    progress: bool = False
+    class Watched(jaxgran.AbstractModel):
+        stochastic: ClassVar[bool] = model.stochastic
+        derivative_accuracy: ClassVar[float] = model.derivative_accuracy
 
-    def cool(self, gas: jaxgran.Gas, times) -> jaxgran.CoolingCurve:
-        point = [float(jax.lax.stop_gradient(gas.value(name))) for name in PARAMETERS]
-        self.visits.append((self.clock(), np.asarray(point)))
-        return dataclasses.replace(self.model, key=self.key).cool(gas, times)
+        def check(self, gas):
+            model.check(gas)
+
+        def simulate(self, gas, times, run):
+            visit(gas)
+            return model.simulate(gas, times, run)
+
+        def estimated_error(self, course):
+            return model.estimated_error(course)
+
+        def omissions(self, gas, num_particles=None):
+            return model.omissions(gas, num_particles)
+
+    return Watched()
 
 
 def with_derivatives(problem: Problem, count: int, most: int | None):
-    model, visited, clock = problem.model, [], Clock()
-    watched: Any = Watched(model, model.key, visited, clock, model.replicas, model.accuracy)
-    names = PARAMETERS[:count]
-    start = problem.at(OFF[:count])
+    """The visits of `jaxgran.fit`, and its guess after each."""
+    visited, clock, names = [], Clock(), PARAMETERS[:count]
+
+    def visit(gas: jaxgran.Gas) -> None:
+        point = [float(jax.lax.stop_gradient(gas.value(name))) for name in PARAMETERS]
+        visited.append((clock(), np.asarray(point)))
+
     fitted = jaxgran.fit(
-        problem.gas, problem.curve, model=watched, free=names, start=start, max_steps=most
+        problem.gas,
+        problem.curve,
+        model=watched(problem.model, visit),
+        free=names,
+        start=problem.at(OFF[:count]),
+        max_steps=most,
+        key=jax.random.key(KEY),
+        progress=False,
     )
     true = np.asarray([float(problem.gas.value(name)) for name in names])
-    # The guess after a simulation is where the next one is made.
+    # The guess after a simulation is the point of the next one.
     points = [point[:count] for _, point in visited[1:]] + [np.asarray(fitted.estimate)]
     seconds = [begun for begun, _ in visited[1:]] + [clock()]
     guesses = [np.log(point / true) for point in points]
@@ -244,7 +278,7 @@ def with_derivatives(problem: Problem, count: int, most: int | None):
 
 
 def without(search: Callable, sigma: np.ndarray) -> Callable:
-    """A search that sees chi^2 alone."""
+    """A search that uses values of chi^2 only: its visits, and its best guess after each."""
 
     def run(problem: Problem, count: int, most: int | None):
         visits: list[Visit] = []
@@ -253,8 +287,8 @@ def without(search: Callable, sigma: np.ndarray) -> Callable:
 
         def chi2(point) -> float:
             point = np.atleast_1d(np.asarray(point, float))
-            computed = jaxgran.cool(problem.at(point), problem.curve.times, model=problem.model)
-            misfit = (measured - np.log(np.asarray(computed.temperature))[1:]) / sigma
+            computed = np.asarray(problem.simulated(point).temperature)
+            misfit = (measured - np.log(computed)[1:]) / sigma
             visits.append(Visit(point, float(misfit @ misfit), clock()))
             return visits[-1].chi2
 

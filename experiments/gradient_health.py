@@ -1,15 +1,20 @@
-"""Is the derivative of a chaotic gas's cooling curve right, and for how long?
+"""Is the derivative of the cooling curve of a chaotic gas right, and until when?
 
     python experiments/gradient_health.py [--scenes dilute dense clustering] [--late-differences]
                                           [--smoke] [--out DIR]
 
-d ln T / d ln A of three gases at 1, 3, 10, 30 and 100 collisions a particle, by finite differences
-(many replicas, the same random starts on both sides, corrected for their step by kinetic theory),
-by plain forward mode, by thermally projected forward and reverse mode, and by kinetic theory; and
-how the projected derivative depends on the interval between projections. Standard errors are over
-replicas. Prints tables, draws a picture, writes JSON; scenes that are in the JSON file already are
-kept in both unless asked for, and with --late-differences all of them is kept but the differences
-of the late times.
+d ln T / d ln A of three gases after 1, 3, 10, 30 and 100 collisions per particle, by
+
+- central finite differences (many replicas, the same initial states on both sides; the truncation
+  error of the step is corrected by kinetic theory),
+- forward mode without projection ("plain"),
+- thermally projected forward and reverse mode,
+- kinetic theory;
+
+and how the projected derivative depends on the interval between projections. Standard errors are
+over replicas. Prints tables, draws a picture and writes a JSON file. Scenes of an older JSON file
+that are not asked for are kept in both. With --late-differences all results of a scene are kept
+except the finite differences at the late times, which are computed again.
 """
 
 import argparse
@@ -34,17 +39,17 @@ import jaxgran  # noqa: E402
 COLLISIONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 INTERVALS = (0.03, 0.1, 0.3, 1.0)
 STEP = 0.3  # of ln A, to either side
-# packing fraction, beta_T0, contact duration over mean free time, particles in a box, boxes
+# packing fraction, beta_T0, contact duration over mean free time, particles in a box, replicas
 SCENES = {
     "dilute": (0.05, 0.1, 0.01, 500, 16),
     "dense": (0.25, 0.05, 0.05, 500, 16),
     "clustering": (0.3, 0.2, 0.05, 1000, 8),
 }
-# So many sets of boxes for differences, which scatter more than tangents.
+# Sets of replicas for finite differences, which scatter more than tangents.
 SETS = {"dilute": 1, "dense": 1, "clustering": 6}
 FEW_REPLICAS = 4
-EARLY, EARLY_REPLICAS = 2, 64  # the first of the times, whose slopes are small, have more
-PLAIN_HORIZON = 3  # of the times; the plain derivative overflows at the last
+EARLY, EARLY_REPLICAS = 2, 64  # the first times, where derivatives are small, have more replicas
+PLAIN_HORIZON = 3  # times at which the plain derivative is computed; at the last it overflows
 STEPS_PER_CONTACT = 25
 
 
@@ -53,17 +58,17 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
-    parser.add_argument("--late-differences", action="store_true", help="only these, anew")
+    parser.add_argument("--late-differences", action="store_true", help="compute only these again")
     parser.add_argument("--smoke", action="store_true", help="few particles, early times only")
     parser.add_argument("--out", type=Path, default=Path("results") / "gradient_health")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     file, results = options.out / "gradient_health.json", {}
-    if file.exists():  # scenes not asked for again
+    if file.exists():  # scenes that are not asked for are kept
         results = json.loads(file.read_text())["scenes"]
     if options.late_differences and (missing := set(options.scenes) - set(results)):
         parser.error(
-            f"--late-differences needs all the rest from before, and {file} has none of "
+            f"--late-differences needs earlier results, and {file} has none of "
             f"{', '.join(sorted(missing))}: run these scenes without it first"
         )
     options.out.mkdir(parents=True, exist_ok=True)
@@ -77,25 +82,26 @@ def main() -> None:
 
 
 def times_of(gas: jaxgran.Gas, collisions, size: int) -> np.ndarray:
-    """When a particle has collided so often, by kinetic theory; in clusters, in a run of their own.
+    """Times at which a particle has made so many collisions on average.
 
-    There spheres collide more often than theory says, and than its T would let them.
+    By kinetic theory, or, if the box exceeds L_c, by a run of soft spheres: in clusters spheres
+    collide more often than kinetic theory predicts.
     """
 
     def times(model, t):
-        counts = np.asarray(jaxgran.cool(gas, t, model=model).collisions)
+        counts = np.asarray(jaxgran.cool(gas, t, model=model, progress=False).collisions)
         return np.exp(np.interp(np.log(collisions), np.log(np.maximum(counts, 1e-9)), np.log(t)))
 
     tau_c = float(gas.mean_free_time)
     found = times(jaxgran.KineticTheory(), tau_c * np.geomspace(0.1, 1e6, 400))
     if gas.box_side(size) < gas.critical_box:
         return found
-    model = jaxgran.SoftSpheres(size, steps_per_contact=10, progress=False)
+    model = jaxgran.SoftSpheres(size, steps_per_contact=10)
     return times(model, np.geomspace(0.1 * tau_c, found[-1], 60))
 
 
 def examine(name: str, smoke: bool, before: dict | None) -> dict:
-    """All that is told of a scene; if told before, with its late differences made anew."""
+    """All results of a scene; given earlier ones, only the late differences are computed again."""
     begin, gas = time.perf_counter(), beads(*SCENES[name][:3])
     collisions = COLLISIONS[:2] if smoke else COLLISIONS
     (size, many), few, most = SCENES[name][3:], FEW_REPLICAS, EARLY_REPLICAS
@@ -104,10 +110,10 @@ def examine(name: str, smoke: bool, before: dict | None) -> dict:
     times = times_of(gas, collisions, size)
     constant = gas.value("dissipative_constant")
 
-    def log_temperatures(log_scale, model, times=times):
-        curve = jaxgran.cool(
-            gas.replace(dissipative_constant=constant * jnp.exp(log_scale)), times, model=model
-        )
+    def log_temperatures(log_scale, model, times=times, seed=0):
+        changed = gas.replace(dissipative_constant=constant * jnp.exp(log_scale))
+        key = jax.random.key(seed)
+        curve = jaxgran.cool(changed, times, model=model, key=key, progress=not smoke)
         each = curve.temperature[None] if curve.replicas is None else curve.replicas.temperature
         return jnp.log(each), curve.collisions  # shape (replicas, times)
 
@@ -124,27 +130,24 @@ def examine(name: str, smoke: bool, before: dict | None) -> dict:
             size,
             replicas=replicas,
             steps_per_contact=STEPS_PER_CONTACT,
-            progress=not smoke,
             **settings,
         )
 
     theory = jaxgran.KineticTheory()
     exact = forward(theory)[0][0]
     ends = [np.asarray(log_temperatures(s * STEP, theory)[0][0]) for s in (1, -1)]
-    too_long_step = (ends[0] - ends[1]) / (2 * STEP) - exact
+    truncation = (ends[0] - ends[1]) / (2 * STEP) - exact
 
-    def differences(model, times):
-        ends = [np.asarray(log_temperatures(s * STEP, model, times)[0]) for s in (1, -1)]
-        return (ends[0] - ends[1]) / (2 * STEP) - too_long_step[: len(times)]
+    def differences(model, times, seed=0):
+        ends = [np.asarray(log_temperatures(s * STEP, model, times, seed)[0]) for s in (1, -1)]
+        return (ends[0] - ends[1]) / (2 * STEP) - truncation[: len(times)]
 
     def joined(early, late):
         pairs = zip(over_replicas(early), over_replicas(late), strict=True)
         return tuple(np.concatenate([a[:EARLY], b[EARLY:]]) for a, b in pairs)
 
     sets = 1 if smoke else SETS[name]
-    late = np.concatenate(
-        [differences(spheres(many, key=jax.random.key(k)), times) for k in range(sets)]
-    )
+    late = np.concatenate([differences(spheres(many), times, seed) for seed in range(sets)])
     if before is None:
         early = spheres(most), times[:EARLY]
         slopes, counts, seconds = forward(spheres(many))
@@ -153,14 +156,14 @@ def examine(name: str, smoke: bool, before: dict | None) -> dict:
             "differences": joined(differences(*early), late),
             "projected": joined(forward(*early)[0], slopes),
         }
-        # A plain derivative is traced, and arrays do not grow in it.
+        # A plain derivative is computed under tracing, where arrays cannot be enlarged.
         plain = spheres(few, projection=None).sized_for(gas)
         columns["plain"] = over_replicas(forward(plain, times[:PLAIN_HORIZON])[0])
         by_interval = {}
         for interval in INTERVALS[:2] if smoke else INTERVALS:
             slopes = forward(spheres(few, projection=interval))[0]
             by_interval[interval] = over_replicas(slopes)
-        # Reverse mode: the gradient of the last mean of ln T, beside forward mode of the same run.
+        # Reverse mode: the gradient of the mean ln T at the last time, compared with forward mode.
         model = spheres(few, projection=INTERVALS[1])
         last = jax.grad(lambda x: jnp.mean(log_temperatures(x, model)[0][:, -1]))(0.0)
         disagreement = abs(float(last) - by_interval[INTERVALS[1]][0][-1])
@@ -206,7 +209,7 @@ def examine(name: str, smoke: bool, before: dict | None) -> dict:
 
 
 def arrays(columns: dict) -> dict[str, tuple[np.ndarray, ...]]:
-    """Means and standard errors out of a JSON file."""
+    """Means and standard errors from a JSON file."""
     return {name: tuple(map(np.asarray, values)) for name, values in columns.items()}
 
 
@@ -232,7 +235,7 @@ def draw(results: dict, path: Path) -> None:
                 continue
             at = n[: len(mean)] * 1.06 ** (shift - 1)
             top.errorbar(at, mean, error, fmt=marker, ms=5, label=label)
-        top.set(xscale="log", title=name, xlabel="collisions a particle", ylim=(-2.2, 0.7))
+        top.set(xscale="log", title=name, xlabel="collisions per particle", ylim=(-2.2, 0.7))
         reference = np.asarray(result["d_ln_T_d_ln_A"]["differences"][0])
         for i, goal in enumerate(COLLISIONS[: len(n)]):
             x = [float(k) for k in result["by_interval"]]

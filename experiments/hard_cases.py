@@ -1,12 +1,12 @@
-"""Where do the numbers break, and do ours?
+"""In which limits do simulations of granular gases fail, and does jaxgran?
 
     python experiments/hard_cases.py [--only WORDS ...] [--heavy] [--smoke] [--out DIR]
 
-Runs the hard cases of the modules beside it (impacts, gases, runs) and prints one table: case, what
-goes wrong elsewhere, what jaxgran does, and for every model and precision the error of a value and
-of a derivative beside what is allowed, and the status. A tolerance's reason stands in its case.
-Writes the table as markdown and as JSON after every case; cases found there and not run again are
-kept. Ends with 1 if any row fails.
+Runs the cases of `hard_cases_impacts.py`, `hard_cases_gases.py` and `hard_cases_runs.py`. Prints
+one table: the case, how other codes fail, what jaxgran does, and for every model and precision the
+error of a value and of a derivative with the largest error allowed, and the status. The reason for
+each tolerance is given in its case. Writes the table in Markdown and as JSON after every case;
+cases of older files that are not run again are kept. The exit status is 1 if a row fails.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from hard_cases_rows import Row
 from hard_cases_runs import RUNS
 from record import save
 
-from jaxgran.checkpoint import write_whole
+from jaxgran.data.files import write_whole
 
 CASES = [*IMPACTS, *GASES, *RUNS]
 SMOKE = "order flips"
@@ -45,9 +45,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--only", nargs="*", default=[""], help="cases whose name holds any")
-    parser.add_argument("--heavy", action="store_true", help="the cases of minutes too")
-    parser.add_argument("--smoke", action="store_true", help="one case, in seconds")
+    parser.add_argument("--only", nargs="*", default=[""], help="cases whose name contains any")
+    parser.add_argument("--heavy", action="store_true", help="also the cases that take minutes")
+    parser.add_argument("--smoke", action="store_true", help="one case, which takes seconds")
     parser.add_argument("--out", type=Path, default=Path("results/hard_cases"))
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -56,7 +56,7 @@ def main() -> int:
     cases = [c for c in asked if options.heavy or not c.heavy]
     if not cases:
         parser.error(
-            f"no case's name holds {only!r}; there are: {', '.join(c.name for c in CASES)}"
+            f"no case's name contains {only!r}; the cases: {', '.join(c.name for c in CASES)}"
         )
     record = options.out / "hard_cases.json"
     kept = json.loads(record.read_text(encoding="utf-8"))["cases"] if record.exists() else []
@@ -67,11 +67,11 @@ def main() -> int:
         begin = time.perf_counter()
         try:
             rows = case.run()
-        except Exception as error:  # a case that ends is a failed one; the others still run
+        except Exception as error:  # fails this case; the others still run
             words = " ".join(str(error).split())[:200]
             rows = [Row(type(error).__name__, "", float("inf"), 0.0, status=words)]
         seconds = round(time.perf_counter() - begin, 1)
-        jax.clear_caches()  # all that the cases compile is more than a process may map
+        jax.clear_caches()  # else the compiled code of all cases exceeds the memory maps allowed
         for row in rows:
             words = f"{row.model}, {row.precision}"
             print(f"    {words:50} {_error(row):22} {_slope(row):22} {_status(row)}", flush=True)

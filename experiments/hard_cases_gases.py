@@ -1,4 +1,4 @@
-"""Hard cases of whole gases: no loss and all, thin and dense, few and many, cold, in any units."""
+"""Hard cases of whole gases: limits of dissipation, density, size, temperature and units."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +9,6 @@ from hard_cases_rows import (
     box,
     finite,
     precision,
-    quiet,
     slope_of,
     spheres,
     theory,
@@ -19,8 +18,8 @@ from hard_cases_rows import (
 from scenes import beads
 
 import jaxgran
-from jaxgran import closed_forms
-from jaxgran.neighbours import find_pairs
+from jaxgran.particles.neighbours import find_pairs
+from jaxgran.theory import closed_forms
 
 DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
 MAXWELLIAN = jaxgran.KineticTheory(softness=False, sonine=False)
@@ -31,7 +30,7 @@ def _taus(gas, *taus):
 
 
 def _run(model, gas, times, free=None):
-    """T/T_0 of a particle model at some times, and if asked d ln T of a float."""
+    """T/T_0 of a particle model at some times, and d ln T in a float of the gas if it is named."""
     first = float(gas.temperature)
     if free is None:
         return np.asarray(jaxgran.cool(gas, times, model=model).temperature) / first, None
@@ -52,7 +51,7 @@ def elastic_limit() -> list[Row]:
             per_delta = -5 / 3 * closed_forms.COOLING_RATE[3] * tau
             exact = per_delta * float(gas.delta) / float(gas.value(free))
             value, slope = theory(gas.replace(**{free: 0.0}), times, free)
-            # Solver 1e-9 or 1e-5; in float32 times as large and small as these carry 1e-6.
+            # The solver's rtol is 1e-9 or 1e-5; times in float32 have a round-off of up to 1e-6.
             allowed = 1e-12 if name == "float64" else 1e-6
             slope_ok = 1e-7 if name == "float64" else 1e-4
             errors = float(np.max(np.abs(value))), allowed, worst(slope, exact), slope_ok
@@ -60,7 +59,7 @@ def elastic_limit() -> list[Row]:
             weak = gas.replace(**{free: 1e-7 * gas.value(free)})  # beta = 1e-8
             value, slope = theory(weak, times, free)
             error = float(np.max(np.abs(value - exact * float(weak.value(free)))))
-            # Of ln T = -1e-7 at most: its square, and round-off of T.
+            # |ln T| is at most 1e-7: its square is left out, and T has round-off.
             allowed = 1e-13 if name == "float64" else 1.2e-7
             errors = error, allowed, worst(slope, exact), slope_ok
             rows.append(Row("KineticTheory, beta = 1e-8", name, *errors))
@@ -71,24 +70,24 @@ def elastic_limit() -> list[Row]:
             times = jnp.asarray(_taus(weak, 1e2, 1e3, 1e4))
             value, slope = theory(weak, times, free)
             found.append((np.asarray(value, float), np.asarray(slope, float)))
-    # Where 1 - eps cancels, float32 knows 1e-5 to 1 %: -expm1(ln eps) keeps its digits.
+    # In float32, 1 - eps = 1e-5 would have an error of 1 %; -expm1(ln eps) has none.
     errors = worst(found[1][0], found[0][0]), 3e-4, worst(found[1][1], found[0][1]), 3e-4
     rows.append(Row("KineticTheory, beta = 1e-5", "float32", *errors))
     gas = beads(0.05, 0.1)
     times = _taus(gas, 1.0)
     still, slope = gas.replace(**{free: 0.0}), 0.0
     exact = -5 / 3 * closed_forms.COOLING_RATE[3] * float(gas.delta) / float(gas.value(free))
-    # T keeps to round-off. The slope counts impacts: 2000 of them scatter by 2 %, 50 by 14 %.
-    for model, noise in ((DSMC, 0.1), (HARD, 0.5)):
-        some = quiet(model, {DSMC: 4000, HARD: 100}[model])
-        value, slope = _run(some, still, times, free)
+    # T stays constant up to round-off. The derivative is proportional to the number of impacts,
+    # which scatters by 2 % (2000 impacts) and 14 % (50).
+    for kind, size, noise in ((DSMC, 4000, 0.1), (HARD, 100, 0.5)):
+        value, slope = _run(kind(size), still, times, free)
         errors = worst(value, 1.0), 1e-11, worst(slope, exact), noise
-        rows.append(Row(model.__name__, "float64", *errors))
+        rows.append(Row(kind.__name__, "float64", *errors))
     soft = beads(0.05, 0.1, 0.02).replace(**{free: 0.0})
-    curve = jaxgran.cool(soft, [0.0, float(soft.mean_free_time)], model=quiet(SOFT, 100))
+    curve = jaxgran.cool(soft, [0.0, float(soft.mean_free_time)], model=SOFT(100))
     assert curve.elastic_energy is not None
     held = np.asarray(1.5 * soft.mass * curve.temperature + curve.elastic_energy)
-    # The step's energy error: 1e-4 over 100 mean free times.
+    # The energy error of the time steps: 1e-4 in 100 mean free times.
     rows.append(Row("SoftSpheres, energy", "float64", worst(held[1], held[0]), 1e-4))
     return rows
 
@@ -117,17 +116,17 @@ def plastic_and_elastic() -> list[Row]:
         gas = unit_gas(jaxgran.ConstantRestitution(e), 0.05)
         times = _taus(gas, 5.0)
         haff = float(closed_forms.haff(5.0, e))
-        # At e = 0 a_2 is near .1 and kinetic theory's second order leaves some per cent; 100
-        # spheres' losses scatter by 10 %.
-        for model, size, noise in ((DSMC, 4000, 0.05), (HARD, 100, 0.4)):
-            value, slope = _run(quiet(model, size), gas, times, free)
+        # At e = 0 a_2 is near .1, which Haff's law neglects: an error of some per cent. The energy
+        # loss of 100 spheres scatters by 10 %.
+        for kind, size, noise in ((DSMC, 4000, 0.05), (HARD, 100, 0.4)):
+            value, slope = _run(kind(size), gas, times, free)
             errors = worst(value, haff), noise if e == 0 else 1e-11, finite(slope), 0.0
-            rows.append(Row(f"{model.__name__}, e = {e:g}", "float64", *errors))
+            rows.append(Row(f"{kind.__name__}, e = {e:g}", "float64", *errors))
     return rows
 
 
 def _deepest_overlap(particles) -> float:
-    """In diameters of 1."""
+    """The deepest overlap of two spheres of diameter 1; 0 if none overlap."""
     d = particles.position.shape[-1]
     position = particles.position.reshape(-1, d)
     pairs = find_pairs(position, particles.box_side, 1.02, room=20 * len(position))
@@ -137,22 +136,22 @@ def _deepest_overlap(particles) -> float:
 
 
 def collapse() -> list[Row]:
-    """Three spheres in a row and a dense cluster that would meet infinitely often."""
+    """Three spheres in a row and a dense cluster, which would collide infinitely often."""
     rows = []
     for name in PRECISIONS:
         with precision(name):
             gas = unit_gas(jaxgran.ConstantRestitution(0.05), 3 * np.pi / 6 / 10.0**3)
             x = [[2.0, 5, 5], [5.0, 5, 5], [8.5, 5, 5]]
             v = [[1.0, 0, 0], [0.0, 0, 0], [-1.0, 0, 0]]
-            model = quiet(HARD, 3, start=spheres(x, v, 10.0))
+            model = HARD(3, start=spheres(x, v, 10.0))
             curve = jaxgran.cool(gas, [8.0], model=model)
         assert curve.collisions is not None and float(curve.collisions[-1]) < 100
-        # Places in a box of ten: 1e-15 and 1e-6.
+        # Round-off of positions in a box of ten diameters: 1e-15 and 1e-6.
         allowed = 1e-9 if name == "float64" else 1e-5
         overlap = _deepest_overlap(curve.particles)
         rows.append(Row("HardSpheres, three in a row", name, overlap, allowed))
     gas = unit_gas(jaxgran.ConstantRestitution(0.3), 0.5, 2)
-    curve = jaxgran.cool(gas, _taus(gas, 20.0), model=quiet(HARD, 100))
+    curve = jaxgran.cool(gas, _taus(gas, 20.0), model=HARD(100))
     assert curve.dissipated_energy is not None
     ledger = float(curve.temperature[-1] + curve.dissipated_energy[-1]) - 1
     overlap = _deepest_overlap(curve.particles)
@@ -180,19 +179,20 @@ def thin_and_dense() -> list[Row]:
             )
         for phi in packings:
             gas = unit_gas(jaxgran.ConstantRestitution(0.9), phi, d)
-            curve = jaxgran.cool(gas, _taus(gas, 5.0), model=quiet(HARD, 100))
+            curve = jaxgran.cool(gas, _taus(gas, 5.0), model=HARD(100))
             assert curve.collisions is not None and curve.dissipated_energy is not None
             ledger = abs(float(d / 2 * curve.temperature[0] + curve.dissipated_energy[0]) - d / 2)
             told = closed_forms.haff(5.0, 0.9, d)
-            # 250 impacts scatter by 6 %; a dense inelastic gas meets oftener than Enskog says.
+            # 250 impacts scatter by 6 %; in a dense inelastic gas there are more than Enskog's
+            # frequency predicts.
             error = worst(curve.temperature[0], told)
             rows.append(Row(f"HardSpheres, {d}D, phi = {phi:g}", "float64", error, 0.15))
             rows.append(Row(f"HardSpheres, {d}D, ledger", "float64", ledger, 1e-12))
-    # A contact that long a part of a mean free time would be deeper than a sphere when thin.
+    # At phi = 1e-4 contacts of .02 mean free times would be deeper than a sphere.
     for phi, contact in ((1e-4, 2e-4), (0.45, 0.02)):
         gas = beads(phi, 0.1, contact)
-        curve = jaxgran.cool(gas, _taus(gas, 0.0, 2.0), model=quiet(SOFT, 100))
-        # Kinetic theory with its softness; 100 impacts scatter by 10 % of a loss of .16.
+        curve = jaxgran.cool(gas, _taus(gas, 0.0, 2.0), model=SOFT(100))
+        # Kinetic theory of hard spheres; 100 impacts scatter the loss, .16, by 10 %.
         told = float(jnp.exp(theory(gas, jnp.asarray(_taus(gas, 2.0)), "diameter")[0][0]))
         error = worst(curve.temperature[1] / curve.temperature[0], told)
         rows.append(Row(f"SoftSpheres, 3D, phi = {phi:g}", "float64", error, 0.1))
@@ -206,22 +206,22 @@ def two_particles() -> list[Row]:
         with precision(name):
             gas = beads(0.02, 0.1, 0.05)
             times = _taus(gas, 0.0, 3.0)
-            # In float32 hard and soft pairs are met in the smallest box.
-            for model in (DSMC, HARD, SOFT) if name == "float64" else (DSMC,):
-                value, _ = _run(quiet(model, 2), gas, times)
-                # Two particles lose at most all, and gain nothing.
+            # Pairs of hard and soft spheres in float32 are run in the case of the smallest box.
+            for kind in (DSMC, HARD, SOFT) if name == "float64" else (DSMC,):
+                value, _ = _run(kind(2), gas, times)
+                # Two particles gain no energy and keep some.
                 wrong = np.max(value) - 1 if np.min(value) > 0 else np.nan
-                rows.append(Row(model.__name__, name, max(float(wrong), 0.0), 1e-5))
+                rows.append(Row(kind.__name__, name, max(float(wrong), 0.0), 1e-5))
     return rows
 
 
 def million_particles() -> list[Row]:
-    """N = 1e6: stochastic for 5 mean free times, with positions for a moment, from a lattice."""
+    """N = 1e6: DSMC for 5 mean free times; hard, soft spheres for .2, from a perturbed lattice."""
     gas, rows, n = beads(0.05, 0.15, 0.02), [], 1_000_000
     times = _taus(gas, 5.0)
-    value, _ = _run(quiet(DSMC, n), gas, times)
+    value, _ = _run(DSMC(n), gas, times)
     told = np.exp(theory(gas, jnp.asarray(times), "diameter")[0])
-    rows.append(Row("DSMC", "float64", worst(value, told), 2e-3))  # 1/sqrt(N), second Sonine
+    rows.append(Row("DSMC", "float64", worst(value, told), 2e-3))  # noise, higher Sonine orders
     side = box(gas, n)
     grid = (np.arange(100) + 0.5) * side / 100
     place = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), -1).reshape(-1, 3)
@@ -231,22 +231,23 @@ def million_particles() -> list[Row]:
     velocity -= velocity.mean(axis=0)
     start = spheres(place, velocity, side)
     first = float(np.mean(velocity**2))
-    for model in (HARD, SOFT):
-        curve = jaxgran.cool(gas, _taus(gas, 0.2), model=quiet(model, n, start=start))
+    for kind in (HARD, SOFT):
+        curve = jaxgran.cool(gas, _taus(gas, 0.2), model=kind(n, start=start))
         assert curve.dissipated_energy is not None
         kept = 1.5 * float(gas.mass) * float(curve.temperature[0]) + float(
             curve.dissipated_energy[0]
         )
         if curve.elastic_energy is not None:
             kept += float(curve.elastic_energy[0])
-        # The ledger: round-off for instant impacts, 1e-3 of what 40 steps a contact exchange.
+        # The energy balance of hard spheres closes up to round-off, that of soft spheres to 1e-3 of
+        # the work done in contacts of 40 steps.
         kept /= 1.5 * float(gas.mass) * first
-        rows.append(Row(model.__name__, "float64", worst(kept, 1.0), 1e-4))
+        rows.append(Row(kind.__name__, "float64", worst(kept, 1.0), 1e-4))
     return rows
 
 
 def deep_cold() -> list[Row]:
-    """T/T_0 down to 1e-12 in theory, 1e-6 in DSMC and hard spheres, 1e-4 in soft spheres."""
+    """T/T_0 down to 1e-12 by theory, 1e-6 by DSMC and hard spheres, 1e-4 by soft spheres."""
     rows, free, e = [], "coefficient", 0.5
     gamma = (1 - e * e) / 6
     for name in PRECISIONS:
@@ -257,54 +258,50 @@ def deep_cold() -> list[Row]:
             tau = np.asarray(times / gas.mean_free_time, float)
             exact = np.log(np.asarray(closed_forms.haff(tau, e)))
             assert exact[-1] < np.log(1e-12)
-            allowed = (
-                1e-7 if name == "float64" else 3e-3
-            )  # of ln T = -28, by a solver of 1e-9, 1e-5
+            # Of ln T = -28, by a solver with an rtol of 1e-9 and 1e-5.
+            allowed = 1e-7 if name == "float64" else 3e-3
             error = float(np.max(np.abs(value - exact)))
             along = worst(slope, 4 * e / 6 * tau / (1 + gamma * tau))
             rows.append(Row("KineticTheory, 1e-12", name, error, allowed, along, allowed))
             end = [float(gas.mean_free_time) * 2e3 / gamma]
-            for model, size, noise in ((DSMC, 4000, 0.1), (HARD, 50, 1.5)):
-                value, slope = _run(quiet(model, size), gas, end, free if model is DSMC else None)
-                assert value[0] < 1e-6 or model is HARD
-                # a_2 = .048 makes Haff's clock 1 % slow; DSMC's 4000 and 50 spheres in one small
-                # box scatter. Late, T goes as 1/clock^2.
-                # Its slope is what two ten times larger ones leave: 2 % of T are 20 % of it.
-                told = float(closed_forms.haff(2e3 / gamma, e))
-                rows.append(
-                    Row(
-                        f"{model.__name__}, {told:.0e}",
-                        name,
-                        abs(float(np.log(value[0] / told))),
-                        noise,
-                        None if slope is None else worst(slope[0], along_of(e, 2e3 / gamma)),
-                        None if slope is None else 0.3,
-                    )
-                )
+            told = float(closed_forms.haff(2e3 / gamma, e))
+            # With a_2 = .048 the gas cools 1 % more slowly than Haff's law, and late T goes as the
+            # inverse square of the rate. 4000 particles of DSMC and 50 spheres in one small box
+            # scatter besides.
+            value, slope = _run(DSMC(4000), gas, end, free)
+            assert slope is not None and value[0] < 1e-6
+            # The derivative is a small difference of terms that are ten times larger: 2 % of T are
+            # 20 % of it.
+            errors = abs(float(np.log(value[0] / told))), 0.1
+            along = worst(slope[0], along_of(e, 2e3 / gamma))
+            rows.append(Row(f"DSMC, {told:.0e}", name, *errors, along, 0.3))
+            value, _ = _run(HARD(50), gas, end)
+            error = abs(float(np.log(value[0] / told)))
+            rows.append(Row(f"HardSpheres, {told:.0e}", name, error, 1.5))
     gas = beads(0.05, 0.9, 0.05)
     tau = 3e3
     end = _taus(gas, 0.0, tau)
-    curve = jaxgran.cool(gas, end, model=quiet(SOFT, 50, steps_per_contact=20))
+    curve = jaxgran.cool(gas, end, model=SOFT(50, steps_per_contact=20))
     theta = np.asarray(curve.temperature) / float(gas.temperature)
     assert curve.elastic_energy is not None and curve.dissipated_energy is not None
     held = curve.elastic_energy + curve.dissipated_energy
     held = held / (1.5 * gas.mass * gas.temperature)
     told = float(jnp.exp(theory(gas, jnp.asarray(end), "diameter")[0][1]))
     ledger = abs(float(theta[1] + held[1] - theta[0] - held[0]))
-    rows.append(Row("SoftSpheres, ledger", "float64", ledger, 5e-3))  # 20 steps a contact
+    rows.append(Row("SoftSpheres, ledger", "float64", ledger, 5e-3))  # 20 steps per contact
     rows.append(
         Row(
             f"SoftSpheres, {theta[1]:.0e}",
             "float64",
             abs(float(np.log(theta[1] / told))),
-            0.7,  # 50 spheres' start decides by some ten per cent, late T by twice that
+            0.7,  # T of 50 spheres depends by tens of per cent on their initial state
         )
     )
     return rows
 
 
 def along_of(e, tau):
-    """d ln T / d e of Haff's law in 3D."""
+    """d ln T / d e by Haff's law in 3D."""
     return 4 * e / 6 * tau / (1 + (1 - e * e) / 6 * tau)
 
 
@@ -317,7 +314,7 @@ MATERIALS = {  # Y in Pa, nu, density in kg/m^3
 
 
 def si_units() -> list[Row]:
-    """Steel, glass, ice and gel, 10 um to 10 cm, um/s to 10 m/s: one curve in reduced units."""
+    """Steel, glass, ice, gel, 10 um to 10 cm, um/s to 10 m/s: the same curve in reduced units."""
     rows, free = [], "dissipative_constant"
     scenes = [
         (material, diameter, speed)
@@ -336,22 +333,23 @@ def si_units() -> list[Row]:
                 value, slope = theory(gas, jnp.asarray(_taus(gas, *taus)), free)
                 values.append(value)
                 slopes.append(slope * gas.value(free))
-                runs.append(_run(quiet(DSMC, 200), gas, _taus(gas, 3.0))[0][0])
+                runs.append(_run(DSMC(200), gas, _taus(gas, 3.0))[0][0])
             value = float(np.max(np.abs(np.asarray(values) - np.asarray(exact))))
-            # float64: round-off of a dozen products and powers. float32: the solver's 1e-5.
+            # float64: round-off of a dozen products and powers. float32: the solver's rtol of 1e-5.
             allowed = 1e-9 if name == "float64" else 5e-4
             rows.append(
                 Row("KineticTheory", name, value, allowed, worst(slopes, along[None]), allowed)
             )
-            # The same random numbers, and so the same impacts until round-off tips one over.
+            # The same random numbers, and so the same collisions until round-off changes one.
             spread = worst(runs, runs[0])
             rows.append(Row("DSMC", name, spread, 1e-9 if name == "float64" else 1e-3))
-            for model in (HARD, SOFT):
-                rows.append(Row(model.__name__, name, *_same_in_units(model, name)))
+            for kind in (HARD, SOFT):
+                rows.append(Row(kind.__name__, name, *_same_in_units(kind, name)))
     return rows
 
 
 def _of_material(material, diameter, speed, contact=None):
+    """A gas of beta = .15; `contact` is t_c/tau_c, to which Y is adapted."""
     youngs, poisson, density = MATERIALS[material]
     gas = jaxgran.Gas(
         jaxgran.Viscoelastic(youngs, poisson, 1e-6),
@@ -366,8 +364,9 @@ def _of_material(material, diameter, speed, contact=None):
     return gas.replace(dissipative_constant=1e-6 * 0.15 / float(gas.thermal_beta))
 
 
-def _same_in_units(model, name) -> tuple[float, float]:
-    """How much T after a mean free time differs between gases that differ in units alone."""
+def _same_in_units(kind, name) -> tuple[float, float]:
+    """Relative difference of T after a mean free time of two gases that are the same in reduced
+    units, and the largest one allowed."""
     ends = []
     for material, diameter, speed in (("soft gel", 1e-5, 1e-6), ("steel", 0.1, 10.0)):
         gas = _of_material(material, diameter, speed, 0.02)
@@ -377,9 +376,9 @@ def _same_in_units(model, name) -> tuple[float, float]:
         place = (cell + 0.5) * side / 4 + random.uniform(-0.1, 0.1, (50, 3)) * sigma
         velocity = random.normal(size=(50, 3)) * float(jnp.sqrt(gas.temperature))
         start = spheres(place, velocity, side)
-        curve = jaxgran.cool(gas, _taus(gas, 1.0), model=quiet(model, 50, start=start))
+        curve = jaxgran.cool(gas, _taus(gas, 1.0), model=kind(50, start=start))
         ends.append(float(curve.temperature[0] / gas.temperature))
-    # Round-off of 1e-16, 1e-7 grows by e^3 an impact, of which a sphere has one or two.
+    # Round-off of 1e-16 or 1e-7 grows by e^3 per impact, of which a sphere has one or two.
     return worst(ends[1], ends[0]), 1e-10 if name == "float64" else 1e-3
 
 

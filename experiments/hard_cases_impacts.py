@@ -1,4 +1,4 @@
-"""Hard cases of one impact, and of a few spheres."""
+"""Hard cases of single impacts and of a few spheres."""
 
 import dataclasses
 from functools import cache, partial
@@ -14,7 +14,6 @@ from hard_cases_rows import (
     finite,
     flagged,
     precision,
-    quiet,
     refusal,
     slope_of,
     spheres,
@@ -25,16 +24,16 @@ from scenes import beads
 from scipy.integrate import solve_ivp
 
 import jaxgran
-from jaxgran import contact
-from jaxgran.boxes import SMALLEST_BOX
-from jaxgran.restitution import C1, viscoelastic_restitution
-from jaxgran.room import Room
+from jaxgran.particles.capacity import Capacity
+from jaxgran.particles.simulation import SMALLEST_BOX
+from jaxgran.scene import contact
+from jaxgran.scene.restitution_table import C1, viscoelastic_restitution
 
 HARD, SOFT = jaxgran.HardSpheres, jaxgran.SoftSpheres
 
 
 def wide_range_of_beta() -> list[Row]:
-    """One impact by its equation of motion and by the fast law, over eleven decades of beta."""
+    """One impact by its equation of motion and by the fitted law, over eleven decades of beta."""
     rows = []
     betas = np.array([1e-8, 1e-6, 1e-4, 1e-2, 0.3, 1.0, 10.0, 100.0, 1e3])
     for clipped, some in ((True, betas), (False, betas[:7])):
@@ -65,8 +64,8 @@ def wide_range_of_beta() -> list[Row]:
                 law = partial(viscoelastic_restitution, clipped=clipped)
                 at = jnp.asarray(some, jnp.result_type(float))
                 value, along = jax.jvp(law, (at,), (jnp.ones_like(at),))
-            # Fitted to 1e-9 (clipped), 1e-7 (unclipped); slopes lose a digit or two. In float32
-            # exp and log1p of ten decades carry 1e-7 times ln eps.
+            # Fitted to 1e-9 (clipped) and 1e-7 (unclipped); derivatives have one or two digits
+            # fewer. In float32 round-off gives a relative error of about 1e-7 |ln eps|.
             best = {("float64", True): (2e-9, 1e-6), ("float64", False): (1e-7, 1e-5)}
             value_ok, slope_ok = best.get((name, clipped), (5e-6, 1e-4))
             errors = worst(value, exact), value_ok, worst(along, slope), slope_ok
@@ -75,14 +74,22 @@ def wide_range_of_beta() -> list[Row]:
 
 
 def creeping_rebound() -> list[Row]:
-    """The unclipped impact at beta = 1e3, whose rebound creeps."""
+    """The unclipped impact at beta = 1e3, whose rebound is very slow."""
     eps = float(contact.impact(1e3, clipped=False).restitution)
     # The asymptote's next term is of order beta^(-5/2).
     return [Row("equation of motion", "float64", worst(eps, 5.15838170427e-15), 1e-4)]
 
 
 def _pair(gas, speed, offset=0.0, gap=1.0, origin=None):
-    """Two spheres that meet at a relative speed along x, offset along y, in the middle of a box."""
+    """Two spheres that approach along x at a relative speed, with an impact parameter along y.
+
+    Args:
+        gas: the scene, with a box for two spheres.
+        speed: relative.
+        offset: impact parameter in diameters.
+        gap: distance that the pair approaches before contact, in diameters.
+        origin: centre of mass; by default the centre of the box.
+    """
     side, sigma = box(gas, 2), float(gas.diameter)
     apart = sigma * np.sqrt(1 - offset**2) + gap * sigma
     middle = np.full(gas.dimension, side / 2) if origin is None else np.asarray(origin, float)
@@ -99,10 +106,10 @@ def _pair_temperature(speed, dimension=3):
 
 
 def _hard_impact(gas, free, speed, offset=0.0, **place):
-    """T after one impact of hard spheres over that before, and its projected derivative."""
+    """Ratio of T after to before one impact of hard spheres, and its projected derivative."""
     start = _pair(gas, speed, offset, **place)
     times = [2.0 * float(gas.diameter) / speed]  # before they meet the next images
-    model = quiet(HARD, 2, start=start)
+    model = HARD(2, start=start)
     value, slope = slope_of(
         lambda x: jaxgran.cool(gas.replace(**{free: x}), times, model=model), gas.value(free)
     )
@@ -110,13 +117,13 @@ def _hard_impact(gas, free, speed, offset=0.0, **place):
 
 
 def _soft_impact(gas, free, speed, offset=0.0, steps=40):
-    """The same of soft spheres; the plain derivative, exact for one impact."""
+    """The same for soft spheres, with the plain derivative, which is exact for one impact."""
     duration = float(gas.contact_duration) * (speed / float(gas.impact_speed)) ** -0.2
     gap = 2.37 * speed * duration / steps / float(gas.diameter)
     start = _pair(gas, speed, offset, gap=gap)
-    # The slower an oblique impact's normal speed, the longer it lasts, but not much.
+    # An oblique impact lasts a little longer, as its normal speed is lower.
     times = [4 * duration]
-    model = quiet(SOFT, 2, start=start, projection=None, steps_per_contact=steps)
+    model = SOFT(2, start=start, projection=None, steps_per_contact=steps)
     value, slope = slope_of(
         lambda x: jaxgran.cool(gas.replace(**{free: x}), times, model=model), gas.value(free)
     )
@@ -125,12 +132,12 @@ def _soft_impact(gas, free, speed, offset=0.0, steps=40):
 
 @cache
 def _stiff_pair_gas(beta: float = 0.1):
-    """So stiff that spheres do not turn about each other while in contact."""
+    """Spheres so stiff that they do not turn about each other during a contact."""
     return beads(0.02, beta, 1e-6)
 
 
 def _exact(gas, speed, free):
-    """eps^2 of an impact and d ln eps^2 in a float."""
+    """eps^2 of an impact, and the derivative of ln eps^2 in a float of the gas."""
 
     def log_square(x):
         return 2 * jnp.log(gas.replace(**{free: x}).restitution(speed))
@@ -153,8 +160,8 @@ def speeds_over_eighteen_decades() -> list[Row]:
                 found.append(_hard_impact(beads(0.02, 0.1), free, speed))
         value, slope = np.array(found).T
         value_exact, _ = np.array(exact).T
-        allowed = 1e-8 if name == "float64" else 1e-5  # the fast law's own, and round-off
-        # A projected derivative is of a gas that cools on: of one pair it is only finite.
+        allowed = 1e-8 if name == "float64" else 1e-5  # of the fitted law, and round-off
+        # A projected derivative is that of a gas; for one pair only finiteness is required.
         rows.append(
             Row("HardSpheres", name, worst(value, value_exact), allowed, finite(slope), 0.0)
         )
@@ -166,7 +173,8 @@ def speeds_over_eighteen_decades() -> list[Row]:
         exact = _exact(gas, speed, free)
         found.append([value / exact[0] - 1, slope / exact[1] - 1])
     value, slope = np.max(np.abs(found), axis=0)
-    # 40 steps: eps scatters by 2e-4 to 5e-4, from the onset, and the smallest eps^2 here is 0.06.
+    # At 40 steps eps scatters by 2e-4 to 5e-4 with the phase of the step at first touch; the
+    # smallest eps^2 here is 0.06.
     rows.append(Row("SoftSpheres, from 1e-8 on", "float64", value, 6e-3, slope, 0.05))
     return rows
 
@@ -181,7 +189,8 @@ def onset_and_end() -> list[Row]:
             xi, rate = jnp.asarray(at).T
             values = force(xi, rate)
             slopes = jax.vmap(jax.grad(force, argnums=(0, 1)))(xi, rate)
-        # At touch 0; at xi = A' |rate|, the end, 0 up to round-off; just inside 0.3 sqrt(xi).
+        # 0 at touch; 0 up to round-off at the end of contact, xi = 1.5 A |rate|; just inside
+        # 0.3 sqrt(xi).
         exact = np.array([0.0, 0.0, 0.0, 0.0, 0.3 * 1e-15])
         error = float(np.max(np.abs(np.asarray(values) - exact)))
         finite = 0.0 if np.all(np.isfinite(slopes)) else np.nan
@@ -191,15 +200,16 @@ def onset_and_end() -> list[Row]:
         errors[steps] = np.mean(_phases(steps), axis=0)
     orders = np.log2(np.abs(errors[20] / errors[80])) / 2
     bias, slope_bias = np.abs(errors[40])
-    # Second order in the mean over phases: 1.2e-5 at 50 steps, 2e-5 at 40.
+    # The mean over phases is of second order: 1.2e-5 at 50 steps, 2e-5 at 40.
     rows.append(Row("SoftSpheres, eps at 40 steps", "float64", bias, 6e-5, slope_bias, 1e-2))
-    # 32 phases leave 1e-5 of scatter in the finest mean, a third of an order.
+    # The finest mean, over 32 phases, has a standard error of 1e-5, a third of an order.
     rows.append(Row("SoftSpheres, order below 2", "float64", max(2 - orders[0], 0.0), 0.5))
     return rows
 
 
 def _phases(steps: int, count: int = 32):
-    """Errors of eps, and of its derivative in ln A, of one impact that begins at many phases."""
+    """Errors of eps and of its derivative in ln A, of impacts that begin at different phases of a
+    time step."""
     gas = _stiff_pair_gas()
     sigma, speed = float(gas.diameter), 2 * float(jnp.sqrt(gas.temperature))
     side = box(gas, 2)
@@ -212,10 +222,10 @@ def _phases(steps: int, count: int = 32):
     velocity[:, :, 0] = speed / 2, -speed / 2
     start = jaxgran.Particles(*map(jnp.asarray, (position, velocity, side)))
     settings = {"replicas": count, "start": start, "steps_per_contact": steps}
-    model = quiet(SOFT, 2, projection=None, **settings).sized_for(gas)
+    model = SOFT(2, projection=None, **settings).sized_for(gas)
     assert model.plan is not None
-    # A gas has few pairs in contact at a time; here all are.
-    plan = model.plan._replace(room=Room(*[4 * count] * 5))
+    # In a gas few pairs are in contact at a time; here all are.
+    plan = model.plan._replace(capacity=Capacity(*[4 * count] * 5))
     model = dataclasses.replace(model, plan=plan)
     times = [6 * float(gas.contact_duration)]
     a = gas.value("dissipative_constant")
@@ -249,7 +259,7 @@ def angles() -> list[Row]:
                 left = 1 - (1 - e * e) * normal
                 errors.append([value / left - 1, slope])
         value = np.max(np.abs(errors), axis=0)[0]
-        # float32 knows the place of an impact to 1e-6 of a box of ten.
+        # In float32 the position of an impact has an error of 1e-6 in a box of ten diameters.
         allowed = 1e-12 if name == "float64" else 1e-5
         rows.append(Row("HardSpheres", name, value, allowed, finite(errors), 0.0))
     gas, errors = _stiff_pair_gas(), []
@@ -261,13 +271,13 @@ def angles() -> list[Row]:
         left = 1 - (1 - square) * normal
         errors.append([value / left - 1, a * (slope - log_slope * square * normal / left)])
     value, slope = np.max(np.abs(errors), axis=0)
-    # At 40 steps eps scatters by 2e-4 over the phases of the onset.
+    # At 40 steps eps scatters by 2e-4 with the phase of the step at first touch.
     rows.append(Row("SoftSpheres", "float64", value, 1e-3, slope, 2e-2))
     return rows
 
 
 def touching_coincident_corner() -> list[Row]:
-    """A pair that touches, coincides, or meets across the corner of the box."""
+    """A pair that touches, coincides, or collides across a corner of the box."""
     rows, e = [], 0.7
     for name in PRECISIONS:
         with precision(name):
@@ -276,7 +286,7 @@ def touching_coincident_corner() -> list[Row]:
             x = [[7.0, 5.0, 5.0], [8.0, 5.0, 5.0]]
             toward, away = ([[s, 0.0, 0.0], [-s, 0.0, 0.0]] for s in (1.0, -1.0))
             ratios = [
-                jaxgran.cool(gas, [0.5], model=quiet(HARD, 2, start=spheres(x, v, 10.0)))
+                jaxgran.cool(gas, [0.5], model=HARD(2, start=spheres(x, v, 10.0)))
                 for v in (toward, away)
             ]
             touch = [float(curve.temperature[0]) / _pair_temperature(2.0) for curve in ratios]
@@ -299,19 +309,20 @@ def touching_coincident_corner() -> list[Row]:
         jaxgran.cool(
             gas,
             [4 * float(gas.contact_duration)],
-            model=quiet(SOFT, 2, start=_pair(gas, speed, 0.6, gap=gap, origin=(o, o, o))),
+            model=SOFT(2, start=_pair(gas, speed, 0.6, gap=gap, origin=(o, o, o))),
         ).temperature[0]
         for o in (side / 2, 0.0)
     ]
-    # The phase of the onset is the same but for the round-off of places, 1e-16 over 1e-6 or so.
+    # The phase of the step at first touch is the same up to the round-off of positions, about
+    # 1e-16 over 1e-6.
     rows.append(Row("SoftSpheres, corner", "float64", worst(ends[1], ends[0]), 1e-8))
     return rows
 
 
 def _coincident_in_jit() -> Row:
-    """Starts of a batch, one of them coincident: nothing can be raised there."""
+    """A batch of starts, in one of which the spheres coincide: compiled code cannot raise."""
     gas = unit_gas(jaxgran.ConstantRestitution(0.7), 2 * np.pi / 6 / 10.0**3)
-    sized = quiet(HARD, 2).sized_for(gas)
+    sized = HARD(2).sized_for(gas)
 
     def run(x):
         place = jnp.array([[[5.0, 5.0, 5.0], [5.0, 5.0, 5.0]]]).at[0, 1, 0].add(x)
@@ -327,53 +338,52 @@ def _coincident_in_jit() -> Row:
 def _coincident_hard():
     gas = unit_gas(jaxgran.ConstantRestitution(0.7), 2 * np.pi / 6 / 10.0**3)
     start = spheres(np.full((2, 3), 5.0), [[1.0, 0, 0], [-1.0, 0, 0]], 10.0)
-    jaxgran.cool(gas, [0.1], model=quiet(HARD, 2, start=start))
+    jaxgran.cool(gas, [0.1], model=HARD(2, start=start))
 
 
 def _coincident_soft():
     gas = beads(0.02, 0.1, 0.05)
     side = box(gas, 2)
     start = spheres(np.full((2, 3), side / 2), np.zeros((2, 3)), side)
-    jaxgran.cool(gas, [1e-6], model=quiet(SOFT, 2, start=start))
+    jaxgran.cool(gas, [1e-6], model=SOFT(2, start=start))
 
 
 def smallest_box() -> list[Row]:
-    """Two spheres that meet each other and each other's images in the smallest box allowed."""
+    """Two spheres that collide with each other and each other's images in the smallest box."""
     rows = []
-    smallest = SMALLEST_BOX
-    phi = float(2 * np.pi / 6 / (smallest * (1 + 1e-6)) ** 3)
+    phi = float(2 * np.pi / 6 / (SMALLEST_BOX * (1 + 1e-6)) ** 3)
     for name in PRECISIONS:
         with precision(name):
             gas = unit_gas(jaxgran.ConstantRestitution(1.0), phi)
             side = box(gas, 2)
             x = np.array([[0.1, 0.2, 0.3], [1.2, 1.1, 1.3]])
             v = np.array([[1.0, 0.7, -0.4], [-1.0, -0.7, 0.4]])
-            # Elastic spheres of a pair exchange what is along the normal: T stays, for ever.
-            models = quiet(HARD, 2, start=spheres(x, v, side))
-            hard = jaxgran.cool(gas, [1.0, 20.0], model=models)
+            # An elastic pair exchanges its normal velocities, which leaves T unchanged.
+            model = HARD(2, start=spheres(x, v, side))
+            hard = jaxgran.cool(gas, [1.0, 20.0], model=model)
             assert hard.collisions is not None and float(hard.collisions[-1]) > 5
             error = worst(hard.temperature, np.sum(v**2) / 6)
         rows.append(Row("HardSpheres", name, error, 1e-13 if name == "float64" else 1e-5))
         with precision(name):
             gas = beads(phi, 0.2, 0.05)
-            curve = jaxgran.cool(gas, [0.0, 5 * float(gas.mean_free_time)], model=quiet(SOFT, 2))
+            curve = jaxgran.cool(gas, [0.0, 5 * float(gas.mean_free_time)], model=SOFT(2))
             assert curve.elastic_energy is not None and curve.dissipated_energy is not None
             held = 1.5 * gas.mass * curve.temperature + curve.elastic_energy
             held = np.asarray((held + curve.dissipated_energy) / (1.5 * gas.mass))
-        # The ledger of an 80-collision run at 40 steps closes to 1e-3.
+        # The energy balance of a run of 80 collisions at 40 steps closes to 1e-3.
         rows.append(Row("SoftSpheres, ledger", name, worst(held[1], held[0]), 2e-3))
     return rows
 
 
 def three_and_four_at_once() -> list[Row]:
-    """Three and four spheres in contact at once, against a general ODE solver."""
+    """Three and four spheres in contact at once, compared with a general ODE solver."""
     gas = beads(0.02, 0.2, 0.05)
     rows = []
     for count in (3, 4):
         side, sigma = box(gas, count), float(gas.diameter)
         corner = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])[:count]
         corner *= sigma / np.sqrt(8)
-        # Just apart, drawn together at different speeds: every pair is in contact at some time.
+        # Just apart, and approaching the centre at different speeds: all pairs come into contact.
         speed = float(gas.impact_speed)
         velocity = -corner / sigma * np.array([1.0, 1.3, 0.8, 1.1])[:count, None] * speed
         place = 1.0001 * corner + side / 2
@@ -381,21 +391,19 @@ def three_and_four_at_once() -> list[Row]:
         exact = _contacts(gas, place, velocity, end)
         errors = []
         for steps in (40, 160):
-            model = quiet(
-                SOFT, count, steps_per_contact=steps, start=spheres(place, velocity, side)
-            )
+            model = SOFT(count, steps_per_contact=steps, start=spheres(place, velocity, side))
             last = jaxgran.cool(gas, [end], model=model).particles
             assert last is not None
             errors.append(float(np.max(np.abs(np.asarray(last.velocity[0]) - exact)) / speed))
-        # Six onsets at 40 steps, each of some 3e-4 of a velocity; with the step they fall at least
-        # as fast as it does.
+        # Six first touches at 40 steps, each with an error of some 3e-4 of a velocity, which is at
+        # least of first order in the step.
         rows.append(Row(f"SoftSpheres, {count} bodies, 40 steps", "float64", errors[0], 3e-3))
         rows.append(Row(f"SoftSpheres, {count} bodies, 160 steps", "float64", errors[1], 4e-4))
     return rows
 
 
 def _contacts(gas, position, velocity, end):
-    """Velocities of free spheres after a time, by SciPy."""
+    """Velocities of spheres without a box after a time, by SciPy."""
     law, m, sigma = gas.law, float(gas.mass), float(gas.diameter)
     rho = float(contact.elastic_constant(law.youngs_modulus, law.poisson_ratio, sigma))
     a = float(law.dissipative_constant)
@@ -416,7 +424,7 @@ def _contacts(gas, position, velocity, end):
 
 
 def order_that_flips() -> list[Row]:
-    """Three in a row whose two impacts come within round-off of each other, in either order."""
+    """Three spheres in a row whose impacts are simultaneous up to round-off, in either order."""
     rows, e = [], 0.6
     for name in PRECISIONS:
         shifts = (1e-13, -1e-13, 0.0) if name == "float64" else (3e-6, -3e-6, 0.0)
@@ -426,7 +434,7 @@ def order_that_flips() -> list[Row]:
             for shift in shifts:
                 x = [[3.0, 5, 5], [5.0, 5, 5], [7.0 + shift, 5, 5]]
                 v = [[1.0, 0, 0], [0.0, 0, 0], [-1.0, 0, 0]]
-                model = quiet(HARD, 3, contact_time=0.0, start=spheres(x, v, 10.0))
+                model = HARD(3, contact_time=0.0, start=spheres(x, v, 10.0))
                 value, slope = slope_of(
                     lambda y, model=model, gas=gas: jaxgran.cool(
                         gas.replace(coefficient=y), [2.0], model=model
@@ -436,9 +444,9 @@ def order_that_flips() -> list[Row]:
                 errors.append([value[0], slope[0]])
         exact = [_row_of_three(e), (_row_of_three(e + 1e-6) - _row_of_three(e - 1e-6)) / 2e-6]
         errors = np.array(errors)
-        allowed = 1e-11 if name == "float64" else 1e-4  # round-off of the places, of ten
-        # A projected derivative is exact for one impact, an estimate for several: finite, and
-        # the same in either order.
+        allowed = 1e-11 if name == "float64" else 1e-4  # round-off of positions in a box of ten
+        # A projected derivative is exact for one impact and an estimate for several: it must be
+        # finite, and the same in either order.
         rows.append(
             Row(
                 "HardSpheres",
@@ -453,7 +461,7 @@ def order_that_flips() -> list[Row]:
 
 
 def _row_of_three(e):
-    """T after all impacts of a row of three, one by one; mirrored if the other comes first."""
+    """T after all impacts of a row of three, resolved one after another."""
     v = np.array([1.0, 0.0, -1.0])
     pair = 0
     while v[0] > v[1] or v[1] > v[2]:

@@ -1,4 +1,4 @@
-"""What every hard case shares: its rows, two precisions, and values with their derivatives."""
+"""What the hard cases share: rows of the table, precisions, and values with derivatives."""
 
 import re
 import warnings
@@ -19,15 +19,15 @@ HARD_THEORY = jaxgran.KineticTheory(softness=False)
 
 
 class Row(NamedTuple):
-    """What one model did in one case, in one precision.
+    """The result of one model in one case, in one precision.
 
     Attributes:
-        model: its name, with the part of the case where there are several.
+        model: its name, and which part of the case if there are several.
         precision: float64 or float32.
         error: of the value; relative unless the case says otherwise.
-        allowed: largest error; why so much stands beside it in the case.
-        slope_error, slope_allowed: of a derivative; None where there is none.
-        status: "ok", or the error or status that the case asks for.
+        allowed: the largest error; the case gives the reason.
+        slope_error, slope_allowed: the same for a derivative; None where there is none.
+        status: "ok", or the error or status that the case expects.
     """
 
     model: str
@@ -40,7 +40,7 @@ class Row(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether all errors are allowed ones; nan never is."""
+        """Whether all errors are allowed; nan never is."""
         slope = self.slope_error is None or self.slope_error <= (self.slope_allowed or 0.0)
         return bool(self.error <= self.allowed and slope)
 
@@ -49,11 +49,11 @@ class Case(NamedTuple):
     """One hard case.
 
     Attributes:
-        name: what is hard.
-        elsewhere: what goes wrong in simulations that do not take care.
-        here: what jaxgran does, and where its limit lies.
-        run: makes the rows.
-        heavy: takes a minute or more.
+        name: of the case.
+        elsewhere: how other simulations fail in it.
+        here: what jaxgran does, and up to which limit.
+        run: computes the rows.
+        heavy: whether it takes a minute or more.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Case(NamedTuple):
 
 @contextmanager
 def precision(name: str) -> Iterator[None]:
-    """Numbers made inside are of this precision."""
+    """Context in which new numbers have this precision."""
     with jax.enable_x64(name == "float64"):
         yield
 
@@ -83,20 +83,20 @@ def finite(*values) -> float:
 
 
 def refusal(model: str, name: str, call: Callable, asked: str) -> Row:
-    """A row that passes if the call raises an error whose words match `asked`."""
+    """A row that passes if the call raises an error whose message matches the regex `asked`."""
     try:
         with precision(name), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             call()
     except (ValueError, RuntimeError, OSError) as error:
-        words = re.sub(r"/\S*/", "", " ".join(str(error).split()))  # folders differ each time
+        words = re.sub(r"/\S*/", "", " ".join(str(error).split()))  # folders differ from run to run
         found = re.search(asked, words)
         return Row(model, name, 0.0 if found else np.inf, 0.0, status=f"error: {words}")
     return Row(model, name, np.inf, 0.0, status="no error")
 
 
 def flagged(model: str, name: str, values, codes, bad: int, asked: str) -> Row:
-    """A row of a batch of which one member must be nan with a status, the others finite and ok."""
+    """A row of a batch whose member `bad` must be nan with a status, the others finite and ok."""
     values, codes = np.asarray(values), np.asarray(codes)
     words = jaxgran.explain_status(int(codes[bad]))
     others = np.delete(np.arange(len(codes)), bad)
@@ -107,17 +107,17 @@ def flagged(model: str, name: str, values, codes, bad: int, asked: str) -> Row:
 
 @eqx.filter_jit
 def theory(gas: jaxgran.Gas, times, free: str, model=HARD_THEORY) -> tuple:
-    """Kinetic theory's ln(T/T_0) and its derivative in a float of the gas."""
+    """ln(T/T_0) by kinetic theory, and its derivative in a float of the gas."""
 
     def log_ratio(value):
         changed = gas.replace(**{free: value})
-        return jnp.log(model.cool(changed, times).temperature / gas.temperature)
+        return jnp.log(jaxgran.cool(changed, times, model=model).temperature / gas.temperature)
 
     return jax.jvp(log_ratio, (gas.value(free),), (jnp.ones_like(gas.value(free)),))
 
 
 def slope_of(run: Callable, at) -> tuple:
-    """A particle model's curve at a number, and the derivative of its T."""
+    """T of a particle model's curve, as a function of one number, and its derivative."""
     at = jnp.asarray(at, jnp.result_type(float))
 
     def temperature(x):
@@ -141,17 +141,12 @@ def unit_gas(law, packing_fraction: float, dimension: int = 3) -> jaxgran.Gas:
 
 
 def spheres(position, velocity, side) -> jaxgran.Particles:
-    """One replica of given particles."""
+    """Given particles as a start with one replica."""
     arrays = (np.asarray(x, float)[None] for x in (position, velocity))
     place, speed = map(jnp.asarray, arrays)
     return jaxgran.Particles(place, speed, jnp.asarray(float(side)))
 
 
 def box(gas: jaxgran.Gas, num_particles: int) -> float:
-    """Side of the box."""
+    """Side of the box, m."""
     return float(gas.box_side(num_particles))
-
-
-def quiet(model: type, num_particles: int, **settings):
-    """A particle model without a progress bar."""
-    return model(num_particles, progress=False, **settings)

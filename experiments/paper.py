@@ -1,4 +1,4 @@
-"""What the scripts that reproduce the paper share: options, the clock, slopes, and the files."""
+"""What the scripts that reproduce the paper share: options, timing, local slopes, result files."""
 
 import argparse
 import time
@@ -20,7 +20,7 @@ DPI = 110
 
 
 class Clock:
-    """Wall time since it was made, and what of it JAX took to compile."""
+    """Wall time since the clock was created, and how much of it JAX spent on compilation."""
 
     def __init__(self) -> None:
         self.begin, self.compile_s = time.perf_counter(), 0.0
@@ -38,18 +38,18 @@ class Clock:
 
 
 def options(doc: str | None, name: str) -> argparse.Namespace:
-    """--smoke and --out, as all these scripts take them; float64 is switched on."""
+    """Parse --smoke and --out, which all these scripts take, and switch float64 on."""
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--smoke", action="store_true", help="a run of seconds, with few particles")
+    parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, default=Path("results") / name)
     jax.config.update("jax_enable_x64", True)
     return parser.parse_args()
 
 
 def write(figure: Figure, folder: Path, name: str, config: Any, clock: Clock, **found: Any) -> None:
-    """The picture, and beside it what it shows as JSON; says where."""
+    """Write the picture and, as JSON, its data; print where."""
     folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / f"{name}.png", dpi=DPI)
     save(folder / f"{name}.json", config=asdict(config), found=found, **clock.times)
@@ -57,7 +57,7 @@ def write(figure: Figure, folder: Path, name: str, config: Any, clock: Clock, **
 
 
 def figure(title: str, columns: int, rows: int = 1) -> Figure:
-    """Panels under one sentence; `Figure.axes` are the panels, row by row."""
+    """A figure with a title and panels; `Figure.axes` are the panels, row by row."""
     made = Figure(figsize=(4.6 * columns, 0.4 + 4.0 * rows), layout="constrained")
     made.suptitle(title, color=INK)
     made.subplots(rows, columns)
@@ -65,20 +65,20 @@ def figure(title: str, columns: int, rows: int = 1) -> Figure:
 
 
 def from_here(inside: np.ndarray, x: np.ndarray) -> float:
-    """The first x from which on all are inside; nan if the last is not."""
+    """The first x from which on `inside` is always true; nan if it is false at the last."""
     outside = np.flatnonzero(~inside)
     start = outside[-1] + 1 if outside.size else 0
     return float(x[start]) if start < x.size else float("nan")
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where, and d ln y / d ln x there: between neighbouring points along the last axis."""
+    """Midpoints between neighbouring x, and d ln y / d ln x there, along the last axis."""
     x, y = np.log(x), np.log(y)
     return np.exp((x[1:] + x[:-1]) / 2), np.diff(y) / np.diff(x)
 
 
 def mean_and_error(each: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Over replicas, the first axis; the standard error of the mean."""
+    """Mean over the replicas, the first axis, and its standard error."""
     return each.mean(axis=0), each.std(axis=0, ddof=1) / len(each) ** 0.5
 
 
@@ -89,7 +89,7 @@ def replicas_of(curve: jaxgran.CoolingCurve, name: str) -> np.ndarray:
 
 
 def caption(axes: Axes, title: str, **settings: Any) -> None:
-    """A panel's title, which says what it shows, its labels and its legend."""
+    """Give a panel its title, labels and legend."""
     axes.set(**settings)
     axes.set_title(title, fontsize=10, color=INK, loc="left")
     axes.grid(color="0.92", lw=0.6)
@@ -100,11 +100,11 @@ def caption(axes: Axes, title: str, **settings: Any) -> None:
 
 
 def listed(values: Iterable[Any]) -> list[float]:
-    """Plain floats, for JSON."""
+    """A list of floats, for JSON."""
     return [float(x) for x in values]
 
 
 def alike(gas: jaxgran.Gas) -> float:
-    """The constant restitution with which a Maxwellian gas begins to cool as fast as this one."""
+    """The constant restitution with which a Maxwellian gas has the initial cooling rate of this."""
     rate = jaxgran.KineticTheory().cooling_rate(gas) / gas.collision_frequency
     return float((1 - gas.dimension * rate) ** 0.5)

@@ -1,10 +1,10 @@
-"""Every numbered claim of the paper beside what is found here, as one table.
+"""A table of every numbered claim of the paper, compared with what is found here.
 
     python experiments/paper_claims.py [--results results] [--out DIR]
 
-Constants and formulas are computed here, in seconds; what needs particles is read from the JSON
-files that the other paper_*.py scripts left in the results folder (run these first; a row without
-its file says so). A verdict stands only if the numbers of its row bear it out.
+Constants and formulas are computed here, in seconds. Results that need particles are read from the
+JSON files of the other paper_*.py scripts in the results folder: run these first, rows without
+their file are left out. A verdict is replaced by "DOES NOT HOLD" if the numbers contradict it.
 """
 
 import argparse
@@ -21,9 +21,9 @@ from claims_diffusion import diffusion, equilibrium, memory
 from record import save
 
 import jaxgran
-from jaxgran.contact import impact
-from jaxgran.curve import header_number
-from jaxgran.restitution import C1, C2
+from jaxgran.data.curve_file import header_number
+from jaxgran.scene.contact import impact
+from jaxgran.scene.restitution_table import C1, C2
 
 DATA = Path(__file__).parent / "data"
 HEAD = """# The paper's claims
@@ -36,6 +36,7 @@ out (15–21, 23, 25, 26, 28–30, 35, 37). θ = T/T₀, u = 1 + t/τ₀, 𝒯 =
 
 
 def restitution(table: Table) -> None:
+    """The series of eps, its coefficients and the impact of Hertzian spheres."""
     shot = table.found("paper_restitution")
     if shot:
         reach = shot["two_terms_good_to_one_per_cent"]
@@ -68,6 +69,7 @@ def restitution(table: Table) -> None:
 
 
 def remarks(table: Table) -> None:
+    """Other laws of restitution, and a measured curve."""
     run = table.found("paper_exponents")
     if run:
         seen = [run[k] for k in run if k.startswith("γ")]
@@ -129,6 +131,7 @@ def main() -> None:
 
 
 def _place(row: Row) -> float:
+    """Position of a row in the table, by its first equation; "text" comes last."""
     first = row.equation.split(",")[0].split("–")[0]
     return float(first) if first.isdigit() else 99.0 if first else 35.5
 

@@ -1,16 +1,16 @@
-"""When does a gas leave Haff's law, and is clustering retarded where dissipation fades?
+"""When does a gas depart from Haff's law, and does clustering begin later in a viscoelastic gas?
 
     python experiments/paper_clustering.py [--smoke] [--out DIR]
 
-The last argument of Brilliantov & Poeschel's self-diffusion paper: two gases of disks that differ
-in the collisions per particle N_c at which clustering begins (70 and 23) have it at nearly the same
-T_c/T_0 (.0031 and .0027), so that temperature would be the better clock. Here both gases cool, and
-viscoelastic ones that begin to cool at the same rate, from several seeds. Writes two pictures and a
-JSON file.
+The last argument of Brilliantov & Poeschel's self-diffusion paper: clustering begins in two gases
+of disks after different numbers of collisions per particle, N_c = 70 and 23, but at nearly the same
+temperature, T_c/T_0 = .0031 and .0027, so that temperature would be the better clock. Both gases
+are simulated from several seeds, and so are viscoelastic gases with the same initial cooling rates.
+Writes two pictures and a JSON file.
 
-A gas leaves Haff's law when its T, all kinetic energy, first exceeds by a given factor what kinetic
-theory (Enskog, Sonine a_2) has at the same number of collisions per particle, or at the same time;
-or when ln T first falls half as fast with the collisions. T_c is the T measured there.
+A gas departs from Haff's law when its T, that of all kinetic energy, first exceeds by a given
+factor the T of kinetic theory (Enskog, Sonine a_2) at the same number of collisions per particle,
+or at the same time, or when ln T first falls half as fast per collision. T_c is T at this point.
 """
 
 import argparse
@@ -65,7 +65,7 @@ class Config:
         Scene(0.245, 0.9, (130.0, 170.0), (70.0, 0.0031)),
         Scene(0.05, 0.6, (36.0, 60.0), (23.0, 0.0027)),
     )
-    fields: tuple[float, ...] = (20.0, 60.0, 95.0, 128.0)  # collisions, of the first scene
+    fields: tuple[float, ...] = (20.0, 60.0, 95.0, 128.0)  # collisions at which density is drawn
 
 
 SMOKE = Config(
@@ -80,7 +80,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--smoke", action="store_true", help="few disks, one stronger scene")
+    parser.add_argument(
+        "--smoke", action="store_true", help="few disks, one scene with more dissipation"
+    )
     parser.add_argument("--out", type=Path, default=Path("results") / "paper_clustering")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -96,7 +98,7 @@ def main() -> None:
 
 
 def simulate(config: Config) -> dict:
-    """Every run by scene, law and seed, with kinetic theory beside it."""
+    """Every run, by scene, law and seed, compared with kinetic theory."""
     runs = {}
     for i, scene in enumerate(config.scenes):
         constant = hard_beads(scene.packing_fraction, scene.restitution, dimension=2)
@@ -126,7 +128,7 @@ def simulate(config: Config) -> dict:
 
 
 def analyse(config: Config, runs: dict) -> dict:
-    """Means and standard errors over the seeds; the clocks of scenes and laws compared."""
+    """Means and standard errors over the seeds, and ratios between the scenes and the laws."""
     scenes = {}
     for scene in config.scenes:
         found = {}
@@ -174,7 +176,7 @@ def analyse(config: Config, runs: dict) -> dict:
 
 
 def found_in_all(values: Iterable[float]) -> list[float] | None:
-    """Mean and standard error, or None: not every seed departed."""
+    """Mean and standard error, or None if not every seed departed."""
     found = mean_error(values)
     return found if np.isfinite(found[0]) else None
 
@@ -184,7 +186,7 @@ def mean_curve(runs: list[dict], grid: np.ndarray, name: str) -> list[float]:
 
 
 def ratios(one: dict, other: dict) -> dict[str, list[float] | None]:
-    """One over another in every clock, with standard errors; None where one did not depart."""
+    """Ratio of two departures in each clock, with its standard error; None if one is missing."""
 
     def ratio(x, y):
         if x is None or y is None:
@@ -220,7 +222,7 @@ def report(config: Config, figures: dict) -> None:
 
 
 def draw_curves(config: Config, runs: dict, figures: dict, path: Path) -> None:
-    """T against N, and how far above Haff's law it is against N and against T_0/T."""
+    """T over N, and its ratio to Haff's law over N and over T_0/T."""
     figure, axes = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
     for scene, colour in zip(config.scenes, COLOURS, strict=False):
         for law, style in zip(LAWS, ("-", "--"), strict=True):
@@ -263,7 +265,7 @@ def draw_curves(config: Config, runs: dict, figures: dict, path: Path) -> None:
 
 
 def draw_fields(config: Config, runs: dict, path: Path) -> None:
-    """The density of the first scene, smoothed over 1.5 mean distances, at some times."""
+    """The density of the first scene at some times, smoothed over 1.5 mean distances of disks."""
     scene, seed = config.scenes[0], config.seeds[0]
     figure, axes = plt.subplots(
         2, len(config.fields), figsize=(2.6 * len(config.fields) + 0.8, 5.6), layout="constrained"
@@ -273,7 +275,7 @@ def draw_fields(config: Config, runs: dict, path: Path) -> None:
         run = runs[scene.name, law, seed]
         for mark, axis in zip(config.fields, row, strict=True):
             place = run["positions"][mark]
-            pixels = int(len(place) ** 0.5)  # one a mean distance
+            pixels = int(len(place) ** 0.5)  # as large as the mean distance of disks
             number = np.histogram2d(*place.T % 1.0, bins=pixels, range=[[0, 1], [0, 1]])[0]
             density = gaussian_filter(number, 1.5, mode="wrap") / number.mean()
             axis.imshow(

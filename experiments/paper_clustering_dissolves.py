@@ -1,12 +1,12 @@
-"""Do clusters of viscoelastic disks dissolve again, as the coefficient of restitution goes to 1?
+"""Do clusters of viscoelastic disks dissolve as the coefficient of restitution approaches 1?
 
     python experiments/paper_clustering_dissolves.py [--smoke] [--out DIR]
 
-Viscoelastic disks and disks of constant restitution that begin to cool at the same rate, in a box
-two to three times longer than the one in which a gas stays homogeneous, L_c. The viscoelastic L_c
-grows as the gas cools and impacts lose less; where it passes the box, clusters should end. The box
-is small because the collisions until then grow as the number of disks. Writes a picture and a JSON
-file.
+Viscoelastic disks and disks of constant restitution with the same initial cooling rate, in a box
+two to three times as long as L_c, up to which a gas stays homogeneous. L_c of the viscoelastic gas
+grows as the gas cools and its impacts lose less energy; once it exceeds the box, clusters should
+dissolve. The box is small because the number of collisions until then is proportional to the number
+of disks. Writes a picture and a JSON file.
 """
 
 import argparse
@@ -74,7 +74,7 @@ def gases(config: Config) -> dict[str, jaxgran.Gas]:
 
 
 def simulate(config: Config) -> dict[str, list[dict]]:
-    """The runs of each law, one a seed."""
+    """The runs of each law, one per seed."""
     runs = {law: [] for law in LAWS}
     for (law, gas), until in zip(gases(config).items(), config.until, strict=True):
         for seed in config.seeds:
@@ -91,14 +91,14 @@ def simulate(config: Config) -> dict[str, list[dict]]:
 
 
 def critical_boxes(config: Config, run: dict) -> np.ndarray:
-    """L_c at each temperature of a run of viscoelastic disks, in box sides."""
+    """L_c in box sides, at each temperature of a run of viscoelastic disks."""
     gas = gases(config)["viscoelastic"]
     lengths = jax.vmap(lambda t: gas.replace(temperature=t).critical_box)(run["temperature"])
     return np.asarray(lengths / gas.box_side(config.num_particles))
 
 
 def analyse(config: Config, runs: dict[str, list[dict]]) -> dict:
-    """Means and standard errors over the seeds, on common collisions; and prints some."""
+    """Means and standard errors over the seeds, at common numbers of collisions; prints some."""
     elastic = mean_error(run["unevenness"][0] for each in runs.values() for run in each)
     figures = {"elastic_unevenness": elastic, "cells_of": PER_CELL}
     print(f"unevenness of the elastic fluid {elastic[0]:.3f} +- {elastic[1]:.3f}")
@@ -133,12 +133,12 @@ def analyse(config: Config, runs: dict[str, list[dict]]) -> dict:
         beyond = np.flatnonzero(critical_boxes(config, run) > 1)
         passes.append(float(run["collisions"][beyond[0]]) if beyond.size else None)
     figures["critical_box_passes_at"] = passes
-    print(f"L_c, of a dilute gas at T, passes the box at N = {passes} (None: not yet)")
+    print(f"L_c, of a dilute gas at T, exceeds the box from N = {passes} on (None: not reached)")
     return figures
 
 
 def smooth(grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Averages of y within a tenth of each x, or the nearest value."""
+    """Averages of y over points within 10 % of each grid point, else by interpolation."""
     near = [np.abs(np.log(np.maximum(x, 1e-9) / at)) < 0.1 for at in grid]
     return np.array(
         [y[i].mean() if i.any() else np.interp(at, x, y) for i, at in zip(near, grid, strict=True)]
@@ -146,7 +146,7 @@ def smooth(grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def draw(config: Config, runs: dict[str, list[dict]], figures: dict, path: Path) -> None:
-    """Unevenness and flow against collisions, and the viscoelastic disks at some times."""
+    """Unevenness and flow over the collisions, and the viscoelastic disks at some times."""
     columns = len(config.fields)
     figure = plt.figure(figsize=(11, 7.2), layout="constrained")
     grid = figure.add_gridspec(2, 2 * columns, height_ratios=[1.15, 1])

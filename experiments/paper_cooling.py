@@ -2,8 +2,8 @@
 
     python experiments/paper_cooling.py [--smoke] [--out DIR]
 
-Two gases that begin to cool alike, through seven decades of time: stochastic simulation, kinetic
-theory, and the paper's closed forms, Eqs. (10), (38) and (44), as printed and as corrected.
+Two gases with the same initial cooling rate over seven decades of time: DSMC, kinetic theory, and
+the paper's closed forms, Eqs. (10), (38) and (44), as printed and as corrected.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ import paper
 from scenes import beads, hard_beads
 
 import jaxgran
-from jaxgran import closed_forms
+from jaxgran.theory import closed_forms
 
 NAME = "paper_cooling"
 
@@ -48,7 +48,8 @@ def main() -> None:
     labels["constant"] = f"constant ε = {e:.3f}"
     tau = np.geomspace(0.1, config.last_theory, 133)
     measured = np.geomspace(0.1, config.last, config.points)
-    model = jaxgran.DSMC(config.num_particles, config.replicas, key=jax.random.key(config.seed))
+    model = jaxgran.DSMC(config.num_particles, config.replicas)
+    key = jax.random.key(config.seed)
 
     figure = paper.figure(
         "Viscoelastic spheres cool as t$^{-5/3}$, spheres of constant ε as t$^{-2}$:"
@@ -62,7 +63,7 @@ def main() -> None:
             gas, tau * gas.mean_free_time, model=jaxgran.KineticTheory(softness=False)
         )
         theta = np.asarray(theory.temperature / gas.temperature)
-        dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model)
+        dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model, key=key)
         each = paper.replicas_of(dsmc, "temperature") / float(gas.temperature)
         mean, error = paper.mean_and_error(each)
         at, exponents = paper.slope(measured, each)
@@ -130,11 +131,12 @@ def main() -> None:
 
 
 def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
+    """Interpolate linearly in ln x."""
     return float(np.interp(np.log(x), np.log(where), values))
 
 
 def formulas(axes, tau: np.ndarray, theta: np.ndarray, delta: float) -> dict:
-    """The paper's forms of T(t) less the exact one, drawn and at some times."""
+    """Relative errors of the paper's closed forms of T(t), drawn, and at some times."""
     u = 1 + closed_forms.COOLING_RATE[3] * delta * tau
     t = jnp.asarray(tau)
     forms = {

@@ -1,10 +1,11 @@
-"""How do grains spread: in time, in collisions, in temperature; and when do the paper's laws hold?
+"""How does <dr^2> grow with time, collisions and 1/T, and when do the paper's laws of it hold?
 
     python experiments/paper_diffusion.py [--smoke] [--out DIR]
 
-<dr^2> of two gases that begin to cool alike, of viscoelastic and of constant restitution, by
-stochastic simulation, kinetic theory and the closed forms (paper, Eqs. (42), (45), (46), (47)); its
-local exponent; and the window of time in which the paper expects its laws, Eq. (43), as measured.
+<dr^2> of two gases with the same initial cooling rate, of viscoelastic and of constant restitution,
+by DSMC, kinetic theory and the closed forms (paper, Eqs. (42), (45), (46), (47)); its local
+exponent; and the range of times in which the paper expects its laws to hold, Eq. (43), compared
+with the range in which they do.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import paper
 from scenes import beads, hard_beads
 
 import jaxgran
-from jaxgran import closed_forms
+from jaxgran.theory import closed_forms
 
 NAME = "paper_diffusion"
 
@@ -31,7 +32,7 @@ class Config:
     last: float = 1e6  # mean free times simulated
     points: int = 22
     last_theory: float = 1e14
-    deltas: tuple[float, ...] = (0.1, 0.03, 0.01)  # whose windows are tabulated
+    deltas: tuple[float, ...] = (0.1, 0.03, 0.01)  # for which the range of times is tabulated
 
 
 SMOKE = Config(num_particles=1000, replicas=2, last=1e3, points=9, last_theory=1e10, deltas=(0.1,))
@@ -56,13 +57,13 @@ def main() -> None:
     tau = np.geomspace(0.1, config.last_theory, 400)
     measured = np.geomspace(0.1, config.last, config.points)
     key = jax.random.key(config.seed)
-    model = jaxgran.DSMC(config.num_particles, config.replicas, key=key)
+    model = jaxgran.DSMC(config.num_particles, config.replicas)
     found = {}
     for name, gas in gases.items():
         unit = float(gas.temperature * gas.mean_free_time**2)
         theory = jaxgran.KineticTheory(softness=False)
         of = jaxgran.cool(gas, tau * gas.mean_free_time, model=theory)
-        dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model)
+        dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model, key=key)
         spread, collisions, theta = columns(of, float(gas.temperature), unit)
         each = paper.replicas_of(dsmc, "displacement") / unit
         mean, error = paper.mean_and_error(each)
@@ -107,7 +108,7 @@ def main() -> None:
             in_temperature.plot(
                 guide, leading, ":", color=colors[name], label="~ $\\mathcal{T}^{1/10}$ − 1"
             )
-    # Fewer collisions a step of the solver as delta falls: shorter, or it would take minutes.
+    # At small delta the solver's steps cover few collisions; longer times would take minutes.
     short = tau[tau < 1e12]
     found["windows"] = [
         cooling_window(x, short, window if x == 0.1 else None) for x in config.deltas
@@ -134,11 +135,12 @@ def columns(curve: jaxgran.CoolingCurve, temperature: float, unit: float) -> lis
 
 
 def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
+    """Interpolate linearly in ln x."""
     return float(np.interp(np.log(x), np.log(where), values))
 
 
 def formulas(axes, tau: np.ndarray, spread: np.ndarray, delta: float) -> dict:
-    """The paper's <dr^2>(t) and the corrected one less the exact, drawn and at some times."""
+    """Relative errors of the closed forms of <dr^2>(t), drawn, and at some times."""
     rate = closed_forms.COOLING_RATE[3] * delta
     u, t = 1 + rate * tau, jnp.asarray(tau)
     of = {
@@ -156,7 +158,7 @@ def formulas(axes, tau: np.ndarray, spread: np.ndarray, delta: float) -> dict:
 
 
 def cooling_window(delta: float, tau: np.ndarray, axes) -> dict:
-    """When the paper's conditions are met by a gas of this delta, and what holds there."""
+    """Times at which the paper's conditions are met for a given delta, and what holds there."""
     gas = beads(0.05, 1.5 * 2**0.1 * delta)
     curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=jaxgran.KineticTheory(softness=False))
     unit = float(gas.temperature * gas.mean_free_time**2)
@@ -195,7 +197,7 @@ def cooling_window(delta: float, tau: np.ndarray, axes) -> dict:
 
 
 def dress(panels) -> None:
-    """Titles that say what each panel shows, and labels."""
+    """Give the panels their titles and labels."""
     in_time, exponent, in_collisions, in_temperature, forms, window = panels
     spread, time = "⟨Δr²⟩ / (T$_0$ τ$_c$(0)²)", "time t / τ$_c$(0)"
     title = "In time: a straight line is log t\n● DSMC"

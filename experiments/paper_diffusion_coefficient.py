@@ -1,10 +1,11 @@
-"""Is D = T tau_v, and does D fall as the paper says?
+"""Is D = T tau_v, and does D decrease with time as in the paper?
 
     python experiments/paper_diffusion_coefficient.py [--smoke] [--out DIR]
 
-D(t) of a cooling gas by three routes: the integral of the velocity autocorrelation, Eq. (9) from
-t' on, the slope of <dr^2>, Eq. (14), and theory: Eqs. (34) and (40) as printed, and with memory,
-dD/dt = T - D/tau_v. Stochastic simulation, and hard and soft spheres at one age.
+D(t) of a cooling gas is computed in three ways: from the integral of the velocity autocorrelation
+from t' on, Eq. (9); from the slope of <dr^2>, Eq. (14); and by theory, Eqs. (34) and (40) as
+printed and with memory, dD/dt = T - D/tau_v. The simulations are DSMC, and hard and soft spheres at
+one time t'.
 """
 
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,7 @@ from paper_velocity_correlation import Config as Correlation
 from scenes import beads, hard_beads
 
 import jaxgran
-from jaxgran import closed_forms
+from jaxgran.theory import closed_forms
 
 NAME = "paper_diffusion_coefficient"
 
@@ -33,7 +34,7 @@ NAME = "paper_diffusion_coefficient"
 class Config:
     correlation: Correlation = field(default_factory=lambda: Correlation(seed=1))
     waits: tuple[float, ...] = (1.0, 0.1, 0.01, 0.001)  # T(t')/T_0 of the viscoelastic gas
-    last: float = 3000.0  # mean free times
+    last: float = 3000.0  # the last time, in mean free times
     points: int = 14
 
 
@@ -68,7 +69,7 @@ def main() -> None:
     tau = np.geomspace(0.3, config.last, 200)
     delta = float(viscoelastic.delta)
     u = 1 + closed_forms.COOLING_RATE[3] * delta * tau
-    a_3 = closed_forms.TWO_TERM + closed_forms.SLOWING
+    a_3 = closed_forms.COOLING_CORRECTION + closed_forms.RELAXATION_CORRECTION
     printed = u ** (-5 / 6) + a_3 * delta / u
     fall.plot(tau, printed, "--", lw=1, color=paper.VISCOELASTIC, label="Eq. (40), to order δ")
     paper.caption(
@@ -108,18 +109,18 @@ def main() -> None:
 
 
 def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio) -> dict:
-    """D of one gas, drawn and returned, in units of T tau_E."""
+    """D of one gas by all methods, in units of T tau_E; drawn and returned."""
     start, tau_c = float(gas.temperature), float(gas.mean_free_time)
     unit = 9 * start * tau_c**2  # of <dr^2> per collision at D = T tau_E
-    # Elastic spheres go on colliding as at first, and are at their D after a few collisions.
+    # D of elastic spheres is constant after a few collisions, and their collision rate is constant.
     last = config.last if name != "elastic" else min(config.last, 30.0)
     tau = np.geomspace(0.5, last, config.points)
     fine = np.geomspace(0.02, last, 400)
     of = jaxgran.cool(gas, fine * tau_c, model=jaxgran.KineticTheory(softness=False))
     theta = np.asarray(of.temperature) / start
     size = config.correlation
-    model = jaxgran.DSMC(size.num_particles, size.replicas, key=jax.random.key(size.seed + 1))
-    curve = jaxgran.cool(gas, tau * tau_c, model=model)
+    model, key = jaxgran.DSMC(size.num_particles, size.replicas), jax.random.key(size.seed + 1)
+    curve = jaxgran.cool(gas, tau * tau_c, model=model, key=key)
     slopes, errors = diffusion(curve, gas, slice(None))
     cooled = np.asarray(curve.temperature) / start
     middle = np.sqrt(cooled[1:] * cooled[:-1])
@@ -149,7 +150,7 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio)
         mean = slopes * np.diff(np.asarray(curve.collisions)) / np.diff(tau)
         at = np.sqrt(tau[1:] * tau[:-1])
         fall.errorbar(at[4:], mean[4:], (errors / slopes * mean)[4:], fmt="o", ms=4, color=color)
-    # Elastic spheres stay at T_0: they have one point, at the right end of their line.
+    # Elastic spheres stay at T_0: one point.
     if name == "elastic":
         ratio.axhline(1.0, color=color, label="elastic: first Sonine order, 1.7 % below DSMC")
         middle, slopes, errors = (np.array(x[-1:]) for x in (middle, slopes, errors))

@@ -1,11 +1,11 @@
-"""How does a gas cool if epsilon falls with any power of the impact speed, or as measured on ice?
+"""How does a gas cool if 1 - eps is any power of the impact speed, or eps as measured on ice?
 
     python experiments/paper_exponents.py [--smoke] [--out DIR]
 
-The paper's closing remark takes epsilon = 1 - c v^gamma with other exponents than 1/5. Then
+The paper's closing remark considers eps = 1 - c v^gamma with exponents other than 1/5. Then
 dT/dt ~ -T^((3 + gamma)/2), T ~ t^(-2/(1 + gamma)) and <dr^2> ~ t^(gamma/(1 + gamma)). Ice as
-Bridges, Hatzes & Lin (Nature 309, 333, 1984) measured it, epsilon = min(1, 0.34 v^-0.234), v in
-cm/s, is no such power law: its gas goes from one exponent to the next. Theory and DSMC.
+measured by Bridges, Hatzes & Lin (Nature 309, 333, 1984), eps = min(1, 0.34 v^-0.234) with v in
+cm/s, is not such a power law: the exponent of its T(t) changes with time. By theory and DSMC.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,7 @@ from matplotlib.ticker import NullFormatter
 from scenes import beads
 
 import jaxgran
-from jaxgran.domain import POSITIVE, Domain
-from jaxgran.restitution import number
+from jaxgran.checks.validation import POSITIVE, Domain, number
 
 NAME = "paper_exponents"
 
@@ -45,7 +44,7 @@ SMOKE = Config(gammas=(0.0, 1.0), num_particles=1000, replicas=2, last=100.0, po
 
 
 class Ice(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
-    """``eps = min(1, (v/v_1)^(-p))``: elastic below v_1, more lossy the faster the impact."""
+    """``eps = min(1, (v/v_1)^(-p))``: elastic below v_1, decreasing with the speed above."""
 
     threshold: Float[Array, ""] = eqx.field(converter=number, default=0.01 * 0.34 ** (1 / 0.234))
     exponent: Float[Array, ""] = eqx.field(converter=number, default=0.234)
@@ -60,10 +59,11 @@ class Ice(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
 
 
 def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """T/T_0 of a Maxwellian gas whatever its law, and gamma = d ln <1 - eps^2> / d ln sqrt(T).
+    """T/T_0 of a Maxwellian gas with any law, and gamma = d ln <1 - eps^2> / d ln sqrt(T).
 
-    ``d ln T/d tau = -<1 - eps^2> sqrt(T/T_0)/3`` with the mean over ``g^3 exp(-g^2/2)`` by a fine
-    sum: `jaxgran.KineticTheory` takes laws to be smooth, which that of ice is not.
+    ``d ln T/d tau = -<1 - eps^2> sqrt(T/T_0)/3`` with the mean weighted by ``g^3 exp(-g^2/2)``,
+    computed as a sum over a fine grid, since `jaxgran.KineticTheory` requires a smooth law, which
+    that of ice is not.
     """
     theta = np.geomspace(1.0, 1e-7, 1500)
     g = (np.arange(4000) + 0.5) / 400
@@ -99,7 +99,7 @@ def main() -> None:
     tau = np.geomspace(0.1, config.last_theory, 181)
     measured = np.geomspace(0.1, config.last, config.points)
     key = jax.random.key(config.seed)
-    model = jaxgran.DSMC(config.num_particles, config.replicas, key=key)
+    model = jaxgran.DSMC(config.num_particles, config.replicas)
     frozen = jaxgran.Gas(
         Ice(),
         diameter=0.02,
@@ -115,7 +115,7 @@ def main() -> None:
     for name, (gas, color, gamma) in gases.items():
         start = float(gas.temperature)
         of = jaxgran.cool(gas, tau * gas.mean_free_time)
-        dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model)
+        dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model, key=key)
         theta, spread = np.asarray(of.temperature) / start, np.asarray(of.displacement)
         each = paper.replicas_of(dsmc, "temperature") / start
         mean, error = paper.mean_and_error(each)
@@ -129,7 +129,7 @@ def main() -> None:
             where, expected = paper.slope(tau, theta)
             speed = 100 * config.ice_speed * np.sqrt(theta)
             seen = 100 * config.ice_speed * np.sqrt(np.sqrt(mean[1:] * mean[:-1]))
-            aged, old = at > 100, tau > 100  # the start is forgotten
+            aged, old = at > 100, tau > 100  # past the initial transient
             ice.plot(speed[1:][old[1:]], expected[old[1:]], color=color, label="theory, Maxwellian")
             ice.errorbar(seen[aged], local_mean[aged], local_error[aged], label="DSMC", **dots)
             label = "−2/(1 + γ), γ = d ln⟨1 − ε²⟩ / d ln T$^{1/2}$"

@@ -1,9 +1,10 @@
-"""Is the paper's restitution series, Eqs. (1), (5) and (6), right, and up to which dissipation?
+"""Is the paper's series of eps, Eqs. (1), (5) and (6), right, and up to which beta is it accurate?
 
     python experiments/paper_restitution.py [--smoke] [--out DIR]
 
-Integrates single impacts for both ways in which contact can end, recovers the series' coefficients
-from them by a fit, and measures how far the truncated series are off.
+Integrates the equation of motion of single impacts for both conditions at which contact can end
+(xi = 0 and F = 0), obtains the coefficients of the series from them by a fit, and measures the
+errors of the truncated series.
 """
 
 from dataclasses import dataclass
@@ -13,8 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import paper
 
-from jaxgran.contact import impact
-from jaxgran.restitution import C1, C2, C_CLIP, UNCLIPPED_SERIES, viscoelastic_restitution
+from jaxgran.scene.contact import impact
+from jaxgran.scene.restitution_table import (
+    C1,
+    C2,
+    C_CLIP,
+    UNCLIPPED_SERIES,
+    viscoelastic_restitution,
+)
 
 NAME = "paper_restitution"
 PRINTED = (1.15344, 0.79826)
@@ -25,7 +32,7 @@ RAMIREZ = (0.48358, 0.28528)
 @dataclass(frozen=True)
 class Config:
     rtol: float = 1e-13  # of an impact's solver
-    num_impacts: int = 60  # along beta, for the picture
+    num_impacts: int = 60  # values of beta in the picture
     lowest: float = 1e-3
     highest: float = 2.0
     fit_top: float = 0.3  # the series are fitted to impacts up to this beta
@@ -45,8 +52,8 @@ def series(betas: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
 
 
 def recovered(config: Config) -> dict[str, list[float]]:
-    """Coefficients of beta^(1/2), beta, ... (clipped) or beta, beta^2, ..., from impacts alone."""
-    # Chebyshev nodes, twice as many as coefficients: a fit in the least-squares sense.
+    """Coefficients of beta^(1/2), beta, ... (clipped) or beta, beta^2, ..., fitted to impacts."""
+    # A least-squares fit on Chebyshev nodes, twice as many as coefficients.
     nodes = (
         1 - np.cos((np.arange(2 * config.fit_degree) + 0.5) / config.fit_degree * np.pi / 2)
     ) / 2

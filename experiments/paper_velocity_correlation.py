@@ -1,13 +1,14 @@
-"""How long does a grain remember its velocity?
+"""How fast does the velocity autocorrelation function of a cooling gas decay?
 
     python experiments/paper_velocity_correlation.py [--smoke] [--out DIR]
 
-The velocity autocorrelation <v(t').v(t)> of elastic spheres, of constant and of viscoelastic
-restitution, by stochastic simulation and by hard and soft spheres: its decay, and its relaxation
-time tau_v against the elastic Enskog time tau_E (paper, Eqs. (24), (31), (32)).
+The velocity autocorrelation <v(t').v(t)> of elastic spheres and of spheres of constant and of
+viscoelastic restitution, by DSMC and by hard and soft spheres: its decay, and its relaxation time
+tau_v compared with the elastic Enskog time tau_E (paper, Eqs. (24), (31), (32)).
 
-Stochastic simulation starts Maxwellian at T(t'); spheres go on from the state they had reached at
-t', elastic ones excepted, which do not age. Soft spheres have the viscoelastic law only.
+DSMC starts from Maxwellian velocities at T(t'). Hard and soft spheres first cool until t' and
+continue from the state reached there; elastic spheres, whose state does not change, start at once.
+Soft spheres take the viscoelastic law only.
 """
 
 from dataclasses import dataclass, replace
@@ -22,11 +23,13 @@ from scenes import beads, hard_beads
 from scipy.integrate import simpson
 
 import jaxgran
-from jaxgran import closed_forms, kinetics
+from jaxgran.theory import closed_forms
+from jaxgran.theory.averages import Rates, averages, collision_rate
 
 NAME = "paper_velocity_correlation"
 SPHERES = {"hard_spheres": jaxgran.HardSpheres, "soft_spheres": jaxgran.SoftSpheres}
-MARKERS = {"dsmc": ("o", 3), "hard_spheres": ("s", 1), "soft_spheres": ("^", 1)}  # every so many
+MARKERS = {"dsmc": ("o", 3), "hard_spheres": ("s", 1), "soft_spheres": ("^", 1)}
+"""Marker of each model in the picture, and which points are drawn: every third, every one."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Config:
     betas: tuple[float, ...] = (0.05, 0.15, 0.3, 0.6, 1.0)
     num_spheres: int = 2000  # in a box
     boxes: int = 4
-    age: float = 6.0  # t' of spheres, in tau_c(0)
+    age: float = 6.0  # t' of hard and soft spheres, in tau_c(0)
     sphere_lags: int = 25
 
 
@@ -57,24 +60,26 @@ SMOKE = replace(
 
 
 def enskog_time(gas: jaxgran.Gas) -> float:
-    """tau_E = (3/2) tau_c, of the gas at its first temperature."""
+    """tau_E = (3/2) tau_c, of the gas at its initial temperature."""
     return 1.5 * float(gas.mean_free_time)
 
 
 @partial(jax.jit, static_argnames="dimension")
 def relaxation(law, theta, sonine, dimension: int):
-    """nu_v and the collision rate at temperatures in units of the first, reduced units."""
+    """nu_v and the collision rate, in reduced units, at the temperatures theta = T/T_0."""
 
     def one(theta, sonine):
-        averages = kinetics.averages(law, jnp.sqrt(theta), dimension)
-        rates = kinetics.Rates.of(averages, sonine)
-        return jnp.stack([rates.relaxation, kinetics.collision_rate(sonine, dimension)])
+        rates = Rates.of(averages(law, jnp.sqrt(theta), dimension), sonine)
+        return jnp.stack([rates.relaxation, collision_rate(sonine, dimension)])
 
     return (jax.vmap(one)(theta, sonine) * jnp.sqrt(theta)[:, None]).T
 
 
 def theory(gas: jaxgran.Gas, lags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """<v(0).v(t)>/(d T_0) = exp(-int nu_v dt), and collisions, at lags of tau_E, fine ones."""
+    """<v(0).v(t)>/(d T_0) = exp(-int nu_v dt) and the collisions per particle.
+
+    The lags, in tau_E, must be so dense that the trapezoidal rule suffices.
+    """
     times = lags * enskog_time(gas)
     curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False))
     theta = curve.temperature / gas.temperature
@@ -85,20 +90,21 @@ def theory(gas: jaxgran.Gas, lags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stochastic(gas: jaxgran.Gas, config: Config) -> dict:
-    """The correlation from a Maxwellian start; its relaxation time and its integral."""
+    """The autocorrelation by DSMC from a Maxwellian start, its relaxation time and its integral."""
     lags = np.linspace(0, config.longest, config.lags)
+    model = jaxgran.DSMC(config.num_particles, config.replicas)
     key = jax.random.key(config.seed)
-    model = jaxgran.DSMC(config.num_particles, config.replicas, key=key)
-    curve = jaxgran.cool(gas, lags * enskog_time(gas), model=model)
+    curve = jaxgran.cool(gas, lags * enskog_time(gas), model=model, key=key)
     return summary(curve, lags, float(gas.temperature))
 
 
 def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray, temperature: float) -> dict:
+    """Means and standard errors over the replicas, as lists and numbers for JSON."""
     each = paper.replicas_of(curve, "velocity_correlation")
     each = each / each[:, :1]
     collisions = paper.replicas_of(curve, "collisions").mean(axis=0)
     early = (collisions > 0) & (collisions < 2.5)
-    # -ln C = r N + s N^2 at first: 1/r is the relaxation time in collisions, tau_E is 3/2 of them.
+    # Early -ln C = r N + s N^2: the relaxation time is 1/r collisions, and tau_E is 3/2 collisions.
     basis = np.stack([collisions[early], collisions[early] ** 2], axis=1)
     fits = np.linalg.lstsq(basis, -np.log(each[:, early]).T, rcond=None)[0][0]
     times = {
@@ -115,29 +121,26 @@ def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray, temperature: float) -
 
 
 def in_boxes(gas: jaxgran.Gas, config: Config, ages: bool) -> dict[str, dict]:
-    """The same by every model of spheres that the gas has; none without boxes."""
+    """The same by every model of spheres that can take the gas; empty if `config.boxes` is 0."""
     kinds = SPHERES if isinstance(gas.law, jaxgran.Viscoelastic) else ["hard_spheres"]
-    key = jax.random.key(config.seed)
     return {
-        kind: spheres(
-            SPHERES[kind](config.num_spheres, replicas=config.boxes, key=key), gas, config, ages
-        )
+        kind: spheres(SPHERES[kind](config.num_spheres, replicas=config.boxes), gas, config, ages)
         for kind in kinds
         if config.boxes
     }
 
 
 def spheres(model, gas: jaxgran.Gas, config: Config, ages: bool) -> dict:
-    """The same in boxes of spheres, from t' on; and D by the slope of <dr^2> until t'."""
-    age = config.age * float(gas.mean_free_time)
-    grown = jaxgran.cool(gas, [age / 2, age] if ages else [age / 100], model=model)
+    """The same in boxes of spheres, from t' on, and D from the slope of <dr^2> there."""
+    age, key = config.age * float(gas.mean_free_time), jax.random.key(config.seed)
+    grown = jaxgran.cool(gas, [age / 2, age] if ages else [age / 100], model=model, key=key)
     temperature = float(grown.temperature[-1])
     later = replace(model, start=grown.particles)
     aged = gas.replace(temperature=temperature)
     lags = np.linspace(0, config.longest, config.sphere_lags)
     curve = jaxgran.cool(aged, lags * enskog_time(aged), model=later)
     row = summary(curve, lags, temperature)
-    # From 4 tau_E on the start is forgotten, whatever the age.
+    # From 4 tau_E on the velocities at t' no longer matter, whatever the age.
     i = int(np.searchsorted(lags, 4.0))
     (slope,), (error,) = diffusion(curve, aged, slice(i, None, len(lags) - 1 - i))
     row |= {"slope": float(slope), "slope_error": float(error)}
@@ -147,7 +150,7 @@ def spheres(model, gas: jaxgran.Gas, config: Config, ages: bool) -> dict:
 def diffusion(
     curve: jaxgran.CoolingCurve, gas: jaxgran.Gas, which: slice
 ) -> tuple[np.ndarray, np.ndarray]:
-    """D/(T tau_E) between times, d<dr^2>/(6 T tau_E dt), with T tau_E dt ~ sqrt(T) dt ~ dN."""
+    """D/(T tau_E) between times: d<dr^2>/(6 T tau_E dt), where T tau_E dt ~ sqrt(T) dt ~ dN."""
     spread = paper.replicas_of(curve, "displacement")[:, which]
     collisions = paper.replicas_of(curve, "collisions")[:, which]
     unit = 9 * float(gas.temperature * gas.mean_free_time**2)
@@ -211,7 +214,7 @@ def main() -> None:
 
 
 def exact_relaxation(gas: jaxgran.Gas) -> jax.Array:
-    """tau_v/tau_E of the Maxwellian gas at its first temperature, any law."""
+    """tau_v/tau_E of the Maxwellian gas at its initial temperature, for any law."""
     nu, rate = relaxation(gas.reduced_law, jnp.ones(1), jnp.zeros(1), gas.dimension)
     return (2 / 3 * rate / nu)[0]
 
@@ -222,11 +225,11 @@ def printed_relaxation(gas: jaxgran.Gas) -> jax.Array:
         return 2 / (1 + gas.law.coefficient)
     one = jnp.ones(())
     nu = closed_forms.paper_averages(gas.reduced_law, one, gas.dimension)[2, 0]
-    return 2 / 3 * kinetics.collision_rate(0.0, gas.dimension) / nu
+    return 2 / 3 * collision_rate(0.0, gas.dimension) / nu
 
 
 def relaxation_times(axes, config: Config) -> dict:
-    """tau_v/tau_E of many dissipations, against the loss of an impact at the thermal speed."""
+    """tau_v/tau_E for several strengths of dissipation, drawn over 1 - eps at the thermal speed."""
     short = replace(config, longest=2.0, lags=11)
     phi, found = config.packing_fraction, {}
     laws = {

@@ -1,4 +1,4 @@
-"""How experiments take times and keep what they found."""
+"""Timing of experiments, and files of their results."""
 
 import json
 import os
@@ -11,13 +11,13 @@ from pathlib import Path
 
 import jax
 
-from jaxgran.checkpoint import write_whole
+from jaxgran.data.files import write_whole
 
 PACKAGES = ("jaxgran", "jax", "jax-md", "diffrax", "optimistix", "vesin", "numpy", "scipy")
 
 
 def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
-    """Of compilation (the first call less a later one), and the median of later calls."""
+    """Seconds of compilation (the first call less a later one), and the median of later calls."""
     took = []
     for _ in range(repeats + 1):
         begin = time.perf_counter()
@@ -28,9 +28,10 @@ def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
 
 
 def save(path: Path, **figures) -> None:
-    """Writes figures as JSON, with the versions and the device that made them.
+    """Write results as JSON, with the versions of the packages and the device that made them.
 
-    Either the whole file is written, or an older one stays as it was and an error names the path.
+    The file is replaced as a whole; if that fails, an older file is unchanged and an OSError names
+    the path.
     """
     made_by = {
         "versions": {name: found for name in PACKAGES if (found := _version(name))},

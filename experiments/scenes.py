@@ -9,12 +9,12 @@ def beads(
     contact_fraction: float | None = None,
     dimension: int = 3,
 ) -> jaxgran.Gas:
-    """Viscoelastic beads of 2 mm at a thermal speed of .1 m/s.
+    """Viscoelastic beads of 2 mm with T = 0.01 m^2/s^2.
 
     Args:
         packing_fraction: phi.
         beta: dissipation of an impact at the speed sqrt(2 T), `jaxgran.Gas.thermal_beta`.
-        contact_fraction: contact duration over mean free time; Y follows from it.
+        contact_fraction: contact duration over mean free time; fixes Y. None for Y = 1e7 Pa.
         dimension: 2 or 3.
     """
     gas = jaxgran.Gas(
@@ -32,7 +32,7 @@ def beads(
 
 
 def hard_beads(packing_fraction: float, restitution: float, dimension: int = 3) -> jaxgran.Gas:
-    """The same beads with a constant coefficient of restitution."""
+    """Beads as those of `beads`, with a constant coefficient of restitution."""
     return jaxgran.Gas(
         jaxgran.ConstantRestitution(restitution),
         diameter=2e-3,

@@ -1,11 +1,12 @@
-"""How wrong are soft spheres, and how does that fall with the steps per contact?
+"""How large are the errors of soft spheres, and of which order in the time step?
 
     python experiments/soft_sphere_accuracy.py [--smoke] [--out DIR]
 
-Four measurements, none with anything fitted: the last velocities of a LAMMPS trajectory of 64
-spheres; eps of a single impact against its equation of motion, over many phases of the onset; the
-energy ledger of a cooling gas; the energy of an elastic gas. Each table gives the order of the
-error, the slope of its logarithm over that of the step. Writes a picture and a JSON file.
+Four measurements without fitted parameters: the final velocities of 64 spheres compared with a
+LAMMPS trajectory; eps of a single impact compared with its equation of motion, for many phases of
+the time step at first touch; the energy balance of a cooling gas; the energy of an elastic gas.
+Each table gives the order of the error: the slope of its logarithm over that of the time step.
+Writes a picture and a JSON file.
 """
 
 import argparse
@@ -23,17 +24,17 @@ from record import save
 from scenes import beads
 
 import jaxgran
+from jaxgran.particles.capacity import Capacity
 from jaxgran.plotting import DATA, GUIDE, INK, MODEL
-from jaxgran.room import Room
 
 TRAJECTORY = Path(__file__).parent / "data" / "lammps_trajectory_n64.npz"
 TRAJECTORY_STEPS = (40, 100, 400, 1600)
-FINEST = 6400  # of the run that tells our error from that of LAMMPS' own step
-IMPACT_STEPS = (25, 50, 100, 200)  # each twice the last
+FINEST = 6400  # steps of a reference run, which separates our error from that of LAMMPS
+IMPACT_STEPS = (25, 50, 100, 200)  # each twice the one before
 GAS_STEPS = (20, 40, 80)
 BETA = 0.1  # of the head-on impact
-ANGLES = {"head-on": 0.0, "at 45°": np.pi / 4}  # between the approach and the line of centres
-PHASES = 499  # odd, or they repeat where they span several steps
+ANGLES = {"head-on": 0.0, "at 45°": np.pi / 4}  # between relative velocity and line of centres
+PHASES = 499  # odd: they span several steps of the finer runs, and must not repeat there
 LEDGER = {"num_particles": 200, "beta": 0.3, "collision_times": 20, "replicas": 4}
 ELASTIC = {"num_particles": 200, "beta": 0.0, "collision_times": 100, "replicas": 4}
 CONTACT_FRACTION = 0.05  # of the mean free time, in both gases
@@ -57,7 +58,7 @@ def main() -> None:
     results = {
         "trajectory": follow_lammps(TRAJECTORY_STEPS[:num], finest),
         "impact": impacts(IMPACT_STEPS[:num], phases),
-        "ledger": balance("energy ledger of a cooling gas", GAS_STEPS[:num], **ledger),
+        "ledger": balance("energy balance of a cooling gas", GAS_STEPS[:num], **ledger),
         "elastic": balance("energy of an elastic gas", GAS_STEPS[:num], **elastic),
     }
     seconds = time.perf_counter() - begin
@@ -117,18 +118,18 @@ def follow_lammps(steps_per_contact, finest: int) -> dict:
 
 
 def impacts(steps_per_contact, phases: int) -> dict:
-    """Errors of eps over all phases of a step at first touch: one replica a phase."""
-    # So stiff that spheres do not turn about each other while in contact.
+    """Errors of eps over all phases of a time step at first touch: one replica per phase."""
+    # So stiff that spheres do not turn about each other during a contact.
     gas = beads(0.02, 0.0, 1e-8)
     side, sigma, contact = (float(x) for x in (gas.box_side(2), gas.diameter, gas.contact_duration))
-    speed = float(jnp.sqrt(12 * gas.temperature))  # two spheres that close so fast are as hot
+    speed = float(jnp.sqrt(12 * gas.temperature))  # relative speed of a pair with temperature T
     gas = gas.replace(dissipative_constant=BETA / (1.5 * gas.alpha**0.4 * speed**0.2))
     normal_speeds = speed * np.cos(list(ANGLES.values()))
     betas = 1.5 * gas.value("dissipative_constant") * gas.alpha**0.4 * normal_speeds**0.2
     exact = jax.vmap(jaxgran.impact)(betas)
     durations = np.asarray(exact.duration * (gas.alpha**2 * normal_speeds) ** -0.2 / contact)
-    # Touches spread over one of the longest steps, so early that the contact ends within the first
-    # mean contact duration: there a block of steps ends, and the step may change.
+    # First touches are spread over one step of the coarsest run, so early that the contact ends
+    # within the first mean contact duration: after it a new block begins, with another step.
     touch = contact * (0.02 + np.arange(phases) / phases / IMPACT_STEPS[0])
     assert touch[-1] / contact + max(durations) < 1
     results = {}
@@ -144,8 +145,8 @@ def impacts(steps_per_contact, phases: int) -> dict:
             model = jaxgran.SoftSpheres(2, replicas=phases, steps_per_contact=steps, start=start)
             plan = model.sized_for(gas).plan
             assert plan is not None
-            room = Room(phases, 2, phases, phases, 2 * phases)  # all collide at once
-            model = dataclasses.replace(model, plan=plan._replace(room=room))
+            capacity = Capacity(phases, 2, phases, phases, 2 * phases)  # all collide at once
+            model = dataclasses.replace(model, plan=plan._replace(capacity=capacity))
             end = jaxgran.cool(gas, [2 * contact], model=model)
             assert end.particles is not None and end.replicas is not None
             assert np.all(np.asarray(end.replicas.collisions) == 1)
@@ -172,7 +173,7 @@ def balance(
     collision_times: float,
     replicas: int,
 ) -> dict:
-    """How far kinetic, elastic and dissipated energy together stray from the first energy."""
+    """Relative error of the sum of kinetic, elastic and dissipated energy, which is constant."""
     gas = beads(PACKING, 0.0, CONTACT_FRACTION)
     gas = gas.replace(dissipative_constant=beta / (1.5 * 2**0.1 * gas.alpha**0.4 * 0.01**0.1))
     times = np.linspace(0, collision_times, 41) * float(gas.mean_free_time)
@@ -202,7 +203,7 @@ def balance(
 
 
 def table(rows: list[dict], columns: dict[str, str]) -> dict:
-    """Print the rows, and under each column the order of the error in the step."""
+    """Print the rows, and under each column the order of the error in the time step."""
     print(f"{'steps':>8}" + "".join(f"{head:>22}" for head in columns.values()))
     for row in rows:
         print(f"{row['steps']:8d}" + "".join(f"{row[name]:22.2e}" for name in columns))
@@ -227,7 +228,7 @@ def draw(results: dict, path: Path) -> None:
         line(impact, result, "scatter", "o-", colour, f"scatter, {name}")
         line(impact, result, "bias", "s--", colour, f"|mean|, {name}")
     for axes, key, title in (
-        (ledger, "ledger", "Energy ledger of a cooling gas"),
+        (ledger, "ledger", "Energy balance of a cooling gas"),
         (elastic, "elastic", "Energy of an elastic gas"),
     ):
         axes.set(title=title, ylabel="error, of the first energy")
@@ -255,7 +256,7 @@ def line(axes: Axes, result: dict, name: str, style: str, colour: str, label: st
 
 
 def guides(axes: Axes) -> None:
-    """Second order and dt^(3/2) from above the first point, for the eye."""
+    """Draw lines of order 2 and 3/2, which begin above the first point."""
     steps = np.asarray(axes.lines[0].get_xdata(), float)
     top = 1.6 * max(np.max(np.asarray(one.get_ydata(), float)) for one in axes.lines)
     for order, style, name in ((1.5, ":", "3/2"), (2.0, "-", "2")):

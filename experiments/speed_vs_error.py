@@ -1,19 +1,20 @@
-"""How fast and how wrong is each model? Run time against the error of T(t), every knob swept.
+"""How fast and how accurate is each model? Run time and error of T(t) for all its settings.
 
     python experiments/speed_vs_error.py [--scenes dilute dense clustering]
-        [--models KineticTheory DSMC HardSpheres SoftSpheres] [--smoke] [--out DIR]
+        [--models kinetic-theory dsmc hard-spheres soft-spheres] [--smoke] [--out DIR]
 
 The error is the largest relative difference of T from an independent reference over the whole
-curve: LAMMPS for the dilute and the dense gas, for the clustering one soft spheres in four boxes
-with twice the steps and all its particles. Each row is run twice, so that compilation can be told
-apart. Scenes and models not asked for keep the rows of an older run in the same folder.
+curve: LAMMPS for the dilute and the dense gas; for the clustering gas soft spheres with 80 steps
+per contact, in as large a box as the largest here and with three times the replicas. Each row is
+run twice, to tell compilation from run time. Scenes and models that are not asked for keep the rows
+of an older run in the same folder.
 """
 
 import argparse
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -25,17 +26,17 @@ from scenes import beads
 from tqdm import tqdm
 
 import jaxgran
-from jaxgran.choice import words
-from jaxgran.curve import header_number
+from jaxgran.data.curve_file import header_number
 
 DATA_FOLDER = Path(__file__).parent / "data"
-KEY = 1  # of the rows; the reference has another
+KEY = 1  # of the random numbers of the rows; the reference has another
 COLOURS = {
-    "KineticTheory": "#222222",
+    "kinetic theory": "#222222",
     "DSMC": "#2a9d8f",
-    "HardSpheres": "#20639b",
-    "SoftSpheres": "#d1495b",
+    "hard spheres": "#20639b",
+    "soft spheres": "#d1495b",
 }
+"""Colours of the models, by their names."""
 SIZES = {
     "dilute": (500, 2000, 8000),
     "dense": (500, 2000, 8000),
@@ -44,17 +45,26 @@ SIZES = {
 REPLICAS = 4
 DSMC_SIZES = (1000, 10_000, 100_000)
 STEPS = (10, 20, 80)
-SOFTER = (4, 16)  # times, at fixed A alpha^(2/5)
+SOFTER = (4, 16)  # factors by which Y is reduced at fixed A alpha^(2/5)
 CLUSTERING = (0.2, 0.5, 0.02)  # packing fraction, beta, contact fraction
 CLUSTERING_TIMES = np.geomspace(0.5, 60, 30)  # mean free times
 
 
 @dataclass
 class Scene:
+    """A gas with a reference curve.
+
+    Attributes:
+        gas, times: what is simulated.
+        temperature: of the reference.
+        error: standard error of the reference's T.
+        reference: how it was obtained, in words.
+    """
+
     gas: jaxgran.Gas
     times: np.ndarray
-    temperature: np.ndarray  # of the reference
-    error: np.ndarray  # one standard deviation
+    temperature: np.ndarray
+    error: np.ndarray
     reference: str
 
 
@@ -63,8 +73,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", nargs="+", choices=SIZES, default=list(SIZES))
-    parser.add_argument("--models", nargs="+", choices=COLOURS, default=list(COLOURS))
-    parser.add_argument("--smoke", action="store_true", help="a row a model, early times only")
+    names = [option(name) for name in COLOURS]
+    parser.add_argument("--models", nargs="+", choices=names, default=names)
+    parser.add_argument("--smoke", action="store_true", help="few rows, early times only")
     parser.add_argument("--out", type=Path, default=Path("results") / "speed_vs_error")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -73,17 +84,18 @@ def main() -> None:
     if file.exists():
         found = json.loads(file.read_text(encoding="utf-8"))["scenes"]
     for name in ("dense",) if options.smoke else options.scenes:
-        jax.clear_caches()  # every scene compiles anew
+        jax.clear_caches()  # so that every scene compiles for itself
         scene = clustering() if name == "clustering" else measured(name, options.smoke)
         before = found[name]["rows"] if name in found else []
-        kept = [row for row in before if row["model"] not in options.models]
+        kept = [row for row in before if option(row["model"]) not in options.models]
         runs = few_runs(scene.gas) if options.smoke else all_runs(scene.gas, SIZES[name])
-        runs = [run for run in runs if type(run.model).__name__ in options.models]
+        runs = [run for run in runs if option(run.model.name) in options.models]
         rows = [measure(scene, run) for run in tqdm(runs, disable=True if options.smoke else None)]
         rows = sorted(kept + rows, key=lambda row: list(COLOURS).index(row["model"]))
-        estimates = jaxgran.choose_model(
+        choice = jaxgran.choose_model(
             scene.gas, scene.times, num_particles=SIZES[name][-1], replicas=REPLICAS
-        ).errors
+        )
+        estimates = {c.model.name: c.error for c in choice.candidates if c.error is not None}
         found[name] = {"reference": scene.reference, "estimates": estimates, "rows": rows}
         print(table(name, found[name]))
         save(file, scenes=found, key=KEY, replicas=REPLICAS)
@@ -94,8 +106,18 @@ def main() -> None:
     print(f"written to {options.out}")
 
 
+def option(name: str) -> str:
+    """The name of a model on the command line."""
+    return name.lower().replace(" ", "-")
+
+
+def title(name: str) -> str:
+    """The name of a model in a table."""
+    return name[:1].upper() + name[1:]
+
+
 def measured(name: str, smoke: bool) -> Scene:
-    """A gas that was measured in LAMMPS."""
+    """A gas whose curve was measured in LAMMPS."""
     curve, header = jaxgran.read_curve(DATA_FOLDER / f"lammps_cooling_{name}.csv")
     gas = jaxgran.read_gas(header).replace(dissipative_constant=header_number(header, "A"))
     assert curve.temperature_error is not None
@@ -111,12 +133,12 @@ def measured(name: str, smoke: bool) -> Scene:
 
 
 def clustering() -> Scene:
-    """A box of four L_c, and soft spheres in it by finer steps."""
+    """A gas in a box of four L_c, with a reference by soft spheres of finer time steps."""
     gas = beads(*CLUSTERING)
     size, times = SIZES["clustering"][-1], CLUSTERING_TIMES * float(gas.mean_free_time)
     key = jax.random.key(KEY + 1)
-    model = jaxgran.SoftSpheres(size, replicas=3 * REPLICAS, steps_per_contact=80, key=key)
-    curve = jaxgran.cool(gas, times, model=model)
+    model = jaxgran.SoftSpheres(size, replicas=3 * REPLICAS, steps_per_contact=80)
+    curve = jaxgran.cool(gas, times, model=model, key=key)
     assert curve.temperature_error is not None
     label = f"soft spheres, N = {size}, {3 * REPLICAS} replicas, 80 steps a contact"
     return Scene(
@@ -125,14 +147,23 @@ def clustering() -> Scene:
 
 
 class Run(NamedTuple):
+    """A row of the table.
+
+    Attributes:
+        knob: the settings of the model, in words.
+        model: with these settings.
+        gas: that of the scene, or a softer one.
+        double: whether it is run in float64.
+    """
+
     knob: str
-    model: jaxgran.KineticTheory | jaxgran.DSMC | jaxgran.HardSpheres | jaxgran.SoftSpheres
+    model: jaxgran.AbstractModel
     gas: jaxgran.Gas
     double: bool = True
 
 
 def few_runs(gas: jaxgran.Gas) -> list[Run]:
-    few = {"num_particles": 100, "replicas": 2, "progress": False}
+    few: dict[str, Any] = {"num_particles": 100, "replicas": 2}
     return [
         Run("rtol 1e-03", jaxgran.KineticTheory(rtol=1e-3), gas),
         Run("rtol 1e-05, float32", jaxgran.KineticTheory(rtol=1e-5), gas, double=False),
@@ -144,7 +175,7 @@ def few_runs(gas: jaxgran.Gas) -> list[Run]:
 
 
 def all_runs(gas: jaxgran.Gas, sizes: tuple[int, ...]) -> list[Run]:
-    few = {"replicas": REPLICAS, "key": jax.random.key(KEY), "progress": False}
+    few: dict[str, Any] = {"replicas": REPLICAS}
     middle, many = sizes[1], DSMC_SIZES[1]
     dsmc, hard = jaxgran.DSMC(many, **few), jaxgran.HardSpheres(middle, **few)
     soft = jaxgran.SoftSpheres(middle, **few)
@@ -176,8 +207,10 @@ def measure(scene: Scene, row: Run) -> dict:
     curves = []
 
     def run():
-        curves.append(jaxgran.cool(gas, scene.times, model=row.model))
-        return curves[-1].temperature
+        key = jax.random.key(KEY)
+        curve = jaxgran.cool(gas, scene.times, model=row.model, key=key, progress=False)
+        curves.append(curve)
+        return curve.temperature
 
     compile_s, run_s = seconds(run, repeats=1)
     T = np.asarray(curves[-1].temperature, float)
@@ -187,7 +220,7 @@ def measure(scene: Scene, row: Run) -> dict:
     worst = int(np.argmax(miss))
     noise = scene.error[worst] if own is None else np.hypot(own[worst], scene.error[worst])
     return {
-        "model": type(row.model).__name__,
+        "model": row.model.name,
         "knob": row.knob,
         "float64": row.double,
         "compile_s": compile_s,
@@ -208,11 +241,11 @@ def table(name: str, results: dict) -> str:
     for row in results["rows"]:
         error = f"{100 * row['error']:.2g} ± {100 * row['standard_error']:.1g} %"
         lines.append(
-            f"| {words(row['model'])} | {row['knob']} | {row['compile_s']:.1f} | "
+            f"| {title(row['model'])} | {row['knob']} | {row['compile_s']:.1f} | "
             f"{row['run_s']:.3g} | {error} | {row['worst_at']:.3g} |"
         )
-    said = (f"{words(model)} {100 * x:.2g} %" for model, x in results["estimates"].items())
-    lines += ["", f"`choose_model` estimates, for the most particles: {', '.join(said)}."]
+    each = (f"{title(model)} {100 * x:.2g} %" for model, x in results["estimates"].items())
+    lines += ["", f"`choose_model` estimates, for the most particles: {', '.join(each)}."]
     return "\n".join(lines)
 
 
@@ -242,9 +275,9 @@ def panel(axes: Axes, rows: list[dict]) -> None:
                 ms=5,
                 lw=0.8,
                 color=colour,
-                label=words(name) if double else None,
+                label=title(name) if double else None,
             )
-    # The front: who is not both slower and more wrong than another.
+    # The Pareto front: rows for which no other is both faster and more accurate.
     best = np.inf
     front = []
     for row in sorted(rows, key=lambda row: row["run_s"]):

@@ -1,42 +1,51 @@
 """jaxgran: differentiable granular gases in JAX."""
 
-from jaxgran.choice import Choice, choose_model
-from jaxgran.contact import Impact, contact_force, elastic_constant, impact
+from jaxgran.checks.status import explain as explain_status
 from jaxgran.cooling import cool
-from jaxgran.curve import CoolingCurve, Particles, read_curve, read_gas, write_curve
-from jaxgran.diagnosis import Diagnosis, diagnose
-from jaxgran.estimate import Fit
-from jaxgran.fitting import fit
-from jaxgran.gas import Gas, sphere_mass
+from jaxgran.data.curve import CoolingCurve, Particles
+from jaxgran.data.curve_file import read_curve, read_gas, write_curve
+from jaxgran.data.run import Run
+from jaxgran.fitting.diagnosis import Diagnosis, diagnose
+from jaxgran.fitting.fit import fit
+from jaxgran.fitting.result import Fit
+from jaxgran.models.base import AbstractModel, Omission
+from jaxgran.models.course import Course
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.selection import Choice, choose_model
 from jaxgran.models.soft_spheres import SoftSpheres
-from jaxgran.restitution import (
+from jaxgran.scene.contact import Impact, contact_force, elastic_constant, impact
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.geometry import sphere_mass
+from jaxgran.scene.restitution import (
     ConstantRestitution,
     ReducedLaw,
     RestitutionLaw,
     RestitutionSeries,
     Viscoelastic,
-    viscoelastic_restitution,
 )
-from jaxgran.status import explain as explain_status
+from jaxgran.scene.restitution_table import viscoelastic_restitution
 
 __all__ = [
     "DSMC",
+    "AbstractModel",
     "Choice",
     "ConstantRestitution",
     "CoolingCurve",
+    "Course",
     "Diagnosis",
     "Fit",
     "Gas",
     "HardSpheres",
     "Impact",
     "KineticTheory",
+    "Omission",
     "Particles",
     "ReducedLaw",
     "RestitutionLaw",
     "RestitutionSeries",
+    "Run",
     "SoftSpheres",
     "Viscoelastic",
     "choose_model",

@@ -2,39 +2,58 @@
 
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import ArrayLike
+from jaxtyping import ArrayLike, PRNGKeyArray
 
-from jaxgran import kinetics
-from jaxgran.choice import Model, check_softness, choose_model
-from jaxgran.curve import CoolingCurve
-from jaxgran.domain import checked_times
-from jaxgran.gas import Gas
+from jaxgran.checks import status
+from jaxgran.checks.tracing import any_traced
+from jaxgran.checks.validation import checked_times
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run import Run
+from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.soft_spheres import SoftSpheres
+from jaxgran.models.selection import choose_model
+from jaxgran.scene.gas import Gas
 
 
 def cool(
     gas: Gas,
     times: ArrayLike | Sequence[float],
     *,
-    model: Model | Literal["auto"] | None = None,
+    model: AbstractModel | Literal["auto"] | None = None,
+    key: PRNGKeyArray | None = None,
+    progress: bool = True,
+    checkpoint: str | Path | None = None,
+    throw: bool = True,
     tolerance: float | None = None,
     num_particles: int | None = None,
 ) -> CoolingCurve:
     """How the gas cools and spreads from its initial temperature at t = 0.
 
+    The model is a description; `key`, `progress`, `checkpoint` and `throw` are options of this run.
+    Called with known numbers, a particle model is run from the host, which enlarges its arrays
+    where they are too small, shows progress and writes checkpoints. Called inside `jax.jit`,
+    `jax.vmap` or a derivative it is a pure function of arrays.
+
     Args:
         gas: the scene; its floats may be traced, differentiated and batched with `jax.vmap`.
         times: t, s, increasing and >= 0, shape (times,); need not start at 0.
-        model: how closely to look; `jaxgran.KineticTheory()` by default. "auto" takes the cheapest
-            whose estimated error is small enough; `jaxgran.choose_model` tells which, and why.
+        model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`. "auto" takes the
+            cheapest whose estimated error is small enough; `jaxgran.choose_model` says which, and
+            why.
+        key: of the random numbers of a particle model. Without one it is `jax.random.key(0)`: two
+            such calls return the same numbers.
+        progress: show a progress bar on a terminal during a run of some seconds.
+        checkpoint: a file to which a particle model's run is saved each minute and when it is
+            interrupted, and from which it is resumed; the resumed run gives the same numbers bit
+            for bit. Not inside `jax.jit`, `jax.vmap` or a derivative.
+        throw: raise RuntimeError if the run fails. False returns the curve, nan from the failure
+            on, and its ``status`` (`jaxgran.explain_status` puts it into words); inside compiled
+            code, where nothing can be raised, that is always so.
         tolerance: for "auto" only, relative error of T allowed; 0.02 by default.
         num_particles: for "auto" only, N of the gas, if known.
 
@@ -42,46 +61,60 @@ def cool(
         `CoolingCurve` at those times.
 
     Raises:
-        ValueError: for times that are negative, unsorted, not finite or not a list, a law that
-            heats the gas, contacts too soft for kinetic theory, or options of "auto" with another
-            model.
-        RuntimeError: if the solver needs more steps than the model allows.
+        ValueError: for times that are negative, unsorted, not finite or not a list, a scene that
+            the model cannot take, a checkpoint where none can be kept, or options of "auto" with
+            another model.
+        RuntimeError: if the run fails and `throw` is True, with what to do.
+
+    This docstring is long because it documents every option of every model's run.
     """
     if not isinstance(gas, Gas):
         raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
     times = checked_times(times)
     model = KineticTheory() if model is None else model
-    if isinstance(model, str) and model != "auto":
-        raise ValueError(f'model must be a model or "auto", got {model!r}; try KineticTheory()')
-    if model != "auto" and not (tolerance is None and num_particles is None):
-        raise ValueError(
-            'tolerance and num_particles go with model="auto"; give them to the model instead, as '
-            "in SoftSpheres(num_particles), or leave them out"
-        )
-    # Contacts resolved in time cannot heat a gas; a law of restitution, or averages of it, can.
-    if not isinstance(model, SoftSpheres):
-        theory = model if isinstance(model, KineticTheory) else KineticTheory()
-        first_rate, softness = _at_start(gas, theory)
-        known = not isinstance(first_rate, Tracer)
-        if known and theory is model and theory.softness:
-            check_softness(gas, softness)
-        if known and np.any(np.asarray(first_rate) < 0):
-            raise ValueError(
-                "the law of restitution makes this gas heat up: averaged over its impacts, eps is "
-                "above 1 (a truncated series beyond its range); lower T_0 or A, or use another law"
-            )
-    if isinstance(model, str):
+    if model == "auto":
         tolerance = 0.02 if tolerance is None else tolerance
         choice = choose_model(gas, times, tolerance, num_particles)
         if choice.error > tolerance:
             warnings.warn(choice.reasons[0], stacklevel=2)
         model = choice.model
-    return model.cool(gas, times)
+    elif not (tolerance is None and num_particles is None):
+        raise ValueError(
+            'tolerance and num_particles go with model="auto"; give them to the model instead, as '
+            "in SoftSpheres(num_particles), or leave them out"
+        )
+    if not isinstance(model, AbstractModel):
+        raise ValueError(f'model must be a model or "auto", got {model!r}; try KineticTheory()')
+    if checkpoint is not None:
+        _check_checkpoint(model, any_traced(gas, times, model, key), checkpoint)
+    model.check(gas)
+    curve = model.simulate(gas, times, Run(key, progress, checkpoint))
+    if throw and curve.status is not None and not isinstance(curve.status, Tracer):
+        _raise_if_failed(curve, gas)
+    return curve
 
 
-@eqx.filter_jit
-def _at_start(gas: Gas, model: KineticTheory) -> tuple[jax.Array, jax.Array]:
-    """The first cooling rate, 1/s, and the factor by which soft contacts change it."""
-    at_start = jnp.ones_like(gas.temperature)
-    factor = kinetics.softness_factor(gas.reduced_law, at_start, gas.dimension)
-    return model.cooling_rate(gas), factor
+def _check_checkpoint(model: AbstractModel, traced: bool, path: str | Path) -> None:
+    if traced:
+        raise ValueError(
+            f"inside jax.jit, jax.vmap and derivatives {type(model).__name__} keeps no checkpoint: "
+            f"leave checkpoint out, got {str(path)!r}"
+        )
+    if not model.stochastic:
+        raise ValueError(
+            f"{type(model).__name__} has no run to be saved: leave checkpoint out, got "
+            f"{str(path)!r}"
+        )
+
+
+def _raise_if_failed(curve: CoolingCurve, gas: Gas) -> None:
+    fault = int(np.bitwise_or.reduce(np.asarray(curve.status), axis=None))
+    if fault == status.OK:
+        return
+    known = np.isfinite(np.asarray(curve.temperature))
+    reached = ""
+    if np.any(known):
+        last = int(np.flatnonzero(known)[-1])
+        ratio = float(curve.temperature[last] / gas.temperature)
+        reached = f"stopped after t = {curve.times[last]:.3g} s, T/T_0 = {ratio:.3g}: "
+    raise RuntimeError(reached + status.explain(fault))

@@ -1,127 +1,33 @@
 """Direct simulation Monte Carlo: the velocities of a homogeneous gas, by random collisions."""
 
-from functools import partial
-from math import sqrt
-from pathlib import Path
+from math import hypot
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, UInt32
 
-from jaxgran import collisions, initial, kinetics, observables, status
-from jaxgran.checkpoint import fingerprint, refuse
-from jaxgran.collisions import Scheme, State, Tangents
-from jaxgran.curve import CoolingCurve
-from jaxgran.gas import Gas
-from jaxgran.restitution import ReducedLaw
-from jaxgran.simulation import simulate
+from jaxgran.checks import status
+from jaxgran.checks.tracing import any_traced
+from jaxgran.data.checkpoint import fingerprint
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run import DEFAULTS, Run
+from jaxgran.models import checks
+from jaxgran.models.base import AbstractModel, Omission
+from jaxgran.models.course import Course
+from jaxgran.particles.driver import follow
+from jaxgran.particles.stochastic import simulation
+from jaxgran.particles.stochastic.collisions import Scheme
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.restitution import ReducedLaw
 
 LONGEST_STEP = 0.1
 """Most collisions per particle in one step: a particle can be drawn at most twice in it."""
 
-MISSED = 1e-4
-"""Share of collisions that a run may miss beyond the ceiling before it is declared wrong."""
 
-_CHUNK = 4_000_000  # candidate pairs between two looks at the clock: about a second
-
-
-@partial(jax.jit, static_argnames=("scheme", "tangents"))
-def _observe(state: State, first, law, key, *, scheme: Scheme, tangents: bool = False) -> dict:
-    """Each replica at `time`: its next step is done in part, and then forgotten."""
-    share = (state.time - state.clock) * jnp.sqrt(state.temperature) / scheme.own_step
-    state = collisions.step(state, key, jnp.clip(share, 0.0, 1.0), law, scheme, tangents)
-    d = scheme.dimension
-
-    def centred(x):
-        return x - jnp.mean(x, axis=1, keepdims=True)
-
-    velocity = centred(state.particles[..., :d])
-    travelled = centred(
-        state.particles[..., d:] + state.clock[:, None, None] * state.particles[..., :d]
-    )
-    theta = 2 * observables.temperature(velocity)
-    values = {
-        "temperature": theta,
-        "sonine": observables.sonine(velocity),
-        "displacement": observables.mean_square_displacement(travelled),
-        "velocity_correlation": 2 * observables.velocity_correlation(first, velocity),
-        "collisions": 2 / scheme.num_particles * state.collisions,
-    }
-    fast = status.flag(status.TOO_FAST, state.missed > MISSED * state.collisions + 1)
-    values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
-    if not tangents:
-        return values
-
-    # How fast each changes, so that a shift of the clock can be turned into one of the value.
-    speed = jnp.sqrt(theta)
-    a2, along = values["sonine"], state.tangents
-
-    @jax.vmap
-    def rates_of(speed, a2):
-        return kinetics.Rates.of(kinetics.averages(law, speed, d), a2)
-
-    rates = rates_of(speed, a2)
-    cooling = 2 / d * rates.cooling * speed
-    correlation = values["velocity_correlation"]
-    per_time = {
-        "temperature": -cooling * theta,
-        "sonine": 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment * speed,
-        "displacement": 2 * jnp.mean(jnp.sum(travelled * velocity, axis=-1), axis=-1),
-        "velocity_correlation": -rates.relaxation * speed * correlation,
-        "collisions": kinetics.collision_rate(a2, d) * speed,
-    }
-    c = along.log_temperature
-    at_own_time = {
-        "temperature": theta[:, None] * c,
-        "velocity_correlation": correlation[:, None] * (c / 2 + along.persistence),
-        "displacement": along.displacement,
-    }
-    shifted = {
-        name: at_own_time.get(name, 0.0) - rate[:, None] * along.clock
-        for name, rate in per_time.items()
-    }
-    return {"values": values, "rates": per_time, "along": shifted}
-
-
-@partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
-def _start(key: Array, replicas: int, scheme: Scheme, num_parameters: int) -> State:
-    d = scheme.dimension
-    key = jax.random.fold_in(collisions.wrapped(key), 2**32 - 1)
-    v = initial.velocities(key, replicas, scheme.num_particles, d).reshape(replicas, -1, d)
-    each, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
-    return State(
-        time=jnp.zeros((), v.dtype),
-        clock=each,
-        temperature=each + 1,
-        particles=jnp.concatenate([v / sqrt(2), jnp.zeros_like(v)], axis=-1),
-        collisions=each,
-        missed=each,
-        steps=jnp.zeros(replicas, jnp.uint32),
-        mobility=each,
-        tangents=Tangents(*[along] * len(Tangents._fields)),
-    )
-
-
-@partial(jax.jit, static_argnames=("replicas", "scheme", "tangents"))
-def _run(law: ReducedLaw, times, key, *, replicas: int, scheme: Scheme, tangents: bool):
-    """Records at all times, as arrays of shape (times, replicas, ...), in compiled code alone."""
-    num_parameters = ravel_pytree(law)[0].size if tangents else 0
-    state = _start(key, replicas, scheme, num_parameters)
-    first = state.particles[..., : scheme.dimension]
-    forever = jnp.asarray(2**31 - 1, jnp.int32)
-
-    def to(state, end):
-        state = collisions.advance(state, end, law, key, forever, scheme=scheme, tangents=tangents)
-        return state, _observe(state, first, law, key, scheme=scheme, tangents=tangents)
-
-    return jax.lax.scan(to, state, times)[1]
-
-
-class DSMC(eqx.Module):
+class DSMC(AbstractModel):
     """Homogeneous gas of hard spheres by direct simulation Monte Carlo: velocities, no positions.
 
     Solves the Enskog-Boltzmann equation of the homogeneous gas with any law of restitution:
@@ -132,23 +38,20 @@ class DSMC(eqx.Module):
 
     A step takes a fixed share of the current mean free time. Its error is of second order: a
     step draws disjoint random pairs, and then pairs that share a particle with those, as often as
-    drawing one pair after the other would. Means of N particles err by O(1/N).
+    drawing one pair after the other would. Means over N particles have errors of O(1/N).
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
-    The derivatives are estimates: at fixed own time (dt = dtau / sqrt(T), so that the order of
-    collisions does not depend on the speeds) the gas is taken to remember its temperature alone,
-    and <dr^2> and the velocity correlation to change by the first Sonine order of diffusion; a_2
-    is taken not to change. Rates of change with time are those of the Maxwell-Sonine distribution.
+    The derivatives are estimates. They are taken at a fixed own time (dt = dtau / sqrt(T), so that
+    the order of collisions does not depend on the speeds). The gas is assumed to remember its
+    temperature only; <dr^2> and the velocity correlation are assumed to change by the first Sonine
+    order of diffusion, and a_2 not to change. Rates of change with time are those of the
+    Maxwell-Sonine distribution.
 
     Args:
         num_particles: N, >= 2.
-        replicas: independent gases run side by side; two or more give error bars.
-        key: of the random numbers; `jax.random.key(0)` by default.
-        step: collisions per particle in one step, in (0, 0.1]; one pair at least, 0.5/N, which
-            in a gas of some ten particles is longer than asked.
-        progress: show a progress bar on a terminal.
-        checkpoint: a file to save the run to each minute and to resume it from. The resumed run
-            gives the same numbers bit for bit.
+        replicas: independent gases that are simulated together; two or more give error bars.
+        step: collisions per particle in one step, in (0, 0.1]. A step has one pair at least, which
+            is 0.5/N and in a gas of some ten particles longer than asked.
 
     Raises:
         ValueError: for numbers out of range.
@@ -159,10 +62,10 @@ class DSMC(eqx.Module):
 
     num_particles: int = eqx.field(static=True)
     replicas: int = eqx.field(static=True, default=1)
-    key: PRNGKeyArray | None = None
     step: float = eqx.field(static=True, default=0.05)
-    progress: bool = eqx.field(static=True, default=True)
-    checkpoint: str | Path | None = eqx.field(static=True, default=None)
+
+    stochastic: ClassVar[bool] = True
+    derivative_accuracy: ClassVar[float] = 0.01
 
     def __check_init__(self):
         for name, least in (("num_particles", 2), ("replicas", 1)):
@@ -175,89 +78,75 @@ class DSMC(eqx.Module):
                 "a particle collides at most twice in a step"
             )
 
-    @property
-    def accuracy(self) -> float:
-        """Relative error of a derivative: what differs by less is not told apart."""
-        return 0.01
+    def check(self, gas: Gas) -> None:
+        """Raise ValueError for a law of restitution that heats the gas."""
+        checks.check_cools(gas)
 
-    def cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
-        """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them.
+    def estimated_error(self, course: Course) -> float:
+        """Error of Enskog's rate, lasting and soft contacts, and the shot noise of all replicas."""
+        rate_error = course.homogeneous + course.lasting_contacts + course.softness
+        noise = course.shot_noise(self.num_particles * self.replicas)
+        return hypot(course.error_of_temperature(rate_error), noise)
 
-        Raises:
-            RuntimeError: if impacts were too fast for the ceiling of the collision rate.
+    def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
+        """Contacts that last, correlated collisions and boxes in which a flow grows."""
+        lasting = checks.omitted_by_instant_impacts(gas)
+        return lasting + checks.omitted_by_homogeneity(gas, num_particles)
+
+    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
+        """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`.
+
+        A run fails if too many pairs meet faster than the ceiling of the collision rate.
         """
+        key = jax.random.key(0) if run.key is None else run.key
+        # Two words of any kind of key, for the kind that is used here.
+        words = jax.random.bits(key, (2,), jnp.uint32)
         scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
-        law = gas.reduced_law
-        # Of any kind of key, two words for the kind that is used here.
-        key = jax.random.bits(jax.random.key(0) if self.key is None else self.key, (2,), jnp.uint32)
-        reduced = times * gas.impact_speed / gas.path_length
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, times, key))):
-            records = self._traced(law, reduced, key, scheme)
+        law, reduced = gas.reduced_law, times * gas.impact_speed / gas.path_length
+        if any_traced(gas, times, words):
+            records = simulation.differentiable_run(
+                law, reduced, words, replicas=self.replicas, scheme=scheme
+            )
         else:
-            records = self._driven(law, reduced, key, scheme)
-        return self._curve(gas, times, records)
+            records = self._driven(law, reduced, words, scheme, run)
+        return _curve(gas, times, records)
 
-    def _driven(self, law: ReducedLaw, times: Array, key: Array, scheme: Scheme) -> dict:
-        """Run by a loop on the host, which shows progress and writes checkpoints."""
-        start = _start(key, self.replicas, scheme, 0)
-        scene = fingerprint(law, times, start, key, scheme)
-        pairs = self.replicas * (scheme.first + scheme.second)
-        max_steps = jnp.asarray(max(_CHUNK // pairs, 16), jnp.int32)
-        first = start.particles[..., : scheme.dimension]
-
-        def advance(state: State, end: float) -> State:
-            end_array = jnp.asarray(end, times.dtype)
-            return collisions.advance(state, end_array, law, key, max_steps, scheme=scheme)
-
-        _, records = simulate(
+    def _driven(
+        self,
+        law: ReducedLaw,
+        times: Float[Array, "times"],
+        words: UInt32[Array, "2"],
+        scheme: Scheme,
+        run: Run,
+    ) -> dict[str, Array]:
+        """The records of a run by the driver on the host, with progress and checkpoints."""
+        start, advance, observe = simulation.parts(
+            law, words, replicas=self.replicas, scheme=scheme
+        )
+        _, records, _ = follow(
             start,
             np.asarray(times),
             advance,
-            partial(_observe, first=first, law=law, key=key, scheme=scheme),
-            scene=scene,
-            progress=self.progress,
-            path=self.checkpoint,
+            observe,
+            scene=fingerprint(law, times, start, words, scheme),
+            progress=run.progress,
+            path=run.checkpoint,
         )
-        fault = int(np.bitwise_or.reduce(records["fault"], axis=None))
-        if fault != status.OK:
-            raise RuntimeError(status.explain(fault))
         return {name: jnp.asarray(value) for name, value in records.items()}
 
-    def _traced(self, law: ReducedLaw, times: Array, key: Array, scheme: Scheme) -> dict:
-        """The same inside `jax.jit`, `jax.vmap` or a derivative."""
-        refuse(self.checkpoint, "DSMC")
-        parameters, unravel = ravel_pytree(law)
-        run = partial(_run, replicas=self.replicas, scheme=scheme)
 
-        # One linear rule for forward and reverse mode, from tangents carried beside the state.
-        @jax.custom_jvp
-        def solve(parameters, times, key):
-            return run(unravel(parameters), times, key, tangents=False)
-
-        @solve.defjvp
-        def solve_jvp(at, along):
-            parameters, times, key = at
-            out = run(unravel(parameters), times, key, tangents=True)
-            values = out["values"]
-            tangents = {
-                name: rate * along[1][:, None] + out["along"][name] @ along[0]
-                for name, rate in out["rates"].items()
-            }
-            return values, tangents | {"fault": np.zeros(values["fault"].shape, jax.dtypes.float0)}
-
-        return solve(parameters, times, key)
-
-    def _curve(self, gas: Gas, times: Array, records: dict) -> CoolingCurve:
-        fault = records["fault"]
-        units = {
-            "temperature": gas.temperature,
-            "sonine": 1.0,
-            "displacement": gas.path_length**2,
-            "velocity_correlation": gas.temperature,
-            "collisions": 1.0,
-        }
-        each = {
-            name: jnp.where(fault == status.OK, records[name], jnp.nan).T * unit
-            for name, unit in units.items()
-        }
-        return CoolingCurve.of_replicas(times, each, status=jnp.bitwise_or.reduce(fault, axis=None))
+def _curve(gas: Gas, times: Float[Array, "times"], records: dict[str, Array]) -> CoolingCurve:
+    """The curve in SI units; each replica is nan from its first fault on."""
+    fault = records["fault"]
+    failed = jnp.cumsum(fault != status.OK, axis=0) > 0
+    units = {
+        "temperature": gas.temperature,
+        "sonine": 1.0,
+        "displacement": gas.path_length**2,
+        "velocity_correlation": gas.temperature,
+        "collisions": 1.0,
+    }
+    each = {
+        name: jnp.where(failed, jnp.nan, records[name]).T * unit for name, unit in units.items()
+    }
+    return CoolingCurve.of_replicas(times, each, status=jnp.bitwise_or.reduce(fault, axis=None))

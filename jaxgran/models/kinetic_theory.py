@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -10,18 +10,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from jaxgran import closed_forms, kinetics, status
-from jaxgran.curve import CoolingCurve
-from jaxgran.gas import Gas
-from jaxgran.restitution import ReducedLaw
+from jaxgran.checks import status
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run import DEFAULTS, Run
+from jaxgran.models import checks
+from jaxgran.models.base import AbstractModel, Omission
+from jaxgran.models.course import Course
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.theory import averages, closed_forms
 
 
 class _State(NamedTuple):
-    # Chosen to stay of order one while T falls by decades. Units as in kinetics.
+    # Chosen to stay of order one while T falls by decades. Units as in theory.averages.
     log_temperature: Array  # ln(T/T_0)
     sonine: Array  # a_2
     diffusion: Array  # D / sqrt(T), so that cooling does not shrink it
@@ -29,17 +33,17 @@ class _State(NamedTuple):
     collisions: Array  # per particle
 
 
-class KineticTheory(eqx.Module):
+class KineticTheory(AbstractModel):
     """The homogeneous cooling gas, by Maxwell-Sonine kinetic theory; integrated with diffrax.
 
     ``dT/dt = -(2/d) mu_2 T (1 - c X_T/sigma)``,
     ``da_2/dt = (4/d) mu_2 (1 + a_2) - 4 mu_4/(d(d+2))``,
     ``dD/dt = T - nu_v D``, ``d<dr^2>/dt = 2 d D``, ``dN/dt = nu``, all but T from 0,
-    with averages exact in eps(v) (`jaxgran.kinetics.averages`). Leaves out correlations, clustering
-    and three-body contacts: right for dilute gases in boxes below L_c whose contacts are short.
-    The averages take eps(v) to be smooth: for a law of your own with a kink, such as an eps capped
-    at 1, use `jaxgran.DSMC`; ice that ends elastic is 3 % off after some 1e5 mean free times, and
-    ever more.
+    with averages exact in eps(v) (`jaxgran.theory.averages.averages`). Leaves out correlations,
+    clustering and three-body contacts: right for dilute gases in boxes below L_c whose contacts are
+    short. The averages assume that eps(v) is smooth: for a law of your own with a kink, such as an
+    eps capped at 1, use `jaxgran.DSMC`; T of ice, whose impacts become elastic at low speed, is 3 %
+    off after some 1e5 mean free times, and the error grows.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
 
@@ -74,44 +78,48 @@ class KineticTheory(eqx.Module):
         if self.averages not in ("exact", "paper"):
             raise ValueError(f'averages must be "exact" or "paper", got {self.averages!r}')
 
-    @property
-    def accuracy(self) -> float:
-        """Relative error of the gas's clock, the collision rate times the loss a collision.
-
-        For scenes inside the model's reach; measured against particle simulation at phi = .05.
-        """
-        return 0.015
+    stochastic: ClassVar[bool] = False
+    derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs
 
     def displacement_accuracy(self, gas: Gas) -> Float[Array, ""]:
-        """Relative error of <dr^2>: of the first Sonine order, and of free flights forgotten.
+        """Relative error of <dr^2>: first Sonine order of D, and correlated collisions.
 
-        Spheres that have met meet again, which kinetic theory leaves out: hard spheres diffuse
-        faster than Enskog's by 0.85 phi up to phi = .2, as Speedy's fit says, Mol. Phys. 62 (1987)
-        509; disks are taken alike.
+        Kinetic theory takes successive collisions as uncorrelated. Hard spheres diffuse faster than
+        Enskog's theory says, by the share 0.85 phi up to phi = .2 (Speedy, Mol. Phys. 62 (1987)
+        509); the same is assumed for disks.
         """
         correlation = 0.85 * jnp.minimum(gas.packing_fraction, 0.2)
         return jnp.hypot({2: 0.024, 3: 0.017}[gas.dimension], correlation)
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """``-d ln T/dt`` at t = 0, 1/s, of the Maxwellian gas; negative if the law heats it."""
-        speed = jnp.ones_like(gas.temperature)
-        mu_2 = self._averages(gas.reduced_law, speed, gas.dimension)[0, 0]
-        return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
+        return checks.first_cooling_rate(gas, self._averages)
 
-    def cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
-        """The cooling curve at the given times, s; see `jaxgran.cool`, which checks them.
+    def check(self, gas: Gas) -> None:
+        """Raise ValueError for a law that heats the gas or contacts too soft for the theory."""
+        if self.softness:
+            checks.check_softness(gas, _first_softness_factor(gas))
+        checks.check_cools(gas, self._averages)
 
-        Raises:
-            RuntimeError: if the solver fails, with what to do. Under `jax.jit` and `jax.vmap`,
-                where nothing can be raised, the curve of that gas is nan and carries a status.
-        """
-        curve = self._cool(gas, times)
-        if not isinstance(curve.status, Tracer) and int(np.asarray(curve.status)) != status.OK:
-            raise RuntimeError(status.explain(int(np.asarray(curve.status))))
-        return curve
+    def estimated_error(self, course: Course) -> float:
+        """Of Enskog's rate, lasting contacts and the terms beyond a_2 and the first softness."""
+        softness = course.second_order_softness if self.softness else course.softness
+        rate = course.homogeneous + course.lasting_contacts + softness
+        return course.error_of_temperature(rate + course.truncation)
+
+    def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
+        """Contacts that last, correlated collisions and boxes in which a flow grows."""
+        beyond = "beyond the first-order softness correction"
+        return checks.omitted_by_instant_impacts(gas, beyond) + checks.omitted_by_homogeneity(
+            gas, num_particles
+        )
+
+    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
+        """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        return self._simulate(gas, times)
 
     @eqx.filter_jit
-    def _cool(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
+    def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
         law = gas.reduced_law
         parameters, unravel = ravel_pytree(law)
@@ -151,27 +159,28 @@ class KineticTheory(eqx.Module):
             status=fault,
         )
 
-    def _averages(self, law: ReducedLaw, speed: Array, dimension: int) -> Array:
-        of = kinetics.averages if self.averages == "exact" else closed_forms.paper_averages
-        return of(law, speed, dimension)
+    @property
+    def _averages(self) -> Callable[..., Array]:
+        """The averages over impacts, a function of law, speed and dimension."""
+        return averages.averages if self.averages == "exact" else closed_forms.paper_averages
 
-    def _velocity(self, state: Array, averages: Array, law: ReducedLaw, dimension: int) -> Array:
+    def _velocity(self, state: Array, rates_of_a2: Array, law: ReducedLaw, dimension: int) -> Array:
         """Time derivative of the state, in reduced time."""
         log_theta, a2, diffusion, _, _ = state
         d = dimension
         speed = jnp.exp(log_theta / 2)
-        rates = kinetics.Rates.of(averages, a2)
+        rates = averages.Rates.of(rates_of_a2, a2)
         cooling = 2 / d * rates.cooling * speed
         peaking = 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment * speed
         if self.softness:
-            cooling = cooling * kinetics.softness_factor(law, speed, d)
+            cooling = cooling * averages.softness_factor(law, speed, d)
         maxwellian = not self.sonine or self.averages == "paper"
         rate = _State(
             log_temperature=-cooling,
             sonine=jnp.zeros_like(speed) if maxwellian else peaking,
             diffusion=speed / 2 - (rates.relaxation * speed - cooling / 2) * diffusion,
             displacement=2 * d * speed * diffusion,
-            collisions=kinetics.collision_rate(a2, d) * speed,
+            collisions=averages.collision_rate(a2, d) * speed,
         )
         return jnp.stack(rate)
 
@@ -191,35 +200,46 @@ class KineticTheory(eqx.Module):
 
         def tabulate(parameters):
             law = unravel(parameters)
-            averages = partial(self._averages, law, dimension=dimension)
-            return kinetics.RateTable.of(averages, times[-1], dimension, law.num_nodes)
+            averages_of = partial(self._averages, law, dimension=dimension)
+            return averages.RateTable.of(averages_of, times[-1], dimension, law.num_nodes)
 
-        def velocity(state, averages, parameters):
-            return self._velocity(state, averages, unravel(parameters), dimension)
+        def velocity(state, rates, parameters):
+            return self._velocity(state, rates, unravel(parameters), dimension)
 
         table, table_along = jax.linearize(tabulate, parameters)
         along = jax.vmap(lambda x: table_along(x).coefficients, out_axes=1)(directions)
-        tables_along = kinetics.RateTable(along, table.lowest)
+        tables_along = averages.RateTable(along, table.lowest)
+        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
 
         def rows_velocity(s, rows, args):
             # s = ln(1 + t): a power law of time takes the same number of steps each decade.
             # Row 0 is the state; the others, its tangents, obey the linearised equation.
             state, state_tangents = rows[0], rows[1:]
             log_theta, ones = state[0], jnp.ones((), times.dtype)
-            averages, slope = jax.jvp(table, (log_theta,), (ones,))
+            rates, slope = jax.jvp(table, (log_theta,), (ones,))
 
-            def along(tangent, averages_along, direction):
-                averages_along = averages_along + slope * tangent[0]
-                at = (state, averages, parameters)
-                return jax.jvp(velocity, at, (tangent, averages_along, direction))[1]
+            def along(tangent, rates_along, direction):
+                rates_along = rates_along + slope * tangent[0]
+                at = (state, rates, parameters)
+                return jax.jvp(velocity, at, (tangent, rates_along, direction))[1]
 
-            rate = velocity(state, averages, parameters)
+            rate = velocity(state, rates, parameters)
             rates_along = jax.vmap(along)(state_tangents, tables_along(log_theta), directions)
-            rates = jnp.concatenate([rate[None], rates_along]) * jnp.exp(s)
-            return jnp.where(known, rates, 0.0)
+            both = jnp.concatenate([rate[None], rates_along]) * jnp.exp(s)
+            return jnp.where(known, both, 0.0)
 
-        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
-        # A gas of nan stands still, lest its solver try ever shorter steps; its curve is nan.
+        rows, fault = self._integrate(rows_velocity, 1 + len(directions), times, known)
+        states = rows[:, 0]
+        velocities = jax.vmap(lambda x: velocity(x, table(x[0]), parameters))(states)
+        jacobian = jnp.moveaxis(rows[:, 1:], 2, 0)
+        jacobian = jnp.swapaxes(jacobian, 1, 2)
+        return _State(*states.T), _State(*velocities.T), _State(*jacobian), fault
+
+    def _integrate(
+        self, rows_velocity: Callable, num_rows: int, times: Array, known: Array
+    ) -> tuple[Array, Int[Array, ""]]:
+        """The rows at the given reduced times, shape (times, rows, states), and a status."""
+        # A gas of nan keeps its state, so that its solver does not try ever shorter steps.
         times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=times.dtype))
         s = jnp.log1p(times)
         rtol = self.rtol or (1e-9 if times.dtype == jnp.float64 else 1e-5)
@@ -236,7 +256,7 @@ class KineticTheory(eqx.Module):
             t0=jnp.zeros((), times.dtype),
             t1=s[-1],
             dt0=None,
-            y0=jnp.zeros((1 + len(directions), len(_State._fields)), times.dtype),
+            y0=jnp.zeros((num_rows, len(_State._fields)), times.dtype),
             saveat=diffrax.SaveAt(ts=s),
             stepsize_controller=controller,
             adjoint=diffrax.ForwardMode(),
@@ -249,9 +269,10 @@ class KineticTheory(eqx.Module):
         spent = solution.result == diffrax.RESULTS.max_steps_reached
         fault = status.flag(status.STEPS_SPENT, spent)
         fault |= status.flag(status.NOT_FINITE, ~spent & ~(ended & finite))
-        rows = jnp.where(fault == status.OK, solution.ys, jnp.nan)
-        states = rows[:, 0]
-        velocities = jax.vmap(lambda x: velocity(x, table(x[0]), parameters))(states)
-        jacobian = jnp.moveaxis(rows[:, 1:], 2, 0)
-        jacobian = jnp.swapaxes(jacobian, 1, 2)
-        return _State(*states.T), _State(*velocities.T), _State(*jacobian), fault
+        return jnp.where(fault == status.OK, solution.ys, jnp.nan), fault
+
+
+@eqx.filter_jit
+def _first_softness_factor(gas: Gas) -> Float[Array, ""]:
+    at_start = jnp.ones_like(gas.temperature)
+    return averages.softness_factor(gas.reduced_law, at_start, gas.dimension)

@@ -1,0 +1,134 @@
+"""Validation of numbers given by a user, and the map between a range and the whole real line."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+if TYPE_CHECKING:
+    UserNumber = ArrayLike | Sequence[float]
+else:
+    # A run-time type checker lets everything pass, so that a wrong type is reported in words.
+    UserNumber = Any
+
+
+class Domain(NamedTuple):
+    """The interval of allowed values of a number; open, unless an end is said to be included.
+
+    Attributes:
+        low, high: the ends; may be infinite.
+        low_allowed, high_allowed: whether the end itself is an allowed value.
+    """
+
+    low: float = -np.inf
+    high: float = np.inf
+    low_allowed: bool = False
+    high_allowed: bool = False
+
+    def __str__(self) -> str:
+        left = "[" if self.low_allowed else "("
+        right = "]" if self.high_allowed else ")"
+        return f"{left}{self.low:g}, {self.high:g}{right}"
+
+    def check(self, name: str, value: UserNumber, advice: str = "") -> None:
+        """Check that every element of a value is finite and lies in the interval.
+
+        Traced values are not checked.
+
+        Args:
+            name: name of the value in the error message.
+            value: any shape.
+            advice: a sentence that tells the user what to do; ends the error message.
+
+        Raises:
+            ValueError: if the value is no number, or an element is not finite or lies outside.
+        """
+        if isinstance(value, Tracer):
+            return
+        try:
+            numbers = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"{name} must be a number in {self}, got {value!r}. {advice}"
+            ) from None
+        above = numbers >= self.low if self.low_allowed else numbers > self.low
+        below = numbers <= self.high if self.high_allowed else numbers < self.high
+        wrong = ~(above & below & np.isfinite(numbers))
+        if np.any(wrong):
+            raise ValueError(f"{name} must lie in {self}, got {numbers[wrong].flat[0]:g}. {advice}")
+
+    def to_free(self, value: ArrayLike) -> Float[Array, "..."]:
+        """Map the interior of the interval one-to-one onto the whole real line.
+
+        The identity if both ends are infinite, ``ln(x - low)`` if only the upper one is, else the
+        logit ``ln(x - low) - ln(high - x)``.
+        """
+        value = jnp.asarray(value)
+        if np.isinf(self.low) and np.isinf(self.high):
+            return value
+        if np.isinf(self.high):
+            return jnp.log(value - self.low)
+        return jnp.log(value - self.low) - jnp.log(self.high - value)
+
+    def from_free(self, free: ArrayLike) -> Float[Array, "..."]:
+        """Inverse of `to_free`."""
+        free = jnp.asarray(free)
+        if np.isinf(self.low) and np.isinf(self.high):
+            return free
+        if np.isinf(self.high):
+            return self.low + jnp.exp(free)
+        return self.low + (self.high - self.low) * jax.nn.sigmoid(free)
+
+
+POSITIVE = Domain(low=0.0)
+NOT_NEGATIVE = Domain(low=0.0, low_allowed=True)
+FRACTION = Domain(low=0.0, high=1.0, low_allowed=True, high_allowed=True)
+ANY = Domain()
+
+
+def number(value: UserNumber) -> Float[Array, "..."]:
+    """Convert a number, or a list of numbers, to a JAX array of the default float type.
+
+    The array is strongly typed, so that two Python floats do not cause two compilations.
+
+    Raises:
+        ValueError: if the value cannot be converted.
+    """
+    try:
+        return jnp.asarray(value, dtype=jnp.result_type(float))
+    except (TypeError, ValueError):
+        raise ValueError(f"expected a number or an array of numbers, got {value!r}") from None
+
+
+def checked_times(times: UserNumber) -> Float[Array, "times"]:
+    """Convert output times to a JAX array, after checking that they increase from t >= 0.
+
+    Traced times are not checked.
+
+    Args:
+        times: t, s, shape (times,).
+
+    Raises:
+        ValueError: if there is no time, or times are not finite, negative or not increasing.
+    """
+    if not isinstance(times, Tracer):
+        numbers = np.asarray(times, dtype=float)
+        if numbers.ndim != 1 or numbers.size == 0:
+            raise ValueError(f"times must be a list of numbers, got shape {numbers.shape}")
+        wrong = ~np.isfinite(numbers) | (numbers < 0)
+        if np.any(wrong):
+            raise ValueError(
+                f"times must be finite and not negative, got {numbers[wrong][0]:g}; "
+                "the gas starts at t = 0"
+            )
+        if np.any(np.diff(numbers) <= 0):
+            i = int(np.argmax(np.diff(numbers) <= 0)) + 1
+            raise ValueError(
+                f"times must increase, got {numbers[i]:g} after {numbers[i - 1]:g}; sort them and "
+                "remove repeated ones"
+            )
+    return jnp.asarray(times, dtype=jnp.result_type(float))

@@ -1,0 +1,152 @@
+"""Checkpoints: the state of a run in a file, from which only the same run can be resumed.
+
+The first line is a JSON object: format, version of jaxgran, fingerprint of the scene, the type and
+shape of every array, and the SHA-256 digest of the rest. The rest is what
+`equinox.tree_serialise_leaves` writes.
+"""
+
+import hashlib
+import io
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxgran.data.files import write_whole
+
+FORMAT = 2
+
+
+def fingerprint(*trees: Any) -> str:
+    """SHA-256 digest of the structure, the types and the values of some pytrees.
+
+    Static fields belong to the structure.
+    """
+    digest = hashlib.sha256()
+    for tree in trees:
+        leaves, structure = jax.tree.flatten(tree)
+        digest.update(str(structure).encode())
+        for leaf in leaves:
+            if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+                leaf = jax.random.key_data(leaf)
+            array = np.asarray(leaf)
+            digest.update(f"{array.dtype}{array.shape}".encode())
+            digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def refuse(path: str | Path | None, model: str) -> None:
+    """Refuse a checkpoint where a model runs inside compiled code, which cannot write files.
+
+    Raises:
+        ValueError: if `path` is not None.
+    """
+    if path is not None:
+        raise ValueError(
+            f"inside jax.jit, jax.vmap and derivatives {model} keeps no checkpoint: leave "
+            f"checkpoint out, got {str(path)!r}"
+        )
+
+
+def save(path: str | Path, scene: str, tree: Any) -> None:
+    """Write the arrays of a pytree to a checkpoint, atomically.
+
+    Args:
+        path: the file; an existing one is replaced.
+        scene: fingerprint of everything that determines the run.
+        tree: JAX and NumPy arrays and Python numbers.
+
+    Raises:
+        OSError: naming the path, if it cannot be written; an existing file is then unchanged.
+    """
+    body = io.BytesIO()
+    eqx.tree_serialise_leaves(body, tree)
+    header = {
+        "format": FORMAT,
+        "version": version("jaxgran"),
+        "scene": scene,
+        "arrays": _types_and_shapes(tree),
+        "digest": hashlib.sha256(body.getbuffer()).hexdigest(),
+    }
+
+    def write(file):
+        file.write(json.dumps(header).encode() + b"\n")
+        file.write(body.getbuffer())
+
+    write_whole(path, write)
+
+
+def load(path: str | Path, scene: str, like: Any) -> Any:
+    """Read a checkpoint.
+
+    Args:
+        path: the file that `save` wrote.
+        scene: fingerprint of everything that determines the run.
+        like: a pytree with the structure, types and shapes of the saved one.
+
+    Returns:
+        A pytree like `like` with the saved values.
+
+    Raises:
+        ValueError: if the file cannot be read, is no checkpoint, is damaged, or belongs to another
+            version, format or scene.
+    """
+    header, body = _read(path)
+    _check_version(path, header)
+    damaged = (
+        f"{path} is damaged: its arrays do not match its header; name another file, or remove it"
+    )
+    if hashlib.sha256(body).hexdigest() != header["digest"]:
+        raise ValueError(damaged)
+    if header["scene"] != scene or header["arrays"] != _types_and_shapes(like):
+        raise ValueError(
+            f"{path} belongs to another scene: gas, times, model, precision or start differ; name "
+            "another file, or remove it to begin anew"
+        )
+    try:
+        return eqx.tree_deserialise_leaves(io.BytesIO(body), like)
+    except RuntimeError:  # a file made by hand
+        raise ValueError(damaged) from None
+
+
+def _types_and_shapes(tree: Any) -> list[str]:
+    """Type and shape of every leaf, such as "float64(3, 2)"."""
+    leaves = jax.tree.leaves(tree)
+    return [f"{getattr(leaf, 'dtype', type(leaf).__name__)}{np.shape(leaf)}" for leaf in leaves]
+
+
+def _read(path: str | Path) -> tuple[dict[str, Any], bytes]:
+    """The header and the body of a checkpoint."""
+    try:
+        with open(path, "rb") as file:
+            line = file.readline()
+            body = file.read()
+        header = json.loads(line)
+        missing = {"format", "version", "scene", "arrays", "digest"} - set(header)
+        if missing:
+            raise ValueError(f"its first line lacks {', '.join(sorted(missing))}")
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise ValueError(
+            f"{path} is no checkpoint of jaxgran ({error}); name another file, or remove it"
+        ) from None
+    return header, body
+
+
+def _check_version(path: str | Path, header: dict[str, Any]) -> None:
+    """Refuse a checkpoint of another format or another version of jaxgran."""
+    if header["format"] != FORMAT:
+        raise ValueError(
+            f"{path} was written by jaxgran {header['version']} in checkpoint format "
+            f"{header['format']}, this is format {FORMAT}; finish the run with that version"
+        )
+    if header["version"] != version("jaxgran"):
+        raise ValueError(
+            f"{path} was written by jaxgran {header['version']}, this is {version('jaxgran')}, "
+            "which may compute different steps; finish the run with that version, or remove the "
+            "file"
+        )

@@ -1,0 +1,155 @@
+"""Cooling curves: one type for measured and for simulated ones, and its validation."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+MIN_POINTS = 3
+"""The smallest number of times of a measured curve."""
+
+COLUMNS = {
+    "t": "times",
+    "T": "temperature",
+    "T_err": "temperature_error",
+    "msd": "displacement",
+    "msd_err": "displacement_error",
+}
+"""Measured quantities: names of the columns of a file, and the fields of `CoolingCurve`."""
+
+
+class Particles(NamedTuple):
+    """Positions and velocities of all particles of all replicas at one time.
+
+    Attributes:
+        position: in [0, box_side), m, shape (replicas, N, d).
+        velocity: m/s, same shape.
+        box_side: side of the periodic cube (d = 3) or square (d = 2), m.
+    """
+
+    position: Float[Array, "replicas N d"]
+    velocity: Float[Array, "replicas N d"]
+    box_side: Float[Array, ""]
+
+
+class CoolingCurve(eqx.Module):
+    """Temperature, and what else is known, of a cooling gas at given times; measured or computed.
+
+    All arrays have the shape of `times`, those of `replicas` a first axis of replicas besides.
+
+    Attributes:
+        times: t, s, increasing.
+        temperature: T = <v^2>/d, m^2/s^2.
+        displacement: mean square displacement <dr^2> since t = 0, m^2; None if unknown.
+        sonine: a_2, second Sonine coefficient of the velocity distribution; None if unknown.
+        collisions: collisions per particle since t = 0; None if unknown.
+        diffusion: self-diffusion coefficient D(t), m^2/s; None if unknown.
+        temperature_error: standard error of T, m^2/s^2, of a measured or stochastic curve.
+        displacement_error: standard error of <dr^2>, m^2.
+        velocity_correlation: <v(0) . v(t)>/d, m^2/s^2, of particle models.
+        elastic_energy: energy of the contacts per particle, J, of soft spheres.
+        dissipated_energy: energy dissipated since t = 0 per particle, J, of soft and hard spheres.
+            The sum of (d/2) m T, elastic and dissipated energy is constant.
+        regularised: impacts per particle, of hard spheres, that were made elastic to prevent
+            inelastic collapse.
+        replicas: the curve of each replica, with arrays of shape (replicas, times).
+        particles: the final state of a particle model.
+        status: 0, or the faults of a run under `jax.jit` or `jax.vmap`, where nothing can be
+            raised; values are then nan. `jaxgran.explain_status` puts it into words.
+    """
+
+    times: Float[Array, "times"]
+    temperature: Float[Array, "... times"]
+    displacement: Float[Array, "... times"] | None = None
+    sonine: Float[Array, "... times"] | None = None
+    collisions: Float[Array, "... times"] | None = None
+    diffusion: Float[Array, "... times"] | None = None
+    temperature_error: Float[Array, "... times"] | None = None
+    displacement_error: Float[Array, "... times"] | None = None
+    velocity_correlation: Float[Array, "... times"] | None = None
+    elastic_energy: Float[Array, "... times"] | None = None
+    dissipated_energy: Float[Array, "... times"] | None = None
+    regularised: Float[Array, "... times"] | None = None
+    replicas: "CoolingCurve | None" = None
+    particles: Particles | None = None
+    status: Int[Array, ""] | None = None
+
+    @classmethod
+    def of_replicas(cls, times: Array, values: dict[str, Any], **others: Any) -> "CoolingCurve":
+        """The mean curve of independent replicas, with standard errors if there are two or more.
+
+        Args:
+            times: t, s, shape (times,).
+            values: fields of the curve by name, each of shape (replicas, times).
+            others: further fields, taken over as they are.
+        """
+        means: dict[str, Any] = {name: jnp.mean(each, axis=0) for name, each in values.items()}
+        num_replicas = len(values["temperature"])
+        if num_replicas > 1:
+            for name in ("temperature", "displacement"):
+                # At t = 0 all replicas agree, and the derivative of a root at 0 is not finite.
+                deviation = jnp.std(jax.lax.stop_gradient(values[name]), axis=0, ddof=1)
+                means[f"{name}_error"] = deviation / num_replicas**0.5
+        return cls(times=times, **means, replicas=cls(times=times, **values), **others)
+
+    def check(self, place: Callable[[int], str] = "point {}".format) -> None:
+        """Check that this can be a measured curve: finite, positive, at increasing times.
+
+        At t = 0, where the state of the gas was prepared, an error and a displacement may be 0.
+        Traced curves are not checked.
+
+        Args:
+            place: returns the name of a point, given its index, for error messages.
+
+        Raises:
+            ValueError: naming the first wrong point, and saying what to do.
+        """
+        if isinstance(self.times, Tracer) or isinstance(self.temperature, Tracer):
+            return
+        times = np.asarray(self.times)
+        if times.ndim != 1 or times.size < MIN_POINTS:
+            raise ValueError(
+                f"a curve needs at least {MIN_POINTS} points, got {times.size}; "
+                "measure the cooling at more times"
+            )
+        for column, field in COLUMNS.items():
+            values = getattr(self, field)
+            if values is not None and not isinstance(values, Tracer):
+                _check_column(column, np.asarray(values), times, place)
+        not_later = np.flatnonzero(np.diff(times) <= 0)
+        if not_later.size:
+            i = int(not_later[0]) + 1
+            raise ValueError(
+                f"{place(i)}: t is {times[i]:g} after {times[i - 1]:g}; times must increase: "
+                "sort the rows by time and remove repeated ones"
+            )
+
+
+def _check_column(
+    column: str,
+    values: np.ndarray,
+    times: Float[np.ndarray, "times"],
+    place: Callable[[int], str],
+) -> None:
+    """Check the values of one measured quantity: one for each time, finite and positive."""
+    if values.shape != times.shape:
+        raise ValueError(
+            f"{column} has shape {values.shape}, but there are {times.size} times; "
+            "give one value for each time"
+        )
+    zero_allowed = np.zeros(times.shape, bool)
+    if column != "T":
+        zero_allowed[0] = column == "t" or times[0] == 0
+    wrong = ~np.isfinite(values) | ~((values > 0) | zero_allowed & (values == 0))
+    if np.any(wrong):
+        i = int(np.argmax(wrong))
+        raise ValueError(
+            f"{place(i)}: {column} is {values[i]:g}, it must be a positive number"
+            + ("" if column == "T" else " (zero is allowed in a first row at t = 0 only)")
+            + "; correct or remove this row"
+        )

@@ -1,0 +1,206 @@
+"""Files of measured cooling curves: CSV with a header that describes the gas."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxgran.data.curve import COLUMNS, MIN_POINTS, CoolingCurve
+from jaxgran.data.files import write_whole
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.geometry import sphere_mass
+from jaxgran.scene.restitution import Viscoelastic
+
+GAS_KEYS = ("eta", "diameter", "density", "Y", "nu", "T0")
+"""Keys of the header that `read_gas` needs."""
+
+
+def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
+    """Read a measured cooling curve from a CSV file.
+
+    The file has header lines ``# key: value``, a line with the names of the columns, and rows of
+    numbers::
+
+        # eta: 0.05
+        t,T,T_err,msd
+        0.0,1.0e-2,0,0
+        7.8e-3,9.79e-3,8.0e-6,1.7e-6
+
+    Args:
+        path: the file. Its columns are t (s) and T (m^2/s^2) and, where measured, T_err (m^2/s^2),
+            msd and msd_err (m^2), in any order.
+
+    Returns:
+        The curve, and the header as a dictionary of strings.
+
+    Raises:
+        ValueError: saying what is wrong, in which line, and what to do.
+    """
+    path = Path(path)
+    header: dict[str, str] = {}
+    names: list[str] = []
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    for i, line in enumerate(_read_text(path).splitlines(), start=1):
+        line = line.strip()
+        if line.startswith("#"):
+            key, colon, value = line[1:].partition(":")
+            if colon:
+                header[key.strip()] = value.strip()
+        elif line and not names:
+            names = _column_names(path, i, line)
+        elif line:
+            rows.append(_row(path, i, line, names))
+            lines.append(i)
+    if len(rows) < MIN_POINTS:
+        raise ValueError(
+            f"{path}: {len(rows)} rows of numbers, at least {MIN_POINTS} are needed; "
+            "measure the cooling at more times"
+        )
+    columns = jnp.asarray(np.array(rows, dtype=float).T)
+    fields = {COLUMNS[name]: column for name, column in zip(names, columns, strict=True)}
+    curve = CoolingCurve(**fields)
+    curve.check(lambda i: f"{path}, line {lines[i]}")
+    return curve, header
+
+
+def _read_text(path: Path) -> str:
+    """The text of a file; ValueError if it cannot be read, is empty or is no text."""
+    columns = "t,T[,T_err][,msd][,msd_err]"
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; check the path") from None
+    except (UnicodeDecodeError, IsADirectoryError):
+        raise ValueError(
+            f"{path}: not a text file; give a CSV file with the columns {columns}"
+        ) from None
+    except OSError as error:
+        raise ValueError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions"
+        ) from None
+    if "\x00" in text:
+        raise ValueError(f"{path}: a binary file; give a CSV file with the columns {columns}")
+    if not text.strip():
+        raise ValueError(f"{path}: the file is empty; it needs the columns {columns}")
+    return text
+
+
+def _column_names(path: Path, i: int, line: str) -> list[str]:
+    """Names of the columns from line i; ValueError if one is unknown, missing or repeated."""
+    names = [name.strip() for name in line.split(",")]
+    unknown = [name for name in names if name not in COLUMNS]
+    missing = [name for name in ("t", "T") if name not in names]
+    if unknown or missing or len(set(names)) < len(names):
+        raise ValueError(
+            f"{path}, line {i}: the columns are {', '.join(names)}; "
+            + (f"missing: {', '.join(missing)}; " if missing else "")
+            + (f"not known: {', '.join(unknown)}; " if unknown else "")
+            + f"name them t,T and, where measured, {', '.join(list(COLUMNS)[2:])}, each once"
+        )
+    return names
+
+
+def _row(path: Path, i: int, line: str, names: list[str]) -> list[float]:
+    """The numbers of line i; ValueError unless there is a finite one for each column."""
+    cells = line.split(",")
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError:
+        values = []
+    if len(values) != len(names) or not np.all(np.isfinite(values)):
+        raise ValueError(
+            f"{path}, line {i}: expected {len(names)} finite numbers ({','.join(names)}), "
+            f"got {line!r}; correct or remove this row"
+        )
+    return values
+
+
+def read_gas(header: dict[str, str]) -> Gas:
+    """The gas that the header of a curve describes, with A = 0, since A is what a fit estimates.
+
+    Args:
+        header: eta (the packing fraction), diameter (m), density (of the material, kg/m^3), Y
+            (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension, as `read_curve` returns them.
+
+    Returns:
+        A gas of viscoelastic spheres.
+
+    Raises:
+        ValueError: for a missing key, or a value that is no number or outside its range.
+    """
+    missing = [key for key in GAS_KEYS if key not in header]
+    if missing:
+        raise ValueError(
+            f"the header lacks {', '.join(missing)}; add lines such as '# {missing[0]}: VALUE' "
+            f"(needed: {', '.join(GAS_KEYS)}; in SI units)"
+        )
+    values = {key: header_number(header, key) for key in GAS_KEYS}
+    law = Viscoelastic(values["Y"], values["nu"], 0.0)
+    return Gas(
+        law,
+        diameter=values["diameter"],
+        mass=sphere_mass(values["diameter"], values["density"]),
+        packing_fraction=values["eta"],
+        temperature=values["T0"],
+        dimension=header_count(header, "dimension") or 3,
+    )
+
+
+def header_number(header: dict[str, str], key: str) -> float:
+    """The value of a key in the header of a curve, as a number.
+
+    Raises:
+        ValueError: if the value is not a number.
+        KeyError: if there is no such key.
+    """
+    try:
+        return float(header[key])
+    except ValueError:
+        raise ValueError(f"header line {key}: {header[key]!r} is not a number") from None
+
+
+def header_count(header: dict[str, str], key: str) -> int | None:
+    """The value of a key in the header of a curve, such as N, as a positive whole number.
+
+    Returns:
+        The number, or None if there is no such key.
+
+    Raises:
+        ValueError: if the value is not a positive whole number.
+    """
+    if key not in header:
+        return None
+    number = header_number(header, key)
+    if not (number >= 1 and number.is_integer()):
+        raise ValueError(f"header line {key}: must be a positive whole number, got {header[key]!r}")
+    return int(number)
+
+
+def write_curve(
+    path: str | Path, curve: CoolingCurve, header: dict[str, str], *, overwrite: bool = False
+) -> None:
+    """Write a curve to a CSV file in the format that `read_curve` reads.
+
+    Numbers are written with 17 digits, so that they are read back without loss.
+
+    Args:
+        path: the file.
+        curve: its t, T and, where known, T_err, msd and msd_err are written.
+        header: written as lines ``# key: value``.
+        overwrite: whether an existing file may be replaced.
+
+    Raises:
+        ValueError: if the file exists and `overwrite` is False.
+        OSError: naming the path, if it cannot be written; an existing file is then unchanged.
+    """
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists; choose another name or say overwrite=True")
+    fields = {name: getattr(curve, field) for name, field in COLUMNS.items()}
+    present = {name: np.asarray(v) for name, v in fields.items() if v is not None}
+    lines = [f"# {key}: {value}" for key, value in header.items()]
+    lines.append(",".join(present))
+    lines += [",".join(f"{x:.17g}" for x in row) for row in zip(*present.values(), strict=True)]
+    text = "\n".join(lines) + "\n"
+    write_whole(path, lambda f: f.write(text.encode()))

@@ -1,0 +1,24 @@
+"""The options of one run, as opposed to the description of a model."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxtyping import PRNGKeyArray
+
+
+class Run(NamedTuple):
+    """The options of one run. `jaxgran.cool` makes it from its arguments.
+
+    Attributes:
+        key: of the random numbers; None is `jax.random.key(0)`. Deterministic models ignore it.
+        progress: show a progress bar on a terminal.
+        checkpoint: file to which the run is saved and from which it is resumed; None for none.
+    """
+
+    key: PRNGKeyArray | None = None
+    progress: bool = False
+    checkpoint: str | Path | None = None
+
+
+DEFAULTS = Run()
+"""A silent run with the default random numbers, not saved."""

@@ -1,0 +1,16 @@
+"""Fits of the parameters of a gas to a measured cooling curve.
+
+- `fit`: the public function: checks of its arguments, warnings.
+- `deterministic`: a fit through a model without noise, and its residuals; uses `least_squares`, the
+  minimisers (Levenberg-Marquardt, L-BFGS).
+- `stochastic`: a fit through a model with noise; uses `gauss_newton`, the search through
+  repeated simulations.
+- `guess`: initial guesses from the measured curve.
+- `parameters`: the free parameters as one array in a scale without bounds.
+- `result`: `Fit`, what a fit returns, and goodness of fit.
+- `diagnosis`: what a fit means, in words.
+
+The top floor: may import every other package. Models are known by `jaxgran.AbstractModel` only;
+`KineticTheory` is imported as the default model. Is imported by `jaxgran` itself, `jaxgran.plotting`
+and experiments. Nothing is re-exported.
+"""

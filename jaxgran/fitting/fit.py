@@ -1,0 +1,170 @@
+"""Fit floats of a gas to a measured cooling curve."""
+
+import warnings
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import PRNGKeyArray
+
+from jaxgran.checks import status
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.deterministic import SEARCHES, fit_deterministic
+from jaxgran.fitting.guess import guess_from_data
+from jaxgran.fitting.result import Fit
+from jaxgran.fitting.stochastic import fit_stochastic
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.scene.gas import Gas
+
+
+def fit(
+    gas: Gas,
+    curve: CoolingCurve,
+    *,
+    model: AbstractModel | None = None,
+    free: tuple[str, ...] = ("dissipative_constant",),
+    start: Gas | None = None,
+    num_particles: int | None = None,
+    method: Literal["levenberg-marquardt", "lbfgs"] = "levenberg-marquardt",
+    max_steps: int | None = None,
+    key: PRNGKeyArray | None = None,
+    progress: bool = True,
+) -> Fit:
+    """Estimate floats of a gas from its measured cooling curve.
+
+    Minimises ``chi^2 = sum [(ln T_measured - ln T_model) / (T_err/T)]^2``, to which <dr^2> adds the
+    like where it is measured with a known error, over the free floats in a scale without bounds
+    (the logarithm of a positive one). Points with an error of 0 (a prepared state at t = 0) have no
+    weight. <dr^2> is compared to within the model's accuracy (kinetic theory in 3D: 1.7 %), which
+    applies both to each point and to a common factor of the diffusive part.
+
+    A deterministic model is fitted by least squares; this works under `jax.vmap` and `jax.jit`. A
+    stochastic one is fitted to T alone, by Gauss-Newton steps on one simulation each, beginning at
+    the result of kinetic theory's fit (or at `start`). The errors then include the noise of the
+    simulations, estimated from their replicas. A derivative that is biased by some per cent slows
+    the search and scales the standard error by as much, but does not move the answer, which is
+    where the residuals vanish.
+
+    Args:
+        gas: the scene. Its values of free parameters are not used where the data give a guess (A,
+            T_0, a constant restitution); elsewhere they are the guess.
+        curve: the measurement; without errors of T their relative size is taken to be the same at
+            all times, and estimated from the scatter.
+        model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`; a stochastic one
+            needs two or more replicas.
+        free: names of floats of the gas or its law, such as "temperature" (which is T_0).
+        start: a gas whose values are another guess for a deterministic model, which begins at the
+            better one, and the only guess for a stochastic model.
+        num_particles: number of particles over which <dr^2> is a mean; gives its relative error,
+            ``sqrt(2 / (d N))``, where the curve has none. Without either <dr^2> is not used, nor
+            is it where T has no errors, as their weights could not be compared.
+        method: Levenberg-Marquardt, or L-BFGS by reverse mode (deterministic models only).
+        max_steps: >= 1; most steps of Levenberg-Marquardt or evaluations of L-BFGS, 100 by default;
+            most simulations of a stochastic model, 8.
+        key: of the random numbers of a stochastic model. Without one it is `jax.random.key(0)`: two
+            such calls return the same numbers.
+        progress: show progress bars on a terminal during simulations.
+
+    Returns:
+        `Fit`; `jaxgran.diagnose` says in words what it means.
+
+    Raises:
+        ValueError: for an unknown parameter or method, a curve that cannot be one (see
+            `CoolingCurve.check`), no more points with a weight than parameters, or a scene that the
+            model cannot take or fit.
+        RuntimeError: if the model cannot compute the curve where the search ends. Under `jax.vmap`,
+            where nothing can be raised, chi2 and the errors of that fit are nan, `converged` is
+            False and `curve.status` tells why.
+
+    This docstring is long because the arguments mean different things to the two kinds of models.
+    """
+    _check_request(gas, curve, free, max_steps, num_particles)
+    names = tuple(free)
+    model = KineticTheory() if model is None else model
+    _check_model(model, method, names)
+    if model.stochastic:
+        max_runs = 8 if max_steps is None else max_steps
+        result = fit_stochastic(gas, curve, model, names, start, key, progress, max_runs)
+    else:
+        guesses = [guess_from_data(gas, curve, names)] + ([] if start is None else [start])
+        model.check(guesses[-1])
+        steps = 100 if max_steps is None else max_steps
+        result = fit_deterministic(gas, curve, model, names, guesses, num_particles, method, steps)
+    if not isinstance(result.chi2, Tracer):
+        _check_computed(result)
+        _warn(result)
+    return result
+
+
+def _check_request(
+    gas: Gas,
+    curve: CoolingCurve,
+    free: tuple[str, ...],
+    max_steps: int | None,
+    num_particles: int | None,
+) -> None:
+    curve.check()
+    if isinstance(free, str) or not free or len(set(free)) < len(free):
+        raise ValueError(f"free must be a tuple of different names, got {free!r}")
+    for name in free:
+        gas.value(name)
+    for name, number in (("max_steps", max_steps), ("num_particles", num_particles)):
+        if number is not None and not (isinstance(number, int | np.integer) and number >= 1):
+            raise ValueError(f"{name} must be a whole number >= 1, or None, got {number!r}")
+    size, points = sum(gas.value(name).size for name in free), curve.times.shape[-1]
+    if curve.temperature_error is not None and not isinstance(curve.temperature_error, Tracer):
+        points = int(np.sum(np.asarray(curve.temperature_error) > 0))
+    if points <= size:
+        raise ValueError(
+            f"{points} points (those with an error of 0 not counted) cannot determine {size} "
+            "parameters; free fewer of them"
+        )
+
+
+def _check_model(model: AbstractModel, method: str, names: tuple[str, ...]) -> None:
+    if method not in SEARCHES:
+        known = " or ".join(f'"{name}"' for name in SEARCHES)
+        raise ValueError(f"method must be {known}, got {method!r}")
+    if not isinstance(model, AbstractModel):
+        raise ValueError(
+            f"model must be a model, got {model!r}; choose_model(fit(gas, curve).gas, curve.times, "
+            "num_particles=N, replicas=3).model is the one this curve needs"
+        )
+    if model.stochastic and method != "levenberg-marquardt":
+        raise ValueError(f"a stochastic model is fitted by least squares, not by {method!r}")
+    replicas = getattr(model, "replicas", None)
+    if model.stochastic and isinstance(replicas, int) and replicas < 2:
+        raise ValueError(
+            f"a fit through {type(model).__name__} needs replicas >= 2, whose scatter is its "
+            f"noise; got {replicas}"
+        )
+    model.check_fit(names)
+
+
+def _check_computed(result: Fit) -> None:
+    fault = status.OK if result.curve.status is None else int(result.curve.status)
+    if fault != status.OK:
+        values = zip(result.names, np.asarray(result.estimate), strict=False)
+        at = ", ".join(f"{name} = {value:.3g}" for name, value in values)
+        raise RuntimeError(
+            f"{type(result.model).__name__} could not compute the curve at {at}, where the search "
+            f"ended: {status.explain(fault)}"
+        )
+
+
+def _warn(result: Fit) -> None:
+    if result.chi2.dtype == jnp.float32:
+        warnings.warn(
+            "fitting in float32: errors below 1e-4 are noise; "
+            'jax.config.update("jax_enable_x64", True) first',
+            stacklevel=3,
+        )
+    group = result.undetermined()
+    if group:
+        warnings.warn(
+            f"the curve does not determine {' and '.join(group)}: it depends on a combination of "
+            "them only (in a gas of hard spheres A and Y enter as A Y^(2/5) alone); free fewer",
+            stacklevel=3,
+        )

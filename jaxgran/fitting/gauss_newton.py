@@ -1,0 +1,205 @@
+"""Gauss-Newton search through simulations, whose residuals have noise of their own.
+
+Every step is made from one simulation with fresh random numbers and its derivatives. The answer is
+the mean of the Gauss-Newton estimates of all simulations near it.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from tqdm import tqdm
+
+from jaxgran.data.curve import CoolingCurve
+
+LONGEST_STEP = 0.7
+"""Longest Gauss-Newton step of a parameter in its unbounded scale: a factor of two."""
+
+NEAR = 0.1
+"""Distance in every parameter's unbounded scale within which runs are averaged."""
+
+QUIET = 0.5
+"""Share of the standard error below which the noise of the simulations needs no further runs."""
+
+NOISE_WINDOW = 9
+"""Neighbouring times over which the variance between replicas is averaged."""
+
+
+class Simulated(NamedTuple):
+    """Result of a search through simulations, of p parameters in their unbounded scale.
+
+    Attributes:
+        flat: the estimate.
+        computed: the curve of the last run.
+        residuals: weighted, at `flat` by linear extrapolation of the runs; 0 where not used.
+        sensitivity: derivative of the weighted residuals.
+        error_covariance: covariance of `flat` by the errors of the measurement.
+        noise_covariance: and by the noise of the simulations.
+        num_runs: simulations made.
+        converged: whether the last step was below `NEAR`.
+    """
+
+    flat: Float[np.ndarray, "p"]
+    computed: CoolingCurve
+    residuals: Float[np.ndarray, "times"]
+    sensitivity: Float[np.ndarray, "times p"]
+    error_covariance: Float[np.ndarray, "p p"]
+    noise_covariance: Float[np.ndarray, "p p"]
+    num_runs: int
+    converged: bool
+
+
+class _Sample(NamedTuple):
+    """One simulation at some parameters, at the times that are used."""
+
+    flat: Float[np.ndarray, "p"]
+    log_temperature: Float[np.ndarray, "used"]
+    slope: Float[np.ndarray, "used p"]  # derivative of log_temperature
+    deviation: Float[np.ndarray, "replicas used"]  # of each replica's ln T from their mean
+
+
+class _Average(NamedTuple):
+    """The estimate that the samples near each other give together."""
+
+    flat: Float[np.ndarray, "p"]
+    sigma: Float[np.ndarray, "used"]  # standard error of each residual; 1 if errors are unknown
+    errors: Float[np.ndarray, "p p"]  # covariance of `flat` by the errors of the measurement
+    noises: Float[np.ndarray, "p p"]  # and by the noise of the samples
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "p p"]:
+        return self.errors + self.noises
+
+
+def by_simulation(
+    simulate: Callable[[Array, int], CoolingCurve],
+    first: Float[np.ndarray, "p"],
+    measured: Float[np.ndarray, "times"],
+    error: Float[np.ndarray, "times"],
+    used: Bool[np.ndarray, "times"],
+    *,
+    resolution: float,
+    max_runs: int,
+    progress: bool,
+) -> Simulated:
+    """Gauss-Newton steps, each on one simulation and its derivatives.
+
+    Every simulation has its own random numbers. Those within `NEAR` of the last give independent
+    Gauss-Newton estimates, whose mean is the answer. Residuals are weighted by the measured error
+    and the noise of the mean of these simulations, or equally if no error is known. The noise of
+    the answer is estimated from the changes that single replicas would make to it. The search ends
+    when a step is below `NEAR` and the noise is below `QUIET` of the standard error.
+
+    A derivative that is wrong by some per cent slows the search and scales the standard error by as
+    much, but does not move the answer, which is where the residuals vanish.
+
+    Args:
+        simulate: the cooling curve, with replicas, of the parameters and the number of the run.
+        first: the initial guess.
+        measured, error: ln T and its standard error, which is 0 everywhere if it is not known.
+        used: the times that have a weight.
+        resolution: singular values of the sensitivity below this share of the largest are ignored:
+            the parameters do not move in those directions.
+        max_runs: the most runs.
+        progress: show a bar.
+    """
+    flat, measured, error = np.asarray(first, float), measured[used], error[used]
+    known = bool(error.any())
+    samples: list[_Sample] = []
+    bar = tqdm(total=max_runs, disable=None if progress else True, desc="fit", unit="run")
+    with bar:
+        while True:
+            sample, curve = _sample(simulate, flat, len(samples), used)
+            samples.append(sample)
+            near = [s for s in samples if np.abs(s.flat - flat).max() < NEAR]
+            average = _average(near, measured, error if known else None, resolution)
+            step = average.flat - flat
+            step *= min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-300))
+            settled = bool(np.abs(step).max() < NEAR)
+            flat = flat + step
+            variance = np.diag(average.covariance)
+            quiet = np.all(np.diag(average.noises) <= QUIET**2 * variance)
+            in_errors = np.abs(step / np.sqrt(variance)).max()
+            bar.update()
+            bar.set_postfix_str(f"last step {in_errors:.2g} standard errors")
+            if len(samples) == max_runs or (settled and len(near) > 1 and (quiet or not known)):
+                break
+    residuals, sensitivity = _residuals_at(flat, near, measured, average.sigma, used)
+    covariances = average.errors, average.noises
+    return Simulated(flat, curve, residuals, sensitivity, *covariances, len(samples), settled)
+
+
+def _sample(
+    simulate: Callable[[Array, int], CoolingCurve],
+    flat: Float[np.ndarray, "p"],
+    number: int,
+    used: Bool[np.ndarray, "times"],
+) -> tuple[_Sample, CoolingCurve]:
+    """One simulation with its derivatives, and its curve."""
+
+    def log_temperature(flat):
+        curve = simulate(flat, number)
+        value = jnp.log(curve.temperature)
+        return value, (value, curve)
+
+    slope, (value, curve) = jax.jacfwd(log_temperature, has_aux=True)(jnp.asarray(flat))
+    assert curve.replicas is not None
+    each = np.log(np.asarray(curve.replicas.temperature))[:, used]
+    value, slope = np.asarray(value)[used], np.asarray(slope)[used]
+    return _Sample(flat, value, slope, each - each.mean(axis=0)), curve
+
+
+def _average(
+    near: list[_Sample],
+    measured: Float[np.ndarray, "used"],
+    error: Float[np.ndarray, "used"] | None,
+    resolution: float,
+) -> _Average:
+    """The mean of the Gauss-Newton estimates of some samples, the last of which is the newest.
+
+    Args:
+        near: the samples.
+        measured, error: ln T and its standard error, None if it is not known.
+        resolution: see `by_simulation`.
+    """
+    noise = np.sqrt(np.mean([_variance(s.deviation) for s in near], axis=0) / len(near))
+    sigma = np.ones_like(measured) if error is None else np.hypot(error, noise)
+    ends, scatter = [], []
+    for sample in near:
+        sensitivity = sample.slope / sigma[:, None]
+        inverse = np.linalg.pinv(sensitivity, rcond=resolution)
+        ends.append(sample.flat + inverse @ ((measured - sample.log_temperature) / sigma))
+        replicas = len(sample.deviation)
+        moved = (sample.deviation / sigma) @ inverse.T / (replicas * (replicas - 1)) ** 0.5
+        scatter.append(moved.T @ moved)
+    share = inverse * (np.ones_like(sigma) if error is None else error / sigma)
+    noises = np.mean(scatter, axis=0) / len(near)
+    return _Average(np.mean(ends, axis=0), sigma, share @ share.T, noises)
+
+
+def _variance(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:
+    """Variance of the mean over replicas, averaged over neighbouring times."""
+    replicas, num_times = deviation.shape
+    variance = np.sum(deviation**2, axis=0) / (replicas * (replicas - 1))
+    window = np.ones(min(NOISE_WINDOW, num_times))
+    parts = np.convolve(np.ones(num_times), window, "same")
+    return np.convolve(variance, window, "same") / parts
+
+
+def _residuals_at(
+    flat: Float[np.ndarray, "p"],
+    near: list[_Sample],
+    measured: Float[np.ndarray, "used"],
+    sigma: Float[np.ndarray, "used"],
+    used: Bool[np.ndarray, "times"],
+) -> tuple[Float[np.ndarray, "times"], Float[np.ndarray, "times p"]]:
+    """Weighted residuals, extrapolated from each sample and averaged, and their derivative."""
+    each = [measured - s.log_temperature - s.slope @ (flat - s.flat) for s in near]
+    slope = np.mean([s.slope for s in near], axis=0)
+    residuals, sensitivity = np.zeros(len(used)), np.zeros((len(used), len(flat)))
+    residuals[used] = np.mean(each, axis=0) / sigma
+    sensitivity[used] = slope / sigma[:, None]
+    return residuals, sensitivity

@@ -1,0 +1,49 @@
+"""Initial guesses of parameters from the measured curve."""
+
+import jax.numpy as jnp
+
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.restitution import ConstantRestitution, Viscoelastic
+from jaxgran.theory import closed_forms
+
+
+def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
+    """The gas with A (or e) and T_0, where they are free, guessed from the measured curve.
+
+    ``T^(-3/5)`` (``T^(-1/2)`` for constant restitution) of a cooling gas is a straight line in
+    time, whose value at t = 0 gives T_0 and whose slope over that value is 1/tau_0, proportional to
+    A (to 1 - e^2). The line is fitted by linear least squares. Other parameters keep the values of
+    the gas.
+
+    Args:
+        gas: the scene.
+        curve: the measured curve.
+        free: names of the free parameters.
+    """
+    haff = isinstance(gas.law, ConstantRestitution)
+    power = 1 / 2 if haff else 3 / 5
+    scale = curve.temperature[0]
+    line = (curve.temperature / scale) ** -power
+    weight = 1 / line  # equal relative errors
+    if "temperature" in free:
+        design = jnp.stack([weight, weight * curve.times], axis=1)
+        size = jnp.linalg.norm(design, axis=0)
+        origin, slope = jnp.linalg.lstsq(design / size[None], weight * line)[0] / size
+        origin = jnp.maximum(origin, 0.1 * line.min())
+        gas = gas.replace(temperature=scale * origin ** (-1 / power))
+    else:
+        origin = (gas.temperature / scale) ** -power
+        slope = jnp.sum(weight**2 * (line - origin) * curve.times)
+        slope = slope / jnp.sum((weight * curve.times) ** 2)
+    rate = jnp.maximum(slope / origin, 1e-9 / curve.times[-1]) * gas.mean_free_time
+    if haff and "coefficient" in free:
+        loss = jnp.clip(2 * gas.dimension * rate, 1e-6, 0.99)
+        gas = gas.replace(coefficient=jnp.sqrt(1 - loss))
+    if isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free:
+        delta = rate / closed_forms.COOLING_RATE[gas.dimension]
+        # To the next order in delta the cooling rate is that of delta (1 - q delta / 2): invert it.
+        correction = 0.5 * closed_forms.COOLING_CORRECTION * delta
+        delta = delta / (1 - jnp.minimum(correction, 0.7))
+        gas = gas.replace(dissipative_constant=delta / (gas.alpha**0.4 * gas.temperature**0.1))
+    return gas

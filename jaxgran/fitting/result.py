@@ -1,0 +1,131 @@
+"""The result of a fit: estimates, their errors, and goodness of fit."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.models.base import AbstractModel
+from jaxgran.scene.gas import Gas
+
+SIGNIFICANCE = 0.01
+"""Level of significance of the chi^2 test: below it a model does not explain the curve."""
+
+
+class Fit(eqx.Module):
+    """Result of a fit of p free parameters. Under `jax.vmap` all arrays have a batch axis.
+
+    Attributes:
+        names: the free parameters.
+        model: the model that was fitted.
+        estimate: estimated values, SI, shape (p,).
+        standard_error: one standard deviation of each, SI, shape (p,): the errors of the
+            measurement propagated to the parameters, times sqrt(reduced chi^2) if the model does
+            not explain the curve or the curve has no errors; includes the noise of a stochastic
+            model.
+        model_error: by how much each estimate changes if the time scale of a deterministic model
+            is wrong by its ``derivative_accuracy``, SI, shape (p,). Not part of `standard_error`.
+            0 for a stochastic model; `jaxgran.diagnose` says in words what that leaves out.
+        covariance: of the estimates, SI, shape (p, p), scaled like `standard_error`.
+        sensitivity: derivative of the weighted residuals in the parameters' unbounded scale (the
+            logarithm of a positive one), shape (residuals, p).
+        start: the guess at which the search began, SI, shape (p,).
+        gas: the fitted gas.
+        curve: its cooling curve at the measured times; of a stochastic model that of the last run,
+            one Gauss-Newton step before the estimate.
+        residuals: (ln T_measured - ln T_model) over its error; 0 where a point has no weight.
+        displacement_residuals: the same of <dr^2>; None if it was not used.
+        chi2, degrees_of_freedom, reduced_chi2, p_value: of the weighted residuals; p_value is nan
+            if the curve has no errors (they are then scaled so that reduced chi^2 is 1).
+        iterations: steps of Levenberg-Marquardt, evaluations of L-BFGS, or runs of a stochastic
+            model.
+        converged: whether the search reached its tolerance; of a stochastic model, whether the last
+            step was below 0.1 in the parameters' unbounded scale.
+        simulation_error: the part of `standard_error` due to the noise of a stochastic model,
+            estimated from its replicas, shape (p,); None for a deterministic model.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    model: AbstractModel
+    estimate: Float[Array, "p"]
+    standard_error: Float[Array, "p"]
+    model_error: Float[Array, "p"]
+    covariance: Float[Array, "p p"]
+    sensitivity: Float[Array, "residuals p"]
+    start: Float[Array, "p"]
+    gas: Gas
+    curve: CoolingCurve
+    residuals: Float[Array, "times"]
+    displacement_residuals: Float[Array, "times"] | None
+    chi2: Float[Array, ""]
+    degrees_of_freedom: Int[Array, ""]
+    reduced_chi2: Float[Array, ""]
+    p_value: Float[Array, ""]
+    iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+    simulation_error: Float[Array, "p"] | None = None
+
+    def value(self, name: str) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Estimate and standard error of one parameter."""
+        if name not in self.names:
+            raise ValueError(f"{name!r} was not free; free were {', '.join(self.names)}")
+        i = self.names.index(name)
+        return self.estimate[..., i], self.standard_error[..., i]
+
+    def undetermined(self) -> tuple[str, ...]:
+        """Parameters of which the curve determines no value, or only a combination; () if none.
+
+        These are the parameters in the singular vector of the sensitivity with the smallest
+        singular value, if its standard error exceeds 1 (a factor e), or if that singular value
+        is below ``model.derivative_accuracy`` times the largest.
+        """
+        known = not bool(jnp.isnan(self.p_value))
+        error = 1.0 if known else float(self.reduced_chi2) ** 0.5
+        _, singular, rotation = jnp.linalg.svd(self.sensitivity, full_matrices=False)
+        resolution = self.model.derivative_accuracy * float(singular[0])
+        if float(singular[-1]) > error and float(singular[-1]) >= resolution:
+            return ()
+        share = [abs(float(x)) for x in rotation[-1]]
+        sized = [n for n in self.names for _ in range(self.gas.value(n).size)]
+        undetermined = {n: 0 for n, x in zip(sized, share, strict=True) if x > 0.05 * max(share)}
+        return tuple(undetermined)
+
+
+class Misfit(NamedTuple):
+    """Goodness of fit.
+
+    Attributes:
+        chi2: sum of squared weighted residuals.
+        reduced: chi^2 per degree of freedom.
+        p_value: probability of a chi^2 as large by chance; nan if the errors are unknown.
+        inflation: factor by which the covariance is multiplied.
+    """
+
+    chi2: Float[Array, ""]
+    reduced: Float[Array, ""]
+    p_value: Float[Array, ""]
+    inflation: Float[Array, ""]
+
+
+def misfit(
+    residuals: Float[Array, "residuals"],
+    degrees_of_freedom: Int[Array, ""],
+    *,
+    errors_known: bool,
+) -> Misfit:
+    """Goodness of fit of weighted residuals.
+
+    The covariance is inflated by the reduced chi^2 (at least 1) where the p-value is below
+    `SIGNIFICANCE`, and always where the errors are unknown.
+    """
+    chi2 = jnp.sum(jnp.asarray(residuals) ** 2)
+    reduced = chi2 / degrees_of_freedom
+    if not errors_known:
+        return Misfit(chi2, reduced, jnp.full((), jnp.nan), reduced)
+    p_value = jax.scipy.stats.chi2.sf(chi2, degrees_of_freedom)
+    unexplained = p_value < SIGNIFICANCE
+    inflation = jnp.where(unexplained, jnp.maximum(reduced, 1.0), 1.0)
+    return Misfit(chi2, reduced, p_value, inflation)

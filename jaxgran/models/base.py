@@ -1,0 +1,99 @@
+"""The interface of a model of a cooling gas."""
+
+import re
+from abc import abstractmethod
+from typing import NamedTuple
+
+import equinox as eqx
+from equinox import AbstractClassVar
+from jaxtyping import Array, Float
+
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run import Run
+from jaxgran.models.course import Course
+from jaxgran.scene.gas import Gas
+
+
+class Omission(NamedTuple):
+    """Something that a model leaves out and a scene contains.
+
+    Attributes:
+        words: what, as the clause of a sentence.
+        decisive: estimates of a fit cannot be trusted; else the scene is at the edge of validity.
+        remedy: a sentence saying which model contains it.
+    """
+
+    words: str
+    decisive: bool
+    remedy: str
+
+
+class AbstractModel(eqx.Module):
+    """A model of a cooling gas: a description, without state and without the options of a run.
+
+    A subclass defines the members below; it then works in `jaxgran.cool`, `jaxgran.fit`,
+    `jaxgran.choose_model` and `jaxgran.diagnose`, which ask the model nothing else. Numbers that a
+    person may differentiate or sweep are array fields, counts and choices are static fields. A
+    missing member is named by the TypeError that creating the model raises.
+
+    `jaxgran.DSMC` is a short example; `tests/models/test_own_model.py` defines one in 25 lines.
+    """
+
+    stochastic: AbstractClassVar[bool]
+    """Whether curves carry random noise. A fit then makes repeated runs with fresh random numbers,
+    takes the noise from ``curve.replicas`` and needs two replicas at least."""
+
+    derivative_accuracy: AbstractClassVar[float]
+    """Relative accuracy of a derivative of ln T in a parameter. Parameters whose effects differ by
+    less count as undetermined; of a deterministic model it is also the error of the clock."""
+
+    @abstractmethod
+    def check(self, gas: Gas) -> None:
+        """Check that the model can take this law and scene. Traced values pass unchecked.
+
+        Raises:
+            ValueError: saying what was given, what is allowed and what to do.
+        """
+
+    @abstractmethod
+    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run) -> CoolingCurve:
+        """The cooling curve at the given times.
+
+        Inside `jax.jit`, `jax.vmap` and derivatives this is a pure function. A failure is reported
+        by ``curve.status``, and values that could not be computed are nan.
+
+        Args:
+            gas: a scene that has passed `check`.
+            times: t, s, increasing, >= 0.
+            run: options of this run.
+        """
+
+    @abstractmethod
+    def estimated_error(self, course: Course) -> float:
+        """Estimated relative error of T at the worst time of a gas's course, noise included."""
+
+    @abstractmethod
+    def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
+        """What the model leaves out of a scene, the most serious first; () if nothing matters.
+
+        Args:
+            gas: the scene.
+            num_particles: N of the gas, or None if it is unknown.
+        """
+
+    def check_fit(self, names: tuple[str, ...]) -> None:
+        """Check that the named floats of a gas can be fitted through this model (default: all).
+
+        Raises:
+            ValueError: saying which cannot, and why.
+        """
+
+    def displacement_accuracy(self, gas: Gas) -> Float[Array, ""] | None:
+        """Relative accuracy of <dr^2>; None (the default) if a fit should not use it."""
+        return None
+
+    @property
+    def name(self) -> str:
+        """The model's name in a sentence: "soft spheres" for `SoftSpheres`."""
+        parted = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(self).__name__)
+        return " ".join(word if word.isupper() else word.lower() for word in parted.split())

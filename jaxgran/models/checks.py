@@ -1,0 +1,102 @@
+"""Checks of a scene, and clauses about what it contains, that several models share."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran.models.base import Omission
+from jaxgran.scene.gas import Gas
+from jaxgran.theory.averages import averages as exact_averages
+
+CONTACT_LIMIT = 0.03
+"""Contact duration over mean free time above which impacts are not instantaneous and binary."""
+
+OVERLAP_LIMIT = 0.01
+"""Mean overlap, in diameters, above which the first-order softness correction fails."""
+
+CORRELATED_PACKING = {2: 0.4, 3: 0.25}
+"""Packing fraction above which successive collisions are correlated."""
+
+SOFT_SPHERES_NEEDED = "This scene needs soft spheres, which resolve every contact in time."
+POSITIONS_NEEDED = "This scene needs particles with positions."
+
+
+def check_cools(gas: Gas, averages: Callable = exact_averages) -> None:
+    """Raise ValueError for a law of restitution that heats the gas. Traced gases pass unchecked.
+
+    Args:
+        gas: the scene.
+        averages: over the impacts, as `jaxgran.theory.averages.averages`.
+    """
+    rate = first_cooling_rate(gas, averages)
+    if not isinstance(rate, Tracer) and np.any(np.asarray(rate) < 0):
+        raise ValueError(
+            "the law of restitution makes this gas heat up: averaged over its impacts, eps is "
+            "above 1 (a truncated series beyond its range); lower T_0 or A, or use another law"
+        )
+
+
+@eqx.filter_jit
+def first_cooling_rate(gas: Gas, averages: Callable = exact_averages) -> Float[Array, ""]:
+    """``-d ln T/dt`` at t = 0, 1/s, of the Maxwellian gas; negative if the law heats it."""
+    mu_2 = averages(gas.reduced_law, jnp.ones_like(gas.temperature), gas.dimension)[0, 0]
+    return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
+
+
+def check_softness(gas: Gas, factor: ArrayLike) -> None:
+    """Raise ValueError where the factor by which soft contacts slow the cooling is not positive."""
+    if not isinstance(factor, Tracer) and np.any(np.asarray(factor) <= 0):
+        raise ValueError(
+            f"spheres overlap by {float(np.max(gas.mean_overlap)):.2g} diameters at T_0, where "
+            "the softness correction has no meaning; is youngs_modulus in Pa? If so use "
+            "SoftSpheres, or KineticTheory(softness=False)"
+        )
+
+
+def omitted_by_instant_impacts(
+    gas: Gas, beyond: str = "which instantaneous impacts leave out"
+) -> tuple[Omission, ...]:
+    """What a model of instantaneous, binary impacts leaves out of a scene.
+
+    Args:
+        gas: the scene.
+        beyond: the clause about overlaps that are not small.
+    """
+    found = []
+    duration, overlap = float(gas.contact_fraction), float(gas.mean_overlap)
+    if duration > CONTACT_LIMIT:
+        found.append(
+            f"contacts last {duration:.2g} of the mean free time, so spheres meet three at a time"
+        )
+    if overlap > OVERLAP_LIMIT:
+        found.append(f"spheres overlap by {100 * overlap:.2g} % of a diameter, {beyond}")
+    return tuple(Omission(words, True, SOFT_SPHERES_NEEDED) for words in found)
+
+
+def omitted_by_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Omission, ...]:
+    """What a model of a homogeneous, uncorrelated gas leaves out of a scene.
+
+    Args:
+        gas: the scene.
+        num_particles: N of the gas, which tells its box; None if unknown.
+    """
+    found = []
+    phi, limit = float(gas.packing_fraction), CORRELATED_PACKING[gas.dimension]
+    if phi > limit:
+        found.append(
+            f"the packing fraction {phi:.2g} is above {limit:g}, where successive collisions are "
+            "correlated"
+        )
+    if num_particles is not None:
+        diameter = float(gas.diameter)
+        box, critical = float(gas.box_side(num_particles)), float(gas.critical_box)
+        if box > critical:
+            found.append(
+                f"the box, {box / diameter:.3g} diameters, is above "
+                f"L_c = {critical / diameter:.3g}: the gas does not stay homogeneous"
+            )
+    return tuple(Omission(words, False, POSITIONS_NEEDED) for words in found)

@@ -1,0 +1,252 @@
+"""Selection of the cheapest model whose estimated error in a scene is small enough."""
+
+from collections.abc import Sequence
+from math import hypot
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike
+
+from jaxgran.checks import status
+from jaxgran.checks.validation import checked_times
+from jaxgran.data.run import Run
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.checks import check_softness
+from jaxgran.models.course import Course
+from jaxgran.models.dsmc import DSMC
+from jaxgran.models.hard_spheres import HardSpheres
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.soft_spheres import SoftSpheres
+from jaxgran.scene.gas import Gas
+from jaxgran.theory.averages import softness_factor
+from jaxgran.theory.shear_modes import flow_share
+
+NUM_PARTICLES = 4000
+"""Particles of a particle model if no number is given."""
+
+COURSE_POINTS = 65
+"""Times at which the course of a gas is sampled."""
+
+
+class Candidate(NamedTuple):
+    """A model that was considered for a scene.
+
+    Attributes:
+        model: the model.
+        error: its estimated relative error of T at the worst of the times, at most 1, which means
+            that nothing is known of T; None if the model cannot take the scene.
+        refusal: why it cannot take the scene; None if it can.
+    """
+
+    model: AbstractModel
+    error: float | None
+    refusal: str | None
+
+
+class Choice(NamedTuple):
+    """The model chosen for a scene.
+
+    Attributes:
+        model: ready to be given to `jaxgran.cool` or `jaxgran.fit`.
+        reasons: why, a sentence each, the verdict first.
+        candidates: all models considered, cheapest first.
+        error: estimated relative error of T of the chosen model.
+    """
+
+    model: AbstractModel
+    reasons: tuple[str, ...]
+    candidates: tuple[Candidate, ...]
+    error: float
+
+
+def default_models(num_particles: int, replicas: int = 1) -> tuple[AbstractModel, ...]:
+    """The models of this package, cheapest first."""
+    kinds = (DSMC, HardSpheres, SoftSpheres)
+    return KineticTheory(), *(kind(num_particles, replicas=replicas) for kind in kinds)
+
+
+def choose_model(
+    gas: Gas,
+    times: ArrayLike | Sequence[float],
+    tolerance: float = 0.02,
+    num_particles: int | None = None,
+    *,
+    replicas: int = 1,
+    models: Sequence[AbstractModel] | None = None,
+) -> Choice:
+    """The cheapest model whose estimated error of T is within a tolerance.
+
+    A model whose cooling rate errs by a share e(t) errs in T by ``|d ln T/dt| int_0^t e dt'``. The
+    share adds up from Enskog's collision frequency, from contacts that last and overlap, and, in a
+    box of known size, from the flow that grows in it, whose energy kinetic theory and DSMC count as
+    heat, which cools. Particle models have noise. Each model estimates its own error
+    (`jaxgran.AbstractModel.estimated_error`).
+
+    Args:
+        gas: the scene.
+        times: t, s, as given to `jaxgran.cool`; they tell how long the gas is followed.
+        tolerance: relative error of T allowed, > 0.
+        num_particles: N of the gas, if known: gives the box, and the number of particles of a
+            particle model (4000 if unknown). Without it the gas is taken to stay homogeneous.
+        replicas: of a particle model.
+        models: the models to choose from, cheapest first; by default those of this package.
+
+    Returns:
+        `Choice`: the model, reasons in words, all candidates with their estimated errors. If no
+        model is accurate enough, the most accurate one; the first reason says so.
+
+    Raises:
+        ValueError: for values out of range or being traced, a gas so soft that kinetic theory is
+            meaningless, or a scene that no model can take.
+        RuntimeError: if kinetic theory, which estimates the errors, cannot follow the gas so far.
+    """
+    _check_arguments(gas, times, tolerance)
+    size = NUM_PARTICLES if num_particles is None else num_particles
+    models = default_models(size, replicas) if models is None else models
+    course = course_of(gas, float(checked_times(times)[-1]), num_particles)
+    candidates = tuple(_candidate(model, course) for model in models)
+    possible = [(c.error, c) for c in candidates if c.error is not None]
+    if not possible:
+        refusals = "; ".join(str(c.refusal) for c in candidates)
+        raise ValueError(f"no model can take this scene: {refusals}")
+    good = [(error, c) for error, c in possible if error <= tolerance]
+    error, best = good[0] if good else min(possible, key=lambda pair: pair[0])
+    reasons = [
+        _verdict(best.model, error, tolerance, enough=bool(good)),
+        *_scene_in_words(course, size, replicas),
+        *(f"{_first_upper(c.model.name)}: {c.refusal}." for c in candidates if c.refusal),
+    ]
+    return Choice(best.model, tuple(reasons), candidates, error)
+
+
+def _check_arguments(gas: Any, times: Any, tolerance: Any) -> None:
+    if not isinstance(gas, Gas):
+        raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, times))):
+        raise ValueError(
+            "a model cannot be chosen for values being traced by jax.jit, jax.grad or jax.vmap: "
+            "call choose_model outside, and give its model to cool"
+        )
+    if not (isinstance(tolerance, float | int | np.number) and 0 < tolerance < np.inf):
+        raise ValueError(
+            f"tolerance must be a number > 0, got {tolerance!r}; 0.02 allows T to err by 2 %"
+        )
+
+
+def _candidate(model: AbstractModel, course: Course) -> Candidate:
+    try:
+        model.check(course.gas)
+    except ValueError as refusal:
+        return Candidate(model, None, str(refusal))
+    return Candidate(model, min(model.estimated_error(course), 1.0), None)
+
+
+def _verdict(model: AbstractModel, error: float, tolerance: float, enough: bool) -> str:
+    name, share = _first_upper(model.name), _percent(error)
+    if enough:
+        return (
+            f"{name}: the cheapest model whose estimated error of T, {share}, is within "
+            f"{_percent(tolerance)}."
+        )
+    verdict = (
+        f"{name}: the closest; no model is within {_percent(tolerance)}, and its estimated error "
+        f"of T is {share}."
+    )
+    if model.stochastic:
+        verdict += " More particles or replicas have less noise."
+    return verdict
+
+
+def course_of(gas: Gas, end: float, num_particles: int | None = None) -> Course:
+    """The course of a gas from t = 0 to an end, s, as kinetic theory predicts it.
+
+    Raises:
+        ValueError: for a gas so soft that the softness correction has no meaning.
+        RuntimeError: if kinetic theory cannot follow the gas so far.
+    """
+    fault, critical_box, values = _course(gas, jnp.asarray(end))
+    values = {name: np.asarray(value, float) for name, value in values.items()}
+    check_softness(gas, 1 - values["softness"][0])
+    if int(fault) != status.OK:
+        raise RuntimeError(
+            f"kinetic theory, which estimates the errors: {status.explain(int(fault))}"
+        )
+    flow = scatter = np.zeros_like(values["time"])
+    if num_particles is not None:
+        critical = np.asarray(critical_box, float)
+        flow, scatter = flow_share(gas, values["log_temperature"], critical, num_particles)
+    return Course(gas, num_particles, **values, flow_share=flow, flow_scatter=scatter)
+
+
+@eqx.filter_jit
+def _course(gas: Gas, end: Array) -> tuple[Array, Array, dict[str, Array]]:
+    grid = jnp.linspace(0, jnp.log1p(end / gas.mean_free_time), COURSE_POINTS)
+    t = jnp.expm1(grid) * gas.mean_free_time
+    curve = KineticTheory().simulate(gas, t, Run())
+    assert curve.sonine is not None and curve.collisions is not None
+
+    def scales(temperature):
+        now = gas.replace(temperature=temperature)
+        factor = softness_factor(now.reduced_law, jnp.ones_like(temperature), now.dimension)
+        return now.contact_fraction, now.mean_overlap, 1 - factor, now.critical_box
+
+    contact, overlap, softness, critical_box = jax.vmap(scales)(curve.temperature)
+    values = {
+        "time": t,
+        "log_temperature": jnp.log(curve.temperature / gas.temperature),
+        "collisions": curve.collisions,
+        "sonine": curve.sonine,
+        "contact_fraction": contact,
+        "overlap": overlap,
+        "softness": softness,
+    }
+    return jnp.asarray(curve.status), critical_box, values
+
+
+def _scene_in_words(course: Course, size: int, replicas: int) -> list[str]:
+    hard = course.error_of_temperature(course.lasting_contacts + course.softness)
+    corrected = course.error_of_temperature(course.lasting_contacts + course.second_order_softness)
+    return [
+        f"T falls to {np.exp(course.log_temperature.min()):.2g} T_0 in "
+        f"{course.collisions[-1]:.3g} collisions per particle.",
+        f"Contacts last {_percent(course.contact_fraction.max())} of the mean free time and overlap"
+        f" by {_percent(course.overlap.max())} of a diameter: T errs by {_percent(hard)} with "
+        f"instantaneous impacts, {_percent(corrected)} with kinetic theory's first correction.",
+        _box_in_words(course),
+        _noise_in_words(course, size, replicas),
+    ]
+
+
+def _box_in_words(course: Course) -> str:
+    gas, error = course.gas, _percent(course.error_of_temperature(course.homogeneous))
+    text = f"At a packing fraction of {float(gas.packing_fraction):.2g}"
+    if course.num_particles is None:
+        return (
+            f"{text} a gas that stays homogeneous leaves an error of {error}; without "
+            "num_particles the box is unknown, and clustering is not estimated."
+        )
+    ratio = float(gas.box_side(course.num_particles) / gas.critical_box)
+    return (
+        f"{text} in a box of {ratio:.2g} L_c, where the flow comes to hold "
+        f"{_percent(course.flow_share.max())} of the energy, homogeneous models err by {error}."
+    )
+
+
+def _noise_in_words(course: Course, size: int, replicas: int) -> str:
+    noise, flowing = course.shot_noise(size * replicas), course.flow_noise(replicas)
+    text = f"{size * replicas} particles have a noise of {_percent(noise)} in T"
+    if flowing <= noise / 10:
+        return f"{text}."
+    return f"{text}, {_percent(hypot(noise, flowing))} with the chance amplitudes of the flow."
+
+
+def _first_upper(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"

@@ -1,0 +1,236 @@
+"""What models of spheres in periodic boxes share: checks, array sizes, runs and curves."""
+
+import dataclasses
+from abc import abstractmethod
+from typing import Any, ClassVar, NamedTuple, Self
+
+import jax
+import jax.numpy as jnp
+from equinox import AbstractClassVar, AbstractVar
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jaxgran.checks import status
+from jaxgran.checks.tracing import any_traced
+from jaxgran.data.curve import CoolingCurve, Particles
+from jaxgran.data.run import DEFAULTS, Run
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.course import Course
+from jaxgran.particles import driver, initial, neighbours, pure, user_start
+from jaxgran.particles.capacity import Capacity, skin_adding
+from jaxgran.particles.dynamics import AbstractDynamics
+from jaxgran.particles.simulation import SMALLEST_BOX, Simulation
+from jaxgran.scene.gas import Gas
+from jaxgran.tangents.rule import Inputs, Outputs, differentiable
+
+
+class Plan(NamedTuple):
+    """The static sizes of a compiled run.
+
+    Attributes:
+        replicas: number of boxes.
+        pace: static settings of the steps, which differ between kinds of spheres.
+        capacity: of the run.
+        melt_capacity: of the first mean free times of its melt.
+    """
+
+    replicas: int
+    pace: Any
+    capacity: Capacity
+    melt_capacity: Capacity
+
+
+class AbstractSpheres(AbstractModel):
+    """A model of spheres in periodic boxes.
+
+    Attributes:
+        num_particles: N in each box.
+        replicas: independent boxes.
+        start: positions and velocities given by a user; None for random ones.
+        neighbours: who finds the pairs.
+        plan: static sizes, where `sized_for` has settled them.
+        listed_by_skin: pairs per particle that the skin adds to a neighbour list.
+        projected: whether derivatives are thermally projected.
+    """
+
+    num_particles: AbstractVar[int]
+    replicas: AbstractVar[int]
+    start: AbstractVar[Particles | None]
+    neighbours: AbstractVar[str]
+    plan: AbstractVar[Plan | None]
+    projected: AbstractVar[bool]
+    listed_by_skin: AbstractClassVar[float]
+
+    stochastic: ClassVar[bool] = True
+    derivative_accuracy: ClassVar[float] = 0.02
+
+    @abstractmethod
+    def scene(self, gas: Gas) -> Any:
+        """The gas in units of its diameter, mass and first temperature."""
+
+    @abstractmethod
+    def planned(self, scene: Any, dimension: int, spare: float | None = None) -> Plan:
+        """Static sizes for a scene of known numbers, with a spare factor on the capacities."""
+
+    @abstractmethod
+    def dynamics(self, scene: Any, plan: Plan) -> AbstractDynamics:
+        """How the spheres move."""
+
+    @abstractmethod
+    def pace_fixed(self) -> dict[str, Any]:
+        """Settings of this model that `Plan.pace` repeats, by name."""
+
+    def check_fit(self, names: tuple[str, ...]) -> None:
+        """A given start has its own temperature and lengths, which then cannot be fitted."""
+        if not self.projected:
+            raise ValueError(
+                f"a fit needs projected derivatives: give {type(self).__name__} a projection"
+            )
+        fixed = [n for n in ("temperature", "diameter", "packing_fraction") if n in names]
+        if self.start is not None and fixed:
+            raise ValueError(
+                f"{' and '.join(fixed)} cannot be fitted from a given start, which has its own: "
+                f"leave start out of {type(self).__name__}, or free other parameters"
+            )
+
+    def sized_for(self, gas: Gas, spare: float = 2.0) -> Self:
+        """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
+
+        Outside of jit sizes follow from the gas, and arrays grow where they must. Inside they are
+        fixed; a run that exceeds them ends in nan and a status.
+
+        Args:
+            gas: with known numbers, like the gases to come: the densest, hottest and softest.
+            spare: capacity over the expected need.
+        """
+        self.check(gas)
+        plan = self.planned(self.scene(gas), gas.dimension, spare)
+        return dataclasses.replace(self, plan=plan)
+
+    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
+        """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        gas = user_start.with_constant_temperature(self.start, gas)
+        inputs = Inputs(
+            scene=self.scene(gas),
+            times=times * jnp.sqrt(gas.temperature) / gas.diameter,
+            start=user_start.reduced(self.start, gas, differentiable=not self.projected),
+            key=run.key,
+        )
+
+        def outputs(inputs: Inputs, directions: Any = None) -> Outputs:
+            return self._outputs(inputs, directions, gas.dimension, run)
+
+        if self.projected:
+            found = differentiable(outputs, lambda scene: scene.material)(inputs)
+        else:
+            found = outputs(inputs)
+        return self._curve(gas, times, inputs.scene.side, found)
+
+    def _outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
+        """The run in reduced units: driven from the host if all numbers are known, else pure."""
+        plan = self._settled_plan(inputs.scene, dimension)
+        skin = skin_adding(self.listed_by_skin, self.num_particles, inputs.scene.side, dimension)
+        sim = Simulation(
+            dynamics=self.dynamics(inputs.scene, plan),
+            melt_capacity=plan.melt_capacity,
+            inputs=inputs,
+            directions=directions,
+            num_particles=self.num_particles,
+            dimension=dimension,
+            skin=skin,
+            engine=self.neighbours,
+        )
+        if not any_traced(inputs):
+            settings = self.num_particles, plan.replicas, plan.pace, self.neighbours
+            return driver.drive(sim, run, settings)
+        if self.neighbours == "jax-md":
+            raise ValueError(
+                'inside jax.jit or jax.vmap neighbours="jax-md" cannot find the pairs, as it sizes '
+                "its cells from known numbers: leave neighbours out"
+            )
+        return pure.simulate(sim)
+
+    def _settled_plan(self, scene: Any, dimension: int) -> Plan:
+        """The model's plan, or one made now, if all numbers that it depends on are known."""
+        name = type(self).__name__
+        if self.plan is not None:
+            planned = {"replicas": self.plan.replicas} | self.plan.pace._asdict()
+            for setting, value in ({"replicas": self.replicas} | self.pace_fixed()).items():
+                if planned[setting] != value:
+                    raise ValueError(
+                        f"this {name} was sized for {setting} = {planned[setting]!r}, and now has "
+                        f"{value!r}: call sized_for(gas) again"
+                    )
+            return self.plan
+        try:
+            with jax.ensure_compile_time_eval():
+                return self.planned(scene, dimension)
+        except jax.errors.ConcretizationTypeError:
+            raise ValueError(
+                f"inside jax.jit the sizes of arrays must be known: give {name}(...)"
+                ".sized_for(gas), made outside with a gas of known numbers"
+            ) from None
+
+    def _curve(
+        self, gas: Gas, times: Float[Array, "times"], side: Array, out: Outputs
+    ) -> CoolingCurve:
+        """The curve in SI units, of records in units of diameter, mass and first temperature."""
+        energy = gas.mass * gas.temperature
+        units = {
+            "temperature": gas.temperature,
+            "sonine": 1.0,
+            "displacement": gas.diameter**2,
+            "velocity_correlation": gas.temperature,
+            "elastic_energy": energy,
+            "dissipated_energy": energy,
+            "collisions": 1.0,
+            "regularised": 1.0,
+        }
+        each = {name: values.T * units[name] for name, values in out.records.items()}
+        # Where it could not be checked before.
+        other = user_start.is_of_other_box(self.start, gas, self.num_particles)
+        each = {name: jnp.where(other, jnp.nan, values) for name, values in each.items()}
+        shape = self.replicas, self.num_particles, gas.dimension
+        return CoolingCurve.of_replicas(
+            times,
+            each,
+            particles=Particles(
+                position=out.position.reshape(shape) * gas.diameter,
+                velocity=out.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
+                box_side=side * gas.diameter,
+            ),
+            status=out.status | status.flag(status.OTHER_BOX, other),
+        )
+
+    def check_counts(self, **least: int) -> None:
+        """Raise ValueError where a whole number of the model is less than it must be."""
+        for name, lowest in ({"num_particles": 2, "replicas": 1} | least).items():
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < lowest:
+                raise ValueError(
+                    f"{name} must be a whole number >= {lowest}, an int, got {value!r}"
+                )
+        neighbours.engine(self.neighbours)
+
+    def check_box(self, gas: Gas) -> None:
+        """Raise ValueError for a gas too dense, a box too small, or a start not of this gas."""
+        user_start.check(self.start, gas, self.replicas, self.num_particles)
+        if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
+            return
+        limit, phi = initial.PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
+        if phi > limit and self.start is None:
+            raise ValueError(
+                f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g}; "
+                "lower it, or give your own start"
+            )
+        side = float(jnp.min(gas.box_side(self.num_particles) / gas.diameter))
+        if side < SMALLEST_BOX:
+            raise ValueError(
+                f"the box is {side:.3g} diameters long, at least {SMALLEST_BOX} are needed to tell "
+                "a sphere from its image; use more particles or a lower packing_fraction"
+            )
+
+    def noise(self, course: Course) -> tuple[float, float]:
+        """Standard errors of ln T by shot noise and by the chance amplitudes of a flow."""
+        total = self.num_particles * self.replicas
+        return course.shot_noise(total), course.flow_noise(self.replicas)

@@ -1,0 +1,255 @@
+"""The host driver of particle runs: progress, checkpoints, interruption, arrays that grow.
+
+Around compiled functions that advance a state by a limited amount of work. For runs whose numbers
+are all known; the same run as a pure function is in `pure`.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from jaxgran.checks import status
+from jaxgran.data import checkpoint
+from jaxgran.data.run import Run
+from jaxgran.particles import neighbours
+from jaxgran.particles.capacity import Capacity
+from jaxgran.particles.dynamics import AbstractDynamics, stretches
+from jaxgran.particles.simulation import SETTLED, Simulation
+from jaxgran.particles.state import State
+from jaxgran.tangents.rule import Outputs
+
+CHECKPOINT_SECONDS = 60.0
+"""A checkpoint is written this often, and when the run is interrupted."""
+
+STRETCHES = 8
+"""Neighbour lists used in one call of compiled code; progress is shown between calls."""
+
+MOST_PAIRS = 100
+"""Rows per particle beyond which an array does not grow any more."""
+
+
+class Failure(Exception):
+    """A run that cannot go on, with its status."""
+
+    def __init__(self, fault: int):
+        super().__init__(status.explain(fault))
+        self.fault = fault
+
+
+class _Timed(Protocol):
+    @property
+    def time(self) -> Any: ...
+
+
+S = TypeVar("S", bound=_Timed)
+
+
+def follow(
+    state: S,
+    times: np.ndarray,
+    advance: Callable[[S, float], S],
+    observe: Callable[[S], dict[str, jax.Array]],
+    *,
+    scene: str = "",
+    progress: bool = True,
+    label: str | None = None,
+    path: str | Path | None = None,
+    fault: int = status.OK,
+) -> tuple[S, dict[str, np.ndarray], int]:
+    """Take a state through all times and observe it at each.
+
+    Args:
+        state: a pytree with a field `time`; where the run starts.
+        times: increasing, not before the state's own.
+        advance: takes a state some way towards a time, at most to it; raises `Failure` if it
+            cannot.
+        observe: what to record, a dictionary of arrays; "temperature" is shown in the bar.
+        scene: fingerprint of everything that fixes the result.
+        label: put before the bar.
+        progress: show a bar with T/T_0 and the time left, after a few seconds, on a terminal.
+        path: of the checkpoint; if the file exists the run is resumed from it. None for none.
+        fault: the status before; unless it is ok nothing is done.
+
+    Returns:
+        The last state; the records, stacked along a first axis of times, nan from a failure on;
+        and the status of the run.
+    """
+    done, state, records = _resumed(path, scene, state, _empty(observe(state), len(times)))
+    saved = time.monotonic()
+
+    def save():
+        if path is not None:
+            checkpoint.save(path, scene, (done, state, records))
+
+    with _progress_bar(float(times[-1]), float(state.time), progress, label) as bar:
+        try:
+            if fault != status.OK:
+                raise Failure(fault)
+            while done < len(times):
+                while float(state.time) < times[done]:
+                    state = advance(state, float(times[done]))
+                    _show(bar, state, observe)
+                    if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                        save()
+                        saved = time.monotonic()
+                for name, value in observe(state).items():
+                    records[name][done] = value
+                done += 1
+            save()
+        except KeyboardInterrupt:
+            save()
+            raise
+        except Failure as failure:
+            fault = failure.fault
+            for values in records.values():
+                values[done:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
+    return state, records, fault
+
+
+def _empty(observed: dict[str, jax.Array], num_times: int) -> dict[str, np.ndarray]:
+    """Records at so many times, of the shapes and types of those at one time."""
+    each = {name: np.asarray(value) for name, value in observed.items()}
+    return {name: np.zeros((num_times, *v.shape), v.dtype) for name, v in each.items()}
+
+
+def _resumed(
+    path: str | Path | None, scene: str, state: S, records: dict[str, np.ndarray]
+) -> tuple[int, S, dict[str, np.ndarray]]:
+    """The number of times done, the state and the records: of a checkpoint, if there is one."""
+    if path is None or not Path(path).exists():
+        return 0, state, records
+    done, loaded, records = checkpoint.load(path, scene, (0, state, records))
+    # As JAX arrays of the same types: the compiled functions must not see a difference.
+    state = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), loaded, state)
+    return int(done), state, records
+
+
+def _progress_bar(total: float, initial: float, progress: bool, label: str | None) -> tqdm:
+    return tqdm(
+        total=total,
+        initial=initial,
+        disable=None if progress else True,
+        delay=3,
+        desc=label,
+        bar_format="{l_bar}{bar}| {elapsed} elapsed, {remaining} left{postfix}",
+    )
+
+
+def _show(bar: tqdm, state: Any, observe: Callable[[Any], dict[str, jax.Array]]) -> None:
+    bar.update(float(state.time) - bar.n)
+    if not bar.disable:
+        ratio = float(np.mean(observe(state)["temperature"]))
+        bar.set_postfix_str(f"T/T_0 = {ratio:.3g}", refresh=False)
+
+
+_stretches = jax.jit(stretches, static_argnames=("engine", "least", "most"))
+
+_GROWN: dict[Capacity, Capacity] = {}
+"""What capacities came to be enlarged to: the next run begins with the larger ones, and neither
+fails on the way to them nor compiles again. Results do not depend on it."""
+
+
+def drive(sim: Simulation, run: Run, settings: tuple) -> Outputs:
+    """Melt and cool, enlarging arrays where they are too short.
+
+    Args:
+        sim: the run, with known numbers.
+        run: its options.
+        settings: what else of the model fixes the result, for the checkpoint's fingerprint.
+    """
+    # Concrete inputs of a derivative rule: nothing here is to be staged into the outer trace.
+    with jax.ensure_compile_time_eval():
+        return _drive(sim, run, settings)
+
+
+def _drive(sim: Simulation, run: Run, settings: tuple) -> Outputs:
+    dynamics, fault, state = sim.dynamics, status.OK, sim.first_state()
+    engine = neighbours.engine(sim.engine, dynamics.capacity.lookahead)
+    resumed = run.checkpoint is not None and Path(run.checkpoint).exists()
+    if sim.melts and not resumed:
+        state, fault = _melt(sim, state, engine, run.progress)
+    state = sim.cooling_state(state)
+    try:
+        if fault == status.OK:  # counts the energy in contacts
+            state = _advance(state, 0.0, dynamics, dynamics.capacity, engine)
+    except Failure as failure:
+        fault = failure.fault
+    times = np.asarray(sim.inputs.times)
+    scene = (
+        ""
+        if run.checkpoint is None
+        else checkpoint.fingerprint(sim.inputs, state.tangents, settings)
+    )
+
+    def advance(state: State, end: float) -> State:
+        return _advance(state, end, dynamics, dynamics.capacity, engine)
+
+    state, records, fault = follow(
+        state,
+        times,
+        advance,
+        dynamics.observe,
+        scene=scene,
+        progress=run.progress,
+        path=run.checkpoint,
+        fault=fault,
+    )
+    return Outputs(
+        neighbours.wrap(dynamics.scene.side, state.position),
+        state.velocity,
+        {name: jnp.asarray(value) for name, value in records.items()},
+        jnp.asarray(fault, jnp.int32),
+    )
+
+
+def _melt(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[State, int]:
+    """The state after elastic motion, and the status."""
+    elastic = sim.dynamics.elastic()
+    settled = SETTLED / float(elastic.scene.collision_frequency)
+
+    def advance(state: State, end: float) -> State:
+        crowded = float(state.time) < settled
+        capacity = sim.melt_capacity if crowded else elastic.capacity
+        return _advance(state, end, elastic, capacity, engine)
+
+    end = np.asarray([sim.melt_time])
+    state, _, fault = follow(state, end, advance, elastic.observe, progress=progress, label="melt")
+    return state, fault
+
+
+def _advance(
+    state: State, end: float, dynamics: AbstractDynamics, capacity: Capacity, engine: str
+) -> State:
+    """Some stretches towards an end, in arrays that grow from a given capacity.
+
+    Raises:
+        Failure: if something else goes wrong.
+    """
+    while True:
+        roomy = dynamics.with_capacity(_GROWN.get(capacity, capacity))
+        state, fault, needed = _some_stretches(roomy, state, end, engine)
+        if fault == status.OK:
+            return state
+        full = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
+        if not full or max(needed) > MOST_PAIRS * len(state.position):
+            raise Failure(fault)
+        # That stretch is made again as a whole: a list made on the way has another order.
+        _GROWN[capacity] = roomy.capacity.grown(needed)
+
+
+def _some_stretches(
+    dynamics: AbstractDynamics, state: State, end: float, engine: str
+) -> tuple[State, int, list[int]]:
+    """Several stretches in one compiled call, or one if the host finds the pairs."""
+    if engine == "sweep":
+        state, fault, needed = _stretches(dynamics, state, end, engine, 1, STRETCHES)
+        return state, int(fault), [int(x) for x in needed]
+    now = dynamics.stretch(state, end, engine)
+    fault = int(now.status)
+    return (now.state if fault == status.OK else state), fault, [int(x) for x in now.needed]

@@ -1,0 +1,200 @@
+"""Execution of the impacts of hard spheres within one window of time.
+
+Units here: the diameter, the mass and the first temperature are 1. Times and positions count as in
+`jaxgran.particles.hard.prediction`: an impact changes both the velocity of a path and its position
+extrapolated back to the start of the window.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from jaxgran.particles.hard.candidates import Selection
+from jaxgran.particles.hard.prediction import FirstImpacts, Rows, Slots, first_impacts
+from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.tangents.impact import ImpactTangents
+
+MAX_ROUNDS = 100_000
+"""Rounds of independent impacts in one window from which on the run counts as stalled."""
+
+
+class Scene(NamedTuple):
+    """The gas in units of its diameter, mass and first temperature.
+
+    Attributes:
+        side: of the box.
+        law: of restitution, for speeds in units of sqrt(2).
+        collision_frequency: at T = 1.
+        contact_time: in mean free times; the impact of a sphere within this time of its last one
+            is elastic.
+        elastic: whether all impacts are.
+    """
+
+    side: Float[Array, ""]
+    law: ReducedLaw
+    collision_frequency: Float[Array, ""]
+    contact_time: Float[Array, ""]
+    elastic: Bool[Array, ""]
+
+    @property
+    def material(self) -> ReducedLaw:
+        """The numbers that derivatives are followed in: those of the law."""
+        return self.law
+
+
+class Work(NamedTuple):
+    """The particles after the impacts of a window, and sums over these impacts.
+
+    Attributes:
+        slots: the particles.
+        dissipated: energy lost, half of it counted for each of two spheres.
+        impacts: number of impacts of each particle.
+        regularised: number of those that were elastic because they followed too soon.
+        moved: largest squared distance of each particle, at its impacts, from the place for which
+            the neighbour list was built.
+        fastest: largest squared speed of each particle.
+        pending: whether the last round executed an impact.
+        num_rounds: number of rounds.
+        gains: of energy along directions in the law, see `ImpactTangents`; without these, no rows.
+    """
+
+    slots: Slots
+    dissipated: Float[Array, "slots"]
+    impacts: Int[Array, "slots"]
+    regularised: Int[Array, "slots"]
+    moved: Float[Array, "slots"]
+    fastest: Float[Array, "slots"]
+    pending: Bool[Array, ""]
+    num_rounds: Int[Array, ""]
+    gains: Float[Array, "changes rows"]
+
+
+def resolve(
+    slots: Slots,
+    listed: Float[Array, "slots d"],
+    chosen: Selection,
+    scene: Scene,
+    duration: ArrayLike,
+    shortest: Float[Array, "replicas"],
+    along: ImpactTangents | None,
+) -> Work:
+    """Execute all impacts of a window, in rounds of independent impacts.
+
+    A round executes every impact that is the first of both its spheres before either path can have
+    changed. The earliest impact of all is always one of them.
+
+    Args:
+        slots: the members of the selection.
+        listed: the places for which the neighbour list was built.
+        chosen: the selection.
+        scene: the gas.
+        duration: of the window.
+        shortest: time after a sphere's last impact within which its next one is elastic.
+        along: the tangents, if they are followed, for the gains of energy along their directions.
+    """
+    num_rows, num_slots = len(chosen.rows.a), len(slots.v)
+    shortest = shortest[jnp.minimum(chosen.replica, len(shortest) - 1)]
+
+    def one_round(work: Work) -> Work:
+        rows, last = chosen.rows, work.slots.last
+        impacts, safe, row = _executable(work.slots, rows, duration)
+        last = jnp.maximum(last[rows.a], last[rows.b])
+        effect = _effect(impacts, safe, last, shortest[rows.a], scene, along)
+        return _executed(work, effect, safe, row, rows, listed)
+
+    def unfinished(work: Work):
+        return work.pending & (work.num_rounds < MAX_ROUNDS)
+
+    count, zeros = jnp.zeros(num_slots, jnp.int32), jnp.zeros(num_slots, slots.x.dtype)
+    size = (0, 0) if along is None else (len(along.log_temperature) + 1, num_rows)
+    gains = jnp.zeros(size, zeros.dtype)
+    work = Work(slots, zeros, count, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains)
+    return jax.lax.while_loop(unfinished, one_round, work)
+
+
+def _executable(
+    slots: Slots, rows: Rows, duration: ArrayLike
+) -> tuple[FirstImpacts, Bool[Array, "rows"], Int[Array, "slots"]]:
+    """The next impacts, which of them can be executed now, and the row of each particle's own.
+
+    A particle without one has a row beyond the last.
+    """
+    a, b = rows.a, rows.b
+    index = jnp.arange(len(a), dtype=jnp.int32)
+    impacts = first_impacts(slots, rows, duration)
+    safe = jnp.isfinite(impacts.times)
+    for k in (a, b):
+        safe &= (impacts.times == impacts.first[k]) & (impacts.times == impacts.final[k])
+    # Of several impacts at the very same time a sphere takes the one in the first row.
+    rank = jnp.where(safe, index, len(a))
+    row = jnp.full(len(slots.v), len(a), jnp.int32).at[a].min(rank).at[b].min(rank)
+    return impacts, safe & (row[a] == index) & (row[b] == index), row
+
+
+class _Effect(NamedTuple):
+    """What impacts do; in other rows the values have no meaning."""
+
+    s: Float[Array, "rows"]  # time
+    kick: Float[Array, "rows d"]  # change of velocity of a; that of b is opposite
+    lost: Float[Array, "rows"]  # energy, half of it
+    soon: Bool[Array, "rows"]  # elastic, as too little time has passed
+    gains: Float[Array, "changes rows"]
+
+
+def _effect(
+    impacts: FirstImpacts,
+    safe: Bool[Array, "rows"],
+    last: Float[Array, "rows"],
+    shortest: Float[Array, "rows"],
+    scene: Scene,
+    along: ImpactTangents | None,
+) -> _Effect:
+    """The effect of the impacts marked as safe, by the law of restitution."""
+    s = jnp.where(safe, impacts.times, 0.0)
+    r = impacts.r + impacts.w * s[:, None]
+    normal = r / jnp.where(safe, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
+    speed = jnp.where(safe, -jnp.sum(impacts.w * normal, -1), 1.0)
+    soon = s - last < shortest
+    eps = scene.law.restitution(speed * 0.5**0.5)
+    eps = jnp.where(soon | scene.elastic, 1.0, eps)
+    kick = (0.5 * (1 + eps) * speed)[:, None] * normal
+    lost = 0.125 * (1 - eps * eps) * speed**2
+    gains = jnp.zeros((0, 0), speed.dtype)
+    if along is not None:
+        # The law's unit of speed is sqrt(2).
+        gained = 2 * along.gains(scene.law, speed * 0.5**0.5)
+        gains = jnp.where((safe & ~soon & ~scene.elastic)[None], gained, 0.0)
+    return _Effect(s, kick, lost, soon, gains)
+
+
+def _executed(
+    work: Work,
+    effect: _Effect,
+    safe: Bool[Array, "rows"],
+    row: Int[Array, "slots"],
+    rows: Rows,
+    listed: Float[Array, "slots d"],
+) -> Work:
+    """The particles after the impacts marked as safe, and the sums with these impacts."""
+    slots, own = work.slots, jnp.arange(len(row), dtype=jnp.int32)
+    row = jnp.minimum(row, len(rows.a) - 1)
+    hit = safe[row] & ((rows.a[row] == own) | (rows.b[row] == own))
+    s = jnp.where(hit, effect.s[row], 0.0)
+    sign = jnp.where(hit, jnp.where(rows.a[row] == own, 1.0, -1.0), 0.0)
+    kick = sign[:, None] * effect.kick[row]
+    place = slots.x + slots.v * s[:, None]
+    v = slots.v + kick
+    away = jnp.where(hit, jnp.sum((place - listed) ** 2, -1), 0.0)
+    return Work(
+        slots=Slots(slots.x - kick * s[:, None], v, jnp.where(hit, s, slots.last)),
+        dissipated=work.dissipated + jnp.where(hit, effect.lost[row], 0.0),
+        impacts=work.impacts + hit,
+        regularised=work.regularised + (hit & effect.soon[row]),
+        moved=jnp.maximum(work.moved, away),
+        fastest=jnp.maximum(work.fastest, jnp.sum(v * v, -1)),
+        pending=jnp.any(safe),
+        num_rounds=work.num_rounds + 1,
+        gains=work.gains + effect.gains,
+    )

@@ -1,0 +1,282 @@
+"""Hard spheres in windows of time, in each of which many impacts are resolved at once."""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from jaxgran.checks import status
+from jaxgran.particles import neighbours, user_start
+from jaxgran.particles.capacity import Capacity
+from jaxgran.particles.dynamics import (
+    AbstractDynamics,
+    Progress,
+    first_progress,
+    kept_if,
+    repeat_until,
+)
+from jaxgran.particles.hard.candidates import Selection, select
+from jaxgran.particles.hard.impacts import MAX_ROUNDS, Scene, Work, resolve
+from jaxgran.particles.hard.observation import cooling_trend, observe
+from jaxgran.particles.hard.prediction import Slots
+from jaxgran.particles.neighbours import Pairs
+from jaxgran.particles.state import State, fastest, temperature
+from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.tangents.impact import ImpactTangents
+from jaxgran.tangents.thermal import remembered
+
+LEAST_IMPACTS = 8
+"""Impacts that a window should have at least, in all replicas together."""
+
+CROWDED = 20.0
+"""Listed pairs per particle from which on the skin is shortened: clusters fill a long cutoff."""
+
+SHORTEST_SKIN = 0.2
+"""In diameters; below it the skin is not shortened."""
+
+WINDOW_EXPONENT = 0.3
+"""Damping exponent of the window-length controller: the length changes by
+``(wanted / found impacts)^0.3``, as their number scatters."""
+
+SPEED_MARGIN = 1.15
+"""How much faster than the fastest sphere one may become within a window."""
+
+
+class HardState(NamedTuple):
+    """What hard spheres have besides `State`.
+
+    Attributes:
+        age: time since the last impact.
+        regularised: impacts made elastic because they followed the last one too soon.
+        window: length of the next window.
+    """
+
+    age: Float[Array, "n"]
+    regularised: Int[Array, "replicas"]
+    window: Float[Array, ""]
+
+
+class HardProgress(NamedTuple):
+    """What hard spheres have besides `Progress`.
+
+    Attributes:
+        widen: factor by which the bound on speeds is raised.
+        num_windows, num_failed, num_rounds: made with this neighbour list.
+    """
+
+    widen: Float[Array, ""]
+    num_windows: Int[Array, ""]
+    num_failed: Int[Array, ""]
+    num_rounds: Int[Array, ""]
+
+
+class HardDynamics(AbstractDynamics):
+    """Hard spheres in windows of time.
+
+    Attributes:
+        scene, replicas, capacity: see `AbstractDynamics`.
+        share: impacts per particle in a window.
+        overlap: overlap up to which positions given by a user are those of hard spheres.
+        max_windows: with one neighbour list, for tests.
+    """
+
+    scene: Scene
+    replicas: int = eqx.field(static=True)
+    capacity: Capacity = eqx.field(static=True)
+    share: float = eqx.field(static=True)
+    overlap: float = eqx.field(static=True, default=1e-9)
+    max_windows: int = eqx.field(static=True, default=1_000_000)
+
+    def own_state(self, num_rows, dtype) -> HardState:
+        # Short at first: in random places many spheres are near contact.
+        window = self.share / (8 * self.scene.collision_frequency)
+        return HardState(
+            age=jnp.full(num_rows, jnp.inf, dtype),
+            regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
+            window=jnp.asarray(window, dtype),
+        )
+
+    def elastic(self) -> "HardDynamics":
+        lossless = self.scene._replace(elastic=jnp.array(True))
+        return dataclasses.replace(self, scene=lossless)
+
+    def with_tangents(self, state: State, directions: ReducedLaw) -> State:
+        along = ImpactTangents.at_start(directions, self.replicas, state.velocity.dtype)
+        return state._replace(tangents=along)
+
+    def observe(self, state: State) -> dict[str, Array]:
+        return observe(state, self.scene, self.replicas)
+
+    def check_start(self, state: State) -> Int[Array, ""]:
+        x, side = state.position, self.scene.side
+        closest = user_start.closest(x, side, self.replicas, self.capacity.pairs)
+        tolerance = user_start.overlap_by_rounding(x, side, self.overlap)
+        return status.flag(status.OVERLAPPING, closest < 1 - tolerance)
+
+    def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, ArrayLike]:
+        """The neighbour list is of the positions to which free flight leads at the middle of its
+        life, which doubles that life."""
+        return _prepared(self, state, end)
+
+    def advance(
+        self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
+    ) -> Progress:
+        zero = jnp.zeros((), jnp.int32)
+        own = HardProgress(jnp.ones((), state.position.dtype), zero, zero, zero)
+        first = first_progress(state, pairs, self.capacity, own)
+        window = partial(self._window, listed=listed, pairs=pairs, end=end)
+        return repeat_until(end, window, first)
+
+    def _window(self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike) -> Progress:
+        """One window, accepted if no sphere became faster than the bound and nothing went wrong."""
+        old, more = now.state, now.own
+        left = jnp.asarray(end - old.time)
+        num_left = jnp.maximum(jnp.ceil(left / old.own.window * (1 - 1e-9)), 1.0)
+        duration = left / num_left
+        bound = SPEED_MARGIN * more.widen * fastest(old.velocity, self.replicas)
+        chosen = select(old.position, old.velocity, pairs, duration, bound, self.capacity)
+        work = self._resolved(old, listed, chosen, duration)
+        most = bound[jnp.minimum(chosen.replica, self.replicas - 1)]
+        too_fast = jnp.any(work.fastest > most**2)
+        new = self._moved(old, chosen, work, duration)
+        new = new._replace(time=jnp.where(num_left > 1, old.time + duration, end))
+
+        full = self.capacity.exceeded_by(chosen.needed)
+        finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
+        away = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
+        outrun = jnp.maximum(away, jnp.max(work.moved)) > (0.5 * old.skin) ** 2
+        fault = status.flag(status.SKIN_OUTRUN, outrun)
+        fault |= status.flag(status.STALLED, work.num_rounds >= MAX_ROUNDS)
+        fault = jnp.where(finite, fault, status.NOT_FINITE.bit)
+        fault = jnp.where(full > 0, full, fault)  # a window with too short arrays is no window
+        done = (fault == status.OK) & ~too_fast
+        again = too_fast & finite & (full == 0)
+        state = kept_if(done, new, old)
+        ahead = state.position + state.velocity * jnp.minimum(state.own.window, end - state.time)
+        ahead = jnp.max(jnp.sum((ahead - listed) ** 2, -1))
+        enough = more.num_windows + 1 >= self.max_windows
+        return Progress(
+            state=state,
+            stale=(done & (ahead > (0.5 * old.skin) ** 2)) | enough,
+            status=jnp.where(again, status.OK, fault).astype(jnp.int32),
+            needed=jnp.maximum(now.needed, chosen.needed),
+            own=HardProgress(
+                widen=jnp.where(again, 1.3 * more.widen, 1.0),
+                num_windows=more.num_windows + 1,
+                num_failed=more.num_failed + ~done,
+                num_rounds=more.num_rounds + work.num_rounds,
+            ),
+        )
+
+    def _resolved(self, state: State, listed: Array, chosen: Selection, duration: Array) -> Work:
+        """The impacts of a window."""
+
+        def of_members(values):
+            return values.at[chosen.members].get(mode="fill", fill_value=0.0)
+
+        heat = temperature(state.velocity, self.replicas)
+        heat = jnp.maximum(heat, jnp.finfo(heat.dtype).tiny)
+        scene = self.scene
+        shortest = scene.contact_time / (scene.collision_frequency * jnp.sqrt(heat))
+        slots = Slots(
+            of_members(state.position), of_members(state.velocity), -of_members(state.own.age)
+        )
+        return resolve(slots, of_members(listed), chosen, scene, duration, shortest, state.tangents)
+
+    def _moved(self, state: State, chosen: Selection, work: Work, duration: Array) -> State:
+        """The state after a window, but for its time, and the length of the next one."""
+
+        def by_replica(values):  # an empty slot is of no replica
+            sums = jnp.zeros(self.replicas, values.dtype)
+            return sums.at[chosen.replica].add(values, mode="drop")
+
+        def to_members(values, new):
+            return values.at[chosen.members].set(new, mode="drop")
+
+        impacts, lost = by_replica(work.impacts) // 2, by_replica(work.dissipated)
+        wanted = max(0.5 * self.share * len(state.position), LEAST_IMPACTS)
+        ratio = (wanted / jnp.maximum(jnp.sum(impacts), 1)) ** WINDOW_EXPONENT
+        ratio = jnp.clip(ratio, 0.5, 1.5)
+        slots, own = work.slots, state.own
+        regularised = own.regularised + by_replica(work.regularised) // 2
+        # The last, short window before an end says nothing about the rate of impacts.
+        full_length = duration > 0.5 * own.window
+        new = state._replace(
+            position=to_members(
+                state.position + state.velocity * duration, slots.x + slots.v * duration
+            ),
+            velocity=to_members(state.velocity, slots.v),
+            dissipated=state.dissipated + lost,
+            collisions=state.collisions + impacts,
+            own=HardState(
+                age=to_members(own.age + duration, duration - slots.last),
+                regularised=regularised,
+                window=jnp.where(full_length, duration * ratio, own.window),
+            ),
+        )
+        if state.tangents is None:
+            return new
+        return new._replace(tangents=self._followed(new, chosen, work, lost, impacts, duration))
+
+    def _followed(
+        self,
+        new: State,
+        chosen: Selection,
+        work: Work,
+        lost: Array,
+        impacts: Array,
+        duration: Array,
+    ) -> ImpactTangents:
+        """The tangents after a window."""
+        along, d = new.tangents, new.velocity.shape[1]
+        num_particles = len(new.velocity) // self.replicas
+        heat = temperature(new.velocity, self.replicas)
+        energy = 0.5 * d * num_particles * heat
+        replica = chosen.replica[chosen.rows.a]
+        gains = jnp.zeros((len(work.gains), self.replicas), energy.dtype)
+        rates = remembered(
+            along.rates,
+            lost=lost,
+            met=2 / num_particles * impacts,
+            energy=energy,
+            temperature=heat,
+            trend=cooling_trend(self.scene.law, heat, d),
+            duration=duration,
+            collision_frequency=self.scene.collision_frequency,
+        )
+        gains = gains.at[:, replica].add(work.gains, mode="drop")
+        return along.after(gains, energy + 0.5 * lost, duration, rates)
+
+    def mend(self, now: Progress, began: State) -> tuple[State, Int[Array, ""]]:
+        """Where a new list was outrun the window is shortened; where it is crowded, the skin."""
+        state = now.state
+        fresh = state.time == began.time  # else a new list is all that an outrun skin needs
+        shorten = status.has(now.status, status.SKIN_OUTRUN) & fresh
+        # Only where the capacity sufficed, so that this does not depend on a resumed run's.
+        crowded = now.needed[0] > CROWDED * len(state.position)
+        crowded &= now.status == status.OK
+        shorter = jnp.maximum(0.8 * state.skin, jnp.minimum(state.skin, SHORTEST_SKIN))
+        beyond = status.LIST_FULL.bit | status.CONTACTS_FULL.bit
+        beyond |= status.NOT_FINITE.bit | status.STALLED.bit
+        window = jnp.where(shorten, 0.5 * state.own.window, state.own.window)
+        mended = state._replace(
+            skin=jnp.where(crowded, shorter, state.skin), own=state.own._replace(window=window)
+        )
+        return mended, now.status & beyond
+
+
+@jax.jit
+def _prepared(dynamics: HardDynamics, state: State, end: ArrayLike) -> tuple[State, Array, Array]:
+    side, replicas = dynamics.scene.side, dynamics.replicas
+    speed = jnp.max(fastest(state.velocity, replicas))
+    life = 0.95 * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
+    left = end - state.time
+    flown = 0.5 * jnp.minimum(life, left) * state.velocity
+    listed = neighbours.wrap(side, state.position + flown)
+    image = jnp.round((state.position + flown - listed) / side).astype(jnp.int32)
+    began = state._replace(position=listed - flown, image=state.image + image)
+    return began, listed, jnp.where(life < left, state.time + life, end)

@@ -1,0 +1,82 @@
+"""A run of spheres in boxes: what its two layers, `pure` and `driver`, have in common.
+
+A gas starts from random positions and Maxwellian velocities, melts elastically, and then cools from
+exactly T_0 without momentum; or it starts from what a user gives.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+from jaxtyping import Array, ArrayLike
+
+from jaxgran.particles import initial
+from jaxgran.particles.capacity import Capacity
+from jaxgran.particles.dynamics import AbstractDynamics
+from jaxgran.particles.state import State
+from jaxgran.tangents.rule import Inputs
+
+MELT_COLLISIONS = 10.0
+"""Mean free times of elastic motion before t = 0."""
+
+SETTLED = 2.0
+"""Mean free times of melting after which the capacity of the run suffices."""
+
+SMALLEST_BOX = 2.1
+"""Box side in diameters below which a sphere could touch another one and its image at once."""
+
+
+class Simulation(NamedTuple):
+    """A run of spheres in boxes.
+
+    Attributes:
+        dynamics: how they move; with the capacity of the run.
+        melt_capacity: of the first mean free times of the melt.
+        inputs: times, start and key, in reduced units.
+        directions: in the material, along which tangents are followed; None for no tangents.
+        num_particles: in each box.
+        dimension: d.
+        skin: of the first neighbour list.
+        engine: who finds the pairs, see `neighbours.engine`.
+    """
+
+    dynamics: AbstractDynamics
+    melt_capacity: Capacity
+    inputs: Inputs
+    directions: Any
+    num_particles: int
+    dimension: int
+    skin: ArrayLike
+    engine: str
+
+    @property
+    def melts(self) -> bool:
+        """Whether the start is random."""
+        return self.inputs.start is None
+
+    @property
+    def melt_time(self) -> Array:
+        """Duration of the melt."""
+        return MELT_COLLISIONS / self.dynamics.scene.collision_frequency
+
+    def first_state(self) -> State:
+        """The state at the beginning of the melt, or of the run of a given start."""
+        if self.inputs.start is not None:
+            return self.dynamics.begin(*self.inputs.start, self.skin)
+        key = jax.random.key(0) if self.inputs.key is None else self.inputs.key
+        places, speeds = jax.random.split(key)
+        size = self.dynamics.replicas, self.num_particles, self.dimension
+        position = initial.positions(places, self.dynamics.scene.side, *size)
+        return self.dynamics.begin(position, initial.velocities(speeds, *size), self.skin)
+
+    def cooling_state(self, melted: State) -> State:
+        """The state at t = 0, from that at the end of the melt; with tangents if they are wanted.
+
+        The energy in contacts is counted by the first call of `AbstractDynamics.advance`.
+        """
+        velocity = melted.velocity
+        if self.melts:
+            velocity = initial.settle(velocity, self.dynamics.replicas)
+        state = self.dynamics.begin(melted.position, velocity, melted.skin)
+        if self.directions is None:
+            return state
+        return self.dynamics.with_tangents(state, self.directions)

@@ -1,0 +1,281 @@
+"""Soft spheres in blocks of time steps: those that may touch are stepped, the rest flies freely.
+
+Free flight is exact, and which spheres may touch is decided once a block: indices are fixed within
+it, which keeps them out of the derivative.
+"""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from jaxgran.checks import status
+from jaxgran.particles.capacity import Capacity, longest_skin
+from jaxgran.particles.dynamics import (
+    AbstractDynamics,
+    Progress,
+    first_progress,
+    kept_if,
+    repeat_until,
+)
+from jaxgran.particles.neighbours import Pairs
+from jaxgran.particles.soft import candidates, linearised, steps
+from jaxgran.particles.soft.candidates import Encounters
+from jaxgran.particles.soft.observation import observe
+from jaxgran.particles.soft.scene import SoftScene
+from jaxgran.particles.soft.steps import Work
+from jaxgran.particles.state import State, fastest, kinetic_energy, rewrapped, temperature
+from jaxgran.tangents import thermal
+from jaxgran.tangents.thermal import ThermalTangents
+from jaxgran.theory import closed_forms
+
+MAX_REFINE = 64.0
+"""Largest factor by which the step may become shorter than asked before the run fails."""
+
+WORK_TOLERANCE = 0.1
+"""Energy error of a block that is allowed, over the work done by elastic forces in it."""
+
+ENERGY_TOLERANCE = 1e-3
+"""And over all energy: a contact that began after the last kick holds energy not yet accounted."""
+
+REACH_MARGIN = 1.5
+"""How much farther than the fastest sphere would fly a sphere may get in a block."""
+
+
+class SoftState(NamedTuple):
+    """What soft spheres have besides `State`.
+
+    Attributes:
+        elastic: energy in contacts.
+        refine: factor by which steps are shorter than asked.
+    """
+
+    elastic: Float[Array, "replicas"]
+    refine: Float[Array, ""]
+
+
+class SoftProgress(NamedTuple):
+    """What soft spheres have besides `Progress`.
+
+    Attributes:
+        extra: particles found to take part only when a block had been stepped.
+        widen: factor by which the next block looks farther.
+        num_blocks: made with this neighbour list.
+    """
+
+    extra: Bool[Array, "n"]
+    widen: Float[Array, ""]
+    num_blocks: Int[Array, ""]
+
+
+class _Stepped(NamedTuple):
+    """The result of one block, not yet accepted."""
+
+    state: State
+    work: Work
+    distance: Array  # square of the largest distance that a member moved
+
+
+class SoftDynamics(AbstractDynamics):
+    """Viscoelastic spheres in blocks of equal time steps.
+
+    Attributes:
+        scene, replicas, capacity: see `AbstractDynamics`.
+        steps_per_contact: steps in the mean contact duration at the current temperature.
+        steps_per_block: steps in which the candidates for contact are fixed.
+        projection: mean free times between thermal projections of tangents.
+    """
+
+    scene: SoftScene
+    replicas: int = eqx.field(static=True)
+    capacity: Capacity = eqx.field(static=True)
+    steps_per_contact: Int[Array, ""]
+    steps_per_block: Int[Array, ""]
+    projection: Float[Array, ""]
+
+    def own_state(self, num_rows, dtype) -> SoftState:
+        # The elastic energy of the start is counted by the first `advance`.
+        return SoftState(jnp.zeros(self.replicas, dtype), jnp.ones((), dtype))
+
+    def elastic(self) -> "SoftDynamics":
+        lossless = dataclasses.replace(self.scene, dissipative_constant=0.0 * self.scene.alpha)
+        return dataclasses.replace(self, scene=lossless)
+
+    def with_tangents(self, state: State, directions: tuple[Array, Array]) -> State:
+        scene = self.scene
+        damping = closed_forms.COOLING_CORRECTION * scene.dissipative_constant * scene.alpha**0.4
+        along = thermal.at_start(
+            *directions, state.velocity, self.replicas, self.projection, damping
+        )
+        return state._replace(tangents=along)
+
+    def observe(self, state: State) -> dict[str, Array]:
+        return observe(state, self.scene, self.replicas)
+
+    def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, ArrayLike]:
+        began = rewrapped(state, self.scene.side)
+        return began, began.position, end
+
+    def advance(
+        self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
+    ) -> Progress:
+        xi, _, touching = steps.overlap(state.position, pairs.i, pairs.j, pairs.offset)
+        touching &= jnp.arange(len(xi)) < pairs.count
+        stored = steps.elastic_energy(jnp.where(touching, xi, 0.0), self.scene.alpha)
+        replica = pairs.i // (len(state.position) // self.replicas)
+        elastic = jnp.zeros_like(state.own.elastic).at[replica].add(stored)
+        own = SoftProgress(
+            extra=jnp.zeros(len(state.position), bool),
+            widen=jnp.ones((), state.position.dtype),
+            num_blocks=jnp.zeros((), jnp.int32),
+        )
+        state = state._replace(own=state.own._replace(elastic=elastic))
+        first = first_progress(state, pairs, self.capacity, own)
+        block = partial(self._block, listed=listed, pairs=pairs, end=end)
+        return repeat_until(end, block, first)
+
+    def _block(self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike) -> Progress:
+        """One block, accepted if all that took part in it was expected and nothing went wrong."""
+        old, more = now.state, now.own
+        duration, num_left = self._duration(old, end)
+        # Of all replicas: they share their blocks.
+        speed = jnp.max(fastest(old.velocity, self.replicas))
+        reach = REACH_MARGIN * speed * duration * more.widen
+        chosen = candidates.select(
+            old.position,
+            old.velocity,
+            pairs,
+            duration,
+            2 * reach,
+            more.extra,
+            self.replicas,
+            self.capacity[2:],
+        )
+        stepped = self._stepped(old, chosen, duration)
+        new = stepped.state
+        new = new._replace(time=jnp.where(num_left > 1, old.time + duration, end))
+        if old.tangents is not None:
+            new = new._replace(tangents=self._projected(new, chosen, stepped.work, duration))
+        work = stepped.work
+
+        # A sphere outside the chosen ones was hit, or one went farther than was looked.
+        surprise = work.touched & ~chosen.expected
+        partners = chosen.members[jnp.stack([chosen.a, chosen.b], 1)]
+        hit = jnp.where(surprise[:, None], partners, len(old.position))
+        extra = more.extra.at[hit].set(True, mode="drop")
+        too_far = stepped.distance > reach**2
+        again = jnp.any(surprise) | too_far
+
+        moved = jnp.sqrt(jnp.max(jnp.sum((new.position - listed) ** 2, -1)))
+        fault = self._fault(old, new, work, chosen, moved)
+        done = (fault == status.OK) & ~again
+        return Progress(
+            state=kept_if(done, new, old),
+            stale=done & (moved + 2 * speed * duration > 0.5 * old.skin),
+            status=fault,
+            needed=jnp.maximum(now.needed, chosen.needed),
+            own=SoftProgress(
+                extra=jnp.where(done, False, extra),
+                widen=jnp.where(done, 1.0, jnp.where(too_far, 2 * more.widen, more.widen)),
+                num_blocks=more.num_blocks + 1,
+            ),
+        )
+
+    def _duration(self, state: State, end: ArrayLike) -> tuple[Array, Array]:
+        """Duration of the next block, and how many as long are left until the end."""
+        # With the energy in contacts, or a step would lengthen while all of it is stored there.
+        stored = 2 * self.replicas / state.position.size * state.own.elastic
+        hottest = jnp.max(temperature(state.velocity, self.replicas) + stored)
+        per_contact = self.steps_per_contact * state.own.refine
+        longest_step = self.scene.contact_duration * hottest**-0.1 / per_contact
+        longest = self.steps_per_block * longest_step
+        left = jnp.asarray(end - state.time)
+        num_left = jnp.maximum(jnp.ceil(left / longest * (1 - 1e-9)), 1.0)
+        return left / num_left, num_left
+
+    def _stepped(self, state: State, chosen: Encounters, duration: Array) -> _Stepped:
+        """The state after the block, but for its time; tangents are followed, not projected."""
+        x, v = state.position, state.velocity
+        before = x.at[chosen.members].get(mode="fill", fill_value=0.0)
+        v_before = v.at[chosen.members].get(mode="fill", fill_value=0.0)
+        after, v_after, work, along = linearised.follow(
+            before, v_before, self.scene, chosen, duration, self.steps_per_block, state.tangents
+        )
+        by_replica = self._sums_over(chosen)
+        own = state.own._replace(elastic=by_replica(work.stored))
+        new = state._replace(
+            position=(x + v * duration).at[chosen.members].set(after, mode="drop"),
+            velocity=v.at[chosen.members].set(v_after, mode="drop"),
+            dissipated=state.dissipated + by_replica(work.dissipated),
+            collisions=state.collisions + by_replica(work.begun),
+            own=own,
+            tangents=along,
+        )
+        return _Stepped(new, work, jnp.max(jnp.sum((after - before) ** 2, -1)))
+
+    def _sums_over(self, chosen: Encounters):
+        """A function from values of the chosen pairs to their sums over each replica."""
+
+        def by_replica(values):
+            return jnp.zeros(self.replicas, values.dtype).at[chosen.replica].add(values)
+
+        return by_replica
+
+    def _projected(
+        self, new: State, chosen: Encounters, work: Work, duration: Array
+    ) -> ThermalTangents:
+        """The tangents after a block, projected if it is time to."""
+        along, by_replica = new.tangents, self._sums_over(chosen)
+        partners = chosen.members[jnp.stack([chosen.a, chosen.b], 1)]
+        ends = jnp.where(work.touching[:, None], partners, len(new.position))
+        heat = temperature(new.velocity, self.replicas)
+        rates = thermal.remembered(
+            along.rates,
+            lost=by_replica(work.dissipated),
+            met=2 * self.replicas / len(new.position) * by_replica(work.begun),
+            energy=kinetic_energy(new.velocity, self.replicas) + new.own.elastic,
+            temperature=heat,
+            trend=along.trend(heat),
+            duration=duration,
+            collision_frequency=self.scene.collision_frequency,
+        )
+        free = jnp.ones_like(along.free).at[ends].set(False, mode="drop")
+        along = along._replace(free=free, rates=rates)
+        passed = (new.time - along.since) * jnp.sqrt(jnp.mean(heat))
+        due = passed * self.scene.collision_frequency >= along.interval
+        return thermal.project(along, new.velocity, new.time, due)
+
+    def _fault(
+        self, old: State, new: State, work: Work, chosen: Encounters, moved: Array
+    ) -> Int[Array, ""]:
+        """The status of a block that moved spheres by at most so much since the list was built."""
+        by_replica = self._sums_over(chosen)
+        kinetic = kinetic_energy(old.velocity, self.replicas)
+        gain = kinetic_energy(new.velocity, self.replicas) - kinetic
+        gain = gain + new.own.elastic - old.own.elastic + by_replica(work.dissipated)
+        allowed = WORK_TOLERANCE * by_replica(work.exchanged)
+        allowed += ENERGY_TOLERANCE * (kinetic + old.own.elastic)
+        wrong = jnp.any(jnp.abs(gain) > allowed)
+        full = self.capacity.exceeded_by(chosen.needed)
+        finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
+        outrun = status.flag(status.SKIN_OUTRUN, moved > 0.5 * old.skin)
+        fault = jnp.where(finite, outrun, status.NOT_FINITE.bit)
+        fault |= status.flag(status.STEP_TOO_LARGE, wrong & finite)
+        return jnp.where(full > 0, full, fault)  # a block with too short arrays is no block
+
+    def mend(self, now: Progress, began: State) -> tuple[State, Int[Array, ""]]:
+        """A step that is too large is halved, and a skin that was outrun lengthened."""
+        state, longest = now.state, longest_skin(self.scene.side)
+        fresh = state.time == began.time  # else a new list is all that an outrun skin needs
+        outrun = status.has(now.status, status.SKIN_OUTRUN) & fresh
+        shorten = status.has(now.status, status.STEP_TOO_LARGE)
+        shorten |= outrun & (state.skin >= longest)
+        hopeless = shorten & (state.own.refine >= MAX_REFINE)
+        beyond = status.LIST_FULL.bit | status.CONTACTS_FULL.bit | status.NOT_FINITE.bit
+        finer = jnp.where(shorten & ~hopeless, 2 * state.own.refine, state.own.refine)
+        longer = jnp.where(outrun, jnp.minimum(1.5 * state.skin, longest), state.skin)
+        mended = state._replace(skin=longer, own=state.own._replace(refine=finer))
+        return mended, jnp.where(hopeless, now.status, now.status & beyond)

@@ -1,0 +1,116 @@
+"""The state of spheres in periodic boxes, soft or hard, and what is recorded of it.
+
+Units here: diameter, mass and first temperature are 1. All particles of all boxes stand in one
+array, replica after replica (n = replicas * N rows).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from jaxgran.particles import neighbours, observables
+
+
+class State(NamedTuple):
+    """Particles of all replicas at one time.
+
+    Attributes:
+        time: t.
+        position: not wrapped into the box since the last neighbour list was built.
+        velocity: in the laboratory frame.
+        image: box sides that wrapping has subtracted from the position.
+        origin: position at t = 0.
+        first_velocity: velocity at t = 0.
+        dissipated: energy lost since t = 0.
+        collisions: begun since t = 0, each pair counted once.
+        skin: of the neighbour list.
+        own: what only one kind of spheres has.
+        tangents: derivatives of the state, if they are followed.
+    """
+
+    time: Float[Array, ""]
+    position: Float[Array, "n d"]
+    velocity: Float[Array, "n d"]
+    image: Int[Array, "n d"]
+    origin: Float[Array, "n d"]
+    first_velocity: Float[Array, "n d"]
+    dissipated: Float[Array, "replicas"]
+    collisions: Int[Array, "replicas"]
+    skin: Float[Array, ""]
+    own: Any
+    tangents: Any = None
+
+
+def at_start(
+    position: Float[Array, "n d"],
+    velocity: Float[Array, "n d"],
+    side: ArrayLike,
+    skin: ArrayLike,
+    replicas: int,
+    own: Any,
+) -> State:
+    """The state at t = 0."""
+    dtype, inside = position.dtype, neighbours.wrap(side, position)
+    return State(
+        time=jnp.zeros((), dtype),
+        position=inside,
+        velocity=velocity,
+        image=jnp.zeros(position.shape, jnp.int32),
+        origin=inside,
+        first_velocity=velocity,
+        dissipated=jnp.zeros(replicas, dtype),
+        collisions=jnp.zeros(replicas, jnp.result_type(int)),
+        skin=jnp.asarray(skin, dtype),
+        own=own,
+    )
+
+
+@jax.jit
+def rewrapped(state: State, side: ArrayLike) -> State:
+    """The same state with every position inside the box; a new neighbour list must follow."""
+    inside = neighbours.wrap(side, state.position)
+    image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
+    return state._replace(position=inside, image=image)
+
+
+def centred(values: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas N d"]:
+    """Values less their mean over each replica: in the frame in which its momentum is zero."""
+    each = values.reshape(replicas, -1, values.shape[-1])
+    return each - jnp.mean(each, axis=1, keepdims=True)
+
+
+def temperature(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas"]:
+    """T of each replica."""
+    return observables.temperature(centred(velocity, replicas))
+
+
+def kinetic_energy(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas"]:
+    """Kinetic energy of each replica in the laboratory frame."""
+    return 0.5 * jnp.sum(velocity.reshape(replicas, -1) ** 2, axis=-1)
+
+
+def fastest(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas"]:
+    """Speed of the fastest sphere of each replica."""
+    return jnp.sqrt(jnp.max(jnp.sum(velocity * velocity, -1).reshape(replicas, -1), axis=-1))
+
+
+def records(
+    state: State, side: ArrayLike, replicas: int
+) -> tuple[dict[str, Array], Float[Array, "replicas N d"], Float[Array, "replicas N d"]]:
+    """What is recorded of every kind of spheres, and displacements and velocities, centred."""
+    velocity = centred(state.velocity, replicas)
+    travelled = centred(state.position - state.origin + side * state.image, replicas)
+    num_particles = velocity.shape[1]
+    values = {
+        "temperature": observables.temperature(velocity),
+        "sonine": observables.sonine(velocity),
+        "displacement": observables.mean_square_displacement(travelled),
+        "velocity_correlation": observables.velocity_correlation(
+            centred(state.first_velocity, replicas), velocity
+        ),
+        "dissipated_energy": state.dissipated / num_particles,
+        "collisions": 2 / num_particles * state.collisions,
+    }
+    return values, travelled, velocity

@@ -1,0 +1,206 @@
+"""A DSMC run: its initial state, its records, and the run as a pure function.
+
+Units here: the impact speed sqrt(2 T_0) and the path length. Laws of restitution are reduced, times
+are in these units, and a key of random numbers is two 32-bit words.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from math import sqrt
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, UInt32
+
+from jaxgran.checks import status
+from jaxgran.particles import initial, observables
+from jaxgran.particles.stochastic import collisions
+from jaxgran.particles.stochastic.collisions import DSMCState, DSMCTangents, Scheme
+from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.theory import averages
+
+MISSED = 1e-4
+"""Share of collisions missed because of the ceiling of the collision rate that fails a run."""
+
+CHUNK = 4_000_000
+"""Candidate pairs of one call to compiled code by the host driver, which take about a second."""
+
+
+@partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
+def at_start(
+    key: UInt32[Array, "2"], replicas: int, scheme: Scheme, num_parameters: int
+) -> DSMCState:
+    """Maxwellian velocities at t = 0, with tangents in so many parameters."""
+    d = scheme.dimension
+    key = jax.random.fold_in(collisions.wrapped(key), 2**32 - 1)
+    v = initial.velocities(key, replicas, scheme.num_particles, d).reshape(replicas, -1, d)
+    each, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
+    return DSMCState(
+        time=jnp.zeros((), v.dtype),
+        clock=each,
+        temperature=each + 1,
+        particles=jnp.concatenate([v / sqrt(2), jnp.zeros_like(v)], axis=-1),
+        collisions=each,
+        missed=each,
+        steps=jnp.zeros(replicas, jnp.uint32),
+        mobility=each,
+        tangents=DSMCTangents(*[along] * len(DSMCTangents._fields)),
+    )
+
+
+@partial(jax.jit, static_argnames=("scheme", "tangents"))
+def observe(
+    state: DSMCState,
+    first: Float[Array, "replicas N d"],
+    law: ReducedLaw,
+    key: UInt32[Array, "2"],
+    *,
+    scheme: Scheme,
+    tangents: bool = False,
+) -> dict[str, Any]:
+    """The records of each replica at the time of a state, and the status of each, "fault".
+
+    The next step of each replica is done in part, up to this time, and then discarded.
+
+    Args:
+        state: of the gas.
+        first: velocities at t = 0.
+        law, key, scheme: of the run.
+        tangents: return three dictionaries instead: "values", the "rates" of their change with
+            time, and "along", their tangents in the parameters of the law at this time.
+    """
+    share = (state.time - state.clock) * jnp.sqrt(state.temperature) / scheme.own_step
+    state = collisions.step(state, key, jnp.clip(share, 0.0, 1.0), law, scheme, tangents)
+    d = scheme.dimension
+
+    def centred(x):
+        return x - jnp.mean(x, axis=1, keepdims=True)
+
+    velocity = centred(state.particles[..., :d])
+    travelled = centred(
+        state.particles[..., d:] + state.clock[:, None, None] * state.particles[..., :d]
+    )
+    theta = 2 * observables.temperature(velocity)
+    values = {
+        "temperature": theta,
+        "sonine": observables.sonine(velocity),
+        "displacement": observables.mean_square_displacement(travelled),
+        "velocity_correlation": 2 * observables.velocity_correlation(first, velocity),
+        "collisions": 2 / scheme.num_particles * state.collisions,
+    }
+    fast = status.flag(status.TOO_FAST, state.missed > MISSED * state.collisions + 1)
+    values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
+    if not tangents:
+        return values
+    walked = 2 * jnp.mean(jnp.sum(travelled * velocity, axis=-1), axis=-1)
+    rates = _rates(values, law, d) | {"displacement": walked}
+    return {"values": values, "rates": rates, "along": _along(values, rates, state.tangents)}
+
+
+def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array]:
+    """Rates of change with time of all records but <dr^2>, of the Maxwell-Sonine distribution."""
+    theta, a2 = values["temperature"], values["sonine"]
+    speed = jnp.sqrt(theta)
+
+    @jax.vmap
+    def rates_of(speed, a2):
+        return averages.Rates.of(averages.averages(law, speed, d), a2)
+
+    rates = rates_of(speed, a2)
+    cooling = 2 / d * rates.cooling * speed
+    return {
+        "temperature": -cooling * theta,
+        "sonine": 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment * speed,
+        "velocity_correlation": -rates.relaxation * speed * values["velocity_correlation"],
+        "collisions": averages.collision_rate(a2, d) * speed,
+    }
+
+
+def _along(
+    values: dict[str, Array], rates: dict[str, Array], tangents: DSMCTangents
+) -> dict[str, Array]:
+    """Tangents of the records at a fixed time, from those at a fixed own time and the clock's."""
+    theta, c = values["temperature"], tangents.log_temperature
+    correlation = values["velocity_correlation"]
+    at_own_time = {
+        "temperature": theta[:, None] * c,
+        "velocity_correlation": correlation[:, None] * (c / 2 + tangents.persistence),
+        "displacement": tangents.displacement,
+    }
+    return {
+        name: at_own_time.get(name, 0.0) - rate[:, None] * tangents.clock
+        for name, rate in rates.items()
+    }
+
+
+@partial(jax.jit, static_argnames=("replicas", "scheme", "tangents"))
+def run(
+    law: ReducedLaw,
+    times: Float[Array, "times"],
+    key: UInt32[Array, "2"],
+    *,
+    replicas: int,
+    scheme: Scheme,
+    tangents: bool,
+) -> dict[str, Any]:
+    """The records of `observe` at all times, with a first axis of times. A pure function."""
+    num_parameters = ravel_pytree(law)[0].size if tangents else 0
+    state = at_start(key, replicas, scheme, num_parameters)
+    first = state.particles[..., : scheme.dimension]
+    forever = jnp.asarray(2**31 - 1, jnp.int32)
+
+    def to(state, end):
+        state = collisions.advance(state, end, law, key, forever, scheme=scheme, tangents=tangents)
+        return state, observe(state, first, law, key, scheme=scheme, tangents=tangents)
+
+    return jax.lax.scan(to, state, times)[1]
+
+
+def differentiable_run(
+    law: ReducedLaw,
+    times: Float[Array, "times"],
+    key: UInt32[Array, "2"],
+    *,
+    replicas: int,
+    scheme: Scheme,
+) -> dict[str, Array]:
+    """`run` with one linear rule for forward and reverse mode, from tangents beside the state."""
+    parameters, unravel = ravel_pytree(law)
+
+    @jax.custom_jvp
+    def solve(parameters, times, key):
+        law = unravel(parameters)
+        return run(law, times, key, replicas=replicas, scheme=scheme, tangents=False)
+
+    @solve.defjvp
+    def solve_jvp(at, along):
+        parameters, times, key = at
+        law = unravel(parameters)
+        out = run(law, times, key, replicas=replicas, scheme=scheme, tangents=True)
+        values = out["values"]
+        tangents = {
+            name: rate * along[1][:, None] + out["along"][name] @ along[0]
+            for name, rate in out["rates"].items()
+        }
+        return values, tangents | {"fault": np.zeros(values["fault"].shape, jax.dtypes.float0)}
+
+    return solve(parameters, times, key)
+
+
+def parts(
+    law: ReducedLaw, key: UInt32[Array, "2"], *, replicas: int, scheme: Scheme
+) -> tuple[DSMCState, Callable[[DSMCState, float], DSMCState], Callable[[DSMCState], dict]]:
+    """The parts of `run` that the host driver needs: a state, how to advance, and to observe it."""
+    state = at_start(key, replicas, scheme, 0)
+    pairs = replicas * (scheme.first + scheme.second)
+    max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
+    first = state.particles[..., : scheme.dimension]
+
+    def advance(state: DSMCState, end: float) -> DSMCState:
+        end_array = jnp.asarray(end, state.clock.dtype)
+        return collisions.advance(state, end_array, law, key, max_steps, scheme=scheme)
+
+    return state, advance, partial(observe, first=first, law=law, key=key, scheme=scheme)

@@ -1,0 +1,86 @@
+"""Positions and velocities given by a user for a run of spheres to begin with."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from jaxgran.data.curve import Particles
+from jaxgran.particles import neighbours
+from jaxgran.scene.gas import Gas
+
+SAME_BOX = 1e-6
+"""Relative difference up to which the box of a start counts as that of the gas."""
+
+
+def check(start: Particles | None, gas: Gas, replicas: int, num_particles: int) -> None:
+    """Raise ValueError for a start of another shape, or, if its numbers are known, another box."""
+    if start is None:
+        return
+    shape = (replicas, num_particles, gas.dimension)
+    for name, values in zip(start._fields[:2], start[:2], strict=True):
+        if np.shape(values) != shape:
+            raise ValueError(f"start.{name} has shape {np.shape(values)}, not {shape}")
+    other = is_of_other_box(start, gas, num_particles)
+    if not isinstance(other, Tracer) and bool(other):
+        side = gas.box_side(num_particles)
+        raise ValueError(
+            f"start.box_side is {float(start.box_side / gas.diameter):.7g} diameters, that of the "
+            f"gas {float(side / gas.diameter):.7g}: change packing_fraction or the start"
+        )
+
+
+def is_of_other_box(start: Particles | None, gas: Gas, num_particles: int) -> Bool[Array, ""]:
+    """Whether there is a start and its box is not that of the gas."""
+    if start is None:
+        return jnp.array(False)
+    ratio = jax.lax.stop_gradient(start.box_side / gas.box_side(num_particles))
+    return ~(jnp.abs(ratio - 1) < SAME_BOX + 10 * jnp.finfo(ratio.dtype).eps)
+
+
+def with_constant_temperature(start: Particles | None, gas: Gas) -> Gas:
+    """The gas as derivatives see it: with a start, T_0 is a unit of speed and nothing else."""
+    if start is None:
+        return gas
+    return gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
+
+
+def reduced(
+    start: Particles | None, gas: Gas, *, differentiable: bool = False
+) -> tuple[Float[Array, "n d"], Float[Array, "n d"]] | None:
+    """Positions and velocities in units of the gas, replica after replica; None without a start.
+
+    Args:
+        start: as given by the user.
+        gas: the scene.
+        differentiable: whether derivatives see the diameter as the unit of length; else the start
+            is the same, in diameters, for a gas of any diameter.
+    """
+    if start is None:
+        return None
+    length = gas.diameter if differentiable else jax.lax.stop_gradient(gas.diameter)
+    position = start.position / length
+    velocity = start.velocity / jnp.sqrt(gas.temperature)
+    return position.reshape(-1, gas.dimension), velocity.reshape(-1, gas.dimension)
+
+
+def closest(
+    position: Float[Array, "n d"], side: ArrayLike, replicas: int, num_pairs: int
+) -> Float[Array, ""]:
+    """The least distance between two spheres, in diameters; 1 if none is below.
+
+    `num_pairs` is the number of overlapping pairs that can be looked at.
+    """
+    pairs = neighbours.find_pairs(position, side, 1.0, replicas=replicas, room=num_pairs)
+    apart = position[pairs.i] - position[pairs.j] - pairs.offset
+    real = jnp.arange(num_pairs) < pairs.count
+    square = jnp.where(real, jnp.sum(apart * apart, -1), 1.0)
+    return jnp.sqrt(jnp.min(square, initial=1.0))
+
+
+def overlap_by_rounding(
+    position: Float[Array, "n d"], side: ArrayLike, least: float
+) -> Float[Array, ""]:
+    """Overlap that rounding of positions can give two spheres in contact; at least `least`."""
+    return jnp.maximum(least, 10 * side * jnp.finfo(position.dtype).eps)

@@ -1,0 +1,240 @@
+"""Contact of two viscoelastic spheres: the normal force, and the solution of one impact."""
+
+from functools import partial
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran.checks.validation import NOT_NEGATIVE
+
+ELASTIC_CONTACT_TIME = 3.21806546
+"""Duration of an elastic Hertz impact in units of ``X/v = (alpha^2 v)^(-1/5)``."""
+
+ELASTIC_OVERLAP = 1.09336207
+"""Largest overlap of an elastic Hertz impact in units of ``X = (v^2/alpha)^(2/5)``."""
+
+
+def elastic_constant(
+    youngs_modulus: ArrayLike, poisson_ratio: ArrayLike, diameter: ArrayLike
+) -> Float[Array, ""]:
+    """Hertz constant of two equal spheres, rho in ``F = rho xi^(3/2)``.
+
+    ``rho = 2 Y sqrt(R_eff) / (3 (1 - nu^2))`` with ``R_eff = sigma / 4``.
+
+    Args:
+        youngs_modulus: Y, Pa, > 0.
+        poisson_ratio: nu, in (-1, 0.5).
+        diameter: sigma, m, > 0.
+
+    Returns:
+        rho, N / m^(3/2).
+
+    Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eq. (2) times m_eff.
+    """
+    y, nu, sigma = jnp.asarray(youngs_modulus), jnp.asarray(poisson_ratio), jnp.asarray(diameter)
+    return 2 * y * jnp.sqrt(sigma / 4) / (3 * (1 - nu**2))
+
+
+def stress(
+    overlap: ArrayLike, overlap_rate: ArrayLike, relaxation_time: ArrayLike
+) -> Float[Array, "..."]:
+    """Contact force over ``rho sqrt(xi)``, which is ``xi + (3/2) A xi_dot``.
+
+    A contact between spheres without adhesion ends where it is 0.
+
+    Args:
+        overlap: xi = sigma - r, any shape, positive in contact.
+        overlap_rate: xi_dot, same shape, positive while the spheres approach.
+        relaxation_time: (3/2) A.
+
+    Returns:
+        The stress in the units of `overlap`, same shape.
+    """
+    return jnp.asarray(overlap) + relaxation_time * jnp.asarray(overlap_rate)
+
+
+def contact_force(
+    overlap: ArrayLike,
+    overlap_rate: ArrayLike,
+    elastic_constant: ArrayLike,
+    dissipative_constant: ArrayLike,
+    *,
+    clipped: bool = True,
+) -> Float[Array, "..."]:
+    """Normal force between two viscoelastic spheres, positive if it is repulsive.
+
+    ``F = rho sqrt(xi) (xi + (3/2) A xi_dot)`` for xi > 0, else 0. Unless ``clipped=False``,
+    negative values are replaced by 0, since spheres without adhesion cannot attract each other.
+
+    Args:
+        overlap: xi = sigma - r, m, any shape.
+        overlap_rate: xi_dot, m/s, same shape, positive while the spheres approach.
+        elastic_constant: rho, N / m^(3/2), see `jaxgran.elastic_constant`.
+        dissipative_constant: A, s, >= 0.
+        clipped: whether contact ends where F = 0 (True) or where xi = 0 (False).
+
+    Returns:
+        F, N, same shape. Values and derivatives are finite at xi = 0, where the derivative is
+        taken as 0.
+
+    Reference: Brilliantov, Spahn, Hertzsch & Poeschel, Phys. Rev. E 53, 5382 (1996).
+    """
+    xi = jnp.asarray(overlap)
+    touching = xi > 0
+    root = jnp.sqrt(jnp.where(touching, xi, 1.0))
+    strength = stress(xi, overlap_rate, 1.5 * jnp.asarray(dissipative_constant))
+    if clipped:
+        strength = jnp.maximum(strength, 0.0)
+    return jnp.where(touching, elastic_constant * root * strength, 0.0)
+
+
+def midpoint_rate(
+    overlap: ArrayLike,
+    overlap_rate: ArrayLike,
+    alpha: ArrayLike,
+    dissipative_constant: ArrayLike,
+    dt: ArrayLike,
+) -> Float[Array, "..."]:
+    """Mean of the overlap rates before and after a velocity update at fixed overlap.
+
+    The update is ``xi_dot' = xi_dot - dt alpha sqrt(xi) (xi + (3/2) A r)`` with the mean
+    ``r = (xi_dot + xi_dot')/2``: the implicit midpoint rule, of second order. Its solution is
+    ``r = (xi_dot - h xi) / (1 + (3/2) A h)`` with ``h = dt alpha sqrt(xi) / 2``. The force at this
+    rate does the work ``F r dt``, which is exactly the change of the kinetic energy.
+
+    Args:
+        overlap: xi, any shape; for xi <= 0 the rate is returned unchanged.
+        overlap_rate: xi_dot before the update, same shape.
+        alpha: elastic constant over effective mass.
+        dissipative_constant: A, >= 0.
+        dt: time step of the update.
+
+    Returns:
+        r, same shape.
+    """
+    xi = jnp.asarray(overlap)
+    touching = xi > 0
+    half = 0.5 * dt * alpha * jnp.sqrt(jnp.where(touching, xi, 1.0))
+    rate = jnp.asarray(overlap_rate)
+    mean = (rate - half * xi) / (1 + half * 1.5 * jnp.asarray(dissipative_constant))
+    return jnp.where(touching, mean, rate)
+
+
+class Impact(NamedTuple):
+    """One head-on impact, in units of its initial speed v and of ``X = (v^2/alpha)^(2/5)``.
+
+    Attributes:
+        restitution: coefficient of restitution eps.
+        duration: contact duration, in X/v.
+        largest_overlap: in X.
+    """
+
+    restitution: Float[Array, ""]
+    duration: Float[Array, ""]
+    largest_overlap: Float[Array, ""]
+
+
+def _rates(state, beta):
+    # xi = X y^2 and dt = (X/v) 2 y ds turn xi'' = -sqrt(xi) (xi + beta xi') into polynomials.
+    y, w, _ = state
+    return w, -2 * y * y * stress(y * y, w, beta), 2 * y
+
+
+# An impact is followed until one of these three functions of its state falls to 0.
+
+
+def _overlap_rate(state, beta):
+    return state[1]
+
+
+def _root_of_overlap(state, beta):
+    return state[0]
+
+
+def _scaled_stress(state, beta):
+    # sqrt(xi) - sqrt(-beta w) is 0 where the stress xi + beta w is, and its root is always simple.
+    y, w, _ = state
+    attraction = jnp.maximum(-beta * w, 0.0)
+    positive = attraction > 0
+    return y - jnp.where(positive, jnp.sqrt(jnp.where(positive, attraction, 1.0)), 0.0)
+
+
+def _integrate_to_zero(end, beta, state, smallest, rtol, max_steps):
+    """Integrate the state of an impact until `end(state, beta)` has fallen to 0."""
+    solve = partial(
+        diffrax.diffeqsolve,
+        solver=diffrax.Dopri8(),
+        dt0=None,
+        args=beta,
+        adjoint=diffrax.ForwardMode(),
+        max_steps=max_steps,
+    )
+    controller = diffrax.PIDController(rtol=rtol, atol=rtol * smallest, dtmax=0.25 + beta)
+    past = solve(
+        diffrax.ODETerm(lambda s, y, beta: _rates(y, beta)),
+        t0=0.0,
+        t1=jnp.inf,
+        y0=state,
+        stepsize_controller=controller,
+        event=diffrax.Event(lambda t, y, args, **_: end(y, args) <= 0),
+    )
+    state = jax.tree.map(lambda leaf: leaf[-1], past.ys)
+
+    # The event stops the solver up to one step after the root. A second integration, backwards and
+    # with `end` as the independent variable, ends on the root to the tolerance of the solver,
+    # without interpolation (Henon, Physica D 5, 412 (1982)).
+    def rates_per_end(_, state, beta):
+        rates = _rates(state, beta)
+        _, slope = jax.jvp(lambda state: end(state, beta), (state,), (rates,))
+        return jax.tree.map(lambda rate: rate / slope, rates)
+
+    exact = solve(
+        diffrax.ODETerm(rates_per_end),
+        t0=end(state, beta),
+        t1=0.0,
+        y0=state,
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol * smallest),
+    )
+    return jax.tree.map(lambda leaf: leaf[-1], exact.ys)
+
+
+def impact(
+    beta: ArrayLike, *, clipped: bool = True, rtol: float = 1e-11, max_steps: int = 1_000_000
+) -> Impact:
+    """Solve one head-on impact of two viscoelastic spheres, from first contact to separation.
+
+    With ``xi = X y^2`` and ``t = (X/v) int 2y ds`` the equation of motion
+    ``xi'' = -alpha sqrt(xi) (xi + (3/2) A xi')`` becomes ``y' = w``,
+    ``w' = -2 y^2 (y^2 + beta w)`` from ``(y, w) = (0, 1)``. This is polynomial and hence without
+    the square-root singularity at first contact. Compression ends at ``w = 0``, the contact at
+    ``y^2 + beta w = 0`` (clipped) or ``y = 0``.
+
+    Args:
+        beta: ``(3/2) A alpha^(2/5) v^(1/5)``, dimensionless, >= 0, a scalar (use `jax.vmap` for
+            more). Derivatives (forward mode only) need beta > 0.
+        clipped: whether contact ends where the force vanishes (default) or where the overlap does.
+        rtol: relative tolerance of the adaptive eighth-order solver.
+        max_steps: largest number of steps of either half of the impact. The default suffices for
+            beta <= 1e4 (clipped) and for beta <= 1e3 (unclipped, where the slow rebound takes
+            seconds to compute).
+
+    Returns:
+        `jaxgran.Impact`: restitution, duration in X/v and largest overlap in X.
+
+    Raises:
+        ValueError: for a negative beta, unless it is traced.
+    """
+    NOT_NEGATIVE.check("beta", beta, "It is 1.5 A alpha^0.4 v^0.2.")
+    beta = jnp.asarray(beta, dtype=jnp.result_type(float))
+    zero, one = jnp.zeros_like(beta), jnp.ones_like(beta)
+
+    # Order of magnitude of the rebound speed: the absolute tolerance must be small against it.
+    smallest = (1 + jax.lax.stop_gradient(beta)) ** (-5 / 3 if clipped else -5)
+    solve = partial(_integrate_to_zero, smallest=smallest, rtol=rtol, max_steps=max_steps)
+    y, _, half_time = solve(_overlap_rate, beta, (zero, one, zero))
+    separation = _scaled_stress if clipped else _root_of_overlap
+    _, w, time = solve(separation, beta, (y, zero, half_time))
+    return Impact(restitution=-w, duration=time, largest_overlap=y * y)

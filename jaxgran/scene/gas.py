@@ -1,0 +1,242 @@
+"""The scene: a homogeneous gas of equal spheres, and the physical scales that follow from it."""
+
+from math import gamma, pi
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxgran.checks.validation import POSITIVE, Domain, UserNumber, number
+from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
+from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
+from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw, Viscoelastic
+
+if TYPE_CHECKING:
+    UserLaw = RestitutionLaw
+else:
+    # A run-time type checker lets everything pass, so that a wrong type is reported in words.
+    UserLaw = Any
+
+
+def _checked_law(law: UserLaw) -> RestitutionLaw:
+    if not isinstance(law, RestitutionLaw):
+        raise ValueError(f"law must be a restitution law such as jaxgran.Viscoelastic, got {law!r}")
+    return law
+
+
+class Gas(eqx.Module):
+    """A homogeneous gas of equal spheres in its initial state.
+
+    Every float can be traced, differentiated and batched with `jax.vmap`.
+
+    Args:
+        law: law of restitution, such as `jaxgran.Viscoelastic`, `jaxgran.ConstantRestitution` or
+            `jaxgran.RestitutionSeries`.
+        diameter: sigma, m, > 0.
+        mass: m, kg, > 0; `jaxgran.sphere_mass` computes it from the density of the material.
+        packing_fraction: phi (the paper's eta), in (0, close packing): the fraction of the volume
+            (of the area if d = 2) that the spheres occupy.
+        temperature: T_0 = <v^2>/d at t = 0, m^2/s^2, > 0, without the mass, as in the paper.
+        dimension: d, 3, or 2 for spheres that move in a plane.
+
+    Raises:
+        ValueError: for a value outside its range.
+    """
+
+    law: RestitutionLaw = eqx.field(converter=_checked_law)
+    diameter: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    mass: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    packing_fraction: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    temperature: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
+    dimension: int = eqx.field(static=True, default=3, kw_only=True)
+
+    _domains: ClassVar[dict[str, Domain]] = {
+        "diameter": POSITIVE,
+        "mass": POSITIVE,
+        "temperature": POSITIVE,
+    }
+    _advice: ClassVar[dict[str, str]] = {
+        "diameter": "Give it in metres.",
+        "mass": "Give it in kilograms; sphere_mass(diameter, density) computes it.",
+        "temperature": "Give <v^2>/d in m^2/s^2.",
+        "packing_fraction": "It is the fraction of the volume (of the area if dimension = 2) that "
+        "the spheres occupy; the upper end is close packing.",
+    }
+
+    def __check_init__(self):
+        if self.dimension not in CLOSE_PACKING:
+            raise ValueError(f"dimension must be 2 or 3, got {self.dimension!r}")
+        for name, domain in self.domains.items():
+            if name in self._advice:
+                domain.check(name, getattr(self, name), self._advice[name])
+
+    @property
+    def domains(self) -> dict[str, Domain]:
+        """Allowed range of every float of the gas and of its law, by name."""
+        packing = Domain(0.0, CLOSE_PACKING[self.dimension])
+        return {**self.law.domains, **self._domains, "packing_fraction": packing}
+
+    def value(self, name: str) -> Float[Array, "..."]:
+        """The value of a float of the gas or of its law, by name.
+
+        Raises:
+            ValueError: for an unknown name.
+        """
+        if name not in self.domains:
+            raise ValueError(f"no float {name!r} in this gas; it has {', '.join(self.domains)}")
+        return getattr(self.law if name in self.law.domains else self, name)
+
+    def replace(self, **values: UserNumber) -> "Gas":
+        """A copy with other values of some floats: ``gas.replace(dissipative_constant=1e-6)``.
+
+        Args:
+            values: floats of the gas or of its law, by name.
+
+        Raises:
+            ValueError: for an unknown name or a value outside its range.
+        """
+        for name, value in values.items():
+            self.value(name)
+            self.domains[name].check(name, value)
+
+        def get(gas):
+            return [getattr(gas.law if k in gas.law.domains else gas, k) for k in values]
+
+        return eqx.tree_at(get, self, [number(value) for value in values.values()])
+
+    @property
+    def number_density(self) -> Float[Array, ""]:
+        """Number density n, m^-d."""
+        volume_of_sphere = (
+            sphere_surface(self.dimension) / self.dimension * (self.diameter / 2) ** self.dimension
+        )
+        return self.packing_fraction / volume_of_sphere
+
+    @property
+    def contact_value(self) -> Float[Array, ""]:
+        """Pair correlation at contact g_2: Carnahan & Starling (3D) or Henderson (2D)."""
+        return contact_value(self.packing_fraction, self.dimension)
+
+    @property
+    def path_length(self) -> Float[Array, ""]:
+        """``1 / (n g_2 sigma^(d-1))``, m, a length of the order of the mean free path."""
+        return 1 / (
+            self.number_density * self.contact_value * self.diameter ** (self.dimension - 1)
+        )
+
+    @property
+    def impact_speed(self) -> Float[Array, ""]:
+        """``sqrt(2 T_0)``, m/s, the rms of a component of the relative velocity of two spheres."""
+        return jnp.sqrt(2 * self.temperature)
+
+    @property
+    def collision_frequency(self) -> Float[Array, ""]:
+        """Collisions per particle per second of a Maxwellian gas at t = 0.
+
+        ``nu_0 = n g_2 sigma^(d-1) S_d sqrt(T_0/pi)``. A collision counts once for each of its two
+        particles.
+        """
+        return sphere_surface(self.dimension) * jnp.sqrt(self.temperature / pi) / self.path_length
+
+    @property
+    def mean_free_time(self) -> Float[Array, ""]:
+        """Mean free time at t = 0, ``tau_c(0) = 1 / nu_0``, s; the paper's Eq. (12)."""
+        return 1 / self.collision_frequency
+
+    @property
+    def reduced_law(self) -> ReducedLaw:
+        """The law of restitution in units of the diameter and of `impact_speed`."""
+        return self.law.reduced(diameter=self.diameter, mass=self.mass, speed=self.impact_speed)
+
+    def restitution(self, normal_speed: UserNumber) -> Float[Array, "..."]:
+        """Coefficient of restitution eps of an impact.
+
+        Args:
+            normal_speed: normal relative speed before the impact, m/s, > 0, any shape.
+
+        Returns:
+            eps, same shape.
+
+        Raises:
+            ValueError: for a speed that is not positive.
+        """
+        POSITIVE.check("normal_speed", normal_speed, "Give the normal approach speed in m/s.")
+        law = self.law.reduced(diameter=self.diameter, mass=self.mass, speed=number(1.0))
+        return law.restitution(number(normal_speed))
+
+    def _viscoelastic(self, quantity: str) -> Viscoelastic:
+        if not isinstance(self.law, Viscoelastic):
+            raise ValueError(
+                f"{quantity} belongs to the Viscoelastic law, this gas has "
+                f"{type(self.law).__name__}; make the gas with jaxgran.Viscoelastic"
+            )
+        return self.law
+
+    @property
+    def alpha(self) -> Float[Array, ""]:
+        """Elastic constant over effective mass, m^(-1/2) s^(-2); viscoelastic spheres only."""
+        return self._viscoelastic("alpha").alpha(diameter=self.diameter, mass=self.mass)
+
+    @property
+    def delta(self) -> Float[Array, ""]:
+        """The paper's small parameter, ``delta = A alpha^(2/5) T_0^(1/10)``."""
+        law = self._viscoelastic("delta")
+        return law.dissipative_constant * self.alpha**0.4 * self.temperature**0.1
+
+    @property
+    def thermal_beta(self) -> Float[Array, ""]:
+        """beta of an impact at `impact_speed`, ``beta_T0 = (3/2) A alpha^(2/5) (2 T_0)^(1/10)``."""
+        return 1.5 * 2**0.1 * self.delta
+
+    @property
+    def contact_duration(self) -> Float[Array, ""]:
+        """Mean duration of the contacts at t = 0 if they were elastic, s; 0 for hard spheres.
+
+        ``t_c = 3.218 (X/v) <g^(-1/5)>`` with X and v at `impact_speed` and, g being the normal
+        speed over v, the mean over impacts ``<g^(-1/5)> = 2^(-1/10) Gamma(9/10)``.
+        """
+        length = self.reduced_law.impact_length(jnp.ones_like(self.temperature)) * self.diameter
+        return ELASTIC_CONTACT_TIME * 2**-0.1 * gamma(0.9) * length / self.impact_speed
+
+    @property
+    def contact_fraction(self) -> Float[Array, ""]:
+        """Mean contact duration over mean free time, t_c/tau_c.
+
+        Where it is small against 1, nearly all impacts are binary.
+        """
+        return self.contact_duration * self.collision_frequency
+
+    @property
+    def mean_overlap(self) -> Float[Array, ""]:
+        """Mean of the largest overlap of the impacts at t = 0 if they were elastic, in diameters.
+
+        ``1.093 X_T <g^(4/5)>`` with X_T at `impact_speed` and, g being the normal speed over
+        `impact_speed`, the mean over impacts ``<g^(4/5)> = 2^(2/5) Gamma(7/5)``; 0 for hard
+        spheres.
+        """
+        length = self.reduced_law.impact_length(jnp.ones_like(self.temperature))
+        return ELASTIC_OVERLAP * 2**0.4 * gamma(1.4) * length
+
+    @property
+    def critical_box(self) -> Float[Array, ""]:
+        """Critical length of the shear instability, ``L_c = 2 pi / k_c``, m, at t = 0.
+
+        A gas in a periodic box longer than L_c does not stay homogeneous. ``k_c sigma = n sigma^3
+        sqrt((32 pi / 15) (1 - eps^2))`` (3D) or ``n sigma^2 sqrt(pi (1 - eps^2))`` (2D), of a
+        dilute gas, with eps at `impact_speed`. Infinite for elastic spheres.
+        """
+        eps = self.reduced_law.restitution(jnp.ones_like(self.temperature))
+        factor = 32 * pi / 15 if self.dimension == 3 else pi
+        density = self.number_density * self.diameter**self.dimension
+        inelastic = eps < 1
+        root = jnp.sqrt(factor * jnp.where(inelastic, 1 - eps**2, 1.0))
+        return jnp.where(inelastic, 2 * pi * self.diameter / (density * root), jnp.inf)
+
+    def box_side(self, num_particles: int) -> Float[Array, ""]:
+        """Side of the cube (of the square if d = 2) that contains N spheres of this gas, m.
+
+        Args:
+            num_particles: N, >= 1.
+        """
+        return (num_particles / self.number_density) ** (1 / self.dimension)

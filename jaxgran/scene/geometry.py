@@ -1,0 +1,54 @@
+"""Geometry of equal spheres: surface, mass, packing, and the pair correlation at contact."""
+
+from math import gamma, pi
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran.checks.validation import POSITIVE, UserNumber, number
+
+CLOSE_PACKING = {2: pi / (2 * 3**0.5), 3: pi / (3 * 2**0.5)}
+"""Packing fraction of the densest packing of equal disks (2) and of equal spheres (3)."""
+
+
+def sphere_surface(dimension: int) -> float:
+    """Surface area of the unit sphere in d dimensions, ``S_d = 2 pi^(d/2) / Gamma(d/2)``."""
+    return 2 * pi ** (dimension / 2) / gamma(dimension / 2)
+
+
+def sphere_mass(diameter: UserNumber, density: UserNumber) -> Float[Array, "..."]:
+    """Mass of a solid sphere, ``m = pi density diameter^3 / 6``.
+
+    Args:
+        diameter: sigma, m, > 0, any shape.
+        density: of the material, kg/m^3, > 0, same shape or a scalar.
+
+    Returns:
+        m, kg.
+
+    Raises:
+        ValueError: for a value that is not positive or not a number.
+    """
+    POSITIVE.check("diameter", diameter, "Give the diameter in metres.")
+    POSITIVE.check("density", density, "Give the density of the material in kg/m^3.")
+    return pi / 6 * number(density) * number(diameter) ** 3
+
+
+def contact_value(packing_fraction: ArrayLike, dimension: int) -> Float[Array, "..."]:
+    """Equilibrium pair correlation function at contact, ``g_2(sigma)``.
+
+    ``(2 - phi) / (2 (1 - phi)^3)`` in three dimensions (Carnahan & Starling 1969),
+    ``(1 - 7 phi/16) / (1 - phi)^2`` in two (Henderson 1975). It tends to 1 for a dilute gas.
+
+    Args:
+        packing_fraction: phi, any shape; the formulae hold in the fluid, for phi below about 0.5
+            (3D) or 0.7 (2D).
+        dimension: d, 2 or 3.
+
+    Returns:
+        g_2, same shape.
+    """
+    phi = jnp.asarray(packing_fraction)
+    if dimension == 3:
+        return (2 - phi) / (2 * (1 - phi) ** 3)
+    return (1 - 7 * phi / 16) / (1 - phi) ** 2

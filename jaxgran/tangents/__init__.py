@@ -1,0 +1,8 @@
+"""Derivatives of particle runs beyond the time after which chaos makes plain ones useless.
+
+- `thermal`: tangents of positions and velocities, projected onto T at regular intervals.
+- `impact`: tangents of a gas of instantaneous impacts, projected at every impact.
+- `rule`: the rule of differentiation of a whole run, for forward and reverse mode.
+
+May import `scene` and `theory`; is imported by `particles` and `models`. Nothing is re-exported.
+"""

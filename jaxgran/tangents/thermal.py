@@ -1,0 +1,205 @@
+"""Tangents of a gas of lasting contacts: exact for a while, then projected onto its temperature.
+
+The trajectories of a gas diverge by a factor of e^2 to e^5 per collision, and the exact derivative
+of a run with them: after a few collisions it says nothing about the mean. But a homogeneous gas
+forgets all of its microscopic state except its temperature, and a change of temperature is only a
+change of clock: with velocities s times as large, and with ``alpha s^2`` and ``A / s`` in place of
+alpha and A, the particles follow the same paths s times as fast. So the tangent of a state in a
+parameter p is kept in three parts:
+
+- ``c = d ln T/dp``, which stands for velocities ``(c/2) v`` and for the corresponding changes of
+  alpha and A;
+- the tangent of the clock, the integral of ``-(c/2) dt``, at a fixed place in the sequence of
+  collisions;
+- the exact rest of the tangents of positions and velocities.
+
+At regular intervals the rest is projected onto v (thermal projection): the energy in it is added to
+c, and what is orthogonal to v is dropped. Spheres in contact are left out until they part.
+
+The derivative at a fixed time is the derivative at a fixed place in the sequence of collisions plus
+the rate of change of the gas times the tangent of the clock. The rates are averaged over the last
+mean free times. This is less noisy than projecting at fixed times, since no time step is left out
+or counted twice where a fixed end time moves through the steps.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float
+
+MEMORY = 5.0
+"""Mean free times over which the rates of cooling and of collision are averaged."""
+
+
+class Rates(NamedTuple):
+    """Exponentially weighted sums, by replica, from which rates are estimated.
+
+    Attributes:
+        lost: energy lost.
+        could_lose: energy that would have been lost, had the cooling rate been the trend itself.
+        met: collisions per particle.
+        could_meet: collisions per particle, had their rate been ``T^(1/2)``.
+    """
+
+    lost: Float[Array, "replicas"]
+    could_lose: Float[Array, "replicas"]
+    met: Float[Array, "replicas"]
+    could_meet: Float[Array, "replicas"]
+
+    @classmethod
+    def none(cls, replicas: int, dtype: DTypeLike) -> "Rates":
+        """The sums before the first collision."""
+        return cls(*[jnp.zeros(replicas, dtype)] * 4)
+
+    def cooling(self, trend: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
+        """``-d ln T/dt``, given its trend, which is its dependence on T in an arbitrary unit."""
+        return _ratio(self.lost, self.could_lose) * trend
+
+    def collision(self, temperature: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
+        """Collisions per particle and time, proportional to ``T^(1/2)``."""
+        return _ratio(self.met, self.could_meet) * temperature**0.5
+
+
+class ThermalTangents(NamedTuple):
+    """Tangents of the state of a gas along p directions in (alpha, A).
+
+    Attributes:
+        alpha, dissipative_constant: the directions.
+        log_temperature: c = d ln T.
+        clock: tangent of the time at a fixed place in the sequence of collisions.
+        position: tangent of the positions.
+        velocity: tangent of the velocities, without the part (c/2) v.
+        free: whether a sphere touches no other one.
+        since: time of the last projection.
+        interval: between projections, in mean free times.
+        damping: q delta of the trend.
+        rates: of the gas.
+    """
+
+    alpha: Float[Array, "p"]
+    dissipative_constant: Float[Array, "p"]
+    log_temperature: Float[Array, "p replicas"]
+    clock: Float[Array, "p replicas"]
+    position: Float[Array, "p n d"]
+    velocity: Float[Array, "p n d"]
+    free: Bool[Array, "n"]
+    since: Float[Array, ""]
+    interval: Float[Array, ""]
+    damping: Float[Array, ""]
+    rates: Rates
+
+    def trend(self, temperature: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
+        """Dependence of the cooling rate on T, ``T^(3/5) / (1 + q delta T^(1/10))``.
+
+        This has the first two terms of the rate in the dissipation delta.
+        """
+        return temperature**0.6 / (1 + self.damping * temperature**0.1)
+
+    def material(self, scene_alpha: ArrayLike, scene_constant: ArrayLike) -> tuple[Array, Array]:
+        """Tangents of alpha and A with the change of clock by c, each of shape (p, replicas)."""
+        c = self.log_temperature
+        alpha = self.alpha[:, None] - c * scene_alpha
+        return alpha, self.dissipative_constant[:, None] + 0.5 * c * scene_constant
+
+
+def at_start(
+    alpha: Float[Array, "p"],
+    dissipative_constant: Float[Array, "p"],
+    velocity: Float[Array, "n d"],
+    replicas: int,
+    interval: ArrayLike,
+    damping: ArrayLike,
+) -> ThermalTangents:
+    """The tangents of an initial state, which does not depend on the parameters.
+
+    Args:
+        alpha, dissipative_constant: the p directions in (alpha, A).
+        velocity: of the state, for its shape and dtype.
+        replicas: number of boxes.
+        interval: between projections, in mean free times.
+        damping: q delta of `ThermalTangents.trend`.
+    """
+    p, dtype = len(alpha), velocity.dtype
+    zeros = jnp.zeros((p, replicas), dtype)
+    nothing = jnp.zeros((p, *velocity.shape), dtype)
+    return ThermalTangents(
+        alpha=alpha,
+        dissipative_constant=dissipative_constant,
+        log_temperature=zeros,
+        clock=zeros,
+        position=nothing,
+        velocity=nothing,
+        free=jnp.ones(len(velocity), bool),
+        since=jnp.zeros((), dtype),
+        interval=jnp.asarray(interval, dtype),
+        damping=jnp.asarray(damping, dtype),
+        rates=Rates.none(replicas, dtype),
+    )
+
+
+def projected(
+    tangents: ThermalTangents, velocity: Float[Array, "n d"], time: ArrayLike
+) -> tuple[Float[Array, "p replicas"], Float[Array, "p replicas"]]:
+    """c and the tangent of the clock after a projection at this time, of the free spheres."""
+    c = tangents.log_temperature
+    replicas = c.shape[1]
+    v = jnp.where(tangents.free[:, None], velocity, 0.0).reshape(replicas, -1)
+    rest = tangents.velocity.reshape(len(c), *v.shape)
+    gain = _ratio(2 * jnp.sum(rest * v[None], -1), jnp.sum(v * v, -1)[None])
+    return c + gain, tangents.clock - 0.5 * (c + 0.5 * gain) * (time - tangents.since)
+
+
+def project(
+    tangents: ThermalTangents, velocity: Float[Array, "n d"], time: ArrayLike, due: ArrayLike
+) -> ThermalTangents:
+    """The tangents after a thermal projection at this time, or unchanged unless it is due."""
+    c, clock = projected(tangents, velocity, time)
+    replicas = c.shape[1]
+    gain = jnp.repeat(c - tangents.log_temperature, len(velocity) // replicas, axis=1)
+    forgotten = due & tangents.free[None, :, None]
+    kept = tangents.velocity - 0.5 * gain[:, :, None] * velocity[None]
+    held = jnp.where(due, kept, tangents.velocity)
+    return tangents._replace(
+        log_temperature=jnp.where(due, c, tangents.log_temperature),
+        clock=jnp.where(due, clock, tangents.clock),
+        position=jnp.where(forgotten, 0.0, tangents.position),
+        velocity=jnp.where(forgotten, 0.0, held),
+        since=jnp.where(due, time, tangents.since),
+    )
+
+
+def remembered(
+    rates: Rates,
+    lost: Float[Array, "replicas"],
+    met: Float[Array, "replicas"],
+    energy: Float[Array, "replicas"],
+    temperature: Float[Array, "replicas"],
+    trend: Float[Array, "replicas"],
+    duration: ArrayLike,
+    collision_frequency: ArrayLike,
+) -> Rates:
+    """The exponentially weighted sums after a further time.
+
+    Args:
+        rates: the sums before.
+        lost: energy lost in this time.
+        met: collisions per particle that began in it.
+        energy: of the gas.
+        temperature: of the gas.
+        trend: the dependence of the cooling rate on T, at this temperature.
+        duration: of this time.
+        collision_frequency: at T = 1.
+    """
+    passed = duration * jnp.sqrt(temperature)
+    old = jnp.exp(-passed * collision_frequency / MEMORY)
+    return Rates(
+        lost=old * rates.lost + lost,
+        could_lose=old * rates.could_lose + energy * trend * duration,
+        met=old * rates.met + met,
+        could_meet=old * rates.could_meet + passed,
+    )
+
+
+def _ratio(above: Array, below: Array) -> Array:
+    """The ratio, 0 where the denominator is 0."""
+    return jnp.where(below != 0, above / jnp.where(below != 0, below, 1.0), 0.0)

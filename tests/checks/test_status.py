@@ -1,0 +1,49 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.checks import status
+from jaxgran.checks.status import FAULTS, LIST_FULL, NOT_FINITE, OK, STALLED, explain, flag, has
+
+
+def test_every_fault_has_a_bit_of_its_own():
+    bits = [fault.bit for fault in FAULTS]
+    assert sorted(bits) == [2**k for k in range(len(bits))]
+    named = [value for value in vars(status).values() if isinstance(value, status.Fault)]
+    assert sorted(named) == sorted(FAULTS)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_flag_and_has(fault):
+    raised, clear = flag(fault, True), flag(fault, False)
+    assert raised == fault.bit and clear == OK
+    assert raised.dtype == clear.dtype == jnp.int32
+    for other in FAULTS:
+        assert bool(has(raised, other)) == (other == fault)
+        assert not has(clear, other)
+        assert has(raised | flag(other, True), fault)
+
+
+def test_status_of_a_batch():
+    when = jnp.array([[True, False], [True, True]])
+
+    @jax.jit
+    def of(when):
+        return flag(LIST_FULL, when) | flag(NOT_FINITE, ~when) | flag(STALLED, True)
+
+    result = of(when)
+    np.testing.assert_array_equal(result, [[33, 48], [33, 33]])
+    np.testing.assert_array_equal(has(result, LIST_FULL), when)
+    np.testing.assert_array_equal(jax.jit(lambda s: has(s, NOT_FINITE))(result), ~when)
+
+
+def test_explain():
+    assert explain(OK) == explain(jnp.int32(0)) == "ok"
+    for fault in FAULTS:
+        assert explain(fault.bit) == f"{fault.meaning}: {fault.advice}"
+        assert fault.meaning and fault.advice
+    both = explain(flag(STALLED, True) | flag(LIST_FULL, True))
+    assert both.startswith(LIST_FULL.meaning) and STALLED.advice in both
+    everything = explain(np.int32(sum(fault.bit for fault in FAULTS)))
+    assert all(fault.meaning in everything for fault in FAULTS)

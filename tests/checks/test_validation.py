@@ -1,0 +1,70 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxgran.checks.validation import ANY, FRACTION, POSITIVE, Domain, checked_times, number
+
+
+def test_numbers_are_strongly_typed():
+    for value in (2, 2.0, np.float32(2), np.array(2), jnp.asarray(2)):
+        assert number(value) == 2.0
+        assert number(value).dtype == jnp.result_type(float) and not number(value).weak_type
+    assert number([1, 2.5]).shape == (2,)
+
+
+@pytest.mark.parametrize("value", ["steel", object(), [1.0, [2.0]]])
+def test_what_is_no_number_is_refused(value):
+    with pytest.raises(ValueError, match="expected a number or an array of numbers, got"):
+        number(value)
+    with pytest.raises(ValueError, match=r"speed must be a number in \(0, inf\), got .* Give m/s"):
+        POSITIVE.check("speed", value, "Give m/s.")
+
+
+def test_ends_of_a_domain():
+    FRACTION.check("share", np.array([0.0, 1.0]))
+    half_open = Domain(0.0, 1.0, high_allowed=True)
+    half_open.check("share", 1.0)
+    with pytest.raises(ValueError, match=r"share must lie in \(0, 1\], got 0"):
+        half_open.check("share", [1.0, 0.0])
+    for value in (np.nan, np.inf, -np.inf):
+        with pytest.raises(ValueError, match="must lie in"):
+            ANY.check("share", value)
+
+
+def test_traced_values_are_not_checked():
+    @jax.jit
+    def checked(x):
+        POSITIVE.check("x", x)
+        return checked_times(jnp.stack([x, x]))
+
+    np.testing.assert_array_equal(checked(-1.0), [-1.0, -1.0])
+
+
+@given(st.floats(0.01, 0.99))
+@settings(deadline=None)
+def test_free_values_return(fraction):
+    for domain in (ANY, POSITIVE, Domain(low=-1.0), Domain(-1.0, 0.5)):
+        low, high = max(domain.low, -3.0), min(domain.high, 3.0)
+        value = low + fraction * (high - low)
+        free = domain.to_free(value)
+        assert jnp.isfinite(free)
+        # The logarithm of a distance of 1e-2 loses two digits.
+        np.testing.assert_allclose(domain.from_free(free), value, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "times, message",
+    [
+        ([1.0, -1.0], "times must be finite and not negative, got -1"),
+        ([0.0, np.inf], "times must be finite and not negative, got inf"),
+        ([0.0, 2.0, 2.0], "times must increase, got 2 after 2; sort them"),
+        ([], r"times must be a list of numbers, got shape \(0,\)"),
+        ([[1.0]], r"times must be a list of numbers, got shape \(1, 1\)"),
+    ],
+)
+def test_bad_times_are_refused(times, message):
+    with pytest.raises(ValueError, match=message):
+        checked_times(times)

@@ -1,0 +1,300 @@
+import errno
+import hashlib
+import io
+import json
+import tempfile
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.data import checkpoint, files
+from jaxgran.data.checkpoint import fingerprint, load, save
+from jaxgran.data.files import write_whole
+
+
+class State(NamedTuple):
+    time: jax.Array
+    rest: dict
+
+
+def state():
+    rest = {
+        "odd": np.array([np.nan, -0.0, np.inf, 5e-324, 1 / 3]),
+        "empty": np.zeros((0, 3)),
+        "single": jnp.linspace(0, 1, 6, dtype=jnp.float32).reshape(2, 3),
+        "whole": jnp.arange(-2, 3, dtype=jnp.int32),
+        "truth": (np.array([True, False]), np.uint8(200)),
+        "nothing": None,
+    }
+    return State(jnp.asarray(0.1), rest)
+
+
+def same_bits(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(map(np.asarray, jax.tree.leaves(a)), jax.tree.leaves(b), strict=True):
+        assert x.dtype == np.asarray(y).dtype and x.shape == np.shape(y)
+        assert x.tobytes() == np.asarray(y).tobytes()
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run.eqx"
+
+
+def test_round_trip_bit_for_bit(path):
+    for scene in ("", "abc"):
+        save(path, scene, state())
+        same_bits(load(path, scene, state()), state())
+    save(str(path), "abc", jnp.ones(3))  # written over
+    same_bits(load(str(path), "abc", jnp.zeros(3)), jnp.ones(3))
+    assert [file.name for file in path.parent.iterdir()] == ["run.eqx"]
+
+
+def test_more_leaves_than_ten_keep_their_order(path):
+    tree = [np.full(2, k) for k in range(23)]
+    save(path, "s", tree)
+    same_bits(load(path, "s", tree), tree)
+
+
+def test_other_scenes_are_refused(path):
+    save(path, "abc", state())
+    with pytest.raises(ValueError, match="run.eqx belongs to another scene"):
+        load(path, "abd", state())
+    with pytest.raises(ValueError, match="run.eqx belongs to another scene"):
+        load(path, "abc", (state(), jnp.zeros(3)))
+    with pytest.raises(ValueError, match="run.eqx belongs to another scene"):
+        load(path, "abc", jnp.zeros(3))
+
+
+@pytest.mark.parametrize(
+    "like",
+    [
+        np.zeros((2, 3)),  # another shape of as many numbers
+        np.zeros((3, 2, 1)),
+        np.zeros((3, 2), np.float32),
+        np.zeros((3, 2), np.int64),
+        [np.zeros((3, 2)), 0],
+        (),
+        0.0,
+    ],
+)
+def test_other_arrays_are_refused(path, like):
+    save(path, "abc", np.ones((3, 2)))
+    with pytest.raises(ValueError, match="run.eqx belongs to another scene"):
+        load(path, "abc", like)
+    same_bits(load(path, "abc", np.zeros((3, 2))), np.ones((3, 2)))
+
+
+def test_python_numbers_keep_their_type(path):
+    save(path, "abc", (3, 0.1, True))
+    loaded = load(path, "abc", (0, 0.0, False))
+    assert loaded == (3, 0.1, True) and [type(x) for x in loaded] == [int, float, bool]
+
+
+def test_other_formats_are_refused(path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "FORMAT", 7)
+    save(path, "abc", state())
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match="run.eqx was written by jaxgran .* format 7, this is"):
+        load(path, "abc", state())
+
+
+def test_other_versions_are_refused(path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "version", lambda package: "0.0.7")
+    save(path, "abc", state())
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match="run.eqx was written by jaxgran 0.0.7, this is"):
+        load(path, "abc", state())
+
+
+@pytest.mark.parametrize("part", [0.0, 0.001, 0.3, 0.9, 0.999])
+def test_truncated_files_are_refused(path, part):
+    save(path, "abc", state())
+    data = path.read_bytes()
+    path.write_bytes(data[: int(part * len(data))])
+    with pytest.raises(ValueError, match="run.eqx is (damaged|no checkpoint of jaxgran)"):
+        load(path, "abc", state())
+
+
+def test_a_damaged_byte_is_told_or_harmless(path):
+    save(path, "abc", state())
+    data = path.read_bytes()
+    rng = np.random.default_rng(0)
+    told = 0
+    for _ in range(300):
+        damaged = bytearray(data)
+        damaged[rng.integers(len(data))] ^= rng.integers(1, 256)
+        path.write_bytes(damaged)
+        try:
+            loaded = load(path, "abc", state())
+        except ValueError as error:
+            assert str(path) in str(error)
+            told += 1
+        else:  # white space of the header
+            same_bits(loaded, state())
+    assert told > 280
+
+
+def test_files_of_others_are_refused(path):
+    with pytest.raises(ValueError, match="run.eqx is no checkpoint .* No such file"):
+        load(path, "abc", state())
+    with pytest.raises(ValueError, match=f"{path.parent.name} is no checkpoint"):
+        load(path.parent, "abc", state())
+    for content in (b"t,T\n0,1\n", b"\x89PNG\r\n\x1a\n", b"\x00" * 100):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="run.eqx is no checkpoint"):
+            load(path, "abc", state())
+    np.savez(path, leaf_0=np.zeros(3))
+    with pytest.raises(ValueError, match="run.eqx is no checkpoint"):
+        load(path, "abc", state())
+    for header in (b"3", b"[]", b"{}", b'{"format": 2}', b"[" * 100_000):
+        path.write_bytes(header + b"\n")
+        with pytest.raises(ValueError, match="run.eqx is no checkpoint"):
+            load(path, "abc", state())
+
+
+def test_nothing_is_unpickled(path):
+    save(path, "abc", np.zeros(1))
+    header = json.loads(path.read_bytes().split(b"\n")[0])
+    body = io.BytesIO()
+    np.save(body, np.array([{}]), allow_pickle=True)
+    header["digest"] = hashlib.sha256(body.getvalue()).hexdigest()
+    path.write_bytes(json.dumps(header).encode() + b"\n" + body.getvalue())
+    with pytest.raises(ValueError, match="run.eqx is damaged"):
+        load(path, "abc", np.zeros(1))
+
+
+def test_folders_that_are_not_there(tmp_path):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "folder").mkdir()
+    for path in (
+        tmp_path / "none" / "run.eqx",
+        tmp_path / "file" / "run.eqx",
+        tmp_path / "folder",
+    ):
+        with pytest.raises(OSError, match="cannot write") as error:
+            save(path, "abc", state())
+        assert str(path) in str(error.value) and error.value.filename == str(path)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_a_folder_closed_to_writing_keeps_the_old_file(path, monkeypatch):
+    save(path, "abc", state())
+    before = path.read_bytes()
+
+    def closed(*args, **kwargs):  # as the system says it, to all but its administrator
+        raise PermissionError(errno.EACCES, "Permission denied", kwargs["dir"])
+
+    monkeypatch.setattr(tempfile, "NamedTemporaryFile", closed)
+    with pytest.raises(
+        PermissionError, match="Permission denied.*any earlier file is unharmed"
+    ) as e:
+        save(path, "abc", jnp.zeros(3))
+    assert e.value.errno == errno.EACCES and str(path) in str(e.value)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("stage", ["write", "fsync", "replace"])
+def test_a_full_disk_keeps_the_old_file(path, monkeypatch, stage):
+    save(path, "abc", state())
+    before = path.read_bytes()
+
+    def full(*args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def write(file):
+        file.write(b"half")
+        if stage == "write":
+            full()
+
+    if stage != "write":
+        monkeypatch.setattr(files.os, stage, full)
+    with pytest.raises(OSError, match="No space left") as error:
+        write_whole(path, write)
+    assert error.value.errno == errno.ENOSPC and str(path) in str(error.value)
+    assert path.read_bytes() == before
+    assert [file.name for file in path.parent.iterdir()] == ["run.eqx"]
+
+
+@pytest.mark.parametrize("what", [KeyboardInterrupt, MemoryError, ZeroDivisionError])
+def test_any_end_of_writing_keeps_the_old_file(path, what):
+    save(path, "abc", state())
+    before = path.read_bytes()
+
+    def write(file):
+        file.write(b"half")
+        raise what
+
+    with pytest.raises(what):
+        write_whole(path, write)
+    assert path.read_bytes() == before
+    same_bits(load(path, "abc", state()), state())
+
+
+def test_what_is_written_is_whole(path):
+    write_whole(path, lambda file: file.write(b"first"))
+    write_whole(str(path), lambda file: file.write(b"second"))
+    assert path.read_bytes() == b"second"
+    assert [file.name for file in path.parent.iterdir()] == ["run.eqx"]
+
+
+class Model(eqx.Module):
+    value: jax.Array
+    order: int = eqx.field(static=True, default=2)
+
+
+def test_fingerprints_tell_everything_apart():
+    key = jax.random.key
+    trees = [
+        {"a": 1.0, "b": np.arange(3)},
+        {"a": np.nextafter(1.0, 2), "b": np.arange(3)},  # any number
+        {"a": 1.0, "b": np.array([0, 1, 3])},
+        {"a": -1.0, "b": np.arange(3)},
+        {"a": 1, "b": np.arange(3)},  # any type
+        {"a": True, "b": np.arange(3)},
+        {"a": np.float32(1.0), "b": np.arange(3)},
+        {"a": 1.0, "b": np.arange(3, dtype=np.int32)},
+        {"a": 1.0, "b": np.arange(3)[None]},  # any shape
+        {"a": 1.0, "b": (0, 1, 2)},
+        {"a": 1.0, "c": np.arange(3)},  # any structure
+        {"a": 1.0, "b": np.arange(3), "c": None},
+        {"a": 1.0},
+        (1.0, np.arange(3)),
+        [1.0, np.arange(3)],
+        0.0,
+        -0.0,
+        0,  # the bits of 0.0
+        np.zeros(2),
+        np.zeros(2, np.int64),
+        np.zeros(2, np.uint64),
+        "abc",
+        "abd",
+        None,
+        (),
+        Model(jnp.ones(2)),
+        Model(jnp.ones(2), order=3),  # any static choice
+        key(0),
+        key(1),
+        key(0, impl="rbg"),
+        {"key": key(0)},
+        jax.random.split(key(0), 2),
+    ]
+    assert len({fingerprint(tree) for tree in trees}) == len(trees)
+    assert fingerprint(1.0, 2.0) != fingerprint(2.0, 1.0)
+    assert len({fingerprint(*n * [1.0]) for n in range(4)}) == 4
+
+
+def test_fingerprints_are_of_values_not_of_objects():
+    first, second = (
+        (Model(jnp.arange(3.0)), jax.random.key(5), {"x": 1.5, "y": "text"}) for _ in range(2)
+    )
+    assert fingerprint(first) == fingerprint(second)
+    assert fingerprint(*first) == fingerprint(*second)
+    assert fingerprint(jnp.arange(3.0)) == fingerprint(np.arange(3.0))
+    assert fingerprint(np.arange(6.0)[::2]) == fingerprint(np.array([0.0, 2.0, 4.0]))
+    digest = fingerprint(first)
+    assert len(digest) == 64 and set(digest) <= set("0123456789abcdef")

@@ -1,0 +1,200 @@
+"""The scripts a person runs, run as a person would."""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import fit_cooling_curve
+import pytest
+
+import jaxgran
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+DENSE = EXPERIMENTS / "data" / "lammps_cooling_dense.csv"
+
+
+def run(script, *arguments, cwd):
+    command = [sys.executable, str(EXPERIMENTS / script), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
+
+
+def test_main_job_without_arguments(tmp_path):
+    done = run("fit_cooling_curve.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout.splitlines()[-1])
+    assert abs(summary["A"] / 3e-6 - 1) < 0.02
+    assert abs(summary["A"] - 3e-6) < 2 * summary["A_std_err"]
+    assert summary["converged"] and summary["explains"] and summary["model"] == "kinetic-theory"
+    assert 0.5 < summary["reduced_chi2"] < 1.5
+    assert "Kinetic theory explains this curve." in done.stdout
+    folder = tmp_path / "results" / "lammps_cooling_dilute-kinetic-theory"
+    picture, record = sorted(folder.iterdir(), reverse=True)
+    assert picture.suffix == ".png" and picture.stat().st_size > 20_000
+    assert json.loads(record.read_text())["parameters"][0]["parameter"] == "A"
+
+
+@pytest.mark.slow
+def test_main_job_says_what_it_cannot_explain(tmp_path):
+    done = run("fit_cooling_curve.py", DENSE, "--free", "A", "T0", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "This scene needs soft spheres" in done.stdout
+    assert not json.loads(done.stdout.splitlines()[-1])["explains"]
+    # Nothing is written over unless asked.
+    before = {path: path.read_bytes() for path in (tmp_path / "here").iterdir()}
+    again = run("fit_cooling_curve.py", DENSE, "--out", "here", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "exists; name another --out or say --overwrite" in again.stderr
+    assert {path: path.read_bytes() for path in (tmp_path / "here").iterdir()} == before
+
+
+def test_auto_judges_the_box_that_was_measured():
+    curve, header = jaxgran.read_curve(DENSE)
+    gas, size = jaxgran.read_gas(header), int(header["N"])
+    free = ("dissipative_constant",)
+    fitted = jaxgran.fit(gas, curve, free=free).gas
+    ratio = float(fitted.box_side(size) / fitted.critical_box)
+    for particles in (None, 300):
+        options = argparse.Namespace(
+            model="auto", tolerance=0.02, particles=particles, replicas=3, key=0
+        )
+        model, reasons = fit_cooling_curve.model_of(options, gas, curve, free, size)
+        assert isinstance(model, jaxgran.SoftSpheres)
+        assert model.num_particles == (particles or size)
+        assert f"in a box of {ratio:.2g} L_c" in " ".join(reasons)
+
+
+def test_auto_takes_kinetic_theory_where_it_will_do(tmp_path):
+    done = run("fit_cooling_curve.py", "--model", "auto", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Kinetic theory: the cheapest model whose estimated error of T" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["nowhere.csv"], "no such file"),
+        (["--set", "Y=-1"], "youngs_modulus must lie in"),
+        (["--set", "youngs=1"], "give KEY=VALUE with KEY one of eta"),
+        (["--set", "N=many"], "header line N"),
+        (["bare.csv"], "the header lacks eta, diameter"),
+    ],
+)
+def test_main_job_refuses_bad_input(arguments, message, tmp_path):
+    (tmp_path / "bare.csv").write_text("t,T\n1,3\n2,2\n3,1\n")
+    done = run("fit_cooling_curve.py", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ") and message in done.stderr
+    assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.slow
+def test_main_job_reads_the_header_a_not(tmp_path):
+    # A header's A is only compared with: another one changes no estimate.
+    text = DENSE.read_text().replace("# A: 8e-05", "# A: 1")
+    (tmp_path / "other.csv").write_text(text)
+    done = run("fit_cooling_curve.py", "other.csv", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert 6.0e-5 < json.loads(done.stdout.splitlines()[-1])["A"] < 6.8e-5
+
+
+@pytest.mark.slow
+def test_benchmark_runs(tmp_path):
+    done = run("benchmark_kinetic_theory.py", "--smoke", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    row = json.loads(done.stdout.splitlines()[-1])
+    assert row["vmap_error"] < 1e-6 and row["scipy_error"] < 1e-6  # the same physics, twice
+
+
+@pytest.mark.slow
+def test_particle_benchmark_runs(tmp_path):
+    done = run("benchmark_particles.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    assert row["collisions_per_s"] > 0 and 0.5 < row["temperature_ratio"] < 1
+    for lammps in row["lammps"].values():  # where it is installed
+        assert lammps["temperature_ratio"] == pytest.approx(row["temperature_ratio"], rel=0.01)
+
+
+@pytest.mark.slow
+def test_stochastic_benchmark_runs(tmp_path):
+    done = run("benchmark_dsmc.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    assert row["collisions_per_s"] > 0 and 0.05 < row["temperature_ratio"] < 0.9
+
+
+@pytest.mark.slow
+def test_hard_sphere_benchmark_runs(tmp_path):
+    arguments = "--smoke", "--dimensions", 3, "--out", "figures.json"
+    done = run("benchmark_hard_spheres.py", *arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    # Four collisions a sphere at beta = 0.15: kinetic theory says 0.7.
+    assert row["collisions_per_s"] > 0 and 0.55 < row["temperature_ratio"] < 0.85
+
+
+@pytest.mark.slow
+def test_comparison_with_lammps_runs(tmp_path):
+    done = run("compare_lammps.py", "--smoke", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "here" / "compare_lammps.png").stat().st_size > 20_000
+    record = json.loads((tmp_path / "here" / "compare_lammps.json").read_text())
+    assert set(record["curves"]) == {"dilute", "dense"}
+
+
+@pytest.mark.slow
+def test_soft_sphere_accuracy_runs(tmp_path):
+    done = run("soft_sphere_accuracy.py", "--smoke", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "here" / "soft_sphere_accuracy.png").stat().st_size > 20_000
+    record = json.loads((tmp_path / "here" / "soft_sphere_accuracy.json").read_text())
+    for impact in record["impact"].values():
+        assert 1.8 < impact["order"]["bias"] < 2.4  # second order; 2.17 and 2.09 at 25 and 50 steps
+    assert record["ledger"]["rows"][1]["worst"] < 2e-4  # 5e-5 at 40 steps
+    assert record["trajectory"]["finest_to_lammps"] < 1e-3  # 3e-4 at 200 steps
+
+
+@pytest.mark.slow
+def test_speed_against_error_runs(tmp_path):
+    done = run("speed_vs_error.py", "--smoke", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "here" / "speed_vs_error_smoke.png").stat().st_size > 20_000
+    rows = json.loads((tmp_path / "here" / "speed_vs_error_smoke.json").read_text())["scenes"][
+        "dense"
+    ]
+    for row in rows["rows"]:  # at early times all models agree to the noise of 200 particles
+        assert row["run_s"] > 0 and row["error"] < 0.01 + 4 * row["standard_error"]
+
+
+@pytest.mark.slow
+def test_benchmark_of_derivatives_runs(tmp_path):
+    done = run("benchmark_derivatives.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    assert len(rows) == 2  # soft spheres and stochastic simulation
+    for row in rows:  # the same linear rule, read in both directions
+        assert row["reverse_over_forward"] == pytest.approx(1.0, abs=1e-9)
+        assert all(way["run_s"] > 0 for way in row["ways"].values())
+
+
+@pytest.mark.slow
+def test_fits_head_to_head_run(tmp_path):
+    done = run("fit_head_to_head.py", "--smoke", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "here" / "fit_head_to_head.json").read_text())["rows"]
+    for row in rows:
+        assert len(row["guesses"]) == row["all_simulations"] > 0
+        if row["search"] == "jaxgran.fit":  # 1000 spheres leave A open by some per cent
+            assert abs(row["last_error"][0]) < 0.15
+
+
+@pytest.mark.slow
+def test_hard_cases_run(tmp_path):
+    done = run("hard_cases.py", "--smoke", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (case,) = json.loads((tmp_path / "here" / "hard_cases.json").read_text())["cases"]
+    assert {row["precision"] for row in case["rows"]} == {"float64", "float32"}
+    table = (tmp_path / "here" / "hard_cases.md").read_text().splitlines()
+    assert len(table) == 2 + len(case["rows"])

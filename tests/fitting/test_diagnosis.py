@@ -1,0 +1,102 @@
+"""What a fit means, in words."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxgran
+from jaxgran.models.base import Omission
+from jaxgran.models.selection import default_models
+from tests.conftest import glass_beads
+from tests.fitting.curves import measured, synthetic
+
+
+def test_a_search_that_was_cut_short_is_said_to_be():
+    gas, curve, *_ = measured("dilute")
+    result = jaxgran.fit(gas, curve, max_steps=1)
+    assert not bool(result.converged)
+    diagnosis = jaxgran.diagnose(result, curve)
+    assert not diagnosis.explains and "did not converge" in diagnosis.verdict
+    assert any("more max_steps" in reason for reason in diagnosis.reasons)
+
+
+def test_dense_measured_curve_is_not_explained():
+    gas, curve, a_true, n, _ = measured("dense")
+    result = jaxgran.fit(gas, curve)
+    assert 0.7 < result.estimate[0] / a_true < 0.85  # the known failure of kinetic theory here
+    diagnosis = jaxgran.diagnose(result, curve, n)
+    assert not diagnosis.explains
+    assert "does not explain this curve" in diagnosis.verdict
+    assert "needs soft spheres" in diagnosis.verdict
+    text = " ".join(diagnosis.reasons)
+    for word in ("reduced chi^2", "hotter (+)", "three at a time", "overlap", "above L_c"):
+        assert word in text
+
+
+def test_a_good_scene_omits_nothing():
+    gas = glass_beads(0.09)
+    for model in default_models(4000):
+        assert model.omissions(gas, 4000) == ()
+
+
+def test_every_model_says_what_it_omits():
+    gas, _, a, n, _ = measured("dense")
+    gas = gas.replace(dissipative_constant=a)
+    theory, dsmc, hard, soft = (model.omissions(gas, n) for model in default_models(n))
+    assert [omission.decisive for omission in theory] == [True, True, False]
+    assert "softness correction" in theory[1].words and "above L_c" in theory[2].words
+    assert dsmc[2] == theory[2] and "instantaneous impacts leave out" in dsmc[1].words
+    assert hard == dsmc[:2] and soft == ()
+
+
+class Stub(jaxgran.KineticTheory):
+    """Kinetic theory that says to omit what it is told."""
+
+    told: tuple[Omission, ...] = ()
+
+    def omissions(self, gas, num_particles=None):
+        return self.told
+
+
+EDGE = Omission("the gas is dense", False, "Take positions.")
+DECISIVE = Omission("contacts last", True, "Take contacts.")
+GOOD, BAD = 0.5, 0.001
+NOT_EXPLAINED = "Stub does not explain this curve: do not trust its estimates."
+
+
+@pytest.mark.parametrize(
+    "omissions, p_value, explains, verdict",
+    [
+        ((), GOOD, True, "Stub explains this curve."),
+        (
+            (EDGE,),
+            GOOD,
+            True,
+            "Stub fits this curve, but the scene is at the edge of the model's validity.",
+        ),
+        (
+            (DECISIVE, EDGE),
+            GOOD,
+            False,
+            "Stub cannot be trusted in this scene, though the curve fits. Take contacts.",
+        ),
+        ((), BAD, False, NOT_EXPLAINED),
+        ((EDGE,), BAD, False, f"{NOT_EXPLAINED} Take positions."),
+        ((DECISIVE, EDGE), BAD, False, f"{NOT_EXPLAINED} Take contacts."),
+    ],
+)
+def test_verdicts(result, omissions, p_value, explains, verdict):
+    fitted, curve = result
+    fitted = dataclasses.replace(fitted, model=Stub(told=omissions), p_value=jnp.asarray(p_value))
+    diagnosis = jaxgran.diagnose(fitted, curve)
+    assert (diagnosis.explains, diagnosis.verdict) == (explains, verdict)
+    assert {omission.words for omission in omissions} <= set(diagnosis.reasons)
+
+
+@pytest.fixture(scope="module")
+def result():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(1))
+    return jaxgran.fit(gas, curve), curve

@@ -1,0 +1,94 @@
+"""Fits through particle models."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from tests.fitting.curves import synthetic
+
+
+@pytest.mark.slow
+def test_fit_through_dsmc_agrees_with_kinetic_theory(beads):
+    gas = beads(0.15)
+    times = jnp.geomspace(0.3, 30.0, 20) * gas.mean_free_time
+    exact = jaxgran.cool(gas, times).temperature
+    curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
+    model = jaxgran.DSMC(5000, replicas=3)
+    result = jaxgran.fit(gas, curve, model=model, progress=False)
+    estimate, error = result.value("dissipative_constant")
+    true = gas.value("dissipative_constant")
+    # Kinetic theory and DSMC differ by 0.2 % in T, which is some 0.4 % in A.
+    assert abs(estimate / true - 1) < 2 * error / true + 0.004
+    assert error < 0.02 * true
+    assert 0 < result.simulation_error[0] < error
+    assert "DSMC" in jaxgran.diagnose(result, curve).verdict
+
+
+@pytest.mark.slow
+def test_noise_of_a_simulation_is_counted_once_without_error_bars(beads):
+    # Measured with a scatter of 3 %, simulated with a noise of 1 %: told the scatter, or left to
+    # find it in the residuals, the same error, to the 11 % that 40 points tell it and as much again
+    # that the weights differ by (and three times the noise if it were inflated).
+    gas = beads(0.15)
+    curve = synthetic(gas, jax.random.key(13), relative_error=0.03)
+    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature)
+    model = jaxgran.DSMC(1000, replicas=3)
+    told, left = (
+        jaxgran.fit(gas, c, model=model, max_steps=6, progress=False) for c in (curve, bare)
+    )
+    np.testing.assert_allclose(left.standard_error, told.standard_error, rtol=0.35)
+
+
+def test_the_key_is_that_of_the_simulations(beads):
+    gas = beads(0.15)
+    times = jnp.geomspace(0.3, 3.0, 8) * gas.mean_free_time
+    curve = jaxgran.CoolingCurve(times=times, temperature=jaxgran.cool(gas, times).temperature)
+    model = jaxgran.DSMC(100, replicas=2)
+    options = {"model": model, "max_steps": 1, "progress": False}
+    default = jaxgran.fit(gas, curve, **options)
+    assert default.model is model and default.iterations == 1
+    same, other = (jaxgran.fit(gas, curve, **options, key=jax.random.key(k)) for k in (0, 1))
+    np.testing.assert_array_equal(default.estimate, same.estimate)
+    assert default.estimate[0] != other.estimate[0]
+
+
+def test_fit_through_particles_refuses_what_it_cannot_do(beads):
+    gas = beads(0.15)
+    times = jnp.geomspace(0.3, 30.0, 20) * gas.mean_free_time
+    curve = jaxgran.CoolingCurve(times=times, temperature=jaxgran.cool(gas, times).temperature)
+    with pytest.raises(ValueError, match="replicas >= 2"):
+        jaxgran.fit(gas, curve, model=jaxgran.SoftSpheres(100))
+    with pytest.raises(ValueError, match="projection"):
+        jaxgran.fit(gas, curve, model=jaxgran.SoftSpheres(100, replicas=2, projection=None))
+    with pytest.raises(ValueError, match="least squares"):
+        jaxgran.fit(gas, curve, model=jaxgran.SoftSpheres(100, replicas=2), method="lbfgs")
+    still = gas.replace(dissipative_constant=0.0)
+    with pytest.raises(ValueError, match="cannot start at dissipative_constant = 0.0"):
+        jaxgran.fit(gas, curve, model=jaxgran.DSMC(100, replicas=2), start=still)
+    with pytest.raises(ValueError, match="one curve at a time"):
+        jax.jit(lambda g: jaxgran.fit(g, curve, model=jaxgran.SoftSpheres(9, replicas=2)).chi2)(gas)
+
+
+def test_fit_through_soft_spheres_finds_what_made_the_curve(beads):
+    gas = beads(0.3, packing_fraction=0.2)
+    stiff = (float(gas.contact_fraction) / 0.1) ** 2.5
+    gas = gas.replace(youngs_modulus=stiff * gas.value("youngs_modulus"))
+    gas = gas.replace(
+        dissipative_constant=gas.value("dissipative_constant") * 0.3 / gas.thermal_beta
+    )
+    times = jnp.geomspace(0.3, 12.0, 12) * gas.mean_free_time
+    model = jaxgran.SoftSpheres(300, replicas=4, steps_per_contact=20)
+    curve = jaxgran.cool(gas, times, model=model, key=jax.random.key(7), progress=False)
+    curve = jaxgran.CoolingCurve(
+        times=times, temperature=curve.temperature, temperature_error=0.015 * curve.temperature
+    )
+    result = jaxgran.fit(gas, curve, model=model, max_steps=5, progress=False)
+    estimate, error = result.value("dissipative_constant")
+    true = float(gas.value("dissipative_constant"))
+    # The measured curve is a run of 1200 spheres itself, whose noise its 1.5 % stand for.
+    assert abs(float(estimate) / true - 1) < 3 * float(error) / true
+    assert float(error) < 0.1 * true and bool(result.converged)
+    theory = jaxgran.fit(gas, curve)
+    assert abs(theory.estimate[0] / true - 1) > abs(estimate / true - 1)

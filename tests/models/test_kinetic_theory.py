@@ -1,0 +1,258 @@
+"""Kinetic theory against the reference solutions, and its numerics over many decades."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxgran
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.theory import closed_forms
+
+# d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
+# equations, clipped restitution, Gaussian start, no softness correction.
+REFERENCE = """
+3 .05 1 .9611838 .9611565 -.005641 .04808981
+3 .05 10 .6984981 .6979185 -.013184 1.437598
+3 .05 100 .1289209 .1284777 -.011842 10.42569
+3 .15 1 .9037366 .9036523 -.007574 .04770303
+3 .15 10 .4431792 .4422072 -.018296 1.347421
+3 .15 100 .03485851 .03464156 -.018733 7.40483
+3 .15 1000 .0008602316 .000854318 -.016810 18.50849
+2 .15 1 .861079 .8608634 -.013827 .1148266
+2 .15 10 .3299659 .3283514 -.032185 2.37369
+2 .15 100 .01899688 .01877722 -.033265 10.74937
+"""
+HARD = jaxgran.KineticTheory(softness=False)
+
+
+@pytest.mark.parametrize("row", REFERENCE.split("\n")[1:-1])
+def test_reference_table(row, beads):
+    d, beta, tau, theta, maxwellian, a2, displacement = (float(x) for x in row.split())
+    gas = beads(beta, dimension=int(d))
+    times = jnp.array([tau]) * gas.mean_free_time
+    curve = jaxgran.cool(gas, times, model=HARD)
+    # Asked: 2e-4. Reached: 8e-6 in T and 3e-6 in <dr^2>, the accuracy of the table's own eps(v).
+    np.testing.assert_allclose(curve.temperature[0] / gas.temperature, theta, rtol=1e-5)
+    np.testing.assert_allclose(curve.displacement[0] / gas.path_length**2, displacement, rtol=5e-6)
+    np.testing.assert_allclose(curve.sonine[0], a2, atol=1e-6)
+    no_a2 = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False, sonine=False))
+    np.testing.assert_allclose(no_a2.temperature[0] / gas.temperature, maxwellian, rtol=1e-5)
+
+
+def test_sensitivity_table(beads):
+    gas = beads(0.15)
+    times = jnp.array([1.0, 5, 10, 50, 100, 1000]) * gas.mean_free_time
+
+    def log_temperature(log_a):
+        cooled = jaxgran.cool(gas.replace(dissipative_constant=jnp.exp(log_a)), times, model=HARD)
+        return jnp.log(cooled.temperature)
+
+    log_a = jnp.log(gas.value("dissipative_constant"))
+    table = [-0.07813, -0.3193, -0.52054, -1.05837, -1.22284, -1.4631]
+    # Asked: 1e-3. Reached: 5e-5, the last digit of the table.
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(log_temperature)(log_a), table, rtol=1e-4)
+
+
+def test_twelve_decades_of_cooling(beads):
+    gas = beads(0.15)
+    tau = jnp.geomspace(1e-3, 3e8, 200)
+    curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=HARD)
+    assert curve.temperature[-1] / gas.temperature < 1e-12
+    for field in jax.tree.leaves(curve):
+        assert jnp.all(jnp.isfinite(field))
+    # Late exponent: -5/3 + O(u^(-1/6)); two decades before the end the loss of b_2 still shows.
+    slope = jnp.diff(jnp.log(curve.temperature))[-1] / jnp.diff(jnp.log(tau))[-1]
+    np.testing.assert_allclose(slope, -5 / 3, atol=0.01)
+
+
+def test_tolerance_is_met(beads):
+    gas = beads(0.15)
+    times = jnp.geomspace(0.01, 1e5, 50) * gas.mean_free_time
+    exact = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(rtol=1e-12))
+    for rtol in (1e-4, 1e-6, 1e-9):
+        curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(rtol=rtol))
+        np.testing.assert_allclose(curve.temperature, exact.temperature, rtol=10 * rtol)
+
+
+def test_ballistic_start_and_diffusive_end(beads):
+    gas = beads(0.0)
+    times = jnp.array([1e-4, 1e3]) * gas.mean_free_time
+    curve = jaxgran.cool(gas, times)
+    np.testing.assert_allclose(curve.temperature, gas.temperature, rtol=1e-9)
+    free_flight = 3 * gas.temperature * times[0] ** 2
+    # Collisions take (2/9) tau of it: 7e-5... of t/tau_c = 1e-4; the solver 1e-9 of mfp^2.
+    np.testing.assert_allclose(curve.displacement[0], free_flight, rtol=1e-3)
+    # Elastic Enskog, first Sonine: D = T tau_E with tau_E = 3/2 tau_c (the paper's D_0, put right).
+    enskog = gas.temperature * 1.5 * gas.mean_free_time
+    np.testing.assert_allclose(curve.diffusion[1], enskog, rtol=1e-8)
+    np.testing.assert_allclose(curve.collisions[1], 1e3, rtol=1e-8)
+
+
+def test_constant_restitution_diffusion():
+    # Quasi-steady D nu / T = (d/2) 4/(1+e)^2 of the Maxwellian gas.
+    e = 0.8
+    gas = jaxgran.Gas(
+        jaxgran.ConstantRestitution(e),
+        diameter=1.0,
+        mass=1.0,
+        packing_fraction=0.1,
+        temperature=1.0,
+    )
+    times = jnp.array([3e3]) * gas.mean_free_time
+    curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(sonine=False))
+    frequency = gas.collision_frequency * jnp.sqrt(curve.temperature / gas.temperature)
+    np.testing.assert_allclose(
+        curve.diffusion * frequency / curve.temperature, 1.5 * 4 / (1 + e) ** 2, rtol=1e-4
+    )  # memory of the start dies as a power of time here
+
+
+def test_softness_slows_cooling(beads):
+    # dT/dt (1 - c X_T/sigma): at the start, directly.
+    gas = beads(0.15).replace(youngs_modulus=1e6)
+    times = jnp.array([1e-3]) * gas.mean_free_time
+    soft = 1 - jaxgran.cool(gas, times).temperature / gas.temperature
+    hard = 1 - jaxgran.cool(gas, times, model=HARD).temperature / gas.temperature
+    length = (2 * gas.temperature / gas.alpha) ** 0.4 / gas.diameter
+    np.testing.assert_allclose(soft / hard, 1 - 1.937 * length, rtol=1e-4)  # O(t) of the decay
+
+
+def test_stiff_solver_for_nearly_elastic_gases(beads):
+    gas = beads(1e-6)
+    times = jnp.geomspace(1.0, 1e9, 20) * gas.mean_free_time
+    model = jaxgran.KineticTheory(solver=diffrax.Kvaerno5(), rtol=1e-7)
+    curve = jaxgran.cool(gas, times, model=model)
+    formula = closed_forms.paper_temperature(times / gas.mean_free_time, gas.delta)
+    # The expansion is right to delta here; softness 0.8 % of the rate, a_2 less.
+    np.testing.assert_allclose(curve.temperature / gas.temperature, formula, rtol=0.03)
+
+
+def test_times_of_every_kind(beads):
+    gas = beads(0.15)
+    whole = jaxgran.cool(gas, np.linspace(0.0, 5.0, 11))
+    assert whole.temperature[0] == gas.temperature
+    assert whole.displacement[0] == 0.0
+    one = jaxgran.cool(gas, [2.5])
+    late = jaxgran.cool(gas, [2.0, 2.5])
+    # Dense output of the solver at rtol 1e-9: where else one looks changes no value.
+    np.testing.assert_allclose(one.temperature[0], whole.temperature[5], rtol=1e-8)
+    np.testing.assert_allclose(late.temperature[1], whole.temperature[5], rtol=1e-8)
+    many = jaxgran.cool(gas, np.linspace(1e-3, 10.0, 100_000))
+    assert jnp.all(jnp.diff(many.temperature) < 0)
+    assert jaxgran.cool(gas, [0.0]).temperature[0] == gas.temperature
+
+
+@pytest.mark.parametrize(
+    "times, message",
+    [
+        ([-1.0, 1.0], "times must be finite and not negative, got -1"),
+        ([1.0, 1.0], "times must increase, got 1 after 1; sort them"),
+        ([2.0, 1.0], "times must increase"),
+        ([0.0, float("nan")], "finite"),
+        ([], "list of numbers"),
+        (1.0, "list of numbers"),
+    ],
+)
+def test_bad_times_are_refused(times, message, beads):
+    with pytest.raises(ValueError, match=message):
+        jaxgran.cool(beads(0.15), times)
+
+
+@given(st.lists(st.floats(-10, 1e6), min_size=1, max_size=6))
+@settings(max_examples=60, deadline=None)
+def test_times_are_ordered_or_refused(times):
+    from tests.conftest import glass_beads
+
+    good = times[0] >= 0 and all(b > a for a, b in zip(times, times[1:], strict=False))
+    if good:
+        temperature = jaxgran.cool(glass_beads(), times).temperature
+        assert jnp.all((temperature > 0) & (temperature <= 0.01))
+    else:
+        with pytest.raises(ValueError, match="times must"):
+            jaxgran.cool(glass_beads(), times)
+
+
+def test_a_law_that_heats_is_refused(beads):
+    hot = jaxgran.RestitutionSeries([0.1], [0.2])
+    gas = jaxgran.Gas(hot, diameter=1.0, mass=1.0, packing_fraction=0.1, temperature=1.0)
+    with pytest.raises(ValueError, match="makes this gas heat up"):
+        jaxgran.cool(gas, [1.0])
+    # The paper's two terms do the same once delta > 1/q = 0.434.
+    paper = jaxgran.KineticTheory(averages="paper")
+    jaxgran.cool(beads(0.69), [1.0], model=paper)
+    with pytest.raises(ValueError, match="truncated series beyond its range"):
+        jaxgran.cool(beads(0.71), [1.0], model=paper)
+
+
+def test_a_gas_as_soft_as_air_is_refused(beads):
+    gas = beads(0.1)
+    gas = gas.replace(youngs_modulus=1e-9 * gas.value("youngs_modulus"))  # GPa taken for Pa
+    with pytest.raises(ValueError, match="is youngs_modulus in Pa"):
+        jaxgran.cool(gas, [1.0])
+    assert jaxgran.cool(gas, [1.0], model=KineticTheory(softness=False)).temperature[0] > 0
+
+
+def test_bad_options_are_refused(beads):
+    with pytest.raises(ValueError, match='averages must be "exact" or "paper", got \'printed\''):
+        jaxgran.KineticTheory(averages="printed")
+    with pytest.raises(ValueError, match="gas must be a jaxgran.Gas, got float"):
+        jaxgran.cool(1.0, [1.0])  # pyright: ignore
+
+
+def test_values_do_not_recompile(beads):
+    cool = KineticTheory._cool.__wrapped__  # as it is inside its own jit
+    checked = eqx.filter_jit(eqx.debug.assert_max_traces(cool, max_traces=1))
+    times = jnp.array([1.0, 2.0, 4.0])
+    for a in (1e-7, 1e-6):
+        for t0 in (0.01, 0.5):
+            gas = beads(0.15).replace(dissipative_constant=a, temperature=t0)
+            checked(HARD, gas, times * t0)
+
+
+@pytest.mark.slow
+def test_vmap_over_any_float(beads):
+    gas = beads(0.15)
+    times = jnp.array([0.1, 1.0])
+    sweeps = {
+        "dissipative_constant": jnp.geomspace(1e-7, 1e-5, 4),
+        "youngs_modulus": jnp.geomspace(1e6, 1e9, 4),
+        "packing_fraction": jnp.linspace(0.01, 0.4, 4),
+        "temperature": jnp.geomspace(1e-4, 1.0, 4),
+        "diameter": jnp.geomspace(1e-4, 1e-2, 4),
+    }
+    for name, values in sweeps.items():
+        batch = jax.vmap(lambda x, name=name: jaxgran.cool(gas.replace(**{name: x}), times))(values)
+        single = [jaxgran.cool(gas.replace(**{name: x}), times).temperature for x in values]
+        # Steps of a batch are its members' own; only the order of sums differs.
+        np.testing.assert_allclose(batch.temperature, jnp.stack(single), rtol=1e-11, err_msg=name)
+
+
+def test_too_few_steps_are_an_error(beads):
+    model = jaxgran.KineticTheory(max_steps=5)
+    with pytest.raises(RuntimeError, match="reached its largest number of steps"):
+        jaxgran.cool(beads(0.15), [100.0], model=model)
+
+
+def test_float32(beads):
+    gas, times = beads(0.15), jnp.geomspace(0.1, 1e3, 20)
+    exact = jaxgran.cool(gas, times)
+    with jax.enable_x64(False):
+        from tests.conftest import glass_beads
+
+        single = jaxgran.cool(glass_beads(0.15), np.asarray(times, np.float32))
+        assert single.temperature.dtype == jnp.float32
+        # The solver's rtol is 1e-5 here, float32 carries 1e-7 and ln T down to -15.
+        np.testing.assert_allclose(single.temperature, exact.temperature, rtol=3e-4)
+
+
+def test_displacement_accuracy_covers_dense_hard_spheres(beads):
+    # Speedy's D over Enskog's first Sonine order, evaluated apart; rounded, so 15 % of the excess.
+    for phi, excess in ((0.05, 0.0407), (0.1, 0.0844), (0.2, 0.1883)):
+        accuracy = KineticTheory().displacement_accuracy(beads(0.1, packing_fraction=phi))
+        np.testing.assert_allclose(np.sqrt(accuracy**2 - 0.017**2), excess, rtol=0.15)
+    assert KineticTheory().displacement_accuracy(beads(0.1, packing_fraction=1e-6)) < 0.0171

@@ -1,0 +1,74 @@
+import gc
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.checks import status
+from jaxgran.particles import driver
+from jaxgran.particles.capacity import Capacity, Neighbourhood, on_grid
+
+
+@pytest.mark.parametrize("ratio", [1.06, 1.3])
+def test_the_grid_is_geometric(ratio):
+    values = np.geomspace(1e-3, 1e3, 2000)
+    rounded = np.array([on_grid(x, ratio) for x in values])
+    assert np.all(rounded >= values) and np.all(rounded <= ratio * values * (1 + 1e-9))
+    steps = np.log(np.unique(rounded.round(12))) / np.log(ratio)
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    np.testing.assert_allclose([on_grid(x, ratio) for x in rounded], rounded, rtol=1e-9)
+
+
+def test_a_capacity_grows_where_it_must():
+    capacity = Capacity(pairs=100, lookahead=10, near=50, contacts=20, members=20)
+    needed = jnp.array([80, 30, 50, 10, 21], jnp.int32)
+    fault = capacity.exceeded_by(needed)
+    assert status.has(fault, status.LIST_FULL) and status.has(fault, status.CONTACTS_FULL)
+    grown = capacity.grown([int(x) for x in needed])
+    assert grown.pairs == 100 and grown.near == 50 and grown.contacts == 20
+    assert grown.lookahead > 30 and grown.members > 21
+    assert grown.exceeded_by(needed) == status.OK
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_neighbourhood_is_that_of_the_gas(beads, dimension):
+    gas = beads(packing_fraction=0.1, dimension=dimension)
+    side = float(gas.box_side(1000) / gas.diameter)
+    around = Neighbourhood.of(side, 1000, 1, dimension, listed_more=3.0)
+    rate = float(gas.collision_frequency * gas.diameter / jnp.sqrt(gas.temperature))
+    # The density is rounded up by 30 % at most; the pair correlation and the rate follow it.
+    for rounded, exact in (
+        (around.in_contact, 0.1 * 2 ** (dimension - 1)),
+        (around.collision_frequency, rate),
+        (around.contact_value, float(gas.contact_value)),
+    ):
+        assert exact * (1 - 1e-9) <= rounded < 1.5 * exact
+    assert around.listed == pytest.approx(around.in_contact + 3.0)
+
+
+@pytest.mark.parametrize("kind", [jaxgran.SoftSpheres, jaxgran.HardSpheres])
+def test_thirty_densities_share_four_programs(beads, kind):
+    compiled = []
+
+    def count(event, duration, **_):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(duration)
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+    before, arrays = driver._stretches._cache_size(), []
+    try:
+        for phi in np.linspace(0.05, 0.10, 30):
+            gas = beads(packing_fraction=phi)
+            jaxgran.cool(gas, [0.02 * float(gas.mean_free_time)], model=kind(200))
+            gc.collect()
+            arrays.append((len(compiled), sum(x.nbytes for x in jax.live_arrays())))
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
+    programs = driver._stretches._cache_size() - before
+    print(f"\n{kind.__name__}: {programs} programs, {len(compiled)} compilations in all")
+    assert programs <= 4
+    # Beside these, small functions are compiled for the first gas only.
+    assert arrays[-1][0] - arrays[0][0] < 8
+    assert arrays[-1][1] <= arrays[0][1] + 100_000

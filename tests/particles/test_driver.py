@@ -1,0 +1,249 @@
+import io
+from contextlib import redirect_stderr
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tqdm import tqdm
+
+from jaxgran.checks import status
+from jaxgran.data import checkpoint
+from jaxgran.particles import driver
+from jaxgran.particles.driver import Failure, follow
+
+TIMES = np.array([0.0, 0.3, 1.0, 1.1, 2.5])
+STEPS = 2 + 3 + 1 + 6  # of at most 0.25, from time to time
+
+
+class State(NamedTuple):
+    time: jax.Array
+    x: jax.Array
+    count: jax.Array
+
+
+def start():
+    return State(jnp.zeros(()), jnp.array([1.0, 2.0]), jnp.zeros((), jnp.int32))
+
+
+def advance(state, until):
+    dt = jnp.minimum(0.25, until - state.time)
+    last = until - state.time <= 0.25
+    time = jnp.where(last, until, state.time + dt)
+    return State(time, state.x * jnp.exp(-dt), state.count + 1)
+
+
+def observe(state):
+    return {"temperature": state.x**2, "total": jnp.sum(state.x), "count": state.count}
+
+
+class Calls:
+    """`advance`, counted, that raises something at one call."""
+
+    def __init__(self, at=None, error=KeyboardInterrupt):
+        self.number, self.at, self.error = 0, at, error
+
+    def __call__(self, state, until):
+        if self.number == self.at:
+            raise self.error
+        self.number += 1
+        return advance(state, until)
+
+
+def quiet(*args, **options):
+    """The last state and the records of a run that does not fail."""
+    *found, fault = follow(*args, progress=False, **options)
+    assert fault == status.OK
+    return tuple(found)
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+    kinds = [[(np.asarray(x).dtype, np.shape(x)) for x in jax.tree.leaves(t)] for t in (a, b)]
+    assert kinds[0] == kinds[1]
+
+
+def test_records_are_taken_at_the_times():
+    calls = Calls()
+    state, records = quiet(start(), TIMES, calls, observe)
+    assert isinstance(state, State) and state.time == 2.5 and calls.number == STEPS
+    assert records["temperature"].shape == (5, 2) and records["total"].shape == (5,)
+    # Products of up to twelve rounded factors.
+    decay = np.exp(-TIMES)
+    np.testing.assert_allclose(records["total"], 3 * decay, rtol=1e-14)
+    np.testing.assert_allclose(records["temperature"], np.outer(decay**2, [1.0, 4.0]), rtol=1e-14)
+    np.testing.assert_array_equal(records["count"], [0, 2, 5, 6, 12])
+    assert records["count"].dtype == np.int32
+
+
+def test_a_time_already_reached_takes_no_step():
+    calls = Calls(at=0)
+    state, records = quiet(start(), np.array([0.0]), calls, observe)
+    same(state, start())
+    np.testing.assert_array_equal(records["total"], [3.0])
+
+
+def test_advance_never_needs_to_look_beyond_the_next_time():
+    seen = []
+
+    def recorded(state, until):
+        seen.append((float(state.time), until))
+        return advance(state, until)
+
+    quiet(start(), TIMES, recorded, observe)
+    assert all(time < until for time, until in seen)
+    assert [until for _, until in seen] == [0.3] * 2 + [1.0] * 3 + [1.1] + [2.5] * 6
+    assert all(type(until) is float for _, until in seen)
+
+
+@pytest.mark.parametrize("at", [0, 1, 2, 4, 8, STEPS - 1])
+def test_an_interrupted_run_is_resumed(tmp_path, at):
+    path = tmp_path / "run.npz"
+    whole = quiet(start(), TIMES, advance, observe)
+    with pytest.raises(KeyboardInterrupt):
+        quiet(start(), TIMES, Calls(at), observe, scene="toy", path=path)
+    assert path.exists()
+    rest = Calls()
+    resumed = quiet(start(), TIMES, rest, observe, scene="toy", path=path)
+    assert rest.number == STEPS - at
+    same(resumed, whole)
+    assert all(isinstance(leaf, jax.Array) for leaf in resumed[0])
+
+
+def test_a_run_may_be_interrupted_often(tmp_path):
+    path = tmp_path / "run.npz"
+    whole = quiet(start(), TIMES, advance, observe)
+    for _ in range(5):
+        with pytest.raises(KeyboardInterrupt):
+            quiet(start(), TIMES, Calls(2), observe, path=path)
+    same(quiet(start(), TIMES, Calls(3), observe, path=path), whole)
+
+
+def test_a_run_that_dies_loses_little(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
+    path = tmp_path / "run.npz"
+    whole = quiet(start(), TIMES, advance, observe)
+    with pytest.raises(MemoryError):
+        quiet(start(), TIMES, Calls(7, MemoryError), observe, scene="toy", path=path)
+    rest = Calls()
+    resumed = quiet(start(), TIMES, rest, observe, scene="toy", path=path)
+    assert rest.number == STEPS - 7
+    same(resumed, whole)
+
+
+def test_checkpoints_are_as_seldom_as_said(tmp_path, monkeypatch):
+    now, saves = [0.0], []
+    monkeypatch.setattr(driver.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(checkpoint, "save", lambda *args: saves.append(now[0]))
+
+    def slow(state, until):
+        now[0] += 25.0
+        return advance(state, until)
+
+    quiet(start(), TIMES, slow, observe, path=tmp_path / "run.npz")
+    assert saves == [75.0, 150.0, 225.0, 300.0, 300.0]  # after more than 60 s, and at the end
+    saves.clear()
+    quiet(start(), TIMES, slow, observe)
+    assert not saves
+
+
+def test_a_finished_run_is_read_back(tmp_path):
+    path = tmp_path / "run.npz"
+    whole = quiet(start(), TIMES, advance, observe, scene="toy", path=path)
+    same(quiet(start(), TIMES, Calls(0), observe, scene="toy", path=path), whole)
+
+
+def test_checkpoints_of_other_scenes_are_refused(tmp_path):
+    path = tmp_path / "run.npz"
+    quiet(start(), TIMES, advance, observe, scene="toy", path=path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="run.npz belongs to another scene"):
+        quiet(start(), TIMES, advance, observe, scene="other", path=path)
+    assert path.read_bytes() == before
+
+
+def test_without_a_path_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        quiet(start(), TIMES, Calls(3), observe)
+    assert not list(tmp_path.iterdir())
+
+
+def test_resuming_compiles_nothing_anew(tmp_path):
+    traces = []
+
+    @jax.jit
+    def compiled(state, until):
+        traces.append(until)
+        return advance(state, until)
+
+    path = tmp_path / "run.npz"
+    number = [0]
+
+    def interrupted(state, until):
+        number[0] += 1
+        if number[0] == 4:
+            raise KeyboardInterrupt
+        return compiled(state, until)
+
+    with pytest.raises(KeyboardInterrupt):
+        quiet(compiled(start(), 0.0), TIMES, interrupted, observe, path=path)
+    count = len(traces)
+    quiet(compiled(start(), 0.0), TIMES, interrupted, observe, path=path)
+    assert len(traces) == count
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def eager(monkeypatch):
+    """Bars are drawn at once."""
+    monkeypatch.setattr(driver, "tqdm", lambda **kw: tqdm(**(kw | {"delay": 0, "mininterval": 0})))
+
+
+def shown(stream, capsys, **settings):
+    with redirect_stderr(stream):
+        follow(start(), TIMES, advance, observe, label="toy", **settings)
+    assert capsys.readouterr() == ("", "")  # nothing elsewhere
+    return stream.getvalue()
+
+
+def test_the_bar_shows_the_temperature(eager, capsys):
+    last = shown(Terminal(), capsys).split("\r")[-1]
+    # The mean of 1 and 4, cooled by exp(-2 x 2.5).
+    assert last.startswith("toy: 100%") and "T/T_0 = 0.0168" in last and "left" in last
+
+
+def test_no_bar_where_none_is_wanted(eager, capsys):
+    assert shown(Terminal(), capsys, progress=False) == ""
+
+
+def test_no_bar_without_a_terminal(eager, capsys):
+    assert shown(io.StringIO(), capsys) == ""
+
+
+def test_no_bar_for_a_moment(capsys):
+    assert shown(Terminal(), capsys).strip() == ""
+
+
+def test_the_bar_goes_on_where_the_run_was(tmp_path, eager, capsys):
+    path = tmp_path / "run.npz"
+    with pytest.raises(KeyboardInterrupt):
+        quiet(start(), TIMES, Calls(6), observe, path=path)  # at t = 1.1 of 2.5
+    first = shown(Terminal(), capsys, path=path).split("\r")[1]
+    assert first.startswith("toy:  44%")
+
+
+def test_a_failure_leaves_nan_and_a_status():
+    def fails(state, until):
+        if state.time >= 1.0:
+            raise Failure(status.NOT_FINITE.bit)
+        return advance(state, until)
+
+    state, records, fault = follow(start(), TIMES, fails, observe, progress=False)
+    assert fault == status.NOT_FINITE.bit and state.time == 1.0
+    assert np.all(np.isfinite(records["total"][:3])) and np.all(np.isnan(records["total"][3:]))

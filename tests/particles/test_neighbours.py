@@ -1,0 +1,373 @@
+import itertools
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import KDTree
+
+import jaxgran
+from jaxgran.particles.capacity import within_reach
+from jaxgran.particles.neighbours import (
+    MOST_AHEAD,
+    displacement,
+    engine,
+    find_pairs,
+    vesin_search,
+    wrap,
+)
+from jaxgran.particles.sweep_and_prune import sweep, unsorted
+
+# In boxes of less than three cutoffs jax-md itself warns about its integers.
+jax_md_warns = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")
+
+
+def brute_force(position, side, cutoff, replicas=1):
+    """Shortest x_i - x_j of every pair i < j closer than the cutoff."""
+    found = {}
+    n = len(position) // replicas
+    for first in range(0, len(position), n):
+        for i, j in itertools.combinations(range(first, first + n), 2):
+            apart = position[i] - position[j]
+            apart = apart - side * np.round(apart / side)
+            if np.sqrt(np.sum(apart**2)) < cutoff:
+                found[i, j] = apart
+    return found
+
+
+def listed(pairs):
+    count = int(pairs.count)
+    return list(zip(pairs.i[:count].tolist(), pairs.j[:count].tolist(), strict=True))
+
+
+def awkward(dimension, replicas, side, n=30):
+    """Random points, points on faces and corners of the box, and points on top of each other."""
+    rng = np.random.default_rng(dimension)
+    last = np.nextafter(side, 0)
+    boxes = side * rng.random((replicas, n, dimension))
+    corners = np.array(list(itertools.product([0.0, last], repeat=dimension)))
+    boxes[:, : len(corners)] = corners
+    boxes[:, 10, 0], boxes[:, 11, 0], boxes[:, 12, -1], boxes[:, 13, -1] = 0.0, last, 0.0, last
+    boxes[:, 15] = boxes[:, 14]
+    boxes[:, 17:19] = 0.0
+    return boxes.reshape(-1, dimension)
+
+
+def compare(dimension, replicas, side, cutoff, by):
+    position = awkward(dimension, replicas, side)
+    expected = brute_force(position, side, cutoff, replicas)
+    capacity = len(expected) + 7
+    search = partial(find_pairs, replicas=replicas, room=capacity, by=by)
+    pairs = search(jnp.asarray(position), side, cutoff)
+    found = listed(pairs)
+    assert int(pairs.count) == len(expected)  # each once
+    assert set(found) == set(expected)  # and with i < j
+    assert pairs.i.dtype == pairs.j.dtype == jnp.int32 and pairs.i.shape == (capacity,)
+    assert not np.any(pairs.i[-7:]) and not np.any(pairs.j[-7:])
+    offset = np.asarray(pairs.offset)[: len(found)]
+    np.testing.assert_array_equal(offset, side * np.round(offset / side))
+    i, j = np.array(found).T
+    # Not component by component, as half a box has two shortest ways. Round-off of the side.
+    np.testing.assert_allclose(
+        np.linalg.norm(position[i] - position[j] - offset, axis=1),
+        [np.linalg.norm(expected[pair]) for pair in found],
+        atol=1e-14 * side,
+    )
+
+
+# Each sweep is compiled for its shapes.
+WAYS = [("vesin", f) for f in (0.15, 1 / 3, 0.4999, 0.5)] + [("sweep", f) for f in (0.15, 0.5)]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("replicas", [1, 3])
+@pytest.mark.parametrize("by, fraction", WAYS)
+def test_pairs_are_those_of_brute_force(dimension, replicas, fraction, by):
+    compare(dimension, replicas, 3.7, 3.7 * fraction, by)
+
+
+@jax_md_warns
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("replicas, fraction", [(1, 0.4999), (2, 0.15)])
+def test_jax_md_finds_what_brute_force_finds(dimension, replicas, fraction):
+    compare(dimension, replicas, 3.7, 3.7 * fraction, "jax-md")
+
+
+@given(
+    st.lists(st.tuples(*3 * [st.integers(0, 7)]), min_size=2, max_size=12),
+    st.sampled_from([2, 3]),
+    st.sampled_from([0.07, 0.3, 0.49]),  # no distance of grid points
+)
+@settings(max_examples=40, deadline=None)
+def test_points_of_a_grid(points, dimension, cutoff):
+    position = np.array(points, float)[:, :dimension] / 8
+    expected = brute_force(position, 1.0, cutoff)
+    for by in ("vesin", "sweep"):
+        on_a_grid(position, expected, cutoff, by)
+
+
+def on_a_grid(position, expected, cutoff, by):
+    pairs = find_pairs(jnp.asarray(position), 1.0, cutoff, room=66, by=by)
+    assert sorted(listed(pairs)) == sorted(expected)
+    for i, j, offset in zip(pairs.i, pairs.j, pairs.offset, strict=True):
+        if i != j:  # else a row past the last
+            apart = position[i] - position[j] - np.asarray(offset)
+            np.testing.assert_array_equal(apart, expected[int(i), int(j)])  # eighths are exact
+
+
+COMPILED = pytest.mark.parametrize("by", ["vesin", "sweep"])
+
+
+@COMPILED
+def test_coincident_particles_are_pairs(by):
+    position = jnp.stack([jnp.array([1.0, 2.0, 3.0])] * 3 + [jnp.array([3.0, 0.0, 1.0])])
+    pairs = find_pairs(position, 4.0, 1e-3, room=8, by=by)
+    assert sorted(listed(pairs)) == [(0, 1), (0, 2), (1, 2)]
+    assert not np.any(pairs.offset)
+
+
+@COMPILED
+def test_pairs_across_the_faces(by):
+    position = jnp.array([[0.1, 2.0], [3.9, 2.0], [0.0, 0.0], [3.95, 3.95]])
+    pairs = find_pairs(position, 4.0, 0.5, room=8, by=by)
+    offset = dict(zip(listed(pairs), np.asarray(pairs.offset).tolist(), strict=False))
+    assert offset == {(0, 1): [-4.0, 0.0], (2, 3): [-4.0, -4.0]}
+
+
+def test_offset_outlasts_motion_without_wrapping():
+    rng = np.random.default_rng(1)
+    side = 3.7
+    position = side * rng.random((60, 3))
+    pairs = find_pairs(jnp.asarray(position), side, 0.8, room=400)
+    assert 0 < pairs.count <= 400
+    k = slice(int(pairs.count))
+    i, j = pairs.i[k], pairs.j[k]
+    moved = jnp.asarray(position + 0.2 * rng.uniform(-1, 1, position.shape))
+    inside = wrap(side, moved)
+    assert np.any(inside != moved)
+    np.testing.assert_allclose(
+        moved[i] - moved[j] - pairs.offset[k],
+        displacement(side, inside[i], inside[j]),
+        atol=1e-14 * side,  # round-off
+    )
+
+
+def test_a_capacity_that_is_exceeded_is_reported():
+    position = awkward(2, 2, 3.7)
+    cutoff = 3.7 * 0.15
+    expected = brute_force(position, 3.7, cutoff, 2)
+    for by in ("vesin", "sweep", "jax-md"):
+        search = partial(find_pairs, jnp.asarray(position), 3.7, cutoff, replicas=2, by=by)
+        for capacity in (1, len(expected) // 4, len(expected) - 1):
+            pairs = search(room=capacity)
+            assert pairs.count > capacity
+            assert pairs.i.shape == pairs.j.shape == pairs.offset.shape[:1] == (capacity,)
+            assert set(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)) < set(expected)
+        assert search(room=len(expected)).count == len(expected)
+
+
+def test_lists_of_jax_md_grow_with_the_gas():
+    # A gas that has clumped since has the same shape, so the list kept for it is too small.
+    rng = np.random.default_rng(2)
+    side, cutoff = 2.0, 0.3
+    sparse = side * rng.random((30, 2))
+    for position in (sparse, 0.2 * sparse, sparse):
+        pairs = find_pairs(jnp.asarray(position), side, cutoff, room=500, by="jax-md")
+        assert set(listed(pairs)) == set(brute_force(position, side, cutoff))
+
+
+@COMPILED
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_jit_and_vmap(dimension, by):
+    rng = np.random.default_rng(3)
+    batch = jnp.asarray(rng.random((3, 40, dimension)))
+    search = partial(find_pairs, replicas=2, room=120, by=by)
+    compiled = jax.jit(search)(2 * batch[0], 2.0, 0.4)
+    jax.tree.map(np.testing.assert_array_equal, compiled, search(2 * batch[0], 2.0, 0.4))
+    sides = jnp.array([1.0, 2.0, 4.0])
+    scaled = batch * sides[:, None, None]
+    together = jax.jit(jax.vmap(search))(scaled, sides, 0.2 * sides)
+    for k in range(3):
+        alone = search(scaled[k], sides[k], 0.2 * sides[k])
+        assert 0 < alone.count <= 120
+        for all_three, one in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(all_three[k], one)
+
+
+def test_pairs_carry_no_derivatives():
+    position = jnp.array([[0.1, 2.0], [3.9, 2.5], [2.0, 2.0]])
+
+    def square(position):
+        pairs = find_pairs(position, 4.0, 1.0, room=1)
+        return jnp.sum((position[pairs.i] - position[pairs.j] - pairs.offset) ** 2)
+
+    for gradient in (jax.grad(square)(position), jax.jit(jax.grad(square))(position)):
+        # d/dx of 0.2^2 + 0.5^2, rounded.
+        np.testing.assert_allclose(gradient, [[0.4, -1.0], [-0.4, 1.0], [0.0, 0.0]], atol=1e-14)
+
+
+@COMPILED
+def test_numbers_that_are_not_finite_have_no_pairs(by):
+    for bad in (jnp.nan, jnp.inf):
+        position = jnp.ones((4, 3)).at[2, 1].set(bad)
+        assert find_pairs(position, 4.0, 1.0, room=3, by=by).count == 0
+
+
+@COMPILED
+def test_one_particle_has_no_pairs(by):
+    assert find_pairs(jnp.ones((1, 3)), 4.0, 1.0, room=3, by=by).count == 0
+
+
+@pytest.mark.parametrize("side", [1.0, 3.7])
+def test_wrap_lands_inside(side):
+    edges = [0.0, -1e-20, -1e-300, side, -side, 7 * side, np.nextafter(side, 0), 1.5 * side]
+    random = np.random.default_rng(4).uniform(-20, 20, 90)
+    position = np.append(edges, random)[:, None] * np.ones((1, 2))
+    inside = np.asarray(wrap(side, jnp.asarray(position)))
+    assert np.all(inside >= 0) and np.all(inside < side)
+    sides = np.round((position - inside) / side)
+    # Coordinates of up to 26 are rounded at 4e-15.
+    np.testing.assert_allclose(inside + sides * side, position, atol=1e-14)
+    np.testing.assert_array_equal(wrap(side, jnp.asarray(inside)), inside)
+
+
+def test_displacement_is_the_shortest():
+    rng = np.random.default_rng(5)
+    a, b = 3.7 * rng.random((2, 50, 3))
+    images = np.array(list(itertools.product([-3.7, 0.0, 3.7], repeat=3)))
+    lengths = np.linalg.norm((a - b)[:, None] + images[None], axis=-1)
+    apart = displacement(3.7, jnp.asarray(a), jnp.asarray(b))
+    # Round-off.
+    np.testing.assert_allclose(np.linalg.norm(apart, axis=-1), lengths.min(axis=1), rtol=1e-13)
+    sides = (apart - (a - b)) / 3.7
+    np.testing.assert_allclose(sides, np.round(sides), atol=1e-14)
+
+
+def test_engine_follows_the_device_and_the_gas(monkeypatch):
+    assert engine("vesin", 1) == "vesin" and engine("sweep", 10**6) == "sweep"
+    assert engine("jax-md") == "jax-md"
+    for device, dense, traced in (("cpu", "vesin", "vesin"), ("gpu", "jax-md", "vesin")):
+        monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
+        assert engine("auto", MOST_AHEAD + 1) == dense
+        assert engine("auto", MOST_AHEAD) == ("sweep" if device == "cpu" else "jax-md")
+        assert engine("auto", 2 * MOST_AHEAD, traced=True) == "sweep"
+        assert engine("auto", 2 * MOST_AHEAD + 1, traced=True) == traced
+
+
+def test_unknown_engines_are_refused():
+    message = "neighbours must be one of auto, sweep, vesin, jax-md, got 'kd'"
+    with pytest.raises(ValueError, match=message):
+        engine("kd")
+
+
+@pytest.mark.parametrize("side, n", [(500.0, 20_000), (5000.0, 2000)])
+def test_wide_planes(side, n):
+    # More cells than vesin allows: a layer of them alone would end the process.
+    position = np.random.default_rng(0).uniform(0, side, (n, 2))
+    i, j, count = vesin_search(position, side, 1.4, 1, 2 * n)
+    found = np.sort(np.stack([i[:count], j[:count]], axis=1), axis=1)
+    expected = KDTree(position, boxsize=side).query_pairs(1.4)
+    assert set(map(tuple, found.tolist())) == expected
+    pairs = find_pairs(jnp.asarray(position), side, 1.4, room=2 * n, by="sweep")
+    assert set(listed(pairs)) == expected
+
+
+def test_a_sweep_looks_as_far_as_it_must():
+    # A gas, the same gas squeezed into a slab, and all of it in one plane across the sweep.
+    rng = np.random.default_rng(6)
+    side, n = 10.0, 1000
+    gas = side * rng.random((2, n, 3))
+    for squeezed, crowd in ((1.0, 1), (0.1, 10), (0.0, n)):
+        position = gas * np.array([squeezed, 1.0, 1.0])
+        trees = [KDTree(box, boxsize=side).query_pairs(1.0) for box in position]
+        expected = {(i + n * k, j + n * k) for k, tree in enumerate(trees) for i, j in tree}
+        flat = jnp.asarray(position.reshape(-1, 3))
+        look = partial(sweep, flat, side, 1.0, replicas=2, capacity=len(expected) + 9)
+        i, j, count, ahead = look(ahead=n)
+        found = list(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
+        assert set(found) == expected and len(found) == len(expected)
+        # Within .1 of the box, evenly: 100, and up to five standard errors more.
+        assert min(100 * crowd, n - 1) <= ahead <= min(150 * crowd + 32, n - 1)
+        *_, short_count, told = look(ahead=int(ahead) // 2)
+        assert told == ahead and short_count < count
+        *_, enough, told = look(ahead=int(ahead))
+        assert told == ahead and enough == count
+
+
+def test_a_sweep_in_single_precision_misses_nothing():
+    rng = np.random.default_rng(7)
+    position = (30 * rng.random((4000, 3))).astype(np.float32)
+    i, j, count, _ = sweep(
+        jnp.asarray(position), 30.0, 1.5, replicas=1, capacity=20_000, ahead=4000
+    )
+    found = set(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
+    tree = KDTree(position.astype(float), boxsize=30.0)
+    # As documented: 10^-6 of the cutoff and of the side.
+    assert tree.query_pairs(1.5) <= found <= tree.query_pairs(1.5 + 3.2e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_sweep_misses_no_pair_just_within_the_cutoff(dtype):
+    # Far apart, so that a whole number of steps of the side is many of the cutoff's round-off.
+    rng = np.random.default_rng(8)
+    side, n, cutoff = 1000.0, 20_000, 0.5
+    first = side * rng.random((n, 3))
+    way = rng.normal(size=(n, 3))
+    second = first + cutoff * way / np.linalg.norm(way, axis=1)[:, None]
+    position = (np.concatenate([first, second]) % side).astype(dtype)
+    position = np.where(position >= side, dtype(0), position)
+    apart = position[:n].astype(float) - position[n:]
+    apart -= side * np.round(apart / side)
+    within = np.flatnonzero(np.sum(apart**2, axis=1) < cutoff**2)
+    assert 0.3 * n < len(within) < 0.7 * n
+    i, j, count, _ = sweep(
+        jnp.asarray(position), side, cutoff, replicas=1, capacity=3 * n, ahead=200
+    )
+    found = set(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
+    assert {(k, k + n) for k in within.tolist()} <= found
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_sweep_over_few(n):
+    position = jnp.array([[0.1, 0.1], [9.9, 9.9], [5.0, 5.0]])[:n]
+    i, j, count, ahead = sweep(position, 10.0, 1.0, replicas=1, capacity=5, ahead=n)
+    assert (count, i[0], j[0]) == (1, 0, 1) and ahead < n
+
+
+def test_a_sweep_over_too_many_is_refused():
+    position = jax.ShapeDtypeStruct((2**26, 3), jnp.float32)
+    look = partial(sweep, side=1000.0, cutoff=1.0, replicas=1, capacity=9, ahead=2**10)
+    with pytest.raises(ValueError, match="cannot look 1024 particles ahead: .* allow 992 ahead"):
+        jax.eval_shape(look, position)
+
+
+def test_planes_of_a_lattice_are_in_reach_under_jit(beads):
+    # The first in a plane has the rest of it and all of the next within reach: 1249.
+    points = np.stack(np.meshgrid(*3 * [np.arange(25)], indexing="ij"), -1).reshape(-1, 3)
+    gas = beads(packing_fraction=0.1)
+    capacity = jaxgran.HardSpheres(25**3).sized_for(gas).plan.capacity
+    side = float(gas.box_side(25**3) / gas.diameter)
+    cutoff = 1.01 * side / 25
+    position, most = jnp.asarray(points * side / 25), capacity.lookahead
+    *_, count, ahead = sweep(
+        position, side, cutoff, replicas=1, capacity=capacity.pairs, ahead=most
+    )
+    assert count == 3 * 25**3 and 1200 < ahead <= most
+
+
+def test_very_many_disks_are_in_reach(beads):
+    # In order of x only by a coarse number, as the index takes most of its bits.
+    gas = beads(packing_fraction=0.1, dimension=2)
+    n = 600_000
+    side = float(gas.box_side(n) / gas.diameter)
+    rng = np.random.default_rng(9)
+    position = jnp.asarray(side * rng.random((n, 2)))
+    for skin in (0.2, 1.0):
+        reach = within_reach(n, side, skin)
+        *_, ahead = sweep(position, side, 1 + skin, replicas=1, capacity=9, ahead=int(reach))
+        # From two widths of what is unsorted to three, and the scatter of counts.
+        least = reach - n * unsorted(n)
+        assert least - 5 * least**0.5 < ahead < reach + 5 * reach**0.5

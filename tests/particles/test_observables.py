@@ -1,0 +1,171 @@
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import j1
+
+from jaxgran.particles.observables import (
+    mean_square_displacement,
+    pair_correlation,
+    sonine,
+    structure_factor,
+    temperature,
+    velocity_correlation,
+)
+
+
+def lattice(per_side, dimension):
+    points = itertools.product(range(per_side), repeat=dimension)
+    return np.array(list(points), float)
+
+
+def random_directions(n, dimension):
+    v = np.random.default_rng(dimension).normal(size=(n, dimension))
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def test_temperature():
+    v = jnp.array([[3.0, 0.0, 0.0], [0.0, -3.0, 0.0], [1.0, 2.0, 2.0]])
+    assert temperature(v) == pytest.approx(3.0, rel=1e-15)
+    batch = jnp.stack([v, 2 * v])
+    np.testing.assert_allclose(temperature(batch), [3.0, 12.0], rtol=1e-15)
+    assert temperature(v[:, :2]) == pytest.approx(23 / 6, rel=1e-15)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_sonine_of_known_distributions(dimension):
+    d = dimension
+    one_speed = random_directions(1000, d)
+    two_speeds = one_speed * np.repeat([1.0, 3.0], 500)[:, None]
+    cube = np.array(list(itertools.product([-2.0, 0.0, 2.0], repeat=d)))  # <x^2> = 8/3, <x^4> = 6 x
+    fourth = d * 32 / 3 + d * (d - 1) * 64 / 9
+    # Round-off of sums of 1000.
+    assert sonine(jnp.asarray(one_speed)) == pytest.approx(-2 / (d + 2), rel=1e-12)
+    assert sonine(jnp.asarray(two_speeds)) == pytest.approx(d / (d + 2) * 41 / 25 - 1, rel=1e-12)
+    exact = d / (d + 2) * fourth / (d * 8 / 3) ** 2 - 1
+    assert sonine(jnp.asarray(cube)) == pytest.approx(exact, rel=1e-12)
+    batch = sonine(jnp.stack([one_speed, 5 * two_speeds]))
+    np.testing.assert_allclose(batch, [-2 / (d + 2), d / (d + 2) * 41 / 25 - 1], rtol=1e-12)
+    maxwell = jax.random.normal(jax.random.key(0), (200_000, d))
+    # Its standard error is sqrt(8 / (d (d + 2) n)).
+    assert abs(sonine(maxwell)) < 4 * np.sqrt(8 / (d * (d + 2) * 200_000))
+
+
+def test_mean_square_displacement():
+    moved = jnp.array([[1.0, 2.0, 2.0], [0.0, 0.0, 5.0], [0.0, 1.0, 0.0]])
+    assert mean_square_displacement(moved) == pytest.approx(35 / 3, rel=1e-15)
+    batch = mean_square_displacement(jnp.stack([moved, jnp.zeros_like(moved)]))
+    np.testing.assert_allclose(batch, [35 / 3, 0.0], rtol=1e-15)
+
+
+def test_velocity_correlation():
+    v = jax.random.normal(jax.random.key(1), (100, 3))
+    # Round-off of sums of 300.
+    assert velocity_correlation(v, v) == pytest.approx(float(temperature(v)), rel=1e-14)
+    assert velocity_correlation(v, -0.5 * v) == pytest.approx(-0.5 * float(temperature(v)))
+    turned = jnp.stack([-v[:, 1], v[:, 0], 0 * v[:, 2]], axis=1)
+    assert velocity_correlation(v, turned) == pytest.approx(0.0, abs=1e-15)
+    batch = velocity_correlation(jnp.stack([v, v]), jnp.stack([v, 2 * v]))
+    np.testing.assert_allclose(batch, temperature(v) * jnp.array([1.0, 2.0]), rtol=1e-14)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_ideal_gas_has_no_pair_correlation(dimension):
+    n, side = 1500, 3.7
+    rng = np.random.default_rng(0)
+    edges = np.linspace(0, side / 2, 9)
+    g = pair_correlation(jnp.asarray(side * rng.random((n, dimension))), side, edges)
+    ball = {2: np.pi, 3: 4 / 3 * np.pi}[dimension] * (edges / side) ** dimension
+    error = 1 / np.sqrt(n**2 / 2 * np.diff(ball))
+    miss = (g - (1 - 1 / n)) / error  # a particle is no neighbour of itself
+    assert np.all(np.abs(miss) < 4)
+    assert np.sum(miss**2) < 8 + 4 * 4  # chi^2 of eight bins is 8 +- 4
+
+
+@pytest.mark.parametrize(
+    "dimension, shells",  # square lattice: 4 neighbours at 1, 4 at sqrt(2); cubic: 6 and 12
+    [(2, (4, 0, 4)), (3, (6, 0, 12))],
+)
+def test_shells_of_a_lattice(dimension, shells):
+    edges = np.array([0.9, 1.1, 1.3, 1.5])
+    ball = {2: np.pi, 3: 4 / 3 * np.pi}[dimension] * edges**dimension
+    spacing = 0.5
+    g = pair_correlation(jnp.asarray(spacing * lattice(4, dimension)), 4 * spacing, spacing * edges)
+    np.testing.assert_allclose(g, shells / np.diff(ball), rtol=1e-12)  # round-off
+
+
+def test_pairs_of_a_clump_are_all_counted():
+    # Far more pairs than the mean density lets expect.
+    rng = np.random.default_rng(1)
+    position, side = rng.random((120, 3)), 100.0
+    edges = np.linspace(0, 2, 5)
+    distances = np.linalg.norm(position[:, None] - position[None], axis=-1)
+    counts = np.histogram(distances[np.triu_indices(120, 1)], edges)[0]
+    assert counts.sum() == 120 * 119 // 2
+    expected = 120**2 / 2 / side**3 * 4 / 3 * np.pi * np.diff(edges**3)
+    g = pair_correlation(jnp.asarray(position), side, edges)
+    np.testing.assert_allclose(g, counts / expected, rtol=1e-12)  # round-off
+
+
+def test_pair_correlation_ends_at_half_the_box():
+    position = jnp.asarray(np.random.default_rng(2).random((10, 2)))
+    assert pair_correlation(position, 1.0, [0.0, 0.25, 0.5]).shape == (2,)
+    with pytest.raises(ValueError, match=r"the last edge of g\(r\) is 0.51, at most half a box"):
+        pair_correlation(position, 1.0, [0.0, 0.25, 0.51])
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_structure_factor_of_an_ideal_gas(dimension):
+    rng = np.random.default_rng(dimension)
+    runs, side = 400, 3.7
+    shapes = [structure_factor(side * rng.random((50, dimension)), side)[1] for _ in range(runs)]
+    # A mode's S is exponential with mean 1; a shell has at least two modes (k and -k are one).
+    np.testing.assert_allclose(np.mean(shapes, axis=0), 1.0, atol=4 / np.sqrt(2 * runs))
+
+
+@pytest.mark.parametrize("dimension, squares", [(2, (1, 2, 4, 5, 8)), (3, (1, 2, 3, 4, 5))])
+def test_shells_of_wave_vectors(dimension, squares):
+    points = np.ones((7, dimension))
+    k, shape = structure_factor(points, 3.7, num_shells=5)
+    np.testing.assert_allclose(k, 2 * np.pi / 3.7 * np.sqrt(squares), rtol=1e-15)
+    np.testing.assert_allclose(shape, 7.0, rtol=1e-14)  # all in one place: N
+    k, shape = structure_factor(points, 3.7)
+    assert k.shape == shape.shape == (4,)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_structure_factor_of_layers_and_waves(dimension):
+    per_side = 8
+    points = lattice(per_side, dimension)
+    n, side = len(points), float(per_side)
+    _, shape = structure_factor(points, side)
+    np.testing.assert_allclose(shape, 0.0, atol=1e-25)  # squares of round-off
+    # Particles on one plane: N for the waves across it, none for those along it.
+    layer = points * np.array([0.0] + [1.0] * (dimension - 1))
+    _, shape = structure_factor(layer, side)
+    np.testing.assert_allclose(shape[0], n / dimension, rtol=1e-12)
+    np.testing.assert_allclose(shape[1], 0.0, atol=1e-25)
+    # A density wave along x: |sum exp(i k x)| / N is the Bessel function J_1 of its strength,
+    # up to J_7 = 2e-9 of the eight points.
+    strength = 0.5
+    wave = points.copy()
+    phase = 2 * np.pi * points[:, 0] / side
+    wave[:, 0] += strength * side / (2 * np.pi) * np.sin(phase)
+    _, shape = structure_factor(wave, side)
+    np.testing.assert_allclose(shape[0], n * j1(strength) ** 2 / dimension, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_images_have_the_same_structure_factor(dimension):
+    rng = np.random.default_rng(3)
+    side = 3.7
+    position = side * rng.random((60, dimension))
+    _, shape = structure_factor(position, side)
+    images = position + side * rng.integers(-9, 10, position.shape)
+    # Phases of up to 400 are rounded at 1e-13.
+    np.testing.assert_allclose(structure_factor(images, side)[1], shape, rtol=1e-10)
+    moved = structure_factor(position + rng.random((1, dimension)), side)[1]
+    np.testing.assert_allclose(moved, shape, rtol=1e-10)
+    np.testing.assert_allclose(structure_factor(jnp.asarray(position), jnp.asarray(side))[1], shape)

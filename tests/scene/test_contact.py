@@ -1,0 +1,110 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.scene.contact import contact_force, elastic_constant, impact
+
+# beta, eps unclipped, eps clipped, contact time in X/v clipped: high-precision solutions of the
+# impact equation, to the digits given.
+REFERENCE = [
+    (0.001, 0.99884734888593, 0.9988473573041, 3.2174368568),
+    (0.01, 0.98854481865685, 0.98854743964273, 3.2117983002),
+    (0.05, 0.94425997234334, 0.94439677917763, 3.1871469118),
+    (0.1, 0.89214758729023, 0.89285887550655, 3.1572556558),
+    (0.2, 0.79755006203945, 0.80096546813576, 3.1004127665),
+    (0.5, 0.57382462866495, 0.59525150113513, 2.9504446857),
+    (1.0, 0.33116481046664, 0.39393060322987, 2.7520265740),
+    (5.0, 0.0016506820717733, 0.068899657679239, 2.0051302797),
+]
+
+solve = jax.jit(impact, static_argnames=("clipped", "rtol"))
+
+
+@pytest.mark.parametrize("beta, unclipped, clipped, duration", REFERENCE)
+def test_impact_reproduces_reference(beta, unclipped, clipped, duration):
+    result = solve(beta)
+    # The solver's rtol is 1e-11; the reference has 13 digits (eps) and 11 (time).
+    np.testing.assert_allclose(result.restitution, clipped, rtol=2e-11)
+    np.testing.assert_allclose(result.duration, duration, rtol=5e-11)
+    np.testing.assert_allclose(solve(beta, clipped=False).restitution, unclipped, rtol=2e-11)
+
+
+def test_elastic_impact():
+    result = solve(0.0)
+    np.testing.assert_allclose(result.restitution, 1.0, rtol=1e-10)
+    # Closed forms: t_c = 2 (5/4)^(2/5) sqrt(pi) Gamma(7/5) / Gamma(9/10) and (5/4)^(2/5).
+    np.testing.assert_allclose(result.duration, 3.21806546, rtol=1e-8)
+    np.testing.assert_allclose(result.largest_overlap, (5 / 4) ** 0.4, rtol=1e-10)
+
+
+def test_heavy_damping_limits():
+    # Leading powers; the clipped one is approached as beta^(-5/3): 2e-4 at 1e3.
+    np.testing.assert_allclose(
+        solve(1e3).restitution, (3 / 2) ** (2 / 3) * 1e3 ** (-5 / 3), rtol=2e-4
+    )
+    result = solve(100.0, clipped=False).restitution
+    np.testing.assert_allclose(result, 5.15838170427e-10, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "beta, slope",
+    [(0.01, -1.13698828), (0.1, -0.991601507), (0.5, -0.548253884), (1.0, -0.291955441)],
+)
+def test_derivative_of_restitution(beta, slope):
+    result = jax.jacfwd(lambda b: solve(b).restitution)(beta)
+    np.testing.assert_allclose(result, slope, rtol=5e-9)  # the reference has nine digits
+
+
+def test_error_follows_tolerance():
+    exact = REFERENCE[5][2]
+    errors = [abs(float(solve(0.5, rtol=rtol).restitution) - exact) for rtol in (1e-4, 1e-7, 1e-10)]
+    assert errors[0] > 10 * errors[1] > 100 * errors[2]
+    assert errors[0] < 1e-3
+
+
+def test_impact_obeys_the_contact_force():
+    # The regular variable and the force law are two routes: Verlet on the second must reach the
+    # first. 2e5 steps leave the sqrt onset's error, dt^(3/2) = 1e-6.
+    beta, dt = 0.2, 3.2e-5
+
+    def step(carry, _):
+        xi, v = carry
+        half = v - 0.5 * dt * contact_force(xi, v, 1.0, beta / 1.5)
+        xi = xi + dt * half
+        v = half - 0.5 * dt * contact_force(xi, half, 1.0, beta / 1.5)
+        return (xi, v), None
+
+    (_, v), _ = jax.lax.scan(step, (jnp.zeros(()), jnp.ones(())), None, length=110_000)
+    np.testing.assert_allclose(-v, 0.80096546813576, rtol=5e-5)
+
+
+def test_force_is_never_attractive_unless_asked():
+    assert contact_force(1e-3, -1.0, 1.0, 1.0) == 0.0
+    assert contact_force(1e-3, -1.0, 1.0, 1.0, clipped=False) < 0.0
+    assert contact_force(-1e-3, 1.0, 1.0, 1.0) == 0.0
+
+
+def test_force_has_finite_derivatives_at_touch():
+    grads = jax.grad(contact_force, argnums=(0, 1, 2, 3))(0.0, 1.0, 2.0, 0.5)
+    assert all(jnp.isfinite(g) for g in grads)
+
+
+def test_elastic_constant_of_steel_balls():
+    # 2 Y sqrt(sigma/4) / (3 (1 - nu^2)) by hand: Y = 2e11, nu = 0.3, sigma = 0.01.
+    np.testing.assert_allclose(
+        elastic_constant(2e11, 0.3, 0.01), 2e11 * 0.1 / (3 * 0.91), rtol=1e-12
+    )
+
+
+def test_negative_beta_is_refused():
+    with pytest.raises(ValueError, match=r"beta must lie in \[0, inf\), got -0.1"):
+        impact(-0.1)
+
+
+@pytest.mark.slow
+def test_batches():
+    betas = jnp.array([0.01, 0.1, 1.0])
+    batch = jax.vmap(impact)(betas)
+    single = [impact(b).restitution for b in betas]
+    np.testing.assert_allclose(batch.restitution, jnp.stack(single), rtol=2e-11)  # solver: 1e-11

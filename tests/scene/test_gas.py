@@ -1,0 +1,176 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxgran
+from jaxgran.scene.geometry import CLOSE_PACKING
+
+
+def test_derived_scales(beads):
+    # By hand for 2 mm glass beads, phi = .05, T_0 = .01 m^2/s^2, 3D.
+    gas = beads(0.0898, dissipative_constant=3e-6)
+    n = 0.05 * 6 / (np.pi * 8e-9)
+    g2 = 1.95 / (2 * 0.95**3)
+    np.testing.assert_allclose(gas.number_density, n, rtol=1e-12)
+    np.testing.assert_allclose(gas.contact_value, g2, rtol=1e-12)
+    nu_0 = 4 * np.sqrt(np.pi) * g2 * n * 4e-6 * 0.1
+    np.testing.assert_allclose(gas.collision_frequency, nu_0, rtol=1e-12)
+    np.testing.assert_allclose(gas.mean_free_time * nu_0, 1.0, rtol=1e-12)
+    mass = np.pi / 6 * 2500 * 8e-9
+    alpha = 2 * 5e7 * np.sqrt(0.0005) / (3 * (1 - 0.22**2)) / (mass / 2)
+    np.testing.assert_allclose(gas.alpha, alpha, rtol=1e-12)
+    np.testing.assert_allclose(gas.delta, 3e-6 * alpha**0.4 * 0.01**0.1, rtol=1e-12)
+    # As the header notes of the measured scene have them: beta_T0 = .090, t_c/tau_c = .006.
+    assert round(float(gas.thermal_beta), 3) == 0.090
+    assert round(float(gas.contact_fraction), 3) == 0.006
+    assert float(gas.box_side(4000) / gas.diameter) == pytest.approx(34.73, abs=0.01)
+
+
+def test_dense_scene_scales():
+    # The dense measured scene: beta_T0 = .53, t_c/tau_c = .17, box 22 sigma, above L_c.
+    law = jaxgran.Viscoelastic(2e6, 0.35, 8e-5)
+    gas = jaxgran.Gas(
+        law,
+        diameter=0.004,
+        mass=jaxgran.sphere_mass(0.004, 1200.0),
+        packing_fraction=0.2,
+        temperature=0.04,
+    )
+    assert round(float(gas.thermal_beta), 2) == 0.53
+    assert round(float(gas.contact_fraction), 2) == 0.17
+    assert round(float(gas.box_side(4000) / gas.diameter)) == 22
+    assert gas.box_side(4000) > gas.critical_box
+
+
+def test_contact_duration_is_the_mean_over_impacts(beads):
+    # Sample impacts: normal speeds g exp(-g^2/2) in units of sqrt(2 T).
+    gas = beads(0.15)
+    g = np.sqrt(-2 * np.log(np.random.default_rng(1).random(400_000)))
+    x = float(gas.alpha**2 * gas.impact_speed) ** -0.2
+    # 4e5 samples of g^(-1/5), relative scatter 0.2: 3e-4.
+    np.testing.assert_allclose(gas.contact_duration, 3.21806546 * x * (g**-0.2).mean(), rtol=1e-3)
+    length = float(gas.impact_speed**2 / gas.alpha) ** 0.4
+    overlap = 1.09336207 * length * (g**0.8).mean() / float(gas.diameter)
+    np.testing.assert_allclose(gas.mean_overlap, overlap, rtol=3e-3)
+
+
+def test_two_dimensions(beads):
+    gas = beads(0.15, dimension=2)
+    n = 0.05 * 4 / (np.pi * 4e-6)
+    g2 = (1 - 7 * 0.05 / 16) / 0.95**2
+    np.testing.assert_allclose(gas.number_density, n, rtol=1e-12)
+    np.testing.assert_allclose(
+        gas.collision_frequency, 2 * np.sqrt(np.pi) * g2 * n * 0.002 * 0.1, rtol=1e-12
+    )
+
+
+def test_hard_gas_has_no_stiffness():
+    gas = jaxgran.Gas(
+        jaxgran.ConstantRestitution(0.9),
+        diameter=1.0,
+        mass=1.0,
+        packing_fraction=0.1,
+        temperature=1.0,
+    )
+    assert gas.contact_fraction == 0.0
+    assert gas.mean_overlap == 0.0
+    k_c = float(gas.number_density) * np.sqrt(32 * np.pi / 15 * (1 - 0.81))
+    np.testing.assert_allclose(gas.critical_box, 2 * np.pi / k_c, rtol=1e-12)
+    with pytest.raises(ValueError, match="delta belongs to the Viscoelastic law"):
+        _ = gas.delta
+    assert gas.replace(coefficient=1.0).critical_box == jnp.inf
+
+
+def test_units_do_not_matter(beads):
+    # The same gas in millimetres and milliseconds: dimensionless numbers to round-off.
+    gas, length, time, mass = beads(0.15), 1e3, 1e3, 1e6
+    other = jaxgran.Gas(
+        jaxgran.Viscoelastic(
+            gas.law.youngs_modulus * mass / (length * time**2),
+            gas.law.poisson_ratio,
+            gas.law.dissipative_constant * time,
+        ),
+        diameter=gas.diameter * length,
+        mass=gas.mass * mass,
+        packing_fraction=gas.packing_fraction,
+        temperature=gas.temperature * (length / time) ** 2,
+    )
+    for name in ("thermal_beta", "contact_fraction", "mean_overlap", "delta"):
+        expected = getattr(gas, name)
+        np.testing.assert_allclose(getattr(other, name), expected, rtol=1e-12, err_msg=name)
+    curve = jaxgran.cool(gas, [1.0, 100.0])
+    same = jaxgran.cool(other, [time, 100.0 * time])
+    np.testing.assert_allclose(
+        same.temperature / other.temperature, curve.temperature / gas.temperature, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        ({"packing_fraction": 0.0}, r"packing_fraction must lie in \(0, 0.74048\), got 0"),
+        ({"packing_fraction": 0.75}, "close packing"),
+        ({"diameter": -1e-3}, "diameter .* metres"),
+        ({"mass": 0.0}, "mass .* kilograms"),
+        ({"temperature": -1.0}, "temperature"),
+        ({"temperature": float("inf")}, "temperature"),
+        ({"dimension": 4}, "dimension must be 2 or 3, got 4"),
+        ({"law": 0.9}, "law must be a restitution law"),
+    ],
+)
+def test_bad_scenes_are_refused(values, message):
+    scene = dict(
+        law=jaxgran.ConstantRestitution(0.9),
+        diameter=1.0,
+        mass=1.0,
+        packing_fraction=0.1,
+        temperature=1.0,
+    )
+    with pytest.raises(ValueError, match=message):
+        jaxgran.Gas(**(scene | values))  # pyright: ignore
+
+
+@given(phi=st.floats(-1, 2), dimension=st.sampled_from([2, 3]))
+@settings(max_examples=100, deadline=None)
+def test_packing_is_in_range_or_refused(phi, dimension):
+    def build():
+        return jaxgran.Gas(
+            jaxgran.ConstantRestitution(0.9),
+            diameter=1.0,
+            mass=1.0,
+            packing_fraction=phi,
+            temperature=1.0,
+            dimension=dimension,
+        )
+
+    if 0 < phi < CLOSE_PACKING[dimension]:
+        build()
+    else:
+        with pytest.raises(ValueError, match="packing_fraction"):
+            build()
+
+
+def test_replace_knows_names_and_ranges(beads):
+    gas = beads(0.15)
+    assert gas.replace(temperature=0.5).temperature == 0.5
+    assert gas.replace(poisson_ratio=0.1).law.poisson_ratio == 0.1
+    with pytest.raises(
+        ValueError, match="no float 'temprature' in this gas; it has youngs_modulus"
+    ):
+        gas.replace(temprature=1.0)
+    with pytest.raises(ValueError, match="packing_fraction must lie in"):
+        gas.replace(packing_fraction=0.9)
+
+
+def test_batched_values_are_all_checked(beads):
+    with pytest.raises(ValueError, match="got -2"):
+        beads(0.15).replace(dissipative_constant=jnp.array([1e-6, -2.0]))
+
+
+def test_scales_can_be_differentiated(beads):
+    gas = beads(0.15)
+    slope = jax.grad(lambda a: gas.replace(dissipative_constant=a).thermal_beta)(1e-6)
+    np.testing.assert_allclose(slope * 1e-6, gas.replace(dissipative_constant=1e-6).thermal_beta)

@@ -1,0 +1,230 @@
+"""Derivatives through hard spheres: projected at every impact."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.data.run import Run
+from jaxgran.scene.restitution import ConstantRestitution, ReducedViscoelastic, RestitutionSeries
+from jaxgran.tangents.impact import ImpactTangents
+from tests.conftest import glass_beads
+from tests.models.test_dsmc import SENSITIVITY
+from tests.models.test_hard_spheres import hard_gas
+from tests.tangents.test_thermal import FLOATS, log_temperature
+
+# One scene for kinetic theory and for the fit, so that it is compiled once.
+DILUTE = {"beta": 0.3, "packing_fraction": 0.03}
+
+
+def dilute_model(gas, **settings):
+    return jaxgran.HardSpheres(500, replicas=4, **settings).sized_for(gas, spare=2.0)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        ReducedViscoelastic(jnp.array(0.4), jnp.array(0.01), True),
+        ConstantRestitution(0.7),
+        RestitutionSeries([-0.2, 0.03], [0.2, 0.4]),
+    ],
+)
+def test_gains_are_slopes_of_the_loss(law):
+    g = jnp.array([0.03, 0.5, 2.0])
+    leaves, structure = jax.tree.flatten(law)
+    flat = jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
+    ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
+
+    def eps(flat, log_scale=0.0):
+        parts = zip(jnp.split(flat, ends), leaves, strict=True)
+        law = structure.unflatten([part.reshape(leaf.shape) for part, leaf in parts])
+        return law.restitution(g * jnp.exp(log_scale))
+
+    def energy(eps):  # of relative motion, with the reduced mass 1/2
+        return eps**2 * g**2 / 4
+
+    parts = zip(jnp.split(jnp.eye(flat.size), ends, axis=1), leaves, strict=True)
+    directions = structure.unflatten([p.reshape(-1, *leaf.shape) for p, leaf in parts])
+    along = ImpactTangents.at_start(directions, 1, g.dtype)
+    h = 1e-5
+    steps = h * jnp.eye(flat.size)
+    pairs = [(eps(flat + e), eps(flat - e)) for e in steps] + [(eps(flat, h), eps(flat, -h))]
+    expected = [(energy(more) - energy(less)) / (2 * h) for more, less in pairs]
+    # A central difference errs by h^2 and by round-off over h.
+    np.testing.assert_allclose(along.gains(law, g), jnp.stack(expected), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_slopes_in_every_float_are_those_of_kinetic_theory():
+    gas = glass_beads(**DILUTE)
+    times = np.array([2.0, 8.0]) * float(gas.mean_free_time)
+    values = {name: gas.value(name) for name in FLOATS}
+
+    def records(model, log_scales):
+        scaled = {n: v * jnp.exp(s) for (n, v), s in zip(values.items(), log_scales, strict=True)}
+        curve = jaxgran.cool(gas.replace(**scaled), times, model=model)
+        logs = jnp.log(jnp.stack([curve.temperature, curve.collisions, curve.displacement]))
+        return logs, curve.temperature / gas.temperature
+
+    def jacobian(model):
+        slopes = jax.jacfwd(partial(records, model), has_aux=True)
+        return map(np.asarray, slopes(jnp.zeros(len(FLOATS))))
+
+    particles, ratio = jacobian(dilute_model(gas))
+    theory, expected = jacobian(jaxgran.KineticTheory(softness=False))
+    # 8000 collisions scatter the rates by some 2 %, 2000 by 5 %. <dr^2> in A leaves out that
+    # dissipation makes velocities last longer: 0.15, as the model says.
+    np.testing.assert_allclose(particles[0], theory[0], rtol=0.08, atol=0.03)
+    np.testing.assert_allclose(particles[1], theory[1], rtol=0.08, atol=0.03)
+    np.testing.assert_allclose(particles[2], theory[2], rtol=0.1, atol=0.2)
+    # Impacts that happen to be strong make cooling and its slope in A alike larger: of the
+    # scatter, 1 % is left.
+    share = particles[0][:, 0] / np.log(ratio)
+    np.testing.assert_allclose(share, theory[0][:, 0] / np.log(expected), rtol=0.025)
+
+
+@pytest.mark.slow
+def test_slope_is_that_of_the_sensitivity_table(beads):
+    gas, n, replicas = beads(0.15, packing_fraction=0.01), 1000, 8
+    assert gas.box_side(n) < gas.critical_box
+    times = np.array(list(SENSITIVITY)) * float(gas.mean_free_time)
+    f = log_temperature(gas, times, jaxgran.HardSpheres(n, replicas=replicas))
+    slopes = np.asarray(jax.jvp(f, (0.0,), (1.0,))[1])
+    mean, error = slopes.mean(axis=0), slopes.std(axis=0, ddof=1) / replicas**0.5
+    ratio, spread = mean / np.array(list(SENSITIVITY.values())), error / np.abs(mean)
+    print(f"\nslopes over those of the table: {ratio} +- {spread}")
+    # Enskog's clock, on which the table is, is off by .5 % and a tenth of the packing fraction.
+    assert np.all(np.abs(ratio - 1) < 0.006 + 3 * spread)
+
+
+def test_fit_finds_what_made_the_curve():
+    gas = glass_beads(**DILUTE)
+    times = jnp.geomspace(0.5, 8.0, 10) * gas.mean_free_time
+    exact = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False)).temperature
+    curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
+    # Temperature too, which makes this the program of the test before.
+    free = "dissipative_constant", "temperature"
+    model, key = dilute_model(gas), jax.random.key(3)
+    wrong = gas.replace(dissipative_constant=1.3 * gas.value("dissipative_constant"))
+    result = jaxgran.fit(gas, curve, model=model, free=free, start=wrong, max_steps=4, key=key)
+    for name, slack in (("dissipative_constant", 0.02), ("temperature", 0.0)):
+        estimate, error = result.value(name)
+        true = float(gas.value(name))
+        # Kinetic theory and hard spheres differ by some 1 % in the cooling rate.
+        assert abs(float(estimate) / true - 1) < 3 * float(error) / true + slack
+        assert float(error) < 0.15 * true
+    assert result.simulation_error is not None and np.all(result.simulation_error > 0)
+    assert result.model == "HardSpheres"
+    assert "Hard spheres explain" in jaxgran.diagnose(result, curve).verdict
+
+
+COEFFICIENT = 0.8
+
+
+@pytest.fixture(scope="module")
+def constant():
+    """A gas of constant restitution, its model, and ln T of (e, ln of all times, ln T_0)."""
+    gas = hard_gas(COEFFICIENT, 0.1)
+    start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(100, replicas=8)).particles
+    model = jaxgran.HardSpheres(100, replicas=8, start=start).sized_for(gas, spare=2.0)
+    times = jnp.array([0.3, 1.0, 3.0]) * gas.mean_free_time
+
+    def f(x, model=model, checkpoint=None):
+        changed = gas.replace(coefficient=x[0], temperature=jnp.exp(x[2]))
+        run = Run(checkpoint=checkpoint)
+        return jnp.log(model.simulate(changed, times * jnp.exp(x[1]), run).temperature)
+
+    at = jnp.array([COEFFICIENT, 0.0, 0.0])
+    return f, at, model, jax.jacfwd(f)(at)
+
+
+def test_constant_restitution_has_the_slopes_of_haff(constant):
+    f, at, _, slopes = constant
+    e, cooled = COEFFICIENT, 1 - jnp.exp(f(at) / 2)
+    # T = (1 + gamma t)^-2 with gamma as 1 - e^2, and the gas's own gamma: of Haff's law only a_2,
+    # which depends on e, changes that, by 1 %.
+    np.testing.assert_allclose(slopes[:, 0], 4 * e / (1 - e**2) * cooled, rtol=0.02)
+    # The rate is a mean over the run: 240 impacts up to the first time, 2400 to the last.
+    np.testing.assert_allclose(slopes[:, 1], -2 * cooled, rtol=0.04)
+    # The start brings its own speeds.
+    np.testing.assert_array_equal(slopes[:, 2], 0.0)
+
+
+def test_forward_and_reverse_and_jit_agree(constant):
+    f, at, _, slopes = constant
+    reverse = jax.grad(lambda x: jnp.sum(f(x)))(at)
+    np.testing.assert_allclose(reverse, jnp.sum(slopes, 0), rtol=1e-12)  # the same run
+    both = jax.jit(jax.vmap(jax.jacfwd(f)))(jnp.stack([at, at]))
+    # In another order sums are rounded differently, which chaos grows: one impact a sphere.
+    np.testing.assert_allclose(both[:, :2], jnp.stack([slopes, slopes])[:, :2], rtol=1e-6)
+
+
+def test_a_checkpoint_keeps_the_tangents(constant, tmp_path):
+    f, at, _, slopes = constant
+    kept = partial(f, checkpoint=tmp_path / "a.npz")
+    for _ in range(2):  # run, and read
+        np.testing.assert_array_equal(jax.jacfwd(kept)(at), slopes)
+    with pytest.raises(ValueError, match="another scene"):
+        kept(at)
+
+
+def test_a_start_has_no_projected_slope():
+    gas = hard_gas(0.8, 0.01)
+    apart = jnp.array([[[1.0, 1.0, 1.0], [3.0, 1.0, 1.0]]])
+
+    def f(scale):
+        start = jaxgran.Particles(apart, scale * apart, gas.box_side(2))
+        return jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(2, start=start)).temperature[0]
+
+    for derivative in (jax.grad, jax.jacfwd):
+        with pytest.raises(ValueError, match="chaos"):
+            derivative(f)(1.0)
+
+
+def test_speed_is_a_unit_of_random_starts_and_not_of_given_ones(constant):
+    f, at, model, _ = constant
+    random = dataclasses.replace(model, start=None)
+
+    def both(model):
+        return jax.jacfwd(lambda x: f(at.at[1:].set(x), model=model))(jnp.zeros(2))
+
+    slopes = both(random)  # T(t) = T_0 f(t sqrt(T_0))
+    np.testing.assert_allclose(slopes[:, 1], 1 + slopes[:, 0] / 2, rtol=1e-12)
+    hotter = f(at.at[2].set(0.1), model=model)
+    np.testing.assert_allclose(hotter, f(at, model=model), rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "beta, packing",
+    [
+        (0.2, 0.02),
+        (0.1, 0.2),
+        pytest.param(
+            0.3,
+            0.2,
+            marks=pytest.mark.xfail(
+                strict=True,
+                reason="in 1.2 L_c flows keep T 4 to 9 % above kinetic theory's; how that depends "
+                "on A is lost to a memory of T alone",
+            ),
+        ),
+    ],
+)
+def test_projected_slope_against_differences(beads, beta, packing):
+    gas = beads(beta, packing_fraction=packing)
+    times = np.array([10.0, 30.0]) * float(gas.mean_free_time)
+    model, h = jaxgran.HardSpheres(500, replicas=32), 0.3
+    f = log_temperature(gas, times, model)
+    difference = (f(h) - f(-h)) / (2 * h)
+    got = jax.jvp(f, (0.0,), (1.0,))[1]
+    error = np.hypot(*(np.std(x, axis=0, ddof=1) / 32**0.5 for x in (difference, got)))
+    mean = np.mean(difference, axis=0)
+    bias, spread = np.mean(got, axis=0) / mean - 1, error / np.abs(mean)
+    print(f"\nphi {packing:g}, beta {beta:g}: projected over differences {bias} +- {spread}")
+    # The difference itself bends by 2 % of h^2 at this step.
+    assert np.all(np.abs(bias) < np.maximum(0.05, 2 * spread))
