@@ -1,7 +1,11 @@
 import jax
 import pytest
+from jaxtyping import install_import_hook
 
-import jaxgran
+# The types and shapes of all annotations are checked while the tests run. Under jax.vmap and in
+# pytrees of tracers annotations hold for one member.
+with install_import_hook("jaxgran", "beartype.beartype"):
+    import jaxgran
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,9 @@ from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.simulation import SMALLEST_BOX, Simulation
 from jaxgran.scene.gas import Gas
 from jaxgran.tangents.rule import Inputs, Outputs, differentiable
+
+
+S = TypeVar("S", bound="AbstractSpheres")
 
 
 class Plan(NamedTuple):
@@ -50,7 +53,6 @@ class AbstractSpheres(AbstractModel):
         neighbours: who finds the pairs.
         plan: static sizes, where `sized_for` has settled them.
         listed_by_skin: pairs per particle that the skin adds to a neighbour list.
-        projected: whether derivatives are thermally projected.
     """
 
     num_particles: AbstractVar[int]
@@ -58,11 +60,15 @@ class AbstractSpheres(AbstractModel):
     start: AbstractVar[Particles | None]
     neighbours: AbstractVar[str]
     plan: AbstractVar[Plan | None]
-    projected: AbstractVar[bool]
     listed_by_skin: AbstractClassVar[float]
 
     stochastic: ClassVar[bool] = True
     derivative_accuracy: ClassVar[float] = 0.02
+
+    @property
+    @abstractmethod
+    def projected(self) -> bool:
+        """Whether derivatives are thermally projected."""
 
     @abstractmethod
     def scene(self, gas: Gas) -> Any:
@@ -93,7 +99,7 @@ class AbstractSpheres(AbstractModel):
                 f"leave start out of {type(self).__name__}, or free other parameters"
             )
 
-    def sized_for(self, gas: Gas, spare: float = 2.0) -> Self:
+    def sized_for(self: S, gas: Gas, spare: float = 2.0) -> S:
         """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
 
         Outside of jit sizes follow from the gas, and arrays grow where they must. Inside they are

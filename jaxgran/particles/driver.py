@@ -7,7 +7,7 @@ are all known; the same run as a pure function is in `pure`.
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +42,7 @@ class Failure(Exception):
         self.fault = fault
 
 
+@runtime_checkable
 class _Timed(Protocol):
     @property
     def time(self) -> Any: ...

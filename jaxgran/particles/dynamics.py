@@ -4,7 +4,7 @@ import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -73,7 +73,7 @@ class AbstractDynamics(eqx.Module):
         """The records of a state; with tangents, those of `jaxgran.tangents.rule`, too."""
 
     @abstractmethod
-    def elastic(self) -> Self:
+    def elastic(self) -> "AbstractDynamics":
         """The same spheres without dissipation."""
 
     @abstractmethod
@@ -89,7 +89,7 @@ class AbstractDynamics(eqx.Module):
         own = self.own_state(len(position), position.dtype)
         return at_start(position, velocity, self.scene.side, skin, self.replicas, own)
 
-    def with_capacity(self, capacity: Capacity) -> Self:
+    def with_capacity(self, capacity: Capacity) -> "AbstractDynamics":
         """The same spheres in arrays of other lengths."""
         return dataclasses.replace(self, capacity=capacity)
 

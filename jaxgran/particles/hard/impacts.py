@@ -98,11 +98,9 @@ def resolve(
     shortest = shortest[jnp.minimum(chosen.replica, len(shortest) - 1)]
 
     def one_round(work: Work) -> Work:
-        rows, last = chosen.rows, work.slots.last
-        impacts, safe, row = _executable(work.slots, rows, duration)
-        last = jnp.maximum(last[rows.a], last[rows.b])
-        effect = _effect(impacts, safe, last, shortest[rows.a], scene, along)
-        return _executed(work, effect, safe, row, rows, listed)
+        impacts, safe, row = _executable(work.slots, chosen.rows, duration)
+        effect = _effect(impacts, safe, work.slots, chosen.rows, shortest, scene, along)
+        return _executed(work, effect, safe, row, chosen.rows, listed)
 
     def unfinished(work: Work):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
@@ -146,8 +144,9 @@ class _Effect(NamedTuple):
 def _effect(
     impacts: FirstImpacts,
     safe: Bool[Array, "rows"],
-    last: Float[Array, "rows"],
-    shortest: Float[Array, "rows"],
+    slots: Slots,
+    rows: Rows,
+    shortest: Float[Array, "slots"],
     scene: Scene,
     along: ImpactTangents | None,
 ) -> _Effect:
@@ -156,7 +155,7 @@ def _effect(
     r = impacts.r + impacts.w * s[:, None]
     normal = r / jnp.where(safe, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
     speed = jnp.where(safe, -jnp.sum(impacts.w * normal, -1), 1.0)
-    soon = s - last < shortest
+    soon = s - jnp.maximum(slots.last[rows.a], slots.last[rows.b]) < shortest[rows.a]
     eps = scene.law.restitution(speed * 0.5**0.5)
     eps = jnp.where(soon | scene.elastic, 1.0, eps)
     kick = (0.5 * (1 + eps) * speed)[:, None] * normal

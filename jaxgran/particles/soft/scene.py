@@ -1,5 +1,7 @@
 """A gas of soft spheres in reduced units."""
 
+from typing import Any
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
@@ -24,6 +26,6 @@ class SoftScene(eqx.Module):
     clipped: bool = eqx.field(static=True, default=True)
 
     @property
-    def material(self) -> tuple[Array, Array]:
-        """The numbers that derivatives are followed in: (alpha, A)."""
+    def material(self) -> tuple[Any, Any]:
+        """The numbers that derivatives are followed in: (alpha, A), or their tangents."""
         return self.alpha, self.dissipative_constant

@@ -63,12 +63,13 @@ def collide(
     met = (sine_square < 1) & (square > 0)
     hit = met & (chance * 2.0**-22 * ceiling < speed * share)
     cosine = jnp.sqrt(jnp.where(met, 1 - sine_square, 1.0))
+    sideways = _perpendicular(axis)
     normal_speed = jnp.where(hit, speed * cosine, ceiling)
     eps, along, along_speed = _restitution(normal_speed, hit, law, tangents)
     square = jnp.where(hit, normal_speed**2, 0.0)
     push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
     normal = [
-        cosine * axis[k] + sum(b * e[k] for b, e in zip(offset, _perpendicular(axis), strict=True))
+        cosine * axis[k] + sum(b * e[k] for b, e in zip(offset, sideways, strict=True))
         for k in range(d)
     ]
     return Outcome(
