@@ -90,10 +90,10 @@ def follow_disks(size: int, until: float, out: Path | None) -> None:
             bar.update(min(done, until) - bar.n)
 
         run = follow(gas, 0, size, until, progress=show)
-    stretches = np.searchsorted(run["collisions"], np.linspace(0.1, 1, 10) * until)
+    shown = np.searchsorted(run["collisions"], np.linspace(0.1, 1, 10) * until)
     print(f"{size} disks, phi = {PACKINGS[2]:g}, e = {RESTITUTION:g}")
     print(f"{'collisions/disk':>16}{'T/T_0':>10}{'unevenness':>12}{'flow':>7}")
-    for i in np.minimum(stretches, len(run["t"]) - 1):
+    for i in np.minimum(shown, len(run["t"]) - 1):
         theta = run["temperature"][i] / float(gas.temperature)
         print(f"{run['collisions'][i]:16.1f}{theta:10.2e}{run['unevenness'][i]:12.2f}", end="")
         print(f"{run['flow'][i]:7.3f}")
@@ -123,7 +123,7 @@ def measure(
     curve = jaxgran.cool(gas, times, model=model)
     first = time.perf_counter() - begin
     in_a_row = -(-TIMED // size)
-    seconds, beside = {0.0: [], times[0]: []}, []
+    seconds, lammps_s = {0.0: [], times[0]: []}, []
     for _ in range(repeats):
         for end, took in seconds.items():
             begin = time.perf_counter()
@@ -134,17 +134,17 @@ def measure(
         if dimension == 3 and ranks:
             # The faster of two skins in every repeat, which slightly favours LAMMPS.
             dt = float(gas.contact_duration) / STEPS_PER_CONTACT
-            beside.append(time_lammps(gas, start, dt, round(times[0] / dt), 1, ranks[0])[0])
+            lammps_s.append(time_lammps(gas, start, dt, round(times[0] / dt), 1, ranks[0])[0])
     assert curve.collisions is not None
     set_up, run = (statistics.median(took) for took in seconds.values())
     steps = run - set_up
     collisions = float(curve.collisions[-1]) * size / 2
     lammps = {}
-    if beside:
-        ratios = [a / (b - set_up) for a, b in zip(beside, seconds[times[0]], strict=True)]
+    if lammps_s:
+        ratios = [a / (b - set_up) for a, b in zip(lammps_s, seconds[times[0]], strict=True)]
         lammps = {
-            "run_s": statistics.median(beside),
-            "collisions_per_s": collisions / statistics.median(beside),
+            "run_s": statistics.median(lammps_s),
+            "collisions_per_s": collisions / statistics.median(lammps_s),
             "ratio": statistics.median(ratios),
             "ratios": ratios,
         }

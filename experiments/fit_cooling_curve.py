@@ -4,14 +4,13 @@
         [--model soft-spheres [--particles N] [--replicas R]] [--model auto [--tolerance 0.02]]
 
 CURVE.csv holds header lines `# key: value` (N, eta, diameter, density, Y, nu, T0; SI units), a line
-of column names and rows: t,T and, where measured, T_err, msd, msd_err. A header line A is never
-used in the fit, only compared with at the end. --model auto takes the cheapest model whose error,
-estimated for the gas that kinetic theory fits, is under the tolerance, and says why. Prints a table
-and one JSON line, and writes a picture and a JSON file.
+of column names and rows: t,T and, where measured, T_err, msd, msd_err. A header line A is not used
+in the fit; the estimate is compared with it. --model auto takes the cheapest model whose estimated
+error, for the gas that kinetic theory fits, is within the tolerance, and says why. Prints a table
+and one line of JSON, and writes a picture and a JSON file.
 """
 
 import argparse
-import dataclasses
 import json
 import platform
 import sys
@@ -28,12 +27,12 @@ import numpy as np  # noqa: E402
 import jaxgran  # noqa: E402
 from jaxgran.data.curve_file import GAS_KEYS, header_count, header_number  # noqa: E402
 from jaxgran.data.files import write_whole  # noqa: E402
-from jaxgran.models.selection import words  # noqa: E402
+from jaxgran.models.base import AbstractModel  # noqa: E402
+from jaxgran.models.selection import default_models  # noqa: E402
 from jaxgran.plotting import plot_fit  # noqa: E402
 
 HERE = Path(__file__).parent
 DEFAULT_CURVE = HERE / "data" / "lammps_cooling_dilute.csv"
-MODELS = ("kinetic-theory", "soft-spheres", "auto")
 PARAMETERS = {
     "A": ("dissipative_constant", "s"),
     "T0": ("temperature", "m^2/s^2"),
@@ -42,6 +41,14 @@ PARAMETERS = {
     "eta": ("packing_fraction", ""),
     "diameter": ("diameter", "m"),
 }
+
+
+def named(models) -> dict[str, AbstractModel]:
+    """Models by their names as arguments: "soft-spheres"."""
+    return {model.name.lower().replace(" ", "-"): model for model in models}
+
+
+MODELS = (*named(default_models(2)), "auto")
 
 
 def main() -> int:
@@ -93,61 +100,15 @@ def run(options: argparse.Namespace) -> None:
     picture, record = outputs(options)
     free = tuple(PARAMETERS[key][0] for key in options.free)
     model, reasons = model_of(options, gas, curve, free, n)
-    model_name = words(type(model).__name__).lower().replace(" ", "-")
+    (model_name,) = named([model])
     imported = time.perf_counter() - started
-
-    def fit():
-        begin = time.perf_counter()
-        total = n * replicas if n is not None else None
-        result = jaxgran.fit(gas, curve, model=model, free=free, num_particles=total)
-        jax.block_until_ready(result.chi2)
-        return result, time.perf_counter() - begin
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # said again, in words, by the diagnosis
-        result, first_seconds = fit()
-        fit_seconds = first_seconds
-        if isinstance(model, jaxgran.KineticTheory):  # the second time without compilation
-            result, fit_seconds = fit()
+    total = n * replicas if n is not None else None
+    result, first_seconds, fit_seconds = timed_fit(options, gas, curve, model, free, total)
     diagnosis = jaxgran.diagnose(result, curve, n)
-
-    rows = []
-    for key, name in zip(options.free, free, strict=True):
-        estimate, statistical = (float(x) for x in result.value(name))
-        statistical *= diagnosis.correlation_factor
-        model_error = float(result.model_error[free.index(name)])
-        rows.append(
-            {
-                "parameter": key,
-                "unit": PARAMETERS[key][1],
-                "estimate": estimate,
-                "std_err": float(np.hypot(statistical, model_error)),
-                "statistical": statistical,
-                "model": model_error,
-                "header": header_number(header, key) if key in header else None,
-            }
-        )
-    theta = np.asarray(curve.temperature)
-    print(f"curve    {options.curve.name}: {theta.size} points, t = 0 .. {curve.times[-1]:.3g} s,")
-    print(f"         T falls to {theta[-1] / theta[0]:.3g} of its first value")
-    print(
-        f"gas      phi = {float(gas.packing_fraction):.3g}, tau_c = "
-        f"{float(gas.mean_free_time):.3g} s, t_c/tau_c = {float(gas.contact_fraction):.2g}, "
-        f"beta_T0 = {float(result.gas.thermal_beta):.3g} (fitted)"
-    )
-    steps = "simulations" if result.simulation_error is not None else "steps of least squares"
-    print(f"model    {model_name}, {int(result.iterations)} {steps}")
-    if reasons:
-        print("chosen", "\n".join(f"         - {reason}" for reason in reasons).lstrip())
-    print()
-    print(f"{'':10}{'estimate':>13} {'+-':>10} {'statistical':>12} {'model':>10}  header's")
-    for row in rows:
-        print(f"{row['parameter']:4}{row['unit']:6}{row['estimate']:13.5g} ", end="")
-        print(f"{row['std_err']:10.2g} {row['statistical']:12.2g} {row['model']:10.2g}", end="")
-        if row["header"]:
-            print(f"  {row['header']:.5g} ({100 * (row['estimate'] / row['header'] - 1):+.2f} %)")
-        else:
-            print()
+    rows = rows_of(options, result, diagnosis, header)
+    print_scene(options, gas, curve, result)
+    print_model(model_name, result, reasons)
+    print_rows(rows)
     print(f"\n{diagnosis.verdict}")
     for reason in diagnosis.reasons:
         print(f"  - {reason}")
@@ -177,9 +138,7 @@ def run(options: argparse.Namespace) -> None:
         "covariance": np.asarray(result.covariance).tolist(),
         "diagnosis": {"verdict": diagnosis.verdict, "reasons": diagnosis.reasons},
         "import_seconds": round(imported, 2),
-        "versions": {name: version(name) for name in ("jaxgran", "jax", "diffrax", "optimistix")},
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
+        **environment(),
     }
     text = json.dumps(summary | details, indent=2) + "\n"
     write_whole(record, lambda f: f.write(text.encode()))
@@ -189,23 +148,108 @@ def run(options: argparse.Namespace) -> None:
 
 def model_of(options: argparse.Namespace, gas, curve, free, num_particles: int | None):
     """The model, and why it was chosen if it was."""
-    if options.model == "kinetic-theory":
-        return jaxgran.KineticTheory(), ()
-    key, size = jax.random.key(options.key), options.particles or num_particles
-    if options.model == "soft-spheres":
-        if size is None:
+    size, replicas = options.particles or num_particles, options.replicas
+    if options.model != "auto":
+        model = named(default_models(size or 2, replicas))[options.model]
+        if model.stochastic and size is None:
             raise ValueError(f"{options.curve} does not say N: give --particles")
-        return jaxgran.SoftSpheres(size, replicas=options.replicas, key=key), ()
+        return model, ()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # said of the last fit by the diagnosis
+        warnings.simplefilter("ignore", UserWarning)  # the diagnosis of the final fit says it
         first = jaxgran.fit(gas, curve, free=free)
     choice = jaxgran.choose_model(
-        first.gas, curve.times, options.tolerance, num_particles or size, replicas=options.replicas
+        first.gas, curve.times, options.tolerance, num_particles or size, replicas=replicas
     )
-    if isinstance(choice.model, jaxgran.KineticTheory):
+    if options.particles is None:
         return choice.model, choice.reasons
-    followed = options.particles or choice.model.num_particles  # the box is that of the file's N
-    return dataclasses.replace(choice.model, key=key, num_particles=followed), choice.reasons
+    # Chosen for the box of the file's N, followed with as many particles as asked.
+    (name,) = named([choice.model])
+    return named(default_models(options.particles, replicas))[name], choice.reasons
+
+
+def timed_fit(options: argparse.Namespace, gas, curve, model, free, num_particles: int | None):
+    """The fit, seconds of the first and of the last time that it was made."""
+
+    def fit():
+        begin = time.perf_counter()
+        result = jaxgran.fit(
+            gas,
+            curve,
+            model=model,
+            free=free,
+            num_particles=num_particles,
+            key=jax.random.key(options.key),
+        )
+        jax.block_until_ready(result.chi2)
+        return result, time.perf_counter() - begin
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # said again, in words, by the diagnosis
+        result, first_seconds = fit()
+        fit_seconds = first_seconds
+        if not model.stochastic:  # the second time without compilation
+            result, fit_seconds = fit()
+    return result, first_seconds, fit_seconds
+
+
+def rows_of(options: argparse.Namespace, result, diagnosis, header) -> list[dict]:
+    """Estimates and errors, a row for each parameter."""
+    rows = []
+    for key in options.free:
+        name, unit = PARAMETERS[key]
+        estimate, statistical = (float(x) for x in result.value(name))
+        statistical *= diagnosis.correlation_factor
+        model_error = float(result.model_error[result.names.index(name)])
+        rows.append(
+            {
+                "parameter": key,
+                "unit": unit,
+                "estimate": estimate,
+                "std_err": float(np.hypot(statistical, model_error)),
+                "statistical": statistical,
+                "model": model_error,
+                "header": header_number(header, key) if key in header else None,
+            }
+        )
+    return rows
+
+
+def print_scene(options: argparse.Namespace, gas, curve, result) -> None:
+    T = np.asarray(curve.temperature)
+    print(f"curve    {options.curve.name}: {T.size} points, t = 0 .. {curve.times[-1]:.3g} s,")
+    print(f"         T falls to {T[-1] / T[0]:.3g} of its first value")
+    print(
+        f"gas      phi = {float(gas.packing_fraction):.3g}, tau_c = "
+        f"{float(gas.mean_free_time):.3g} s, t_c/tau_c = {float(gas.contact_fraction):.2g}, "
+        f"beta_T0 = {float(result.gas.thermal_beta):.3g} (fitted)"
+    )
+
+
+def print_model(name: str, result, reasons) -> None:
+    steps = "simulations" if result.simulation_error is not None else "steps of least squares"
+    print(f"model    {name}, {int(result.iterations)} {steps}")
+    if reasons:
+        print("chosen", "\n".join(f"         - {reason}" for reason in reasons).lstrip())
+
+
+def print_rows(rows: list[dict]) -> None:
+    print(f"\n{'':10}{'estimate':>13} {'+-':>10} {'statistical':>12} {'model':>10}  header's")
+    for row in rows:
+        print(f"{row['parameter']:4}{row['unit']:6}{row['estimate']:13.5g} ", end="")
+        print(f"{row['std_err']:10.2g} {row['statistical']:12.2g} {row['model']:10.2g}", end="")
+        if row["header"]:
+            print(f"  {row['header']:.5g} ({100 * (row['estimate'] / row['header'] - 1):+.2f} %)")
+        else:
+            print()
+
+
+def environment() -> dict:
+    """Versions and device."""
+    return {
+        "versions": {name: version(name) for name in ("jaxgran", "jax", "diffrax", "optimistix")},
+        "python": platform.python_version(),
+        "device": jax.devices()[0].device_kind,
+    }
 
 
 def settings(pairs: list[str]) -> dict[str, str]:

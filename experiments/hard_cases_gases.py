@@ -182,10 +182,10 @@ def thin_and_dense() -> list[Row]:
             curve = jaxgran.cool(gas, _taus(gas, 5.0), model=HARD(100))
             assert curve.collisions is not None and curve.dissipated_energy is not None
             ledger = abs(float(d / 2 * curve.temperature[0] + curve.dissipated_energy[0]) - d / 2)
-            told = closed_forms.haff(5.0, 0.9, d)
+            expected = closed_forms.haff(5.0, 0.9, d)
             # 250 impacts scatter by 6 %; in a dense inelastic gas there are more than Enskog's
             # frequency predicts.
-            error = worst(curve.temperature[0], told)
+            error = worst(curve.temperature[0], expected)
             rows.append(Row(f"HardSpheres, {d}D, phi = {phi:g}", "float64", error, 0.15))
             rows.append(Row(f"HardSpheres, {d}D, ledger", "float64", ledger, 1e-12))
     # At phi = 1e-4 contacts of .02 mean free times would be deeper than a sphere.
@@ -193,8 +193,8 @@ def thin_and_dense() -> list[Row]:
         gas = beads(phi, 0.1, contact)
         curve = jaxgran.cool(gas, _taus(gas, 0.0, 2.0), model=SOFT(100))
         # Kinetic theory of hard spheres; 100 impacts scatter the loss, .16, by 10 %.
-        told = float(jnp.exp(theory(gas, jnp.asarray(_taus(gas, 2.0)), "diameter")[0][0]))
-        error = worst(curve.temperature[1] / curve.temperature[0], told)
+        expected = float(jnp.exp(theory(gas, jnp.asarray(_taus(gas, 2.0)), "diameter")[0][0]))
+        error = worst(curve.temperature[1] / curve.temperature[0], expected)
         rows.append(Row(f"SoftSpheres, 3D, phi = {phi:g}", "float64", error, 0.1))
     return rows
 
@@ -220,8 +220,8 @@ def million_particles() -> list[Row]:
     gas, rows, n = beads(0.05, 0.15, 0.02), [], 1_000_000
     times = _taus(gas, 5.0)
     value, _ = _run(DSMC(n), gas, times)
-    told = np.exp(theory(gas, jnp.asarray(times), "diameter")[0])
-    rows.append(Row("DSMC", "float64", worst(value, told), 2e-3))  # noise, higher Sonine orders
+    expected = np.exp(theory(gas, jnp.asarray(times), "diameter")[0])
+    rows.append(Row("DSMC", "float64", worst(value, expected), 2e-3))  # noise, higher Sonine orders
     side = box(gas, n)
     grid = (np.arange(100) + 0.5) * side / 100
     place = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), -1).reshape(-1, 3)
@@ -264,7 +264,7 @@ def deep_cold() -> list[Row]:
             along = worst(slope, 4 * e / 6 * tau / (1 + gamma * tau))
             rows.append(Row("KineticTheory, 1e-12", name, error, allowed, along, allowed))
             end = [float(gas.mean_free_time) * 2e3 / gamma]
-            told = float(closed_forms.haff(2e3 / gamma, e))
+            expected = float(closed_forms.haff(2e3 / gamma, e))
             # With a_2 = .048 the gas cools 1 % more slowly than Haff's law, and late T goes as the
             # inverse square of the rate. 4000 particles of DSMC and 50 spheres in one small box
             # scatter besides.
@@ -272,12 +272,12 @@ def deep_cold() -> list[Row]:
             assert slope is not None and value[0] < 1e-6
             # The derivative is a small difference of terms that are ten times larger: 2 % of T are
             # 20 % of it.
-            errors = abs(float(np.log(value[0] / told))), 0.1
+            errors = abs(float(np.log(value[0] / expected))), 0.1
             along = worst(slope[0], along_of(e, 2e3 / gamma))
-            rows.append(Row(f"DSMC, {told:.0e}", name, *errors, along, 0.3))
+            rows.append(Row(f"DSMC, {expected:.0e}", name, *errors, along, 0.3))
             value, _ = _run(HARD(50), gas, end)
-            error = abs(float(np.log(value[0] / told)))
-            rows.append(Row(f"HardSpheres, {told:.0e}", name, error, 1.5))
+            error = abs(float(np.log(value[0] / expected)))
+            rows.append(Row(f"HardSpheres, {expected:.0e}", name, error, 1.5))
     gas = beads(0.05, 0.9, 0.05)
     tau = 3e3
     end = _taus(gas, 0.0, tau)
@@ -286,14 +286,14 @@ def deep_cold() -> list[Row]:
     assert curve.elastic_energy is not None and curve.dissipated_energy is not None
     held = curve.elastic_energy + curve.dissipated_energy
     held = held / (1.5 * gas.mass * gas.temperature)
-    told = float(jnp.exp(theory(gas, jnp.asarray(end), "diameter")[0][1]))
+    expected = float(jnp.exp(theory(gas, jnp.asarray(end), "diameter")[0][1]))
     ledger = abs(float(theta[1] + held[1] - theta[0] - held[0]))
     rows.append(Row("SoftSpheres, ledger", "float64", ledger, 5e-3))  # 20 steps per contact
     rows.append(
         Row(
             f"SoftSpheres, {theta[1]:.0e}",
             "float64",
-            abs(float(np.log(theta[1] / told))),
+            abs(float(np.log(theta[1] / expected))),
             0.7,  # T of 50 spheres depends by tens of per cent on their initial state
         )
     )
@@ -386,13 +386,13 @@ GASES = [
     Case(
         "A = 0 and A -> 0",
         "division by A; 1 - eps lost to cancellation",
-        "exact at 0, with its derivative; weak losses keep their digits, in float32 too",
+        "exact at 0, with the derivative; weak dissipation is accurate, in float32 too",
         elastic_limit,
     ),
     Case(
         "constant eps = 0 and 1",
         "logarithms of 0, stuck pairs, drifting energy",
-        "both are ordinary values; kinetic theory's a_2 is some per cent off at 0",
+        "neither is special; a_2 of kinetic theory errs by some per cent at 0",
         plastic_and_elastic,
     ),
     Case(
@@ -403,15 +403,15 @@ GASES = [
     ),
     Case(
         "phi from 1e-4 to .45 (3D), .6 (2D)",
-        "no start without overlap; lists that are all or nothing",
-        "right; soft spheres pay for every contact time of free flight; beyond .48 (3D), .65 (2D) "
-        "a fluid start is refused",
+        "no initial state without overlaps; neighbour lists of all pairs or of none",
+        "right; soft spheres are slow where flights are long; beyond .48 (3D), .65 (2D) a random "
+        "initial state is refused",
         thin_and_dense,
     ),
     Case(
         "N = 2",
         "means over N - 1, pairs drawn with themselves",
-        "right: nothing gained, not all lost",
+        "right: no energy is gained, and some is kept",
         two_particles,
     ),
     Case(
@@ -423,14 +423,14 @@ GASES = [
     ),
     Case(
         "T/T_0 down to 1e-12, 1e-6, 1e-4",
-        "fixed steps and lists freeze; T underflows",
-        "ln T is the state; step, list and window follow the gas",
+        "fixed time steps and neighbour lists stop the run; T underflows",
+        "ln T is integrated; time steps, neighbour lists and windows adapt to the temperature",
         deep_cold,
     ),
     Case(
         "SI values of steel, glass, ice, gel",
-        "1e21 beside 1e-13: digits lost, float32 overflows",
-        "one set of reduced units inside: the same curve to round-off",
+        "1e21 next to 1e-13: digits are lost, float32 overflows",
+        "reduced units are used inside: the same curve up to round-off",
         si_units,
     ),
 ]

@@ -475,21 +475,21 @@ def _row_of_three(e):
 IMPACTS = [
     Case(
         "beta from 1e-8 to 1e3 in one impact",
-        "truncated series leave [0, 1]; the root's own singularity stops the solver's order",
-        "regular variables, own end of contact; the fast law is fitted to that",
+        "truncated series leave [0, 1]; the singularity of sqrt(xi) lowers the order of the solver",
+        "regular variables; the end of contact is located; gases use a fit to such impacts",
         wide_range_of_beta,
     ),
     Case(
         "unclipped impact at beta = 1e3",
-        "the rebound creeps and is cut off",
-        "right, in some seconds: use the fast law there",
+        "the rebound is slow, and is cut off",
+        "right, but takes some seconds: use the fitted law there",
         creeping_rebound,
         heavy=True,
     ),
     Case(
         "impact speeds from 1e-12 to 1e6 of thermal",
         "absolute tolerances, a fixed step",
-        "relative throughout; soft spheres end where an overlap is within round-off of a place",
+        "relative throughout; overlaps of soft spheres must exceed the round-off of positions",
         speeds_over_eighteen_decades,
     ),
     Case(
@@ -501,31 +501,31 @@ IMPACTS = [
     Case(
         "head-on, oblique, grazing",
         "cancellation in the impact time of grazing pairs",
-        "a form without cancellation; grazes to a depth of round-off pass",
+        "a formula without cancellation; impacts shallower than round-off are left out",
         angles,
     ),
     Case(
         "touching, coincident, across a corner",
         "0/0 normals, missed contacts, pairs lost at the boundary",
-        "right, or refused by name",
+        "right, or refused by an error that names the reason",
         touching_coincident_corner,
     ),
     Case(
         "own image in the smallest box",
         "a sphere touches a partner and its image, one of them is lost",
-        "boxes from 2.1 diameters on, energy kept",
+        "boxes of 2.1 diameters or more are right, and conserve energy",
         smallest_box,
     ),
     Case(
         "three and four bodies in contact",
-        "pairwise event codes cannot",
-        "soft spheres resolve it; instant impacts leave it out",
+        "event-driven codes resolve pairs only",
+        "soft spheres resolve it; models of instantaneous impacts leave it out",
         three_and_four_at_once,
     ),
     Case(
         "near-simultaneous impacts whose order flips",
         "the result depends on the machine",
-        "either order is one of a serial code's; of ties the pair listed first goes first",
+        "both orders are right; of simultaneous impacts that of the first listed pair is first",
         order_that_flips,
     ),
 ]

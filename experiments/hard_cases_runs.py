@@ -158,10 +158,10 @@ def solver_ends() -> list[Row]:
     weak = beads(0.05, 1e-6)
     late = jnp.geomspace(1.0, 1e9, 3) * weak.mean_free_time
     value, slope = theory(weak, late, FREE, stiff)
-    told = jnp.log(closed_forms.paper_temperature(late / weak.mean_free_time, weak.delta))
+    expected = jnp.log(closed_forms.paper_temperature(late / weak.mean_free_time, weak.delta))
     # The expansion is right to first order in delta, but for a_2, which it leaves out and which is
     # of that order too.
-    error = float(np.max(np.abs(np.asarray(value) - np.asarray(told))))
+    error = float(np.max(np.abs(np.asarray(value) - np.asarray(expected))))
     rows.append(Row("Kvaerno5, 1e9 collisions", "float64", error, 1e-5))
     for name in PRECISIONS:
         rows.append(
@@ -225,7 +225,9 @@ def fits() -> list[Row]:
                 Row("unidentifiable", name, 0.0 if named else np.inf, 0.0, status="named, warned")
             )
             wrong = curve.temperature * jnp.where(jnp.arange(40) % 20 == 5, 1.2, 1.0)
-            rows.append(_told("outliers", name, gas, curve, wrong, truth, "far outliers at t ="))
+            rows.append(
+                _diagnosed("outliers", name, gas, curve, wrong, truth, "far outliers at t =")
+            )
             boast = jaxgran.CoolingCurve(
                 times=curve.times,
                 temperature=curve.temperature,
@@ -234,18 +236,18 @@ def fits() -> list[Row]:
             result, _ = _fitted(gas, boast)
             widened = float(result.standard_error[0]) / sigma
             # The fit takes them from the scatter instead, which 40 points give to 11 %.
-            told = not jaxgran.diagnose(result, boast).explains
+            noticed = not jaxgran.diagnose(result, boast).explains
             rows.append(
                 Row("error bars 5 times too small", name, worst(widened, 1.0), 0.3)
-                if told
+                if noticed
                 else Row("error bars 5 times too small", name, np.inf, 0.3)
             )
             rises = curve.temperature[::-1]
-            rows.append(_told("no model explains", name, gas, curve, rises, None, "drift"))
+            rows.append(_diagnosed("no model explains", name, gas, curve, rises, None, "drift"))
     return rows
 
 
-def _told(case, name, gas, curve, temperature, truth, words) -> Row:
+def _diagnosed(case, name, gas, curve, temperature, truth, words) -> Row:
     """A row that passes if the diagnosis of a wrong curve contains `words`, and the estimate is
     within three of its standard errors of the truth, if there is one."""
     spoilt = jaxgran.CoolingCurve(
@@ -410,45 +412,45 @@ def _write_curve(path):
 RUNS = [
     Case(
         "times: one, 1e5, not from 0, 12 decades",
-        "output times move the result; late starts lose the beginning",
-        "the run begins at 0 whatever is asked; particles pay milliseconds a time",
+        "output times change the result; if the first is late, the beginning is left out",
+        "every run begins at t = 0; an output time costs particle models milliseconds",
         times_of_every_kind,
     ),
     Case(
         "1e5 times through particles",
-        "output every so many fixed steps; memory of every state",
-        "right, at 1 to 2 ms a time",
+        "output only after fixed numbers of steps; memory for every state",
+        "right, at 1 to 2 ms per output time",
         many_times,
         heavy=True,
     ),
     Case(
         "step 5 times too large, list 10 times too small",
-        "energy appears, neighbours are lost, in silence",
-        "refused, halved or grown and rerun; under jit nan and a status",
+        "energy grows or neighbours are missed, without a warning",
+        "refused, or repeated with a smaller step or larger arrays; under jit nan and a status",
         steps_and_lists,
     ),
     Case(
         "stiff and non-stiff ends, rtol 1e-3 to 1e-12",
-        "a tolerance that does nothing; a solver that creeps for ever",
-        "the error follows; beyond some 1e6 collisions an error names the implicit solver",
+        "a tolerance without effect; a solver that does not finish",
+        "the error follows rtol; beyond some 1e6 collisions an error advises the implicit solver",
         solver_ends,
     ),
     Case(
         "fits: open, spoilt, unexplained, far",
-        "a number with a small error bar",
-        "named, widened or disowned in words",
+        "a wrong value with a small error bar",
+        "a warning or the diagnosis says so, or the error bars are widened",
         fits,
     ),
     Case(
         "one member of a batch fails",
         "all members raise, or all are nan",
-        "that one is nan with a status, the others are as alone",
+        "that one is nan with a status, the others are as in single runs",
         one_of_a_batch_fails,
     ),
     Case(
         "faults on the way",
-        "half a file, a lost run, numbers of another run",
-        "whole or not at all; refused with the reason",
+        "incomplete files, lost runs, results of another run",
+        "files are complete or unchanged; a wrong checkpoint is refused with the reason",
         faults_on_the_way,
     ),
 ]

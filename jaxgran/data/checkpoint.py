@@ -40,19 +40,6 @@ def fingerprint(*trees: Any) -> str:
     return digest.hexdigest()
 
 
-def refuse(path: str | Path | None, model: str) -> None:
-    """Refuse a checkpoint where a model runs inside compiled code, which cannot write files.
-
-    Raises:
-        ValueError: if `path` is not None.
-    """
-    if path is not None:
-        raise ValueError(
-            f"inside jax.jit, jax.vmap and derivatives {model} keeps no checkpoint: leave "
-            f"checkpoint out, got {str(path)!r}"
-        )
-
-
 def save(path: str | Path, scene: str, tree: Any) -> None:
     """Write the arrays of a pytree to a checkpoint, atomically.
 

@@ -59,7 +59,7 @@ class Comparison:
     model: AbstractModel
     parameters: Parameters
     weights: list[Array]
-    displacement_accuracy: Array | None
+    displacement_accuracy: Float[Array, ""] | None
 
     @classmethod
     def of(
@@ -73,10 +73,9 @@ class Comparison:
         """Compare T and, where its errors are known on both sides, <dr^2>."""
         T, T_error = curve.temperature, curve.temperature_error
         weights = [_weights(T, T if T_error is None else T_error)]
-        accuracy = None
-        if _displacement_is_used(gas, curve, model, num_particles):
+        accuracy = _displacement_accuracy(gas, curve, model, num_particles)
+        if accuracy is not None:
             assert curve.displacement is not None
-            accuracy = model.displacement_accuracy(gas)
             sampling = (2 / (gas.dimension * (num_particles or 1))) ** 0.5 * curve.displacement
             error = sampling if curve.displacement_error is None else curve.displacement_error
             error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
@@ -188,18 +187,23 @@ def _propagated(
     return root, jnp.abs(root @ (spread.T @ (jacobian.T @ clock_slope)))
 
 
-def _displacement_is_used(
+def _displacement_accuracy(
     gas: Gas, curve: CoolingCurve, model: AbstractModel, num_particles: int | None
-) -> bool:
-    """Whether <dr^2> is measured and computed, both with an error, and T with one to weigh it."""
+) -> Float[Array, ""] | None:
+    """Relative accuracy of the model's <dr^2>; None if the fit cannot use <dr^2>.
+
+    It must be measured and computed, and its error be known, and that of T to weigh it with.
+    """
     if curve.displacement is None or curve.temperature_error is None:
-        return False
+        return None
     if curve.displacement_error is None and num_particles is None:
-        return False
-    if model.displacement_accuracy(gas) is None:
-        return False
-    computed = eqx.filter_eval_shape(model.simulate, gas, curve.times, Run())
-    return computed.displacement is not None and computed.collisions is not None
+        return None
+    accuracy = model.displacement_accuracy(gas)
+    if accuracy is not None:
+        computed = eqx.filter_eval_shape(model.simulate, gas, curve.times, Run())
+        if computed.displacement is None or computed.collisions is None:
+            return None
+    return accuracy
 
 
 def _weights(values: Float[Array, "times"], error: Float[Array, "times"]) -> Float[Array, "times"]:

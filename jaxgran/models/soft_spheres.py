@@ -11,7 +11,7 @@ from jaxgran.data.curve import Particles
 from jaxgran.models.base import Omission
 from jaxgran.models.course import Course
 from jaxgran.models.spheres import AbstractSpheres, Plan
-from jaxgran.particles.capacity import Neighbourhood, capacities, grid_ratio, on_grid
+from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
 from jaxgran.particles.soft.block import SoftDynamics
 from jaxgran.particles.soft.scene import SoftScene
 from jaxgran.scene.gas import Gas
@@ -136,7 +136,7 @@ class SoftSpheres(AbstractSpheres):
         around = Neighbourhood.of(
             float(scene.side), self.num_particles, self.replicas, d, self.listed_by_skin
         )
-        duration = on_grid(float(scene.contact_duration), grid_ratio(n))
+        duration = Grid.of(n).up(float(scene.contact_duration))
         block = self._steps_per_block(duration) / self.steps_per_contact
         flight = FASTEST * duration * block
         near = 0.75 * around.in_contact * around.contact_value * ((1 + 5 * flight) ** d - 1)

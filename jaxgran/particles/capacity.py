@@ -1,7 +1,7 @@
 """Capacities: the fixed lengths of the arrays of a compiled run, from the expected numbers of rows.
 
 Capacities are static, so that every new set of them is a compilation. They are computed for a
-density (and a contact duration) that is rounded up to a geometric grid (`on_grid`): gases that
+density (and a contact duration) that is rounded up to a geometric grid (`Grid`): gases that
 differ little share a compiled program.
 """
 
@@ -19,14 +19,40 @@ from jaxgran.scene.geometry import contact_value, sphere_surface
 FEW = 128
 """Rows whose run time costs less than one more compilation."""
 
-GRID = 1.3
-"""Ratio of neighbouring grid points for small runs, which take less time than a compilation."""
+SMALL, LARGE = 500, 5000
+"""Particles of all replicas below (above) which a run counts as small (large)."""
 
-FINE_GRID = 1.06
-"""And for large runs, where unused rows cost more than a compilation."""
 
-LARGE = 2000
-"""Particles of all replicas from which the fine grid is used."""
+class Grid(NamedTuple):
+    """The geometric grid of densities and contact durations for which capacities are computed.
+
+    A small run takes less time than a compilation: its grid is coarse and its arrays are long. In a
+    large one unused rows cost more: what rounding up adds on average is taken from the spare rows.
+
+    Attributes:
+        ratio: of neighbouring grid points.
+        spare: factor on the spare capacity.
+    """
+
+    ratio: float
+    spare: float
+
+    @classmethod
+    def of(cls, num_particles: int) -> "Grid":
+        """The grid for a number of particles of all replicas."""
+        if num_particles < SMALL:
+            return cls(1.5, 1.4)
+        ratio = 1.2 if num_particles < LARGE else 1.06
+        return cls(ratio, ratio**-0.5)
+
+    def up(self, value: float) -> float:
+        """The least grid point, an integer power of the ratio, that is not below a value > 0."""
+        power = ceil(log(value) / log(self.ratio) - 1e-9)
+        return max(self.ratio**power, value)
+
+
+GROWTH = Grid(1.3, 1.0)
+"""The grid of capacities that have grown."""
 
 
 class Capacity(NamedTuple):
@@ -55,18 +81,7 @@ class Capacity(NamedTuple):
     def grown(self, needed: Sequence[int]) -> "Capacity":
         """With more rows than needed wherever there are too few."""
         each = zip(self, needed, strict=True)
-        return Capacity(*(r if n <= r else ceil(on_grid(1.2 * n + 32)) for r, n in each))
-
-
-def on_grid(value: float, ratio: float = GRID) -> float:
-    """The least power of a ratio that is not below a positive value."""
-    power = ceil(log(value) / log(ratio) - 1e-9)
-    return max(ratio**power, value)
-
-
-def grid_ratio(num_particles: int) -> float:
-    """Ratio of the grid on which the capacities of a run are computed."""
-    return GRID if num_particles < LARGE else FINE_GRID
+        return Capacity(*(r if n <= r else ceil(GROWTH.up(1.2 * n + 32)) for r, n in each))
 
 
 class Neighbourhood(NamedTuple):
@@ -102,7 +117,7 @@ class Neighbourhood(NamedTuple):
         per_volume = sphere_surface(dimension) / (2 * dimension)
         exact = per_volume * num_particles / side**dimension
         phi = exact / 2 ** (dimension - 1)
-        phi = min(on_grid(phi, grid_ratio(replicas * num_particles)), max(phi, 0.9))
+        phi = min(Grid.of(replicas * num_particles).up(phi), max(phi, 0.9))
         in_contact = phi * 2 ** (dimension - 1)
         side = (per_volume * num_particles / in_contact) ** (1 / dimension)
         skin = float(skin_adding(listed_more, num_particles, side, dimension))
@@ -126,6 +141,7 @@ def capacities(
         extra: pairs per particle that are near contact besides, in random places.
         num_particles: of all replicas; members cannot be more.
     """
+    spare = max(spare * Grid.of(num_particles).spare, 1.0)
     counts, spares = [num_particles * x for x in expected], (spare**0.5, spare, spare, spare)
     pairs, near, contacts, members = (
         int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)

@@ -156,14 +156,14 @@ def project(
     c, clock = projected(tangents, velocity, time)
     replicas = c.shape[1]
     gain = jnp.repeat(c - tangents.log_temperature, len(velocity) // replicas, axis=1)
-    forgotten = due & tangents.free[None, :, None]
+    dropped = due & tangents.free[None, :, None]
     kept = tangents.velocity - 0.5 * gain[:, :, None] * velocity[None]
     held = jnp.where(due, kept, tangents.velocity)
     return tangents._replace(
         log_temperature=jnp.where(due, c, tangents.log_temperature),
         clock=jnp.where(due, clock, tangents.clock),
-        position=jnp.where(forgotten, 0.0, tangents.position),
-        velocity=jnp.where(forgotten, 0.0, held),
+        position=jnp.where(dropped, 0.0, tangents.position),
+        velocity=jnp.where(dropped, 0.0, held),
         since=jnp.where(due, time, tangents.since),
     )
 

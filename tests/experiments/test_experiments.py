@@ -65,6 +65,25 @@ def test_auto_judges_the_box_that_was_measured():
         assert f"in a box of {ratio:.2g} L_c" in " ".join(reasons)
 
 
+@pytest.mark.parametrize(
+    "name, model",
+    [
+        ("kinetic-theory", jaxgran.KineticTheory()),
+        ("dsmc", jaxgran.DSMC(100, replicas=3)),
+        ("hard-spheres", jaxgran.HardSpheres(100, replicas=3)),
+        ("soft-spheres", jaxgran.SoftSpheres(100, replicas=3)),
+    ],
+)
+def test_models_are_found_by_their_names(name, model):
+    assert name in fit_cooling_curve.MODELS
+    options = argparse.Namespace(model=name, particles=100, replicas=3, curve="curve.csv")
+    assert fit_cooling_curve.model_of(options, None, None, (), None) == (model, ())
+    options.particles = None
+    if model.stochastic:
+        with pytest.raises(ValueError, match="curve.csv does not say N: give --particles"):
+            fit_cooling_curve.model_of(options, None, None, (), None)
+
+
 def test_auto_takes_kinetic_theory_where_it_will_do(tmp_path):
     done = run("fit_cooling_curve.py", "--model", "auto", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -97,6 +116,13 @@ def test_main_job_reads_the_header_a_not(tmp_path):
     done = run("fit_cooling_curve.py", "other.csv", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert 6.0e-5 < json.loads(done.stdout.splitlines()[-1])["A"] < 6.8e-5
+
+
+@pytest.mark.slow
+def test_own_model_runs(tmp_path):
+    done = run("own_model.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Haff law explains this curve." in done.stdout
 
 
 @pytest.mark.slow

@@ -205,7 +205,7 @@ def test_bad_options_are_refused(beads):
 
 
 def test_values_do_not_recompile(beads):
-    cool = KineticTheory._cool.__wrapped__  # as it is inside its own jit
+    cool = KineticTheory._simulate.__wrapped__  # as it is inside its own jit
     checked = eqx.filter_jit(eqx.debug.assert_max_traces(cool, max_traces=1))
     times = jnp.array([1.0, 2.0, 4.0])
     for a in (1e-7, 1e-6):

@@ -8,17 +8,19 @@ import pytest
 import jaxgran
 from jaxgran.checks import status
 from jaxgran.particles import driver
-from jaxgran.particles.capacity import Capacity, Neighbourhood, on_grid
+from jaxgran.particles.capacity import Capacity, Grid, Neighbourhood
 
 
-@pytest.mark.parametrize("ratio", [1.06, 1.3])
-def test_the_grid_is_geometric(ratio):
+@pytest.mark.parametrize("num_particles", [200, 2000, 20_000])
+def test_the_grid_is_geometric(num_particles):
+    grid = Grid.of(num_particles)
+    ratio = grid.ratio
     values = np.geomspace(1e-3, 1e3, 2000)
-    rounded = np.array([on_grid(x, ratio) for x in values])
+    rounded = np.array([grid.up(x) for x in values])
     assert np.all(rounded >= values) and np.all(rounded <= ratio * values * (1 + 1e-9))
     steps = np.log(np.unique(rounded.round(12))) / np.log(ratio)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
-    np.testing.assert_allclose([on_grid(x, ratio) for x in rounded], rounded, rtol=1e-9)
+    np.testing.assert_allclose([grid.up(x) for x in rounded], rounded, rtol=1e-9)
 
 
 def test_a_capacity_grows_where_it_must():
@@ -38,7 +40,7 @@ def test_the_neighbourhood_is_that_of_the_gas(beads, dimension):
     side = float(gas.box_side(1000) / gas.diameter)
     around = Neighbourhood.of(side, 1000, 1, dimension, listed_more=3.0)
     rate = float(gas.collision_frequency * gas.diameter / jnp.sqrt(gas.temperature))
-    # The density is rounded up by 30 % at most; the pair correlation and the rate follow it.
+    # The density is rounded up by 20 % at most; the pair correlation and the rate follow it.
     for rounded, exact in (
         (around.in_contact, 0.1 * 2 ** (dimension - 1)),
         (around.collision_frequency, rate),

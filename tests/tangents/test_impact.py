@@ -118,7 +118,7 @@ def test_fit_finds_what_made_the_curve():
         assert abs(float(estimate) / true - 1) < 3 * float(error) / true + slack
         assert float(error) < 0.15 * true
     assert result.simulation_error is not None and np.all(result.simulation_error > 0)
-    assert result.model == "HardSpheres"
+    assert result.model.name == "hard spheres"
     assert "Hard spheres explain" in jaxgran.diagnose(result, curve).verdict
 
 

@@ -1,5 +1,11 @@
 """Hard spheres: instantaneous impacts, predicted and executed in windows of time.
 
-May import the modules directly under `particles` and what they may import; not `soft` nor
-`stochastic`. Is imported by `models` only.
+- `prediction`: the next impact of each pair, and until when each path is final.
+- `candidates`: the pairs that may touch in a window.
+- `impacts`: the execution of the impacts of a window.
+- `windows`: from window to window.
+- `observation`: the records.
+
+May import the modules directly under `particles`, except for `driver`, `pure` and `simulation`, and
+the floors below `particles`; not `soft` nor `stochastic`. Is imported by `models` only.
 """

@@ -2,8 +2,8 @@
 
 - `collision_rule`: which candidate pairs collide, and what a collision does.
 - `collisions`: one step of many collisions.
-- `simulation`: a whole run, as a pure function and by the driver on the host.
+- `simulation`: a whole run as a pure function, and the parts of it that the host driver needs.
 
-May import the modules directly under `particles` and what they may import; not `soft` nor `hard`.
-Is imported by `models` only.
+May import the modules directly under `particles`, except for `driver`, `pure` and `simulation`, and
+the floors below `particles`; not `soft` nor `hard`. Is imported by `models` only.
 """

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt, UInt32
 
 from jaxgran.particles.stochastic.collision_rule import Outcome, collide
 from jaxgran.scene.geometry import sphere_surface
@@ -120,7 +120,7 @@ def _strides(num_particles: int) -> np.ndarray:
 
 
 def _draw(
-    bits: UInt32[Array, "4"], scheme: Scheme
+    bits: UInt[Array, "4"], scheme: Scheme
 ) -> tuple[Int[Array, "first"], Int[Array, "first"], Int[Array, "second"]]:
     """Indices of the particles of the first pairs, and of the new particles of the second pairs.
 

@@ -1,0 +1,217 @@
+"""A model of a user's own works wherever one of this package does."""
+
+import types
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.theory import closed_forms
+
+
+class HaffLaw(jaxgran.AbstractModel):
+    """Haff's law: spheres of constant restitution with Maxwellian velocities."""
+
+    stochastic: ClassVar[bool] = False
+    derivative_accuracy: ClassVar[float] = 0.02
+
+    def check(self, gas):
+        if not isinstance(gas.law, jaxgran.ConstantRestitution):
+            raise ValueError("HaffLaw needs ConstantRestitution; use jaxgran.KineticTheory")
+
+    def simulate(self, gas, times, run):
+        loss = (1 - gas.value("coefficient") ** 2) / (2 * gas.dimension)
+        T = gas.temperature * (1 + loss * gas.collision_frequency * times) ** -2
+        return jaxgran.CoolingCurve(times=times, temperature=T)
+
+    def estimated_error(self, course):
+        return course.error_of_temperature(course.homogeneous + 3 / 16 * np.abs(course.sonine))
+
+    def omissions(self, gas, num_particles=None):
+        if float(gas.value("coefficient")) > 0.7:
+            return ()
+        remedy = "This scene needs kinetic theory with a_2."
+        return (jaxgran.Omission("velocities are not Maxwellian", True, remedy),)
+
+
+MEMBERS = sorted(
+    jaxgran.AbstractModel.__abstractmethods__ | jaxgran.AbstractModel.__abstractclassvars__
+)
+
+
+def gas_of(coefficient=0.9, **values):
+    law = jaxgran.ConstantRestitution(coefficient)
+    scene = {"diameter": 0.002, "mass": 1e-5, "packing_fraction": 0.02, "temperature": 0.01}
+    return jaxgran.Gas(law, **scene | values)
+
+
+def times_of(gas, num=40):
+    return jnp.geomspace(0.3, 300.0, num) * gas.mean_free_time
+
+
+def measured(gas, key=None):
+    """A curve by Haff's law with errors of 1 %, and noise of that size where a key is given."""
+    times = times_of(gas)
+    T = gas.temperature * closed_forms.haff(
+        gas.collision_frequency * times, gas.value("coefficient")
+    )
+    noise = 0.0 if key is None else 0.01 * jax.random.normal(key, times.shape)
+    return jaxgran.CoolingCurve(
+        times=times, temperature=T * jnp.exp(noise), temperature_error=0.01 * T
+    )
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_cool(dimension):
+    gas = gas_of(0.8, dimension=dimension)
+    times = times_of(gas)
+    curve = jaxgran.cool(gas, times, model=HaffLaw())
+    expected = closed_forms.haff(gas.collision_frequency * times, 0.8, dimension)
+    np.testing.assert_allclose(curve.temperature / gas.temperature, expected, rtol=1e-14)
+
+
+def test_its_refusals_are_raised(beads):
+    gas = beads(0.1)
+    curve = jaxgran.cool(gas, times_of(gas))
+    for ask in (
+        lambda: jaxgran.cool(gas, curve.times, model=HaffLaw()),
+        lambda: jaxgran.fit(gas, curve, model=HaffLaw()),
+        lambda: jaxgran.choose_model(gas, curve.times, models=[HaffLaw()]),
+    ):
+        with pytest.raises(ValueError, match="HaffLaw needs ConstantRestitution"):
+            ask()
+
+
+def test_checkpoints_are_of_stochastic_models(tmp_path):
+    gas = gas_of()
+    with pytest.raises(ValueError, match="HaffLaw has no run to be saved"):
+        jaxgran.cool(gas, [1.0], model=HaffLaw(), checkpoint=tmp_path / "run.npz")
+
+
+@pytest.mark.parametrize("method", ["levenberg-marquardt", "lbfgs"])
+def test_fit_finds_what_made_the_curve(method):
+    gas = gas_of()
+    curve = measured(gas, jax.random.key(0))
+    free = ("coefficient", "temperature")
+    unknown = gas.replace(coefficient=0.5, temperature=1.0)
+    result = jaxgran.fit(unknown, curve, model=HaffLaw(), free=free, method=method)
+    assert bool(result.converged) and isinstance(result.model, HaffLaw)
+    for name in free:
+        estimate, error = result.value(name)
+        assert abs(estimate - gas.value(name)) < 3 * error
+        assert error < 0.01 * gas.value(name)
+    assert np.all(result.model_error > 0)
+    diagnosis = jaxgran.diagnose(result, curve)
+    assert diagnosis.explains and diagnosis.verdict == "Haff law explains this curve."
+
+
+def test_fit_under_jit_and_vmap():
+    gas, free = gas_of(), ("coefficient",)
+    curve = measured(gas, jax.random.key(1))
+
+    def estimate(packing):
+        scene = gas.replace(packing_fraction=packing)
+        result = jaxgran.fit(scene, curve, model=HaffLaw(), free=free)
+        assert isinstance(result.model, HaffLaw)
+        return result
+
+    packings = jnp.array([0.018, 0.02, 0.022])
+    single = jnp.stack([estimate(packing).estimate for packing in packings])
+    batch = jax.vmap(estimate)(packings)
+    assert isinstance(batch.model, HaffLaw)
+    # The tolerance of the search is 1e-7.
+    np.testing.assert_allclose(batch.estimate, single, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(estimate)(packings[1]).estimate, single[1], rtol=1e-6)
+
+
+def test_displacement_is_not_used_where_it_is_not_computed():
+    class Claiming(HaffLaw):
+        def displacement_accuracy(self, gas):
+            return jnp.asarray(0.01)
+
+    gas = gas_of()
+    curve = measured(gas)
+    curve = jaxgran.CoolingCurve(
+        times=curve.times,
+        temperature=curve.temperature,
+        temperature_error=curve.temperature_error,
+        displacement=curve.times,
+        displacement_error=0.01 * curve.times,
+    )
+    for model in (HaffLaw(), Claiming()):
+        result = jaxgran.fit(gas, curve, model=model, free=("coefficient",))
+        assert result.displacement_residuals is None
+        np.testing.assert_allclose(result.estimate, 0.9, rtol=1e-6)
+
+
+def test_diagnosis_asks_the_model():
+    gas = gas_of(0.6)
+    curve = measured(gas, jax.random.key(2))
+    result = jaxgran.fit(gas, curve, model=HaffLaw(), free=("coefficient",))
+    diagnosis = jaxgran.diagnose(result, curve)
+    assert not diagnosis.explains and "velocities are not Maxwellian" in diagnosis.reasons
+    assert diagnosis.verdict == (
+        "Haff law cannot be trusted in this scene, though the curve fits. "
+        "This scene needs kinetic theory with a_2."
+    )
+
+
+def test_choice(beads):
+    gas = gas_of(0.95)
+    times, models = times_of(gas), (HaffLaw(), jaxgran.KineticTheory())
+    theory = jaxgran.cool(gas, times)
+    off = jnp.abs(jnp.log(jaxgran.cool(gas, times, model=HaffLaw()).temperature))
+    off = float(jnp.max(jnp.abs(off - jnp.abs(jnp.log(theory.temperature)))))
+    rough = jaxgran.choose_model(gas, times, 0.1, models=models)
+    assert isinstance(rough.model, HaffLaw)
+    assert rough.reasons[0].startswith("Haff law: the cheapest model whose estimated error")
+    assert off < rough.error < 0.1  # a_2 is known, what Enskog's theory leaves out comes on top
+    own, better = rough.candidates
+    assert own.error == rough.error > better.error
+    fine = jaxgran.choose_model(gas, times, (own.error + better.error) / 2, models=models)
+    assert isinstance(fine.model, jaxgran.KineticTheory)
+    viscous = beads(0.1)
+    own, _ = jaxgran.choose_model(viscous, times_of(viscous), models=models).candidates
+    assert own.error is None and "HaffLaw needs ConstantRestitution" in own.refusal
+
+
+class NoisyHaffLaw(HaffLaw):
+    """Haff's law with the noise of a particle model."""
+
+    num: int = 3
+    stochastic: ClassVar[bool] = True
+
+    def simulate(self, gas, times, run):
+        exact = super().simulate(gas, times, run).temperature
+        noise = 0.01 * jax.random.normal(run.key, (self.num, times.size))
+        each = jaxgran.CoolingCurve(times=times, temperature=exact[None] * jnp.exp(noise))
+        mean = jnp.mean(each.temperature, axis=0)
+        return jaxgran.CoolingCurve(times=times, temperature=mean, replicas=each)
+
+
+def test_a_stochastic_model_is_fitted_through_its_replicas():
+    gas, free = gas_of(), ("coefficient", "temperature")
+    curve = measured(gas, jax.random.key(3))
+    options = {"free": free, "progress": False, "key": jax.random.key(1)}
+    result = jaxgran.fit(gas.replace(coefficient=0.8), curve, model=NoisyHaffLaw(), **options)
+    assert bool(result.converged) and result.simulation_error is not None
+    for i, name in enumerate(free):
+        estimate, error = result.value(name)
+        # Errors of the measurement and, with kinetic theory's guess close by, of two or three runs.
+        assert abs(estimate - gas.value(name)) < 3 * error
+        assert 0.1 < result.simulation_error[i] / error < 0.8
+    with pytest.raises(ValueError, match="NoisyHaffLaw needs curves with two replicas"):
+        jaxgran.fit(gas, curve, model=NoisyHaffLaw(num=1), **options)
+
+
+@pytest.mark.parametrize("member", MEMBERS)
+def test_a_missing_member_is_named(member):
+    members = {name: vars(HaffLaw)[name] for name in MEMBERS if name != member}
+    part = types.new_class(
+        "Part", (jaxgran.AbstractModel,), exec_body=lambda ns: ns.update(members)
+    )
+    with pytest.raises(TypeError, match=rf"Part.*\b{member}\b"):
+        part()
