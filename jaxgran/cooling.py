@@ -10,8 +10,7 @@ from jax.core import Tracer
 from jaxtyping import ArrayLike, PRNGKeyArray
 
 from jaxgran.checks import status
-from jaxgran.checks.tracing import any_traced
-from jaxgran.checks.validation import checked_times
+from jaxgran.checks.validation import checked_times, no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel
@@ -20,6 +19,7 @@ from jaxgran.models.selection import choose_model
 from jaxgran.scene.gas import Gas
 
 
+@no_type_check
 def cool(
     gas: Gas,
     times: ArrayLike | Sequence[float],
@@ -50,7 +50,7 @@ def cool(
         progress: show a progress bar on a terminal during a run of some seconds.
         checkpoint: a file to which a particle model's run is saved each minute and when it is
             interrupted, and from which it is resumed; the resumed run gives the same numbers bit
-            for bit. Not inside `jax.jit`, `jax.vmap` or a derivative.
+            for bit. Not inside `jax.jit` and `jax.vmap`.
         throw: raise RuntimeError if the run fails. False returns the curve, nan from the failure
             on, and its ``status`` (`jaxgran.explain_status` puts it into words); inside compiled
             code, where nothing can be raised, that is always so.
@@ -85,26 +85,16 @@ def cool(
         )
     if not isinstance(model, AbstractModel):
         raise ValueError(f'model must be a model or "auto", got {model!r}; try KineticTheory()')
-    if checkpoint is not None:
-        _check_checkpoint(model, any_traced(gas, times, model, key), checkpoint)
+    if checkpoint is not None and not model.stochastic:
+        raise ValueError(
+            f"{type(model).__name__} has no run to be saved: leave checkpoint out, got "
+            f"{str(checkpoint)!r}"
+        )
     model.check(gas)
     curve = model.simulate(gas, times, Run(key, progress, checkpoint))
     if throw and curve.status is not None and not isinstance(curve.status, Tracer):
         _raise_if_failed(curve, gas)
     return curve
-
-
-def _check_checkpoint(model: AbstractModel, traced: bool, path: str | Path) -> None:
-    if traced:
-        raise ValueError(
-            f"inside jax.jit, jax.vmap and derivatives {type(model).__name__} keeps no checkpoint: "
-            f"leave checkpoint out, got {str(path)!r}"
-        )
-    if not model.stochastic:
-        raise ValueError(
-            f"{type(model).__name__} has no run to be saved: leave checkpoint out, got "
-            f"{str(path)!r}"
-        )
 
 
 def _raise_if_failed(curve: CoolingCurve, gas: Gas) -> None:

@@ -1,11 +1,22 @@
-"""Whether numbers are known, or are being traced by a JAX transformation."""
+"""Numbers that are known, and those that are being traced by a JAX transformation."""
 
 from typing import Any
 
 import jax
+import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array, DTypeLike
 
 
 def any_traced(*trees: Any) -> bool:
     """Whether some number among the leaves of these pytrees is being traced."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def concrete(value: Any, dtype: DTypeLike | None = None) -> Array:
+    """Numbers known to Python or NumPy as a JAX array.
+
+    Unlike `jax.numpy.asarray` it returns a concrete array also inside a rule of differentiation,
+    within `jax.ensure_compile_time_eval`.
+    """
+    return jax.device_put(np.asarray(value, dtype))

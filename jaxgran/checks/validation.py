@@ -1,7 +1,7 @@
 """Validation of numbers given by a user, and the map between a range and the whole real line."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +9,21 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+F = TypeVar("F", bound=Callable)
+
 if TYPE_CHECKING:
     UserNumber = ArrayLike | Sequence[float]
+    UserCount = int
+    UserFloat = float
+
+    def no_type_check(function: F) -> F:
+        """Mark a public function that checks its arguments itself, with clearer errors."""
+        return function
 else:
     # A run-time type checker lets everything pass, so that a wrong type is reported in words.
-    UserNumber = Any
+    from typing import no_type_check  # noqa: F401
+
+    UserNumber = UserCount = UserFloat = Any
 
 
 class Domain(NamedTuple):

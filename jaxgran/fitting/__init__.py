@@ -11,6 +11,6 @@
 - `diagnosis`: what a fit means, in words.
 
 The top floor: may import every other package. Models are known by `jaxgran.AbstractModel` only;
-`KineticTheory` is imported as the default model. Is imported by `jaxgran` itself, `jaxgran.plotting`
-and experiments. Nothing is re-exported.
+`KineticTheory` is imported as the default model. Is imported by `jaxgran` itself, by
+`jaxgran.plotting` and by experiments. Nothing is re-exported.
 """

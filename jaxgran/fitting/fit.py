@@ -1,7 +1,7 @@
 """Fit floats of a gas to a measured cooling curve."""
 
 import warnings
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import PRNGKeyArray
 
 from jaxgran.checks import status
+from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.deterministic import SEARCHES, fit_deterministic
 from jaxgran.fitting.guess import guess_from_data
@@ -18,26 +19,18 @@ from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
 
-if TYPE_CHECKING:
-    UserModel = AbstractModel | None
-    UserNames = tuple[str, ...]
-    UserMethod = Literal["levenberg-marquardt", "lbfgs"]
-    UserCount = int | None
-else:
-    # A run-time type checker lets everything pass, so that a wrong type is reported in words.
-    UserModel = UserNames = UserMethod = UserCount = Any
 
-
+@no_type_check
 def fit(
     gas: Gas,
     curve: CoolingCurve,
     *,
-    model: UserModel = None,
-    free: UserNames = ("dissipative_constant",),
+    model: AbstractModel | None = None,
+    free: tuple[str, ...] = ("dissipative_constant",),
     start: Gas | None = None,
-    num_particles: UserCount = None,
-    method: UserMethod = "levenberg-marquardt",
-    max_steps: UserCount = None,
+    num_particles: int | None = None,
+    method: Literal["levenberg-marquardt", "lbfgs"] = "levenberg-marquardt",
+    max_steps: int | None = None,
     key: PRNGKeyArray | None = None,
     progress: bool = True,
 ) -> Fit:
@@ -107,12 +100,13 @@ def fit(
     return result
 
 
+@no_type_check
 def _check_request(
     gas: Gas,
     curve: CoolingCurve,
-    free: UserNames,
-    max_steps: UserCount,
-    num_particles: UserCount,
+    free: tuple[str, ...],
+    max_steps: int | None,
+    num_particles: int | None,
 ) -> None:
     curve.check()
     if isinstance(free, str) or not free or len(set(free)) < len(free):
@@ -132,7 +126,8 @@ def _check_request(
         )
 
 
-def _check_model(model: UserModel, method: UserMethod, names: tuple[str, ...]) -> None:
+@no_type_check
+def _check_model(model: AbstractModel, method: str, names: tuple[str, ...]) -> None:
     if method not in SEARCHES:
         known = " or ".join(f'"{name}"' for name in SEARCHES)
         raise ValueError(f"method must be {known}, got {method!r}")

@@ -70,8 +70,9 @@ def least_squares(residuals: Residuals, first: Float[Array, "p"], max_steps: int
 def quasi_newton(residuals: Residuals, first: Float[Array, "p"], max_steps: int) -> Minimum:
     """The same minimum by L-BFGS, with reverse-mode gradients.
 
-    The first step follows the gradient. The objective is divided by the norm of the gradient at the
-    initial guess, so that this step has length 1: a factor e of a positive parameter.
+    The first step goes along the gradient, as far as the residuals linearised at the initial guess
+    say (the Cauchy step), but no further than 1: a factor e of a positive parameter. The objective
+    is scaled for that, as L-BFGS begins with a Hessian of 1.
 
     Args:
         residuals, first: as for `least_squares`.
@@ -81,8 +82,11 @@ def quasi_newton(residuals: Residuals, first: Float[Array, "p"], max_steps: int)
     def half_chi2(flat):
         return 0.5 * jnp.sum(residuals(flat) ** 2)
 
-    scale = jnp.linalg.norm(jax.grad(half_chi2)(first))
-    scale = jnp.where(scale > 0, scale, 1.0)
+    gradient = jax.grad(half_chi2)(first)
+    steepness = jnp.linalg.norm(gradient)
+    steepness = jnp.where(steepness > 0, steepness, 1.0)
+    _, slope = jax.jvp(residuals, (first,), (gradient / steepness,))
+    scale = jnp.maximum(jnp.sum(slope**2), steepness)
     solution = optx.minimise(
         lambda flat, scale: half_chi2(flat) / scale,
         optx.LBFGS(rtol=TOLERANCE, atol=TOLERANCE),

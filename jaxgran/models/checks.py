@@ -8,7 +8,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.models.base import Omission
+from jaxgran.data.run import Run
+from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.scene.gas import Gas
 from jaxgran.theory.averages import averages as exact_averages
 
@@ -54,6 +55,15 @@ def check_softness(gas: Gas, factor: ArrayLike) -> None:
             f"spheres overlap by {float(np.max(gas.mean_overlap)):.2g} diameters at T_0, where "
             "the softness correction has no meaning; is youngs_modulus in Pa? If so use "
             "SoftSpheres, or KineticTheory(softness=False)"
+        )
+
+
+def refuse_checkpoint(model: AbstractModel, run: Run) -> None:
+    """Raise ValueError for a checkpoint, where a model's run is compiled and can keep none."""
+    if run.checkpoint is not None:
+        raise ValueError(
+            f"inside jax.jit and jax.vmap {type(model).__name__} keeps no checkpoint: leave "
+            f"checkpoint out, got {str(run.checkpoint)!r}"
         )
 
 

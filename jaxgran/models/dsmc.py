@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, UInt32
 
 from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
+from jaxgran.checks.validation import UserCount, UserFloat
 from jaxgran.data.checkpoint import fingerprint
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import DEFAULTS, Run
@@ -60,9 +61,9 @@ class DSMC(AbstractModel):
     (1996) for dense gases; Brilliantov & Poeschel for the granular gas.
     """
 
-    num_particles: int = eqx.field(static=True)
-    replicas: int = eqx.field(static=True, default=1)
-    step: float = eqx.field(static=True, default=0.05)
+    num_particles: UserCount = eqx.field(static=True)
+    replicas: UserCount = eqx.field(static=True, default=1)
+    step: UserFloat = eqx.field(static=True, default=0.05)
 
     stochastic: ClassVar[bool] = True
     derivative_accuracy: ClassVar[float] = 0.01
@@ -104,6 +105,7 @@ class DSMC(AbstractModel):
         scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
         law, reduced = gas.reduced_law, times * gas.impact_speed / gas.path_length
         if any_traced(gas, times, words):
+            checks.refuse_checkpoint(self, run)
             records = simulation.differentiable_run(
                 law, reduced, words, replicas=self.replicas, scheme=scheme
             )

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxgran.checks.tracing import any_traced
+from jaxgran.checks.validation import UserCount, UserFloat
 from jaxgran.data.curve import Particles
 from jaxgran.models import checks
 from jaxgran.models.base import Omission
@@ -75,9 +76,9 @@ class HardSpheres(AbstractSpheres):
         ValueError: for numbers out of range.
     """
 
-    num_particles: int = eqx.field(static=True)
-    replicas: int = eqx.field(static=True, default=1)
-    contact_time: float = eqx.field(static=True, default=1e-5)
+    num_particles: UserCount = eqx.field(static=True)
+    replicas: UserCount = eqx.field(static=True, default=1)
+    contact_time: UserFloat = eqx.field(static=True, default=1e-5)
     start: Particles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
     plan: Plan | None = eqx.field(static=True, default=None)
@@ -166,5 +167,5 @@ def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Sc
         law=gas.reduced_law,
         collision_frequency=gas.collision_frequency * unit_time,
         contact_time=jnp.asarray(contact_time, gas.temperature.dtype),
-        elastic=jnp.array(False),
+        elastic=jnp.zeros((), bool),
     )

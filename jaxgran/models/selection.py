@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
 from jaxgran.checks import status
-from jaxgran.checks.validation import checked_times
+from jaxgran.checks.validation import checked_times, no_type_check
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import check_softness
@@ -69,6 +69,7 @@ def default_models(num_particles: int, replicas: int = 1) -> tuple[AbstractModel
     return KineticTheory(), *(kind(num_particles, replicas=replicas) for kind in kinds)
 
 
+@no_type_check
 def choose_model(
     gas: Gas,
     times: ArrayLike | Sequence[float],

@@ -6,7 +6,10 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxgran.checks.tracing import concrete
+from jaxgran.checks.validation import UserCount, UserFloat
 from jaxgran.data.curve import Particles
 from jaxgran.models.base import Omission
 from jaxgran.models.course import Course
@@ -74,12 +77,12 @@ class SoftSpheres(AbstractSpheres):
         ValueError: for numbers out of range.
     """
 
-    num_particles: int = eqx.field(static=True)
-    steps_per_contact: int = eqx.field(static=True, default=40)
-    replicas: int = eqx.field(static=True, default=1)
+    num_particles: UserCount = eqx.field(static=True)
+    steps_per_contact: UserCount = eqx.field(static=True, default=40)
+    replicas: UserCount = eqx.field(static=True, default=1)
     start: Particles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
-    projection: float | None = eqx.field(static=True, default=PROJECTION)
+    projection: UserFloat | None = eqx.field(static=True, default=PROJECTION)
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 3.0
@@ -121,8 +124,8 @@ class SoftSpheres(AbstractSpheres):
 
     def dynamics(self, scene: SoftScene, plan: Plan) -> SoftDynamics:
         """How the spheres move."""
-        projection = jnp.asarray(self.projection or jnp.inf, scene.side.dtype)
-        per_contact, per_block = (jnp.asarray(steps, jnp.int32) for steps in plan.pace)
+        projection = concrete(self.projection or np.inf, scene.side.dtype)
+        per_contact, per_block = (concrete(steps, np.int32) for steps in plan.pace)
         return SoftDynamics(scene, plan.replicas, plan.capacity, per_contact, per_block, projection)
 
     def pace_fixed(self) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
 from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.data.run import DEFAULTS, Run
+from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.course import Course
 from jaxgran.particles import driver, initial, neighbours, pure, user_start
@@ -22,7 +23,6 @@ from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.simulation import SMALLEST_BOX, Simulation
 from jaxgran.scene.gas import Gas
 from jaxgran.tangents.rule import Inputs, Outputs, differentiable
-
 
 S = TypeVar("S", bound="AbstractSpheres")
 
@@ -149,6 +149,7 @@ class AbstractSpheres(AbstractModel):
         if not any_traced(inputs):
             settings = self.num_particles, plan.replicas, plan.pace, self.neighbours
             return driver.drive(sim, run, settings)
+        checks.refuse_checkpoint(self, run)
         if self.neighbours == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap neighbours="jax-md" cannot find the pairs, as it sizes '

@@ -5,7 +5,10 @@ are all known; the same run as a pure function is in `pure`.
 """
 
 import time
+from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -15,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxgran.checks import status
+from jaxgran.checks.tracing import any_traced, concrete
 from jaxgran.data import checkpoint
 from jaxgran.data.run import Run
 from jaxgran.particles import neighbours
@@ -49,6 +53,7 @@ class _Timed(Protocol):
 
 
 S = TypeVar("S", bound=_Timed)
+T = TypeVar("T")
 
 
 def follow(
@@ -127,7 +132,7 @@ def _resumed(
         return 0, state, records
     done, loaded, records = checkpoint.load(path, scene, (0, state, records))
     # As JAX arrays of the same types: the compiled functions must not see a difference.
-    state = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), loaded, state)
+    state = jax.tree.map(lambda new, old: concrete(new, old.dtype), loaded, state)
     return int(done), state, records
 
 
@@ -149,7 +154,41 @@ def _show(bar: tqdm, state: Any, observe: Callable[[Any], dict[str, jax.Array]])
         bar.set_postfix_str(f"T/T_0 = {ratio:.3g}", refresh=False)
 
 
-_stretches = jax.jit(stretches, static_argnames=("engine", "least", "most"))
+MOST_PROGRAMS = 32
+"""Compiled programs that are kept; beyond that the one unused for longest is released."""
+
+_PROGRAMS: OrderedDict[Any, jax.stages.Compiled] = OrderedDict()
+"""Programs of `stretches` by what they were compiled for. Unlike those that `jax.jit` keeps they
+are bounded in number, and shared by plain runs and those inside a rule of differentiation."""
+
+
+def _compiled(dynamics: AbstractDynamics, state: State, end: jax.Array, engine: str):
+    """`stretches` as a function of these arguments, compiled for their types and static fields."""
+    arguments = dynamics, state, end
+    some = jax.jit(partial(stretches, engine=engine, least=1, most=STRETCHES))
+    if any_traced(arguments):  # constants within a transformation of something else
+        return some
+    leaves, structure = jax.tree.flatten(arguments)
+    key = engine, STRETCHES, structure, tuple((x.shape, x.dtype, x.sharding) for x in leaves)
+    if key not in _PROGRAMS:
+        _PROGRAMS[key] = _outside_of_transformations(lambda: some.lower(*arguments).compile())
+        if len(_PROGRAMS) > MOST_PROGRAMS:
+            _PROGRAMS.popitem(last=False)
+    _PROGRAMS.move_to_end(key)
+    return _PROGRAMS[key]
+
+
+def _outside_of_transformations(function: Callable[[], T]) -> T:
+    """Call a function in a thread of its own, where no JAX transformation is under way."""
+    x64 = jax.config.read("jax_enable_x64")
+
+    def call() -> T:
+        with jax.enable_x64(x64):
+            return function()
+
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        return pool.submit(call).result()
+
 
 _GROWN: dict[Capacity, Capacity] = {}
 """What capacities came to be enlarged to: the next run begins with the larger ones, and neither
@@ -164,7 +203,9 @@ def drive(sim: Simulation, run: Run, settings: tuple) -> Outputs:
         run: its options.
         settings: what else of the model fixes the result, for the checkpoint's fingerprint.
     """
-    # Concrete inputs of a derivative rule: nothing here is to be staged into the outer trace.
+    if sim.directions is None:
+        return _drive(sim, run, settings)
+    # In a rule of differentiation operations on known numbers would be staged.
     with jax.ensure_compile_time_eval():
         return _drive(sim, run, settings)
 
@@ -182,11 +223,9 @@ def _drive(sim: Simulation, run: Run, settings: tuple) -> Outputs:
     except Failure as failure:
         fault = failure.fault
     times = np.asarray(sim.inputs.times)
-    scene = (
-        ""
-        if run.checkpoint is None
-        else checkpoint.fingerprint(sim.inputs, state.tangents, settings)
-    )
+    scene = ""
+    if run.checkpoint is not None:
+        scene = checkpoint.fingerprint(sim.inputs, state.tangents, settings)
 
     def advance(state: State, end: float) -> State:
         return _advance(state, end, dynamics, dynamics.capacity, engine)
@@ -249,7 +288,8 @@ def _some_stretches(
 ) -> tuple[State, int, list[int]]:
     """Several stretches in one compiled call, or one if the host finds the pairs."""
     if engine == "sweep":
-        state, fault, needed = _stretches(dynamics, state, end, engine, 1, STRETCHES)
+        until = concrete(end, state.time.dtype)
+        state, fault, needed = _compiled(dynamics, state, until, engine)(dynamics, state, until)
         return state, int(fault), [int(x) for x in needed]
     now = dynamics.stretch(state, end, engine)
     fault = int(now.status)

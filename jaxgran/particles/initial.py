@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
+from jaxgran.checks.tracing import any_traced, concrete
 from jaxgran.particles.neighbours import vesin_search
 
 PACKING_LIMIT = {2: 0.65, 3: 0.48}
@@ -68,8 +68,8 @@ def positions(
     shape = (replicas * num_particles, dimension)
     uniform = jax.random.uniform(key, shape, jnp.result_type(float))
     host = _OverlapRemoval(replicas)
-    if not any(isinstance(x, Tracer) for x in (uniform, side)):
-        return jnp.asarray(host(uniform, side))
+    if not any_traced(uniform, side):
+        return concrete(host(uniform, side))
     out = jax.ShapeDtypeStruct(shape, uniform.dtype)
     return jax.pure_callback(host, out, uniform, side, vmap_method="sequential")
 

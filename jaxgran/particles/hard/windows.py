@@ -101,7 +101,7 @@ class HardDynamics(AbstractDynamics):
         )
 
     def elastic(self) -> "HardDynamics":
-        lossless = self.scene._replace(elastic=jnp.array(True))
+        lossless = self.scene._replace(elastic=jnp.ones((), bool))
         return dataclasses.replace(self, scene=lossless)
 
     def with_tangents(self, state: State, directions: ReducedLaw) -> State:
