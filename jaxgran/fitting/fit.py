@@ -36,8 +36,8 @@ def fit(
 ) -> Fit:
     """Estimate floats of a gas from its measured cooling curve.
 
-    Minimises ``chi^2 = sum [(ln T_measured - ln T_model) / (T_err/T)]^2``, to which <dr^2> adds the
-    like where it is measured with a known error, over the free floats in a scale without bounds
+    Minimises ``chi^2 = sum [(ln T_measured - ln T_model) / (T_err/T)]^2``, plus the same sum for
+    <dr^2> where that is measured with a known error, over the free floats in a scale without bounds
     (the logarithm of a positive one). Points with an error of 0 (a prepared state at t = 0) have no
     weight. <dr^2> is compared to within the model's accuracy (kinetic theory in 3D: 1.7 %), which
     applies both to each point and to a common factor of the diffusive part.
@@ -57,8 +57,8 @@ def fit(
         model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`; a stochastic one
             needs two or more replicas.
         free: names of floats of the gas or its law, such as "temperature" (which is T_0).
-        start: a gas whose values are another guess for a deterministic model, which begins at the
-            better one, and the only guess for a stochastic model.
+        start: a gas whose values are a further guess. A deterministic model begins at this or at
+            that from the data, whichever fits better; a stochastic model begins at this.
         num_particles: number of particles over which <dr^2> is a mean; gives its relative error,
             ``sqrt(2 / (d N))``, where the curve has none. Without either <dr^2> is not used, nor
             is it where T has no errors, as their weights could not be compared.
@@ -87,8 +87,8 @@ def fit(
     model = KineticTheory() if model is None else model
     _check_model(model, method, names)
     if model.stochastic:
-        max_runs = 8 if max_steps is None else max_steps
-        result = fit_stochastic(gas, curve, model, names, start, key, progress, max_runs)
+        steps = 8 if max_steps is None else max_steps
+        result = fit_stochastic(gas, curve, model, names, start, key, progress, steps)
     else:
         guesses = [guess_from_data(gas, curve, names)] + ([] if start is None else [start])
         model.check(guesses[-1])

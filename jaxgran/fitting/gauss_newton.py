@@ -19,10 +19,10 @@ LONGEST_STEP = 0.7
 """Longest Gauss-Newton step of a parameter in its unbounded scale: a factor of two."""
 
 NEAR = 0.1
-"""Distance in every parameter's unbounded scale within which runs are averaged."""
+"""Distance in every parameter's unbounded scale within which simulations are averaged."""
 
 QUIET = 0.5
-"""Share of the standard error below which the noise of the simulations needs no further runs."""
+"""Share of the standard error below which the noise needs no further simulations."""
 
 NOISE_WINDOW = 9
 """Neighbouring times over which the variance between replicas is averaged."""
@@ -33,12 +33,12 @@ class Simulated(NamedTuple):
 
     Attributes:
         flat: the estimate.
-        computed: the curve of the last run.
-        residuals: weighted, at `flat` by linear extrapolation of the runs; 0 where not used.
+        computed: the curve of the last simulation.
+        residuals: weighted, at `flat` extrapolated linearly from the simulations; 0 where not used.
         sensitivity: derivative of the weighted residuals.
         error_covariance: covariance of `flat` by the errors of the measurement.
         noise_covariance: and by the noise of the simulations.
-        num_runs: simulations made.
+        num_simulations: how many were made.
         converged: whether the last step was below `NEAR`.
     """
 
@@ -48,11 +48,11 @@ class Simulated(NamedTuple):
     sensitivity: Float[np.ndarray, "times p"]
     error_covariance: Float[np.ndarray, "p p"]
     noise_covariance: Float[np.ndarray, "p p"]
-    num_runs: int
+    num_simulations: int
     converged: bool
 
 
-class _Sample(NamedTuple):
+class _Simulation(NamedTuple):
     """One simulation at some parameters, at the times that are used."""
 
     flat: Float[np.ndarray, "p"]
@@ -62,12 +62,12 @@ class _Sample(NamedTuple):
 
 
 class _Average(NamedTuple):
-    """The estimate that the samples near each other give together."""
+    """The estimate that simulations near each other give together."""
 
     flat: Float[np.ndarray, "p"]
     sigma: Float[np.ndarray, "used"]  # standard error of each residual; 1 if errors are unknown
     errors: Float[np.ndarray, "p p"]  # covariance of `flat` by the errors of the measurement
-    noises: Float[np.ndarray, "p p"]  # and by the noise of the samples
+    noises: Float[np.ndarray, "p p"]  # and by the noise of the simulations
 
     @property
     def covariance(self) -> Float[np.ndarray, "p p"]:
@@ -82,7 +82,7 @@ def by_simulation(
     used: Bool[np.ndarray, "times"],
     *,
     resolution: float,
-    max_runs: int,
+    max_simulations: int,
     progress: bool,
 ) -> Simulated:
     """Gauss-Newton steps, each on one simulation and its derivatives.
@@ -97,24 +97,25 @@ def by_simulation(
     much, but does not move the answer, which is where the residuals vanish.
 
     Args:
-        simulate: the cooling curve, with replicas, of the parameters and the number of the run.
+        simulate: makes a cooling curve, with replicas, of the parameters and a number that differs
+            between simulations.
         first: the initial guess.
         measured, error: ln T and its standard error, which is 0 everywhere if it is not known.
         used: the times that have a weight.
         resolution: singular values of the sensitivity below this share of the largest are ignored:
             the parameters do not move in those directions.
-        max_runs: the most runs.
+        max_simulations: the most simulations.
         progress: show a bar.
     """
     flat, measured, error = np.asarray(first, float), measured[used], error[used]
     known = bool(error.any())
-    samples: list[_Sample] = []
-    bar = tqdm(total=max_runs, disable=None if progress else True, desc="fit", unit="run")
-    with bar:
+    simulations: list[_Simulation] = []
+    hidden = None if progress else True  # None hides the bar where there is no terminal
+    with tqdm(total=max_simulations, disable=hidden, desc="fit", unit="simulation") as bar:
         while True:
-            sample, curve = _sample(simulate, flat, len(samples), used)
-            samples.append(sample)
-            near = [s for s in samples if np.abs(s.flat - flat).max() < NEAR]
+            simulation, curve = _simulated(simulate, flat, len(simulations), used)
+            simulations.append(simulation)
+            near = [s for s in simulations if np.abs(s.flat - flat).max() < NEAR]
             average = _average(near, measured, error if known else None, resolution)
             step = average.flat - flat
             step *= min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-300))
@@ -125,19 +126,20 @@ def by_simulation(
             in_errors = np.abs(step / np.sqrt(variance)).max()
             bar.update()
             bar.set_postfix_str(f"last step {in_errors:.2g} standard errors")
-            if len(samples) == max_runs or (settled and len(near) > 1 and (quiet or not known)):
+            ended = settled and len(near) > 1 and (quiet or not known)
+            if ended or len(simulations) == max_simulations:
                 break
     residuals, sensitivity = _residuals_at(flat, near, measured, average.sigma, used)
     covariances = average.errors, average.noises
-    return Simulated(flat, curve, residuals, sensitivity, *covariances, len(samples), settled)
+    return Simulated(flat, curve, residuals, sensitivity, *covariances, len(simulations), settled)
 
 
-def _sample(
+def _simulated(
     simulate: Callable[[Array, int], CoolingCurve],
     flat: Float[np.ndarray, "p"],
     number: int,
     used: Bool[np.ndarray, "times"],
-) -> tuple[_Sample, CoolingCurve]:
+) -> tuple[_Simulation, CoolingCurve]:
     """One simulation with its derivatives, and its curve."""
 
     def log_temperature(flat):
@@ -149,31 +151,31 @@ def _sample(
     assert curve.replicas is not None
     each = np.log(np.asarray(curve.replicas.temperature))[:, used]
     value, slope = np.asarray(value)[used], np.asarray(slope)[used]
-    return _Sample(flat, value, slope, each - each.mean(axis=0)), curve
+    return _Simulation(flat, value, slope, each - each.mean(axis=0)), curve
 
 
 def _average(
-    near: list[_Sample],
+    near: list[_Simulation],
     measured: Float[np.ndarray, "used"],
     error: Float[np.ndarray, "used"] | None,
     resolution: float,
 ) -> _Average:
-    """The mean of the Gauss-Newton estimates of some samples, the last of which is the newest.
+    """The mean of the Gauss-Newton estimates of some simulations, the last of which is the newest.
 
     Args:
-        near: the samples.
+        near: the simulations.
         measured, error: ln T and its standard error, None if it is not known.
         resolution: see `by_simulation`.
     """
     noise = np.sqrt(np.mean([_variance(s.deviation) for s in near], axis=0) / len(near))
     sigma = np.ones_like(measured) if error is None else np.hypot(error, noise)
     ends, scatter = [], []
-    for sample in near:
-        sensitivity = sample.slope / sigma[:, None]
+    for simulation in near:
+        sensitivity = simulation.slope / sigma[:, None]
         inverse = np.linalg.pinv(sensitivity, rcond=resolution)
-        ends.append(sample.flat + inverse @ ((measured - sample.log_temperature) / sigma))
-        replicas = len(sample.deviation)
-        moved = (sample.deviation / sigma) @ inverse.T / (replicas * (replicas - 1)) ** 0.5
+        ends.append(simulation.flat + inverse @ ((measured - simulation.log_temperature) / sigma))
+        replicas = len(simulation.deviation)
+        moved = (simulation.deviation / sigma) @ inverse.T / (replicas * (replicas - 1)) ** 0.5
         scatter.append(moved.T @ moved)
     share = inverse * (np.ones_like(sigma) if error is None else error / sigma)
     noises = np.mean(scatter, axis=0) / len(near)
@@ -191,12 +193,12 @@ def _variance(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray
 
 def _residuals_at(
     flat: Float[np.ndarray, "p"],
-    near: list[_Sample],
+    near: list[_Simulation],
     measured: Float[np.ndarray, "used"],
     sigma: Float[np.ndarray, "used"],
     used: Bool[np.ndarray, "times"],
 ) -> tuple[Float[np.ndarray, "times"], Float[np.ndarray, "times p"]]:
-    """Weighted residuals, extrapolated from each sample and averaged, and their derivative."""
+    """Weighted residuals, extrapolated from each simulation and averaged, and their derivative."""
     each = [measured - s.log_temperature - s.slope @ (flat - s.flat) for s in near]
     slope = np.mean([s.slope for s in near], axis=0)
     residuals, sensitivity = np.zeros(len(used)), np.zeros((len(used), len(flat)))

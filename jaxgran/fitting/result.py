@@ -34,14 +34,14 @@ class Fit(eqx.Module):
             logarithm of a positive one), shape (residuals, p).
         start: the guess at which the search began, SI, shape (p,).
         gas: the fitted gas.
-        curve: its cooling curve at the measured times; of a stochastic model that of the last run,
-            one Gauss-Newton step before the estimate.
+        curve: its cooling curve at the measured times; of a stochastic model that of the last
+            simulation, one Gauss-Newton step before the estimate.
         residuals: (ln T_measured - ln T_model) over its error; 0 where a point has no weight.
         displacement_residuals: the same of <dr^2>; None if it was not used.
         chi2, degrees_of_freedom, reduced_chi2, p_value: of the weighted residuals; p_value is nan
             if the curve has no errors (they are then scaled so that reduced chi^2 is 1).
-        iterations: steps of Levenberg-Marquardt, evaluations of L-BFGS, or runs of a stochastic
-            model.
+        iterations: steps of Levenberg-Marquardt, evaluations of L-BFGS, or simulations by a
+            stochastic model.
         converged: whether the search reached its tolerance; of a stochastic model, whether the last
             step was below 0.1 in the parameters' unbounded scale.
         simulation_error: the part of `standard_error` due to the noise of a stochastic model,

@@ -26,7 +26,7 @@ def fit_stochastic(
     guess: Gas | None = None,
     key: PRNGKeyArray | None = None,
     progress: bool = True,
-    max_runs: int = 8,
+    max_simulations: int = 8,
 ) -> Fit:
     """Fit through a stochastic model, from a guess, by default the result of kinetic theory.
 
@@ -66,7 +66,7 @@ def fit_stochastic(
         error,
         used & (np.asarray(curve.times) > 0),
         resolution=model.derivative_accuracy,
-        max_runs=max_runs,
+        max_simulations=max_simulations,
         progress=progress,
     )
     return _fit_of(model, parameters, names, first, found, errors_known)
@@ -122,7 +122,7 @@ def _fit_of(
         degrees_of_freedom=degrees_of_freedom,
         reduced_chi2=chance.reduced,
         p_value=chance.p_value,
-        iterations=jnp.asarray(found.num_runs),
+        iterations=jnp.asarray(found.num_simulations),
         converged=jnp.asarray(found.converged),
         simulation_error=jnp.sqrt(jnp.diag(noise)),
     )

@@ -36,7 +36,7 @@ def simulator(bias=1.0, noise=0.01, replicas=4, seed=0):
     return simulate
 
 
-def searched(simulate, measured, first=(0.0, 0.0), max_runs=8, **settings):
+def searched(simulate, measured, first=(0.0, 0.0), max_simulations=8, **settings):
     settings = {"resolution": 0.01, "progress": False, "error": ERROR} | settings
     used = np.ones(TIMES.size, bool)
     return by_simulation(
@@ -44,7 +44,7 @@ def searched(simulate, measured, first=(0.0, 0.0), max_runs=8, **settings):
         np.array(first),
         np.asarray(measured),
         used=used,
-        max_runs=max_runs,
+        max_simulations=max_simulations,
         **settings,
     )
 
@@ -55,7 +55,7 @@ def test_a_biased_slope_does_not_move_the_answer(bias):
     quiet = searched(simulator(bias, noise=1e-6), measured, first=(-0.6, 0.3))
     # What is left is what a biased step leaves of the last step, 20 % of less than a tenth.
     np.testing.assert_allclose(quiet.flat, TRUTH, atol=0.02)
-    assert quiet.converged and quiet.num_runs <= 8
+    assert quiet.converged and quiet.num_simulations <= 8
 
 
 def test_the_error_bar_holds_the_simulations_noise():
@@ -72,8 +72,8 @@ def test_the_error_bar_holds_the_simulations_noise():
 def test_more_runs_make_it_quieter():
     measured = exact(TRUTH)
     found = searched(simulator(noise=0.03), measured, first=(0.25, -0.2))
-    assert found.num_runs > 2  # the noise of one run is more than half the error bar
-    once = searched(simulator(noise=0.03), measured, first=(0.25, -0.2), max_runs=1)
+    assert found.num_simulations > 2  # the noise of one run is more than half the error bar
+    once = searched(simulator(noise=0.03), measured, first=(0.25, -0.2), max_simulations=1)
     assert np.all(np.diag(found.noise_covariance) < np.diag(once.noise_covariance))
 
 
