@@ -91,7 +91,7 @@ class CoolingCurve(eqx.Module):
         means: dict[str, Any] = {name: jnp.mean(each, axis=0) for name, each in values.items()}
         num_replicas = len(values["temperature"])
         if num_replicas > 1:
-            for name in ("temperature", "displacement"):
+            for name in {"temperature", "displacement"} & set(values):
                 # At t = 0 all replicas agree, and the derivative of a root at 0 is not finite.
                 deviation = jnp.std(jax.lax.stop_gradient(values[name]), axis=0, ddof=1)
                 means[f"{name}_error"] = deviation / num_replicas**0.5

@@ -106,6 +106,7 @@ def choose_model(
         RuntimeError: if kinetic theory, which estimates the errors, cannot follow the gas so far.
     """
     _check_arguments(gas, times, tolerance)
+    tolerance = float(tolerance)
     size = NUM_PARTICLES if num_particles is None else num_particles
     models = default_models(size, replicas) if models is None else models
     course = course_of(gas, float(checked_times(times)[-1]), num_particles)
