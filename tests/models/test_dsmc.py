@@ -327,7 +327,7 @@ def test_cools_by_six_decades():
 def test_replicas_are_runs_of_their_own(beads):
     gas = beads(0.15)
     times = np.array([1.0, 5.0]) * float(gas.mean_free_time)
-    two = jaxgran.cool(gas, times, model=DSMC(1000, replicas=2, key=jax.random.key(0)))
+    two = jaxgran.cool(gas, times, model=DSMC(1000, replicas=2), key=jax.random.key(0))
     assert two.replicas.temperature.shape == (2, 2)
     assert two.replicas.temperature[0, 1] != two.replicas.temperature[1, 1]
     other = jaxgran.cool(gas, times, model=DSMC(1000, replicas=2), key=jax.random.key(1))
