@@ -1,6 +1,6 @@
 """The hard cases, one test each.
 
-Their tolerances, with the reasons, stand beside them in experiments/hard_cases_*.py.
+Their tolerances, with reasons, are given in experiments/hard_cases_*.py.
 """
 
 import jax
@@ -28,7 +28,7 @@ LONG = (
     "fits:",
     "one member",
 )
-"""Cases that take longest, besides the heavy ones."""
+"""Beginnings of the names of further cases that take long."""
 
 
 def marks(case):

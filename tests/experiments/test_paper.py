@@ -17,10 +17,10 @@ def test_clustering_leaves_haffs_law(tmp_path):
     record = json.loads((tmp_path / "here" / "paper_clustering.json").read_text())
     (scene,) = record["scenes"].values()
     assert scene["viscoelastic"]["gamma_0"] == pytest.approx(scene["constant"]["gamma_0"])
-    # At e = .6 even 500 disks leave Haff's law, 10 % above it after 4.3 +- 0.9 collisions.
+    # At e = .6 even 500 disks depart from Haff's law: by 10 % in T after 4.3 +- 0.9 collisions.
     left = scene["constant"]["departures"]["T over theory's of N by 1.1"]
     assert 2 < left["N"][0] < 9 and 0.1 < left["T"][0] < 0.6
-    assert scene["constant"]["last_flow"][0] > 0.1  # and move together
+    assert scene["constant"]["last_flow"][0] > 0.1  # clusters flow
 
 
 @pytest.mark.slow
@@ -29,15 +29,15 @@ def test_clusters_dissolve(tmp_path):
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / "dissolves.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / "dissolves.json").read_text())
-    # A box of 300 disks is as long as L_c at the start: no clusters, T as in kinetic theory; seen
-    # 0.08 +- 0.05 above it after 60 collisions, at T/T_0 = 6e-6.
+    # A box of 300 disks is as long as the initial L_c: no clusters form and T is that of kinetic
+    # theory; ln T was measured 0.08 +- 0.05 above it after 60 collisions, at T/T_0 = 6e-6.
     gas = record["viscoelastic"]
     assert gas["temperature"][-1] < 2e-5 * gas["temperature"][0]
     assert abs(gas["excess"][-1]) < 0.4 and abs(gas["flow"][-1]) < 0.1
 
 
 def cools_as_theory(found):
-    # 2000 particles: T is open by 2 % at the end, its local exponent by .02.
+    # With 2000 particles the final T has a standard error of 2 %, its local exponent of .02.
     for name, power in (("viscoelastic", -5 / 3), ("constant", -2.0)):
         assert found[name]["largest_difference_of_theory"] < 0.08
         assert abs(list(found[name]["exponent"].values())[-1] - power) < 0.15
@@ -50,7 +50,7 @@ def series_is_that_of_impacts(found):
 
 
 def dissipation_lengthens_the_memory(found):
-    # 8000 particles leave the relaxation time open by 3 %; at e = .7 it is 18 % longer.
+    # With 8000 particles the relaxation time has an error of 3 %; at e = .7 it is 18 % longer.
     elastic, constant = (found[name]["dsmc"]["relaxation"] for name in ("elastic", "constant"))
     assert constant / elastic == pytest.approx(2 / (1 + found["restitution"]), rel=0.12)
 
