@@ -19,15 +19,15 @@ from jaxgran.scene.geometry import contact_value, sphere_surface
 FEW = 128
 """Rows whose run time costs less than one more compilation."""
 
-SMALL, LARGE = 500, 5000
-"""Particles of all replicas below (above) which a run counts as small (large)."""
+SMALL = 500
+"""Particles of all replicas below which a run takes less time than a compilation."""
 
 
 class Grid(NamedTuple):
     """The geometric grid of densities and contact durations for which capacities are computed.
 
-    A small run takes less time than a compilation: its grid is coarse and its arrays are long. In a
-    large one unused rows cost more: what rounding up adds on average is taken from the spare rows.
+    The grid of a small run is coarse, and its arrays are long. In a large one unused rows cost more
+    than a compilation: its grid is fine, and what rounding up adds is taken from the spare rows.
 
     Attributes:
         ratio: of neighbouring grid points.
@@ -42,8 +42,7 @@ class Grid(NamedTuple):
         """The grid for a number of particles of all replicas."""
         if num_particles < SMALL:
             return cls(1.5, 1.4)
-        ratio = 1.2 if num_particles < LARGE else 1.06
-        return cls(ratio, ratio**-0.5)
+        return cls(1.03, 1.03**-0.5)
 
     def up(self, value: float) -> float:
         """The least grid point, an integer power of the ratio, that is not below a value > 0."""
