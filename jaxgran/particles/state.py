@@ -114,3 +114,37 @@ def records(
         "collisions": 2 / num_particles * state.collisions,
     }
     return values, travelled, velocity
+
+
+def derivatives_of_records(
+    values: dict[str, Array],
+    travelled: Float[Array, "replicas N d"],
+    velocity: Float[Array, "replicas N d"],
+    log_temperature: Float[Array, "p replicas"],
+    cooling: Float[Array, "replicas"],
+    meeting: Float[Array, "replicas"],
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Derivatives of the records of `records`, as `jaxgran.tangents.rule.with_tangents` takes them.
+
+    At a fixed place in the sequence of collisions the paths are the same, and ``<v(0).v>`` goes as
+    sqrt(T); in time it decays at 2/d of the collision rate.
+
+    Args:
+        values, travelled, velocity: what `records` returns.
+        log_temperature: derivatives of ln T along p directions.
+        cooling: ``-d ln T/dt``.
+        meeting: collisions per particle and time.
+
+    Returns:
+        The derivatives along the directions at a fixed place, and those in time.
+    """
+    c, d = log_temperature, velocity.shape[-1]
+    T, C = values["temperature"], values["velocity_correlation"]
+    kept = {"temperature": c * T[None], "velocity_correlation": 0.5 * c * C[None]}
+    rates = {
+        "temperature": -cooling * T,
+        "displacement": 2 * jnp.mean(jnp.sum(travelled * velocity, -1), axis=1),
+        "velocity_correlation": -2 / d * meeting * C,
+        "collisions": meeting,
+    }
+    return kept, rates

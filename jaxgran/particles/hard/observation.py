@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgran.particles.hard.impacts import Scene
-from jaxgran.particles.state import State, records
+from jaxgran.particles.state import State, derivatives_of_records, records
 from jaxgran.scene.restitution import ReducedLaw
 from jaxgran.tangents import rule
 from jaxgran.theory import averages
@@ -26,25 +26,14 @@ def cooling_trend(
 
 @partial(jax.jit, static_argnames="replicas")
 def observe(state: State, scene: Scene, replicas: int) -> dict[str, Array]:
-    """The records of a state; with tangents, also those that `rule.with_tangents` adds.
-
-    At a fixed place in the sequence of collisions the paths are the same, and ``<v(0).v>`` goes as
-    sqrt(T).
-    """
+    """The records of a state; with tangents, also those that `rule.with_tangents` adds."""
     values, travelled, velocity = records(state, scene.side, replicas)
-    num_particles, d = velocity.shape[1:]
-    values["regularised"] = 2 / num_particles * state.own.regularised
+    values["regularised"] = 2 / velocity.shape[1] * state.own.regularised
     along = state.tangents
     if along is None:
         return values
-    T, C = values["temperature"], values["velocity_correlation"]
-    cooling = along.rates.cooling(cooling_trend(scene.law, T, d))
+    T = values["temperature"]
+    cooling = along.rates.cooling(cooling_trend(scene.law, T, velocity.shape[-1]))
     meeting, c = along.rates.collision(T), along.log_temperature
-    kept = {"temperature": c * T[None], "velocity_correlation": 0.5 * c * C[None]}
-    rates = {
-        "temperature": -cooling * T,
-        "displacement": 2 * jnp.mean(jnp.sum(travelled * velocity, -1), axis=1),
-        "velocity_correlation": -2 / d * meeting * C,
-        "collisions": meeting,
-    }
+    kept, rates = derivatives_of_records(values, travelled, velocity, c, cooling, meeting)
     return rule.with_tangents(values, kept, rates, along.clock)
