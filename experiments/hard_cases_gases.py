@@ -129,7 +129,7 @@ def _deepest_overlap(particles) -> float:
     """The deepest overlap of two spheres of diameter 1; 0 if none overlap."""
     d = particles.position.shape[-1]
     position = particles.position.reshape(-1, d)
-    pairs = find_pairs(position, particles.box_side, 1.02, room=20 * len(position))
+    pairs = find_pairs(position, particles.box_side, 1.02, capacity=20 * len(position))
     apart = position[pairs.i] - position[pairs.j] - pairs.offset
     distance = np.linalg.norm(np.asarray(apart), axis=-1)[: int(pairs.count)]
     return max(1 - float(np.min(distance, initial=1.0)), 0.0)

@@ -16,7 +16,7 @@ from jaxgran.models.course import Course
 from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles import neighbours, user_start
 from jaxgran.particles.capacity import Neighbourhood, capacities
-from jaxgran.particles.hard.impacts import Scene
+from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.hard.windows import LEAST_IMPACTS, SPEED_MARGIN, HardDynamics
 from jaxgran.scene.gas import Gas
 
@@ -127,11 +127,11 @@ class HardSpheres(AbstractSpheres):
         """Contacts that last."""
         return checks.omitted_by_instant_impacts(gas)
 
-    def scene(self, gas: Gas) -> Scene:
+    def scene(self, gas: Gas) -> HardScene:
         """The gas in units of its diameter, mass and first temperature."""
         return reduced_scene(gas, self.num_particles, self.contact_time)
 
-    def dynamics(self, scene: Scene, plan: Plan) -> HardDynamics:
+    def dynamics(self, scene: HardScene, plan: Plan) -> HardDynamics:
         """How the spheres move."""
         return HardDynamics(scene, plan.replicas, plan.capacity, plan.pace.share, OVERLAP)
 
@@ -139,7 +139,7 @@ class HardSpheres(AbstractSpheres):
         """Settings that a plan repeats."""
         return {}
 
-    def planned(self, scene: Scene, dimension: int, spare: float | None = None) -> Plan:
+    def planned(self, scene: HardScene, dimension: int, spare: float | None = None) -> Plan:
         """Static sizes: capacities as measured for phi = .001 to .4 (disks: .6), N = 125 to
         50 000."""
         d, n = dimension, self.replicas * self.num_particles
@@ -159,10 +159,10 @@ class HardSpheres(AbstractSpheres):
         return Plan(self.replicas, HardPace(share), *sizes)
 
 
-def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Scene:
+def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:
     """A gas of hard spheres in units of its diameter, mass and first temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    return Scene(
+    return HardScene(
         side=gas.box_side(num_particles) / gas.diameter,
         law=gas.reduced_law,
         collision_frequency=gas.collision_frequency * unit_time,

@@ -123,7 +123,7 @@ def _until_stale(
 def first_progress(state: State, pairs: Pairs, capacity: Capacity, own: Any) -> Progress:
     """Before the first block within a neighbour list."""
     zero = jnp.zeros((), jnp.int32)
-    needed = jnp.stack([pairs.count, pairs.ahead, zero, zero, zero])
+    needed = jnp.stack([pairs.count, pairs.lookahead, zero, zero, zero])
     return Progress(state, jnp.zeros((), bool), capacity.exceeded_by(needed), needed, own)
 
 

@@ -36,15 +36,15 @@ class Pairs(NamedTuple):
             the shortest displacement of the pair. It remains valid while particles move without
             being wrapped.
         count: number of pairs found. If it exceeds the capacity of the list, pairs are missing.
-        ahead: look-ahead, in particles, that a sweep needed. If it exceeds the sweep's capacity,
-            pairs are missing. 0 for the other builders.
+        lookahead: look-ahead, in particles, that a sweep needed. If it exceeds the capacity of the
+            sweep, pairs are missing. 0 for the other builders.
     """
 
     i: Int[Array, "pairs"]
     j: Int[Array, "pairs"]
     offset: Float[Array, "pairs d"]
     count: Int[Array, ""]
-    ahead: Int[Array, ""]
+    lookahead: Int[Array, ""]
 
 
 def displacement(
@@ -99,7 +99,7 @@ def find_pairs(
     cutoff: ArrayLike,
     *,
     replicas: int = 1,
-    room: int,
+    capacity: int,
     by: str = "vesin",
 ) -> Pairs:
     """All pairs closer than a cutoff, in each of several equal periodic boxes.
@@ -114,7 +114,7 @@ def find_pairs(
         cutoff: in the same unit, > 0 and at most half a side; for a sweep less than that by at
             least a part in 10^6.
         replicas: number of boxes; particles of different boxes form no pairs.
-        room: capacity of the list, in pairs.
+        capacity: of the list, in pairs.
         by: "vesin", "sweep" or "jax-md"; all return the same pairs, except that pairs within
             rounding error of the cutoff may or may not be included.
 
@@ -122,11 +122,11 @@ def find_pairs(
         ValueError: for another `by`.
     """
     n = len(position) // replicas
-    return with_offsets(position, side, search(position, side, cutoff, replicas, (room, n), by))
+    return with_offsets(position, side, search(position, side, cutoff, replicas, (capacity, n), by))
 
 
 Found = tuple[Int[Any, "pairs"], Int[Any, "pairs"], Int[Any, ""], Int[Any, ""]]
-"""i, j, count and ahead of `Pairs`; NumPy arrays if they come from the host."""
+"""i, j, count and lookahead of `Pairs`; NumPy arrays if they come from the host."""
 
 
 def search(
@@ -156,9 +156,9 @@ def search(
 def with_offsets(position: Float[Array, "particles d"], side: ArrayLike, found: Found) -> Pairs:
     """The pairs found for these positions, with their offsets."""
     position, side = jax.lax.stop_gradient((position, jnp.asarray(side)))
-    i, j, count, ahead = found
+    i, j, count, lookahead = found
     offset = side * jnp.round((position[i] - position[j]) / side)
-    return Pairs(i, j, offset, count, ahead)
+    return Pairs(i, j, offset, count, lookahead)
 
 
 def _vesin_pairs(position, side, cutoff, replicas: int, capacity: int):

@@ -63,10 +63,10 @@ def pair_correlation(
     ball = np.pi * edges**2 if d == 2 else 4 / 3 * np.pi * edges**3
     expected = n / 2 * density * np.diff(ball)
     capacity = max(1024, int(2 * n * density * ball[-1]))
-    pairs = find_pairs(position, side, float(edges[-1]), room=capacity)
+    pairs = find_pairs(position, side, float(edges[-1]), capacity=capacity)
     while int(pairs.count) > capacity:
         capacity = int(pairs.count)
-        pairs = find_pairs(position, side, float(edges[-1]), room=capacity)
+        pairs = find_pairs(position, side, float(edges[-1]), capacity=capacity)
     i, j = (np.asarray(index)[: int(pairs.count)] for index in (pairs.i, pairs.j))
     distance = np.linalg.norm(np.asarray(displacement(side, position[i], position[j])), axis=-1)
     return np.histogram(distance, edges)[0] / expected

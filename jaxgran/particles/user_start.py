@@ -72,7 +72,7 @@ def closest(
 
     `num_pairs` is the number of overlapping pairs that can be looked at.
     """
-    pairs = neighbours.find_pairs(position, side, 1.0, replicas=replicas, room=num_pairs)
+    pairs = neighbours.find_pairs(position, side, 1.0, replicas=replicas, capacity=num_pairs)
     apart = position[pairs.i] - position[pairs.j] - pairs.offset
     real = jnp.arange(num_pairs) < pairs.count
     square = jnp.where(real, jnp.sum(apart * apart, -1), 1.0)

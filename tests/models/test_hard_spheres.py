@@ -100,7 +100,7 @@ def closest(particles) -> float:
     """The least distance between two spheres, in a gas of diameter 1."""
     replicas, n, d = particles.position.shape
     position = particles.position.reshape(-1, d)
-    pairs = find_pairs(position, particles.box_side, 1.05, replicas=replicas, room=20 * n)
+    pairs = find_pairs(position, particles.box_side, 1.05, replicas=replicas, capacity=20 * n)
     apart = position[pairs.i] - position[pairs.j] - pairs.offset
     return float(np.min(np.linalg.norm(apart, axis=-1)[: int(pairs.count)]))
 

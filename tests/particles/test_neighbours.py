@@ -60,7 +60,7 @@ def compare(dimension, replicas, side, cutoff, by):
     position = awkward(dimension, replicas, side)
     expected = brute_force(position, side, cutoff, replicas)
     capacity = len(expected) + 7
-    search = partial(find_pairs, replicas=replicas, room=capacity, by=by)
+    search = partial(find_pairs, replicas=replicas, capacity=capacity, by=by)
     pairs = search(jnp.asarray(position), side, cutoff)
     found = listed(pairs)
     assert int(pairs.count) == len(expected)  # each once
@@ -110,7 +110,7 @@ def test_points_of_a_grid(points, dimension, cutoff):
 
 
 def on_a_grid(position, expected, cutoff, by):
-    pairs = find_pairs(jnp.asarray(position), 1.0, cutoff, room=66, by=by)
+    pairs = find_pairs(jnp.asarray(position), 1.0, cutoff, capacity=66, by=by)
     assert sorted(listed(pairs)) == sorted(expected)
     for i, j, offset in zip(pairs.i, pairs.j, pairs.offset, strict=True):
         if i != j:  # else a row past the last
@@ -124,7 +124,7 @@ COMPILED = pytest.mark.parametrize("by", ["vesin", "sweep"])
 @COMPILED
 def test_coincident_particles_are_pairs(by):
     position = jnp.stack([jnp.array([1.0, 2.0, 3.0])] * 3 + [jnp.array([3.0, 0.0, 1.0])])
-    pairs = find_pairs(position, 4.0, 1e-3, room=8, by=by)
+    pairs = find_pairs(position, 4.0, 1e-3, capacity=8, by=by)
     assert sorted(listed(pairs)) == [(0, 1), (0, 2), (1, 2)]
     assert not np.any(pairs.offset)
 
@@ -132,7 +132,7 @@ def test_coincident_particles_are_pairs(by):
 @COMPILED
 def test_pairs_across_the_faces(by):
     position = jnp.array([[0.1, 2.0], [3.9, 2.0], [0.0, 0.0], [3.95, 3.95]])
-    pairs = find_pairs(position, 4.0, 0.5, room=8, by=by)
+    pairs = find_pairs(position, 4.0, 0.5, capacity=8, by=by)
     offset = dict(zip(listed(pairs), np.asarray(pairs.offset).tolist(), strict=False))
     assert offset == {(0, 1): [-4.0, 0.0], (2, 3): [-4.0, -4.0]}
 
@@ -141,7 +141,7 @@ def test_offset_outlasts_motion_without_wrapping():
     rng = np.random.default_rng(1)
     side = 3.7
     position = side * rng.random((60, 3))
-    pairs = find_pairs(jnp.asarray(position), side, 0.8, room=400)
+    pairs = find_pairs(jnp.asarray(position), side, 0.8, capacity=400)
     assert 0 < pairs.count <= 400
     k = slice(int(pairs.count))
     i, j = pairs.i[k], pairs.j[k]
@@ -162,11 +162,11 @@ def test_a_capacity_that_is_exceeded_is_reported():
     for by in ("vesin", "sweep", "jax-md"):
         search = partial(find_pairs, jnp.asarray(position), 3.7, cutoff, replicas=2, by=by)
         for capacity in (1, len(expected) // 4, len(expected) - 1):
-            pairs = search(room=capacity)
+            pairs = search(capacity=capacity)
             assert pairs.count > capacity
             assert pairs.i.shape == pairs.j.shape == pairs.offset.shape[:1] == (capacity,)
             assert set(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)) < set(expected)
-        assert search(room=len(expected)).count == len(expected)
+        assert search(capacity=len(expected)).count == len(expected)
 
 
 def test_lists_of_jax_md_grow_with_the_gas():
@@ -175,7 +175,7 @@ def test_lists_of_jax_md_grow_with_the_gas():
     side, cutoff = 2.0, 0.3
     sparse = side * rng.random((30, 2))
     for position in (sparse, 0.2 * sparse, sparse):
-        pairs = find_pairs(jnp.asarray(position), side, cutoff, room=500, by="jax-md")
+        pairs = find_pairs(jnp.asarray(position), side, cutoff, capacity=500, by="jax-md")
         assert set(listed(pairs)) == set(brute_force(position, side, cutoff))
 
 
@@ -184,7 +184,7 @@ def test_lists_of_jax_md_grow_with_the_gas():
 def test_jit_and_vmap(dimension, by):
     rng = np.random.default_rng(3)
     batch = jnp.asarray(rng.random((3, 40, dimension)))
-    search = partial(find_pairs, replicas=2, room=120, by=by)
+    search = partial(find_pairs, replicas=2, capacity=120, by=by)
     compiled = jax.jit(search)(2 * batch[0], 2.0, 0.4)
     jax.tree.map(np.testing.assert_array_equal, compiled, search(2 * batch[0], 2.0, 0.4))
     sides = jnp.array([1.0, 2.0, 4.0])
@@ -201,7 +201,7 @@ def test_pairs_carry_no_derivatives():
     position = jnp.array([[0.1, 2.0], [3.9, 2.5], [2.0, 2.0]])
 
     def square(position):
-        pairs = find_pairs(position, 4.0, 1.0, room=1)
+        pairs = find_pairs(position, 4.0, 1.0, capacity=1)
         return jnp.sum((position[pairs.i] - position[pairs.j] - pairs.offset) ** 2)
 
     for gradient in (jax.grad(square)(position), jax.jit(jax.grad(square))(position)):
@@ -213,12 +213,12 @@ def test_pairs_carry_no_derivatives():
 def test_numbers_that_are_not_finite_have_no_pairs(by):
     for bad in (jnp.nan, jnp.inf):
         position = jnp.ones((4, 3)).at[2, 1].set(bad)
-        assert find_pairs(position, 4.0, 1.0, room=3, by=by).count == 0
+        assert find_pairs(position, 4.0, 1.0, capacity=3, by=by).count == 0
 
 
 @COMPILED
 def test_one_particle_has_no_pairs(by):
-    assert find_pairs(jnp.ones((1, 3)), 4.0, 1.0, room=3, by=by).count == 0
+    assert find_pairs(jnp.ones((1, 3)), 4.0, 1.0, capacity=3, by=by).count == 0
 
 
 @pytest.mark.parametrize("side", [1.0, 3.7])
@@ -271,7 +271,7 @@ def test_wide_planes(side, n):
     found = np.sort(np.stack([i[:count], j[:count]], axis=1), axis=1)
     expected = KDTree(position, boxsize=side).query_pairs(1.4)
     assert set(map(tuple, found.tolist())) == expected
-    pairs = find_pairs(jnp.asarray(position), side, 1.4, room=2 * n, by="sweep")
+    pairs = find_pairs(jnp.asarray(position), side, 1.4, capacity=2 * n, by="sweep")
     assert set(listed(pairs)) == expected
 
 

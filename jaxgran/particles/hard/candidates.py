@@ -31,7 +31,7 @@ class Selection(NamedTuple):
     needed: Int[Array, "kinds"]
 
 
-def select(
+def select_reachable(
     x: Float[Array, "n d"],
     v: Float[Array, "n d"],
     pairs: Pairs,
@@ -49,7 +49,7 @@ def select(
         capacity: sizes of the arrays.
     """
     n, size = len(x), len(x) // len(bound)
-    rows, num_near = _reachable(x, pairs, duration, bound, capacity.near)
+    rows, num_near = _reachable_pairs(x, pairs, duration, bound, capacity.near)
     free = first_impacts(Slots(x, v, jnp.zeros(n, x.dtype)), rows, duration)
     i, j = rows.a, rows.b
     disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
@@ -67,11 +67,11 @@ def select(
     slot = jnp.zeros(n, jnp.int32).at[members].set(own, mode="drop")
     a, b = (jnp.where(real, slot[k], 0) for k in (i, j))
     rows = Rows(a, b, rows.offset[picked], rows.bound[picked], real)
-    needed = jnp.stack([pairs.count, pairs.ahead, num_near, num_chosen, num_members])
+    needed = jnp.stack([pairs.count, pairs.lookahead, num_near, num_chosen, num_members])
     return Selection(members, rows, members // size, needed)
 
 
-def _reachable(
+def _reachable_pairs(
     x: Float[Array, "n d"],
     pairs: Pairs,
     duration: ArrayLike,

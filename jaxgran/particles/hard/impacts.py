@@ -13,38 +13,14 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.particles.hard.candidates import Selection
 from jaxgran.particles.hard.prediction import FirstImpacts, Rows, Slots, first_impacts
-from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.particles.hard.scene import HardScene
 from jaxgran.tangents.impact import ImpactTangents
 
 MAX_ROUNDS = 100_000
 """Rounds of independent impacts in one window from which on the run counts as stalled."""
 
 
-class Scene(NamedTuple):
-    """The gas in units of its diameter, mass and first temperature.
-
-    Attributes:
-        side: of the box.
-        law: of restitution, for speeds in units of sqrt(2).
-        collision_frequency: at T = 1.
-        contact_time: in mean free times; the impact of a sphere within this time of its last one
-            is elastic.
-        elastic: whether all impacts are.
-    """
-
-    side: Float[Array, ""]
-    law: ReducedLaw
-    collision_frequency: Float[Array, ""]
-    contact_time: Float[Array, ""]
-    elastic: Bool[Array, ""]
-
-    @property
-    def material(self) -> ReducedLaw:
-        """The numbers that derivatives are followed in: those of the law."""
-        return self.law
-
-
-class Work(NamedTuple):
+class ImpactWork(NamedTuple):
     """The particles after the impacts of a window, and sums over these impacts.
 
     Attributes:
@@ -75,11 +51,11 @@ def resolve(
     slots: Slots,
     listed: Float[Array, "slots d"],
     chosen: Selection,
-    scene: Scene,
+    scene: HardScene,
     duration: ArrayLike,
     shortest: Float[Array, "replicas"],
     along: ImpactTangents | None,
-) -> Work:
+) -> ImpactWork:
     """Execute all impacts of a window, in rounds of independent impacts.
 
     A round executes every impact that is the first of both its spheres before either path can have
@@ -97,18 +73,20 @@ def resolve(
     num_rows, num_slots = len(chosen.rows.a), len(slots.v)
     shortest = shortest[jnp.minimum(chosen.replica, len(shortest) - 1)]
 
-    def one_round(work: Work) -> Work:
+    def one_round(work: ImpactWork) -> ImpactWork:
         impacts, safe, row = _executable(work.slots, chosen.rows, duration)
         effect = _effect(impacts, safe, work.slots, chosen.rows, shortest, scene, along)
         return _executed(work, effect, safe, row, chosen.rows, listed)
 
-    def unfinished(work: Work):
+    def unfinished(work: ImpactWork):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
     count, zeros = jnp.zeros(num_slots, jnp.int32), jnp.zeros(num_slots, slots.x.dtype)
     size = (0, 0) if along is None else (len(along.log_temperature) + 1, num_rows)
     gains = jnp.zeros(size, zeros.dtype)
-    work = Work(slots, zeros, count, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains)
+    work = ImpactWork(
+        slots, zeros, count, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains
+    )
     return jax.lax.while_loop(unfinished, one_round, work)
 
 
@@ -147,7 +125,7 @@ def _effect(
     slots: Slots,
     rows: Rows,
     shortest: Float[Array, "slots"],
-    scene: Scene,
+    scene: HardScene,
     along: ImpactTangents | None,
 ) -> _Effect:
     """The effect of the impacts marked as safe, by the law of restitution."""
@@ -169,13 +147,13 @@ def _effect(
 
 
 def _executed(
-    work: Work,
+    work: ImpactWork,
     effect: _Effect,
     safe: Bool[Array, "rows"],
     row: Int[Array, "slots"],
     rows: Rows,
     listed: Float[Array, "slots d"],
-) -> Work:
+) -> ImpactWork:
     """The particles after the impacts marked as safe, and the sums with these impacts."""
     slots, own = work.slots, jnp.arange(len(row), dtype=jnp.int32)
     row = jnp.minimum(row, len(rows.a) - 1)
@@ -186,7 +164,7 @@ def _executed(
     place = slots.x + slots.v * s[:, None]
     v = slots.v + kick
     away = jnp.where(hit, jnp.sum((place - listed) ** 2, -1), 0.0)
-    return Work(
+    return ImpactWork(
         slots=Slots(slots.x - kick * s[:, None], v, jnp.where(hit, s, slots.last)),
         dissipated=work.dissipated + jnp.where(hit, effect.lost[row], 0.0),
         impacts=work.impacts + hit,

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxgran.particles.hard.impacts import Scene
+from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.state import State, derivatives_of_records, records
 from jaxgran.scene.restitution import ReducedLaw
 from jaxgran.tangents import rule
@@ -25,7 +25,7 @@ def cooling_trend(
 
 
 @partial(jax.jit, static_argnames="replicas")
-def observe(state: State, scene: Scene, replicas: int) -> dict[str, Array]:
+def observe(state: State, scene: HardScene, replicas: int) -> dict[str, Array]:
     """The records of a state; with tangents, also those that `rule.with_tangents` adds."""
     values, travelled, velocity = records(state, scene.side, replicas)
     values["regularised"] = 2 / velocity.shape[1] * state.own.regularised

@@ -19,10 +19,11 @@ from jaxgran.particles.dynamics import (
     kept_if,
     repeat_until,
 )
-from jaxgran.particles.hard.candidates import Selection, select
-from jaxgran.particles.hard.impacts import MAX_ROUNDS, Scene, Work, resolve
+from jaxgran.particles.hard.candidates import Selection, select_reachable
+from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, resolve
 from jaxgran.particles.hard.observation import cooling_trend, observe
 from jaxgran.particles.hard.prediction import Slots
+from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.neighbours import Pairs
 from jaxgran.particles.state import State, fastest, temperature
 from jaxgran.scene.restitution import ReducedLaw
@@ -84,7 +85,7 @@ class HardDynamics(AbstractDynamics):
         max_windows: with one neighbour list, for tests.
     """
 
-    scene: Scene
+    scene: HardScene
     replicas: int = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
     share: float = eqx.field(static=True)
@@ -138,7 +139,7 @@ class HardDynamics(AbstractDynamics):
         num_left = jnp.maximum(jnp.ceil(left / old.own.window * (1 - 1e-9)), 1.0)
         duration = left / num_left
         bound = SPEED_MARGIN * more.widen * fastest(old.velocity, self.replicas)
-        chosen = select(old.position, old.velocity, pairs, duration, bound, self.capacity)
+        chosen = select_reachable(old.position, old.velocity, pairs, duration, bound, self.capacity)
         work = self._resolved(old, listed, chosen, duration)
         most = bound[jnp.minimum(chosen.replica, self.replicas - 1)]
         too_fast = jnp.any(work.fastest > most**2)
@@ -172,7 +173,9 @@ class HardDynamics(AbstractDynamics):
             ),
         )
 
-    def _resolved(self, state: State, listed: Array, chosen: Selection, duration: Array) -> Work:
+    def _resolved(
+        self, state: State, listed: Array, chosen: Selection, duration: Array
+    ) -> ImpactWork:
         """The impacts of a window."""
 
         def of_members(values):
@@ -187,7 +190,7 @@ class HardDynamics(AbstractDynamics):
         )
         return resolve(slots, of_members(listed), chosen, scene, duration, shortest, state.tangents)
 
-    def _moved(self, state: State, chosen: Selection, work: Work, duration: Array) -> State:
+    def _moved(self, state: State, chosen: Selection, work: ImpactWork, duration: Array) -> State:
         """The state after a window, but for its time, and the length of the next one."""
 
         def by_replica(values):  # an empty slot is of no replica
@@ -226,7 +229,7 @@ class HardDynamics(AbstractDynamics):
         self,
         new: State,
         chosen: Selection,
-        work: Work,
+        work: ImpactWork,
         lost: Array,
         impacts: Array,
         duration: Array,

@@ -26,7 +26,7 @@ from jaxgran.particles.soft import candidates, linearised, steps
 from jaxgran.particles.soft.candidates import Encounters
 from jaxgran.particles.soft.observation import observe
 from jaxgran.particles.soft.scene import SoftScene
-from jaxgran.particles.soft.steps import Work
+from jaxgran.particles.soft.steps import ContactWork
 from jaxgran.particles.state import State, fastest, kinetic_energy, rewrapped, temperature
 from jaxgran.tangents import thermal
 from jaxgran.tangents.thermal import ThermalTangents
@@ -75,7 +75,7 @@ class _Stepped(NamedTuple):
     """The result of one block, not yet accepted."""
 
     state: State
-    work: Work
+    work: ContactWork
     distance: Array  # square of the largest distance that a member moved
 
 
@@ -144,7 +144,7 @@ class SoftDynamics(AbstractDynamics):
         # Of all replicas: they share their blocks.
         speed = jnp.max(fastest(old.velocity, self.replicas))
         reach = REACH_MARGIN * speed * duration * more.widen
-        chosen = candidates.select(
+        chosen = candidates.select_encounters(
             old.position,
             old.velocity,
             pairs,
@@ -225,7 +225,7 @@ class SoftDynamics(AbstractDynamics):
         return by_replica
 
     def _projected(
-        self, new: State, chosen: Encounters, work: Work, duration: Array
+        self, new: State, chosen: Encounters, work: ContactWork, duration: Array
     ) -> ThermalTangents:
         """The tangents after a block, projected if it is time to."""
         along, by_replica = new.tangents, self._sums_over(chosen)
@@ -249,7 +249,7 @@ class SoftDynamics(AbstractDynamics):
         return thermal.project(along, new.velocity, new.time, due)
 
     def _fault(
-        self, old: State, new: State, work: Work, chosen: Encounters, moved: Array
+        self, old: State, new: State, work: ContactWork, chosen: Encounters, moved: Array
     ) -> Int[Array, ""]:
         """The status of a block that moved spheres by at most so much since the list was built."""
         by_replica = self._sums_over(chosen)

@@ -35,7 +35,7 @@ class Encounters(NamedTuple):
     needed: Int[Array, "kinds"]
 
 
-def select(
+def select_encounters(
     position: Float[Array, "n d"],
     velocity: Float[Array, "n d"],
     pairs: Pairs,
@@ -84,7 +84,7 @@ def select(
         offset=jnp.where(real[:, None], offset, 2.0),  # an empty row is a pair out of reach
         replica=i // (n // replicas),
         expected=active[i] & active[j],
-        needed=jnp.stack([pairs.count, pairs.ahead, num_near, num_contacts, num_members]),
+        needed=jnp.stack([pairs.count, pairs.lookahead, num_near, num_contacts, num_members]),
     )
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran.particles.soft import steps
 from jaxgran.particles.soft.candidates import Encounters
 from jaxgran.particles.soft.scene import SoftScene
-from jaxgran.particles.soft.steps import Work
+from jaxgran.particles.soft.steps import ContactWork
 from jaxgran.tangents.thermal import ThermalTangents
 
 
@@ -21,7 +21,7 @@ def follow(
     duration: Array,
     num_steps: ArrayLike,
     along: ThermalTangents | None,
-) -> tuple[Array, Array, Work, ThermalTangents | None]:
+) -> tuple[Array, Array, ContactWork, ThermalTangents | None]:
     """The members after the steps of a block, and the exact tangents of all particles.
 
     Members are stepped and their tangents pushed forward through the steps; the tangents of all

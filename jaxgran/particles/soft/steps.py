@@ -32,7 +32,7 @@ def elastic_energy(xi: Float[Array, "contacts"], alpha: ArrayLike) -> Float[Arra
     return 0.2 * jnp.asarray(alpha) * xi**2.5
 
 
-class Work(NamedTuple):
+class ContactWork(NamedTuple):
     """Energies and contacts of a block, for each pair of its `Encounters`.
 
     Attributes:
@@ -61,7 +61,7 @@ def follow(
     duration: ArrayLike,
     num_steps: ArrayLike,
     clipped: bool,
-) -> tuple[Float[Array, "members d"], Float[Array, "members d"], Work]:
+) -> tuple[Float[Array, "members d"], Float[Array, "members d"], ContactWork]:
     """Positions and velocities of the members of a block after its time steps.
 
     Drift-kick-drift steps of equal length, second order; the kick is the implicit midpoint rule of
@@ -103,7 +103,7 @@ def follow(
     x, v, dissipated, exchanged, begun, touching = end
     x = x - 0.5 * dt * v
     xi, _, last = overlap(x, a, b, offset)
-    work = Work(
+    work = ContactWork(
         dissipated=dissipated,
         exchanged=exchanged,
         begun=begun + (last & ~touching),  # contacts that begin in the last half drift

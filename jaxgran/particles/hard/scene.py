@@ -1,0 +1,31 @@
+"""A gas of hard spheres in reduced units."""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float
+
+from jaxgran.scene.restitution import ReducedLaw
+
+
+class HardScene(NamedTuple):
+    """A gas of hard spheres in units of its diameter, mass and first temperature.
+
+    Attributes:
+        side: of the box.
+        law: of restitution, for speeds in units of sqrt(2).
+        collision_frequency: at T = 1.
+        contact_time: in mean free times; the impact of a sphere within this time of its last one
+            is elastic.
+        elastic: whether all impacts are.
+    """
+
+    side: Float[Array, ""]
+    law: ReducedLaw
+    collision_frequency: Float[Array, ""]
+    contact_time: Float[Array, ""]
+    elastic: Bool[Array, ""]
+
+    @property
+    def material(self) -> ReducedLaw:
+        """The numbers that derivatives are followed in: those of the law."""
+        return self.law
