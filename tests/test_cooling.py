@@ -21,7 +21,9 @@ def test_a_model_is_a_description():
     assert set(OPTIONS) <= set(inspect.signature(jaxgran.cool).parameters)
 
 
-@pytest.mark.parametrize("kind", [jaxgran.DSMC, jaxgran.HardSpheres])
+@pytest.mark.parametrize(
+    "kind", [jaxgran.DSMC, pytest.param(jaxgran.HardSpheres, marks=pytest.mark.slow)]
+)
 def test_the_key_fixes_the_run(beads, kind):
     gas = beads(0.3, packing_fraction=0.1)
     times = [float(gas.mean_free_time)]

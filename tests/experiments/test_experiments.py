@@ -49,6 +49,7 @@ def test_main_job_says_what_it_cannot_explain(tmp_path):
     assert {path: path.read_bytes() for path in (tmp_path / "here").iterdir()} == before
 
 
+@pytest.mark.slow
 def test_auto_judges_the_box_that_was_measured():
     curve, header = jaxgran.read_curve(DENSE)
     gas, size = jaxgran.read_gas(header), int(header["N"])

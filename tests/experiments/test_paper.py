@@ -102,6 +102,7 @@ def test_paper_is_reproduced(name, holds, tmp_path):
     holds(record["found"])
 
 
+@pytest.mark.slow
 def test_claims_that_need_no_particles_hold(tmp_path):
     done = run("paper_claims.py", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -75,6 +75,7 @@ def test_intervals_cover_the_truth():
     np.testing.assert_allclose(jnp.mean(reduced), 1.0, atol=0.04)  # 38 d.o.f., 500 curves: 0.01
 
 
+@pytest.mark.slow
 def test_errors_from_the_scatter():
     # Without error bars the scatter itself must tell the error, to the 11 % that 40 points allow.
     gas = glass_beads(0.15)
@@ -88,6 +89,7 @@ def test_errors_from_the_scatter():
     assert "no errors" in jaxgran.diagnose(without, bare).reasons[0]
 
 
+@pytest.mark.slow
 def test_a_short_curve_without_errors_determines_what_its_scatter_lets_it():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(6), relative_error=0.003, num_points=10)

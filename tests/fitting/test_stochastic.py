@@ -71,6 +71,7 @@ def test_fit_through_particles_refuses_what_it_cannot_do(beads):
         jax.jit(lambda g: jaxgran.fit(g, curve, model=jaxgran.SoftSpheres(9, replicas=2)).chi2)(gas)
 
 
+@pytest.mark.slow
 def test_fit_through_soft_spheres_finds_what_made_the_curve(beads):
     gas = beads(0.3, packing_fraction=0.2)
     stiff = (float(gas.contact_fraction) / 0.1) ** 2.5

@@ -236,6 +236,7 @@ def test_every_pair_is_about_equally_likely(n):
     assert np.all(np.abs(each - 1) < 6 / (2 * i.size / n) ** 0.5)
 
 
+@pytest.mark.slow
 def test_the_step_is_second_order(monkeypatch):
     # Memory of the first velocity, 2/3 (1 + eps)/2 per collision, feels the step most.
     gas, n = constant(0.6), 200_000
@@ -516,6 +517,7 @@ class Step(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
         return jnp.full_like(v, 0.6)
 
 
+@pytest.mark.slow
 def test_a_law_without_floats_has_derivatives():
     gas = constant(0.6)
     times = jnp.array([1.0, 3.0]) * gas.mean_free_time

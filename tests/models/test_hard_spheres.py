@@ -66,11 +66,11 @@ def serial(gas, start, end):
 @pytest.mark.parametrize(
     "dimension, packing_fraction, law",
     [
-        (2, 0.1, 0.9),
+        pytest.param(2, 0.1, 0.9, marks=pytest.mark.slow),
         (2, 0.6, 0.8),
         (3, 0.02, jaxgran.Viscoelastic(5e7, 0.22, 1e-6)),
         (3, 0.3, jaxgran.RestitutionSeries([-0.1], [0.2])),
-        (3, 0.45, 1.0),
+        pytest.param(3, 0.45, 1.0, marks=pytest.mark.slow),
         (3, 0.2, 0.4),
     ],
 )
@@ -105,7 +105,10 @@ def closest(particles) -> float:
     return float(np.min(np.linalg.norm(apart, axis=-1)[: int(pairs.count)]))
 
 
-@pytest.mark.parametrize("dimension, packing_fraction, eps", [(2, 0.6, 0.7), (3, 0.45, 1.0)])
+@pytest.mark.parametrize(
+    "dimension, packing_fraction, eps",
+    [pytest.param(2, 0.6, 0.7, marks=pytest.mark.slow), (3, 0.45, 1.0)],
+)
 def test_spheres_stay_apart_and_the_ledger_closes(dimension, packing_fraction, eps):
     gas = hard_gas(eps, packing_fraction, dimension)
     start = None
@@ -129,6 +132,7 @@ def measured_rate(gas, num_particles, replicas, mean_free_times):
     return float(curve.collisions[-1]) / mean_free_times
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension, packing_fraction", [(2, 0.3), (3, 0.2)])
 def test_impacts_come_as_often_as_enskog_says(dimension, packing_fraction):
     # 12 500 impacts scatter by 0.9 % at most: they are less random than independent ones.
@@ -180,7 +184,7 @@ def test_diffuses_as_published(packing_fraction, size, replicas, begin):
         np.testing.assert_allclose(D, speedy, atol=2 * error + 0.01 * speedy)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_cools_as_kinetic_theory_says(beads, dimension):
     # Box below L_c, so that the gas stays homogeneous.
     gas = beads(0.15, dimension, packing_fraction={2: 0.03, 3: 0.02}[dimension])
@@ -258,6 +262,7 @@ def test_a_fast_sphere_outruns_no_list():
     np.testing.assert_allclose(curve.particles.velocity[0], v, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     gas = hard_gas(0.8, 0.2)
     times = np.array([0.3, 1.0]) * float(gas.mean_free_time)
@@ -318,6 +323,7 @@ def test_jit_and_vmap_give_the_same_numbers():
         np.testing.assert_allclose(swept[i], temperature(coefficients[i])[0], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dimension", "packing_fraction", "size"), [(3, 0.05, 500), (3, 0.4, 2000), (2, 0.6, 500)]
 )
@@ -380,6 +386,7 @@ def test_jit_flags_the_start_of_another_gas():
         jax.jit(partial(cooled, checkpoint="run.npz"))(0.1)
 
 
+@pytest.mark.slow
 def test_jit_flags_what_it_cannot_grow():
     gas = hard_gas(0.8, 0.1)
     plan = HardSpheres(100).sized_for(gas).plan
@@ -397,7 +404,9 @@ def test_jit_flags_what_it_cannot_grow():
     assert "neighbour list is full" in jaxgran.explain_status(curve.status)
 
 
-@pytest.mark.parametrize("kind", [HardSpheres, jaxgran.SoftSpheres])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(HardSpheres, marks=pytest.mark.slow), jaxgran.SoftSpheres]
+)
 def test_jit_flags_a_box_too_small(beads, kind):
     def temperature(packing_fraction):
         gas = beads(packing_fraction=packing_fraction)
@@ -490,6 +499,7 @@ def test_lammps_curve():
     assert np.all(raw < 0.015)
 
 
+@pytest.mark.slow
 def test_a_skin_full_of_spheres_is_shortened(monkeypatch):
     # A clump in a wide box: by the mean density the skin would hold seven pairs a disk, not 31.
     size, gas = 64, hard_gas(0.9, 0.01, 2)

@@ -92,6 +92,7 @@ def test_one_impact_and_the_order_of_its_error(beads, angle):
     assert bias[100] < max(bias[25] / 6, 5e-6)  # 1/16 of second order; 200 phases tell 5e-6
 
 
+@pytest.mark.slow
 def test_elastic_gas_keeps_its_energy(beads):
     gas = soft_beads(beads, 0.05, 0.0, packing_fraction=0.2)
     times = np.linspace(10, 100, 10) * float(gas.mean_free_time)
@@ -119,7 +120,7 @@ def test_ledger_closes_and_momentum_stays(beads):
     assert worst[20] / worst[40] > 2.5 and worst[40] / worst[80] > 2.5
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_shifts_boosts_and_names_change_nothing(beads, dimension):
     gas = soft_beads(beads, 0.05, 0.2, dimension, packing_fraction=0.2)
     tau = float(gas.mean_free_time)
@@ -333,6 +334,7 @@ def test_jit_flags_what_it_cannot_grow(beads):
         jax.jit(lambda gas: jaxgran.cool(gas, times, model=SoftSpheres(100)).temperature)(gas)
 
 
+@pytest.mark.slow
 def test_whoever_finds_the_pairs_the_run_is_the_same(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     times = [0.5 * float(gas.mean_free_time)]
@@ -414,6 +416,7 @@ def test_refuses_what_it_cannot_do(beads):
         jaxgran.cool(gas, [1e-3], model=SoftSpheres(100, start=broken))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packing_fraction", [0.25, 0.3])
 def test_a_settled_capacity_is_enough_for_a_dense_gas(beads, packing_fraction, monkeypatch):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=packing_fraction)

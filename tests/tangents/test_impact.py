@@ -101,6 +101,7 @@ def test_slope_is_that_of_the_sensitivity_table(beads):
     assert np.all(np.abs(ratio - 1) < 0.006 + 3 * spread)
 
 
+@pytest.mark.slow
 def test_fit_finds_what_made_the_curve():
     gas = glass_beads(**DILUTE)
     times = jnp.geomspace(0.5, 8.0, 10) * gas.mean_free_time

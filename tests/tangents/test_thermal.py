@@ -87,6 +87,7 @@ def test_one_impact_has_the_slope_of_its_law(beads, beta, angle):
         assert got == pytest.approx(loss_slope(gas, angle, speed), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_the_tangent_is_exact_between_projections(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.15)
     model = SoftSpheres(100, replicas=1)
@@ -185,6 +186,7 @@ def test_slope_with_respect_to_times_is_the_cooling_rate(beads):
     np.testing.assert_allclose(got, slope(partial(f, model=jaxgran.KineticTheory())), rtol=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval", [0.02, 0.05, 0.25])
 def test_slope_does_not_depend_on_the_interval(beads, interval):
     # A dense soft gas: a tenth of the spheres is in contact whenever a projection comes.
@@ -218,6 +220,7 @@ def test_elastic_limit(beads):
     assert float(at_zero) == pytest.approx(float(reference), rel=0.15)  # 400 collisions: 7 %
 
 
+@pytest.mark.slow
 def test_touching_two_and_three_bodies_have_finite_slopes(beads):
     gas = soft_beads(beads, 0.02, 0.2, packing_fraction=0.02)
     scene = reduced_scene(gas, 3)

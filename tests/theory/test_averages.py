@@ -75,6 +75,7 @@ def test_rate_table_is_exact_over_decades(beads):
             assert jnp.max(jnp.abs(error)) < tolerance
 
 
+@pytest.mark.slow
 def test_no_gas_leaves_its_rate_table(beads):
     # Outside, a Chebyshev series means nothing. Gases from nearly elastic to plastic, all horizons.
     def floor_and_end(beta, tau):

@@ -2,12 +2,14 @@ import heapq
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxgran
 from jaxgran.particles.hard.prediction import Rows, Slots, first_impacts
 from jaxgran.particles.neighbours import find_pairs
 
 
+@pytest.mark.slow
 def test_disturbances_go_from_sphere_to_sphere_as_far_as_they_can():
     # Who is disturbed when, by Dijkstra's algorithm: the earliest disturbance is final, and sends
     # others to its neighbours, at the bound on speeds.
