@@ -29,6 +29,9 @@ FASTEST = 4.8
 BLOCK_FLIGHT = 0.08
 """Diameters that the fastest sphere may fly in a block."""
 
+BLOCK_RATIO = 1.2
+"""Ratio of neighbouring lengths of blocks."""
+
 INTEGRATION = 0.001
 """Relative error of T by the time steps: eps is right to 1e-4."""
 
@@ -125,8 +128,9 @@ class SoftSpheres(AbstractSpheres):
     def dynamics(self, scene: SoftScene, plan: Plan) -> SoftDynamics:
         """How the spheres move."""
         projection = concrete(self.projection or np.inf, scene.side.dtype)
-        per_contact, per_block = (concrete(steps, np.int32) for steps in plan.pace)
-        return SoftDynamics(scene, plan.replicas, plan.capacity, per_contact, per_block, projection)
+        pace: SoftPace = plan.pace
+        steps = pace.steps_per_contact, pace.steps_per_block
+        return SoftDynamics(scene, plan.replicas, plan.capacity, *steps, projection)
 
     def pace_fixed(self) -> dict[str, Any]:
         """Settings that a plan repeats."""
@@ -156,9 +160,13 @@ class SoftSpheres(AbstractSpheres):
         return Plan(self.replicas, SoftPace(self.steps_per_contact, steps), *sizes)
 
     def _steps_per_block(self, contact_duration: float) -> int:
-        """A block is at most a contact long, and shorter where spheres fly far in that time."""
-        flight = FASTEST * contact_duration
-        return max(round(self.steps_per_contact * min(1.0, BLOCK_FLIGHT / flight)), 8)
+        """A block is at most a contact long, and shorter where spheres fly far in that time.
+
+        Of few different lengths, as each is compiled: a loop with a known count is faster.
+        """
+        shorter = min(1.0, BLOCK_FLIGHT / (FASTEST * contact_duration))
+        grid = math.floor(math.log(shorter) / math.log(BLOCK_RATIO) + 1e-9)
+        return max(round(self.steps_per_contact * BLOCK_RATIO**grid), 8)
 
 
 def reduced_scene(gas: Gas, num_particles: int) -> SoftScene:

@@ -92,8 +92,8 @@ class SoftDynamics(AbstractDynamics):
     scene: SoftScene
     replicas: int = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
-    steps_per_contact: Int[Array, ""]
-    steps_per_block: Int[Array, ""]
+    steps_per_contact: int = eqx.field(static=True)
+    steps_per_block: int = eqx.field(static=True)
     projection: Float[Array, ""]
 
     def own_state(self, num_rows, dtype) -> SoftState:

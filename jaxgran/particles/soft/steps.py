@@ -73,7 +73,7 @@ def follow(
         dissipative_constant: A, likewise.
         chosen: the pairs.
         duration: of the block.
-        num_steps: number of steps; may be traced, so that it costs no compilation.
+        num_steps: number of steps.
         clipped: whether contacts end at zero force, as in `contact_force`.
     """
     rho, dt = 0.5 * alpha, duration / num_steps
