@@ -29,8 +29,8 @@ FASTEST = 4.8
 BLOCK_FLIGHT = 0.08
 """Diameters that the fastest sphere may fly in a block."""
 
-BLOCK_RATIO = 1.2
-"""Ratio of neighbouring lengths of blocks."""
+BLOCK_LENGTHS = Grid(ratio=1.2, spare=1.0)
+"""Grid of the lengths of blocks, in mean contact durations: each length is compiled anew."""
 
 INTEGRATION = 0.001
 """Relative error of T by the time steps: eps is right to 1e-4."""
@@ -144,7 +144,8 @@ class SoftSpheres(AbstractSpheres):
             float(scene.side), self.num_particles, self.replicas, d, self.listed_by_skin
         )
         duration = Grid.of(n).up(float(scene.contact_duration))
-        block = self._steps_per_block(duration) / self.steps_per_contact
+        steps = self._steps_per_block(float(scene.contact_duration))
+        block = steps / self.steps_per_contact
         flight = FASTEST * duration * block
         near = 0.75 * around.in_contact * around.contact_value * ((1 + 5 * flight) ** d - 1)
         near = near * around.listed / (near + around.listed)
@@ -156,17 +157,12 @@ class SoftSpheres(AbstractSpheres):
         # In random places about as many pairs touch besides as would without correlation.
         extra = 1.3 * around.in_contact
         sizes = capacities(expected, around.lookahead, spare or 1.2, extra, n)
-        steps = self._steps_per_block(float(scene.contact_duration))
         return Plan(self.replicas, SoftPace(self.steps_per_contact, steps), *sizes)
 
     def _steps_per_block(self, contact_duration: float) -> int:
-        """A block is at most a contact long, and shorter where spheres fly far in that time.
-
-        Of few different lengths, as each is compiled: a loop with a known count is faster.
-        """
-        shorter = min(1.0, BLOCK_FLIGHT / (FASTEST * contact_duration))
-        grid = math.floor(math.log(shorter) / math.log(BLOCK_RATIO) + 1e-9)
-        return max(round(self.steps_per_contact * BLOCK_RATIO**grid), 8)
+        """A block is at most a contact long, and shorter where spheres fly far in that time."""
+        shorter = BLOCK_LENGTHS.up(max(1.0, FASTEST * contact_duration / BLOCK_FLIGHT))
+        return max(round(self.steps_per_contact / shorter), 8)
 
 
 def reduced_scene(gas: Gas, num_particles: int) -> SoftScene:

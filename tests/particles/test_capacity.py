@@ -7,6 +7,7 @@ import pytest
 
 import jaxgran
 from jaxgran.checks import status
+from jaxgran.models import soft_spheres
 from jaxgran.particles import driver
 from jaxgran.particles.capacity import Capacity, Grid, Neighbourhood
 
@@ -76,3 +77,26 @@ def test_thirty_densities_share_four_programs(beads, kind):
     # Beside these, small functions are compiled for the first gas only.
     assert arrays[-1][0] - arrays[0][0] < 8
     assert arrays[-1][1] <= arrays[0][1] + 100_000
+
+
+@pytest.mark.parametrize("kind", [jaxgran.SoftSpheres, jaxgran.HardSpheres])
+def test_a_loop_over_the_material_shares_programs(beads, kind):
+    model = kind(200)
+
+    def plans(name, values):
+        gas = beads(packing_fraction=0.2)
+        scenes = [model.scene(gas.replace(**{name: value})) for value in values]
+        return {model.planned(scene, 3) for scene in scenes}
+
+    assert len(plans("dissipative_constant", np.geomspace(1e-7, 1e-5, 30))) == 1
+    # Contact durations within a factor of 2.5: 4 points of the grid of capacities, 6 of blocks.
+    assert len(plans("youngs_modulus", np.geomspace(1e6, 1e7, 30))) <= 4 + 6
+
+
+@pytest.mark.parametrize("duration", np.geomspace(1e-3, 0.1, 7))
+def test_a_block_is_no_longer_than_a_contact_or_a_flight(duration):
+    # In a block the fastest sphere flies BLOCK_FLIGHT at most, unless a block has its least steps.
+    steps = jaxgran.SoftSpheres(200)._steps_per_block(duration)
+    longest = min(40.0, 40 * soft_spheres.BLOCK_FLIGHT / (soft_spheres.FASTEST * duration))
+    assert 8 <= steps <= max(round(longest), 8)
+    assert steps >= min(longest / soft_spheres.BLOCK_LENGTHS.ratio - 0.5, 40)  # 0.5 by rounding

@@ -4,7 +4,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from jaxgran.particles.soft import steps
 from jaxgran.particles.soft.candidates import Encounters
@@ -19,7 +19,7 @@ def follow(
     scene: SoftScene,
     chosen: Encounters,
     duration: Array,
-    num_steps: ArrayLike,
+    num_steps: int,
     along: ThermalTangents | None,
 ) -> tuple[Array, Array, ContactWork, ThermalTangents | None]:
     """The members after the steps of a block, and the exact tangents of all particles.

@@ -59,7 +59,7 @@ def follow(
     dissipative_constant: ArrayLike,
     chosen: Encounters,
     duration: ArrayLike,
-    num_steps: ArrayLike,
+    num_steps: int,
     clipped: bool,
 ) -> tuple[Float[Array, "members d"], Float[Array, "members d"], ContactWork]:
     """Positions and velocities of the members of a block after its time steps.
