@@ -1,7 +1,8 @@
 """Cooling curves: one type for measured and for simulated ones, and its validation."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,8 +11,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from jaxgran.checks.validation import listed_numbers
+
 MIN_POINTS = 3
 """The smallest number of times of a measured curve."""
+
+SMALLEST = 1e-100
+"""The smallest positive number of a measured curve, and the inverse of the largest, in SI units."""
 
 COLUMNS = {
     "t": "times",
@@ -35,6 +41,15 @@ class Particles(NamedTuple):
     position: Float[Array, "replicas N d"]
     velocity: Float[Array, "replicas N d"]
     box_side: Float[Array, ""]
+
+
+if TYPE_CHECKING:
+    UserParticles = Particles
+else:
+    # A run-time type checker lets everything pass, so that a wrong type is reported in words.
+    UserParticles = Any
+
+_number_field = partial(eqx.field, converter=listed_numbers)
 
 
 class CoolingCurve(eqx.Module):
@@ -63,18 +78,18 @@ class CoolingCurve(eqx.Module):
             raised; values are then nan. `jaxgran.explain_status` puts it into words.
     """
 
-    times: Float[Array, "times"]
-    temperature: Float[Array, "... times"]
-    displacement: Float[Array, "... times"] | None = None
-    sonine: Float[Array, "... times"] | None = None
-    collisions: Float[Array, "... times"] | None = None
-    diffusion: Float[Array, "... times"] | None = None
-    temperature_error: Float[Array, "... times"] | None = None
-    displacement_error: Float[Array, "... times"] | None = None
-    velocity_correlation: Float[Array, "... times"] | None = None
-    elastic_energy: Float[Array, "... times"] | None = None
-    dissipated_energy: Float[Array, "... times"] | None = None
-    regularised: Float[Array, "... times"] | None = None
+    times: Float[Array, "times"] = _number_field()
+    temperature: Float[Array, "... times"] = _number_field()
+    displacement: Float[Array, "... times"] | None = _number_field(default=None)
+    sonine: Float[Array, "... times"] | None = _number_field(default=None)
+    collisions: Float[Array, "... times"] | None = _number_field(default=None)
+    diffusion: Float[Array, "... times"] | None = _number_field(default=None)
+    temperature_error: Float[Array, "... times"] | None = _number_field(default=None)
+    displacement_error: Float[Array, "... times"] | None = _number_field(default=None)
+    velocity_correlation: Float[Array, "... times"] | None = _number_field(default=None)
+    elastic_energy: Float[Array, "... times"] | None = _number_field(default=None)
+    dissipated_energy: Float[Array, "... times"] | None = _number_field(default=None)
+    regularised: Float[Array, "... times"] | None = _number_field(default=None)
     replicas: "CoolingCurve | None" = None
     particles: Particles | None = None
     status: Int[Array, ""] | None = None
@@ -146,10 +161,12 @@ def _check_column(
     if column != "T":
         zero_allowed[0] = column == "t" or times[0] == 0
     wrong = ~np.isfinite(values) | ~((values > 0) | zero_allowed & (values == 0))
+    wrong |= (values != 0) & ((values < SMALLEST) | (values > 1 / SMALLEST))
     if np.any(wrong):
         i = int(np.argmax(wrong))
         raise ValueError(
-            f"{place(i)}: {column} is {values[i]:g}, it must be a positive number"
+            f"{place(i)}: {column} is {values[i]:g}, it must be a positive number between "
+            f"{SMALLEST:g} and {1 / SMALLEST:g}"
             + ("" if column == "T" else " (zero is allowed in a first row at t = 0 only)")
             + "; correct or remove this row"
         )

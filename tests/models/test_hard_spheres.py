@@ -301,7 +301,7 @@ def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
     resumed = jaxgran.cool(gas, times, model=HardSpheres(100, neighbours=by), checkpoint=file)
     np.testing.assert_array_equal(resumed.temperature, whole.temperature)
     np.testing.assert_array_equal(resumed.particles.position, whole.particles.position)
-    with pytest.raises(ValueError, match="another scene"):
+    with pytest.raises(ValueError, match="another run"):
         jaxgran.cool(gas, 2 * times, model=HardSpheres(100, neighbours=by), checkpoint=file)
 
 
