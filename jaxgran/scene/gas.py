@@ -28,8 +28,8 @@ def _checked_law(law: UserLaw) -> RestitutionLaw:
 
 
 def _check_normal(name: str, value: Array) -> None:
-    """Raise ValueError for a number that its type cannot hold in full precision."""
-    if not isinstance(value, Tracer):
+    """Raise ValueError for a number that single precision cannot hold, where that is used."""
+    if not isinstance(value, Tracer) and value.dtype != jnp.float64:
         small = np.asarray(value)
         if np.any((small != 0) & (np.abs(small) < np.finfo(small.dtype).tiny)):
             raise ValueError(
