@@ -76,7 +76,7 @@ BOX_TOO_SMALL = Fault(
 )
 ENERGY_DRIFT = Fault(
     2048,
-    "the energy balance of the whole run is off by more than 2 %, by small errors of many steps",
+    "the energy balance of the whole run is off by more than 5 %, by small errors of many steps",
     "raise steps_per_contact, or in single precision use float64",
 )
 OUT_OF_RANGE = Fault(

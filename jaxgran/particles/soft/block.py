@@ -46,7 +46,7 @@ from jaxgran.theory import closed_forms
 MAX_REFINE = 64.0
 """Largest factor by which the step may become shorter than asked before the run fails."""
 
-DRIFT_TOLERANCE = 0.02
+DRIFT_TOLERANCE = 0.05
 """Sum of the relative energy errors of all blocks, which is an error of ln T, that is allowed."""
 
 RECOVERY = 200
