@@ -16,9 +16,6 @@ from jaxgran.checks.validation import listed_numbers
 MIN_POINTS = 3
 """The smallest number of times of a measured curve."""
 
-SMALLEST = 1e-100
-"""The smallest positive number of a measured curve, and the inverse of the largest, in SI units."""
-
 COLUMNS = {
     "t": "times",
     "T": "temperature",
@@ -161,12 +158,10 @@ def _check_column(
     if column != "T":
         zero_allowed[0] = column == "t" or times[0] == 0
     wrong = ~np.isfinite(values) | ~((values > 0) | zero_allowed & (values == 0))
-    wrong |= (values != 0) & ((values < SMALLEST) | (values > 1 / SMALLEST))
     if np.any(wrong):
         i = int(np.argmax(wrong))
         raise ValueError(
-            f"{place(i)}: {column} is {values[i]:g}, it must be a positive number between "
-            f"{SMALLEST:g} and {1 / SMALLEST:g}"
+            f"{place(i)}: {column} is {values[i]:g}, it must be a positive number"
             + ("" if column == "T" else " (zero is allowed in a first row at t = 0 only)")
             + "; correct or remove this row"
         )

@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from jaxgran.checks import status
+from jaxgran.checks.tracing import is_known
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel, Omission
@@ -162,15 +163,15 @@ def replaced_where_traced(
         increase from 0 or later; and whether all was allowed, None if nothing is traced.
     """
     traced = {name: gas.value(name) for name in gas.domains}
-    traced = {name: value for name, value in traced.items() if isinstance(value, Tracer)}
-    if not traced and not isinstance(times, Tracer):
+    traced = {name: value for name, value in traced.items() if not is_known(value)}
+    if not traced and is_known(times):
         return gas, times, None
     allowed = jnp.ones((), bool)
     for name, value in traced.items():
         allowed &= jnp.all(gas.domains[name].contains(value))
     held = {name: jnp.where(allowed, value, jnp.nan) for name, value in traced.items()}
     gas = gas.replace(**held)
-    if isinstance(times, Tracer):
+    if not is_known(times):
         increase = jnp.all(jnp.diff(times) > 0) & (times[0] >= 0) & jnp.isfinite(times[-1])
         allowed &= increase
         times = jnp.where(increase, times, jnp.arange(1.0, 1.0 + times.size, dtype=times.dtype))
