@@ -12,12 +12,14 @@ and one line of JSON, and writes a picture and a JSON file.
 
 import argparse
 import json
+import os
 import platform
 import sys
 import time
 import warnings
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 started = time.perf_counter()
 
@@ -56,7 +58,7 @@ def main() -> int:
     jax.config.update("jax_enable_x64", True)
     try:
         run(options)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError, OverflowError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
@@ -95,6 +97,7 @@ def run(options: argparse.Namespace) -> None:
     curve, header = jaxgran.read_curve(options.curve)
     header |= settings(options.set)
     gas = jaxgran.read_gas(header)
+    gas = with_given_constant(gas, header, options.free)
     n = header_count(header, "N")
     replicas = header_count(header, "replicas") or 1
     picture, record = outputs(options)
@@ -140,15 +143,30 @@ def run(options: argparse.Namespace) -> None:
         "import_seconds": round(imported, 2),
         **environment(),
     }
-    text = json.dumps(summary | details, indent=2) + "\n"
+    summary = finite_or_null(summary)
+    text = json.dumps(finite_or_null(summary | details), indent=2, allow_nan=False) + "\n"
     write_whole(record, lambda f: f.write(text.encode()))
     print(f"\nwritten  {picture}\n         {record}\n")
-    print(json.dumps(summary))
+    print(json.dumps(summary, allow_nan=False))
+
+
+def with_given_constant(gas, header, free: list[str]):
+    """The gas with the header's A, where A is not fitted."""
+    if "A" in header:
+        given = gas.replace(dissipative_constant=header_number(header, "A"))
+        return gas if "A" in free else given
+    if "A" in free:
+        return gas
+    raise ValueError(
+        f"--free {' '.join(free)} leaves A fixed, and the file does not give it: add --set A=VALUE "
+        "(in s), or free A too"
+    )
 
 
 def model_of(options: argparse.Namespace, gas, curve, free, num_particles: int | None):
     """The model, and why it was chosen if it was."""
-    size, replicas = options.particles or num_particles, options.replicas
+    size = num_particles if options.particles is None else options.particles
+    replicas = options.replicas
     if options.model != "auto":
         model = named(default_models(size or 2, replicas))[options.model]
         if model.stochastic and size is None:
@@ -158,7 +176,11 @@ def model_of(options: argparse.Namespace, gas, curve, free, num_particles: int |
         warnings.simplefilter("ignore", UserWarning)  # the diagnosis of the final fit says it
         first = jaxgran.fit(gas, curve, free=free)
     choice = jaxgran.choose_model(
-        first.gas, curve.times, options.tolerance, num_particles or size, replicas=replicas
+        first.gas,
+        curve.times,
+        options.tolerance,
+        size if num_particles is None else num_particles,
+        replicas=replicas,
     )
     if options.particles is None:
         return choice.model, choice.reasons
@@ -252,6 +274,15 @@ def environment() -> dict:
     }
 
 
+def finite_or_null(value: Any) -> Any:
+    """The same lists and dictionaries with None, which is null in JSON, for nan and inf."""
+    if isinstance(value, dict):
+        return {key: finite_or_null(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite_or_null(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
 def settings(pairs: list[str]) -> dict[str, str]:
     known = (*GAS_KEYS, "N", "A", "dimension", "replicas")
     values = {}
@@ -271,6 +302,9 @@ def outputs(options: argparse.Namespace) -> tuple[Path, Path]:
         folder, i = Path("results") / stem, 2
         while folder.exists():
             folder, i = Path("results") / f"{stem}-{i}", i + 1
+    existing = next(part for part in (folder, *folder.absolute().parents) if part.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise ValueError(f"{existing} is no folder to write to; name another --out")
     files = folder / f"{stem}.png", folder / f"{stem}.json"
     for file in files:
         if file.exists() and not options.overwrite:

@@ -31,7 +31,7 @@ from scenes import beads
 import jaxgran
 from jaxgran.data import checkpoint
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.soft.block import WORK_TOLERANCE
+from jaxgran.particles.soft.energy import WORK_TOLERANCE
 from jaxgran.theory import closed_forms
 
 DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
@@ -319,7 +319,7 @@ import sys, numpy as np
 from jaxgran.data import checkpoint
 path, start = sys.argv[1], int(sys.argv[2])
 for k in range(start, 10**9):
-    checkpoint.save(path, "scene", np.full(200_000, k))
+    checkpoint.save(path, {"N": "3"}, np.full(200_000, k))
 """
 
 _DISK_FULL = """
@@ -332,7 +332,7 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
 curve = jaxgran.CoolingCurve(times=np.arange(1, 5000.0), temperature=np.arange(1, 5000.0))
 for write in (
-    lambda: checkpoint.save(path, "scene", np.full(200_000, 7)),
+    lambda: checkpoint.save(path, {"N": "3"}, np.full(200_000, 7)),
     lambda: jaxgran.write_curve(path, curve, {}, overwrite=True),
 ):
     try:
@@ -348,7 +348,7 @@ def faults_on_the_way() -> list[Row]:
     rows, like = [], np.zeros(200_000, int)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.ckpt"
-        checkpoint.save(path, "scene", like)
+        checkpoint.save(path, {"N": "3"}, like)
         ages = []
         for delay in (0.05, 0.11, 0.17):
             writer = subprocess.Popen([sys.executable, "-c", _WRITER, str(path), "1"])
@@ -358,7 +358,7 @@ def faults_on_the_way() -> list[Row]:
             time.sleep(delay)
             writer.send_signal(signal.SIGKILL)
             writer.wait()
-            ages.append(len(np.unique(checkpoint.load(path, "scene", like))))
+            ages.append(len(np.unique(checkpoint.load(path, {"N": "3"}, like))))
         rows.append(_right("killed while writing", ages == [1, 1, 1], "the file is whole"))
         whole = path.read_bytes()
         for left in Path(folder).glob(".run.ckpt.*"):  # a killed process leaves its temporary file
@@ -376,7 +376,7 @@ def faults_on_the_way() -> list[Row]:
         rows.append(_right("no room on the disk", right, words))
         nowhere = Path(folder) / "not there" / "run.ckpt"
         for what, write in (
-            ("checkpoint", lambda: checkpoint.save(nowhere, "scene", like)),
+            ("checkpoint", lambda: checkpoint.save(nowhere, {"N": "3"}, like)),
             ("curve", lambda: _write_curve(nowhere)),
         ):
             asked = r"cannot write .*run\.ckpt"
@@ -390,8 +390,8 @@ def faults_on_the_way() -> list[Row]:
 
         resume(gas)
         other = gas.replace(coefficient=0.8)
-        asked = "belongs to another scene"
-        rows.append(refusal("another scene", "float64", lambda: resume(other), asked))
+        asked = "belongs to another run: law.coefficient was float64 0.9 and is float64 0.8"
+        rows.append(refusal("another gas", "float64", lambda: resume(other), asked))
         header, body = file.read_bytes().split(b"\n", maxsplit=1)
         changed = json.loads(header) | {"version": "0.0.1"}
         file.write_bytes(json.dumps(changed).encode() + b"\n" + body)

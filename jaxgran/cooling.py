@@ -1,9 +1,10 @@
 """The one verb: cool a gas."""
 
+import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jax.core import Tracer
@@ -12,7 +13,9 @@ from jaxtyping import ArrayLike, PRNGKeyArray
 from jaxgran.checks import status
 from jaxgran.checks.validation import checked_times, no_type_check
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.files import check_writable
 from jaxgran.data.run import Run
+from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.selection import choose_model
@@ -63,14 +66,14 @@ def cool(
     Raises:
         ValueError: for times that are negative, unsorted, not finite or not a list, a scene that
             the model cannot take, a checkpoint where none can be kept, or options of "auto" with
-            another model.
+            another model. Values being traced cannot be looked at: where they lie outside their
+            ranges the curve is nan, and its status says so.
+        OSError: for a checkpoint that cannot be written.
         RuntimeError: if the run fails and `throw` is True, with what to do.
 
     This docstring is long because it documents every option of every model's run.
     """
-    if not isinstance(gas, Gas):
-        raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
-    times = checked_times(times)
+    gas, times, key = checks.checked_gas(gas), checked_times(times), checks.checked_key(key)
     model = KineticTheory() if model is None else model
     if model == "auto":
         tolerance = 0.02 if tolerance is None else tolerance
@@ -83,18 +86,27 @@ def cool(
             'tolerance and num_particles go with model="auto"; give them to the model instead, as '
             "in SoftSpheres(num_particles), or leave them out"
         )
-    if not isinstance(model, AbstractModel):
-        raise ValueError(f'model must be a model or "auto", got {model!r}; try KineticTheory()')
-    if checkpoint is not None and not model.stochastic:
+    model = checks.checked_model(model)
+    if checkpoint is not None:
+        _check_checkpoint(checkpoint, model)
+    model.check(gas)
+    gas, simulated, allowed = checks.replaced_where_traced(gas, times)
+    curve = model.simulate(gas, simulated, Run(key, progress, checkpoint))
+    curve = checks.spoilt_unless(allowed, curve, times)
+    if throw and curve.status is not None and not isinstance(curve.status, Tracer):
+        _raise_if_failed(curve, gas)
+    return curve
+
+
+def _check_checkpoint(checkpoint: Any, model: AbstractModel) -> None:
+    if not isinstance(checkpoint, str | os.PathLike):
+        raise ValueError(f"checkpoint must be a path, got {checkpoint!r}")
+    if not model.stochastic:
         raise ValueError(
             f"{type(model).__name__} has no run to be saved: leave checkpoint out, got "
             f"{str(checkpoint)!r}"
         )
-    model.check(gas)
-    curve = model.simulate(gas, times, Run(key, progress, checkpoint))
-    if throw and curve.status is not None and not isinstance(curve.status, Tracer):
-        _raise_if_failed(curve, gas)
-    return curve
+    check_writable(os.fspath(checkpoint))
 
 
 def _raise_if_failed(curve: CoolingCurve, gas: Gas) -> None:

@@ -74,6 +74,16 @@ BOX_TOO_SMALL = Fault(
     "the box is too short to tell a sphere from its periodic image",
     "use more particles or a lower packing_fraction",
 )
+ENERGY_DRIFT = Fault(
+    2048,
+    "the energy balance of the whole run is off by more than 5 %, by small errors of many steps",
+    "raise steps_per_contact, or in single precision use float64",
+)
+OUT_OF_RANGE = Fault(
+    4096,
+    "a float of the gas lies outside its range, or the times do not increase from 0 or later",
+    "look at gas.domains, and sort the times",
+)
 FAULTS = (
     LIST_FULL,
     CONTACTS_FULL,
@@ -86,6 +96,8 @@ FAULTS = (
     OVERLAPPING,
     OTHER_BOX,
     BOX_TOO_SMALL,
+    ENERGY_DRIFT,
+    OUT_OF_RANGE,
 )
 
 

@@ -20,3 +20,10 @@ def concrete(value: Any, dtype: DTypeLike | None = None) -> Array:
     within `jax.ensure_compile_time_eval`.
     """
     return jax.device_put(np.asarray(value, dtype))
+
+
+def is_known(value: Any) -> bool:
+    """Whether the value of a number is known, though a derivative in it may be taken."""
+    while isinstance(value, Tracer) and hasattr(value, "primal"):
+        value = value.primal
+    return not isinstance(value, Tracer)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 F = TypeVar("F", bound=Callable)
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     UserNumber = ArrayLike | Sequence[float]
     UserCount = int
     UserFloat = float
+    UserTruth = bool
 
     def no_type_check(function: F) -> F:
         """Mark a public function that checks its arguments itself, with clearer errors."""
@@ -23,7 +24,7 @@ else:
     # A run-time type checker lets everything pass, so that a wrong type is reported in words.
     from typing import no_type_check  # noqa: F401
 
-    UserNumber = UserCount = UserFloat = Any
+    UserNumber = UserCount = UserFloat = UserTruth = Any
 
 
 class Domain(NamedTuple):
@@ -60,7 +61,7 @@ class Domain(NamedTuple):
         if isinstance(value, Tracer):
             return
         try:
-            numbers = np.asarray(value, dtype=float)
+            numbers = _floats(value)
         except (TypeError, ValueError):
             raise ValueError(
                 f"{name} must be a number in {self}, got {value!r}. {advice}"
@@ -70,6 +71,13 @@ class Domain(NamedTuple):
         wrong = ~(above & below & np.isfinite(numbers))
         if np.any(wrong):
             raise ValueError(f"{name} must lie in {self}, got {numbers[wrong].flat[0]:g}. {advice}")
+
+    def contains(self, value: ArrayLike) -> Bool[Array, "..."]:
+        """Whether each element of a value, which may be traced, is finite and in the interval."""
+        value = jnp.asarray(value)
+        above = value >= self.low if self.low_allowed else value > self.low
+        below = value <= self.high if self.high_allowed else value < self.high
+        return above & below & jnp.isfinite(value)
 
     def to_free(self, value: ArrayLike) -> Float[Array, "..."]:
         """Map the interior of the interval one-to-one onto the whole real line.
@@ -109,9 +117,73 @@ def number(value: UserNumber) -> Float[Array, "..."]:
         ValueError: if the value cannot be converted.
     """
     try:
-        return jnp.asarray(value, dtype=jnp.result_type(float))
+        if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
+            return jnp.asarray(value, dtype=jnp.result_type(float))
+        return jnp.asarray(_floats(value), dtype=jnp.result_type(float))
     except (TypeError, ValueError):
         raise ValueError(f"expected a number or an array of numbers, got {value!r}") from None
+
+
+def _floats(value: Any) -> np.ndarray:
+    """Numbers as NumPy floats; TypeError or ValueError for texts, truth values and the like."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf" and not jnp.issubdtype(array.dtype, jnp.floating):
+        raise TypeError
+    return array.astype(float)
+
+
+def python_number(value: Any) -> Any:
+    """A whole number of NumPy as one of Python, which compares and prints the same everywhere."""
+    return int(value) if isinstance(value, np.integer) else value
+
+
+def whole_number(name: str, value: Any, least: int, advice: str = "") -> int:
+    """A whole number given by a user, of Python or NumPy.
+
+    Args:
+        name: of the value in the error message.
+        value: what was given.
+        least: the smallest allowed.
+        advice: ends the error message.
+
+    Raises:
+        ValueError: for anything else or less.
+    """
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or value < least:
+        raise ValueError(
+            f"{name} must be a whole number >= {least}, an int, got {value!r}. {advice}".rstrip()
+        )
+    return int(value)
+
+
+def plain_number(name: str, value: Any, domain: Domain, advice: str = "") -> float:
+    """A number given by a user that is fixed when a program is compiled.
+
+    Args:
+        name: of the value in the error message.
+        value: what was given.
+        domain: the allowed interval.
+        advice: ends the error message.
+
+    Raises:
+        ValueError: for anything that is no single number, or outside of the interval.
+    """
+    if not isinstance(value, float | int | np.number) or isinstance(value, bool):
+        raise ValueError(f"{name} must be a number in {domain}, got {value!r}. {advice}".rstrip())
+    domain.check(name, value, advice)
+    return float(value)
+
+
+def truth_value(name: str, value: Any) -> None:
+    """Raise ValueError for anything but True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+
+
+def listed_numbers(value: Any) -> Any:
+    """A list, tuple or NumPy array of numbers as a JAX array; anything else as it is."""
+    return number(value) if isinstance(value, list | tuple | np.ndarray) else value
 
 
 def checked_times(times: UserNumber) -> Float[Array, "times"]:
@@ -126,7 +198,10 @@ def checked_times(times: UserNumber) -> Float[Array, "times"]:
         ValueError: if there is no time, or times are not finite, negative or not increasing.
     """
     if not isinstance(times, Tracer):
-        numbers = np.asarray(times, dtype=float)
+        try:
+            numbers = _floats(times)
+        except (TypeError, ValueError):
+            raise ValueError(f"times must be a list of numbers, got {times!r}") from None
         if numbers.ndim != 1 or numbers.size == 0:
             raise ValueError(f"times must be a list of numbers, got shape {numbers.shape}")
         wrong = ~np.isfinite(numbers) | (numbers < 0)
@@ -141,4 +216,10 @@ def checked_times(times: UserNumber) -> Float[Array, "times"]:
                 f"times must increase, got {numbers[i]:g} after {numbers[i - 1]:g}; sort them and "
                 "remove repeated ones"
             )
-    return jnp.asarray(times, dtype=jnp.result_type(float))
+    times = jnp.asarray(times, dtype=jnp.result_type(float))
+    if not isinstance(times, Tracer) and np.any(np.diff(np.asarray(times)) <= 0):
+        raise ValueError(
+            f"times are closer together than {times.dtype} can tell apart: give fewer of them, or "
+            'jax.config.update("jax_enable_x64", True) first'
+        )
+    return times

@@ -1,7 +1,7 @@
 """Checkpoints: the state of a run in a file, from which only the same run can be resumed.
 
-The first line is a JSON object: format, version of jaxgran, fingerprint of the scene, the type and
-shape of every array, and the SHA-256 digest of the rest. The rest is what
+The first line is a JSON object: format, version of jaxgran, a description of all that determines
+the run, the type and shape of every array, and the SHA-256 digest of the rest. The rest is what
 `equinox.tree_serialise_leaves` writes.
 """
 
@@ -14,38 +14,23 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxgran.data.description import differences
 from jaxgran.data.files import write_whole
 
-FORMAT = 2
+FORMAT = 3
+
+MOST_NAMED = 4
+"""Differences between two runs that an error message names."""
 
 
-def fingerprint(*trees: Any) -> str:
-    """SHA-256 digest of the structure, the types and the values of some pytrees.
-
-    Static fields belong to the structure.
-    """
-    digest = hashlib.sha256()
-    for tree in trees:
-        leaves, structure = jax.tree.flatten(tree)
-        digest.update(str(structure).encode())
-        for leaf in leaves:
-            if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-                leaf = jax.random.key_data(leaf)
-            array = np.asarray(leaf)
-            digest.update(f"{array.dtype}{array.shape}".encode())
-            digest.update(array.tobytes())
-    return digest.hexdigest()
-
-
-def save(path: str | Path, scene: str, tree: Any) -> None:
+def save(path: str | Path, scene: dict[str, str], tree: Any) -> None:
     """Write the arrays of a pytree to a checkpoint, atomically.
 
     Args:
         path: the file; an existing one is replaced.
-        scene: fingerprint of everything that determines the run.
+        scene: description of everything that determines the run.
         tree: JAX and NumPy arrays and Python numbers.
 
     Raises:
@@ -68,12 +53,12 @@ def save(path: str | Path, scene: str, tree: Any) -> None:
     write_whole(path, write)
 
 
-def load(path: str | Path, scene: str, like: Any) -> Any:
+def load(path: str | Path, scene: dict[str, str], like: Any) -> Any:
     """Read a checkpoint.
 
     Args:
         path: the file that `save` wrote.
-        scene: fingerprint of everything that determines the run.
+        scene: description of everything that determines the run.
         like: a pytree with the structure, types and shapes of the saved one.
 
     Returns:
@@ -81,7 +66,7 @@ def load(path: str | Path, scene: str, like: Any) -> Any:
 
     Raises:
         ValueError: if the file cannot be read, is no checkpoint, is damaged, or belongs to another
-            version, format or scene.
+            version, format or run, naming what differs.
     """
     header, body = _read(path)
     _check_version(path, header)
@@ -90,11 +75,7 @@ def load(path: str | Path, scene: str, like: Any) -> Any:
     )
     if hashlib.sha256(body).hexdigest() != header["digest"]:
         raise ValueError(damaged)
-    if header["scene"] != scene or header["arrays"] != _types_and_shapes(like):
-        raise ValueError(
-            f"{path} belongs to another scene: gas, times, model, precision or start differ; name "
-            "another file, or remove it to begin anew"
-        )
+    _check_run(path, header, scene, _types_and_shapes(like))
     try:
         return eqx.tree_deserialise_leaves(io.BytesIO(body), like)
     except RuntimeError:  # a file made by hand
@@ -117,11 +98,28 @@ def _read(path: str | Path) -> tuple[dict[str, Any], bytes]:
         missing = {"format", "version", "scene", "arrays", "digest"} - set(header)
         if missing:
             raise ValueError(f"its first line lacks {', '.join(sorted(missing))}")
+        if header["format"] == FORMAT and not isinstance(header["scene"], dict):
+            raise ValueError("its first line does not describe a run")
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(
             f"{path} is no checkpoint of jaxgran ({error}); name another file, or remove it"
         ) from None
     return header, body
+
+
+def _check_run(
+    path: str | Path, header: dict[str, Any], scene: dict[str, str], arrays: list[str]
+) -> None:
+    """Refuse a checkpoint of another run."""
+    differ = differences(header["scene"], scene)
+    if not differ and header["arrays"] != arrays:
+        differ = ["the types or shapes of its arrays are others"]
+    if differ:
+        more = f" and {len(differ) - MOST_NAMED} more" if len(differ) > MOST_NAMED else ""
+        raise ValueError(
+            f"{path} belongs to another run: {'; '.join(differ[:MOST_NAMED])}{more}. Name another "
+            "file, or remove it to begin anew"
+        )
 
 
 def _check_version(path: str | Path, header: dict[str, Any]) -> None:

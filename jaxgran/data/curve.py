@@ -1,7 +1,8 @@
 """Cooling curves: one type for measured and for simulated ones, and its validation."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
+
+from jaxgran.checks.validation import listed_numbers
 
 MIN_POINTS = 3
 """The smallest number of times of a measured curve."""
@@ -37,6 +40,15 @@ class Particles(NamedTuple):
     box_side: Float[Array, ""]
 
 
+if TYPE_CHECKING:
+    UserParticles = Particles
+else:
+    # A run-time type checker lets everything pass, so that a wrong type is reported in words.
+    UserParticles = Any
+
+_number_field = partial(eqx.field, converter=listed_numbers)
+
+
 class CoolingCurve(eqx.Module):
     """Temperature, and what else is known, of a cooling gas at given times; measured or computed.
 
@@ -63,18 +75,18 @@ class CoolingCurve(eqx.Module):
             raised; values are then nan. `jaxgran.explain_status` puts it into words.
     """
 
-    times: Float[Array, "times"]
-    temperature: Float[Array, "... times"]
-    displacement: Float[Array, "... times"] | None = None
-    sonine: Float[Array, "... times"] | None = None
-    collisions: Float[Array, "... times"] | None = None
-    diffusion: Float[Array, "... times"] | None = None
-    temperature_error: Float[Array, "... times"] | None = None
-    displacement_error: Float[Array, "... times"] | None = None
-    velocity_correlation: Float[Array, "... times"] | None = None
-    elastic_energy: Float[Array, "... times"] | None = None
-    dissipated_energy: Float[Array, "... times"] | None = None
-    regularised: Float[Array, "... times"] | None = None
+    times: Float[Array, "times"] = _number_field()
+    temperature: Float[Array, "... times"] = _number_field()
+    displacement: Float[Array, "... times"] | None = _number_field(default=None)
+    sonine: Float[Array, "... times"] | None = _number_field(default=None)
+    collisions: Float[Array, "... times"] | None = _number_field(default=None)
+    diffusion: Float[Array, "... times"] | None = _number_field(default=None)
+    temperature_error: Float[Array, "... times"] | None = _number_field(default=None)
+    displacement_error: Float[Array, "... times"] | None = _number_field(default=None)
+    velocity_correlation: Float[Array, "... times"] | None = _number_field(default=None)
+    elastic_energy: Float[Array, "... times"] | None = _number_field(default=None)
+    dissipated_energy: Float[Array, "... times"] | None = _number_field(default=None)
+    regularised: Float[Array, "... times"] | None = _number_field(default=None)
     replicas: "CoolingCurve | None" = None
     particles: Particles | None = None
     status: Int[Array, ""] | None = None

@@ -14,6 +14,9 @@ from jaxgran.scene.restitution import Viscoelastic
 GAS_KEYS = ("eta", "diameter", "density", "Y", "nu", "T0")
 """Keys of the header that `read_gas` needs."""
 
+LARGEST_COUNT = 10**12
+"""The largest whole number of a header."""
+
 
 def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
     """Read a measured cooling curve from a CSV file.
@@ -46,7 +49,7 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
         if line.startswith("#"):
             key, colon, value = line[1:].partition(":")
             if colon:
-                header[key.strip()] = value.strip()
+                _add_to_header(path, i, header, key.strip(), value.strip())
         elif line and not names:
             names = _column_names(path, i, line)
         elif line:
@@ -64,11 +67,19 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
     return curve, header
 
 
+def _add_to_header(path: Path, i: int, header: dict[str, str], key: str, value: str) -> None:
+    if key in header:
+        raise ValueError(
+            f"{path}, line {i}: {key} is given again, as {value} after {header[key]}; remove one"
+        )
+    header[key] = value
+
+
 def _read_text(path: Path) -> str:
     """The text of a file; ValueError if it cannot be read, is empty or is no text."""
     columns = "t,T[,T_err][,msd][,msd_err]"
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte-order mark
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; check the path") from None
     except (UnicodeDecodeError, IsADirectoryError):
@@ -151,13 +162,16 @@ def header_number(header: dict[str, str], key: str) -> float:
     """The value of a key in the header of a curve, as a number.
 
     Raises:
-        ValueError: if the value is not a number.
+        ValueError: if the value is not a finite number.
         KeyError: if there is no such key.
     """
     try:
-        return float(header[key])
+        number = float(header[key])
     except ValueError:
-        raise ValueError(f"header line {key}: {header[key]!r} is not a number") from None
+        number = float("nan")
+    if not np.isfinite(number):
+        raise ValueError(f"header line {key}: {header[key]!r} is not a finite number")
+    return number
 
 
 def header_count(header: dict[str, str], key: str) -> int | None:
@@ -172,8 +186,11 @@ def header_count(header: dict[str, str], key: str) -> int | None:
     if key not in header:
         return None
     number = header_number(header, key)
-    if not (number >= 1 and number.is_integer()):
-        raise ValueError(f"header line {key}: must be a positive whole number, got {header[key]!r}")
+    if not (1 <= number <= LARGEST_COUNT and number.is_integer()):
+        raise ValueError(
+            f"header line {key}: must be a whole number from 1 to {LARGEST_COUNT:g}, got "
+            f"{header[key]!r}"
+        )
     return int(number)
 
 

@@ -1,6 +1,8 @@
 """Atomic writing of files."""
 
+import errno
 import os
+import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +12,9 @@ from typing import Any
 def write_whole(path: str | Path, write: Callable[[Any], Any]) -> None:
     """Write a file atomically: it replaces `path` only once it is complete.
 
+    An existing file keeps its permissions, a new one gets those that the user gives new files. A
+    symbolic link is followed.
+
     Args:
         path: the file; an existing one is replaced.
         write: writes the content to a binary file that is open for writing.
@@ -18,16 +23,18 @@ def write_whole(path: str | Path, write: Callable[[Any], Any]) -> None:
         OSError: naming the path, if it cannot be written; an existing file is then unchanged.
     """
     path = Path(path)
+    target = Path(os.path.realpath(path))
     name = None
     try:
         with tempfile.NamedTemporaryFile(
-            dir=path.parent, prefix=f".{path.name}.", delete=False
+            dir=target.parent, prefix=f".{target.name}.", delete=False
         ) as f:
             name = f.name
             write(f)
             f.flush()
+            os.chmod(name, _permissions(target))
             os.fsync(f.fileno())
-        os.replace(name, path)
+        os.replace(name, target)
     except BaseException as error:
         if name is not None:
             Path(name).unlink(missing_ok=True)
@@ -36,3 +43,32 @@ def write_whole(path: str | Path, write: Callable[[Any], Any]) -> None:
         raise OSError(
             error.errno, f"cannot write ({error.strerror}); any earlier file is unharmed", str(path)
         ) from error
+
+
+def _permissions(path: Path) -> int:
+    """The permissions of a file, or those of a new one."""
+    try:
+        return stat.S_IMODE(path.stat().st_mode)
+    except OSError:
+        mask = os.umask(0)
+        os.umask(mask)
+        return 0o666 & ~mask
+
+
+def check_writable(path: str | Path) -> None:
+    """Check that a file could be written, before a long run whose result it is to hold.
+
+    Raises:
+        OSError: naming the path, if its folder does not exist or cannot be written to, or if it is
+            a folder itself.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
+        code = errno.EISDIR
+    elif not target.parent.is_dir():
+        code = errno.ENOENT
+    elif not os.access(target.parent, os.W_OK):
+        code = errno.EACCES
+    else:
+        return
+    raise OSError(code, f"cannot write ({os.strerror(code)}); name another file", str(path))

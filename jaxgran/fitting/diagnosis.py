@@ -7,9 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
 from jaxgran.models.base import Omission
+
+LARGEST_SCATTER = 0.3
+"""Relative scatter of T about a model above which it does not explain a curve without errors."""
 
 
 class Diagnosis(NamedTuple):
@@ -31,6 +35,7 @@ class Diagnosis(NamedTuple):
     correlation_factor: float
 
 
+@no_type_check
 def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None) -> Diagnosis:
     """Say whether the model of a fit explains the measured curve, and if not, why.
 
@@ -39,13 +44,20 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         curve: the measured curve.
         num_particles: N of the measured gas, if known.
     """
+    if not isinstance(result, Fit) or not isinstance(curve, CoolingCurve):
+        raise ValueError(
+            "diagnose takes the result of jaxgran.fit and the curve that was fitted, got "
+            f"{type(result).__name__} and {type(curve).__name__}"
+        )
     residuals = np.asarray(result.residuals)
     used = residuals != 0
     residuals, times = residuals[used], np.asarray(curve.times)[used]
     correlation = _neighbour_correlation(residuals)
     factor = np.sqrt((1 + correlation) / (1 - correlation)) if correlation > 0 else 1.0
     p_value, converged = float(result.p_value), bool(result.converged)
-    misfit = not np.isnan(p_value) and p_value < SIGNIFICANCE
+    # Without errors chi^2 says nothing, but no model explains what it misses by this much.
+    scattered = np.isnan(p_value) and float(result.reduced_chi2) > LARGEST_SCATTER**2
+    misfit = scattered or p_value < SIGNIFICANCE
     omissions = result.model.omissions(result.gas, num_particles)
 
     reasons = [

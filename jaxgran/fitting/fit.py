@@ -16,6 +16,7 @@ from jaxgran.fitting.guess import guess_from_data
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.stochastic import fit_stochastic
 from jaxgran.models.base import AbstractModel
+from jaxgran.models.checks import checked_gas, checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
 
@@ -83,7 +84,7 @@ def fit(
     This docstring is long because the arguments mean different things to the two kinds of models.
     """
     _check_request(gas, curve, free, max_steps, num_particles)
-    names = tuple(free)
+    names, key = tuple(free), checked_key(key)
     model = KineticTheory() if model is None else model
     _check_model(model, method, names)
     if model.stochastic:
@@ -108,6 +109,9 @@ def _check_request(
     max_steps: int | None,
     num_particles: int | None,
 ) -> None:
+    checked_gas(gas)
+    if not isinstance(curve, CoolingCurve):
+        raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
     curve.check()
     if isinstance(free, str) or not free or len(set(free)) < len(free):
         raise ValueError(f"free must be a tuple of different names, got {free!r}")
@@ -131,11 +135,12 @@ def _check_model(model: AbstractModel, method: str, names: tuple[str, ...]) -> N
     if method not in SEARCHES:
         known = " or ".join(f'"{name}"' for name in SEARCHES)
         raise ValueError(f"method must be {known}, got {method!r}")
-    if not isinstance(model, AbstractModel):
+    if isinstance(model, str):
         raise ValueError(
             f"model must be a model, got {model!r}; choose_model(fit(gas, curve).gas, curve.times, "
             "num_particles=N, replicas=3).model is the one this curve needs"
         )
+    checked_model(model)
     if model.stochastic and method != "levenberg-marquardt":
         raise ValueError(f"a stochastic model is fitted by least squares, not by {method!r}")
     replicas = getattr(model, "replicas", None)

@@ -5,7 +5,7 @@ the mean of the Gauss-Newton estimates of all simulations near it.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -148,8 +148,8 @@ def _simulated(
         return value, (value, curve)
 
     slope, (value, curve) = jax.jacfwd(log_temperature, has_aux=True)(jnp.asarray(flat))
-    assert curve.replicas is not None
-    each = np.log(np.asarray(curve.replicas.temperature))[:, used]
+    replicas: Any = curve.replicas  # checked by the caller
+    each = np.log(np.asarray(replicas.temperature))[:, used]
     value, slope = np.asarray(value)[used], np.asarray(slope)[used]
     return _Simulation(flat, value, slope, each - each.mean(axis=0)), curve
 
@@ -177,6 +177,9 @@ def _average(
         replicas = len(simulation.deviation)
         moved = (simulation.deviation / sigma) @ inverse.T / (replicas * (replicas - 1)) ** 0.5
         scatter.append(moved.T @ moved)
+    # The errors of the measurement are the same in all of them: those of the newest stand for all.
+    newest = near[-1].slope / sigma[:, None]
+    inverse = np.linalg.pinv(newest, rcond=resolution)
     share = inverse * (np.ones_like(sigma) if error is None else error / sigma)
     noises = np.mean(scatter, axis=0) / len(near)
     return _Average(np.mean(ends, axis=0), sigma, share @ share.T, noises)

@@ -1,13 +1,19 @@
 """Checks of a scene, and clauses about what it contains, that several models share."""
 
+import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
+from jaxgran.checks import status
+from jaxgran.checks.tracing import is_known
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.scene.gas import Gas
@@ -24,6 +30,41 @@ CORRELATED_PACKING = {2: 0.4, 3: 0.25}
 
 SOFT_SPHERES_NEEDED = "This scene needs soft spheres, which resolve every contact in time."
 POSITIONS_NEEDED = "This scene needs particles with positions."
+
+
+def checked_gas(gas: Any) -> Gas:
+    """The gas, if it is one.
+
+    Raises:
+        ValueError: for anything else, and for a batch of gases outside of `jax.vmap`.
+    """
+    if not isinstance(gas, Gas):
+        raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
+    gas.check_single()
+    return gas
+
+
+def checked_model(model: Any) -> AbstractModel:
+    """The model, if it is one; else ValueError."""
+    if isinstance(model, AbstractModel):
+        return model
+    if isinstance(model, type) and issubclass(model, AbstractModel):
+        raise ValueError(
+            f"model must be a model, got the class {model.__name__}: make one of it, as in "
+            "KineticTheory() or SoftSpheres(1000)"
+        )
+    raise ValueError(f"model must be a model, such as KineticTheory(), got {model!r:.60}")
+
+
+def checked_key(key: Any) -> PRNGKeyArray | None:
+    """The key of random numbers, if it is one; else ValueError."""
+    if key is None:
+        return key
+    if isinstance(key, jax.Array):
+        typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
+        if typed or (key.dtype == jnp.uint32 and key.ndim == 1):
+            return key
+    raise ValueError(f"key must be a key such as jax.random.key(5), got {key!r:.60}")
 
 
 def check_cools(gas: Gas, averages: Callable = exact_averages) -> None:
@@ -110,3 +151,42 @@ def omitted_by_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Omissio
                 f"L_c = {critical / diameter:.3g}: the gas does not stay homogeneous"
             )
     return tuple(Omission(words, False, POSITIONS_NEEDED) for words in found)
+
+
+def replaced_where_traced(
+    gas: Gas, times: Float[Array, "times"]
+) -> tuple[Gas, Float[Array, "times"], Bool[Array, ""] | None]:
+    """A gas and times that every model can take, where traced ones lie outside their ranges.
+
+    Returns:
+        The gas, nan where a traced float is out of range; the times, replaced if traced ones do not
+        increase from 0 or later; and whether all was allowed, None if nothing is traced.
+    """
+    traced = {name: gas.value(name) for name in gas.domains}
+    traced = {name: value for name, value in traced.items() if not is_known(value)}
+    if not traced and is_known(times):
+        return gas, times, None
+    allowed = jnp.ones((), bool)
+    for name, value in traced.items():
+        allowed &= jnp.all(gas.domains[name].contains(value))
+    held = {name: jnp.where(allowed, value, jnp.nan) for name, value in traced.items()}
+    gas = gas.replace(**held)
+    if not is_known(times):
+        increase = jnp.all(jnp.diff(times) > 0) & (times[0] >= 0) & jnp.isfinite(times[-1])
+        allowed &= increase
+        times = jnp.where(increase, times, jnp.arange(1.0, 1.0 + times.size, dtype=times.dtype))
+    return gas, times, allowed
+
+
+def spoilt_unless(
+    allowed: Bool[Array, ""] | None, curve: CoolingCurve, times: Float[Array, "times"]
+) -> CoolingCurve:
+    """The curve, nan and with a status unless all was allowed."""
+    if allowed is None:
+        return curve
+    fault = status.flag(status.OUT_OF_RANGE, ~allowed)
+    spoilt = jax.tree.map(
+        lambda x: jnp.where(allowed, x, jnp.nan) if eqx.is_inexact_array(x) else x, curve
+    )
+    fault = fault if curve.status is None else jnp.where(allowed, curve.status, fault)
+    return dataclasses.replace(spoilt, times=times, status=fault)

@@ -11,9 +11,16 @@ from jaxtyping import Array, Float, UInt32
 
 from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
-from jaxgran.checks.validation import UserCount, UserFloat
-from jaxgran.data.checkpoint import fingerprint
+from jaxgran.checks.validation import (
+    Domain,
+    UserCount,
+    UserFloat,
+    plain_number,
+    python_number,
+    whole_number,
+)
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.description import described
 from jaxgran.data.run import DEFAULTS, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
@@ -45,8 +52,9 @@ class DSMC(AbstractModel):
     The derivatives are estimates. They are taken at a fixed own time (dt = dtau / sqrt(T), so that
     the order of collisions does not depend on the speeds). The gas is assumed to remember its
     temperature only; <dr^2> and the velocity correlation are assumed to change by the first Sonine
-    order of diffusion, and a_2 not to change. Rates of change with time are those of the
-    Maxwell-Sonine distribution.
+    order of diffusion. The derivative of a_2 in a float of the gas is not known, and is nan. Rates
+    of change with time are those of the Maxwell-Sonine distribution. Second derivatives are
+    refused.
 
     Args:
         num_particles: N, >= 2.
@@ -61,23 +69,18 @@ class DSMC(AbstractModel):
     (1996) for dense gases; Brilliantov & Poeschel for the granular gas.
     """
 
-    num_particles: UserCount = eqx.field(static=True)
-    replicas: UserCount = eqx.field(static=True, default=1)
+    num_particles: UserCount = eqx.field(static=True, converter=python_number)
+    replicas: UserCount = eqx.field(static=True, converter=python_number, default=1)
     step: UserFloat = eqx.field(static=True, default=0.05)
 
     stochastic: ClassVar[bool] = True
     derivative_accuracy: ClassVar[float] = 0.01
 
     def __check_init__(self):
-        for name, least in (("num_particles", 2), ("replicas", 1)):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise ValueError(f"{name} must be a whole number >= {least}, an int, got {value!r}")
-        if not isinstance(self.step, float | int) or not 0 < self.step <= LONGEST_STEP:
-            raise ValueError(
-                f"step must lie in (0, {LONGEST_STEP}] collisions per particle, got {self.step!r}; "
-                "a particle collides at most twice in a step"
-            )
+        whole_number("num_particles", self.num_particles, 2)
+        whole_number("replicas", self.replicas, 1)
+        allowed = Domain(0.0, LONGEST_STEP, high_allowed=True)
+        plain_number("step", self.step, allowed, "A particle collides at most twice in a step.")
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError for a law of restitution that heats the gas."""
@@ -125,15 +128,16 @@ class DSMC(AbstractModel):
         start, advance, observe = simulation.parts(
             law, words, replicas=self.replicas, scheme=scheme
         )
-        _, records, _ = follow(
+        _, records, fault = follow(
             start,
             np.asarray(times),
             advance,
             observe,
-            scene=fingerprint(law, times, start, words, scheme),
+            scene=described(law=law, times=times, key=words, scheme=scheme, model=self),
             progress=run.progress,
             path=run.checkpoint,
         )
+        records["fault"][np.isnan(records["temperature"])] |= fault  # of the driver itself
         return {name: jnp.asarray(value) for name, value in records.items()}
 
 

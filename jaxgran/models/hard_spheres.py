@@ -8,8 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from jaxgran.checks.tracing import any_traced
-from jaxgran.checks.validation import UserCount, UserFloat
-from jaxgran.data.curve import Particles
+from jaxgran.checks.validation import (
+    Domain,
+    UserCount,
+    UserFloat,
+    plain_number,
+    python_number,
+)
+from jaxgran.data.curve import UserParticles
 from jaxgran.models import checks
 from jaxgran.models.base import Omission
 from jaxgran.models.course import Course
@@ -22,6 +28,8 @@ from jaxgran.scene.gas import Gas
 
 WINDOW_SHARE = 0.05
 """Impacts per particle in a window."""
+
+CONTACT_TIMES = Domain(0.0, 0.1, low_allowed=True, high_allowed=True)
 
 OVERLAP = 1e-9
 """Overlap in diameters up to which a given start is one of hard spheres."""
@@ -66,20 +74,22 @@ class HardSpheres(AbstractSpheres):
     only, and to continue to cool at the rate of its last 5 mean free times. Against finite
     differences d ln T/d ln A is right within 5 % in boxes shorter than L_c, but 14 % too large
     after 10 mean free times where flows have begun to hold energy (phi = .2, beta = .3, 1.2 L_c).
-    a_2 and the paths are taken as the same at the same number of collisions (so that
-    d ln<dr^2>/d ln A is up to 0.2 too low: dissipation makes velocities last longer), the velocity
-    correlation as decaying at 2/d of the collision rate. The density acts through Enskog's
-    collision frequency. The final particles carry no derivative. With a given start T_0 is a unit
-    only, and its derivative 0; the start takes part in a change of the diameter.
+    The paths are followed by the first Sonine order of diffusion (see `jaxgran.tangents.paths`),
+    the velocity correlation in time as decaying at 2/d of the collision rate. The density acts
+    through Enskog's collision frequency; that the box changes with it at fixed N, and with the box
+    the growth of flows, is left out. The derivatives of a_2 and of the final particles are not
+    known, and are nan. Second derivatives are refused. A run is followed in the frame in which each
+    replica is at rest. With a given start T_0 is a unit only, and its derivative 0; the start takes
+    part in a change of the diameter.
 
     Raises:
         ValueError: for numbers out of range.
     """
 
-    num_particles: UserCount = eqx.field(static=True)
-    replicas: UserCount = eqx.field(static=True, default=1)
+    num_particles: UserCount = eqx.field(static=True, converter=python_number)
+    replicas: UserCount = eqx.field(static=True, converter=python_number, default=1)
     contact_time: UserFloat = eqx.field(static=True, default=1e-5)
-    start: Particles | None = None
+    start: UserParticles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
     plan: Plan | None = eqx.field(static=True, default=None)
 
@@ -87,11 +97,8 @@ class HardSpheres(AbstractSpheres):
 
     def __check_init__(self):
         self.check_counts()
-        if not isinstance(self.contact_time, float | int) or not 0 <= self.contact_time <= 0.1:
-            raise ValueError(
-                f"contact_time must lie in [0, 0.1] mean free times, got {self.contact_time!r}; it "
-                "only keeps clusters from collapsing, so leave it small"
-            )
+        advice = "In mean free times; it only keeps clusters from collapsing, so leave it small."
+        plain_number("contact_time", self.contact_time, CONTACT_TIMES, advice)
 
     @property
     def projected(self) -> bool:

@@ -13,7 +13,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from jaxgran.checks import status
+from jaxgran.checks import status, validation
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import DEFAULTS, Run
 from jaxgran.models import checks
@@ -22,6 +22,9 @@ from jaxgran.models.course import Course
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.restitution import ReducedLaw
 from jaxgran.theory import averages, closed_forms
+
+TOLERANCES = validation.Domain(0.0, 0.1)
+"""Relative tolerances of the solver."""
 
 
 class _State(NamedTuple):
@@ -46,6 +49,8 @@ class KineticTheory(AbstractModel):
     off after some 1e5 mean free times, and the error grows.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
+    Second derivatives are forward over forward or over reverse: `jax.hessian` or
+    ``jax.jacfwd(jax.jacfwd(...))``, not ``jax.jacrev(jax.jacrev(...))``.
 
     Args:
         sonine: follow a_2; otherwise the gas stays Maxwellian.
@@ -59,7 +64,7 @@ class KineticTheory(AbstractModel):
         max_steps: the most steps of one curve.
 
     Raises:
-        ValueError: for an unknown `averages`.
+        ValueError: for values out of range.
 
     Reference: van Noije & Ernst 1998 for the averages; Brilliantov & Poeschel for the gas. D is
     the first Sonine approximation: 1.7 % (3D), 2.4 % (2D) below the exact elastic value of a
@@ -67,16 +72,27 @@ class KineticTheory(AbstractModel):
     0.85 phi.
     """
 
-    sonine: bool = eqx.field(static=True, default=True)
-    softness: bool = eqx.field(static=True, default=True)
+    sonine: validation.UserTruth = eqx.field(static=True, default=True)
+    softness: validation.UserTruth = eqx.field(static=True, default=True)
     averages: str = eqx.field(static=True, default="exact")
-    rtol: float | None = eqx.field(static=True, default=None)
-    solver: diffrax.AbstractSolver = eqx.field(static=True, default=diffrax.Tsit5())
-    max_steps: int = eqx.field(static=True, default=200_000)
+    rtol: validation.UserFloat | None = eqx.field(static=True, default=None)
+    solver: Any = eqx.field(static=True, default=diffrax.Tsit5())
+    max_steps: validation.UserCount = eqx.field(static=True, default=200_000)
 
     def __check_init__(self):
+        validation.truth_value("sonine", self.sonine)
+        validation.truth_value("softness", self.softness)
         if self.averages not in ("exact", "paper"):
             raise ValueError(f'averages must be "exact" or "paper", got {self.averages!r}')
+        if self.rtol is not None:
+            validation.plain_number(
+                "rtol", self.rtol, TOLERANCES, "Leave it out for 1e-9 (float32: 1e-5)."
+            )
+        if not isinstance(self.solver, diffrax.AbstractSolver):
+            raise ValueError(
+                f"solver must be a diffrax solver such as diffrax.Kvaerno5(), got {self.solver!r}"
+            )
+        validation.whole_number("max_steps", self.max_steps, 1, "Leave it out for 200000.")
 
     stochastic: ClassVar[bool] = False
     derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs

@@ -12,10 +12,10 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
 from jaxgran.checks import status
-from jaxgran.checks.validation import checked_times, no_type_check
+from jaxgran.checks.validation import POSITIVE, checked_times, no_type_check, plain_number
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.checks import check_softness
+from jaxgran.models.checks import check_softness, checked_gas
 from jaxgran.models.course import Course
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.hard_spheres import HardSpheres
@@ -126,17 +126,13 @@ def choose_model(
 
 
 def _check_arguments(gas: Any, times: Any, tolerance: Any) -> None:
-    if not isinstance(gas, Gas):
-        raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
+    checked_gas(gas)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, times))):
         raise ValueError(
             "a model cannot be chosen for values being traced by jax.jit, jax.grad or jax.vmap: "
             "call choose_model outside, and give its model to cool"
         )
-    if not (isinstance(tolerance, float | int | np.number) and 0 < tolerance < np.inf):
-        raise ValueError(
-            f"tolerance must be a number > 0, got {tolerance!r}; 0.02 allows T to err by 2 %"
-        )
+    plain_number("tolerance", tolerance, POSITIVE, "0.02 allows T to err by 2 %.")
 
 
 def _candidate(model: AbstractModel, course: Course) -> Candidate:

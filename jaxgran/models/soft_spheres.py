@@ -9,8 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.checks.tracing import concrete
-from jaxgran.checks.validation import UserCount, UserFloat
-from jaxgran.data.curve import Particles
+from jaxgran.checks.validation import (
+    POSITIVE,
+    UserCount,
+    UserFloat,
+    plain_number,
+    python_number,
+)
+from jaxgran.data.curve import UserParticles
 from jaxgran.models.base import Omission
 from jaxgran.models.course import Course
 from jaxgran.models.spheres import AbstractSpheres, Plan
@@ -70,20 +76,21 @@ class SoftSpheres(AbstractSpheres):
     Derivatives of T, collisions, <dr^2> and the energies are taken in every float of the gas,
     forward and reverse alike: a gas depends on (alpha, A), its collision frequency and the times
     only. The first two are followed by tangents; the density acts through Enskog's collision
-    frequency. T is followed exactly but for the projection, the rest is estimated from it: a_2 and
-    the paths are taken as the same at the same number of collisions (so that d ln<dr^2>/d ln A is
-    up to 0.2 too low: dissipation makes velocities last longer), the velocity correlation as
-    decaying at 2/d of the collision rate. The final particles carry no derivative. With a given
-    start T_0 is a unit only, and its derivative 0.
+    frequency; that the box changes with it at fixed N, and with it the growth of flows, is left
+    out. T is followed exactly but for the projection, the rest is estimated from it: the paths by
+    the first Sonine order of diffusion (see `jaxgran.tangents.paths`), the velocity correlation in
+    time as decaying at 2/d of the collision rate. The derivatives of a_2 and of the final particles
+    are not known, and are nan. Second derivatives are refused. A run is followed in the frame in
+    which each replica is at rest. With a given start T_0 is a unit only, and its derivative 0.
 
     Raises:
         ValueError: for numbers out of range.
     """
 
-    num_particles: UserCount = eqx.field(static=True)
-    steps_per_contact: UserCount = eqx.field(static=True, default=40)
-    replicas: UserCount = eqx.field(static=True, default=1)
-    start: Particles | None = None
+    num_particles: UserCount = eqx.field(static=True, converter=python_number)
+    steps_per_contact: UserCount = eqx.field(static=True, converter=python_number, default=40)
+    replicas: UserCount = eqx.field(static=True, converter=python_number, default=1)
+    start: UserParticles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
     projection: UserFloat | None = eqx.field(static=True, default=PROJECTION)
     plan: Plan | None = eqx.field(static=True, default=None)
@@ -92,11 +99,9 @@ class SoftSpheres(AbstractSpheres):
 
     def __check_init__(self):
         self.check_counts(steps_per_contact=10)
-        if self.projection is not None and not 0 < self.projection < math.inf:
-            raise ValueError(
-                f"projection must be a number of mean free times > 0, got {self.projection!r}; "
-                f"take {PROJECTION}, or None for the plain derivative"
-            )
+        if self.projection is not None:
+            advice = f"It is in mean free times: {PROJECTION}, or None for the plain derivative."
+            plain_number("projection", self.projection, POSITIVE, advice)
 
     @property
     def projected(self) -> bool:
@@ -168,8 +173,7 @@ class SoftSpheres(AbstractSpheres):
 def reduced_scene(gas: Gas, num_particles: int) -> SoftScene:
     """A gas of viscoelastic spheres in units of its diameter, mass and first temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    law = gas.law
-    assert isinstance(law, Viscoelastic)
+    law: Any = gas.law  # `SoftSpheres.check` refuses laws without a force
     return SoftScene(
         side=gas.box_side(num_particles) / gas.diameter,
         alpha=gas.alpha * gas.diameter**0.5 * unit_time**2,

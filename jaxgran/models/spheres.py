@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
+from jaxgran.checks.validation import POSITIVE, no_type_check, plain_number, whole_number
 from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.data.run import DEFAULTS, Run
 from jaxgran.models import checks
@@ -99,6 +100,7 @@ class AbstractSpheres(AbstractModel):
                 f"leave start out of {type(self).__name__}, or free other parameters"
             )
 
+    @no_type_check
     def sized_for(self: S, gas: Gas, spare: float = 2.0) -> S:
         """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
 
@@ -109,6 +111,9 @@ class AbstractSpheres(AbstractModel):
             gas: with known numbers, like the gases to come: the densest, hottest and softest.
             spare: capacity over the expected need.
         """
+        if not isinstance(gas, Gas):
+            raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
+        plain_number("spare", spare, POSITIVE, "2 is twice the expected need.")
         self.check(gas)
         plan = self.planned(self.scene(gas), gas.dimension, spare)
         return dataclasses.replace(self, plan=plan)
@@ -147,8 +152,8 @@ class AbstractSpheres(AbstractModel):
             engine=self.neighbours,
         )
         if not any_traced(inputs):
-            settings = self.num_particles, plan.replicas, plan.pace, self.neighbours
-            return driver.drive(sim, run, settings)
+            model = dataclasses.replace(self, start=None, plan=None)
+            return driver.drive(sim, run, {"model": model, "pace": plan.pace})
         checks.refuse_checkpoint(self, run)
         if self.neighbours == "jax-md":
             raise ValueError(
@@ -212,11 +217,7 @@ class AbstractSpheres(AbstractModel):
     def check_counts(self, **least: int) -> None:
         """Raise ValueError where a whole number of the model is less than it must be."""
         for name, lowest in ({"num_particles": 2, "replicas": 1} | least).items():
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < lowest:
-                raise ValueError(
-                    f"{name} must be a whole number >= {lowest}, an int, got {value!r}"
-                )
+            whole_number(name, getattr(self, name), lowest)
         neighbours.engine(self.neighbours)
 
     def check_box(self, gas: Gas) -> None:

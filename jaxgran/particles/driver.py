@@ -7,7 +7,6 @@ are all known; the same run as a pure function is in `pure`.
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -20,10 +19,12 @@ from tqdm import tqdm
 from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced, concrete
 from jaxgran.data import checkpoint
+from jaxgran.data.description import described
 from jaxgran.data.run import Run
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.dynamics import AbstractDynamics, stretches
+from jaxgran.particles.dynamics import MOST_IDLE, AbstractDynamics, stretches
+from jaxgran.particles.interruption import in_thread, outside_of_transformations
 from jaxgran.particles.simulation import SETTLED, Simulation
 from jaxgran.particles.state import State
 from jaxgran.tangents.rule import Outputs
@@ -62,7 +63,7 @@ def follow(
     advance: Callable[[S, float], S],
     observe: Callable[[S], dict[str, jax.Array]],
     *,
-    scene: str = "",
+    scene: dict[str, str] | None = None,
     progress: bool = True,
     label: str | None = None,
     path: str | Path | None = None,
@@ -73,10 +74,9 @@ def follow(
     Args:
         state: a pytree with a field `time`; where the run starts.
         times: increasing, not before the state's own.
-        advance: takes a state some way towards a time, at most to it; raises `Failure` if it
-            cannot.
+        advance: takes a state towards a time, at most to it; raises `Failure` if it cannot.
         observe: what to record, a dictionary of arrays; "temperature" is shown in the bar.
-        scene: fingerprint of everything that fixes the result.
+        scene: description of everything that fixes the result.
         label: put before the bar.
         progress: show a bar with T/T_0 and the time left, after a few seconds, on a terminal.
         path: of the checkpoint; if the file exists the run is resumed from it. None for none.
@@ -87,11 +87,11 @@ def follow(
         and the status of the run.
     """
     done, state, records = _resumed(path, scene, state, _empty(observe(state), len(times)))
-    saved = time.monotonic()
+    saved, idle = time.monotonic(), 0
 
     def save():
         if path is not None:
-            checkpoint.save(path, scene, (done, state, records))
+            checkpoint.save(path, scene or {}, (done, state, records))
 
     with _progress_bar(float(times[-1]), float(state.time), progress, label) as bar:
         try:
@@ -99,7 +99,8 @@ def follow(
                 raise Failure(fault)
             while done < len(times):
                 while float(state.time) < times[done]:
-                    state = advance(state, float(times[done]))
+                    before, state = state, _waited_for(advance(state, float(times[done])))
+                    idle = _idle(idle, before, state)
                     _show(bar, state, observe)
                     if time.monotonic() - saved > CHECKPOINT_SECONDS:
                         save()
@@ -118,6 +119,19 @@ def follow(
     return state, records, fault
 
 
+def _waited_for(arrays: T) -> T:
+    """The same arrays, once they are computed."""
+    return in_thread(partial(jax.block_until_ready, arrays))
+
+
+def _idle(idle: int, before: S, state: S) -> int:
+    """How often in a row the time has not advanced; Failure if too often."""
+    idle = idle + 1 if float(state.time) <= float(before.time) else 0
+    if idle >= MOST_IDLE:
+        raise Failure(status.STALLED.bit)
+    return idle
+
+
 def _empty(observed: dict[str, jax.Array], num_times: int) -> dict[str, np.ndarray]:
     """Records at so many times, of the shapes and types of those at one time."""
     each = {name: np.asarray(value) for name, value in observed.items()}
@@ -125,12 +139,12 @@ def _empty(observed: dict[str, jax.Array], num_times: int) -> dict[str, np.ndarr
 
 
 def _resumed(
-    path: str | Path | None, scene: str, state: S, records: dict[str, np.ndarray]
+    path: str | Path | None, scene: dict[str, str] | None, state: S, records: dict[str, np.ndarray]
 ) -> tuple[int, S, dict[str, np.ndarray]]:
     """The number of times done, the state and the records: of a checkpoint, if there is one."""
     if path is None or not Path(path).exists():
         return 0, state, records
-    done, loaded, records = checkpoint.load(path, scene, (0, state, records))
+    done, loaded, records = checkpoint.load(path, scene or {}, (0, state, records))
     # As JAX arrays of the same types: the compiled functions must not see a difference.
     state = jax.tree.map(lambda new, old: concrete(new, old.dtype), loaded, state)
     return int(done), state, records
@@ -171,23 +185,11 @@ def _compiled(dynamics: AbstractDynamics, state: State, end: jax.Array, engine: 
     leaves, structure = jax.tree.flatten(arguments)
     key = engine, STRETCHES, structure, tuple((x.shape, x.dtype, x.sharding) for x in leaves)
     if key not in _PROGRAMS:
-        _PROGRAMS[key] = _outside_of_transformations(lambda: some.lower(*arguments).compile())
+        _PROGRAMS[key] = outside_of_transformations(lambda: some.lower(*arguments).compile())
         if len(_PROGRAMS) > MOST_PROGRAMS:
             _PROGRAMS.popitem(last=False)
     _PROGRAMS.move_to_end(key)
     return _PROGRAMS[key]
-
-
-def _outside_of_transformations(function: Callable[[], T]) -> T:
-    """Call a function in a thread of its own, where no JAX transformation is under way."""
-    x64 = jax.config.read("jax_enable_x64")
-
-    def call() -> T:
-        with jax.enable_x64(x64):
-            return function()
-
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        return pool.submit(call).result()
 
 
 _GROWN: dict[Capacity, Capacity] = {}
@@ -195,13 +197,13 @@ _GROWN: dict[Capacity, Capacity] = {}
 fails on the way to them nor compiles again. Results do not depend on it."""
 
 
-def drive(sim: Simulation, run: Run, settings: tuple) -> Outputs:
+def drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
     """Melt and cool, enlarging arrays where they are too short.
 
     Args:
         sim: the run, with known numbers.
         run: its options.
-        settings: what else of the model fixes the result, for the checkpoint's fingerprint.
+        settings: what else fixes the result, by name, for the checkpoint's description.
     """
     if sim.directions is None:
         return _drive(sim, run, settings)
@@ -210,7 +212,7 @@ def drive(sim: Simulation, run: Run, settings: tuple) -> Outputs:
         return _drive(sim, run, settings)
 
 
-def _drive(sim: Simulation, run: Run, settings: tuple) -> Outputs:
+def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
     dynamics, fault, state = sim.dynamics, status.OK, sim.first_state()
     engine = neighbours.engine(sim.engine, dynamics.capacity.lookahead)
     resumed = run.checkpoint is not None and Path(run.checkpoint).exists()
@@ -223,9 +225,9 @@ def _drive(sim: Simulation, run: Run, settings: tuple) -> Outputs:
     except Failure as failure:
         fault = failure.fault
     times = np.asarray(sim.inputs.times)
-    scene = ""
+    scene = {}
     if run.checkpoint is not None:
-        scene = checkpoint.fingerprint(sim.inputs, state.tangents, settings)
+        scene = described(**sim.inputs._asdict(), **settings, directions=sim.directions)
 
     def advance(state: State, end: float) -> State:
         return _advance(state, end, dynamics, dynamics.capacity, engine)
@@ -240,12 +242,8 @@ def _drive(sim: Simulation, run: Run, settings: tuple) -> Outputs:
         path=run.checkpoint,
         fault=fault,
     )
-    return Outputs(
-        neighbours.wrap(dynamics.scene.side, state.position),
-        state.velocity,
-        {name: jnp.asarray(value) for name, value in records.items()},
-        jnp.asarray(fault, jnp.int32),
-    )
+    arrays = {name: jnp.asarray(value) for name, value in records.items()}
+    return sim.outputs(state, arrays, fault)
 
 
 def _melt(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[State, int]:
@@ -289,7 +287,8 @@ def _some_stretches(
     """Several stretches in one compiled call, or one if the host finds the pairs."""
     if engine == "sweep":
         until = concrete(end, state.time.dtype)
-        state, fault, needed = _compiled(dynamics, state, until, engine)(dynamics, state, until)
+        called = _compiled(dynamics, state, until, engine)(dynamics, state, until)
+        state, fault, needed = _waited_for(called)
         return state, int(fault), [int(x) for x in needed]
     now = dynamics.stretch(state, end, engine)
     fault = int(now.status)

@@ -18,6 +18,12 @@ from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.neighbours import Found, Pairs
 from jaxgran.particles.state import State, at_start
 
+MOST_IDLE = 1000
+"""Blocks, or neighbour lists, in a row that may advance the time by nothing."""
+
+SHORTEST_FLIGHT = 1e-15
+"""Flight of the fastest sphere, in diameters, below which a block advances the time by nothing."""
+
 
 class Progress(NamedTuple):
     """A state on its way within one neighbour list.
@@ -135,12 +141,31 @@ def kept_if(good: Array, new: State, old: State) -> State:
 def repeat_until(
     end: ArrayLike, block: Callable[[Progress], Progress], first: Progress
 ) -> Progress:
-    """Blocks until the end is reached, the neighbour list is stale or a block fails."""
+    """Blocks until the end is reached, the neighbour list is stale or a block fails.
 
-    def unfinished(now: Progress):
+    Blocks that do not advance the time fail in the end, too.
+    """
+
+    def unfinished(carry):
+        now, _ = carry
         return (now.state.time < end) & ~now.stale & (now.status == status.OK)
 
-    return jax.lax.while_loop(unfinished, block, first)
+    def further(carry):
+        old, idle = carry
+        new = block(old)
+        idle = jnp.where(_is_later(new.state, old.state), 0, idle + 1)
+        stalled = status.flag(status.STALLED, idle >= MOST_IDLE)
+        return new._replace(status=new.status | stalled), idle
+
+    return jax.lax.while_loop(unfinished, further, (first, jnp.zeros((), jnp.int32)))[0]
+
+
+def _is_later(new: State, old: State) -> Bool[Array, ""]:
+    """Whether one state is later than another by more than nothing, compared with the time that
+    the fastest sphere takes to fly a diameter."""
+    passed = (new.time - old.time) + (new.time_rest - old.time_rest)
+    speed = jnp.sqrt(jnp.max(jnp.sum(old.velocity * old.velocity, -1)))
+    return passed * speed > SHORTEST_FLIGHT
 
 
 def stretches(
@@ -159,18 +184,20 @@ def stretches(
     """
 
     def unfinished(carry):
-        made, state, fault, _ = carry
+        made, _, state, fault, _ = carry
         going = (made < least) | (state.time < end)
         if most is not None:
             going &= made < most
         return going & (fault == status.OK)
 
     def further(carry):
-        made, state, _, needed = carry
+        made, idle, state, _, needed = carry
         now = dynamics.stretch(state, end, engine)
+        idle = jnp.where(_is_later(now.state, state), 0, idle + 1)
+        fault = now.status | status.flag(status.STALLED, idle >= MOST_IDLE)
         kept = jax.tree.map(partial(jnp.where, now.status == status.OK), now.state, state)
-        return made + 1, kept, now.status, jnp.maximum(needed, now.needed)
+        return made + 1, idle, kept, fault, jnp.maximum(needed, now.needed)
 
     zero, needed = jnp.zeros((), jnp.int32), jnp.zeros(len(dynamics.capacity), jnp.int32)
-    begin = zero, state, jnp.asarray(fault, jnp.int32), needed
-    return jax.lax.while_loop(unfinished, further, begin)[1:]
+    begin = zero, zero, state, jnp.asarray(fault, jnp.int32), needed
+    return jax.lax.while_loop(unfinished, further, begin)[2:]

@@ -36,4 +36,4 @@ def simulate(sim: Simulation) -> Outputs:
         return (state, fault), jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), records)
 
     (state, fault), records = jax.lax.scan(to, (state, fault), inputs.times)
-    return Outputs(neighbours.wrap(side, state.position), state.velocity, records, fault)
+    return sim.outputs(state, records, fault)

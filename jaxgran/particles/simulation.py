@@ -7,13 +7,14 @@ exactly T_0 without momentum; or it starts from what a user gives.
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from jaxgran.particles import initial
+from jaxgran.particles import initial, neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics
-from jaxgran.particles.state import State
-from jaxgran.tangents.rule import Inputs
+from jaxgran.particles.state import State, centred
+from jaxgran.tangents.rule import Inputs, Outputs
 
 MELT_COLLISIONS = 10.0
 """Mean free times of elastic motion before t = 0."""
@@ -58,10 +59,32 @@ class Simulation(NamedTuple):
         """Duration of the melt."""
         return MELT_COLLISIONS / self.dynamics.scene.collision_frequency
 
+    @property
+    def drift(self) -> Array:
+        """Velocity of the centre of mass of each particle's replica, in which the run is at rest.
+
+        Shape (n, d), or 0 for a random start.
+        """
+        if self.inputs.start is None:
+            return jnp.zeros(())
+        velocity = self.inputs.start[1]
+        return velocity - centred(velocity, self.dynamics.replicas).reshape(velocity.shape)
+
+    def outputs(self, state: State, records: dict[str, Array], fault: ArrayLike) -> Outputs:
+        """The results of a run, in the frame in which the start was given."""
+        travelled = self.drift * self.inputs.times[-1]
+        return Outputs(
+            neighbours.wrap(self.dynamics.scene.side, state.position + travelled),
+            state.velocity + self.drift,
+            records,
+            jnp.asarray(fault, jnp.int32),
+        )
+
     def first_state(self) -> State:
         """The state at the beginning of the melt, or of the run of a given start."""
         if self.inputs.start is not None:
-            return self.dynamics.begin(*self.inputs.start, self.skin)
+            position, velocity = self.inputs.start
+            return self.dynamics.begin(position, velocity - self.drift, self.skin)
         key = jax.random.key(0) if self.inputs.key is None else self.inputs.key
         places, speeds = jax.random.split(key)
         size = self.dynamics.replicas, self.num_particles, self.dimension

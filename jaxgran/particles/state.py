@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxgran.particles import neighbours, observables
+from jaxgran.tangents.paths import PathTangents
 
 
 class State(NamedTuple):
@@ -18,6 +19,8 @@ class State(NamedTuple):
 
     Attributes:
         time: t.
+        time_rest: what rounding has left out of `time`, which thus is the sum of even the shortest
+            steps in single precision.
         position: not wrapped into the box since the last neighbour list was built.
         velocity: in the laboratory frame.
         image: box sides that wrapping has subtracted from the position.
@@ -31,6 +34,7 @@ class State(NamedTuple):
     """
 
     time: Float[Array, ""]
+    time_rest: Float[Array, ""]
     position: Float[Array, "n d"]
     velocity: Float[Array, "n d"]
     image: Int[Array, "n d"]
@@ -55,6 +59,7 @@ def at_start(
     dtype, inside = position.dtype, neighbours.wrap(side, position)
     return State(
         time=jnp.zeros((), dtype),
+        time_rest=jnp.zeros((), dtype),
         position=inside,
         velocity=velocity,
         image=jnp.zeros(position.shape, jnp.int32),
@@ -64,6 +69,21 @@ def at_start(
         collisions=jnp.zeros(replicas, jnp.result_type(int)),
         skin=jnp.asarray(skin, dtype),
         own=own,
+    )
+
+
+def time_left(state: State, end: ArrayLike) -> Array:
+    """The time from a state to an end."""
+    return (jnp.asarray(end) - state.time) - state.time_rest
+
+
+def later(state: State, duration: ArrayLike, end: ArrayLike, at_end: ArrayLike) -> State:
+    """The state with its time after a duration, or at the end; a compensated sum."""
+    step = state.time_rest + duration
+    time = state.time + step
+    return state._replace(
+        time=jnp.where(at_end, end, time),
+        time_rest=jnp.where(at_end, 0.0, step - (time - state.time)),
     )
 
 
@@ -121,17 +141,18 @@ def derivatives_of_records(
     travelled: Float[Array, "replicas N d"],
     velocity: Float[Array, "replicas N d"],
     log_temperature: Float[Array, "p replicas"],
+    paths: PathTangents,
     cooling: Float[Array, "replicas"],
     meeting: Float[Array, "replicas"],
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Derivatives of the records of `records`, as `jaxgran.tangents.rule.with_tangents` takes them.
 
-    At a fixed place in the sequence of collisions the paths are the same, and ``<v(0).v>`` goes as
-    sqrt(T); in time it decays at 2/d of the collision rate.
+    In time ``<v(0).v>`` decays at 2/d of the collision rate.
 
     Args:
         values, travelled, velocity: what `records` returns.
         log_temperature: derivatives of ln T along p directions.
+        paths: tangents of the paths.
         cooling: ``-d ln T/dt``.
         meeting: collisions per particle and time.
 
@@ -140,7 +161,11 @@ def derivatives_of_records(
     """
     c, d = log_temperature, velocity.shape[-1]
     T, C = values["temperature"], values["velocity_correlation"]
-    kept = {"temperature": c * T[None], "velocity_correlation": 0.5 * c * C[None]}
+    kept = {
+        "temperature": c * T[None],
+        "displacement": paths.log_displacement * values["displacement"][None],
+        "velocity_correlation": (0.5 * c + paths.correlation_along) * C[None],
+    }
     rates = {
         "temperature": -cooling * T,
         "displacement": 2 * jnp.mean(jnp.sum(travelled * velocity, -1), axis=1),

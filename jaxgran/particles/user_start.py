@@ -6,7 +6,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jaxgran.data.curve import Particles
+from jaxgran.data.curve import Particles, UserParticles
 from jaxgran.particles import neighbours
 from jaxgran.scene.gas import Gas
 
@@ -14,10 +14,15 @@ SAME_BOX = 1e-6
 """Relative difference up to which the box of a start counts as that of the gas."""
 
 
-def check(start: Particles | None, gas: Gas, replicas: int, num_particles: int) -> None:
+def check(start: UserParticles | None, gas: Gas, replicas: int, num_particles: int) -> None:
     """Raise ValueError for a start of another shape, or, if its numbers are known, another box."""
     if start is None:
         return
+    if not isinstance(start, Particles):
+        raise ValueError(
+            "start must be a jaxgran.Particles(position, velocity, box_side), such as "
+            f"curve.particles, got {type(start).__name__}"
+        )
     shape = (replicas, num_particles, gas.dimension)
     for name, values in zip(start._fields[:2], start[:2], strict=True):
         if np.shape(values) != shape:

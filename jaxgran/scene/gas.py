@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxgran.checks.validation import POSITIVE, Domain, UserNumber, number
+from jaxgran.checks.validation import POSITIVE, Domain, UserNumber, number, whole_number
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
 from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw, Viscoelastic
@@ -23,6 +25,17 @@ def _checked_law(law: UserLaw) -> RestitutionLaw:
     if not isinstance(law, RestitutionLaw):
         raise ValueError(f"law must be a restitution law such as jaxgran.Viscoelastic, got {law!r}")
     return law
+
+
+def _check_normal(name: str, value: Array) -> None:
+    """Raise ValueError for a number that single precision cannot hold, where that is used."""
+    if not isinstance(value, Tracer) and value.dtype != jnp.float64:
+        small = np.asarray(value)
+        if np.any((small != 0) & (np.abs(small) < np.finfo(small.dtype).tiny)):
+            raise ValueError(
+                f"{name} is too small for {small.dtype}, got {small.min():g}: "
+                'jax.config.update("jax_enable_x64", True) first'
+            )
 
 
 class Gas(eqx.Module):
@@ -65,11 +78,19 @@ class Gas(eqx.Module):
     }
 
     def __check_init__(self):
-        if self.dimension not in CLOSE_PACKING:
+        if self.dimension not in CLOSE_PACKING or isinstance(self.dimension, bool | float):
             raise ValueError(f"dimension must be 2 or 3, got {self.dimension!r}")
+        shared = [name for name in self.law.domains if name in self._advice]
+        if shared:
+            raise ValueError(
+                f"the law {type(self.law).__name__} has a field {shared[0]!r}, which is the name "
+                "of a float of the gas: rename it"
+            )
         for name, domain in self.domains.items():
             if name in self._advice:
-                domain.check(name, getattr(self, name), self._advice[name])
+                value = getattr(self, name)
+                domain.check(name, value, self._advice[name])
+                _check_normal(name, value)
 
     @property
     def domains(self) -> dict[str, Domain]:
@@ -104,6 +125,21 @@ class Gas(eqx.Module):
             return [getattr(gas.law if k in gas.law.domains else gas, k) for k in values]
 
         return eqx.tree_at(get, self, [number(value) for value in values.values()])
+
+    def check_single(self) -> None:
+        """Check that this is one gas, not a batch of them outside of `jax.vmap`.
+
+        Raises:
+            ValueError: naming the float that has more than one value.
+        """
+        for name in self.domains:
+            value = jnp.shape(self.value(name))
+            if value != () and name not in self.law.lists:
+                raise ValueError(
+                    f"{name} of the gas has shape {value}, and one number is allowed: take many "
+                    "gases with jax.vmap(lambda gas: jaxgran.cool(gas, times))(gases), or call "
+                    "this for one gas at a time"
+                )
 
     @property
     def number_density(self) -> Float[Array, ""]:
@@ -239,4 +275,5 @@ class Gas(eqx.Module):
         Args:
             num_particles: N, >= 1.
         """
+        num_particles = whole_number("num_particles", num_particles, 1)
         return (num_particles / self.number_density) ** (1 / self.dimension)

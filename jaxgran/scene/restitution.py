@@ -5,9 +5,19 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from equinox import AbstractClassVar
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.checks.validation import ANY, FRACTION, NOT_NEGATIVE, POSITIVE, Domain, number
+from jaxgran.checks.validation import (
+    ANY,
+    FRACTION,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Domain,
+    UserTruth,
+    number,
+    truth_value,
+)
 from jaxgran.scene import contact
 from jaxgran.scene.restitution_table import (
     UNCLIPPED_SERIES,
@@ -20,17 +30,27 @@ class RestitutionLaw(eqx.Module):
     """A law of restitution of a material, in SI units.
 
     To add a law, define a subclass with float fields, their allowed ranges in `domains`, and
-    `reduced`, which returns a subclass of `ReducedLaw`. A class may be both.
+    `reduced`, which returns a subclass of `ReducedLaw`. A class may be both. A missing member is
+    named by the TypeError that creating the law raises. No field may have the name of a float of
+    `jaxgran.Gas`.
     """
 
-    domains: ClassVar[dict[str, Domain]]
+    domains: AbstractClassVar[dict[str, Domain]]
     """Allowed range of every float field, by name; used for validation and for fits."""
+
+    lists: ClassVar[tuple[str, ...]] = ()
+    """Names of those fields that hold more than one number."""
 
     advice: ClassVar[dict[str, str]] = {}
     """What to do about a value outside its range, by name: a sentence for the error message."""
 
     def __check_init__(self):
         for name, domain in self.domains.items():
+            if not hasattr(self, name):
+                raise ValueError(
+                    f"domains of {type(self).__name__} has {name!r}, which is no field: give "
+                    "domains the names of its float fields"
+                )
             domain.check(name, getattr(self, name), self.advice.get(name, ""))
 
     @abstractmethod
@@ -132,7 +152,7 @@ class Viscoelastic(RestitutionLaw):
     youngs_modulus: Float[Array, ""] = eqx.field(converter=number)
     poisson_ratio: Float[Array, ""] = eqx.field(converter=number)
     dissipative_constant: Float[Array, ""] = eqx.field(converter=number)
-    clipped: bool = eqx.field(static=True, default=True)
+    clipped: UserTruth = eqx.field(static=True, default=True)
 
     domains: ClassVar[dict[str, Domain]] = {
         "youngs_modulus": POSITIVE,
@@ -144,6 +164,9 @@ class Viscoelastic(RestitutionLaw):
         "poisson_ratio": "Most solids lie between 0.2 and 0.45.",
         "dissipative_constant": "Give A in seconds; A = 0 makes the spheres elastic.",
     }
+
+    def __check_init__(self):
+        truth_value("clipped", self.clipped)
 
     def alpha(self, *, diameter: ArrayLike, mass: ArrayLike) -> Float[Array, ""]:
         """Elastic constant over effective mass, ``alpha = rho / m_eff`` with ``m_eff = m / 2``.
@@ -213,12 +236,14 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
     exponents: Float[Array, "terms"] = eqx.field(converter=number)
 
     domains: ClassVar[dict[str, Domain]] = {"coefficients": ANY, "exponents": ANY}
+    lists: ClassVar[tuple[str, ...]] = ("coefficients", "exponents")
 
     def __check_init__(self):
-        if self.coefficients.shape != self.exponents.shape or self.coefficients.ndim < 1:
+        shape = self.coefficients.shape
+        if shape != self.exponents.shape or self.coefficients.ndim < 1 or shape[-1] < 1:
             raise ValueError(
-                "coefficients and exponents must be lists of the same length, got shapes "
-                f"{self.coefficients.shape} and {self.exponents.shape}"
+                "coefficients and exponents must be lists of the same length, 1 or more, got "
+                f"shapes {shape} and {self.exponents.shape}"
             )
 
     @classmethod

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxgran.checks.validation import NOT_NEGATIVE
+
 C1 = gamma(3 / 5) * sqrt(pi) / (2 ** (1 / 5) * 5 ** (2 / 5) * gamma(21 / 10))
 """First coefficient of the restitution series, 1.153448858; Brilliantov & Poeschel, Eq. (5)."""
 
@@ -128,4 +130,5 @@ def viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[
 
     Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eqs. (4)-(6).
     """
+    NOT_NEGATIVE.check("beta", beta, "It is (3/2) A alpha^(2/5) v^(1/5).")
     return jnp.exp(log_viscoelastic_restitution(beta, clipped=clipped))

@@ -2,7 +2,9 @@
 
 - `thermal`: tangents of positions and velocities, projected onto T at regular intervals.
 - `impact`: tangents of a gas of instantaneous impacts, projected at every impact.
+- `paths`: what a change of the temperature does to displacements and the velocity correlation.
 - `rule`: the rule of differentiation of a whole run, for forward and reverse mode.
+- `limits`: what a rule refuses (second derivatives) and what it does not know (nan).
 
 May import `scene` and `theory`; is imported by `particles` and `models`. Nothing is re-exported.
 """

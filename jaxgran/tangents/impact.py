@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, DTypeLike, Float
 
 from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.tangents.paths import PathTangents
 from jaxgran.tangents.thermal import Rates
 
 
@@ -22,19 +23,22 @@ class ImpactTangents(NamedTuple):
         log_temperature: c = d ln T.
         clock: tangent of the time at a fixed place in the sequence of collisions.
         rates: of the gas.
+        paths: tangents of the paths of the particles.
     """
 
     law: ReducedLaw
     log_temperature: Float[Array, "p replicas"]
     clock: Float[Array, "p replicas"]
     rates: Rates
+    paths: PathTangents
 
     @classmethod
     def at_start(cls, law: ReducedLaw, replicas: int, dtype: DTypeLike) -> "ImpactTangents":
         """The tangents of an initial state, which does not depend on the law."""
         num_directions = max((len(leaf) for leaf in jax.tree.leaves(law)), default=0)
         zeros = jnp.zeros((num_directions, replicas), dtype)
-        return cls(law, zeros, zeros, Rates.none(replicas, dtype))
+        paths = PathTangents.at_start(num_directions, replicas, dtype)
+        return cls(law, zeros, zeros, Rates.none(replicas, dtype), paths)
 
     def gains(
         self, law: ReducedLaw, normal_speed: Float[Array, "rows"]
@@ -54,19 +58,37 @@ class ImpactTangents(NamedTuple):
         self,
         gains: Float[Array, "changes replicas"],
         energy: Float[Array, "replicas"],
+        temperature: Float[Array, "replicas"],
         duration: ArrayLike,
         rates: Rates,
+        trend: Float[Array, "replicas"],
+        dimension: int,
     ) -> "ImpactTangents":
         """The tangents after some impacts, by the implicit midpoint rule.
 
         Args:
             gains: the sums of `gains` over the impacts.
             energy: mean thermal energy of each replica during them.
+            temperature: T of each replica after them.
             duration: of the time in which they happened.
             rates: of the gas after them.
+            trend: the dependence of its cooling rate on T, now.
+            dimension: d.
         """
         c = self.log_temperature
         half = gains[-1:] / (4 * energy[None])
         new = ((1 + half) * c + gains[:-1] / energy[None]) / (1 - half)
-        clock = self.clock - 0.25 * (c + new) * duration
-        return self._replace(log_temperature=new, clock=clock, rates=rates)
+        speed = jnp.sqrt(temperature)
+        paths = self.paths.after(
+            speed * duration,
+            new - c,
+            meeting=rates.collision(jnp.ones_like(speed)),
+            cooling=rates.cooling(trend) / jnp.where(speed > 0, speed, 1.0),
+            dimension=dimension,
+        )
+        return self._replace(
+            log_temperature=new,
+            clock=self.clock - 0.25 * (c + new) * duration,
+            rates=rates,
+            paths=paths,
+        )

@@ -11,6 +11,8 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, DTypeLike, Float, Int, PRNGKeyArray
 
+from jaxgran.tangents.limits import first_order_only, unknown
+
 _DENSITY_POWER = {"displacement": -2.0, "elastic_energy": 1.0}
 """Power of the collision frequency in a record at a fixed place in the sequence of collisions."""
 
@@ -87,8 +89,9 @@ def differentiable(
         material: the pytree of numbers of a scene, such as (alpha, A) or a reduced law.
 
     Returns:
-        The run as a function of its inputs. Its derivative in positions and velocities of a start
-        raises ValueError; its last particles carry no derivative.
+        The run as a function of its inputs. Its derivative in positions and velocities of a start,
+        and its second derivatives, raise ValueError; derivatives of a_2 and of the last particles
+        are nan.
     """
 
     @jax.custom_jvp
@@ -100,15 +103,18 @@ def differentiable(
     def outputs_jvp(at: tuple[Inputs], along: tuple[Inputs]):
         (inputs,), (change,) = at, along
         _refuse_derivative_in_start(change)
+        inputs = first_order_only(inputs)
         directions, amounts = _directions(
             material(inputs.scene), material(change.scene), inputs.times.dtype
         )
         out = run(inputs, directions=directions)
         denser, later = _changes_of_clock(inputs, change)
         moved = _moved(out.records, amounts, denser, later, out.velocity.shape[1])
+        changes = amounts, denser, later
+        moved["sonine"] = unknown(out.records["sonine"].shape, *changes)
         return out._replace(records=_plain(out.records)), Outputs(
-            position=jnp.zeros_like(out.position),
-            velocity=jnp.zeros_like(out.velocity),
+            position=unknown(out.position.shape, *changes),
+            velocity=unknown(out.velocity.shape, *changes),
             records=moved,
             status=np.zeros(out.status.shape, jax.dtypes.float0),  # type: ignore[arg-type]
         )

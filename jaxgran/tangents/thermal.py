@@ -24,8 +24,11 @@ or counted twice where a fixed end time moves through the steps.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float
+
+from jaxgran.tangents.paths import PathTangents
 
 MEMORY = 5.0
 """Mean free times over which the rates of cooling and of collision are averaged."""
@@ -70,10 +73,12 @@ class ThermalTangents(NamedTuple):
         position: tangent of the positions.
         velocity: tangent of the velocities, without the part (c/2) v.
         free: whether a sphere touches no other one.
-        since: time of the last projection.
+        elapsed: time since the last projection.
+        own_elapsed: the integral of T^(1/2) over this time.
         interval: between projections, in mean free times.
         damping: q delta of the trend.
         rates: of the gas.
+        paths: tangents of the paths of the particles, up to the last projection.
     """
 
     alpha: Float[Array, "p"]
@@ -83,10 +88,12 @@ class ThermalTangents(NamedTuple):
     position: Float[Array, "p n d"]
     velocity: Float[Array, "p n d"]
     free: Bool[Array, "n"]
-    since: Float[Array, ""]
+    elapsed: Float[Array, ""]
+    own_elapsed: Float[Array, "replicas"]
     interval: Float[Array, ""]
     damping: Float[Array, ""]
     rates: Rates
+    paths: PathTangents
 
     def trend(self, temperature: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
         """Dependence of the cooling rate on T, ``T^(3/5) / (1 + q delta T^(1/10))``.
@@ -130,41 +137,76 @@ def at_start(
         position=nothing,
         velocity=nothing,
         free=jnp.ones(len(velocity), bool),
-        since=jnp.zeros((), dtype),
+        elapsed=jnp.zeros((), dtype),
+        own_elapsed=jnp.zeros(replicas, dtype),
         interval=jnp.asarray(interval, dtype),
         damping=jnp.asarray(damping, dtype),
         rates=Rates.none(replicas, dtype),
+        paths=PathTangents.at_start(p, replicas, dtype),
     )
 
 
-def projected(
-    tangents: ThermalTangents, velocity: Float[Array, "n d"], time: ArrayLike
-) -> tuple[Float[Array, "p replicas"], Float[Array, "p replicas"]]:
-    """c and the tangent of the clock after a projection at this time, of the free spheres."""
+class Projection(NamedTuple):
+    """What a projection changes.
+
+    Attributes:
+        log_temperature: c = d ln T, with the energy that the rest held.
+        clock: tangent of the clock.
+        paths: tangents of the paths.
+    """
+
+    log_temperature: Float[Array, "p replicas"]
+    clock: Float[Array, "p replicas"]
+    paths: PathTangents
+
+
+def projected(tangents: ThermalTangents, velocity: Float[Array, "n d"]) -> Projection:
+    """A projection now, of the spheres that touch no other one.
+
+    Args:
+        tangents: of the state.
+        velocity: of the particles, in the frame in which each replica is at rest.
+    """
     c = tangents.log_temperature
-    replicas = c.shape[1]
+    replicas, d = c.shape[1], velocity.shape[1]
+    each = velocity.reshape(replicas, -1)
     v = jnp.where(tangents.free[:, None], velocity, 0.0).reshape(replicas, -1)
     rest = tangents.velocity.reshape(len(c), *v.shape)
     gain = _ratio(2 * jnp.sum(rest * v[None], -1), jnp.sum(v * v, -1)[None])
-    return c + gain, tangents.clock - 0.5 * (c + 0.5 * gain) * (time - tangents.since)
+    heat = jnp.mean(each * each, -1)
+    one = jnp.ones_like(heat)
+    return Projection(
+        log_temperature=c + gain,
+        clock=tangents.clock - 0.5 * (c + 0.5 * gain) * tangents.elapsed,
+        paths=tangents.paths.after(
+            tangents.own_elapsed,
+            gain,
+            meeting=tangents.rates.collision(one),
+            cooling=_ratio(tangents.rates.cooling(tangents.trend(heat)), jnp.sqrt(heat)),
+            dimension=d,
+        ),
+    )
 
 
 def project(
-    tangents: ThermalTangents, velocity: Float[Array, "n d"], time: ArrayLike, due: ArrayLike
+    tangents: ThermalTangents, velocity: Float[Array, "n d"], due: ArrayLike
 ) -> ThermalTangents:
-    """The tangents after a thermal projection at this time, or unchanged unless it is due."""
-    c, clock = projected(tangents, velocity, time)
-    replicas = c.shape[1]
-    gain = jnp.repeat(c - tangents.log_temperature, len(velocity) // replicas, axis=1)
+    """The tangents after a thermal projection now, or unchanged unless it is due."""
+    new = projected(tangents, velocity)
+    replicas = new.clock.shape[1]
+    gain = new.log_temperature - tangents.log_temperature
+    each_gain = jnp.repeat(gain, len(velocity) // replicas, axis=1)
     dropped = due & tangents.free[None, :, None]
-    kept = tangents.velocity - 0.5 * gain[:, :, None] * velocity[None]
+    kept = tangents.velocity - 0.5 * each_gain[:, :, None] * velocity[None]
     held = jnp.where(due, kept, tangents.velocity)
+    old = Projection(tangents.log_temperature, tangents.clock, tangents.paths)
+    now = jax.tree.map(lambda new, old: jnp.where(due, new, old), new, old)
     return tangents._replace(
-        log_temperature=jnp.where(due, c, tangents.log_temperature),
-        clock=jnp.where(due, clock, tangents.clock),
+        **now._asdict(),
         position=jnp.where(dropped, 0.0, tangents.position),
         velocity=jnp.where(dropped, 0.0, held),
-        since=jnp.where(due, time, tangents.since),
+        elapsed=jnp.where(due, 0.0, tangents.elapsed),
+        own_elapsed=jnp.where(due, 0.0, tangents.own_elapsed),
     )
 
 

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from jaxgran.data import checkpoint, files
-from jaxgran.data.checkpoint import fingerprint, load, save
+from jaxgran.data.checkpoint import load, save
+from jaxgran.data.description import described, differences
 from jaxgran.data.files import write_whole
+
+ABC = {"name": "abc"}
 
 
 class State(NamedTuple):
@@ -46,28 +49,29 @@ def path(tmp_path):
 
 
 def test_round_trip_bit_for_bit(path):
-    for scene in ("", "abc"):
+    for scene in ({}, ABC):
         save(path, scene, state())
         same_bits(load(path, scene, state()), state())
-    save(str(path), "abc", jnp.ones(3))  # written over
-    same_bits(load(str(path), "abc", jnp.zeros(3)), jnp.ones(3))
+    save(str(path), ABC, jnp.ones(3))  # written over
+    same_bits(load(str(path), ABC, jnp.zeros(3)), jnp.ones(3))
     assert [file.name for file in path.parent.iterdir()] == ["run.eqx"]
 
 
 def test_more_leaves_than_ten_keep_their_order(path):
     tree = [np.full(2, k) for k in range(23)]
-    save(path, "s", tree)
-    same_bits(load(path, "s", tree), tree)
+    save(path, {}, tree)
+    same_bits(load(path, {}, tree), tree)
 
 
 def test_other_scenes_are_refused(path):
-    save(path, "abc", state())
-    with pytest.raises(ValueError, match="run.eqx belongs to another scene"):
-        load(path, "abd", state())
-    with pytest.raises(ValueError, match="run.eqx belongs to another scene"):
-        load(path, "abc", (state(), jnp.zeros(3)))
-    with pytest.raises(ValueError, match="run.eqx belongs to another scene"):
-        load(path, "abc", jnp.zeros(3))
+    save(path, ABC, state())
+    other = {"name": "abd", "N": "3"}
+    with pytest.raises(ValueError, match="run.eqx .* name was abc and is abd; N was absent and is"):
+        load(path, other, state())
+    with pytest.raises(ValueError, match="run.eqx belongs to another run"):
+        load(path, ABC, (state(), jnp.zeros(3)))
+    with pytest.raises(ValueError, match="run.eqx belongs to another run"):
+        load(path, ABC, jnp.zeros(3))
 
 
 @pytest.mark.parametrize(
@@ -83,45 +87,45 @@ def test_other_scenes_are_refused(path):
     ],
 )
 def test_other_arrays_are_refused(path, like):
-    save(path, "abc", np.ones((3, 2)))
-    with pytest.raises(ValueError, match="run.eqx belongs to another scene"):
-        load(path, "abc", like)
-    same_bits(load(path, "abc", np.zeros((3, 2))), np.ones((3, 2)))
+    save(path, ABC, np.ones((3, 2)))
+    with pytest.raises(ValueError, match="run.eqx belongs to another run"):
+        load(path, ABC, like)
+    same_bits(load(path, ABC, np.zeros((3, 2))), np.ones((3, 2)))
 
 
 def test_python_numbers_keep_their_type(path):
-    save(path, "abc", (3, 0.1, True))
-    loaded = load(path, "abc", (0, 0.0, False))
+    save(path, ABC, (3, 0.1, True))
+    loaded = load(path, ABC, (0, 0.0, False))
     assert loaded == (3, 0.1, True) and [type(x) for x in loaded] == [int, float, bool]
 
 
 def test_other_formats_are_refused(path, monkeypatch):
     monkeypatch.setattr(checkpoint, "FORMAT", 7)
-    save(path, "abc", state())
+    save(path, ABC, state())
     monkeypatch.undo()
     with pytest.raises(ValueError, match="run.eqx was written by jaxgran .* format 7, this is"):
-        load(path, "abc", state())
+        load(path, ABC, state())
 
 
 def test_other_versions_are_refused(path, monkeypatch):
     monkeypatch.setattr(checkpoint, "version", lambda package: "0.0.7")
-    save(path, "abc", state())
+    save(path, ABC, state())
     monkeypatch.undo()
     with pytest.raises(ValueError, match="run.eqx was written by jaxgran 0.0.7, this is"):
-        load(path, "abc", state())
+        load(path, ABC, state())
 
 
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.3, 0.9, 0.999])
 def test_truncated_files_are_refused(path, part):
-    save(path, "abc", state())
+    save(path, ABC, state())
     data = path.read_bytes()
     path.write_bytes(data[: int(part * len(data))])
     with pytest.raises(ValueError, match="run.eqx is (damaged|no checkpoint of jaxgran)"):
-        load(path, "abc", state())
+        load(path, ABC, state())
 
 
 def test_a_damaged_byte_is_told_or_harmless(path):
-    save(path, "abc", state())
+    save(path, ABC, state())
     data = path.read_bytes()
     rng = np.random.default_rng(0)
     told = 0
@@ -130,7 +134,7 @@ def test_a_damaged_byte_is_told_or_harmless(path):
         damaged[rng.integers(len(data))] ^= rng.integers(1, 256)
         path.write_bytes(damaged)
         try:
-            loaded = load(path, "abc", state())
+            loaded = load(path, ABC, state())
         except ValueError as error:
             assert str(path) in str(error)
             told += 1
@@ -141,31 +145,31 @@ def test_a_damaged_byte_is_told_or_harmless(path):
 
 def test_files_of_others_are_refused(path):
     with pytest.raises(ValueError, match="run.eqx is no checkpoint .* No such file"):
-        load(path, "abc", state())
+        load(path, ABC, state())
     with pytest.raises(ValueError, match=f"{path.parent.name} is no checkpoint"):
-        load(path.parent, "abc", state())
+        load(path.parent, ABC, state())
     for content in (b"t,T\n0,1\n", b"\x89PNG\r\n\x1a\n", b"\x00" * 100):
         path.write_bytes(content)
         with pytest.raises(ValueError, match="run.eqx is no checkpoint"):
-            load(path, "abc", state())
+            load(path, ABC, state())
     np.savez(path, leaf_0=np.zeros(3))
     with pytest.raises(ValueError, match="run.eqx is no checkpoint"):
-        load(path, "abc", state())
+        load(path, ABC, state())
     for header in (b"3", b"[]", b"{}", b'{"format": 2}', b"[" * 100_000):
         path.write_bytes(header + b"\n")
         with pytest.raises(ValueError, match="run.eqx is no checkpoint"):
-            load(path, "abc", state())
+            load(path, ABC, state())
 
 
 def test_nothing_is_unpickled(path):
-    save(path, "abc", np.zeros(1))
+    save(path, ABC, np.zeros(1))
     header = json.loads(path.read_bytes().split(b"\n")[0])
     body = io.BytesIO()
     np.save(body, np.array([{}]), allow_pickle=True)
     header["digest"] = hashlib.sha256(body.getvalue()).hexdigest()
     path.write_bytes(json.dumps(header).encode() + b"\n" + body.getvalue())
     with pytest.raises(ValueError, match="run.eqx is damaged"):
-        load(path, "abc", np.zeros(1))
+        load(path, ABC, np.zeros(1))
 
 
 def test_folders_that_are_not_there(tmp_path):
@@ -177,13 +181,13 @@ def test_folders_that_are_not_there(tmp_path):
         tmp_path / "folder",
     ):
         with pytest.raises(OSError, match="cannot write") as error:
-            save(path, "abc", state())
+            save(path, ABC, state())
         assert str(path) in str(error.value) and error.value.filename == str(path)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["file", "folder"]
 
 
 def test_a_folder_closed_to_writing_keeps_the_old_file(path, monkeypatch):
-    save(path, "abc", state())
+    save(path, ABC, state())
     before = path.read_bytes()
 
     def closed(*args, **kwargs):  # as the system says it, to all but its administrator
@@ -193,14 +197,14 @@ def test_a_folder_closed_to_writing_keeps_the_old_file(path, monkeypatch):
     with pytest.raises(
         PermissionError, match="Permission denied.*any earlier file is unharmed"
     ) as e:
-        save(path, "abc", jnp.zeros(3))
+        save(path, ABC, jnp.zeros(3))
     assert e.value.errno == errno.EACCES and str(path) in str(e.value)
     assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize("stage", ["write", "fsync", "replace"])
 def test_a_full_disk_keeps_the_old_file(path, monkeypatch, stage):
-    save(path, "abc", state())
+    save(path, ABC, state())
     before = path.read_bytes()
 
     def full(*args):
@@ -222,7 +226,7 @@ def test_a_full_disk_keeps_the_old_file(path, monkeypatch, stage):
 
 @pytest.mark.parametrize("what", [KeyboardInterrupt, MemoryError, ZeroDivisionError])
 def test_any_end_of_writing_keeps_the_old_file(path, what):
-    save(path, "abc", state())
+    save(path, ABC, state())
     before = path.read_bytes()
 
     def write(file):
@@ -232,7 +236,7 @@ def test_any_end_of_writing_keeps_the_old_file(path, what):
     with pytest.raises(what):
         write_whole(path, write)
     assert path.read_bytes() == before
-    same_bits(load(path, "abc", state()), state())
+    same_bits(load(path, ABC, state()), state())
 
 
 def test_what_is_written_is_whole(path):
@@ -247,7 +251,7 @@ class Model(eqx.Module):
     order: int = eqx.field(static=True, default=2)
 
 
-def test_fingerprints_tell_everything_apart():
+def test_descriptions_tell_everything_apart():
     key = jax.random.key
     trees = [
         {"a": 1.0, "b": np.arange(3)},
@@ -283,18 +287,32 @@ def test_fingerprints_tell_everything_apart():
         {"key": key(0)},
         jax.random.split(key(0), 2),
     ]
-    assert len({fingerprint(tree) for tree in trees}) == len(trees)
-    assert fingerprint(1.0, 2.0) != fingerprint(2.0, 1.0)
-    assert len({fingerprint(*n * [1.0]) for n in range(4)}) == 4
+    words = [described(run=tree) for tree in trees]
+    for i, first in enumerate(words):
+        for j, second in enumerate(words):
+            assert (first == second) == (i == j), (first, second)
+            assert bool(differences(first, second)) == (i != j)
 
 
-def test_fingerprints_are_of_values_not_of_objects():
+def law(factor):
+    class Law(eqx.Module):
+        function: object = eqx.field(static=True)
+
+        def restitution(self, speed):
+            return factor * speed
+
+    return Law
+
+
+def test_descriptions_are_of_values_not_of_objects():
     first, second = (
         (Model(jnp.arange(3.0)), jax.random.key(5), {"x": 1.5, "y": "text"}) for _ in range(2)
     )
-    assert fingerprint(first) == fingerprint(second)
-    assert fingerprint(*first) == fingerprint(*second)
-    assert fingerprint(jnp.arange(3.0)) == fingerprint(np.arange(3.0))
-    assert fingerprint(np.arange(6.0)[::2]) == fingerprint(np.array([0.0, 2.0, 4.0]))
-    digest = fingerprint(first)
-    assert len(digest) == 64 and set(digest) <= set("0123456789abcdef")
+    assert described(a=first) == described(a=second)
+    assert described(a=jnp.arange(3.0)) == described(a=np.arange(3.0))
+    assert described(a=np.arange(6.0)[::2]) == described(a=np.array([0.0, 2.0, 4.0]))
+    one, two = (law(3)(np.square) for _ in range(2))
+    assert described(law=one) == described(law=two)
+    assert differences(described(law=one), described(law=law(3)(np.sqrt)))
+    assert not any("0x" in words for words in described(law=one, f=lambda x: x).values())
+    assert described(a=object()) == described(a=object())

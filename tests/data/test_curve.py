@@ -102,14 +102,14 @@ def test_missing_files_are_refused(tmp_path):
     [
         ({"Y": None}, "the header lacks Y; add lines such as '# Y: VALUE'"),
         ({"Y": None, "T0": None}, "the header lacks Y, T0"),
-        ({"Y": "soft"}, "header line Y: 'soft' is not a number"),
+        ({"Y": "soft"}, "header line Y: 'soft' is not a finite number"),
         ({"Y": "-1"}, "youngs_modulus must lie in"),
         ({"nu": "0.7"}, "poisson_ratio must lie in"),
         ({"eta": "0.9"}, "packing_fraction must lie in"),
         ({"density": "0"}, "density must lie in"),
         ({"T0": "-3"}, "temperature must lie in"),
         ({"dimension": "4"}, "dimension must be 2 or 3"),
-        ({"dimension": "2.9"}, "dimension: must be a positive whole number, got '2.9'"),
+        ({"dimension": "2.9"}, "dimension: must be a whole number from 1 to 1e.12, got '2.9'"),
     ],
 )
 def test_bad_headers_are_refused(change, message):

@@ -362,7 +362,7 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
     resumed = jaxgran.cool(gas, times, model=DSMC(1000, replicas=2), checkpoint=file)
     for name in ("temperature", "sonine", "displacement", "collisions", "velocity_correlation"):
         np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))
-    with pytest.raises(ValueError, match="another scene"):
+    with pytest.raises(ValueError, match="another run"):
         jaxgran.cool(gas, 2 * times, model=DSMC(1000, replicas=2), checkpoint=file)
 
 

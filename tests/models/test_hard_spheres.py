@@ -301,7 +301,7 @@ def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
     resumed = jaxgran.cool(gas, times, model=HardSpheres(100, neighbours=by), checkpoint=file)
     np.testing.assert_array_equal(resumed.temperature, whole.temperature)
     np.testing.assert_array_equal(resumed.particles.position, whole.particles.position)
-    with pytest.raises(ValueError, match="another scene"):
+    with pytest.raises(ValueError, match="another run"):
         jaxgran.cool(gas, 2 * times, model=HardSpheres(100, neighbours=by), checkpoint=file)
 
 
@@ -438,8 +438,8 @@ def test_refuses_what_it_cannot_do():
         ({"num_particles": 1}, "num_particles must be a whole number >= 2"),
         ({"num_particles": 10.0}, "num_particles"),
         ({"num_particles": 10, "replicas": 0}, "replicas"),
-        ({"num_particles": 10, "contact_time": 1.0}, "contact_time must lie in"),
-        ({"num_particles": 10, "contact_time": "short"}, "contact_time must lie in"),
+        ({"num_particles": 10, "contact_time": 1.0}, "contact_time must"),
+        ({"num_particles": 10, "contact_time": "short"}, "contact_time must"),
         ({"num_particles": 10, "neighbours": "best"}, "neighbours must be one of"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -252,7 +252,7 @@ def test_cool_chooses_particles():
 def test_bad_requests_are_refused(beads):
     gas = beads(0.15)
     for tolerance in (0, -0.1, float("nan"), "2 %"):
-        with pytest.raises(ValueError, match="tolerance must be a number > 0"):
+        with pytest.raises(ValueError, match="tolerance must"):
             jaxgran.choose_model(gas, [1.0], tolerance)
     jaxgran.choose_model(gas, [1.0], np.float32(0.02), 1000)
     with pytest.raises(ValueError, match="num_particles must be a whole number >= 2, an int"):
@@ -263,7 +263,7 @@ def test_bad_requests_are_refused(beads):
         jaxgran.choose_model("gas", [1.0])
     with pytest.raises(ValueError, match='go with model="auto"'):
         jaxgran.cool(gas, [1.0], tolerance=0.1)
-    with pytest.raises(ValueError, match='must be a model or "auto"'):
+    with pytest.raises(ValueError, match="model must be a model"):
         jaxgran.cool(gas, [1.0], model="best")
     with pytest.raises(ValueError, match="call choose_model outside"):
         jax.jit(lambda g: jaxgran.cool(g, [1.0], model="auto").temperature)(gas)

@@ -266,7 +266,7 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
     resumed = jaxgran.cool(gas, times, model=SoftSpheres(100), checkpoint=file)
     np.testing.assert_array_equal(resumed.temperature, whole.temperature)
     np.testing.assert_array_equal(resumed.particles.position, whole.particles.position)
-    with pytest.raises(ValueError, match="another scene"):
+    with pytest.raises(ValueError, match="another run"):
         jaxgran.cool(gas, 2 * times, model=SoftSpheres(100), checkpoint=file)
 
 
@@ -386,7 +386,7 @@ def test_refuses_what_it_cannot_do(beads):
         ({"num_particles": 10, "steps_per_contact": 5}, "steps_per_contact"),
         ({"num_particles": 10, "replicas": 0}, "replicas"),
         ({"num_particles": 10, "neighbours": "best"}, "neighbours must be one of"),
-        ({"num_particles": 10, "projection": 0.0}, "projection must be a number"),
+        ({"num_particles": 10, "projection": 0.0}, "projection must"),
     ):
         with pytest.raises(ValueError, match=message):
             SoftSpheres(**settings)

@@ -102,10 +102,10 @@ def test_an_interrupted_run_is_resumed(tmp_path, at):
     path = tmp_path / "run.npz"
     whole = quiet(start(), TIMES, advance, observe)
     with pytest.raises(KeyboardInterrupt):
-        quiet(start(), TIMES, Calls(at), observe, scene="toy", path=path)
+        quiet(start(), TIMES, Calls(at), observe, scene={"name": "toy"}, path=path)
     assert path.exists()
     rest = Calls()
-    resumed = quiet(start(), TIMES, rest, observe, scene="toy", path=path)
+    resumed = quiet(start(), TIMES, rest, observe, scene={"name": "toy"}, path=path)
     assert rest.number == STEPS - at
     same(resumed, whole)
     assert all(isinstance(leaf, jax.Array) for leaf in resumed[0])
@@ -125,9 +125,9 @@ def test_a_run_that_dies_loses_little(tmp_path, monkeypatch):
     path = tmp_path / "run.npz"
     whole = quiet(start(), TIMES, advance, observe)
     with pytest.raises(MemoryError):
-        quiet(start(), TIMES, Calls(7, MemoryError), observe, scene="toy", path=path)
+        quiet(start(), TIMES, Calls(7, MemoryError), observe, scene={"name": "toy"}, path=path)
     rest = Calls()
-    resumed = quiet(start(), TIMES, rest, observe, scene="toy", path=path)
+    resumed = quiet(start(), TIMES, rest, observe, scene={"name": "toy"}, path=path)
     assert rest.number == STEPS - 7
     same(resumed, whole)
 
@@ -150,16 +150,16 @@ def test_checkpoints_are_as_seldom_as_said(tmp_path, monkeypatch):
 
 def test_a_finished_run_is_read_back(tmp_path):
     path = tmp_path / "run.npz"
-    whole = quiet(start(), TIMES, advance, observe, scene="toy", path=path)
-    same(quiet(start(), TIMES, Calls(0), observe, scene="toy", path=path), whole)
+    whole = quiet(start(), TIMES, advance, observe, scene={"name": "toy"}, path=path)
+    same(quiet(start(), TIMES, Calls(0), observe, scene={"name": "toy"}, path=path), whole)
 
 
 def test_checkpoints_of_other_scenes_are_refused(tmp_path):
     path = tmp_path / "run.npz"
-    quiet(start(), TIMES, advance, observe, scene="toy", path=path)
+    quiet(start(), TIMES, advance, observe, scene={"name": "toy"}, path=path)
     before = path.read_bytes()
-    with pytest.raises(ValueError, match="run.npz belongs to another scene"):
-        quiet(start(), TIMES, advance, observe, scene="other", path=path)
+    with pytest.raises(ValueError, match="run.npz belongs to another run"):
+        quiet(start(), TIMES, advance, observe, scene={"name": "other"}, path=path)
     assert path.read_bytes() == before
 
 

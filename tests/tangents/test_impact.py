@@ -169,7 +169,7 @@ def test_a_checkpoint_keeps_the_tangents(constant, tmp_path):
     kept = partial(f, checkpoint=tmp_path / "a.npz")
     for _ in range(2):  # run, and read
         np.testing.assert_array_equal(jax.jacfwd(kept)(at), slopes)
-    with pytest.raises(ValueError, match="another scene"):
+    with pytest.raises(ValueError, match="another run"):
         kept(at)
 
 

@@ -80,7 +80,7 @@ def test_one_impact_has_the_slope_of_its_law(beads, beta, angle):
     for interval in (1e-9, 1e-4, 1e3):
         state, scene = followed(gas, position, velocity, len(gaps), end, interval)
         assert bool(jnp.all(state.tangents.free))
-        c, _ = thermal.projected(state.tangents, state.velocity, state.time)
+        c = thermal.projected(state.tangents, state.velocity).log_temperature
         got = float(jnp.mean(c) * scene.dissipative_constant)
         speed = 2.0 * float(jnp.sqrt(gas.temperature))
         # The onset's sqrt(xi) in steps of t_c/40 leaves 1e-3 of a slope on average over its phase.

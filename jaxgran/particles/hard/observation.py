@@ -35,5 +35,7 @@ def observe(state: State, scene: HardScene, replicas: int) -> dict[str, Array]:
     T = values["temperature"]
     cooling = along.rates.cooling(cooling_trend(scene.law, T, velocity.shape[-1]))
     meeting, c = along.rates.collision(T), along.log_temperature
-    kept, rates = derivatives_of_records(values, travelled, velocity, c, cooling, meeting)
+    kept, rates = derivatives_of_records(
+        values, travelled, velocity, c, along.paths, cooling, meeting
+    )
     return rule.with_tangents(values, kept, rates, along.clock)

@@ -25,7 +25,7 @@ from jaxgran.particles.hard.observation import cooling_trend, observe
 from jaxgran.particles.hard.prediction import Slots
 from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.neighbours import Pairs
-from jaxgran.particles.state import State, fastest, temperature
+from jaxgran.particles.state import State, fastest, later, temperature, time_left
 from jaxgran.scene.restitution import ReducedLaw
 from jaxgran.tangents.impact import ImpactTangents
 from jaxgran.tangents.thermal import remembered
@@ -135,7 +135,7 @@ class HardDynamics(AbstractDynamics):
     def _window(self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike) -> Progress:
         """One window, accepted if no sphere became faster than the bound and nothing went wrong."""
         old, more = now.state, now.own
-        left = jnp.asarray(end - old.time)
+        left = time_left(old, end)
         num_left = jnp.maximum(jnp.ceil(left / old.own.window * (1 - 1e-9)), 1.0)
         duration = left / num_left
         bound = SPEED_MARGIN * more.widen * fastest(old.velocity, self.replicas)
@@ -144,7 +144,7 @@ class HardDynamics(AbstractDynamics):
         most = bound[jnp.minimum(chosen.replica, self.replicas - 1)]
         too_fast = jnp.any(work.fastest > most**2)
         new = self._moved(old, chosen, work, duration)
-        new = new._replace(time=jnp.where(num_left > 1, old.time + duration, end))
+        new = later(new, duration, end, num_left <= 1)
 
         full = self.capacity.exceeded_by(chosen.needed)
         finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
@@ -157,7 +157,8 @@ class HardDynamics(AbstractDynamics):
         done = (fault == status.OK) & ~too_fast
         again = too_fast & finite & (full == 0)
         state = kept_if(done, new, old)
-        ahead = state.position + state.velocity * jnp.minimum(state.own.window, end - state.time)
+        ahead = jnp.minimum(state.own.window, time_left(state, end))
+        ahead = state.position + state.velocity * ahead
         ahead = jnp.max(jnp.sum((ahead - listed) ** 2, -1))
         enough = more.num_windows + 1 >= self.max_windows
         return Progress(
@@ -240,6 +241,7 @@ class HardDynamics(AbstractDynamics):
         heat = temperature(new.velocity, self.replicas)
         energy = 0.5 * d * num_particles * heat
         replica = chosen.replica[chosen.rows.a]
+        trend = cooling_trend(self.scene.law, heat, d)
         gains = jnp.zeros((len(work.gains), self.replicas), energy.dtype)
         rates = remembered(
             along.rates,
@@ -247,12 +249,13 @@ class HardDynamics(AbstractDynamics):
             met=2 / num_particles * impacts,
             energy=energy,
             temperature=heat,
-            trend=cooling_trend(self.scene.law, heat, d),
+            trend=trend,
             duration=duration,
             collision_frequency=self.scene.collision_frequency,
         )
         gains = gains.at[:, replica].add(work.gains, mode="drop")
-        return along.after(gains, energy + 0.5 * lost, duration, rates)
+        mean_energy = energy + 0.5 * lost
+        return along.after(gains, mean_energy, heat, duration, rates, trend, d)
 
     def mend(self, now: Progress, began: State) -> tuple[State, Int[Array, ""]]:
         """Where a new list was outrun the window is shortened; where it is crowded, the skin."""
@@ -277,7 +280,7 @@ def _prepared(dynamics: HardDynamics, state: State, end: ArrayLike) -> tuple[Sta
     side, replicas = dynamics.scene.side, dynamics.replicas
     speed = jnp.max(fastest(state.velocity, replicas))
     life = 0.95 * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
-    left = end - state.time
+    left = time_left(state, end)
     flown = 0.5 * jnp.minimum(life, left) * state.velocity
     listed = neighbours.wrap(side, state.position + flown)
     image = jnp.round((state.position + flown - listed) / side).astype(jnp.int32)

@@ -24,8 +24,8 @@ def observe(state: State, scene: SoftScene, replicas: int) -> dict[str, Array]:
         return values
     T, U = values["temperature"], values["elastic_energy"]
     cooling, meeting = along.rates.cooling(along.trend(T)), along.rates.collision(T)
-    c, clock = thermal.projected(along, state.velocity, state.time)
-    kept, rates = derivatives_of_records(values, travelled, velocity, c, cooling, meeting)
+    c, clock, paths = thermal.projected(along, velocity.reshape(state.velocity.shape))
+    kept, rates = derivatives_of_records(values, travelled, velocity, c, paths, cooling, meeting)
     stiffer = (along.alpha / scene.alpha)[:, None]
     kept["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
     rates["elastic_energy"] = -1.4 * cooling * U

@@ -57,6 +57,7 @@ class DSMCState(NamedTuple):
     Attributes:
         time: which all replicas have reached.
         clock: start of the step of each replica that ends beyond `time`.
+        clock_rest: what rounding has left out of `clock`, a compensated sum.
         temperature: T/T_0, updated by the losses and recomputed every `RECOUNTED` steps.
         particles: the 2 d components of v and of x - v t, which only collisions change.
         collisions: number of pairs that collided.
@@ -68,6 +69,7 @@ class DSMCState(NamedTuple):
 
     time: Float[Array, ""]
     clock: Float[Array, "*replicas"]
+    clock_rest: Float[Array, "*replicas"]
     temperature: Float[Array, "*replicas"]
     particles: Float[Array, "*replicas N components"]
     collisions: Float[Array, "*replicas"]
@@ -181,8 +183,11 @@ def _step(
 
     energy = n * d / 2  # sum v^2 at T_0
     temperature = state.temperature - one.loss / energy
+    passed = state.clock_rest + dt
+    clock = state.clock + passed
     state = state._replace(
-        clock=state.clock + dt,
+        clock=clock,
+        clock_rest=passed - (clock - state.clock),
         temperature=temperature,
         particles=state.particles.at[index].set(new, **options),
         collisions=state.collisions + one.num,
@@ -275,7 +280,8 @@ def advance(
     """
 
     def due(state):
-        return state.clock + scheme.own_step / jnp.sqrt(state.temperature) <= end
+        left = (end - state.clock) - state.clock_rest
+        return scheme.own_step / jnp.sqrt(state.temperature) <= left
 
     def unfinished(carry):
         state, left = carry

@@ -20,6 +20,7 @@ from jaxgran.particles import initial, observables
 from jaxgran.particles.stochastic import collisions
 from jaxgran.particles.stochastic.collisions import DSMCState, DSMCTangents, Scheme
 from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.tangents.limits import first_order_only, unknown
 from jaxgran.theory import averages
 
 MISSED = 1e-4
@@ -41,6 +42,7 @@ def at_start(
     return DSMCState(
         time=jnp.zeros((), v.dtype),
         clock=each,
+        clock_rest=each,
         temperature=each + 1,
         particles=jnp.concatenate([v / sqrt(2), jnp.zeros_like(v)], axis=-1),
         collisions=each,
@@ -72,7 +74,8 @@ def observe(
         tangents: return three dictionaries instead: "values", the "rates" of their change with
             time, and "along", their tangents in the parameters of the law at this time.
     """
-    share = (state.time - state.clock) * jnp.sqrt(state.temperature) / scheme.own_step
+    left = (state.time - state.clock) - state.clock_rest
+    share = left * jnp.sqrt(state.temperature) / scheme.own_step
     state = collisions.step(state, key, jnp.clip(share, 0.0, 1.0), law, scheme, tangents)
     d = scheme.dimension
 
@@ -177,7 +180,7 @@ def differentiable_run(
 
     @solve.defjvp
     def solve_jvp(at, along):
-        parameters, times, key = at
+        parameters, times, key = first_order_only(at)
         law = unravel(parameters)
         out = run(law, times, key, replicas=replicas, scheme=scheme, tangents=True)
         values = out["values"]
@@ -185,6 +188,8 @@ def differentiable_run(
             name: rate * along[1][:, None] + out["along"][name] @ along[0]
             for name, rate in out["rates"].items()
         }
+        in_time = out["rates"]["sonine"] * along[1][:, None]
+        tangents["sonine"] = in_time + unknown(in_time.shape, along[0])
         return values, tangents | {"fault": np.zeros(values["fault"].shape, jax.dtypes.float0)}
 
     return solve(parameters, times, key)

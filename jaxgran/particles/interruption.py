@@ -1,0 +1,44 @@
+"""Waiting for compiled code in a way that the user can interrupt."""
+
+import queue
+import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+
+T = TypeVar("T")
+
+
+def in_thread(function: Callable[[], T]) -> T:
+    """The result of a function that is called in a thread of its own.
+
+    An interruption from the keyboard ends the waiting at once; the thread, which Python cannot end,
+    then goes on in the background. No JAX transformation and no JAX configuration of the calling
+    thread is under way in that thread.
+    """
+    results: queue.SimpleQueue[tuple[bool, object]] = queue.SimpleQueue()
+
+    def call() -> None:
+        try:
+            results.put((True, function()))
+        except BaseException as error:
+            results.put((False, error))
+
+    threading.Thread(target=call, daemon=True).start()
+    succeeded, result = results.get()
+    if not succeeded:
+        assert isinstance(result, BaseException)
+        raise result
+    return result  # type: ignore[return-value]
+
+
+def outside_of_transformations(function: Callable[[], T]) -> T:
+    """Call a function in a thread of its own, where no JAX transformation is under way."""
+    x64 = jax.config.read("jax_enable_x64")
+
+    def call() -> T:
+        with jax.enable_x64(x64):
+            return function()
+
+    return in_thread(call)

@@ -1,0 +1,327 @@
+"""What can go wrong, where, and what happens: nothing wrong comes out without a word."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.checks import status
+from jaxgran.checks.validation import ANY
+from jaxgran.data.run import Run
+from jaxgran.particles import driver
+from jaxgran.particles import dynamics as moving
+from jaxgran.particles.dynamics import stretches
+from jaxgran.particles.interruption import in_thread
+from jaxgran.particles.soft import block
+from jaxgran.particles.state import later
+from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw
+from tests.conftest import glass_beads
+
+GAS = glass_beads(0.3, packing_fraction=0.1)
+TAU = float(GAS.mean_free_time)
+CURVE = jaxgran.CoolingCurve(times=[0.1, 0.2, 0.3, 0.4], temperature=[4e-3, 3e-3, 2e-3, 1e-3])
+SOFT = jaxgran.SoftSpheres(20)
+
+
+class NoDomains(RestitutionLaw):
+    """A law that lacks a member."""
+
+    def reduced(self, *, diameter, mass, speed):
+        raise NotImplementedError
+
+
+class OfMass(RestitutionLaw, ReducedLaw):
+    """A law with a float called like one of the gas."""
+
+    mass: float = 1.0
+    domains = {"mass": ANY}
+
+    def reduced(self, *, diameter, mass, speed):
+        return self
+
+    def restitution(self, normal_speed):
+        return 0.9 * jnp.ones_like(normal_speed)
+
+
+def with_law(law):
+    values = {"diameter": 1.0, "mass": 1.0, "packing_fraction": 0.1, "temperature": 1.0}
+    return jaxgran.Gas(law, **values)
+
+
+def cool(gas=GAS, times=(TAU,), **options):
+    return jaxgran.cool(gas, times, progress=False, **options)
+
+
+REFUSED = [
+    # what is given, the call, what is said
+    ("many gases at once", lambda: cool(GAS.replace(mass=[1.0, 2.0])), "mass .* shape .2,.*vmap"),
+    ("many gases in a fit", lambda: jaxgran.fit(GAS.replace(mass=np.ones(4)), CURVE), "vmap"),
+    ("the class of a model", lambda: cool(model=jaxgran.SoftSpheres), "got the class SoftSpheres"),
+    ("a number for a model", lambda: cool(model=3), "model must be a model, .* got 3"),
+    ("a number for a key", lambda: cool(model=SOFT, key=5), "jax.random.key.5., got 5"),
+    ("a number for a path", lambda: cool(model=SOFT, checkpoint=5), "checkpoint must be a path"),
+    ("times as a dictionary", lambda: cool(times={"t": 1.0}), "times must be a list of numbers"),
+    ("complex times", lambda: cool(times=[1j]), "times must be a list of numbers"),
+    ("times as texts", lambda: cool(times=["1"]), "times must be a list of numbers"),
+    ("no curve", lambda: jaxgran.fit(GAS, None), "curve must be a jaxgran.CoolingCurve, got None"),
+    ("no gas", lambda: jaxgran.fit(None, CURVE), "gas must be a jaxgran.Gas, got None"),
+    ("no gas to size for", lambda: SOFT.sized_for(None), "gas must be a jaxgran.Gas"),
+    ("negative capacity", lambda: SOFT.sized_for(GAS, spare=-1), "spare must lie in"),
+    ("no fit", lambda: jaxgran.diagnose(None, CURVE), "got NoneType and CoolingCurve"),
+    ("a start of a tuple", lambda: cool(model=jaxgran.SoftSpheres(20, start=(1, 2))), "Particles"),
+    ("a text for a number", lambda: jaxgran.Viscoelastic("5e7", 0.2, 1e-6), "got '5e7'"),
+    ("a truth value for a number", lambda: GAS.replace(mass=True), "mass must be a number"),
+    ("a text for a choice", lambda: jaxgran.KineticTheory(sonine="no"), "must be True or False"),
+    ("a text for a law's choice", lambda: jaxgran.Viscoelastic(5e7, 0.2, 0, "no"), "True or False"),
+    ("a truth value for a count", lambda: jaxgran.DSMC(50, replicas=True), "whole number >= 1"),
+    ("a truth value for an interval", lambda: jaxgran.SoftSpheres(20, projection=True), "number"),
+    ("a text for an interval", lambda: jaxgran.SoftSpheres(20, projection="x"), "number"),
+    ("a negative tolerance", lambda: jaxgran.KineticTheory(rtol=-1), "rtol must lie in"),
+    ("a tolerance of nan", lambda: jaxgran.KineticTheory(rtol=float("nan")), "rtol must lie in"),
+    ("no steps", lambda: jaxgran.KineticTheory(max_steps=0), "max_steps must be a whole number"),
+    ("steps of None", lambda: jaxgran.KineticTheory(max_steps=None), "max_steps must be a whole"),
+    ("a truth value for a tolerance", lambda: cool(model="auto", tolerance=True), "tolerance"),
+    ("a negative number of spheres", lambda: GAS.box_side(-5), "num_particles must be a whole"),
+    ("a negative beta", lambda: jaxgran.viscoelastic_restitution(-1.0), "beta must lie in"),
+    ("an empty series", lambda: jaxgran.RestitutionSeries([], []), "same length, 1 or more"),
+    ("a law's float named as the gas's", lambda: with_law(OfMass()), "'mass'.*rename it"),
+    ("a law without domains", lambda: NoDomains(), "domains"),
+]
+
+
+@pytest.mark.parametrize("call, words", [pytest.param(c, w, id=n) for n, c, w in REFUSED])
+def test_refused(call, words):
+    with pytest.raises((ValueError, TypeError), match=words) as error:
+        call()
+    assert error.type is ValueError or "abstract" in str(error.value)
+
+
+def test_whole_numbers_of_numpy_are_taken():
+    model = jaxgran.DSMC(np.int64(50), replicas=np.int32(2))
+    assert type(model.num_particles) is int and model == jaxgran.DSMC(50, replicas=2)
+
+
+def test_a_checkpoint_that_cannot_be_written_is_told_before_the_run(tmp_path):
+    with pytest.raises(OSError, match="cannot write"):
+        cool(model=SOFT, checkpoint=tmp_path / "none" / "x.ckpt")
+    with pytest.raises(OSError, match="cannot write"):
+        cool(model=SOFT, checkpoint=tmp_path)
+
+
+def test_curves_of_lists_are_curves():
+    assert isinstance(CURVE.times, jax.Array)
+    CURVE.check()
+
+
+@pytest.mark.parametrize("name, value", [("packing_fraction", 0.9), ("dissipative_constant", -1.0)])
+def test_a_member_of_a_batch_out_of_range_says_so(name, value):
+    good = float(GAS.value(name))
+    values = jnp.array([good, value])
+    curve = jax.vmap(lambda x: cool(GAS.replace(**{name: x})))(values)
+    assert curve.status[0] == status.OK and np.isfinite(curve.temperature[0])
+    assert curve.status[1] == status.OUT_OF_RANGE.bit and np.isnan(curve.temperature[1])
+
+
+def test_bad_times_of_a_member_end_no_other():
+    times = jnp.array([[1.0, 2.0], [2.0, 1.0], [-1.0, 1.0]]) * TAU
+    curve = jax.vmap(lambda t: cool(times=t))(times)
+    assert list(curve.status) == [status.OK] + 2 * [status.OUT_OF_RANGE.bit]
+    np.testing.assert_allclose(curve.temperature[0], cool(times=times[0]).temperature)
+
+
+# --- derivatives ---------------------------------------------------------------------------------
+
+MODELS = [
+    jaxgran.SoftSpheres(20, replicas=2),
+    jaxgran.HardSpheres(20, replicas=2),
+    jaxgran.DSMC(20, replicas=2),
+]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_what_is_not_known_has_no_derivative(model):
+    def curve(log_scale):
+        A = GAS.value("dissipative_constant") * jnp.exp(log_scale)
+        return cool(GAS.replace(dissipative_constant=A), model=model)
+
+    def log_temperature(x):
+        return jnp.log(curve(x).temperature[0])
+
+    for second in (jax.hessian, lambda f: jax.jacfwd(jax.jacfwd(f))):
+        with pytest.raises(ValueError, match="second derivative .* KineticTheory"):
+            second(log_temperature)(0.0)
+    value, slope = jax.jvp(curve, (0.0,), (1.0,))
+    assert np.isfinite(slope.temperature) and np.isnan(slope.sonine)
+    assert np.isnan(jax.grad(lambda x: curve(x).sonine[0])(0.0))
+    np.testing.assert_allclose(
+        jax.grad(log_temperature)(0.0), slope.temperature / value.temperature
+    )
+    if value.particles is not None:
+        assert np.all(np.isnan(slope.particles.velocity))
+
+
+# --- runs that stop ------------------------------------------------------------------------------
+
+
+class Standing:
+    """A state whose time does not advance."""
+
+    time = np.zeros(())
+
+
+def test_a_run_that_stands_still_ends():
+    state, records, fault = driver.follow(
+        Standing(), np.ones(1), lambda s, end: s, lambda s: {"temperature": jnp.ones(())}
+    )
+    assert fault == status.STALLED.bit and np.isnan(records["temperature"])
+
+
+@pytest.mark.parametrize("kind", [jaxgran.SoftSpheres, jaxgran.HardSpheres])
+@pytest.mark.parametrize("x64", [True, False])
+def test_blocks_that_stand_still_end(kind, x64, monkeypatch):
+    with jax.enable_x64(x64):
+        gas = glass_beads(0.3, packing_fraction=0.1)
+        monkeypatch.setattr(moving, "SHORTEST_FLIGHT", 1e9)  # no flight is long enough
+        monkeypatch.setattr(moving, "MOST_IDLE", 3)
+        monkeypatch.setattr(driver, "_PROGRAMS", type(driver._PROGRAMS)())
+        jax.clear_caches()
+        curve = kind(20).simulate(gas, jnp.array([TAU]), Run())
+        jax.clear_caches()
+    assert int(curve.status) & status.STALLED.bit and np.isnan(curve.temperature[0])
+
+
+def test_waiting_can_be_interrupted():
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    old = signal.signal(signal.SIGALRM, interrupt)
+    began = time.monotonic()
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.3)
+        with pytest.raises(KeyboardInterrupt):
+            in_thread(lambda: time.sleep(20))
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, old)
+    assert time.monotonic() - began < 5
+
+
+def soft_spheres(gas=GAS, replicas=1):
+    """Dynamics of soft spheres and their first state."""
+    model = jaxgran.SoftSpheres(20, replicas=replicas)
+    scene = model.scene(gas)
+    dynamics = model.dynamics(scene, model.planned(scene, 3))
+    start = cool(gas, [0.0], model=model).particles
+    inputs = start.position / gas.diameter, start.velocity / jnp.sqrt(gas.temperature)
+    return dynamics, dynamics.begin(*(x.reshape(-1, 3) for x in inputs), jnp.asarray(0.3))
+
+
+def test_a_shortened_step_recovers():
+    dynamics, state = soft_spheres()
+    state = state._replace(own=state.own._replace(refine=jnp.asarray(4.0)))
+    end = jnp.asarray(3.0)
+    after, fault, _ = jax.jit(lambda s: stretches(dynamics, s, end, "sweep", 1, None))(state)
+    assert fault == status.OK and after.own.refine == 1 and after.time == end
+    assert np.all(np.abs(after.own.drift) < 1e-3)  # over some 600 blocks
+
+
+def test_small_energy_errors_add_up():
+    dynamics, state = soft_spheres()
+    drift = jnp.full(1, 0.5 * block.DRIFT_TOLERANCE)
+    for factor, fault in ((1, status.OK), (3, status.ENERGY_DRIFT.bit)):
+        begun = state._replace(own=state.own._replace(drift=factor * drift))
+        run = jax.jit(lambda s: stretches(dynamics, s, jnp.asarray(1.0), "sweep", 1, None))
+        assert run(begun)[1] == fault
+
+
+def test_the_clock_of_single_precision_keeps_time():
+    step, count = 0.004, 300_000
+    state = soft_spheres()[1]
+    single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, state)
+    # Unlike a plain sum, which gains .7 % in each step from t = 1024 on.
+    end = jnp.float32(1e9)
+    after = jax.jit(
+        lambda s: jax.lax.fori_loop(
+            0, count, lambda _, s: later(s, jnp.float32(step), end, jnp.asarray(False)), s
+        )
+    )(single)
+    assert after.time.dtype == jnp.float32
+    exact = count * float(np.float32(step))
+    np.testing.assert_allclose(after.time, exact, rtol=2e-7)
+    plain = np.cumsum(np.full(count, step, np.float32), dtype=np.float32)[-1]
+    assert abs(plain / exact - 1) > 1e-4
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+
+def test_checkpoints_know_their_law(tmp_path):
+    path = tmp_path / "x.ckpt"
+    cool(GAS, model=SOFT, checkpoint=path)
+    law = jaxgran.Viscoelastic(*(GAS.value(n) for n in GAS.law.domains), clipped=False)
+    other = jaxgran.Gas(
+        law, **{n: GAS.value(n) for n in GAS.domains if n not in law.domains}, dimension=3
+    )
+    with pytest.raises(ValueError, match="scene.clipped was True and is False"):
+        cool(other, model=SOFT, checkpoint=path)
+    for wrong, words in (
+        (jaxgran.SoftSpheres(21), "num_particles was 20 and is 21"),
+        (jaxgran.SoftSpheres(20, steps_per_contact=50), "steps_per_contact was 40 and is 50"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            cool(GAS, model=wrong, checkpoint=path)
+    denser = GAS.replace(packing_fraction=0.11)
+    with pytest.raises(ValueError, match="scene.side was float64"):
+        cool(denser, model=SOFT, checkpoint=path)
+
+
+OWN_LAW = """
+import sys, jax, jax.numpy as jnp, jaxgran
+from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw
+jax.config.update("jax_enable_x64", True)
+def slow(v): return FACTOR * jnp.ones_like(v)
+class Own(RestitutionLaw, ReducedLaw):
+    function: object
+    domains = {}
+    def reduced(self, *, diameter, mass, speed): return self
+    def restitution(self, normal_speed): return self.function(normal_speed)
+gas = jaxgran.Gas(Own(jax.tree_util.Partial(slow)), diameter=1.0, mass=1.0, packing_fraction=0.1,
+    temperature=1.0)
+print(repr(jaxgran.cool(gas, [1.0], model=jaxgran.DSMC(50), checkpoint=sys.argv[1]).temperature))
+"""
+
+
+def test_a_run_of_a_users_law_resumes_in_another_process(tmp_path):
+    def run(factor):
+        script = tmp_path / "own.py"
+        script.write_text(OWN_LAW.replace("FACTOR", factor))
+        command = [sys.executable, str(script), str(tmp_path / "run.ckpt")]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    first, again, other = run("0.9"), run("0.9"), run("0.8")
+    assert first.returncode == 0, first.stderr
+    assert again.stdout == first.stdout and again.returncode == 0
+    assert "belongs to another run" in other.stderr
+
+
+def test_files_keep_permissions_and_follow_links(tmp_path):
+    target, link = tmp_path / "target.csv", tmp_path / "link.csv"
+    target.write_text("old")
+    target.chmod(0o640)
+    link.symlink_to(target)
+    jaxgran.write_curve(link, CURVE, {}, overwrite=True)
+    assert link.is_symlink() and target.read_text().startswith("t,T")
+    assert target.stat().st_mode & 0o777 == 0o640
+    old = os.umask(0o022)
+    try:
+        jaxgran.write_curve(tmp_path / "new.csv", CURVE, {})
+    finally:
+        os.umask(old)
+    assert (tmp_path / "new.csv").stat().st_mode & 0o777 == 0o644
