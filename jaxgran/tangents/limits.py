@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
@@ -21,8 +22,13 @@ def first_order_only(inputs: T) -> T:
     Raises:
         ValueError: if a derivative in these inputs is taken.
     """
-    numbers, others = eqx.partition(inputs, eqx.is_inexact_array)
+    # Known numbers stay known, for runs that are driven from the host.
+    numbers, others = eqx.partition(inputs, _may_change)
     return eqx.combine(_held(numbers), others)
+
+
+def _may_change(leaf: Any) -> bool:
+    return isinstance(leaf, Tracer) and eqx.is_inexact_array(leaf)
 
 
 @jax.custom_jvp
