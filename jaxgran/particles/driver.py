@@ -7,13 +7,13 @@ are all known; the same run as a pure function is in `pure`.
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from tqdm import tqdm
 
 from jaxgran.checks import status
@@ -24,7 +24,7 @@ from jaxgran.data.run import Run
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import MOST_IDLE, AbstractDynamics, stretches
-from jaxgran.particles.interruption import in_thread, outside_of_transformations
+from jaxgran.particles.interruption import outside_of_transformations, waited_for
 from jaxgran.particles.simulation import SETTLED, Simulation
 from jaxgran.particles.state import State
 from jaxgran.tangents.rule import Outputs
@@ -54,7 +54,6 @@ class _Timed(Protocol):
 
 
 S = TypeVar("S", bound=_Timed)
-T = TypeVar("T")
 
 
 def follow(
@@ -99,7 +98,7 @@ def follow(
                 raise Failure(fault)
             while done < len(times):
                 while float(state.time) < times[done]:
-                    before, state = state, _waited_for(advance(state, float(times[done])))
+                    before, state = state, waited_for(advance(state, float(times[done])))
                     idle = _idle(idle, before, state)
                     _show(bar, state, observe)
                     if time.monotonic() - saved > CHECKPOINT_SECONDS:
@@ -117,11 +116,6 @@ def follow(
             for values in records.values():
                 values[done:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
     return state, records, fault
-
-
-def _waited_for(arrays: T) -> T:
-    """The same arrays, once they are computed."""
-    return in_thread(partial(jax.block_until_ready, arrays))
 
 
 def _idle(idle: int, before: S, state: S) -> int:
@@ -176,20 +170,25 @@ _PROGRAMS: OrderedDict[Any, jax.stages.Compiled] = OrderedDict()
 are bounded in number, and shared by plain runs and those inside a rule of differentiation."""
 
 
-def _compiled(dynamics: AbstractDynamics, state: State, end: jax.Array, engine: str):
-    """`stretches` as a function of these arguments, compiled for their types and static fields."""
-    arguments = dynamics, state, end
-    some = jax.jit(partial(stretches, engine=engine, least=1, most=STRETCHES))
-    if any_traced(arguments):  # constants within a transformation of something else
-        return some
-    leaves, structure = jax.tree.flatten(arguments)
-    key = engine, STRETCHES, structure, tuple((x.shape, x.dtype, x.sharding) for x in leaves)
+def _stretches(
+    dynamics: AbstractDynamics, state: State, end: np.ndarray, engine: str
+) -> tuple[State, Array, Array]:
+    """`STRETCHES` stretches, compiled for the types and the static fields of these arguments."""
+    leaves, structure = jax.tree.flatten((dynamics, state, end))
+
+    def some(leaves: list[Array]) -> tuple[State, Array, Array]:
+        return stretches(*structure.unflatten(leaves), engine, 1, STRETCHES)
+
+    if any_traced(leaves):  # constants within a transformation of something else
+        return jax.jit(some)(leaves)
+    types = tuple((x.shape, x.dtype, getattr(x, "sharding", None)) for x in leaves)
+    key = engine, STRETCHES, structure, types
     if key not in _PROGRAMS:
-        _PROGRAMS[key] = outside_of_transformations(lambda: some.lower(*arguments).compile())
+        _PROGRAMS[key] = outside_of_transformations(lambda: jax.jit(some).lower(leaves).compile())
         if len(_PROGRAMS) > MOST_PROGRAMS:
             _PROGRAMS.popitem(last=False)
     _PROGRAMS.move_to_end(key)
-    return _PROGRAMS[key]
+    return _PROGRAMS[key](leaves)
 
 
 _GROWN: dict[Capacity, Capacity] = {}
@@ -270,7 +269,8 @@ def _advance(
         Failure: if something else goes wrong.
     """
     while True:
-        roomy = dynamics.with_capacity(_GROWN.get(capacity, capacity))
+        room = _GROWN.get(capacity, capacity)
+        roomy = dynamics if dynamics.capacity == room else dynamics.with_capacity(room)
         state, fault, needed = _some_stretches(roomy, state, end, engine)
         if fault == status.OK:
             return state
@@ -278,7 +278,7 @@ def _advance(
         if not full or max(needed) > MOST_PAIRS * len(state.position):
             raise Failure(fault)
         # That stretch is made again as a whole: a list made on the way has another order.
-        _GROWN[capacity] = roomy.capacity.grown(needed)
+        _GROWN[capacity] = room.grown(needed)
 
 
 def _some_stretches(
@@ -286,10 +286,9 @@ def _some_stretches(
 ) -> tuple[State, int, list[int]]:
     """Several stretches in one compiled call, or one if the host finds the pairs."""
     if engine == "sweep":
-        until = concrete(end, state.time.dtype)
-        called = _compiled(dynamics, state, until, engine)(dynamics, state, until)
-        state, fault, needed = _waited_for(called)
-        return state, int(fault), [int(x) for x in needed]
+        until = np.asarray(end, state.time.dtype)
+        state, fault, needed = waited_for(_stretches(dynamics, state, until, engine))
+        return state, int(fault), np.asarray(needed).tolist()
     now = dynamics.stretch(state, end, engine)
     fault = int(now.status)
-    return (now.state if fault == status.OK else state), fault, [int(x) for x in now.needed]
+    return (now.state if fault == status.OK else state), fault, np.asarray(now.needed).tolist()

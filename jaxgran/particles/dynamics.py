@@ -146,6 +146,8 @@ def repeat_until(
     Blocks that do not advance the time fail in the end, too.
     """
 
+    shortest = _shortest(first.state)
+
     def unfinished(carry):
         now, _ = carry
         return (now.state.time < end) & ~now.stale & (now.status == status.OK)
@@ -153,19 +155,22 @@ def repeat_until(
     def further(carry):
         old, idle = carry
         new = block(old)
-        idle = jnp.where(_is_later(new.state, old.state), 0, idle + 1)
+        idle = jnp.where(_passed(old.state, new.state) > shortest, 0, idle + 1)
         stalled = status.flag(status.STALLED, idle >= MOST_IDLE)
         return new._replace(status=new.status | stalled), idle
 
     return jax.lax.while_loop(unfinished, further, (first, jnp.zeros((), jnp.int32)))[0]
 
 
-def _is_later(new: State, old: State) -> Bool[Array, ""]:
-    """Whether one state is later than another by more than nothing, compared with the time that
-    the fastest sphere takes to fly a diameter."""
-    passed = (new.time - old.time) + (new.time_rest - old.time_rest)
-    speed = jnp.sqrt(jnp.max(jnp.sum(old.velocity * old.velocity, -1)))
-    return passed * speed > SHORTEST_FLIGHT
+def _passed(old: State, new: State) -> Float[Array, ""]:
+    """The time from one state to another."""
+    return (new.time - old.time) + (new.time_rest - old.time_rest)
+
+
+def _shortest(state: State) -> Float[Array, ""]:
+    """The time in which the fastest sphere of a state flies `SHORTEST_FLIGHT`."""
+    speed = jnp.sqrt(jnp.max(jnp.sum(state.velocity * state.velocity, -1)))
+    return SHORTEST_FLIGHT / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
 
 
 def stretches(
@@ -193,7 +198,7 @@ def stretches(
     def further(carry):
         made, idle, state, _, needed = carry
         now = dynamics.stretch(state, end, engine)
-        idle = jnp.where(_is_later(now.state, state), 0, idle + 1)
+        idle = jnp.where(_passed(state, now.state) > _shortest(state), 0, idle + 1)
         fault = now.status | status.flag(status.STALLED, idle >= MOST_IDLE)
         kept = jax.tree.map(partial(jnp.where, now.status == status.OK), now.state, state)
         return made + 1, idle, kept, fault, jnp.maximum(needed, now.needed)
