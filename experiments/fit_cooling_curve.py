@@ -168,7 +168,7 @@ def model_of(options: argparse.Namespace, gas, curve, free, num_particles: int |
     size = num_particles if options.particles is None else options.particles
     replicas = options.replicas
     if options.model != "auto":
-        model = named(default_models(size or 2, replicas))[options.model]
+        model = named(default_models(2 if size is None else size, replicas))[options.model]
         if model.stochastic and size is None:
             raise ValueError(f"{options.curve} does not say N: give --particles")
         return model, ()

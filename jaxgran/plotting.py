@@ -19,6 +19,9 @@ except ModuleNotFoundError as error:  # pragma: no cover
         'jaxgran.plotting needs matplotlib: pip install "jaxgran[experiments]"'
     ) from error
 
+MOST_DRAWN = 1000
+"""Points that are drawn of a longer curve, evenly spaced in the logarithm of time."""
+
 INK, DATA, MODEL, GUIDE = "#222222", "#20639b", "#d1495b", "#8d99ae"
 
 
@@ -67,16 +70,27 @@ def plot_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
 
 def _draw(axis, times, measured, error, computed, fitted: str) -> None:
     """Measured values with error bars, and the fitted curve, at t > 0."""
-    shown = np.asarray(times) > 0
+    shown = _shown(times)
     t, measured, computed = (np.asarray(x)[shown] for x in (times, measured, computed))
     error = None if error is None else np.asarray(error)[shown]
-    axis.errorbar(t, measured, error, fmt="o", ms=3.5, color=DATA, label="measured", zorder=2)
+    label = "measured" if len(times) <= MOST_DRAWN else f"measured: {t.size} of {len(times)}"
+    axis.errorbar(t, measured, error, fmt="o", ms=3.5, color=DATA, label=label, zorder=2)
     axis.plot(t, computed, color=MODEL, lw=1.6, label=fitted, zorder=3)
     axis.set(xscale="log", yscale="log")
 
 
+def _shown(times) -> np.ndarray:
+    """Indices of the times that are drawn: those after 0, or `MOST_DRAWN` of them."""
+    times = np.asarray(times)
+    (shown,) = np.nonzero(times > 0)
+    if shown.size <= MOST_DRAWN:
+        return shown
+    t = times[shown]
+    return shown[np.unique(np.searchsorted(t[:-1], np.geomspace(t[0], t[-1], MOST_DRAWN)))]
+
+
 def _draw_residuals(axis, times, residuals) -> None:
-    shown = np.asarray(times) > 0
+    shown = _shown(times)
     axis.axhspan(-1, 1, color=GUIDE, alpha=0.25, lw=0)
     axis.axhline(0, color=MODEL, lw=1)
     axis.plot(np.asarray(times)[shown], np.asarray(residuals)[shown], "o", ms=3.5, color=DATA)

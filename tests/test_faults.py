@@ -1,6 +1,8 @@
 """What can go wrong, where, and what happens: nothing wrong comes out without a word."""
 
+import dataclasses
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran import plotting
 from jaxgran.checks import status
 from jaxgran.checks.validation import ANY
 from jaxgran.data.run import Run
@@ -96,6 +99,18 @@ REFUSED = [
 ]
 
 
+for point, field, value in (
+    (2, "temperature", 1e308),
+    (2, "temperature", 1e-320),
+    (3, "times", 1e308),
+    (1, "temperature_error", 1e-300),
+):
+    slip = dataclasses.replace(CURVE, temperature_error=0.01 * CURVE.temperature)
+    slip = dataclasses.replace(slip, **{field: getattr(slip, field).at[point].set(value)})
+    words = re.escape(f"{value:g}, which cannot be measured")
+    REFUSED.append((f"{field} of {value:g}", lambda slip=slip: jaxgran.fit(GAS, slip), words))
+
+
 @pytest.mark.parametrize("call, words", [pytest.param(c, w, id=n) for n, c, w in REFUSED])
 def test_refused(call, words):
     with pytest.raises((ValueError, TypeError), match=words) as error:
@@ -134,6 +149,29 @@ def test_bad_times_of_a_member_end_no_other():
     curve = jax.vmap(lambda t: cool(times=t))(times)
     assert list(curve.status) == [status.OK] + 2 * [status.OUT_OF_RANGE.bit]
     np.testing.assert_allclose(curve.temperature[0], cool(times=times[0]).temperature)
+
+
+def test_all_that_a_curve_does_not_determine_is_named():
+    times = np.geomspace(0.1, 100.0, 20) * TAU
+    T = cool(times=times).temperature
+    curve = jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=0.02 * T)
+    free = "dissipative_constant", "temperature", "youngs_modulus", "packing_fraction", "diameter"
+    with pytest.warns(UserWarning, match="does not determine"):
+        result = jaxgran.fit(GAS, curve, free=free)
+    loose = [n for n in free if result.value(n)[1] > result.value(n)[0]]
+    assert len(loose) > 2 and set(loose) <= set(result.undetermined())
+    assert "temperature" not in result.undetermined()
+
+
+def test_a_picture_of_a_long_curve_draws_some_of_it(tmp_path):
+    times = np.linspace(0.1, 100.0, 200_000) * TAU
+    T = cool(times=times).temperature
+    curve = jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=0.02 * T)
+    result = jaxgran.fit(GAS, curve)
+    shown = plotting._shown(curve.times)
+    assert 500 < shown.size <= plotting.MOST_DRAWN and {0, times.size - 1} <= set(shown)
+    plotting.plot_fit(result, curve, "long", tmp_path / "long.png")
+    assert (tmp_path / "long.png").stat().st_size < 500_000
 
 
 # --- derivatives ---------------------------------------------------------------------------------
@@ -268,6 +306,65 @@ def test_the_clock_of_single_precision_keeps_time():
     np.testing.assert_allclose(after.time, exact, rtol=2e-7)
     plain = np.cumsum(np.full(count, step, np.float32), dtype=np.float32)[-1]
     assert abs(plain / exact - 1) > 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [jaxgran.SoftSpheres, jaxgran.HardSpheres, jaxgran.DSMC])
+def test_single_precision_has_no_trend(kind):
+    model = kind(50, replicas=32)
+    gas = glass_beads(0.01, packing_fraction=0.1)
+    unit = float(gas.diameter / jnp.sqrt(gas.temperature))
+    times = np.geomspace(1.0, 3000.0, 12) * unit  # a soft step is .004 of the unit
+    double = cool(gas, times, model=model, key=jax.random.key(1)).replicas
+    with jax.enable_x64(False):
+        narrow = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), gas)
+        single = cool(narrow, np.float32(times), model=model, key=jax.random.key(2)).replicas
+    each = [np.log(np.asarray(r.temperature, float)) for r in (double, single)]
+    assert each[0].mean(axis=0)[-1] < np.log(0.3)
+    # Slopes of ln T in ln t over the last decades: of each replica, as its times are correlated.
+    late = np.log(times[5:])
+    slopes = [np.polyfit(late, logs[:, 5:].T, 1)[0] for logs in each]
+    for a, b in (slopes, [logs[:, -1] for logs in each]):
+        error = np.hypot(a.std(ddof=1), b.std(ddof=1)) / len(a) ** 0.5
+        print(kind.__name__, b.mean() - a.mean(), error)
+        assert abs(b.mean() - a.mean()) < 3 * error < 0.06
+
+
+# --- hard starts ---------------------------------------------------------------------------------
+
+
+def two_spheres(gas, distance, speed):
+    """Two spheres at a distance in diameters that approach each other."""
+    side = gas.box_side(2)
+    apart = jnp.array([0.5 * distance * gas.diameter, 0.0, 0.0])
+    along = jnp.array([speed, 0.0, 0.0])
+    position, velocity = 0.5 * side + jnp.stack([apart, -apart]), jnp.stack([-along, along])
+    return jaxgran.Particles(position[None], velocity[None], side)
+
+
+@pytest.mark.parametrize("overlap", [1e-3, 0.05])
+def test_soft_spheres_start_overlapped_and_at_rest(overlap):
+    gas = GAS.replace(dissipative_constant=0.0, packing_fraction=0.02)
+    start = two_spheres(gas, 1 - overlap, 0.0)
+    curve = cool(gas, [0.0, 0.1 * TAU, TAU], model=jaxgran.SoftSpheres(2, start=start))
+    kinetic = 1.5 * gas.mass * curve.temperature
+    assert kinetic[0] == 0 and kinetic[-1] > 0
+    total = kinetic + curve.elastic_energy
+    np.testing.assert_allclose(total, total[0], rtol=3e-3)
+
+
+@pytest.mark.parametrize("beta", [300.0, 1e4])
+def test_heavily_damped_impacts_end(beta):
+    gas = glass_beads(beta, packing_fraction=0.02)
+    start = two_spheres(gas, 1.05, 0.1)
+    soft, hard = (
+        cool(gas, [0.0, TAU], model=kind(2, start=start))
+        for kind in (jaxgran.SoftSpheres, jaxgran.HardSpheres)
+    )
+    ratio = soft.temperature / hard.temperature
+    np.testing.assert_allclose(ratio, 1.0, atol=0.005)
+    assert hard.temperature[1] < 1e-8 * hard.temperature[0]
+    np.testing.assert_allclose(soft.dissipated_energy, hard.dissipated_energy, rtol=1e-3)
 
 
 # --- files ---------------------------------------------------------------------------------------

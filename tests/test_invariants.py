@@ -50,10 +50,15 @@ def reference(model_or_kind):
     return curve_and_slope(GAS, TIMES, model)
 
 
+def check_same(found, expected):
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-8, atol=1e-10)
+    # Rounding may let soft spheres project their tangents a block earlier or later.
+    np.testing.assert_allclose(found[1], expected[1], rtol=1e-5, atol=1e-8)
+
+
 def check_start(kind, **changed):
     model = kind(20, start=start_of(kind)._replace(**changed))
-    found = curve_and_slope(GAS, TIMES, model)
-    np.testing.assert_allclose(found, reference(kind), rtol=1e-6, atol=1e-8)
+    check_same(curve_and_slope(GAS, TIMES, model), reference(kind))
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: type(model).__name__)
@@ -69,7 +74,7 @@ def test_units(model, length, duration, mass):
         dissipative_constant=value("dissipative_constant") * duration,
     )
     found = curve_and_slope(gas, TIMES * duration, model)
-    np.testing.assert_allclose(found, reference(model), rtol=1e-6, atol=1e-8)
+    check_same(found, reference(model))
 
 
 @pytest.mark.parametrize("kind", SPHERES)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.data.curve import CoolingCurve
@@ -78,20 +79,18 @@ class Fit(eqx.Module):
     def undetermined(self) -> tuple[str, ...]:
         """Parameters of which the curve determines no value, or only a combination; () if none.
 
-        These are the parameters in the singular vector of the sensitivity with the smallest
-        singular value, if its standard error exceeds 1 (a factor e), or if that singular value
-        is below ``model.derivative_accuracy`` times the largest.
+        These are the parameters in those singular vectors of the sensitivity whose standard error
+        exceeds 1 (a factor e), or whose singular value is below ``model.derivative_accuracy`` times
+        the largest.
         """
         known = not bool(jnp.isnan(self.p_value))
         error = 1.0 if known else float(self.reduced_chi2) ** 0.5
-        _, singular, rotation = jnp.linalg.svd(self.sensitivity, full_matrices=False)
-        resolution = self.model.derivative_accuracy * float(singular[0])
-        if float(singular[-1]) > error and float(singular[-1]) >= resolution:
-            return ()
-        share = [abs(float(x)) for x in rotation[-1]]
-        sized = [n for n in self.names for _ in range(self.gas.value(n).size)]
-        undetermined = {n: 0 for n, x in zip(sized, share, strict=True) if x > 0.05 * max(share)}
-        return tuple(undetermined)
+        _, singular, rotation = np.linalg.svd(np.asarray(self.sensitivity), full_matrices=False)
+        weak = (singular <= error) | (singular < self.model.derivative_accuracy * singular[0])
+        share = np.abs(rotation[weak])
+        found = np.any(share > 0.05 * share.max(axis=1, initial=0.0, keepdims=True), axis=0)
+        sized = [name for name in self.names for _ in range(self.gas.value(name).size)]
+        return tuple(dict.fromkeys(n for n, yes in zip(sized, found, strict=True) if yes))
 
 
 class Misfit(NamedTuple):

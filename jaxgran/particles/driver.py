@@ -177,7 +177,8 @@ def _stretches(
     leaves, structure = jax.tree.flatten((dynamics, state, end))
 
     def some(leaves: list[Array]) -> tuple[State, Array, Array]:
-        return stretches(*structure.unflatten(leaves), engine, 1, STRETCHES)
+        dynamics, state, end = structure.unflatten(leaves)
+        return stretches(dynamics, state, end, engine, least=1, most=STRETCHES)
 
     if any_traced(leaves):  # constants within a transformation of something else
         return jax.jit(some)(leaves)

@@ -168,9 +168,9 @@ def _passed(old: State, new: State) -> Float[Array, ""]:
 
 
 def _shortest(state: State) -> Float[Array, ""]:
-    """The time in which the fastest sphere of a state flies `SHORTEST_FLIGHT`."""
+    """The time in which the fastest sphere of a state flies `SHORTEST_FLIGHT`; 0 at rest."""
     speed = jnp.sqrt(jnp.max(jnp.sum(state.velocity * state.velocity, -1)))
-    return SHORTEST_FLIGHT / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
+    return jnp.where(speed > 0, SHORTEST_FLIGHT / jnp.where(speed > 0, speed, 1.0), 0.0)
 
 
 def stretches(

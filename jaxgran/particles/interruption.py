@@ -20,8 +20,7 @@ SHORTEST_PAUSE, LONGEST_PAUSE = 1e-5, 1e-3
 
 def waited_for(arrays: T) -> T:
     """The same arrays, once they are computed; an interruption ends the waiting at once."""
-    pending = [leaf for leaf in jax.tree.leaves(arrays) if isinstance(leaf, jax.Array)]
-    pending = [leaf for leaf in pending if not isinstance(leaf, jax.core.Tracer)]
+    pending = [leaf for leaf in jax.tree.leaves(arrays) if hasattr(leaf, "is_ready")]
     began = time.perf_counter()
     while not all(leaf.is_ready() for leaf in pending):
         pause = SHARE_WAITED * (time.perf_counter() - began)

@@ -109,6 +109,54 @@ def test_main_job_refuses_bad_input(arguments, message, tmp_path):
     assert not (tmp_path / "results").exists()
 
 
+def main_job(monkeypatch, capsys, folder, *arguments):
+    """The main job in this process: its exit code, and what it prints."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["fit_cooling_curve.py", *map(str, arguments)])
+    return fit_cooling_curve.main(), *capsys.readouterr()
+
+
+HEADER = "# eta: 0.05\n# diameter: 0.002\n# density: 2500\n# Y: 5e7\n# nu: 0.22\n# T0: 0.01\n"
+ROWS = "t,T,T_err\n1,6e-3,1e-4\n2,5e-3,1e-4\n3,4e-3,1e-4\n4,3e-3,1e-4\n"
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--set", "N=inf"], "header line N"),
+        (["--set", "N=1e30"], "header line N"),
+        (["--key", 10**30], "too large"),
+        (["--set", "Y=0.05"], "in Pa"),
+        (["--set", "T0=1e4"], ""),
+        (["--set", "eta=1e-300"], ""),
+        (["--free", "T0"], "leaves A fixed"),
+        (["--model", "hard-spheres", "--particles", 0], "num_particles must be a whole number"),
+        (["--out", "taken"], "is no folder to write to"),
+    ],
+)
+def test_main_job_ends_with_one_line(arguments, words, tmp_path, monkeypatch, capsys):
+    (tmp_path / "bare.csv").write_text(HEADER + ROWS)
+    (tmp_path / "taken").write_text("")
+    code, _, told = main_job(monkeypatch, capsys, tmp_path, "bare.csv", *arguments)
+    assert code == 2 and told.startswith("error: ") and words in told
+    assert len(told.splitlines()) == 1 and not (tmp_path / "results").exists()
+
+
+def test_main_job_writes_json_that_others_can_read(tmp_path, monkeypatch, capsys):
+    def refuse(word):
+        raise AssertionError(f"{word} is no JSON")
+
+    (tmp_path / "bare.csv").write_text(HEADER + ROWS)
+    options = "bare.csv", "--free", "A", "Y", "nu"  # of which only a combination is determined
+    code, said, _ = main_job(monkeypatch, capsys, tmp_path, *options)
+    assert code == 0
+    summary = json.loads(said.splitlines()[-1], parse_constant=refuse)
+    assert "nu_std_err" in summary
+    (record,) = (tmp_path / "results").rglob("*.json")
+    json.loads(record.read_text(), parse_constant=refuse)
+    assert fit_cooling_curve.finite_or_null({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}
+
+
 @pytest.mark.slow
 def test_main_job_reads_the_header_a_not(tmp_path):
     # A header's A is only compared with: another one changes no estimate.

@@ -43,7 +43,7 @@ from jaxgran.tangents import thermal
 from jaxgran.tangents.thermal import ThermalTangents
 from jaxgran.theory import closed_forms
 
-MAX_REFINE = 64.0
+MAX_REFINE = 4096.0
 """Largest factor by which the step may become shorter than asked before the run fails."""
 
 DRIFT_TOLERANCE = 0.05
@@ -126,10 +126,12 @@ class SoftDynamics(AbstractDynamics):
     def _block(self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike) -> Progress:
         """One block, accepted if all that took part in it was expected and nothing went wrong."""
         old, more = now.state, now.own
-        duration, num_left = self._duration(old, end)
+        duration, num_left, hottest = self._duration(old, end)
         # Of all replicas: they share their blocks.
         speed = jnp.max(fastest(old.velocity, self.replicas))
-        reach = REACH_MARGIN * speed * duration * more.widen
+        # From rest the first reach is 0, and the next one is that of the energy in contacts.
+        reach = REACH_MARGIN * speed * more.widen + (more.widen - 1) * jnp.sqrt(hottest)
+        reach = reach * duration
         chosen = candidates.select_encounters(
             old.position,
             old.velocity,
@@ -172,8 +174,9 @@ class SoftDynamics(AbstractDynamics):
             ),
         )
 
-    def _duration(self, state: State, end: ArrayLike) -> tuple[Array, Array]:
-        """Duration of the next block, and how many as long are left until the end."""
+    def _duration(self, state: State, end: ArrayLike) -> tuple[Array, Array, Array]:
+        """Duration of the next block, how many as long are left until the end, and the temperature
+        of the hottest replica, with the energy in its contacts."""
         # With the energy in contacts, or a step would lengthen while all of it is stored there.
         stored = 2 * self.replicas / state.position.size * state.own.elastic
         hottest = jnp.max(temperature(state.velocity, self.replicas) + stored)
@@ -182,7 +185,7 @@ class SoftDynamics(AbstractDynamics):
         longest = self.steps_per_block * longest_step
         left = time_left(state, end)
         num_left = jnp.maximum(jnp.ceil(left / longest * (1 - 1e-9)), 1.0)
-        return left / num_left, num_left
+        return left / num_left, num_left, hottest
 
     def _stepped(self, state: State, chosen: Encounters, duration: Array) -> _Stepped:
         """The state after the block, but for its time; tangents are followed, not projected."""
