@@ -128,6 +128,8 @@ def run(options: argparse.Namespace) -> None:
         "model": model_name,
         "reduced_chi2": round(float(result.reduced_chi2), 4),
         "converged": bool(result.converged),
+        **{f"{row['parameter']}_low": row["low"] for row in rows},
+        **{f"{row['parameter']}_high": row["high"] for row in rows},
         "explains": diagnosis.explains,
         "seconds": round(time.perf_counter() - started, 2),
         "compile_seconds": round(first_seconds - fit_seconds, 2),
@@ -140,6 +142,7 @@ def run(options: argparse.Namespace) -> None:
         "parameters": rows,
         "covariance": np.asarray(result.covariance).tolist(),
         "diagnosis": {"verdict": diagnosis.verdict, "reasons": diagnosis.reasons},
+        "rivals": [plain(rival) for rival in diagnosis.rivals],
         "import_seconds": round(imported, 2),
         **environment(),
     }
@@ -230,10 +233,16 @@ def rows_of(options: argparse.Namespace, result, diagnosis, header) -> list[dict
                 "std_err": float(np.hypot(statistical, model_error)),
                 "statistical": statistical,
                 "model": model_error,
+                **dict(zip(("low", "high"), limits(diagnosis, name), strict=True)),
                 "header": header_number(header, key) if key in header else None,
             }
         )
     return rows
+
+
+def limits(diagnosis, name: str) -> list[float]:
+    """The range of a parameter over all rivals that fit as well, 95 %; nan if there is none."""
+    return [float(np.squeeze(x)) for x in diagnosis.ranges.get(name, (np.nan, np.nan))]
 
 
 def print_scene(options: argparse.Namespace, gas, curve, result) -> None:
@@ -255,10 +264,13 @@ def print_model(name: str, result, reasons) -> None:
 
 
 def print_rows(rows: list[dict]) -> None:
-    print(f"\n{'':10}{'estimate':>13} {'+-':>10} {'statistical':>12} {'model':>10}  header's")
+    print(f"\n{'':10}{'estimate':>13} {'+-':>10} {'statistical':>12} {'model':>10}", end="")
+    print(f" {'95 %, with rivals':>24}  header's")
     for row in rows:
         print(f"{row['parameter']:4}{row['unit']:6}{row['estimate']:13.5g} ", end="")
         print(f"{row['std_err']:10.2g} {row['statistical']:12.2g} {row['model']:10.2g}", end="")
+        between = f"{row['low']:.3g} .. {row['high']:.3g}"
+        print(f" {between:>24}", end="")
         if row["header"]:
             print(f"  {row['header']:.5g} ({100 * (row['estimate'] / row['header'] - 1):+.2f} %)")
         else:
@@ -272,6 +284,12 @@ def environment() -> dict:
         "python": platform.python_version(),
         "device": jax.devices()[0].device_kind,
     }
+
+
+def plain(rival) -> dict[str, Any]:
+    """A rival as JSON has it."""
+    fields = rival._asdict().items()
+    return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in fields}
 
 
 def finite_or_null(value: Any) -> Any:

@@ -143,10 +143,15 @@ def _fit_at(
     num_used = jnp.sum(jnp.concatenate(comparison.weights) > 0) + int(use_displacement)
     degrees_of_freedom = num_used - flat.size
     errors_known = comparison.curve.temperature_error is not None
-    chance = misfit(residuals, degrees_of_freedom, errors_known=errors_known)
+    num_times = comparison.curve.times.size
+    of_temperature = jnp.sum(comparison.weights[0] > 0) - comparison.free(flat).size
+    parts = [(residuals[:num_times], of_temperature)]
+    if use_displacement:
+        parts.append((residuals[num_times:], jnp.sum(comparison.weights[1] > 0)))
+    chance = misfit(parts, degrees_of_freedom, errors_known=errors_known)
     root, clock_error = _propagated(comparison, flat, jacobian, clock_slope)
     covariance = chance.inflation * root @ root.T
-    num_times, free = comparison.curve.times.size, comparison.free(flat)
+    free = comparison.free(flat)
     return Fit(
         names=names,
         model=comparison.model,

@@ -3,17 +3,23 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.residuals import correlation_factor, neighbour_correlation
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
+from jaxgran.fitting.rivals import ASKED, Rival, ranges, rivals
 from jaxgran.models.base import Omission
 
 LARGEST_SCATTER = 0.3
 """Relative scatter of T about a model above which it does not explain a curve without errors."""
+
+
+STEADY = 3.0
+"""Correlation of neighbouring residuals, in standard errors of it for independent ones, from which
+on a curve without errors is not explained."""
 
 
 class Diagnosis(NamedTuple):
@@ -26,6 +32,9 @@ class Diagnosis(NamedTuple):
         reasons: for the verdict, a sentence each.
         correlation: of neighbouring residuals; 0 for independent errors.
         correlation_factor: by which correlated errors increase the standard error, >= 1.
+        rivals: other laws of cooling compared with the fitted one, those that fit best first.
+        ranges: the range of each free parameter, 95 %, SI, over all rivals that fit as well as the
+            best: of a parameter that the rivals leave open this is much wider than its error.
     """
 
     explains: bool
@@ -33,6 +42,8 @@ class Diagnosis(NamedTuple):
     reasons: tuple[str, ...]
     correlation: float
     correlation_factor: float
+    rivals: tuple[Rival, ...]
+    ranges: dict[str, tuple[Float[np.ndarray, "size"], Float[np.ndarray, "size"]]]
 
 
 @no_type_check
@@ -52,33 +63,44 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     residuals = np.asarray(result.residuals)
     used = residuals != 0
     residuals, times = residuals[used], np.asarray(curve.times)[used]
-    correlation = _neighbour_correlation(residuals)
-    factor = np.sqrt((1 + correlation) / (1 - correlation)) if correlation > 0 else 1.0
+    correlation = neighbour_correlation(residuals)
+    factor = correlation_factor(correlation)
     p_value, converged = float(result.p_value), bool(result.converged)
-    # Without errors chi^2 says nothing, but no model explains what it misses by this much.
-    scattered = np.isnan(p_value) and float(result.reduced_chi2) > LARGEST_SCATTER**2
-    misfit = scattered or p_value < SIGNIFICANCE
+    misfit = p_value < SIGNIFICANCE
+    if np.isnan(p_value):
+        misfit = _is_misfit(result, residuals, correlation, num_particles)
     omissions = result.model.omissions(result.gas, num_particles)
+    found = rivals(result, curve) if converged and np.isfinite(result.chi2) else ()
+    limits = ranges(result, found) if found else {}
 
     reasons = [
         _chance(result),
+        *_about_rivals(result, found),
         *_about_residuals(residuals, times, correlation, p_value),
         *(omission.words for omission in omissions),
         *_about_search(result),
     ]
-    verdict = _verdict(result.model.name, converged, misfit, omissions)
+    verdict = _verdict(result.model.name, converged, misfit, omissions, found)
     explains = converged and not misfit and not any(o.decisive for o in omissions)
-    return Diagnosis(explains, verdict, tuple(reasons), correlation, float(factor))
+    explains &= not any(rival.asked for rival in found)
+    return Diagnosis(explains, verdict, tuple(reasons), correlation, factor, found, limits)
 
 
-def _neighbour_correlation(residuals: Float[np.ndarray, "used"]) -> float:
-    """Correlation of neighbouring residuals, outliers clipped."""
-    if residuals.size < 4 or np.ptp(residuals) == 0:
-        return 0.0
-    clipped = np.clip(residuals, *(np.median(residuals) + np.array([-3, 3]) * residuals.std()))
-    centred = clipped - clipped.mean()
-    correlation = float(jnp.dot(centred[1:], centred[:-1]) / jnp.dot(centred, centred))
-    return min(max(correlation, -0.95), 0.95)
+def _is_misfit(
+    result: Fit,
+    residuals: Float[np.ndarray, "used"],
+    correlation: float,
+    num_particles: int | None,
+) -> bool:
+    """Whether a curve without errors is missed by too much, or too steadily for chance.
+
+    Without errors chi^2 says nothing. Fluctuations of few particles are correlated in time, and of
+    a size that N tells.
+    """
+    scatter = float(result.reduced_chi2) ** 0.5
+    expected = np.sqrt(2 / (result.gas.dimension * num_particles)) if num_particles else 0.0
+    steady = correlation > STEADY / np.sqrt(residuals.size) and scatter > 2 * expected
+    return scatter > LARGEST_SCATTER or bool(steady)
 
 
 def _chance(result: Fit) -> str:
@@ -127,6 +149,29 @@ def _about_residuals(
         yield f"far outliers at {at}: check their error bars"
 
 
+def _about_rivals(result: Fit, found: tuple[Rival, ...]) -> Iterator[str]:
+    """The rivals that the curve asks for or allows, and what the first parameter would then be."""
+    if not found:
+        return
+    yield (
+        "this rests on the grains being smooth, equal spheres, far from walls, in vacuum and at "
+        "homogeneous density"
+    )
+    name = result.names[0]
+    for rival in found:
+        between = f"{name} is then between {rival.low[0]:.3g} and {rival.high[0]:.3g}"
+        if rival.asked:
+            yield (
+                f"{rival.name} added to the model fits better (chi^2 by {rival.improvement:.3g}, "
+                f"1 % by chance would be {ASKED:.3g}): {between}"
+            )
+        elif not rival.told_apart:
+            yield (
+                f"{rival.name} cannot be excluded: {between}; errors of the curve and of the model "
+                f"{rival.sharper:.2g} times as small would tell"
+            )
+
+
 def _about_search(result: Fit) -> Iterator[str]:
     """Convergence, noise of simulations and undetermined parameters."""
     if not bool(result.converged):
@@ -142,7 +187,13 @@ def _about_search(result: Fit) -> Iterator[str]:
         yield f"this curve does not determine {' and '.join(group)}"
 
 
-def _verdict(name: str, converged: bool, misfit: bool, omissions: tuple[Omission, ...]) -> str:
+def _verdict(
+    name: str,
+    converged: bool,
+    misfit: bool,
+    omissions: tuple[Omission, ...],
+    found: tuple[Rival, ...],
+) -> str:
     """The verdict on a model.
 
     Args:
@@ -150,20 +201,28 @@ def _verdict(name: str, converged: bool, misfit: bool, omissions: tuple[Omission
         converged: whether the search did.
         misfit: whether it is significant.
         omissions: what the model leaves out of the scene, the most serious first.
+        found: the rivals, those that fit best first.
     """
     if not converged:
         return "The search did not converge: do not trust its estimates."
     plural = name.endswith("s")
     name = name[:1].upper() + name[1:]
     decisive = any(omission.decisive for omission in omissions)
-    if misfit:
+    asked = [rival for rival in found if rival.asked]
+    if misfit or asked:
         do, its = ("do", "their") if plural else ("does", "its")
         verdict = f"{name} {do} not explain this curve: do not trust {its} estimates."
+        if asked:
+            verdict += f" The curve asks for {asked[0].name}."
     elif decisive:
         verdict = f"{name} cannot be trusted in this scene, though the curve fits."
     elif omissions:
         s = "" if plural else "s"
         return f"{name} fit{s} this curve, but the scene is at the edge of the model's validity."
     else:
-        return f"{name} explain{'' if plural else 's'} this curve."
+        verdict = f"{name} {'are' if plural else 'is'} compatible with this curve."
+        open_to = [rival.name for rival in found if not rival.told_apart]
+        if open_to:
+            verdict = f"{verdict[:-1]}, which does not exclude {open_to[0]}."
+        return verdict
     return " ".join([verdict, *(omission.remedy for omission in omissions[:1])])

@@ -39,8 +39,9 @@ class Fit(eqx.Module):
             simulation, one Gauss-Newton step before the estimate.
         residuals: (ln T_measured - ln T_model) over its error; 0 where a point has no weight.
         displacement_residuals: the same of <dr^2>; None if it was not used.
-        chi2, degrees_of_freedom, reduced_chi2, p_value: of the weighted residuals; p_value is nan
-            if the curve has no errors (they are then scaled so that reduced chi^2 is 1).
+        chi2, degrees_of_freedom, reduced_chi2: of all weighted residuals.
+        p_value: probability of a chi^2 as large by chance, of T or of <dr^2>, whichever fits worse;
+            nan if the curve has no errors.
         iterations: steps of Levenberg-Marquardt, evaluations of L-BFGS, or simulations by a
             stochastic model.
         converged: whether the search reached its tolerance; of a stochastic model, whether the last
@@ -110,21 +111,32 @@ class Misfit(NamedTuple):
 
 
 def misfit(
-    residuals: Float[Array, "residuals"],
+    parts: list[tuple[Float[Array, "_"], Int[Array, ""]]],
     degrees_of_freedom: Int[Array, ""],
     *,
     errors_known: bool,
 ) -> Misfit:
     """Goodness of fit of weighted residuals.
 
-    The covariance is inflated by the reduced chi^2 (at least 1) where the p-value is below
-    `SIGNIFICANCE`, and always where the errors are unknown.
+    T and <dr^2> are tested apart, so that many points of one do not hide a misfit of the other: the
+    p-value is that of the worse one, corrected for the choice.
+
+    The covariance is inflated by the reduced chi^2 (at least 1) of the worse one where the p-value
+    is below `SIGNIFICANCE`, and always where the errors are unknown.
+
+    Args:
+        parts: weighted residuals of each observable, and their degrees of freedom.
+        degrees_of_freedom: of all of them.
+        errors_known: whether they are.
     """
-    chi2 = jnp.sum(jnp.asarray(residuals) ** 2)
+    each = jnp.stack([jnp.sum(jnp.asarray(residuals) ** 2) for residuals, _ in parts])
+    chi2 = jnp.sum(each)
     reduced = chi2 / degrees_of_freedom
     if not errors_known:
         return Misfit(chi2, reduced, jnp.full((), jnp.nan), reduced)
-    p_value = jax.scipy.stats.chi2.sf(chi2, degrees_of_freedom)
+    degrees = jnp.stack([jnp.maximum(number, 1) for _, number in parts])
+    worst = jnp.min(jax.scipy.stats.chi2.sf(each, degrees))
+    p_value = -jnp.expm1(len(parts) * jnp.log1p(-worst)) if len(parts) > 1 else worst
     unexplained = p_value < SIGNIFICANCE
-    inflation = jnp.where(unexplained, jnp.maximum(reduced, 1.0), 1.0)
+    inflation = jnp.where(unexplained, jnp.maximum(jnp.max(each / degrees), 1.0), 1.0)
     return Misfit(chi2, reduced, p_value, inflation)

@@ -101,7 +101,8 @@ def _fit_of(
     """The fit in SI units of what a search found."""
     flat = jnp.asarray(found.flat)
     degrees_of_freedom = jnp.asarray(int(np.sum(found.residuals != 0)) - flat.size)
-    chance = misfit(jnp.asarray(found.residuals), degrees_of_freedom, errors_known=errors_known)
+    parts = [(jnp.asarray(found.residuals), degrees_of_freedom)]
+    chance = misfit(parts, degrees_of_freedom, errors_known=errors_known)
     scale = jax.jacfwd(parameters.estimates)(flat)
     noise = scale @ found.noise_covariance @ scale.T
     covariance = chance.inflation * (scale @ found.error_covariance @ scale.T) + noise

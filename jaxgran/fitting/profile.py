@@ -1,0 +1,109 @@
+"""Fits of a curve by the fitted law and something besides, of a given amplitude."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran.fitting.least_squares import least_squares
+from jaxgran.fitting.parameters import Parameters
+from jaxgran.scene.gas import Gas
+from jaxgran.theory.table_of_times import log_temperature, relaxed_cooling_rate
+
+MOST_STEPS = 30
+"""Steps of each search."""
+
+
+class Trial(NamedTuple):
+    """What is added to a fitted law, each field a number or an array of one for each trial.
+
+    Attributes:
+        constant: share of the first cooling rate that is a loss of a fixed share of the energy in
+            each impact, ``T^(1/2)``: constant restitution, walls, friction.
+        drag: share of it that is linear drag, independent of T.
+        floor: noise in T, over the last measured temperature.
+        delay: time after t = 0 at which the clock was started, over the first cooling time.
+    """
+
+    constant: Float[Array, "*trials"]
+    drag: Float[Array, "*trials"]
+    floor: Float[Array, "*trials"]
+    delay: Float[Array, "*trials"]
+
+
+class Profile(NamedTuple):
+    """Fits of all trials."""
+
+    chi2: Float[Array, "trials"]
+    estimate: Float[Array, "trials p"]
+    error: Float[Array, "trials p"]
+    residuals: Float[Array, "trials times"]
+
+
+@eqx.filter_jit
+def fit_trials(
+    gas: Gas,
+    names: tuple[str, ...],
+    times: Float[Array, "times"],
+    measured: Float[Array, "times"],
+    weights: Float[Array, "times"],
+    modelled: Float[Array, "times"],
+    trials: Trial,
+    accuracy: float,
+) -> Profile:
+    """Fits of all trials.
+
+    Args:
+        gas: as fitted.
+        names: of the free parameters.
+        times, measured, weights: t, ln T and inverse relative errors; 0 where a point is not used.
+        modelled: ln T of the fitted model.
+        trials: what is added.
+        accuracy: relative error of the model's cooling rate, of its mean and of its trend in ln T.
+    """
+    parameters, used = Parameters(gas, names), weights > 0
+    unsure = jnp.asarray(accuracy, measured.dtype)
+    lowest = jnp.min(jnp.where(used, measured, jnp.inf))
+    depth = jnp.max(jnp.where(used, measured, -jnp.inf)) - lowest + 2.0
+
+    def computed(trial: Trial, flat: Array, mean: ArrayLike, trend: ArrayLike) -> Array:
+        changed = parameters.gas(flat)
+        log_theta, rate = relaxed_cooling_rate(changed, depth)
+        rate = rate * jnp.exp(unsure * (mean + trend * (2 * log_theta / depth + 1)))
+        other = 1 - trial.constant - trial.drag
+        added = (trial.constant * jnp.exp(log_theta / 2) + trial.drag) / other * rate[0]
+        later = jnp.maximum(times + trial.delay / rate[0], 0.0)
+        cooled = log_temperature(log_theta, rate + added, later)
+        floor = jnp.log(jnp.maximum(trial.floor, jnp.finfo(rate.dtype).tiny)) + lowest
+        return jnp.logaddexp(jnp.log(changed.temperature) + cooled, floor)
+
+    nothing = Trial(*(jnp.zeros(()) for _ in Trial._fields))
+    beside = jnp.where(used, modelled - computed(nothing, parameters.flat(gas), 0.0, 0.0), 0.0)
+
+    def fitted(trial: Trial) -> Profile:
+        def residuals(unknowns: Array) -> Array:
+            flat, errors = unknowns[:-2], unknowns[-2:]
+            differences = measured - computed(trial, flat, *errors) - beside
+            return jnp.concatenate([weights * jnp.where(used, differences, 0.0), errors])
+
+        first = jnp.pad(parameters.flat(_guess(gas, names, trial)), (0, 2))
+        unknowns = least_squares(residuals, first, MOST_STEPS)[0]
+        value, jacobian = residuals(unknowns), jax.jacfwd(residuals)(unknowns)
+        flat = unknowns[:-2]
+        slope = jnp.pad(jax.jacfwd(parameters.estimates)(flat), ((0, 0), (0, 2)))
+        covariance = slope @ jnp.linalg.pinv(jacobian.T @ jacobian) @ slope.T
+        error = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
+        return Profile(jnp.sum(value**2), parameters.estimates(flat), error, value[:-2])
+
+    # One after another: a batch of searches takes twice as long to compile.
+    return jax.lax.map(fitted, trials)
+
+
+def _guess(gas: Gas, names: tuple[str, ...], trial: Trial) -> Gas:
+    """The gas whose first cooling rate, with what is added, is about that of the fitted one."""
+    if "dissipative_constant" not in names:
+        return gas
+    A = gas.value("dissipative_constant") * (1 - trial.constant - trial.drag)
+    return gas.replace(dissipative_constant=A)

@@ -1,0 +1,202 @@
+"""Rivals of a fitted law: what else could have made a measured curve, and what A would then be.
+
+Each rival adds a loss of energy, or an error of the measurement, to the fitted model. Its amplitude
+is varied from nothing to all of the curve while the free parameters are fitted anew. chi^2 as a
+function of the amplitude says whether the curve asks for the rival, or excludes it; where it does
+neither, the parameters are known only as well as the amplitude is.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.profile import Profile, Trial, fit_trials
+from jaxgran.fitting.residuals import chi2_scale
+from jaxgran.fitting.result import Fit
+from jaxgran.scene.restitution import ConstantRestitution
+
+SHARES = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97, 0.995)
+"""Amplitudes of an added loss, as shares of the first cooling rate, and of a noise floor, as shares
+of the last temperature."""
+
+DRAG_SHARES = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
+"""The same of drag, which gains on collisions as the gas cools."""
+
+DELAYS = (0.003, 0.01, 0.03, 0.1, 0.3, -0.001, -0.003, -0.01, -0.03, -0.1, -0.3)
+"""Errors of the start of the clock, over the first cooling time."""
+
+ASKED = 6.63
+"""chi^2 by which a rival must fit better for the curve to ask for it (1 % by chance)."""
+
+ALLOWED = 3.84
+"""chi^2 over the best one up to which an amplitude is allowed (5 % by chance)."""
+
+TOLD_APART = 0.1
+"""Relative change of an estimate below which an allowed rival does not matter."""
+
+
+class Rival(NamedTuple):
+    """One rival of a fitted law.
+
+    Attributes:
+        name: the words for it.
+        amplitude: the best one, see `Trial`.
+        allowed: the smallest and the largest amplitude that the curve allows.
+        improvement: chi^2 of the fitted law less that of the best amplitude, over the scale of
+            chi^2 (1 for independent errors of the given size).
+        low, high: range of each free parameter over the allowed amplitudes, SI, 95 %.
+        asked: whether the curve asks for this rival (1 % by chance).
+        told_apart: whether the curve tells the rival apart from the fitted law, so that it changes
+            the first parameter by less than 10 % or two standard errors.
+        sharper: factor by which the errors must be smaller to tell it apart; 1 if it is.
+    """
+
+    name: str
+    amplitude: float
+    allowed: tuple[float, float]
+    improvement: float
+    low: Float[np.ndarray, "p"]
+    high: Float[np.ndarray, "p"]
+    asked: bool
+    told_apart: bool
+    sharper: float
+
+
+def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
+    """Compare a fitted law with its rivals, by T alone.
+
+    The course of T comes from `jaxgran.theory.table_of_times`; what the fitted model has besides is
+    added to all trials alike.
+
+    Args:
+        result: of `jaxgran.fit`, of one curve.
+        curve: the measured curve.
+
+    Returns:
+        The rivals, those that fit best first.
+    """
+    kinds = _kinds(result)
+    columns = [np.zeros(len(Trial._fields))]
+    for _, field, amplitudes in kinds:
+        rows = np.zeros((len(amplitudes), len(Trial._fields)))
+        rows[:, Trial._fields.index(field)] = amplitudes
+        columns += list(rows)
+    trials = Trial(*jnp.asarray(np.array(columns).T))
+    used = np.asarray(result.residuals) != 0
+    weights, measured = _weights(result, curve, used), np.log(curve.temperature)
+    differences = np.asarray(result.residuals) / np.where(used & (weights > 0), weights, 1.0)
+    if curve.temperature_error is None:
+        differences = np.asarray(result.residuals)  # not weighted
+    model = result.model
+    columns = _padded(np.asarray(curve.times), measured, weights, measured - differences)
+    accuracy = 1e-3 if model.stochastic else model.derivative_accuracy
+    profile = fit_trials(
+        result.gas, result.names, *map(jnp.asarray, columns), trials=trials, accuracy=accuracy
+    )
+    profile = jax.tree.map(np.asarray, profile)
+    best = profile.residuals[int(np.nanargmin(profile.chi2))][: used.size][used]
+    scale = chi2_scale(best, len(result.names))
+    found, begin = [], 1
+    for name, _, amplitudes in kinds:
+        rows = np.array([0, *range(begin, begin + len(amplitudes))])
+        order = np.argsort([0.0, *amplitudes])
+        each = np.array([0.0, *amplitudes])[order]
+        found.append(_rival(name, each, profile, rows[order], scale))
+        begin += len(amplitudes)
+    return tuple(sorted(found, key=lambda rival: -rival.improvement))
+
+
+def _kinds(result: Fit) -> list[tuple[str, str, tuple[float, ...]]]:
+    """The words, the field of `Trial` and the amplitudes of each rival that the fit can have."""
+    kinds = [
+        ("linear drag, as of air", "drag", DRAG_SHARES),
+        ("a noise floor in T", "floor", SHARES),
+    ]
+    if not isinstance(result.gas.law, ConstantRestitution):
+        words = "a further loss at constant eps, as of walls or rough grains"
+        kinds.insert(0, (words, "constant", SHARES))
+    if "temperature" not in result.names:
+        kinds.append(("a wrong start of the clock, or a wrong T_0", "delay", DELAYS))
+    return kinds
+
+
+def _weights(
+    result: Fit, curve: CoolingCurve, used: Bool[np.ndarray, "times"]
+) -> Float[np.ndarray, "times"]:
+    """Inverse relative errors of T; where they are unknown, of the scatter of the residuals."""
+    T = np.asarray(curve.temperature)
+    if curve.temperature_error is None:
+        return used / max(float(result.reduced_chi2) ** 0.5, 1e-12)
+    return np.where(used, T / np.where(used, curve.temperature_error, 1.0), 0.0)
+
+
+def _padded(times: np.ndarray, *columns: np.ndarray) -> list[np.ndarray]:
+    """The times and other columns, with rows of 0 up to a power of two.
+
+    Curves of many lengths then share a compiled program.
+    """
+    rows = max(32, 2 ** (times.size - 1).bit_length()) - times.size
+    return [np.pad(times, (0, rows), "edge"), *(np.pad(column, (0, rows)) for column in columns)]
+
+
+def _rival(
+    name: str,
+    amplitudes: Float[np.ndarray, "rows"],
+    profile: Profile,
+    rows: np.ndarray,
+    scale: float,
+) -> Rival:
+    """A rival, from those rows of the profile that have its amplitudes, in increasing order.
+
+    Between the amplitudes chi^2 and the estimates are interpolated.
+    """
+    chi2 = np.where(np.isfinite(profile.chi2), profile.chi2, np.inf)
+    own = np.where(np.isfinite(chi2[rows]), chi2[rows], 1e300)
+    margin = 1.96 * scale**0.5 * profile.error
+    place = np.linspace(0, len(rows) - 1, 40 * (len(rows) - 1) + 1)
+
+    def between(values):
+        return np.interp(place, np.arange(len(rows)), values)
+
+    allowed = between(own) <= own.min() + ALLOWED * scale
+    estimate, spread = profile.estimate[rows], margin[rows]
+    columns = range(estimate.shape[1])
+    low = [between(estimate[:, k] - spread[:, k])[allowed].min() for k in columns]
+    high = [between(estimate[:, k] + spread[:, k])[allowed].max() for k in columns]
+    first, own_margin = profile.estimate[0, 0], margin[0, 0]
+    wider = max(first - own_margin - low[0], high[0] - first - own_margin) / abs(first)
+    improvement = float((chi2[0] - own.min()) / scale)
+    reached = between(amplitudes)[allowed]
+    return Rival(
+        name=name,
+        amplitude=float(amplitudes[np.argmin(own)]),
+        allowed=(float(reached.min()), float(reached.max())),
+        improvement=improvement,
+        low=np.array(low),
+        high=np.array(high),
+        asked=improvement > ASKED,
+        told_apart=bool(wider < TOLD_APART),
+        sharper=float(max(wider / TOLD_APART, 1.0)),
+    )
+
+
+def ranges(
+    result: Fit, found: tuple[Rival, ...]
+) -> dict[str, tuple[Float[np.ndarray, "size"], Float[np.ndarray, "size"]]]:
+    """The range of each free parameter, 95 %, over all rivals that fit as well as the best.
+
+    Args:
+        result: of `jaxgran.fit`.
+        found: its rivals.
+    """
+    best = max(rival.improvement for rival in found)
+    equal = [rival for rival in found if rival.improvement >= best - ALLOWED]
+    low = np.min([rival.low for rival in equal], axis=0)
+    high = np.max([rival.high for rival in equal], axis=0)
+    sizes = [result.gas.value(name).size for name in result.names]
+    parts = (np.split(x, np.cumsum(sizes)[:-1]) for x in (low, high))
+    return dict(zip(result.names, zip(*parts, strict=True), strict=True))

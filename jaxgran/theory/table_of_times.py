@@ -1,0 +1,93 @@
+"""T(t) of a homogeneous gas by quadrature, where the cooling rate is a function of T alone.
+
+A table of ln T over time, much cheaper than the differential equations of
+`jaxgran.models.KineticTheory`: it serves to compare many laws of cooling. Its a_2 has always the
+value that it relaxes to, where the equations follow it from 0.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxgran.scene.gas import Gas
+from jaxgran.theory import averages
+
+NUM_NODES = 192
+"""Temperatures of the table of times."""
+
+NUM_RATES = 20
+"""Temperatures at which the cooling rate is computed; its logarithm is a polynomial of ln T."""
+
+RELAXATION_STEPS = 3
+"""Newton steps for the value to which a_2 relaxes."""
+
+
+def _interpolation(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Chebyshev nodes in [0, 1], and the matrix from values there to those at even spacing."""
+    nodes = 0.5 - 0.5 * np.cos((np.arange(NUM_RATES) + 0.5) * np.pi / NUM_RATES)
+    series = np.polynomial.chebyshev.chebvander
+    even = np.linspace(-1.0, 1.0, num_nodes)
+    return nodes, series(even, NUM_RATES - 1) @ np.linalg.inv(series(2 * nodes - 1, NUM_RATES - 1))
+
+
+_RATE_NODES, _TO_NODES = _interpolation(NUM_NODES)
+
+
+def relaxed_cooling_rate(
+    gas: Gas, depth: Float[Array, ""]
+) -> tuple[Float[Array, "nodes"], Float[Array, "nodes"]]:
+    """``-d ln T/dt``, 1/s, of a gas of hard spheres whose a_2 has relaxed.
+
+    Args:
+        gas: the scene.
+        depth: the range of ln(T/T_0) is from 0 to minus this.
+
+    Returns:
+        ln(T/T_0) at `NUM_NODES` evenly spaced nodes, and the rate there.
+    """
+    d, law = gas.dimension, gas.reduced_law
+
+    def rate(log_theta):
+        speed = jnp.exp(log_theta / 2)
+        coefficients = averages.averages(law, speed, d)
+
+        def drift(a2):
+            rates = averages.Rates.of(coefficients, a2)
+            return 4 / d * rates.cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment
+
+        a2 = jnp.zeros_like(speed)
+        for _ in range(RELAXATION_STEPS):
+            value, slope = jax.jvp(drift, (a2,), (jnp.ones_like(a2),))
+            a2 = a2 - value / slope
+        cooling = 2 / d * averages.Rates.of(coefficients, a2).cooling * speed
+        return cooling
+
+    at_nodes = jax.vmap(rate)(-depth * jnp.asarray(_RATE_NODES))
+    even = jnp.exp(jnp.asarray(_TO_NODES) @ jnp.log(at_nodes))
+    return -depth * jnp.linspace(0.0, 1.0, NUM_NODES), even * gas.impact_speed / gas.path_length
+
+
+def log_temperature(
+    log_theta: Float[Array, "nodes"], rate: Float[Array, "nodes"], times: Float[Array, "times"]
+) -> Float[Array, "times"]:
+    """ln(T/T_0) at some times of a gas that cools at a given rate.
+
+    ``t = int dy / rate(y)`` over y = -ln(T/T_0), in which between two nodes the rate is taken for a
+    power of T.
+
+    Args:
+        log_theta: ln(T/T_0) at the nodes, from 0 downwards.
+        rate: ``-d ln T/dt`` at the nodes, > 0.
+        times: t, >= 0. Beyond the last node ln T stays what it is there.
+    """
+    time = 1 / rate
+    growth = jnp.log(time[1:] / time[:-1])
+    small = jnp.abs(growth) < 1e-4
+    mean = jnp.where(
+        small, 0.5 * (time[1:] + time[:-1]), jnp.diff(time) / jnp.where(small, 1.0, growth)
+    )
+    passed = jnp.cumsum(-jnp.diff(log_theta) * mean)
+    # In ln(1 + t/t_0) the curve bends little.
+    nodes = jnp.concatenate([jnp.zeros(1), jnp.log1p(passed * rate[0])])
+    return jnp.interp(jnp.log1p(times * rate[0]), nodes, log_theta)
