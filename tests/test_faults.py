@@ -342,7 +342,7 @@ def two_spheres(gas, distance, speed):
     return jaxgran.Particles(position[None], velocity[None], side)
 
 
-@pytest.mark.parametrize("overlap", [1e-3, 0.05])
+@pytest.mark.parametrize("overlap", [pytest.param(1e-3, marks=pytest.mark.slow), 0.05])
 def test_soft_spheres_start_overlapped_and_at_rest(overlap):
     gas = GAS.replace(dissipative_constant=0.0, packing_fraction=0.02)
     start = two_spheres(gas, 1 - overlap, 0.0)
@@ -353,7 +353,7 @@ def test_soft_spheres_start_overlapped_and_at_rest(overlap):
     np.testing.assert_allclose(total, total[0], rtol=3e-3)
 
 
-@pytest.mark.parametrize("beta", [300.0, 1e4])
+@pytest.mark.parametrize("beta", [pytest.param(300.0, marks=pytest.mark.slow), 1e4])
 def test_heavily_damped_impacts_end(beta):
     gas = glass_beads(beta, packing_fraction=0.02)
     start = two_spheres(gas, 1.05, 0.1)

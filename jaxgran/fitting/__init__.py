@@ -8,6 +8,9 @@
 - `guess`: initial guesses from the measured curve.
 - `parameters`: the free parameters as one array in a scale without bounds.
 - `result`: `Fit`, what a fit returns, and goodness of fit.
+- `rivals`: what else could have made the curve, and the range of the parameters then; uses
+  `profile`, fits of the law and something besides, of a given amplitude.
+- `residuals`: statistics of residuals.
 - `diagnosis`: what a fit means, in words.
 
 The top floor: may import every other package. Models are known by `jaxgran.AbstractModel` only;

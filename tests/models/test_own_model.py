@@ -81,7 +81,7 @@ def test_fit_finds_what_made_the_curve(method):
         assert error < 0.01 * gas.value(name)
     assert np.all(result.model_error > 0)
     diagnosis = jaxgran.diagnose(result, curve)
-    assert diagnosis.explains and diagnosis.verdict == "Haff law explains this curve."
+    assert diagnosis.explains and diagnosis.verdict == "Haff law is compatible with this curve."
 
 
 def test_fit_under_jit_and_vmap():

@@ -119,7 +119,7 @@ def test_fit_finds_what_made_the_curve():
         assert float(error) < 0.15 * true
     assert result.simulation_error is not None and np.all(result.simulation_error > 0)
     assert result.model.name == "hard spheres"
-    assert "Hard spheres explain" in jaxgran.diagnose(result, curve).verdict
+    assert "Hard spheres are compatible" in jaxgran.diagnose(result, curve).verdict
 
 
 COEFFICIENT = 0.8

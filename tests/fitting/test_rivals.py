@@ -1,0 +1,100 @@
+"""What else could have made a curve, and what A then is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import wrong_physics
+
+import jaxgran
+from jaxgran.fitting.rivals import ranges, rivals
+from tests.conftest import glass_beads
+from tests.fitting.curves import synthetic
+
+FREE = ("dissipative_constant", "temperature")
+
+
+def curve_of(rates_of, floor=0.0, *, errors=True, seed=0):
+    """A curve of `wrong_physics` with 3 % noise."""
+    gas = wrong_physics.beads()
+    T_0 = float(gas.temperature)
+    times, values = wrong_physics.cooled(rates_of(gas), T_0, 0.02)
+    t = np.geomspace(times[-1] / 300, times[-1], 30)
+    T = np.interp(t, times, values) + floor * T_0
+    T = T * np.exp(0.03 * np.random.default_rng(seed).standard_normal(30))
+    return gas, jaxgran.CoolingCurve(
+        times=t, temperature=T, temperature_error=0.03 * T if errors else None
+    )
+
+
+CASES = [
+    # what the curve contains, noise floor, true A over 3e-6, words, whether it must be noticed
+    ("nothing", wrong_physics.nothing, 0.0, 1.0, "", False),
+    ("rough", wrong_physics.rough(-0.5), 0.0, 1.0, "constant eps", False),
+    ("walls", wrong_physics.walls(0.8), 0.0, 1.0, "constant eps", False),
+    ("constant", wrong_physics.constant(0.8), 0.0, 0.05, "constant eps", True),
+    ("drag", wrong_physics.drag(0.05), 0.0, 1.0, "drag", True),
+    ("floor", wrong_physics.nothing, 0.01, 1.0, "noise floor", True),
+]
+
+
+OFTEN, QUICK, SLOW = ("nothing", "walls", "constant"), (), pytest.mark.slow
+
+
+@pytest.mark.parametrize("errors", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "rates_of, floor, true, words, noticed",
+    [pytest.param(*c[1:], id=c[0], marks=QUICK if c[0] in OFTEN else SLOW) for c in CASES],
+)
+def test_the_range_contains_the_truth(rates_of, floor, true, words, noticed, errors):
+    gas, curve = curve_of(rates_of, floor, errors=errors)
+    result = jaxgran.fit(gas, curve, free=FREE)
+    diagnosis = jaxgran.diagnose(result, curve)
+    low, high = (x[0] / wrong_physics.TRUE_A for x in diagnosis.ranges["dissipative_constant"])
+    assert low < true < high
+    said = " ".join([diagnosis.verdict, *diagnosis.reasons])
+    assert words in said and "smooth, equal spheres" in said
+    if noticed:
+        assert not diagnosis.explains and f"asks for {diagnosis.rivals[0].name}" in said
+    if words == "":
+        assert diagnosis.explains and high - low < 0.8
+
+
+def test_a_loss_that_is_not_told_apart_makes_a_an_upper_bound():
+    gas, curve = curve_of(wrong_physics.walls(0.8))
+    result = jaxgran.fit(gas, curve, free=FREE)
+    found = {rival.name: rival for rival in rivals(result, curve)}
+    loss = next(rival for name, rival in found.items() if "constant eps" in name)
+    assert not loss.told_apart and loss.sharper > 2
+    # The fit alone is wrong by many of its standard errors.
+    a, error = result.value("dissipative_constant")
+    assert (a - wrong_physics.TRUE_A) / error > 10
+    low, high = ranges(result, tuple(found.values()))["dissipative_constant"]
+    assert low[0] <= loss.low[0] < 0.7 * a < a < high[0]
+
+
+def test_without_errors_a_steady_misfit_is_no_explanation():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(3))
+    wave = jnp.exp(0.05 * jnp.sin(jnp.linspace(0.0, 12.0, curve.times.size)))
+    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature * wave)
+    result = jaxgran.fit(gas, bare, free=FREE)
+    assert not jaxgran.diagnose(result, bare).explains
+    # Of 200 particles T scatters by as much by itself.
+    assert jaxgran.diagnose(result, bare, 200).verdict.startswith("Kinetic theory is compatible")
+
+
+def test_many_points_of_displacement_do_not_hide_a_misfit_of_temperature():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(4), displacement=True)
+    wave = jnp.exp(0.025 * jnp.sin(jnp.linspace(0.0, 12.0, curve.times.size)))
+    bent = jaxgran.CoolingCurve(
+        times=curve.times,
+        temperature=curve.temperature * wave,
+        temperature_error=curve.temperature_error,
+        displacement=curve.displacement,
+        displacement_error=30 * curve.displacement_error,
+    )
+    result = jaxgran.fit(gas, bent)
+    assert float(result.reduced_chi2) < 1.9 * float(jnp.mean(result.residuals**2))
+    assert float(result.p_value) < 1e-4
