@@ -77,7 +77,7 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
         curve: the measured curve.
 
     Returns:
-        The rivals, those that fit best first.
+        The rivals, those that fit best first; () where the fitted gas does not cool.
     """
     kinds = _kinds(result)
     columns = [np.zeros(len(Trial._fields))]
@@ -98,6 +98,8 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
         result.gas, result.names, *map(jnp.asarray, columns), trials=trials, accuracy=accuracy
     )
     profile = jax.tree.map(np.asarray, profile)
+    if not np.isfinite(profile.chi2[0]):
+        return ()
     best = profile.residuals[int(np.nanargmin(profile.chi2))][: used.size][used]
     scale = chi2_scale(best, len(result.names))
     found, begin = [], 1

@@ -98,3 +98,14 @@ def test_many_points_of_displacement_do_not_hide_a_misfit_of_temperature():
     result = jaxgran.fit(gas, bent)
     assert float(result.reduced_chi2) < 1.9 * float(jnp.mean(result.residuals**2))
     assert float(result.p_value) < 1e-4
+
+
+def test_a_gas_that_does_not_cool_has_no_rivals():
+    gas = glass_beads(0.0)
+    times = np.geomspace(1.0, 10.0, 8)
+    curve = jaxgran.CoolingCurve(
+        times=times, temperature=np.full(8, 0.01), temperature_error=np.full(8, 1e-4)
+    )
+    result = jaxgran.fit(gas, curve, free=("temperature",))
+    diagnosis = jaxgran.diagnose(result, curve)
+    assert diagnosis.rivals == () and diagnosis.ranges == {}
