@@ -6,6 +6,7 @@ Makes cooling curves of 2 mm beads (phi = .05, A = 3e-6 s; 30 points, 3 % noise)
 grains, walls, drag, a noise floor or a constant eps besides or instead, fits A and T_0 with kinetic
 theory of smooth viscoelastic spheres, and prints for each: A found over A true, how often the
 verdict still says "compatible", and how often the range of A over all rivals contains the true A.
+A curve of constant eps has no A: there the range must reach down to 1 % of the A found.
 
 The curves are integrated here, by rates of T that the fit does not use: rough spheres as two
 temperatures with constant tangential restitution (Huthmann & Zippelius, PRE 56, R6275 (1997)),
@@ -26,6 +27,7 @@ TRUE_A = 3e-6
 NUM_POINTS, NOISE = 30, 0.03
 STEPS = 4000
 BOX = 0.05  # m
+NOTE = "In rows of constant eps there is no A: the range must reach down to 1 % of the A found."
 
 
 def beads(A: float = TRUE_A) -> jaxgran.Gas:
@@ -151,7 +153,7 @@ def main() -> None:
         lines.append(row(name, rates_of, floor, true, options.draws))
         print(lines[-1], flush=True)
     if options.out is not None:
-        options.out.write_text("\n".join(lines) + "\n")
+        options.out.write_text("\n".join([*lines, "", NOTE]) + "\n")
 
 
 def row(name: str, rates_of, floor: float, true: float, draws: int) -> str:

@@ -51,7 +51,7 @@ def fit_trials(
     weights: Float[Array, "times"],
     modelled: Float[Array, "times"],
     trials: Trial,
-    accuracy: float,
+    accuracy: Float[Array, ""],
 ) -> Profile:
     """Fits of all trials.
 
@@ -64,7 +64,7 @@ def fit_trials(
         accuracy: relative error of the model's cooling rate, of its mean and of its trend in ln T.
     """
     parameters, used = Parameters(gas, names), weights > 0
-    unsure = jnp.asarray(accuracy, measured.dtype)
+    unsure = accuracy.astype(measured.dtype)
     lowest = jnp.min(jnp.where(used, measured, jnp.inf))
     depth = jnp.max(jnp.where(used, measured, -jnp.inf)) - lowest + 2.0
 

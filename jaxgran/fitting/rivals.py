@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.profile import Profile, Trial, fit_trials
@@ -51,7 +51,7 @@ class Rival(NamedTuple):
         low, high: range of each free parameter over the allowed amplitudes, SI, 95 %.
         asked: whether the curve asks for this rival (1 % by chance).
         told_apart: whether the curve tells the rival apart from the fitted law, so that it changes
-            the first parameter by less than 10 % or two standard errors.
+            the first parameter by less than 10 %, over the fitted law's own error.
         sharper: factor by which the errors must be smaller to tell it apart; 1 if it is.
     """
 
@@ -80,27 +80,23 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
         The rivals, those that fit best first; () where the fitted gas does not cool.
     """
     kinds = _kinds(result)
-    columns = [np.zeros(len(Trial._fields))]
-    for _, field, amplitudes in kinds:
-        rows = np.zeros((len(amplitudes), len(Trial._fields)))
-        rows[:, Trial._fields.index(field)] = amplitudes
-        columns += list(rows)
-    trials = Trial(*jnp.asarray(np.array(columns).T))
-    used = np.asarray(result.residuals) != 0
-    weights, measured = _weights(result, curve, used), np.log(curve.temperature)
-    differences = np.asarray(result.residuals) / np.where(used & (weights > 0), weights, 1.0)
-    if curve.temperature_error is None:
-        differences = np.asarray(result.residuals)  # not weighted
+    weights, residuals = _weighted(result, curve)
+    measured = np.log(curve.temperature)
+    fitted = measured - residuals / np.where(weights > 0, weights, 1.0)
+    columns = _padded(np.asarray(curve.times), measured, weights, fitted)
     model = result.model
-    columns = _padded(np.asarray(curve.times), measured, weights, measured - differences)
-    accuracy = 1e-3 if model.stochastic else model.derivative_accuracy
     profile = fit_trials(
-        result.gas, result.names, *map(jnp.asarray, columns), trials=trials, accuracy=accuracy
+        result.gas,
+        result.names,
+        *map(jnp.asarray, columns),
+        trials=_trials(kinds),
+        # What a particle model leaves uncertain is in the weights.
+        accuracy=jnp.asarray(0.0 if model.stochastic else model.derivative_accuracy),
     )
     profile = jax.tree.map(np.asarray, profile)
     if not np.isfinite(profile.chi2[0]):
         return ()
-    best = profile.residuals[int(np.nanargmin(profile.chi2))][: used.size][used]
+    best = profile.residuals[int(np.nanargmin(profile.chi2))][: weights.size][weights > 0]
     scale = chi2_scale(best, len(result.names))
     found, begin = [], 1
     for name, _, amplitudes in kinds:
@@ -126,14 +122,30 @@ def _kinds(result: Fit) -> list[tuple[str, str, tuple[float, ...]]]:
     return kinds
 
 
-def _weights(
-    result: Fit, curve: CoolingCurve, used: Bool[np.ndarray, "times"]
-) -> Float[np.ndarray, "times"]:
-    """Inverse relative errors of T; where they are unknown, of the scatter of the residuals."""
-    T = np.asarray(curve.temperature)
+def _trials(kinds: list[tuple[str, str, tuple[float, ...]]]) -> Trial:
+    """The fitted law itself, then each amplitude of each rival, the others being 0."""
+    rows = [np.zeros(len(Trial._fields))]
+    for _, field, amplitudes in kinds:
+        own = np.zeros((len(amplitudes), len(Trial._fields)))
+        own[:, Trial._fields.index(field)] = amplitudes
+        rows += list(own)
+    return Trial(*jnp.asarray(np.array(rows).T))
+
+
+def _weighted(
+    result: Fit, curve: CoolingCurve
+) -> tuple[Float[np.ndarray, "times"], Float[np.ndarray, "times"]]:
+    """Inverse relative errors of T, 0 where the fit used none, and the residuals over the errors.
+
+    Where the errors are unknown they are the scatter of the residuals.
+    """
+    residuals = np.asarray(result.residuals)
+    used = residuals != 0
     if curve.temperature_error is None:
-        return used / max(float(result.reduced_chi2) ** 0.5, 1e-12)
-    return np.where(used, T / np.where(used, curve.temperature_error, 1.0), 0.0)
+        weights = used / max(float(result.reduced_chi2) ** 0.5, 1e-12)
+        return weights, residuals * weights
+    error = np.where(used, curve.temperature_error, 1.0)
+    return np.where(used, np.asarray(curve.temperature) / error, 0.0), residuals
 
 
 def _padded(times: np.ndarray, *columns: np.ndarray) -> list[np.ndarray]:

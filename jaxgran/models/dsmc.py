@@ -26,6 +26,7 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import Course
 from jaxgran.particles.driver import follow
+from jaxgran.particles.interruption import waited_for
 from jaxgran.particles.stochastic import simulation
 from jaxgran.particles.stochastic.collisions import Scheme
 from jaxgran.scene.gas import Gas
@@ -131,7 +132,7 @@ class DSMC(AbstractModel):
         _, records, fault = follow(
             start,
             np.asarray(times),
-            advance,
+            lambda state, end: waited_for(advance(state, end)),
             observe,
             scene=described(law=law, times=times, key=words, scheme=scheme, model=self),
             progress=run.progress,

@@ -98,7 +98,7 @@ def follow(
                 raise Failure(fault)
             while done < len(times):
                 while float(state.time) < times[done]:
-                    before, state = state, waited_for(advance(state, float(times[done])))
+                    before, state = state, advance(state, float(times[done]))
                     idle = _idle(idle, before, state)
                     _show(bar, state, observe)
                     if time.monotonic() - saved > CHECKPOINT_SECONDS:
@@ -290,6 +290,6 @@ def _some_stretches(
         until = np.asarray(end, state.time.dtype)
         state, fault, needed = waited_for(_stretches(dynamics, state, until, engine))
         return state, int(fault), np.asarray(needed).tolist()
-    now = dynamics.stretch(state, end, engine)
+    now = waited_for(dynamics.stretch(state, end, engine))
     fault = int(now.status)
     return (now.state if fault == status.OK else state), fault, np.asarray(now.needed).tolist()

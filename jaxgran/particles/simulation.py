@@ -72,10 +72,11 @@ class Simulation(NamedTuple):
 
     def outputs(self, state: State, records: dict[str, Array], fault: ArrayLike) -> Outputs:
         """The results of a run, in the frame in which the start was given."""
-        travelled = self.drift * self.inputs.times[-1]
+        drift = self.drift
+        travelled = drift * self.inputs.times[-1]
         return Outputs(
             neighbours.wrap(self.dynamics.scene.side, state.position + travelled),
-            state.velocity + self.drift,
+            state.velocity + drift,
             records,
             jnp.asarray(fault, jnp.int32),
         )
