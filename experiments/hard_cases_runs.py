@@ -31,7 +31,7 @@ from scenes import beads
 import jaxgran
 from jaxgran.data import checkpoint
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.soft.energy import WORK_TOLERANCE
+from jaxgran.particles.soft.block import DRIFT_TOLERANCE
 from jaxgran.theory import closed_forms
 
 DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
@@ -125,15 +125,19 @@ def steps_and_lists() -> list[Row]:
     shift = jnp.array([0.5, 0.0, 0.0]) * gas.diameter
     place = still.position.at[0, 1].set(still.position[0, 0] + shift)
     start = still._replace(position=jnp.mod(place, still.box_side))
-    curve = jaxgran.cool(gas, [1e-9, times[0]], model=SOFT(100, start=start, steps_per_contact=10))
+    # A step is halved where its energy error is too large a share of the work that it does. At ten
+    # steps per contact, the fewest allowed, the errors of many such steps still add up to more than
+    # a run may have.
+    later = [1e-9, times[0]]
+    call = lambda: jaxgran.cool(gas, later, model=SOFT(100, start=start, steps_per_contact=10))  # noqa: E731
+    rows.append(refusal("SoftSpheres, 10 steps", "float64", call, "energy balance"))
+    curve = jaxgran.cool(gas, later, model=SOFT(100, start=start, steps_per_contact=20))
     assert curve.elastic_energy is not None and curve.dissipated_energy is not None
     held = np.asarray(
         1.5 * gas.mass * curve.temperature + curve.elastic_energy + curve.dissipated_energy
     )
-    # At ten steps per contact, the fewest allowed. A step is halved where its energy error is more
-    # than this share of the work that it does.
     error = worst(held[1], held[0])
-    rows.append(Row("SoftSpheres, step mended", "float64", error, WORK_TOLERANCE))
+    rows.append(Row("SoftSpheres, step mended", "float64", error, DRIFT_TOLERANCE))
     return rows
 
 
@@ -290,7 +294,7 @@ def one_of_a_batch_fails() -> list[Row]:
                 ok = np.all(np.isfinite(slope[::2])) and np.all(np.isnan(slope[1]))
                 rows.append(Row("KineticTheory, slopes", name, 0.0 if ok else np.inf, 0.0))
             values, codes = jax.vmap(cooled)(a * jnp.array([1.0, jnp.nan, 0.5]))
-            rows.append(flagged("KineticTheory, nan", name, values, codes, 1, "not a finite"))
+            rows.append(flagged("KineticTheory, nan", name, values, codes, 1, "outside its range"))
     gas = beads(0.05, 0.15, 0.05)
     times = jnp.asarray([0.5 * float(gas.mean_free_time)])
     # The others differ from single runs by round-off, which grows in the ten impacts of the melt.
@@ -307,7 +311,7 @@ def one_of_a_batch_fails() -> list[Row]:
 
         some = gas.value(FREE) * jnp.array([1.0, jnp.nan, 0.5])
         values, codes = jax.jit(jax.vmap(simulated))(some)
-        rows.append(flagged(model, "float64", values, codes, 1, "not a finite"))
+        rows.append(flagged(model, "float64", values, codes, 1, "outside its range"))
         alone = [simulated(x)[0] for x in some[::2]]
         error = worst(values[::2], np.asarray(alone))
         rows.append(Row(f"{model}, others", "float64", error, allowed))

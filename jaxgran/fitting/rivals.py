@@ -169,7 +169,7 @@ def _rival(
     Between the amplitudes chi^2 and the estimates are interpolated.
     """
     chi2 = np.where(np.isfinite(profile.chi2), profile.chi2, np.inf)
-    own = np.where(np.isfinite(chi2[rows]), chi2[rows], 1e300)
+    own = np.where(np.isfinite(chi2[rows]), chi2[rows], 1e30)
     margin = 1.96 * scale**0.5 * profile.error
     place = np.linspace(0, len(rows) - 1, 40 * (len(rows) - 1) + 1)
 

@@ -63,8 +63,10 @@ def relaxed_cooling_rate(
         cooling = 2 / d * averages.Rates.of(coefficients, a2).cooling * speed
         return cooling
 
-    at_nodes = jax.vmap(rate)(-depth * jnp.asarray(_RATE_NODES))
-    even = jnp.exp(jnp.asarray(_TO_NODES) @ jnp.log(at_nodes))
+    # Cast in NumPy: the constants of a program have the precision of the rest.
+    rate_nodes, to_nodes = (jnp.asarray(x.astype(depth.dtype)) for x in (_RATE_NODES, _TO_NODES))
+    at_nodes = jax.vmap(rate)(-depth * rate_nodes)
+    even = jnp.exp(to_nodes @ jnp.log(at_nodes))
     return -depth * jnp.linspace(0.0, 1.0, NUM_NODES), even * gas.impact_speed / gas.path_length
 
 

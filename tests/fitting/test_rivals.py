@@ -109,3 +109,17 @@ def test_a_gas_that_does_not_cool_has_no_rivals():
     result = jaxgran.fit(gas, curve, free=("temperature",))
     diagnosis = jaxgran.diagnose(result, curve)
     assert diagnosis.rivals == () and diagnosis.ranges == {}
+
+
+@pytest.mark.slow  # two compilations
+@pytest.mark.filterwarnings("ignore:fitting in float32")
+def test_both_precisions_in_one_process():
+    """Constants of one precision must not enter a program of the other."""
+    _, curve = curve_of(wrong_physics.nothing)
+    found = {}
+    for x64 in (True, False):
+        with jax.enable_x64(x64):
+            gas, curve = wrong_physics.beads(), jax.tree.map(np.asarray, curve)
+            result = jaxgran.fit(gas, curve, free=FREE)
+            found[x64] = ranges(result, rivals(result, curve))["dissipative_constant"]
+    np.testing.assert_allclose(found[False], found[True], rtol=0.02)
