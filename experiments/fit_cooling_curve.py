@@ -110,16 +110,17 @@ def run(options: argparse.Namespace) -> None:
     diagnosis = jaxgran.diagnose(result, curve, n)
     rows = rows_of(options, result, diagnosis, header)
     print_scene(options, gas, curve, result)
+    print_impacts(result.gas, float(curve.temperature[-1]), n)
     print_model(model_name, result, reasons)
     print_rows(rows)
     print(f"\n{diagnosis.verdict}")
     for reason in diagnosis.reasons:
         print(f"  - {reason}")
     head = rows[0]
-    title = (
-        f"{options.curve.stem}: {head['parameter']} = {head['estimate']:.4g} "
-        f"± {head['std_err']:.2g} {head['unit']}\n{diagnosis.verdict}"
-    )
+    answer = "not determined"
+    if not np.isnan(head["estimate"]):
+        answer = f"{head['estimate']:.4g} ± {head['std_err']:.2g} {head['unit']}"
+    title = f"{options.curve.stem}: {head['parameter']} = {answer}\n{diagnosis.verdict}"
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_fit(result, curve, title, picture)
     summary = {
@@ -218,11 +219,14 @@ def timed_fit(options: argparse.Namespace, gas, curve, model, free, num_particle
 
 
 def rows_of(options: argparse.Namespace, result, diagnosis, header) -> list[dict]:
-    """Estimates and errors, a row for each parameter."""
-    rows = []
+    """Estimates and errors, a row for each parameter; nan where the curve determines none."""
+    rows, unknown = [], result.undetermined()
     for key in options.free:
         name, unit = PARAMETERS[key]
         estimate, statistical = (float(x) for x in result.value(name))
+        between = limits(diagnosis, name)
+        if name in unknown:
+            estimate, statistical, *between = 4 * [float("nan")]
         statistical *= diagnosis.correlation_factor
         model_error = float(result.model_error[result.names.index(name)])
         rows.append(
@@ -233,7 +237,7 @@ def rows_of(options: argparse.Namespace, result, diagnosis, header) -> list[dict
                 "std_err": float(np.hypot(statistical, model_error)),
                 "statistical": statistical,
                 "model": model_error,
-                **dict(zip(("low", "high"), limits(diagnosis, name), strict=True)),
+                **dict(zip(("low", "high"), between, strict=True)),
                 "header": header_number(header, key) if key in header else None,
             }
         )
@@ -256,6 +260,19 @@ def print_scene(options: argparse.Namespace, gas, curve, result) -> None:
     )
 
 
+def print_impacts(gas, last_T: float, num_particles: int | None) -> None:
+    """What the fitted A means: eps at the rms impact speeds of the first and of the last T."""
+    first, last = (float(gas.restitution(np.sqrt(2 * T))) for T in (gas.temperature, last_T))
+    print(f"impacts  eps = {first:.3g} at the thermal speed of t = 0, {last:.3g} at the last one;")
+    print(f"         mean free path {1e3 * float(gas.mean_free_path):.3g} mm", end="")
+    if num_particles is not None:
+        box = 1e3 * float(gas.box_side(num_particles))
+        print(f", in a box of {box:.3g} mm if it is a cube", end="")
+    print()
+    if isinstance(gas.law, jaxgran.Viscoelastic):
+        print("         A and Y enter as A Y^(2/5) where contacts are short: 10 % in Y is 4 % in A")
+
+
 def print_model(name: str, result, reasons) -> None:
     steps = "simulations" if result.simulation_error is not None else "steps of least squares"
     print(f"model    {name}, {int(result.iterations)} {steps}")
@@ -267,7 +284,11 @@ def print_rows(rows: list[dict]) -> None:
     print(f"\n{'':10}{'estimate':>13} {'+-':>10} {'statistical':>12} {'model':>10}", end="")
     print(f" {'95 %, with rivals':>24}  header's")
     for row in rows:
-        print(f"{row['parameter']:4}{row['unit']:6}{row['estimate']:13.5g} ", end="")
+        print(f"{row['parameter']:4}{row['unit']:6}", end="")
+        if np.isnan(row["estimate"]):
+            print(f"{'not determined':>13}")
+            continue
+        print(f"{row['estimate']:13.5g} ", end="")
         print(f"{row['std_err']:10.2g} {row['statistical']:12.2g} {row['model']:10.2g}", end="")
         between = f"{row['low']:.3g} .. {row['high']:.3g}"
         print(f" {between:>24}", end="")

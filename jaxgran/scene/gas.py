@@ -162,6 +162,11 @@ class Gas(eqx.Module):
         )
 
     @property
+    def mean_free_path(self) -> Float[Array, ""]:
+        """``1 / (sqrt(2) pi n g_2 sigma^2)`` (3D) or ``1 / (2 sqrt(2) n g_2 sigma)`` (2D), m."""
+        return self.path_length / (2**0.5 * (pi if self.dimension == 3 else 2))
+
+    @property
     def impact_speed(self) -> Float[Array, ""]:
         """``sqrt(2 T_0)``, m/s, the rms of a component of the relative velocity of two spheres."""
         return jnp.sqrt(2 * self.temperature)

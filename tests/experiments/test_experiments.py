@@ -24,6 +24,7 @@ def test_main_job_without_arguments(tmp_path):
     done = run("fit_cooling_curve.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout.splitlines()[-1])
+    assert "eps = 0.9" in done.stdout and "mean free path 4.15 mm" in done.stdout
     assert abs(summary["A"] / 3e-6 - 1) < 0.02
     assert abs(summary["A"] - 3e-6) < 2 * summary["A_std_err"]
     assert summary["converged"] and summary["explains"] and summary["model"] == "kinetic-theory"
@@ -152,7 +153,8 @@ def test_main_job_writes_json_that_others_can_read(tmp_path, monkeypatch, capsys
     code, said, _ = main_job(monkeypatch, capsys, tmp_path, *options)
     assert code == 0
     summary = json.loads(said.splitlines()[-1], parse_constant=refuse)
-    assert "nu_std_err" in summary
+    assert summary["A"] is None and summary["nu_std_err"] is None
+    assert said.count("not determined") == 3  # and not as a number with a huge error
     (record,) = (tmp_path / "results").rglob("*.json")
     json.loads(record.read_text(), parse_constant=refuse)
     assert fit_cooling_curve.finite_or_null({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}
@@ -162,8 +164,8 @@ def test_main_job_writes_json_that_others_can_read(tmp_path, monkeypatch, capsys
 def test_wrong_physics_runs(tmp_path):
     done = run("wrong_physics.py", "--draws", 2, "--out", "table.md", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    rows = (tmp_path / "table.md").read_text().splitlines()[2:]
-    assert len(rows) == 11 and "| 2 of 2 |" in rows[0]
+    *rows, _, note = (tmp_path / "table.md").read_text().splitlines()[2:]
+    assert "there is no A" in note and len(rows) == 11 and "| 2 of 2 |" in rows[0]
     assert all("0 of 2" in row for row in rows if "constant eps" in row)
 
 

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +21,11 @@ def test_derived_scales(beads):
     nu_0 = 4 * np.sqrt(np.pi) * g2 * n * 4e-6 * 0.1
     np.testing.assert_allclose(gas.collision_frequency, nu_0, rtol=1e-12)
     np.testing.assert_allclose(gas.mean_free_time * nu_0, 1.0, rtol=1e-12)
+    # Mean speed of a Maxwellian gas, sqrt(8 T / pi) or sqrt(pi T / 2), times the mean free time.
+    np.testing.assert_allclose(gas.mean_free_path * nu_0, np.sqrt(0.08 / np.pi), rtol=1e-12)
+    flat = dataclasses.replace(gas, dimension=2)
+    speed = np.sqrt(np.pi * 0.01 / 2)
+    np.testing.assert_allclose(flat.mean_free_path / flat.mean_free_time, speed, rtol=1e-12)
     mass = np.pi / 6 * 2500 * 8e-9
     alpha = 2 * 5e7 * np.sqrt(0.0005) / (3 * (1 - 0.22**2)) / (mass / 2)
     np.testing.assert_allclose(gas.alpha, alpha, rtol=1e-12)
