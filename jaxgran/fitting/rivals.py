@@ -90,7 +90,7 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
         result.names,
         *map(jnp.asarray, columns),
         trials=_trials(kinds),
-        # What a particle model leaves uncertain is in the weights.
+        # A particle model's noise is added to the errors below.
         accuracy=jnp.asarray(0.0 if model.stochastic else model.derivative_accuracy),
     )
     profile = jax.tree.map(np.asarray, profile)
@@ -98,6 +98,9 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
         return ()
     best = profile.residuals[int(np.nanargmin(profile.chi2))][: weights.size][weights > 0]
     scale = chi2_scale(best, len(result.names))
+    if result.simulation_error is not None:
+        noise = np.asarray(result.simulation_error) / scale**0.5
+        profile = profile._replace(error=np.hypot(profile.error, noise))
     found, begin = [], 1
     for name, _, amplitudes in kinds:
         rows = np.array([0, *range(begin, begin + len(amplitudes))])
