@@ -267,7 +267,8 @@ def print_impacts(gas, last_T: float, num_particles: int | None) -> None:
     print(f"         mean free path {1e3 * float(gas.mean_free_path):.3g} mm", end="")
     if num_particles is not None:
         box = 1e3 * float(gas.box_side(num_particles))
-        print(f", in a box of {box:.3g} mm if it is a cube", end="")
+        shape = "cube" if gas.dimension == 3 else "square"
+        print(f", in a box of {box:.3g} mm if it is a {shape}", end="")
     print()
     if isinstance(gas.law, jaxgran.Viscoelastic):
         print("         A and Y enter as A Y^(2/5) where contacts are short: 10 % in Y is 4 % in A")

@@ -51,9 +51,10 @@ def reference(model_or_kind):
 
 
 def check_same(found, expected):
-    np.testing.assert_allclose(found[0], expected[0], rtol=1e-8, atol=1e-10)
-    # Rounding may let soft spheres project their tangents a block earlier or later.
-    np.testing.assert_allclose(found[1], expected[1], rtol=1e-5, atol=1e-8)
+    # Rounding grows some hundredfold in the mean free time that is followed.
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-10, atol=1e-12)
+    # It may also let soft spheres project their tangents a block earlier or later.
+    np.testing.assert_allclose(found[1], expected[1], rtol=1e-6, atol=1e-8)
 
 
 def check_start(kind, **changed):

@@ -28,14 +28,15 @@ def test_is_that_of_kinetic_theory(beta, dimension):
     np.testing.assert_allclose(found, jnp.log(expected / gas.temperature), atol=0.01 * beta + 5e-4)
     shift = 1e-4
     difference = (course(shift) - course(-shift)) / (2 * shift)
-    np.testing.assert_allclose(slope, difference, atol=2e-3)
+    np.testing.assert_allclose(slope, difference, atol=1e-8)  # 4e-10: of the difference
 
 
 def test_haffs_law_exactly():
     nodes = -12.0 * jnp.linspace(0.0, 1.0, 192)
     times = jnp.geomspace(1e-3, 100.0, 50)
+    # Trapezoids between nodes 12/191 apart err by 2 to 4e-4.
     found = log_temperature(nodes, 2 * jnp.exp(nodes / 2), times)
     np.testing.assert_allclose(found, -2 * jnp.log1p(times), atol=5e-4)
     # A rate that does not depend on T: an exponential.
     found = log_temperature(nodes, jnp.full(192, 3.0), jnp.linspace(0.0, 3.0, 20))
-    np.testing.assert_allclose(found, -3 * jnp.linspace(0.0, 3.0, 20), atol=2e-3)
+    np.testing.assert_allclose(found, -3 * jnp.linspace(0.0, 3.0, 20), atol=5e-4)
