@@ -4,8 +4,10 @@
         [--model soft-spheres [--particles N] [--replicas R]] [--model auto [--tolerance 0.02]]
 
 CURVE.csv holds header lines `# key: value` (N, eta, diameter, density, Y, nu, T0; SI units), a line
-of column names and rows: t,T and, where measured, T_err, msd, msd_err. A header line A is not used
-in the fit; the estimate is compared with it. --model auto takes the cheapest model whose estimated
+of column names and rows: t,T and, where measured, T_err, msd, msd_err. Header lines eta_err,
+diameter_err, density_err, Y_err, nu_err, T0_err are standard errors of the values beside them,
+which then enter the error of the answer. A header line A is not used in the fit; the estimate is
+compared with it. --model auto takes the cheapest model whose estimated
 error, for the gas that kinetic theory fits, is within the tolerance, and says why. Prints a table
 and one line of JSON, and writes a picture and a JSON file.
 """
@@ -27,8 +29,14 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxgran  # noqa: E402
-from jaxgran.data.curve_file import GAS_KEYS, header_count, header_number  # noqa: E402
+from jaxgran.data.curve_file import (  # noqa: E402
+    GAS_KEYS,
+    PRIOR_KEYS,
+    header_count,
+    header_number,
+)
 from jaxgran.data.files import write_whole  # noqa: E402
+from jaxgran.fitting.fit import free_by_default  # noqa: E402
 from jaxgran.models.base import AbstractModel  # noqa: E402
 from jaxgran.models.selection import default_models  # noqa: E402
 from jaxgran.plotting import plot_fit  # noqa: E402
@@ -43,6 +51,11 @@ PARAMETERS = {
     "eta": ("packing_fraction", ""),
     "diameter": ("diameter", "m"),
 }
+
+
+def names_of(floats: tuple[str, ...]) -> list[str]:
+    """Arguments of --free for floats of a gas."""
+    return [key for key, (name, _) in PARAMETERS.items() if name in floats]
 
 
 def named(models) -> dict[str, AbstractModel]:
@@ -79,7 +92,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--replicas", type=int, default=3, help="of a particle model (default: 3)")
     parser.add_argument("--key", type=int, default=0, help="of a particle model's random start")
     parser.add_argument(
-        "--free", nargs="+", choices=PARAMETERS, default=["A"], help="what to fit (default: A)"
+        "--free",
+        nargs="+",
+        choices=PARAMETERS,
+        help="what to fit (default: A, and T0 where T has no errors)",
     )
     parser.add_argument(
         "--set",
@@ -96,7 +112,8 @@ def parse() -> argparse.Namespace:
 def run(options: argparse.Namespace) -> None:
     curve, header = jaxgran.read_curve(options.curve)
     header |= settings(options.set)
-    gas = jaxgran.read_gas(header)
+    gas, priors = jaxgran.read_gas(header), jaxgran.read_priors(header)
+    options.free = options.free or names_of(free_by_default(gas, curve))
     gas = with_given_constant(gas, header, options.free)
     n = header_count(header, "N")
     replicas = header_count(header, "replicas") or 1
@@ -105,14 +122,15 @@ def run(options: argparse.Namespace) -> None:
     model, reasons = model_of(options, gas, curve, free, n)
     (model_name,) = named([model])
     imported = time.perf_counter() - started
-    total = n * replicas if n is not None else None
-    result, first_seconds, fit_seconds = timed_fit(options, gas, curve, model, free, total)
+    asked = {"free": free, "priors": priors, "num_particles": n, "replicas": replicas}
+    result, first_seconds, fit_seconds = timed_fit(options, gas, curve, model, asked)
     diagnosis = jaxgran.diagnose(result, curve, n)
     rows = rows_of(options, result, diagnosis, header)
     print_scene(options, gas, curve, result)
     print_impacts(result.gas, float(curve.temperature[-1]), n)
     print_model(model_name, result, reasons)
     print_rows(rows)
+    print_budget(rows)
     print(f"\n{diagnosis.verdict}")
     for reason in diagnosis.reasons:
         print(f"  - {reason}")
@@ -193,19 +211,13 @@ def model_of(options: argparse.Namespace, gas, curve, free, num_particles: int |
     return named(default_models(options.particles, replicas))[name], choice.reasons
 
 
-def timed_fit(options: argparse.Namespace, gas, curve, model, free, num_particles: int | None):
+def timed_fit(options: argparse.Namespace, gas, curve, model, asked: dict[str, Any]):
     """The fit, seconds of the first and of the last time that it was made."""
 
     def fit():
         begin = time.perf_counter()
-        result = jaxgran.fit(
-            gas,
-            curve,
-            model=model,
-            free=free,
-            num_particles=num_particles,
-            key=jax.random.key(options.key),
-        )
+        key = jax.random.key(options.key)
+        result = jaxgran.fit(gas, curve, model=model, key=key, **asked)
         jax.block_until_ready(result.chi2)
         return result, time.perf_counter() - begin
 
@@ -223,20 +235,18 @@ def rows_of(options: argparse.Namespace, result, diagnosis, header) -> list[dict
     rows, unknown = [], result.undetermined()
     for key in options.free:
         name, unit = PARAMETERS[key]
-        estimate, statistical = (float(x) for x in result.value(name))
+        estimate, error = (float(x) for x in result.value(name))
         between = limits(diagnosis, name)
         if name in unknown:
-            estimate, statistical, *between = 4 * [float("nan")]
-        statistical *= diagnosis.correlation_factor
-        model_error = float(result.model_error[result.names.index(name)])
+            estimate, error, *between = 4 * [float("nan")]
+        i = result.names.index(name)
         rows.append(
             {
                 "parameter": key,
                 "unit": unit,
                 "estimate": estimate,
-                "std_err": float(np.hypot(statistical, model_error)),
-                "statistical": statistical,
-                "model": model_error,
+                "std_err": error,
+                "error_budget": {part: float(x[i]) for part, x in result.error_budget.items()},
                 **dict(zip(("low", "high"), between, strict=True)),
                 "header": header_number(header, key) if key in header else None,
             }
@@ -275,28 +285,35 @@ def print_impacts(gas, last_T: float, num_particles: int | None) -> None:
 
 
 def print_model(name: str, result, reasons) -> None:
-    steps = "simulations" if result.simulation_error is not None else "steps of least squares"
+    steps = "simulations" if result.model.stochastic else "steps of least squares"
     print(f"model    {name}, {int(result.iterations)} {steps}")
     if reasons:
         print("chosen", "\n".join(f"         - {reason}" for reason in reasons).lstrip())
 
 
 def print_rows(rows: list[dict]) -> None:
-    print(f"\n{'':10}{'estimate':>13} {'+-':>10} {'statistical':>12} {'model':>10}", end="")
-    print(f" {'95 %, with rivals':>24}  header's")
+    print(f"\n{'':10}{'estimate':>13} {'+-':>10} {'95 %, with rivals':>24}  header's")
     for row in rows:
         print(f"{row['parameter']:4}{row['unit']:6}", end="")
         if np.isnan(row["estimate"]):
             print(f"{'not determined':>13}")
             continue
-        print(f"{row['estimate']:13.5g} ", end="")
-        print(f"{row['std_err']:10.2g} {row['statistical']:12.2g} {row['model']:10.2g}", end="")
         between = f"{row['low']:.3g} .. {row['high']:.3g}"
-        print(f" {between:>24}", end="")
+        print(f"{row['estimate']:13.5g} {row['std_err']:10.2g} {between:>24}", end="")
         if row["header"]:
             print(f"  {row['header']:.5g} ({100 * (row['estimate'] / row['header'] - 1):+.2f} %)")
         else:
             print()
+
+
+def print_budget(rows: list[dict]) -> None:
+    """The parts of each error, in per cent of the estimate, the largest first."""
+    for row in rows:
+        if np.isnan(row["estimate"]):
+            continue
+        parts = sorted(row["error_budget"].items(), key=lambda part: -part[1])
+        shares = [f"{name} {100 * x / abs(row['estimate']):.2g} %" for name, x in parts if x > 0]
+        print(f"error of {row['parameter']}: {', '.join(shares)}")
 
 
 def environment() -> dict:
@@ -324,7 +341,7 @@ def finite_or_null(value: Any) -> Any:
 
 
 def settings(pairs: list[str]) -> dict[str, str]:
-    known = (*GAS_KEYS, "N", "A", "dimension", "replicas")
+    known = (*GAS_KEYS, *PRIOR_KEYS, "N", "A", "dimension", "replicas")
     values = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")

@@ -71,8 +71,8 @@ def main() -> int:
     for i, name in enumerate(free):
         estimate, error = result.value(name)
         print(
-            f"{name:12} {float(estimate):.5g} +- {float(error):.1g} "
-            f"+- {float(result.model_error[i]):.1g} (model); true {float(gas.value(name)):.5g}"
+            f"{name:12} {float(estimate):.5g} +- {float(error):.1g}, of the model's clock "
+            f"{float(result.error_budget['model'][i]):.1g}; true {float(gas.value(name)):.5g}"
         )
     print(jaxgran.diagnose(result, curve).verdict)
     return 0

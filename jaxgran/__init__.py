@@ -3,10 +3,11 @@
 from jaxgran.checks.status import explain as explain_status
 from jaxgran.cooling import cool
 from jaxgran.data.curve import CoolingCurve, Particles
-from jaxgran.data.curve_file import read_curve, read_gas, write_curve
+from jaxgran.data.curve_file import read_curve, read_gas, read_priors, write_curve
 from jaxgran.data.run import Run
 from jaxgran.fitting.diagnosis import Diagnosis, diagnose
 from jaxgran.fitting.fit import fit
+from jaxgran.fitting.likelihood import log_likelihood
 from jaxgran.fitting.result import Fit
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import Course
@@ -56,8 +57,10 @@ __all__ = [
     "explain_status",
     "fit",
     "impact",
+    "log_likelihood",
     "read_curve",
     "read_gas",
+    "read_priors",
     "sphere_mass",
     "viscoelastic_restitution",
     "write_curve",

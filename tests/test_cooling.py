@@ -35,6 +35,7 @@ def test_the_key_fixes_the_run(beads, kind):
     assert final() != final(key=jax.random.key(1))
 
 
+@pytest.mark.slow
 def test_a_failed_run_returns_its_status(beads, monkeypatch):
     gas = beads(0.15)
     times = np.array([1e-3, 1e3]) * float(gas.mean_free_time)

@@ -151,6 +151,7 @@ def test_bad_times_of_a_member_end_no_other():
     np.testing.assert_allclose(curve.temperature[0], cool(times=times[0]).temperature)
 
 
+@pytest.mark.slow
 def test_all_that_a_curve_does_not_determine_is_named():
     times = np.geomspace(0.1, 100.0, 20) * TAU
     T = cool(times=times).temperature
@@ -163,6 +164,7 @@ def test_all_that_a_curve_does_not_determine_is_named():
     assert "temperature" not in result.undetermined()
 
 
+@pytest.mark.slow
 def test_a_picture_of_a_long_curve_draws_some_of_it(tmp_path):
     times = np.linspace(0.1, 100.0, 200_000) * TAU
     T = cool(times=times).temperature
@@ -177,8 +179,8 @@ def test_a_picture_of_a_long_curve_draws_some_of_it(tmp_path):
 # --- derivatives ---------------------------------------------------------------------------------
 
 MODELS = [
-    jaxgran.SoftSpheres(20, replicas=2),
-    jaxgran.HardSpheres(20, replicas=2),
+    pytest.param(jaxgran.SoftSpheres(20, replicas=2), marks=pytest.mark.slow),
+    pytest.param(jaxgran.HardSpheres(20, replicas=2), marks=pytest.mark.slow),
     jaxgran.DSMC(20, replicas=2),
 ]
 
@@ -221,6 +223,7 @@ def test_a_run_that_stands_still_ends():
     assert fault == status.STALLED.bit and np.isnan(records["temperature"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [jaxgran.SoftSpheres, jaxgran.HardSpheres])
 @pytest.mark.parametrize("x64", [True, False])
 def test_blocks_that_stand_still_end(kind, x64, monkeypatch):
@@ -272,6 +275,7 @@ def soft_spheres(gas=GAS, replicas=1):
     return dynamics, dynamics.begin(*(x.reshape(-1, 3) for x in inputs), jnp.asarray(0.3))
 
 
+@pytest.mark.slow
 def test_a_shortened_step_recovers():
     dynamics, state = soft_spheres()
     state = state._replace(own=state.own._replace(refine=jnp.asarray(4.0)))
@@ -281,6 +285,7 @@ def test_a_shortened_step_recovers():
     assert np.all(np.abs(after.own.drift) < 1e-3)  # over some 600 blocks
 
 
+@pytest.mark.slow
 def test_small_energy_errors_add_up():
     dynamics, state = soft_spheres()
     drift = jnp.full(1, 0.5 * block.DRIFT_TOLERANCE)
@@ -370,6 +375,7 @@ def test_heavily_damped_impacts_end(beta):
 # --- files ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_checkpoints_know_their_law(tmp_path):
     path = tmp_path / "x.ckpt"
     cool(GAS, model=SOFT, checkpoint=path)
@@ -406,6 +412,7 @@ print(repr(jaxgran.cool(gas, [1.0], model=jaxgran.DSMC(50), checkpoint=sys.argv[
 """
 
 
+@pytest.mark.slow
 def test_a_run_of_a_users_law_resumes_in_another_process(tmp_path):
     def run(factor):
         script = tmp_path / "own.py"

@@ -98,6 +98,7 @@ def test_batches_of_derivatives():
     np.testing.assert_allclose(grad_of_vmap, single, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_second_derivative():
     gas = gases(3)["viscoelastic"]
     times = TAUS * gas.mean_free_time

@@ -14,6 +14,19 @@ from jaxgran.scene.restitution import Viscoelastic
 GAS_KEYS = ("eta", "diameter", "density", "Y", "nu", "T0")
 """Keys of the header that `read_gas` needs."""
 
+PRIOR_KEYS = {
+    "eta_err": "packing_fraction",
+    "diameter_err": "diameter",
+    "density_err": "density",
+    "Y_err": "youngs_modulus",
+    "nu_err": "poisson_ratio",
+    "T0_err": "temperature",
+}
+"""Keys of the header with standard errors, and the names that `jaxgran.fit` gives them."""
+
+EXACT = 1e-4
+"""Relative error of a density that is given without one, where the diameter has one."""
+
 LARGEST_COUNT = 10**12
 """The largest whole number of a header."""
 
@@ -156,6 +169,38 @@ def read_gas(header: dict[str, str]) -> Gas:
         temperature=values["T0"],
         dimension=header_count(header, "dimension") or 3,
     )
+
+
+def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
+    """What the header says of the errors of its values, as `jaxgran.fit` takes ``priors``.
+
+    Where the diameter has an error and the density has none, the mass follows the diameter.
+
+    Args:
+        header: with some of eta_err, diameter_err (m), density_err (kg/m^3), Y_err (Pa), nu_err and
+            T0_err (m^2/s^2), the standard errors of the values beside them.
+
+    Raises:
+        ValueError: for an error without its value, or one that is no positive number.
+    """
+    priors = {}
+    for key, name in PRIOR_KEYS.items():
+        if key not in header:
+            continue
+        value_key = key.removesuffix("_err")
+        if value_key not in header:
+            raise ValueError(f"the header gives {key} without {value_key}; add the value itself")
+        error = header_number(header, key)
+        if error <= 0:
+            raise ValueError(
+                f"header line {key}: must be a positive number, got {header[key]!r}; leave it out "
+                f"where {value_key} is known exactly"
+            )
+        priors[name] = (header_number(header, value_key), error)
+    if "diameter" in priors and "density" not in priors:
+        density = header_number(header, "density")
+        priors["density"] = (density, EXACT * density)
+    return priors
 
 
 def header_number(header: dict[str, str], key: str) -> float:

@@ -3,12 +3,13 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.residuals import correlation_factor, neighbour_correlation
+from jaxgran.fitting.residuals import neighbour_correlation
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
 from jaxgran.fitting.rivals import ASKED, Rival, ranges, rivals
 from jaxgran.models.base import Omission
@@ -31,7 +32,6 @@ class Diagnosis(NamedTuple):
         verdict: one plain sentence, and what to do if the model does not explain the curve.
         reasons: for the verdict, a sentence each.
         correlation: of neighbouring residuals; 0 for independent errors.
-        correlation_factor: by which correlated errors increase the standard error, >= 1.
         rivals: other laws of cooling compared with the fitted one, those that fit best first.
         ranges: the range of each free parameter, 95 %, SI, over all rivals that fit as well as the
             best: of a parameter that the rivals leave open this is much wider than its error.
@@ -41,7 +41,6 @@ class Diagnosis(NamedTuple):
     verdict: str
     reasons: tuple[str, ...]
     correlation: float
-    correlation_factor: float
     rivals: tuple[Rival, ...]
     ranges: dict[str, tuple[Float[np.ndarray, "size"], Float[np.ndarray, "size"]]]
 
@@ -63,8 +62,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     residuals = np.asarray(result.residuals)
     used = residuals != 0
     residuals, times = residuals[used], np.asarray(curve.times)[used]
-    correlation = neighbour_correlation(residuals)
-    factor = correlation_factor(correlation)
+    correlation = float(neighbour_correlation(jnp.asarray(residuals)))
     p_value, converged = float(result.p_value), bool(result.converged)
     misfit = p_value < SIGNIFICANCE
     if np.isnan(p_value):
@@ -83,7 +81,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     verdict = _verdict(result.model.name, converged, misfit, omissions, found)
     explains = converged and not misfit and not any(o.decisive for o in omissions)
     explains &= not any(rival.asked for rival in found)
-    return Diagnosis(explains, verdict, tuple(reasons), correlation, factor, found, limits)
+    return Diagnosis(explains, verdict, tuple(reasons), correlation, found, limits)
 
 
 def _is_misfit(
@@ -97,7 +95,7 @@ def _is_misfit(
     Without errors chi^2 says nothing. Fluctuations of few particles are correlated in time, and of
     a size that N tells.
     """
-    scatter = float(result.reduced_chi2) ** 0.5
+    scatter = float(np.asarray(result.scatter))
     expected = np.sqrt(2 / (result.gas.dimension * num_particles)) if num_particles else 0.0
     steady = correlation > STEADY / np.sqrt(residuals.size) and scatter > 2 * expected
     return scatter > LARGEST_SCATTER or bool(steady)
@@ -106,7 +104,7 @@ def _is_misfit(
 def _chance(result: Fit) -> str:
     reduced, p_value = float(result.reduced_chi2), float(result.p_value)
     if np.isnan(p_value):
-        scatter = 100 * np.sqrt(reduced)
+        scatter = 100 * float(np.asarray(result.scatter))
         return (
             f"the curve carries no errors; the residuals scatter by {scatter:.2g} % of T, taken as "
             "the error"
@@ -176,8 +174,9 @@ def _about_search(result: Fit) -> Iterator[str]:
     """Convergence, noise of simulations and undetermined parameters."""
     if not bool(result.converged):
         yield "the search stopped early: allow more max_steps or free fewer parameters"
-    if result.simulation_error is not None:
-        share = np.asarray(result.simulation_error / result.standard_error)
+    noise = result.error_budget.get("simulation")
+    if noise is not None:
+        share = np.asarray(noise / result.standard_error)
         yield (
             f"{int(result.iterations)} simulations were run; their own noise is "
             f"{100 * float(np.max(share)):.0f} % of the error bar at most"

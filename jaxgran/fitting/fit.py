@@ -10,10 +10,12 @@ from jaxtyping import PRNGKeyArray
 
 from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
-from jaxgran.checks.validation import no_type_check
+from jaxgran.checks.validation import no_type_check, whole_number
 from jaxgran.data.curve import COLUMNS, CoolingCurve
+from jaxgran.fitting.budget import in_scene
 from jaxgran.fitting.deterministic import SEARCHES, fit_deterministic
 from jaxgran.fitting.guess import guess_from_data
+from jaxgran.fitting.priors import Priors
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.stochastic import fit_stochastic
 from jaxgran.models.base import AbstractModel
@@ -34,9 +36,11 @@ def fit(
     curve: CoolingCurve,
     *,
     model: AbstractModel | None = None,
-    free: tuple[str, ...] = ("dissipative_constant",),
+    free: tuple[str, ...] | None = None,
+    priors: dict[str, tuple[float, float]] | None = None,
     start: Gas | None = None,
     num_particles: int | None = None,
+    replicas: int = 1,
     method: Literal["levenberg-marquardt", "lbfgs"] = "levenberg-marquardt",
     max_steps: int | None = None,
     key: PRNGKeyArray | None = None,
@@ -64,12 +68,19 @@ def fit(
             all times, and estimated from the scatter.
         model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`; a stochastic one
             needs two or more replicas.
-        free: names of floats of the gas or its law, such as "temperature" (which is T_0).
+        free: names of floats of the gas or its law, such as "temperature" (which is T_0); by
+            default A (or a constant restitution) and, where T has no errors, T_0.
+        priors: what else is known: values and standard errors of floats of the gas, SI, by name, as
+            ``{"packing_fraction": (0.05, 0.002)}``, or of "density", which lets the mass vary. Each
+            is Gaussian in the float's unbounded scale, and is fitted along with the free ones; the
+            errors of a stochastic model are propagated with kinetic theory's derivatives.
         start: a gas whose values are a further guess. A deterministic model begins at this or at
             that from the data, whichever fits better; a stochastic model begins at this.
-        num_particles: number of particles over which <dr^2> is a mean; gives its relative error,
-            ``sqrt(2 / (d N))``, where the curve has none. Without either <dr^2> is not used, nor
+        num_particles: N of the measured gas, if known: gives the error by its few particles and by
+            a flow that grows in its box, and the relative error of <dr^2>, ``sqrt(2 / (d N))`` over
+            the root of `replicas`, where the curve has none. Without either <dr^2> is not used, nor
             is it where T has no errors, as their weights could not be compared.
+        replicas: number of measured runs over which the curve is a mean.
         method: Levenberg-Marquardt, or L-BFGS by reverse mode (deterministic models only).
         max_steps: >= 1; most steps of Levenberg-Marquardt or evaluations of L-BFGS, 100 by default;
             most simulations of a stochastic model, 8.
@@ -78,7 +89,9 @@ def fit(
         progress: show progress bars on a terminal during simulations.
 
     Returns:
-        `Fit`; `jaxgran.diagnose` says in words what it means.
+        `Fit`; `jaxgran.diagnose` says in words what it means. Under `jax.vmap` and `jax.jit` its
+        errors hold the model's ``derivative_accuracy`` for the error of the clock instead of that
+        in this scene, and not the chance of few particles.
 
     Raises:
         ValueError: for an unknown parameter or method, a curve that cannot be one (see
@@ -90,22 +103,40 @@ def fit(
 
     This docstring is long because the arguments mean different things to the two kinds of models.
     """
-    _check_request(gas, curve, free, max_steps, num_particles)
-    names, key = tuple(free), checked_key(key)
+    names = free_by_default(gas, curve) if free is None else free
+    _check_request(gas, curve, names, max_steps, num_particles, replicas)
+    names, key, known = tuple(names), checked_key(key), Priors.of(gas, priors)
     model = KineticTheory() if model is None else model
-    _check_model(model, method, names)
+    _check_model(model, method, names, known)
     if model.stochastic:
         steps = 8 if max_steps is None else max_steps
-        result = fit_stochastic(gas, curve, model, names, start, key, progress, steps)
+        result = fit_stochastic(gas, curve, model, names, start, key, progress, steps, known)
     else:
         guesses = [guess_from_data(gas, curve, names)] + ([] if start is None else [start])
         model.check(guesses[-1])
         steps = 100 if max_steps is None else max_steps
-        result = fit_deterministic(gas, curve, model, names, guesses, num_particles, method, steps)
-    if not isinstance(result.chi2, Tracer):
+        total = None if num_particles is None else num_particles * replicas
+        search = method, steps, known
+        result = fit_deterministic(gas, curve, model, names, guesses, total, *search)
+    if not any_traced(result.chi2, curve, gas):
         _check_computed(result)
         _warn(result)
+        if np.isfinite(result.chi2):
+            result = in_scene(result, num_particles, replicas)
     return result
+
+
+def free_by_default(gas: Gas, curve: CoolingCurve) -> tuple[str, ...]:
+    """A or a constant restitution and, where the first T has an error that nobody knows, T_0."""
+    checked_gas(gas)
+    known = [name for name in ("dissipative_constant", "coefficient") if name in gas.domains]
+    if not known:
+        raise ValueError(
+            f"the law {type(gas.law).__name__} has neither A nor a constant coefficient: say what "
+            f"is free, of {', '.join(gas.domains)}"
+        )
+    bare = isinstance(curve, CoolingCurve) and curve.temperature_error is None
+    return (known[0], "temperature") if bare else (known[0],)
 
 
 @no_type_check
@@ -115,6 +146,7 @@ def _check_request(
     free: tuple[str, ...],
     max_steps: int | None,
     num_particles: int | None,
+    replicas: int,
 ) -> None:
     checked_gas(gas)
     if not isinstance(curve, CoolingCurve):
@@ -125,6 +157,7 @@ def _check_request(
         raise ValueError(f"free must be a tuple of different names, got {free!r}")
     for name in free:
         gas.value(name)
+    whole_number("replicas", replicas, 1)
     for name, number in (("max_steps", max_steps), ("num_particles", num_particles)):
         if number is not None and not (isinstance(number, int | np.integer) and number >= 1):
             raise ValueError(f"{name} must be a whole number >= 1, or None, got {number!r}")
@@ -161,7 +194,7 @@ def _check_magnitudes(curve: CoolingCurve) -> None:
 
 
 @no_type_check
-def _check_model(model: AbstractModel, method: str, names: tuple[str, ...]) -> None:
+def _check_model(model: AbstractModel, method: str, names: tuple[str, ...], priors: Priors) -> None:
     if method not in SEARCHES:
         known = " or ".join(f'"{name}"' for name in SEARCHES)
         raise ValueError(f"method must be {known}, got {method!r}")
@@ -173,6 +206,12 @@ def _check_model(model: AbstractModel, method: str, names: tuple[str, ...]) -> N
     checked_model(model)
     if model.stochastic and method != "levenberg-marquardt":
         raise ValueError(f"a stochastic model is fitted by least squares, not by {method!r}")
+    both = [name for name in priors.names if name in names]
+    if model.stochastic and both:
+        raise ValueError(
+            f"a stochastic model is fitted to the curve alone: leave {both[0]} out of free, so "
+            "that its prior widens the error, or out of priors"
+        )
     replicas = getattr(model, "replicas", None)
     if model.stochastic and isinstance(replicas, int) and replicas < 2:
         raise ValueError(

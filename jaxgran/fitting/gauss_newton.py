@@ -36,6 +36,7 @@ class Simulated(NamedTuple):
         computed: the curve of the last simulation.
         residuals: weighted, at `flat` extrapolated linearly from the simulations; 0 where not used.
         sensitivity: derivative of the weighted residuals.
+        gain: derivative of `flat` in each measured ln T; 0 where not used.
         error_covariance: covariance of `flat` by the errors of the measurement.
         noise_covariance: and by the noise of the simulations.
         num_simulations: how many were made.
@@ -46,6 +47,7 @@ class Simulated(NamedTuple):
     computed: CoolingCurve
     residuals: Float[np.ndarray, "times"]
     sensitivity: Float[np.ndarray, "times p"]
+    gain: Float[np.ndarray, "p times"]
     error_covariance: Float[np.ndarray, "p p"]
     noise_covariance: Float[np.ndarray, "p p"]
     num_simulations: int
@@ -66,6 +68,7 @@ class _Average(NamedTuple):
 
     flat: Float[np.ndarray, "p"]
     sigma: Float[np.ndarray, "used"]  # standard error of each residual; 1 if errors are unknown
+    gain: Float[np.ndarray, "p used"]  # derivative of `flat` in the measured ln T
     errors: Float[np.ndarray, "p p"]  # covariance of `flat` by the errors of the measurement
     noises: Float[np.ndarray, "p p"]  # and by the noise of the simulations
 
@@ -130,8 +133,10 @@ def by_simulation(
             if ended or len(simulations) == max_simulations:
                 break
     residuals, sensitivity = _residuals_at(flat, near, measured, average.sigma, used)
-    covariances = average.errors, average.noises
-    return Simulated(flat, curve, residuals, sensitivity, *covariances, len(simulations), settled)
+    gain = np.zeros(sensitivity.T.shape)
+    gain[:, used] = average.gain
+    parts = gain, average.errors, average.noises
+    return Simulated(flat, curve, residuals, sensitivity, *parts, len(simulations), settled)
 
 
 def _simulated(
@@ -179,10 +184,10 @@ def _average(
         scatter.append(moved.T @ moved)
     # The errors of the measurement are the same in all of them: those of the newest stand for all.
     newest = near[-1].slope / sigma[:, None]
-    inverse = np.linalg.pinv(newest, rcond=resolution)
-    share = inverse * (np.ones_like(sigma) if error is None else error / sigma)
+    gain = np.linalg.pinv(newest, rcond=resolution) / sigma
+    share = gain * (np.ones_like(sigma) if error is None else error)
     noises = np.mean(scatter, axis=0) / len(near)
-    return _Average(np.mean(ends, axis=0), sigma, share @ share.T, noises)
+    return _Average(np.mean(ends, axis=0), sigma, gain, share @ share.T, noises)
 
 
 def _variance(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:

@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.fitting.least_squares import least_squares
 from jaxgran.fitting.parameters import Parameters
+from jaxgran.fitting.priors import Priors
 from jaxgran.scene.gas import Gas
 from jaxgran.theory.table_of_times import log_temperature, relaxed_cooling_rate
 
@@ -52,6 +53,7 @@ def fit_trials(
     modelled: Float[Array, "times"],
     trials: Trial,
     accuracy: Float[Array, ""],
+    priors: Priors,
 ) -> Profile:
     """Fits of all trials.
 
@@ -62,8 +64,10 @@ def fit_trials(
         modelled: ln T of the fitted model.
         trials: what is added.
         accuracy: relative error of the model's cooling rate, of its mean and of its trend in ln T.
+        priors: what else is known of the gas.
     """
-    parameters, used = Parameters(gas, names), weights > 0
+    parameters, used = Parameters(gas, (*names, *priors.also_free(names))), weights > 0
+    num_free = sum(gas.value(name).size for name in names)
     unsure = accuracy.astype(measured.dtype)
     lowest = jnp.min(jnp.where(used, measured, jnp.inf))
     depth = jnp.max(jnp.where(used, measured, -jnp.inf)) - lowest + 2.0
@@ -86,19 +90,27 @@ def fit_trials(
         def residuals(unknowns: Array) -> Array:
             flat, errors = unknowns[:-2], unknowns[-2:]
             differences = measured - computed(trial, flat, *errors) - beside
-            return jnp.concatenate([weights * jnp.where(used, differences, 0.0), errors])
+            known = priors.residuals(parameters.gas(flat))
+            return jnp.concatenate([weights * jnp.where(used, differences, 0.0), known, errors])
 
         first = jnp.pad(parameters.flat(_guess(gas, names, trial)), (0, 2))
         unknowns = least_squares(residuals, first, MOST_STEPS)[0]
         value, jacobian = residuals(unknowns), jax.jacfwd(residuals)(unknowns)
-        flat = unknowns[:-2]
-        slope = jnp.pad(jax.jacfwd(parameters.estimates)(flat), ((0, 0), (0, 2)))
-        covariance = slope @ jnp.linalg.pinv(jacobian.T @ jacobian) @ slope.T
-        error = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
-        return Profile(jnp.sum(value**2), parameters.estimates(flat), error, value[:-2])
+        estimates = parameters.estimates(unknowns[:-2])[:num_free]
+        error = _errors(parameters, unknowns[:-2], jacobian)[:num_free]
+        return Profile(jnp.sum(value**2), estimates, error, value[: times.size])
 
     # One after another: a batch of searches takes twice as long to compile.
     return jax.lax.map(fitted, trials)
+
+
+def _errors(
+    parameters: Parameters, flat: Float[Array, "q"], jacobian: Float[Array, "residuals unknowns"]
+) -> Float[Array, "q"]:
+    """Standard errors, SI, of parameters that are the first of all unknowns."""
+    slope = jnp.pad(jax.jacfwd(parameters.estimates)(flat), ((0, 0), (0, 2)))
+    covariance = slope @ jnp.linalg.pinv(jacobian.T @ jacobian) @ slope.T
+    return jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
 
 
 def _guess(gas: Gas, names: tuple[str, ...], trial: Trial) -> Gas:

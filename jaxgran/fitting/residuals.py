@@ -1,30 +1,54 @@
 """Statistics of the residuals of a fit."""
 
-import numpy as np
-from jaxtyping import Float
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Num
+
+FEWEST = 4
+"""Residuals below which no correlation is estimated."""
+
+OUTLIER = 3.0
+"""Distance from the median, in standard deviations, beyond which a residual is clipped."""
+
+STRONGEST = 0.95
+"""Largest correlation that is taken over from an estimate."""
 
 
-def neighbour_correlation(residuals: Float[np.ndarray, "used"]) -> float:
-    """Correlation of neighbouring residuals, outliers clipped; from -.95 to .95."""
-    if residuals.size < 4 or np.ptp(residuals) == 0:
-        return 0.0
-    clipped = np.clip(residuals, *(np.median(residuals) + np.array([-3, 3]) * residuals.std()))
-    centred = clipped - clipped.mean()
-    correlation = float(np.dot(centred[1:], centred[:-1]) / np.dot(centred, centred))
-    return min(max(correlation, -0.95), 0.95)
+def neighbour_correlation(
+    residuals: Num[Array, "n"], used: Bool[Array, "n"] | None = None
+) -> Float[Array, ""]:
+    """Correlation of neighbouring residuals, outliers clipped; from -.95 to .95.
+
+    Args:
+        residuals: in the order of time.
+        used: which of them count, by default those that are not 0.
+    """
+    used = residuals != 0 if used is None else used
+    number = jnp.sum(used)
+    packed = jnp.argsort(~used, stable=True)
+    known = jnp.where(used, residuals, jnp.nan)[packed]
+    spread = OUTLIER * jnp.nanstd(known)
+    middle = jnp.nanmedian(known)
+    clipped = jnp.clip(known, middle - spread, middle + spread)
+    centred = jnp.nan_to_num(clipped - jnp.nanmean(clipped))
+    square = jnp.sum(centred**2)
+    enough = (number >= FEWEST) & (square > 0)
+    correlation = jnp.sum(centred[1:] * centred[:-1]) / jnp.where(enough, square, 1.0)
+    return jnp.clip(jnp.where(enough, correlation, 0.0), -STRONGEST, STRONGEST)
 
 
-def correlation_factor(correlation: float) -> float:
+def correlation_factor(correlation: Float[Array, ""]) -> Float[Array, ""]:
     """Factor >= 1 by which correlated errors increase a standard error."""
-    return float(np.sqrt((1 + correlation) / (1 - correlation))) if correlation > 0 else 1.0
+    positive = jnp.maximum(correlation, 0.0)
+    return jnp.sqrt((1 + positive) / (1 - positive))
 
 
-def chi2_scale(residuals: Float[np.ndarray, "used"], num_parameters: int) -> float:
+def chi2_scale(residuals: Num[Array, "n"], num_parameters: int) -> Float[Array, ""]:
     """Scale of differences of chi^2: 1 for independent errors of the given size.
 
     Args:
-        residuals: over their errors, of the best fit.
+        residuals: over their errors, of the best fit; 0 where a point is not used.
         num_parameters: of that fit.
     """
-    reduced = float(np.sum(residuals**2)) / max(residuals.size - num_parameters, 1)
-    return correlation_factor(neighbour_correlation(residuals)) ** 2 * max(reduced, 1.0)
+    degrees = jnp.maximum(jnp.sum(residuals != 0) - num_parameters, 1)
+    reduced = jnp.sum(residuals**2) / degrees
+    return correlation_factor(neighbour_correlation(residuals)) ** 2 * jnp.maximum(reduced, 1.0)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.priors import Priors
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
@@ -23,52 +24,76 @@ class Fit(eqx.Module):
         names: the free parameters.
         model: the model that was fitted.
         estimate: estimated values, SI, shape (p,).
-        standard_error: one standard deviation of each, SI, shape (p,): the errors of the
-            measurement propagated to the parameters, times sqrt(reduced chi^2) if the model does
-            not explain the curve or the curve has no errors; includes the noise of a stochastic
-            model.
-        model_error: by how much each estimate changes if the time scale of a deterministic model
-            is wrong by its ``derivative_accuracy``, SI, shape (p,). Not part of `standard_error`.
-            0 for a stochastic model; `jaxgran.diagnose` says in words what that leaves out.
-        covariance: of the estimates, SI, shape (p, p), scaled like `standard_error`.
-        sensitivity: derivative of the weighted residuals in the parameters' unbounded scale (the
-            logarithm of a positive one), shape (residuals, p).
+        covariances: of the estimates, SI, shape (p, p), a part of the whole error each:
+            "measurement", the errors of the curve, increased by the correlation of neighbouring
+            residuals, and by sqrt(reduced chi^2) if the model does not explain the curve;
+            "model", the error of the model's clock, `clock_error`; "model of <dr^2>", that of a
+            factor common to all <dr^2>; one part for each of the `priors`, under its name;
+            "few particles", what the chance of single collisions adds where N is known; and
+            "simulation", the noise of a stochastic model, estimated from its replicas.
+        clock_error: relative error of the model's clock, in this scene, at the measured times.
+        gain: derivative of each estimate in each measured ln T, SI, shape (p, times).
+        clock_gain: its change over a relative change of the model's clock at each time, SI, shape
+            (p, times).
+        sensitivity: derivative of the weighted residuals of T, and of <dr^2> if it was used, in the
+            parameters' unbounded scale (the logarithm of a positive one), shape (residuals, p).
         start: the guess at which the search began, SI, shape (p,).
-        gas: the fitted gas.
+        gas: the fitted gas, with all floats that have priors.
+        priors: what was known besides the curve.
         curve: its cooling curve at the measured times; of a stochastic model that of the last
             simulation, one Gauss-Newton step before the estimate.
         residuals: (ln T_measured - ln T_model) over its error; 0 where a point has no weight.
         displacement_residuals: the same of <dr^2>; None if it was not used.
-        chi2, degrees_of_freedom, reduced_chi2: of all weighted residuals.
+        scatter: of ln T about the model, taken for the error of a curve without errors; else None.
+        chi2, degrees_of_freedom, reduced_chi2: of all weighted residuals; without errors of the
+            curve reduced chi^2 is 1.
         p_value: probability of a chi^2 as large by chance, of T or of <dr^2>, whichever fits worse;
             nan if the curve has no errors.
         iterations: steps of Levenberg-Marquardt, evaluations of L-BFGS, or simulations by a
             stochastic model.
         converged: whether the search reached its tolerance; of a stochastic model, whether the last
             step was below 0.1 in the parameters' unbounded scale.
-        simulation_error: the part of `standard_error` due to the noise of a stochastic model,
-            estimated from its replicas, shape (p,); None for a deterministic model.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
     model: AbstractModel
     estimate: Float[Array, "p"]
-    standard_error: Float[Array, "p"]
-    model_error: Float[Array, "p"]
-    covariance: Float[Array, "p p"]
+    covariances: dict[str, Float[Array, "p p"]]
+    clock_error: Float[Array, "times"]
+    gain: Float[Array, "p times"]
+    clock_gain: Float[Array, "p times"]
     sensitivity: Float[Array, "residuals p"]
     start: Float[Array, "p"]
     gas: Gas
+    priors: Priors
     curve: CoolingCurve
     residuals: Float[Array, "times"]
     displacement_residuals: Float[Array, "times"] | None
+    scatter: Float[Array, ""] | None
     chi2: Float[Array, ""]
     degrees_of_freedom: Int[Array, ""]
     reduced_chi2: Float[Array, ""]
     p_value: Float[Array, ""]
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
-    simulation_error: Float[Array, "p"] | None = None
+
+    @property
+    def covariance(self) -> Float[Array, "p p"]:
+        """Covariance of the estimates, SI: the sum of all parts."""
+        return sum(self.covariances.values(), jnp.zeros_like(self.covariances["measurement"]))
+
+    @property
+    def standard_error(self) -> Float[Array, "p"]:
+        """One standard deviation of each estimate, SI, with everything that is known of its error.
+
+        What it leaves out is what the model leaves out: see `jaxgran.diagnose`.
+        """
+        return _deviations(self.covariance)
+
+    @property
+    def error_budget(self) -> dict[str, Float[Array, "p"]]:
+        """The parts of `standard_error`, SI; their squares add up to its square."""
+        return {name: _deviations(part) for name, part in self.covariances.items()}
 
     def value(self, name: str) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Estimate and standard error of one parameter."""
@@ -84,14 +109,16 @@ class Fit(eqx.Module):
         exceeds 1 (a factor e), or whose singular value is below ``model.derivative_accuracy`` times
         the largest.
         """
-        known = not bool(jnp.isnan(self.p_value))
-        error = 1.0 if known else float(self.reduced_chi2) ** 0.5
         _, singular, rotation = np.linalg.svd(np.asarray(self.sensitivity), full_matrices=False)
-        weak = (singular <= error) | (singular < self.model.derivative_accuracy * singular[0])
+        weak = (singular <= 1) | (singular < self.model.derivative_accuracy * singular[0])
         share = np.abs(rotation[weak])
         found = np.any(share > 0.05 * share.max(axis=1, initial=0.0, keepdims=True), axis=0)
         sized = [name for name in self.names for _ in range(self.gas.value(name).size)]
         return tuple(dict.fromkeys(n for n, yes in zip(sized, found, strict=True) if yes))
+
+
+def _deviations(covariance: Float[Array, "p p"]) -> Float[Array, "p"]:
+    return jnp.sqrt(jnp.diagonal(covariance, axis1=-2, axis2=-1))
 
 
 class Misfit(NamedTuple):
@@ -101,7 +128,7 @@ class Misfit(NamedTuple):
         chi2: sum of squared weighted residuals.
         reduced: chi^2 per degree of freedom.
         p_value: probability of a chi^2 as large by chance; nan if the errors are unknown.
-        inflation: factor by which the covariance is multiplied.
+        inflation: factor by which the covariance of the measurement is multiplied.
     """
 
     chi2: Float[Array, ""]

@@ -84,23 +84,23 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
     measured = np.log(curve.temperature)
     fitted = measured - residuals / np.where(weights > 0, weights, 1.0)
     columns = _padded(np.asarray(curve.times), measured, weights, fitted)
-    model = result.model
     profile = fit_trials(
         result.gas,
         result.names,
         *map(jnp.asarray, columns),
         trials=_trials(kinds),
-        # A particle model's noise is added to the errors below.
-        accuracy=jnp.asarray(0.0 if model.stochastic else model.derivative_accuracy),
+        accuracy=jnp.max(result.clock_error),
+        priors=result.priors,
     )
     profile = jax.tree.map(np.asarray, profile)
     if not np.isfinite(profile.chi2[0]):
         return ()
-    best = profile.residuals[int(np.nanargmin(profile.chi2))][: weights.size][weights > 0]
-    scale = chi2_scale(best, len(result.names))
-    if result.simulation_error is not None:
-        noise = np.asarray(result.simulation_error) / scale**0.5
-        profile = profile._replace(error=np.hypot(profile.error, noise))
+    best = profile.residuals[int(np.nanargmin(profile.chi2))]
+    scale = float(chi2_scale(jnp.asarray(best), len(result.names)))
+    # What trials, which have no noise of their own, cannot tell.
+    beside = [result.error_budget.get(part, 0.0) for part in ("simulation", "few particles")]
+    noise = np.hypot(*map(np.asarray, beside)) / scale**0.5
+    profile = profile._replace(error=np.hypot(profile.error, noise))
     found, begin = [], 1
     for name, _, amplitudes in kinds:
         rows = np.array([0, *range(begin, begin + len(amplitudes))])
@@ -144,10 +144,9 @@ def _weighted(
     """
     residuals = np.asarray(result.residuals)
     used = residuals != 0
-    if curve.temperature_error is None:
-        weights = used / max(float(result.reduced_chi2) ** 0.5, 1e-12)
-        return weights, residuals * weights
-    error = np.where(used, curve.temperature_error, 1.0)
+    if result.scatter is not None:
+        return used / np.asarray(result.scatter), residuals
+    error = np.where(used, np.asarray(curve.temperature_error), 1.0)
     return np.where(used, np.asarray(curve.temperature) / error, 0.0), residuals
 
 

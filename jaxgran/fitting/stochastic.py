@@ -8,10 +8,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxgran.checks.tracing import any_traced
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
+from jaxgran.fitting.budget import effects_on_temperature
 from jaxgran.fitting.deterministic import fit_deterministic
 from jaxgran.fitting.gauss_newton import Simulated, by_simulation
 from jaxgran.fitting.guess import guess_from_data
 from jaxgran.fitting.parameters import Parameters
+from jaxgran.fitting.priors import NO_PRIORS, Priors
+from jaxgran.fitting.residuals import correlation_factor, neighbour_correlation
 from jaxgran.fitting.result import Fit, misfit
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -27,6 +30,7 @@ def fit_stochastic(
     key: PRNGKeyArray | None = None,
     progress: bool = True,
     max_simulations: int = 8,
+    priors: Priors = NO_PRIORS,
 ) -> Fit:
     """Fit through a stochastic model, from a guess, by default the result of kinetic theory.
 
@@ -69,7 +73,7 @@ def fit_stochastic(
         max_simulations=max_simulations,
         progress=progress,
     )
-    return _fit_of(model, parameters, names, first, found, errors_known)
+    return _fit_of(model, parameters, names, first, found, priors, errors_known)
 
 
 def _check_replicas(model: AbstractModel, computed: CoolingCurve) -> None:
@@ -96,34 +100,52 @@ def _fit_of(
     names: tuple[str, ...],
     first: Float[Array, "p"],
     found: Simulated,
+    priors: Priors,
     errors_known: bool,
 ) -> Fit:
     """The fit in SI units of what a search found."""
     flat = jnp.asarray(found.flat)
-    degrees_of_freedom = jnp.asarray(int(np.sum(found.residuals != 0)) - flat.size)
-    parts = [(jnp.asarray(found.residuals), degrees_of_freedom)]
-    chance = misfit(parts, degrees_of_freedom, errors_known=errors_known)
+    residuals, sensitivity = jnp.asarray(found.residuals), jnp.asarray(found.sensitivity)
+    used = residuals != 0
+    degrees_of_freedom = jnp.sum(used) - flat.size
+    scatter = None
+    if not errors_known:
+        scatter = jnp.sqrt(jnp.sum(residuals**2) / degrees_of_freedom)
+        residuals, sensitivity = residuals / scatter, sensitivity / scatter
+    tested = [(residuals, degrees_of_freedom)]
+    chance = misfit(tested, degrees_of_freedom, errors_known=errors_known)
     scale = jax.jacfwd(parameters.estimates)(flat)
-    noise = scale @ found.noise_covariance @ scale.T
-    covariance = chance.inflation * (scale @ found.error_covariance @ scale.T) + noise
+    gain = scale @ jnp.asarray(found.gain)
+    gas = parameters.gas(flat)
+    slope, changes = effects_on_temperature(gas, priors, found.computed.times)
+    measured = scale @ found.error_covariance @ scale.T * (1.0 if scatter is None else scatter**2)
+    factor = correlation_factor(neighbour_correlation(residuals, used)) ** 2
+    moved = {name: gain @ change for name, change in changes.items()}
+    covariances = {
+        "measurement": chance.inflation * factor * measured,
+        **{name: change @ change.T for name, change in moved.items()},
+        "simulation": scale @ found.noise_covariance @ scale.T,
+    }
     return Fit(
         names=names,
         model=model,
         estimate=parameters.estimates(flat),
-        standard_error=jnp.sqrt(jnp.diag(covariance)),
-        model_error=jnp.zeros(flat.shape),
-        covariance=covariance,
-        sensitivity=jnp.asarray(found.sensitivity),
+        covariances=covariances,
+        clock_error=jnp.zeros(used.shape),
+        gain=gain,
+        clock_gain=-gain * slope[None],
+        sensitivity=sensitivity,
         start=parameters.estimates(first),
-        gas=parameters.gas(flat),
+        gas=gas,
+        priors=priors,
         curve=found.computed,
-        residuals=jnp.asarray(found.residuals),
+        residuals=residuals,
         displacement_residuals=None,
+        scatter=scatter,
         chi2=chance.chi2,
         degrees_of_freedom=degrees_of_freedom,
         reduced_chi2=chance.reduced,
         p_value=chance.p_value,
         iterations=jnp.asarray(found.num_simulations),
         converged=jnp.asarray(found.converged),
-        simulation_error=jnp.sqrt(jnp.diag(noise)),
     )

@@ -5,6 +5,7 @@ from abc import abstractmethod
 from typing import NamedTuple
 
 import equinox as eqx
+import numpy as np
 from equinox import AbstractClassVar
 from jaxtyping import Array, Float
 
@@ -45,7 +46,7 @@ class AbstractModel(eqx.Module):
 
     derivative_accuracy: AbstractClassVar[float]
     """Relative accuracy of a derivative of ln T in a parameter. Parameters whose effects differ by
-    less count as undetermined; of a deterministic model it is also the error of the clock."""
+    less count as undetermined."""
 
     @abstractmethod
     def check(self, gas: Gas) -> None:
@@ -71,6 +72,14 @@ class AbstractModel(eqx.Module):
     @abstractmethod
     def estimated_error(self, course: Course) -> float:
         """Estimated relative error of T at the worst time of a gas's course, noise included."""
+
+    def rate_error(self, course: Course) -> Float[np.ndarray, "times"] | float:
+        """Estimated relative error of the cooling rate along a gas's course, without noise.
+
+        The error bars of a fit contain it. By default `derivative_accuracy`, or 0 for a stochastic
+        model.
+        """
+        return 0.0 if self.stochastic else self.derivative_accuracy
 
     @abstractmethod
     def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:

@@ -87,9 +87,28 @@ class Course(NamedTuple):
         t = self.time
         if t[-1] == 0:
             return 0.0
-        e = np.broadcast_to(rate_error, t.shape)
-        delay = np.concatenate([[0], np.cumsum((e[1:] + e[:-1]) / 2 * np.diff(t))])
+        delay = self._integral(np.broadcast_to(rate_error, t.shape))
         return float(np.max(np.abs(np.gradient(self.log_temperature, t)) * delay))
+
+    def clock_error(
+        self, rate_error: Float[np.ndarray, "times"] | float
+    ) -> Float[np.ndarray, "times"]:
+        """Relative error of the clock, ``int_0^t e dt' / t``, of a cooling rate wrong by e(t)."""
+        e = np.broadcast_to(rate_error, self.time.shape)
+        return np.where(self.time > 0, self._integral(e) / np.where(self.time > 0, self.time, 1), e)
+
+    def chance_of_clock(self, num_particles: int) -> Float[np.ndarray, "times"]:
+        """Variance of the clock, s^2, by the chance of single collisions of N particles.
+
+        ln T scatters by ``NOISE sqrt(ds/N)`` while it falls by ds. A deviation is a delay, which
+        lasts: its variance is the sum of ``NOISE^2 ds / (N r^2)`` with ``r = -d ln T/dt``.
+        """
+        rate = np.maximum(-np.gradient(self.log_temperature, self.time), 1e-300)
+        return self._integral(NOISE**2 / (num_particles * rate))
+
+    def _integral(self, values: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
+        steps = (values[1:] + values[:-1]) / 2 * np.diff(self.time)
+        return np.concatenate([[0.0], np.cumsum(steps)])
 
     @property
     def homogeneous(self) -> Float[np.ndarray, "times"]:

@@ -89,9 +89,12 @@ class DSMC(AbstractModel):
 
     def estimated_error(self, course: Course) -> float:
         """Error of Enskog's rate, lasting and soft contacts, and the shot noise of all replicas."""
-        rate_error = course.homogeneous + course.lasting_contacts + course.softness
         noise = course.shot_noise(self.num_particles * self.replicas)
-        return hypot(course.error_of_temperature(rate_error), noise)
+        return hypot(course.error_of_temperature(self.rate_error(course)), noise)
+
+    def rate_error(self, course: Course) -> Float[np.ndarray, "times"]:
+        """Error of Enskog's rate, and of contacts that last and are soft."""
+        return course.homogeneous + course.lasting_contacts + course.softness
 
     def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
         """Contacts that last, correlated collisions and boxes in which a flow grows."""

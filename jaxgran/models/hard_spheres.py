@@ -6,6 +6,8 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
 from jaxgran.checks.tracing import any_traced
 from jaxgran.checks.validation import (
@@ -127,8 +129,12 @@ class HardSpheres(AbstractSpheres):
 
     def estimated_error(self, course: Course) -> float:
         """Contacts that last and overlap, and noise."""
-        contacts = course.error_of_temperature(course.lasting_contacts + course.softness)
+        contacts = course.error_of_temperature(self.rate_error(course))
         return math.hypot(contacts, *self.noise(course))
+
+    def rate_error(self, course: Course) -> Float[np.ndarray, "times"]:
+        """Error of contacts that last and overlap."""
+        return course.lasting_contacts + course.softness
 
     def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
         """Contacts that last."""

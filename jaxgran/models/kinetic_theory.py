@@ -119,9 +119,12 @@ class KineticTheory(AbstractModel):
 
     def estimated_error(self, course: Course) -> float:
         """Of Enskog's rate, lasting contacts and the terms beyond a_2 and the first softness."""
+        return course.error_of_temperature(self.rate_error(course))
+
+    def rate_error(self, course: Course) -> Float[np.ndarray, "times"]:
+        """The same, of the cooling rate."""
         softness = course.second_order_softness if self.softness else course.softness
-        rate = course.homogeneous + course.lasting_contacts + softness
-        return course.error_of_temperature(rate + course.truncation)
+        return course.homogeneous + course.lasting_contacts + softness + course.truncation
 
     def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
         """Contacts that last, correlated collisions and boxes in which a flow grows."""

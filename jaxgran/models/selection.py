@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.checks import status
 from jaxgran.checks.validation import POSITIVE, checked_times, no_type_check, plain_number
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import check_softness, checked_gas
@@ -166,43 +167,52 @@ def course_of(gas: Gas, end: float, num_particles: int | None = None) -> Course:
         ValueError: for a gas so soft that the softness correction has no meaning.
         RuntimeError: if kinetic theory cannot follow the gas so far.
     """
-    fault, critical_box, values = _course(gas, jnp.asarray(end))
-    values = {name: np.asarray(value, float) for name, value in values.items()}
-    check_softness(gas, 1 - values["softness"][0])
-    if int(fault) != status.OK:
-        raise RuntimeError(
-            f"kinetic theory, which estimates the errors: {status.explain(int(fault))}"
-        )
-    flow = scatter = np.zeros_like(values["time"])
+    grid = jnp.linspace(0, jnp.log1p(end / gas.mean_free_time), COURSE_POINTS)
+    curve = KineticTheory().simulate(gas, jnp.expm1(grid) * gas.mean_free_time, Run())
+    course = course_along(gas, curve, num_particles)
+    check_softness(gas, 1 - course.softness[0])
+    fault = int(jnp.asarray(curve.status))
+    if fault != status.OK:
+        raise RuntimeError(f"kinetic theory, which estimates the errors: {status.explain(fault)}")
+    return course
+
+
+def course_along(gas: Gas, curve: CoolingCurve, num_particles: int | None = None) -> Course:
+    """The course of a gas along its cooling curve, which begins at t = 0.
+
+    a_2 and the collisions are taken for 0 where the curve does not have them.
+    """
+    nothing = jnp.zeros_like(curve.temperature)
+    values = {
+        "time": curve.times,
+        "log_temperature": jnp.log(curve.temperature / gas.temperature),
+        "collisions": nothing if curve.collisions is None else curve.collisions,
+        "sonine": nothing if curve.sonine is None else curve.sonine,
+    }
+    scales = _scales(gas, curve.temperature)
+    values = {name: np.asarray(value, float) for name, value in (values | scales).items()}
+    critical, flow = values.pop("critical_box"), np.zeros_like(values["time"])
+    scatter = flow
     if num_particles is not None:
-        critical = np.asarray(critical_box, float)
         flow, scatter = flow_share(gas, values["log_temperature"], critical, num_particles)
     return Course(gas, num_particles, **values, flow_share=flow, flow_scatter=scatter)
 
 
 @eqx.filter_jit
-def _course(gas: Gas, end: Array) -> tuple[Array, Array, dict[str, Array]]:
-    grid = jnp.linspace(0, jnp.log1p(end / gas.mean_free_time), COURSE_POINTS)
-    t = jnp.expm1(grid) * gas.mean_free_time
-    curve = KineticTheory().simulate(gas, t, Run())
-    assert curve.sonine is not None and curve.collisions is not None
+def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Array, "times"]]:
+    """Contacts and the critical box at each temperature."""
 
     def scales(temperature):
         now = gas.replace(temperature=temperature)
         factor = softness_factor(now.reduced_law, jnp.ones_like(temperature), now.dimension)
-        return now.contact_fraction, now.mean_overlap, 1 - factor, now.critical_box
+        return {
+            "contact_fraction": now.contact_fraction,
+            "overlap": now.mean_overlap,
+            "softness": 1 - factor,
+            "critical_box": now.critical_box,
+        }
 
-    contact, overlap, softness, critical_box = jax.vmap(scales)(curve.temperature)
-    values = {
-        "time": t,
-        "log_temperature": jnp.log(curve.temperature / gas.temperature),
-        "collisions": curve.collisions,
-        "sonine": curve.sonine,
-        "contact_fraction": contact,
-        "overlap": overlap,
-        "softness": softness,
-    }
-    return jnp.asarray(curve.status), critical_box, values
+    return jax.vmap(scales)(temperature)
 
 
 def _scene_in_words(course: Course, size: int, replicas: int) -> list[str]:

@@ -122,6 +122,10 @@ class SoftSpheres(AbstractSpheres):
         """Time steps and noise: every contact is resolved."""
         return math.hypot(INTEGRATION, *self.noise(course))
 
+    def rate_error(self, course: Course) -> float:
+        """Error of time steps."""
+        return INTEGRATION
+
     def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
         """Nothing that a scene contains."""
         return ()

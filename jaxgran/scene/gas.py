@@ -150,6 +150,11 @@ class Gas(eqx.Module):
         return self.packing_fraction / volume_of_sphere
 
     @property
+    def density(self) -> Float[Array, ""]:
+        """Mass over the volume of a sphere, ``6 m / (pi sigma^3)``, kg/m^3."""
+        return 6 / pi * self.mass / self.diameter**3
+
+    @property
     def contact_value(self) -> Float[Array, ""]:
         """Pair correlation at contact g_2: Carnahan & Starling (3D) or Henderson (2D)."""
         return contact_value(self.packing_fraction, self.dimension)

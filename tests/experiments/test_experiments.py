@@ -38,6 +38,20 @@ def test_main_job_without_arguments(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_posterior_is_that_of_the_budget(tmp_path):
+    done = run("sample_posterior.py", "--samples", "300", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    line = next(line for line in done.stdout.splitlines() if line.startswith("{"))
+    summary = json.loads(line)
+    found = summary["dissipative_constant"]
+    # 1200 samples: the mean within .1, the spread within 10 % at 3 standard errors.
+    assert abs(found["mean"] - found["fit"]) < 0.1 * found["std"]
+    assert found["std"] == pytest.approx(found["fit_std"], rel=0.1)
+    assert summary["divergent"] == 0 and summary["r_hat"] < 1.05
+    assert (tmp_path / "here" / "sample_posterior.png").stat().st_size > 20_000
+
+
+@pytest.mark.slow
 def test_main_job_says_what_it_cannot_explain(tmp_path):
     done = run("fit_cooling_curve.py", DENSE, "--free", "A", "T0", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -87,6 +101,7 @@ def test_models_are_found_by_their_names(name, model):
             fit_cooling_curve.model_of(options, None, None, (), None)
 
 
+@pytest.mark.slow
 def test_auto_takes_kinetic_theory_where_it_will_do(tmp_path):
     done = run("fit_cooling_curve.py", "--model", "auto", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -144,6 +159,7 @@ def test_main_job_ends_with_one_line(arguments, words, tmp_path, monkeypatch, ca
     assert len(told.splitlines()) == 1 and not (tmp_path / "results").exists()
 
 
+@pytest.mark.slow
 def test_main_job_writes_json_that_others_can_read(tmp_path, monkeypatch, capsys):
     def refuse(word):
         raise AssertionError(f"{word} is no JSON")

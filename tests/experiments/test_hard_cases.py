@@ -23,6 +23,7 @@ LONG = (
     "phi from",
     "T/T_0",
     "times:",
+    "near-simultaneous",
     "step 5",
     "stiff and",
     "fits:",

@@ -80,7 +80,7 @@ def exponents_follow_gamma(found):
     "name, holds",
     [
         ("paper_restitution", series_is_that_of_impacts),
-        ("paper_cooling", cools_as_theory),
+        pytest.param("paper_cooling", cools_as_theory, marks=pytest.mark.slow),
         pytest.param(
             "paper_velocity_correlation", dissipation_lengthens_the_memory, marks=pytest.mark.slow
         ),

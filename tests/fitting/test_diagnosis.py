@@ -13,6 +13,7 @@ from tests.conftest import glass_beads
 from tests.fitting.curves import measured, synthetic
 
 
+@pytest.mark.slow
 def test_a_search_that_was_cut_short_is_said_to_be():
     gas, curve, *_ = measured("dilute")
     result = jaxgran.fit(gas, curve, max_steps=1)
@@ -22,6 +23,7 @@ def test_a_search_that_was_cut_short_is_said_to_be():
     assert any("more max_steps" in reason for reason in diagnosis.reasons)
 
 
+@pytest.mark.slow
 def test_dense_measured_curve_is_not_explained():
     gas, curve, a_true, n, _ = measured("dense")
     result = jaxgran.fit(gas, curve)

@@ -58,6 +58,7 @@ def test_a_biased_slope_does_not_move_the_answer(bias):
     assert quiet.converged and quiet.num_simulations <= 8
 
 
+@pytest.mark.slow
 def test_the_error_bar_holds_the_simulations_noise():
     measured = exact(TRUTH)
     pulls = []

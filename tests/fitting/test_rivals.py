@@ -77,6 +77,7 @@ def test_a_loss_that_is_not_told_apart_makes_a_an_upper_bound():
     assert low[0] <= loss.low[0] < 0.7 * a < a < high[0]
 
 
+@pytest.mark.slow
 def test_without_errors_a_steady_misfit_is_no_explanation():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(3))
@@ -88,6 +89,7 @@ def test_without_errors_a_steady_misfit_is_no_explanation():
     assert jaxgran.diagnose(result, bare, 200).verdict.startswith("Kinetic theory is compatible")
 
 
+@pytest.mark.slow
 def test_many_points_of_displacement_do_not_hide_a_misfit_of_temperature():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(4), displacement=True)
@@ -104,6 +106,7 @@ def test_many_points_of_displacement_do_not_hide_a_misfit_of_temperature():
     assert float(result.p_value) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_gas_that_does_not_cool_has_no_rivals():
     gas = glass_beads(0.0)
     times = np.geomspace(1.0, 10.0, 8)
@@ -119,7 +122,8 @@ def test_noise_of_simulations_widens_the_range():
     gas, curve = curve_of(wrong_physics.nothing)
     result = jaxgran.fit(gas, curve, free=FREE)
     noise = 0.2 * result.estimate
-    noisy = dataclasses.replace(result, simulation_error=noise)
+    parts = result.covariances | {"simulation": jnp.diag(noise**2)}
+    noisy = dataclasses.replace(result, covariances=parts)
     (low, high), (lower, higher) = (
         ranges(fit, rivals(fit, curve))["dissipative_constant"] for fit in (result, noisy)
     )

@@ -300,6 +300,7 @@ def test_the_order_of_the_step(monkeypatch):
             assert off == pytest.approx(slope * step, abs=0.2 * abs(slope) * step + 3 * error)
 
 
+@pytest.mark.slow
 def test_other_times_change_nothing(beads):
     gas = beads(0.15)
     tau = float(gas.mean_free_time)
@@ -313,6 +314,7 @@ def test_other_times_change_nothing(beads):
     assert many.displacement[1] == pytest.approx(float(3 * gas.temperature * t**2), rel=0.02)
 
 
+@pytest.mark.slow
 def test_cools_by_six_decades():
     gas = constant(0.8)
     gamma = (1 - 0.8**2) / 6
@@ -397,6 +399,7 @@ def logs(scale, gas, taus, model):
     return jnp.log(jnp.stack([curve.temperature, curve.displacement, curve.collisions]))
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_kinetic_theory(beads):
     gas, zero = beads(0.15), jnp.zeros(3)
     ours, theory = (
@@ -429,6 +432,7 @@ def test_derivatives_are_those_of_the_runs(beads):
     np.testing.assert_allclose(forward[1, :, 0], difference[1], rtol=0.02, atol=noise * MSD_SCATTER)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["constant", "series"])
 def test_derivatives_of_other_laws(law):
     gas = constant(0.9)
@@ -451,6 +455,7 @@ def test_derivatives_of_other_laws(law):
     np.testing.assert_allclose(ours, theory, rtol=0.03, atol=0.015)  # terms of order one cancel
 
 
+@pytest.mark.slow
 def test_gradient_of_error_bars_does_not_spoil_that_of_values(beads):
     gas = beads(0.15)
 
@@ -463,6 +468,7 @@ def test_gradient_of_error_bars_does_not_spoil_that_of_values(beads):
     assert slopes[0] < 0 and slopes[1][0] == 0 and slopes[1][1] < 0
 
 
+@pytest.mark.slow
 def test_single_precision(beads):
     gas = beads(0.15)
     times = np.array([1.0, 10.0]) * float(gas.mean_free_time)
@@ -478,6 +484,7 @@ def test_single_precision(beads):
     np.testing.assert_allclose(coarse.displacement, fine.displacement, rtol=6 / 5000**0.5)
 
 
+@pytest.mark.slow
 def test_says_when_impacts_are_too_fast(beads, monkeypatch):
     gas = beads(0.15)
     times = jnp.array([3.0]) * gas.mean_free_time

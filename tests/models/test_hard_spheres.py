@@ -67,11 +67,11 @@ def serial(gas, start, end):
     "dimension, packing_fraction, law",
     [
         pytest.param(2, 0.1, 0.9, marks=pytest.mark.slow),
-        (2, 0.6, 0.8),
+        pytest.param(2, 0.6, 0.8, marks=pytest.mark.slow),
         (3, 0.02, jaxgran.Viscoelastic(5e7, 0.22, 1e-6)),
         (3, 0.3, jaxgran.RestitutionSeries([-0.1], [0.2])),
         pytest.param(3, 0.45, 1.0, marks=pytest.mark.slow),
-        (3, 0.2, 0.4),
+        pytest.param(3, 0.2, 0.4, marks=pytest.mark.slow),
     ],
 )
 def test_impacts_are_those_of_a_serial_code(dimension, packing_fraction, law):
@@ -184,6 +184,7 @@ def test_diffuses_as_published(packing_fraction, size, replicas, begin):
         np.testing.assert_allclose(D, speedy, atol=2 * error + 0.01 * speedy)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_cools_as_kinetic_theory_says(beads, dimension):
     # Box below L_c, so that the gas stays homogeneous.
@@ -243,6 +244,7 @@ def closest_in_row(particles) -> float:
     return float(np.min(np.diff(np.sort(particles.position[0, :, 0]))))
 
 
+@pytest.mark.slow
 def test_a_dense_dissipative_cluster_does_not_stall():
     gas = hard_gas(0.3, 0.4, 2)
     curve = jaxgran.cool(gas, [20 * float(gas.mean_free_time)], model=HardSpheres(300))
@@ -366,6 +368,7 @@ def test_arrays_fit_what_they_hold(dimension, packing_fraction, monkeypatch):
     assert np.all(fullest <= 1) and np.all(fullest > 0.4)
 
 
+@pytest.mark.slow
 def test_jit_flags_the_start_of_another_gas():
     gas = hard_gas(0.8, 0.1)
     start = jaxgran.cool(gas, [0.0], model=HardSpheres(100)).particles
@@ -404,6 +407,7 @@ def test_jit_flags_what_it_cannot_grow():
     assert "neighbour list is full" in jaxgran.explain_status(curve.status)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [pytest.param(HardSpheres, marks=pytest.mark.slow), jaxgran.SoftSpheres]
 )
@@ -419,6 +423,7 @@ def test_jit_flags_a_box_too_small(beads, kind):
     assert status[0] == 0 and "the box is too short" in jaxgran.explain_status(status[1])
 
 
+@pytest.mark.slow
 def test_single_precision():
     gas = hard_gas(0.8, 0.1)
     start = jaxgran.cool(gas, [0.0], model=HardSpheres(100)).particles

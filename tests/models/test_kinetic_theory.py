@@ -71,6 +71,7 @@ def test_twelve_decades_of_cooling(beads):
     np.testing.assert_allclose(slope, -5 / 3, atol=0.01)
 
 
+@pytest.mark.slow
 def test_tolerance_is_met(beads):
     gas = beads(0.15)
     times = jnp.geomspace(0.01, 1e5, 50) * gas.mean_free_time
@@ -122,6 +123,7 @@ def test_softness_slows_cooling(beads):
     np.testing.assert_allclose(soft / hard, 1 - 1.937 * length, rtol=1e-4)  # O(t) of the decay
 
 
+@pytest.mark.slow
 def test_stiff_solver_for_nearly_elastic_gases(beads):
     gas = beads(1e-6)
     times = jnp.geomspace(1.0, 1e9, 20) * gas.mean_free_time

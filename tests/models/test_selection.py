@@ -145,6 +145,7 @@ def test_only_a_flow_makes_noise_besides():
         assert (noise > 1.5 * shots) is more
 
 
+@pytest.mark.slow
 def test_noise_of_dsmc():
     gas = hard_gas(0.9)
     times = over(gas, 10)

@@ -82,6 +82,7 @@ def impacts(beads, beta, steps, angle, phases=200):
     return -after @ normal / (speed * np.cos(angle)) - exact
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, 0.7, 1.2])
 def test_one_impact_and_the_order_of_its_error(beads, angle):
     errors = {steps: impacts(beads, 0.1, steps, angle) for steps in (25, 50, 100)}
@@ -120,6 +121,7 @@ def test_ledger_closes_and_momentum_stays(beads):
     assert worst[20] / worst[40] > 2.5 and worst[40] / worst[80] > 2.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_shifts_boosts_and_names_change_nothing(beads, dimension):
     gas = soft_beads(beads, 0.05, 0.2, dimension, packing_fraction=0.2)
@@ -151,6 +153,7 @@ def test_shifts_boosts_and_names_change_nothing(beads, dimension):
         np.testing.assert_allclose(v, expected, atol=1e-8 * speed)
 
 
+@pytest.mark.slow
 def test_replicas_are_the_runs_they_stand_for(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     tau = float(gas.mean_free_time)
@@ -164,6 +167,7 @@ def test_replicas_are_the_runs_they_stand_for(beads):
         np.testing.assert_allclose(alone.temperature[0], pair.replicas.temperature[k], rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_cools_as_kinetic_theory_with_softness_says(beads, dimension):
     # Already in .8 L_c of two dimensions the waves of the flow keep T 3 to 4 % higher.
@@ -203,6 +207,7 @@ def test_clusters_above_the_critical_box_only(beads):
     assert shapes[2000].max() > 3
 
 
+@pytest.mark.slow
 def test_what_is_too_small_is_grown_without_a_trace(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.2)
     times = np.array([0.3, 1.0]) * float(gas.mean_free_time)
@@ -231,6 +236,7 @@ def test_a_fast_sphere_outruns_no_list(beads):
     np.testing.assert_allclose(energy(gas, ends[0]), energy(gas, ends[1]), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_step_too_large_is_shortened(beads):
     gas = soft_beads(beads, 0.001, 0.1, packing_fraction=0.1)
     cold = jaxgran.cool(gas, [0.0], model=SoftSpheres(64)).particles
@@ -244,6 +250,7 @@ def test_a_step_too_large_is_shortened(beads):
     np.testing.assert_allclose(total[0], total[-1], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     times = np.array([0.3, 1.0, 2.0]) * float(gas.mean_free_time)
@@ -287,6 +294,7 @@ def test_jit_and_vmap_give_the_same_numbers(beads):
         np.testing.assert_allclose(swept[i], temperature(constants[i])[0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_dense_random_start_melts_under_jit(beads):
     # As it begins six tenths of the spheres touch; in the run it is one in twenty.
     gas = soft_beads(beads, 0.02, 0.1, packing_fraction=0.2)
@@ -321,6 +329,7 @@ def test_arrays_fit_what_they_hold(beads, packing, fraction, monkeypatch):
     assert np.all(fullest <= 1) and np.all(fullest > 0.4)
 
 
+@pytest.mark.slow
 def test_jit_flags_what_it_cannot_grow(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     model = SoftSpheres(100).sized_for(gas)
@@ -355,6 +364,7 @@ def test_whoever_finds_the_pairs_the_run_is_the_same(beads):
         np.testing.assert_allclose(a.particles.velocity, b.particles.velocity, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_single_precision(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     times = [0.5 * float(gas.mean_free_time)]

@@ -51,9 +51,8 @@ def test_the_neighbourhood_is_that_of_the_gas(beads, dimension):
     assert around.listed == pytest.approx(around.in_contact + 3.0)
 
 
-@pytest.mark.parametrize(
-    "kind", [jaxgran.SoftSpheres, pytest.param(jaxgran.HardSpheres, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [jaxgran.SoftSpheres, jaxgran.HardSpheres])
 def test_thirty_densities_share_four_programs(beads, kind):
     compiled = []
 

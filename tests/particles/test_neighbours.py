@@ -96,6 +96,7 @@ def test_jax_md_finds_what_brute_force_finds(dimension, replicas, fraction):
     compare(dimension, replicas, 3.7, 3.7 * fraction, "jax-md")
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(*3 * [st.integers(0, 7)]), min_size=2, max_size=12),
     st.sampled_from([2, 3]),
@@ -155,6 +156,7 @@ def test_offset_outlasts_motion_without_wrapping():
     )
 
 
+@pytest.mark.slow
 def test_a_capacity_that_is_exceeded_is_reported():
     position = awkward(2, 2, 3.7)
     cutoff = 3.7 * 0.15
@@ -275,6 +277,7 @@ def test_wide_planes(side, n):
     assert set(listed(pairs)) == expected
 
 
+@pytest.mark.slow
 def test_a_sweep_looks_as_far_as_it_must():
     # A gas, the same gas squeezed into a slab, and all of it in one plane across the sweep.
     rng = np.random.default_rng(6)

@@ -56,6 +56,7 @@ def test_derivative_of_restitution(beta, slope):
     np.testing.assert_allclose(result, slope, rtol=5e-9)  # the reference has nine digits
 
 
+@pytest.mark.slow
 def test_error_follows_tolerance():
     exact = REFERENCE[5][2]
     errors = [abs(float(solve(0.5, rtol=rtol).restitution) - exact) for rtol in (1e-4, 1e-7, 1e-10)]

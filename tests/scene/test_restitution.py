@@ -41,6 +41,7 @@ def test_fast_law_beyond_its_fit(clipped, limit):
         np.testing.assert_allclose(fast, limit, rtol=tolerance)
 
 
+@pytest.mark.slow
 def test_fast_law_derivative():
     beta = jnp.concatenate([jnp.geomspace(1e-5, 1e-2, 10), jnp.linspace(0.01, 1.0, 40)])
     fast = jax.vmap(jax.grad(viscoelastic_restitution))(beta)

@@ -117,7 +117,7 @@ def test_fit_finds_what_made_the_curve():
         # Kinetic theory and hard spheres differ by some 1 % in the cooling rate.
         assert abs(float(estimate) / true - 1) < 3 * float(error) / true + slack
         assert float(error) < 0.15 * true
-    assert result.simulation_error is not None and np.all(result.simulation_error > 0)
+    assert np.all(result.error_budget["simulation"] > 0)
     assert result.model.name == "hard spheres"
     assert "Hard spheres are compatible" in jaxgran.diagnose(result, curve).verdict
 
@@ -142,6 +142,7 @@ def constant():
     return f, at, model, jax.jacfwd(f)(at)
 
 
+@pytest.mark.slow
 def test_constant_restitution_has_the_slopes_of_haff(constant):
     f, at, _, slopes = constant
     e, cooled = COEFFICIENT, 1 - jnp.exp(f(at) / 2)
@@ -185,6 +186,7 @@ def test_a_start_has_no_projected_slope():
             derivative(f)(1.0)
 
 
+@pytest.mark.slow
 def test_speed_is_a_unit_of_random_starts_and_not_of_given_ones(constant):
     f, at, model, _ = constant
     random = dataclasses.replace(model, start=None)

@@ -67,6 +67,7 @@ def loss_slope(gas, angle, speed):
     return float(slope(temperature))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beta", [1e-6, 0.1, 0.5])
 @pytest.mark.parametrize("angle", [0.0, 0.7, 1.5])
 def test_one_impact_has_the_slope_of_its_law(beads, beta, angle):
@@ -158,6 +159,7 @@ def test_slopes_in_every_float_are_those_of_kinetic_theory(beads):
     np.testing.assert_allclose(particles[2], theory[2], rtol=0.1, atol=0.03)
 
 
+@pytest.mark.slow
 def test_the_ledger_closes_in_the_tangent_too(beads):
     gas = soft_beads(beads, 0.05, 0.3, packing_fraction=0.15)
     times = np.array([1.0, 3.0]) * float(gas.mean_free_time)
@@ -284,6 +286,7 @@ def test_four_decades_of_cooling(beads):
     np.testing.assert_allclose(change.mean(0), slope(of_theory), rtol=0.15, atol=0.03)
 
 
+@pytest.mark.slow
 def test_a_start_has_no_projected_slope(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     first = jaxgran.cool(gas, [1e-4], model=SoftSpheres(20)).particles

@@ -54,6 +54,7 @@ def test_stationary_kurtosis(d, e, a2):
     np.testing.assert_allclose(curve.sonine[0], a2, rtol=0.16)
 
 
+@pytest.mark.slow
 def test_rate_table_is_exact_over_decades(beads):
     laws = [
         beads(0.15).reduced_law,

@@ -43,6 +43,7 @@ def test_two_term_solution(beads):
         closed_forms.two_term_time(0.5, 0.5)
 
 
+@pytest.mark.slow
 def test_expansion_is_right_to_its_order(beads):
     # The first neglected term is delta^(5/2): the error must fall so, with a bounded coefficient.
     for clipped in (True, False):
@@ -101,6 +102,7 @@ def test_velocity_relaxation_as_printed(beads):
     np.testing.assert_allclose(paper / elastic, printed, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_displacement_of_constant_restitution():
     for d, e in ((3, 0.6), (2, 0.9)):
         gas = hard_gas(e, d)

@@ -1,0 +1,105 @@
+"""Errors that follow from the fitted gas: of its model's clock there, and of few particles."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run import Run
+from jaxgran.fitting.parameters import Parameters
+from jaxgran.fitting.priors import Priors
+from jaxgran.fitting.result import Fit
+from jaxgran.models.course import Course
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.selection import course_along
+from jaxgran.scene.gas import Gas
+
+
+def in_scene(result: Fit, num_particles: int | None, replicas: int) -> Fit:
+    """A fit with the errors of its model's clock in this scene, and of few particles.
+
+    Args:
+        result: of one curve, of known numbers.
+        num_particles: N of each measured run, if known.
+        replicas: measured runs over which the curve is a mean.
+    """
+    course = _course(result, num_particles)
+    times = np.asarray(result.curve.times)
+    own = course.clock_error(result.model.rate_error(course))[-times.size :]
+    # A deterministic model's clock was compared in a few scenes, and is not known better in others.
+    clock_error = jnp.maximum(jnp.asarray(own, result.clock_error.dtype), result.clock_error)
+    fitted = bool(result.priors.names) and not result.model.stochastic
+    moved = result.clock_gain @ jnp.sqrt(clock_error**2 - fitted * result.clock_error**2)
+    covariances = dict(result.covariances)
+    model = covariances["model"] if fitted else 0.0
+    covariances["model"] = model + jnp.outer(moved, moved)
+    if num_particles is not None:
+        chance = _by_chance(result, course, num_particles * replicas)
+        covariances["few particles"] = _beyond(chance, covariances["measurement"])
+    return dataclasses.replace(result, clock_error=clock_error, covariances=covariances)
+
+
+def _course(result: Fit, num_particles: int | None) -> Course:
+    """The course of the fitted gas, at t = 0 and the measured times."""
+    curve = result.curve
+    times = jnp.asarray(curve.times)
+    before = jnp.zeros(int(times[0] > 0), times.dtype)
+
+    def whole(values: Array | None, first: Array) -> Array | None:
+        return None if values is None else jnp.concatenate([before + first, values])
+
+    along = CoolingCurve(
+        times=jnp.concatenate([before, times]),
+        temperature=jnp.concatenate([before + result.gas.temperature, curve.temperature]),
+        sonine=whole(curve.sonine, jnp.zeros(())),
+        collisions=whole(curve.collisions, jnp.zeros(())),
+    )
+    return course_along(result.gas, along, num_particles)
+
+
+def _by_chance(result: Fit, course: Course, num_particles: int) -> Float[Array, "p p"]:
+    """Covariance of the estimates by the chance of single collisions of N particles.
+
+    The delays of the clock at two times have in common what was gathered until the earlier one.
+    """
+    times = np.asarray(result.curve.times)
+    gathered = course.chance_of_clock(num_particles)[-times.size :]
+    common = np.minimum(gathered[:, None], gathered[None, :])
+    gain = np.asarray(result.clock_gain) / np.where(times > 0, times, 1.0)[None]
+    return jnp.asarray(gain @ common @ gain.T)
+
+
+def _beyond(whole: Float[Array, "p p"], measured: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """What a covariance adds to that of measured errors, which may hold it already."""
+    share = 1 - jnp.diag(measured) / jnp.maximum(jnp.diag(whole), jnp.finfo(whole.dtype).tiny)
+    factor = jnp.sqrt(jnp.clip(share, 0.0, 1.0))
+    return whole * jnp.outer(factor, factor)
+
+
+def effects_on_temperature(
+    gas: Gas, priors: Priors, times: Float[Array, "times"]
+) -> tuple[Float[Array, "times"], dict[str, Float[Array, "times size"]]]:
+    """How ln T of kinetic theory changes with its clock, and by one standard error of each prior.
+
+    Returns:
+        ``d ln T/d ln t``, and for each prior the changes by one standard error of its numbers.
+    """
+    model, varied = KineticTheory(), priors.also_free(())
+    parameters = Parameters(gas, varied)
+
+    def log_temperature(flat: Array, clock: Array) -> Array:
+        computed = model.simulate(parameters.gas(flat), times * clock, Run())
+        return jnp.log(computed.temperature)
+
+    flat, clock = parameters.flat(gas), jnp.ones_like(times)
+    slope = jax.jvp(lambda x: log_temperature(flat, x), (clock,), (clock,))[1]
+    if not varied:
+        return slope, {}
+    by_parameter = jax.jacfwd(log_temperature)(flat, clock)
+    by_residual = jax.jacfwd(lambda x: priors.residuals(parameters.gas(x)))(flat)
+    changes = by_parameter @ jnp.linalg.pinv(by_residual)
+    ends = np.cumsum([given.size for given in priors.given])[:-1]
+    return slope, dict(zip(priors.names, jnp.split(changes, ends, axis=1), strict=True))

@@ -1,0 +1,190 @@
+"""Weighted residuals of a measured curve as a function of the parameters of a model."""
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run import Run
+from jaxgran.fitting.parameters import Parameters
+from jaxgran.fitting.priors import NO_PRIORS, Priors
+from jaxgran.models.base import AbstractModel
+from jaxgran.scene.gas import Gas
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Weighted residuals of a measured curve as a function of the parameters of a model.
+
+    The parameters ``flat`` are those of the gas in their unbounded scale: the free ones, then those
+    that vary because of a prior. After them, where there are priors, come errors of the model's
+    clock, of its mean and of its trend in ln T, so that these are not blamed on the gas; and, if
+    <dr^2> is used, the logarithm of a factor common to all values of D. Both have the model's
+    accuracy for a prior.
+
+    Attributes:
+        curve: the measured curve.
+        model: of the computed curve.
+        parameters: the free ones and those that vary because of a prior.
+        num_free: how many numbers the free ones are.
+        priors: of floats of the gas.
+        weights: of ln T and, if it is used, of ln <dr^2>; the inverse relative errors.
+        displacement_accuracy: relative accuracy of the model's <dr^2>; None if it is not used.
+        scatter: relative error of T where the curve has none; else None.
+    """
+
+    curve: CoolingCurve
+    model: AbstractModel
+    parameters: Parameters
+    num_free: int
+    priors: Priors
+    weights: list[Array]
+    displacement_accuracy: Float[Array, ""] | None
+    scatter: Float[Array, ""] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        gas: Gas,
+        curve: CoolingCurve,
+        model: AbstractModel,
+        names: tuple[str, ...],
+        num_particles: int | None,
+        priors: Priors = NO_PRIORS,
+    ) -> "Comparison":
+        """Compare T and, where its errors are known on both sides, <dr^2>."""
+        T, T_error = curve.temperature, curve.temperature_error
+        weights = [_weights(T, T if T_error is None else T_error)]
+        accuracy = _displacement_accuracy(gas, curve, model, num_particles)
+        if accuracy is not None:
+            assert curve.displacement is not None
+            sampling = (2 / (gas.dimension * (num_particles or 1))) ** 0.5 * curve.displacement
+            error = sampling if curve.displacement_error is None else curve.displacement_error
+            error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
+            weights.append(_weights(curve.displacement, error))
+        parameters = Parameters(gas, (*names, *priors.also_free(names)))
+        num_free = sum(gas.value(name).size for name in names)
+        return cls(curve, model, parameters, num_free, priors, weights, accuracy)
+
+    def scaled(self, flat: Float[Array, "q"]) -> "Comparison":
+        """The same with the scatter of ln T at some parameters for its error."""
+        T, computed = self.curve.temperature, self.evaluate(flat)[1][1]
+        used = self.weights[0] > 0
+        square = jnp.sum(jnp.where(used, _log_ratio(T, computed.temperature), 0.0) ** 2)
+        scatter = jnp.sqrt(square / (jnp.sum(used) - self.num_free))
+        # Not 0 for data without noise: the errors are then as small as numbers of this precision.
+        scatter = jnp.maximum(scatter, jnp.finfo(scatter.dtype).eps)
+        return replace(self, weights=[jnp.where(used, 1 / scatter, 0.0)], scatter=scatter)
+
+    @property
+    def num_measured(self) -> int:
+        """How many residuals are of measured values, which come before those of priors."""
+        return sum(weights.size for weights in self.weights)
+
+    @property
+    def num_beside(self) -> int:
+        """How many parameters there are after those of the gas."""
+        return 2 * bool(self.priors.names) + (self.displacement_accuracy is not None)
+
+    def of_gas(self, flat: Float[Array, "q"]) -> Float[Array, "r"]:
+        """The parameters of the gas."""
+        return flat[: flat.size - self.num_beside]
+
+    def clock(self, flat: Float[Array, "q"]) -> tuple[Float[Array, "times"], Float[Array, "_"]]:
+        """Factors of the model's clock, and the residuals of their priors."""
+        if not self.priors.names:
+            return jnp.ones_like(self.curve.times), flat[:0]
+        mean, trend = errors = flat[self.of_gas(flat).size :][:2]
+        log_T = jnp.log(self.curve.temperature)
+        along = 2 * (log_T - log_T[0]) / (log_T[-1] - log_T[0]) - 1
+        return jnp.exp(self.model.derivative_accuracy * (mean + trend * along)), errors
+
+    def estimates(self, flat: Float[Array, "q"]) -> Float[Array, "p"]:
+        """SI values of the free parameters."""
+        return self.parameters.estimates(self.of_gas(flat))[: self.num_free]
+
+    def evaluate(
+        self, flat: Float[Array, "q"], clock: Float[Array, "times"] | float = 1.0
+    ) -> tuple[Float[Array, "residuals"], tuple[Float[Array, "residuals"], CoolingCurve]]:
+        """The weighted residuals, twice, and the computed curve, as `jax.jacfwd` takes them.
+
+        Args:
+            flat: the parameters.
+            clock: factors by which the times of the model are multiplied.
+        """
+        gas = self.parameters.gas(self.of_gas(flat))
+        own_clock, errors_of_clock = self.clock(flat)
+        computed = self.model.simulate(gas, self.curve.times * clock * own_clock, Run())
+        parts = [self.weights[0] * _log_ratio(self.curve.temperature, computed.temperature)]
+        if self.displacement_accuracy is not None:
+            assert self.curve.displacement is not None
+            assert computed.displacement is not None and computed.collisions is not None
+            # The common factor is one of D: the ballistic flight before collisions is exact.
+            diffusive = computed.collisions / (1 + computed.collisions)
+            ratio = _log_ratio(self.curve.displacement, computed.displacement)
+            ratio = ratio - flat[-1] * diffusive
+            parts += [self.weights[1] * ratio, flat[-1:] / self.displacement_accuracy]
+        residuals = jnp.concatenate([*parts, errors_of_clock, self.priors.residuals(gas)])
+        return residuals, (residuals, computed)
+
+    def residuals(self, flat: Float[Array, "q"]) -> Float[Array, "residuals"]:
+        """The weighted residuals of ln T, of ln <dr^2>, of the factor of D and of the priors."""
+        return self.evaluate(flat)[0]
+
+    def split(self, rows: Float[Array, "*_ residuals"]) -> dict[str, Float[Array, "*_ part"]]:
+        """What belongs to which residuals, by the names of `Fit.covariances`."""
+        parts = [("measurement", self.curve.times.size)]
+        if self.displacement_accuracy is not None:
+            parts += [("displacement", self.curve.times.size), ("model of <dr^2>", 1)]
+        if self.priors.names:
+            sizes = zip(self.priors.names, self.priors.given, strict=True)
+            parts += [("model", 2), *((name, given.size) for name, given in sizes)]
+        ends = np.cumsum([size for _, size in parts])[:-1]
+        names = [name for name, _ in parts]
+        return dict(zip(names, jnp.split(rows, ends, axis=-1), strict=True))
+
+    def best(self, guesses: list[Gas]) -> Float[Array, "q"]:
+        """Of some guesses the one with the least chi^2."""
+        flats = jnp.stack([self.parameters.flat(guess) for guess in guesses])
+        flats = jnp.pad(flats, ((0, 0), (0, self.num_beside)))
+        if len(guesses) == 1:
+            return flats[0]
+        costs = jnp.stack([jnp.sum(self.residuals(flat) ** 2) for flat in flats])
+        return flats[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
+
+
+def _displacement_accuracy(
+    gas: Gas, curve: CoolingCurve, model: AbstractModel, num_particles: int | None
+) -> Float[Array, ""] | None:
+    """Relative accuracy of the model's <dr^2>; None if the fit cannot use <dr^2>.
+
+    It must be measured and computed, and its error be known, and that of T to weigh it with.
+    """
+    if curve.displacement is None or curve.temperature_error is None:
+        return None
+    if curve.displacement_error is None and num_particles is None:
+        return None
+    accuracy = model.displacement_accuracy(gas)
+    if accuracy is not None:
+        computed = eqx.filter_eval_shape(model.simulate, gas, curve.times, Run())
+        if computed.displacement is None or computed.collisions is None:
+            return None
+    return accuracy
+
+
+def _weights(values: Float[Array, "times"], error: Float[Array, "times"]) -> Float[Array, "times"]:
+    """Inverse relative errors; 0 where the error is 0: a value that was set, not measured."""
+    known = (values > 0) & (error > 0)
+    return jnp.where(known, values / jnp.where(known, error, 1.0), 0.0)
+
+
+def _log_ratio(
+    measured: Float[Array, "times"], computed: Float[Array, "times"]
+) -> Float[Array, "times"]:
+    # Not `computed > 0`: a curve that could not be computed, nan, must not count as a perfect fit.
+    positive = (measured > 0) & ~(computed <= 0)
+    safe = jnp.where(positive, measured, 1.0), jnp.where(positive, computed, 1.0)
+    return jnp.log(safe[0]) - jnp.log(safe[1])

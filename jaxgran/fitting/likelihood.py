@@ -1,0 +1,76 @@
+"""The likelihood of a measured curve, for samplers."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran.checks.validation import POSITIVE, no_type_check
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.comparison import Comparison
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.checks import checked_gas, checked_model
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.scene.gas import Gas
+
+
+@no_type_check
+def log_likelihood(
+    gas: Gas,
+    curve: CoolingCurve,
+    *,
+    model: AbstractModel | None = None,
+    clock: ArrayLike = 1.0,
+    num_particles: int | None = None,
+) -> Float[Array, ""]:
+    """Logarithm of the likelihood of a measured curve, but for a constant.
+
+    ``-chi^2/2`` of the residuals that `jaxgran.fit` minimises, with a common factor of all <dr^2>
+    integrated out. Where T has no errors, ``-(n/2) ln sum (ln T_measured - ln T_model)^2``: their
+    common relative size is integrated out with the prior 1/size.
+
+    A pure function, for `jax.jit`, `jax.vmap` and `jax.grad`; `experiments/sample_posterior.py`
+    samples it. Priors are the caller's to add.
+
+    Args:
+        gas: the scene, of one or of traced numbers.
+        curve: the measurement.
+        model: a deterministic model, by default `jaxgran.KineticTheory()`.
+        clock: factor by which the times of the model are multiplied, > 0, or one for each time.
+            With the prior 1 +- ``fit(...).clock_error`` it stands for the error of the model, which
+            is no part of the likelihood.
+        num_particles: number of particles over which <dr^2> is a mean; see `jaxgran.fit`.
+
+    Returns:
+        The logarithm; -inf where the model cannot compute the curve.
+
+    Raises:
+        ValueError: for a curve that cannot be one, a scene that the model cannot take, or a
+            stochastic model, of which each call has other noise.
+    """
+    checked_gas(gas)
+    if not isinstance(curve, CoolingCurve):
+        raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
+    curve.check()
+    POSITIVE.check("clock", clock, "1 leaves the model's times as they are.")
+    model = KineticTheory() if model is None else model
+    checked_model(model)
+    if model.stochastic:
+        raise ValueError(
+            f"{type(model).__name__} is stochastic: its likelihood would have other noise at each "
+            "call; use a deterministic model"
+        )
+    model.check(gas)
+    comparison = Comparison.of(gas, curve, model, (), num_particles)
+    flat = jnp.zeros(comparison.num_beside, gas.temperature.dtype)
+    times_factor = jnp.broadcast_to(jnp.asarray(clock), curve.times.shape)
+    residuals, slope = jax.jvp(
+        lambda x: comparison.evaluate(x, times_factor)[0], (flat,), (jnp.ones_like(flat),)
+    )
+    # Linear in the factor of <dr^2>, whose best value is subtracted.
+    square = jnp.sum(slope**2)
+    known = jnp.sum(residuals**2) - jnp.sum(slope * residuals) ** 2 / jnp.where(square, square, 1)
+    if curve.temperature_error is None:
+        value = -0.5 * curve.times.size * jnp.log(known)
+    else:
+        value = -0.5 * known
+    return jnp.where(jnp.isnan(value), -jnp.inf, value)

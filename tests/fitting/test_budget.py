@@ -1,0 +1,166 @@
+"""The whole error of an estimate, part by part."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from tests.conftest import glass_beads
+from tests.fitting.curves import measured, synthetic
+
+A = ("dissipative_constant",)
+BOTH = ("dissipative_constant", "temperature")
+
+
+def relative(result, part):
+    return float(result.error_budget[part][0] / result.estimate[0])
+
+
+def test_the_parts_add_up():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(0))
+    result = jaxgran.fit(gas, curve, free=BOTH, num_particles=500)
+    squares = sum(part**2 for part in result.error_budget.values())
+    np.testing.assert_allclose(result.standard_error**2, squares, rtol=1e-12)
+    assert set(result.error_budget) == {"measurement", "model", "few particles"}
+    # A wrong clock is a wrong A, by a little more, since the rate grows less than A.
+    assert 0.015 < relative(result, "model") < 0.02
+
+
+PHI, DIAMETER, DENSITY, Y = -1.27, 2.13, 0.40, -0.40
+"""d ln A / d ln of each, at fixed others (the density of the material fixed, not the mass): known
+from refits of the dilute curve at other values."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "names, part, slope",
+    [
+        (("packing_fraction",), "packing_fraction", PHI),
+        (("diameter", "density"), "diameter", DIAMETER),
+        (("density",), "density", DENSITY),
+        (("youngs_modulus",), "youngs_modulus", Y),
+    ],
+)
+def test_inputs_are_propagated(names, part, slope):
+    gas, curve, a_true, n, replicas = measured("dilute")
+    values = {name: float(gas.density if name == "density" else gas.value(name)) for name in names}
+    # What is not asked for is known ten thousand times better.
+    errors = {name: 0.04 if name == part else 1e-5 for name in names}
+    priors = {name: (values[name], errors[name] * values[name]) for name in names}
+    result = jaxgran.fit(gas, curve, free=A, priors=priors)
+    assert relative(result, part) == pytest.approx(0.04 * abs(slope), rel=0.05)
+    alone = jaxgran.fit(gas, curve, free=A)
+    # The input is not known better than before: A stays where it was.
+    assert abs(result.estimate[0] / alone.estimate[0] - 1) < 0.2 * relative(result, part)
+    low, high = jaxgran.diagnose(result, curve).ranges["dissipative_constant"]
+    assert low < a_true < high
+
+
+def test_a_prior_and_a_curve_share_what_they_know():
+    """Of T_0 both tell something: the estimate is the mean by inverse variances."""
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(1), relative_error=0.05)
+    alone = jaxgran.fit(gas, curve, free=BOTH)
+    T_0 = float(gas.temperature)
+    given, error = 1.05 * T_0, 0.02 * T_0
+    result = jaxgran.fit(gas, curve, free=BOTH, priors={"temperature": (given, error)})
+    curve_alone = float(np.log(alone.estimate[1] / T_0))
+    variance = float(alone.error_budget["measurement"][1] / alone.estimate[1]) ** 2
+    prior = np.log(1.05), (0.02 / 1.05) ** 2
+    expected = (curve_alone / variance + prior[0] / prior[1]) / (1 / variance + 1 / prior[1])
+    # The clock, which is fitted too where there are priors, and neighbours' chance correlation
+    # change the weights by some per cent.
+    assert float(np.log(result.estimate[1] / T_0)) == pytest.approx(
+        expected, abs=0.15 * variance**0.5
+    )
+    assert result.standard_error[1] < 0.95 * min(error, float(alone.standard_error[1]))
+
+
+@pytest.mark.slow
+def test_the_clock_is_that_of_the_scene():
+    """A box of 297 diameters at phi = .2: the flow that grows there is no heat."""
+    gas = glass_beads(0.18).replace(packing_fraction=0.2)
+    n = round(297**3 * float(gas.number_density * gas.diameter**3))
+    times = jnp.geomspace(0.3, 300.0, 40) * gas.mean_free_time
+    exact = jaxgran.cool(gas, times).temperature
+    curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
+    unknown, known = (jaxgran.fit(gas, curve, num_particles=x) for x in (None, n))
+    choice = jaxgran.choose_model(gas, times, num_particles=n, models=[jaxgran.KineticTheory()])
+    assert relative(unknown, "model") < 0.04 < 0.09 < relative(known, "model") < 0.13
+    # T errs by more than the clock: by |d ln T / d ln t|, at most 5/3 (the grids of times differ).
+    ratio = choice.error / float(jnp.max(known.clock_error))
+    assert 1.3 < ratio < 1.8, (choice.error, known.clock_error)
+
+
+def test_without_errors_the_residuals_have_their_scatter():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(5), relative_error=0.03)
+    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature)
+    result = jaxgran.fit(gas, bare)
+    assert result.names == BOTH and float(result.reduced_chi2) == pytest.approx(1)
+    assert float(jnp.std(result.residuals)) == pytest.approx(1, abs=0.1)
+    assert float(result.scatter) == pytest.approx(0.03, rel=0.25)
+
+
+@pytest.mark.slow
+def test_a_prior_counts_in_a_curve_without_errors():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(6), relative_error=0.05)
+    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature)
+    T_0 = float(gas.temperature)
+    loose, tight = (
+        jaxgran.fit(gas, bare, priors={"temperature": (1.3 * T_0, e * T_0)}) for e in (10.0, 1e-4)
+    )
+    assert abs(loose.estimate[1] / T_0 - 1) < 0.1
+    assert tight.estimate[1] == pytest.approx(1.3 * T_0, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "priors, message",
+    [
+        ([("packing_fraction", 0.05, 0.01)], "priors must be a dictionary of names"),
+        ({"phi": (0.05, 0.01)}, "priors: no float 'phi' in this gas; it has .*, and density"),
+        ({"packing_fraction": 0.05}, r"priors: packing_fraction needs \(value, standard error\)"),
+        ({"packing_fraction": (0.05, -0.01)}, "standard error of packing_fraction must lie in"),
+        ({"packing_fraction": (0.05, 0.0)}, "Leave out what is known exactly"),
+        ({"packing_fraction": (1.5, 0.1)}, "priors: packing_fraction must lie in"),
+        ({"dissipative_constant": (0.0, 1e-7)}, "lies on the end of its range"),
+    ],
+)
+def test_bad_priors_are_refused(priors, message):
+    gas = glass_beads(0.15)
+    with pytest.raises(ValueError, match=message):
+        jaxgran.fit(gas, synthetic(gas, jax.random.key(0)), priors=priors)
+
+
+def test_a_stochastic_model_takes_no_prior_of_a_free_parameter():
+    gas = glass_beads(0.15)
+    model = jaxgran.DSMC(100, replicas=2)
+    with pytest.raises(ValueError, match="leave temperature out of free"):
+        jaxgran.fit(
+            gas,
+            synthetic(gas, jax.random.key(0)),
+            model=model,
+            free=BOTH,
+            priors={"temperature": (0.01, 1e-4)},
+        )
+
+
+@pytest.mark.slow
+def test_the_budget_of_a_particle_fit(beads):
+    gas = beads(0.15)
+    times = jnp.geomspace(0.3, 30.0, 20) * gas.mean_free_time
+    exact = jaxgran.cool(gas, times).temperature
+    curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
+    phi = float(gas.packing_fraction)
+    priors = {"packing_fraction": (phi, 0.04 * phi)}
+    options = {"priors": priors, "num_particles": 1000}
+    model = jaxgran.DSMC(2000, replicas=3)
+    result = jaxgran.fit(gas, curve, model=model, progress=False, **options)
+    theory = jaxgran.fit(gas, curve, **options)
+    for part in ("packing_fraction", "few particles"):
+        assert relative(result, part) == pytest.approx(relative(theory, part), rel=0.15)
+    assert set(result.error_budget) >= {"simulation", "model"}
+    assert relative(result, "model") > 0.005  # DSMC has Enskog's rate too
