@@ -295,6 +295,7 @@ def test_small_energy_errors_add_up():
         assert run(begun)[1] == fault
 
 
+@pytest.mark.slow
 def test_the_clock_of_single_precision_keeps_time():
     step, count = 0.004, 300_000
     state = soft_spheres()[1]

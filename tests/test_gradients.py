@@ -69,6 +69,7 @@ def expected_to_matter(values):
     return jnp.array([soft or n != "mass" for n in names])
 
 
+@pytest.mark.slow
 def test_derivative_in_time_is_the_rate():
     gas = gases(3)["viscoelastic"]
     times = TAUS * gas.mean_free_time
@@ -112,6 +113,7 @@ def test_second_derivative():
     np.testing.assert_allclose(hessian, difference, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_elastic_limit():
     # A = 0 is a legal gas, and its derivative exists: d ln T/dA is finite and negative.
     gas = gases(3)["viscoelastic"]

@@ -33,6 +33,7 @@ class Comparison:
         priors: of floats of the gas.
         weights: of ln T and, if it is used, of ln <dr^2>; the inverse relative errors.
         displacement_accuracy: relative accuracy of the model's <dr^2>; None if it is not used.
+        clock_of_few: factor by which the measured gas cools faster because its N are few.
         scatter: relative error of T where the curve has none; else None.
     """
 
@@ -43,6 +44,7 @@ class Comparison:
     priors: Priors
     weights: list[Array]
     displacement_accuracy: Float[Array, ""] | None
+    clock_of_few: Float[Array, ""] | float
     scatter: Float[Array, ""] | None = None
 
     @classmethod
@@ -52,7 +54,8 @@ class Comparison:
         curve: CoolingCurve,
         model: AbstractModel,
         names: tuple[str, ...],
-        num_particles: int | None,
+        num_particles: Float[Array, ""] | None,
+        replicas: Float[Array, ""] | float = 1.0,
         priors: Priors = NO_PRIORS,
     ) -> "Comparison":
         """Compare T and, where its errors are known on both sides, <dr^2>."""
@@ -61,13 +64,15 @@ class Comparison:
         accuracy = _displacement_accuracy(gas, curve, model, num_particles)
         if accuracy is not None:
             assert curve.displacement is not None
-            sampling = (2 / (gas.dimension * (num_particles or 1))) ** 0.5 * curve.displacement
+            total = (1 if num_particles is None else num_particles) * replicas
+            sampling = (2 / (gas.dimension * total)) ** 0.5 * curve.displacement
             error = sampling if curve.displacement_error is None else curve.displacement_error
             error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
             weights.append(_weights(curve.displacement, error))
         parameters = Parameters(gas, (*names, *priors.also_free(names)))
         num_free = sum(gas.value(name).size for name in names)
-        return cls(curve, model, parameters, num_free, priors, weights, accuracy)
+        faster = 1.0 if num_particles is None else _clock_of_few(gas, num_particles)
+        return cls(curve, model, parameters, num_free, priors, weights, accuracy, faster)
 
     def scaled(self, flat: Float[Array, "q"]) -> "Comparison":
         """The same with the scatter of ln T at some parameters for its error."""
@@ -96,11 +101,12 @@ class Comparison:
     def clock(self, flat: Float[Array, "q"]) -> tuple[Float[Array, "times"], Float[Array, "_"]]:
         """Factors of the model's clock, and the residuals of their priors."""
         if not self.priors.names:
-            return jnp.ones_like(self.curve.times), flat[:0]
+            return jnp.full_like(self.curve.times, self.clock_of_few), flat[:0]
         mean, trend = errors = flat[self.of_gas(flat).size :][:2]
         log_T = jnp.log(self.curve.temperature)
         along = 2 * (log_T - log_T[0]) / (log_T[-1] - log_T[0]) - 1
-        return jnp.exp(self.model.derivative_accuracy * (mean + trend * along)), errors
+        own = jnp.exp(self.model.derivative_accuracy * (mean + trend * along))
+        return self.clock_of_few * own, errors
 
     def estimates(self, flat: Float[Array, "q"]) -> Float[Array, "p"]:
         """SI values of the free parameters."""
@@ -156,8 +162,25 @@ class Comparison:
         return flats[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
 
 
+def _clock_of_few(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:
+    """Factor by which N particles without a total momentum cool faster than many, at the same T.
+
+    Their relative velocities are those of the temperature ``T' = T N/(N-1)``, and each meets N - 1
+    others: of ``-d ln T/dt = r(T)`` remains r(T')/r(T), here with the loss ``1 - eps^2`` at the
+    impact speed sqrt(2 T): 1 + .6/N for viscoelastic spheres, 1 + .5/N for a constant eps.
+    """
+    hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
+    one = jnp.ones_like(gas.temperature)
+    loss = 1 - gas.reduced_law.restitution(one) ** 2
+    ratio = (1 - gas.reduced_law.restitution(hotter * one) ** 2) / jnp.where(loss > 0, loss, 1.0)
+    return hotter * jnp.where(loss > 0, ratio, 1.0)
+
+
 def _displacement_accuracy(
-    gas: Gas, curve: CoolingCurve, model: AbstractModel, num_particles: int | None
+    gas: Gas,
+    curve: CoolingCurve,
+    model: AbstractModel,
+    num_particles: Float[Array, ""] | None,
 ) -> Float[Array, ""] | None:
     """Relative accuracy of the model's <dr^2>; None if the fit cannot use <dr^2>.
 

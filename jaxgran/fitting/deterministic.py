@@ -25,16 +25,17 @@ def fit_deterministic(
     model: AbstractModel,
     names: tuple[str, ...],
     guesses: list[Gas],
-    num_particles: int | None = None,
+    num_particles: Float[Array, ""] | None = None,
+    replicas: Float[Array, ""] | float = 1.0,
     method: str = "levenberg-marquardt",
     max_steps: int = 100,
     priors: Priors = NO_PRIORS,
 ) -> Fit:
     """Fit through a deterministic model, from the best of some guesses.
 
-    Args, returns: as `jaxgran.fit`, but `num_particles` is that of all measured runs.
+    Args, returns: as `jaxgran.fit`.
     """
-    comparison = Comparison.of(gas, curve, model, names, num_particles, priors)
+    comparison = Comparison.of(gas, curve, model, names, num_particles, replicas, priors)
     first = comparison.best(guesses)
     search = SEARCHES[method]
     flat, iterations, converged = search(comparison.residuals, first, max_steps)
@@ -55,7 +56,8 @@ def _fit_at(
     converged: Bool[Array, ""],
 ) -> Fit:
     """The fit whose search began at one and ended at another point."""
-    jacobian, (residuals, computed) = jax.jacfwd(comparison.evaluate, has_aux=True)(flat)
+    derivatives = jax.jacfwd(comparison.evaluate, argnums=(0, 1), has_aux=True)
+    (jacobian, clock_slope), (residuals, computed) = derivatives(flat, jnp.ones(()))
     parts = comparison.split(residuals)
     gain = _gain(comparison, flat, jacobian)
     gains = comparison.split(gain)
@@ -68,7 +70,7 @@ def _fit_at(
         tested.append((factor, jnp.sum(comparison.weights[1] > 0)))
     known = comparison.curve.temperature_error is not None
     chance = misfit(tested, degrees_of_freedom, errors_known=known)
-    clock_gain = _clock_gain(comparison, flat, gains)
+    clock_gain = _clock_gain(comparison.split(clock_slope), gains)
     accuracy = comparison.model.derivative_accuracy
     clock_error = jnp.full(comparison.curve.times.shape, accuracy, flat.dtype)
     moved = clock_gain @ clock_error
@@ -102,22 +104,24 @@ def _fit_at(
 def _gain(
     comparison: Comparison, flat: Float[Array, "q"], jacobian: Float[Array, "residuals q"]
 ) -> Float[Array, "p residuals"]:
-    """Change of each estimate, SI, for a change of the residuals by 1."""
+    """Change of each estimate, SI, for a change of the residuals at fixed parameters by 1."""
     left, singular, rotation = jnp.linalg.svd(jacobian, full_matrices=False)
     spread = rotation.T / jnp.maximum(singular, jnp.finfo(flat.dtype).tiny ** 0.5)[None]
-    return jax.jacfwd(comparison.estimates)(flat) @ spread @ left.T
+    return -jax.jacfwd(comparison.estimates)(flat) @ spread @ left.T
 
 
 def _clock_gain(
-    comparison: Comparison, flat: Float[Array, "q"], gains: dict[str, Float[Array, "p part"]]
+    slope: dict[str, Float[Array, "part"]], gains: dict[str, Float[Array, "p part"]]
 ) -> Float[Array, "p times"]:
-    """Change of each estimate, SI, over a relative change of the model's clock at each time."""
-    clock = jnp.ones_like(comparison.curve.times)
-    slope = jax.jvp(lambda x: comparison.evaluate(flat, x)[0], (clock,), (clock,))[1]
-    parts = comparison.split(slope)
-    moved = gains["measurement"] * parts["measurement"][None]
-    if "displacement" in parts:
-        moved = moved + gains["displacement"] * parts["displacement"][None]
+    """Change of each estimate, SI, over a relative change of the model's clock at each time.
+
+    Args:
+        slope: derivatives of the residuals in a factor of all times.
+        gains: changes of the estimates over those of the residuals.
+    """
+    moved = gains["measurement"] * slope["measurement"][None]
+    if "displacement" in slope:
+        moved = moved + gains["displacement"] * slope["displacement"][None]
     return moved
 
 

@@ -76,10 +76,12 @@ def fit(
             errors of a stochastic model are propagated with kinetic theory's derivatives.
         start: a gas whose values are a further guess. A deterministic model begins at this or at
             that from the data, whichever fits better; a stochastic model begins at this.
-        num_particles: N of the measured gas, if known: gives the error by its few particles and by
-            a flow that grows in its box, and the relative error of <dr^2>, ``sqrt(2 / (d N))`` over
-            the root of `replicas`, where the curve has none. Without either <dr^2> is not used, nor
-            is it where T has no errors, as their weights could not be compared.
+        num_particles: N of the measured gas, if known. It gives the error by the chance of single
+            collisions and by a flow that grows in the box, and corrects a deterministic model for
+            the faster cooling of few particles (give a particle model as many as were measured).
+            Where <dr^2> has no error, its relative one is ``sqrt(2 / (d N))`` over the root of
+            `replicas`; without either it is not used, nor is it where T has no errors, as their
+            weights could not be compared.
         replicas: number of measured runs over which the curve is a mean.
         method: Levenberg-Marquardt, or L-BFGS by reverse mode (deterministic models only).
         max_steps: >= 1; most steps of Levenberg-Marquardt or evaluations of L-BFGS, 100 by default;
@@ -115,9 +117,10 @@ def fit(
         guesses = [guess_from_data(gas, curve, names)] + ([] if start is None else [start])
         model.check(guesses[-1])
         steps = 100 if max_steps is None else max_steps
-        total = None if num_particles is None else num_particles * replicas
-        search = method, steps, known
-        result = fit_deterministic(gas, curve, model, names, guesses, total, *search)
+        # As arrays: other numbers share the compiled program.
+        N = None if num_particles is None else jnp.asarray(float(num_particles))
+        search = N, jnp.asarray(float(replicas)), method, steps, known
+        result = fit_deterministic(gas, curve, model, names, guesses, *search)
     if not any_traced(result.chi2, curve, gas):
         _check_computed(result)
         _warn(result)
@@ -126,16 +129,17 @@ def fit(
     return result
 
 
+@no_type_check
 def free_by_default(gas: Gas, curve: CoolingCurve) -> tuple[str, ...]:
     """A or a constant restitution and, where the first T has an error that nobody knows, T_0."""
-    checked_gas(gas)
+    _check_curve(gas, curve)
     known = [name for name in ("dissipative_constant", "coefficient") if name in gas.domains]
     if not known:
         raise ValueError(
             f"the law {type(gas.law).__name__} has neither A nor a constant coefficient: say what "
             f"is free, of {', '.join(gas.domains)}"
         )
-    bare = isinstance(curve, CoolingCurve) and curve.temperature_error is None
+    bare = curve.temperature_error is None
     return (known[0], "temperature") if bare else (known[0],)
 
 
@@ -148,11 +152,7 @@ def _check_request(
     num_particles: int | None,
     replicas: int,
 ) -> None:
-    checked_gas(gas)
-    if not isinstance(curve, CoolingCurve):
-        raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
-    curve.check()
-    _check_magnitudes(curve)
+    _check_curve(gas, curve)
     if isinstance(free, str) or not free or len(set(free)) < len(free):
         raise ValueError(f"free must be a tuple of different names, got {free!r}")
     for name in free:
@@ -169,6 +169,15 @@ def _check_request(
             f"{points} points (those with an error of 0 not counted) cannot determine {size} "
             "parameters; free fewer of them"
         )
+
+
+@no_type_check
+def _check_curve(gas: Gas, curve: CoolingCurve) -> None:
+    checked_gas(gas)
+    if not isinstance(curve, CoolingCurve):
+        raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
+    curve.check()
+    _check_magnitudes(curve)
 
 
 def _check_magnitudes(curve: CoolingCurve) -> None:

@@ -21,6 +21,7 @@ def log_likelihood(
     model: AbstractModel | None = None,
     clock: ArrayLike = 1.0,
     num_particles: int | None = None,
+    replicas: int = 1,
 ) -> Float[Array, ""]:
     """Logarithm of the likelihood of a measured curve, but for a constant.
 
@@ -38,7 +39,7 @@ def log_likelihood(
         clock: factor by which the times of the model are multiplied, > 0, or one for each time.
             With the prior 1 +- ``fit(...).clock_error`` it stands for the error of the model, which
             is no part of the likelihood.
-        num_particles: number of particles over which <dr^2> is a mean; see `jaxgran.fit`.
+        num_particles, replicas: of the measurement, as in `jaxgran.fit`.
 
     Returns:
         The logarithm; -inf where the model cannot compute the curve.
@@ -60,7 +61,8 @@ def log_likelihood(
             "call; use a deterministic model"
         )
     model.check(gas)
-    comparison = Comparison.of(gas, curve, model, (), num_particles)
+    N = None if num_particles is None else jnp.asarray(float(num_particles))
+    comparison = Comparison.of(gas, curve, model, (), N, float(replicas))
     flat = jnp.zeros(comparison.num_beside, gas.temperature.dtype)
     times_factor = jnp.broadcast_to(jnp.asarray(clock), curve.times.shape)
     residuals, slope = jax.jvp(

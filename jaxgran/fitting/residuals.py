@@ -1,7 +1,8 @@
 """Statistics of the residuals of a fit."""
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Num
+from jaxtyping import Array, Bool, Float, Int, Num
 
 FEWEST = 4
 """Residuals below which no correlation is estimated."""
@@ -13,6 +14,7 @@ STRONGEST = 0.95
 """Largest correlation that is taken over from an estimate."""
 
 
+@jax.jit
 def neighbour_correlation(
     residuals: Num[Array, "n"], used: Bool[Array, "n"] | None = None
 ) -> Float[Array, ""]:
@@ -42,7 +44,10 @@ def correlation_factor(correlation: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.sqrt((1 + positive) / (1 - positive))
 
 
-def chi2_scale(residuals: Num[Array, "n"], num_parameters: int) -> Float[Array, ""]:
+@jax.jit
+def chi2_scale(
+    residuals: Num[Array, "n"], num_parameters: Int[Array, ""] | int
+) -> Float[Array, ""]:
     """Scale of differences of chi^2: 1 for independent errors of the given size.
 
     Args:

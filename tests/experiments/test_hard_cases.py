@@ -23,6 +23,7 @@ LONG = (
     "phi from",
     "T/T_0",
     "times:",
+    "N = 2",
     "near-simultaneous",
     "step 5",
     "stiff and",

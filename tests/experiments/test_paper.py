@@ -76,6 +76,7 @@ def exponents_follow_gamma(found):
     assert -2 < found["ice"]["exponent"] < -1.2 < found["ice"]["last_exponent_of_theory"] < 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, holds",
     [

@@ -58,6 +58,7 @@ def test_inputs_are_propagated(names, part, slope):
     assert low < a_true < high
 
 
+@pytest.mark.slow
 def test_a_prior_and_a_curve_share_what_they_know():
     """Of T_0 both tell something: the estimate is the mean by inverse variances."""
     gas = glass_beads(0.15)
@@ -94,6 +95,7 @@ def test_the_clock_is_that_of_the_scene():
     assert 1.3 < ratio < 1.8, (choice.error, known.clock_error)
 
 
+@pytest.mark.slow
 def test_without_errors_the_residuals_have_their_scatter():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(5), relative_error=0.03)

@@ -194,6 +194,7 @@ def test_bad_requests_are_refused(options, message):
         jaxgran.fit(gas, synthetic(gas, jax.random.key(0)), **options)
 
 
+@pytest.mark.slow
 def test_too_few_points_are_refused():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(0), num_points=3)
@@ -232,6 +233,7 @@ def test_dilute_measured_curve(free):
         assert low < a_true < high
 
 
+@pytest.mark.slow
 def test_wrong_error_bars_widen_the_error():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(11))

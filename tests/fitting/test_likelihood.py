@@ -10,6 +10,7 @@ from tests.conftest import glass_beads
 from tests.fitting.curves import synthetic
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("displacement", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_is_the_chi2_of_the_fit(displacement):
     gas = glass_beads(0.15)

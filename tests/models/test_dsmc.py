@@ -58,9 +58,10 @@ def compare_all_but_temperature(theory, curve, n, tolerance):
 
 
 SCENES = [(0.05, 3), (0.15, 3), (0.15, 2)]
+OFTEN = [SCENES[0], *(pytest.param(*scene, marks=pytest.mark.slow) for scene in SCENES[1:])]
 
 
-@pytest.mark.parametrize("beta, dimension", SCENES)
+@pytest.mark.parametrize("beta, dimension", OFTEN)
 def test_cools_and_spreads_as_kinetic_theory_says(beads, beta, dimension):
     n = 20_000
     theory, curve = theory_and_dsmc(beads(beta, dimension), n)
@@ -553,6 +554,7 @@ def test_refuses_a_law_that_heats():
         jaxgran.cool(gas, [1.0], model=DSMC(100))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_few_particles(n):
     gas = constant(0.9)

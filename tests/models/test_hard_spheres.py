@@ -105,6 +105,7 @@ def closest(particles) -> float:
     return float(np.min(np.linalg.norm(apart, axis=-1)[: int(pairs.count)]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "dimension, packing_fraction, eps",
     [pytest.param(2, 0.6, 0.7, marks=pytest.mark.slow), (3, 0.45, 1.0)],
@@ -227,6 +228,7 @@ def test_dilute_gas_is_that_of_dsmc(beads):
         assert np.all(np.abs(mean - other) < slack * np.abs(other) + 3.5 * error)
 
 
+@pytest.mark.slow
 def test_three_spheres_in_a_row_do_not_collapse():
     # eps below 7 - 4 sqrt(3) = 0.072: infinitely many impacts in a finite time (McNamara & Young,
     # Phys. Fluids A 4, 496 (1992)).
@@ -281,7 +283,7 @@ def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
 
 
-@pytest.mark.parametrize("by", ["sweep", "vesin"])
+@pytest.mark.parametrize("by", ["sweep", pytest.param("vesin", marks=pytest.mark.slow)])
 def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
     gas = hard_gas(0.8, 0.1)
     times = np.array([0.3, 1.0, 2.0]) * float(gas.mean_free_time)

@@ -240,6 +240,7 @@ def test_too_few_steps_are_an_error(beads):
         jaxgran.cool(beads(0.15), [100.0], model=model)
 
 
+@pytest.mark.slow
 def test_float32(beads):
     gas, times = beads(0.15), jnp.geomspace(0.1, 1e3, 20)
     exact = jaxgran.cool(gas, times)

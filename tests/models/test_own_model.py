@@ -49,6 +49,7 @@ def test_cool(dimension):
     np.testing.assert_allclose(curve.temperature / gas.temperature, expected, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_its_refusals_are_raised(beads):
     gas = beads(0.1)
     curve = jaxgran.cool(gas, times_of(gas))
@@ -124,6 +125,7 @@ def test_displacement_is_not_used_where_it_is_not_computed():
         np.testing.assert_allclose(result.estimate, 0.9, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_diagnosis_asks_the_model():
     gas = gas_of(0.6)
     curve = measured(gas, jax.random.key(2))

@@ -91,7 +91,9 @@ def test_pairs_are_those_of_brute_force(dimension, replicas, fraction, by):
 
 @jax_md_warns
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("replicas, fraction", [(1, 0.4999), (2, 0.15)])
+@pytest.mark.parametrize(
+    "replicas, fraction", [pytest.param(1, 0.4999, marks=pytest.mark.slow), (2, 0.15)]
+)
 def test_jax_md_finds_what_brute_force_finds(dimension, replicas, fraction):
     compare(dimension, replicas, 3.7, 3.7 * fraction, "jax-md")
 

@@ -20,6 +20,7 @@ def test_constants():
     assert abs(restitution_table.C2 - 0.798266560944795) < 1e-15
 
 
+@pytest.mark.slow
 def test_fast_law_matches_the_impact():
     # Documented: 1e-9 clipped and 1e-7 unclipped; the ODE adds 1e-11.
     small = jnp.concatenate([jnp.geomspace(1e-6, 1e-2, 20), jnp.linspace(0.01, 1.0, 60)])

@@ -155,6 +155,7 @@ def test_constant_restitution_has_the_slopes_of_haff(constant):
     np.testing.assert_array_equal(slopes[:, 2], 0.0)
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_and_jit_agree(constant):
     f, at, _, slopes = constant
     reverse = jax.grad(lambda x: jnp.sum(f(x)))(at)

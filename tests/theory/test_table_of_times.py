@@ -12,6 +12,7 @@ from tests.conftest import glass_beads
 SLOW = pytest.mark.slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beta, dimension", [(0.5, 3), pytest.param(0.05, 2, marks=SLOW)])
 def test_is_that_of_kinetic_theory(beta, dimension):
     gas = glass_beads(beta, dimension)

@@ -109,8 +109,8 @@ class Scheme(NamedTuple):
 
     @property
     def own_step(self) -> float:
-        """``dt sqrt(T/T_0)`` of a step."""
-        candidates = 2 * (self.first + self.second) / self.num_particles
+        """``dt sqrt(T/T_0)`` of a step, in which each particle meets the N - 1 others alike."""
+        candidates = 2 * (self.first + self.second) / (self.num_particles - 1)
         return candidates / (2 ** (self.dimension - 1) * CEILING)
 
 
