@@ -48,19 +48,8 @@ def log_likelihood(
         ValueError: for a curve that cannot be one, a scene that the model cannot take, or a
             stochastic model, of which each call has other noise.
     """
-    checked_gas(gas)
-    if not isinstance(curve, CoolingCurve):
-        raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
-    curve.check()
-    POSITIVE.check("clock", clock, "1 leaves the model's times as they are.")
     model = KineticTheory() if model is None else model
-    checked_model(model)
-    if model.stochastic:
-        raise ValueError(
-            f"{type(model).__name__} is stochastic: its likelihood would have other noise at each "
-            "call; use a deterministic model"
-        )
-    model.check(gas)
+    _check(gas, curve, model, clock)
     N = None if num_particles is None else jnp.asarray(float(num_particles))
     comparison = Comparison.of(gas, curve, model, (), N, float(replicas))
     flat = jnp.zeros(comparison.num_beside, gas.temperature.dtype)
@@ -76,3 +65,19 @@ def log_likelihood(
     else:
         value = -0.5 * known
     return jnp.where(jnp.isnan(value), -jnp.inf, value)
+
+
+@no_type_check
+def _check(gas: Gas, curve: CoolingCurve, model: AbstractModel, clock: ArrayLike) -> None:
+    checked_gas(gas)
+    if not isinstance(curve, CoolingCurve):
+        raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
+    curve.check()
+    POSITIVE.check("clock", clock, "1 leaves the model's times as they are.")
+    checked_model(model)
+    if model.stochastic:
+        raise ValueError(
+            f"{type(model).__name__} is stochastic: its likelihood would have other noise at each "
+            "call; use a deterministic model"
+        )
+    model.check(gas)
