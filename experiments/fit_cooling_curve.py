@@ -126,7 +126,7 @@ def run(options: argparse.Namespace) -> None:
     result, first_seconds, fit_seconds = timed_fit(options, gas, curve, model, asked)
     diagnosis = jaxgran.diagnose(result, curve, n)
     rows = rows_of(options, result, diagnosis, header)
-    print_scene(options, gas, curve, result)
+    print_scene(options, gas, curve, header, result)
     print_impacts(result.gas, float(curve.temperature[-1]), n)
     print_model(model_name, result, reasons)
     print_rows(rows)
@@ -259,10 +259,12 @@ def limits(diagnosis, name: str) -> list[float]:
     return [float(np.squeeze(x)) for x in diagnosis.ranges.get(name, (np.nan, np.nan))]
 
 
-def print_scene(options: argparse.Namespace, gas, curve, result) -> None:
+def print_scene(options: argparse.Namespace, gas, curve, header, result) -> None:
     T = np.asarray(curve.temperature)
     print(f"curve    {options.curve.name}: {T.size} points, t = 0 .. {curve.times[-1]:.3g} s,")
     print(f"         T falls to {T[-1] / T[0]:.3g} of its first value")
+    if "T_from" in header:
+        print(f"         {header['T_from']}")
     print(
         f"gas      phi = {float(gas.packing_fraction):.3g}, tau_c = "
         f"{float(gas.mean_free_time):.3g} s, t_c/tau_c = {float(gas.contact_fraction):.2g}, "

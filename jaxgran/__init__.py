@@ -4,9 +4,11 @@ from jaxgran.checks.status import explain as explain_status
 from jaxgran.cooling import cool
 from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.data.curve_file import read_curve, read_gas, read_priors, write_curve
+from jaxgran.data.drop_test import DropTest, read_drop_test
 from jaxgran.data.run import Run
 from jaxgran.fitting.diagnosis import Diagnosis, diagnose
 from jaxgran.fitting.fit import fit
+from jaxgran.fitting.joint import JointFit, fit_jointly
 from jaxgran.fitting.likelihood import log_likelihood
 from jaxgran.fitting.result import Fit
 from jaxgran.models.base import AbstractModel, Omission
@@ -36,10 +38,12 @@ __all__ = [
     "CoolingCurve",
     "Course",
     "Diagnosis",
+    "DropTest",
     "Fit",
     "Gas",
     "HardSpheres",
     "Impact",
+    "JointFit",
     "KineticTheory",
     "Omission",
     "Particles",
@@ -56,9 +60,11 @@ __all__ = [
     "elastic_constant",
     "explain_status",
     "fit",
+    "fit_jointly",
     "impact",
     "log_likelihood",
     "read_curve",
+    "read_drop_test",
     "read_gas",
     "read_priors",
     "sphere_mass",

@@ -1,12 +1,14 @@
 """Files of measured cooling curves: CSV with a header that describes the gas."""
 
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.data.curve import COLUMNS, MIN_POINTS, CoolingCurve
 from jaxgran.data.files import write_whole
+from jaxgran.data.quantities import STAND_INS, in_si, warn_of_units
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.restitution import Viscoelastic
@@ -44,10 +46,14 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
 
     Args:
         path: the file. Its columns are t (s) and T (m^2/s^2) and, where measured, T_err (m^2/s^2),
-            msd and msd_err (m^2), in any order.
+            msd and msd_err (m^2), in any order. In place of T there may be mean_speed, vx2, v2_xy
+            or energy (see `jaxgran.data.quantities.STAND_INS`), with errors under the same name and
+            _err. Header keys length_unit (m, cm, mm, um) and time_unit (s, ms, us, min) are those
+            of the columns and of diameter, T0 and A; density and Y stay in SI.
 
     Returns:
-        The curve, and the header as a dictionary of strings.
+        The curve, and the header as a dictionary of strings, in SI; its entry T_from says how T was
+        computed, where it was.
 
     Raises:
         ValueError: saying what is wrong, in which line, and what to do.
@@ -73,8 +79,12 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
             f"{path}: {len(rows)} rows of numbers, at least {MIN_POINTS} are needed; "
             "measure the cooling at more times"
         )
-    columns = jnp.asarray(np.array(rows, dtype=float).T)
-    fields = {COLUMNS[name]: column for name, column in zip(names, columns, strict=True)}
+    columns = dict(zip(names, np.array(rows, dtype=float).T, strict=True))
+    try:
+        columns, header = in_si(columns, header)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    fields: dict[str, Any] = {COLUMNS[name]: jnp.asarray(x) for name, x in columns.items()}
     curve = CoolingCurve(**fields)
     curve.check(lambda i: f"{path}, line {lines[i]}")
     return curve, header
@@ -113,14 +123,22 @@ def _read_text(path: Path) -> str:
 def _column_names(path: Path, i: int, line: str) -> list[str]:
     """Names of the columns from line i; ValueError if one is unknown, missing or repeated."""
     names = [name.strip() for name in line.split(",")]
-    unknown = [name for name in names if name not in COLUMNS]
-    missing = [name for name in ("t", "T") if name not in names]
+    stand_ins = [name for name in ("T", *STAND_INS) if name in names]
+    known = {*COLUMNS, *(f"{name}{end}" for name in STAND_INS for end in ("", "_err"))}
+    unknown = [name for name in names if name not in known]
+    unknown += [f"{name}_err" for name in STAND_INS if f"{name}_err" in names and name not in names]
+    missing = ([] if "t" in names else ["t"]) + ([] if stand_ins else ["T"])
+    if len(stand_ins) > 1:
+        raise ValueError(
+            f"{path}, line {i}: {' and '.join(stand_ins)} each give the temperature; keep one"
+        )
     if unknown or missing or len(set(names)) < len(names):
         raise ValueError(
             f"{path}, line {i}: the columns are {', '.join(names)}; "
             + (f"missing: {', '.join(missing)}; " if missing else "")
             + (f"not known: {', '.join(unknown)}; " if unknown else "")
-            + f"name them t,T and, where measured, {', '.join(list(COLUMNS)[2:])}, each once"
+            + f"name them t,T and, where measured, {', '.join(list(COLUMNS)[2:])}, each once; in "
+            f"place of T there may be {', '.join(STAND_INS)}"
         )
     return names
 
@@ -148,7 +166,7 @@ def read_gas(header: dict[str, str]) -> Gas:
             (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension, as `read_curve` returns them.
 
     Returns:
-        A gas of viscoelastic spheres.
+        A gas of viscoelastic spheres. Values that no granular gas has are warned of.
 
     Raises:
         ValueError: for a missing key, or a value that is no number or outside its range.
@@ -161,7 +179,7 @@ def read_gas(header: dict[str, str]) -> Gas:
         )
     values = {key: header_number(header, key) for key in GAS_KEYS}
     law = Viscoelastic(values["Y"], values["nu"], 0.0)
-    return Gas(
+    gas = Gas(
         law,
         diameter=values["diameter"],
         mass=sphere_mass(values["diameter"], values["density"]),
@@ -169,6 +187,8 @@ def read_gas(header: dict[str, str]) -> Gas:
         temperature=values["T0"],
         dimension=header_count(header, "dimension") or 3,
     )
+    warn_of_units(gas)
+    return gas
 
 
 def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:

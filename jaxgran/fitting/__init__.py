@@ -1,12 +1,15 @@
 """Fits of the parameters of a gas to a measured cooling curve.
 
 - `fit`: the public function: checks of its arguments, warnings.
-- `deterministic`: a fit through a model without noise, and its residuals; uses `least_squares`, the
-  minimisers (Levenberg-Marquardt, L-BFGS).
+- `deterministic`: a fit through a model without noise; uses `comparison`, the weighted residuals,
+  and `least_squares`, the minimisers (Levenberg-Marquardt, L-BFGS).
 - `stochastic`: a fit through a model with noise; uses `gauss_newton`, the search through
   repeated simulations.
 - `guess`: initial guesses from the measured curve.
 - `parameters`: the free parameters as one array in a scale without bounds.
+- `priors`: what is known of a gas besides the curve.
+- `budget`: errors that follow from the fitted gas: of the model's clock there, of few particles.
+- `likelihood`: `log_likelihood`, the same residuals for samplers.
 - `result`: `Fit`, what a fit returns, and goodness of fit.
 - `rivals`: what else could have made the curve, and the range of the parameters then; uses
   `profile`, fits of the law and something besides, of a given amplitude.

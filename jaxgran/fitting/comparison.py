@@ -113,13 +113,13 @@ class Comparison:
         return self.parameters.estimates(self.of_gas(flat))[: self.num_free]
 
     def evaluate(
-        self, flat: Float[Array, "q"], clock: Float[Array, "times"] | float = 1.0
+        self, flat: Float[Array, "q"], clock: Float[Array, "..."] | float = 1.0
     ) -> tuple[Float[Array, "residuals"], tuple[Float[Array, "residuals"], CoolingCurve]]:
         """The weighted residuals, twice, and the computed curve, as `jax.jacfwd` takes them.
 
         Args:
             flat: the parameters.
-            clock: factors by which the times of the model are multiplied.
+            clock: factor by which the times of the model are multiplied, or one for each.
         """
         gas = self.parameters.gas(self.of_gas(flat))
         own_clock, errors_of_clock = self.clock(flat)
