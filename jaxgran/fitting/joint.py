@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
+from jaxgran.data.run import Run
 from jaxgran.fitting.comparison import Comparison
 from jaxgran.fitting.guess import guess_from_data
 from jaxgran.fitting.least_squares import least_squares
@@ -19,6 +20,7 @@ from jaxgran.fitting.result import SIGNIFICANCE
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.selection import course_along
 from jaxgran.scene.gas import Gas
 
 MOST_STEPS = 100
@@ -62,7 +64,7 @@ def fit_jointly(
     """Estimate what several measurements of one material have in common.
 
     Minimises the sum of all chi^2. Every curve has a clock of its own, known within the model's
-    accuracy, and its own `separate` parameters; the errors hold both.
+    accuracy in its scene, and its own `separate` parameters; the errors hold both.
 
     Args:
         measurements: by a label of each, the gas (its diameter, packing fraction, ...) and its
@@ -82,7 +84,8 @@ def fit_jointly(
     _check(measurements, shared, separate, model)
     labels, pairs = tuple(measurements), tuple(measurements.values())
     names = tuple(shared), tuple(separate)
-    found = _search(pairs, *names, model)
+    clocks = [_clock_error(gas, data, sum(names, ()), model) for gas, data in pairs]
+    found = _search(pairs, *names, model, clocks)
     if not all(np.all(np.isfinite(part)) for part in found[1]):
         raise RuntimeError("the model could not compute a curve where the joint search ended")
     return _result(labels, pairs, *names, *found)
@@ -123,12 +126,26 @@ def _check(measurements, shared, separate, model) -> None:
             )
 
 
+def _clock_error(
+    gas: Gas, data: CoolingCurve | DropTest, names: tuple[str, ...], model: AbstractModel
+) -> Float[Array, ""]:
+    """Relative error of the model's clock in the scene of a curve; 0 for a drop test."""
+    if isinstance(data, DropTest):
+        return jnp.zeros(())
+    guess = guess_from_data(gas, data, names)
+    times = jnp.concatenate([jnp.zeros(int(data.times[0] > 0)), data.times])
+    course = course_along(guess, model.simulate(guess, times, Run()))
+    found = np.max(course.clock_error(model.rate_error(course)))
+    return jnp.asarray(max(float(found), model.derivative_accuracy))
+
+
 @eqx.filter_jit
 def _search(
     pairs: tuple[tuple[Gas, CoolingCurve | DropTest], ...],
     shared: tuple[str, ...],
     separate: tuple[str, ...],
     model: AbstractModel,
+    clocks: list[Float[Array, ""]],
 ) -> tuple[Array, list[Array], list[Array], Bool[Array, ""]]:
     """The unknowns, and each measurement's residuals and their derivatives in all unknowns."""
     first, parts = _unknowns(pairs, shared, separate)
@@ -136,7 +153,7 @@ def _search(
 
     def residuals(unknowns: Array) -> list[Array]:
         common, begin, each = unknowns[:num_shared], num_shared, []
-        for (gas, data), (names, size) in zip(pairs, parts, strict=True):
+        for (gas, data), (names, size), unsure in zip(pairs, parts, clocks, strict=True):
             own = unknowns[begin : begin + size]
             begin += size
             if isinstance(data, DropTest):
@@ -145,7 +162,7 @@ def _search(
             T, error = data.temperature, data.temperature_error
             bare = CoolingCurve(times=data.times, temperature=T, temperature_error=error)
             comparison = Comparison.of(gas, bare, model, (*shared, *names), None)
-            clock = jnp.exp(model.derivative_accuracy * own[-1])
+            clock = jnp.exp(unsure * own[-1])
             at = jnp.concatenate([common, own[:-1]])
             each.append(jnp.concatenate([comparison.evaluate(at, clock)[0], own[-1:]]))
         return each
