@@ -112,7 +112,9 @@ def parse() -> argparse.Namespace:
 def run(options: argparse.Namespace) -> None:
     curve, header = jaxgran.read_curve(options.curve)
     header |= settings(options.set)
-    gas, priors = jaxgran.read_gas(header), jaxgran.read_priors(header)
+    with warnings.catch_warnings(record=True) as doubts:  # of units
+        warnings.simplefilter("always", UserWarning)
+        gas, priors = jaxgran.read_gas(header), jaxgran.read_priors(header)
     options.free = options.free or names_of(free_by_default(gas, curve))
     gas = with_given_constant(gas, header, options.free)
     n = header_count(header, "N")
@@ -127,6 +129,8 @@ def run(options: argparse.Namespace) -> None:
     diagnosis = jaxgran.diagnose(result, curve, n)
     rows = rows_of(options, result, diagnosis, header)
     print_scene(options, gas, curve, header, result)
+    for doubt in doubts:
+        print(f"check    {doubt.message}")
     print_impacts(result.gas, float(curve.temperature[-1]), n)
     print_model(model_name, result, reasons)
     print_rows(rows)

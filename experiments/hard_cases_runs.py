@@ -211,7 +211,7 @@ def fits() -> list[Row]:
             truth = float(gas.value(FREE))
             curve = _measured(gas)
             best, _ = _fitted(gas, curve)
-            sigma = float(best.standard_error[0])
+            sigma = float(best.error_budget["measurement"][0])
             # In standard errors: three are exceeded once in 400 fits.
             off = abs(float(best.estimate[0]) - truth) / sigma
             rows.append(Row("fit, in standard errors", name, off, 3.0))
@@ -238,7 +238,7 @@ def fits() -> list[Row]:
                 temperature_error=curve.temperature_error / 5,  # pyright: ignore
             )
             result, _ = _fitted(gas, boast)
-            widened = float(result.standard_error[0]) / sigma
+            widened = float(result.error_budget["measurement"][0]) / sigma
             # The fit takes them from the scatter instead, which 40 points give to 11 %.
             noticed = not jaxgran.diagnose(result, boast).explains
             rows.append(
@@ -262,7 +262,7 @@ def _diagnosed(case, name, gas, curve, temperature, truth, words) -> Row:
     said = not diagnosis.explains and words in " ".join(diagnosis.reasons)
     off = 0.0
     if truth is not None:
-        off = abs(float(result.estimate[0]) - truth) / float(result.standard_error[0])
+        off = abs(float(result.estimate[0]) - truth) / float(result.error_budget["measurement"][0])
     return Row(case, name, off if said else np.inf, 3.0, status=diagnosis.verdict)
 
 

@@ -9,6 +9,7 @@
 - `parameters`: the free parameters as one array in a scale without bounds.
 - `priors`: what is known of a gas besides the curve.
 - `budget`: errors that follow from the fitted gas: of the model's clock there, of few particles.
+- `joint`: one fit of several curves and drop tests.
 - `likelihood`: `log_likelihood`, the same residuals for samplers.
 - `result`: `Fit`, what a fit returns, and goodness of fit.
 - `rivals`: what else could have made the curve, and the range of the parameters then; uses
