@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.data.curve import COLUMNS, MIN_POINTS, CoolingCurve
-from jaxgran.data.files import write_whole
+from jaxgran.data.files import number_row, read_text, write_whole
 from jaxgran.data.quantities import STAND_INS, in_si, warn_of_units
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
@@ -63,7 +63,7 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
     names: list[str] = []
     rows: list[list[float]] = []
     lines: list[int] = []
-    for i, line in enumerate(_read_text(path).splitlines(), start=1):
+    for i, line in enumerate(read_text(path, "t,T[,T_err][,msd][,msd_err]").splitlines(), start=1):
         line = line.strip()
         if line.startswith("#"):
             key, colon, value = line[1:].partition(":")
@@ -72,7 +72,7 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
         elif line and not names:
             names = _column_names(path, i, line)
         elif line:
-            rows.append(_row(path, i, line, names))
+            rows.append(number_row(path, i, line, names))
             lines.append(i)
     if len(rows) < MIN_POINTS:
         raise ValueError(
@@ -98,28 +98,6 @@ def _add_to_header(path: Path, i: int, header: dict[str, str], key: str, value: 
     header[key] = value
 
 
-def _read_text(path: Path) -> str:
-    """The text of a file; ValueError if it cannot be read, is empty or is no text."""
-    columns = "t,T[,T_err][,msd][,msd_err]"
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte-order mark
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path") from None
-    except (UnicodeDecodeError, IsADirectoryError):
-        raise ValueError(
-            f"{path}: not a text file; give a CSV file with the columns {columns}"
-        ) from None
-    except OSError as error:
-        raise ValueError(
-            f"{path}: cannot be read ({error.strerror}); check its permissions"
-        ) from None
-    if "\x00" in text:
-        raise ValueError(f"{path}: a binary file; give a CSV file with the columns {columns}")
-    if not text.strip():
-        raise ValueError(f"{path}: the file is empty; it needs the columns {columns}")
-    return text
-
-
 def _column_names(path: Path, i: int, line: str) -> list[str]:
     """Names of the columns from line i; ValueError if one is unknown, missing or repeated."""
     names = [name.strip() for name in line.split(",")]
@@ -141,21 +119,6 @@ def _column_names(path: Path, i: int, line: str) -> list[str]:
             f"place of T there may be {', '.join(STAND_INS)}"
         )
     return names
-
-
-def _row(path: Path, i: int, line: str, names: list[str]) -> list[float]:
-    """The numbers of line i; ValueError unless there is a finite one for each column."""
-    cells = line.split(",")
-    try:
-        values = [float(cell) for cell in cells]
-    except ValueError:
-        values = []
-    if len(values) != len(names) or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"{path}, line {i}: expected {len(names)} finite numbers ({','.join(names)}), "
-            f"got {line!r}; correct or remove this row"
-        )
-    return values
 
 
 def read_gas(header: dict[str, str]) -> Gas:
@@ -218,6 +181,8 @@ def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
             )
         priors[name] = (header_number(header, value_key), error)
     if "diameter" in priors and "density" not in priors:
+        if "density" not in header:
+            raise ValueError("the header gives diameter_err without density; add the density")
         density = header_number(header, "density")
         priors["density"] = (density, EXACT * density)
     return priors

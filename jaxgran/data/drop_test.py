@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.checks.validation import POSITIVE, Domain, UserNumber, UserTruth, number, truth_value
+from jaxgran.data.files import number_row, read_text
 from jaxgran.scene.gas import Gas
 
 COLUMNS = ("v", "eps", "eps_err")
@@ -68,34 +69,23 @@ def read_drop_test(path: str | Path, *, onto_plate: bool = False) -> DropTest:
     Raises:
         ValueError: saying what is wrong, in which line.
     """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: cannot be read as text ({error}); check the path") from None
+    path, wanted = Path(path), ",".join(COLUMNS)
     rows: list[list[float]] = []
     names: list[str] = []
-    for i, line in enumerate(lines, start=1):
-        cells = [cell.strip() for cell in line.split(",")]
-        if not line.strip() or line.startswith("#"):
+    for i, line in enumerate(read_text(path, wanted).splitlines(), start=1):
+        line = line.strip()
+        if not line or line.startswith("#"):
             continue
-        if not names:
-            names = cells
-            if sorted(names) != sorted(COLUMNS):
-                raise ValueError(
-                    f"{path}, line {i}: the columns are {', '.join(names)}; name them "
-                    f"{','.join(COLUMNS)}"
-                )
+        if names:
+            rows.append(number_row(path, i, line, names))
             continue
-        try:
-            row = [float(cell) for cell in cells]
-        except ValueError:
-            row = []
-        if len(row) != len(names) or not np.all(np.isfinite(row)):
-            raise ValueError(f"{path}, line {i}: expected {len(names)} numbers, got {line!r}")
-        rows.append(row)
+        names = [name.strip() for name in line.split(",")]
+        if sorted(names) != sorted(COLUMNS):
+            raise ValueError(
+                f"{path}, line {i}: the columns are {', '.join(names)}; name them {wanted}"
+            )
     if not rows:
-        raise ValueError(f"{path}: no rows of numbers under {','.join(COLUMNS)}")
+        raise ValueError(f"{path}: no rows of numbers under {wanted}")
     columns = dict(zip(names, np.array(rows).T, strict=True))
     try:
         return DropTest(columns["v"], columns["eps"], columns["eps_err"], onto_plate)

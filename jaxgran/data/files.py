@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 
 def write_whole(path: str | Path, write: Callable[[Any], Any]) -> None:
     """Write a file atomically: it replaces `path` only once it is complete.
@@ -72,3 +74,44 @@ def check_writable(path: str | Path) -> None:
     else:
         return
     raise OSError(code, f"cannot write ({os.strerror(code)}); name another file", str(path))
+
+
+def read_text(path: Path, columns: str) -> str:
+    """The text of a CSV file; ValueError if it cannot be read, is empty or is no text.
+
+    Args:
+        path: the file.
+        columns: that it should have, for the message.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte-order mark
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; check the path") from None
+    except (UnicodeDecodeError, IsADirectoryError):
+        raise ValueError(
+            f"{path}: not a text file; give a CSV file with the columns {columns}"
+        ) from None
+    except OSError as error:
+        raise ValueError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions"
+        ) from None
+    if "\x00" in text:
+        raise ValueError(f"{path}: a binary file; give a CSV file with the columns {columns}")
+    if not text.strip():
+        raise ValueError(f"{path}: the file is empty; it needs the columns {columns}")
+    return text
+
+
+def number_row(path: Path, i: int, line: str, names: list[str]) -> list[float]:
+    """The numbers of line i; ValueError unless there is a finite one for each column."""
+    cells = line.split(",")
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError:
+        values = []
+    if len(values) != len(names) or not np.all(np.isfinite(values)):
+        raise ValueError(
+            f"{path}, line {i}: expected {len(names)} finite numbers ({','.join(names)}), "
+            f"got {line!r}; correct or remove this row"
+        )
+    return values

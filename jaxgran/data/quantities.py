@@ -67,7 +67,8 @@ def in_si(
         ValueError: for a unit that is not known, or an energy of particles of unknown mass.
     """
     units = _unit(header, "length_unit", LENGTHS), _unit(header, "time_unit", TIMES)
-    header = {key: value for key, value in header.items() if not key.endswith("_unit")}
+    named = ("length_unit", "time_unit")
+    header = {key: value for key, value in header.items() if key not in named}
     for key in DIMENSIONS.keys() & header.keys():
         factor = _power(units, key)
         if factor != 1 and (value := _number(header[key])) is not None:
@@ -119,7 +120,7 @@ def temperature_of(
     Raises:
         ValueError: for an energy of particles of unknown mass.
     """
-    three = header.get("dimension", "3").strip() == "3"
+    three = _number(header.get("dimension", "3")) == 3
     if name == "mean_speed":
         factor, words = (pi / 8, "pi/8") if three else (2 / pi, "2/pi")
         return factor * values**2, 2.0, f"T = ({words}) mean_speed^2, of Maxwellian velocities"

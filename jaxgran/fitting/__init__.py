@@ -1,6 +1,6 @@
 """Fits of the parameters of a gas to a measured cooling curve.
 
-- `fit`: the public function: checks of its arguments, warnings.
+- `fit`: the public function: checks of its arguments, warnings; `checks`: those of all fits.
 - `deterministic`: a fit through a model without noise; uses `comparison`, the weighted residuals,
   and `least_squares`, the minimisers (Levenberg-Marquardt, L-BFGS).
 - `stochastic`: a fit through a model with noise; uses `gauss_newton`, the search through

@@ -65,7 +65,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     correlation = float(neighbour_correlation(jnp.asarray(residuals)))
     p_value, converged = float(result.p_value), bool(result.converged)
     misfit = p_value < SIGNIFICANCE
-    if np.isnan(p_value):
+    if result.scatter is not None:
         misfit = _is_misfit(result, residuals, correlation, num_particles)
     omissions = result.model.omissions(result.gas, num_particles)
     found = rivals(result, curve) if converged and np.isfinite(result.chi2) else ()
@@ -103,7 +103,7 @@ def _is_misfit(
 
 def _chance(result: Fit) -> str:
     reduced, p_value = float(result.reduced_chi2), float(result.p_value)
-    if np.isnan(p_value):
+    if result.scatter is not None:
         scatter = 100 * float(np.asarray(result.scatter))
         return (
             f"the curve carries no errors; the residuals scatter by {scatter:.2g} % of T, taken as "

@@ -11,23 +11,18 @@ from jaxtyping import PRNGKeyArray
 from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
 from jaxgran.checks.validation import no_type_check, whole_number
-from jaxgran.data.curve import COLUMNS, CoolingCurve
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.budget import in_scene
+from jaxgran.fitting.checks import check_curve
 from jaxgran.fitting.deterministic import SEARCHES, fit_deterministic
 from jaxgran.fitting.guess import guess_from_data
 from jaxgran.fitting.priors import Priors
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.stochastic import fit_stochastic
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.checks import checked_gas, checked_key, checked_model
+from jaxgran.models.checks import checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
-
-MAGNITUDES = 1e-30, 1e30
-"""Smallest and largest values of a measurement, SI."""
-
-LEAST_ERROR = 1e-12
-"""Least relative error of a measurement."""
 
 
 @no_type_check
@@ -132,7 +127,7 @@ def fit(
 @no_type_check
 def free_by_default(gas: Gas, curve: CoolingCurve) -> tuple[str, ...]:
     """A or a constant restitution and, where the first T has an error that nobody knows, T_0."""
-    _check_curve(gas, curve)
+    check_curve(gas, curve)
     known = [name for name in ("dissipative_constant", "coefficient") if name in gas.domains]
     if not known:
         raise ValueError(
@@ -152,7 +147,7 @@ def _check_request(
     num_particles: int | None,
     replicas: int,
 ) -> None:
-    _check_curve(gas, curve)
+    check_curve(gas, curve)
     if isinstance(free, str) or not free or len(set(free)) < len(free):
         raise ValueError(f"free must be a tuple of different names, got {free!r}")
     for name in free:
@@ -169,37 +164,6 @@ def _check_request(
             f"{points} points (those with an error of 0 not counted) cannot determine {size} "
             "parameters; free fewer of them"
         )
-
-
-@no_type_check
-def _check_curve(gas: Gas, curve: CoolingCurve) -> None:
-    checked_gas(gas)
-    if not isinstance(curve, CoolingCurve):
-        raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
-    curve.check()
-    _check_magnitudes(curve)
-
-
-def _check_magnitudes(curve: CoolingCurve) -> None:
-    """Raise ValueError for values that are no measurement: mostly slips of the pen or of units."""
-    if any_traced(curve):
-        return
-    smallest, largest = MAGNITUDES
-    for column, field in COLUMNS.items():
-        values = getattr(curve, field)
-        if values is None:
-            continue
-        least, values = smallest, np.asarray(values)
-        if column.endswith("_err"):
-            least = LEAST_ERROR * np.asarray(getattr(curve, field.removesuffix("_error")))
-        wrong = (values > 0) & ((values < least) | (values > largest))
-        if np.any(wrong):
-            i = int(np.argmax(wrong))
-            raise ValueError(
-                f"point {i}: {column} is {values[i]:g}, which cannot be measured (allowed are "
-                f"{smallest:g} to {largest:g} in SI units, and errors above {LEAST_ERROR:g} of the "
-                "value); correct or remove it"
-            )
 
 
 @no_type_check

@@ -12,13 +12,14 @@ from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.run import Run
+from jaxgran.fitting.checks import check_curve, check_deterministic
 from jaxgran.fitting.comparison import Comparison
 from jaxgran.fitting.guess import guess_from_data
 from jaxgran.fitting.least_squares import least_squares
 from jaxgran.fitting.parameters import Parameters
 from jaxgran.fitting.result import SIGNIFICANCE
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.checks import checked_gas, checked_model
+from jaxgran.models.checks import checked_gas
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.selection import course_along
 from jaxgran.scene.gas import Gas
@@ -97,9 +98,7 @@ def _check(measurements, shared, separate, model) -> None:
             "fit_jointly takes two or more measurements, as {'first': (gas, curve), 'second': "
             "(gas, drop_test)}; for one curve use jaxgran.fit"
         )
-    checked_model(model)
-    if model.stochastic:
-        raise ValueError(f"a joint fit needs a model without noise, got {type(model).__name__}")
+    check_deterministic(model, "a joint fit")
     names = (*shared, *separate)
     if not shared or len(set(names)) < len(names):
         raise ValueError(f"shared and separate must be different names, got {names}")
@@ -117,7 +116,7 @@ def _check(measurements, shared, separate, model) -> None:
                 f"measurement {label!r} must hold a jaxgran.CoolingCurve or a jaxgran.DropTest, "
                 f"got {type(data).__name__}"
             )
-        data.check()
+        check_curve(gas, data)
         model.check(gas)
         if data.temperature_error is None:
             raise ValueError(

@@ -6,9 +6,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.checks.validation import POSITIVE, no_type_check
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.checks import check_curve, check_deterministic
 from jaxgran.fitting.comparison import Comparison
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.checks import checked_gas, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
 
@@ -69,15 +69,7 @@ def log_likelihood(
 
 @no_type_check
 def _check(gas: Gas, curve: CoolingCurve, model: AbstractModel, clock: ArrayLike) -> None:
-    checked_gas(gas)
-    if not isinstance(curve, CoolingCurve):
-        raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
-    curve.check()
+    check_curve(gas, curve)
     POSITIVE.check("clock", clock, "1 leaves the model's times as they are.")
-    checked_model(model)
-    if model.stochastic:
-        raise ValueError(
-            f"{type(model).__name__} is stochastic: its likelihood would have other noise at each "
-            "call; use a deterministic model"
-        )
+    check_deterministic(model, "a likelihood")
     model.check(gas)

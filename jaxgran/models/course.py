@@ -62,7 +62,6 @@ class Course(NamedTuple):
         contact_fraction: contact duration over mean free time.
         overlap: mean largest overlap, in diameters.
         softness: c X_T/sigma, by which soft contacts slow the cooling.
-        inelasticity: 1 - eps^2 at the impact speed sqrt(2 T).
         flow_share: mean share of the kinetic energy in the flow, 0 where the box is unknown.
         flow_scatter: its standard deviation between realisations.
     """
@@ -76,7 +75,6 @@ class Course(NamedTuple):
     contact_fraction: Float[np.ndarray, "times"]
     overlap: Float[np.ndarray, "times"]
     softness: Float[np.ndarray, "times"]
-    inelasticity: Float[np.ndarray, "times"]
     flow_share: Float[np.ndarray, "times"]
     flow_scatter: Float[np.ndarray, "times"]
 
@@ -102,15 +100,13 @@ class Course(NamedTuple):
     def chance_of_clock(self, num_particles: int) -> Float[np.ndarray, "times"]:
         """Variance of the clock, s^2, by the chance of single collisions of N particles.
 
-        Collisions are a Poisson process: of losses x of ln T of all particles, ``sum x = ds``, the
-        variance is ``ds <x^2>/<x> = (4/d) (1 - eps^2) ds / N``, as the squares of normal speeds are
-        distributed exponentially. A deviation is a delay, which lasts: its variance is the sum of
-        that over r^2, with ``r = -d ln T/dt``. Measured: the scatter of A fitted to 200 runs of 50
-        to 500 hard spheres or of DSMC, beta_T0 = .18 and .5, is .9 to 1.1 of this.
+        Collisions are a Poisson process of rate N nu/2. The energy lost in each goes as the square
+        of the normal speed, which is distributed exponentially: its mean square is twice the square
+        of its mean. Time, told by the loss, is then uncertain by ``int 4 dt / (N nu)``. (It is 4.4
+        where ``1 - eps^2`` grows as v^(1/5).)
         """
-        rate = np.maximum(-np.gradient(self.log_temperature, self.time), 1e-300)
-        loss = 4 / self.gas.dimension * np.maximum(self.inelasticity, 0.0)
-        return self._integral(loss / (num_particles * rate))
+        frequency = float(self.gas.collision_frequency) * np.exp(self.log_temperature / 2)
+        return self._integral(4 / (num_particles * frequency))
 
     def _integral(self, values: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
         steps = (values[1:] + values[:-1]) / 2 * np.diff(self.time)

@@ -209,7 +209,6 @@ def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Arr
             "contact_fraction": now.contact_fraction,
             "overlap": now.mean_overlap,
             "softness": 1 - factor,
-            "inelasticity": 1 - now.reduced_law.restitution(jnp.ones_like(temperature)) ** 2,
             "critical_box": now.critical_box,
         }
 

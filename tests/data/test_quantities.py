@@ -44,6 +44,14 @@ def test_what_stands_in_for_the_temperature(read, dimension):
         relative = curve.temperature_error / curve.temperature
         np.testing.assert_allclose(relative, 0.01 / power, rtol=1e-12)
         assert said["T_from"].startswith("T = ")
+        # The dimension is a number, however it is written.
+        same, _ = read(
+            header.replace(f"dimension: {dimension}", f"dimension: {dimension}.0"),
+            f"t,{name}",
+            TIMES,
+            measured,
+        )
+        np.testing.assert_array_equal(same.temperature, curve.temperature)
     gas = jaxgran.read_gas(said)
     energy = 0.5 * dimension * float(gas.mass) * T
     curve, said = read(header, "t,energy", TIMES, energy)
@@ -94,6 +102,11 @@ def test_values_of_no_granular_gas_are_warned_of(read):
         jaxgran.read_gas(header)
 
 
+def test_only_the_units_leave_the_header(read):
+    _, header = read(HEADER + "# force_unit: N\n# time_unit: s\n", "t,T", TIMES, T)
+    assert header["force_unit"] == "N" and "time_unit" not in header
+
+
 def test_one_temperature_only(read):
     with pytest.raises(ValueError, match="T and vx2 each give the temperature; keep one"):
         read("", "t,T,vx2", TIMES, T, T)
@@ -104,6 +117,7 @@ def test_priors_of_the_header_are_checked():
         ({"eta_err": "0.01"}, "gives eta_err without eta"),
         ({"eta": "0.05", "eta_err": "-0.01"}, "eta_err: must be a positive number"),
         ({"eta": "0.05", "eta_err": "some"}, "not a finite number"),
+        ({"diameter": "2e-3", "diameter_err": "1e-5"}, "diameter_err without density"),
     ):
         with pytest.raises(ValueError, match=message):
             jaxgran.read_priors(header)

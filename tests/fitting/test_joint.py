@@ -103,7 +103,7 @@ def test_drop_tests_are_read(tmp_path):
     assert drops.onto_plate
     for text, message in (
         ("v,e\n1,2\n", "line 1: the columns are v, e; name them v,eps,eps_err"),
-        ("v,eps,eps_err\n0.1,0.9\n", "line 2: expected 3 numbers, got '0.1,0.9'"),
+        ("v,eps,eps_err\n0.1,0.9\n", "line 2: expected 3 finite numbers .*, got '0.1,0.9'"),
         ("v,eps,eps_err\n", "no rows of numbers"),
         ("v,eps,eps_err\n0.1,1.9,0.01\n", r"restitution must lie in \(0, 1\], got 1.9"),
         ("v,eps,eps_err\n0.1,0.9,0\n", "error must lie in"),
@@ -111,7 +111,7 @@ def test_drop_tests_are_read(tmp_path):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
             jaxgran.read_drop_test(path)
-    with pytest.raises(ValueError, match="cannot be read as text"):
+    with pytest.raises(ValueError, match="no such file"):
         jaxgran.read_drop_test(tmp_path / "missing.csv")
     with pytest.raises(ValueError, match="lists of one length"):
         jaxgran.DropTest([0.1, 0.2], [0.9], [0.01])

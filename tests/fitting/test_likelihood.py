@@ -57,7 +57,7 @@ def test_a_clock_is_that_of_the_model():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"model": jaxgran.DSMC(10)}, "DSMC is stochastic"),
+        ({"model": jaxgran.DSMC(10)}, "a likelihood needs a model without noise, got DSMC"),
         ({"model": "theory"}, "model"),
         ({"clock": 0.0}, "clock must lie in"),
         ({"curve": 3}, "curve must be a jaxgran.CoolingCurve"),
