@@ -67,14 +67,8 @@ def checked_key(key: Any) -> PRNGKeyArray | None:
     raise ValueError(f"key must be a key such as jax.random.key(5), got {key!r:.60}")
 
 
-def check_cools(gas: Gas, averages: Callable = exact_averages) -> None:
-    """Raise ValueError for a law of restitution that heats the gas. Traced gases pass unchecked.
-
-    Args:
-        gas: the scene.
-        averages: over the impacts, as `jaxgran.theory.averages.averages`.
-    """
-    rate = first_cooling_rate(gas, averages)
+def check_cools(rate: ArrayLike) -> None:
+    """Raise ValueError where a `first_cooling_rate` is negative: the law of restitution heats."""
     if not isinstance(rate, Tracer) and np.any(np.asarray(rate) < 0):
         raise ValueError(
             "the law of restitution makes this gas heat up: averaged over its impacts, eps is "
@@ -162,10 +156,10 @@ def replaced_where_traced(
         The gas, nan where a traced float is out of range; the times, replaced if traced ones do not
         increase from 0 or later; and whether all was allowed, None if nothing is traced.
     """
+    if all(map(is_known, (times, *jax.tree.leaves(gas)))):
+        return gas, times, None
     traced = {name: gas.value(name) for name in gas.domains}
     traced = {name: value for name, value in traced.items() if not is_known(value)}
-    if not traced and is_known(times):
-        return gas, times, None
     allowed = jnp.ones((), bool)
     for name, value in traced.items():
         allowed &= jnp.all(gas.domains[name].contains(value))

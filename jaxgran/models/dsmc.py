@@ -85,7 +85,7 @@ class DSMC(AbstractModel):
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError for a law of restitution that heats the gas."""
-        checks.check_cools(gas)
+        checks.check_cools(checks.first_cooling_rate(gas))
 
     def estimated_error(self, course: Course) -> float:
         """Error of Enskog's rate, lasting and soft contacts, and the shot noise of all replicas."""

@@ -110,7 +110,7 @@ class HardSpheres(AbstractSpheres):
     def check(self, gas: Gas) -> None:
         """Raise ValueError for a law that heats the gas, a gas too dense, a box too small or a
         start whose spheres overlap."""
-        checks.check_cools(gas)
+        checks.check_cools(checks.first_cooling_rate(gas))
         with jax.ensure_compile_time_eval():
             self.check_box(gas)
             self._check_overlap(gas)

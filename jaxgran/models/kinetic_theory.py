@@ -113,9 +113,10 @@ class KineticTheory(AbstractModel):
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError for a law that heats the gas or contacts too soft for the theory."""
+        rate, factor = _at_start(gas, self._averages)
         if self.softness:
-            checks.check_softness(gas, _first_softness_factor(gas))
-        checks.check_cools(gas, self._averages)
+            checks.check_softness(gas, factor)
+        checks.check_cools(rate)
 
     def estimated_error(self, course: Course) -> float:
         """Of Enskog's rate, lasting contacts and the terms beyond a_2 and the first softness."""
@@ -292,6 +293,8 @@ class KineticTheory(AbstractModel):
 
 
 @eqx.filter_jit
-def _first_softness_factor(gas: Gas) -> Float[Array, ""]:
-    at_start = jnp.ones_like(gas.temperature)
-    return averages.softness_factor(gas.reduced_law, at_start, gas.dimension)
+def _at_start(gas: Gas, averages_of: Callable[..., Array]) -> tuple[Array, Array]:
+    """The first cooling rate and softness factor."""
+    one = jnp.ones_like(gas.temperature)
+    factor = averages.softness_factor(gas.reduced_law, one, gas.dimension)
+    return checks.first_cooling_rate(gas, averages_of), factor

@@ -4,6 +4,7 @@ from math import gamma, pi
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 else:
     # A run-time type checker lets everything pass, so that a wrong type is reported in words.
     UserLaw = Any
+
+
+_PACKINGS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
 
 
 def _checked_law(law: UserLaw) -> RestitutionLaw:
@@ -95,8 +99,8 @@ class Gas(eqx.Module):
     @property
     def domains(self) -> dict[str, Domain]:
         """Allowed range of every float of the gas and of its law, by name."""
-        packing = Domain(0.0, CLOSE_PACKING[self.dimension])
-        return {**self.law.domains, **self._domains, "packing_fraction": packing}
+        packing = {"packing_fraction": _PACKINGS[self.dimension]}
+        return {**self.law.domains, **self._domains, **packing}
 
     def value(self, name: str) -> Float[Array, "..."]:
         """The value of a float of the gas or of its law, by name.
@@ -132,6 +136,8 @@ class Gas(eqx.Module):
         Raises:
             ValueError: naming the float that has more than one value.
         """
+        if all(jnp.shape(leaf) == () for leaf in jax.tree.leaves(self)):
+            return
         for name in self.domains:
             value = jnp.shape(self.value(name))
             if value != () and name not in self.law.lists:
