@@ -19,6 +19,7 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.selection import Choice, choose_model
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.contact import Impact, contact_force, elastic_constant, impact
+from jaxgran.scene.elements import Rough, StokesDrag, Walls
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.restitution import (
@@ -50,9 +51,12 @@ __all__ = [
     "ReducedLaw",
     "RestitutionLaw",
     "RestitutionSeries",
+    "Rough",
     "Run",
     "SoftSpheres",
+    "StokesDrag",
     "Viscoelastic",
+    "Walls",
     "choose_model",
     "contact_force",
     "cool",

@@ -22,6 +22,8 @@ COLUMNS = {
     "T_err": "temperature_error",
     "msd": "displacement",
     "msd_err": "displacement_error",
+    "T_rot": "rotational_temperature",
+    "T_rot_err": "rotational_temperature_error",
 }
 """Measured quantities: names of the columns of a file, and the fields of `CoolingCurve`."""
 
@@ -63,6 +65,9 @@ class CoolingCurve(eqx.Module):
         diffusion: self-diffusion coefficient D(t), m^2/s; None if unknown.
         temperature_error: standard error of T, m^2/s^2, of a measured or stochastic curve.
         displacement_error: standard error of <dr^2>, m^2.
+        rotational_temperature: T_rot = I <w^2>/(d_rot m), m^2/s^2, of rough spheres; None if
+            unknown.
+        rotational_temperature_error: its standard error, m^2/s^2.
         velocity_correlation: <v(0) . v(t)>/d, m^2/s^2, of particle models.
         elastic_energy: energy of the contacts per particle, J, of soft spheres.
         dissipated_energy: energy dissipated since t = 0 per particle, J, of soft and hard spheres.
@@ -83,6 +88,8 @@ class CoolingCurve(eqx.Module):
     diffusion: Float[Array, "... times"] | None = _number_field(default=None)
     temperature_error: Float[Array, "... times"] | None = _number_field(default=None)
     displacement_error: Float[Array, "... times"] | None = _number_field(default=None)
+    rotational_temperature: Float[Array, "... times"] | None = _number_field(default=None)
+    rotational_temperature_error: Float[Array, "... times"] | None = _number_field(default=None)
     velocity_correlation: Float[Array, "... times"] | None = _number_field(default=None)
     elastic_energy: Float[Array, "... times"] | None = _number_field(default=None)
     dissipated_energy: Float[Array, "... times"] | None = _number_field(default=None)
@@ -103,7 +110,7 @@ class CoolingCurve(eqx.Module):
         means: dict[str, Any] = {name: jnp.mean(each, axis=0) for name, each in values.items()}
         num_replicas = len(values["temperature"])
         if num_replicas > 1:
-            for name in {"temperature", "displacement"} & set(values):
+            for name in {"temperature", "displacement", "rotational_temperature"} & set(values):
                 # At t = 0 all replicas agree, and the derivative of a root at 0 is not finite.
                 deviation = jnp.std(jax.lax.stop_gradient(values[name]), axis=0, ddof=1)
                 means[f"{name}_error"] = deviation / num_replicas**0.5

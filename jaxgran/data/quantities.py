@@ -16,6 +16,7 @@ DIMENSIONS = {
     "t": (0, 1),
     "T": (2, -2),
     "msd": (2, 0),
+    "T_rot": (2, -2),
     "mean_speed": (1, -1),
     "vx2": (2, -2),
     "v2_xy": (2, -2),
@@ -23,6 +24,9 @@ DIMENSIONS = {
     "diameter_err": (1, 0),
     "T0": (2, -2),
     "T0_err": (2, -2),
+    "T_rot_0": (2, -2),
+    "container_side": (1, 0),
+    "gamma": (0, -1),
     "A": (0, 1),
 }
 """Powers of length and time in columns, with their errors, and header values; all others are SI."""

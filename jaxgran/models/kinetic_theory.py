@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -20,20 +20,12 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import Course
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.restitution import ReducedLaw
-from jaxgran.theory import averages, closed_forms
+from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
+from jaxgran.theory import averages, closed_forms, elements, moments
+from jaxgran.theory.moments import Moments
 
 TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
-
-
-class _State(NamedTuple):
-    # Chosen to stay of order one while T falls by decades. Units as in theory.averages.
-    log_temperature: Array  # ln(T/T_0)
-    sonine: Array  # a_2
-    diffusion: Array  # D / sqrt(T), so that cooling does not shrink it
-    displacement: Array  # <dr^2>
-    collisions: Array  # per particle
 
 
 class KineticTheory(AbstractModel):
@@ -141,10 +133,10 @@ class KineticTheory(AbstractModel):
     @eqx.filter_jit
     def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
-        law = gas.reduced_law
-        parameters, unravel = ravel_pytree(law)
+        scene = reduced_scene(gas)
+        parameters, unravel = ravel_pytree(scene)
         if parameters.size == 0:  # a law of no floats: jax gives none of them a type of its own
-            parameters, unravel = jnp.zeros(0, times.dtype), lambda _: law
+            parameters, unravel = jnp.zeros(0, times.dtype), lambda _: scene
 
         # In reduced units the gas has one or two parameters: following all their tangents beside
         # the state costs little, and one linear rule then serves forward and reverse mode alike.
@@ -169,14 +161,20 @@ class KineticTheory(AbstractModel):
         length = gas.path_length
         # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
         spoilt = jnp.where(fault == status.OK, 0.0, jnp.nan).astype(theta.dtype)
+        temperature, further = gas.temperature * theta + spoilt, {}
+        if state.rotation is not None:
+            further["rotational_temperature"] = temperature * state.rotation
+        if gas.container is None:  # else spheres do not go far
+            diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
+            further["diffusion"] = diffusion + spoilt
+            further["displacement"] = state.displacement * length**2 + spoilt
         return CoolingCurve(
             times=times,
-            temperature=gas.temperature * theta + spoilt,
+            temperature=temperature,
             sonine=state.sonine + spoilt,
             collisions=state.collisions + spoilt,
-            diffusion=state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed + spoilt,
-            displacement=state.displacement * length**2 + spoilt,
             status=fault,
+            **further,
         )
 
     @property
@@ -184,34 +182,20 @@ class KineticTheory(AbstractModel):
         """The averages over impacts, a function of law, speed and dimension."""
         return averages.averages if self.averages == "exact" else closed_forms.paper_averages
 
-    def _velocity(self, state: Array, rates_of_a2: Array, law: ReducedLaw, dimension: int) -> Array:
+    def _velocity(self, state: Array, rates: Array, scene: ReducedScene, dimension: int) -> Array:
         """Time derivative of the state, in reduced time."""
-        log_theta, a2, diffusion, _, _ = state
-        d = dimension
-        speed = jnp.exp(log_theta / 2)
-        rates = averages.Rates.of(rates_of_a2, a2)
-        cooling = 2 / d * rates.cooling * speed
-        peaking = 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment * speed
-        if self.softness:
-            cooling = cooling * averages.softness_factor(law, speed, d)
         maxwellian = not self.sonine or self.averages == "paper"
-        rate = _State(
-            log_temperature=-cooling,
-            sonine=jnp.zeros_like(speed) if maxwellian else peaking,
-            diffusion=speed / 2 - (rates.relaxation * speed - cooling / 2) * diffusion,
-            displacement=2 * d * speed * diffusion,
-            collisions=averages.collision_rate(a2, d) * speed,
-        )
-        return jnp.stack(rate)
+        options = {"softness": self.softness, "maxwellian": maxwellian}
+        return moments.velocity(state, rates, scene, dimension, **options)
 
     def _solve(
         self,
         parameters: Array,
-        unravel: Callable[[Array], ReducedLaw],
+        unravel: Callable[[Array], ReducedScene],
         times: Array,
         dimension: int,
         tangents: bool = True,
-    ) -> tuple[_State, _State, _State, Int[Array, ""]]:
+    ) -> tuple[Moments, Moments, Moments, Int[Array, ""]]:
         """States, their time derivatives and their derivatives in the parameters of the law.
 
         Last, a status; unless it is ok all of them are nan.
@@ -219,9 +203,10 @@ class KineticTheory(AbstractModel):
         directions = jnp.eye(parameters.size, dtype=times.dtype)[: None if tangents else 0]
 
         def tabulate(parameters):
-            law = unravel(parameters)
-            averages_of = partial(self._averages, law, dimension=dimension)
-            return averages.RateTable.of(averages_of, times[-1], dimension, law.num_nodes)
+            scene = unravel(parameters)
+            averages_of = partial(self._averages, scene.law, dimension=dimension)
+            num_nodes, faster = scene.law.num_nodes, elements.fastest_cooling(scene, dimension)
+            return averages.RateTable.of(averages_of, times[-1], dimension, num_nodes, faster)
 
         def velocity(state, rates, parameters):
             return self._velocity(state, rates, unravel(parameters), dimension)
@@ -248,15 +233,20 @@ class KineticTheory(AbstractModel):
             both = jnp.concatenate([rate[None], rates_along]) * jnp.exp(s)
             return jnp.where(known, both, 0.0)
 
-        rows, fault = self._integrate(rows_velocity, 1 + len(directions), times, known)
+        def at_start(parameters):
+            return Moments.at_start(unravel(parameters), times)
+
+        start, start_along = jax.linearize(at_start, parameters)
+        first = jnp.concatenate([start[None], jax.vmap(start_along)(directions)])
+        rows, fault = self._integrate(rows_velocity, first, times, known)
         states = rows[:, 0]
         velocities = jax.vmap(lambda x: velocity(x, table(x[0]), parameters))(states)
         jacobian = jnp.moveaxis(rows[:, 1:], 2, 0)
         jacobian = jnp.swapaxes(jacobian, 1, 2)
-        return _State(*states.T), _State(*velocities.T), _State(*jacobian), fault
+        return Moments(*states.T), Moments(*velocities.T), Moments(*jacobian), fault
 
     def _integrate(
-        self, rows_velocity: Callable, num_rows: int, times: Array, known: Array
+        self, rows_velocity: Callable, first: Array, times: Array, known: Array
     ) -> tuple[Array, Int[Array, ""]]:
         """The rows at the given reduced times, shape (times, rows, states), and a status."""
         # A gas of nan keeps its state, so that its solver does not try ever shorter steps.
@@ -276,7 +266,7 @@ class KineticTheory(AbstractModel):
             t0=jnp.zeros((), times.dtype),
             t1=s[-1],
             dt0=None,
-            y0=jnp.zeros((num_rows, len(_State._fields)), times.dtype),
+            y0=jnp.where(known, first, 0.0),
             saveat=diffrax.SaveAt(ts=s),
             stepsize_controller=controller,
             adjoint=diffrax.ForwardMode(),

@@ -1,10 +1,10 @@
 """The scene: a homogeneous gas of equal spheres, and the physical scales that follow from it."""
 
+from collections.abc import Callable, Iterator
 from math import gamma, pi
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -12,7 +12,9 @@ from jaxtyping import Array, Float
 
 from jaxgran.checks.validation import POSITIVE, Domain, UserNumber, number, whole_number
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
+from jaxgran.scene.elements import Rough, StokesDrag, Walls, check_walls
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
+from jaxgran.scene.named_floats import NamedFloats, Place
 from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw, Viscoelastic
 
 if TYPE_CHECKING:
@@ -31,6 +33,15 @@ def _checked_law(law: UserLaw) -> RestitutionLaw:
     return law
 
 
+def _element(kind: type) -> Callable[[Any], Any]:
+    def checked(value: Any) -> Any:
+        if value is None or isinstance(value, kind):
+            return value
+        raise ValueError(f"expected a jaxgran.{kind.__name__} or None, got {value!r}")
+
+    return checked
+
+
 def _check_normal(name: str, value: Array) -> None:
     """Raise ValueError for a number that single precision cannot hold, where that is used."""
     if not isinstance(value, Tracer) and value.dtype != jnp.float64:
@@ -42,7 +53,7 @@ def _check_normal(name: str, value: Array) -> None:
             )
 
 
-class Gas(eqx.Module):
+class Gas(NamedFloats):
     """A homogeneous gas of equal spheres in its initial state.
 
     Every float can be traced, differentiated and batched with `jax.vmap`.
@@ -56,6 +67,12 @@ class Gas(eqx.Module):
             (of the area if d = 2) that the spheres occupy.
         temperature: T_0 = <v^2>/d at t = 0, m^2/s^2, > 0, without the mass, as in the paper.
         dimension: d, 3, or 2 for spheres that move in a plane.
+        surface: `jaxgran.Rough` of spheres that rotate; None is smooth ones.
+        container: `jaxgran.Walls`; None is periodic or unbounded.
+        drag: `jaxgran.StokesDrag`; None is a vacuum.
+
+    Floats of elements are known by name as those of the gas are: those of a container with the
+    prefix wall_, those of drag with drag_, as in ``gas.replace(wall_coefficient=0.8)``.
 
     Raises:
         ValueError: for a value outside its range.
@@ -67,6 +84,9 @@ class Gas(eqx.Module):
     packing_fraction: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     temperature: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
+    surface: Rough | None = eqx.field(converter=_element(Rough), default=None, kw_only=True)
+    container: Walls | None = eqx.field(converter=_element(Walls), default=None, kw_only=True)
+    drag: StokesDrag | None = eqx.field(converter=_element(StokesDrag), default=None, kw_only=True)
 
     _domains: ClassVar[dict[str, Domain]] = {
         "diameter": POSITIVE,
@@ -95,40 +115,37 @@ class Gas(eqx.Module):
                 value = getattr(self, name)
                 domain.check(name, value, self._advice[name])
                 _check_normal(name, value)
+        if self.container is not None:
+            check_walls(
+                self.container, self.diameter, self.dimension, rough=self.surface is not None
+            )
 
     @property
-    def domains(self) -> dict[str, Domain]:
-        """Allowed range of every float of the gas and of its law, by name."""
-        packing = {"packing_fraction": _PACKINGS[self.dimension]}
-        return {**self.law.domains, **self._domains, **packing}
+    def _places(self) -> dict[str, Place]:
+        own = {**self._domains, "packing_fraction": _PACKINGS[self.dimension]}
+        places = {name: Place(("law", name), domain) for name, domain in self.law.domains.items()}
+        places |= {name: Place((name,), domain) for name, domain in own.items()}
+        for prefix, path, part in self._elements():
+            for name, domain in part.domains.items():
+                places[prefix + name] = Place((*path, name), domain)
+        return places
 
-    def value(self, name: str) -> Float[Array, "..."]:
-        """The value of a float of the gas or of its law, by name.
+    def _elements(self) -> Iterator[tuple[str, tuple[str, ...], Any]]:
+        """Elements of the scene: the prefix of the names of their floats, where they are, and they
+        themselves."""
+        if self.surface is not None:
+            yield "", ("surface",), self.surface
+        if self.container is not None:
+            yield "wall_", ("container",), self.container
+            yield "wall_", ("container", "restitution"), self.container.restitution
+        if self.drag is not None:
+            yield "drag_", ("drag",), self.drag
 
-        Raises:
-            ValueError: for an unknown name.
-        """
-        if name not in self.domains:
-            raise ValueError(f"no float {name!r} in this gas; it has {', '.join(self.domains)}")
-        return getattr(self.law if name in self.law.domains else self, name)
-
-    def replace(self, **values: UserNumber) -> "Gas":
-        """A copy with other values of some floats: ``gas.replace(dissipative_constant=1e-6)``.
-
-        Args:
-            values: floats of the gas or of its law, by name.
-
-        Raises:
-            ValueError: for an unknown name or a value outside its range.
-        """
-        for name, value in values.items():
-            self.value(name)
-            self.domains[name].check(name, value)
-
-        def get(gas):
-            return [getattr(gas.law if k in gas.law.domains else gas, k) for k in values]
-
-        return eqx.tree_at(get, self, [number(value) for value in values.values()])
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Names of the optional fields that this scene has."""
+        names = ("surface", "container", "drag")
+        return tuple(name for name in names if getattr(self, name) is not None)
 
     def check_single(self) -> None:
         """Check that this is one gas, not a batch of them outside of `jax.vmap`.
@@ -136,16 +153,7 @@ class Gas(eqx.Module):
         Raises:
             ValueError: naming the float that has more than one value.
         """
-        if all(jnp.shape(leaf) == () for leaf in jax.tree.leaves(self)):
-            return
-        for name in self.domains:
-            value = jnp.shape(self.value(name))
-            if value != () and name not in self.law.lists:
-                raise ValueError(
-                    f"{name} of the gas has shape {value}, and one number is allowed: take many "
-                    "gases with jax.vmap(lambda gas: jaxgran.cool(gas, times))(gases), or call "
-                    "this for one gas at a time"
-                )
+        self._check_single((*self.law.lists, "wall_side"))
 
     @property
     def number_density(self) -> Float[Array, ""]:

@@ -63,6 +63,13 @@ class RestitutionLaw(eqx.Module):
             speed: reference speed, m/s, > 0.
         """
 
+    def on_wall(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> "ReducedLaw":
+        """The law for a sphere and a flat wall, for which it is given.
+
+        Args: as `reduced`.
+        """
+        return self.reduced(diameter=diameter, mass=mass, speed=speed)
+
 
 class ReducedLaw(eqx.Module):
     """A law of restitution for two given spheres, in units of a length and a reference speed.
@@ -190,6 +197,17 @@ class Viscoelastic(RestitutionLaw):
         beta = 1.5 * self.dissipative_constant * alpha**0.4 * speed**0.2
         length = jnp.asarray((speed**2 / alpha) ** 0.4 / diameter)
         return ReducedViscoelastic(beta, length, self.clipped)
+
+    def on_wall(
+        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
+    ) -> ReducedViscoelastic:
+        """The law for a sphere and a flat wall of its material.
+
+        ``alpha``, proportional to ``Y sqrt(R_eff)/m_eff``, is smaller by sqrt(2): the effective
+        radius and mass are twice those of two spheres.
+        """
+        softer = eqx.tree_at(lambda law: law.youngs_modulus, self, self.youngs_modulus / 2**0.5)
+        return softer.reduced(diameter=diameter, mass=mass, speed=speed)
 
 
 class ConstantRestitution(RestitutionLaw, ReducedLaw):

@@ -38,6 +38,17 @@ def _quadrature(num_nodes: int, top: float) -> tuple[np.ndarray, np.ndarray]:
 _NODES, _NODE_WEIGHTS = _quadrature(num_nodes=32, top=9.0)
 
 
+def impact_average(function: Callable[[Array], Array], like: Float[Array, ""]) -> Float[Array, ""]:
+    """``int_0^inf g exp(-g^2/2) f(g) dg``, the average over the normal speeds of impacts.
+
+    Args:
+        function: f, of an array of g.
+        like: a number of the precision that is wanted.
+    """
+    nodes, weights = (jnp.asarray(x, like.dtype) for x in (_NODES, _NODE_WEIGHTS))
+    return jnp.sum(weights * function(nodes))
+
+
 class Rates(NamedTuple):
     """Rates of a gas at one temperature, per unit of reduced time and divided by sqrt(T/T_0).
 
@@ -174,6 +185,7 @@ class RateTable(eqx.Module):
         duration: Float[Array, ""],
         dimension: int,
         num_nodes: int,
+        faster: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
     ) -> "RateTable":
         """The series for all temperatures that a gas reaches in a given time.
 
@@ -182,8 +194,10 @@ class RateTable(eqx.Module):
             duration: reduced time.
             dimension: d.
             num_nodes: number of terms; see `ReducedLaw.num_nodes`.
+            faster: an upper bound of a further ``-d ln T/dt``: a part over sqrt(T/T_0), and one
+                that is constant.
         """
-        lowest = _lowest_log_temperature(averages, duration, dimension)
+        lowest = _lowest_log_temperature(averages, duration, dimension, faster)
         nodes, to_coefficients = (jnp.asarray(x, lowest.dtype) for x in _chebyshev(num_nodes))
         values = jax.vmap(averages)(jnp.exp(lowest * (1 - nodes) / 4))
         return cls(jnp.tensordot(to_coefficients, values, 1), lowest)
@@ -206,6 +220,7 @@ def _lowest_log_temperature(
     averages: Callable[[Float[Array, ""]], Float[Array, "3 3"]],
     duration: Float[Array, ""],
     dimension: int,
+    faster: tuple[ArrayLike, ArrayLike],
 ) -> Float[Array, ""]:
     """A lower bound of ln(T/T_0) after a reduced time, negative and not far below the true value.
 
@@ -214,13 +229,15 @@ def _lowest_log_temperature(
     to cool is bounded from below by integrating the law's own rate, with 10 % added, over
     `_SCAN_POINTS` temperatures, and the range is cut off one point below what is reached.
     """
-    duration = jax.lax.stop_gradient(duration)
+    duration, (by_speed, constant) = jax.lax.stop_gradient((duration, faster))
     collisions = sphere_surface(dimension) / sqrt(2 * pi)
-    bound = -2 * jnp.log1p(1.1 * collisions / (2 * dimension) * duration)
+    haff = 1.1 * collisions / (2 * dimension) + by_speed / 2
+    bound = -2 * jnp.log1p(haff * duration) - constant * duration
     scan = bound * jnp.linspace(0, 1, _SCAN_POINTS, dtype=bound.dtype)
     speeds = jnp.exp(scan / 2)
     loss = jax.lax.stop_gradient(jax.vmap(averages)(speeds)[:, 0, 0])
-    rate = jnp.maximum(2.2 / dimension * loss * speeds, jnp.finfo(bound.dtype).tiny)
+    rate = 2.2 / dimension * loss * speeds + by_speed * speeds + constant
+    rate = jnp.maximum(rate, jnp.finfo(bound.dtype).tiny)
     earliest = jnp.cumsum(-jnp.diff(scan) / jnp.maximum(rate[1:], rate[:-1]))
     reached = jnp.min(jnp.where(earliest < duration, scan[1:], 0.0))
     lowest = reached + scan[1]

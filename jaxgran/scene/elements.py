@@ -1,0 +1,149 @@
+"""Elements that a scene may have besides smooth spheres in free flight: roughness, walls, drag.
+
+Each is an optional field of `Gas`; a program of a scene without it does not contain it.
+"""
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxgran.checks.validation import FRACTION, NOT_NEGATIVE, POSITIVE, Domain, number
+from jaxgran.scene.restitution import ConstantRestitution, RestitutionLaw
+
+TANGENTIAL = Domain(-1.0, 1.0, low_allowed=True, high_allowed=True)
+"""Coefficients of tangential restitution: -1 is a smooth surface, 1 a perfectly rough one."""
+
+SPINS = {2: 1, 3: 3}
+"""d_rot: components of the angular velocity by dimension."""
+
+if TYPE_CHECKING:
+    UserWallLaw = RestitutionLaw | float
+else:
+    # A run-time type checker lets everything pass, so that a wrong type is reported in words.
+    UserWallLaw = Any
+
+
+class Rough(eqx.Module):
+    """Rough spheres, which rotate: the tangential velocity at contact is multiplied by -beta_t.
+
+    The velocity at contact is ``u = v_i - v_j - (sigma/2) (w_i + w_j) x n`` with the unit vector n
+    from j to i and angular velocities w. An impact changes its normal part by -eps(|u_n|) and its
+    tangential part by -beta_t: with ``eta = q (1 + beta_t) / (2 (1 + q))``
+
+        v_i -> v_i - (1 + eps)/2 u_n - eta u_t,    w_i -> w_i + (2 eta/(q sigma)) n x u_t,
+
+    and v_j the opposite, w_j the same. The energy lost in tangential motion is
+    ``(m/4) q/(1 + q) (1 - beta_t^2) u_t^2``.
+
+    Args:
+        tangential_restitution: beta_t, in [-1, 1], the same for all impacts; -1 is smooth.
+        inertia: q = 4 I/(m sigma^2), in (0, 1]: 2/5 of a solid sphere, 2/3 of a hollow one, 1/2 of
+            a disk.
+        rotational_temperature: T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2, >= 0, with d_rot = 3
+            (1 in a plane).
+
+    Raises:
+        ValueError: for a value outside its range.
+
+    Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997).
+    """
+
+    tangential_restitution: Float[Array, ""] = eqx.field(converter=number)
+    inertia: Float[Array, ""] = eqx.field(converter=number, default=0.4)
+    rotational_temperature: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+
+    domains: ClassVar[dict[str, Domain]] = {
+        "tangential_restitution": TANGENTIAL,
+        "inertia": Domain(0.0, 1.0, high_allowed=True),
+        "rotational_temperature": NOT_NEGATIVE,
+    }
+
+    def __check_init__(self):
+        advice = {
+            "tangential_restitution": "-1 is a smooth surface, 1 a perfectly rough one.",
+            "inertia": "It is 4 I/(m sigma^2): 0.4 for solid spheres.",
+            "rotational_temperature": "Give I <w^2>/(d_rot m) at t = 0 in m^2/s^2.",
+        }
+        for name, domain in self.domains.items():
+            domain.check(name, getattr(self, name), advice[name])
+
+
+def _wall_law(law: UserWallLaw) -> RestitutionLaw:
+    if isinstance(law, RestitutionLaw):
+        return law
+    FRACTION.check("restitution of the walls", law, "Give a number or a law of restitution.")
+    return ConstantRestitution(law)
+
+
+class Walls(eqx.Module):
+    """Flat walls around the gas, at rest: a cube (square), or a box of given sides.
+
+    A wall reverses the normal velocity of a sphere, times its restitution. Of a viscoelastic law
+    the effective mass and radius are those of a sphere on a flat wall of its own material.
+
+    Args:
+        side: of the cube, m, or d sides; the centres of the spheres have a diameter less.
+        restitution: of impacts on the walls: a number in [0, 1], or a law of restitution.
+        tangential_restitution: of rough spheres (`Rough`), in [-1, 1]; None is smooth walls.
+
+    Raises:
+        ValueError: for a value outside its range.
+    """
+
+    side: Float[Array, "..."] = eqx.field(converter=number)
+    restitution: RestitutionLaw = eqx.field(converter=_wall_law, kw_only=True)
+    tangential_restitution: Float[Array, ""] | None = eqx.field(
+        converter=lambda x: None if x is None else number(x), default=None, kw_only=True
+    )
+
+    def __check_init__(self):
+        POSITIVE.check("side of the walls", self.side, "Give it in metres.")
+        if self.tangential_restitution is not None:
+            TANGENTIAL.check("tangential_restitution of the walls", self.tangential_restitution)
+
+    @property
+    def domains(self) -> dict[str, Domain]:
+        """Allowed range of each float that is not one of the law."""
+        own = {"side": POSITIVE}
+        if self.tangential_restitution is not None:
+            own["tangential_restitution"] = TANGENTIAL
+        return own
+
+
+class StokesDrag(eqx.Module):
+    """Drag of a gas or liquid around the spheres, ``dv/dt = -gamma v``.
+
+    Args:
+        rate: gamma, 1/s, >= 0.
+        rotational_rate: of ``dw/dt = -rate w`` of rough spheres, 1/s, >= 0; by Stokes' law
+            ``4/(3 q)`` of gamma, 10/3 for solid spheres.
+
+    Raises:
+        ValueError: for a negative rate.
+    """
+
+    rate: Float[Array, ""] = eqx.field(converter=number)
+    rotational_rate: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+
+    domains: ClassVar[dict[str, Domain]] = {"rate": NOT_NEGATIVE, "rotational_rate": NOT_NEGATIVE}
+
+    def __check_init__(self):
+        for name, domain in self.domains.items():
+            domain.check(f"{name} of the drag", getattr(self, name), "Give it in 1/s.")
+
+
+def check_walls(walls: Walls, diameter: Array, dimension: int, rough: bool) -> None:
+    """Raise ValueError for walls that cannot contain the spheres of a gas."""
+    if np.ndim(walls.side) > 0 and np.shape(walls.side) != (dimension,):
+        raise ValueError(
+            f"side of the walls must be one number or {dimension}, got shape {np.shape(walls.side)}"
+        )
+    least = Domain(low=2.1)
+    least.check("side of the walls, over the diameter,", walls.side / diameter, "Enlarge it.")
+    if walls.tangential_restitution is not None and not rough:
+        raise ValueError(
+            "tangential_restitution of the walls needs rough spheres: add "
+            "surface=jaxgran.Rough(...)"
+        )

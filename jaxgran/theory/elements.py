@@ -1,0 +1,134 @@
+"""What the elements of a scene do to a homogeneous gas: roughness, walls, drag.
+
+Units as in `jaxgran.theory.averages`.
+"""
+
+from functools import partial
+from math import sqrt
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxgran.scene.elements import SPINS
+from jaxgran.scene.reduced_scene import ReducedRough, ReducedScene, ReducedWalls
+from jaxgran.theory.averages import collision_rate, impact_average
+
+
+class Changes(NamedTuple):
+    """Rates of change by the elements of a scene.
+
+    Attributes:
+        cooling: part of ``-d ln T/dt``.
+        rotation: ``dT_rot/dt`` over T.
+        relaxation: part of the relaxation rate of the velocity autocorrelation function.
+    """
+
+    cooling: Float[Array, ""]
+    rotation: Float[Array, ""]
+    relaxation: Float[Array, ""]
+
+
+def changes(
+    scene: ReducedScene,
+    speed: Float[Array, ""],
+    ratio: Float[Array, ""] | float,
+    sonine: Float[Array, ""],
+    dimension: int,
+) -> Changes:
+    """The changes by all elements of a scene, for Maxwellian velocities and angular velocities.
+
+    Args:
+        scene: in reduced units.
+        speed: sqrt(T/T_0).
+        ratio: T_rot/T; without meaning where the spheres are smooth.
+        sonine: a_2, on which the collision rate depends.
+        dimension: d.
+    """
+    total = Changes(*[jnp.zeros_like(speed)] * 3)
+    if scene.surface is not None:
+        rate = collision_rate(sonine, dimension) * speed
+        total = _sum(total, _of_impacts(scene.surface, rate, ratio, dimension))
+    if scene.walls is not None:
+        loss = impact_average(partial(_lost, scene.walls, speed), speed)
+        own = _of_walls(scene.walls, scene.surface, loss, speed, ratio, dimension)
+        total = _sum(total, own)
+    if scene.drag is not None:
+        drag = scene.drag
+        own = Changes(2 * drag.rate, -2 * drag.rotational_rate * ratio, drag.rate)
+        total = _sum(total, own)
+    return total
+
+
+def _sum(a: Changes, b: Changes) -> Changes:
+    return Changes(*(x + y for x, y in zip(a, b, strict=True)))
+
+
+def _of_impacts(surface: ReducedRough, rate: Array, ratio: Array | float, d: int) -> Changes:
+    """Of the tangential part of impacts between spheres, nu a particle and unit of time.
+
+    ``dT/dt = -(2 (d-1)/d) nu (eta (1 - eta) T - eta^2 T_rot/q)``,
+    ``dT_rot/dt = -(2 (d-1)/d_rot) nu (eta/q) ((1 - eta/q) T_rot - eta T)``: the mean squares of the
+    tangential velocity of two spheres that meet are 2 (d-1) T of the centres and 2 (d-1) T_rot/q of
+    the surfaces. Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997).
+    """
+    eta, q = surface.eta, surface.inertia
+    strength = 2 * (d - 1) * rate
+    return Changes(
+        cooling=strength / d * (eta * (1 - eta) - eta**2 * ratio / q),
+        rotation=-strength / SPINS[d] * eta / q * ((1 - eta / q) * ratio - eta),
+        relaxation=strength / (2 * d) * eta,
+    )
+
+
+def _of_walls(
+    walls: ReducedWalls,
+    surface: ReducedRough | None,
+    loss: Array,
+    speed: Array,
+    ratio: Array | float,
+    d: int,
+) -> Changes:
+    """Of impacts on walls that take a loss times T each, which all parts of a mixed gas meet alike.
+
+    A wall takes ``(1 - eps^2) v_n^2/2``, of constant eps ``(1 - eps^2) T`` in the mean, and from
+    rough spheres what an impact between spheres takes with ``eta_w = q (1 + beta_w)/(1 + q)`` for
+    2 eta. Velocities are reversed, so that displacements are not those of a free gas.
+    """
+    rate = walls.frequency * speed
+    cooling = 2 / d * rate * loss
+    nothing = jnp.zeros_like(speed)
+    if surface is None or walls.beta is None:
+        return Changes(cooling, nothing, nothing)
+    q = surface.inertia
+    eta = q * (1 + walls.beta) / (1 + q)
+    strength = 2 * (d - 1) * rate
+    return Changes(
+        cooling=cooling + strength / d * (eta * (1 - eta / 2) - eta**2 / 2 * ratio / q),
+        rotation=-strength / SPINS[d] * eta / q * ((1 - eta / (2 * q)) * ratio - eta / 2),
+        relaxation=nothing,
+    )
+
+
+def _lost(walls: ReducedWalls, speed: Array, g: Array) -> Array:
+    """Energy lost to a wall over T, at a normal speed of g sqrt(T)."""
+    lost = walls.law.loss(g * speed / sqrt(2))
+    return lost * (2 - lost) * g**2 / 2
+
+
+def fastest_cooling(scene: ReducedScene, dimension: int) -> tuple[Array | float, Array | float]:
+    """An upper bound of the cooling by elements: a part over sqrt(T/T_0), and one that is constant.
+
+    It is reached where the spheres do not rotate and walls stop them.
+    """
+    by_speed, constant = 0.0, 0.0
+    one = jnp.ones(())
+    if scene.surface is not None:
+        rate = collision_rate(0.0, dimension)
+        by_speed = by_speed + _of_impacts(scene.surface, rate, 0.0, dimension).cooling
+    if scene.walls is not None:
+        walls = _of_walls(scene.walls, scene.surface, one, one, 0.0, dimension)
+        by_speed = by_speed + walls.cooling
+    if scene.drag is not None:
+        constant = 2 * scene.drag.rate
+    return by_speed, constant
