@@ -21,7 +21,7 @@ import numpy as np  # noqa: E402
 from record import save  # noqa: E402
 
 import jaxgran  # noqa: E402
-from jaxgran.data.curve_file import header_number  # noqa: E402
+from jaxgran.data.header import header_number  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 SCENES = ("dilute", "dense")

@@ -4,7 +4,9 @@
         [--model soft-spheres [--particles N] [--replicas R]] [--model auto [--tolerance 0.02]]
 
 CURVE.csv holds header lines `# key: value` (N, eta, diameter, density, Y, nu, T0; SI units), a line
-of column names and rows: t,T and, where measured, T_err, msd, msd_err. Header lines eta_err,
+of column names and rows: t,T and, where measured, T_err, msd, msd_err, T_rot, T_rot_err. Spheres
+are smooth, far from walls and in vacuum unless header lines say otherwise: beta_t, reduced_inertia,
+T_rot_0 of rough ones; container_side, wall_restitution, wall_beta_t; gamma of drag. Lines eta_err,
 diameter_err, density_err, Y_err, nu_err, T0_err are standard errors of the values beside them,
 which then enter the error of the answer. A header line A is not used in the fit; the estimate is
 compared with it. --model auto takes the cheapest model whose estimated
@@ -32,10 +34,10 @@ import jaxgran  # noqa: E402
 from jaxgran.data.curve_file import (  # noqa: E402
     GAS_KEYS,
     PRIOR_KEYS,
-    header_count,
-    header_number,
 )
 from jaxgran.data.files import write_whole  # noqa: E402
+from jaxgran.data.header import header_count, header_number  # noqa: E402
+from jaxgran.data.scene_keys import ELEMENT_KEYS  # noqa: E402
 from jaxgran.fitting.fit import free_by_default  # noqa: E402
 from jaxgran.models.base import AbstractModel  # noqa: E402
 from jaxgran.models.selection import default_models  # noqa: E402
@@ -50,6 +52,13 @@ PARAMETERS = {
     "nu": ("poisson_ratio", ""),
     "eta": ("packing_fraction", ""),
     "diameter": ("diameter", "m"),
+    "beta_t": ("tangential_restitution", ""),
+    "reduced_inertia": ("inertia", ""),
+    "T_rot_0": ("rotational_temperature", "m^2/s^2"),
+    "container_side": ("wall_side", "m"),
+    "wall_restitution": ("wall_coefficient", ""),
+    "wall_beta_t": ("wall_tangential_restitution", ""),
+    "gamma": ("drag_rate", "1/s"),
 }
 
 
@@ -347,7 +356,7 @@ def finite_or_null(value: Any) -> Any:
 
 
 def settings(pairs: list[str]) -> dict[str, str]:
-    known = (*GAS_KEYS, *PRIOR_KEYS, "N", "A", "dimension", "replicas")
+    known = (*GAS_KEYS, *PRIOR_KEYS, *ELEMENT_KEYS, "N", "A", "dimension", "replicas")
     values = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")

@@ -34,7 +34,7 @@ import scipy.optimize
 from record import save
 
 import jaxgran
-from jaxgran.data.curve_file import header_number
+from jaxgran.data.header import header_number
 
 try:
     import cma  # type: ignore[import-not-found]

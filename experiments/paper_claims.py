@@ -21,7 +21,7 @@ from claims_diffusion import diffusion, equilibrium, memory
 from record import save
 
 import jaxgran
-from jaxgran.data.curve_file import header_number
+from jaxgran.data.header import header_number
 from jaxgran.scene.contact import impact
 from jaxgran.scene.restitution_table import C1, C2
 

@@ -26,7 +26,7 @@ from scenes import beads
 from tqdm import tqdm
 
 import jaxgran
-from jaxgran.data.curve_file import header_number
+from jaxgran.data.header import header_number
 
 DATA_FOLDER = Path(__file__).parent / "data"
 KEY = 1  # of the random numbers of the rows; the reference has another

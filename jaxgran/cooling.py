@@ -89,7 +89,7 @@ def cool(
     model = checks.checked_model(model)
     if checkpoint is not None:
         _check_checkpoint(checkpoint, model)
-    model.check(gas)
+    model.check_scene(gas)
     gas, simulated, allowed = checks.replaced_where_traced(gas, times)
     curve = model.simulate(gas, simulated, Run(key, progress, checkpoint))
     curve = checks.spoilt_unless(allowed, curve, times)

@@ -124,6 +124,17 @@ def number(value: UserNumber) -> Float[Array, "..."]:
         raise ValueError(f"expected a number or an array of numbers, got {value!r}") from None
 
 
+def check_normal(name: str, value: Array) -> None:
+    """Raise ValueError for a number that single precision cannot hold, where that is used."""
+    if not isinstance(value, Tracer) and value.dtype != jnp.float64:
+        small = np.asarray(value)
+        if np.any((small != 0) & (np.abs(small) < np.finfo(small.dtype).tiny)):
+            raise ValueError(
+                f"{name} is too small for {small.dtype}, got {small.min():g}: "
+                'jax.config.update("jax_enable_x64", True) first'
+            )
+
+
 def _floats(value: Any) -> np.ndarray:
     """Numbers as NumPy floats; TypeError or ValueError for texts, truth values and the like."""
     array = np.asarray(value)

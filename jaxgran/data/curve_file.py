@@ -8,7 +8,9 @@ import numpy as np
 
 from jaxgran.data.curve import COLUMNS, MIN_POINTS, CoolingCurve
 from jaxgran.data.files import number_row, read_text, write_whole
+from jaxgran.data.header import header_count, header_number
 from jaxgran.data.quantities import STAND_INS, in_si, warn_of_units
+from jaxgran.data.scene_keys import read_elements, warn_of_unknown_keys
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.restitution import Viscoelastic
@@ -28,9 +30,6 @@ PRIOR_KEYS = {
 
 EXACT = 1e-4
 """Relative error of a density that is given without one, where the diameter has one."""
-
-LARGEST_COUNT = 10**12
-"""The largest whole number of a header."""
 
 
 def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
@@ -126,10 +125,12 @@ def read_gas(header: dict[str, str]) -> Gas:
 
     Args:
         header: eta (the packing fraction), diameter (m), density (of the material, kg/m^3), Y
-            (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension, as `read_curve` returns them.
+            (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension, as `read_curve` returns them; and
+            of rough spheres, walls and drag what `jaxgran.data.scene_keys.read_elements` takes.
 
     Returns:
-        A gas of viscoelastic spheres. Values that no granular gas has are warned of.
+        A gas of viscoelastic spheres. Values that no granular gas has, and keys that are not known,
+        are warned of.
 
     Raises:
         ValueError: for a missing key, or a value that is no number or outside its range.
@@ -149,8 +150,10 @@ def read_gas(header: dict[str, str]) -> Gas:
         packing_fraction=values["eta"],
         temperature=values["T0"],
         dimension=header_count(header, "dimension") or 3,
+        **read_elements(header),
     )
     warn_of_units(gas)
+    warn_of_unknown_keys(header, (*GAS_KEYS, *PRIOR_KEYS))
     return gas
 
 
@@ -186,42 +189,6 @@ def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
         density = header_number(header, "density")
         priors["density"] = (density, EXACT * density)
     return priors
-
-
-def header_number(header: dict[str, str], key: str) -> float:
-    """The value of a key in the header of a curve, as a number.
-
-    Raises:
-        ValueError: if the value is not a finite number.
-        KeyError: if there is no such key.
-    """
-    try:
-        number = float(header[key])
-    except ValueError:
-        number = float("nan")
-    if not np.isfinite(number):
-        raise ValueError(f"header line {key}: {header[key]!r} is not a finite number")
-    return number
-
-
-def header_count(header: dict[str, str], key: str) -> int | None:
-    """The value of a key in the header of a curve, such as N, as a positive whole number.
-
-    Returns:
-        The number, or None if there is no such key.
-
-    Raises:
-        ValueError: if the value is not a positive whole number.
-    """
-    if key not in header:
-        return None
-    number = header_number(header, key)
-    if not (1 <= number <= LARGEST_COUNT and number.is_integer()):
-        raise ValueError(
-            f"header line {key}: must be a whole number from 1 to {LARGEST_COUNT:g}, got "
-            f"{header[key]!r}"
-        )
-    return int(number)
 
 
 def write_curve(

@@ -31,7 +31,8 @@ class Comparison:
         parameters: the free ones and those that vary because of a prior.
         num_free: how many numbers the free ones are.
         priors: of floats of the gas.
-        weights: of ln T and, if it is used, of ln <dr^2>; the inverse relative errors.
+        weights: the inverse relative errors of the logarithms of T ("measurement") and, where they
+            are used, of T_rot ("rotation") and of <dr^2> ("displacement").
         displacement_accuracy: relative accuracy of the model's <dr^2>; None if it is not used.
         clock_of_few: factor by which the measured gas cools faster because its N are few.
         scatter: relative error of T where the curve has none; else None.
@@ -42,7 +43,7 @@ class Comparison:
     parameters: Parameters
     num_free: int
     priors: Priors
-    weights: list[Array]
+    weights: dict[str, Array]
     displacement_accuracy: Float[Array, ""] | None
     clock_of_few: Float[Array, ""] | float
     scatter: Float[Array, ""] | None = None
@@ -58,9 +59,13 @@ class Comparison:
         replicas: Float[Array, ""] | float = 1.0,
         priors: Priors = NO_PRIORS,
     ) -> "Comparison":
-        """Compare T and, where its errors are known on both sides, <dr^2>."""
+        """Compare T and, where errors are known on both sides, T_rot and <dr^2>."""
         T, T_error = curve.temperature, curve.temperature_error
-        weights = [_weights(T, T if T_error is None else T_error)]
+        weights = {"measurement": _weights(T, T if T_error is None else T_error)}
+        if uses_rotation(gas, curve):
+            T_rot, error = curve.rotational_temperature, curve.rotational_temperature_error
+            assert T_rot is not None and error is not None
+            weights["rotation"] = _weights(T_rot, error)
         accuracy = _displacement_accuracy(gas, curve, model, num_particles)
         if accuracy is not None:
             assert curve.displacement is not None
@@ -68,7 +73,7 @@ class Comparison:
             sampling = (2 / (gas.dimension * total)) ** 0.5 * curve.displacement
             error = sampling if curve.displacement_error is None else curve.displacement_error
             error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
-            weights.append(_weights(curve.displacement, error))
+            weights["displacement"] = _weights(curve.displacement, error)
         parameters = Parameters(gas, (*names, *priors.also_free(names)))
         num_free = sum(gas.value(name).size for name in names)
         faster = 1.0 if num_particles is None else _clock_of_few(gas, num_particles)
@@ -77,17 +82,19 @@ class Comparison:
     def scaled(self, flat: Float[Array, "q"]) -> "Comparison":
         """The same with the scatter of ln T at some parameters for its error."""
         T, computed = self.curve.temperature, self.evaluate(flat)[1][1]
-        used = self.weights[0] > 0
+        used = self.weights["measurement"] > 0
         square = jnp.sum(jnp.where(used, _log_ratio(T, computed.temperature), 0.0) ** 2)
         scatter = jnp.sqrt(square / (jnp.sum(used) - self.num_free))
         # Not 0 for data without noise: the errors are then as small as numbers of this precision.
         scatter = jnp.maximum(scatter, jnp.finfo(scatter.dtype).eps)
-        return replace(self, weights=[jnp.where(used, 1 / scatter, 0.0)], scatter=scatter)
+        return replace(
+            self, weights={"measurement": jnp.where(used, 1 / scatter, 0.0)}, scatter=scatter
+        )
 
     @property
     def num_measured(self) -> int:
         """How many residuals are of measured values, which come before those of priors."""
-        return sum(weights.size for weights in self.weights)
+        return sum(weights.size for weights in self.weights.values())
 
     @property
     def num_beside(self) -> int:
@@ -124,7 +131,13 @@ class Comparison:
         gas = self.parameters.gas(self.of_gas(flat))
         own_clock, errors_of_clock = self.clock(flat)
         computed = self.model.simulate(gas, self.curve.times * clock * own_clock, Run())
-        parts = [self.weights[0] * _log_ratio(self.curve.temperature, computed.temperature)]
+        ratio = _log_ratio(self.curve.temperature, computed.temperature)
+        parts = [self.weights["measurement"] * ratio]
+        if "rotation" in self.weights:
+            assert self.curve.rotational_temperature is not None
+            assert computed.rotational_temperature is not None
+            T_rot = self.curve.rotational_temperature, computed.rotational_temperature
+            parts.append(self.weights["rotation"] * _log_ratio(*T_rot))
         if self.displacement_accuracy is not None:
             assert self.curve.displacement is not None
             assert computed.displacement is not None and computed.collisions is not None
@@ -132,7 +145,7 @@ class Comparison:
             diffusive = computed.collisions / (1 + computed.collisions)
             ratio = _log_ratio(self.curve.displacement, computed.displacement)
             ratio = ratio - flat[-1] * diffusive
-            parts += [self.weights[1] * ratio, flat[-1:] / self.displacement_accuracy]
+            parts += [self.weights["displacement"] * ratio, flat[-1:] / self.displacement_accuracy]
         residuals = jnp.concatenate([*parts, errors_of_clock, self.priors.residuals(gas)])
         return residuals, (residuals, computed)
 
@@ -142,9 +155,9 @@ class Comparison:
 
     def split(self, rows: Float[Array, "*_ residuals"]) -> dict[str, Float[Array, "*_ part"]]:
         """What belongs to which residuals, by the names of `Fit.covariances`."""
-        parts = [("measurement", self.curve.times.size)]
+        parts = [(name, weights.size) for name, weights in self.weights.items()]
         if self.displacement_accuracy is not None:
-            parts += [("displacement", self.curve.times.size), ("model of <dr^2>", 1)]
+            parts.append(("model of <dr^2>", 1))
         if self.priors.names:
             sizes = zip(self.priors.names, self.priors.given, strict=True)
             parts += [("model", 2), *((name, given.size) for name, given in sizes)]
@@ -160,6 +173,14 @@ class Comparison:
             return flats[0]
         costs = jnp.stack([jnp.sum(self.residuals(flat) ** 2) for flat in flats])
         return flats[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
+
+
+def uses_rotation(gas: Gas, curve: CoolingCurve) -> bool:
+    """Whether a fit uses a measured T_rot: where its errors are known, and those of T to weigh it
+    with, and the spheres are rough."""
+    measured = curve.rotational_temperature, curve.rotational_temperature_error
+    known = None not in (*measured, curve.temperature_error)
+    return known and gas.surface is not None
 
 
 def _clock_of_few(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:

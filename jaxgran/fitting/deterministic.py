@@ -61,13 +61,16 @@ def _fit_at(
     parts = comparison.split(residuals)
     gain = _gain(comparison, flat, jacobian)
     gains = comparison.split(gain)
-    used = jnp.sum(jnp.concatenate(comparison.weights) > 0)
+    used = jnp.sum(jnp.concatenate([*comparison.weights.values()]) > 0)
     own = residuals.size - comparison.num_measured
     degrees_of_freedom = used + own - flat.size
-    tested = [(parts["measurement"], jnp.sum(comparison.weights[0] > 0) - comparison.num_free)]
+    num_used = {name: jnp.sum(weights > 0) for name, weights in comparison.weights.items()}
+    tested = [(parts["measurement"], num_used["measurement"] - comparison.num_free)]
+    if "rotation" in parts:
+        tested.append((parts["rotation"], num_used["rotation"]))
     if "displacement" in parts:
         factor = jnp.concatenate([parts["displacement"], parts["model of <dr^2>"]])
-        tested.append((factor, jnp.sum(comparison.weights[1] > 0)))
+        tested.append((factor, num_used["displacement"]))
     known = comparison.curve.temperature_error is not None
     chance = misfit(tested, degrees_of_freedom, errors_known=known)
     clock_gain = _clock_gain(comparison.split(clock_slope), gains)
@@ -82,7 +85,7 @@ def _fit_at(
         estimate=comparison.estimates(flat),
         covariances=covariances,
         clock_error=clock_error,
-        gain=gains["measurement"] * comparison.weights[0][None],
+        gain=gains["measurement"] * comparison.weights["measurement"][None],
         clock_gain=clock_gain,
         sensitivity=jacobian[: comparison.num_measured, : comparison.num_free],
         start=comparison.estimates(first),
@@ -119,10 +122,9 @@ def _clock_gain(
         slope: derivatives of the residuals in a factor of all times.
         gains: changes of the estimates over those of the residuals.
     """
-    moved = gains["measurement"] * slope["measurement"][None]
-    if "displacement" in slope:
-        moved = moved + gains["displacement"] * slope["displacement"][None]
-    return moved
+    measured = [name for name in ("measurement", "rotation", "displacement") if name in slope]
+    moved = [gains[name] * slope[name][None] for name in measured]
+    return sum(moved[1:], moved[0])
 
 
 def _covariances(
@@ -133,8 +135,8 @@ def _covariances(
 ) -> dict[str, Float[Array, "p p"]]:
     """The parts of the covariance, but for that of a clock that is not fitted."""
     covariances = {name: part @ part.T for name, part in gains.items()}
-    correlation = neighbour_correlation(residuals, comparison.weights[0] > 0)
+    correlation = neighbour_correlation(residuals, comparison.weights["measurement"] > 0)
     measured = correlation_factor(correlation) ** 2 * covariances["measurement"]
-    if "displacement" in covariances:
-        measured = measured + covariances.pop("displacement")
+    for name in {"rotation", "displacement"} & covariances.keys():
+        measured = measured + covariances.pop(name)
     return covariances | {"measurement": inflation * measured}

@@ -110,7 +110,7 @@ def fit(
         result = fit_stochastic(gas, curve, model, names, start, key, progress, steps, known)
     else:
         guesses = [guess_from_data(gas, curve, names)] + ([] if start is None else [start])
-        model.check(guesses[-1])
+        model.check_scene(guesses[-1])
         steps = 100 if max_steps is None else max_steps
         # As arrays: other numbers share the compiled program.
         N = None if num_particles is None else jnp.asarray(float(num_particles))

@@ -46,4 +46,27 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         correction = 0.5 * closed_forms.COOLING_CORRECTION * delta
         delta = delta / (1 - jnp.minimum(correction, 0.7))
         gas = gas.replace(dissipative_constant=delta / (gas.alpha**0.4 * gas.temperature**0.1))
+    return _elements_from_data(gas, curve, free)
+
+
+def _elements_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
+    """The gas with those free floats of its elements guessed that are at an end of their range.
+
+    A fit in an unbounded scale cannot begin there. beta_t is taken for 0, T_rot at t = 0 for the
+    first measured one, or a tenth of T_0, and a rate of drag for a tenth of the mean cooling rate.
+    """
+    measured = curve.rotational_temperature
+    first = 0.1 * gas.temperature if measured is None else jnp.maximum(measured[0], measured[1])
+    mean_rate = jnp.log(curve.temperature[0] / curve.temperature[-1]) / curve.times[-1]
+    guesses = {
+        "tangential_restitution": jnp.zeros(()),
+        "rotational_temperature": jnp.maximum(first, 1e-6 * gas.temperature),
+        "wall_coefficient": jnp.full((), 0.8),
+        "wall_tangential_restitution": jnp.zeros(()),
+        "drag_rate": 0.1 * jnp.maximum(mean_rate, 1e-9 / curve.times[-1]),
+        "drag_rotational_rate": 0.1 * jnp.maximum(mean_rate, 1e-9 / curve.times[-1]),
+    }
+    for name in guesses.keys() & set(free):
+        at_end = ~jnp.isfinite(gas.domains[name].to_free(gas.value(name)))
+        gas = gas.replace(**{name: jnp.where(at_end, guesses[name], gas.value(name))})
     return gas

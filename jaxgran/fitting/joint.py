@@ -117,7 +117,7 @@ def _check(measurements, shared, separate, model) -> None:
                 f"got {type(data).__name__}"
             )
         check_curve(gas, data)
-        model.check(gas)
+        model.check_scene(gas)
         if data.temperature_error is None:
             raise ValueError(
                 f"the curve of {label!r} has no errors, by which measurements are weighed: give "

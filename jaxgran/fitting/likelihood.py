@@ -72,4 +72,4 @@ def _check(gas: Gas, curve: CoolingCurve, model: AbstractModel, clock: ArrayLike
     check_curve(gas, curve)
     POSITIVE.check("clock", clock, "1 leaves the model's times as they are.")
     check_deterministic(model, "a likelihood")
-    model.check(gas)
+    model.check_scene(gas)

@@ -50,7 +50,7 @@ def fit_stochastic(
             f"a fit cannot start at {at}: positive parameters are fitted in their logarithm; give "
             "a start inside their ranges, or leave it out"
         )
-    model.check(parameters.gas(first))
+    model.check_scene(parameters.gas(first))
     key = jax.random.key(0) if key is None else key
 
     def simulate(flat, number):

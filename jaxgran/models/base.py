@@ -2,7 +2,7 @@
 
 import re
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -13,6 +13,15 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.course import Course
 from jaxgran.scene.gas import Gas
+
+ELEMENTS = {
+    "surface": "rough spheres (surface)",
+    "container": "walls (container)",
+    "drag": "drag",
+}
+"""Words for the elements of a scene."""
+
+TAKES_ALL = "KineticTheory(), which takes all elements"
 
 
 class Omission(NamedTuple):
@@ -47,6 +56,19 @@ class AbstractModel(eqx.Module):
     derivative_accuracy: AbstractClassVar[float]
     """Relative accuracy of a derivative of ln T in a parameter. Parameters whose effects differ by
     less count as undetermined."""
+
+    elements: ClassVar[tuple[str, ...]] = ()
+    """Names of the optional fields of a `Gas` that the model takes: see `Gas.elements`."""
+
+    def check_scene(self, gas: Gas) -> None:
+        """`check`, after refusing the elements of a scene that the model does not take."""
+        for name in gas.elements:
+            if name not in self.elements:
+                raise ValueError(
+                    f"{type(self).__name__} does not take {ELEMENTS[name]}: use {TAKES_ALL}, or "
+                    f"leave {name} out of the gas"
+                )
+        self.check(gas)
 
     @abstractmethod
     def check(self, gas: Gas) -> None:

@@ -87,6 +87,7 @@ class KineticTheory(AbstractModel):
         validation.whole_number("max_steps", self.max_steps, 1, "Leave it out for 200000.")
 
     stochastic: ClassVar[bool] = False
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag")
     derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs
 
     def displacement_accuracy(self, gas: Gas) -> Float[Array, ""]:

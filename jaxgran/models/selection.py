@@ -138,7 +138,7 @@ def _check_arguments(gas: Any, times: Any, tolerance: Any) -> None:
 
 def _candidate(model: AbstractModel, course: Course) -> Candidate:
     try:
-        model.check(course.gas)
+        model.check_scene(course.gas)
     except ValueError as refusal:
         return Candidate(model, None, str(refusal))
     return Candidate(model, min(model.estimated_error(course), 1.0), None)

@@ -114,7 +114,7 @@ class AbstractSpheres(AbstractModel):
         if not isinstance(gas, Gas):
             raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
         plain_number("spare", spare, POSITIVE, "2 is twice the expected need.")
-        self.check(gas)
+        self.check_scene(gas)
         plan = self.planned(self.scene(gas), gas.dimension, spare)
         return dataclasses.replace(self, plan=plan)
 

@@ -6,11 +6,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxgran.checks.validation import POSITIVE, Domain, UserNumber, number, whole_number
+from jaxgran.checks.validation import (
+    POSITIVE,
+    Domain,
+    UserNumber,
+    check_normal,
+    number,
+    whole_number,
+)
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
 from jaxgran.scene.elements import Rough, StokesDrag, Walls, check_walls
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
@@ -40,17 +45,6 @@ def _element(kind: type) -> Callable[[Any], Any]:
         raise ValueError(f"expected a jaxgran.{kind.__name__} or None, got {value!r}")
 
     return checked
-
-
-def _check_normal(name: str, value: Array) -> None:
-    """Raise ValueError for a number that single precision cannot hold, where that is used."""
-    if not isinstance(value, Tracer) and value.dtype != jnp.float64:
-        small = np.asarray(value)
-        if np.any((small != 0) & (np.abs(small) < np.finfo(small.dtype).tiny)):
-            raise ValueError(
-                f"{name} is too small for {small.dtype}, got {small.min():g}: "
-                'jax.config.update("jax_enable_x64", True) first'
-            )
 
 
 class Gas(NamedFloats):
@@ -114,7 +108,7 @@ class Gas(NamedFloats):
             if name in self._advice:
                 value = getattr(self, name)
                 domain.check(name, value, self._advice[name])
-                _check_normal(name, value)
+                check_normal(name, value)
         if self.container is not None:
             check_walls(
                 self.container, self.diameter, self.dimension, rough=self.surface is not None

@@ -64,10 +64,7 @@ class RestitutionLaw(eqx.Module):
         """
 
     def on_wall(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> "ReducedLaw":
-        """The law for a sphere and a flat wall, for which it is given.
-
-        Args: as `reduced`.
-        """
+        """The same for a sphere and a flat wall, where the law is that of the wall."""
         return self.reduced(diameter=diameter, mass=mass, speed=speed)
 
 

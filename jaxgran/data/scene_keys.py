@@ -1,0 +1,77 @@
+"""Elements of a scene in the header of a curve: roughness, walls and drag."""
+
+import warnings
+from typing import Any
+
+from jaxgran.data.header import header_number
+from jaxgran.scene.elements import Rough, StokesDrag, Walls
+
+ROUGH_KEYS = ("beta_t", "reduced_inertia", "T_rot_0")
+WALL_KEYS = ("container_side", "wall_restitution", "wall_beta_t")
+DRAG_KEYS = ("gamma",)
+
+OTHER_KEYS = ("N", "A", "dimension", "replicas", "T_from", "length_unit", "time_unit")
+"""Keys that say something besides the gas and its elements."""
+
+PROVENANCE_KEYS = ("units", "points", "end_tau", "melt_tau", "steps_per_contact", "source")
+"""Keys that say how a curve was made, and that nothing depends on."""
+
+
+def read_elements(header: dict[str, str]) -> dict[str, Any]:
+    """The elements that a header describes, as `jaxgran.Gas` takes them.
+
+    Args:
+        header: where spheres are rough beta_t and, if they are not .4 and 0, reduced_inertia,
+            4 I/(m sigma^2), and T_rot_0, T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2; where there
+            are walls container_side, of a cube, m, wall_restitution and, of rough ones,
+            wall_beta_t; where there is drag gamma, 1/s, of dv/dt = -gamma v.
+
+    Raises:
+        ValueError: for a key that needs another one, or a value outside its range.
+    """
+    found = {key: header_number(header, key) for key in header if key in ELEMENT_KEYS}
+    elements: dict[str, Any] = {}
+    if _whole(found, ROUGH_KEYS, needed=("beta_t",)):
+        elements["surface"] = Rough(
+            found["beta_t"],
+            inertia=found.get("reduced_inertia", 0.4),
+            rotational_temperature=found.get("T_rot_0", 0.0),
+        )
+    if _whole(found, WALL_KEYS, needed=("container_side", "wall_restitution")):
+        elements["container"] = Walls(
+            found["container_side"],
+            restitution=found["wall_restitution"],
+            tangential_restitution=found.get("wall_beta_t"),
+        )
+    if "gamma" in found:
+        elements["drag"] = StokesDrag(found["gamma"])
+    return elements
+
+
+ELEMENT_KEYS = (*ROUGH_KEYS, *WALL_KEYS, *DRAG_KEYS)
+
+
+def _whole(found: dict[str, float], keys: tuple[str, ...], needed: tuple[str, ...]) -> bool:
+    given = [key for key in keys if key in found]
+    missing = [key for key in needed if key not in found]
+    if given and missing:
+        raise ValueError(f"the header gives {given[0]} without {missing[0]}; add {missing[0]}")
+    return bool(given)
+
+
+def warn_of_unknown_keys(header: dict[str, str], known: tuple[str, ...]) -> None:
+    """Warn of header keys that nothing is made of. Comments that are no single word are not keys.
+
+    Args:
+        header: of a curve.
+        known: keys of the gas and of its priors.
+    """
+    known = (*known, *ELEMENT_KEYS, *OTHER_KEYS, *PROVENANCE_KEYS)
+    unknown = [key for key in header if key.isidentifier() and key not in known]
+    if unknown:
+        warnings.warn(
+            f"the header key {unknown[0]!r} is not known, and nothing is made of it"
+            + (f"; neither are {', '.join(unknown[1:])}" if unknown[1:] else "")
+            + f": known are {', '.join(known)}",
+            stacklevel=3,
+        )

@@ -1,0 +1,219 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+
+TAUS = np.geomspace(1.0, 300.0, 8)
+
+
+def scene(gas, **elements) -> jaxgran.Gas:
+    return dataclasses.replace(gas, **elements)
+
+
+def constant(eps, dimension=3, **elements) -> jaxgran.Gas:
+    return jaxgran.Gas(
+        jaxgran.ConstantRestitution(eps),
+        diameter=2e-3,
+        mass=1e-5,
+        packing_fraction=0.02,
+        temperature=0.01,
+        dimension=dimension,
+        **elements,
+    )
+
+
+def cooled(gas, taus=TAUS, **settings) -> jaxgran.CoolingCurve:
+    times = taus * float(gas.mean_free_time)
+    return jaxgran.cool(gas, times, model=jaxgran.KineticTheory(**settings))
+
+
+def test_smooth_surfaces_change_nothing(beads):
+    smooth = cooled(beads())
+    rough = cooled(scene(beads(), surface=jaxgran.Rough(-1.0, rotational_temperature=3e-3)))
+    # Within the tolerance of the solver, whose steps follow T_rot too.
+    for name in ("temperature", "sonine", "displacement", "collisions"):
+        np.testing.assert_allclose(getattr(rough, name), getattr(smooth, name), rtol=1e-7)
+    np.testing.assert_allclose(rough.rotational_temperature, 3e-3, rtol=1e-7)
+    assert smooth.rotational_temperature is None
+
+
+@pytest.mark.parametrize("dimension, spins", [(3, 3), (2, 1)])
+def test_perfectly_rough_elastic_spheres_keep_their_energy(dimension, spins):
+    surface = jaxgran.Rough(1.0, rotational_temperature=2e-3)
+    curve = cooled(constant(1.0, dimension, surface=surface), sonine=False)
+    energy = dimension * curve.temperature + spins * curve.rotational_temperature
+    np.testing.assert_allclose(energy, dimension * 0.01 + spins * 2e-3, rtol=1e-8)
+    # In the end each of the d + d_rot squares of the energy has the same share.
+    np.testing.assert_allclose(curve.rotational_temperature[-1], curve.temperature[-1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("inertia", [0.4, 2 / 3])
+@pytest.mark.parametrize("beta", [-0.3, 0.0, 0.5, 0.9])
+@pytest.mark.parametrize("eps", [0.6, 0.9, 1.0])
+def test_the_temperatures_reach_the_ratio_of_the_literature(eps, beta, inertia):
+    # Santos, Kremer & Garzo, Prog. Theor. Phys. Suppl. 184, 31 (2010): the homogeneous cooling
+    # state of inelastic rough spheres, Maxwellian.
+    q, surface = inertia, jaxgran.Rough(beta, inertia=inertia, rotational_temperature=0.01)
+    gas = constant(eps, surface=surface)
+    curve = cooled(gas, np.array([1e6]), sonine=False)
+    c = (1 + q) ** 2 / (2 * q * (1 + beta) ** 2)
+    c *= 1 - eps**2 - (1 - q) / (1 + q) * (1 - beta**2)
+    expected = c + np.sqrt(1 + c**2)
+    ratio = float(curve.rotational_temperature[0] / curve.temperature[0])
+    assert ratio == pytest.approx(expected, rel=2e-3)  # approached as a power of time
+
+
+def test_drag_alone_is_an_exponential():
+    gas = constant(1.0, drag=jaxgran.StokesDrag(2.0))
+    curve = cooled(gas)
+    # The tolerance of the solver is one of ln T, which falls to -85.
+    np.testing.assert_allclose(jnp.log(curve.temperature / 0.01), -4 * curve.times, rtol=1e-8)
+
+
+def test_walls_take_energy_as_haff_has_it():
+    # dT/dt = -(4/L) Z (1 - e^2) sqrt(T/(2 pi)) T in a cube of free width L - sigma.
+    gas = constant(1.0, container=jaxgran.Walls(0.05, restitution=0.8))
+    curve = cooled(gas)
+    phi = 0.02
+    pressure = 1 + 4 * phi * (1 - phi / 2) / (1 - phi) ** 3
+    rate = 4 / 0.048 * pressure * 0.36 * (0.01 / (2 * np.pi)) ** 0.5
+    np.testing.assert_allclose(
+        curve.temperature, 0.01 / (1 + rate * curve.times / 2) ** 2, rtol=1e-6
+    )
+    assert curve.displacement is None and curve.diffusion is None
+
+
+def test_a_viscoelastic_wall_is_softer_by_the_root_of_two():
+    law = jaxgran.Viscoelastic(5e7, 0.22, 1e-6)
+    softer = jaxgran.Viscoelastic(5e7 / 2**0.5, 0.22, 1e-6)
+    shape = {"diameter": 2e-3, "mass": 1e-5, "speed": 0.1}
+    wall, pair = law.on_wall(**shape), softer.reduced(**shape)
+    assert float(wall.beta) == pytest.approx(float(pair.beta), rel=1e-12)
+    assert float(wall.length) == pytest.approx(float(pair.length), rel=1e-12)
+
+
+ELEMENTS = {
+    "surface": jaxgran.Rough(0.3, rotational_temperature=1e-3),
+    "container": jaxgran.Walls(0.05, restitution=0.8, tangential_restitution=0.2),
+    "drag": jaxgran.StokesDrag(0.3, rotational_rate=0.5),
+}
+
+
+def test_derivatives_in_the_floats_of_elements_are_those_of_differences(beads):
+    gas = scene(beads(), **ELEMENTS)
+    times = jnp.asarray(TAUS) * gas.mean_free_time
+    names = [
+        "tangential_restitution",
+        "inertia",
+        "rotational_temperature",
+        "wall_side",
+        "wall_coefficient",
+        "wall_tangential_restitution",
+        "drag_rate",
+        "drag_rotational_rate",
+        "dissipative_constant",
+    ]
+
+    def both(values):
+        changed = gas.replace(**dict(zip(names, values, strict=True)))
+        curve = jaxgran.cool(changed, times, model=jaxgran.KineticTheory(rtol=1e-11))
+        return jnp.log(jnp.concatenate([curve.temperature, curve.rotational_temperature]))
+
+    at = jnp.stack([gas.value(name) for name in names])
+    forward, reverse = jax.jacfwd(both)(at), jax.jacrev(both)(at)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
+    step = 1e-4 * np.asarray(at)
+    for k in range(len(names)):
+        moved = np.zeros(len(names))
+        moved[k] = step[k]
+        difference = (both(at + moved) - both(at - moved)) / (2 * step[k])
+        # Their second order is 1e-8, and rounding 1e-10/1e-4 of ln T.
+        np.testing.assert_allclose(
+            forward[:, k] * at[k], difference * at[k], rtol=1e-4, atol=2e-6, err_msg=names[k]
+        )
+
+
+@pytest.mark.parametrize("name", ELEMENTS)
+def test_other_models_refuse_what_they_do_not_take(beads, name):
+    if name == "container":
+        elements = {name: jaxgran.Walls(0.05, restitution=0.8)}
+    else:
+        elements = {name: ELEMENTS[name]}
+    gas = scene(beads(), **elements)
+    times = TAUS * float(gas.mean_free_time)
+    for model in (jaxgran.HardSpheres(100), jaxgran.SoftSpheres(100)):
+        kind = type(model).__name__
+        with pytest.raises(ValueError, match=f"{kind} does not take .*{name}.*KineticTheory"):
+            jaxgran.cool(gas, times, model=model)
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: jaxgran.Rough(1.1), r"tangential_restitution must lie in \[-1, 1\], got 1.1"),
+        (lambda: jaxgran.Rough(0.0, inertia=0.0), r"inertia must lie in \(0, 1\]"),
+        (lambda: jaxgran.Rough(0.0, rotational_temperature=-1.0), "rotational_temperature"),
+        (lambda: jaxgran.StokesDrag(-1.0), r"rate of the drag must lie in \[0, inf\), got -1"),
+        (lambda: jaxgran.Walls(0.0, restitution=0.9), "side of the walls must lie in"),
+        (lambda: jaxgran.Walls(0.1, restitution=1.2), "restitution of the walls must lie in"),
+        (lambda: jaxgran.Walls(0.1, restitution="hard"), "restitution of the walls must be a num"),
+        (
+            lambda: constant(0.9, container=jaxgran.Walls(4.1e-3, restitution=0.9)),
+            r"side of the walls, over the diameter, must lie in \(2.1, inf\), got 2.05",
+        ),
+        (
+            lambda: constant(0.9, container=jaxgran.Walls([0.1, 0.1], restitution=0.9)),
+            "must be one number or 3",
+        ),
+        (
+            lambda: constant(
+                0.9,
+                container=jaxgran.Walls(0.1, restitution=0.9, tangential_restitution=0.0),
+            ),
+            "needs rough spheres: add surface",
+        ),
+        (lambda: constant(0.9, surface=0.5), "expected a jaxgran.Rough or None, got 0.5"),
+        (lambda: constant(0.9, drag=0.5), "expected a jaxgran.StokesDrag or None, got 0.5"),
+    ],
+)
+def test_bad_elements_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_elements_are_read_from_a_header():
+    header = {
+        "eta": "0.05",
+        "diameter": "2e-3",
+        "density": "2500",
+        "Y": "5e7",
+        "nu": "0.2",
+        "T0": "0.01",
+    }
+    extra = {
+        "beta_t": "-0.2",
+        "T_rot_0": "2e-3",
+        "container_side": "0.05",
+        "wall_restitution": "0.9",
+        "wall_beta_t": "0.1",
+        "gamma": "0.3",
+    }
+    gas = jaxgran.read_gas(header | extra)
+    assert gas.elements == ("surface", "container", "drag")
+    assert float(gas.value("inertia")) == 0.4
+    read = {name: float(gas.value(name)) for name in gas.domains}
+    assert read["tangential_restitution"] == -0.2 and read["rotational_temperature"] == 2e-3
+    assert read["wall_side"] == 0.05 and read["wall_coefficient"] == 0.9
+    assert read["wall_tangential_restitution"] == 0.1 and read["drag_rate"] == 0.3
+    for wrong, message in (
+        ({"T_rot_0": "1"}, "gives T_rot_0 without beta_t"),
+        ({"container_side": "0.05"}, "gives container_side without wall_restitution"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jaxgran.read_gas(header | wrong)
+    with pytest.warns(UserWarning, match="'friction' is not known.*known are eta"):
+        jaxgran.read_gas(header | {"friction": "0.5", "A comment of some words": "x"})
