@@ -21,7 +21,7 @@ ELEMENTS = {
 }
 """Words for the elements of a scene."""
 
-TAKES_ALL = "KineticTheory(), which takes all elements"
+TAKES_ALL = "KineticTheory() or DSMC(N), which take all elements"
 
 
 class Omission(NamedTuple):

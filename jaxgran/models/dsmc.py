@@ -28,9 +28,10 @@ from jaxgran.models.course import Course
 from jaxgran.particles.driver import follow
 from jaxgran.particles.interruption import waited_for
 from jaxgran.particles.stochastic import simulation
-from jaxgran.particles.stochastic.collisions import Scheme
+from jaxgran.particles.stochastic.elements import transformed
+from jaxgran.particles.stochastic.pairing import Scheme
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
 
 LONGEST_STEP = 0.1
 """Most collisions per particle in one step: a particle can be drawn at most twice in it."""
@@ -75,6 +76,7 @@ class DSMC(AbstractModel):
     step: UserFloat = eqx.field(static=True, default=0.05)
 
     stochastic: ClassVar[bool] = True
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag")
     derivative_accuracy: ClassVar[float] = 0.01
 
     def __check_init__(self):
@@ -110,19 +112,21 @@ class DSMC(AbstractModel):
         # Two words of any kind of key, for the kind that is used here.
         words = jax.random.bits(key, (2,), jnp.uint32)
         scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
-        law, reduced = gas.reduced_law, times * gas.impact_speed / gas.path_length
+        scene, reduced = reduced_scene(gas), times * gas.impact_speed / gas.path_length
+        if scene.drag is not None:
+            reduced = transformed(scene.drag, reduced)
         if any_traced(gas, times, words):
             checks.refuse_checkpoint(self, run)
             records = simulation.differentiable_run(
-                law, reduced, words, replicas=self.replicas, scheme=scheme
+                scene, reduced, words, replicas=self.replicas, scheme=scheme
             )
         else:
-            records = self._driven(law, reduced, words, scheme, run)
+            records = self._driven(scene, reduced, words, scheme, run)
         return _curve(gas, times, records)
 
     def _driven(
         self,
-        law: ReducedLaw,
+        scene: ReducedScene,
         times: Float[Array, "times"],
         words: UInt32[Array, "2"],
         scheme: Scheme,
@@ -130,14 +134,14 @@ class DSMC(AbstractModel):
     ) -> dict[str, Array]:
         """The records of a run by the driver on the host, with progress and checkpoints."""
         start, advance, observe = simulation.parts(
-            law, words, replicas=self.replicas, scheme=scheme
+            scene, words, replicas=self.replicas, scheme=scheme
         )
         _, records, fault = follow(
             start,
             np.asarray(times),
             lambda state, end: waited_for(advance(state, end)),
             observe,
-            scene=described(law=law, times=times, key=words, scheme=scheme, model=self),
+            scene=described(scene=scene, times=times, key=words, scheme=scheme, model=self),
             progress=run.progress,
             path=run.checkpoint,
         )
@@ -155,8 +159,13 @@ def _curve(gas: Gas, times: Float[Array, "times"], records: dict[str, Array]) ->
         "displacement": gas.path_length**2,
         "velocity_correlation": gas.temperature,
         "collisions": 1.0,
+        "rotational_temperature": gas.temperature,
     }
+    if gas.container is not None:  # spheres do not go far
+        del units["displacement"]
     each = {
-        name: jnp.where(failed, jnp.nan, records[name]).T * unit for name, unit in units.items()
+        name: jnp.where(failed, jnp.nan, records[name]).T * unit
+        for name, unit in units.items()
+        if name in records
     }
     return CoolingCurve.of_replicas(times, each, status=jnp.bitwise_or.reduce(fault, axis=None))

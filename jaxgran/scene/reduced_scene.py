@@ -34,12 +34,13 @@ class ReducedWalls(NamedTuple):
 
     Attributes:
         law: of restitution, in units of `Gas.impact_speed`.
-        frequency: impacts on walls per particle and unit of time, over sqrt(T/T_0).
+        frequency: impacts on the two walls across each axis per particle and unit of time, over
+            sqrt(T/T_0).
         beta: beta_t of the walls; None if they are smooth.
     """
 
     law: ReducedLaw
-    frequency: Float[Array, ""]
+    frequency: Float[Array, "d"]
     beta: Float[Array, ""] | None
 
 
@@ -76,7 +77,7 @@ def reduced_scene(gas: Gas) -> ReducedScene:
         law = box.restitution.on_wall(diameter=gas.diameter, mass=gas.mass, speed=speed)
         pressure = 1 + 2 ** (d - 1) * gas.packing_fraction * gas.contact_value
         widths = jnp.broadcast_to(box.side - gas.diameter, (d,))
-        frequency = pressure * jnp.sum(length / widths) / pi**0.5
+        frequency = pressure * length / widths / pi**0.5
         walls = ReducedWalls(law, frequency, box.tangential_restitution)
     if gas.drag is not None:
         time = length / speed

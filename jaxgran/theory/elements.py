@@ -95,7 +95,7 @@ def _of_walls(
     rough spheres what an impact between spheres takes with ``eta_w = q (1 + beta_w)/(1 + q)`` for
     2 eta. Velocities are reversed, so that displacements are not those of a free gas.
     """
-    rate = walls.frequency * speed
+    rate = jnp.sum(walls.frequency) * speed
     cooling = 2 / d * rate * loss
     nothing = jnp.zeros_like(speed)
     if surface is None or walls.beta is None:

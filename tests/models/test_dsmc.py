@@ -12,7 +12,8 @@ import jaxgran
 from jaxgran.models.dsmc import DSMC
 from jaxgran.particles import driver
 from jaxgran.particles.stochastic import collisions, simulation
-from jaxgran.particles.stochastic.collisions import Scheme
+from jaxgran.particles.stochastic.pairing import Scheme
+from jaxgran.scene.reduced_scene import ReducedScene
 from jaxgran.theory import averages as kinetics
 from tests.conftest import glass_beads
 
@@ -192,7 +193,7 @@ def state_after(gas, scheme, steps, replicas=1, key=0):
     step = jax.jit(collisions.step, static_argnums=(4, 5))
     share = jnp.ones(replicas)
     for _ in range(steps):
-        state = step(state, key, share, gas.reduced_law, scheme, False)
+        state = step(state, key, share, ReducedScene(gas.reduced_law), scheme, False)
     return state
 
 
@@ -212,7 +213,7 @@ def test_every_pair_is_about_equally_likely(n):
     scheme = Scheme.of(3, n, 0.1)
 
     def draw(key):
-        i, j, k = collisions._draw(jax.random.bits(key, (4,)), scheme)
+        i, j, k = draw(jax.random.bits(key, (4,)), scheme)
         one = jnp.stack([i, j])
         return jnp.concatenate([one, jnp.stack([i[: scheme.second], k])], axis=1)
 

@@ -1,6 +1,9 @@
 """Direct simulation Monte Carlo (DSMC): velocities that change by random collisions.
 
 - `collision_rule`: which candidate pairs collide, and what a collision does.
+- `pairing`: which pairs are drawn in a step.
+- `elements`: drag, rough spheres and walls.
+- `tangents`: in the parameters of the law.
 - `collisions`: one step of many collisions.
 - `simulation`: a whole run as a pure function, and the parts of it that the host driver needs.
 

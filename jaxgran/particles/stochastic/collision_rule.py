@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, UInt32
 
+from jaxgran.particles.stochastic.elements import torque, twisted
+from jaxgran.scene.reduced_scene import ReducedRough, ReducedScene
 from jaxgran.scene.restitution import ReducedLaw
 
 
@@ -22,6 +24,7 @@ class Outcome(NamedTuple):
         memory: ``sum (1 + eps)^2 (g.n)^2 / 4``, by which D/sqrt(T) decays.
         along: tangents of -loss and of memory in the parameters of the law.
         along_speed: their tangents in the logarithm of all speeds.
+        twist: change of the spins of both particles of each pair; None of smooth ones.
     """
 
     kick: Float[Array, "pairs d"]
@@ -31,6 +34,7 @@ class Outcome(NamedTuple):
     memory: Float[Array, ""]
     along: Float[Array, "2 P"]
     along_speed: Float[Array, "..."]  # (2,)
+    twist: Float[Array, "pairs spins"] | None = None
 
 
 def collide(
@@ -38,8 +42,10 @@ def collide(
     bits: UInt32[Array, "2 pairs"],
     ceiling: Float[Array, ""],
     share: Float[Array, ""],
-    law: ReducedLaw,
+    scene: ReducedScene,
     tangents: bool,
+    spin: Float[Array, "pairs spins"] | None = None,
+    slowed: Float[Array, ""] | None = None,
 ) -> Outcome:
     """Let candidate pairs collide at a rate proportional to |g|, with normals weighted by g.n.
 
@@ -48,8 +54,10 @@ def collide(
         bits: random ones.
         ceiling: |g| at which a candidate collides with probability 1 in a whole step.
         share: of the step to be done.
-        law: of restitution.
+        scene: in reduced units.
         tangents: whether the tangents are wanted.
+        spin: s_i + s_j of rough spheres.
+        slowed: physical velocities over these; None if they are the same.
     """
     d, dtype = relative.shape[-1], relative.dtype
     g = [relative[:, k] for k in range(d)]
@@ -65,14 +73,15 @@ def collide(
     cosine = jnp.sqrt(jnp.where(met, 1 - sine_square, 1.0))
     sideways = _perpendicular(axis)
     normal_speed = jnp.where(hit, speed * cosine, ceiling)
-    eps, along, along_speed = _restitution(normal_speed, hit, law, tangents)
+    at_impact = normal_speed if slowed is None else normal_speed * slowed
+    eps, along, along_speed = _restitution(at_impact, hit, scene.law, tangents)
     square = jnp.where(hit, normal_speed**2, 0.0)
     push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
     normal = [
         cosine * axis[k] + sum(b * e[k] for b, e in zip(offset, sideways, strict=True))
         for k in range(d)
     ]
-    return Outcome(
+    outcome = Outcome(
         kick=jnp.stack([-push * n for n in normal], axis=-1),
         num=jnp.sum(hit, dtype=dtype),
         missed=share * jnp.sum(jnp.where(met, jnp.maximum(speed / ceiling - 1, 0.0), 0.0)),
@@ -80,6 +89,30 @@ def collide(
         memory=jnp.sum((1 + eps) ** 2 / 4 * square),
         along=along,
         along_speed=along_speed,
+    )
+    if scene.surface is None or spin is None:
+        return outcome
+    return _rubbed(outcome, scene.surface, relative, spin, jnp.stack(normal, axis=-1), hit)
+
+
+def _rubbed(
+    outcome: Outcome,
+    surface: ReducedRough,
+    relative: Float[Array, "pairs d"],
+    spin: Float[Array, "pairs spins"],
+    normal: Float[Array, "pairs d"],
+    hit: Bool[Array, "pairs"],
+) -> Outcome:
+    """The outcome with the tangential part of the impacts; see `jaxgran.Rough`."""
+    along_normal = jnp.sum(relative * normal, axis=-1, keepdims=True)
+    sideways = relative - along_normal * normal
+    slip = jnp.where(hit[:, None], sideways + twisted(spin, normal), 0.0)
+    kick = -surface.eta * slip
+    lost = -2 * jnp.sum(kick * (sideways + kick))
+    return outcome._replace(
+        kick=outcome.kick + kick,
+        loss=outcome.loss + lost,
+        twist=torque(normal, kick) / surface.inertia,
     )
 
 

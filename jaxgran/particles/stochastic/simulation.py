@@ -17,8 +17,12 @@ from jaxtyping import Array, Float, UInt32
 
 from jaxgran.checks import status
 from jaxgran.particles import initial, observables
-from jaxgran.particles.stochastic import collisions
-from jaxgran.particles.stochastic.collisions import DSMCState, DSMCTangents, Scheme
+from jaxgran.particles.stochastic import collisions, elements
+from jaxgran.particles.stochastic.collisions import DSMCState
+from jaxgran.particles.stochastic.pairing import Scheme
+from jaxgran.particles.stochastic.tangents import DSMCTangents
+from jaxgran.scene.elements import SPINS
+from jaxgran.scene.reduced_scene import ReducedScene
 from jaxgran.scene.restitution import ReducedLaw
 from jaxgran.tangents.limits import first_order_only, unknown
 from jaxgran.theory import averages
@@ -32,19 +36,28 @@ CHUNK = 4_000_000
 
 @partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
 def at_start(
-    key: UInt32[Array, "2"], replicas: int, scheme: Scheme, num_parameters: int
+    key: UInt32[Array, "2"],
+    replicas: int,
+    scheme: Scheme,
+    num_parameters: int,
+    scene: ReducedScene | None = None,
 ) -> DSMCState:
     """Maxwellian velocities at t = 0, with tangents in so many parameters."""
     d = scheme.dimension
     key = jax.random.fold_in(collisions.wrapped(key), 2**32 - 1)
     v = initial.velocities(key, replicas, scheme.num_particles, d).reshape(replicas, -1, d)
+    parts = [v / sqrt(2), jnp.zeros_like(v)]
+    if scene is not None and scene.surface is not None:
+        shape = (replicas, scheme.num_particles, SPINS[d])
+        key = jax.random.fold_in(key, 0)
+        parts.append(elements.spins_at_start(scene.surface, key, shape, v))
     each, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
     return DSMCState(
         time=jnp.zeros((), v.dtype),
         clock=each,
         clock_rest=each,
         temperature=each + 1,
-        particles=jnp.concatenate([v / sqrt(2), jnp.zeros_like(v)], axis=-1),
+        particles=jnp.concatenate(parts, axis=-1),
         collisions=each,
         missed=each,
         steps=jnp.zeros(replicas, jnp.uint32),
@@ -57,7 +70,7 @@ def at_start(
 def observe(
     state: DSMCState,
     first: Float[Array, "replicas N d"],
-    law: ReducedLaw,
+    scene: ReducedScene,
     key: UInt32[Array, "2"],
     *,
     scheme: Scheme,
@@ -70,13 +83,13 @@ def observe(
     Args:
         state: of the gas.
         first: velocities at t = 0.
-        law, key, scheme: of the run.
+        scene, key, scheme: of the run.
         tangents: return three dictionaries instead: "values", the "rates" of their change with
             time, and "along", their tangents in the parameters of the law at this time.
     """
     left = (state.time - state.clock) - state.clock_rest
     share = left * jnp.sqrt(state.temperature) / scheme.own_step
-    state = collisions.step(state, key, jnp.clip(share, 0.0, 1.0), law, scheme, tangents)
+    state = collisions.step(state, key, jnp.clip(share, 0.0, 1.0), scene, scheme, tangents)
     d = scheme.dimension
 
     def centred(x):
@@ -84,7 +97,7 @@ def observe(
 
     velocity = centred(state.particles[..., :d])
     travelled = centred(
-        state.particles[..., d:] + state.clock[:, None, None] * state.particles[..., :d]
+        state.particles[..., d : 2 * d] + state.clock[:, None, None] * state.particles[..., :d]
     )
     theta = 2 * observables.temperature(velocity)
     values = {
@@ -94,12 +107,20 @@ def observe(
         "velocity_correlation": 2 * observables.velocity_correlation(first, velocity),
         "collisions": 2 / scheme.num_particles * state.collisions,
     }
+    if scene.surface is not None:
+        spin = jnp.mean(state.particles[..., 2 * d :] ** 2, axis=(1, 2))
+        values["rotational_temperature"] = 2 * scene.surface.inertia * spin
+    if scene.drag is not None:
+        left = elements.decay(scene.drag, state.time)
+        powers = {"temperature": left.velocity**2, "velocity_correlation": left.velocity}
+        powers["rotational_temperature"] = left.kept**2
+        values |= {name: powers[name] * values[name] for name in powers.keys() & values.keys()}
     fast = status.flag(status.TOO_FAST, state.missed > MISSED * state.collisions + 1)
     values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
     if not tangents:
         return values
     walked = 2 * jnp.mean(jnp.sum(travelled * velocity, axis=-1), axis=-1)
-    rates = _rates(values, law, d) | {"displacement": walked}
+    rates = _rates(values, scene.law, d) | {"displacement": walked}
     return {"values": values, "rates": rates, "along": _along(values, rates, state.tangents)}
 
 
@@ -141,7 +162,7 @@ def _along(
 
 @partial(jax.jit, static_argnames=("replicas", "scheme", "tangents"))
 def run(
-    law: ReducedLaw,
+    scene: ReducedScene,
     times: Float[Array, "times"],
     key: UInt32[Array, "2"],
     *,
@@ -150,20 +171,21 @@ def run(
     tangents: bool,
 ) -> dict[str, Any]:
     """The records of `observe` at all times, with a first axis of times. A pure function."""
-    num_parameters = ravel_pytree(law)[0].size if tangents else 0
-    state = at_start(key, replicas, scheme, num_parameters)
+    num_parameters = ravel_pytree(scene)[0].size if tangents else 0
+    state = at_start(key, replicas, scheme, num_parameters, scene)
     first = state.particles[..., : scheme.dimension]
     forever = jnp.asarray(2**31 - 1, jnp.int32)
 
     def to(state, end):
-        state = collisions.advance(state, end, law, key, forever, scheme=scheme, tangents=tangents)
-        return state, observe(state, first, law, key, scheme=scheme, tangents=tangents)
+        options = {"scheme": scheme, "tangents": tangents}
+        state = collisions.advance(state, end, scene, key, forever, **options)
+        return state, observe(state, first, scene, key, **options)
 
     return jax.lax.scan(to, state, times)[1]
 
 
 def differentiable_run(
-    law: ReducedLaw,
+    scene: ReducedScene,
     times: Float[Array, "times"],
     key: UInt32[Array, "2"],
     *,
@@ -171,18 +193,23 @@ def differentiable_run(
     scheme: Scheme,
 ) -> dict[str, Array]:
     """`run` with one linear rule for forward and reverse mode, from tangents beside the state."""
-    parameters, unravel = ravel_pytree(law)
+    parameters, unravel = ravel_pytree(scene)
 
     @jax.custom_jvp
     def solve(parameters, times, key):
-        law = unravel(parameters)
-        return run(law, times, key, replicas=replicas, scheme=scheme, tangents=False)
+        scene = unravel(parameters)
+        return run(scene, times, key, replicas=replicas, scheme=scheme, tangents=False)
 
     @solve.defjvp
     def solve_jvp(at, along):
         parameters, times, key = first_order_only(at)
-        law = unravel(parameters)
-        out = run(law, times, key, replicas=replicas, scheme=scheme, tangents=True)
+        scene = unravel(parameters)
+        if scene[1:] != (None, None, None):
+            raise ValueError(
+                "derivatives of DSMC runs with rough spheres, walls or drag are not known: use "
+                "KineticTheory(), or differences of runs"
+            )
+        out = run(scene, times, key, replicas=replicas, scheme=scheme, tangents=True)
         values = out["values"]
         tangents = {
             name: rate * along[1][:, None] + out["along"][name] @ along[0]
@@ -196,16 +223,16 @@ def differentiable_run(
 
 
 def parts(
-    law: ReducedLaw, key: UInt32[Array, "2"], *, replicas: int, scheme: Scheme
+    scene: ReducedScene, key: UInt32[Array, "2"], *, replicas: int, scheme: Scheme
 ) -> tuple[DSMCState, Callable[[DSMCState, float], DSMCState], Callable[[DSMCState], dict]]:
     """The parts of `run` that the host driver needs: a state, how to advance, and to observe it."""
-    state = at_start(key, replicas, scheme, 0)
+    state = at_start(key, replicas, scheme, 0, scene)
     pairs = replicas * (scheme.first + scheme.second)
     max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
     first = state.particles[..., : scheme.dimension]
 
     def advance(state: DSMCState, end: float) -> DSMCState:
         end_array = jnp.asarray(end, state.clock.dtype)
-        return collisions.advance(state, end_array, law, key, max_steps, scheme=scheme)
+        return collisions.advance(state, end_array, scene, key, max_steps, scheme=scheme)
 
-    return state, advance, partial(observe, first=first, law=law, key=key, scheme=scheme)
+    return state, advance, partial(observe, first=first, scene=scene, key=key, scheme=scheme)
