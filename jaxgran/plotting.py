@@ -34,11 +34,29 @@ def plot_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
         title: above the picture.
         path: of the file; its suffix is the format, PNG without one.
     """
-    has_displacement = result.displacement_residuals is not None
-    figure = Figure(figsize=(8.0, 6.4), layout="constrained")
+    further = [
+        (
+            curve.rotational_temperature,
+            curve.rotational_temperature_error,
+            result.curve.rotational_temperature,
+            result.rotation_residuals,
+            r"rotational temperature $T_\mathrm{rot}$ (m$^2$/s$^2$)",
+            "lower left",
+        ),
+        (
+            curve.displacement,
+            curve.displacement_error,
+            result.curve.displacement,
+            result.displacement_residuals,
+            r"mean square displacement $\langle\Delta r^2\rangle$ (m$^2$)",
+            "upper left",
+        ),
+    ]
+    further = [panel for panel in further if panel[3] is not None]
+    figure = Figure(figsize=(max(8.0, 4.0 + 4.0 * len(further)), 6.4), layout="constrained")
     axes = figure.subplots(
         2,
-        2 if has_displacement else 1,
+        1 + len(further),
         sharex=True,
         squeeze=False,
         gridspec_kw={"height_ratios": [3, 1]},
@@ -55,13 +73,12 @@ def plot_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
     T = np.asarray(curve.temperature)
     top.set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
     top.legend(frameon=False, loc="lower left")
-    if has_displacement:
-        top, bottom = axes[:, 1]
-        measured, error = curve.displacement, curve.displacement_error
-        _draw(top, curve.times, measured, error, result.curve.displacement, fitted)
-        _draw_residuals(bottom, curve.times, result.displacement_residuals)
-        top.set_ylabel(r"mean square displacement $\langle\Delta r^2\rangle$ (m$^2$)")
-        top.legend(frameon=False, loc="upper left")
+    for (top, bottom), panel in zip(axes[:, 1:].T, further, strict=True):
+        measured, error, computed, residuals, label, corner = panel
+        _draw(top, curve.times, measured, error, computed, fitted)
+        _draw_residuals(bottom, curve.times, residuals)
+        top.set_ylabel(label)
+        top.legend(frameon=False, loc=corner)
     for axis in axes.flat:
         axis.spines[["top", "right"]].set_visible(False)
     picture_format = Path(path).suffix.lstrip(".") or "png"

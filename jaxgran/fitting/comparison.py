@@ -14,6 +14,9 @@ from jaxgran.fitting.priors import NO_PRIORS, Priors
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
+QUANTITIES = {"rotation": "T_rot", "displacement": "<dr^2>"}
+"""What else than T a fit may use."""
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -21,9 +24,9 @@ class Comparison:
 
     The parameters ``flat`` are those of the gas in their unbounded scale: the free ones, then those
     that vary because of a prior. After them, where there are priors, come errors of the model's
-    clock, of its mean and of its trend in ln T, so that these are not blamed on the gas; and, if
-    <dr^2> is used, the logarithm of a factor common to all values of D. Both have the model's
-    accuracy for a prior.
+    clock, of its mean and of its trend in ln T, so that these are not blamed on the gas; and, where
+    they are used, the logarithms of a factor common to all T_rot and of one common to all values of
+    D. All have the model's accuracy for a prior.
 
     Attributes:
         curve: the measured curve.
@@ -33,7 +36,8 @@ class Comparison:
         priors: of floats of the gas.
         weights: the inverse relative errors of the logarithms of T ("measurement") and, where they
             are used, of T_rot ("rotation") and of <dr^2> ("displacement").
-        displacement_accuracy: relative accuracy of the model's <dr^2>; None if it is not used.
+        accuracies: relative accuracy of the model's T_rot ("rotation") and <dr^2> ("displacement"),
+            where they are used.
         clock_of_few: factor by which the measured gas cools faster because its N are few.
         scatter: relative error of T where the curve has none; else None.
     """
@@ -44,7 +48,7 @@ class Comparison:
     num_free: int
     priors: Priors
     weights: dict[str, Array]
-    displacement_accuracy: Float[Array, ""] | None
+    accuracies: dict[str, Float[Array, ""] | float]
     clock_of_few: Float[Array, ""] | float
     scatter: Float[Array, ""] | None = None
 
@@ -62,10 +66,12 @@ class Comparison:
         """Compare T and, where errors are known on both sides, T_rot and <dr^2>."""
         T, T_error = curve.temperature, curve.temperature_error
         weights = {"measurement": _weights(T, T if T_error is None else T_error)}
+        accuracies: dict[str, Float[Array, ""] | float] = {}
         if uses_rotation(gas, curve):
             T_rot, error = curve.rotational_temperature, curve.rotational_temperature_error
             assert T_rot is not None and error is not None
             weights["rotation"] = _weights(T_rot, error)
+            accuracies["rotation"] = model.rotation_accuracy
         accuracy = _displacement_accuracy(gas, curve, model, num_particles)
         if accuracy is not None:
             assert curve.displacement is not None
@@ -74,10 +80,11 @@ class Comparison:
             error = sampling if curve.displacement_error is None else curve.displacement_error
             error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
             weights["displacement"] = _weights(curve.displacement, error)
+            accuracies["displacement"] = accuracy
         parameters = Parameters(gas, (*names, *priors.also_free(names)))
         num_free = sum(gas.value(name).size for name in names)
         faster = 1.0 if num_particles is None else _clock_of_few(gas, num_particles)
-        return cls(curve, model, parameters, num_free, priors, weights, accuracy, faster)
+        return cls(curve, model, parameters, num_free, priors, weights, accuracies, faster)
 
     def scaled(self, flat: Float[Array, "q"]) -> "Comparison":
         """The same with the scatter of ln T at some parameters for its error."""
@@ -99,7 +106,7 @@ class Comparison:
     @property
     def num_beside(self) -> int:
         """How many parameters there are after those of the gas."""
-        return 2 * bool(self.priors.names) + (self.displacement_accuracy is not None)
+        return 2 * bool(self.priors.names) + len(self.accuracies)
 
     def of_gas(self, flat: Float[Array, "q"]) -> Float[Array, "r"]:
         """The parameters of the gas."""
@@ -133,19 +140,22 @@ class Comparison:
         computed = self.model.simulate(gas, self.curve.times * clock * own_clock, Run())
         ratio = _log_ratio(self.curve.temperature, computed.temperature)
         parts = [self.weights["measurement"] * ratio]
-        if "rotation" in self.weights:
+        factors = dict(zip(self.accuracies, flat[flat.size - len(self.accuracies) :], strict=True))
+        if "rotation" in factors:
             assert self.curve.rotational_temperature is not None
             assert computed.rotational_temperature is not None
             T_rot = self.curve.rotational_temperature, computed.rotational_temperature
-            parts.append(self.weights["rotation"] * _log_ratio(*T_rot))
-        if self.displacement_accuracy is not None:
+            ratio = _log_ratio(*T_rot) - factors["rotation"]
+            parts.append(self.weights["rotation"] * ratio)
+        if "displacement" in factors:
             assert self.curve.displacement is not None
             assert computed.displacement is not None and computed.collisions is not None
             # The common factor is one of D: the ballistic flight before collisions is exact.
             diffusive = computed.collisions / (1 + computed.collisions)
             ratio = _log_ratio(self.curve.displacement, computed.displacement)
-            ratio = ratio - flat[-1] * diffusive
-            parts += [self.weights["displacement"] * ratio, flat[-1:] / self.displacement_accuracy]
+            ratio = ratio - factors["displacement"] * diffusive
+            parts.append(self.weights["displacement"] * ratio)
+        parts += [factors[name][None] / self.accuracies[name] for name in factors]
         residuals = jnp.concatenate([*parts, errors_of_clock, self.priors.residuals(gas)])
         return residuals, (residuals, computed)
 
@@ -156,8 +166,7 @@ class Comparison:
     def split(self, rows: Float[Array, "*_ residuals"]) -> dict[str, Float[Array, "*_ part"]]:
         """What belongs to which residuals, by the names of `Fit.covariances`."""
         parts = [(name, weights.size) for name, weights in self.weights.items()]
-        if self.displacement_accuracy is not None:
-            parts.append(("model of <dr^2>", 1))
+        parts += [(f"model of {QUANTITIES[name]}", 1) for name in self.accuracies]
         if self.priors.names:
             sizes = zip(self.priors.names, self.priors.given, strict=True)
             parts += [("model", 2), *((name, given.size) for name, given in sizes)]

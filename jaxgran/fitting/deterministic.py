@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.comparison import Comparison
+from jaxgran.fitting.comparison import QUANTITIES, Comparison
 from jaxgran.fitting.least_squares import least_squares, quasi_newton
 from jaxgran.fitting.priors import NO_PRIORS, Priors
 from jaxgran.fitting.residuals import correlation_factor, neighbour_correlation
@@ -66,11 +66,9 @@ def _fit_at(
     degrees_of_freedom = used + own - flat.size
     num_used = {name: jnp.sum(weights > 0) for name, weights in comparison.weights.items()}
     tested = [(parts["measurement"], num_used["measurement"] - comparison.num_free)]
-    if "rotation" in parts:
-        tested.append((parts["rotation"], num_used["rotation"]))
-    if "displacement" in parts:
-        factor = jnp.concatenate([parts["displacement"], parts["model of <dr^2>"]])
-        tested.append((factor, num_used["displacement"]))
+    for name in comparison.accuracies:
+        own_part = jnp.concatenate([parts[name], parts[f"model of {QUANTITIES[name]}"]])
+        tested.append((own_part, num_used[name]))
     known = comparison.curve.temperature_error is not None
     chance = misfit(tested, degrees_of_freedom, errors_known=known)
     clock_gain = _clock_gain(comparison.split(clock_slope), gains)
@@ -94,6 +92,7 @@ def _fit_at(
         curve=computed,
         residuals=parts["measurement"],
         displacement_residuals=parts.get("displacement"),
+        rotation_residuals=parts.get("rotation"),
         scatter=comparison.scatter,
         chi2=chance.chi2,
         degrees_of_freedom=degrees_of_freedom,

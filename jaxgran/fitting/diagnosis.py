@@ -11,7 +11,7 @@ from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.residuals import neighbour_correlation
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
-from jaxgran.fitting.rivals import ASKED, Rival, ranges, rivals
+from jaxgran.fitting.rivals import ASKED, Rival, free_elements, ranges, rivals
 from jaxgran.models.base import Omission
 
 LARGEST_SCATTER = 0.3
@@ -149,12 +149,13 @@ def _about_residuals(
 
 def _about_rivals(result: Fit, found: tuple[Rival, ...]) -> Iterator[str]:
     """The rivals that the curve asks for or allows, and what the first parameter would then be."""
-    if not found:
-        return
-    yield (
-        "this rests on the grains being smooth, equal spheres, far from walls, in vacuum and at "
-        "homogeneous density"
-    )
+    yield _assumptions(result)
+    free = free_elements(result)
+    if free:
+        yield (
+            f"further losses are not looked for beside {', '.join(free)}, which would take them "
+            "over"
+        )
     name = result.names[0]
     for rival in found:
         between = f"{name} is then between {rival.low[0]:.3g} and {rival.high[0]:.3g}"
@@ -168,6 +169,15 @@ def _about_rivals(result: Fit, found: tuple[Rival, ...]) -> Iterator[str]:
                 f"{rival.name} cannot be excluded: {between}; errors of the curve and of the model "
                 f"{rival.sharper:.2g} times as small would tell"
             )
+
+
+def _assumptions(result: Fit) -> str:
+    elements = result.gas.elements
+    spheres = "rough spheres of constant beta_t" if "surface" in elements else "smooth spheres"
+    where = [] if "container" in elements else ["far from walls"]
+    where += [] if "drag" in elements else ["in vacuum"]
+    where.append("at homogeneous density")
+    return f"this rests on equal, {spheres}, {', '.join(where)}"
 
 
 def _about_search(result: Fit) -> Iterator[str]:

@@ -103,6 +103,11 @@ def fit(
     names = free_by_default(gas, curve) if free is None else free
     _check_request(gas, curve, names, max_steps, num_particles, replicas)
     names, key, known = tuple(names), checked_key(key), Priors.of(gas, priors)
+    if curve.rotational_temperature is not None and gas.surface is None:
+        warnings.warn(
+            "the measured T_rot is not used, since the gas has no surface=jaxgran.Rough(...)",
+            stacklevel=2,
+        )
     model = KineticTheory() if model is None else model
     _check_model(model, method, names, known)
     if model.stochastic:

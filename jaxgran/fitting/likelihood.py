@@ -54,12 +54,13 @@ def log_likelihood(
     comparison = Comparison.of(gas, curve, model, (), N, float(replicas))
     flat = jnp.zeros(comparison.num_beside, gas.temperature.dtype)
     times_factor = jnp.broadcast_to(jnp.asarray(clock), curve.times.shape)
-    residuals, slope = jax.jvp(
-        lambda x: comparison.evaluate(x, times_factor)[0], (flat,), (jnp.ones_like(flat),)
-    )
-    # Linear in the factor of <dr^2>, whose best value is subtracted.
-    square = jnp.sum(slope**2)
-    known = jnp.sum(residuals**2) - jnp.sum(slope * residuals) ** 2 / jnp.where(square, square, 1)
+    residuals = comparison.evaluate(flat, times_factor)[0]
+    known = jnp.sum(residuals**2)
+    if flat.size:
+        # Linear in the factors of T_rot and <dr^2>, whose best values are subtracted.
+        slope = jax.jacfwd(lambda x: comparison.evaluate(x, times_factor)[0])(flat)
+        against = slope.T @ residuals
+        known = known - against @ jnp.linalg.solve(slope.T @ slope, against)
     if curve.temperature_error is None:
         value = -0.5 * curve.times.size * jnp.log(known)
     else:

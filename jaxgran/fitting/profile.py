@@ -11,7 +11,11 @@ from jaxgran.fitting.least_squares import least_squares
 from jaxgran.fitting.parameters import Parameters
 from jaxgran.fitting.priors import Priors
 from jaxgran.scene.gas import Gas
-from jaxgran.theory.table_of_times import log_temperature, relaxed_cooling_rate
+from jaxgran.theory.table_of_times import (
+    cooling_by_elements,
+    log_temperature,
+    relaxed_cooling_rate,
+)
 
 MOST_STEPS = 30
 """Steps of each search."""
@@ -51,6 +55,7 @@ def fit_trials(
     measured: Float[Array, "times"],
     weights: Float[Array, "times"],
     modelled: Float[Array, "times"],
+    ratios: Float[Array, "times"],
     trials: Trial,
     accuracy: Float[Array, ""],
     priors: Priors,
@@ -62,6 +67,7 @@ def fit_trials(
         names: of the free parameters.
         times, measured, weights: t, ln T and inverse relative errors; 0 where a point is not used.
         modelled: ln T of the fitted model.
+        ratios: T_rot/T of the fitted model; 0 of smooth spheres.
         trials: what is added.
         accuracy: relative error of the model's cooling rate, of its mean and of its trend in ln T.
         priors: what else is known of the gas.
@@ -75,6 +81,9 @@ def fit_trials(
     def computed(trial: Trial, flat: Array, mean: ArrayLike, trend: ArrayLike) -> Array:
         changed = parameters.gas(flat)
         log_theta, rate = relaxed_cooling_rate(changed, depth)
+        if changed.elements:
+            ratio = jnp.interp(-log_theta - jnp.log(changed.temperature), -modelled, ratios)
+            rate = rate + cooling_by_elements(changed, log_theta, ratio)
         rate = rate * jnp.exp(unsure * (mean + trend * (2 * log_theta / depth + 1)))
         other = 1 - trial.constant - trial.drag
         added = (trial.constant * jnp.exp(log_theta / 2) + trial.drag) / other * rate[0]

@@ -27,10 +27,10 @@ class Fit(eqx.Module):
         covariances: of the estimates, SI, shape (p, p), a part of the whole error each:
             "measurement", the errors of the curve, increased by the correlation of neighbouring
             residuals, and by sqrt(reduced chi^2) if the model does not explain the curve;
-            "model", the error of the model's clock, `clock_error`; "model of <dr^2>", that of a
-            factor common to all <dr^2>; one part for each of the `priors`, under its name;
-            "few particles", what the chance of single collisions adds where N is known; and
-            "simulation", the noise of a stochastic model, estimated from its replicas.
+            "model", the error of the model's clock, `clock_error`; "model of <dr^2>" and "model of
+            T_rot", those of a factor common to all of these; one part for each of the `priors`,
+            under its name; "few particles", what the chance of single collisions adds where N is
+            known; and "simulation", the noise of a stochastic model, estimated from its replicas.
         clock_error: relative error of the model's clock, in this scene, at the measured times.
         gain: derivative of each estimate in each measured ln T, SI, shape (p, times).
         clock_gain: its change over a relative change of the model's clock at each time, SI, shape
@@ -44,6 +44,7 @@ class Fit(eqx.Module):
             simulation, one Gauss-Newton step before the estimate.
         residuals: (ln T_measured - ln T_model) over its error; 0 where a point has no weight.
         displacement_residuals: the same of <dr^2>; None if it was not used.
+        rotation_residuals: the same of T_rot; None if it was not used.
         scatter: of ln T about the model, taken for the error of a curve without errors; else None.
         chi2, degrees_of_freedom, reduced_chi2: of all weighted residuals; without errors of the
             curve reduced chi^2 is 1.
@@ -69,6 +70,7 @@ class Fit(eqx.Module):
     curve: CoolingCurve
     residuals: Float[Array, "times"]
     displacement_residuals: Float[Array, "times"] | None
+    rotation_residuals: Float[Array, "times"] | None
     scatter: Float[Array, ""] | None
     chi2: Float[Array, ""]
     degrees_of_freedom: Int[Array, ""]

@@ -6,6 +6,7 @@ function of the amplitude says whether the curve asks for the rival, or excludes
 neither, the parameters are known only as well as the amplitude is.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -77,13 +78,22 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
         curve: the measured curve.
 
     Returns:
-        The rivals, those that fit best first; () where the fitted gas does not cool.
+        The rivals, those that fit best first; () where the fitted gas does not cool, or where
+        floats of its elements were free, whose losses are such rivals themselves.
     """
+    if free_elements(result):
+        return ()
     kinds = _kinds(result)
     weights, residuals = _weighted(result, curve)
     measured = np.log(curve.temperature)
     fitted = measured - residuals / np.where(weights > 0, weights, 1.0)
+    ratios, T_rot = np.zeros_like(measured), result.curve.rotational_temperature
+    if T_rot is not None:
+        ratios = np.asarray(T_rot / result.curve.temperature)
     columns = _padded(np.asarray(curve.times), measured, weights, fitted)
+    rows = columns[0].size - ratios.size
+    columns[3] = np.pad(fitted, (0, rows), "edge")
+    columns.append(np.pad(ratios, (0, rows), "edge"))
     profile = fit_trials(
         result.gas,
         result.names,
@@ -111,14 +121,24 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
     return tuple(sorted(found, key=lambda rival: -rival.improvement))
 
 
+def free_elements(result: Fit) -> tuple[str, ...]:
+    """The free parameters that are floats of the elements of the scene."""
+    plain = dataclasses.replace(result.gas, surface=None, container=None, drag=None)
+    return tuple(name for name in result.names if name not in plain.domains)
+
+
 def _kinds(result: Fit) -> list[tuple[str, str, tuple[float, ...]]]:
     """The words, the field of `Trial` and the amplitudes of each rival that the fit can have."""
     kinds = [
         ("linear drag, as of air", "drag", DRAG_SHARES),
         ("a noise floor in T", "floor", SHARES),
     ]
+    elements = result.gas.elements
     if not isinstance(result.gas.law, ConstantRestitution):
-        words = "a further loss at constant eps, as of walls or rough grains"
+        words = "a further loss at constant eps"
+        causes = {"container": "walls", "surface": "rough grains"}
+        left = [cause for name, cause in causes.items() if name not in elements]
+        words += f", as of {' or '.join(left)}" if left else ""
         kinds.insert(0, (words, "constant", SHARES))
     if "temperature" not in result.names:
         kinds.append(("a wrong start of the clock, or a wrong T_0", "delay", DELAYS))

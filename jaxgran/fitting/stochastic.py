@@ -141,6 +141,7 @@ def _fit_of(
         curve=found.computed,
         residuals=residuals,
         displacement_residuals=None,
+        rotation_residuals=None,
         scatter=scatter,
         chi2=chance.chi2,
         degrees_of_freedom=degrees_of_freedom,

@@ -57,6 +57,9 @@ class AbstractModel(eqx.Module):
     """Relative accuracy of a derivative of ln T in a parameter. Parameters whose effects differ by
     less count as undetermined."""
 
+    rotation_accuracy: ClassVar[float] = 0.05
+    """Relative accuracy of T_rot/T of rough spheres."""
+
     elements: ClassVar[tuple[str, ...]] = ()
     """Names of the optional fields of a `Gas` that the model takes: see `Gas.elements`."""
 

@@ -98,7 +98,10 @@ class KineticTheory(AbstractModel):
         509); the same is assumed for disks.
         """
         correlation = 0.85 * jnp.minimum(gas.packing_fraction, 0.2)
-        return jnp.hypot({2: 0.024, 3: 0.017}[gas.dimension], correlation)
+        first_order = {2: 0.024, 3: 0.017}[gas.dimension]
+        if gas.surface is not None:  # spins and velocities are correlated: DSMC, beta_t = .5
+            first_order += 0.07
+        return jnp.hypot(first_order, correlation)
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """``-d ln T/dt`` at t = 0, 1/s, of the Maxwellian gas; negative if the law heats it."""

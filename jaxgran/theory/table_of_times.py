@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.scene.gas import Gas
-from jaxgran.theory import averages
+from jaxgran.scene.reduced_scene import reduced_scene
+from jaxgran.theory import averages, elements
 
 NUM_NODES = 192
 """Temperatures of the table of times."""
@@ -68,6 +69,26 @@ def relaxed_cooling_rate(
     at_nodes = jax.vmap(rate)(-depth * rate_nodes)
     even = jnp.exp(to_nodes @ jnp.log(at_nodes))
     return -depth * jnp.linspace(0.0, 1.0, NUM_NODES), even * gas.impact_speed / gas.path_length
+
+
+def cooling_by_elements(
+    gas: Gas, log_theta: Float[Array, "nodes"], ratio: Float[Array, "nodes"]
+) -> Float[Array, "nodes"]:
+    """What roughness, walls and drag add to ``-d ln T/dt``, 1/s.
+
+    Args:
+        gas: the scene.
+        log_theta: ln(T/T_0).
+        ratio: T_rot/T there; without meaning for smooth spheres.
+    """
+    scene = reduced_scene(gas)
+    nothing = jnp.zeros((), log_theta.dtype)
+
+    def cooling(log_theta, ratio):
+        speed = jnp.exp(log_theta / 2)
+        return elements.changes(scene, speed, ratio, nothing, gas.dimension).cooling
+
+    return jax.vmap(cooling)(log_theta, ratio) * gas.impact_speed / gas.path_length
 
 
 def log_temperature(

@@ -56,7 +56,7 @@ def test_the_range_contains_the_truth(rates_of, floor, true, words, noticed, err
     low, high = (x[0] / wrong_physics.TRUE_A for x in diagnosis.ranges["dissipative_constant"])
     assert low < true < high
     said = " ".join([diagnosis.verdict, *diagnosis.reasons])
-    assert words in said and "smooth, equal spheres" in said
+    assert words in said and "equal, smooth spheres, far from walls, in vacuum" in said
     if noticed:
         assert not diagnosis.explains and f"asks for {diagnosis.rivals[0].name}" in said
     if words == "":
