@@ -57,7 +57,7 @@ class AbstractModel(eqx.Module):
     """Relative accuracy of a derivative of ln T in a parameter. Parameters whose effects differ by
     less count as undetermined."""
 
-    rotation_accuracy: ClassVar[float] = 0.05
+    rotation_accuracy: ClassVar[float] = 0.07
     """Relative accuracy of T_rot/T of rough spheres."""
 
     elements: ClassVar[tuple[str, ...]] = ()

@@ -27,6 +27,7 @@ from jaxgran.particles.capacity import Neighbourhood, capacities
 from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.hard.windows import LEAST_IMPACTS, SPEED_MARGIN, HardDynamics
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.reduced_scene import reduced_scene as reduced
 
 WINDOW_SHARE = 0.05
 """Impacts per particle in a window."""
@@ -96,6 +97,7 @@ class HardSpheres(AbstractSpheres):
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 7.0
+    elements: ClassVar[tuple[str, ...]] = ("surface",)
 
     def __check_init__(self):
         self.check_counts()
@@ -181,4 +183,5 @@ def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> Ha
         collision_frequency=gas.collision_frequency * unit_time,
         contact_time=jnp.asarray(contact_time, gas.temperature.dtype),
         elastic=jnp.zeros((), bool),
+        surface=reduced(gas).surface,
     )

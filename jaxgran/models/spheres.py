@@ -197,6 +197,7 @@ class AbstractSpheres(AbstractModel):
             "dissipated_energy": energy,
             "collisions": 1.0,
             "regularised": 1.0,
+            "rotational_temperature": gas.temperature,
         }
         each = {name: values.T * units[name] for name, values in out.records.items()}
         # Where it could not be checked before.

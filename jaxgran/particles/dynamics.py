@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from equinox import AbstractVar
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran.checks import status
 from jaxgran.particles import neighbours
@@ -85,6 +85,10 @@ class AbstractDynamics(eqx.Module):
     @abstractmethod
     def with_tangents(self, state: State, directions: Any) -> State:
         """A state that does not depend on the material, with its tangents along directions."""
+
+    def spun(self, state: State, key: PRNGKeyArray) -> State:
+        """The state at t = 0 with random spins, where spheres have some."""
+        return state
 
     def check_start(self, state: State) -> Int[Array, ""]:
         """The status of positions given by a user."""

@@ -98,15 +98,18 @@ def compare(gas, elements):
     times = np.array([1.0, 5.0, 20.0, 60.0]) * float(gas.mean_free_time)
     theory = jaxgran.cool(gas, times)
     curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(10_000, replicas=4))
-    # Of rough spheres, theory leaves out that spins and velocities are correlated: .7 % of T and
-    # 5 % of T_rot/T at N = 1e5. The rest is noise, .8/sqrt(40 000) = .4 %, in both.
-    assert np.all(np.abs(curve.temperature / theory.temperature - 1) < 0.012 + 3 * 0.004)
+    # Of rough spheres theory leaves out that spins and velocities are correlated: .7 % of T and
+    # 5 % of T_rot/T at N = 1e5, 7 % in a plane; and that walls, which are far more frequent here in
+    # a plane, change a_2: 1.3 % of T. The rest is noise, .8/sqrt(40 000) = .4 %, in both.
+    flat = gas.dimension == 2
+    error = 0.02 if flat and gas.container is not None else 0.012
+    assert np.all(np.abs(curve.temperature / theory.temperature - 1) < error + 3 * 0.004)
     assert np.all(np.abs(curve.collisions / theory.collisions - 1) < 0.01)
     if gas.surface is None:
         assert curve.rotational_temperature is None
         return
     ratios = [x.rotational_temperature / x.temperature for x in (curve, theory)]
-    assert np.all(np.abs(ratios[0] / ratios[1] - 1) < 0.07)
+    assert np.all(np.abs(ratios[0] / ratios[1] - 1) < (0.15 if flat else 0.07))
     assert curve.rotational_temperature_error is not None
 
 

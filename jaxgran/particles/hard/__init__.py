@@ -4,6 +4,7 @@
 - `candidates`: the pairs that may touch in a window.
 - `impacts`: the execution of the impacts of a window.
 - `windows`: from window to window.
+- `own_state`: what hard spheres have besides the state of all spheres.
 - `observation`: the records.
 
 May import the modules directly under `particles`, except for `driver`, `pure` and `simulation`, and

@@ -14,6 +14,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxgran.particles.hard.candidates import Selection
 from jaxgran.particles.hard.prediction import FirstImpacts, Rows, Slots, first_impacts
 from jaxgran.particles.hard.scene import HardScene
+from jaxgran.particles.spins import torque, twisted
+from jaxgran.scene.reduced_scene import ReducedRough
 from jaxgran.tangents.impact import ImpactTangents
 
 MAX_ROUNDS = 100_000
@@ -117,6 +119,7 @@ class _Effect(NamedTuple):
     lost: Float[Array, "rows"]  # energy, half of it
     soon: Bool[Array, "rows"]  # elastic, as too little time has passed
     gains: Float[Array, "changes rows"]
+    twist: Float[Array, "rows spins"] | None = None  # change of the spins of both spheres
 
 
 def _effect(
@@ -143,7 +146,32 @@ def _effect(
         # The law's unit of speed is sqrt(2).
         gained = 2 * along.gains(scene.law, speed * 0.5**0.5)
         gains = jnp.where((safe & ~soon & ~scene.elastic)[None], gained, 0.0)
-    return _Effect(s, kick, lost, soon, gains)
+    effect = _Effect(s, kick, lost, soon, gains)
+    if scene.surface is None or slots.spin is None:
+        return effect
+    smooth = ~safe | soon | scene.elastic
+    spin = slots.spin[rows.a] + slots.spin[rows.b]
+    return _rubbed(effect, scene.surface, impacts.w, spin, normal, smooth)
+
+
+def _rubbed(
+    effect: _Effect,
+    surface: ReducedRough,
+    w: Float[Array, "rows d"],
+    spin: Float[Array, "rows spins"],
+    normal: Float[Array, "rows d"],
+    smooth: Bool[Array, "rows"],
+) -> _Effect:
+    """The effect with the tangential part of impacts, see `jaxgran.Rough`, where not smooth."""
+    sideways = w - jnp.sum(w * normal, -1, keepdims=True) * normal
+    slip = jnp.where(smooth[:, None], 0.0, sideways - twisted(spin, normal))
+    kick = -surface.eta * slip
+    share = surface.inertia / (1 + surface.inertia) * (1 - surface.beta**2)
+    return effect._replace(
+        kick=effect.kick + kick,
+        lost=effect.lost + 0.125 * share * jnp.sum(slip**2, -1),
+        twist=-torque(normal, kick) / surface.inertia,
+    )
 
 
 def _executed(
@@ -163,9 +191,12 @@ def _executed(
     kick = sign[:, None] * effect.kick[row]
     place = slots.x + slots.v * s[:, None]
     v = slots.v + kick
+    spin = slots.spin
+    if spin is not None and effect.twist is not None:
+        spin = spin + jnp.where(hit[:, None], effect.twist[row], 0.0)
     away = jnp.where(hit, jnp.sum((place - listed) ** 2, -1), 0.0)
     return ImpactWork(
-        slots=Slots(slots.x - kick * s[:, None], v, jnp.where(hit, s, slots.last)),
+        slots=Slots(slots.x - kick * s[:, None], v, jnp.where(hit, s, slots.last), spin),
         dissipated=work.dissipated + jnp.where(hit, effect.lost[row], 0.0),
         impacts=work.impacts + hit,
         regularised=work.regularised + (hit & effect.soon[row]),

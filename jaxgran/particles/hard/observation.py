@@ -29,6 +29,9 @@ def observe(state: State, scene: HardScene, replicas: int) -> dict[str, Array]:
     """The records of a state; with tangents, also those that `rule.with_tangents` adds."""
     values, travelled, velocity = records(state, scene.side, replicas)
     values["regularised"] = 2 / velocity.shape[1] * state.own.regularised
+    if scene.surface is not None and state.own.spin is not None:  # not so in the melt
+        spin = state.own.spin.reshape(replicas, -1)
+        values["rotational_temperature"] = scene.surface.inertia * jnp.mean(spin**2, axis=1)
     along = state.tangents
     if along is None:
         return values

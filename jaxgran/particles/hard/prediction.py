@@ -68,11 +68,13 @@ class Slots(NamedTuple):
         v: velocity.
         last: time of the last impact, from which on the path is valid; negative if the impact was
             before the window.
+        spin: of rough spheres; else None.
     """
 
     x: Float[Array, "slots d"]
     v: Float[Array, "slots d"]
     last: Float[Array, "slots"]
+    spin: Float[Array, "slots spins"] | None = None
 
 
 class FirstImpacts(NamedTuple):

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
+from jaxgran.scene.reduced_scene import ReducedRough
 from jaxgran.scene.restitution import ReducedLaw
 
 
@@ -16,7 +17,8 @@ class HardScene(NamedTuple):
         collision_frequency: at T = 1.
         contact_time: in mean free times; the impact of a sphere within this time of its last one
             is elastic.
-        elastic: whether all impacts are.
+        elastic: whether all impacts are, and smooth.
+        surface: of rough spheres; else None.
     """
 
     side: Float[Array, ""]
@@ -24,6 +26,7 @@ class HardScene(NamedTuple):
     collision_frequency: Float[Array, ""]
     contact_time: Float[Array, ""]
     elastic: Bool[Array, ""]
+    surface: ReducedRough | None = None
 
     @property
     def material(self) -> ReducedLaw:

@@ -2,15 +2,14 @@
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from jaxgran.checks import status
-from jaxgran.particles import neighbours, user_start
+from jaxgran.particles import neighbours, spins, user_start
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import (
     AbstractDynamics,
@@ -22,10 +21,12 @@ from jaxgran.particles.dynamics import (
 from jaxgran.particles.hard.candidates import Selection, select_reachable
 from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, resolve
 from jaxgran.particles.hard.observation import cooling_trend, observe
+from jaxgran.particles.hard.own_state import HardProgress, HardState
 from jaxgran.particles.hard.prediction import Slots
 from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.neighbours import Pairs
 from jaxgran.particles.state import State, fastest, later, temperature, time_left
+from jaxgran.scene.elements import SPINS
 from jaxgran.scene.restitution import ReducedLaw
 from jaxgran.tangents.impact import ImpactTangents
 from jaxgran.tangents.thermal import remembered
@@ -45,34 +46,6 @@ WINDOW_EXPONENT = 0.3
 
 SPEED_MARGIN = 1.15
 """How much faster than the fastest sphere one may become within a window."""
-
-
-class HardState(NamedTuple):
-    """What hard spheres have besides `State`.
-
-    Attributes:
-        age: time since the last impact.
-        regularised: impacts made elastic because they followed the last one too soon.
-        window: length of the next window.
-    """
-
-    age: Float[Array, "n"]
-    regularised: Int[Array, "replicas"]
-    window: Float[Array, ""]
-
-
-class HardProgress(NamedTuple):
-    """What hard spheres have besides `Progress`.
-
-    Attributes:
-        widen: factor by which the bound on speeds is raised.
-        num_windows, num_failed, num_rounds: made with this neighbour list.
-    """
-
-    widen: Float[Array, ""]
-    num_windows: Int[Array, ""]
-    num_failed: Int[Array, ""]
-    num_rounds: Int[Array, ""]
 
 
 class HardDynamics(AbstractDynamics):
@@ -105,7 +78,22 @@ class HardDynamics(AbstractDynamics):
         lossless = self.scene._replace(elastic=jnp.ones((), bool))
         return dataclasses.replace(self, scene=lossless)
 
+    def spun(self, state: State, key: PRNGKeyArray) -> State:
+        surface = self.scene.surface
+        if surface is None:
+            return state
+        n, d = state.velocity.shape
+        shape = self.replicas, n // self.replicas, SPINS[d]
+        mean_square = (surface.ratio / surface.inertia).astype(state.velocity.dtype)
+        spin = spins.at_start(key, shape, mean_square).reshape(n, SPINS[d])
+        return state._replace(own=state.own._replace(spin=spin))
+
     def with_tangents(self, state: State, directions: ReducedLaw) -> State:
+        if self.scene.surface is not None:
+            raise ValueError(
+                "derivatives of HardSpheres runs with rough spheres are not known: use "
+                "KineticTheory(), or differences of runs"
+            )
         along = ImpactTangents.at_start(directions, self.replicas, state.velocity.dtype)
         return state._replace(tangents=along)
 
@@ -186,8 +174,12 @@ class HardDynamics(AbstractDynamics):
         heat = jnp.maximum(heat, jnp.finfo(heat.dtype).tiny)
         scene = self.scene
         shortest = scene.contact_time / (scene.collision_frequency * jnp.sqrt(heat))
+        own = state.own
         slots = Slots(
-            of_members(state.position), of_members(state.velocity), -of_members(state.own.age)
+            of_members(state.position),
+            of_members(state.velocity),
+            -of_members(own.age),
+            None if own.spin is None else of_members(own.spin),
         )
         return resolve(slots, of_members(listed), chosen, scene, duration, shortest, state.tangents)
 
@@ -220,6 +212,7 @@ class HardDynamics(AbstractDynamics):
                 age=to_members(own.age + duration, duration - slots.last),
                 regularised=regularised,
                 window=jnp.where(full_length, duration * ratio, own.window),
+                spin=None if own.spin is None else to_members(own.spin, slots.spin),
             ),
         )
         if state.tangents is None:

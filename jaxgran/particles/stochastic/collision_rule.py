@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, UInt32
 
-from jaxgran.particles.stochastic.elements import torque, twisted
+from jaxgran.particles.spins import torque, twisted
 from jaxgran.scene.reduced_scene import ReducedRough, ReducedScene
 from jaxgran.scene.restitution import ReducedLaw
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxgran.particles.spins import torque, twisted
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedRough, ReducedWalls
 
 
@@ -42,32 +43,6 @@ def transformed(drag: ReducedDrag, times: Float[Array, "times"]) -> Float[Array,
     """The transformed times of times."""
     safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
     return jnp.where(drag.rate > 0, -jnp.expm1(-drag.rate * times) / safe, times)
-
-
-def spins_at_start(
-    surface: ReducedRough, key: PRNGKeyArray, shape: tuple[int, ...], like: Array
-) -> Float[Array, "replicas N spins"]:
-    """Maxwellian spins of the first T_rot, of mean squares T_rot/q in each component."""
-    size = jnp.sqrt(surface.ratio / (2 * surface.inertia)).astype(like.dtype)
-    return size * jax.random.normal(key, shape, like.dtype)
-
-
-def twisted(
-    spin: Float[Array, "pairs spins"], normal: Float[Array, "pairs d"]
-) -> Float[Array, "pairs d"]:
-    """``s x n``, the velocity of a surface in the direction of n."""
-    if normal.shape[-1] == 2:
-        return spin * jnp.stack([-normal[:, 1], normal[:, 0]], axis=-1)
-    return jnp.cross(spin, normal)
-
-
-def torque(
-    normal: Float[Array, "pairs d"], force: Float[Array, "pairs d"]
-) -> Float[Array, "pairs spins"]:
-    """``n x f``; the one component of two vectors in a plane."""
-    if normal.shape[-1] == 2:
-        return (normal[:, 0] * force[:, 1] - normal[:, 1] * force[:, 0])[:, None]
-    return jnp.cross(normal, force)
 
 
 def hit_walls(

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, UInt32
 
 from jaxgran.checks import status
-from jaxgran.particles import initial, observables
+from jaxgran.particles import initial, observables, spins
 from jaxgran.particles.stochastic import collisions, elements
 from jaxgran.particles.stochastic.collisions import DSMCState
 from jaxgran.particles.stochastic.pairing import Scheme
@@ -50,7 +50,8 @@ def at_start(
     if scene is not None and scene.surface is not None:
         shape = (replicas, scheme.num_particles, SPINS[d])
         key = jax.random.fold_in(key, 0)
-        parts.append(elements.spins_at_start(scene.surface, key, shape, v))
+        mean_square = (scene.surface.ratio / (2 * scene.surface.inertia)).astype(v.dtype)
+        parts.append(spins.at_start(key, shape, mean_square))
     each, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
     return DSMCState(
         time=jnp.zeros((), v.dtype),

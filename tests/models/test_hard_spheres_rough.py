@@ -1,0 +1,154 @@
+"""Rough hard spheres: single impacts, conserved quantities, and gases beside DSMC."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.particles.hard.impacts import _Effect, _rubbed
+from jaxgran.scene.reduced_scene import ReducedRough
+from tests.conftest import glass_beads
+
+
+def rough(gas, *values, **settings) -> jaxgran.Gas:
+    return dataclasses.replace(gas, surface=jaxgran.Rough(*values, **settings))
+
+
+@pytest.mark.parametrize("beta", [-1.0, -0.4, 0.0, 0.7, 1.0])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_impacts_keep_angular_momentum_and_follow_the_rule(dimension, beta):
+    # Unit masses and diameters, I = q/4, spins s = w/2. In 2D as spheres in a plane.
+    q, eps, n = 0.4, 0.8, 50
+    rng = np.random.default_rng(1)
+    r, w = rng.normal(size=(2, n, 3))
+    v = np.stack([w, np.zeros_like(w)])
+    omega = rng.normal(size=(2, n, 3))
+    if dimension == 2:
+        r[:, 2] = v[..., 2] = 0
+        omega[..., :2] = 0
+    normal = r / np.linalg.norm(r, axis=1, keepdims=True)
+    spin = omega.sum(0) / 2
+    kick = -0.5 * (1 + eps) * np.sum(v[0] * normal, -1, keepdims=True) * normal
+    zero = jnp.zeros(n)
+    shown, turning = (slice(None), slice(None)) if dimension == 3 else (slice(2), slice(2, 3))
+    effect = _rubbed(
+        _Effect(zero, jnp.asarray(kick[:, shown]), zero, zero > 0, jnp.zeros((0, 0))),
+        ReducedRough(jnp.asarray(beta), jnp.asarray(q), zero[0]),
+        jnp.asarray(v[0][:, shown]),
+        jnp.asarray(spin[:, turning]),
+        jnp.asarray(normal[:, shown]),
+        zero > 0,
+    )
+    change, twist = np.zeros((n, 3)), np.zeros((n, 3))
+    change[:, shown], twist[:, turning] = effect.kick, effect.twist
+    after = v + np.stack([change, -change])
+    spun = omega + 2 * twist[None]
+
+    def at_contact(v, omega):
+        return v[0] - v[1] - 0.5 * np.cross(omega[0] + omega[1], normal)
+
+    before, behind = at_contact(v, omega), at_contact(after, spun)
+
+    def parts(u):
+        along = np.sum(u * normal, -1, keepdims=True)
+        return along, u - along * normal
+
+    np.testing.assert_allclose(parts(behind)[0], -eps * parts(before)[0], atol=1e-12)
+    np.testing.assert_allclose(parts(behind)[1], -beta * parts(before)[1], atol=1e-12)
+    # Angular momentum about the point of contact.
+    lever = np.stack([0.5 * normal, -0.5 * normal])
+    turned = np.cross(lever, after - v) + q / 4 * (spun - omega)
+    np.testing.assert_allclose(turned.sum(0), 0, atol=1e-12)
+    np.testing.assert_allclose(turned, 0, atol=1e-12)  # of each sphere alone
+    energies = [
+        0.5 * np.sum(v**2, (0, 2)) + q / 8 * np.sum(omega**2, (0, 2))
+        for v, omega in ((v, omega), (after, spun))
+    ]
+    lost = 0.25 * (1 - eps**2) * parts(before)[0][:, 0] ** 2 + 2 * np.asarray(effect.lost)
+    np.testing.assert_allclose(energies[0] - energies[1], lost, atol=1e-12)
+
+
+def run(gas, num_particles, replicas, taus, key=0, kind=jaxgran.HardSpheres):
+    times = jnp.asarray(taus) * gas.mean_free_time
+    model = kind(num_particles, replicas=replicas)
+    return jaxgran.cool(gas, times, model=model, key=jax.random.key(key))
+
+
+def test_smooth_surfaces_change_no_bit(beads):
+    taus = [0.0, 2.0, 8.0]
+    smooth = run(beads(), 200, 2, taus)
+    spinning = run(rough(beads(), -1.0, rotational_temperature=5e-3), 200, 2, taus)
+    for name in ("temperature", "sonine", "displacement", "dissipated_energy", "collisions"):
+        np.testing.assert_array_equal(getattr(spinning, name), getattr(smooth, name))
+    np.testing.assert_allclose(spinning.rotational_temperature, 5e-3, rtol=1e-12)
+    assert smooth.rotational_temperature is None
+
+
+@pytest.mark.parametrize("dimension, spins", [(3, 3), (2, 1)])
+def test_energy_is_conserved(dimension, spins):
+    gas = rough(glass_beads(dimension=dimension), 0.3, rotational_temperature=2e-3)
+    curve = run(gas, 200, 2, [0.0, 1.0, 10.0])
+    energy = dimension * curve.temperature + spins * curve.rotational_temperature
+    total = 0.5 * gas.mass * energy + curve.dissipated_energy
+    np.testing.assert_allclose(total, total[0], rtol=1e-12)
+    assert float(curve.rotational_temperature[0]) == pytest.approx(2e-3, rel=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("beta", [-0.5, 0.0, 0.5])
+def test_rough_spheres_cool_as_in_dsmc(beta, dimension):
+    gas = rough(glass_beads(packing_fraction=0.02, dimension=dimension), beta)
+    taus = [1.0, 5.0, 20.0, 40.0]
+    hard = run(gas, 500, 16, taus)
+    dsmc = run(gas, 20_000, 4, taus, kind=jaxgran.DSMC)
+    # Three standard errors, and 1 % for Enskog's collision rate; 2 % in a plane, where successive
+    # collisions are more correlated.
+    for name, power in (("temperature", 1), ("rotational_temperature", 1)):
+        ratio = np.asarray(getattr(hard, name) / getattr(dsmc, name))
+        error = np.hypot(
+            getattr(hard, f"{name}_error") / getattr(hard, name),
+            getattr(dsmc, f"{name}_error") / getattr(dsmc, name),
+        )
+        assert np.all(np.abs(ratio**power - 1) < 3 * error + (0.01 if dimension == 3 else 0.02))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("eps", [0.7, 0.9])
+@pytest.mark.parametrize("beta", [-0.3, 0.0, 0.6])
+def test_the_ratio_of_temperatures_is_that_of_the_literature(eps, beta):
+    # Santos, Kremer & Garzo (2010), Maxwellian; spins and velocities are correlated besides.
+    gas = jaxgran.Gas(
+        jaxgran.ConstantRestitution(eps),
+        diameter=2e-3,
+        mass=1e-5,
+        packing_fraction=0.02,
+        temperature=0.01,
+        surface=jaxgran.Rough(beta, rotational_temperature=5e-3),
+    )
+    q = 0.4
+    c = (1 + q) ** 2 / (2 * q * (1 + beta) ** 2)
+    c *= 1 - eps**2 - (1 - q) / (1 + q) * (1 - beta**2)
+    expected = c + np.sqrt(1 + c**2)
+    # Boxes below L_c, so that the gas stays homogeneous.
+    ratios = []
+    for kind, size in ((jaxgran.HardSpheres, (250, 32)), (jaxgran.DSMC, (20_000, 2))):
+        curve = run(gas, *size, [40.0, 50.0, 60.0], kind=kind)
+        ratios.append(float(jnp.mean(curve.rotational_temperature / curve.temperature)))
+    assert ratios[0] == pytest.approx(ratios[1], rel=0.03)
+    assert ratios[0] == pytest.approx(expected, rel=0.1)
+
+
+def test_derivatives_of_rough_spheres_are_refused():
+    gas = rough(glass_beads(), 0.0)
+    model = jaxgran.HardSpheres(50).sized_for(gas)
+
+    def temperature(beta):
+        changed = gas.replace(tangential_restitution=beta)
+        return jaxgran.cool(changed, [1e-3, 2e-3], model=model).temperature
+
+    with pytest.raises(ValueError, match="HardSpheres runs with rough spheres.*KineticTheory"):
+        jax.jvp(temperature, (0.0,), (1.0,))
