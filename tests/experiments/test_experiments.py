@@ -183,6 +183,8 @@ def test_wrong_physics_runs(tmp_path):
     *rows, _, note = (tmp_path / "table.md").read_text().splitlines()[2:]
     assert "there is no A" in note and len(rows) == 11 and "| 2 of 2 |" in rows[0]
     assert all("0 of 2" in row for row in rows if "constant eps" in row)
+    told = [row.split("|")[-2].strip() for row in rows if "rough" in row or "walls" in row]
+    assert told == ["2 of 2"] * 5
 
 
 @pytest.mark.slow

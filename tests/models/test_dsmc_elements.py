@@ -104,7 +104,7 @@ def compare(gas, elements):
     flat = gas.dimension == 2
     error = 0.02 if flat and gas.container is not None else 0.012
     assert np.all(np.abs(curve.temperature / theory.temperature - 1) < error + 3 * 0.004)
-    assert np.all(np.abs(curve.collisions / theory.collisions - 1) < 0.01)
+    assert np.all(np.abs(curve.collisions / theory.collisions - 1) < error)
     if gas.surface is None:
         assert curve.rotational_temperature is None
         return
