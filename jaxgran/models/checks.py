@@ -136,7 +136,10 @@ def omitted_by_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Omissio
             f"the packing fraction {phi:.2g} is above {limit:g}, where successive collisions are "
             "correlated"
         )
-    if num_particles is not None:
+    if gas.container is not None:
+        side = float(np.min(gas.container.side) / gas.mean_free_path)
+        found.append(f"walls are {side:.2g} mean free paths apart, and the gas is taken for mixed")
+    elif num_particles is not None:
         diameter = float(gas.diameter)
         box, critical = float(gas.box_side(num_particles)), float(gas.critical_box)
         if box > critical:

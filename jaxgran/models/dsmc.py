@@ -96,7 +96,7 @@ class DSMC(AbstractModel):
 
     def rate_error(self, course: Course) -> Float[np.ndarray, "times"]:
         """Error of Enskog's rate, and of contacts that last and are soft."""
-        return course.homogeneous + course.lasting_contacts + course.softness
+        return course.homogeneous + course.lasting_contacts + course.softness + course.mixing
 
     def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
         """Contacts that last, correlated collisions and boxes in which a flow grows."""

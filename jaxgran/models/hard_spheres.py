@@ -25,7 +25,9 @@ from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles import neighbours, user_start
 from jaxgran.particles.capacity import Neighbourhood, capacities
 from jaxgran.particles.hard.scene import HardScene
+from jaxgran.particles.hard.walls import MARGIN, HardWalls
 from jaxgran.particles.hard.windows import LEAST_IMPACTS, SPEED_MARGIN, HardDynamics
+from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import reduced_scene as reduced
 
@@ -36,6 +38,10 @@ CONTACT_TIMES = Domain(0.0, 0.1, low_allowed=True, high_allowed=True)
 
 OVERLAP = 1e-9
 """Overlap in diameters up to which a given start is one of hard spheres."""
+
+
+SAME_VOLUME = 0.02
+"""Relative difference of volumes up to which a container is that of N spheres of a gas."""
 
 
 class HardPace(NamedTuple):
@@ -97,7 +103,7 @@ class HardSpheres(AbstractSpheres):
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 7.0
-    elements: ClassVar[tuple[str, ...]] = ("surface",)
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container")
 
     def __check_init__(self):
         self.check_counts()
@@ -116,6 +122,8 @@ class HardSpheres(AbstractSpheres):
         with jax.ensure_compile_time_eval():
             self.check_box(gas)
             self._check_overlap(gas)
+        if gas.container is not None:
+            check_cube(gas, gas.container, self.num_particles, self.start is not None)
 
     def _check_overlap(self, gas: Gas) -> None:
         if self.start is None or any_traced(gas, self.start):
@@ -174,14 +182,40 @@ class HardSpheres(AbstractSpheres):
         return Plan(self.replicas, HardPace(share), *sizes)
 
 
+def check_cube(gas: Gas, walls: Walls, num_particles: int, start: bool) -> None:
+    """Raise ValueError for a container that is no cube, or too large or small for N and phi."""
+    if np.ndim(walls.side) > 0:
+        raise ValueError(
+            "HardSpheres takes a cubic container, of one side: give one number, or use "
+            f"KineticTheory() or DSMC(N); got sides {walls.side}"
+        )
+    if start:
+        raise ValueError("HardSpheres takes no start in a container: leave start or container out")
+    if any_traced(walls.side, gas.packing_fraction, gas.diameter):
+        return
+    phi = float(gas.packing_fraction)
+    share = float(gas.box_side(num_particles) / walls.side) ** gas.dimension
+    if abs(share - 1) > SAME_VOLUME:
+        raise ValueError(
+            f"{num_particles} spheres of packing_fraction {phi:.4g} need a container {share:.4g} "
+            f"times as large as that of side {float(walls.side):.4g} m: give packing_fraction="
+            f"{phi * share:.4g} or {num_particles / share:.0f} particles"
+        )
+
+
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:
     """A gas of hard spheres in units of its diameter, mass and first temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
+    side, walls, scene = gas.box_side(num_particles) / gas.diameter, None, reduced(gas)
+    if gas.container is not None and scene.walls is not None:
+        walls = HardWalls(gas.container.side / gas.diameter, scene.walls.law, scene.walls.beta)
+        side = walls.side + MARGIN
     return HardScene(
-        side=gas.box_side(num_particles) / gas.diameter,
+        side=side,
         law=gas.reduced_law,
         collision_frequency=gas.collision_frequency * unit_time,
         contact_time=jnp.asarray(contact_time, gas.temperature.dtype),
         elastic=jnp.zeros((), bool),
-        surface=reduced(gas).surface,
+        surface=scene.surface,
+        walls=walls,
     )

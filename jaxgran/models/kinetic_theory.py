@@ -18,7 +18,7 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import DEFAULTS, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
-from jaxgran.models.course import Course
+from jaxgran.models.course import ROUGH, Course
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
 from jaxgran.theory import averages, closed_forms, elements, moments
@@ -121,7 +121,9 @@ class KineticTheory(AbstractModel):
     def rate_error(self, course: Course) -> Float[np.ndarray, "times"]:
         """The same, of the cooling rate."""
         softness = course.second_order_softness if self.softness else course.softness
-        return course.homogeneous + course.lasting_contacts + softness + course.truncation
+        elements = course.mixing + (0.0 if course.gas.surface is None else ROUGH)
+        rate = course.homogeneous + course.lasting_contacts + softness + course.truncation
+        return rate + elements
 
     def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
         """Contacts that last, correlated collisions and boxes in which a flow grows."""

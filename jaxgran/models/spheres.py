@@ -210,7 +210,7 @@ class AbstractSpheres(AbstractModel):
             particles=Particles(
                 position=out.position.reshape(shape) * gas.diameter,
                 velocity=out.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
-                box_side=side * gas.diameter,
+                box_side=side * gas.diameter if gas.container is None else gas.container.side,
             ),
             status=out.status | status.flag(status.OTHER_BOX, other),
         )

@@ -86,6 +86,11 @@ class AbstractDynamics(eqx.Module):
     def with_tangents(self, state: State, directions: Any) -> State:
         """A state that does not depend on the material, with its tangents along directions."""
 
+    @property
+    def placement(self) -> tuple[Array, float]:
+        """Side of the cube in which random centres are placed, and where in the box it begins."""
+        return self.scene.side, 0.0
+
     def spun(self, state: State, key: PRNGKeyArray) -> State:
         """The state at t = 0 with random spins, where spheres have some."""
         return state

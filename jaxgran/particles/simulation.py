@@ -89,7 +89,8 @@ class Simulation(NamedTuple):
         key = jax.random.key(0) if self.inputs.key is None else self.inputs.key
         places, speeds = jax.random.split(key)
         size = self.dynamics.replicas, self.num_particles, self.dimension
-        position = initial.positions(places, self.dynamics.scene.side, *size)
+        side, shift = self.dynamics.placement
+        position = initial.positions(places, side, *size) + shift
         return self.dynamics.begin(position, initial.velocities(speeds, *size), self.skin)
 
     def cooling_state(self, melted: State) -> State:

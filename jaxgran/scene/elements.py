@@ -3,9 +3,11 @@
 Each is an optional field of `Gas`; a program of a scene without it does not contain it.
 """
 
+from math import pi
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -110,6 +112,21 @@ class Walls(eqx.Module):
         if self.tangential_restitution is not None:
             own["tangential_restitution"] = TANGENTIAL
         return own
+
+    def more_collisions(self, diameter: Array, dimension: int) -> Float[Array, ""]:
+        """Collision frequency over that of spheres without walls of the same mean density.
+
+        ``prod_k L_k/W_k <prod_k (1 - |n_k| sigma/W_k)>`` over all directions n, with the width
+        ``W_k = L_k - sigma`` that centres have: there is less room for them, and beside walls they
+        meet others on one side only. Exact for a dilute gas.
+        """
+        widths = jnp.broadcast_to(self.side, (dimension,)) - diameter
+        near = diameter / widths
+        pairs = (jnp.sum(near) ** 2 - jnp.sum(near**2)) / 2
+        room = jnp.prod(1 + near)
+        if dimension == 2:
+            return room * (1 - 2 / pi * jnp.sum(near) + pairs / pi)
+        return room * (1 - jnp.sum(near) / 2 + 2 / (3 * pi) * pairs - jnp.prod(near) / (4 * pi))
 
 
 class StokesDrag(eqx.Module):

@@ -169,10 +169,11 @@ class Gas(NamedFloats):
 
     @property
     def path_length(self) -> Float[Array, ""]:
-        """``1 / (n g_2 sigma^(d-1))``, m, a length of the order of the mean free path."""
-        return 1 / (
-            self.number_density * self.contact_value * self.diameter ** (self.dimension - 1)
-        )
+        """``1 / (n g_2 sigma^(d-1))``, m, over `Walls.more_collisions` in a container."""
+        meeting = self.number_density * self.contact_value
+        if self.container is not None:
+            meeting = meeting * self.container.more_collisions(self.diameter, self.dimension)
+        return 1 / (meeting * self.diameter ** (self.dimension - 1))
 
     @property
     def mean_free_path(self) -> Float[Array, ""]:

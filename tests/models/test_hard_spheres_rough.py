@@ -152,5 +152,7 @@ def test_derivatives_of_rough_spheres_are_refused():
         changed = gas.replace(tangential_restitution=beta)
         return jaxgran.cool(changed, [1e-3, 2e-3], model=model).temperature
 
-    with pytest.raises(ValueError, match="HardSpheres runs with rough spheres.*KineticTheory"):
+    with pytest.raises(
+        ValueError, match="HardSpheres runs with rough spheres or walls.*KineticTheory"
+    ):
         jax.jvp(temperature, (0.0,), (1.0,))

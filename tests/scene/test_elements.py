@@ -80,11 +80,27 @@ def test_walls_take_energy_as_haff_has_it():
     curve = cooled(gas)
     phi = 0.02
     pressure = 1 + 4 * phi * (1 - phi / 2) / (1 - phi) ** 3
+    assert float(gas.mean_free_path) < float(constant(1.0).mean_free_path)
     rate = 4 / 0.048 * pressure * 0.36 * (0.01 / (2 * np.pi)) ** 0.5
     np.testing.assert_allclose(
         curve.temperature, 0.01 / (1 + rate * curve.times / 2) ** 2, rtol=1e-6
     )
     assert curve.displacement is None and curve.diffusion is None
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_spheres_between_walls_meet_more_often(dimension):
+    # Pairs at contact in a random direction, both centres between the walls.
+    rng, sides = np.random.default_rng(0), np.array([0.012, 0.02, 0.03][:dimension])
+    walls, diameter = jaxgran.Walls(sides, restitution=1.0), 2e-3
+    widths = sides - diameter
+    places = rng.uniform(size=(10**6, dimension)) * widths
+    n = rng.normal(size=places.shape)
+    partners = places + diameter * n / np.linalg.norm(n, axis=1, keepdims=True)
+    inside = np.mean(np.all((partners > 0) & (partners < widths), axis=1))
+    expected = inside * np.prod(sides / widths)
+    found = float(walls.more_collisions(jnp.asarray(diameter), dimension))
+    assert found == pytest.approx(expected, abs=3e-3)  # of 1e6 random numbers, 1 sigma is 5e-4
 
 
 def test_a_viscoelastic_wall_is_softer_by_the_root_of_two():
@@ -146,7 +162,7 @@ def test_other_models_refuse_what_they_do_not_take(beads, name):
     gas = scene(beads(), **elements)
     times = TAUS * float(gas.mean_free_time)
     refusing = [jaxgran.SoftSpheres(100)]
-    refusing += [] if name == "surface" else [jaxgran.HardSpheres(100)]
+    refusing += [jaxgran.HardSpheres(100)] if name == "drag" else []
     for model in refusing:
         kind = type(model).__name__
         with pytest.raises(ValueError, match=f"{kind} does not take .*{name}.*KineticTheory"):

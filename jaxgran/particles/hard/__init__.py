@@ -1,5 +1,6 @@
 """Hard spheres: instantaneous impacts, predicted and executed in windows of time.
 
+- `walls`: impacts on the walls of a container.
 - `prediction`: the next impact of each pair, and until when each path is final.
 - `candidates`: the pairs that may touch in a window.
 - `impacts`: the execution of the impacts of a window.

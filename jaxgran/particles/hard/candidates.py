@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.compaction import rows_where
 from jaxgran.particles.hard.prediction import Rows, Slots, first_impacts
+from jaxgran.particles.hard.walls import HardWalls
 from jaxgran.particles.neighbours import Pairs
 
 
@@ -38,6 +39,7 @@ def select_reachable(
     duration: ArrayLike,
     bound: Float[Array, "replicas"],
     capacity: Capacity,
+    walls: HardWalls | None = None,
 ) -> Selection:
     """The pairs that touch in free flight, and all that may touch once paths have changed.
 
@@ -47,10 +49,11 @@ def select_reachable(
         duration: of the window.
         bound: an upper bound on the speeds in each replica during the window.
         capacity: sizes of the arrays.
+        walls: of a container; who meets them is a member, too.
     """
     n, size = len(x), len(x) // len(bound)
     rows, num_near = _reachable_pairs(x, pairs, duration, bound, capacity.near)
-    free = first_impacts(Slots(x, v, jnp.zeros(n, x.dtype)), rows, duration)
+    free = first_impacts(Slots(x, v, jnp.zeros(n, x.dtype)), rows, duration, walls)
     i, j = rows.a, rows.b
     disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
     closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
@@ -62,6 +65,8 @@ def select_reachable(
     i, j = i[picked], j[picked]
     ends = jnp.where(real[None], jnp.stack([i, j]), n)
     present = jnp.zeros(n, bool).at[ends].set(True, mode="drop")
+    if free.bounces is not None:
+        present |= jnp.isfinite(free.bounces.times)
     members, num_members = rows_where(present, capacity.members)
     own = jnp.arange(capacity.members, dtype=jnp.int32)
     slot = jnp.zeros(n, jnp.int32).at[members].set(own, mode="drop")

@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxgran.particles.hard.candidates import Selection
 from jaxgran.particles.hard.prediction import FirstImpacts, Rows, Slots, first_impacts
 from jaxgran.particles.hard.scene import HardScene
+from jaxgran.particles.hard.walls import HardWalls, bounced
 from jaxgran.particles.spins import torque, twisted
 from jaxgran.scene.reduced_scene import ReducedRough
 from jaxgran.tangents.impact import ImpactTangents
@@ -29,7 +30,8 @@ class ImpactWork(NamedTuple):
         slots: the particles.
         dissipated: energy lost, half of it counted for each of two spheres.
         impacts: number of impacts of each particle.
-        regularised: number of those that were elastic because they followed too soon.
+        bounces: number of impacts on walls of each particle.
+        regularised: number of impacts that were elastic because they followed too soon.
         moved: largest squared distance of each particle, at its impacts, from the place for which
             the neighbour list was built.
         fastest: largest squared speed of each particle.
@@ -41,6 +43,7 @@ class ImpactWork(NamedTuple):
     slots: Slots
     dissipated: Float[Array, "slots"]
     impacts: Int[Array, "slots"]
+    bounces: Int[Array, "slots"]
     regularised: Int[Array, "slots"]
     moved: Float[Array, "slots"]
     fastest: Float[Array, "slots"]
@@ -76,9 +79,13 @@ def resolve(
     shortest = shortest[jnp.minimum(chosen.replica, len(shortest) - 1)]
 
     def one_round(work: ImpactWork) -> ImpactWork:
-        impacts, safe, row = _executable(work.slots, chosen.rows, duration)
+        impacts, safe, row = _executable(work.slots, chosen.rows, duration, scene.walls)
         effect = _effect(impacts, safe, work.slots, chosen.rows, shortest, scene, along)
-        return _executed(work, effect, safe, row, chosen.rows, listed)
+        new = _executed(work, effect, safe, row, chosen.rows, listed)
+        if impacts.bounces is None or scene.walls is None:
+            return new
+        alone = row == len(chosen.rows.a)
+        return _bounced(work, new, impacts, alone, listed, shortest, scene)
 
     def unfinished(work: ImpactWork):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
@@ -87,13 +94,13 @@ def resolve(
     size = (0, 0) if along is None else (len(along.log_temperature) + 1, num_rows)
     gains = jnp.zeros(size, zeros.dtype)
     work = ImpactWork(
-        slots, zeros, count, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains
+        slots, zeros, count, count, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains
     )
     return jax.lax.while_loop(unfinished, one_round, work)
 
 
 def _executable(
-    slots: Slots, rows: Rows, duration: ArrayLike
+    slots: Slots, rows: Rows, duration: ArrayLike, walls: HardWalls | None
 ) -> tuple[FirstImpacts, Bool[Array, "rows"], Int[Array, "slots"]]:
     """The next impacts, which of them can be executed now, and the row of each particle's own.
 
@@ -101,7 +108,7 @@ def _executable(
     """
     a, b = rows.a, rows.b
     index = jnp.arange(len(a), dtype=jnp.int32)
-    impacts = first_impacts(slots, rows, duration)
+    impacts = first_impacts(slots, rows, duration, walls)
     safe = jnp.isfinite(impacts.times)
     for k in (a, b):
         safe &= (impacts.times == impacts.first[k]) & (impacts.times == impacts.final[k])
@@ -199,10 +206,52 @@ def _executed(
         slots=Slots(slots.x - kick * s[:, None], v, jnp.where(hit, s, slots.last), spin),
         dissipated=work.dissipated + jnp.where(hit, effect.lost[row], 0.0),
         impacts=work.impacts + hit,
+        bounces=work.bounces,
         regularised=work.regularised + (hit & effect.soon[row]),
         moved=jnp.maximum(work.moved, away),
         fastest=jnp.maximum(work.fastest, jnp.sum(v * v, -1)),
         pending=jnp.any(safe),
         num_rounds=work.num_rounds + 1,
         gains=work.gains + effect.gains,
+    )
+
+
+def _bounced(
+    old: ImpactWork,
+    new: ImpactWork,
+    impacts: FirstImpacts,
+    alone: Bool[Array, "slots"],
+    listed: Float[Array, "slots d"],
+    shortest: Float[Array, "slots"],
+    scene: HardScene,
+) -> ImpactWork:
+    """The particles after a round, with those impacts on walls that nothing can come before.
+
+    Args:
+        old, new: before the round, and after its impacts of pairs.
+        impacts: the next ones, before the round.
+        alone: who takes part in no impact of a pair.
+        listed, shortest, scene: as for `resolve`.
+    """
+    assert impacts.bounces is not None and scene.walls is not None
+    slots, (times, axis) = old.slots, impacts.bounces
+    hit = alone & jnp.isfinite(times) & (times == impacts.first) & (times == impacts.final)
+    s = jnp.where(hit, times, 0.0)
+    soon = s - slots.last < shortest
+    after = bounced(scene.walls, scene.surface, slots.v, slots.spin, axis, soon | scene.elastic)
+    place = slots.x + slots.v * s[:, None]
+    v = jnp.where(hit[:, None], after.v, new.slots.v)
+    x = jnp.where(hit[:, None], place - v * s[:, None], new.slots.x)
+    spin = new.slots.spin
+    if spin is not None and after.spin is not None:
+        spin = jnp.where(hit[:, None], after.spin, spin)
+    away = jnp.where(hit, jnp.sum((place - listed) ** 2, -1), 0.0)
+    return new._replace(
+        slots=Slots(x, v, jnp.where(hit, s, new.slots.last), spin),
+        dissipated=new.dissipated + jnp.where(hit, after.lost, 0.0),
+        bounces=new.bounces + hit,
+        regularised=new.regularised + 2 * (hit & soon),
+        moved=jnp.maximum(new.moved, away),
+        fastest=jnp.maximum(new.fastest, jnp.sum(v * v, -1)),
+        pending=new.pending | jnp.any(hit),
     )

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxgran.particles import observables
 from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.state import State, derivatives_of_records, records
 from jaxgran.scene.restitution import ReducedLaw
@@ -28,6 +29,11 @@ def cooling_trend(
 def observe(state: State, scene: HardScene, replicas: int) -> dict[str, Array]:
     """The records of a state; with tangents, also those that `rule.with_tangents` adds."""
     values, travelled, velocity = records(state, scene.side, replicas)
+    if scene.walls is not None:  # which stop what moves as a whole, and keep spheres from going far
+        velocity = state.velocity.reshape(velocity.shape)
+        values["temperature"] = observables.temperature(velocity)
+        values["sonine"] = observables.sonine(velocity)
+        del values["displacement"]
     values["regularised"] = 2 / velocity.shape[1] * state.own.regularised
     if scene.surface is not None and state.own.spin is not None:  # not so in the melt
         spin = state.own.spin.reshape(replicas, -1)

@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from jaxgran.particles.hard.walls import Bounces, HardWalls, next_bounces
+
 
 class Motion(NamedTuple):
     """Relative motion ``r + w s`` of pairs, as the scalar products that their distance needs."""
@@ -85,6 +87,7 @@ class FirstImpacts(NamedTuple):
             velocity of each pair.
         motion: the same as scalar products.
         times: of each pair's impact; inf if there is none before the end.
+        bounces: of each particle on a wall; None without walls.
         first: the earliest impact time of each particle on its current path.
         final: a lower bound on the time until which each particle's path is final.
     """
@@ -93,11 +96,14 @@ class FirstImpacts(NamedTuple):
     w: Float[Array, "rows d"]
     motion: Motion
     times: Float[Array, "rows"]
+    bounces: Bounces | None
     first: Float[Array, "slots"]
     final: Float[Array, "slots"]
 
 
-def first_impacts(slots: Slots, rows: Rows, end: ArrayLike) -> FirstImpacts:
+def first_impacts(
+    slots: Slots, rows: Rows, end: ArrayLike, walls: HardWalls | None = None
+) -> FirstImpacts:
     """The next impact of each pair and of each particle before `end`."""
     a, b = rows.a, rows.b
     r, w = slots.x[a] - slots.x[b] - rows.offset, slots.v[a] - slots.v[b]
@@ -106,7 +112,12 @@ def first_impacts(slots: Slots, rows: Rows, end: ArrayLike) -> FirstImpacts:
     times = motion.impact_time(jnp.maximum(jnp.maximum(*last), 0.0))
     times = jnp.where(rows.real & (times < end), times, jnp.inf)
     first = jnp.full(len(slots.x), jnp.inf, times.dtype).at[a].min(times).at[b].min(times)
-    return FirstImpacts(r, w, motion, times, first, _final(slots, rows, motion, first, end))
+    bounces = None
+    if walls is not None:
+        bounces = next_bounces(walls, slots.x, slots.v, slots.last, end)
+        first = jnp.minimum(first, bounces.times)
+    final = _final(slots, rows, motion, first, end)
+    return FirstImpacts(r, w, motion, times, bounces, first, final)
 
 
 def _final(

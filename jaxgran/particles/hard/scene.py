@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
+from jaxgran.particles.hard.walls import HardWalls
 from jaxgran.scene.reduced_scene import ReducedRough
 from jaxgran.scene.restitution import ReducedLaw
 
@@ -12,13 +13,14 @@ class HardScene(NamedTuple):
     """A gas of hard spheres in units of its diameter, mass and first temperature.
 
     Attributes:
-        side: of the box.
+        side: of the periodic box.
         law: of restitution, for speeds in units of sqrt(2).
         collision_frequency: at T = 1.
         contact_time: in mean free times; the impact of a sphere within this time of its last one
             is elastic.
         elastic: whether all impacts are, and smooth.
         surface: of rough spheres; else None.
+        walls: of a container; None where the box is periodic.
     """
 
     side: Float[Array, ""]
@@ -27,6 +29,7 @@ class HardScene(NamedTuple):
     contact_time: Float[Array, ""]
     elastic: Bool[Array, ""]
     surface: ReducedRough | None = None
+    walls: HardWalls | None = None
 
     @property
     def material(self) -> ReducedLaw:

@@ -67,7 +67,10 @@ class HardDynamics(AbstractDynamics):
 
     def own_state(self, num_rows, dtype) -> HardState:
         # Short at first: in random places many spheres are near contact.
-        window = self.share / (8 * self.scene.collision_frequency)
+        rate = self.scene.collision_frequency
+        if self.scene.walls is not None:
+            rate = rate + 2 / (self.scene.walls.side - 1)
+        window = self.share / (8 * rate)
         return HardState(
             age=jnp.full(num_rows, jnp.inf, dtype),
             regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
@@ -77,6 +80,11 @@ class HardDynamics(AbstractDynamics):
     def elastic(self) -> "HardDynamics":
         lossless = self.scene._replace(elastic=jnp.ones((), bool))
         return dataclasses.replace(self, scene=lossless)
+
+    @property
+    def placement(self) -> tuple[Array, float]:
+        walls = self.scene.walls
+        return (self.scene.side, 0.0) if walls is None else (walls.side - 1, 0.5)
 
     def spun(self, state: State, key: PRNGKeyArray) -> State:
         surface = self.scene.surface
@@ -89,9 +97,9 @@ class HardDynamics(AbstractDynamics):
         return state._replace(own=state.own._replace(spin=spin))
 
     def with_tangents(self, state: State, directions: ReducedLaw) -> State:
-        if self.scene.surface is not None:
+        if self.scene.surface is not None or self.scene.walls is not None:
             raise ValueError(
-                "derivatives of HardSpheres runs with rough spheres are not known: use "
+                "derivatives of HardSpheres runs with rough spheres or walls are not known: use "
                 "KineticTheory(), or differences of runs"
             )
         along = ImpactTangents.at_start(directions, self.replicas, state.velocity.dtype)
@@ -127,7 +135,9 @@ class HardDynamics(AbstractDynamics):
         num_left = jnp.maximum(jnp.ceil(left / old.own.window * (1 - 1e-9)), 1.0)
         duration = left / num_left
         bound = SPEED_MARGIN * more.widen * fastest(old.velocity, self.replicas)
-        chosen = select_reachable(old.position, old.velocity, pairs, duration, bound, self.capacity)
+        chosen = select_reachable(
+            old.position, old.velocity, pairs, duration, bound, self.capacity, self.scene.walls
+        )
         work = self._resolved(old, listed, chosen, duration)
         most = bound[jnp.minimum(chosen.replica, self.replicas - 1)]
         too_fast = jnp.any(work.fastest > most**2)
@@ -194,8 +204,10 @@ class HardDynamics(AbstractDynamics):
             return values.at[chosen.members].set(new, mode="drop")
 
         impacts, lost = by_replica(work.impacts) // 2, by_replica(work.dissipated)
+        bounces = by_replica(work.bounces)
         wanted = max(0.5 * self.share * len(state.position), LEAST_IMPACTS)
-        ratio = (wanted / jnp.maximum(jnp.sum(impacts), 1)) ** WINDOW_EXPONENT
+        found = jnp.sum(impacts) if self.scene.walls is None else jnp.sum(impacts + bounces)
+        ratio = (wanted / jnp.maximum(found, 1)) ** WINDOW_EXPONENT
         ratio = jnp.clip(ratio, 0.5, 1.5)
         slots, own = work.slots, state.own
         regularised = own.regularised + by_replica(work.regularised) // 2
@@ -275,6 +287,8 @@ def _prepared(dynamics: HardDynamics, state: State, end: ArrayLike) -> tuple[Sta
     life = 0.95 * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
     left = time_left(state, end)
     flown = 0.5 * jnp.minimum(life, left) * state.velocity
+    if dynamics.scene.walls is not None:
+        flown = jnp.clip(state.position + flown, 0.5, side - 1.5) - state.position
     listed = neighbours.wrap(side, state.position + flown)
     image = jnp.round((state.position + flown - listed) / side).astype(jnp.int32)
     began = state._replace(position=listed - flown, image=state.image + image)

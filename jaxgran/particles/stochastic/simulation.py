@@ -96,7 +96,9 @@ def observe(
     def centred(x):
         return x - jnp.mean(x, axis=1, keepdims=True)
 
-    velocity = centred(state.particles[..., :d])
+    velocity = state.particles[..., :d]
+    if scene.walls is None:  # which stop what moves as a whole
+        velocity = centred(velocity)
     travelled = centred(
         state.particles[..., d : 2 * d] + state.clock[:, None, None] * state.particles[..., :d]
     )

@@ -1,0 +1,136 @@
+"""Hard spheres in a container."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from tests.conftest import glass_beads
+
+SIDE = 0.05
+
+
+def contained(num_particles, walls=1.0, gas=None, diameter=2e-3, **elements) -> jaxgran.Gas:
+    """A gas of N spheres in a cube of 50 mm."""
+    gas = glass_beads() if gas is None else gas
+    phi = num_particles * np.pi / 6 * diameter**3 / SIDE**3
+    gas = gas.replace(diameter=diameter, packing_fraction=phi)
+    rub = elements.pop("rub", None)
+    walls = jaxgran.Walls(SIDE, restitution=walls, tangential_restitution=rub)
+    return dataclasses.replace(gas, container=walls, **elements)
+
+
+def run(gas, num_particles, replicas, taus):
+    times = jnp.asarray(taus) * gas.mean_free_time
+    return jaxgran.cool(gas, times, model=jaxgran.HardSpheres(num_particles, replicas=replicas))
+
+
+@pytest.mark.parametrize(
+    "elements",
+    [{}, {"surface": jaxgran.Rough(0.2, rotational_temperature=3e-3), "rub": 0.3}],
+    ids=["smooth", "rough"],
+)
+def test_energy_is_conserved_and_all_stay_inside(elements):
+    gas = contained(200, 0.8, **elements)
+    curve = run(gas, 200, 2, [0.0, 1.0, 10.0])
+    energy = 3 * curve.temperature
+    if gas.surface is not None:
+        energy = energy + 3 * curve.rotational_temperature
+    total = 0.5 * gas.mass * energy + curve.dissipated_energy
+    np.testing.assert_allclose(total, total[0], rtol=1e-12)
+    assert float(curve.temperature[-1]) < 0.5 * float(gas.temperature)
+    place = np.asarray(curve.particles.position)
+    assert place.min() > 1e-3 * (1 - 1e-9) and place.max() < (SIDE - 1e-3) * (1 + 1e-9)
+    assert float(curve.particles.box_side) == pytest.approx(SIDE)
+    assert curve.displacement is None
+    apart = place[0][:, None] - place[0][None]
+    distance = np.linalg.norm(apart, axis=-1) + np.eye(len(apart))
+    assert distance.min() > 2e-3 * (1 - 1e-8)
+
+
+def free_flight(eps, times, speed=0.1, width=SIDE - 5e-4, num=100_000):
+    """T/T_0 of particles that meet walls only, bounce after bounce."""
+    rng = np.random.default_rng(0)
+    first, place = np.abs(rng.normal(size=num)) * speed, rng.uniform(0, width, size=num)
+    found = []
+    for time in times:
+        v, left, ahead = first.copy(), np.full(num, time), width - place
+        while np.any(hit := (left > 0) & (ahead < v * left)):
+            left = np.where(hit, left - ahead / v, 0.0)
+            v, ahead = np.where(hit, eps * v, v), np.where(hit, width, ahead)
+        found.append(np.mean(v**2) / speed**2)
+    return np.array(found)
+
+
+@pytest.mark.slow
+def test_walls_alone_take_what_free_flight_says():
+    # Elastic spheres with a mean free path of 20 sides: 2 +- 1 % of T are those of collisions.
+    gas = contained(100, 0.8, glass_beads(0.0), diameter=5e-4)
+    times = np.array([0.1, 0.25, 0.5, 1.0])
+    curve = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(100, replicas=32))
+    ratio = np.asarray(curve.temperature / gas.temperature) / free_flight(0.8, times)
+    error = np.asarray(curve.temperature_error / curve.temperature)
+    assert np.all(np.abs(ratio - 1) < 3 * error + 0.02)
+
+
+@pytest.mark.slow
+def test_elastic_walls_cool_as_dsmc():
+    gas = contained(500)
+    taus = [1.0, 5.0, 20.0, 40.0]
+    hard = run(gas, 500, 16, taus)
+    times = jnp.asarray(taus) * gas.mean_free_time
+    dsmc = jaxgran.cool(gas, times, model=jaxgran.DSMC(20_000))
+    error = np.asarray(hard.temperature_error / hard.temperature)
+    ratio = np.asarray(hard.temperature / dsmc.temperature)
+    assert np.all(np.abs(ratio - 1) < 3 * error + 0.015)  # Enskog's rate, and N = 500
+    # Without the collisions that walls add, T would be 7 % higher in the end.
+    assert np.all(np.abs(hard.collisions / dsmc.collisions - 1)[1:] < 0.03)
+
+
+def test_viscoelastic_walls_bounce_by_their_own_law():
+    # Two elastic spheres: what is lost, is lost to the walls, at the eps of their speeds.
+    law = jaxgran.Viscoelastic(5e7, 0.22, 3e-5)
+    gas = contained(2, law, glass_beads(0.0))
+    times = jnp.array([0.0, 1.0, 2.0])
+    curve = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(2))
+    total = 1.5 * gas.mass * curve.temperature + curve.dissipated_energy
+    np.testing.assert_allclose(total, total[0], rtol=1e-12)
+    # Some 5 bounces across each axis in a second, of 1 - eps^2 = .2 to .3 at 1 to 10 cm/s.
+    assert 0.05 < float(curve.temperature[-1] / gas.temperature) < 0.7
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"packing_fraction": 0.03}, "200 spheres of packing_fraction 0.03 need a container"),
+        ({"sides": [SIDE] * 3}, "HardSpheres takes a cubic container"),
+    ],
+)
+def test_containers_that_do_not_fit_are_refused(change, message):
+    gas = contained(200)
+    if "sides" in change:
+        walls = jaxgran.Walls(change["sides"], restitution=1.0)
+        gas = dataclasses.replace(gas, container=walls)
+    else:
+        gas = gas.replace(**change)
+    with pytest.raises(ValueError, match=message):
+        jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(200))
+
+
+def test_derivatives_and_starts_between_walls_are_refused():
+    gas = contained(50)
+    model = jaxgran.HardSpheres(50)
+    curve = jaxgran.cool(gas, [1e-3], model=model)
+    with pytest.raises(ValueError, match="takes no start in a container"):
+        again = jaxgran.HardSpheres(50, start=curve.particles)
+        jaxgran.cool(gas, [1e-3], model=again)
+    sized = model.sized_for(gas)
+
+    def temperature(eps):
+        return jaxgran.cool(gas.replace(wall_coefficient=eps), [1e-3], model=sized).temperature
+
+    with pytest.raises(ValueError, match="rough spheres or walls are not known"):
+        jax.jvp(temperature, (0.9,), (1.0,))
