@@ -177,6 +177,15 @@ def test_main_job_writes_json_that_others_can_read(tmp_path, monkeypatch, capsys
 
 
 @pytest.mark.slow
+def test_drop_tower_runs(tmp_path):
+    done = run("drop_tower.py", "--runs", 1, "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "eps = 0.90: beta_t = -0.73 or 0.16" in done.stdout
+    assert "intervals hold it in 1 of 1" in done.stdout
+    assert (tmp_path / "here" / "drop_tower.png").stat().st_size > 20_000
+
+
+@pytest.mark.slow
 def test_wrong_physics_runs(tmp_path):
     done = run("wrong_physics.py", "--draws", 2, "--out", "table.md", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
