@@ -394,7 +394,7 @@ def faults_on_the_way() -> list[Row]:
 
         resume(gas)
         other = gas.replace(coefficient=0.8)
-        asked = "belongs to another run: law.coefficient was float64 0.9 and is float64 0.8"
+        asked = "belongs to another run: scene.law.coefficient was float64 0.9 and is float64 0.8"
         rows.append(refusal("another gas", "float64", lambda: resume(other), asked))
         header, body = file.read_bytes().split(b"\n", maxsplit=1)
         changed = json.loads(header) | {"version": "0.0.1"}

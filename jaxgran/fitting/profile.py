@@ -63,14 +63,11 @@ def fit_trials(
     """Fits of all trials.
 
     Args:
-        gas: as fitted.
-        names: of the free parameters.
+        gas, names: as fitted, and the free parameters.
         times, measured, weights: t, ln T and inverse relative errors; 0 where a point is not used.
-        modelled: ln T of the fitted model.
-        ratios: T_rot/T of the fitted model; 0 of smooth spheres.
-        trials: what is added.
+        modelled, ratios: ln T and T_rot/T of the fitted model; T_rot is 0 of smooth spheres.
+        trials, priors: what is added, and what else is known of the gas.
         accuracy: relative error of the model's cooling rate, of its mean and of its trend in ln T.
-        priors: what else is known of the gas.
     """
     parameters, used = Parameters(gas, (*names, *priors.also_free(names))), weights > 0
     num_free = sum(gas.value(name).size for name in names)

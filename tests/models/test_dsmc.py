@@ -212,13 +212,15 @@ def test_momentum_energy_and_speeds(dimension):
 def test_every_pair_is_about_equally_likely(n):
     scheme = Scheme.of(3, n, 0.1)
 
-    def draw(key):
+    def drawn(key):
         i, j, k = draw(jax.random.bits(key, (4,)), scheme)
         one = jnp.stack([i, j])
         return jnp.concatenate([one, jnp.stack([i[: scheme.second], k])], axis=1)
 
     draws = 4000 if n < 1000 else 20_000
-    i, j = np.moveaxis(np.asarray(jax.vmap(draw)(jax.random.split(jax.random.key(0), draws))), 1, 0)
+    i, j = np.moveaxis(
+        np.asarray(jax.vmap(drawn)(jax.random.split(jax.random.key(0), draws))), 1, 0
+    )
     for row_i, row_j in zip(i[:50], j[:50], strict=True):
         first = np.concatenate([row_i[: scheme.first], row_j])
         assert len(set(first)) == len(first)  # nobody twice, save the second pairs' first ones
