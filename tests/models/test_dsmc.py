@@ -12,7 +12,7 @@ import jaxgran
 from jaxgran.models.dsmc import DSMC
 from jaxgran.particles import driver
 from jaxgran.particles.stochastic import collisions, simulation
-from jaxgran.particles.stochastic.pairing import Scheme
+from jaxgran.particles.stochastic.pairing import Scheme, draw
 from jaxgran.scene.reduced_scene import ReducedScene
 from jaxgran.theory import averages as kinetics
 from tests.conftest import glass_beads
