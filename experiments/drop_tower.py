@@ -24,6 +24,7 @@ import warnings
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -55,7 +56,7 @@ def scene() -> jaxgran.Gas:
     return gas.replace(dissipative_constant=A)
 
 
-def steady_ratio(eps: float, beta: float, q: float = 0.4) -> float:
+def steady_ratio(eps: float, beta: np.ndarray, q: float = 0.4) -> np.ndarray:
     """T_rot/T that a gas of constant eps and beta_t reaches: Santos, Kremer & Garzo (2010)."""
     c = (1 + q) ** 2 / (2 * q * (1 + beta) ** 2)
     c *= 1 - eps**2 - (1 - q) / (1 + q) * (1 - beta**2)
@@ -83,11 +84,11 @@ def twin(gas: jaxgran.Gas, key: int) -> jaxgran.CoolingCurve:
     exact = jaxgran.cool(gas, times, model=model, key=jax.random.key(key))
     rng = np.random.default_rng(key)
     T, T_rot = (
-        np.asarray(x) * np.exp(ERROR * rng.standard_normal(POINTS))
+        jnp.asarray(x) * np.exp(ERROR * rng.standard_normal(POINTS))
         for x in (exact.temperature, exact.rotational_temperature)
     )
     return jaxgran.CoolingCurve(
-        times=times,
+        times=jnp.asarray(times),
         temperature=T,
         temperature_error=ERROR * T,
         rotational_temperature=T_rot,
@@ -112,18 +113,18 @@ def main() -> int:
         f"twin: phi = {float(gas.packing_fraction):.3f}, mean free path "
         f"{1e3 * float(gas.mean_free_path):.0f} mm in a cube of {1e3 * SIDE:.0f} mm, A = {A:.3g} s"
     )
-    rows, shown = [], None
+    rows, curves = [], []
     for key in range(options.runs):
         curve = twin(gas, key)
+        curves.append(curve)
         rows.append(row(gas, curve))
-        shown = shown or (curve, rows[-1])
         smooth, told = rows[-1]
         print(
             f"run {key}: smooth, unbounded A = {in_words(smooth, A)}; "
             f"told A = {in_words(told, A)}, beta_t = {told.estimate[1]:.2f} +- "
             f"{told.standard_error[1]:.2f} (p = {float(told.p_value):.2g})"
         )
-    ratio = np.asarray(shown[0].rotational_temperature / shown[0].temperature)
+    ratio = np.asarray(curves[0].rotational_temperature / curves[0].temperature)
     print(f"T_rot/T of run 0: {ratio.mean():.2f} +- {ratio.std():.2f}, published some .67")
     held = [
         abs(float(told.estimate[0]) - A) < 1.96 * float(told.standard_error[0]) for _, told in rows
@@ -136,7 +137,7 @@ def main() -> int:
     )
     print(f"  in {none} of {len(rows)} runs: such spheres do not cool so fast, however inelastic;")
     print(f"told: {np.mean(right):.2f} times; 95 % intervals hold it in {sum(held)} of {len(held)}")
-    draw(gas, *shown, options.out / "drop_tower.png")
+    draw(gas, curves[0], rows[0], options.out / "drop_tower.png")
     print(f"{time.perf_counter() - began:.0f} s")
     return 0
 
