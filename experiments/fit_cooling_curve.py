@@ -314,6 +314,7 @@ def print_rows(rows: list[dict]) -> None:
             print(f"{'not determined':>13}")
             continue
         between = f"{row['low']:.3g} .. {row['high']:.3g}"
+        between = "not looked for" if np.isnan(row["low"]) else between
         print(f"{row['estimate']:13.5g} {row['std_err']:10.2g} {between:>24}", end="")
         if row["header"]:
             print(f"  {row['header']:.5g} ({100 * (row['estimate'] / row['header'] - 1):+.2f} %)")
