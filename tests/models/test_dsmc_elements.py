@@ -105,6 +105,8 @@ def compare(gas, elements):
     error = 0.02 if flat and gas.container is not None else 0.012
     assert np.all(np.abs(curve.temperature / theory.temperature - 1) < error + 3 * 0.004)
     assert np.all(np.abs(curve.collisions / theory.collisions - 1) < error)
+    if gas.container is None:  # first Sonine order, whose D is up to 7 % high with spins
+        assert np.all(np.abs(curve.displacement / theory.displacement - 1) < 0.09)
     if gas.surface is None:
         assert curve.rotational_temperature is None
         return
