@@ -198,7 +198,10 @@ def _clock_of_few(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]
     Their relative velocities are those of the temperature ``T' = T N/(N-1)``, and each meets N - 1
     others: of ``-d ln T/dt = r(T)`` remains r(T')/r(T), here with the loss ``1 - eps^2`` at the
     impact speed sqrt(2 T): 1 + .6/N for viscoelastic spheres, 1 + .5/N for a constant eps.
+    Walls take up momentum, so that between them all N are there.
     """
+    if gas.container is not None:
+        return jnp.ones_like(gas.temperature)
     hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
     one = jnp.ones_like(gas.temperature)
     loss = 1 - gas.reduced_law.restitution(one) ** 2

@@ -92,7 +92,7 @@ class AbstractDynamics(eqx.Module):
         return self.scene.side, 0.0
 
     def spun(self, state: State, key: PRNGKeyArray) -> State:
-        """The state at t = 0 with random spins, where spheres have some."""
+        """The state at t = 0 with random spins, where spheres have some; key is that of the run."""
         return state
 
     def check_start(self, state: State) -> Int[Array, ""]:

@@ -103,7 +103,7 @@ class Simulation(NamedTuple):
             velocity = initial.settle(velocity, self.dynamics.replicas)
         key = jax.random.key(0) if self.inputs.key is None else self.inputs.key
         state = self.dynamics.begin(melted.position, velocity, melted.skin)
-        state = self.dynamics.spun(state, jax.random.fold_in(key, 2))
+        state = self.dynamics.spun(state, key)
         if self.directions is None:
             return state
         return self.dynamics.with_tangents(state, self.directions)

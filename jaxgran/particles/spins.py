@@ -1,8 +1,10 @@
 """Spins of rough spheres, ``s = (sigma/2) w``, which are velocities of their surfaces."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 
 def at_start(
@@ -30,3 +32,43 @@ def torque(
     if normal.shape[-1] == 2:
         return (normal[:, 0] * force[:, 1] - normal[:, 1] * force[:, 0])[:, None]
     return jnp.cross(normal, force)
+
+
+class Rub(NamedTuple):
+    """The tangential part of impacts.
+
+    Attributes:
+        sideways: tangential part of the relative velocity of the centres.
+        slip: that of the surfaces at contact; 0 where there is no friction.
+        kick: change of velocity of the first partner.
+        twist: change of spin, of both partners alike.
+    """
+
+    sideways: Float[Array, "pairs d"]
+    slip: Float[Array, "pairs d"]
+    kick: Float[Array, "pairs d"]
+    twist: Float[Array, "pairs spins"]
+
+
+def rub(
+    relative: Float[Array, "pairs d"],
+    spin: Float[Array, "pairs spins"],
+    normal: Float[Array, "pairs d"],
+    where: Bool[Array, "pairs"],
+    eta: Float[Array, ""],
+    inertia: Float[Array, ""],
+) -> Rub:
+    """The tangential part of impacts, ``-eta`` times the slip: see `jaxgran.Rough`.
+
+    Args:
+        relative: velocity of the first partner less that of the second.
+        spin: sum of their spins; a wall has none.
+        normal: from the first to the second.
+        where: there is friction.
+        eta: share of the slip that becomes the kick.
+        inertia: q.
+    """
+    sideways = relative - jnp.sum(relative * normal, axis=-1, keepdims=True) * normal
+    slip = jnp.where(where[:, None], sideways + twisted(spin, normal), 0.0)
+    kick = -eta * slip
+    return Rub(sideways, slip, kick, torque(normal, kick) / inertia)

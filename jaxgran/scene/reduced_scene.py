@@ -26,7 +26,15 @@ class ReducedRough(NamedTuple):
     @property
     def eta(self) -> Float[Array, ""]:
         """``q (1 + beta_t) / (2 (1 + q))``."""
-        return self.inertia * (1 + self.beta) / (2 * (1 + self.inertia))
+        return self.eta_on_wall(self.beta) / 2
+
+    def eta_on_wall(self, beta: Float[Array, ""]) -> Float[Array, ""]:
+        """``q (1 + beta_w) / (1 + q)``, the same where a wall does not give way."""
+        return self.inertia * (1 + beta) / (1 + self.inertia)
+
+    def lost_share(self, beta: Float[Array, ""]) -> Float[Array, ""]:
+        """``q/(1 + q) (1 - beta_t^2)``, the share of the energy of the slip that is lost."""
+        return self.inertia / (1 + self.inertia) * (1 - beta**2)
 
 
 class ReducedWalls(NamedTuple):

@@ -48,7 +48,8 @@ def changes(
     total = Changes(*[jnp.zeros_like(speed)] * 3)
     if scene.surface is not None:
         rate = collision_rate(sonine, dimension) * speed
-        total = _sum(total, _of_impacts(scene.surface, rate, ratio, dimension))
+        own = _of_friction(scene.surface.eta, scene.surface.inertia, rate, ratio, dimension)
+        total = _sum(total, own)
     if scene.walls is not None:
         loss = impact_average(partial(_lost, scene.walls, speed), speed)
         own = _of_walls(scene.walls, scene.surface, loss, speed, ratio, dimension)
@@ -64,7 +65,9 @@ def _sum(a: Changes, b: Changes) -> Changes:
     return Changes(*(x + y for x, y in zip(a, b, strict=True)))
 
 
-def _of_impacts(surface: ReducedRough, rate: Array, ratio: Array | float, d: int) -> Changes:
+def _of_friction(
+    eta: Array, inertia: Array, rate: Array | float, ratio: Array | float, d: int
+) -> Changes:
     """Of the tangential part of impacts between spheres, nu a particle and unit of time.
 
     ``dT/dt = -(2 (d-1)/d) nu (eta (1 - eta) T - eta^2 T_rot/q)``,
@@ -72,11 +75,10 @@ def _of_impacts(surface: ReducedRough, rate: Array, ratio: Array | float, d: int
     tangential velocity of two spheres that meet are 2 (d-1) T of the centres and 2 (d-1) T_rot/q of
     the surfaces. Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997).
     """
-    eta, q = surface.eta, surface.inertia
     strength = 2 * (d - 1) * rate
     return Changes(
-        cooling=strength / d * (eta * (1 - eta) - eta**2 * ratio / q),
-        rotation=-strength / SPINS[d] * eta / q * ((1 - eta / q) * ratio - eta),
+        cooling=strength / d * (eta * (1 - eta) - eta**2 * ratio / inertia),
+        rotation=-strength / SPINS[d] * eta / inertia * ((1 - eta / inertia) * ratio - eta),
         relaxation=strength / (2 * d) * eta,
     )
 
@@ -91,23 +93,18 @@ def _of_walls(
 ) -> Changes:
     """Of impacts on walls that take a loss times T each, which all parts of a mixed gas meet alike.
 
-    A wall takes ``(1 - eps^2) v_n^2/2``, of constant eps ``(1 - eps^2) T`` in the mean, and from
-    rough spheres what an impact between spheres takes with ``eta_w = q (1 + beta_w)/(1 + q)`` for
-    2 eta. Velocities are reversed, so that displacements are not those of a free gas.
+    A wall takes ``(1 - eps^2) v_n^2/2``, of constant eps ``(1 - eps^2) T`` in the mean. By friction
+    it takes from one sphere what the impact of two takes from both, of whose velocities each has
+    half the mean square: as many impacts of spheres with half the eta of a wall, twice. Velocities
+    are reversed, so that displacements are not those of a free gas.
     """
     rate = jnp.sum(walls.frequency) * speed
-    cooling = 2 / d * rate * loss
     nothing = jnp.zeros_like(speed)
+    total = Changes(2 / d * rate * loss, nothing, nothing)
     if surface is None or walls.beta is None:
-        return Changes(cooling, nothing, nothing)
-    q = surface.inertia
-    eta = q * (1 + walls.beta) / (1 + q)
-    strength = 2 * (d - 1) * rate
-    return Changes(
-        cooling=cooling + strength / d * (eta * (1 - eta / 2) - eta**2 / 2 * ratio / q),
-        rotation=-strength / SPINS[d] * eta / q * ((1 - eta / (2 * q)) * ratio - eta / 2),
-        relaxation=nothing,
-    )
+        return total
+    eta = surface.eta_on_wall(walls.beta) / 2
+    return _sum(total, _of_friction(eta, surface.inertia, 2 * rate, ratio, d))
 
 
 def _lost(walls: ReducedWalls, speed: Array, g: Array) -> Array:
@@ -125,7 +122,8 @@ def fastest_cooling(scene: ReducedScene, dimension: int) -> tuple[Array | float,
     one = jnp.ones(())
     if scene.surface is not None:
         rate = collision_rate(0.0, dimension)
-        by_speed = by_speed + _of_impacts(scene.surface, rate, 0.0, dimension).cooling
+        own = _of_friction(scene.surface.eta, scene.surface.inertia, rate, 0.0, dimension)
+        by_speed = by_speed + own.cooling
     if scene.walls is not None:
         walls = _of_walls(scene.walls, scene.surface, one, one, 0.0, dimension)
         by_speed = by_speed + walls.cooling

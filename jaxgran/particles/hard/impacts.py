@@ -15,7 +15,7 @@ from jaxgran.particles.hard.candidates import Selection
 from jaxgran.particles.hard.prediction import FirstImpacts, Rows, Slots, first_impacts
 from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.hard.walls import HardWalls, bounced
-from jaxgran.particles.spins import torque, twisted
+from jaxgran.particles.spins import rub
 from jaxgran.scene.reduced_scene import ReducedRough
 from jaxgran.tangents.impact import ImpactTangents
 
@@ -30,7 +30,7 @@ class ImpactWork(NamedTuple):
         slots: the particles.
         dissipated: energy lost, half of it counted for each of two spheres.
         impacts: number of impacts of each particle.
-        bounces: number of impacts on walls of each particle.
+        bounces: number of impacts on walls of each particle; None without walls.
         regularised: number of impacts that were elastic because they followed too soon.
         moved: largest squared distance of each particle, at its impacts, from the place for which
             the neighbour list was built.
@@ -43,7 +43,7 @@ class ImpactWork(NamedTuple):
     slots: Slots
     dissipated: Float[Array, "slots"]
     impacts: Int[Array, "slots"]
-    bounces: Int[Array, "slots"]
+    bounces: Int[Array, "slots"] | None
     regularised: Int[Array, "slots"]
     moved: Float[Array, "slots"]
     fastest: Float[Array, "slots"]
@@ -93,8 +93,9 @@ def resolve(
     count, zeros = jnp.zeros(num_slots, jnp.int32), jnp.zeros(num_slots, slots.x.dtype)
     size = (0, 0) if along is None else (len(along.log_temperature) + 1, num_rows)
     gains = jnp.zeros(size, zeros.dtype)
+    bounces = None if scene.walls is None else count
     work = ImpactWork(
-        slots, zeros, count, count, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains
+        slots, zeros, count, bounces, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains
     )
     return jax.lax.while_loop(unfinished, one_round, work)
 
@@ -170,14 +171,10 @@ def _rubbed(
     smooth: Bool[Array, "rows"],
 ) -> _Effect:
     """The effect with the tangential part of impacts, see `jaxgran.Rough`, where not smooth."""
-    sideways = w - jnp.sum(w * normal, -1, keepdims=True) * normal
-    slip = jnp.where(smooth[:, None], 0.0, sideways - twisted(spin, normal))
-    kick = -surface.eta * slip
-    share = surface.inertia / (1 + surface.inertia) * (1 - surface.beta**2)
+    found = rub(w, spin, -normal, ~smooth, surface.eta, surface.inertia)
+    lost = 0.125 * surface.lost_share(surface.beta) * jnp.sum(found.slip**2, -1)
     return effect._replace(
-        kick=effect.kick + kick,
-        lost=effect.lost + 0.125 * share * jnp.sum(slip**2, -1),
-        twist=-torque(normal, kick) / surface.inertia,
+        kick=effect.kick + found.kick, lost=effect.lost + lost, twist=found.twist
     )
 
 
@@ -233,7 +230,7 @@ def _bounced(
         alone: who takes part in no impact of a pair.
         listed, shortest, scene: as for `resolve`.
     """
-    assert impacts.bounces is not None and scene.walls is not None
+    assert impacts.bounces is not None and scene.walls is not None and new.bounces is not None
     slots, (times, axis) = old.slots, impacts.bounces
     hit = alone & jnp.isfinite(times) & (times == impacts.first) & (times == impacts.final)
     s = jnp.where(hit, times, 0.0)
@@ -250,7 +247,7 @@ def _bounced(
         slots=Slots(x, v, jnp.where(hit, s, new.slots.last), spin),
         dissipated=new.dissipated + jnp.where(hit, after.lost, 0.0),
         bounces=new.bounces + hit,
-        regularised=new.regularised + 2 * (hit & soon),
+        regularised=new.regularised + 2 * (hit & soon),  # an impact of two spheres counts twice
         moved=jnp.maximum(new.moved, away),
         fastest=jnp.maximum(new.fastest, jnp.sum(v * v, -1)),
         pending=new.pending | jnp.any(hit),

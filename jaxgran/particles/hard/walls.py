@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxgran.particles.spins import torque, twisted
+from jaxgran.particles.spins import rub
 from jaxgran.scene.reduced_scene import ReducedRough
 from jaxgran.scene.restitution import ReducedLaw
 
@@ -90,10 +90,7 @@ def bounced(
     lost = 0.5 * (1 - eps**2) * normal_speed**2
     if surface is None or spin is None or walls.beta is None:
         return Bounced(v + kick, spin, lost)
-    q = surface.inertia
-    slip = jnp.where(across, 0.0, v) + twisted(spin, outwards)
-    slip = jnp.where(jnp.broadcast_to(elastic, normal_speed.shape)[:, None], 0.0, slip)
-    rub = -q * (1 + walls.beta) / (1 + q) * slip
-    share = q / (1 + q) * (1 - walls.beta**2)
-    lost = lost + 0.5 * share * jnp.sum(slip**2, axis=1)
-    return Bounced(v + kick + rub, spin + torque(outwards, rub) / q, lost)
+    where = ~jnp.broadcast_to(elastic, normal_speed.shape)
+    found = rub(v, spin, outwards, where, surface.eta_on_wall(walls.beta), surface.inertia)
+    lost = lost + 0.5 * surface.lost_share(walls.beta) * jnp.sum(found.slip**2, axis=1)
+    return Bounced(v + kick + found.kick, spin + found.twist, lost)

@@ -91,6 +91,7 @@ class HardDynamics(AbstractDynamics):
         if surface is None:
             return state
         n, d = state.velocity.shape
+        key = jax.random.fold_in(key, 2)  # 0 and 1 are of positions and velocities
         shape = self.replicas, n // self.replicas, SPINS[d]
         mean_square = (surface.ratio / surface.inertia).astype(state.velocity.dtype)
         spin = spins.at_start(key, shape, mean_square).reshape(n, SPINS[d])
@@ -204,9 +205,10 @@ class HardDynamics(AbstractDynamics):
             return values.at[chosen.members].set(new, mode="drop")
 
         impacts, lost = by_replica(work.impacts) // 2, by_replica(work.dissipated)
-        bounces = by_replica(work.bounces)
         wanted = max(0.5 * self.share * len(state.position), LEAST_IMPACTS)
-        found = jnp.sum(impacts) if self.scene.walls is None else jnp.sum(impacts + bounces)
+        found = jnp.sum(impacts)
+        if work.bounces is not None:
+            found = found + jnp.sum(work.bounces)
         ratio = (wanted / jnp.maximum(found, 1)) ** WINDOW_EXPONENT
         ratio = jnp.clip(ratio, 0.5, 1.5)
         slots, own = work.slots, state.own

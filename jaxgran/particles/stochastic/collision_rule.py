@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, UInt32
 
-from jaxgran.particles.spins import torque, twisted
+from jaxgran.particles.spins import rub
 from jaxgran.scene.reduced_scene import ReducedRough, ReducedScene
 from jaxgran.scene.restitution import ReducedLaw
 
@@ -104,15 +104,10 @@ def _rubbed(
     hit: Bool[Array, "pairs"],
 ) -> Outcome:
     """The outcome with the tangential part of the impacts; see `jaxgran.Rough`."""
-    along_normal = jnp.sum(relative * normal, axis=-1, keepdims=True)
-    sideways = relative - along_normal * normal
-    slip = jnp.where(hit[:, None], sideways + twisted(spin, normal), 0.0)
-    kick = -surface.eta * slip
-    lost = -2 * jnp.sum(kick * (sideways + kick))
+    found = rub(relative, spin, normal, hit, surface.eta, surface.inertia)
+    lost = -2 * jnp.sum(found.kick * (found.sideways + found.kick))  # of translation alone
     return outcome._replace(
-        kick=outcome.kick + kick,
-        loss=outcome.loss + lost,
-        twist=torque(normal, kick) / surface.inertia,
+        kick=outcome.kick + found.kick, loss=outcome.loss + lost, twist=found.twist
     )
 
 

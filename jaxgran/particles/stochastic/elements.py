@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxgran.particles.spins import torque, twisted
+from jaxgran.particles.spins import rub
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedRough, ReducedWalls
 
 
@@ -68,21 +68,15 @@ def hit_walls(
     n, d = velocity.shape
     each = walls.frequency * sqrt(pi)  # over the speed
     chance = jax.random.uniform(key, (n, d), velocity.dtype)
-    rough, q, eta = surface is not None and walls.beta is not None, 1.0, 0.0
-    if surface is not None and walls.beta is not None:
-        q = surface.inertia
-        eta = q * (1 + walls.beta) / (1 + q)
     for k in range(d):
         speed = jnp.abs(velocity[:, k])
         hit = (chance[:, k] < each[k] * speed * ds) & (speed > 0)
         eps = walls.law.restitution(jnp.where(hit, speed * slowed, 1.0))
         axis = jnp.zeros((n, d), velocity.dtype).at[:, k].set(jnp.sign(velocity[:, k]))
-        along = velocity.at[:, k].set(0.0)
-        if rough:
-            along = along + twisted(spin, axis)
-        push = -eta * along - (1 + eps)[:, None] * speed[:, None] * axis
-        push = jnp.where(hit[:, None], push, 0.0)
-        velocity = velocity + push
-        if rough:
-            spin = spin + torque(axis, push) / q
+        push = jnp.where(hit, (1 + eps) * speed, 0.0)[:, None] * axis
+        if surface is not None and walls.beta is not None:
+            eta = surface.eta_on_wall(walls.beta)
+            found = rub(velocity, spin, axis, hit, eta, surface.inertia)
+            velocity, spin = velocity + found.kick, spin + found.twist
+        velocity = velocity - push
     return velocity, spin
