@@ -10,6 +10,8 @@ import fit_cooling_curve
 import pytest
 
 import jaxgran
+from jaxgran.cli.models import MODELS, model_of
+from jaxgran.cli.output import finite_or_null
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 DENSE = EXPERIMENTS / "data" / "lammps_cooling_dense.csv"
@@ -76,7 +78,7 @@ def test_auto_judges_the_box_that_was_measured():
         options = argparse.Namespace(
             model="auto", tolerance=0.02, particles=particles, replicas=3, key=0
         )
-        model, reasons = fit_cooling_curve.model_of(options, gas, curve, free, size)
+        model, reasons = model_of(options, gas, curve, free, size)
         assert isinstance(model, jaxgran.SoftSpheres)
         assert model.num_particles == (particles or size)
         assert f"in a box of {ratio:.2g} L_c" in " ".join(reasons)
@@ -92,13 +94,13 @@ def test_auto_judges_the_box_that_was_measured():
     ],
 )
 def test_models_are_found_by_their_names(name, model):
-    assert name in fit_cooling_curve.MODELS
+    assert name in MODELS
     options = argparse.Namespace(model=name, particles=100, replicas=3, curve="curve.csv")
-    assert fit_cooling_curve.model_of(options, None, None, (), None) == (model, ())
+    assert model_of(options, None, None, (), None) == (model, ())
     options.particles = None
     if model.stochastic:
         with pytest.raises(ValueError, match="curve.csv does not say N: give --particles"):
-            fit_cooling_curve.model_of(options, None, None, (), None)
+            model_of(options, None, None, (), None)
 
 
 @pytest.mark.slow
@@ -173,7 +175,7 @@ def test_main_job_writes_json_that_others_can_read(tmp_path, monkeypatch, capsys
     assert said.count("not determined") == 3  # and not as a number with a huge error
     (record,) = (tmp_path / "results").rglob("*.json")
     json.loads(record.read_text(), parse_constant=refuse)
-    assert fit_cooling_curve.finite_or_null({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}
+    assert finite_or_null({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}
 
 
 @pytest.mark.slow

@@ -1,0 +1,1 @@
+"""The command `jaxgran`: fit a curve, compute one, choose a model."""

@@ -1,0 +1,117 @@
+"""The command line: `jaxgran fit`, `jaxgran cool` and `jaxgran choose`."""
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+from cyclopts import App, CycloptsError, Parameter
+
+from jaxgran.cli.models import MODELS
+
+Several = Parameter(consume_multiple=True)
+Model = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres", "auto"]
+FREE = Literal[
+    "A",
+    "T0",
+    "Y",
+    "nu",
+    "eta",
+    "diameter",
+    "beta_t",
+    "reduced_inertia",
+    "T_rot_0",
+    "container_side",
+    "wall_restitution",
+    "wall_beta_t",
+    "gamma",
+]
+
+
+def main(
+    arguments: Sequence[str] | None = None,
+    *,
+    started: float | None = None,
+    default_curve: Path | None = None,
+) -> int:
+    """Run a command; bad input is answered with one line and the exit code 2.
+
+    Args:
+        arguments: of the command line, by default those of this process.
+        started: when the job began, of `time.perf_counter`, for the seconds that are printed.
+        default_curve: that `fit` takes if none is given.
+
+    Returns:
+        The exit code.
+    """
+    app = _app(time.perf_counter() if started is None else started, default_curve)
+    jax.config.update("jax_enable_x64", True)
+    try:
+        app(
+            sys.argv[1:] if arguments is None else list(arguments),
+            exit_on_error=False,
+            print_error=False,
+            result_action="return_value",
+        )
+    except CycloptsError as error:
+        reason = " ".join(str(error).split())
+        print(f"error: {reason} See jaxgran --help.", file=sys.stderr)
+        return 2
+    except (ValueError, OSError, RuntimeError, OverflowError, ModuleNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _app(started: float, default_curve: Path | None) -> App:
+    app = App(name="jaxgran", help="Cooling granular gases: fit a curve, compute one.")
+
+    def fit(
+        curve: Path | None = default_curve,
+        /,
+        *,
+        model: Model = "kinetic-theory",
+        tolerance: float = 0.02,
+        particles: int | None = None,
+        replicas: int = 3,
+        key: int = 0,
+        free: Annotated[list[FREE] | None, Several] = None,
+        set: Annotated[list[str] | None, Several] = None,  # noqa: A002
+        out: Path | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Find the dissipative constant A of a measured cooling curve.
+
+        Prints a table and a line of JSON; writes a picture and a JSON file.
+
+        Args:
+            curve: CSV file: header lines `# key: value` (eta, diameter, density, Y, nu, T0; SI),
+                a line of column names, and rows t,T[,T_err].
+            model: auto takes the cheapest whose estimated error is within the tolerance.
+            tolerance: of T, relative, for the model auto.
+            particles: of a particle model, in each replica; by default the file's N.
+            replicas: of a particle model.
+            key: of a particle model's random start.
+            free: what to fit; by default A, and T0 where T has no errors.
+            set: KEY=VALUE, header values to use instead of the file's.
+            out: folder to write to; by default a new one under results.
+            overwrite: replace files in that folder.
+        """
+        from jaxgran.cli.fit import FitOptions, run_fit
+
+        if curve is None:
+            raise ValueError("no curve is given; name a file: jaxgran fit CURVE.csv")
+        told = model, tolerance, particles, replicas, key, [*map(str, free or [])], list(set or [])
+        run_fit(FitOptions(curve, *told, out, overwrite), started)
+
+    app.command(fit)
+    from jaxgran.cli.scene import choose, cool
+
+    app.command(cool)
+    app.command(choose)
+    return app
+
+
+assert set(MODELS) == set(Model.__args__)

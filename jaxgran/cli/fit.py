@@ -1,0 +1,195 @@
+"""The fit of a measured curve, from a file to a table, a picture and a JSON file."""
+
+import json
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxgran
+from jaxgran.cli.models import model_of, named
+from jaxgran.cli.output import environment, finite_or_null, outputs, plain, settings
+from jaxgran.cli.report import (
+    print_budget,
+    print_impacts,
+    print_model,
+    print_rows,
+    print_scene,
+    print_verdict,
+)
+from jaxgran.data.files import write_whole
+from jaxgran.data.header import header_count, header_number
+from jaxgran.fitting.fit import free_by_default
+from jaxgran.plotting import plot_fit
+
+PARAMETERS = {
+    "A": ("dissipative_constant", "s"),
+    "T0": ("temperature", "m^2/s^2"),
+    "Y": ("youngs_modulus", "Pa"),
+    "nu": ("poisson_ratio", ""),
+    "eta": ("packing_fraction", ""),
+    "diameter": ("diameter", "m"),
+    "beta_t": ("tangential_restitution", ""),
+    "reduced_inertia": ("inertia", ""),
+    "T_rot_0": ("rotational_temperature", "m^2/s^2"),
+    "container_side": ("wall_side", "m"),
+    "wall_restitution": ("wall_coefficient", ""),
+    "wall_beta_t": ("wall_tangential_restitution", ""),
+    "gamma": ("drag_rate", "1/s"),
+}
+
+
+@dataclass
+class FitOptions:
+    """What the command `fit` is told; see its help."""
+
+    curve: Path
+    model: str
+    tolerance: float
+    particles: int | None
+    replicas: int
+    key: int
+    free: list[str]
+    set: list[str]
+    out: Path | None
+    overwrite: bool
+
+
+def names_of(floats: tuple[str, ...]) -> list[str]:
+    """Arguments of --free for floats of a gas."""
+    return [key for key, (name, _) in PARAMETERS.items() if name in floats]
+
+
+def run_fit(options: FitOptions, started: float) -> None:
+    """Fit, print, draw and write; `started` is when the clock of the whole job began."""
+    curve, header = jaxgran.read_curve(options.curve)
+    header |= settings(options.set)
+    with warnings.catch_warnings(record=True) as doubts:  # of units
+        warnings.simplefilter("always", UserWarning)
+        gas, priors = jaxgran.read_gas(header), jaxgran.read_priors(header)
+    options.free = options.free or names_of(free_by_default(gas, curve))
+    gas = with_given_constant(gas, header, options.free)
+    n = header_count(header, "N")
+    replicas = header_count(header, "replicas") or 1
+    picture, record = outputs(options)
+    free = tuple(PARAMETERS[key][0] for key in options.free)
+    model, reasons = model_of(options, gas, curve, free, n)
+    (model_name,) = named([model])
+    imported = time.perf_counter() - started
+    asked = {"free": free, "priors": priors, "num_particles": n, "replicas": replicas}
+    result, first_seconds, fit_seconds = timed_fit(options, gas, curve, model, asked)
+    diagnosis = jaxgran.diagnose(result, curve, n)
+    rows = rows_of(options, result, diagnosis, header)
+    print_scene(options, gas, curve, header, result)
+    for doubt in doubts:
+        print(f"check    {doubt.message}")
+    print_impacts(result.gas, float(curve.temperature[-1]), n)
+    print_model(model_name, result, reasons)
+    print_rows(rows)
+    print_budget(rows)
+    print_verdict(diagnosis)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    plot_fit(result, curve, title_of(options, rows, diagnosis), picture)
+    summary = {
+        **{row["parameter"]: row["estimate"] for row in rows},
+        **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},
+        "model": model_name,
+        "reduced_chi2": round(float(result.reduced_chi2), 4),
+        "converged": bool(result.converged),
+        **{f"{row['parameter']}_low": row["low"] for row in rows},
+        **{f"{row['parameter']}_high": row["high"] for row in rows},
+        "explains": diagnosis.explains,
+        "seconds": round(time.perf_counter() - started, 2),
+        "compile_seconds": round(first_seconds - fit_seconds, 2),
+        "fit_seconds": round(fit_seconds, 4),
+    }
+    details = {
+        "curve": options.curve.name,
+        "chosen": reasons,
+        "header": header,
+        "parameters": rows,
+        "covariance": np.asarray(result.covariance).tolist(),
+        "diagnosis": {"verdict": diagnosis.verdict, "reasons": diagnosis.reasons},
+        "rivals": [plain(rival) for rival in diagnosis.rivals],
+        "import_seconds": round(imported, 2),
+        **environment(),
+    }
+    summary = finite_or_null(summary)
+    text = json.dumps(finite_or_null(summary | details), indent=2, allow_nan=False) + "\n"
+    write_whole(record, lambda f: f.write(text.encode()))
+    print(f"\nwritten  {picture}\n         {record}\n")
+    print(json.dumps(summary, allow_nan=False))
+
+
+def title_of(options: FitOptions, rows: list[dict], diagnosis) -> str:
+    """The title of the picture: the first parameter and the verdict."""
+    head = rows[0]
+    answer = "not determined"
+    if not np.isnan(head["estimate"]):
+        answer = f"{head['estimate']:.4g} ± {head['std_err']:.2g} {head['unit']}"
+    return f"{options.curve.stem}: {head['parameter']} = {answer}\n{diagnosis.verdict}"
+
+
+def with_given_constant(gas, header, free: list[str]):
+    """The gas with the header's A, where A is not fitted."""
+    if "A" in header:
+        given = gas.replace(dissipative_constant=header_number(header, "A"))
+        return gas if "A" in free else given
+    if "A" in free:
+        return gas
+    raise ValueError(
+        f"--free {' '.join(free)} leaves A fixed, and the file does not give it: add --set A=VALUE "
+        "(in s), or free A too"
+    )
+
+
+def timed_fit(options: FitOptions, gas, curve, model, asked: dict[str, Any]):
+    """The fit, seconds of the first and of the last time that it was made."""
+
+    def fit():
+        begin = time.perf_counter()
+        key = jax.random.key(options.key)
+        result = jaxgran.fit(gas, curve, model=model, key=key, **asked)
+        jax.block_until_ready(result.chi2)
+        return result, time.perf_counter() - begin
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # said again, in words, by the diagnosis
+        result, first_seconds = fit()
+        fit_seconds = first_seconds
+        if not model.stochastic:  # the second time without compilation
+            result, fit_seconds = fit()
+    return result, first_seconds, fit_seconds
+
+
+def rows_of(options: FitOptions, result, diagnosis, header) -> list[dict]:
+    """Estimates and errors, a row for each parameter; nan where the curve determines none."""
+    rows, unknown = [], result.undetermined()
+    for key in options.free:
+        name, unit = PARAMETERS[key]
+        estimate, error = (float(x) for x in result.value(name))
+        between = limits(diagnosis, name)
+        if name in unknown:
+            estimate, error, *between = 4 * [float("nan")]
+        i = result.names.index(name)
+        rows.append(
+            {
+                "parameter": key,
+                "unit": unit,
+                "estimate": estimate,
+                "std_err": error,
+                "error_budget": {part: float(x[i]) for part, x in result.error_budget.items()},
+                **dict(zip(("low", "high"), between, strict=True)),
+                "header": header_number(header, key) if key in header else None,
+            }
+        )
+    return rows
+
+
+def limits(diagnosis, name: str) -> list[float]:
+    """The range of a parameter over all rivals that fit as well, 95 %; nan if there is none."""
+    return [float(np.squeeze(x)) for x in diagnosis.ranges.get(name, (np.nan, np.nan))]

@@ -1,0 +1,77 @@
+"""What the commands print."""
+
+from typing import Any
+
+import numpy as np
+
+import jaxgran
+
+
+def print_scene(options: Any, gas, curve, header, result) -> None:
+    """The curve and the gas that was fitted to it."""
+    T = np.asarray(curve.temperature)
+    print(f"curve    {options.curve.name}: {T.size} points, t = 0 .. {curve.times[-1]:.3g} s,")
+    print(f"         T falls to {T[-1] / T[0]:.3g} of its first value")
+    if "T_from" in header:
+        print(f"         {header['T_from']}")
+    print(
+        f"gas      phi = {float(gas.packing_fraction):.3g}, tau_c = "
+        f"{float(gas.mean_free_time):.3g} s, t_c/tau_c = {float(gas.contact_fraction):.2g}, "
+        f"beta_T0 = {float(result.gas.thermal_beta):.3g} (fitted)"
+    )
+
+
+def print_impacts(gas, last_T: float, num_particles: int | None) -> None:
+    """What the fitted A means: eps at the rms impact speeds of the first and of the last T."""
+    first, last = (float(gas.restitution(np.sqrt(2 * T))) for T in (gas.temperature, last_T))
+    print(f"impacts  eps = {first:.3g} at the thermal speed of t = 0, {last:.3g} at the last one;")
+    print(f"         mean free path {1e3 * float(gas.mean_free_path):.3g} mm", end="")
+    if num_particles is not None:
+        box = 1e3 * float(gas.box_side(num_particles))
+        shape = "cube" if gas.dimension == 3 else "square"
+        print(f", in a box of {box:.3g} mm if it is a {shape}", end="")
+    print()
+    if isinstance(gas.law, jaxgran.Viscoelastic):
+        print("         A and Y enter as A Y^(2/5) where contacts are short: 10 % in Y is 4 % in A")
+
+
+def print_model(name: str, result, reasons) -> None:
+    """The model, its steps and why it was chosen."""
+    steps = "simulations" if result.model.stochastic else "steps of least squares"
+    print(f"model    {name}, {int(result.iterations)} {steps}")
+    if reasons:
+        print("chosen", "\n".join(f"         - {reason}" for reason in reasons).lstrip())
+
+
+def print_rows(rows: list[dict]) -> None:
+    """The table of estimates."""
+    print(f"\n{'':10}{'estimate':>13} {'+-':>10} {'95 %, with rivals':>24}  header's")
+    for row in rows:
+        print(f"{row['parameter']:4}{row['unit']:6}", end="")
+        if np.isnan(row["estimate"]):
+            print(f"{'not determined':>13}")
+            continue
+        between = f"{row['low']:.3g} .. {row['high']:.3g}"
+        between = "not looked for" if np.isnan(row["low"]) else between
+        print(f"{row['estimate']:13.5g} {row['std_err']:10.2g} {between:>24}", end="")
+        if row["header"]:
+            print(f"  {row['header']:.5g} ({100 * (row['estimate'] / row['header'] - 1):+.2f} %)")
+        else:
+            print()
+
+
+def print_budget(rows: list[dict]) -> None:
+    """The parts of each error, in per cent of the estimate, the largest first."""
+    for row in rows:
+        if np.isnan(row["estimate"]):
+            continue
+        parts = sorted(row["error_budget"].items(), key=lambda part: -part[1])
+        shares = [f"{name} {100 * x / abs(row['estimate']):.2g} %" for name, x in parts if x > 0]
+        print(f"error of {row['parameter']}: {', '.join(shares)}")
+
+
+def print_verdict(diagnosis) -> None:
+    """What the fit is worth, and why."""
+    print(f"\n{diagnosis.verdict}")
+    for reason in diagnosis.reasons:
+        print(f"  - {reason}")

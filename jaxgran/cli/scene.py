@@ -1,0 +1,108 @@
+"""The commands that begin with a scene: `cool` and `choose`."""
+
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+import jaxgran
+from jaxgran.cli.models import named
+from jaxgran.data.files import check_writable, read_text
+from jaxgran.data.header import header_count, header_number
+from jaxgran.models.selection import NUM_PARTICLES, default_models
+
+Model = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres"]
+POINTS = 50
+"""Times of a curve that is computed without a measured one."""
+
+
+def cool(
+    scene: Path,
+    /,
+    *,
+    until: float | None = None,
+    model: Model = "kinetic-theory",
+    particles: int | None = None,
+    replicas: int = 1,
+    key: int = 0,
+    out: Path = Path("cooling.csv"),
+    overwrite: bool = False,
+) -> None:
+    """Compute the cooling curve of a scene and write it as CSV.
+
+    Args:
+        scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI), or a curve's CSV file
+            whose header has them.
+        until: last time, s; by default the times of the CSV file.
+        model: how closely to look.
+        particles: of a particle model, in each replica; by default the scene's N.
+        replicas: of a particle model.
+        key: of a particle model's random start.
+        out: file to write.
+        overwrite: replace that file.
+    """
+    told = _read(scene, until)
+    if out.exists() and not overwrite:
+        raise ValueError(f"{out} exists; name another --out or say --overwrite")
+    check_writable(out)
+    size = NUM_PARTICLES if (told.size or particles) is None else (particles or told.size)
+    chosen = named(default_models(size, replicas))[model]
+    curve = jaxgran.cool(told.gas, told.times, model=chosen, key=jax.random.key(key))
+    jaxgran.write_curve(out, curve, told.header, overwrite=overwrite)
+    ratio = float(curve.temperature[-1] / curve.temperature[0])
+    print(f"{model}: T falls to {ratio:.3g} of its first value in {told.times[-1]:.3g} s")
+    print(f"written  {out}")
+
+
+def choose(scene: Path, /, *, until: float | None = None, tolerance: float = 0.02) -> None:
+    """Say which model is the cheapest that is accurate enough for a scene, and why.
+
+    Args:
+        scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI), and N where the gas is
+            in a box, or a curve's CSV file whose header has them.
+        until: last time, s; by default that of the CSV file.
+        tolerance: relative error of T that is allowed.
+    """
+    told = _read(scene, until)
+    choice = jaxgran.choose_model(told.gas, told.times, tolerance, told.size)
+    for reason in choice.reasons:
+        print(reason)
+
+
+def _read(path: Path, until: float | None) -> SimpleNamespace:
+    """The gas, the times, N and the header of a scene."""
+    measured = None
+    if path.suffix == ".toml":
+        header = _toml(path)
+    else:
+        curve, header = jaxgran.read_curve(path)
+        measured = curve.times
+    if "A" not in header:
+        raise ValueError(f"{path} does not give A, in s; add it, or find it by jaxgran fit")
+    gas = jaxgran.read_gas(header)
+    gas = gas.replace(dissipative_constant=header_number(header, "A"))
+    times = measured
+    if until is not None:
+        first = float(gas.mean_free_time) / 10
+        if not first < until < float("inf"):
+            raise ValueError(f"--until must lie above {first:.3g} s, got {until:g}")
+        times = jnp.geomspace(first, until, POINTS)
+    if times is None:
+        raise ValueError(f"{path} has no times; give the last one, in s, as --until")
+    size = header_count(header, "N")
+    return SimpleNamespace(gas=gas, times=times, size=size, header=header)
+
+
+def _toml(path: Path) -> dict[str, str]:
+    """The keys of a TOML file as those of a header."""
+    try:
+        values = tomllib.loads(read_text(path, "eta, diameter, ..."))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: not TOML ({error}); write lines such as eta = 0.05") from None
+    units = [key for key in ("length_unit", "time_unit") if key in values]
+    if units:
+        raise ValueError(f"{path}: a TOML scene is in SI; convert it and leave out {units[0]}")
+    return {key: str(value) for key, value in values.items()}
