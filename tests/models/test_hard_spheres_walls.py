@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.models.course import WALLS
 from tests.conftest import glass_beads
 
 SIDE = 0.05
@@ -88,6 +89,26 @@ def test_elastic_walls_cool_as_dsmc():
     assert np.all(np.abs(ratio - 1) < 3 * error + 0.015)  # Enskog's rate, and N = 500
     # Without the collisions that walls add, T would be 7 % higher in the end.
     assert np.all(np.abs(hard.collisions / dsmc.collisions - 1)[1:] < 0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num", [100, 500, 4000])
+def test_mixed_gas_between_lossy_walls(num):
+    # Near walls that take much the gas is colder and denser; theory's estimate of that is
+    # course.WALLS of the rate of cooling, so of ln T.
+    gas = contained(num, 0.8)
+    gas = gas.replace(dissipative_constant=gas.law.dissipative_constant * 0.15 / gas.thermal_beta)
+    theory = jaxgran.cool(gas, jnp.geomspace(1e-2, 1e3, 200))
+    ratio = theory.temperature / gas.temperature
+    last = {100: 0.006, 500: 0.04, 4000: 0.1}[num]
+    times = jnp.interp(jnp.log(jnp.array([0.5, last])), jnp.log(ratio[::-1]), theory.times[::-1])
+    hard = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(num, replicas=max(2, 3200 // num)))
+    dsmc = jaxgran.cool(gas, times, model=jaxgran.DSMC(100_000))
+    off = np.log(np.asarray(hard.temperature / dsmc.temperature))
+    error = np.asarray(hard.temperature_error / hard.temperature)
+    fallen = np.abs(np.log(np.asarray(dsmc.temperature / gas.temperature)))
+    print(f"\nN = {num}: at T/T_0 = {np.exp(-fallen)} ln T is {off} +- {error} off")
+    assert np.all(np.abs(off) < WALLS * fallen + 3 * error)
 
 
 def test_viscoelastic_walls_bounce_by_their_own_law():
