@@ -1,6 +1,10 @@
 """The command line, in this process."""
 
+import json
+
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxgran
@@ -61,6 +65,73 @@ def test_bad_input_is_answered_with_one_line(scene, capsys, arguments, words):
     said, told = capsys.readouterr()
     assert told.startswith("error: ") and words in told and len(told.splitlines()) == 1
     assert not said and not (scene / "results").exists()
+
+
+@pytest.fixture
+def measured(scene):
+    """Two curves (errors of 2 %) and a drop test of one material, and a drop test of another."""
+    rng, names = np.random.default_rng(1), {}
+    for name, phi in {"thin": 0.02, "dense": 0.08}.items():
+        text = SCENE.replace("A = 3e-6\n", "").replace("0.05", str(phi))
+        header = dict(line.split(" = ") for line in text.splitlines())
+        gas = jaxgran.read_gas(header).replace(dissipative_constant=3e-6)
+        curve = jaxgran.cool(gas, jnp.geomspace(0.1, 50.0, 30))
+        noisy = curve.temperature * (1 + 0.02 * rng.normal(size=30))
+        rows = jaxgran.CoolingCurve(curve.times, noisy, temperature_error=0.02 * noisy)
+        jaxgran.write_curve(scene / f"{name}.csv", rows, header)
+        names[name] = f"{name}.csv"
+    speed = np.geomspace(0.01, 1.0, 20)
+    for name, A in {"drops": 3e-6, "others": 6e-6}.items():
+        eps = gas.replace(dissipative_constant=A).restitution(speed)
+        eps = np.minimum(eps + 0.004 * rng.normal(size=20), 1.0)
+        lines = [f"{v:.6g},{e:.6g},0.004" for v, e in zip(speed, eps, strict=True)]
+        (scene / f"{name}.csv").write_text("\n".join(["v,eps,eps_err", *lines]) + "\n")
+    return scene
+
+
+def _answer(capsys):
+    said = capsys.readouterr().out
+    return said, json.loads(said.splitlines()[-1])
+
+
+def test_several_measurements_are_fitted_jointly(measured, capsys):
+    assert main(["fit", "thin.csv", "dense.csv", "--drop-test", "drops.csv", "--out", "a"]) == 0
+    said, answer = _answer(capsys)
+    assert abs(answer["A"] / 3e-6 - 1) < 3 * answer["A_std_err"] / 3e-6 < 0.1
+    assert answer["agree"] and "do not contradict" in said
+    record = json.loads((measured / "a" / "thin-kinetic-theory.json").read_text())
+    assert set(record["weight"]) == {"thin", "dense", "drops"}
+    assert sum(part["dissipative_constant"] for part in record["weight"].values()) == (
+        pytest.approx(1.0)
+    )
+    assert set(record["separate"]["thin"]) == {"temperature"}
+
+
+def test_a_contradicting_drop_test_is_named(measured, capsys):
+    assert main(["fit", "thin.csv", "--drop-test", "others.csv", "--free", "A", "--out", "b"]) == 0
+    said, answer = _answer(capsys)
+    assert not answer["agree"] and answer["p_value"] < 1e-4 and "contradict each other" in said
+
+
+def test_the_budget_is_explained(measured, capsys):
+    assert main(["fit", "thin.csv", "--free", "A", "--explain", "--out", "c"]) == 0
+    said, _ = _answer(capsys)
+    assert "error of A, in per cent" in said and "the model's clock in this scene" in said
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["thin.csv", "thin.csv"], "given twice"),
+        (["thin.csv", "dense.csv", "--model", "dsmc"], "fitted with kinetic-theory"),
+        (["thin.csv", "dense.csv", "--free", "T0", "--set", "A=3e-6"], "share none of these"),
+        (["thin.csv", "--drop-test", "dense.csv"], "name them v,eps,eps_err"),
+    ],
+)
+def test_measurements_that_do_not_go_together_are_refused(measured, capsys, arguments, words):
+    assert main(["fit", *arguments]) == 2
+    said, told = capsys.readouterr()
+    assert told.startswith("error: ") and words in told and len(told.splitlines()) == 1
 
 
 @pytest.mark.parametrize("command", [[], ["fit"], ["cool"], ["choose"]])

@@ -30,6 +30,32 @@ FREE = Literal[
 ]
 
 
+FIT = """\
+Find the dissipative constant A of a measured cooling curve, or of several.
+
+Prints a table and a line of JSON; writes a picture and a JSON file.
+
+Args:
+    curves: CSV file: header lines `# key: value` (eta, diameter, density, Y, nu, T0; SI),
+        a line of column names, and rows t,T[,T_err]. Several files are fitted jointly:
+        they share what belongs to the material (A, Y, ...).
+    drop_test: CSV file, or several, of columns v,eps,eps_err: single impacts of the
+        spheres of the first curve, fitted jointly with it.
+    onto_plate: those impacts are on a thick plate of the same material.
+    model: auto takes the cheapest whose estimated error is within the tolerance.
+    tolerance: of T, relative, for the model auto.
+    particles: of a particle model, in each replica; by default the file's N.
+    replicas: of a particle model.
+    key: of a particle model's random start.
+    free: what to fit; by default A, and T0 where T has no errors.
+    set: KEY=VALUE, header values to use instead of the file's.
+    out: folder to write to; by default a new one under results.
+    overwrite: replace files in that folder.
+    explain: print the error budget as a table, and say what each part is.
+"""
+"""What `jaxgran fit --help` says."""
+
+
 def main(
     arguments: Sequence[str] | None = None,
     *,
@@ -66,12 +92,16 @@ def main(
 
 
 def _app(started: float, default_curve: Path | None) -> App:
-    app = App(name="jaxgran", help="Cooling granular gases: fit a curve, compute one.")
+    app = App(
+        name="jaxgran",
+        help="Cooling granular gases: fit a curve, compute one.",
+        default_parameter=Parameter(negative=()),
+    )
 
     def fit(
-        curve: Path | None = default_curve,
-        /,
-        *,
+        *curves: Path,
+        drop_test: Annotated[list[Path] | None, Several] = None,
+        onto_plate: bool = False,
         model: Model = "kinetic-theory",
         tolerance: float = 0.02,
         particles: int | None = None,
@@ -81,31 +111,24 @@ def _app(started: float, default_curve: Path | None) -> App:
         set: Annotated[list[str] | None, Several] = None,  # noqa: A002
         out: Path | None = None,
         overwrite: bool = False,
+        explain: bool = False,
     ) -> None:
-        """Find the dissipative constant A of a measured cooling curve.
-
-        Prints a table and a line of JSON; writes a picture and a JSON file.
-
-        Args:
-            curve: CSV file: header lines `# key: value` (eta, diameter, density, Y, nu, T0; SI),
-                a line of column names, and rows t,T[,T_err].
-            model: auto takes the cheapest whose estimated error is within the tolerance.
-            tolerance: of T, relative, for the model auto.
-            particles: of a particle model, in each replica; by default the file's N.
-            replicas: of a particle model.
-            key: of a particle model's random start.
-            free: what to fit; by default A, and T0 where T has no errors.
-            set: KEY=VALUE, header values to use instead of the file's.
-            out: folder to write to; by default a new one under results.
-            overwrite: replace files in that folder.
-        """
         from jaxgran.cli.fit import FitOptions, run_fit
+        from jaxgran.cli.joint import run_joint
 
-        if curve is None:
+        if not curves and default_curve is not None:
+            curves = (default_curve,)
+        if not curves:
             raise ValueError("no curve is given; name a file: jaxgran fit CURVE.csv")
         told = model, tolerance, particles, replicas, key, [*map(str, free or [])], list(set or [])
-        run_fit(FitOptions(curve, *told, out, overwrite), started)
+        options = FitOptions(curves[0], *told, out, overwrite, explain)
+        drops = list(drop_test or [])
+        if len(curves) + len(drops) > 1:
+            run_joint(list(curves), drops, onto_plate, options, started)
+        else:
+            run_fit(options, started)
 
+    fit.__doc__ = FIT
     app.command(fit)
     from jaxgran.cli.scene import choose, cool
 

@@ -57,6 +57,7 @@ class FitOptions:
     set: list[str]
     out: Path | None
     overwrite: bool
+    explain: bool = False
 
 
 def names_of(floats: tuple[str, ...]) -> list[str]:
@@ -90,7 +91,7 @@ def run_fit(options: FitOptions, started: float) -> None:
     print_impacts(result.gas, float(curve.temperature[-1]), n)
     print_model(model_name, result, reasons)
     print_rows(rows)
-    print_budget(rows)
+    print_budget(rows, options.explain)
     print_verdict(diagnosis)
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_fit(result, curve, title_of(options, rows, diagnosis), picture)

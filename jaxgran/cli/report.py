@@ -60,14 +60,29 @@ def print_rows(rows: list[dict]) -> None:
             print()
 
 
-def print_budget(rows: list[dict]) -> None:
+PARTS = {
+    "measurement": "errors of the points, with the correlation of neighbours",
+    "model": "the model's clock in this scene",
+    "few particles": "chance of the collisions of N particles",
+    "simulation": "noise of the simulations that the fit made",
+}
+"""What a part of the error budget is; the others are named after what is uncertain."""
+
+
+def print_budget(rows: list[dict], explain: bool) -> None:
     """The parts of each error, in per cent of the estimate, the largest first."""
     for row in rows:
         if np.isnan(row["estimate"]):
             continue
         parts = sorted(row["error_budget"].items(), key=lambda part: -part[1])
-        shares = [f"{name} {100 * x / abs(row['estimate']):.2g} %" for name, x in parts if x > 0]
-        print(f"error of {row['parameter']}: {', '.join(shares)}")
+        shares = [(name, 100 * x / abs(row["estimate"])) for name, x in parts if x > 0]
+        if not explain:
+            line = ", ".join(f"{name} {share:.2g} %" for name, share in shares)
+            print(f"error of {row['parameter']}: {line}")
+            continue
+        print(f"\nerror of {row['parameter']}, in per cent; the squares of the parts add up")
+        for name, share in shares:
+            print(f"  {share:8.2g}  {name}: {PARTS.get(name, 'its error as given, or as known')}")
 
 
 def print_verdict(diagnosis) -> None:

@@ -97,7 +97,9 @@ def test_mixed_gas_between_lossy_walls(num):
     # Near walls that take much the gas is colder and denser; theory's estimate of that is
     # course.WALLS of the rate of cooling, so of ln T.
     gas = contained(num, 0.8)
-    gas = gas.replace(dissipative_constant=gas.law.dissipative_constant * 0.15 / gas.thermal_beta)
+    gas = gas.replace(
+        dissipative_constant=gas.value("dissipative_constant") * 0.15 / gas.thermal_beta
+    )
     theory = jaxgran.cool(gas, jnp.geomspace(1e-2, 1e3, 200))
     ratio = theory.temperature / gas.temperature
     last = {100: 0.006, 500: 0.04, 4000: 0.1}[num]
