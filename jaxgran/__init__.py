@@ -1,7 +1,6 @@
 """jaxgran: differentiable granular gases in JAX."""
 
 from jaxgran.checks.status import explain as explain_status
-from jaxgran.cooling import cool
 from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.data.curve_file import read_curve, read_gas, read_priors, write_curve
 from jaxgran.data.drop_test import DropTest, read_drop_test
@@ -12,6 +11,7 @@ from jaxgran.fitting.joint import JointFit, fit_jointly
 from jaxgran.fitting.likelihood import log_likelihood
 from jaxgran.fitting.result import Fit
 from jaxgran.models.base import AbstractModel, Omission
+from jaxgran.models.cooling import cool
 from jaxgran.models.course import Course
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.hard_spheres import HardSpheres

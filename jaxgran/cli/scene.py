@@ -48,7 +48,7 @@ def cool(
     if out.exists() and not overwrite:
         raise ValueError(f"{out} exists; name another --out or say --overwrite")
     check_writable(out)
-    size = NUM_PARTICLES if (told.size or particles) is None else (particles or told.size)
+    size = next(n for n in (particles, told.size, NUM_PARTICLES) if n is not None)
     chosen = named(default_models(size, replicas))[model]
     curve = jaxgran.cool(told.gas, told.times, model=chosen, key=jax.random.key(key))
     jaxgran.write_curve(out, curve, told.header, overwrite=overwrite)

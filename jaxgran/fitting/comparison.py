@@ -83,7 +83,7 @@ class Comparison:
             accuracies["displacement"] = accuracy
         parameters = Parameters(gas, (*names, *priors.also_free(names)))
         num_free = sum(gas.value(name).size for name in names)
-        faster = 1.0 if num_particles is None else _clock_of_few(gas, num_particles)
+        faster = 1.0 if num_particles is None else clock_of_few(gas, num_particles)
         return cls(curve, model, parameters, num_free, priors, weights, accuracies, faster)
 
     def scaled(self, flat: Float[Array, "q"]) -> "Comparison":
@@ -192,7 +192,7 @@ def uses_rotation(gas: Gas, curve: CoolingCurve) -> bool:
     return known and gas.surface is not None
 
 
-def _clock_of_few(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:
+def clock_of_few(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:
     """Factor by which N particles without a total momentum cool faster than many, at the same T.
 
     Their relative velocities are those of the temperature ``T' = T N/(N-1)``, and each meets N - 1

@@ -69,7 +69,7 @@ def velocity(
     if softness:
         cooling = cooling * averages.softness_factor(scene.law, speed, d)
     turning = []
-    if scene[1:] != (None, None, None):
+    if any(element is not None for element in scene[1:]):
         ratio = 0.0 if scene.surface is None else state[5]
         changes = elements.changes(scene, speed, ratio, a2, d)
         cooling, relaxation = cooling + changes.cooling, relaxation + changes.relaxation

@@ -3,10 +3,12 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.fitting.comparison import clock_of_few
 from tests.conftest import glass_beads
 
 THEORY = jaxgran.KineticTheory()
@@ -57,6 +59,7 @@ def test_roughness_and_A_are_found_together(model):
     assert bool(result.converged) and float(result.p_value) > 0.01
     assert all(within(result, gas, name) for name in FREE)
     assert not result.undetermined()
+    # Errors must be of use, too: .06 of A and .04 of beta_t by DSMC, and half as much again.
     assert float(result.standard_error[0] / result.estimate[0]) < 0.1
     assert float(result.standard_error[1]) < 0.08
     assert "model of T_rot" in result.error_budget
@@ -127,3 +130,11 @@ def test_a_measured_T_rot_of_smooth_spheres_is_said_to_be_unused(beads):
     gas = dataclasses.replace(glass_beads(), surface=ROUGH)
     with pytest.warns(UserWarning, match="T_rot.*is not used.*surface"):
         jaxgran.fit(beads(), measured(gas), free=("dissipative_constant",))
+
+
+def test_between_walls_few_particles_have_all_their_energy_in_T():
+    # Without walls N particles of no momentum are hotter by N/(N - 1), and cool faster.
+    count = jnp.asarray(50.0)
+    assert float(clock_of_few(glass_beads(), count)) == pytest.approx(1 + 0.6 / 50, rel=2e-3)
+    walls = jaxgran.Walls(0.05, restitution=0.9)
+    assert float(clock_of_few(dataclasses.replace(glass_beads(), container=walls), count)) == 1.0

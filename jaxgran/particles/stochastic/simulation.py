@@ -207,7 +207,7 @@ def differentiable_run(
     def solve_jvp(at, along):
         parameters, times, key = first_order_only(at)
         scene = unravel(parameters)
-        if scene[1:] != (None, None, None):
+        if any(element is not None for element in scene[1:]):
             raise ValueError(
                 "derivatives of DSMC runs with rough spheres, walls or drag are not known: use "
                 "KineticTheory(), or differences of runs"
