@@ -19,7 +19,7 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.selection import Choice, choose_model
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.contact import Impact, contact_force, elastic_constant, impact
-from jaxgran.scene.elements import Rough, StokesDrag, Walls
+from jaxgran.scene.elements import Rough, StokesDrag, Walls, WhiteNoise
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.restitution import (
@@ -57,6 +57,7 @@ __all__ = [
     "StokesDrag",
     "Viscoelastic",
     "Walls",
+    "WhiteNoise",
     "choose_model",
     "contact_force",
     "cool",

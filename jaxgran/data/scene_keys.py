@@ -1,14 +1,15 @@
-"""Elements of a scene in the header of a curve: roughness, walls and drag."""
+"""Elements of a scene in the header of a curve: roughness, walls, drag and a drive."""
 
 import warnings
 from typing import Any
 
 from jaxgran.data.header import header_number
-from jaxgran.scene.elements import Rough, StokesDrag, Walls
+from jaxgran.scene.elements import Rough, StokesDrag, Walls, WhiteNoise
 
 ROUGH_KEYS = ("beta_t", "reduced_inertia", "T_rot_0")
 WALL_KEYS = ("container_side", "wall_restitution", "wall_beta_t")
 DRAG_KEYS = ("gamma",)
+DRIVE_KEYS = ("drive_strength",)
 
 OTHER_KEYS = ("N", "A", "dimension", "replicas", "T_from", "length_unit", "time_unit")
 """Keys that say something besides the gas and its elements."""
@@ -24,7 +25,8 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
         header: where spheres are rough beta_t and, if they are not .4 and 0, reduced_inertia,
             4 I/(m sigma^2), and T_rot_0, T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2; where there
             are walls container_side, of a cube, m, wall_restitution and, of rough ones,
-            wall_beta_t; where there is drag gamma, 1/s, of dv/dt = -gamma v.
+            wall_beta_t; where there is drag gamma, 1/s, of dv/dt = -gamma v; where white noise
+            drives the gas drive_strength, m^2/s^3, of dT/dt = drive_strength.
 
     Raises:
         ValueError: for a key that needs another one, or a value outside its range.
@@ -45,10 +47,12 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
         )
     if "gamma" in found:
         elements["drag"] = StokesDrag(found["gamma"])
+    if "drive_strength" in found:
+        elements["drive"] = WhiteNoise(found["drive_strength"])
     return elements
 
 
-ELEMENT_KEYS = (*ROUGH_KEYS, *WALL_KEYS, *DRAG_KEYS)
+ELEMENT_KEYS = (*ROUGH_KEYS, *WALL_KEYS, *DRAG_KEYS, *DRIVE_KEYS)
 
 
 def _whole(found: dict[str, float], keys: tuple[str, ...], needed: tuple[str, ...]) -> bool:

@@ -156,6 +156,8 @@ def _about_rivals(result: Fit, found: tuple[Rival, ...]) -> Iterator[str]:
             f"further losses are not looked for beside {', '.join(free)}, which would take them "
             "over"
         )
+    elif result.gas.drive is not None:
+        yield "further losses are not looked for in a driven gas"
     name = result.names[0]
     for rival in found:
         between = f"{name} is then between {rival.low[0]:.3g} and {rival.high[0]:.3g}"

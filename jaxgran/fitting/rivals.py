@@ -78,10 +78,11 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
         curve: the measured curve.
 
     Returns:
-        The rivals, those that fit best first; () where the fitted gas does not cool, or where
+        The rivals, those that fit best first; () where the fitted gas does not cool or is driven,
+        of which T is not a table of times, or where
         floats of its elements were free, whose losses are such rivals themselves.
     """
-    if free_elements(result):
+    if free_elements(result) or result.gas.drive is not None:
         return ()
     kinds = _kinds(result)
     weights, residuals = _weighted(result, curve)
@@ -123,7 +124,7 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
 
 def free_elements(result: Fit) -> tuple[str, ...]:
     """The free parameters that are floats of the elements of the scene."""
-    plain = dataclasses.replace(result.gas, surface=None, container=None, drag=None)
+    plain = dataclasses.replace(result.gas, surface=None, container=None, drag=None, drive=None)
     return tuple(name for name in result.names if name not in plain.domains)
 
 

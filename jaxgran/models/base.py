@@ -18,10 +18,14 @@ ELEMENTS = {
     "surface": "rough spheres (surface)",
     "container": "walls (container)",
     "drag": "drag",
+    "drive": "a drive (drive)",
 }
 """Words for the elements of a scene."""
 
-TAKES_ALL = "KineticTheory() or DSMC(N), which take all elements"
+TAKES = {"drive": "KineticTheory(), which takes it"}
+"""What to use for elements that not both KineticTheory and DSMC take."""
+
+TAKE_BOTH = "KineticTheory() or DSMC(N), which take it"
 
 
 class Omission(NamedTuple):
@@ -68,7 +72,8 @@ class AbstractModel(eqx.Module):
         for name in gas.elements:
             if name not in self.elements:
                 raise ValueError(
-                    f"{type(self).__name__} does not take {ELEMENTS[name]}: use {TAKES_ALL}, or "
+                    f"{type(self).__name__} does not take {ELEMENTS[name]}: use "
+                    f"{TAKES.get(name, TAKE_BOTH)}, or "
                     f"leave {name} out of the gas"
                 )
         self.check(gas)

@@ -95,13 +95,27 @@ class Course(NamedTuple):
         """Relative error of T, at the worst time, of a model whose cooling rate errs.
 
         ``|d ln T/dt| int_0^t e dt'`` for a cooling rate wrong by the share e(t): the model's clock
-        is off by the integral.
+        is off by the integral. Of a driven gas y = |d ln T| obeys
+        ``dy/dt = e zeta - (zeta/2 + xi_0^2/T) y`` with the cooling rate zeta by all losses.
         """
         t = self.time
         if t[-1] == 0:
             return 0.0
+        if self.gas.drive is not None:
+            return self._error_where_driven(np.broadcast_to(rate_error, t.shape))
         delay = self._integral(np.broadcast_to(rate_error, t.shape))
         return float(np.max(np.abs(np.gradient(self.log_temperature, t)) * delay))
+
+    def _error_where_driven(self, e: Float[np.ndarray, "times"]) -> float:
+        t, y, worst = self.time, 0.0, 0.0
+        temperature = float(self.gas.temperature) * np.exp(self.log_temperature)
+        heating = float(self.gas.value("drive_strength")) / temperature
+        loss = np.maximum(heating - np.gradient(self.log_temperature, t), 0.0)
+        for step, rate, gain in zip(np.diff(t), loss / 2 + heating, e * loss, strict=False):
+            decay = np.exp(-rate * step)
+            y = y * decay + gain * (-np.expm1(-rate * step) / rate if rate > 0 else step)
+            worst = max(worst, float(y))
+        return worst
 
     def clock_error(
         self, rate_error: Float[np.ndarray, "times"] | float

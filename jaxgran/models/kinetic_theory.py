@@ -21,7 +21,7 @@ from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import ROUGH, Course
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
-from jaxgran.theory import averages, closed_forms, elements, moments
+from jaxgran.theory import averages, closed_forms, elements, moments, rate_table
 from jaxgran.theory.moments import Moments
 
 TOLERANCES = validation.Domain(0.0, 0.1)
@@ -87,7 +87,7 @@ class KineticTheory(AbstractModel):
         validation.whole_number("max_steps", self.max_steps, 1, "Leave it out for 200000.")
 
     stochastic: ClassVar[bool] = False
-    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag")
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
     derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs
 
     def displacement_accuracy(self, gas: Gas) -> Float[Array, ""]:
@@ -211,15 +211,15 @@ class KineticTheory(AbstractModel):
         def tabulate(parameters):
             scene = unravel(parameters)
             averages_of = partial(self._averages, scene.law, dimension=dimension)
-            num_nodes, faster = scene.law.num_nodes, elements.fastest_cooling(scene, dimension)
-            return averages.RateTable.of(averages_of, times[-1], dimension, num_nodes, faster)
+            num_nodes, bounds = scene.law.num_nodes, elements.fastest_cooling(scene, dimension)
+            return rate_table.RateTable.of(averages_of, times[-1], dimension, num_nodes, bounds)
 
         def velocity(state, rates, parameters):
             return self._velocity(state, rates, unravel(parameters), dimension)
 
         table, table_along = jax.linearize(tabulate, parameters)
         along = jax.vmap(lambda x: table_along(x).coefficients, out_axes=1)(directions)
-        tables_along = averages.RateTable(along, table.lowest)
+        tables_along = rate_table.RateTable(along, table.lowest, table.highest)
         known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
 
         def rows_velocity(s, rows, args):

@@ -218,8 +218,10 @@ def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Arr
 def _scene_in_words(course: Course, size: int, replicas: int) -> list[str]:
     hard = course.error_of_temperature(course.lasting_contacts + course.softness)
     corrected = course.error_of_temperature(course.lasting_contacts + course.second_order_softness)
+    lowest, end = np.exp([course.log_temperature.min(), course.log_temperature[-1]])
+    heated = course.gas.drive is not None and end > 1
     return [
-        f"T falls to {np.exp(course.log_temperature.min()):.2g} T_0 in "
+        f"T {f'rises to {end:.2g}' if heated else f'falls to {lowest:.2g}'} T_0 in "
         f"{course.collisions[-1]:.3g} collisions per particle.",
         f"Contacts last {_percent(course.contact_fraction.max())} of the mean free time and overlap"
         f" by {_percent(course.overlap.max())} of a diameter: T errs by {_percent(hard)} with "

@@ -1,8 +1,10 @@
-"""Elements that a scene may have besides smooth spheres in free flight: roughness, walls, drag.
+"""Elements that a scene may have besides smooth spheres in free flight: roughness, walls, drag,
+a drive.
 
 Each is an optional field of `Gas`; a program of a scene without it does not contain it.
 """
 
+from collections.abc import Callable
 from math import pi
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -25,6 +27,17 @@ if TYPE_CHECKING:
 else:
     # A run-time type checker lets everything pass, so that a wrong type is reported in words.
     UserWallLaw = Any
+
+
+def element(kind: type) -> Callable[[Any], Any]:
+    """The converter of an optional field of a `Gas`; it refuses what is not of the given kind."""
+
+    def checked(value: Any) -> Any:
+        if value is None or isinstance(value, kind):
+            return value
+        raise ValueError(f"expected a jaxgran.{kind.__name__} or None, got {value!r}")
+
+    return checked
 
 
 class Rough(eqx.Module):
@@ -149,6 +162,35 @@ class StokesDrag(eqx.Module):
     def __check_init__(self):
         for name, domain in self.domains.items():
             domain.check(f"{name} of the drag", getattr(self, name), "Give it in 1/s.")
+
+
+class WhiteNoise(eqx.Module):
+    """A drive that heats the gas: each component of each velocity gets Gaussian white noise.
+
+    ``dv_i/dt = xi_i(t)`` with ``<xi_i(t) xi_j(t')> = strength delta_ij delta(t - t')``, independent
+    of each particle: T grows by ``dT/dt = strength``, and the velocities relax to a Maxwellian by
+    ``da_2/dt = -2 a_2 strength/T``. Spins are not driven.
+
+    `jaxgran.KineticTheory` takes it. A steady state has steps of the length of the mean free time:
+    1e5 mean free times are within the default max_steps; for more use
+    ``KineticTheory(solver=diffrax.Kvaerno5())``.
+
+    Args:
+        strength: xi_0^2, m^2/s^3, >= 0.
+
+    Raises:
+        ValueError: for a negative strength.
+
+    Reference: van Noije & Ernst, Granular Matter 1, 57 (1998).
+    """
+
+    strength: Float[Array, ""] = eqx.field(converter=number)
+
+    domains: ClassVar[dict[str, Domain]] = {"strength": NOT_NEGATIVE}
+
+    def __check_init__(self):
+        advice = "Give the growth of T = <v^2>/d in time, m^2/s^3."
+        NOT_NEGATIVE.check("strength of the drive", self.strength, advice)
 
 
 def check_walls(walls: Walls, diameter: Array, dimension: int, rough: bool) -> None:

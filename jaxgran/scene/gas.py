@@ -1,6 +1,6 @@
 """The scene: a homogeneous gas of equal spheres, and the physical scales that follow from it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from math import gamma, pi
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -17,7 +17,7 @@ from jaxgran.checks.validation import (
     whole_number,
 )
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
-from jaxgran.scene.elements import Rough, StokesDrag, Walls, check_walls
+from jaxgran.scene.elements import Rough, StokesDrag, Walls, WhiteNoise, check_walls, element
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
 from jaxgran.scene.named_floats import NamedFloats, Place
 from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw, Viscoelastic
@@ -38,15 +38,6 @@ def _checked_law(law: UserLaw) -> RestitutionLaw:
     return law
 
 
-def _element(kind: type) -> Callable[[Any], Any]:
-    def checked(value: Any) -> Any:
-        if value is None or isinstance(value, kind):
-            return value
-        raise ValueError(f"expected a jaxgran.{kind.__name__} or None, got {value!r}")
-
-    return checked
-
-
 class Gas(NamedFloats):
     """A homogeneous gas of equal spheres in its initial state.
 
@@ -64,9 +55,11 @@ class Gas(NamedFloats):
         surface: `jaxgran.Rough` of spheres that rotate; None is smooth ones.
         container: `jaxgran.Walls`; None is periodic or unbounded.
         drag: `jaxgran.StokesDrag`; None is a vacuum.
+        drive: `jaxgran.WhiteNoise`, which heats the gas; None lets it cool.
 
     Floats of elements are known by name as those of the gas are: those of a container with the
-    prefix wall_, those of drag with drag_, as in ``gas.replace(wall_coefficient=0.8)``.
+    prefix wall_, those of drag with drag_, those of a drive with drive_, as in
+    ``gas.replace(wall_coefficient=0.8)``.
 
     Raises:
         ValueError: for a value outside its range.
@@ -78,9 +71,10 @@ class Gas(NamedFloats):
     packing_fraction: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     temperature: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
-    surface: Rough | None = eqx.field(converter=_element(Rough), default=None, kw_only=True)
-    container: Walls | None = eqx.field(converter=_element(Walls), default=None, kw_only=True)
-    drag: StokesDrag | None = eqx.field(converter=_element(StokesDrag), default=None, kw_only=True)
+    surface: Rough | None = eqx.field(converter=element(Rough), default=None, kw_only=True)
+    container: Walls | None = eqx.field(converter=element(Walls), default=None, kw_only=True)
+    drag: StokesDrag | None = eqx.field(converter=element(StokesDrag), default=None, kw_only=True)
+    drive: WhiteNoise | None = eqx.field(converter=element(WhiteNoise), default=None, kw_only=True)
 
     _domains: ClassVar[dict[str, Domain]] = {
         "diameter": POSITIVE,
@@ -134,11 +128,13 @@ class Gas(NamedFloats):
             yield "wall_", ("container", "restitution"), self.container.restitution
         if self.drag is not None:
             yield "drag_", ("drag",), self.drag
+        if self.drive is not None:
+            yield "drive_", ("drive",), self.drive
 
     @property
     def elements(self) -> tuple[str, ...]:
         """Names of the optional fields that this scene has."""
-        names = ("surface", "container", "drag")
+        names = ("surface", "container", "drag", "drive")
         return tuple(name for name in names if getattr(self, name) is not None)
 
     def check_single(self) -> None:

@@ -59,6 +59,12 @@ class ReducedDrag(NamedTuple):
     rotational_rate: Float[Array, ""]
 
 
+class ReducedDrive(NamedTuple):
+    """`WhiteNoise` in reduced units: the growth of T/T_0 by it."""
+
+    strength: Float[Array, ""]
+
+
 class ReducedScene(NamedTuple):
     """A gas in units of `Gas.impact_speed` and `Gas.path_length`; None is what it does not have."""
 
@@ -66,6 +72,7 @@ class ReducedScene(NamedTuple):
     surface: ReducedRough | None = None
     walls: ReducedWalls | None = None
     drag: ReducedDrag | None = None
+    drive: ReducedDrive | None = None
 
 
 def reduced_scene(gas: Gas) -> ReducedScene:
@@ -76,7 +83,7 @@ def reduced_scene(gas: Gas) -> ReducedScene:
     meets walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
     """
     d, length, speed = gas.dimension, gas.path_length, gas.impact_speed
-    surface = walls = drag = None
+    surface = walls = drag = drive = None
     if gas.surface is not None:
         ratio = gas.surface.rotational_temperature / gas.temperature
         surface = ReducedRough(gas.surface.tangential_restitution, gas.surface.inertia, ratio)
@@ -90,4 +97,6 @@ def reduced_scene(gas: Gas) -> ReducedScene:
     if gas.drag is not None:
         time = length / speed
         drag = ReducedDrag(gas.drag.rate * time, gas.drag.rotational_rate * time)
-    return ReducedScene(gas.reduced_law, surface, walls, drag)
+    if gas.drive is not None:
+        drive = ReducedDrive(gas.drive.strength * (length / speed) / gas.temperature)
+    return ReducedScene(gas.reduced_law, surface, walls, drag, drive)

@@ -6,12 +6,9 @@ dimension and T/T_0 only.
 """
 
 from collections.abc import Callable
-from functools import cache
 from math import pi, sqrt
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -147,101 +144,6 @@ def averages(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[
     loss = law.loss(jnp.asarray(_NODES, speed.dtype) * speed)
     powers = jnp.stack([jnp.ones_like(loss), loss, loss**2, loss**3, loss**4])
     return jnp.tensordot(jnp.asarray(_AVERAGING_MATRICES[dimension], speed.dtype), powers, 2)
-
-
-_SCAN_POINTS = 16
-"""Temperatures at which the cooling rate is computed to find the lower end of a `RateTable`."""
-
-
-@cache
-def _chebyshev(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Chebyshev nodes in [-1, 1], and the matrix from values at them to coefficients."""
-    angles = (np.arange(num_nodes) + 0.5) * pi / num_nodes
-    matrix = 2 / num_nodes * np.cos(np.outer(np.arange(num_nodes), angles))
-    matrix[0] /= 2
-    return np.cos(angles), matrix
-
-
-class RateTable(eqx.Module):
-    """The function `averages` of one gas as a Chebyshev series in ln T.
-
-    The averages are smooth in ln T, so that a few quadratures in advance replace one in every
-    stage of the ODE solver.
-
-    Attributes:
-        coefficients: of the Chebyshev polynomials, shape (nodes, 3, 3), or (nodes, ..., 3, 3) for
-            several such functions over the same range.
-        lowest: lower end of the series in ln(T/T_0); the upper end is 0. The series must not be
-            evaluated outside.
-    """
-
-    coefficients: Float[Array, "nodes ... 3 3"]
-    lowest: Float[Array, ""]
-
-    @classmethod
-    def of(
-        cls,
-        averages: Callable[[Float[Array, ""]], Float[Array, "3 3"]],
-        duration: Float[Array, ""],
-        dimension: int,
-        num_nodes: int,
-        faster: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
-    ) -> "RateTable":
-        """The series for all temperatures that a gas reaches in a given time.
-
-        Args:
-            averages: the function to be tabulated, of sqrt(T/T_0).
-            duration: reduced time.
-            dimension: d.
-            num_nodes: number of terms; see `ReducedLaw.num_nodes`.
-            faster: an upper bound of a further ``-d ln T/dt``: a part over sqrt(T/T_0), and one
-                that is constant.
-        """
-        lowest = _lowest_log_temperature(averages, duration, dimension, faster)
-        nodes, to_coefficients = (jnp.asarray(x, lowest.dtype) for x in _chebyshev(num_nodes))
-        values = jax.vmap(averages)(jnp.exp(lowest * (1 - nodes) / 4))
-        return cls(jnp.tensordot(to_coefficients, values, 1), lowest)
-
-    def __call__(self, log_theta: Float[Array, ""]) -> Float[Array, "... 3 3"]:
-        """The averages at ln(T/T_0), as the function `averages` returns them.
-
-        Args:
-            log_theta: ln(T/T_0), from `lowest` to 0.
-        """
-        x = 2 * (1 - log_theta / self.lowest) - 1
-        # Clenshaw's recurrence, from the highest term down.
-        last = before = jnp.zeros_like(self.coefficients[0])
-        for row in self.coefficients[:0:-1]:
-            last, before = row + 2 * x * last - before, last
-        return self.coefficients[0] + x * last - before
-
-
-def _lowest_log_temperature(
-    averages: Callable[[Float[Array, ""]], Float[Array, "3 3"]],
-    duration: Float[Array, ""],
-    dimension: int,
-    faster: tuple[ArrayLike, ArrayLike],
-) -> Float[Array, ""]:
-    """A lower bound of ln(T/T_0) after a reduced time, negative and not far below the true value.
-
-    The first bound is Haff's law for e = 0 with 10 % added to the rate. A law with small losses at
-    low speed cools much less; a series over the whole range would lose digits. Therefore the time
-    to cool is bounded from below by integrating the law's own rate, with 10 % added, over
-    `_SCAN_POINTS` temperatures, and the range is cut off one point below what is reached.
-    """
-    duration, (by_speed, constant) = jax.lax.stop_gradient((duration, faster))
-    collisions = sphere_surface(dimension) / sqrt(2 * pi)
-    haff = 1.1 * collisions / (2 * dimension) + by_speed / 2
-    bound = -2 * jnp.log1p(haff * duration) - constant * duration
-    scan = bound * jnp.linspace(0, 1, _SCAN_POINTS, dtype=bound.dtype)
-    speeds = jnp.exp(scan / 2)
-    loss = jax.lax.stop_gradient(jax.vmap(averages)(speeds)[:, 0, 0])
-    rate = 2.2 / dimension * loss * speeds + by_speed * speeds + constant
-    rate = jnp.maximum(rate, jnp.finfo(bound.dtype).tiny)
-    earliest = jnp.cumsum(-jnp.diff(scan) / jnp.maximum(rate[1:], rate[:-1]))
-    reached = jnp.min(jnp.where(earliest < duration, scan[1:], 0.0))
-    lowest = reached + scan[1]
-    return jnp.minimum(jnp.maximum(lowest, bound), -1e-3)
 
 
 def softness_factor(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[Array, ""]:

@@ -1,4 +1,4 @@
-"""What the elements of a scene do to a homogeneous gas: roughness, walls, drag.
+"""What the elements of a scene do to a homogeneous gas: roughness, walls, drag, a drive.
 
 Units as in `jaxgran.theory.averages`.
 """
@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxgran.scene.elements import SPINS
 from jaxgran.scene.reduced_scene import ReducedRough, ReducedScene, ReducedWalls
 from jaxgran.theory.averages import collision_rate, impact_average
+from jaxgran.theory.rate_table import Bounds
 
 
 class Changes(NamedTuple):
@@ -22,11 +23,13 @@ class Changes(NamedTuple):
         cooling: part of ``-d ln T/dt``.
         rotation: ``dT_rot/dt`` over T.
         relaxation: part of the relaxation rate of the velocity autocorrelation function.
+        peaking: part of ``da_2/dt``.
     """
 
     cooling: Float[Array, ""]
     rotation: Float[Array, ""]
     relaxation: Float[Array, ""]
+    peaking: Float[Array, ""]
 
 
 def changes(
@@ -45,7 +48,7 @@ def changes(
         sonine: a_2, on which the collision rate depends.
         dimension: d.
     """
-    total = Changes(*[jnp.zeros_like(speed)] * 3)
+    total = Changes(*[jnp.zeros_like(speed)] * 4)
     if scene.surface is not None:
         rate = collision_rate(sonine, dimension) * speed
         own = _of_friction(scene.surface.eta, scene.surface.inertia, rate, ratio, dimension)
@@ -56,8 +59,13 @@ def changes(
         total = _sum(total, own)
     if scene.drag is not None:
         drag = scene.drag
-        own = Changes(2 * drag.rate, -2 * drag.rotational_rate * ratio, drag.rate)
+        nothing = jnp.zeros_like(speed)
+        own = Changes(2 * drag.rate, -2 * drag.rotational_rate * ratio, drag.rate, nothing)
         total = _sum(total, own)
+    if scene.drive is not None:
+        heating = scene.drive.strength / speed**2
+        nothing = jnp.zeros_like(speed)
+        total = _sum(total, Changes(-heating, nothing, nothing, -2 * sonine * heating))
     return total
 
 
@@ -80,6 +88,7 @@ def _of_friction(
         cooling=strength / d * (eta * (1 - eta) - eta**2 * ratio / inertia),
         rotation=-strength / SPINS[d] * eta / inertia * ((1 - eta / inertia) * ratio - eta),
         relaxation=strength / (2 * d) * eta,
+        peaking=jnp.zeros_like(eta),
     )
 
 
@@ -100,7 +109,7 @@ def _of_walls(
     """
     rate = jnp.sum(walls.frequency) * speed
     nothing = jnp.zeros_like(speed)
-    total = Changes(2 / d * rate * loss, nothing, nothing)
+    total = Changes(2 / d * rate * loss, nothing, nothing, nothing)
     if surface is None or walls.beta is None:
         return total
     eta = surface.eta_on_wall(walls.beta) / 2
@@ -113,10 +122,11 @@ def _lost(walls: ReducedWalls, speed: Array, g: Array) -> Array:
     return lost * (2 - lost) * g**2 / 2
 
 
-def fastest_cooling(scene: ReducedScene, dimension: int) -> tuple[Array | float, Array | float]:
-    """An upper bound of the cooling by elements: a part over sqrt(T/T_0), and one that is constant.
+def fastest_cooling(scene: ReducedScene, dimension: int) -> Bounds:
+    """Upper bounds of the cooling by elements, and what heats the gas.
 
-    It is reached where the spheres do not rotate and walls stop them.
+    The cooling is reached where the spheres do not rotate and walls stop them. The heat of rotation
+    counts where there is a drive.
     """
     by_speed, constant = 0.0, 0.0
     one = jnp.ones(())
@@ -129,4 +139,9 @@ def fastest_cooling(scene: ReducedScene, dimension: int) -> tuple[Array | float,
         by_speed = by_speed + walls.cooling
     if scene.drag is not None:
         constant = 2 * scene.drag.rate
-    return by_speed, constant
+    if scene.drive is None:
+        return Bounds(by_speed, constant)
+    rotation = None
+    if scene.surface is not None:
+        rotation = SPINS[dimension] / dimension * scene.surface.ratio
+    return Bounds(by_speed, constant, scene.drive.strength, rotation)

@@ -73,6 +73,7 @@ def velocity(
         ratio = 0.0 if scene.surface is None else state[5]
         changes = elements.changes(scene, speed, ratio, a2, d)
         cooling, relaxation = cooling + changes.cooling, relaxation + changes.relaxation
+        peaking = peaking + changes.peaking
         if scene.surface is not None:
             turning = [changes.rotation + cooling * ratio]
     rate = [

@@ -8,6 +8,7 @@ import pytest
 import jaxgran
 from jaxgran.scene.restitution import ReducedViscoelastic
 from jaxgran.theory import averages as kinetics
+from jaxgran.theory.rate_table import RateTable
 
 
 def test_averages_of_constant_restitution():
@@ -70,7 +71,7 @@ def test_rate_table_is_exact_over_decades(beads):
             def direct(speed, law=law):
                 return kinetics.averages(law, speed, 3)
 
-            table = kinetics.RateTable.of(direct, jnp.asarray(duration), 3, law.num_nodes)
+            table = RateTable.of(direct, jnp.asarray(duration), 3, law.num_nodes)
             x = jnp.linspace(table.lowest, 0.0, 300)
             error = jax.vmap(table)(x)[:, 0, 0] / jax.vmap(direct)(jnp.exp(x / 2))[:, 0, 0] - 1
             assert jnp.max(jnp.abs(error)) < tolerance
@@ -84,7 +85,7 @@ def test_no_gas_leaves_its_rate_table(beads):
         gas = gas.replace(dissipative_constant=gas.value("dissipative_constant") * beta)
         law, duration = gas.reduced_law, tau / gas.collision_frequency
         duration = duration * gas.impact_speed / gas.path_length
-        table = kinetics.RateTable.of(lambda v: kinetics.averages(law, v, 3), duration, 3, 20)
+        table = RateTable.of(lambda v: kinetics.averages(law, v, 3), duration, 3, 20)
         times = tau[None] * gas.mean_free_time
         curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False))
         return table.lowest, jnp.log(curve.temperature[0] / gas.temperature)
