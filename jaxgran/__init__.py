@@ -76,3 +76,7 @@ __all__ = [
     "viscoelastic_restitution",
     "write_curve",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

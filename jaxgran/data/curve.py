@@ -1,6 +1,7 @@
 """Cooling curves: one type for measured and for simulated ones, and its validation."""
 
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxgran.checks.validation import listed_numbers
+from jaxgran.checks.words import Rows, as_html, as_text, said
 
 MIN_POINTS = 3
 """The smallest number of times of a measured curve."""
@@ -97,6 +99,28 @@ class CoolingCurve(eqx.Module):
     replicas: "CoolingCurve | None" = None
     particles: Particles | None = None
     status: Int[Array, ""] | None = None
+
+    def __repr__(self) -> str:
+        return as_text(*self._words)
+
+    def _repr_html_(self) -> str:
+        return as_html(*self._words)
+
+    @property
+    def _words(self) -> tuple[str, Rows]:
+        """Title and rows of a short account of the curve."""
+        first = last = ratio = ""
+        if not any(isinstance(x, Tracer) for x in (self.times, self.temperature)):
+            first, last = (said(np.asarray(self.times)[..., i], "s") for i in (0, -1))
+            T = np.asarray(self.temperature)
+            ratio = said(T[..., -1] / T[..., 0])
+            first, last = f", t = {first}", f" to {last}"
+        known = [f.name for f in fields(self) if getattr(self, f.name) is not None]
+        rows = [("T over its first value", ratio or "traced")]
+        rows += [("known", ", ".join(name for name in known if name not in ("times", "status")))]
+        if self.status is not None:
+            rows.append(("status", said(self.status)))
+        return f"CoolingCurve of {np.shape(self.times)[-1]} times{first}{last}", rows
 
     @classmethod
     def of_replicas(cls, times: Array, values: dict[str, Any], **others: Any) -> "CoolingCurve":

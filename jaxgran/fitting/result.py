@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.checks.words import Rows, as_html, as_text, said
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.priors import Priors
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.gas_words import UNITS
 
 SIGNIFICANCE = 0.01
 """Level of significance of the chi^2 test: below it a model does not explain the curve."""
@@ -96,6 +98,23 @@ class Fit(eqx.Module):
     def error_budget(self) -> dict[str, Float[Array, "p"]]:
         """The parts of `standard_error`, SI; their squares add up to its square."""
         return {name: _deviations(part) for name, part in self.covariances.items()}
+
+    def __repr__(self) -> str:
+        return as_text(*self._words)
+
+    def _repr_html_(self) -> str:
+        return as_html(*self._words)
+
+    @property
+    def _words(self) -> tuple[str, Rows]:
+        """Title and rows: the estimates with their errors, and how well the curve is met."""
+        rows = []
+        for name in self.names:
+            estimate, error = (said(x, UNITS.get(name, "")) for x in self.value(name))
+            rows.append((name, f"{estimate} +- {error}"))
+        rows.append(("reduced chi^2", f"{said(self.reduced_chi2)}, p = {said(self.p_value)}"))
+        rows.append(("converged", str(self.converged)))
+        return f"Fit of {self.model.name}", rows
 
     def value(self, name: str) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Estimate and standard error of one parameter."""

@@ -44,16 +44,19 @@ def checked_gas(gas: Any) -> Gas:
     return gas
 
 
+LIST = "there are KineticTheory(), DSMC(N), HardSpheres(N) and SoftSpheres(N)"
+"""The models of this package, in an error."""
+
+
 def checked_model(model: Any) -> AbstractModel:
     """The model, if it is one; else ValueError."""
     if isinstance(model, AbstractModel):
         return model
     if isinstance(model, type) and issubclass(model, AbstractModel):
         raise ValueError(
-            f"model must be a model, got the class {model.__name__}: make one of it, as in "
-            "KineticTheory() or SoftSpheres(1000)"
+            f"model must be a model, got the class {model.__name__}: make one of it; {LIST}"
         )
-    raise ValueError(f"model must be a model, such as KineticTheory(), got {model!r:.60}")
+    raise ValueError(f"model must be a model, got {model!r:.60}; {LIST}")
 
 
 def checked_key(key: Any) -> PRNGKeyArray | None:

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.checks import status
 from jaxgran.checks.validation import POSITIVE, checked_times, no_type_check, plain_number
+from jaxgran.checks.words import Rows, as_html, as_text
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel
@@ -62,6 +63,16 @@ class Choice(NamedTuple):
     reasons: tuple[str, ...]
     candidates: tuple[Candidate, ...]
     error: float
+
+    def __repr__(self) -> str:
+        return as_text(*self._words())
+
+    def _repr_html_(self) -> str:
+        return as_html(*self._words())
+
+    def _words(self) -> tuple[str, Rows]:
+        title = f"Choice: {self.model.name}, T within {100 * self.error:.2g} % by estimate"
+        return title, [(f"{i}.", reason) for i, reason in enumerate(self.reasons, start=1)]
 
 
 def default_models(num_particles: int, replicas: int = 1) -> tuple[AbstractModel, ...]:

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from functools import reduce
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgran.checks.validation import Domain, UserNumber, number
+from jaxgran.checks.words import as_html, as_text
+from jaxgran.scene.gas_words import gas_rows, gas_title
 
 S = TypeVar("S", bound="NamedFloats")
 
@@ -23,6 +25,18 @@ class Place(NamedTuple):
 
 class NamedFloats(eqx.Module):
     """A module whose floats, those of its parts included, can be read and replaced by name."""
+
+    def __repr__(self) -> str:
+        return as_text(gas_title(self), gas_rows(self))
+
+    def _repr_html_(self) -> str:
+        return as_html(gas_title(self), gas_rows(self))
+
+    def __getattr__(self, name: str) -> Any:
+        # Only for names that are no attributes: floats of parts are read as they are replaced.
+        if not name.startswith("_") and "law" in vars(self) and name in self._places:
+            return self.value(name)
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     @property
     @abstractmethod

@@ -261,3 +261,11 @@ def test_fit_under_vmap_over_a_float_of_the_gas():
     single = [jaxgran.fit(gas.replace(packing_fraction=p), curve).estimate[0] for p in packings]
     np.testing.assert_allclose(batch, jnp.stack(single), rtol=1e-6)
     assert jnp.all(jnp.diff(batch) < 0)  # a denser gas collides more: less A explains the same
+
+
+def test_a_fit_is_shown_by_its_estimates():
+    gas = glass_beads()
+    curve = jaxgran.cool(gas, jnp.geomspace(0.1, 10.0, 30))
+    shown = jaxgran.fit(gas, curve, free=("dissipative_constant",))
+    assert repr(shown).startswith("Fit of kinetic theory\n  dissipative_constant")
+    assert "converged" in shown._repr_html_()
