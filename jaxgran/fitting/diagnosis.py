@@ -141,6 +141,12 @@ def _about_residuals(
             )
         else:
             yield f"{text}, as points of the same runs are: the error is increased for it"
+    if p_value > 1 - SIGNIFICANCE:
+        share = float(np.sqrt(np.mean(residuals**2)))
+        yield (
+            f"residuals scatter by {share:.2g} of the errors of T, less than chance allows: these "
+            "errors are too large, or the points share theirs"
+        )
     far = np.abs(residuals) > 5
     if not np.isnan(p_value) and 0 < far.sum() <= max(2, residuals.size // 20):
         at = ", ".join(f"t = {t:.3g} s" for t in times[far])

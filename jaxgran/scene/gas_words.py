@@ -18,6 +18,7 @@ UNITS = {
     "wall_side": "m",
     "drag_rate": "1/s",
     "drag_rotational_rate": "1/s",
+    "drive_strength": "m^2/s^3",
 }
 """Units of the floats of a gas that have one."""
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxgran
@@ -103,3 +104,17 @@ def result():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(1))
     return jaxgran.fit(gas, curve), curve
+
+
+@pytest.mark.parametrize("too_large, said", [(1.0, False), (3.0, True)])
+def test_errors_that_are_too_large_are_named(too_large, said):
+    # 30 residuals of a third of their errors: chi^2 is 3 of 28 degrees of freedom.
+    gas = glass_beads()
+    curve = jaxgran.cool(gas, jnp.geomspace(0.1, 10.0, 30))
+    noise = 0.02 * np.random.default_rng(3).normal(size=30)
+    T = curve.temperature * jnp.exp(noise)
+    error = 0.02 * too_large * T
+    measured = jaxgran.CoolingCurve(curve.times, T, temperature_error=error)
+    found = jaxgran.diagnose(jaxgran.fit(gas, measured), measured)
+    assert found.explains
+    assert any("errors are too large" in reason for reason in found.reasons) == said
