@@ -56,7 +56,7 @@ def checked_model(model: Any) -> AbstractModel:
         raise ValueError(
             f"model must be a model, got the class {model.__name__}: make one of it; {LIST}"
         )
-    raise ValueError(f"model must be a model, got {model!r:.60}; {LIST}")
+    raise ValueError(f"model must be a model, of which {LIST}; got {model!r:.60}")
 
 
 def checked_key(key: Any) -> PRNGKeyArray | None:
