@@ -27,6 +27,7 @@ FREE = Literal[
     "wall_restitution",
     "wall_beta_t",
     "gamma",
+    "drive_strength",
 ]
 
 

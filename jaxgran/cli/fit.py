@@ -40,6 +40,7 @@ PARAMETERS = {
     "wall_restitution": ("wall_coefficient", ""),
     "wall_beta_t": ("wall_tangential_restitution", ""),
     "gamma": ("drag_rate", "1/s"),
+    "drive_strength": ("drive_strength", "m^2/s^3"),
 }
 
 

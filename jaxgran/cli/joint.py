@@ -18,6 +18,7 @@ from jaxgran.models.selection import default_models
 OF_ONE_SCENE = {"temperature", "packing_fraction", "diameter", "rotational_temperature"} | {
     "wall_side",
     "drag_rate",
+    "drive_strength",
 }
 """Floats that each curve has for itself; the others are of the material, and shared."""
 
