@@ -29,7 +29,7 @@ def log_likelihood(
     integrated out. Where T has no errors, ``-(n/2) ln sum (ln T_measured - ln T_model)^2``: their
     common relative size is integrated out with the prior 1/size.
 
-    A pure function, for `jax.jit`, `jax.vmap` and `jax.grad`; `experiments/sample_posterior.py`
+    A pure function, for `jax.jit`, `jax.vmap` and `jax.grad`; `experiments/fit/sample_posterior.py`
     samples it. Priors are the caller's to add.
 
     Args:

@@ -25,8 +25,8 @@ class _RationalFit(NamedTuple):
     # eps = (1 + kappa beta)^(-decay) exp(beta P / Q). The power is the asymptotic decay for heavy
     # damping. P = decay kappa - C1 + beta p(x) and Q = 1 + beta q(x), with x = sqrt(beta) or
     # x = beta and coefficients in ascending order, were fitted to `contact.impact` by
-    # experiments/derive_restitution.py. There is no odd power of sqrt(beta) below the beta^(5/2)
-    # of the series, so that the first two derivatives at beta = 0 are finite.
+    # experiments/accuracy/derive_restitution.py. There is no odd power of sqrt(beta) below the
+    # beta^(5/2) of the series, so that the first two derivatives at beta = 0 are finite.
     kappa: float
     decay: float
     in_sqrt_beta: bool

@@ -4,8 +4,9 @@ import json
 import re
 from pathlib import Path
 
-import documents
 import pytest
+
+import experiments.documents as documents
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", ROOT / "jaxgran" / "README.md", *ROOT.glob("experiments/*.md")]

@@ -6,9 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import fit_cooling_curve
 import pytest
 
+import experiments.fit_cooling_curve as fit_cooling_curve
 import jaxgran
 from jaxgran.cli.models import MODELS, model_of
 from jaxgran.cli.output import finite_or_null
@@ -41,7 +41,7 @@ def test_main_job_without_arguments(tmp_path):
 
 @pytest.mark.slow
 def test_the_posterior_is_that_of_the_budget(tmp_path):
-    done = run("sample_posterior.py", "--samples", "300", "--out", "here", cwd=tmp_path)
+    done = run("fit/sample_posterior.py", "--samples", "300", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     line = next(line for line in done.stdout.splitlines() if line.startswith("{"))
     summary = json.loads(line)
@@ -180,7 +180,7 @@ def test_main_job_writes_json_that_others_can_read(tmp_path, monkeypatch, capsys
 
 @pytest.mark.slow
 def test_drop_tower_runs(tmp_path):
-    done = run("drop_tower.py", "--runs", 1, "--out", "here", cwd=tmp_path)
+    done = run("fit/drop_tower.py", "--runs", 1, "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "eps = 0.90: beta_t = -0.73 or 0.16" in done.stdout
     assert "intervals hold it in 1 of 1" in done.stdout
@@ -189,7 +189,7 @@ def test_drop_tower_runs(tmp_path):
 
 @pytest.mark.slow
 def test_wrong_physics_runs(tmp_path):
-    done = run("wrong_physics.py", "--draws", 2, "--out", "table.md", cwd=tmp_path)
+    done = run("fit/wrong_physics.py", "--draws", 2, "--out", "table.md", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     *rows, _, note = (tmp_path / "table.md").read_text().splitlines()[2:]
     assert "there is no A" in note and len(rows) == 11 and "| 2 of 2 |" in rows[0]
@@ -210,14 +210,14 @@ def test_main_job_reads_the_header_a_not(tmp_path):
 
 @pytest.mark.slow
 def test_own_model_runs(tmp_path):
-    done = run("own_model.py", cwd=tmp_path)
+    done = run("fit/own_model.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Haff law is compatible with this curve." in done.stdout
 
 
 @pytest.mark.slow
 def test_benchmark_runs(tmp_path):
-    done = run("benchmark_kinetic_theory.py", "--smoke", cwd=tmp_path)
+    done = run("speed/benchmark_kinetic_theory.py", "--smoke", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     row = json.loads(done.stdout.splitlines()[-1])
     assert row["vmap_error"] < 1e-6 and row["scipy_error"] < 1e-6  # the same physics, twice
@@ -225,7 +225,7 @@ def test_benchmark_runs(tmp_path):
 
 @pytest.mark.slow
 def test_particle_benchmark_runs(tmp_path):
-    done = run("benchmark_particles.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    done = run("speed/benchmark_particles.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
     assert row["collisions_per_s"] > 0 and 0.5 < row["temperature_ratio"] < 1
@@ -235,7 +235,7 @@ def test_particle_benchmark_runs(tmp_path):
 
 @pytest.mark.slow
 def test_stochastic_benchmark_runs(tmp_path):
-    done = run("benchmark_dsmc.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    done = run("speed/benchmark_dsmc.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
     assert row["collisions_per_s"] > 0 and 0.05 < row["temperature_ratio"] < 0.9
@@ -244,7 +244,7 @@ def test_stochastic_benchmark_runs(tmp_path):
 @pytest.mark.slow
 def test_hard_sphere_benchmark_runs(tmp_path):
     arguments = "--smoke", "--dimensions", 3, "--out", "figures.json"
-    done = run("benchmark_hard_spheres.py", *arguments, cwd=tmp_path)
+    done = run("speed/benchmark_hard_spheres.py", *arguments, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
     # Four collisions a sphere at beta = 0.15: kinetic theory says 0.7.
@@ -253,7 +253,7 @@ def test_hard_sphere_benchmark_runs(tmp_path):
 
 @pytest.mark.slow
 def test_comparison_with_lammps_runs(tmp_path):
-    done = run("compare_lammps.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run("accuracy/compare_lammps.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / "compare_lammps.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / "compare_lammps.json").read_text())
@@ -262,7 +262,7 @@ def test_comparison_with_lammps_runs(tmp_path):
 
 @pytest.mark.slow
 def test_soft_sphere_accuracy_runs(tmp_path):
-    done = run("soft_sphere_accuracy.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run("accuracy/soft_sphere_accuracy.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / "soft_sphere_accuracy.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / "soft_sphere_accuracy.json").read_text())
@@ -274,7 +274,7 @@ def test_soft_sphere_accuracy_runs(tmp_path):
 
 @pytest.mark.slow
 def test_speed_against_error_runs(tmp_path):
-    done = run("speed_vs_error.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run("speed/speed_vs_error.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / "speed_vs_error_smoke.png").stat().st_size > 20_000
     rows = json.loads((tmp_path / "here" / "speed_vs_error_smoke.json").read_text())["scenes"][
@@ -286,7 +286,7 @@ def test_speed_against_error_runs(tmp_path):
 
 @pytest.mark.slow
 def test_benchmark_of_derivatives_runs(tmp_path):
-    done = run("benchmark_derivatives.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    done = run("speed/benchmark_derivatives.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "figures.json").read_text())["rows"]
     assert len(rows) == 2  # soft spheres and stochastic simulation
@@ -297,7 +297,7 @@ def test_benchmark_of_derivatives_runs(tmp_path):
 
 @pytest.mark.slow
 def test_fits_head_to_head_run(tmp_path):
-    done = run("fit_head_to_head.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run("fit/fit_head_to_head.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "here" / "fit_head_to_head.json").read_text())["rows"]
     for row in rows:
@@ -308,7 +308,7 @@ def test_fits_head_to_head_run(tmp_path):
 
 @pytest.mark.slow
 def test_hard_cases_run(tmp_path):
-    done = run("hard_cases.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run("accuracy/hard_cases.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (case,) = json.loads((tmp_path / "here" / "hard_cases.json").read_text())["cases"]
     assert {row["precision"] for row in case["rows"]} == {"float64", "float32"}

@@ -1,12 +1,13 @@
 """The hard cases, one test each.
 
-Their tolerances, with reasons, are given in experiments/hard_cases_*.py.
+Their tolerances, with reasons, are given in experiments/support/hard_cases/.
 """
 
 import jax
 import pytest
-from hard_cases import CASES
-from hard_cases_rows import Row
+
+from experiments.accuracy.hard_cases import CASES
+from experiments.support.hard_cases.rows import Row
 
 LONG = (
     "A = 0",

@@ -1,9 +1,9 @@
 """Intervals of fits to single runs of few particles."""
 
-import interval_coverage
 import pytest
 
 import jaxgran
+from experiments.fit import interval_coverage
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from tests.experiments.test_experiments import run
 
 @pytest.mark.slow
 def test_clustering_leaves_haffs_law(tmp_path):
-    done = run("paper_clustering.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run("paper/paper_clustering.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for name in ("paper_clustering.png", "paper_clustering_fields.png"):
         assert (tmp_path / "here" / name).stat().st_size > 20_000
@@ -25,7 +25,7 @@ def test_clustering_leaves_haffs_law(tmp_path):
 
 @pytest.mark.slow
 def test_clusters_dissolve(tmp_path):
-    done = run("paper_clustering_dissolves.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run("paper/paper_clustering_dissolves.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / "dissolves.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / "dissolves.json").read_text())
@@ -105,7 +105,7 @@ def test_paper_is_reproduced(name, holds, tmp_path):
 
 @pytest.mark.slow
 def test_claims_that_need_no_particles_hold(tmp_path):
-    done = run("paper_claims.py", "--out", "here", cwd=tmp_path)
+    done = run("paper/paper_claims.py", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "here" / "paper_claims.json").read_text())["rows"]
     verdicts = {row["equation"]: row["verdict"] for row in rows}

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import wrong_physics
 
 import jaxgran
+from experiments.fit import wrong_physics
 from jaxgran.fitting.rivals import ranges, rivals
 from tests.conftest import glass_beads
 from tests.fitting.curves import synthetic

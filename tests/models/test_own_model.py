@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from own_model import HaffLaw
 
 import jaxgran
+from experiments.fit.own_model import HaffLaw
 from jaxgran.theory import closed_forms
 
 MEMBERS = sorted(

@@ -1,0 +1,1 @@
+"""Scripts, one for each question, and what they share (`support`); see README.md here."""

@@ -1,0 +1,77 @@
+"""Where do the coefficients of the fitted restitution law come from, and how accurate is it?
+
+    python experiments/accuracy/derive_restitution.py
+
+Solves the equation of motion of an impact for some 200 values of beta and fits
+``ln eps + decay ln(1 + kappa beta)`` by ``beta P(z) / Q(z)``, z = sqrt(beta). The fit minimises the
+largest error (Lawson's reweighting of a linearised least-squares fit). Prints the coefficients that
+``jaxgran/scene/restitution_table.py`` contains.
+"""
+
+import jax
+import numpy as np
+
+from jaxgran.scene.contact import impact
+from jaxgran.scene.restitution_table import C1
+
+ROUNDS = 300
+
+
+def samples(clipped: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Values of beta, and eps of an impact at each."""
+    top = 3e4 if clipped else 40.0
+    s = (1 - np.cos((np.arange(160) + 0.5) * np.pi / 160)) / 2
+    beta = np.concatenate([s / (1 - s), np.geomspace(1, top, 50)])
+    beta = np.sort(beta[beta <= top])
+    solve = jax.jit(lambda b: impact(b, clipped=clipped, rtol=1e-13).restitution)
+    return beta, np.array([float(solve(b)) for b in beta])
+
+
+def fit_rational(
+    beta: np.ndarray,
+    target: np.ndarray,
+    slope: float,
+    powers_p: list[int],
+    powers_q: list[int],
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """The largest error, and the coefficients of P and Q without the constant ones, slope and 1."""
+    z = np.sqrt(beta)[:, None]
+    basis_p, basis_q = z ** np.array(powers_p), z ** np.array(powers_q)
+    denominator, lawson = np.ones_like(beta), np.ones_like(beta)
+    best = (np.inf, np.array([]), np.array([]))
+    for _ in range(ROUNDS):
+        weight = (lawson / denominator)[:, None]
+        matrix = np.concatenate([beta[:, None] * basis_p, -target[:, None] * basis_q], axis=1)
+        matrix = matrix * weight
+        scale = np.abs(matrix).max(axis=0)
+        right = (target - beta * slope) * weight[:, 0]
+        x = np.linalg.lstsq(matrix / scale, right, rcond=1e-15)[0] / scale
+        p, q = x[: len(powers_p)], x[len(powers_p) :]
+        denominator = 1 + basis_q @ q
+        error = np.abs(beta * (slope + basis_p @ p) / denominator - target)
+        if denominator.min() > 0 and error.max() < best[0]:
+            best = (error.max(), p, q)
+        lawson = lawson * (0.1 + error / error.max()) ** 0.3
+        lawson /= lawson.mean()
+    return best
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    # beta P and Q have the same degree, so that their ratio tends to a constant.
+    shapes = {
+        "clipped": (True, 0.7, 5 / 3, [2, *range(3, 9)], [2, *range(4, 11)]),
+        "unclipped": (False, 0.7, 5.0, list(range(2, 21, 2)), list(range(2, 23, 2))),
+    }
+    for name, (clipped, kappa, decay, powers_p, powers_q) in shapes.items():
+        beta, restitution = samples(clipped)
+        target = np.log(restitution) + decay * np.log1p(kappa * beta)
+        slope = decay * kappa - C1
+        error, p, q = fit_rational(beta, target, slope, powers_p, powers_q)
+        print(f"{name}: largest relative error {error:.1e} over 0 <= beta <= {beta[-1]:g}")
+        for title, powers, values in (("P", powers_p, p), ("Q", powers_q, q)):
+            print("  " + title, {k: float(v) for k, v in zip(powers, values, strict=True)})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""How often does a 95 % interval of A hold the truth, for single runs of few particles?
+
+    python experiments/fit/interval_coverage.py [--runs 200] [--models dsmc hard-spheres]
+        [--numbers 100 500] [--phis 0.02 0.05] [--out experiments/interval_coverage.md]
+
+Each run is one realisation of N particles (beta_T0 = .18, t_c/tau_c = .001, followed for 100 mean
+free times, in which T falls to a few per cent): 30 values of T without errors, as one film of one
+experiment has them. Kinetic theory is fitted to each with A and T_0 free and N given. Prints the
+bias of ln A and its standard error, the scatter of ln A, the scatter that the error budget expects
+without the model's clock, which is the same in all runs, and the coverage by the whole budget.
+"""
+
+import argparse
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxgran
+from experiments.support.scenes import beads
+
+BETA, CONTACT, END, POINTS = 0.18, 0.001, 100.0, 30
+KINDS = {
+    "dsmc": jaxgran.DSMC,
+    "hard-spheres": jaxgran.HardSpheres,
+    "soft-spheres": jaxgran.SoftSpheres,
+}
+HEADINGS = (
+    "runs of",
+    "N",
+    "φ",
+    "bias of A, %",
+    "over σ",
+    "scatter of A, %",
+    "budget's, %",
+    "95 % intervals that hold A",
+)
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--models", nargs="+", choices=KINDS, default=["dsmc", "hard-spheres"])
+    parser.add_argument("--numbers", nargs="+", type=int, default=[100, 500])
+    parser.add_argument("--phis", nargs="+", type=float, default=[0.02, 0.05])
+    parser.add_argument("--out", type=Path, help="file for the table")
+    options = parser.parse_args()
+    lines = [" | ".join(("", *HEADINGS, "")).strip(), "|" + "---|" * len(HEADINGS)]
+    print("\n".join(lines), flush=True)
+    for name in options.models:
+        for number in options.numbers:
+            for phi in options.phis:
+                found = coverage(KINDS[name], number, phi, options.runs)
+                lines.append(row(name, number, phi, found))
+                print(lines[-1], flush=True)
+    if options.out is not None:
+        options.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def coverage(kind, num_particles: int, phi: float, runs: int) -> dict[str, float]:
+    """Statistics of the fits of single runs."""
+    gas = beads(phi, BETA, CONTACT)
+    times = jnp.geomspace(0.3, END, POINTS) * gas.mean_free_time
+    model = kind(num_particles, replicas=runs)
+    key = jax.random.key(num_particles)
+    curve = jaxgran.cool(gas, times, model=model, key=key, progress=False)
+    assert curve.replicas is not None
+    truth = float(gas.value("dissipative_constant"))
+    ratio, error, chance = [], [], []
+    for T in np.asarray(curve.replicas.temperature):
+        single = jaxgran.CoolingCurve(times=times, temperature=T)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            result = jaxgran.fit(gas, single, num_particles=num_particles)
+        parts = {name: float(part[0]) / truth for name, part in result.error_budget.items()}
+        ratio.append(float(result.estimate[0]) / truth)
+        error.append(float(result.standard_error[0]) / truth)
+        chance.append(np.hypot(parts["measurement"], parts["few particles"]))
+    ratio, error = np.array(ratio), np.array(error)
+    log_ratio = np.log(ratio)
+    return {
+        "bias": float(log_ratio.mean()),
+        "bias_error": float(log_ratio.std() / runs**0.5),
+        "bias_over_error": float(np.mean((ratio - 1) / error)),
+        "scatter": float(log_ratio.std()),
+        "expected_scatter": float(np.sqrt(np.mean(np.square(chance)))),
+        "coverage": float(np.mean(np.abs(ratio - 1) < 1.959964 * error)),
+        "runs": runs,
+    }
+
+
+def row(name: str, number: int, phi: float, found: dict[str, float]) -> str:
+    """A line of the table."""
+    cells = (
+        name.replace("-", " "),
+        f"{number}",
+        f"{phi:g}",
+        f"{100 * found['bias']:+.1f} ± {100 * found['bias_error']:.1f}",
+        f"{found['bias_over_error']:+.2f}",
+        f"{100 * found['scatter']:.1f}",
+        f"{100 * found['expected_scatter']:.1f}",
+        f"{100 * found['coverage']:.1f} %",
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    main()

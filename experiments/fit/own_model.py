@@ -1,0 +1,82 @@
+"""How do I add a model of my own? Haff's law in closed form, beside kinetic theory.
+
+    python experiments/fit/own_model.py
+
+Prints T of a gas with a constant coefficient of restitution by both models, the model that
+`choose_model` takes, and a fit of that coefficient and of T_0 through the new model.
+"""
+
+import sys
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxgran
+from experiments.support.scenes import hard_beads
+from jaxgran.theory.closed_forms import haff
+
+
+class HaffLaw(jaxgran.AbstractModel):
+    """Haff's law: spheres of constant restitution, whose velocities stay Maxwellian."""
+
+    stochastic: ClassVar[bool] = False  # curves have no noise
+    derivative_accuracy: ClassVar[float] = 0.02  # of the collision frequency, by Enskog's theory
+
+    def check(self, gas):
+        if not isinstance(gas.law, jaxgran.ConstantRestitution):
+            raise ValueError("HaffLaw needs ConstantRestitution; use jaxgran.KineticTheory")
+
+    def simulate(self, gas, times, run):
+        tau = gas.collision_frequency * times
+        T = gas.temperature * haff(tau, gas.value("coefficient"), gas.dimension)
+        return jaxgran.CoolingCurve(times=times, temperature=T)
+
+    def estimated_error(self, course):
+        # a_2 changes the cooling rate by the share 3 a_2 / 16.
+        return course.error_of_temperature(course.homogeneous + 3 / 16 * np.abs(course.sonine))
+
+    def omissions(self, gas, num_particles=None):
+        if float(gas.value("coefficient")) > 0.7:
+            return ()
+        remedy = "This scene needs kinetic theory, which follows a_2."
+        return (jaxgran.Omission("velocities are not Maxwellian", True, remedy),)
+
+
+def main() -> int:
+    jax.config.update("jax_enable_x64", True)
+    gas = hard_beads(packing_fraction=0.02, restitution=0.9)
+    times = jnp.geomspace(1, 300, 9) * gas.mean_free_time
+    theory = jaxgran.cool(gas, times)
+    own = jaxgran.cool(gas, times, model=HaffLaw())
+    print(f"{'t (s)':>8}{'T/T_0, Haff':>14}{'kinetic theory':>16}{'difference':>12}")
+    for t, a, b in zip(times, own.temperature, theory.temperature, strict=True):
+        a, b = float(a / gas.temperature), float(b / gas.temperature)
+        print(f"{float(t):8.3g}{a:14.5g}{b:16.5g}{100 * (a / b - 1):+10.2f} %")
+
+    models = (HaffLaw(), jaxgran.KineticTheory())
+    choice = jaxgran.choose_model(gas, times, 0.05, models=models)
+    print(f"\n{choice.reasons[0]}")
+
+    times = jnp.geomspace(0.3, 300, 40) * gas.mean_free_time
+    exact = jaxgran.cool(gas, times).temperature
+    noise = 0.01 * jax.random.normal(jax.random.key(0), times.shape)
+    curve = jaxgran.CoolingCurve(
+        times=times, temperature=exact * jnp.exp(noise), temperature_error=0.01 * exact
+    )
+    free = ("coefficient", "temperature")
+    result = jaxgran.fit(gas.replace(coefficient=0.5), curve, model=HaffLaw(), free=free)
+    print("\nfit to a curve by kinetic theory with noise of 1 %:")
+    for i, name in enumerate(free):
+        estimate, error = result.value(name)
+        print(
+            f"{name:12} {float(estimate):.5g} +- {float(error):.1g}, of the model's clock "
+            f"{float(result.error_budget['model'][i]):.1g}; true {float(gas.value(name)):.5g}"
+        )
+    print(jaxgran.diagnose(result, curve).verdict)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,175 @@
+"""Is the error bar of a fit that of the posterior? NUTS on (A, phi, T_0, clock) beside the budget.
+
+    python experiments/fit/sample_posterior.py [--samples 1000] [--chains 4] [--out DIR]
+
+The dilute LAMMPS curve, with phi known within 4 % and T_0 within 1 %. The sampler follows
+`jaxgran.log_likelihood` and the same priors that the fit is given: of phi, of T_0, and of the error
+of kinetic theory's clock, of its mean and its trend. Prints both answers, the effective samples a
+second, and writes a corner plot.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import blackjax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
+from corner import corner
+from matplotlib import pyplot as plt
+
+import jaxgran
+
+HERE = Path(__file__).parents[1]
+FREE = ("dissipative_constant", "temperature")
+PRIORS = {"packing_fraction": 0.04, "temperature": 0.01}
+"""Relative standard errors."""
+
+LABELS = ("A (1e-6 s)", "phi", "T_0 (1e-2 m²/s²)")
+
+
+def main() -> int:
+    jax.config.update("jax_enable_x64", True)
+    options = parse()
+    curve, header = jaxgran.read_curve(HERE / "data" / "lammps_cooling_dilute.csv")
+    gas = jaxgran.read_gas(header)
+    priors = {
+        name: (float(gas.value(name)), e * float(gas.value(name))) for name, e in PRIORS.items()
+    }
+    # T alone: the fit's factor of <dr^2> is a parameter that the likelihood has integrated out.
+    curve = jaxgran.CoolingCurve(
+        times=curve.times, temperature=curve.temperature, temperature_error=curve.temperature_error
+    )
+    result = jaxgran.fit(gas, curve, free=FREE, priors=priors)
+    found, seconds, evaluations = sample(log_posterior(gas, curve, priors, result), options)
+    A, phi, T_0 = (np.asarray(found[..., i]) for i in range(3))
+    report(result, A, phi, T_0, seconds, evaluations)
+    picture(
+        result, np.stack([A.ravel() * 1e6, phi.ravel(), T_0.ravel() * 100], axis=1), options.out
+    )
+    return 0
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--samples", type=int, default=1000, help="of each chain (default: 1000)")
+    parser.add_argument("--chains", type=int, default=4, help="side by side (default: 4)")
+    parser.add_argument("--out", type=Path, default=HERE / "pictures", help="folder of the picture")
+    return parser.parse_args()
+
+
+def log_posterior(gas, curve, priors, result):
+    """The posterior of theta, and the SI values (A, phi, T_0) of theta.
+
+    theta is (ln A, ln phi, ln T_0, mean and trend of ln clock), each less its prior or fitted value
+    and over its prior or fitted error, which a sampler finds of order one.
+    """
+    phi, e_phi = priors["packing_fraction"]
+    T_0, e_T = priors["temperature"]
+    A, e_A = (float(x) for x in result.value("dissipative_constant"))
+    centre = jnp.log(jnp.array([A, phi, T_0]))
+    width = jnp.array([e_A / A, e_phi / phi, e_T / T_0])
+    accuracy = result.model.derivative_accuracy
+    log_T = jnp.log(curve.temperature)
+    along = 2 * (log_T - log_T[0]) / (log_T[-1] - log_T[0]) - 1
+
+    def values(theta):
+        return jnp.exp(centre + width * theta[..., :3])
+
+    def log_density(theta):
+        A, phi, T_0 = values(theta)
+        now = gas.replace(dissipative_constant=A, packing_fraction=phi, temperature=T_0)
+        clock = jnp.exp(accuracy * (theta[3] + theta[4] * along))
+        # All but A, which has a flat one in ln A, have priors.
+        return jaxgran.log_likelihood(now, curve, clock=clock) - 0.5 * jnp.sum(theta[1:] ** 2)
+
+    return log_density, values
+
+
+def sample(posterior, options):
+    """Samples (chains, samples, 3) of SI values, seconds of the run, and effective samples."""
+    log_density, values = posterior
+    warm_key, key = jax.random.split(jax.random.key(0))
+    adapt: Any = blackjax.window_adaptation(
+        blackjax.nuts, log_density, is_mass_matrix_diagonal=False
+    )
+    (state, tuned), _ = adapt.run(warm_key, jnp.zeros(5), 600)
+    nuts: Any = blackjax.nuts(log_density, **tuned)
+
+    @jax.jit
+    def chain(key):
+        def step(state, key):
+            state, info = nuts.step(key, state)
+            return state, (state.position, info.num_integration_steps, info.is_divergent)
+
+        return jax.lax.scan(step, state, jax.random.split(key, options.samples))[1]
+
+    chains = jax.jit(jax.vmap(chain))
+    keys = jax.random.split(key, options.chains)
+    jax.block_until_ready(chains(keys))  # compiles
+    begin = time.perf_counter()
+    theta, steps, divergent = jax.block_until_ready(chains(jax.random.split(keys[0], len(keys))))
+    seconds = time.perf_counter() - begin
+    return (
+        values(theta),
+        seconds,
+        {
+            "steps": float(jnp.mean(steps)),
+            "divergent": int(jnp.sum(divergent)),
+            "effective": float(jnp.min(effective_sample_size(theta))),
+            "r_hat": float(jnp.max(potential_scale_reduction(theta))),
+        },
+    )
+
+
+def report(result, A, phi, T_0, seconds, facts) -> None:
+    """Both answers, side by side, and the speed."""
+    print(f"{'':24}{'posterior (NUTS)':>24}{'fit, with its budget':>24}")
+    summary = {}
+    for name, samples in (("dissipative_constant", A), ("temperature", T_0)):
+        estimate, error = (float(x) for x in result.value(name))
+        mean, spread = float(samples.mean()), float(samples.std())
+        both = (f"{x:.5g} +- {e:.2g}" for x, e in ((mean, spread), (estimate, error)))
+        print(f"{name:24}" + "".join(f"{text:>24}" for text in both))
+        summary[name] = {"mean": mean, "std": spread, "fit": estimate, "fit_std": error}
+    parts = ", ".join(
+        f"{part} {100 * float(x[0] / result.estimate[0]):.2g} %"
+        for part, x in result.error_budget.items()
+    )
+    print(f"error of A by the fit: {parts}")
+    print(f"correlation of A and phi: {np.corrcoef(A.ravel(), phi.ravel())[0, 1]:.3f}")
+    summary |= {"samples_per_second": A.size / seconds, "seconds": seconds, **facts}
+    print(
+        f"{A.size} samples in {seconds:.1f} s: {A.size / seconds:.0f} a second, "
+        f"{facts['effective'] / seconds:.0f} effective; {facts['steps']:.1f} steps each, "
+        f"{facts['divergent']} divergent, R-hat {facts['r_hat']:.3f}"
+    )
+    print(json.dumps(summary))
+
+
+def picture(result, samples, folder: Path) -> None:
+    """A corner plot, with the Gaussian of the fit over the histograms of A and T_0."""
+    figure = corner(samples, labels=LABELS, color="0.3", quantiles=(0.025, 0.975))
+    axes = np.array(figure.axes).reshape(3, 3)
+    for i, name, unit in ((0, FREE[0], 1e6), (2, FREE[1], 100.0)):
+        estimate, error = (float(x) * unit for x in result.value(name))
+        left, right = axes[i, i].get_xlim()
+        x = np.linspace(left, right, 200)
+        normal = np.exp(-0.5 * ((x - estimate) / error) ** 2)
+        axes[i, i].plot(x, normal * axes[i, i].get_ylim()[1] * 0.95, color="C1", lw=2)
+    axes[0, 2].text(0.0, 0.8, "grey: NUTS\norange: fit, with its budget", fontsize=12)
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / "sample_posterior.png", dpi=100)
+    plt.close(figure)
+    print(f"written  {folder / 'sample_posterior.png'}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

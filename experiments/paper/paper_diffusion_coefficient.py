@@ -1,0 +1,171 @@
+"""Is D = T tau_v, and does D decrease with time as in the paper?
+
+    python experiments/paper/paper_diffusion_coefficient.py [--smoke] [--out DIR]
+
+D(t) of a cooling gas is computed in three ways: from the integral of the velocity autocorrelation
+from t' on, Eq. (9); from the slope of <dr^2>, Eq. (14); and by theory, Eqs. (34) and (40) as
+printed and with memory, dD/dt = T - D/tau_v. The simulations are DSMC, and hard and soft spheres at
+one time t'.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+
+import jaxgran
+from experiments.paper.paper_velocity_correlation import (
+    MARKERS,
+    SPHERES,
+    diffusion,
+    in_boxes,
+    printed_relaxation,
+    stochastic,
+)
+from experiments.paper.paper_velocity_correlation import Config as Correlation
+from experiments.support import paper
+from experiments.support.scenes import beads, hard_beads
+from jaxgran.theory import closed_forms
+
+NAME = "paper_diffusion_coefficient"
+
+
+@dataclass(frozen=True)
+class Config:
+    correlation: Correlation = field(default_factory=lambda: Correlation(seed=1))
+    waits: tuple[float, ...] = (1.0, 0.1, 0.01, 0.001)  # T(t')/T_0 of the viscoelastic gas
+    last: float = 3000.0  # the last time, in mean free times
+    points: int = 14
+
+
+SMOKE = Config(
+    replace(Correlation(), num_particles=2000, replicas=4, boxes=0),
+    waits=(1.0,),
+    last=30.0,
+    points=6,
+)
+
+
+def main() -> None:
+    options = paper.options(__doc__, NAME)
+    config = SMOKE if options.smoke else Config()
+    clock = paper.Clock()
+    phi = config.correlation.packing_fraction
+    viscoelastic = beads(phi, config.correlation.beta)
+    e = paper.alike(viscoelastic)
+    gases = {
+        "elastic": (hard_beads(phi, 1.0), paper.ELASTIC),
+        "constant": (hard_beads(phi, e), paper.CONSTANT),
+        "viscoelastic": (viscoelastic, paper.VISCOELASTIC),
+    }
+    figure = paper.figure(
+        "Three routes give one D, and it is not T τ$_v$: the gas cools while it remembers",
+        columns=2,
+    )
+    fall, ratio = figure.axes
+    found = {
+        name: routes(name, gas, color, config, fall, ratio) for name, (gas, color) in gases.items()
+    }
+    tau = np.geomspace(0.3, config.last, 200)
+    delta = float(viscoelastic.delta)
+    u = 1 + closed_forms.COOLING_RATE[3] * delta * tau
+    a_3 = closed_forms.COOLING_CORRECTION + closed_forms.RELAXATION_CORRECTION
+    printed = u ** (-5 / 6) + a_3 * delta / u
+    fall.plot(tau, printed, "--", lw=1, color=paper.VISCOELASTIC, label="Eq. (40), to order δ")
+    paper.caption(
+        fall,
+        f"viscoelastic (β = {config.correlation.beta}) and constant ε = {e:.3f}\n"
+        "— theory, ● slope of ⟨Δr²⟩",
+        xlabel="time t / τ$_c$(0)",
+        ylabel="D / D$_0$,  D$_0$ = T$_0$ τ$_E$(0)",
+        xscale="log",
+        yscale="log",
+    )
+    paper.caption(
+        ratio,
+        "— theory with memory, - - Eq. (34): D = T τ$_v$\n"
+        "● ■ ▲ ⟨Δr²⟩, ◇ □ △ ∫⟨v(t′)·v(t)⟩dt: DSMC, hard, soft",
+        xlabel="T(t′) / T$_0$",
+        ylabel="D / (T τ$_E$)",
+        xscale="log",
+        ylim=(0.93, 1.6),
+    )
+    ratio.invert_xaxis()
+    for name, row in found.items():
+        print(
+            f"{name}: D/(T tau_E) by the slope {row['by_slope'][-1]:.3f} +- "
+            f"{row['by_slope_error'][-1]:.3f} (theory {row['by_slope_theory'][-1]:.3f}), by the "
+            f"integral {row['by_integral'][-1]:.3f} +- {row['by_integral_error'][-1]:.3f}, T tau_v "
+            f"{row['paper'][-1]:.3f}"
+        )
+        for kind in [kind for kind in SPHERES if kind in row]:
+            of = row[kind]
+            print(
+                f"    {kind}, T/T_0 = {of['temperature']:.3f}: by the slope {of['slope']:.3f}"
+                f" +- {of['slope_error']:.3f}, by the integral {of['integral']:.3f} +- "
+                f"{of['integral_error']:.3f}"
+            )
+    paper.write(figure, options.out, NAME, config, clock, restitution=e, **found)
+
+
+def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio) -> dict:
+    """D of one gas by all methods, in units of T tau_E; drawn and returned."""
+    start, tau_c = float(gas.temperature), float(gas.mean_free_time)
+    unit = 9 * start * tau_c**2  # of <dr^2> per collision at D = T tau_E
+    # D of elastic spheres is constant after a few collisions, and their collision rate is constant.
+    last = config.last if name != "elastic" else min(config.last, 30.0)
+    tau = np.geomspace(0.5, last, config.points)
+    fine = np.geomspace(0.02, last, 400)
+    of = jaxgran.cool(gas, fine * tau_c, model=jaxgran.KineticTheory(softness=False))
+    theta = np.asarray(of.temperature) / start
+    size = config.correlation
+    model, key = jaxgran.DSMC(size.num_particles, size.replicas), jax.random.key(size.seed + 1)
+    curve = jaxgran.cool(gas, tau * tau_c, model=model, key=key)
+    slopes, errors = diffusion(curve, gas, slice(None))
+    cooled = np.asarray(curve.temperature) / start
+    middle = np.sqrt(cooled[1:] * cooled[:-1])
+
+    def expected(quantity: str) -> np.ndarray:
+        values = np.log(np.asarray(getattr(of, quantity)))
+        return np.diff(np.exp(np.interp(np.log(tau), np.log(fine), values)))
+
+    waits = config.waits if name == "viscoelastic" else (1.0,)
+    runs = [stochastic(gas.replace(temperature=start * wait), size) for wait in waits]
+    printed = [float(printed_relaxation(gas.replace(temperature=start * x))) for x in theta[::8]]
+    boxes = in_boxes(gas, size, ages=name != "elastic")
+    row = {
+        "temperature": paper.listed(middle),
+        "by_slope": paper.listed(slopes),
+        "by_slope_error": paper.listed(errors),
+        "by_slope_theory": paper.listed(expected("displacement") / expected("collisions") / unit),
+        "waits": list(waits),
+        "by_integral": [run["integral"] for run in runs],
+        "by_integral_error": [run["integral_error"] for run in runs],
+        "paper": [float(printed_relaxation(gas.replace(temperature=start * w))) for w in waits],
+        **boxes,
+    }
+    d_0 = 1.5 * start * tau_c
+    if name != "elastic":
+        fall.plot(fine, np.asarray(of.diffusion) / d_0, color=color, label=name)
+        mean = slopes * np.diff(np.asarray(curve.collisions)) / np.diff(tau)
+        at = np.sqrt(tau[1:] * tau[:-1])
+        fall.errorbar(at[4:], mean[4:], (errors / slopes * mean)[4:], fmt="o", ms=4, color=color)
+    # Elastic spheres stay at T_0: one point.
+    if name == "elastic":
+        ratio.axhline(1.0, color=color, label="elastic: first Sonine order, 1.7 % below DSMC")
+        middle, slopes, errors = (np.array(x[-1:]) for x in (middle, slopes, errors))
+    else:
+        ratio.plot(theta, np.asarray(of.diffusion) / d_0 / np.sqrt(theta), color=color, label=name)
+        ratio.plot(theta[::8], printed, "--", color=color, lw=1)
+    ratio.errorbar(middle, slopes, errors, fmt="o", ms=4, color=color)
+    hollow = {"ms": 6, "mfc": "none", "color": color}
+    ratio.errorbar(waits, row["by_integral"], row["by_integral_error"], fmt="D", **hollow)
+    for kind, of in boxes.items():
+        at, marker = of["temperature"], MARKERS[kind][0]
+        ratio.errorbar(at, of["integral"], of["integral_error"], fmt=marker, **hollow)
+        ratio.errorbar(at, of["slope"], of["slope_error"], fmt=marker, ms=5, color=color)
+    return row
+
+
+if __name__ == "__main__":
+    main()

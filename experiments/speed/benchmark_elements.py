@@ -1,0 +1,105 @@
+"""What do rough spheres, walls and drag cost, over the smooth gas without them?
+
+    python experiments/speed/benchmark_elements.py [--repeats 7] [--smoke] [--out FILE]
+
+Beads (phi = .05, beta_T0 = .15) cool for some mean free times, with each element that a model
+takes. Prints seconds of a first run, the median of repeats in which all scenes take turns, and the
+ratio of the time for each collision to that of the smooth gas (of kinetic theory, of each run), as
+gases with other losses make other numbers of collisions.
+"""
+
+import argparse
+import dataclasses
+import statistics
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import jaxgran
+from experiments.support.record import save
+from experiments.support.scenes import beads
+
+NUM_HARD, NUM_DSMC = 4096, 100_000
+ELEMENTS = {
+    "smooth": {},
+    "rough": {"surface": jaxgran.Rough(0.0, rotational_temperature=4e-3)},
+    "walls": {"container": None},  # of the size of the gas
+    "rough, walls": {"surface": jaxgran.Rough(0.0, rotational_temperature=4e-3), "container": None},
+    "drag": {"drag": jaxgran.StokesDrag(0.5)},
+}
+
+
+def scene(elements: dict) -> jaxgran.Gas:
+    gas = beads(packing_fraction=0.05, beta=0.15)
+    if "container" in elements:
+        side = float(gas.box_side(NUM_HARD))
+        elements = elements | {"container": jaxgran.Walls(side, restitution=0.9)}
+    return dataclasses.replace(gas, **elements)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--smoke", action="store_true", help="one short repeat")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    repeats, until = (1, 1.0) if options.smoke else (options.repeats, 10.0)
+    models = (
+        jaxgran.KineticTheory(),
+        jaxgran.DSMC(NUM_DSMC),
+        jaxgran.HardSpheres(NUM_HARD),
+    )
+    print(f"{jax.devices()[0].device_kind}, float64, {until:g} mean free times")
+    print(f"{'model':>16} {'scene':>14} {'first run s':>12} {'run s':>9} {'ratio':>7}")
+    rows = []
+    for model in models:
+        for row in measured(model, until, repeats):
+            rows.append(row)
+            print(
+                f"{row['model']:>16} {row['scene']:>14} {row['first_s']:12.2f} {row['run_s']:9.4f}"
+                f" {row['ratio']:7.2f}",
+                flush=True,
+            )
+    if options.out is not None:
+        save(options.out, rows=rows)
+
+
+def measured(model, until: float, repeats: int) -> list[dict]:
+    """A row for each scene that the model takes; the scenes take turns."""
+    gases = {
+        name: scene(elements)
+        for name, elements in ELEMENTS.items()
+        if set(elements) <= set(model.elements)
+    }
+    times = np.linspace(0, until, 6)[1:]
+    seconds: dict[str, list[float]] = {name: [] for name in gases}
+    collisions = {}
+    for _ in range(1 + repeats):
+        for name, gas in gases.items():
+            began = time.perf_counter()
+            curve = jaxgran.cool(gas, times * float(gas.mean_free_time), model=model)
+            jax.block_until_ready(curve.temperature)
+            seconds[name].append(time.perf_counter() - began)
+            made = curve.collisions if model.stochastic else None
+            collisions[name] = 1.0 if made is None else float(made[-1])
+    first = {name: each[0] for name, each in seconds.items()}
+    cost = {name: statistics.median(each[1:]) / collisions[name] for name, each in seconds.items()}
+    return [
+        {
+            "model": model.name,
+            "scene": name,
+            "first_s": first[name],
+            "run_s": statistics.median(seconds[name][1:]),
+            "ratio": cost[name] / cost["smooth"],
+        }
+        for name in gases
+    ]
+
+
+if __name__ == "__main__":
+    main()

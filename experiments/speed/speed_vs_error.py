@@ -1,0 +1,296 @@
+"""How fast and how accurate is each model? Run time and error of T(t) for all its settings.
+
+    python experiments/speed/speed_vs_error.py [--scenes dilute dense clustering]
+        [--models kinetic-theory dsmc hard-spheres soft-spheres] [--smoke] [--out DIR]
+
+The error is the largest relative difference of T from an independent reference over the whole
+curve: LAMMPS for the dilute and the dense gas; for the clustering gas soft spheres with 80 steps
+per contact, in as large a box as the largest here and with three times the replicas. Each row is
+run twice, to tell compilation from run time. Scenes and models that are not asked for keep the rows
+of an older run in the same folder.
+"""
+
+import argparse
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+from tqdm import tqdm
+
+import jaxgran
+from experiments.support.record import save, seconds
+from experiments.support.scenes import beads
+from jaxgran.data.header import header_number
+
+DATA_FOLDER = Path(__file__).parents[1] / "data"
+KEY = 1  # of the random numbers of the rows; the reference has another
+COLOURS = {
+    "kinetic theory": "#222222",
+    "DSMC": "#2a9d8f",
+    "hard spheres": "#20639b",
+    "soft spheres": "#d1495b",
+}
+"""Colours of the models, by their names."""
+SIZES = {
+    "dilute": (500, 2000, 8000),
+    "dense": (500, 2000, 8000),
+    "clustering": (1000, 3000, 12_000),
+}
+REPLICAS = 4
+DSMC_SIZES = (1000, 10_000, 100_000)
+STEPS = (10, 20, 80)
+SOFTER = (4, 16)  # factors by which Y is reduced at fixed A alpha^(2/5)
+CLUSTERING = (0.2, 0.5, 0.02)  # packing fraction, beta, contact fraction
+CLUSTERING_TIMES = np.geomspace(0.5, 60, 30)  # mean free times
+
+
+@dataclass
+class Scene:
+    """A gas with a reference curve.
+
+    Attributes:
+        gas, times: what is simulated.
+        temperature: of the reference.
+        error: standard error of the reference's T.
+        reference: how it was obtained, in words.
+    """
+
+    gas: jaxgran.Gas
+    times: np.ndarray
+    temperature: np.ndarray
+    error: np.ndarray
+    reference: str
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenes", nargs="+", choices=SIZES, default=list(SIZES))
+    names = [option(name) for name in COLOURS]
+    parser.add_argument("--models", nargs="+", choices=names, default=names)
+    parser.add_argument("--smoke", action="store_true", help="few rows, early times only")
+    parser.add_argument("--out", type=Path, default=Path("results") / "speed_vs_error")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    stem = "speed_vs_error_smoke" if options.smoke else "speed_vs_error"
+    file, found = options.out / f"{stem}.json", {}
+    if file.exists():
+        found = json.loads(file.read_text(encoding="utf-8"))["scenes"]
+    for name in ("dense",) if options.smoke else options.scenes:
+        jax.clear_caches()  # so that every scene compiles for itself
+        scene = clustering() if name == "clustering" else measured(name, options.smoke)
+        before = found[name]["rows"] if name in found else []
+        kept = [row for row in before if option(row["model"]) not in options.models]
+        runs = few_runs(scene.gas) if options.smoke else all_runs(scene.gas, SIZES[name])
+        runs = [run for run in runs if option(run.model.name) in options.models]
+        rows = [measure(scene, run) for run in tqdm(runs, disable=True if options.smoke else None)]
+        rows = sorted(kept + rows, key=lambda row: list(COLOURS).index(row["model"]))
+        choice = jaxgran.choose_model(
+            scene.gas, scene.times, num_particles=SIZES[name][-1], replicas=REPLICAS
+        )
+        estimates = {c.model.name: c.error for c in choice.candidates if c.error is not None}
+        found[name] = {"reference": scene.reference, "estimates": estimates, "rows": rows}
+        print(table(name, found[name]))
+        save(file, scenes=found, key=KEY, replicas=REPLICAS)
+    found = {name: found[name] for name in SIZES if name in found}
+    draw(found, file.with_suffix(".png"))
+    text = "\n\n".join(table(name, results) for name, results in found.items())
+    file.with_suffix(".md").write_text(text + "\n", encoding="utf-8")
+    print(f"written to {options.out}")
+
+
+def option(name: str) -> str:
+    """The name of a model on the command line."""
+    return name.lower().replace(" ", "-")
+
+
+def title(name: str) -> str:
+    """The name of a model in a table."""
+    return name[:1].upper() + name[1:]
+
+
+def measured(name: str, smoke: bool) -> Scene:
+    """A gas whose curve was measured in LAMMPS."""
+    curve, header = jaxgran.read_curve(DATA_FOLDER / f"lammps_cooling_{name}.csv")
+    gas = jaxgran.read_gas(header).replace(dissipative_constant=header_number(header, "A"))
+    assert curve.temperature_error is not None
+    used = slice(1, 6 if smoke else None)  # at t = 0 nothing is measured
+    label = f"LAMMPS, N = {header['N']}, {header['replicas']} replicas"
+    return Scene(
+        gas,
+        np.asarray(curve.times)[used],
+        np.asarray(curve.temperature)[used],
+        np.asarray(curve.temperature_error)[used],
+        label,
+    )
+
+
+def clustering() -> Scene:
+    """A gas in a box of four L_c, with a reference by soft spheres of finer time steps."""
+    gas = beads(*CLUSTERING)
+    size, times = SIZES["clustering"][-1], CLUSTERING_TIMES * float(gas.mean_free_time)
+    key = jax.random.key(KEY + 1)
+    model = jaxgran.SoftSpheres(size, replicas=3 * REPLICAS, steps_per_contact=80)
+    curve = jaxgran.cool(gas, times, model=model, key=key)
+    assert curve.temperature_error is not None
+    label = f"soft spheres, N = {size}, {3 * REPLICAS} replicas, 80 steps a contact"
+    return Scene(
+        gas, times, np.asarray(curve.temperature), np.asarray(curve.temperature_error), label
+    )
+
+
+class Run(NamedTuple):
+    """A row of the table.
+
+    Attributes:
+        knob: the settings of the model, in words.
+        model: with these settings.
+        gas: that of the scene, or a softer one.
+        double: whether it is run in float64.
+    """
+
+    knob: str
+    model: jaxgran.AbstractModel
+    gas: jaxgran.Gas
+    double: bool = True
+
+
+def few_runs(gas: jaxgran.Gas) -> list[Run]:
+    few: dict[str, Any] = {"num_particles": 100, "replicas": 2}
+    return [
+        Run("rtol 1e-03", jaxgran.KineticTheory(rtol=1e-3), gas),
+        Run("rtol 1e-05, float32", jaxgran.KineticTheory(rtol=1e-5), gas, double=False),
+        *(
+            Run("N 100", model(**few), gas)
+            for model in (jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres)
+        ),
+    ]
+
+
+def all_runs(gas: jaxgran.Gas, sizes: tuple[int, ...]) -> list[Run]:
+    few: dict[str, Any] = {"replicas": REPLICAS}
+    middle, many = sizes[1], DSMC_SIZES[1]
+    dsmc, hard = jaxgran.DSMC(many, **few), jaxgran.HardSpheres(middle, **few)
+    soft = jaxgran.SoftSpheres(middle, **few)
+    runs = [
+        *(Run(f"rtol {r:.0e}", jaxgran.KineticTheory(rtol=r), gas) for r in (1e-3, 1e-6, 1e-9)),
+        Run("rtol 1e-05, float32", jaxgran.KineticTheory(rtol=1e-5), gas, double=False),
+        *(Run(f"N {n}", jaxgran.DSMC(n, **few), gas) for n in DSMC_SIZES),
+        *(Run(f"N {many}, step {s}", replace(dsmc, step=s), gas) for s in (0.1, 0.02)),
+        Run(f"N {many}, float32", dsmc, gas, double=False),
+        *(Run(f"N {n}", jaxgran.HardSpheres(n, **few), gas) for n in sizes),
+        Run(f"N {middle}, float32", hard, gas, double=False),
+        *(Run(f"N {n}, 40 steps", jaxgran.SoftSpheres(n, **few), gas) for n in sizes),
+        *(Run(f"N {middle}, {s} steps", replace(soft, steps_per_contact=s), gas) for s in STEPS),
+    ]
+    for times in SOFTER:
+        softer = gas.replace(
+            youngs_modulus=gas.value("youngs_modulus") / times,
+            dissipative_constant=gas.value("dissipative_constant") * times**0.4,
+        )
+        runs.append(Run(f"N {middle}, {times}x softer", soft, softer))
+    return [*runs, Run(f"N {middle}, 40 steps, float32", soft, gas, double=False)]
+
+
+def measure(scene: Scene, row: Run) -> dict:
+    jax.config.update("jax_enable_x64", row.double)
+    gas = row.gas
+    if not row.double:
+        gas = jax.tree.map(lambda x: x.astype(np.float32), gas)
+    curves = []
+
+    def run():
+        key = jax.random.key(KEY)
+        curve = jaxgran.cool(gas, scene.times, model=row.model, key=key, progress=False)
+        curves.append(curve)
+        return curve.temperature
+
+    compile_s, run_s = seconds(run, repeats=1)
+    T = np.asarray(curves[-1].temperature, float)
+    own = curves[-1].temperature_error
+    jax.config.update("jax_enable_x64", True)
+    miss = np.abs(T / scene.temperature - 1)
+    worst = int(np.argmax(miss))
+    noise = scene.error[worst] if own is None else np.hypot(own[worst], scene.error[worst])
+    return {
+        "model": row.model.name,
+        "knob": row.knob,
+        "float64": row.double,
+        "compile_s": compile_s,
+        "run_s": run_s,
+        "error": float(miss[worst]),
+        "standard_error": float(noise / scene.temperature[worst]),
+        "worst_at": float(scene.times[worst] / float(scene.gas.mean_free_time)),
+    }
+
+
+def table(name: str, results: dict) -> str:
+    lines = [
+        f"**{name}**, against {results['reference']}",
+        "",
+        "| model | knob | compile s | run s | largest error of T | at t/τ_c |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in results["rows"]:
+        error = f"{100 * row['error']:.2g} ± {100 * row['standard_error']:.1g} %"
+        lines.append(
+            f"| {title(row['model'])} | {row['knob']} | {row['compile_s']:.1f} | "
+            f"{row['run_s']:.3g} | {error} | {row['worst_at']:.3g} |"
+        )
+    each = (f"{title(model)} {100 * x:.2g} %" for model, x in results["estimates"].items())
+    lines += ["", f"`choose_model` estimates, for the most particles: {', '.join(each)}."]
+    return "\n".join(lines)
+
+
+def draw(found: dict, path: Path) -> None:
+    figure = Figure(figsize=(4.4 * len(found), 4.6), layout="constrained")
+    grid = figure.subplots(1, len(found), sharey=True, squeeze=False)
+    for axes, (name, results) in zip(grid[0], found.items(), strict=True):
+        panel(axes, results["rows"])
+        axes.set(title=f"{name}\n(against {results['reference'].split(', ')[0]})")
+        axes.set(xlabel="run time without compilation, s")
+    grid[0][0].set(ylabel="largest error of T(t), %")
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+def panel(axes: Axes, rows: list[dict]) -> None:
+    for name, colour in COLOURS.items():
+        mine = [row for row in rows if row["model"] == name]
+        for double, marker in ((True, "o"), (False, "x")):
+            some = [row for row in mine if row["float64"] == double]
+            axes.errorbar(
+                [row["run_s"] for row in some],
+                [100 * row["error"] for row in some],
+                [100 * row["standard_error"] for row in some],
+                fmt=marker,
+                ms=5,
+                lw=0.8,
+                color=colour,
+                label=title(name) if double else None,
+            )
+    # The Pareto front: rows for which no other is both faster and more accurate.
+    best = np.inf
+    front = []
+    for row in sorted(rows, key=lambda row: row["run_s"]):
+        if row["error"] < best:
+            best = row["error"]
+            front.append(row)
+    t, e = ([row[key] for row in front] for key in ("run_s", "error"))
+    axes.step(t, 100 * np.asarray(e), where="post", color="#8d99ae", lw=1, label="front")
+    axes.plot([], [], "x", color="#555555", label="float32")
+    axes.set(xscale="log", yscale="log")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.grid(alpha=0.25)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""The table of claims: its rows, the results of other scripts that it reads, and a test gas."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jax.numpy as jnp
+
+import jaxgran
+from experiments.support.scenes import beads
+from jaxgran.theory import closed_forms
+
+SMALL = 1e-4
+"""delta at which first-order coefficients are measured."""
+
+
+@dataclass
+class Row:
+    """One claim.
+
+    Attributes:
+        equation: its number in the paper, or "text".
+        claim: what the paper says.
+        ours: what is found here.
+        checked: the method by which it was checked.
+        verdict: "agree" or "corrected".
+        holds: whether the numbers support the verdict.
+        why: a reason or a limit.
+    """
+
+    equation: str
+    claim: str
+    ours: str
+    checked: str
+    verdict: str
+    holds: bool = True
+    why: str = ""
+
+
+@dataclass
+class Table:
+    """The rows of the table, made from the JSON files in the folder `results`."""
+
+    results: Path
+    rows: list[Row] = field(default_factory=list)
+
+    def add(self, equation, claim, ours, checked, verdict, holds=True, why="") -> None:
+        self.rows.append(Row(equation, claim, ours, checked, verdict, bool(holds), why))
+
+    def found(self, name: str) -> dict | None:
+        """The entry "found" of the results of a script, or None if there are none."""
+        whole = self.whole(name, f"{name}.json")
+        return whole["found"] if whole else None
+
+    def whole(self, folder: str, file: str) -> dict | None:
+        """All results in a file, or None if there is no such file."""
+        path = self.results / folder / file
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+    def markdown(self) -> str:
+        lines = ["| Eq. | the paper | here | checked by | verdict | why |", "|" + "---|" * 6]
+        for r in self.rows:
+            verdict = r.verdict if r.holds else "DOES NOT HOLD"
+            cells = (r.equation, r.claim, r.ours, r.checked, verdict, r.why)
+            # An unescaped "|" would end the cell.
+            lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        return "\n".join(lines) + "\n"
+
+
+def cooled(delta: float, u, **options) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
+    """Dilute viscoelastic beads of a given delta, cooled to the times u = 1 + t/tau_0."""
+    gas = beads(0.05, 1.5 * 2**0.1 * delta)
+    tau = (jnp.asarray(u) - 1) / (closed_forms.COOLING_RATE[3] * delta)
+    model = jaxgran.KineticTheory(softness=False, rtol=1e-11, **options)
+    return gas, jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
