@@ -19,7 +19,7 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.selection import Choice, choose_model
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.contact import Impact, contact_force, elastic_constant, impact
-from jaxgran.scene.elements import Rough, StokesDrag, Walls, WhiteNoise
+from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.restitution import (
@@ -30,6 +30,7 @@ from jaxgran.scene.restitution import (
     Viscoelastic,
 )
 from jaxgran.scene.restitution_table import viscoelastic_restitution
+from jaxgran.theory.steady import SteadyState, steady_state
 
 __all__ = [
     "DSMC",
@@ -39,6 +40,7 @@ __all__ = [
     "CoolingCurve",
     "Course",
     "Diagnosis",
+    "DrivenStart",
     "DropTest",
     "Fit",
     "Gas",
@@ -54,6 +56,7 @@ __all__ = [
     "Rough",
     "Run",
     "SoftSpheres",
+    "SteadyState",
     "StokesDrag",
     "Viscoelastic",
     "Walls",
@@ -73,6 +76,7 @@ __all__ = [
     "read_gas",
     "read_priors",
     "sphere_mass",
+    "steady_state",
     "viscoelastic_restitution",
     "write_curve",
 ]

@@ -36,12 +36,16 @@ class Particles(NamedTuple):
     Attributes:
         position: in [0, box_side), m, shape (replicas, N, d).
         velocity: m/s, same shape.
-        box_side: side of the periodic cube (d = 3) or square (d = 2), m.
+        box_side: side of the periodic cube (d = 3) or square (d = 2), m; of a container its side,
+            or d sides.
+        angular_velocity: of rough spheres, 1/s, shape (replicas, N, 3), in a plane (replicas, N,
+            1); None of smooth ones.
     """
 
     position: Float[Array, "replicas N d"]
     velocity: Float[Array, "replicas N d"]
-    box_side: Float[Array, ""]
+    box_side: Float[Array, "..."]
+    angular_velocity: Float[Array, "replicas N spins"] | None = None
 
 
 if TYPE_CHECKING:
@@ -73,7 +77,8 @@ class CoolingCurve(eqx.Module):
         velocity_correlation: <v(0) . v(t)>/d, m^2/s^2, of particle models.
         elastic_energy: energy of the contacts per particle, J, of soft spheres.
         dissipated_energy: energy dissipated since t = 0 per particle, J, of soft and hard spheres.
-            The sum of (d/2) m T, elastic and dissipated energy is constant.
+            The sum of (d/2) m T, (d_rot/2) m T_rot, elastic and dissipated energy is constant
+            where nothing drives the gas: what drag takes counts as dissipated.
         regularised: impacts per particle, of hard spheres, that were made elastic to prevent
             inelastic collapse.
         replicas: the curve of each replica, with arrays of shape (replicas, times).

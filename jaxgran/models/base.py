@@ -19,13 +19,12 @@ ELEMENTS = {
     "container": "walls (container)",
     "drag": "drag",
     "drive": "a drive (drive)",
+    "preparation": "a driven start (preparation)",
 }
 """Words for the elements of a scene."""
 
-TAKES = {"drive": "KineticTheory(), which takes it"}
-"""What to use for elements that not both KineticTheory and DSMC take."""
-
-TAKE_BOTH = "KineticTheory() or DSMC(N), which take it"
+TAKE_IT = "KineticTheory(), DSMC(N) or HardSpheres(N), which take it"
+"""What to use for an element that a model does not take."""
 
 
 class Omission(NamedTuple):
@@ -72,8 +71,7 @@ class AbstractModel(eqx.Module):
         for name in gas.elements:
             if name not in self.elements:
                 raise ValueError(
-                    f"{type(self).__name__} does not take {ELEMENTS[name]}: use "
-                    f"{TAKES.get(name, TAKE_BOTH)}, or "
+                    f"{type(self).__name__} does not take {ELEMENTS[name]}: use {TAKE_IT}, or "
                     f"leave {name} out of the gas"
                 )
         self.check(gas)

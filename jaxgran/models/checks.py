@@ -96,6 +96,31 @@ def check_softness(gas: Gas, factor: ArrayLike) -> None:
         )
 
 
+def longest_drag(dtype: Any) -> float:
+    """Largest gamma t up to which particle models follow drag: ``1 - gamma s`` is rounded."""
+    return float(-0.5 * np.log(np.finfo(dtype).eps))
+
+
+def beyond_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
+    """Which times are too late for particle models to follow drag.
+
+    Raises:
+        ValueError: if gas and times are known, and some are too late.
+    """
+    if gas.drag is None:
+        return jnp.zeros(times.shape, bool)
+    most = longest_drag(times.dtype)
+    beyond = gas.drag.rate * times > most
+    if is_known(beyond) and np.any(np.asarray(beyond)):
+        raise ValueError(
+            f"drag has slowed the gas by exp(-{float(gas.drag.rate * times[-1]):.3g}) at the last "
+            f"time, where particle models, which follow it in transformed time, are exact up to "
+            f"exp(-{most:.3g}): end before t = {most / float(gas.drag.rate):.4g} s, or use "
+            "KineticTheory()"
+        )
+    return beyond
+
+
 def refuse_checkpoint(model: AbstractModel, run: Run) -> None:
     """Raise ValueError for a checkpoint, where a model's run is compiled and can keep none."""
     if run.checkpoint is not None:

@@ -25,10 +25,10 @@ from jaxgran.data.run import DEFAULTS, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import Course
+from jaxgran.particles.drag import transformed
 from jaxgran.particles.driver import follow
 from jaxgran.particles.interruption import waited_for
 from jaxgran.particles.stochastic import simulation
-from jaxgran.particles.stochastic.elements import transformed
 from jaxgran.particles.stochastic.pairing import Scheme
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxgran.checks.tracing import any_traced
 from jaxgran.checks.validation import (
@@ -24,12 +24,15 @@ from jaxgran.models.course import Course
 from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles import neighbours, user_start
 from jaxgran.particles.capacity import Neighbourhood, capacities
+from jaxgran.particles.drag import transformed
 from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.hard.walls import MARGIN, HardWalls
 from jaxgran.particles.hard.windows import LEAST_IMPACTS, SPEED_MARGIN, HardDynamics
 from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.reduced_scene import ReducedDrag, ReducedDrive
 from jaxgran.scene.reduced_scene import reduced_scene as reduced
+from jaxgran.theory.averages import collision_rate
 
 WINDOW_SHARE = 0.05
 """Impacts per particle in a window."""
@@ -103,7 +106,7 @@ class HardSpheres(AbstractSpheres):
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 7.0
-    elements: ClassVar[tuple[str, ...]] = ("surface", "container")
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive", "preparation")
 
     def __check_init__(self):
         self.check_counts()
@@ -123,7 +126,7 @@ class HardSpheres(AbstractSpheres):
             self.check_box(gas)
             self._check_overlap(gas)
         if gas.container is not None:
-            check_cube(gas, gas.container, self.num_particles, self.start is not None)
+            check_container(gas, gas.container, self.num_particles, self.start is not None)
 
     def _check_overlap(self, gas: Gas) -> None:
         if self.start is None or any_traced(gas, self.start):
@@ -162,13 +165,23 @@ class HardSpheres(AbstractSpheres):
         """Settings that a plan repeats."""
         return {}
 
+    def clock(self, scene: HardScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
+        """The transformed times of drag."""
+        return times if scene.drag is None else transformed(scene.decay_rates, times)
+
+    def filled_side(self, scene: HardScene) -> Array:
+        """Of the container, where there is one."""
+        if scene.walls is None:
+            return scene.side
+        sides = scene.walls.sides
+        return jnp.prod(sides) ** (1 / len(sides))
+
     def planned(self, scene: HardScene, dimension: int, spare: float | None = None) -> Plan:
         """Static sizes: capacities as measured for phi = .001 to .4 (disks: .6), N = 125 to
         50 000."""
         d, n = dimension, self.replicas * self.num_particles
-        around = Neighbourhood.of(
-            float(scene.side), self.num_particles, self.replicas, d, self.listed_by_skin
-        )
+        filled = float(self.filled_side(scene))
+        around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
         share = max(WINDOW_SHARE, 2 * LEAST_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         reach = 2 * fastest * share / around.collision_frequency
@@ -178,27 +191,26 @@ class HardSpheres(AbstractSpheres):
         chosen = min((0.65 + 0.35 * near) * share, around.listed)
         expected = around.listed, near, chosen, 1.25 * share
         extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # in random places more are near
-        sizes = capacities(expected, around.lookahead, spare or 1.15, extra, n)
+        ahead = around.lookahead
+        if scene.walls is not None:  # a sweep goes along the first axis
+            ahead = min(ahead * max(1.0, filled / float(scene.walls.sides[0])), self.num_particles)
+        sizes = capacities(expected, ahead, spare or 1.15, extra, n)
         return Plan(self.replicas, HardPace(share), *sizes)
 
 
-def check_cube(gas: Gas, walls: Walls, num_particles: int, start: bool) -> None:
-    """Raise ValueError for a container that is no cube, or too large or small for N and phi."""
-    if np.ndim(walls.side) > 0:
-        raise ValueError(
-            "HardSpheres takes a cubic container, of one side: give one number, or use "
-            f"KineticTheory() or DSMC(N); got sides {walls.side}"
-        )
+def check_container(gas: Gas, walls: Walls, num_particles: int, start: bool) -> None:
+    """Raise ValueError for a container that is too large or small for N and phi, or a start."""
     if start:
         raise ValueError("HardSpheres takes no start in a container: leave start or container out")
     if any_traced(walls.side, gas.packing_fraction, gas.diameter):
         return
     phi = float(gas.packing_fraction)
-    share = float(gas.box_side(num_particles) / walls.side) ** gas.dimension
+    sides = jnp.broadcast_to(walls.side, (gas.dimension,))
+    share = float(gas.box_side(num_particles) ** gas.dimension / jnp.prod(sides))
     if abs(share - 1) > SAME_VOLUME:
         raise ValueError(
             f"{num_particles} spheres of packing_fraction {phi:.4g} need a container {share:.4g} "
-            f"times as large as that of side {float(walls.side):.4g} m: give packing_fraction="
+            f"times as large as that of side {np.asarray(walls.side)} m: give packing_fraction="
             f"{phi * share:.4g} or {num_particles / share:.0f} particles"
         )
 
@@ -206,16 +218,27 @@ def check_cube(gas: Gas, walls: Walls, num_particles: int, start: bool) -> None:
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:
     """A gas of hard spheres in units of its diameter, mass and first temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    side, walls, scene = gas.box_side(num_particles) / gas.diameter, None, reduced(gas)
+    side, scene = gas.box_side(num_particles) / gas.diameter, reduced(gas)
+    nu = gas.collision_frequency
+    walls = drag = drive = None
     if gas.container is not None and scene.walls is not None:
-        walls = HardWalls(gas.container.side / gas.diameter, scene.walls.law, scene.walls.beta)
-        side = walls.side + MARGIN
+        sides = jnp.broadcast_to(gas.container.side / gas.diameter, (gas.dimension,))
+        often = scene.walls.frequency / collision_rate(0.0, gas.dimension)
+        walls = HardWalls(sides, scene.walls.law, scene.walls.beta, often)
+        side = jnp.max(sides) + MARGIN
+    if gas.drag is not None:
+        drag = ReducedDrag(gas.drag.rate / nu, gas.drag.rotational_rate / nu)
+    if gas.drive is not None:
+        drive = ReducedDrive(gas.drive.strength / (nu * gas.temperature))
     return HardScene(
         side=side,
         law=gas.reduced_law,
-        collision_frequency=gas.collision_frequency * unit_time,
+        collision_frequency=nu * unit_time,
         contact_time=jnp.asarray(contact_time, gas.temperature.dtype),
         elastic=jnp.zeros((), bool),
         surface=scene.surface,
         walls=walls,
+        drag=drag,
+        drive=drive,
+        prepared=scene.prepared,
     )

@@ -21,7 +21,7 @@ from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import ROUGH, Course
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
-from jaxgran.theory import averages, closed_forms, elements, moments, rate_table
+from jaxgran.theory import averages, closed_forms, elements, moments, rate_table, steady
 from jaxgran.theory.moments import Moments
 
 TOLERANCES = validation.Domain(0.0, 0.1)
@@ -87,7 +87,7 @@ class KineticTheory(AbstractModel):
         validation.whole_number("max_steps", self.max_steps, 1, "Leave it out for 200000.")
 
     stochastic: ClassVar[bool] = False
-    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive", "preparation")
     derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs
 
     def displacement_accuracy(self, gas: Gas) -> Float[Array, ""]:
@@ -240,7 +240,11 @@ class KineticTheory(AbstractModel):
             return jnp.where(known, both, 0.0)
 
         def at_start(parameters):
-            return Moments.at_start(unravel(parameters), times)
+            scene = unravel(parameters)
+            first = Moments.at_start(scene, times)
+            if scene.prepared is None or not self.sonine:
+                return first
+            return first.at[1].set(steady.prepared_sonine(scene, times, dimension))
 
         start, start_along = jax.linearize(at_start, parameters)
         first = jnp.concatenate([start[None], jax.vmap(start_along)(directions)])

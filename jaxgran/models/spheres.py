@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from equinox import AbstractClassVar, AbstractVar
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
@@ -87,6 +87,14 @@ class AbstractSpheres(AbstractModel):
     def pace_fixed(self) -> dict[str, Any]:
         """Settings of this model that `Plan.pace` repeats, by name."""
 
+    def clock(self, scene: Any, times: Float[Array, "times"]) -> Float[Array, "times"]:
+        """The time of the run at reduced times."""
+        return times
+
+    def filled_side(self, scene: Any) -> Array:
+        """Side in diameters of a cube of the volume in which the spheres are."""
+        return scene.side
+
     def check_fit(self, names: tuple[str, ...]) -> None:
         """A given start has its own temperature and lengths, which then cannot be fitted."""
         if not self.projected:
@@ -120,10 +128,12 @@ class AbstractSpheres(AbstractModel):
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        beyond = checks.beyond_drag(gas, times)
         gas = user_start.with_constant_temperature(self.start, gas)
+        scene = self.scene(gas)
         inputs = Inputs(
-            scene=self.scene(gas),
-            times=times * jnp.sqrt(gas.temperature) / gas.diameter,
+            scene=scene,
+            times=self.clock(scene, times * jnp.sqrt(gas.temperature) / gas.diameter),
             start=user_start.reduced(self.start, gas, differentiable=not self.projected),
             key=run.key,
         )
@@ -135,12 +145,13 @@ class AbstractSpheres(AbstractModel):
             found = differentiable(outputs, lambda scene: scene.material)(inputs)
         else:
             found = outputs(inputs)
-        return self._curve(gas, times, inputs.scene.side, found)
+        return self._curve(gas, times, inputs.scene.side, found, beyond)
 
     def _outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
         """The run in reduced units: driven from the host if all numbers are known, else pure."""
         plan = self._settled_plan(inputs.scene, dimension)
-        skin = skin_adding(self.listed_by_skin, self.num_particles, inputs.scene.side, dimension)
+        side = self.filled_side(inputs.scene)
+        skin = skin_adding(self.listed_by_skin, self.num_particles, side, dimension)
         sim = Simulation(
             dynamics=self.dynamics(inputs.scene, plan),
             melt_capacity=plan.melt_capacity,
@@ -184,7 +195,12 @@ class AbstractSpheres(AbstractModel):
             ) from None
 
     def _curve(
-        self, gas: Gas, times: Float[Array, "times"], side: Array, out: Outputs
+        self,
+        gas: Gas,
+        times: Float[Array, "times"],
+        side: Array,
+        out: Outputs,
+        beyond: Bool[Array, "times"],
     ) -> CoolingCurve:
         """The curve in SI units, of records in units of diameter, mass and first temperature."""
         energy = gas.mass * gas.temperature
@@ -202,7 +218,13 @@ class AbstractSpheres(AbstractModel):
         each = {name: values.T * units[name] for name, values in out.records.items()}
         # Where it could not be checked before.
         other = user_start.is_of_other_box(self.start, gas, self.num_particles)
-        each = {name: jnp.where(other, jnp.nan, values) for name, values in each.items()}
+        wrong = other | beyond
+        each = {name: jnp.where(wrong[None], jnp.nan, values) for name, values in each.items()}
+        spin = out.spin
+        if spin is not None:
+            spin = spin.reshape(self.replicas, self.num_particles, -1)
+            spin = spin * (2 * jnp.sqrt(gas.temperature) / gas.diameter)
+        late = status.flag(status.OUT_OF_RANGE, jnp.any(beyond))
         shape = self.replicas, self.num_particles, gas.dimension
         return CoolingCurve.of_replicas(
             times,
@@ -211,8 +233,9 @@ class AbstractSpheres(AbstractModel):
                 position=out.position.reshape(shape) * gas.diameter,
                 velocity=out.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
                 box_side=side * gas.diameter if gas.container is None else gas.container.side,
+                angular_velocity=spin,
             ),
-            status=out.status | status.flag(status.OTHER_BOX, other),
+            status=out.status | status.flag(status.OTHER_BOX, other) | late,
         )
 
     def check_counts(self, **least: int) -> None:

@@ -7,6 +7,7 @@ are all known; the same run as a pure function is in `pure`.
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -247,7 +248,7 @@ def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
 
 
 def _melt(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[State, int]:
-    """The state after elastic motion, and the status."""
+    """The state after elastic motion, and what prepares it else, and the status."""
     elastic = sim.dynamics.elastic()
     settled = SETTLED / float(elastic.scene.collision_frequency)
 
@@ -258,7 +259,12 @@ def _melt(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[S
 
     end = np.asarray([sim.melt_time])
     state, _, fault = follow(state, end, advance, elastic.observe, progress=progress, label="melt")
-    return state, fault
+    steady = sim.dynamics.preparing
+    if steady is None or fault != status.OK:
+        return state, fault
+    prepare = partial(_advance, dynamics=steady, capacity=steady.capacity, engine=engine)
+    state, end = steady.with_kicks(state, sim.key), np.asarray([sim.prepared_time])
+    return follow(state, end, prepare, steady.observe, progress=progress, label="melt")[::2]
 
 
 def _advance(

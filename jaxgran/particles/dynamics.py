@@ -87,13 +87,26 @@ class AbstractDynamics(eqx.Module):
         """A state that does not depend on the material, with its tangents along directions."""
 
     @property
-    def placement(self) -> tuple[Array, float]:
-        """Side of the cube in which random centres are placed, and where in the box it begins."""
-        return self.scene.side, 0.0
+    def room(self) -> Float[Array, "d"] | None:
+        """Lengths of the box, from 1/2 on, in which centres are placed; None for the whole box."""
+        return None
 
-    def spun(self, state: State, key: PRNGKeyArray) -> State:
-        """The state at t = 0 with random spins, where spheres have some; key is that of the run."""
+    @property
+    def preparing(self) -> "AbstractDynamics | None":
+        """The same spheres in the steady state in which they begin; None if they just melt."""
+        return None
+
+    def with_kicks(self, state: State, key: PRNGKeyArray) -> State:
+        """The state after the melt with random numbers for the kicks of `preparing`."""
         return state
+
+    def drawn(self, state: State, key: PRNGKeyArray) -> State:
+        """The state at t = 0 with what else is random: spins; key is that of the run."""
+        return state
+
+    def seen(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
+        """True velocities, from those of a state's kind, and spins, where spheres have some."""
+        return velocity, None
 
     def check_start(self, state: State) -> Int[Array, ""]:
         """The status of positions given by a user."""

@@ -43,7 +43,12 @@ def settle(velocity: Float[Array, "particles d"], replicas: int) -> Float[Array,
 
 
 def positions(
-    key: PRNGKeyArray, side: ArrayLike, replicas: int, num_particles: int, dimension: int
+    key: PRNGKeyArray,
+    side: ArrayLike,
+    replicas: int,
+    num_particles: int,
+    dimension: int,
+    room: Float[Array, "d"] | None = None,
 ) -> Float[Array, "particles d"]:
     """Random positions of unit spheres without overlap in periodic boxes, computed on the host.
 
@@ -57,9 +62,11 @@ def positions(
         replicas: number of boxes, filled independently.
         num_particles: in each.
         dimension: 2 or 3.
+        room: lengths from 0 on along each axis within which positions must be, each at least a
+            diameter less than the side; None is the whole box.
 
     Returns:
-        Positions in [0, side), replica after replica.
+        Positions in [0, side), or in [0, room], replica after replica.
 
     Raises:
         RuntimeError: if overlaps are left after many pushes, which means that the packing is too
@@ -68,10 +75,11 @@ def positions(
     shape = (replicas * num_particles, dimension)
     uniform = jax.random.uniform(key, shape, jnp.result_type(float))
     host = _OverlapRemoval(replicas)
-    if not any_traced(uniform, side):
-        return concrete(host(uniform, side))
+    within = () if room is None else (room,)
+    if not any_traced(uniform, side, *within):
+        return concrete(host(uniform, side, *within))
     out = jax.ShapeDtypeStruct(shape, uniform.dtype)
-    return jax.pure_callback(host, out, uniform, side, vmap_method="sequential")
+    return jax.pure_callback(host, out, uniform, side, *within, vmap_method="sequential")
 
 
 class _OverlapRemoval(NamedTuple):
@@ -87,15 +95,20 @@ class _OverlapRemoval(NamedTuple):
     gap: float = 1e-3
     max_pushes: int = 20_000
 
-    def __call__(self, uniform, side):
+    def __call__(self, uniform, side, room=None):
         uniform, side = np.asarray(uniform), float(side)
-        boxes = uniform.reshape(self.replicas, -1, uniform.shape[-1]).astype(float) * side
-        x = np.concatenate([self._box(x, side) for x in boxes]).astype(uniform.dtype)
+        room = None if room is None else np.asarray(room, float)
+        boxes = uniform.reshape(self.replicas, -1, uniform.shape[-1]).astype(float)
+        boxes = boxes * (side if room is None else room)
+        x = np.concatenate([self._box(x, side, room) for x in boxes]).astype(uniform.dtype)
         return np.where(x >= uniform.dtype.type(side), uniform.dtype.type(0), x)
 
-    def _box(self, x: Float[np.ndarray, "n d"], side: float) -> Float[np.ndarray, "n d"]:
+    def _box(
+        self, x: Float[np.ndarray, "n d"], side: float, room: Float[np.ndarray, "d"] | None
+    ) -> Float[np.ndarray, "n d"]:
         cutoff, built, random = min(1.4, side / 2), None, np.random.default_rng(len(x))
-        largest_gap = _largest_gap(len(x), x.shape[1], side)
+        volume = side ** x.shape[1] if room is None else float(np.prod(room + 1))
+        largest_gap = _largest_gap(len(x), x.shape[1], volume)
         i = j = np.empty(0, int)
         for _ in range(self.max_pushes):
             moved = np.inf if built is None else np.sqrt(np.max(np.sum((x - built) ** 2, axis=1)))
@@ -117,18 +130,20 @@ class _OverlapRemoval(NamedTuple):
             for axis in range(x.shape[1]):
                 x[:, axis] += np.bincount(i[close], push[:, axis], len(x))
                 x[:, axis] -= np.bincount(j[close], push[:, axis], len(x))
+            if room is not None:
+                x = np.clip(x, 0.0, room)
         raise RuntimeError(
             f"{len(x)} spheres at this packing still overlap after {self.max_pushes} pushes; lower "
             "the packing fraction"
         )
 
 
-def _largest_gap(n: int, d: int, side: float) -> float:
+def _largest_gap(n: int, d: int, volume: float) -> float:
     """Largest gap that is added at random between pushed pairs.
 
     With equal gaps all these pairs would touch again at the same moment.
     """
-    filled = n / side**d * {2: np.pi / 4, 3: np.pi / 6}[d]
+    filled = n / volume * {2: np.pi / 4, 3: np.pi / 6}[d]
     return 0.1 * max(0.0, 1 - 1.5 * filled / PACKING_LIMIT[d])
 
 

@@ -24,6 +24,9 @@ def simulate(sim: Simulation) -> Outputs:
     if sim.melts:
         melting = dynamics.elastic().with_capacity(sim.melt_capacity)
         state, fault, _ = stretches(melting, state, sim.melt_time, engine, 0, None, fault)
+        if (preparing := dynamics.preparing) is not None:
+            state, until = preparing.with_kicks(state, sim.key), sim.prepared_time
+            state, fault, _ = stretches(preparing, state, until, engine, 0, None, fault)
     else:
         fault |= dynamics.check_start(state)
     # One stretch to t = 0 counts the energy in contacts.

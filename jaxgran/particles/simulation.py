@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from jaxgran.particles import initial, neighbours
 from jaxgran.particles.capacity import Capacity
@@ -18,6 +18,9 @@ from jaxgran.tangents.rule import Inputs, Outputs
 
 MELT_COLLISIONS = 10.0
 """Mean free times of elastic motion before t = 0."""
+
+PREPARED = 10.0
+"""Further mean free times in a steady state, where a gas begins in one."""
 
 SETTLED = 2.0
 """Mean free times of melting after which the capacity of the run suffices."""
@@ -60,6 +63,16 @@ class Simulation(NamedTuple):
         return MELT_COLLISIONS / self.dynamics.scene.collision_frequency
 
     @property
+    def prepared_time(self) -> Array:
+        """Time at the end of the preparation, which begins at that of the melt."""
+        return (MELT_COLLISIONS + PREPARED) / self.dynamics.scene.collision_frequency
+
+    @property
+    def key(self) -> PRNGKeyArray:
+        """Of the random numbers."""
+        return jax.random.key(0) if self.inputs.key is None else self.inputs.key
+
+    @property
     def drift(self) -> Array:
         """Velocity of the centre of mass of each particle's replica, in which the run is at rest.
 
@@ -74,11 +87,13 @@ class Simulation(NamedTuple):
         """The results of a run, in the frame in which the start was given."""
         drift = self.drift
         travelled = drift * self.inputs.times[-1]
+        velocity, spin = self.dynamics.seen(state, state.velocity + drift)
         return Outputs(
             neighbours.wrap(self.dynamics.scene.side, state.position + travelled),
-            state.velocity + drift,
+            velocity,
             records,
             jnp.asarray(fault, jnp.int32),
+            spin,
         )
 
     def first_state(self) -> State:
@@ -86,11 +101,11 @@ class Simulation(NamedTuple):
         if self.inputs.start is not None:
             position, velocity = self.inputs.start
             return self.dynamics.begin(position, velocity - self.drift, self.skin)
-        key = jax.random.key(0) if self.inputs.key is None else self.inputs.key
-        places, speeds = jax.random.split(key)
+        places, speeds = jax.random.split(self.key)
         size = self.dynamics.replicas, self.num_particles, self.dimension
-        side, shift = self.dynamics.placement
-        position = initial.positions(places, side, *size) + shift
+        side, room = self.dynamics.scene.side, self.dynamics.room
+        position = initial.positions(places, side, *size, room)
+        position = position if room is None else position + 0.5
         return self.dynamics.begin(position, initial.velocities(speeds, *size), self.skin)
 
     def cooling_state(self, melted: State) -> State:
@@ -101,9 +116,8 @@ class Simulation(NamedTuple):
         velocity = melted.velocity
         if self.melts:
             velocity = initial.settle(velocity, self.dynamics.replicas)
-        key = jax.random.key(0) if self.inputs.key is None else self.inputs.key
         state = self.dynamics.begin(melted.position, velocity, melted.skin)
-        state = self.dynamics.spun(state, key)
+        state = self.dynamics.drawn(state, self.key)
         if self.directions is None:
             return state
         return self.dynamics.with_tangents(state, self.directions)

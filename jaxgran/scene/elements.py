@@ -4,7 +4,6 @@ a drive.
 Each is an optional field of `Gas`; a program of a scene without it does not contain it.
 """
 
-from collections.abc import Callable
 from math import pi
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -29,15 +28,15 @@ else:
     UserWallLaw = Any
 
 
-def element(kind: type) -> Callable[[Any], Any]:
-    """The converter of an optional field of a `Gas`; it refuses what is not of the given kind."""
+def optional(kind: type) -> Any:
+    """An optional field of a `Gas`; it refuses what is not of the given kind."""
 
     def checked(value: Any) -> Any:
         if value is None or isinstance(value, kind):
             return value
         raise ValueError(f"expected a jaxgran.{kind.__name__} or None, got {value!r}")
 
-    return checked
+    return eqx.field(converter=checked, default=None, kw_only=True)
 
 
 class Rough(eqx.Module):
@@ -171,9 +170,10 @@ class WhiteNoise(eqx.Module):
     of each particle: T grows by ``dT/dt = strength``, and the velocities relax to a Maxwellian by
     ``da_2/dt = -2 a_2 strength/T``. Spins are not driven.
 
-    `jaxgran.KineticTheory` takes it. A steady state has steps of the length of the mean free time:
-    1e5 mean free times are within the default max_steps; for more use
-    ``KineticTheory(solver=diffrax.Kvaerno5())``.
+    `jaxgran.KineticTheory`, `jaxgran.DSMC` and `jaxgran.HardSpheres` take it; kicks keep the
+    momentum where there are no walls. `jaxgran.steady_state` computes where it leads. In a steady
+    state kinetic theory has steps of the length of the mean free time: 1e5 mean free times are
+    within the default max_steps; for more use ``KineticTheory(solver=diffrax.Kvaerno5())``.
 
     Args:
         strength: xi_0^2, m^2/s^3, >= 0.
@@ -193,7 +193,29 @@ class WhiteNoise(eqx.Module):
         NOT_NEGATIVE.check("strength of the drive", self.strength, advice)
 
 
-def check_walls(walls: Walls, diameter: Array, dimension: int, rough: bool) -> None:
+class DrivenStart(eqx.Module):
+    """A gas that white noise has driven into a steady state at T_0; at t = 0 it is switched off.
+
+    The velocities are then not Maxwellian: a_2 begins at that of the steady state, in which
+    ``da_2/dt = 0`` while the noise returns all that impacts, walls and drag take. Of smooth
+    spheres.
+
+    Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution.
+    """
+
+
+def check(gas: Any) -> None:
+    """Raise ValueError for elements of a gas that do not go together, or not with its spheres."""
+    if gas.preparation is not None and gas.surface is not None:
+        raise ValueError(
+            "preparation=DrivenStart() is known of smooth spheres: leave preparation or surface out "
+            "of the gas"
+        )
+    if gas.container is not None:
+        _check_walls(gas.container, gas.diameter, gas.dimension, rough=gas.surface is not None)
+
+
+def _check_walls(walls: Walls, diameter: Array, dimension: int, rough: bool) -> None:
     """Raise ValueError for walls that cannot contain the spheres of a gas."""
     if np.ndim(walls.side) > 0 and np.shape(walls.side) != (dimension,):
         raise ValueError(

@@ -17,7 +17,8 @@ from jaxgran.checks.validation import (
     whole_number,
 )
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
-from jaxgran.scene.elements import Rough, StokesDrag, Walls, WhiteNoise, check_walls, element
+from jaxgran.scene import elements
+from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise, optional
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
 from jaxgran.scene.named_floats import NamedFloats, Place
 from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw, Viscoelastic
@@ -56,6 +57,8 @@ class Gas(NamedFloats):
         container: `jaxgran.Walls`; None is periodic or unbounded.
         drag: `jaxgran.StokesDrag`; None is a vacuum.
         drive: `jaxgran.WhiteNoise`, which heats the gas; None lets it cool.
+        preparation: `jaxgran.DrivenStart` of smooth spheres that were driven before t = 0; None
+            begins with Maxwellian velocities.
 
     Floats of elements are known by name as those of the gas are: those of a container with the
     prefix wall_, those of drag with drag_, those of a drive with drive_, as in
@@ -71,10 +74,11 @@ class Gas(NamedFloats):
     packing_fraction: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     temperature: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
-    surface: Rough | None = eqx.field(converter=element(Rough), default=None, kw_only=True)
-    container: Walls | None = eqx.field(converter=element(Walls), default=None, kw_only=True)
-    drag: StokesDrag | None = eqx.field(converter=element(StokesDrag), default=None, kw_only=True)
-    drive: WhiteNoise | None = eqx.field(converter=element(WhiteNoise), default=None, kw_only=True)
+    surface: Rough | None = optional(Rough)
+    container: Walls | None = optional(Walls)
+    drag: StokesDrag | None = optional(StokesDrag)
+    drive: WhiteNoise | None = optional(WhiteNoise)
+    preparation: DrivenStart | None = optional(DrivenStart)
 
     _domains: ClassVar[dict[str, Domain]] = {
         "diameter": POSITIVE,
@@ -103,10 +107,7 @@ class Gas(NamedFloats):
                 value = getattr(self, name)
                 domain.check(name, value, self._advice[name])
                 check_normal(name, value)
-        if self.container is not None:
-            check_walls(
-                self.container, self.diameter, self.dimension, rough=self.surface is not None
-            )
+        elements.check(self)
 
     @property
     def _places(self) -> dict[str, Place]:
@@ -134,7 +135,7 @@ class Gas(NamedFloats):
     @property
     def elements(self) -> tuple[str, ...]:
         """Names of the optional fields that this scene has."""
-        names = ("surface", "container", "drag", "drive")
+        names = ("surface", "container", "drag", "drive", "preparation")
         return tuple(name for name in names if getattr(self, name) is not None)
 
     def check_single(self) -> None:

@@ -66,13 +66,17 @@ class ReducedDrive(NamedTuple):
 
 
 class ReducedScene(NamedTuple):
-    """A gas in units of `Gas.impact_speed` and `Gas.path_length`; None is what it does not have."""
+    """A gas in units of `Gas.impact_speed` and `Gas.path_length`; None is what it does not have.
+
+    Of `DrivenStart` there are no numbers: () is that the gas has been prepared so.
+    """
 
     law: ReducedLaw
     surface: ReducedRough | None = None
     walls: ReducedWalls | None = None
     drag: ReducedDrag | None = None
     drive: ReducedDrive | None = None
+    prepared: tuple[()] | None = None
 
 
 def reduced_scene(gas: Gas) -> ReducedScene:
@@ -99,4 +103,5 @@ def reduced_scene(gas: Gas) -> ReducedScene:
         drag = ReducedDrag(gas.drag.rate * time, gas.drag.rotational_rate * time)
     if gas.drive is not None:
         drive = ReducedDrive(gas.drive.strength * (length / speed) / gas.temperature)
-    return ReducedScene(gas.reduced_law, surface, walls, drag, drive)
+    prepared = None if gas.preparation is None else ()
+    return ReducedScene(gas.reduced_law, surface, walls, drag, drive, prepared)

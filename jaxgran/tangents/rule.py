@@ -66,12 +66,14 @@ class Outputs(NamedTuple):
         position, velocity: of all particles at the last time.
         records: by name, each of shape (times, replicas).
         status: of the run, see `jaxgran.checks.status`.
+        spin: of all particles at the last time; None of smooth spheres.
     """
 
     position: Float[Array, "n d"]
     velocity: Float[Array, "n d"]
     records: dict[str, Array]
     status: Int[Array, ""]
+    spin: Float[Array, "n spins"] | None = None
 
 
 def differentiable(
@@ -111,12 +113,14 @@ def differentiable(
         denser, later = _changes_of_clock(inputs, change)
         moved = _moved(out.records, amounts, denser, later, out.velocity.shape[1])
         changes = amounts, denser, later
-        moved["sonine"] = unknown(out.records["sonine"].shape, *changes)
+        for name in set(_plain(out.records)) - set(moved) | {"sonine"}:
+            moved[name] = unknown(out.records[name].shape, *changes)
         return out._replace(records=_plain(out.records)), Outputs(
             position=unknown(out.position.shape, *changes),
             velocity=unknown(out.velocity.shape, *changes),
             records=moved,
             status=np.zeros(out.status.shape, jax.dtypes.float0),  # type: ignore[arg-type]
+            spin=None if out.spin is None else unknown(out.spin.shape, *changes),
         )
 
     return outputs
@@ -189,7 +193,8 @@ def _moved(
     """The tangents of the records.
 
     Args:
-        records: of the run, with those that `with_tangents` adds.
+        records: of the run, with those that `with_tangents` adds; of the others the tangent is not
+            known.
         amounts: changes of the material along the directions.
         denser: relative change of the collision frequency.
         later: change of the times.
@@ -197,9 +202,13 @@ def _moved(
     """
     moved = {}
     for name, x in _plain(records).items():
+        if f"{name}.rate" not in records:
+            continue
         moved[name] = records[f"{name}.rate"] * later[:, None]
         moved[name] += _DENSITY_POWER.get(name, 0.0) * denser * x
         moved[name] += jnp.einsum("tpr,p->tr", records[f"{name}.along"], amounts)
+    if "dissipated_energy" not in moved:
+        return moved
     # The energy balance holds in the tangents, too.
     elastic = moved.get("elastic_energy", 0.0)
     moved["dissipated_energy"] = -0.5 * dimension * moved["temperature"] - elastic

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -125,35 +124,15 @@ def test_viscoelastic_walls_bounce_by_their_own_law():
     assert 0.05 < float(curve.temperature[-1] / gas.temperature) < 0.7
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"packing_fraction": 0.03}, "200 spheres of packing_fraction 0.03 need a container"),
-        ({"sides": [SIDE] * 3}, "HardSpheres takes a cubic container"),
-    ],
-)
-def test_containers_that_do_not_fit_are_refused(change, message):
-    gas = contained(200)
-    if "sides" in change:
-        walls = jaxgran.Walls(change["sides"], restitution=1.0)
-        gas = dataclasses.replace(gas, container=walls)
-    else:
-        gas = gas.replace(**change)
-    with pytest.raises(ValueError, match=message):
+def test_containers_that_do_not_fit_are_refused():
+    gas = contained(200).replace(packing_fraction=0.03)
+    with pytest.raises(ValueError, match="200 spheres of packing_fraction 0.03 need a container"):
         jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(200))
 
 
-def test_derivatives_and_starts_between_walls_are_refused():
+def test_starts_between_walls_are_refused():
     gas = contained(50)
-    model = jaxgran.HardSpheres(50)
-    curve = jaxgran.cool(gas, [1e-3], model=model)
+    curve = jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(50))
     with pytest.raises(ValueError, match="takes no start in a container"):
         again = jaxgran.HardSpheres(50, start=curve.particles)
         jaxgran.cool(gas, [1e-3], model=again)
-    sized = model.sized_for(gas)
-
-    def temperature(eps):
-        return jaxgran.cool(gas.replace(wall_coefficient=eps), [1e-3], model=sized).temperature
-
-    with pytest.raises(ValueError, match="rough spheres or walls are not known"):
-        jax.jvp(temperature, (0.9,), (1.0,))

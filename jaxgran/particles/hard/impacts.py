@@ -5,18 +5,20 @@ Units here: the diameter, the mass and the first temperature are 1. Times and po
 extrapolated back to the start of the window.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from jaxgran.particles.hard import effects
 from jaxgran.particles.hard.candidates import Selection
+from jaxgran.particles.hard.effects import Effect, Impact
 from jaxgran.particles.hard.prediction import FirstImpacts, Rows, Slots, first_impacts
 from jaxgran.particles.hard.scene import HardScene
-from jaxgran.particles.hard.walls import HardWalls, bounced
-from jaxgran.particles.spins import rub
-from jaxgran.scene.reduced_scene import ReducedRough
+from jaxgran.particles.hard.tangents import HardTangents
+from jaxgran.particles.hard.walls import HardWalls
 from jaxgran.tangents.impact import ImpactTangents
 
 MAX_ROUNDS = 100_000
@@ -28,7 +30,8 @@ class ImpactWork(NamedTuple):
 
     Attributes:
         slots: the particles.
-        dissipated: energy lost, half of it counted for each of two spheres.
+        dissipated: translational energy lost, half of it counted for each of two spheres.
+        turned: gain of the energy of the spins that are kept; None of smooth spheres.
         impacts: number of impacts of each particle.
         bounces: number of impacts on walls of each particle; None without walls.
         regularised: number of impacts that were elastic because they followed too soon.
@@ -37,11 +40,14 @@ class ImpactWork(NamedTuple):
         fastest: largest squared speed of each particle.
         pending: whether the last round executed an impact.
         num_rounds: number of rounds.
-        gains: of energy along directions in the law, see `ImpactTangents`; without these, no rows.
+        gains: of energy in impacts of pairs along directions in the material, see
+            `ImpactTangents` and `HardTangents`; without tangents, no rows.
+        wall_gains: in impacts on walls.
     """
 
     slots: Slots
     dissipated: Float[Array, "slots"]
+    turned: Float[Array, "slots"] | None
     impacts: Int[Array, "slots"]
     bounces: Int[Array, "slots"] | None
     regularised: Int[Array, "slots"]
@@ -49,7 +55,8 @@ class ImpactWork(NamedTuple):
     fastest: Float[Array, "slots"]
     pending: Bool[Array, ""]
     num_rounds: Int[Array, ""]
-    gains: Float[Array, "changes rows"]
+    gains: Float[Array, "changes *energies rows"]
+    wall_gains: Float[Array, "wallchanges 2 slots"]
 
 
 def resolve(
@@ -57,9 +64,10 @@ def resolve(
     listed: Float[Array, "slots d"],
     chosen: Selection,
     scene: HardScene,
+    began: Float[Array, ""],
     duration: ArrayLike,
     shortest: Float[Array, "replicas"],
-    along: ImpactTangents | None,
+    along: ImpactTangents | HardTangents | None,
 ) -> ImpactWork:
     """Execute all impacts of a window, in rounds of independent impacts.
 
@@ -71,33 +79,75 @@ def resolve(
         listed: the places for which the neighbour list was built.
         chosen: the selection.
         scene: the gas.
+        began: time at which the window begins.
         duration: of the window.
         shortest: time after a sphere's last impact within which its next one is elastic.
         along: the tangents, if they are followed, for the gains of energy along their directions.
     """
-    num_rows, num_slots = len(chosen.rows.a), len(slots.v)
     shortest = shortest[jnp.minimum(chosen.replica, len(shortest) - 1)]
 
     def one_round(work: ImpactWork) -> ImpactWork:
         impacts, safe, row = _executable(work.slots, chosen.rows, duration, scene.walls)
-        effect = _effect(impacts, safe, work.slots, chosen.rows, shortest, scene, along)
-        new = _executed(work, effect, safe, row, chosen.rows, listed)
+        s, soon, met = _met(impacts, safe, work.slots, chosen.rows, shortest, scene, began)
+        effect = effects.of_pairs(scene, met)
+        new = _executed(work, effect, s, soon, safe, row, chosen.rows, listed)
+        new = new._replace(gains=work.gains + _gains(along, scene, met, safe, soon))
         if impacts.bounces is None or scene.walls is None:
             return new
         alone = row == len(chosen.rows.a)
-        return _bounced(work, new, impacts, alone, listed, shortest, scene)
+        return _bounced(work, new, impacts, alone, listed, shortest, scene, began, along)
 
     def unfinished(work: ImpactWork):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
+    first = _before(slots, scene, along, len(chosen.rows.a))
+    return jax.lax.while_loop(unfinished, one_round, first)
+
+
+def _before(
+    slots: Slots, scene: HardScene, along: ImpactTangents | HardTangents | None, num_rows: int
+) -> ImpactWork:
+    """Before the first round."""
+    num_slots = len(slots.v)
     count, zeros = jnp.zeros(num_slots, jnp.int32), jnp.zeros(num_slots, slots.x.dtype)
-    size = (0, 0) if along is None else (len(along.log_temperature) + 1, num_rows)
-    gains = jnp.zeros(size, zeros.dtype)
-    bounces = None if scene.walls is None else count
-    work = ImpactWork(
-        slots, zeros, count, bounces, count, zeros, zeros, jnp.array(True), jnp.int32(0), gains
+    size, on_walls = (0, num_rows), (0, 2, num_slots)
+    if isinstance(along, ImpactTangents):
+        size = len(along.log_temperature) + 1, num_rows
+    elif along is not None:
+        size = along.num_changes, 2, num_rows
+        on_walls = (0 if scene.walls is None else along.num_changes), 2, num_slots
+    return ImpactWork(
+        slots=slots,
+        dissipated=zeros,
+        turned=None if slots.spin is None else zeros,
+        impacts=count,
+        bounces=None if scene.walls is None else count,
+        regularised=count,
+        moved=zeros,
+        fastest=zeros,
+        pending=jnp.array(True),
+        num_rounds=jnp.int32(0),
+        gains=jnp.zeros(size, zeros.dtype),
+        wall_gains=jnp.zeros(on_walls, zeros.dtype),
     )
-    return jax.lax.while_loop(unfinished, one_round, work)
+
+
+def _gains(
+    along: ImpactTangents | HardTangents | None,
+    scene: HardScene,
+    met: Impact,
+    safe: Bool[Array, "rows"],
+    soon: Bool[Array, "rows"],
+) -> Float[Array, "changes *energies rows"]:
+    """The gains of energy along directions in the material, in the impacts marked as safe."""
+    if along is None:
+        return jnp.zeros((0, len(safe)), met.speed.dtype)
+    if isinstance(along, HardTangents):
+        # By each of two spheres half of it is lost.
+        return 2 * along.gains(scene, met, safe, effects.of_pairs)
+    # The law's unit of speed is sqrt(2).
+    gained = 2 * along.gains(scene.law, met.speed * 0.5**0.5)
+    return jnp.where((safe & ~soon & ~scene.elastic)[None], gained, 0.0)
 
 
 def _executable(
@@ -119,68 +169,31 @@ def _executable(
     return impacts, safe & (row[a] == index) & (row[b] == index), row
 
 
-class _Effect(NamedTuple):
-    """What impacts do; in other rows the values have no meaning."""
-
-    s: Float[Array, "rows"]  # time
-    kick: Float[Array, "rows d"]  # change of velocity of a; that of b is opposite
-    lost: Float[Array, "rows"]  # energy, half of it
-    soon: Bool[Array, "rows"]  # elastic, as too little time has passed
-    gains: Float[Array, "changes rows"]
-    twist: Float[Array, "rows spins"] | None = None  # change of the spins of both spheres
-
-
-def _effect(
+def _met(
     impacts: FirstImpacts,
     safe: Bool[Array, "rows"],
     slots: Slots,
     rows: Rows,
     shortest: Float[Array, "slots"],
     scene: HardScene,
-    along: ImpactTangents | None,
-) -> _Effect:
-    """The effect of the impacts marked as safe, by the law of restitution."""
+    began: Float[Array, ""],
+) -> tuple[Float[Array, "rows"], Bool[Array, "rows"], Impact]:
+    """The impacts of pairs marked as safe: their times, whether they come too soon, and they."""
     s = jnp.where(safe, impacts.times, 0.0)
     r = impacts.r + impacts.w * s[:, None]
     normal = r / jnp.where(safe, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
     speed = jnp.where(safe, -jnp.sum(impacts.w * normal, -1), 1.0)
     soon = s - jnp.maximum(slots.last[rows.a], slots.last[rows.b]) < shortest[rows.a]
-    eps = scene.law.restitution(speed * 0.5**0.5)
-    eps = jnp.where(soon | scene.elastic, 1.0, eps)
-    kick = (0.5 * (1 + eps) * speed)[:, None] * normal
-    lost = 0.125 * (1 - eps * eps) * speed**2
-    gains = jnp.zeros((0, 0), speed.dtype)
-    if along is not None:
-        # The law's unit of speed is sqrt(2).
-        gained = 2 * along.gains(scene.law, speed * 0.5**0.5)
-        gains = jnp.where((safe & ~soon & ~scene.elastic)[None], gained, 0.0)
-    effect = _Effect(s, kick, lost, soon, gains)
-    if scene.surface is None or slots.spin is None:
-        return effect
-    smooth = ~safe | soon | scene.elastic
-    spin = slots.spin[rows.a] + slots.spin[rows.b]
-    return _rubbed(effect, scene.surface, impacts.w, spin, normal, smooth)
-
-
-def _rubbed(
-    effect: _Effect,
-    surface: ReducedRough,
-    w: Float[Array, "rows d"],
-    spin: Float[Array, "rows spins"],
-    normal: Float[Array, "rows d"],
-    smooth: Bool[Array, "rows"],
-) -> _Effect:
-    """The effect with the tangential part of impacts, see `jaxgran.Rough`, where not smooth."""
-    found = rub(w, spin, -normal, ~smooth, surface.eta, surface.inertia)
-    lost = 0.125 * surface.lost_share(surface.beta) * jnp.sum(found.slip**2, -1)
-    return effect._replace(
-        kick=effect.kick + found.kick, lost=effect.lost + lost, twist=found.twist
-    )
+    spin = None if slots.spin is None else slots.spin[rows.a] + slots.spin[rows.b]
+    elastic = soon | scene.elastic | ~safe
+    return s, soon, Impact(began + s, -normal, impacts.w, speed, spin, elastic)
 
 
 def _executed(
     work: ImpactWork,
-    effect: _Effect,
+    effect: Effect,
+    time: Float[Array, "rows"],
+    soon: Bool[Array, "rows"],
     safe: Bool[Array, "rows"],
     row: Int[Array, "slots"],
     rows: Rows,
@@ -190,26 +203,27 @@ def _executed(
     slots, own = work.slots, jnp.arange(len(row), dtype=jnp.int32)
     row = jnp.minimum(row, len(rows.a) - 1)
     hit = safe[row] & ((rows.a[row] == own) | (rows.b[row] == own))
-    s = jnp.where(hit, effect.s[row], 0.0)
+    s = jnp.where(hit, time[row], 0.0)
     sign = jnp.where(hit, jnp.where(rows.a[row] == own, 1.0, -1.0), 0.0)
     kick = sign[:, None] * effect.kick[row]
     place = slots.x + slots.v * s[:, None]
     v = slots.v + kick
-    spin = slots.spin
-    if spin is not None and effect.twist is not None:
+    spin, turned = slots.spin, work.turned
+    if spin is not None and turned is not None and effect.twist is not None:
+        assert effect.turned is not None
         spin = spin + jnp.where(hit[:, None], effect.twist[row], 0.0)
+        turned = turned + jnp.where(hit, effect.turned[row], 0.0)
     away = jnp.where(hit, jnp.sum((place - listed) ** 2, -1), 0.0)
-    return ImpactWork(
+    return work._replace(
         slots=Slots(slots.x - kick * s[:, None], v, jnp.where(hit, s, slots.last), spin),
         dissipated=work.dissipated + jnp.where(hit, effect.lost[row], 0.0),
+        turned=turned,
         impacts=work.impacts + hit,
-        bounces=work.bounces,
-        regularised=work.regularised + (hit & effect.soon[row]),
+        regularised=work.regularised + (hit & soon[row]),
         moved=jnp.maximum(work.moved, away),
         fastest=jnp.maximum(work.fastest, jnp.sum(v * v, -1)),
         pending=jnp.any(safe),
         num_rounds=work.num_rounds + 1,
-        gains=work.gains + effect.gains,
     )
 
 
@@ -221,6 +235,8 @@ def _bounced(
     listed: Float[Array, "slots d"],
     shortest: Float[Array, "slots"],
     scene: HardScene,
+    began: Float[Array, ""],
+    along: ImpactTangents | HardTangents | None,
 ) -> ImpactWork:
     """The particles after a round, with those impacts on walls that nothing can come before.
 
@@ -228,27 +244,55 @@ def _bounced(
         old, new: before the round, and after its impacts of pairs.
         impacts: the next ones, before the round.
         alone: who takes part in no impact of a pair.
-        listed, shortest, scene: as for `resolve`.
+        listed, shortest, scene, began, along: as for `resolve`.
     """
-    assert impacts.bounces is not None and scene.walls is not None and new.bounces is not None
+    assert impacts.bounces is not None and new.bounces is not None
     slots, (times, axis) = old.slots, impacts.bounces
     hit = alone & jnp.isfinite(times) & (times == impacts.first) & (times == impacts.final)
     s = jnp.where(hit, times, 0.0)
     soon = s - slots.last < shortest
-    after = bounced(scene.walls, scene.surface, slots.v, slots.spin, axis, soon | scene.elastic)
+    across = axis[:, None] == jnp.arange(slots.v.shape[1])[None]
+    outwards = jnp.where(across, jnp.sign(slots.v), 0.0)
+    speed = jnp.where(hit, jnp.sum(slots.v * outwards, axis=1), 1.0)
+    met = Impact(began + s, outwards, slots.v, speed, slots.spin, soon | scene.elastic | ~hit)
+    effect = effects.of_walls(scene, met, axis)
+    kick = jnp.where(hit[:, None], effect.kick, 0.0)
     place = slots.x + slots.v * s[:, None]
-    v = jnp.where(hit[:, None], after.v, new.slots.v)
+    v = jnp.where(hit[:, None], slots.v + kick, new.slots.v)
     x = jnp.where(hit[:, None], place - v * s[:, None], new.slots.x)
-    spin = new.slots.spin
-    if spin is not None and after.spin is not None:
-        spin = jnp.where(hit[:, None], after.spin, spin)
+    spin, turned = new.slots.spin, new.turned
+    if spin is not None and turned is not None and effect.twist is not None:
+        assert effect.turned is not None
+        spin = spin + jnp.where(hit[:, None], effect.twist, 0.0)
+        turned = turned + jnp.where(hit, effect.turned, 0.0)
+    gains = new.wall_gains
+    if isinstance(along, HardTangents):
+        gains = gains + along.gains(scene, met, hit, partial(_as_often, scene.walls, axis=axis))
     away = jnp.where(hit, jnp.sum((place - listed) ** 2, -1), 0.0)
     return new._replace(
         slots=Slots(x, v, jnp.where(hit, s, new.slots.last), spin),
-        dissipated=new.dissipated + jnp.where(hit, after.lost, 0.0),
+        dissipated=new.dissipated + jnp.where(hit, effect.lost, 0.0),
+        turned=turned,
         bounces=new.bounces + hit,
         regularised=new.regularised + 2 * (hit & soon),  # an impact of two spheres counts twice
         moved=jnp.maximum(new.moved, away),
         fastest=jnp.maximum(new.fastest, jnp.sum(v * v, -1)),
         pending=new.pending | jnp.any(hit),
+        wall_gains=gains,
     )
+
+
+def _as_often(walls: HardWalls, scene: HardScene, impact: Impact, axis: Array) -> Effect:
+    """The effect of impacts on walls, of which there are more where walls are nearer.
+
+    Where they are, a derivative does not see; it knows the frequency of impacts on them.
+
+    Args:
+        walls: those of the run.
+        scene, impact, axis: as for `of_walls`, with the walls of a derivative.
+    """
+    assert scene.walls is not None
+    effect = effects.of_walls(scene, impact, axis)
+    share = (scene.walls.frequency / walls.frequency)[axis]
+    turned = None if effect.turned is None else effect.turned * share
+    return effect._replace(lost=effect.lost * share, turned=turned)

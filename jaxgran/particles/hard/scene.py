@@ -1,12 +1,29 @@
 """A gas of hard spheres in reduced units."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.particles.hard.walls import HardWalls
-from jaxgran.scene.reduced_scene import ReducedRough
+from jaxgran.scene.reduced_scene import ReducedDrag, ReducedDrive, ReducedRough
 from jaxgran.scene.restitution import ReducedLaw
+
+
+class Material(NamedTuple):
+    """The numbers of a scene with elements that derivatives are followed in.
+
+    Attributes:
+        law, surface, drag, drive: as in `HardScene`.
+        wall_law, wall_beta, wall_frequency: of `HardWalls`.
+    """
+
+    law: ReducedLaw
+    surface: ReducedRough | None
+    drag: ReducedDrag | None
+    drive: ReducedDrive | None
+    wall_law: ReducedLaw | None
+    wall_beta: Float[Array, "..."] | None
+    wall_frequency: Float[Array, "..."] | None
 
 
 class HardScene(NamedTuple):
@@ -21,6 +38,10 @@ class HardScene(NamedTuple):
         elastic: whether all impacts are, and smooth.
         surface: of rough spheres; else None.
         walls: of a container; None where the box is periodic.
+        drag: rates over the collision frequency; None in a vacuum. Time and velocities are then
+            transformed, see `jaxgran.particles.drag`.
+        drive: growth of T over the collision frequency by white noise; None where there is none.
+        prepared: () where the gas begins in the steady state of such a drive; else None.
     """
 
     side: Float[Array, ""]
@@ -30,8 +51,52 @@ class HardScene(NamedTuple):
     elastic: Bool[Array, ""]
     surface: ReducedRough | None = None
     walls: HardWalls | None = None
+    drag: ReducedDrag | None = None
+    drive: ReducedDrive | None = None
+    prepared: tuple[()] | None = None
 
     @property
-    def material(self) -> ReducedLaw:
-        """The numbers that derivatives are followed in: those of the law."""
-        return self.law
+    def has_elements(self) -> bool:
+        """Whether there is more than smooth spheres in free flight."""
+        return any(x is not None for x in (self.surface, self.walls, self.drag, self.drive))
+
+    @property
+    def material(self) -> ReducedLaw | Material:
+        """The numbers that derivatives are followed in: those of the law, and of elements.
+
+        All are per collision, so that a denser gas does the same sooner.
+        """
+        if not self.has_elements:
+            return self.law
+        walls = (None,) * 3
+        if self.walls is not None:
+            walls = self.walls.law, self.walls.beta, self.walls.frequency
+        return Material(self.law, self.surface, self.drag, self.drive, *walls)
+
+    def with_material(self, material: Material) -> "HardScene":
+        """The same scene with other numbers of its material."""
+        walls = self.walls
+        if walls is not None:
+            law: Any = material.wall_law
+            frequency: Any = material.wall_frequency
+            walls = walls._replace(law=law, beta=material.wall_beta, frequency=frequency)
+        return self._replace(
+            law=material.law,
+            surface=material.surface,
+            walls=walls,
+            drag=material.drag,
+            drive=material.drive,
+        )
+
+    def by_impacts(self, elastic: bool) -> "HardScene":
+        """The scene of a melt, without drag and drive; with elastic and smooth impacts or not."""
+        drag = None if self.drag is None else ReducedDrag(*(0 * x for x in self.drag))
+        drive = None if self.drive is None else ReducedDrive(0 * self.drive.strength)
+        return self._replace(elastic=self.elastic | elastic, drag=drag, drive=drive)
+
+    @property
+    def decay_rates(self) -> ReducedDrag:
+        """The drag in the units of the scene's time."""
+        assert self.drag is not None
+        rate, nu = self.drag, self.collision_frequency
+        return ReducedDrag(rate.rate * nu, rate.rotational_rate * nu)

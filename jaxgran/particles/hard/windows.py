@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from jaxgran.checks import status
-from jaxgran.particles import neighbours, spins, user_start
+from jaxgran.particles import neighbours, user_start
 from jaxgran.particles.capacity import Capacity
+from jaxgran.particles.drag import decay
 from jaxgran.particles.dynamics import (
     AbstractDynamics,
     Progress,
@@ -19,17 +20,18 @@ from jaxgran.particles.dynamics import (
     repeat_until,
 )
 from jaxgran.particles.hard.candidates import Selection, select_reachable
+from jaxgran.particles.hard.drive import counted, driven, first_draw, restored, shortened
+from jaxgran.particles.hard.following import exchanged_after, projected_after
 from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, resolve
-from jaxgran.particles.hard.observation import cooling_trend, observe
+from jaxgran.particles.hard.observation import observe
 from jaxgran.particles.hard.own_state import HardProgress, HardState
 from jaxgran.particles.hard.prediction import Slots
-from jaxgran.particles.hard.scene import HardScene
+from jaxgran.particles.hard.scene import HardScene, Material
+from jaxgran.particles.hard.tangents import HardTangents
 from jaxgran.particles.neighbours import Pairs
 from jaxgran.particles.state import State, fastest, later, temperature, time_left
-from jaxgran.scene.elements import SPINS
 from jaxgran.scene.restitution import ReducedLaw
 from jaxgran.tangents.impact import ImpactTangents
-from jaxgran.tangents.thermal import remembered
 
 LEAST_IMPACTS = 8
 """Impacts that a window should have at least, in all replicas together."""
@@ -56,6 +58,7 @@ class HardDynamics(AbstractDynamics):
         share: impacts per particle in a window.
         overlap: overlap up to which positions given by a user are those of hard spheres.
         max_windows: with one neighbour list, for tests.
+        restores: kicks return the energy that impacts take, and T stays 1.
     """
 
     scene: HardScene
@@ -64,12 +67,13 @@ class HardDynamics(AbstractDynamics):
     share: float = eqx.field(static=True)
     overlap: float = eqx.field(static=True, default=1e-9)
     max_windows: int = eqx.field(static=True, default=1_000_000)
+    restores: bool = eqx.field(static=True, default=False)
 
     def own_state(self, num_rows, dtype) -> HardState:
         # Short at first: in random places many spheres are near contact.
         rate = self.scene.collision_frequency
         if self.scene.walls is not None:
-            rate = rate + 2 / (self.scene.walls.side - 1)
+            rate = rate + 2 / jnp.min(self.scene.walls.sides - 1)
         window = self.share / (8 * rate)
         return HardState(
             age=jnp.full(num_rows, jnp.inf, dtype),
@@ -78,32 +82,40 @@ class HardDynamics(AbstractDynamics):
         )
 
     def elastic(self) -> "HardDynamics":
-        lossless = self.scene._replace(elastic=jnp.ones((), bool))
-        return dataclasses.replace(self, scene=lossless)
+        return dataclasses.replace(self, scene=self.scene.by_impacts(elastic=True))
 
     @property
-    def placement(self) -> tuple[Array, float]:
+    def preparing(self) -> "HardDynamics | None":
+        if self.scene.prepared is None:
+            return None
+        scene = self.scene.by_impacts(elastic=False)
+        return dataclasses.replace(self, scene=scene, restores=True)
+
+    def with_kicks(self, state: State, key: PRNGKeyArray) -> State:
+        return state._replace(own=state.own._replace(key=counted(jax.random.fold_in(key, 4))))
+
+    @property
+    def room(self) -> Array | None:
         walls = self.scene.walls
-        return (self.scene.side, 0.0) if walls is None else (walls.side - 1, 0.5)
+        return None if walls is None else walls.sides - 1
 
-    def spun(self, state: State, key: PRNGKeyArray) -> State:
-        surface = self.scene.surface
-        if surface is None:
-            return state
-        n, d = state.velocity.shape
-        key = jax.random.fold_in(key, 2)  # 0 and 1 are of positions and velocities
-        shape = self.replicas, n // self.replicas, SPINS[d]
-        mean_square = (surface.ratio / surface.inertia).astype(state.velocity.dtype)
-        spin = spins.at_start(key, shape, mean_square).reshape(n, SPINS[d])
-        return state._replace(own=state.own._replace(spin=spin))
+    def drawn(self, state: State, key: PRNGKeyArray) -> State:
+        return first_draw(state, self.scene, self.replicas, key)
 
-    def with_tangents(self, state: State, directions: ReducedLaw) -> State:
-        if self.scene.surface is not None or self.scene.walls is not None:
-            raise ValueError(
-                "derivatives of HardSpheres runs with rough spheres or walls are not known: use "
-                "KineticTheory(), or differences of runs"
-            )
-        along = ImpactTangents.at_start(directions, self.replicas, state.velocity.dtype)
+    def seen(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
+        spin, drag = state.own.spin, self.scene.drag
+        if drag is None:
+            return velocity, spin
+        left = decay(self.scene.decay_rates, state.time + state.time_rest)
+        return velocity * left.velocity, None if spin is None else spin * left.kept
+
+    def with_tangents(self, state: State, directions: ReducedLaw | Material) -> State:
+        velocity = state.velocity
+        if isinstance(directions, Material):
+            n, d = len(velocity) // self.replicas, velocity.shape[1]
+            along = HardTangents.at_start(self.scene, directions, self.replicas, n, d)
+        else:
+            along = ImpactTangents.at_start(directions, self.replicas, velocity.dtype)
         return state._replace(tangents=along)
 
     def observe(self, state: State) -> dict[str, Array]:
@@ -132,17 +144,23 @@ class HardDynamics(AbstractDynamics):
     def _window(self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike) -> Progress:
         """One window, accepted if no sphere became faster than the bound and nothing went wrong."""
         old, more = now.state, now.own
-        left = time_left(old, end)
-        num_left = jnp.maximum(jnp.ceil(left / old.own.window * (1 - 1e-9)), 1.0)
+        left, scene = time_left(old, end), self.scene
+        window = shortened(old, scene, self.replicas)
+        num_left = jnp.maximum(jnp.ceil(left / window * (1 - 1e-9)), 1.0)
         duration = left / num_left
-        bound = SPEED_MARGIN * more.widen * fastest(old.velocity, self.replicas)
+        began = driven(old, scene, self.replicas, duration, 0.0)
+        bound = SPEED_MARGIN * more.widen * fastest(began.velocity, self.replicas)
         chosen = select_reachable(
-            old.position, old.velocity, pairs, duration, bound, self.capacity, self.scene.walls
+            old.position, began.velocity, pairs, duration, bound, self.capacity, scene.walls
         )
-        work = self._resolved(old, listed, chosen, duration)
+        work = self._resolved(began, listed, chosen, duration)
         most = bound[jnp.minimum(chosen.replica, self.replicas - 1)]
         too_fast = jnp.any(work.fastest > most**2)
-        new = self._moved(old, chosen, work, duration)
+        new = self._moved(began, chosen, work, duration)
+        if self.restores:
+            new = restored(new, scene, self.replicas, new.dissipated - old.dissipated)
+        else:
+            new = driven(new, scene, self.replicas, duration, 1.0)
         new = later(new, duration, end, num_left <= 1)
 
         full = self.capacity.exceeded_by(chosen.needed)
@@ -192,7 +210,8 @@ class HardDynamics(AbstractDynamics):
             -of_members(own.age),
             None if own.spin is None else of_members(own.spin),
         )
-        return resolve(slots, of_members(listed), chosen, scene, duration, shortest, state.tangents)
+        began, along = state.time + state.time_rest, state.tangents
+        return resolve(slots, of_members(listed), chosen, scene, began, duration, shortest, along)
 
     def _moved(self, state: State, chosen: Selection, work: ImpactWork, duration: Array) -> State:
         """The state after a window, but for its time, and the length of the next one."""
@@ -227,42 +246,17 @@ class HardDynamics(AbstractDynamics):
                 regularised=regularised,
                 window=jnp.where(full_length, duration * ratio, own.window),
                 spin=None if own.spin is None else to_members(own.spin, slots.spin),
+                turned=None if work.turned is None else own.turned + by_replica(work.turned),
+                key=own.key,
             ),
         )
-        if state.tangents is None:
+        if isinstance(state.tangents, HardTangents):
+            along = exchanged_after(state, self.scene, chosen, work, duration)
+        elif state.tangents is not None:
+            along = projected_after(new, self.scene, chosen, work, duration)
+        else:
             return new
-        return new._replace(tangents=self._followed(new, chosen, work, lost, impacts, duration))
-
-    def _followed(
-        self,
-        new: State,
-        chosen: Selection,
-        work: ImpactWork,
-        lost: Array,
-        impacts: Array,
-        duration: Array,
-    ) -> ImpactTangents:
-        """The tangents after a window."""
-        along, d = new.tangents, new.velocity.shape[1]
-        num_particles = len(new.velocity) // self.replicas
-        heat = temperature(new.velocity, self.replicas)
-        energy = 0.5 * d * num_particles * heat
-        replica = chosen.replica[chosen.rows.a]
-        trend = cooling_trend(self.scene.law, heat, d)
-        gains = jnp.zeros((len(work.gains), self.replicas), energy.dtype)
-        rates = remembered(
-            along.rates,
-            lost=lost,
-            met=2 / num_particles * impacts,
-            energy=energy,
-            temperature=heat,
-            trend=trend,
-            duration=duration,
-            collision_frequency=self.scene.collision_frequency,
-        )
-        gains = gains.at[:, replica].add(work.gains, mode="drop")
-        mean_energy = energy + 0.5 * lost
-        return along.after(gains, mean_energy, heat, duration, rates, trend, d)
+        return new._replace(tangents=along)
 
     def mend(self, now: Progress, began: State) -> tuple[State, Int[Array, ""]]:
         """Where a new list was outrun the window is shortened; where it is crowded, the skin."""
@@ -290,7 +284,8 @@ def _prepared(dynamics: HardDynamics, state: State, end: ArrayLike) -> tuple[Sta
     left = time_left(state, end)
     flown = 0.5 * jnp.minimum(life, left) * state.velocity
     if dynamics.scene.walls is not None:
-        flown = jnp.clip(state.position + flown, 0.5, side - 1.5) - state.position
+        most = dynamics.scene.walls.sides[None] - 0.5
+        flown = jnp.clip(state.position + flown, 0.5, most) - state.position
     listed = neighbours.wrap(side, state.position + flown)
     image = jnp.round((state.position + flown - listed) / side).astype(jnp.int32)
     began = state._replace(position=listed - flown, image=state.image + image)

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
+from jaxgran.particles.drag import decay
 from jaxgran.particles.stochastic.collision_rule import Outcome, collide
-from jaxgran.particles.stochastic.elements import decay, hit_walls
+from jaxgran.particles.stochastic.elements import hit_walls
 from jaxgran.particles.stochastic.pairing import CEILING, Scheme, draw
 from jaxgran.particles.stochastic.tangents import DSMCTangents, carried
 from jaxgran.scene.reduced_scene import ReducedScene
@@ -30,7 +31,7 @@ class DSMCState(NamedTuple):
         clock_rest: what rounding has left out of `clock`, a compensated sum.
         temperature: T/T_0, updated by the losses and recomputed every `RECOUNTED` steps.
         particles: the 2 d components of v and of x - v t, which only collisions change, and the
-            spins of rough spheres. With drag they are transformed: see `elements`.
+            spins of rough spheres. With drag they are transformed: see `jaxgran.particles.drag`.
         collisions: number of pairs that collided.
         missed: number of collisions missed because of the `CEILING`.
         steps: number of steps.

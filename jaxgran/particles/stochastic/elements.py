@@ -1,48 +1,17 @@
-"""Drag, rough spheres and walls in DSMC.
+"""Walls in DSMC.
 
-Spins are ``s = (sigma/2) w``, a velocity. Where there is drag, velocities u are those over their
-decay: they change in collisions only, and so do the spins that are kept. Time is then the length
-``ds`` of ``dx = u ds``.
+Spins are ``s = (sigma/2) w``, a velocity. Where there is drag, velocities, spins and time are
+transformed: see `jaxgran.particles.drag`.
 """
 
 from math import pi, sqrt
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxgran.particles.spins import rub
-from jaxgran.scene.reduced_scene import ReducedDrag, ReducedRough, ReducedWalls
-
-
-class Decay(NamedTuple):
-    """What drag has left at a time.
-
-    Attributes:
-        velocity: v over u, ``exp(-gamma t)``.
-        spin: spins in the units of u over those that are kept.
-        kept: spins over those that are kept.
-    """
-
-    velocity: Float[Array, "..."]
-    spin: Float[Array, "..."]
-    kept: Float[Array, "..."]
-
-
-def decay(drag: ReducedDrag, time: Float[Array, "..."]) -> Decay:
-    """What drag has left at a transformed time, ``s = (1 - exp(-gamma t))/gamma``."""
-    velocity = 1 - drag.rate * time
-    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
-    passed = jnp.where(drag.rate > 0, -jnp.log1p(-drag.rate * time) / safe, time)
-    kept = jnp.exp(-drag.rotational_rate * passed)
-    return Decay(velocity, kept / velocity, kept)
-
-
-def transformed(drag: ReducedDrag, times: Float[Array, "times"]) -> Float[Array, "times"]:
-    """The transformed times of times."""
-    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
-    return jnp.where(drag.rate > 0, -jnp.expm1(-drag.rate * times) / safe, times)
+from jaxgran.scene.reduced_scene import ReducedRough, ReducedWalls
 
 
 def hit_walls(

@@ -16,8 +16,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, UInt32
 
 from jaxgran.checks import status
-from jaxgran.particles import initial, observables, spins
-from jaxgran.particles.stochastic import collisions, elements
+from jaxgran.particles import drag, initial, observables, spins
+from jaxgran.particles.stochastic import collisions
 from jaxgran.particles.stochastic.collisions import DSMCState
 from jaxgran.particles.stochastic.pairing import Scheme
 from jaxgran.particles.stochastic.tangents import DSMCTangents
@@ -114,7 +114,7 @@ def observe(
         spin = jnp.mean(state.particles[..., 2 * d :] ** 2, axis=(1, 2))
         values["rotational_temperature"] = 2 * scene.surface.inertia * spin
     if scene.drag is not None:
-        left = elements.decay(scene.drag, state.time)
+        left = drag.decay(scene.drag, state.time)
         powers = {"temperature": left.velocity**2, "velocity_correlation": left.velocity}
         powers["rotational_temperature"] = left.kept**2
         values |= {name: powers[name] * values[name] for name in powers.keys() & values.keys()}
