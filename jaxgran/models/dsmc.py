@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Bool, Float, UInt32
 
 from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
@@ -108,6 +108,7 @@ class DSMC(AbstractModel):
 
         A run fails if too many pairs meet faster than the ceiling of the collision rate.
         """
+        beyond = checks.beyond_drag(gas, times)
         key = jax.random.key(0) if run.key is None else run.key
         # Two words of any kind of key, for the kind that is used here.
         words = jax.random.bits(key, (2,), jnp.uint32)
@@ -122,7 +123,7 @@ class DSMC(AbstractModel):
             )
         else:
             records = self._driven(scene, reduced, words, scheme, run)
-        return _curve(gas, times, records)
+        return _curve(gas, times, records, beyond)
 
     def _driven(
         self,
@@ -149,9 +150,14 @@ class DSMC(AbstractModel):
         return {name: jnp.asarray(value) for name, value in records.items()}
 
 
-def _curve(gas: Gas, times: Float[Array, "times"], records: dict[str, Array]) -> CoolingCurve:
-    """The curve in SI units; each replica is nan from its first fault on."""
-    fault = records["fault"]
+def _curve(
+    gas: Gas,
+    times: Float[Array, "times"],
+    records: dict[str, Array],
+    beyond: Bool[Array, "times"],
+) -> CoolingCurve:
+    """The curve in SI units; each replica is nan from its first fault on, or beyond some time."""
+    fault = records["fault"] | status.flag(status.OUT_OF_RANGE, beyond)[:, None]
     failed = jnp.cumsum(fault != status.OK, axis=0) > 0
     units = {
         "temperature": gas.temperature,

@@ -216,8 +216,7 @@ def drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
 def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
     dynamics, fault, state = sim.dynamics, status.OK, sim.first_state()
     engine = neighbours.engine(sim.engine, dynamics.capacity.lookahead)
-    resumed = run.checkpoint is not None and Path(run.checkpoint).exists()
-    if sim.melts and not resumed:
+    if sim.melts and not (run.checkpoint is not None and Path(run.checkpoint).exists()):
         state, fault = _melt(sim, state, engine, run.progress)
     state = sim.cooling_state(state)
     try:
@@ -226,9 +225,8 @@ def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
     except Failure as failure:
         fault = failure.fault
     times = np.asarray(sim.inputs.times)
-    scene = {}
-    if run.checkpoint is not None:
-        scene = described(**sim.inputs._asdict(), **settings, directions=sim.directions)
+    given = sim.inputs._asdict() | settings | {"directions": sim.directions}
+    scene = {} if run.checkpoint is None else described(**given)
 
     def advance(state: State, end: float) -> State:
         return _advance(state, end, dynamics, dynamics.capacity, engine)
@@ -264,7 +262,8 @@ def _melt(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[S
         return state, fault
     prepare = partial(_advance, dynamics=steady, capacity=steady.capacity, engine=engine)
     state, end = steady.with_kicks(state, sim.key), np.asarray([sim.prepared_time])
-    return follow(state, end, prepare, steady.observe, progress=progress, label="melt")[::2]
+    state, _, fault = follow(state, end, prepare, steady.observe, progress=progress, label="melt")
+    return state, fault
 
 
 def _advance(

@@ -208,8 +208,8 @@ def check(gas: Any) -> None:
     """Raise ValueError for elements of a gas that do not go together, or not with its spheres."""
     if gas.preparation is not None and gas.surface is not None:
         raise ValueError(
-            "preparation=DrivenStart() is known of smooth spheres: leave preparation or surface out "
-            "of the gas"
+            "preparation=DrivenStart() is known of smooth spheres: leave preparation or surface "
+            "out of the gas"
         )
     if gas.container is not None:
         _check_walls(gas.container, gas.diameter, gas.dimension, rough=gas.surface is not None)

@@ -102,9 +102,7 @@ def _rates(
     if scene.surface is not None:
         state.append(_steady_ratio(speed, sonine, scene, d))
     rates = averages(scene.law, speed, d)
-    return velocity(
-        jnp.stack(state), rates, scene, d, softness=softness, maxwellian=False
-    )
+    return velocity(jnp.stack(state), rates, scene, d, softness=softness, maxwellian=False)
 
 
 def _steady_ratio(speed: Array, sonine: Array, scene: ReducedScene, d: int) -> Array:

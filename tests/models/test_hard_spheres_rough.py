@@ -91,8 +91,10 @@ def test_smooth_surfaces_change_no_bit(beads):
     taus = [0.0, 2.0, 8.0]
     smooth = run(beads(), 200, 2, taus)
     spinning = run(rough(beads(), -1.0, rotational_temperature=5e-3), 200, 2, taus)
-    for name in ("temperature", "sonine", "displacement", "dissipated_energy", "collisions"):
+    for name in ("temperature", "sonine", "displacement", "collisions"):
         np.testing.assert_array_equal(getattr(spinning, name), getattr(smooth, name))
+    # Of rough spheres it is a difference of sums, in other units of rounding.
+    np.testing.assert_allclose(spinning.dissipated_energy, smooth.dissipated_energy, rtol=1e-12)
     np.testing.assert_allclose(spinning.rotational_temperature, 5e-3, rtol=1e-12)
     assert smooth.rotational_temperature is None
 

@@ -128,7 +128,7 @@ def test_shifts_boosts_and_names_change_nothing(beads, dimension):
     tau = float(gas.mean_free_time)
     first = jaxgran.cool(gas, [0.1 * tau], model=SoftSpheres(100, replicas=2))
     assert first.particles is not None
-    position, velocity, side = first.particles
+    position, velocity, side, _ = first.particles
 
     def end(position, velocity):
         start = jaxgran.Particles(jnp.mod(position, side), velocity, side)

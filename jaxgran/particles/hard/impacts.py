@@ -246,7 +246,7 @@ def _bounced(
         alone: who takes part in no impact of a pair.
         listed, shortest, scene, began, along: as for `resolve`.
     """
-    assert impacts.bounces is not None and new.bounces is not None
+    assert impacts.bounces is not None and scene.walls is not None and new.bounces is not None
     slots, (times, axis) = old.slots, impacts.bounces
     hit = alone & jnp.isfinite(times) & (times == impacts.first) & (times == impacts.final)
     s = jnp.where(hit, times, 0.0)

@@ -68,10 +68,11 @@ class HardScene(NamedTuple):
         """
         if not self.has_elements:
             return self.law
-        walls = (None,) * 3
-        if self.walls is not None:
-            walls = self.walls.law, self.walls.beta, self.walls.frequency
-        return Material(self.law, self.surface, self.drag, self.drive, *walls)
+        found = Material(self.law, self.surface, self.drag, self.drive, None, None, None)
+        if self.walls is None:
+            return found
+        _, law, beta, frequency = self.walls
+        return found._replace(wall_law=law, wall_beta=beta, wall_frequency=frequency)
 
     def with_material(self, material: Material) -> "HardScene":
         """The same scene with other numbers of its material."""
