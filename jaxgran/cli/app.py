@@ -16,6 +16,7 @@ Model = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres", "auto"
 FREE = Literal[
     "A",
     "T0",
+    "t0",
     "Y",
     "nu",
     "eta",

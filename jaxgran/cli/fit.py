@@ -17,6 +17,7 @@ from jaxgran.cli.report import (
     print_budget,
     print_impacts,
     print_model,
+    print_rivals,
     print_rows,
     print_scene,
     print_verdict,
@@ -29,6 +30,7 @@ from jaxgran.plotting import plot_fit
 PARAMETERS = {
     "A": ("dissipative_constant", "s"),
     "T0": ("temperature", "m^2/s^2"),
+    "t0": ("t0", "s"),
     "Y": ("youngs_modulus", "Pa"),
     "nu": ("poisson_ratio", ""),
     "eta": ("packing_fraction", ""),
@@ -93,6 +95,7 @@ def run_fit(options: FitOptions, started: float) -> None:
     print_model(model_name, result, reasons)
     print_rows(rows)
     print_budget(rows, options.explain)
+    print_rivals(rows[0]["parameter"], diagnosis)
     print_verdict(diagnosis)
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_fit(result, curve, title_of(options, rows, diagnosis), picture)

@@ -19,6 +19,7 @@ OF_ONE_SCENE = {"temperature", "packing_fraction", "diameter", "rotational_tempe
     "wall_side",
     "drag_rate",
     "drive_strength",
+    "t0",
 }
 """Floats that each curve has for itself; the others are of the material, and shared."""
 

@@ -39,7 +39,7 @@ def finite_or_null(value: Any) -> Any:
 
 def settings(pairs: list[str]) -> dict[str, str]:
     """Header values out of KEY=VALUE."""
-    known = (*GAS_KEYS, *PRIOR_KEYS, *ELEMENT_KEYS, "N", "A", "dimension", "replicas")
+    known = (*GAS_KEYS, "t0", *PRIOR_KEYS, *ELEMENT_KEYS, "N", "A", "dimension", "replicas")
     values = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")

@@ -70,19 +70,37 @@ PARTS = {
 
 
 def print_budget(rows: list[dict], explain: bool) -> None:
-    """The parts of each error, in per cent of the estimate, the largest first."""
+    """The parts of each error, in per cent of the estimate, the largest first; of t0 in ms."""
     for row in rows:
         if np.isnan(row["estimate"]):
             continue
         parts = sorted(row["error_budget"].items(), key=lambda part: -part[1])
-        shares = [(name, 100 * x / abs(row["estimate"])) for name, x in parts if x > 0]
+        is_time = row["parameter"] == "t0"  # which may be 0
+        over, unit = (1e-3, "ms") if is_time else (abs(row["estimate"]) / 100, "%")
+        shares = [(name, x / over) for name, x in parts if x > 0]
         if not explain:
-            line = ", ".join(f"{name} {share:.2g} %" for name, share in shares)
+            line = ", ".join(f"{name} {share:.2g} {unit}" for name, share in shares)
             print(f"error of {row['parameter']}: {line}")
             continue
-        print(f"\nerror of {row['parameter']}, in per cent; the squares of the parts add up")
+        print(f"\nerror of {row['parameter']} in {unit}; the squares of the parts add up")
         for name, share in shares:
             print(f"  {share:8.2g}  {name}: {PARTS.get(name, 'its error as given, or as known')}")
+
+
+def print_rivals(name: str, diagnosis) -> None:
+    """The laws that were compared, how much better they fit, and what the first parameter is."""
+    if not diagnosis.rivals:
+        return
+    width = max(len(rival.name) for rival in diagnosis.rivals)
+    print(f"\n{'with, besides':{width}}  chi^2 less {name:>9} {'95 %':>20}  told apart")
+    for rival in diagnosis.rivals:
+        between = f"{rival.low[0]:.3g} .. {rival.high[0]:.3g}"
+        told = "yes" if rival.told_apart else f"no: errors {rival.sharper:.2g} x smaller would"
+        if not rival.told_apart and np.isfinite(rival.decades):
+            told += f", or {rival.decades:g} decades of T more"
+        told = "the curve asks for it" if rival.asked else told
+        print(f"{rival.name:{width}}  {rival.improvement:10.2g}", end="")
+        print(f" {rival.estimate[0]:9.3g} {between:>20}  {told}")
 
 
 def print_verdict(diagnosis) -> None:

@@ -1,5 +1,6 @@
 """Files of measured cooling curves: CSV with a header that describes the gas."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -7,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.data.curve import COLUMNS, MIN_POINTS, CoolingCurve
-from jaxgran.data.files import number_row, read_text, write_whole
+from jaxgran.data.files import write_whole
 from jaxgran.data.header import header_count, header_number
 from jaxgran.data.quantities import STAND_INS, in_si, warn_of_units
 from jaxgran.data.scene_keys import read_elements, warn_of_unknown_keys
+from jaxgran.data.table import read_table
+from jaxgran.data.tracks import check_track_names, curve_of_tracks
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.restitution import Viscoelastic
@@ -25,6 +28,7 @@ PRIOR_KEYS = {
     "Y_err": "youngs_modulus",
     "nu_err": "poisson_ratio",
     "T0_err": "temperature",
+    "t0_err": "t0",
 }
 """Keys of the header with standard errors, and the names that `jaxgran.fit` gives them."""
 
@@ -48,7 +52,8 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
             msd and msd_err (m^2), in any order. In place of T there may be mean_speed, vx2, v2_xy
             or energy (see `jaxgran.data.quantities.STAND_INS`), with errors under the same name and
             _err. Header keys length_unit (m, cm, mm, um) and time_unit (s, ms, us, min) are those
-            of the columns and of diameter, T0 and A; density and Y stay in SI.
+            of the columns and of diameter, T0 and A; density and Y stay in SI. Or its columns are
+            id,t,x,y and z, tracks of particles (see `jaxgran.data.tracks.curve_of_tracks`).
 
     Returns:
         The curve, and the header as a dictionary of strings, in SI; its entry T_from says how T was
@@ -58,27 +63,15 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
         ValueError: saying what is wrong, in which line, and what to do.
     """
     path = Path(path)
-    header: dict[str, str] = {}
-    names: list[str] = []
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    for i, line in enumerate(read_text(path, "t,T[,T_err][,msd][,msd_err]").splitlines(), start=1):
-        line = line.strip()
-        if line.startswith("#"):
-            key, colon, value = line[1:].partition(":")
-            if colon:
-                _add_to_header(path, i, header, key.strip(), value.strip())
-        elif line and not names:
-            names = _column_names(path, i, line)
-        elif line:
-            rows.append(number_row(path, i, line, names))
-            lines.append(i)
-    if len(rows) < MIN_POINTS:
+    table = read_table(path, "t,T[,T_err][,msd][,msd_err]", partial(_check_names, path))
+    if "id" in table.columns:
+        return curve_of_tracks(path, table)
+    columns, header, lines = table.columns, table.header, table.lines
+    if len(lines) < MIN_POINTS:
         raise ValueError(
-            f"{path}: {len(rows)} rows of numbers, at least {MIN_POINTS} are needed; "
+            f"{path}: {len(lines)} rows of numbers, at least {MIN_POINTS} are needed; "
             "measure the cooling at more times"
         )
-    columns = dict(zip(names, np.array(rows, dtype=float).T, strict=True))
     try:
         columns, header = in_si(columns, header)
     except ValueError as error:
@@ -89,17 +82,11 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
     return curve, header
 
 
-def _add_to_header(path: Path, i: int, header: dict[str, str], key: str, value: str) -> None:
-    if key in header:
-        raise ValueError(
-            f"{path}, line {i}: {key} is given again, as {value} after {header[key]}; remove one"
-        )
-    header[key] = value
-
-
-def _column_names(path: Path, i: int, line: str) -> list[str]:
-    """Names of the columns from line i; ValueError if one is unknown, missing or repeated."""
-    names = [name.strip() for name in line.split(",")]
+def _check_names(path: Path, i: int, names: list[str]) -> None:
+    """ValueError if a name of a column in line i is unknown, missing or repeated."""
+    if "id" in names:
+        check_track_names(path, i, names)
+        return
     stand_ins = [name for name in ("T", *STAND_INS) if name in names]
     known = {*COLUMNS, *(f"{name}{end}" for name in STAND_INS for end in ("", "_err"))}
     unknown = [name for name in names if name not in known]
@@ -115,9 +102,8 @@ def _column_names(path: Path, i: int, line: str) -> list[str]:
             + (f"missing: {', '.join(missing)}; " if missing else "")
             + (f"not known: {', '.join(unknown)}; " if unknown else "")
             + f"name them t,T and, where measured, {', '.join(list(COLUMNS)[2:])}, each once; in "
-            f"place of T there may be {', '.join(STAND_INS)}"
+            f"place of T there may be {', '.join(STAND_INS)}; tracks of particles are id,t,x,y[,z]"
         )
-    return names
 
 
 def read_gas(header: dict[str, str]) -> Gas:
@@ -153,7 +139,7 @@ def read_gas(header: dict[str, str]) -> Gas:
         **read_elements(header),
     )
     warn_of_units(gas)
-    warn_of_unknown_keys(header, (*GAS_KEYS, *PRIOR_KEYS))
+    warn_of_unknown_keys(header, (*GAS_KEYS, "t0", *PRIOR_KEYS))
     return gas
 
 
@@ -163,18 +149,23 @@ def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
     Where the diameter has an error and the density has none, the mass follows the diameter.
 
     Args:
-        header: with some of eta_err, diameter_err (m), density_err (kg/m^3), Y_err (Pa), nu_err and
-            T0_err (m^2/s^2), the standard errors of the values beside them.
+        header: with some of eta_err, diameter_err (m), density_err (kg/m^3), Y_err (Pa), nu_err,
+            T0_err (m^2/s^2) and t0_err (s), the standard errors of the values beside them; that of
+            t0, the time at which the gas began to cool, is 0 unless it is given.
 
     Raises:
         ValueError: for an error without its value, or one that is no positive number.
     """
     priors = {}
+    if "t0" in header and "t0_err" not in header:
+        raise ValueError(
+            "the header gives t0 without t0_err; add its error, or subtract t0 from the times"
+        )
     for key, name in PRIOR_KEYS.items():
         if key not in header:
             continue
         value_key = key.removesuffix("_err")
-        if value_key not in header:
+        if value_key not in header and value_key != "t0":
             raise ValueError(f"the header gives {key} without {value_key}; add the value itself")
         error = header_number(header, key)
         if error <= 0:
@@ -182,7 +173,8 @@ def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
                 f"header line {key}: must be a positive number, got {header[key]!r}; leave it out "
                 f"where {value_key} is known exactly"
             )
-        priors[name] = (header_number(header, value_key), error)
+        value = header_number({"t0": "0"} | header, value_key)
+        priors[name] = (value, error)
     if "diameter" in priors and "density" not in priors:
         if "density" not in header:
             raise ValueError("the header gives diameter_err without density; add the density")

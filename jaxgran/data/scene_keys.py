@@ -11,7 +11,9 @@ WALL_KEYS = ("container_side", "wall_restitution", "wall_beta_t")
 DRAG_KEYS = ("gamma",)
 DRIVE_KEYS = ("drive_strength",)
 
-OTHER_KEYS = ("N", "A", "dimension", "replicas", "T_from", "length_unit", "time_unit")
+OTHER_KEYS = ("N", "A", "dimension", "replicas", "T_from", "length_unit", "time_unit") + (
+    "localisation_error",
+)
 """Keys that say something besides the gas and its elements."""
 
 PROVENANCE_KEYS = ("units", "points", "end_tau", "melt_tau", "steps_per_contact", "source")

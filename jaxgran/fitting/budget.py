@@ -27,8 +27,7 @@ def in_scene(result: Fit, num_particles: int | None, replicas: int) -> Fit:
         replicas: measured runs over which the curve is a mean.
     """
     course = _course(result, num_particles)
-    times = np.asarray(result.curve.times)
-    own = course.clock_error(result.model.rate_error(course))[-times.size :]
+    own = course.clock_error(result.model.rate_error(course))[-result.curve.times.size :]
     # A deterministic model's clock was compared in a few scenes, and is not known better in others.
     clock_error = jnp.maximum(jnp.asarray(own, result.clock_error.dtype), result.clock_error)
     fitted = bool(result.priors.names) and not result.model.stochastic
@@ -43,9 +42,9 @@ def in_scene(result: Fit, num_particles: int | None, replicas: int) -> Fit:
 
 
 def _course(result: Fit, num_particles: int | None) -> Course:
-    """The course of the fitted gas, at t = 0 and the measured times."""
+    """The course of the fitted gas, when it began and at the measured times after it."""
     curve = result.curve
-    times = jnp.asarray(curve.times)
+    times = jnp.maximum(curve.times - result.began, 0.0)
     before = jnp.zeros(int(times[0] > 0), times.dtype)
 
     def whole(values: Array | None, first: Array) -> Array | None:
@@ -65,7 +64,7 @@ def _by_chance(result: Fit, course: Course, num_particles: int) -> Float[Array, 
 
     The delays of the clock at two times have in common what was gathered until the earlier one.
     """
-    times = np.asarray(result.curve.times)
+    times = np.asarray(jnp.maximum(result.curve.times - result.began, 0.0))
     gathered = course.chance_of_clock(num_particles)[-times.size :]
     common = np.minimum(gathered[:, None], gathered[None, :])
     gain = np.asarray(result.clock_gain) / np.where(times > 0, times, 1.0)[None]
@@ -91,7 +90,8 @@ def effects_on_temperature(
     parameters = Parameters(gas, varied)
 
     def log_temperature(flat: Array, clock: Array) -> Array:
-        computed = model.simulate(parameters.gas(flat), times * clock, Run())
+        since = (times - parameters.start(flat)) * clock
+        computed = model.simulate(parameters.gas(flat), since, Run())
         return jnp.log(computed.temperature)
 
     flat, clock = parameters.flat(gas), jnp.ones_like(times)
@@ -99,7 +99,9 @@ def effects_on_temperature(
     if not varied:
         return slope, {}
     by_parameter = jax.jacfwd(log_temperature)(flat, clock)
-    by_residual = jax.jacfwd(lambda x: priors.residuals(parameters.gas(x)))(flat)
+    by_residual = jax.jacfwd(lambda x: priors.residuals(parameters.gas(x), parameters.start(x)))(
+        flat
+    )
     changes = by_parameter @ jnp.linalg.pinv(by_residual)
     ends = np.cumsum([given.size for given in priors.given])[:-1]
     return slope, dict(zip(priors.names, jnp.split(changes, ends, axis=1), strict=True))

@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
-from jaxgran.fitting.parameters import Parameters
+from jaxgran.fitting.guess import guess_of_start, halving_time
+from jaxgran.fitting.parameters import START, Parameters, size_of
 from jaxgran.fitting.priors import NO_PRIORS, Priors
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
@@ -72,7 +73,9 @@ class Comparison:
             assert T_rot is not None and error is not None
             weights["rotation"] = _weights(T_rot, error)
             accuracies["rotation"] = model.rotation_accuracy
-        accuracy = _displacement_accuracy(gas, curve, model, num_particles)
+        accuracy = None
+        if START not in (*names, *priors.names):  # <dr^2> is counted from the start of the file
+            accuracy = _displacement_accuracy(gas, curve, model, num_particles)
         if accuracy is not None:
             assert curve.displacement is not None
             total = (1 if num_particles is None else num_particles) * replicas
@@ -81,8 +84,9 @@ class Comparison:
             error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
             weights["displacement"] = _weights(curve.displacement, error)
             accuracies["displacement"] = accuracy
-        parameters = Parameters(gas, (*names, *priors.also_free(names)))
-        num_free = sum(gas.value(name).size for name in names)
+        varied = (*names, *priors.also_free(names))
+        parameters = Parameters(gas, varied, halving_time(curve))
+        num_free = sum(size_of(gas, name) for name in names)
         faster = 1.0 if num_particles is None else clock_of_few(gas, num_particles)
         return cls(curve, model, parameters, num_free, priors, weights, accuracies, faster)
 
@@ -137,7 +141,12 @@ class Comparison:
         """
         gas = self.parameters.gas(self.of_gas(flat))
         own_clock, errors_of_clock = self.clock(flat)
-        computed = self.model.simulate(gas, self.curve.times * clock * own_clock, Run())
+        start = self.parameters.start(self.of_gas(flat))
+        since = (self.curve.times - start) * clock * own_clock
+        if START in self.parameters.names:
+            computed = _begun_at_0(self.model, gas, since)
+        else:
+            computed = self.model.simulate(gas, since, Run())
         ratio = _log_ratio(self.curve.temperature, computed.temperature)
         parts = [self.weights["measurement"] * ratio]
         factors = dict(zip(self.accuracies, flat[flat.size - len(self.accuracies) :], strict=True))
@@ -156,7 +165,7 @@ class Comparison:
             ratio = ratio - factors["displacement"] * diffusive
             parts.append(self.weights["displacement"] * ratio)
         parts += [factors[name][None] / self.accuracies[name] for name in factors]
-        residuals = jnp.concatenate([*parts, errors_of_clock, self.priors.residuals(gas)])
+        residuals = jnp.concatenate([*parts, errors_of_clock, self.priors.residuals(gas, start)])
         return residuals, (residuals, computed)
 
     def residuals(self, flat: Float[Array, "q"]) -> Float[Array, "residuals"]:
@@ -176,12 +185,42 @@ class Comparison:
 
     def best(self, guesses: list[Gas]) -> Float[Array, "q"]:
         """Of some guesses the one with the least chi^2."""
-        flats = jnp.stack([self.parameters.flat(guess) for guess in guesses])
+        names = self.parameters.names
+        starts = [guess_of_start(guess, self.curve, names) for guess in guesses]
+        pairs = zip(guesses, starts, strict=True)
+        flats = jnp.stack([self.parameters.flat(*pair) for pair in pairs])
         flats = jnp.pad(flats, ((0, 0), (0, self.num_beside)))
         if len(guesses) == 1:
             return flats[0]
         costs = jnp.stack([jnp.sum(self.residuals(flat) ** 2) for flat in flats])
         return flats[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
+
+
+def _begun_at_0(model: AbstractModel, gas: Gas, since: Float[Array, "times"]) -> CoolingCurve:
+    """The curve of a gas that has T_0 at t = 0, at times of which some may be earlier.
+
+    Before t = 0 it is continued to first order in t, ``ln T(-t) = 2 ln T_0 - ln T(t)``, and so is
+    T_rot, unless the spheres began without rotation.
+    """
+    away = jnp.where(since >= 0, since, -since)
+    order = jnp.argsort(away)
+    computed = model.simulate(gas, away[order], Run())
+    place = jnp.argsort(order)
+
+    def in_place(values: Array | None) -> Array | None:
+        return None if values is None else values[place]
+
+    T, T_rot = computed.temperature[place], in_place(computed.rotational_temperature)
+    if T_rot is not None:
+        T_rot = jnp.where(since >= 0, T_rot, gas.value("rotational_temperature") ** 2 / T_rot)
+    return CoolingCurve(
+        times=since,
+        temperature=jnp.where(since >= 0, T, gas.temperature**2 / T),
+        sonine=in_place(computed.sonine),
+        collisions=in_place(computed.collisions),
+        rotational_temperature=T_rot,
+        status=computed.status,
+    )
 
 
 def uses_rotation(gas: Gas, curve: CoolingCurve) -> bool:

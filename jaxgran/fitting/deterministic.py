@@ -1,5 +1,7 @@
 """Fits through a deterministic model, whose residuals have no noise of their own."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,10 +32,12 @@ def fit_deterministic(
     method: str = "levenberg-marquardt",
     max_steps: int = 100,
     priors: Priors = NO_PRIORS,
+    of_errors: dict[str, Float[Array, ""]] | None = None,
 ) -> Fit:
     """Fit through a deterministic model, from the best of some guesses.
 
-    Args, returns: as `jaxgran.fit`.
+    Args, returns: as `jaxgran.fit`; of_errors are the degrees of freedom of the errors, see
+    `jaxgran.fitting.few_replicas.smooth_errors`.
     """
     comparison = Comparison.of(gas, curve, model, names, num_particles, replicas, priors)
     first = comparison.best(guesses)
@@ -44,12 +48,13 @@ def fit_deterministic(
         if priors.names:  # which now have their right weight beside the curve
             flat, more, converged = search(comparison.residuals, flat, max_steps)
             comparison, iterations = comparison.scaled(flat), iterations + more
-    return _fit_at(comparison, names, first, flat, iterations, converged)
+    return _fit_at(comparison, names, of_errors or {}, first, flat, iterations, converged)
 
 
 def _fit_at(
     comparison: Comparison,
     names: tuple[str, ...],
+    of_errors: dict[str, Float[Array, ""]],
     first: Float[Array, "q"],
     flat: Float[Array, "q"],
     iterations: Int[Array, ""],
@@ -65,10 +70,11 @@ def _fit_at(
     own = residuals.size - comparison.num_measured
     degrees_of_freedom = used + own - flat.size
     num_used = {name: jnp.sum(weights > 0) for name, weights in comparison.weights.items()}
-    tested = [(parts["measurement"], num_used["measurement"] - comparison.num_free)]
+    degrees = num_used["measurement"] - comparison.num_free
+    tested = [(parts["measurement"], degrees, of_errors.get("measurement"))]
     for name in comparison.accuracies:
         own_part = jnp.concatenate([parts[name], parts[f"model of {QUANTITIES[name]}"]])
-        tested.append((own_part, num_used[name]))
+        tested.append((own_part, num_used[name], of_errors.get(name)))
     known = comparison.curve.temperature_error is not None
     chance = misfit(tested, degrees_of_freedom, errors_known=known)
     clock_gain = _clock_gain(comparison.split(clock_slope), gains)
@@ -88,8 +94,10 @@ def _fit_at(
         sensitivity=jacobian[: comparison.num_measured, : comparison.num_free],
         start=comparison.estimates(first),
         gas=comparison.parameters.gas(comparison.of_gas(flat)),
+        began=jnp.asarray(comparison.parameters.start(comparison.of_gas(flat)), flat.dtype),
         priors=comparison.priors,
-        curve=computed,
+        curve=dataclasses.replace(computed, times=comparison.curve.times),
+        weights=comparison.weights["measurement"],
         residuals=parts["measurement"],
         displacement_residuals=parts.get("displacement"),
         rotation_residuals=parts.get("rotation"),

@@ -1,7 +1,7 @@
 """Whether a model explains a measured curve, in words."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,18 +9,26 @@ from jaxtyping import Float
 
 from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.residuals import neighbour_correlation
+from jaxgran.fitting.amplitudes import ASKED, Rival
+from jaxgran.fitting.residuals import neighbour_correlation, runs_test
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
-from jaxgran.fitting.rivals import ASKED, Rival, free_elements, ranges, rivals
+from jaxgran.fitting.rivals import FURTHER, free_elements, ranges, rivals
 from jaxgran.models.base import Omission
 
 LARGEST_SCATTER = 0.3
 """Relative scatter of T about a model above which it does not explain a curve without errors."""
 
 
+NOTHING = 0.01
+"""Share of an estimate below which the low end of a range is next to nothing."""
+
 STEADY = 3.0
 """Correlation of neighbouring residuals, in standard errors of it for independent ones, from which
 on a curve without errors is not explained."""
+
+
+RAREST_RUNS = 0.00135
+"""The same of the runs of one sign: the chance of 3 standard errors."""
 
 
 class Diagnosis(NamedTuple):
@@ -32,6 +40,8 @@ class Diagnosis(NamedTuple):
         verdict: one plain sentence, and what to do if the model does not explain the curve.
         reasons: for the verdict, a sentence each.
         correlation: of neighbouring residuals; 0 for independent errors.
+        runs_p_value: probability of so few changes of sign between neighbouring residuals, by the
+            runs test of Wald & Wolfowitz.
         rivals: other laws of cooling compared with the fitted one, those that fit best first.
         ranges: the range of each free parameter, 95 %, SI, over all rivals that fit as well as the
             best: of a parameter that the rivals leave open this is much wider than its error.
@@ -41,6 +51,7 @@ class Diagnosis(NamedTuple):
     verdict: str
     reasons: tuple[str, ...]
     correlation: float
+    runs_p_value: float
     rivals: tuple[Rival, ...]
     ranges: dict[str, tuple[Float[np.ndarray, "size"], Float[np.ndarray, "size"]]]
 
@@ -65,8 +76,9 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     correlation = float(neighbour_correlation(jnp.asarray(residuals)))
     p_value, converged = float(result.p_value), bool(result.converged)
     misfit = p_value < SIGNIFICANCE
+    runs = runs_test(residuals)
     if result.scatter is not None:
-        misfit = _is_misfit(result, residuals, correlation, num_particles)
+        misfit = _is_misfit(result, residuals, correlation, runs[2], num_particles)
     omissions = result.model.omissions(result.gas, num_particles)
     found = rivals(result, curve) if converged and np.isfinite(result.chi2) else ()
     limits = ranges(result, found) if found else {}
@@ -75,19 +87,23 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         _chance(result),
         *_about_rivals(result, found),
         *_about_residuals(residuals, times, correlation, p_value),
+        *_about_runs(runs),
         *(omission.words for omission in omissions),
         *_about_search(result),
     ]
-    verdict = _verdict(result.model.name, converged, misfit, omissions, found)
+    verdict = _verdict(result, misfit, omissions, found, limits)
+    in_runs = runs[2] < SIGNIFICANCE and converged and not misfit
+    verdict += " Its residuals come in runs of one sign." if in_runs else ""
     explains = converged and not misfit and not any(o.decisive for o in omissions)
     explains &= not any(rival.asked for rival in found)
-    return Diagnosis(explains, verdict, tuple(reasons), correlation, found, limits)
+    return Diagnosis(explains, verdict, tuple(reasons), correlation, runs[2], found, limits)
 
 
 def _is_misfit(
     result: Fit,
     residuals: Float[np.ndarray, "used"],
     correlation: float,
+    runs_p_value: float,
     num_particles: int | None,
 ) -> bool:
     """Whether a curve without errors is missed by too much, or too steadily for chance.
@@ -97,8 +113,8 @@ def _is_misfit(
     """
     scatter = float(np.asarray(result.scatter))
     expected = np.sqrt(2 / (result.gas.dimension * num_particles)) if num_particles else 0.0
-    steady = correlation > STEADY / np.sqrt(residuals.size) and scatter > 2 * expected
-    return scatter > LARGEST_SCATTER or bool(steady)
+    steady = correlation > STEADY / np.sqrt(residuals.size) or runs_p_value < RAREST_RUNS
+    return scatter > LARGEST_SCATTER or bool(steady and scatter > 2 * expected)
 
 
 def _chance(result: Fit) -> str:
@@ -153,6 +169,15 @@ def _about_residuals(
         yield f"far outliers at {at}: check their error bars"
 
 
+def _about_runs(runs: tuple[int, float, float]) -> Iterator[str]:
+    number, expected, chance = runs
+    if chance < SIGNIFICANCE:
+        yield (
+            f"residuals change their sign seldom: {number} runs of one sign, where independent "
+            f"ones have {expected:.3g} (probability by chance: {100 * chance:.2g} %)"
+        )
+
+
 def _about_rivals(result: Fit, found: tuple[Rival, ...]) -> Iterator[str]:
     """The rivals that the curve asks for or allows, and what the first parameter would then be."""
     yield _assumptions(result)
@@ -166,7 +191,7 @@ def _about_rivals(result: Fit, found: tuple[Rival, ...]) -> Iterator[str]:
         yield "further losses are not looked for in a driven gas"
     name = result.names[0]
     for rival in found:
-        between = f"{name} is then between {rival.low[0]:.3g} and {rival.high[0]:.3g}"
+        between = f"{name} is then {_between(rival.low[0], rival.high[0], result.estimate[0])}"
         if rival.asked:
             yield (
                 f"{rival.name} added to the model fits better (chi^2 by {rival.improvement:.3g}, "
@@ -175,8 +200,23 @@ def _about_rivals(result: Fit, found: tuple[Rival, ...]) -> Iterator[str]:
         elif not rival.told_apart:
             yield (
                 f"{rival.name} cannot be excluded: {between}; errors of the curve and of the model "
-                f"{rival.sharper:.2g} times as small would tell"
+                f"{rival.sharper:.2g} times as small would tell{_or_further(rival)}"
             )
+
+
+def _between(low: float, high: float, estimate: Any) -> str:
+    """A range in words: an upper bound where it goes down to next to nothing."""
+    if 0 <= low < NOTHING * float(np.asarray(estimate)):
+        return f"anything below {high:.3g}, an upper bound"
+    return f"between {low:.3g} and {high:.3g}"
+
+
+def _or_further(rival: Rival) -> str:
+    if np.isnan(rival.decades):
+        return ""
+    if np.isinf(rival.decades):
+        return f", but not {FURTHER[-1]:g} decades of T more"
+    return f", and so would {rival.decades:g} more decades of T with as many points in each"
 
 
 def _assumptions(result: Fit) -> str:
@@ -205,22 +245,23 @@ def _about_search(result: Fit) -> Iterator[str]:
 
 
 def _verdict(
-    name: str,
-    converged: bool,
+    result: Fit,
     misfit: bool,
     omissions: tuple[Omission, ...],
     found: tuple[Rival, ...],
+    limits: dict[str, Any],
 ) -> str:
     """The verdict on a model.
 
     Args:
-        name: of the model.
-        converged: whether the search did.
+        result: of a fit.
         misfit: whether it is significant.
         omissions: what the model leaves out of the scene, the most serious first.
         found: the rivals, those that fit best first.
+        limits: the range of each parameter over them.
     """
-    if not converged:
+    name = result.model.name
+    if not bool(result.converged):
         return "The search did not converge: do not trust its estimates."
     plural = name.endswith("s")
     name = name[:1].upper() + name[1:]
@@ -240,6 +281,9 @@ def _verdict(
         verdict = f"{name} {'are' if plural else 'is'} compatible with this curve."
         open_to = [rival.name for rival in found if not rival.told_apart]
         if open_to:
-            verdict = f"{verdict[:-1]}, which does not exclude {open_to[0]}."
+            low, high = (x[0] for x in limits[result.names[0]])
+            between = _between(low, high, result.estimate[0])
+            verdict = f"{verdict[:-1]}, which does not exclude {open_to[0]}: "
+            verdict += f"{result.names[0]} is {between}."
         return verdict
     return " ".join([verdict, *(omission.remedy for omission in omissions[:1])])

@@ -15,7 +15,9 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.budget import in_scene
 from jaxgran.fitting.checks import check_curve
 from jaxgran.fitting.deterministic import SEARCHES, fit_deterministic
-from jaxgran.fitting.guess import guess_from_data
+from jaxgran.fitting.few_replicas import smooth_errors
+from jaxgran.fitting.guess import guess_from_data, halving_time
+from jaxgran.fitting.parameters import START, domain_of, size_of
 from jaxgran.fitting.priors import Priors
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.stochastic import fit_stochastic
@@ -23,6 +25,9 @@ from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
+
+WIDEST_START = 1.0
+"""Standard error of t0, over the time in which T halves, where T_0 is free too."""
 
 
 @no_type_check
@@ -63,10 +68,15 @@ def fit(
             all times, and estimated from the scatter.
         model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`; a stochastic one
             needs two or more replicas.
-        free: names of floats of the gas or its law, such as "temperature" (which is T_0); by
-            default A (or a constant restitution) and, where T has no errors, T_0.
+        free: names of floats of the gas or its law, such as "temperature" (which is T_0), or
+            "t0", the time at which the gas had T_0 and began to cool, where the clock was not
+            started with it; by default A (or a constant restitution) and, where T has no errors,
+            T_0. A gas forgets how hot it began: a free T_0 makes up for any start of the clock, and
+            T_0 and t0 are not found together; where both are free, t0 is held near 0, to within the
+            time in which T halves. Where t0 is free, <dr^2> is not used.
         priors: what else is known: values and standard errors of floats of the gas, SI, by name, as
-            ``{"packing_fraction": (0.05, 0.002)}``, or of "density", which lets the mass vary. Each
+            ``{"packing_fraction": (0.05, 0.002)}``, or of "density", which lets the mass vary, or
+            of "t0". Each
             is Gaussian in the float's unbounded scale, and is fitted along with the free ones; the
             errors of a stochastic model are propagated with kinetic theory's derivatives.
         start: a gas whose values are a further guess. A deterministic model begins at this or at
@@ -77,7 +87,9 @@ def fit(
             Where <dr^2> has no error, its relative one is ``sqrt(2 / (d N))`` over the root of
             `replicas`; without either it is not used, nor is it where T has no errors, as their
             weights could not be compared.
-        replicas: number of measured runs over which the curve is a mean.
+        replicas: number of measured runs over which the curve is a mean. From 2 on its errors are
+            taken for those of their scatter, which is smoothed along the curve, and as uncertain as
+            so few runs leave it (`jaxgran.fitting.few_replicas.smooth_errors`).
         method: Levenberg-Marquardt, or L-BFGS by reverse mode (deterministic models only).
         max_steps: >= 1; most steps of Levenberg-Marquardt or evaluations of L-BFGS, 100 by default;
             most simulations of a stochastic model, 8.
@@ -103,23 +115,27 @@ def fit(
     names = free_by_default(gas, curve) if free is None else free
     _check_request(gas, curve, names, max_steps, num_particles, replicas)
     names, key, known = tuple(names), checked_key(key), Priors.of(gas, priors)
+    if {START, "temperature"} <= {*names} and not {START, "temperature"} & {*known.names}:
+        known = known.with_one(START, 0.0, WIDEST_START * halving_time(curve))
     if curve.rotational_temperature is not None and gas.surface is None:
         warnings.warn(
             "the measured T_rot is not used, since the gas has no surface=jaxgran.Rough(...)",
             stacklevel=2,
         )
+    curve, of_errors = smooth_errors(curve, replicas)
     model = KineticTheory() if model is None else model
     _check_model(model, method, names, known)
     if model.stochastic:
         steps = 8 if max_steps is None else max_steps
-        result = fit_stochastic(gas, curve, model, names, start, key, progress, steps, known)
+        options = key, progress, steps, known, of_errors
+        result = fit_stochastic(gas, curve, model, names, start, *options)
     else:
         guesses = [guess_from_data(gas, curve, names)] + ([] if start is None else [start])
         model.check_scene(guesses[-1])
         steps = 100 if max_steps is None else max_steps
         # As arrays: other numbers share the compiled program.
         N = None if num_particles is None else jnp.asarray(float(num_particles))
-        search = N, jnp.asarray(float(replicas)), method, steps, known
+        search = N, jnp.asarray(float(replicas)), method, steps, known, of_errors
         result = fit_deterministic(gas, curve, model, names, guesses, *search)
     if not any_traced(result.chi2, curve, gas):
         _check_computed(result)
@@ -156,12 +172,12 @@ def _check_request(
     if isinstance(free, str) or not free or len(set(free)) < len(free):
         raise ValueError(f"free must be a tuple of different names, got {free!r}")
     for name in free:
-        gas.value(name)
+        domain_of(gas, name)
     whole_number("replicas", replicas, 1)
     for name, number in (("max_steps", max_steps), ("num_particles", num_particles)):
         if number is not None and not (isinstance(number, int | np.integer) and number >= 1):
             raise ValueError(f"{name} must be a whole number >= 1, or None, got {number!r}")
-    size, points = sum(gas.value(name).size for name in free), curve.times.shape[-1]
+    size, points = sum(size_of(gas, name) for name in free), curve.times.shape[-1]
     if curve.temperature_error is not None and not isinstance(curve.temperature_error, Tracer):
         points = int(np.sum(np.asarray(curve.temperature_error) > 0))
     if points <= size:
@@ -184,6 +200,11 @@ def _check_model(model: AbstractModel, method: str, names: tuple[str, ...], prio
     checked_model(model)
     if model.stochastic and method != "levenberg-marquardt":
         raise ValueError(f"a stochastic model is fitted by least squares, not by {method!r}")
+    if model.stochastic and START in (*names, *priors.names):
+        raise ValueError(
+            f"{START} is fitted through kinetic theory only: find it so, subtract it from the "
+            f"curve's times, and leave it out of free and priors for {type(model).__name__}"
+        )
     both = [name for name in priors.names if name in names]
     if model.stochastic and both:
         raise ValueError(
@@ -219,8 +240,11 @@ def _warn(result: Fit) -> None:
         )
     group = result.undetermined()
     if group:
+        why = "in a gas of hard spheres A and Y enter as A Y^(2/5) alone"
+        if START in group:
+            why = "a gas forgets how hot it began"
         warnings.warn(
             f"the curve does not determine {' and '.join(group)}: it depends on a combination of "
-            "them only (in a gas of hard spheres A and Y enter as A Y^(2/5) alone); free fewer",
+            f"them only ({why}); free fewer",
             stacklevel=3,
         )

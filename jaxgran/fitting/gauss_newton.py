@@ -34,6 +34,7 @@ class Simulated(NamedTuple):
     Attributes:
         flat: the estimate.
         computed: the curve of the last simulation.
+        weights: of the residuals; 0 where not used.
         residuals: weighted, at `flat` extrapolated linearly from the simulations; 0 where not used.
         sensitivity: derivative of the weighted residuals.
         gain: derivative of `flat` in each measured ln T; 0 where not used.
@@ -45,6 +46,7 @@ class Simulated(NamedTuple):
 
     flat: Float[np.ndarray, "p"]
     computed: CoolingCurve
+    weights: Float[np.ndarray, "times"]
     residuals: Float[np.ndarray, "times"]
     sensitivity: Float[np.ndarray, "times p"]
     gain: Float[np.ndarray, "p times"]
@@ -133,10 +135,13 @@ def by_simulation(
             if ended or len(simulations) == max_simulations:
                 break
     residuals, sensitivity = _residuals_at(flat, near, measured, average.sigma, used)
-    gain = np.zeros(sensitivity.T.shape)
+    gain, weights = np.zeros(sensitivity.T.shape), np.zeros(len(used))
+    weights[used] = 1 / average.sigma
     gain[:, used] = average.gain
     parts = gain, average.errors, average.noises
-    return Simulated(flat, curve, residuals, sensitivity, *parts, len(simulations), settled)
+    return Simulated(
+        flat, curve, weights, residuals, sensitivity, *parts, len(simulations), settled
+    )
 
 
 def _simulated(

@@ -1,8 +1,10 @@
 """Initial guesses of parameters from the measured curve."""
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.parameters import START
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.restitution import ConstantRestitution, Viscoelastic
 from jaxgran.theory import closed_forms
@@ -21,19 +23,17 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         curve: the measured curve.
         free: names of the free parameters.
     """
-    haff = isinstance(gas.law, ConstantRestitution)
-    power = 1 / 2 if haff else 3 / 5
+    power, line = _power_and_line(gas, curve)
     scale = curve.temperature[0]
-    line = (curve.temperature / scale) ** -power
-    weight = 1 / line  # equal relative errors
+    origin = (gas.temperature / scale) ** -power
+    haff = isinstance(gas.law, ConstantRestitution)
     if "temperature" in free:
-        design = jnp.stack([weight, weight * curve.times], axis=1)
-        size = jnp.linalg.norm(design, axis=0)
-        origin, slope = jnp.linalg.lstsq(design / size[None], weight * line)[0] / size
-        origin = jnp.maximum(origin, 0.1 * line.min())
+        origin, slope = _intercept_and_slope(curve, line)
         gas = gas.replace(temperature=scale * origin ** (-1 / power))
+    elif START in free:
+        _, slope = _intercept_and_slope(curve, line)
     else:
-        origin = (gas.temperature / scale) ** -power
+        weight = 1 / line
         slope = jnp.sum(weight**2 * (line - origin) * curve.times)
         slope = slope / jnp.sum((weight * curve.times) ** 2)
     rate = jnp.maximum(slope / origin, 1e-9 / curve.times[-1]) * gas.mean_free_time
@@ -47,6 +47,38 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         delta = delta / (1 - jnp.minimum(correction, 0.7))
         gas = gas.replace(dissipative_constant=delta / (gas.alpha**0.4 * gas.temperature**0.1))
     return _elements_from_data(gas, curve, free)
+
+
+def guess_of_start(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Array | float:
+    """The time, s, at which that line gives the T_0 of a gas, where t0 is free and T_0 is known."""
+    if START not in free or "temperature" in free:
+        return 0.0
+    power, line = _power_and_line(gas, curve)
+    intercept, slope = _intercept_and_slope(curve, line)
+    late = ((gas.temperature / curve.temperature[0]) ** -power - intercept) / slope
+    duration = curve.times[-1]
+    return jnp.clip(jnp.where(slope > 0, late, 0.0), -duration, 0.5 * duration)
+
+
+def halving_time(curve: CoolingCurve) -> Float[Array, ""]:
+    """The time until T has fallen to a half of its first value, or the last time before it has."""
+    halved = (curve.temperature < 0.5 * curve.temperature[0]).at[-1].set(True)
+    return curve.times[jnp.argmax(halved)]
+
+
+def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, Float[Array, "times"]]:
+    """The power of T that is a straight line in time, and it, over its first value."""
+    power = 1 / 2 if isinstance(gas.law, ConstantRestitution) else 3 / 5
+    return power, (curve.temperature / curve.temperature[0]) ** -power
+
+
+def _intercept_and_slope(curve: CoolingCurve, line: Float[Array, "times"]) -> tuple[Array, Array]:
+    """Of a straight line, by least squares with equal relative errors."""
+    weight = 1 / line
+    design = jnp.stack([weight, weight * curve.times], axis=1)
+    size = jnp.linalg.norm(design, axis=0)
+    intercept, slope = jnp.linalg.lstsq(design / size[None], weight * line)[0] / size
+    return jnp.maximum(intercept, 0.1 * line.min()), slope
 
 
 def _elements_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:

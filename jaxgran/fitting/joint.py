@@ -14,9 +14,9 @@ from jaxgran.data.drop_test import DropTest
 from jaxgran.data.run import Run
 from jaxgran.fitting.checks import check_curve, check_deterministic
 from jaxgran.fitting.comparison import Comparison
-from jaxgran.fitting.guess import guess_from_data
+from jaxgran.fitting.guess import guess_from_data, guess_of_start, halving_time
 from jaxgran.fitting.least_squares import least_squares
-from jaxgran.fitting.parameters import Parameters
+from jaxgran.fitting.parameters import START, Parameters, domain_of, size_of
 from jaxgran.fitting.result import SIGNIFICANCE
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas
@@ -71,7 +71,8 @@ def fit_jointly(
         measurements: by a label of each, the gas (its diameter, packing fraction, ...) and its
             cooling curve, whose T must have errors, or a drop test of such spheres.
         shared: floats of the gas or its law that all measurements share.
-        separate: floats that each curve has for itself, such as "temperature".
+        separate: floats that each curve has for itself, such as "temperature", or "t0", the time
+            at which it began (see `jaxgran.fit`).
         model: a deterministic model, by default `jaxgran.KineticTheory()`.
 
     Returns:
@@ -100,15 +101,18 @@ def _check(measurements, shared, separate, model) -> None:
         )
     check_deterministic(model, "a joint fit")
     names = (*shared, *separate)
-    if not shared or len(set(names)) < len(names):
-        raise ValueError(f"shared and separate must be different names, got {names}")
+    if not shared or len(set(names)) < len(names) or START in shared:
+        raise ValueError(
+            f"shared and separate must be different names, and each curve has its own {START}, got "
+            f"shared = {shared}, separate = {separate}"
+        )
     for label, pair in measurements.items():
         if not isinstance(pair, tuple) or len(pair) != 2:
             raise ValueError(f"measurement {label!r} must be (gas, curve), got {pair!r:.60}")
         gas, data = pair
         checked_gas(gas)
         for name in names:
-            gas.value(name)
+            domain_of(gas, name)
         if isinstance(data, DropTest):
             continue
         if not isinstance(data, CoolingCurve):
@@ -186,7 +190,10 @@ def _unknowns(
             continue
         guess = guess_from_data(gas, data, (*shared, *separate))
         common = Parameters(gas, shared).flat(guess) if common is None else common
-        at = Parameters(gas, separate).flat(guess) if separate else jnp.zeros(0)
+        start = guess_of_start(guess, data, (*shared, *separate))
+        at = jnp.zeros(0)
+        if separate:
+            at = Parameters(gas, separate, halving_time(data)).flat(guess, start)
         own += [at, jnp.zeros(1)]
         sizes.append((separate, at.size + 1))
     if common is None:  # drop tests alone: the gas's own values
@@ -210,7 +217,7 @@ def _result(labels, pairs, shared, separate, flat, residuals, jacobians, converg
     decrease = [_decrease(part, r) for part, r in zip(jacobians, residuals, strict=True)]
     informative = sum(bool(np.any(np.diag(part) > 0)) for part in each)
     p_value = float(jax.scipy.stats.chi2.sf(sum(decrease), max(p * (informative - 1), 1)))
-    ends = np.cumsum([gas.value(name).size for name in shared])[:-1]
+    ends = np.cumsum([size_of(gas, name) for name in shared])[:-1]
 
     def named(values):
         return dict(zip(shared, map(np.squeeze, np.split(values, ends)), strict=True))
@@ -237,7 +244,7 @@ def _own(labels, pairs, separate, flat, begin, deviations):
             continue
         size = 0
         if separate:
-            parameters = Parameters(scene, separate)
+            parameters = Parameters(scene, separate, halving_time(data))
             size = parameters.flat(scene).size
             at = flat[begin : begin + size]
             slope = np.diag(np.asarray(jax.jacfwd(parameters.estimates)(at)))

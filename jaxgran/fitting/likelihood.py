@@ -8,6 +8,7 @@ from jaxgran.checks.validation import POSITIVE, no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.checks import check_curve, check_deterministic
 from jaxgran.fitting.comparison import Comparison
+from jaxgran.fitting.few_replicas import smooth_errors
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
@@ -50,6 +51,7 @@ def log_likelihood(
     """
     model = KineticTheory() if model is None else model
     _check(gas, curve, model, clock)
+    curve, _ = smooth_errors(curve, replicas)
     N = None if num_particles is None else jnp.asarray(float(num_particles))
     comparison = Comparison.of(gas, curve, model, (), N, float(replicas))
     flat = jnp.zeros(comparison.num_beside, gas.temperature.dtype)

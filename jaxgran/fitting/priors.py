@@ -6,10 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.checks.tracing import any_traced
 from jaxgran.checks.validation import POSITIVE, Domain
+from jaxgran.fitting.parameters import START, domain_of
 from jaxgran.scene.gas import Gas
 
 DENSITY = "density"
@@ -22,7 +23,8 @@ class Priors(eqx.Module):
     Each is Gaussian in the float's unbounded scale (the logarithm of a positive one).
 
     Attributes:
-        names: of the floats, or "density", which then lets the mass vary.
+        names: of the floats, or "density", which then lets the mass vary, or "t0", the time at
+            which the gas began to cool.
         given: their values, SI.
         errors: and standard errors, SI.
     """
@@ -52,16 +54,27 @@ class Priors(eqx.Module):
         values, errors = zip(*pairs, strict=True) if pairs else ((), ())
         return cls(tuple(priors), tuple(values), tuple(errors))
 
+    def with_one(self, name: str, value: ArrayLike, error: ArrayLike) -> "Priors":
+        """These and one more."""
+        more = (jnp.asarray(value),), (jnp.asarray(error),)
+        return Priors((*self.names, name), self.given + more[0], self.errors + more[1])
+
     def also_free(self, free: tuple[str, ...]) -> tuple[str, ...]:
         """Floats that vary because of a prior, besides those that are free anyway."""
         varied = ("mass" if name == DENSITY else name for name in self.names)
         return tuple(dict.fromkeys(name for name in varied if name not in free))
 
-    def residuals(self, gas: Gas) -> Float[Array, "priors"]:
-        """(value - given one) / standard error of each, in the unbounded scale."""
+    def residuals(self, gas: Gas, start: Array | float = 0.0) -> Float[Array, "priors"]:
+        """(value - given one) / standard error of each, in the unbounded scale.
+
+        Args:
+            gas: with its values.
+            start: the time at which it began to cool, s.
+        """
         parts = []
         for name, given, error in zip(self.names, self.given, self.errors, strict=True):
-            value, domain = _value(gas, name), _domain(gas, name)
+            value = jnp.asarray(start) if name == START else _value(gas, name)
+            domain = _domain(gas, name)
             scale, width = jax.jvp(domain.to_free, (given,), (error,))
             parts.append(jnp.ravel((domain.to_free(value) - scale) / width))
         return jnp.concatenate([jnp.zeros(0, gas.temperature.dtype), *parts])
@@ -75,13 +88,14 @@ def _value(gas: Gas, name: str) -> Float[Array, "..."]:
 
 
 def _domain(gas: Gas, name: str) -> Domain:
-    return POSITIVE if name == DENSITY else gas.domains[name]
+    return POSITIVE if name == DENSITY else domain_of(gas, name)
 
 
 def _check_prior(gas: Gas, name: str, pair: object) -> None:
-    if name != DENSITY and name not in gas.domains:
+    if name not in (DENSITY, START) and name not in gas.domains:
         raise ValueError(
             f"priors: no float {name!r} in this gas; it has {', '.join(gas.domains)}, and {DENSITY}"
+            f" and {START}"
         )
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise ValueError(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.fitting.least_squares import least_squares
-from jaxgran.fitting.parameters import Parameters
+from jaxgran.fitting.parameters import Parameters, size_of
 from jaxgran.fitting.priors import Priors
 from jaxgran.scene.gas import Gas
 from jaxgran.theory.table_of_times import (
@@ -50,6 +50,7 @@ class Profile(NamedTuple):
 @eqx.filter_jit
 def fit_trials(
     gas: Gas,
+    began: Float[Array, ""],
     names: tuple[str, ...],
     times: Float[Array, "times"],
     measured: Float[Array, "times"],
@@ -63,14 +64,15 @@ def fit_trials(
     """Fits of all trials.
 
     Args:
-        gas, names: as fitted, and the free parameters.
+        gas, began, names: as fitted, and the free parameters.
         times, measured, weights: t, ln T and inverse relative errors; 0 where a point is not used.
         modelled, ratios: ln T and T_rot/T of the fitted model; T_rot is 0 of smooth spheres.
         trials, priors: what is added, and what else is known of the gas.
         accuracy: relative error of the model's cooling rate, of its mean and of its trend in ln T.
     """
-    parameters, used = Parameters(gas, (*names, *priors.also_free(names))), weights > 0
-    num_free = sum(gas.value(name).size for name in names)
+    varied, used = (*names, *priors.also_free(names)), weights > 0
+    parameters = Parameters(gas, varied, times[-1])
+    num_free = sum(size_of(gas, name) for name in names)
     unsure = accuracy.astype(measured.dtype)
     lowest = jnp.min(jnp.where(used, measured, jnp.inf))
     depth = jnp.max(jnp.where(used, measured, -jnp.inf)) - lowest + 2.0
@@ -84,22 +86,24 @@ def fit_trials(
         rate = rate * jnp.exp(unsure * (mean + trend * (2 * log_theta / depth + 1)))
         other = 1 - trial.constant - trial.drag
         added = (trial.constant * jnp.exp(log_theta / 2) + trial.drag) / other * rate[0]
-        later = jnp.maximum(times + trial.delay / rate[0], 0.0)
-        cooled = log_temperature(log_theta, rate + added, later)
+        later = times - parameters.start(flat) + trial.delay / rate[0]
+        cooled = log_temperature(log_theta, rate + added, jnp.maximum(later, 0.0))
+        cooled = cooled - (rate + added)[0] * jnp.minimum(later, 0.0)
         floor = jnp.log(jnp.maximum(trial.floor, jnp.finfo(rate.dtype).tiny)) + lowest
         return jnp.logaddexp(jnp.log(changed.temperature) + cooled, floor)
 
     nothing = Trial(*(jnp.zeros(()) for _ in Trial._fields))
-    beside = jnp.where(used, modelled - computed(nothing, parameters.flat(gas), 0.0, 0.0), 0.0)
+    own = computed(nothing, parameters.flat(gas, began), 0.0, 0.0)
+    beside = jnp.where(used, modelled - own, 0.0)
 
     def fitted(trial: Trial) -> Profile:
         def residuals(unknowns: Array) -> Array:
             flat, errors = unknowns[:-2], unknowns[-2:]
             differences = measured - computed(trial, flat, *errors) - beside
-            known = priors.residuals(parameters.gas(flat))
+            known = priors.residuals(parameters.gas(flat), parameters.start(flat))
             return jnp.concatenate([weights * jnp.where(used, differences, 0.0), known, errors])
 
-        first = jnp.pad(parameters.flat(_guess(gas, names, trial)), (0, 2))
+        first = jnp.pad(parameters.flat(_guess(gas, names, trial), began), (0, 2))
         unknowns = least_squares(residuals, first, MOST_STEPS)[0]
         value, jacobian = residuals(unknowns), jax.jacfwd(residuals)(unknowns)
         estimates = parameters.estimates(unknowns[:-2])[:num_free]

@@ -1,7 +1,10 @@
 """Statistics of the residuals of a fit."""
 
+from math import erfc, sqrt
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
 FEWEST = 4
@@ -36,6 +39,30 @@ def neighbour_correlation(
     enough = (number >= FEWEST) & (square > 0)
     correlation = jnp.sum(centred[1:] * centred[:-1]) / jnp.where(enough, square, 1.0)
     return jnp.clip(jnp.where(enough, correlation, 0.0), -STRONGEST, STRONGEST)
+
+
+def runs_test(residuals: Num[np.ndarray, "n"]) -> tuple[int, float, float]:
+    """Wald & Wolfowitz's test of the runs of one sign in a sequence.
+
+    Of ``a`` positive and ``b`` negative residuals in random order, n in all, the number of runs has
+    the mean ``m = 1 + 2 a b/n`` and the variance ``(m - 1)(m - 2)/(n - 1)``; it is taken for
+    Gaussian.
+
+    Args:
+        residuals: in the order of time; those that are 0 do not count.
+
+    Returns:
+        The number of runs, m, and the probability of so few by chance; 1 for fewer than `FEWEST`
+        residuals and where all have one sign.
+    """
+    positive = residuals[residuals != 0] > 0
+    n, a = positive.size, int(np.sum(positive))
+    number = int(np.sum(positive[1:] != positive[:-1])) + bool(n)
+    mean = 1 + 2 * a * (n - a) / max(n, 1)
+    variance = (mean - 1) * (mean - 2) / max(n - 1, 1)
+    if n < FEWEST or variance <= 0:
+        return number, mean, 1.0
+    return number, mean, 0.5 * erfc((mean - number) / sqrt(2 * variance))
 
 
 def correlation_factor(correlation: Float[Array, ""]) -> Float[Array, ""]:

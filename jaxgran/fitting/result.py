@@ -6,10 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.checks.words import Rows, as_html, as_text, said
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.parameters import START, size_of
 from jaxgran.fitting.priors import Priors
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
@@ -41,17 +43,20 @@ class Fit(eqx.Module):
             parameters' unbounded scale (the logarithm of a positive one), shape (residuals, p).
         start: the guess at which the search began, SI, shape (p,).
         gas: the fitted gas, with all floats that have priors.
+        began: t0, the time at which the gas had T_0 and began to cool, s; 0 unless it was free.
         priors: what was known besides the curve.
         curve: its cooling curve at the measured times; of a stochastic model that of the last
             simulation, one Gauss-Newton step before the estimate.
-        residuals: (ln T_measured - ln T_model) over its error; 0 where a point has no weight.
+        weights: of ln T_measured - ln T_model: 1 over its error, which is smooth along a curve of
+            few replicas; 0 where a point has none.
+        residuals: that difference times its weight.
         displacement_residuals: the same of <dr^2>; None if it was not used.
         rotation_residuals: the same of T_rot; None if it was not used.
         scatter: of ln T about the model, taken for the error of a curve without errors; else None.
         chi2, degrees_of_freedom, reduced_chi2: of all weighted residuals; without errors of the
             curve reduced chi^2 is 1.
-        p_value: probability of a chi^2 as large by chance, of T or of <dr^2>, whichever fits worse;
-            nan if the curve has no errors.
+        p_value: probability of a chi^2 as large by chance, of T or of <dr^2>, whichever fits worse,
+            the errors of few replicas being uncertain themselves; nan if the curve has no errors.
         iterations: steps of Levenberg-Marquardt, evaluations of L-BFGS, or simulations by a
             stochastic model.
         converged: whether the search reached its tolerance; of a stochastic model, whether the last
@@ -68,8 +73,10 @@ class Fit(eqx.Module):
     sensitivity: Float[Array, "residuals p"]
     start: Float[Array, "p"]
     gas: Gas
+    began: Float[Array, ""]
     priors: Priors
     curve: CoolingCurve
+    weights: Float[Array, "times"]
     residuals: Float[Array, "times"]
     displacement_residuals: Float[Array, "times"] | None
     rotation_residuals: Float[Array, "times"] | None
@@ -108,10 +115,11 @@ class Fit(eqx.Module):
     @property
     def _words(self) -> tuple[str, Rows]:
         """Title and rows: the estimates with their errors, and how well the curve is met."""
-        rows = []
+        known = not isinstance(self.sensitivity, Tracer) and self.sensitivity.ndim == 2
+        rows, open_to = [], self.undetermined() if known else ()
         for name in self.names:
-            estimate, error = (said(x, UNITS.get(name, "")) for x in self.value(name))
-            rows.append((name, f"{estimate} +- {error}"))
+            estimate, error = (said(x, _unit(name)) for x in self.value(name))
+            rows.append((name, "not determined" if name in open_to else f"{estimate} +- {error}"))
         rows.append(("reduced chi^2", f"{said(self.reduced_chi2)}, p = {said(self.p_value)}"))
         rows.append(("converged", str(self.converged)))
         return f"Fit of {self.model.name}", rows
@@ -134,8 +142,12 @@ class Fit(eqx.Module):
         weak = (singular <= 1) | (singular < self.model.derivative_accuracy * singular[0])
         share = np.abs(rotation[weak])
         found = np.any(share > 0.05 * share.max(axis=1, initial=0.0, keepdims=True), axis=0)
-        sized = [name for name in self.names for _ in range(self.gas.value(name).size)]
+        sized = [name for name in self.names for _ in range(size_of(self.gas, name))]
         return tuple(dict.fromkeys(n for n, yes in zip(sized, found, strict=True) if yes))
+
+
+def _unit(name: str) -> str:
+    return "s" if name == START else UNITS.get(name, "")
 
 
 def _deviations(covariance: Float[Array, "p p"]) -> Float[Array, "p"]:
@@ -159,7 +171,7 @@ class Misfit(NamedTuple):
 
 
 def misfit(
-    parts: list[tuple[Float[Array, "_"], Int[Array, ""]]],
+    parts: list[tuple[Float[Array, "_"], Int[Array, ""], Float[Array, ""] | None]],
     degrees_of_freedom: Int[Array, ""],
     *,
     errors_known: bool,
@@ -167,24 +179,38 @@ def misfit(
     """Goodness of fit of weighted residuals.
 
     T and <dr^2> are tested apart, so that many points of one do not hide a misfit of the other: the
-    p-value is that of the worse one, corrected for the choice.
+    p-value is that of the worse one, corrected for the choice. Residuals over errors that were
+    estimated themselves have Student's t distribution, and their chi^2 per degree of freedom has
+    the F distribution.
 
     The covariance is inflated by the reduced chi^2 (at least 1) of the worse one where the p-value
     is below `SIGNIFICANCE`, and always where the errors are unknown.
 
     Args:
-        parts: weighted residuals of each observable, and their degrees of freedom.
+        parts: weighted residuals of each observable, their degrees of freedom, and those of their
+            errors; None if these are exact.
         degrees_of_freedom: of all of them.
         errors_known: whether they are.
     """
-    each = jnp.stack([jnp.sum(jnp.asarray(residuals) ** 2) for residuals, _ in parts])
+    each = jnp.stack([jnp.sum(jnp.asarray(residuals) ** 2) for residuals, *_ in parts])
     chi2 = jnp.sum(each)
     reduced = chi2 / degrees_of_freedom
     if not errors_known:
         return Misfit(chi2, reduced, jnp.full((), jnp.nan), reduced)
-    degrees = jnp.stack([jnp.maximum(number, 1) for _, number in parts])
-    worst = jnp.min(jax.scipy.stats.chi2.sf(each, degrees))
+    degrees = jnp.stack([jnp.maximum(number, 1) for _, number, _ in parts])
+    chances = [_chance(*x, own) for *x, (*_, own) in zip(each, degrees, parts, strict=True)]
+    worst = jnp.min(jnp.stack(chances))
     p_value = -jnp.expm1(len(parts) * jnp.log1p(-worst)) if len(parts) > 1 else worst
     unexplained = p_value < SIGNIFICANCE
     inflation = jnp.where(unexplained, jnp.maximum(jnp.max(each / degrees), 1.0), 1.0)
     return Misfit(chi2, reduced, p_value, inflation)
+
+
+def _chance(
+    chi2: Float[Array, ""], degrees: Int[Array, ""], of_errors: Float[Array, ""] | None
+) -> Float[Array, ""]:
+    """Probability of a chi^2 as large, over errors of some degrees of freedom, None if exact."""
+    if of_errors is None:
+        return jax.scipy.stats.chi2.sf(chi2, degrees)
+    share = of_errors / (of_errors + chi2)  # of the F distribution
+    return jax.scipy.special.betainc(of_errors / 2, degrees / 2, share)

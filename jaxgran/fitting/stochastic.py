@@ -31,10 +31,11 @@ def fit_stochastic(
     progress: bool = True,
     max_simulations: int = 8,
     priors: Priors = NO_PRIORS,
+    of_errors: dict[str, Float[Array, ""]] | None = None,
 ) -> Fit:
     """Fit through a stochastic model, from a guess, by default the result of kinetic theory.
 
-    Args, returns, raises: as `jaxgran.fit`.
+    Args, returns, raises: as `jaxgran.fit`; of_errors as `fit_deterministic`.
     """
     if any_traced(gas, curve, guess, model, key):
         raise ValueError(
@@ -73,7 +74,8 @@ def fit_stochastic(
         max_simulations=max_simulations,
         progress=progress,
     )
-    return _fit_of(model, parameters, names, first, found, priors, errors_known)
+    degrees = (of_errors or {}).get("measurement")
+    return _fit_of(model, parameters, names, first, found, priors, errors_known, degrees)
 
 
 def _check_replicas(model: AbstractModel, computed: CoolingCurve) -> None:
@@ -102,17 +104,19 @@ def _fit_of(
     found: Simulated,
     priors: Priors,
     errors_known: bool,
+    of_errors: Float[Array, ""] | None,
 ) -> Fit:
     """The fit in SI units of what a search found."""
     flat = jnp.asarray(found.flat)
     residuals, sensitivity = jnp.asarray(found.residuals), jnp.asarray(found.sensitivity)
+    weights = jnp.asarray(found.weights)
     used = residuals != 0
     degrees_of_freedom = jnp.sum(used) - flat.size
     scatter = None
     if not errors_known:
         scatter = jnp.sqrt(jnp.sum(residuals**2) / degrees_of_freedom)
-        residuals, sensitivity = residuals / scatter, sensitivity / scatter
-    tested = [(residuals, degrees_of_freedom)]
+        residuals, sensitivity, weights = (x / scatter for x in (residuals, sensitivity, weights))
+    tested = [(residuals, degrees_of_freedom, of_errors)]
     chance = misfit(tested, degrees_of_freedom, errors_known=errors_known)
     scale = jax.jacfwd(parameters.estimates)(flat)
     gain = scale @ jnp.asarray(found.gain)
@@ -137,8 +141,10 @@ def _fit_of(
         sensitivity=sensitivity,
         start=parameters.estimates(first),
         gas=gas,
+        began=jnp.zeros(()),
         priors=priors,
         curve=found.computed,
+        weights=weights,
         residuals=residuals,
         displacement_residuals=None,
         rotation_residuals=None,

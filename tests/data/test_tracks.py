@@ -1,0 +1,161 @@
+"""Tracks of particles, and T(t) from them."""
+
+import numpy as np
+import pytest
+
+import jaxgran
+from tests.conftest import glass_beads
+
+HEADER = {"eta": "0.05", "diameter": "0.002", "density": "2500", "Y": "5e7", "nu": "0.22"}
+HEADER |= {"T0": "0.01"}
+
+
+def write(path, times, positions, header=HEADER):
+    """A file of tracks, frame by frame, of positions (frames, particles, coordinates)."""
+    lines = [f"# {key}: {value}" for key, value in header.items()]
+    lines.append(",".join(["id", "t", *"xyz"[: positions.shape[2]]]))
+    for t, frame in zip(times, positions, strict=True):
+        lines += [
+            ",".join(map(repr, [i + 1, float(t), *map(float, x)])) for i, x in enumerate(frame)
+        ]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def free_flight(n, *, dimensions=3, drift=(0.3, -0.2, 0.5), seed=0):
+    """Frames of particles that keep a Maxwellian velocity of variance .01 and share a drift."""
+    rng = np.random.default_rng(seed)
+    velocity = 0.1 * rng.standard_normal((n, 3))
+    times = np.linspace(0.0, 0.01, 6)
+    moved = (velocity + np.array(drift)) * times[:, None, None]
+    return times, (rng.uniform(size=(n, 3)) + moved)[:, :, :dimensions], velocity
+
+
+BARE = {"N": "200"}
+
+
+@pytest.mark.parametrize("dimensions", [3, 2])
+def test_free_flight_gives_t_without_drift(tmp_path, dimensions):
+    times, positions, velocity = free_flight(200, dimensions=dimensions)
+    path = write(tmp_path / "tracks.csv", times, positions, BARE)
+    curve, header = jaxgran.read_curve(path)
+    np.testing.assert_allclose(curve.times, (times[1:] + times[:-1]) / 2, rtol=1e-12)
+    # Of all 200, whose momentum is 0: <v^2>/d is the variance with N below, not N - 1.
+    expected = velocity[:, :dimensions].var(axis=0).mean()
+    np.testing.assert_allclose(curve.temperature, expected, rtol=1e-9)  # of differences
+    # Of a Gaussian sample: sqrt(2/(d n)) T, known within 10 % from 200 particles.
+    error = expected * (2 / (dimensions * 200)) ** 0.5
+    np.testing.assert_allclose(curve.temperature_error, error, rtol=0.15)
+    assert "drift of 200 of 200 particles removed" in header["T_from"]
+    assert ("two of three coordinates" in header["T_from"]) == (dimensions == 2)
+
+
+def test_the_jackknife_leaves_one_particle_out(tmp_path):
+    times, positions, velocity = free_flight(7)
+    path = write(tmp_path / "tracks.csv", times, positions, {"N": "1000"})
+    curve, _ = jaxgran.read_curve(path)
+    others = [np.delete(velocity, i, axis=0).var(axis=0, ddof=1).mean() for i in range(7)]
+    expected = np.sqrt(6 / 7 * np.sum((others - np.mean(others)) ** 2)) * 999 / 1000
+    np.testing.assert_allclose(curve.temperature_error, expected, rtol=1e-9)
+
+
+def test_errors_of_positions_are_removed(tmp_path):
+    times, positions, velocity = free_flight(4000)
+    error = 1e-4  # m; over .002 s this adds half of T
+    noisy = positions + error * np.random.default_rng(1).standard_normal(positions.shape)
+    path = write(tmp_path / "t.csv", times, noisy, {"N": "4000", "localisation_error": str(error)})
+    with pytest.warns(UserWarning, match="localisation_error adds up to 3"):
+        curve, header = jaxgran.read_curve(path)
+    assert "localisation_error removed, at most 3" in header["T_from"]
+    # 12000 components, of which a third is noise: sqrt(2/12000) (1 + 1/2) = 2 %, three of it.
+    np.testing.assert_allclose(curve.temperature, velocity.var(axis=0).mean(), rtol=0.06)
+
+
+def test_impacts_between_frames_are_corrected(tmp_path):
+    """Velocities that lose their memory at Enskog's rate (an Ornstein-Uhlenbeck process)."""
+    gas = glass_beads(0.0)
+    rate = 2 / 3 * float(gas.collision_frequency)
+    n, fine, frames = 3000, 40, 6
+    dt = 0.6 / rate / fine  # frames .6 relaxation times apart, each in 40 steps
+    rng, keep = np.random.default_rng(0), np.exp(-rate * dt)
+    v, x, positions = 0.1 * rng.standard_normal((n, 3)), np.zeros((n, 3)), []
+    for step in range(fine * frames + 1):
+        if step % fine == 0:
+            positions.append(x)
+        new = keep * v + 0.1 * np.sqrt(1 - keep**2) * rng.standard_normal((n, 3))
+        x, v = x + dt * (v + new) / 2, new
+    times = np.arange(frames + 1) * fine * dt
+    path = write(tmp_path / "tracks.csv", times, np.array(positions), HEADER | {"N": str(n)})
+    curve, header = jaxgran.read_curve(path)
+    # Uncorrected T is 17 % too small; 9000 components: sqrt(2/9000) = 1.5 %, three of it.
+    np.testing.assert_allclose(curve.temperature, 0.01, rtol=0.045)
+    assert "corrected, at most 17 % of T" in header["T_from"]
+
+
+@pytest.mark.slow
+def test_tracks_of_hard_spheres(tmp_path):
+    """T from positions alone, beside the T of the run."""
+    gas = glass_beads(0.15)
+    tau, n = float(gas.mean_free_time), 1000
+    times = np.linspace(2.0, 3.5, 6) * tau
+    model, side = jaxgran.HardSpheres(n), float(gas.box_side(n))
+    frames = []
+    for k in range(len(times)):  # the same run, ended at each frame
+        end = jaxgran.cool(gas, np.array([0.1 * tau, times[k]]), model=model, progress=False)
+        assert end.particles is not None
+        frames.append(np.asarray(end.particles.position[0]))
+    moved = np.diff(frames, axis=0)
+    moved -= side * np.round(moved / side)
+    positions = np.concatenate([[frames[0]], frames[0] + np.cumsum(moved, axis=0)])
+    truth = jaxgran.cool(gas, (times[1:] + times[:-1]) / 2, model=model, progress=False)
+    path = write(tmp_path / "t.csv", times, positions, HEADER | {"N": str(n)})
+    curve, _ = jaxgran.read_curve(path)
+    # .3 mean free times take 6 % of T, which is corrected; sqrt(x/n) is left of chance.
+    np.testing.assert_allclose(curve.temperature, truth.temperature, rtol=0.02)
+
+
+CASES = [
+    (lambda rows: rows[:30] + rows[31:], r"line \d+: particle 1 stands here, and is missing"),
+    (lambda rows: rows + [rows[-1]], r"line 66: particle 10 at t = .* given again, after line 65"),
+    (lambda rows: [r for r in rows if r.startswith("4,")], r"of 1 particle\(s\); at least 3"),
+    (lambda rows: [r for r in rows if r[0] in "456"][::-1], r"earlier than that of particle"),
+    (lambda rows: rows[:30], r"of 3 frames; at least 4"),
+    (lambda rows: [*rows[:-1], "x" + rows[-1]], r"line 65: expected 5 finite numbers"),
+    (lambda rows: [*rows[:-1], "1.5" + rows[-1][2:]], r"line 65: id is 1.5; number the particles"),
+]
+
+
+@pytest.mark.parametrize("change, message", CASES)
+def test_bad_tracks_name_their_line(tmp_path, change, message):
+    times, positions, _ = free_flight(10)
+    path = write(tmp_path / "tracks.csv", times, positions, {"a": "1", "b": "2", "c": "3", "d": ""})
+    head, rows = (path.read_text().splitlines()[part] for part in (slice(5), slice(5, None)))
+    path.write_text("\n".join([*head, *change(rows)]) + "\n")
+    with pytest.raises(ValueError, match=message):
+        jaxgran.read_curve(path)
+
+
+@pytest.mark.parametrize(
+    "header, message",
+    [
+        ({"N": "5"}, "N = 5, but 10 particles are tracked"),
+        ({"dimension": "2"}, "dimension 2 has no tracks with 3 coordinates"),
+        ({"localisation_error": "-1"}, "localisation_error: must be >= 0"),
+        ({"localisation_error": "1"}, "between frames 0 and 1 particles move no further than"),
+    ],
+)
+def test_headers_that_contradict_the_tracks(tmp_path, header, message):
+    times, positions, _ = free_flight(10)
+    with pytest.raises(ValueError, match=message):
+        jaxgran.read_curve(write(tmp_path / "tracks.csv", times, positions, header))
+
+
+def test_units_are_those_of_the_header(tmp_path):
+    times, positions, _ = free_flight(10)
+    metres, _ = jaxgran.read_curve(write(tmp_path / "m.csv", times, positions, BARE))
+    header = BARE | {"length_unit": "mm", "time_unit": "ms"}
+    path = write(tmp_path / "mm.csv", 1e3 * times, 1e3 * positions, header)
+    converted, _ = jaxgran.read_curve(path)
+    for field in ("times", "temperature", "temperature_error"):
+        one, other = getattr(metres, field), getattr(converted, field)
+        np.testing.assert_allclose(other, one, rtol=1e-9)

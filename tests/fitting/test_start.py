@@ -1,0 +1,132 @@
+"""An unknown start of the clock."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from tests.conftest import glass_beads
+from tests.fitting.curves import synthetic
+
+A = "dissipative_constant"
+
+
+def shifted(curve, late):
+    """The curve on a clock that was started earlier than the gas."""
+    return jaxgran.CoolingCurve(
+        times=curve.times + late,
+        temperature=curve.temperature,
+        temperature_error=curve.temperature_error,
+    )
+
+
+@pytest.fixture(scope="module")
+def measured():
+    gas = glass_beads(0.15)
+    return gas, synthetic(gas, jax.random.key(0))
+
+
+def test_t0_takes_up_a_late_clock(measured):
+    """The same curve on two clocks: the same A, and t0 by the difference."""
+    gas, curve = measured
+    late = 10.0 * float(curve.times[0])
+    early, later = (
+        jaxgran.fit(gas, shifted(curve, shift), free=(A, "t0")) for shift in (0.0, late)
+    )
+    assert bool(early.converged) and bool(later.converged)
+    # Two searches, each to 1e-2 of a standard error.
+    np.testing.assert_allclose(later.estimate[0], early.estimate[0], rtol=1e-4)
+    error = float(later.value("t0")[1])
+    assert float(later.began - early.began) == pytest.approx(late, abs=0.02 * error)
+    # The gas itself began at 0; the curve is theory's own, so that the error is the measurement's.
+    assert abs(float(early.began)) < 3 * float(early.error_budget["measurement"][1])
+    assert early.undetermined() == () and f"{late:.0e}"[0] in repr(later)
+    # Without t0 the same curve is not explained.
+    assert float(jaxgran.fit(gas, shifted(curve, late)).p_value) < 1e-6
+
+
+@pytest.mark.slow
+def test_errors_of_t0_are_its_scatter(measured):
+    """Over 100 draws of the noise."""
+    gas, _ = measured
+    keys = jax.random.split(jax.random.key(1), 100)
+    truth = jnp.array([float(gas.value(A)), 0.0])
+
+    def pull_of(key):
+        result = jaxgran.fit(gas, synthetic(gas, key), free=(A, "t0"))
+        return (result.estimate - truth) / result.error_budget["measurement"]
+
+    pull = np.asarray(jax.vmap(pull_of)(keys))
+    # Of 100 draws the scatter is known within 7 %, the mean within .1: three of each. The error
+    # holds a factor for correlated neighbours, 1.1 in the mean of independent ones.
+    np.testing.assert_allclose(pull.std(axis=0), 0.95, atol=0.21)
+    np.testing.assert_allclose(pull.mean(axis=0), 0.0, atol=0.3)
+
+
+def test_a_gas_begun_before_the_file_is_found(measured):
+    """Times counted from a point that lies after the start: t0 is negative."""
+    gas, _ = measured
+    curve = synthetic(gas, jax.random.key(2), num_points=52)  # 40 are left, as in other tests
+    cut, first = slice(12, None), float(curve.times[12])
+    times, T, error = (x[cut] for x in (curve.times, curve.temperature, curve.temperature_error))
+    part = jaxgran.CoolingCurve(times=times - first, temperature=T, temperature_error=error)
+    result = jaxgran.fit(gas, part, free=(A, "t0"))
+    t0, deviation = result.value("t0")
+    assert abs(float(t0) + first) < 3 * float(deviation)
+
+
+@pytest.mark.parametrize("law", ["viscoelastic", pytest.param("constant", marks=pytest.mark.slow)])
+def test_t0_and_the_first_temperature_are_not_found_together(measured, law):
+    gas, curve = measured
+    name = A
+    if law == "constant":
+        gas = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
+        name, curve = "coefficient", synthetic(gas, jax.random.key(0))
+    with pytest.warns(UserWarning, match="temperature and t0: .*a gas forgets how hot it began"):
+        both = jaxgran.fit(gas, curve, free=(name, "temperature", "t0"))
+    assert both.undetermined() == ("temperature", "t0") and bool(both.converged)
+    assert repr(both).count("not determined") == 2
+    # The constant of the material does not depend on where the course begins.
+    alone = jaxgran.fit(gas, curve, free=(name, "temperature"))
+    error = float(alone.error_budget["measurement"][0])
+    assert float(both.estimate[0]) == pytest.approx(float(alone.estimate[0]), abs=error)
+    diagnosis = jaxgran.diagnose(both, curve)
+    assert any("does not determine temperature and t0" in x for x in diagnosis.reasons)
+    low, high = diagnosis.ranges[name]
+    assert low < gas.value(name) < high
+
+
+@pytest.mark.slow
+def test_a_prior_of_t0_widens_a(measured):
+    gas, curve = measured
+    loose = {"t0": (0.0, float(curve.times[10]))}
+    result = jaxgran.fit(gas, curve, priors=loose)
+    assert "t0" in result.error_budget and result.names == (A,)
+    assert abs(float(result.began)) < 0.2 * float(curve.times[10])  # the curve knows it better
+    bare = jaxgran.fit(gas, curve)
+    assert result.error_budget["t0"][0] < bare.error_budget["measurement"][0]
+
+
+def test_wrong_uses_of_t0_are_refused(measured):
+    gas, curve = measured
+    for more in ({"free": (A, "t0")}, {"priors": {"t0": (0.0, 1.0)}}):
+        with pytest.raises(ValueError, match="t0 is fitted through kinetic theory only"):
+            jaxgran.fit(gas, curve, model=jaxgran.DSMC(100, replicas=2), **more)
+    with pytest.raises(ValueError, match="each curve has its own t0"):
+        jaxgran.fit_jointly({"a": (gas, curve), "b": (gas, curve)}, shared=(A, "t0"))
+
+
+@pytest.mark.slow  # another program
+def test_curves_of_one_material_have_their_own_clocks(measured):
+    gas, curve = measured
+    late = 20.0 * float(curve.times[0])
+    found = jaxgran.fit_jointly(
+        {"prompt": (gas, shifted(curve, 0.0)), "late": (gas, shifted(curve, late))},
+        separate=("t0",),
+    )
+    t0 = {label: own["t0"] for label, own in found.separate.items()}
+    assert t0["late"][0] - t0["prompt"][0] == pytest.approx(late, rel=0.01)
+    assert found.agree and found.converged
