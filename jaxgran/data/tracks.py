@@ -4,6 +4,7 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -97,9 +98,9 @@ def curve_of_tracks(path: Path, table: Table) -> tuple[CoolingCurve, dict[str, s
     T_true, words = _without_impacts(path, T, duration, header)
     notes += words
     curve = CoolingCurve(
-        times=(tracks.times[1:] + tracks.times[:-1]) / 2,
-        temperature=T_true,
-        temperature_error=error * T_true / T,
+        times=jnp.asarray((tracks.times[1:] + tracks.times[:-1]) / 2),
+        temperature=jnp.asarray(T_true),
+        temperature_error=jnp.asarray(error * T_true / T),
     )
     header["T_from"] = f"T = <(u - <u>)^2>/d, u over neighbouring frames; {'; '.join(notes)}"
     curve.check(f"{path}: T between frames {{0}} and the next".format)

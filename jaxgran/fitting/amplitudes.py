@@ -102,7 +102,7 @@ def _rival(
         amplitude=float(amplitudes[np.argmin(own)]),
         allowed=(float(reached.min()), float(reached.max())),
         improvement=improvement,
-        estimate=estimate[np.argmin(own)],
+        estimate=np.array(estimate[np.argmin(own)]),
         low=np.where(positive, np.maximum(low, 0.0), low),
         high=np.array(high),
         asked=improvement > ASKED,

@@ -198,7 +198,8 @@ def misfit(
     if not errors_known:
         return Misfit(chi2, reduced, jnp.full((), jnp.nan), reduced)
     degrees = jnp.stack([jnp.maximum(number, 1) for _, number, _ in parts])
-    chances = [_chance(*x, own) for *x, (*_, own) in zip(each, degrees, parts, strict=True)]
+    own = [of_errors for *_, of_errors in parts]
+    chances = [_chance(x, n, m) for x, n, m in zip(each, degrees, own, strict=True)]
     worst = jnp.min(jnp.stack(chances))
     p_value = -jnp.expm1(len(parts) * jnp.log1p(-worst)) if len(parts) > 1 else worst
     unexplained = p_value < SIGNIFICANCE
