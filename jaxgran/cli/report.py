@@ -82,7 +82,8 @@ def print_budget(rows: list[dict], explain: bool) -> None:
             line = ", ".join(f"{name} {share:.2g} {unit}" for name, share in shares)
             print(f"error of {row['parameter']}: {line}")
             continue
-        print(f"\nerror of {row['parameter']} in {unit}; the squares of the parts add up")
+        words = "ms" if is_time else "per cent"
+        print(f"\nerror of {row['parameter']}, in {words}; the squares of the parts add up")
         for name, share in shares:
             print(f"  {share:8.2g}  {name}: {PARTS.get(name, 'its error as given, or as known')}")
 

@@ -69,6 +69,7 @@ DECISIVE = Omission("contacts last", True, "Take contacts.")
 GOOD, BAD = 0.5, 0.001
 LOSS = "a further loss at constant eps, as of walls or rough grains"
 RANGE = r"dissipative_constant is between [\d.e-]+ and [\d.e-]+"
+COMPATIBLE = "Stub is compatible with this curve"
 NOT_EXPLAINED = "Stub does not explain this curve: do not trust its estimates."
 
 

@@ -35,9 +35,8 @@ def test_errors_become_smooth():
         for each in (curves, [smooth_errors(c, R)[0] for c in curves])
     )
     # 40 points of 2 degrees: 80 for 3 coefficients, sqrt(3/160) = 14 % of an error, 25 % at ends.
-    assert (
-        np.mean(np.abs(np.log(smooth / SIGMA))) < 0.14 < 0.4 < np.mean(np.abs(np.log(raw / SIGMA)))
-    )
+    off = [np.mean(np.abs(np.log(each / SIGMA))) for each in (smooth, raw)]
+    assert off[0] < 0.14 < 0.4 < off[1]
     _, degrees = smooth_errors(curves[0], R)
     # Neighbours are independent: what is found of a correlation is chance, 1/sqrt(40).
     assert 0.55 * 2 * N < float(degrees["measurement"]) <= 2 * N
