@@ -98,7 +98,7 @@ def print_rivals(name: str, diagnosis) -> None:
         between = f"{rival.low[0]:.3g} .. {rival.high[0]:.3g}"
         told = "yes" if rival.told_apart else f"no: errors {rival.sharper:.2g} x smaller would"
         if not rival.told_apart and np.isfinite(rival.decades):
-            told += f", or {rival.decades:g} decades of T more"
+            told += f", or T followed to 1/{10**rival.decades:.2g} of its last"
         told = "the curve asks for it" if rival.asked else told
         print(f"{rival.name:{width}}  {rival.improvement:10.2g}", end="")
         print(f" {rival.estimate[0]:9.3g} {between:>20}  {told}")

@@ -13,8 +13,9 @@
 - `likelihood`: `log_likelihood`, the same residuals for samplers.
 - `result`: `Fit`, what a fit returns, and goodness of fit.
 - `rivals`: what else could have made the curve, and the range of the parameters then; uses
-  `profile`, fits of the law and something besides, of a given amplitude.
-- `residuals`: statistics of residuals.
+  `profile`, fits of the law and something besides, of a given amplitude, and `amplitudes`, what
+  these say of one rival.
+- `residuals`: statistics of residuals; `few_replicas`: errors that few replicas leave uncertain.
 - `diagnosis`: what a fit means, in words.
 
 The top floor: may import every other package. Models are known by `jaxgran.AbstractModel` only;

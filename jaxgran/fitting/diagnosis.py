@@ -215,8 +215,8 @@ def _or_further(rival: Rival) -> str:
     if np.isnan(rival.decades):
         return ""
     if np.isinf(rival.decades):
-        return f", but not {FURTHER[-1]:g} decades of T more"
-    return f", and so would {rival.decades:g} more decades of T with as many points in each"
+        return f", but not {FURTHER[-1]:g} more decades of T"
+    return f", and so would T followed through a factor of {10**rival.decades:.2g} more"
 
 
 def _assumptions(result: Fit) -> str:
