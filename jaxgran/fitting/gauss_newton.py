@@ -134,14 +134,11 @@ def by_simulation(
             ended = settled and len(near) > 1 and (quiet or not known)
             if ended or len(simulations) == max_simulations:
                 break
-    residuals, sensitivity = _residuals_at(flat, near, measured, average.sigma, used)
-    gain, weights = np.zeros(sensitivity.T.shape), np.zeros(len(used))
-    weights[used] = 1 / average.sigma
+    weighted = _residuals_at(flat, near, measured, average.sigma, used)
+    gain = np.zeros((len(flat), len(used)))
     gain[:, used] = average.gain
     parts = gain, average.errors, average.noises
-    return Simulated(
-        flat, curve, weights, residuals, sensitivity, *parts, len(simulations), settled
-    )
+    return Simulated(flat, curve, *weighted, *parts, len(simulations), settled)
 
 
 def _simulated(
@@ -210,11 +207,14 @@ def _residuals_at(
     measured: Float[np.ndarray, "used"],
     sigma: Float[np.ndarray, "used"],
     used: Bool[np.ndarray, "times"],
-) -> tuple[Float[np.ndarray, "times"], Float[np.ndarray, "times p"]]:
-    """Weighted residuals, extrapolated from each simulation and averaged, and their derivative."""
+) -> tuple[Float[np.ndarray, "times"], Float[np.ndarray, "times"], Float[np.ndarray, "times p"]]:
+    """Weights, weighted residuals, extrapolated from each simulation and averaged, and their
+    derivative."""
     each = [measured - s.log_temperature - s.slope @ (flat - s.flat) for s in near]
     slope = np.mean([s.slope for s in near], axis=0)
-    residuals, sensitivity = np.zeros(len(used)), np.zeros((len(used), len(flat)))
+    weights, residuals = np.zeros(len(used)), np.zeros(len(used))
+    sensitivity = np.zeros((len(used), len(flat)))
+    weights[used] = 1 / sigma
     residuals[used] = np.mean(each, axis=0) / sigma
     sensitivity[used] = slope / sigma[:, None]
-    return residuals, sensitivity
+    return weights, residuals, sensitivity

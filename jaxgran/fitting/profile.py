@@ -73,7 +73,6 @@ def fit_trials(
     varied, used = (*names, *priors.also_free(names)), weights > 0
     parameters = Parameters(gas, varied, times[-1])
     num_free = sum(size_of(gas, name) for name in names)
-    unsure = accuracy.astype(measured.dtype)
     lowest = jnp.min(jnp.where(used, measured, jnp.inf))
     depth = jnp.max(jnp.where(used, measured, -jnp.inf)) - lowest + 2.0
 
@@ -83,7 +82,8 @@ def fit_trials(
         if changed.elements:
             ratio = jnp.interp(-log_theta - jnp.log(changed.temperature), -modelled, ratios)
             rate = rate + cooling_by_elements(changed, log_theta, ratio)
-        rate = rate * jnp.exp(unsure * (mean + trend * (2 * log_theta / depth + 1)))
+        unsure = mean + trend * (2 * log_theta / depth + 1)
+        rate = rate * jnp.exp(accuracy.astype(rate.dtype) * unsure)
         other = 1 - trial.constant - trial.drag
         added = (trial.constant * jnp.exp(log_theta / 2) + trial.drag) / other * rate[0]
         later = times - parameters.start(flat) + trial.delay / rate[0]
@@ -93,13 +93,12 @@ def fit_trials(
         return jnp.logaddexp(jnp.log(changed.temperature) + cooled, floor)
 
     nothing = Trial(*(jnp.zeros(()) for _ in Trial._fields))
-    own = computed(nothing, parameters.flat(gas, began), 0.0, 0.0)
-    beside = jnp.where(used, modelled - own, 0.0)
+    beside = modelled - computed(nothing, parameters.flat(gas, began), 0.0, 0.0)
 
     def fitted(trial: Trial) -> Profile:
         def residuals(unknowns: Array) -> Array:
             flat, errors = unknowns[:-2], unknowns[-2:]
-            differences = measured - computed(trial, flat, *errors) - beside
+            differences = measured - beside - computed(trial, flat, *errors)
             known = priors.residuals(parameters.gas(flat), parameters.start(flat))
             return jnp.concatenate([weights * jnp.where(used, differences, 0.0), known, errors])
 
