@@ -87,8 +87,7 @@ def fit_trials(
         other = 1 - trial.constant - trial.drag
         added = (trial.constant * jnp.exp(log_theta / 2) + trial.drag) / other * rate[0]
         later = times - parameters.start(flat) + trial.delay / rate[0]
-        cooled = log_temperature(log_theta, rate + added, jnp.maximum(later, 0.0))
-        cooled = cooled - (rate + added)[0] * jnp.minimum(later, 0.0)
+        cooled = _continued(log_theta, rate + added, later)
         floor = jnp.log(jnp.maximum(trial.floor, jnp.finfo(rate.dtype).tiny)) + lowest
         return jnp.logaddexp(jnp.log(changed.temperature) + cooled, floor)
 
@@ -111,6 +110,14 @@ def fit_trials(
 
     # One after another: a batch of searches takes twice as long to compile.
     return jax.lax.map(fitted, trials)
+
+
+def _continued(
+    log_theta: Float[Array, "table"], rate: Float[Array, "table"], times: Float[Array, "times"]
+) -> Float[Array, "times"]:
+    """ln(T/T_0) of a table of cooling rates; before t = 0 at the first rate."""
+    cooled = log_temperature(log_theta, rate, jnp.maximum(times, 0.0))
+    return cooled - rate[0] * jnp.minimum(times, 0.0)
 
 
 def _errors(
