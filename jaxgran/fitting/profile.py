@@ -72,7 +72,6 @@ def fit_trials(
     """
     varied, used = (*names, *priors.also_free(names)), weights > 0
     parameters = Parameters(gas, varied, times[-1])
-    num_free = sum(size_of(gas, name) for name in names)
     lowest = jnp.min(jnp.where(used, measured, jnp.inf))
     depth = jnp.max(jnp.where(used, measured, -jnp.inf)) - lowest + 2.0
 
@@ -82,14 +81,14 @@ def fit_trials(
         if changed.elements:
             ratio = jnp.interp(-log_theta - jnp.log(changed.temperature), -modelled, ratios)
             rate = rate + cooling_by_elements(changed, log_theta, ratio)
-        unsure = mean + trend * (2 * log_theta / depth + 1)
-        rate = rate * jnp.exp(accuracy.astype(rate.dtype) * unsure)
-        other = 1 - trial.constant - trial.drag
-        added = (trial.constant * jnp.exp(log_theta / 2) + trial.drag) / other * rate[0]
-        later = times - parameters.start(flat) + trial.delay / rate[0]
-        cooled = _continued(log_theta, rate + added, later)
-        floor = jnp.log(jnp.maximum(trial.floor, jnp.finfo(rate.dtype).tiny)) + lowest
-        return jnp.logaddexp(jnp.log(changed.temperature) + cooled, floor)
+        unsure = accuracy.astype(rate.dtype) * (mean + trend * (2 * log_theta / depth + 1))
+        rate = rate * jnp.exp(unsure)
+        added = trial.constant * jnp.exp(log_theta / 2) + trial.drag
+        added = added / (1 - trial.constant - trial.drag) * rate[0]
+        since = times - parameters.start(flat) + trial.delay / rate[0]
+        cooled = _continued(log_theta, rate + added, since)
+        floor = jnp.log(jnp.maximum(trial.floor, jnp.finfo(rate.dtype).tiny))
+        return jnp.logaddexp(jnp.log(changed.temperature) + cooled, floor + lowest)
 
     nothing = Trial(*(jnp.zeros(()) for _ in Trial._fields))
     beside = modelled - computed(nothing, parameters.flat(gas, began), 0.0, 0.0)
@@ -101,15 +100,14 @@ def fit_trials(
             known = priors.residuals(parameters.gas(flat), parameters.start(flat))
             return jnp.concatenate([weights * jnp.where(used, differences, 0.0), known, errors])
 
-        first = jnp.pad(parameters.flat(_guess(gas, names, trial), began), (0, 2))
-        unknowns = least_squares(residuals, first, MOST_STEPS)[0]
-        value, jacobian = residuals(unknowns), jax.jacfwd(residuals)(unknowns)
-        estimates = parameters.estimates(unknowns[:-2])[:num_free]
-        error = _errors(parameters, unknowns[:-2], jacobian)[:num_free]
-        return Profile(jnp.sum(value**2), estimates, error, value[: times.size])
+        first = parameters.flat(_guess(gas, names, trial), began)
+        unknowns = least_squares(residuals, jnp.pad(first, (0, 2)), MOST_STEPS)[0]
+        value, estimates = residuals(unknowns), parameters.estimates(unknowns[:-2])
+        error = _errors(parameters, unknowns[:-2], jax.jacfwd(residuals)(unknowns))
+        free = slice(sum(size_of(gas, name) for name in names))
+        return Profile(jnp.sum(value**2), estimates[free], error[free], value[: times.size])
 
-    # One after another: a batch of searches takes twice as long to compile.
-    return jax.lax.map(fitted, trials)
+    return jax.lax.map(fitted, trials)  # a batch of searches takes twice as long to compile
 
 
 def _continued(
