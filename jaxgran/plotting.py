@@ -22,7 +22,36 @@ except ModuleNotFoundError as error:  # pragma: no cover
 MOST_DRAWN = 1000
 """Points that are drawn of a longer curve, evenly spaced in the logarithm of time."""
 
-INK, DATA, MODEL, GUIDE = "#222222", "#20639b", "#d1495b", "#8d99ae"
+COLOURS = {
+    "measured": "#222222",
+    "guide": "#7f7f7f",
+    "kinetic theory": "#0072b2",
+    "DSMC": "#56b4e9",
+    "hard spheres": "#e69f00",
+    "soft spheres": "#d55e00",
+    "elastic": "#999999",
+    "constant restitution": "#cc79a7",
+    "viscoelastic": "#009e73",
+}
+"""What a colour means in every picture: what was measured (in an experiment, in LAMMPS, by finite
+differences), guides to the eye, a model by its name, a kind of gas. It is the palette of M. Okabe
+and K. Ito, Color Universal Design (2008), which colour-blind people tell apart; in grey, lines
+and points also differ in style."""
+
+STYLES = {
+    "kinetic theory": ("--", "D"),
+    "DSMC": ("-.", "v"),
+    "hard spheres": (":", "s"),
+    "soft spheres": ("-", "^"),
+}
+"""Line and marker of each model."""
+
+INK = COLOURS["measured"]
+
+
+def colour_of(model: str) -> str:
+    """The colour of a model by its name; one that is not the package's is drawn in grey."""
+    return COLOURS.get(model, "#5f5f5f")
 
 
 def plot_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> None:
@@ -63,20 +92,20 @@ def plot_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
     )
     wrapped = [textwrap.fill(line, 84) for line in title.splitlines()]
     figure.suptitle("\n".join(wrapped), color=INK, fontsize=11)
-    fitted = f"{result.model.name}, fitted"
+    fitted = result.model.name
     top, bottom = axes[:, 0]
     measured, error = curve.temperature, curve.temperature_error
     _draw(top, curve.times, measured, error, result.curve.temperature, fitted)
-    _draw_residuals(bottom, curve.times, result.residuals)
+    _draw_residuals(bottom, curve.times, result.residuals, fitted)
     top.set_ylabel(r"temperature $T=\langle v^2\rangle/d$ (m$^2$/s$^2$)")
-    _draw_power_laws(top, result.curve)
     T = np.asarray(curve.temperature)
     top.set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
+    _draw_power_laws(top, result.curve)
     top.legend(frameon=False, loc="lower left")
     for (top, bottom), panel in zip(axes[:, 1:].T, further, strict=True):
         measured, error, computed, residuals, label, corner = panel
         _draw(top, curve.times, measured, error, computed, fitted)
-        _draw_residuals(bottom, curve.times, residuals)
+        _draw_residuals(bottom, curve.times, residuals, fitted)
         top.set_ylabel(label)
         top.legend(frameon=False, loc=corner)
     for axis in axes.flat:
@@ -91,8 +120,8 @@ def _draw(axis, times, measured, error, computed, fitted: str) -> None:
     t, measured, computed = (np.asarray(x)[shown] for x in (times, measured, computed))
     error = None if error is None else np.asarray(error)[shown]
     label = "measured" if len(times) <= MOST_DRAWN else f"measured: {t.size} of {len(times)}"
-    axis.errorbar(t, measured, error, fmt="o", ms=3.5, color=DATA, label=label, zorder=2)
-    axis.plot(t, computed, color=MODEL, lw=1.6, label=fitted, zorder=3)
+    axis.errorbar(t, measured, error, fmt="o", ms=3.5, color=INK, label=label, zorder=2)
+    axis.plot(t, computed, color=colour_of(fitted), lw=1.8, label=f"{fitted}, fitted", zorder=3)
     axis.set(xscale="log", yscale="log")
 
 
@@ -106,19 +135,39 @@ def _shown(times) -> np.ndarray:
     return shown[np.unique(np.searchsorted(t[:-1], np.geomspace(t[0], t[-1], MOST_DRAWN)))]
 
 
-def _draw_residuals(axis, times, residuals) -> None:
+def _draw_residuals(axis, times, residuals, fitted: str) -> None:
     shown = _shown(times)
-    axis.axhspan(-1, 1, color=GUIDE, alpha=0.25, lw=0)
-    axis.axhline(0, color=MODEL, lw=1)
-    axis.plot(np.asarray(times)[shown], np.asarray(residuals)[shown], "o", ms=3.5, color=DATA)
+    axis.axhspan(-1, 1, color=COLOURS["guide"], alpha=0.2, lw=0)
+    axis.axhline(0, color=colour_of(fitted), lw=1.4)
+    axis.plot(np.asarray(times)[shown], np.asarray(residuals)[shown], "o", ms=3.5, color=INK)
     axis.set(xlabel="time t (s)", ylabel="residual / error")
 
 
 def _draw_power_laws(axis, curve: CoolingCurve) -> None:
-    """Guides to the eye: the late power laws of viscoelastic spheres and of Haff's law."""
-    t = np.asarray(curve.times)
-    late = t[(t > 0) & (t >= t[-1] / 30)]
-    end = float(np.asarray(curve.temperature)[-1])
-    for power, style, label in ((-5 / 3, "--", r"$t^{-5/3}$"), (-2.0, ":", r"$t^{-2}$")):
-        values = end * (late / t[-1]) ** power
-        axis.plot(late, values, style, color=INK, lw=1, label=label, zorder=1)
+    """Guides to the eye, labelled in the panel: the late laws of viscoelastic spheres and Haff's.
+
+    They end in the last point and begin at .8 of the largest T; a curve that has not fallen so far
+    that they differ from it has none.
+    """
+    t, T = (np.asarray(x, float) for x in (curve.times, curve.temperature))
+    top = 0.8 * float(T.max())
+    if not T[-1] < 0.3 * top:
+        return
+    for power, style, label, side in (
+        (-5 / 3, "--", r"$t^{-5/3}$", "right"),
+        (-2.0, ":", r"$t^{-2}$", "left"),
+    ):
+        first = t[-1] * (T[-1] / top) ** (-1 / power)
+        times = np.geomspace(first, t[-1], 50)
+        values = T[-1] * (times / t[-1]) ** power
+        axis.plot(times, values, style, color=COLOURS["guide"], lw=1.2, zorder=1)
+        shift = {"left": 4, "right": -4}[side]
+        axis.annotate(
+            label,
+            (first, top),
+            xytext=(shift, 2),
+            textcoords="offset points",
+            ha=side,
+            va="center",
+            color=COLOURS["guide"],
+        )

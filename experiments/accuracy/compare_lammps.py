@@ -12,18 +12,14 @@ import time
 from pathlib import Path
 
 import jax
-import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
 
-matplotlib.use("Agg")
+import jaxgran
+from experiments.support.record import DATA, add_recording, write_picture, write_results
+from jaxgran.data.header import header_number
+from jaxgran.plotting import COLOURS, INK
 
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-import jaxgran  # noqa: E402
-from experiments.support.record import save  # noqa: E402
-from jaxgran.data.header import header_number  # noqa: E402
-
-DATA = Path(__file__).parents[1] / "data"
 SCENES = ("dilute", "dense")
 STEPS_PER_CONTACT = 40
 
@@ -35,16 +31,20 @@ def main() -> None:
     parser.add_argument("--replicas", type=int, default=4)
     parser.add_argument("--smoke", action="store_true", help="few particles, early times only")
     parser.add_argument("--out", type=Path, default=Path("results") / "compare_lammps")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     options.out.mkdir(parents=True, exist_ok=True)
-    figure, axes = plt.subplots(2, 2, figsize=(10, 6), sharex="col", height_ratios=[2, 1])
+    figure = Figure(figsize=(10, 6.4), layout="constrained")
+    axes = figure.subplots(2, 2, sharex="col", height_ratios=[2, 1])
     curves = {}
     for column, name in zip(axes.T, SCENES, strict=True):
         curves[name] = compare(name, options, column)
-    figure.tight_layout()
-    figure.savefig(options.out / "compare_lammps.png", dpi=150)
-    save(
+    figure.suptitle("Temperature of two gases with nothing fitted: the A of LAMMPS is given")
+    write_picture(figure, "compare_lammps", options)
+    write_results(
+        "compare_lammps",
+        options,
         options.out / "compare_lammps.json",
         curves=curves,
         replicas=options.replicas,
@@ -90,15 +90,21 @@ def compare(name: str, options: argparse.Namespace, axes) -> dict:
         "per particle\n"
     )
     top, bottom = axes
-    top.errorbar(t[1:], lammps[1:], measured.temperature_error[1:], fmt="o", ms=3, label="LAMMPS")
-    top.plot(t[1:], curve.temperature[1:], label="soft spheres")
-    top.plot(t[1:], theory.temperature[1:], "--", label="kinetic theory")
-    top.set(xscale="log", yscale="log", ylabel="T, m²/s²", title=f"{name}: nothing fitted")
-    top.legend()
-    bottom.axhline(0, color="0.7")
-    bottom.errorbar(t[1:], 100 * miss[1:], 100 * error[1:], fmt="o", ms=3)
-    bottom.plot(t[1:], 100 * theory_miss[1:], "C2--")
-    bottom.set(xlabel="t, s", ylabel="from LAMMPS, %", ylim=(-6, 6))
+    soft, by_theory = COLOURS["soft spheres"], COLOURS["kinetic theory"]
+    bars = measured.temperature_error[1:]
+    top.errorbar(t[1:], lammps[1:], bars, fmt="o", ms=3.5, color=INK, label="LAMMPS")
+    top.plot(t[1:], curve.temperature[1:], color=soft, label="soft spheres")
+    top.plot(t[1:], theory.temperature[1:], "--", color=by_theory, label="kinetic theory")
+    scene = f"{name} gas, φ = {float(gas.packing_fraction):.2g}"
+    top.set(xscale="log", yscale="log", ylabel="temperature T (m²/s²)", title=scene)
+    top.legend(frameon=False, loc="lower left")
+    bottom.axhline(0, color=INK, lw=1)
+    bottom.errorbar(t[1:], 100 * miss[1:], 100 * error[1:], fmt="^", ms=3.5, color=soft)
+    bottom.plot(t[1:], 100 * theory_miss[1:], "--", color=by_theory)
+    bottom.set(xlabel="time t (s)", ylabel="T over LAMMPS' − 1 (%)")
+    bottom.set_ylim((-3, 3) if np.abs(theory_miss).max() < 0.03 else (-32, 6))
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
     return {
         "largest_temperature_difference": float(np.abs(miss).max()),
         "largest_displacement_difference": float(np.abs(displacement).max()),

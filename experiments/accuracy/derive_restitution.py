@@ -1,6 +1,6 @@
 """Where do the coefficients of the fitted restitution law come from, and how accurate is it?
 
-    python experiments/accuracy/derive_restitution.py
+    python experiments/accuracy/derive_restitution.py [--record]
 
 Solves the equation of motion of an impact for some 200 values of beta and fits
 ``ln eps + decay ln(1 + kappa beta)`` by ``beta P(z) / Q(z)``, z = sqrt(beta). The fit minimises the
@@ -8,9 +8,12 @@ largest error (Lawson's reweighting of a linearised least-squares fit). Prints t
 ``jaxgran/scene/restitution_table.py`` contains.
 """
 
+import argparse
+
 import jax
 import numpy as np
 
+from experiments.support.record import add_recording, write_results
 from jaxgran.scene.contact import impact
 from jaxgran.scene.restitution_table import C1
 
@@ -57,20 +60,28 @@ def fit_rational(
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_recording(parser)
+    options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     # beta P and Q have the same degree, so that their ratio tends to a constant.
     shapes = {
         "clipped": (True, 0.7, 5 / 3, [2, *range(3, 9)], [2, *range(4, 11)]),
         "unclipped": (False, 0.7, 5.0, list(range(2, 21, 2)), list(range(2, 23, 2))),
     }
+    largest = {}
     for name, (clipped, kappa, decay, powers_p, powers_q) in shapes.items():
         beta, restitution = samples(clipped)
         target = np.log(restitution) + decay * np.log1p(kappa * beta)
         slope = decay * kappa - C1
         error, p, q = fit_rational(beta, target, slope, powers_p, powers_q)
+        largest[name] = {"error": float(error), "beta_to": float(beta[-1])}
         print(f"{name}: largest relative error {error:.1e} over 0 <= beta <= {beta[-1]:g}")
         for title, powers, values in (("P", powers_p, p), ("Q", powers_q, q)):
             print("  " + title, {k: float(v) for k, v in zip(powers, values, strict=True)})
+    write_results("derive_restitution", options, None, largest=largest)
 
 
 if __name__ == "__main__":

@@ -24,17 +24,14 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
 
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from tqdm import tqdm  # noqa: E402
-
-import jaxgran  # noqa: E402
-from experiments.support.record import save  # noqa: E402
-from experiments.support.scenes import beads  # noqa: E402
+import jaxgran
+from experiments.support.record import add_recording, figures, save, write_picture, write_results
+from experiments.support.scenes import beads
+from jaxgran.plotting import COLOURS, INK
 
 COLLISIONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 INTERVALS = (0.03, 0.1, 0.3, 1.0)
@@ -61,6 +58,7 @@ def main() -> None:
     parser.add_argument("--late-differences", action="store_true", help="compute only these again")
     parser.add_argument("--smoke", action="store_true", help="few particles, early times only")
     parser.add_argument("--out", type=Path, default=Path("results") / "gradient_health")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     file, results = options.out / "gradient_health.json", {}
@@ -72,12 +70,17 @@ def main() -> None:
             f"{', '.join(sorted(missing))}: run these scenes without it first"
         )
     options.out.mkdir(parents=True, exist_ok=True)
+    settings = {"step_of_ln_A": STEP, "steps_per_contact": STEPS_PER_CONTACT}
     for name in tqdm(options.scenes, disable=options.smoke):
         before = results.get(name) if options.late_differences else None
         results[name] = examine(name, options.smoke, before)
-        settings = {"step_of_ln_A": STEP, "steps_per_contact": STEPS_PER_CONTACT}
         save(file, scenes=results, **settings, key="0; differences of set k of late replicas: k")
-    draw({name: results[name] for name in SCENES if name in results}, file.with_suffix(".png"))
+    shown = {name: results[name] for name in SCENES if name in results}
+    if options.record:  # with what was recorded of the other scenes
+        shown = {name: shown.get(name) or figures(f"gradient_health_{name}") for name in SCENES}
+    write_picture(draw(shown), "gradient_health", options)
+    for name in options.scenes:
+        write_results(f"gradient_health_{name}", options, None, **results[name], **settings)
     print(f"written to {options.out}")
 
 
@@ -218,47 +221,79 @@ def over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return values.mean(0), values.std(0, ddof=1) / len(values) ** 0.5
 
 
-def draw(results: dict, path: Path) -> None:
-    figure, axes = plt.subplots(2, len(results), figsize=(4.2 * len(results), 7), squeeze=False)
-    styles = {
-        "differences": ("o", "finite differences"),
-        "plain": ("x", "plain forward mode"),
-        "projected": ("s", "projected"),
-        "kinetic theory": ("", "kinetic theory"),
-    }
-    for (name, result), (top, bottom) in zip(results.items(), axes.T, strict=True):
-        n = np.asarray(result["collisions"])
-        for shift, (column, (marker, label)) in enumerate(styles.items()):
-            mean, error = (np.asarray(x) for x in result["d_ln_T_d_ln_A"][column])
-            if column == "kinetic theory":
-                top.plot(n, mean, "k--", lw=1, label=label)
-                continue
-            at = n[: len(mean)] * 1.06 ** (shift - 1)
-            top.errorbar(at, mean, error, fmt=marker, ms=5, label=label)
-        top.set(xscale="log", title=name, xlabel="collisions per particle", ylim=(-2.2, 0.7))
+def draw(results: dict) -> Figure:
+    """The derivatives of two gases, their errors, and what the interval of projections does."""
+    figure = Figure(figsize=(10, 8), layout="constrained")
+    (left, right), (errors, intervals) = figure.subplots(2, 2)
+    for axes, name in zip((left, right), results, strict=False):
+        draw_derivatives(axes, results[name])
+        axes.set_title(f"{name} gas: d ln T / d ln A by four ways", fontsize=10, loc="left")
+    left.set_ylabel("d ln T / d ln A")
+    left.legend(frameon=False, fontsize=9, loc="lower left")
+    for (name, result), colour, style in zip(
+        results.items(),
+        (INK, COLOURS["guide"], COLOURS["elastic"]),
+        ("o-", "s--", "^:"),
+        strict=False,
+    ):
+        bias, spread = (100 * np.asarray(x) for x in result["projected_over_differences"])
+        n = np.asarray(result.get("collisions", COLLISIONS))[: len(bias)]
+        look = {"color": colour, "ms": 5, "label": name}
+        errors.errorbar(n, bias, spread, fmt=style, **look)
+        if "by_interval" not in result:
+            continue
         reference = np.asarray(result["d_ln_T_d_ln_A"]["differences"][0])
-        for i, goal in enumerate(COLLISIONS[: len(n)]):
-            x = [float(k) for k in result["by_interval"]]
-            y, e = zip(*((m[i], s[i]) for m, s in result["by_interval"].values()), strict=True)
-            ratio = np.asarray(y) / reference[i] - 1
-            bottom.errorbar(
-                np.asarray(x) * 1.03**i,
-                100 * ratio,
-                100 * np.abs(np.asarray(e) / reference[i]),
-                fmt="o-",
-                ms=3,
-                label=f"{goal:.0f}",
+        at = min(3, len(reference) - 1)  # 30 collisions
+        x = [float(k) for k in result["by_interval"]]
+        y, e = (np.array([v[k][at] for v in result["by_interval"].values()]) for k in (0, 1))
+        ratio = 100 * (y / reference[at] - 1)
+        intervals.errorbar(x, ratio, 100 * np.abs(e / reference[at]), fmt=style, **look)
+    for axes, title, label in (
+        (errors, "Error of the projected derivative", "collisions per particle"),
+        (
+            intervals,
+            "The same after 30 collisions, by interval",
+            "mean free times between projections",
+        ),
+    ):
+        axes.axhspan(-5, 5, color="0.92", zorder=0)
+        axes.set(xscale="log", xlabel=label, ylabel="projected over differences − 1 (%)")
+        axes.set_title(title, fontsize=10, loc="left")
+        axes.legend(frameon=False, fontsize=9, loc="upper left")
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def draw_derivatives(axes, result: dict) -> None:
+    """Those of one gas; plain derivatives that are beyond the panel are said in words."""
+    n = np.asarray(result["collisions"])
+    styles = {
+        "differences": ("o", INK, "finite differences"),
+        "projected": ("^", COLOURS["soft spheres"], "projected"),
+        "plain": ("x", COLOURS["hard spheres"], "plain forward mode"),
+    }
+    low, high = -2.2, 0.5
+    for shift, (column, (marker, colour, label)) in enumerate(styles.items()):
+        mean, error = (np.asarray(x) for x in result["d_ln_T_d_ln_A"][column])
+        at = n[: len(mean)] * 1.08 ** (shift - 1)
+        inside = (mean - error > low) & (mean + error < high)
+        look = {"color": colour, "ms": 5.5, "mfc": "none" if marker == "o" else colour}
+        axes.errorbar(at[inside], mean[inside], error[inside], fmt=marker, label=label, **look)
+        outside = n[: len(mean)][~inside], mean[~inside], error[~inside]
+        for x, m, e in zip(*outside, strict=True):
+            axes.annotate(
+                f"plain after {x:.0f}:\n{m:.1g} ± {e:.1g}",
+                (x, high - 0.02),
+                color=colour,
+                fontsize=8,
+                va="top",
+                ha="left",
             )
-        bottom.axhspan(-5, 5, color="0.9", zorder=0)
-        bottom.set(xscale="log", xlabel="mean free times between projections")
-        low, high = bottom.get_ylim()
-        bottom.set_ylim(min(low, -30), max(high, 70))
-    axes[0, 0].set_ylabel("d ln T / d ln A")
-    axes[0, 0].legend(fontsize=8)
-    axes[1, 0].set_ylabel("projected over differences, %")
-    axes[1, 0].legend(title="collisions", fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=130)
+    theory = np.asarray(result["d_ln_T_d_ln_A"]["kinetic theory"][0])
+    colour = COLOURS["kinetic theory"]
+    axes.plot(n, theory, "--", color=colour, lw=1.2, label="kinetic theory", zorder=0)
+    axes.set(xscale="log", xlabel="collisions per particle", ylim=(low, high))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from experiments.support.hard_cases.gases import GASES
 from experiments.support.hard_cases.impacts import IMPACTS
 from experiments.support.hard_cases.rows import Row
 from experiments.support.hard_cases.runs import RUNS
-from experiments.support.record import save
+from experiments.support.record import add_recording, save, write_results
 from jaxgran.data.files import write_whole
 
 CASES = [*IMPACTS, *GASES, *RUNS]
@@ -49,6 +49,7 @@ def main() -> int:
     parser.add_argument("--heavy", action="store_true", help="also the cases that take minutes")
     parser.add_argument("--smoke", action="store_true", help="one case, which takes seconds")
     parser.add_argument("--out", type=Path, default=Path("results/hard_cases"))
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     only = [SMOKE] if options.smoke else options.only
@@ -83,6 +84,7 @@ def main() -> int:
         save(record, cases=in_order)
         text = _table(in_order)
         write_whole(options.out / "hard_cases.md", lambda f, text=text: f.write(text.encode()))
+    write_results("hard_cases", options, None, cases=[records[c.name] for c in cases])
     print(f"\n{failed} rows failed; {options.out}")
     return int(failed > 0)
 

@@ -22,12 +22,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 import jaxgran
-from experiments.support.record import save
+from experiments.support.record import DATA as DATA_FOLDER
+from experiments.support.record import add_recording, write_picture, write_results
 from experiments.support.scenes import beads
 from jaxgran.particles.capacity import Capacity
-from jaxgran.plotting import DATA, GUIDE, INK, MODEL
+from jaxgran.plotting import COLOURS, INK
 
-TRAJECTORY = Path(__file__).parents[1] / "data" / "lammps_trajectory_n64.npz"
+SOFT = COLOURS["soft spheres"]
+TRAJECTORY = DATA_FOLDER / "lammps_trajectory_n64.npz"
 TRAJECTORY_STEPS = (40, 100, 400, 1600)
 FINEST = 6400  # steps of a reference run, which separates our error from that of LAMMPS
 IMPACT_STEPS = (25, 50, 100, 200)  # each twice the one before
@@ -47,6 +49,7 @@ def main() -> None:
     )
     parser.add_argument("--smoke", action="store_true", help="few steps, early times only")
     parser.add_argument("--out", type=Path, default=Path("results") / "soft_sphere_accuracy")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -62,8 +65,10 @@ def main() -> None:
         "elastic": balance("energy of an elastic gas", GAS_STEPS[:num], **elastic),
     }
     seconds = time.perf_counter() - begin
-    draw(results, options.out / "soft_sphere_accuracy.png")
-    save(
+    write_picture(draw(results), "soft_sphere_accuracy", options, dpi=100)
+    write_results(
+        "soft_sphere_accuracy",
+        options,
         options.out / "soft_sphere_accuracy.json",
         **results,
         phases=phases,
@@ -216,15 +221,15 @@ def table(rows: list[dict], columns: dict[str, str]) -> dict:
     return {"rows": rows, "order": order}
 
 
-def draw(results: dict, path: Path) -> None:
+def draw(results: dict) -> Figure:
     figure = Figure(figsize=(9.0, 7.0), layout="constrained")
     (trajectory, impact), (ledger, elastic) = figure.subplots(2, 2)
     trajectory.set(title="64 spheres of LAMMPS after 2 τ$_c$", ylabel="velocity difference, rms")
-    line(trajectory, results["trajectory"], "lammps", "o-", DATA, "to LAMMPS")
+    line(trajectory, results["trajectory"], "lammps", "o-", SOFT, "to LAMMPS")
     finest = results["trajectory"]["finest"]
-    line(trajectory, results["trajectory"], "own", "s--", MODEL, f"to {finest} steps")
+    line(trajectory, results["trajectory"], "own", "s--", INK, f"to {finest} steps")
     impact.set(title="ε of one impact", ylabel="error of ε")
-    for (name, result), colour in zip(results["impact"].items(), (DATA, MODEL), strict=True):
+    for (name, result), colour in zip(results["impact"].items(), (SOFT, INK), strict=True):
         line(impact, result, "scatter", "o-", colour, f"scatter, {name}")
         line(impact, result, "bias", "s--", colour, f"|mean|, {name}")
     for axes, key, title in (
@@ -232,8 +237,8 @@ def draw(results: dict, path: Path) -> None:
         (elastic, "elastic", "Energy of an elastic gas"),
     ):
         axes.set(title=title, ylabel="error, of the first energy")
-        line(axes, results[key], "worst", "o-", DATA, "worst of all times")
-        line(axes, results[key], "end", "s--", MODEL, "rms at the end")
+        line(axes, results[key], "worst", "o-", SOFT, "worst of all times")
+        line(axes, results[key], "end", "s--", INK, "rms at the end")
     for axes in (trajectory, impact, ledger, elastic):
         axes.set(xscale="log", yscale="log", xlabel="steps per contact")
         guides(axes)
@@ -245,7 +250,7 @@ def draw(results: dict, path: Path) -> None:
         axes.yaxis.set_minor_formatter(NullFormatter())
         axes.legend(frameon=False, fontsize=8.5, loc="lower left")
         axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=100)
+    return figure
 
 
 def line(axes: Axes, result: dict, name: str, style: str, colour: str, label: str) -> None:
@@ -260,7 +265,9 @@ def guides(axes: Axes) -> None:
     steps = np.asarray(axes.lines[0].get_xdata(), float)
     top = 1.6 * max(np.max(np.asarray(one.get_ydata(), float)) for one in axes.lines)
     for order, style, name in ((1.5, ":", "3/2"), (2.0, "-", "2")):
-        axes.plot(steps, top * (steps / steps[0]) ** -order, style, color=GUIDE, lw=1, zorder=0)
+        axes.plot(
+            steps, top * (steps / steps[0]) ** -order, style, color=COLOURS["guide"], lw=1, zorder=0
+        )
         axes.annotate(
             f"order {name}",
             (steps[-1], top * (steps[-1] / steps[0]) ** -order),

@@ -29,8 +29,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
+from experiments.support.record import add_recording, write_picture, write_results
+from jaxgran.plotting import COLOURS
 
-HERE = Path(__file__).parents[1]
 NUM_PARTICLES, DIAMETER, SIDE = 300, 6e-3, 0.1
 EPS, BETA_T, RATIO = 0.85, 0.0, 2 / 3
 POINTS, ERROR = 30, 0.05
@@ -102,7 +103,10 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--runs", type=int, default=6, help="single runs (default: 6)")
-    parser.add_argument("--out", type=Path, default=HERE / "pictures", help="folder of the picture")
+    parser.add_argument(
+        "--out", type=Path, default=Path("results") / "drop_tower", help="folder of the picture"
+    )
+    add_recording(parser)
     options = parser.parse_args()
     began, gas = time.perf_counter(), scene()
     A = float(gas.value("dissipative_constant"))
@@ -136,7 +140,18 @@ def main() -> int:
     )
     print("  do not cool so fast, however inelastic they are;")
     print(f"told: {np.mean(right):.2f} times; 95 % intervals hold it in {sum(held)} of {len(held)}")
-    draw(gas, curves[0], rows[0], options.out / "drop_tower.png")
+    write_picture(draw(gas, curves[0], rows[0]), "drop_tower", options)
+    write_results(
+        "drop_tower",
+        options,
+        None,
+        A_over_true=right,
+        error_over_true=[float(told.standard_error[0]) / A for _, told in rows],
+        held=sum(held),
+        runs=len(rows),
+        smooth_undetermined=none,
+        smooth_over_true=[float(s.estimate[0]) / A for s, _ in rows if not s.undetermined()],
+    )
     print(f"{time.perf_counter() - began:.0f} s")
     return 0
 
@@ -166,7 +181,7 @@ def row(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> tuple[jaxgran.Fit, jax
     return first, told
 
 
-def draw(gas, curve, fits, path: Path) -> None:
+def draw(gas, curve, fits) -> Figure:
     """T and T_rot of a run, with both fits."""
     smooth, told = fits
     A = float(gas.value("dissipative_constant"))
@@ -174,28 +189,44 @@ def draw(gas, curve, fits, path: Path) -> None:
     axis = figure.subplots()
     bars = {"fmt": "o", "markersize": 4, "capsize": 2}
     for values, error, color, label in (
-        (curve.temperature, curve.temperature_error, "#20639b", "$T$, one run of the twin"),
+        (
+            curve.temperature,
+            curve.temperature_error,
+            COLOURS["measured"],
+            "$T$, one run of the twin",
+        ),
         (
             curve.rotational_temperature,
             curve.rotational_temperature_error,
-            "#3caea3",
+            COLOURS["guide"],
             r"$T_\mathrm{rot}$, the same run",
         ),
     ):
         axis.errorbar(curve.times, values, error, color=color, label=label, **bars)
     found = [in_words(fit, A).replace("+-", "±") for fit in (told, smooth)]
     label = f"rough spheres between walls: A over the true one {found[0]}"
-    axis.plot(curve.times, told.curve.temperature, color="#d1495b", label=label)
-    axis.plot(curve.times, told.curve.rotational_temperature, color="#d1495b", linestyle=":")
+    axis.plot(curve.times, told.curve.temperature, color=COLOURS["kinetic theory"], label=label)
+    axis.plot(
+        curve.times,
+        told.curve.rotational_temperature,
+        color=COLOURS["kinetic theory"],
+        linestyle=":",
+    )
     label = f"smooth spheres, no walls: A over the true one {found[1]}"
-    axis.plot(curve.times, smooth.curve.temperature, color="#8d99ae", linestyle="--", label=label)
+    axis.plot(
+        curve.times,
+        smooth.curve.temperature,
+        color=COLOURS["kinetic theory"],
+        linestyle="--",
+        lw=1,
+        label=label,
+    )
     axis.set_yscale("log")
     axis.set_xlabel("t (s)")
     axis.set_ylabel("temperature (m²/s²)")
     axis.legend(frameon=False, fontsize=9)
     axis.spines[["top", "right"]].set_visible(False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    return figure
 
 
 if __name__ == "__main__":

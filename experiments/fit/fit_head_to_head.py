@@ -34,7 +34,7 @@ import numpy as np
 import scipy.optimize
 
 import jaxgran
-from experiments.support.record import save
+from experiments.support.record import DATA, add_recording, write_results
 from jaxgran.data.header import header_number
 
 try:
@@ -42,7 +42,7 @@ try:
 except ImportError:
     cma = None
 
-DENSE = Path(__file__).parents[1] / "data" / "lammps_cooling_dense.csv"
+DENSE = DATA / "lammps_cooling_dense.csv"
 SCENES = ("stochastic", "soft-spheres")
 PARAMETERS = ("dissipative_constant", "temperature")
 OFF = np.log([0.5, 1.2])  # the first guess over the true values, in logarithms
@@ -78,6 +78,7 @@ def main() -> None:
     parser.add_argument("--replicas", type=int, default=4, help="of N = 1000 soft spheres")
     parser.add_argument("--smoke", action="store_true", help="a small run of seconds, DSMC only")
     parser.add_argument("--out", type=Path, default=Path("results") / "fit_head_to_head")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -89,7 +90,8 @@ def main() -> None:
         for count in (1, 2):
             rows += compare(scene, problem, count, options.smoke)
     took = time.perf_counter() - begin
-    save(options.out / "fit_head_to_head.json", rows=rows, seconds=took)
+    path = options.out / "fit_head_to_head.json"
+    write_results("fit_head_to_head", options, path, rows=rows, seconds=took)
     print(f"{took:.0f} s in all; written to {options.out}")
 
 

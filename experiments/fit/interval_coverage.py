@@ -1,7 +1,7 @@
 """How often does a 95 % interval of A hold the truth, for single runs of few particles?
 
     python experiments/fit/interval_coverage.py [--runs 200] [--models dsmc hard-spheres]
-        [--numbers 100 500] [--phis 0.02 0.05] [--out experiments/interval_coverage.md]
+        [--numbers 100 500] [--phis 0.02 0.05] [--record] [--out FILE]
 
 Each run is one realisation of N particles (beta_T0 = .18, t_c/tau_c = .001, followed for 100 mean
 free times, in which T falls to a few per cent): 30 values of T without errors, as one film of one
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads
 
 BETA, CONTACT, END, POINTS = 0.18, 0.001, 100.0, 30
@@ -37,6 +38,7 @@ HEADINGS = (
     "budget's, %",
     "95 % intervals that hold A",
 )
+HEAD = "\n".join((" | ".join(("", *HEADINGS, "")).strip(), "|" + "---|" * len(HEADINGS)))
 
 
 def main() -> None:
@@ -49,17 +51,24 @@ def main() -> None:
     parser.add_argument("--numbers", nargs="+", type=int, default=[100, 500])
     parser.add_argument("--phis", nargs="+", type=float, default=[0.02, 0.05])
     parser.add_argument("--out", type=Path, help="file for the table")
+    add_recording(parser)
     options = parser.parse_args()
-    lines = [" | ".join(("", *HEADINGS, "")).strip(), "|" + "---|" * len(HEADINGS)]
-    print("\n".join(lines), flush=True)
+    rows = []
+    print(HEAD, flush=True)
     for name in options.models:
         for number in options.numbers:
             for phi in options.phis:
                 found = coverage(KINDS[name], number, phi, options.runs)
-                lines.append(row(name, number, phi, found))
-                print(lines[-1], flush=True)
+                rows.append({"model": name, "num_particles": number, "phi": phi, **found})
+                print(row(rows[-1]), flush=True)
+    write_results("interval_coverage", options, None, rows=rows)
     if options.out is not None:
-        options.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        options.out.write_text(table({"rows": rows}), encoding="utf-8")
+
+
+def table(results: dict) -> str:
+    """The table of all rows."""
+    return "\n".join([HEAD, *map(row, results["rows"])]) + "\n"
 
 
 def coverage(kind, num_particles: int, phi: float, runs: int) -> dict[str, float]:
@@ -94,12 +103,12 @@ def coverage(kind, num_particles: int, phi: float, runs: int) -> dict[str, float
     }
 
 
-def row(name: str, number: int, phi: float, found: dict[str, float]) -> str:
+def row(found: dict) -> str:
     """A line of the table."""
     cells = (
-        name.replace("-", " "),
-        f"{number}",
-        f"{phi:g}",
+        found["model"].replace("-", " "),
+        f"{found['num_particles']}",
+        f"{found['phi']:g}",
         f"{100 * found['bias']:+.1f} ± {100 * found['bias_error']:.1f}",
         f"{found['bias_over_error']:+.2f}",
         f"{100 * found['scatter']:.1f}",

@@ -24,8 +24,9 @@ from corner import corner
 from matplotlib import pyplot as plt
 
 import jaxgran
+from experiments.support.record import DATA, add_recording, write_picture, write_results
+from jaxgran.plotting import COLOURS
 
-HERE = Path(__file__).parents[1]
 FREE = ("dissipative_constant", "temperature")
 PRIORS = {"packing_fraction": 0.04, "temperature": 0.01}
 """Relative standard errors."""
@@ -36,7 +37,7 @@ LABELS = ("A (1e-6 s)", "phi", "T_0 (1e-2 m²/s²)")
 def main() -> int:
     jax.config.update("jax_enable_x64", True)
     options = parse()
-    curve, header = jaxgran.read_curve(HERE / "data" / "lammps_cooling_dilute.csv")
+    curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     gas = jaxgran.read_gas(header)
     priors = {
         name: (float(gas.value(name)), e * float(gas.value(name))) for name, e in PRIORS.items()
@@ -48,10 +49,9 @@ def main() -> int:
     result = jaxgran.fit(gas, curve, free=FREE, priors=priors)
     found, seconds, evaluations = sample(log_posterior(gas, curve, priors, result), options)
     A, phi, T_0 = (np.asarray(found[..., i]) for i in range(3))
-    report(result, A, phi, T_0, seconds, evaluations)
-    picture(
-        result, np.stack([A.ravel() * 1e6, phi.ravel(), T_0.ravel() * 100], axis=1), options.out
-    )
+    report(result, A, phi, T_0, seconds, evaluations, options)
+    shown = np.stack([A.ravel() * 1e6, phi.ravel(), T_0.ravel() * 100], axis=1)
+    picture(result, shown, options)
     return 0
 
 
@@ -61,7 +61,13 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--samples", type=int, default=1000, help="of each chain (default: 1000)")
     parser.add_argument("--chains", type=int, default=4, help="side by side (default: 4)")
-    parser.add_argument("--out", type=Path, default=HERE / "pictures", help="folder of the picture")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("results") / "sample_posterior",
+        help="folder of the picture",
+    )
+    add_recording(parser)
     return parser.parse_args()
 
 
@@ -129,7 +135,7 @@ def sample(posterior, options):
     )
 
 
-def report(result, A, phi, T_0, seconds, facts) -> None:
+def report(result, A, phi, T_0, seconds, facts, options) -> None:
     """Both answers, side by side, and the speed."""
     print(f"{'':24}{'posterior (NUTS)':>24}{'fit, with its budget':>24}")
     summary = {}
@@ -152,9 +158,10 @@ def report(result, A, phi, T_0, seconds, facts) -> None:
         f"{facts['divergent']} divergent, R-hat {facts['r_hat']:.3f}"
     )
     print(json.dumps(summary))
+    write_results("sample_posterior", options, None, **summary)
 
 
-def picture(result, samples, folder: Path) -> None:
+def picture(result, samples, options: argparse.Namespace) -> None:
     """A corner plot, with the Gaussian of the fit over the histograms of A and T_0."""
     figure = corner(samples, labels=LABELS, color="0.3", quantiles=(0.025, 0.975))
     axes = np.array(figure.axes).reshape(3, 3)
@@ -163,12 +170,13 @@ def picture(result, samples, folder: Path) -> None:
         left, right = axes[i, i].get_xlim()
         x = np.linspace(left, right, 200)
         normal = np.exp(-0.5 * ((x - estimate) / error) ** 2)
-        axes[i, i].plot(x, normal * axes[i, i].get_ylim()[1] * 0.95, color="C1", lw=2)
-    axes[0, 2].text(0.0, 0.8, "grey: NUTS\norange: fit, with its budget", fontsize=12)
-    folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / "sample_posterior.png", dpi=100)
+        axes[i, i].plot(
+            x, normal * axes[i, i].get_ylim()[1] * 0.95, color=COLOURS["kinetic theory"], lw=2
+        )
+    axes[0, 2].text(0.0, 0.8, "grey: NUTS\nblue: fit, with its budget", fontsize=12)
+    write_picture(figure, "sample_posterior", options, dpi=100)
     plt.close(figure)
-    print(f"written  {folder / 'sample_posterior.png'}")
+    print(f"written  {options.out / 'sample_posterior.png'}")
 
 
 if __name__ == "__main__":

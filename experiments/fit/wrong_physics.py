@@ -1,6 +1,6 @@
 """What does a fit of A say where the curve contains physics that it does not know?
 
-    python experiments/fit/wrong_physics.py [--draws 20] [--out experiments/wrong_physics.md]
+    python experiments/fit/wrong_physics.py [--draws 20] [--record] [--out FILE]
 
 Makes cooling curves of 2 mm beads (phi = .05, A = 3e-6 s; 30 points, 3 % noise) that contain rough
 grains, walls, drag, a noise floor or a constant eps besides or instead, fits A and T_0 with kinetic
@@ -24,12 +24,17 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.support.record import add_recording, write_results
 from jaxgran.theory.table_of_times import relaxed_cooling_rate
 
 TRUE_A = 3e-6
 NUM_POINTS, NOISE = 30, 0.03
 STEPS = 4000
 BOX = 0.05  # m
+HEAD = (
+    "| the curve contains | A found / 3e-6 s | compatible | range of A / 3e-6 s | truth in it "
+    "| A / 3e-6 s where the scene is told | intervals that hold it |\n|---|---|---|---|---|---|---|"
+)
 NOTE = "In rows of constant eps there is no A: the range must reach down to 1 % of the A found."
 
 
@@ -170,22 +175,38 @@ def main() -> None:
     )
     parser.add_argument("--draws", type=int, default=20, help="of the noise (default: 20)")
     parser.add_argument("--out", type=Path, help="a file for the table")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    head = (
-        "| the curve contains | A found / 3e-6 s | compatible | range of A / 3e-6 s | truth in it "
-        "| A / 3e-6 s where the scene is told | intervals that hold it |"
-    )
-    lines = [head, "|---|---|---|---|---|---|---|"]
-    print("\n".join(lines))
+    print(HEAD)
+    rows = []
     for name, rates_of, floor, true, told in SCENES:
-        lines.append(row(name, rates_of, floor, true, told, options.draws))
-        print(lines[-1], flush=True)
+        rows.append(row(name, rates_of, floor, true, told, options.draws))
+        print(line(rows[-1]), flush=True)
+    write_results("wrong_physics", options, None, rows=rows)
     if options.out is not None:
-        options.out.write_text("\n".join([*lines, "", NOTE]) + "\n")
+        options.out.write_text(table({"rows": rows}), encoding="utf-8")
 
 
-def row(name: str, rates_of, floor: float, true: float, told, draws: int) -> str:
+def table(results: dict) -> str:
+    """The table of all rows."""
+    return "\n".join([HEAD, *map(line, results["rows"]), "", NOTE]) + "\n"
+
+
+def line(row: dict) -> str:
+    """A row of the table."""
+    low, high = row["range"]
+    draws = row["draws"]
+    told = "| "
+    if row["told"] is not None:
+        told = f"{row['told']:.2f} | {row['told_held']} of {draws}"
+    return (
+        f"| {row['name']} | {row['A']:.2f} | {row['compatible']} of {draws} | "
+        f"{low:.2f} to {high:.2f} | {row['inside']} of {draws} | {told} |"
+    )
+
+
+def row(name: str, rates_of, floor: float, true: float, told, draws: int) -> dict:
     """One row of the table; for a curve without A, A is compared with 3e-6 s."""
     gas = beads()
     T_0 = float(gas.temperature)
@@ -211,12 +232,16 @@ def row(name: str, rates_of, floor: float, true: float, told, draws: int) -> str
             A, error = (float(x) for x in result.value("dissipative_constant"))
             found_so.append(A / TRUE_A)
             held += abs(A - true) < 1.96 * error
-    so = f"{np.median(found_so):.2f} | {held} of {draws}" if found_so else "| "
-    low, high = np.median(ranges, axis=0)
-    return (
-        f"| {name} | {np.median(found):.2f} | {compatible} of {draws} | {low:.2f} to {high:.2f} | "
-        f"{inside} of {draws} | {so} |"
-    )
+    return {
+        "name": name,
+        "draws": draws,
+        "A": float(np.median(found)),
+        "compatible": int(compatible),
+        "range": [float(x) for x in np.median(ranges, axis=0)],
+        "inside": int(inside),
+        "told": float(np.median(found_so)) if found_so else None,
+        "told_held": int(held),
+    }
 
 
 if __name__ == "__main__":

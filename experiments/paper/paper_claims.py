@@ -20,12 +20,11 @@ from experiments.support.claims.clustering import clustering
 from experiments.support.claims.cooling import cooling
 from experiments.support.claims.diffusion import diffusion, equilibrium, memory
 from experiments.support.claims.table import Row, Table
-from experiments.support.record import save
+from experiments.support.record import DATA, FIGURES, add_recording, write_results
 from jaxgran.data.header import header_number
 from jaxgran.scene.contact import impact
 from jaxgran.scene.restitution_table import C1, C2
 
-DATA = Path(__file__).parents[1] / "data"
 HEAD = """# The paper's claims
 
 Brilliantov & Pöschel, *Self-diffusion in granular gases*; equations as LaTeX numbers the preprint.
@@ -111,8 +110,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--results", type=Path, default=Path("results"))
+    parser.add_argument("--results", type=Path, default=FIGURES)
     parser.add_argument("--out", type=Path, default=Path("results") / "paper_claims")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     clock = paper.Clock()
@@ -120,13 +120,10 @@ def main() -> None:
     for part in (restitution, equilibrium, cooling, memory, diffusion, remarks, clustering):
         part(table)
     table.rows.sort(key=_place)
-    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "paper_claims.json"
+    rows = [asdict(row) for row in table.rows]
+    write_results("paper_claims", options, path, rows=rows, **clock.times)
     (options.out / "paper_claims.md").write_text(HEAD + table.markdown(), encoding="utf-8")
-    save(
-        options.out / "paper_claims.json",
-        rows=[asdict(row) for row in table.rows],
-        **clock.times,
-    )
     print(table.markdown())
 
 

@@ -19,18 +19,15 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import jax
-import matplotlib
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
+from tqdm import tqdm
 
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.cm import ScalarMappable  # noqa: E402
-from matplotlib.colors import Normalize  # noqa: E402
-from scipy.ndimage import gaussian_filter  # noqa: E402
-from tqdm import tqdm  # noqa: E402
-
-from experiments.support.clustering import (  # noqa: E402
+from experiments.support.clustering import (
     COLOURS,
     FACTORS,
     LAWS,
@@ -42,8 +39,9 @@ from experiments.support.clustering import (  # noqa: E402
     slope,
     viscoelastic_like,
 )
-from experiments.support.record import save  # noqa: E402
-from experiments.support.scenes import hard_beads  # noqa: E402
+from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.scenes import hard_beads
+from jaxgran.plotting import COLOURS as COLOURS_OF
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +83,7 @@ def main() -> None:
         "--smoke", action="store_true", help="few disks, one scene with more dissipation"
     )
     parser.add_argument("--out", type=Path, default=Path("results") / "paper_clustering")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     config = SMOKE if options.smoke else Config()
@@ -92,9 +91,10 @@ def main() -> None:
     runs = simulate(config)
     figures = analyse(config, runs)
     report(config, figures)
-    save(options.out / "paper_clustering.json", config=dataclasses.asdict(config), **figures)
-    draw_curves(config, runs, figures, options.out / "paper_clustering.png")
-    draw_fields(config, runs, options.out / "paper_clustering_fields.png")
+    path = options.out / "paper_clustering.json"
+    write_results("paper_clustering", options, path, config=dataclasses.asdict(config), **figures)
+    write_picture(draw_curves(config, runs, figures), "paper_clustering", options, dpi=110)
+    write_picture(draw_fields(config, runs), "paper_clustering_fields", options, dpi=110)
     print(f"written to {options.out}")
 
 
@@ -222,22 +222,23 @@ def report(config: Config, figures: dict) -> None:
             print(f"  {name:32} N {text(row['N'])}   T {text(row['T'])}")
 
 
-def draw_curves(config: Config, runs: dict, figures: dict, path: Path) -> None:
-    """T over N, and its ratio to Haff's law over N and over T_0/T."""
-    figure, axes = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
-    for scene, colour in zip(config.scenes, COLOURS, strict=False):
-        for law, style in zip(LAWS, ("-", "--"), strict=True):
+def draw_curves(config: Config, runs: dict, figures: dict) -> Figure:
+    """T over N, and its ratio to that of kinetic theory over N and over T_0/T.
+
+    A law has a colour, a density a line style; each of the thin lines is a seed.
+    """
+    figure = Figure(figsize=(13, 4.6), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for scene, style in zip(config.scenes, ("-", "--"), strict=False):
+        for law, colour in zip(LAWS, COLOURS, strict=True):
             for seed in config.seeds:
                 run = runs[scene.name, law, seed]
-                first = seed == config.seeds[0]
-                label = f"$\\varphi$ = {scene.packing_fraction:g}, " + (
-                    f"$\\varepsilon$ = {scene.restitution:g}"
-                    if law == "constant"
-                    else "viscoelastic"
-                )
-                look = {"color": colour, "ls": style, "lw": 1.3, "label": label if first else None}
+                name = f"ε = {scene.restitution:g}" if law == "constant" else "viscoelastic"
+                label = f"φ = {scene.packing_fraction:g}, {name}"
+                look = {"color": colour, "ls": style, "lw": 1.1}
+                look["label"] = label if seed == config.seeds[0] else None
                 axes[0].plot(run["collisions"], 1 / run["clock"], **look)
-                if first:
+                if seed == config.seeds[0]:
                     haff = np.exp(-run["excess"]) / run["clock"]
                     axes[0].plot(run["collisions"], haff, color=colour, ls=":", lw=1)
                 axes[1].plot(run["collisions"], np.exp(run["excess"]), **look)
@@ -245,33 +246,38 @@ def draw_curves(config: Config, runs: dict, figures: dict, path: Path) -> None:
         left = figures["scenes"][scene.name]["constant"]["departures"]
         at = left[f"T over theory's of N by {FACTORS[-1]:g}"]
         point = [at[clock][0] if at[clock] else float("nan") for clock in ("N", "T")]
-        ours = axes[0].plot(*point, "o", color=colour, ms=7, mec="k", zorder=5)
-        star = axes[0].plot(*scene.paper, "*", color=colour, ms=14, mec="k", zorder=4)
-    axes[0].plot([], [], ":", color="0.3", label="kinetic theory")
-    ours[0].set_label(f"T = {FACTORS[-1]:g} T$_{{Haff}}$")
+        marks = {"color": COLOURS[0], "mec": "k", "ls": "none"}
+        ours = axes[0].plot(*point, "o", ms=7, zorder=5, **marks)
+        star = axes[0].plot(*scene.paper, "*", ms=13, zorder=4, **marks)
+    axes[0].plot([], [], ":", color=COLOURS_OF["guide"], label="kinetic theory of the same gas")
+    ours[0].set_label(f"T is {FACTORS[-1]:g} times that of theory")
     star[0].set_label("the paper's $N_c$, $T_c$")
     low = min(float(np.min(1 / run["clock"])) for run in runs.values())
     axes[0].set(yscale="log", ylabel="$T/T_0$", ylim=(low / 8, 1.5))
-    axes[1].set(yscale="log", ylabel="$T/T_{Haff}$ at the same N", ylim=(0.9, 20))
-    axes[2].set(yscale="log", xscale="log", ylim=(0.9, 20))
-    axes[2].set(xlabel="$T_0/T$", ylabel="$T/T_{Haff}$ at the same N")
+    axes[0].set_title("Disks cool more slowly than kinetic theory", fontsize=10, loc="left")
+    for axis in axes[1:]:
+        axis.set(yscale="log", ylim=(0.9, 20), ylabel="T / T of theory at the same N")
+        axis.axhline(FACTORS[-1], color=COLOURS_OF["guide"], lw=0.8, zorder=0)
+        axis.set_yticks([1, 2, 5, 10, 20], ["1", "2", "5", "10", "20"])
+        axis.set_yticks([], minor=True)
+    axes[1].set_title("... from different numbers of collisions on", fontsize=10, loc="left")
+    axes[2].set(xscale="log", xlabel="$T_0/T$")
+    axes[2].set_title("... but from nearly the same temperature on", fontsize=10, loc="left")
     for axis in axes[:2]:
         axis.set_xlabel("collisions per particle N")
-    axes[0].legend(frameon=False, fontsize=8)
-    for axis in axes[1:]:
-        axis.axhline(FACTORS[-1], color="0.7", lw=0.8, zorder=0)
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=120)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure
 
 
-def draw_fields(config: Config, runs: dict, path: Path) -> None:
+def draw_fields(config: Config, runs: dict) -> Figure:
     """The density of the first scene at some times, smoothed over 1.5 mean distances of disks."""
     scene, seed = config.scenes[0], config.seeds[0]
-    figure, axes = plt.subplots(
-        2, len(config.fields), figsize=(2.6 * len(config.fields) + 0.8, 5.6), layout="constrained"
-    )
-    shown = ScalarMappable(Normalize(0.0, 2.5), cmap=plt.get_cmap("magma", 25))
+    figure = Figure(figsize=(2.6 * len(config.fields) + 0.8, 5.6), layout="constrained")
+    axes = figure.subplots(2, len(config.fields))
+    shown = ScalarMappable(Normalize(0.0, 2.5), cmap=colormaps["magma"].resampled(25))
     for law, row in zip(LAWS, axes, strict=True):
         run = runs[scene.name, law, seed]
         for mark, axis in zip(config.fields, row, strict=True):
@@ -289,7 +295,7 @@ def draw_fields(config: Config, runs: dict, path: Path) -> None:
             f"$\\varepsilon$ = {scene.restitution:g}" if law == "constant" else "viscoelastic"
         )
     figure.colorbar(shown, ax=axes, shrink=0.7, label="density / mean")
-    figure.savefig(path, dpi=110)
+    return figure
 
 
 if __name__ == "__main__":

@@ -14,17 +14,13 @@ import dataclasses
 from pathlib import Path
 
 import jax
-import matplotlib
+import numpy as np
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+from tqdm import tqdm
 
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.collections import EllipseCollection  # noqa: E402
-from tqdm import tqdm  # noqa: E402
-
-import jaxgran  # noqa: E402
-from experiments.support.clustering import (  # noqa: E402
+import jaxgran
+from experiments.support.clustering import (
     COLOURS,
     LAWS,
     PER_CELL,
@@ -34,8 +30,8 @@ from experiments.support.clustering import (  # noqa: E402
     mean_error,
     viscoelastic_like,
 )
-from experiments.support.record import save  # noqa: E402
-from experiments.support.scenes import hard_beads  # noqa: E402
+from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.scenes import hard_beads
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,14 +53,17 @@ def main() -> None:
     )
     parser.add_argument("--smoke", action="store_true", help="few disks, few collisions")
     parser.add_argument("--out", type=Path, default=Path("results") / "paper_clustering_dissolves")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     config = SMOKE if options.smoke else Config()
     options.out.mkdir(parents=True, exist_ok=True)
     runs = simulate(config)
     figures = analyse(config, runs)
-    save(options.out / "dissolves.json", config=dataclasses.asdict(config), **figures)
-    draw(config, runs, figures, options.out / "dissolves.png")
+    name = "paper_clustering_dissolves"
+    path = options.out / f"{name}.json"
+    write_results(name, options, path, config=dataclasses.asdict(config), **figures)
+    write_picture(draw(config, runs, figures), name, options, dpi=100)
     print(f"written to {options.out}")
 
 
@@ -145,10 +144,10 @@ def smooth(grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     )
 
 
-def draw(config: Config, runs: dict[str, list[dict]], figures: dict, path: Path) -> None:
+def draw(config: Config, runs: dict[str, list[dict]], figures: dict) -> Figure:
     """Unevenness and flow over the collisions, and the viscoelastic disks at some times."""
     columns = len(config.fields)
-    figure = plt.figure(figsize=(11, 7.2), layout="constrained")
+    figure = Figure(figsize=(11, 7.2), layout="constrained")
     grid = figure.add_gridspec(2, 2 * columns, height_ratios=[1.15, 1])
     top = [figure.add_subplot(grid[0, i * columns : (i + 1) * columns]) for i in range(2)]
     bottom = [figure.add_subplot(grid[1, 2 * i : 2 * i + 2]) for i in range(columns)]
@@ -192,7 +191,7 @@ def draw(config: Config, runs: dict[str, list[dict]], figures: dict, path: Path)
         temperature = np.interp(mark, run["collisions"], run["temperature"] / run["temperature"][0])
         axis.set(xlim=(0, 1), ylim=(0, 1), xticks=[], yticks=[], aspect="equal")
         axis.set_title(f"viscoelastic, $N$ = {mark:g}, $T/T_0$ = {temperature:.0e}", fontsize=9)
-    figure.savefig(path, dpi=100)
+    return figure
 
 
 if __name__ == "__main__":

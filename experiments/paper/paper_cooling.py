@@ -127,7 +127,7 @@ def main() -> None:
             f"(its error up to {100 * row['largest_standard_error']:.2f} %), last exponent "
             f"{list(row['exponent'].values())[-1]:.3f} +- {row['exponent_error'][-1]:.3f}"
         )
-    paper.write(figure, options.out, NAME, config, clock, restitution=e, **found)
+    paper.write(figure, options, NAME, config, clock, restitution=e, **found)
 
 
 def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:

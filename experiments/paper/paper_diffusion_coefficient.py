@@ -15,7 +15,6 @@ import numpy as np
 
 import jaxgran
 from experiments.paper.paper_velocity_correlation import (
-    MARKERS,
     SPHERES,
     diffusion,
     in_boxes,
@@ -60,9 +59,9 @@ def main() -> None:
     }
     figure = paper.figure(
         "Three routes give one D, and it is not T τ$_v$: the gas cools while it remembers",
-        columns=2,
+        columns=3,
     )
-    fall, ratio = figure.axes
+    fall, ratio, kinds = figure.axes
     found = {
         name: routes(name, gas, color, config, fall, ratio) for name, (gas, color) in gases.items()
     }
@@ -74,23 +73,26 @@ def main() -> None:
     fall.plot(tau, printed, "--", lw=1, color=paper.VISCOELASTIC, label="Eq. (40), to order δ")
     paper.caption(
         fall,
-        f"viscoelastic (β = {config.correlation.beta}) and constant ε = {e:.3f}\n"
-        "— theory, ● slope of ⟨Δr²⟩",
+        f"viscoelastic (β = {config.correlation.beta}) and constant ε = {e:.3f}",
         xlabel="time t / τ$_c$(0)",
         ylabel="D / D$_0$,  D$_0$ = T$_0$ τ$_E$(0)",
         xscale="log",
         yscale="log",
     )
+    ratio.plot([], [], color=paper.GUIDE, label="theory with memory")
+    ratio.plot([], [], "--", lw=1, color=paper.GUIDE, label="Eq. (34): D = T τ$_v$")
+    for style, label in (("o", "DSMC, slope of ⟨Δr²⟩"), ("D", "DSMC, ∫⟨v(t′)·v(t)⟩dt")):
+        ratio.plot([], [], style, mfc="none", color=paper.GUIDE, label=label)
     paper.caption(
         ratio,
-        "— theory with memory, - - Eq. (34): D = T τ$_v$\n"
-        "● ■ ▲ ⟨Δr²⟩, ◇ □ △ ∫⟨v(t′)·v(t)⟩dt: DSMC, hard, soft",
+        "Over T τ$_E$, as the gas cools (to the right)",
         xlabel="T(t′) / T$_0$",
         ylabel="D / (T τ$_E$)",
         xscale="log",
-        ylim=(0.93, 1.6),
+        xlim=(2, 1e-5),
+        ylim=(0.96, 1.62),
     )
-    ratio.invert_xaxis()
+    by_models(kinds, gases, found)
     for name, row in found.items():
         print(
             f"{name}: D/(T tau_E) by the slope {row['by_slope'][-1]:.3f} +- "
@@ -105,7 +107,7 @@ def main() -> None:
                 f" +- {of['slope_error']:.3f}, by the integral {of['integral']:.3f} +- "
                 f"{of['integral_error']:.3f}"
             )
-    paper.write(figure, options.out, NAME, config, clock, restitution=e, **found)
+    paper.write(figure, options, NAME, config, clock, restitution=e, **found)
 
 
 def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio) -> dict:
@@ -150,21 +152,48 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio)
         mean = slopes * np.diff(np.asarray(curve.collisions)) / np.diff(tau)
         at = np.sqrt(tau[1:] * tau[:-1])
         fall.errorbar(at[4:], mean[4:], (errors / slopes * mean)[4:], fmt="o", ms=4, color=color)
-    # Elastic spheres stay at T_0: one point.
-    if name == "elastic":
-        ratio.axhline(1.0, color=color, label="elastic: first Sonine order, 1.7 % below DSMC")
-        middle, slopes, errors = (np.array(x[-1:]) for x in (middle, slopes, errors))
-    else:
-        ratio.plot(theta, np.asarray(of.diffusion) / d_0 / np.sqrt(theta), color=color, label=name)
+    if name != "elastic":  # elastic spheres stay at T_0
+        d_of_theory = np.asarray(of.diffusion) / d_0 / np.sqrt(theta)
+        ratio.plot(theta, d_of_theory, color=color, label=name)
         ratio.plot(theta[::8], printed, "--", color=color, lw=1)
-    ratio.errorbar(middle, slopes, errors, fmt="o", ms=4, color=color)
-    hollow = {"ms": 6, "mfc": "none", "color": color}
-    ratio.errorbar(waits, row["by_integral"], row["by_integral_error"], fmt="D", **hollow)
-    for kind, of in boxes.items():
-        at, marker = of["temperature"], MARKERS[kind][0]
-        ratio.errorbar(at, of["integral"], of["integral_error"], fmt=marker, **hollow)
-        ratio.errorbar(at, of["slope"], of["slope_error"], fmt=marker, ms=5, color=color)
+        ratio.errorbar(middle, slopes, errors, fmt="o", ms=4, color=color)
+        hollow = {"ms": 6, "mfc": "none", "color": color}
+        ratio.errorbar(waits, row["by_integral"], row["by_integral_error"], fmt="D", **hollow)
     return row
+
+
+def by_models(axes, gases: dict, found: dict) -> None:
+    """D/(T tau_E) soon after the start by each model of particles, a line for each way to it."""
+    lines = [("DSMC", "dsmc")] + [(name.replace("_", " "), name) for name in SPHERES]
+    ways = (("slope", "⟨Δr²⟩", "o"), ("integral", "∫⟨v·v⟩", "D"))
+    labels = [f"{words}, {way}" for words, _ in lines for _, way, _ in ways]
+    for shift, (name, (_, color)) in enumerate(gases.items()):
+        row = found[name]
+        for i, (_, kind) in enumerate(lines):
+            for j, (way, _, marker) in enumerate(ways):
+                if kind == "dsmc":
+                    at = -1 if way == "slope" and name != "viscoelastic" else 0
+                    if way == "slope" and name == "viscoelastic":
+                        continue  # its D/(T tau_E) falls: no value of it is that of a start
+                    value, error = row[f"by_{way}"][at], row[f"by_{way}_error"][at]
+                elif kind in row:
+                    value, error = row[kind][way], row[kind][f"{way}_error"]
+                else:
+                    continue
+                axes.errorbar(
+                    value,
+                    2 * i + j + 0.14 * (shift - 1),
+                    xerr=error,
+                    fmt=marker,
+                    ms=4.5,
+                    mfc=color if marker == "o" else "none",
+                    color=color,
+                    label=name if (i, j) == (0, 1) else None,
+                )
+    axes.set_yticks(range(len(labels)), labels)
+    axes.invert_yaxis()
+    title = "By every model, from T(t′) ≥ 0.4 T$_0$ on"
+    paper.caption(axes, title, xlabel="D / (T τ$_E$)", xlim=(0.95, 1.62))
 
 
 if __name__ == "__main__":

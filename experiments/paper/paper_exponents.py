@@ -23,6 +23,8 @@ from experiments.support import paper
 from experiments.support.scenes import beads
 from jaxgran.checks.validation import POSITIVE, Domain, number
 
+SHADES = ("#084594", "#2171b5", "#6baed6", "#bdc9e1")
+"""From the smallest gamma to the largest: one colour from dark to light, which has no other use."""
 NAME = "paper_exponents"
 
 
@@ -95,7 +97,7 @@ def main() -> None:
         columns=3,
     )
     cooling, exponents, ice = figure.axes
-    colors = dict(zip(config.gammas, ("#20639b", "#d1495b", "#e09f3e", "#3c8d5a"), strict=False))
+    colors = dict(zip(config.gammas, SHADES, strict=False))
     tau = np.geomspace(0.1, config.last_theory, 181)
     measured = np.geomspace(0.1, config.last, config.points)
     key = jax.random.key(config.seed)
@@ -189,7 +191,7 @@ def main() -> None:
     )
     paper.caption(ice, title, xscale="log", ylim=(-2.1, 0.05), **labels)
     ice.xaxis.set_minor_formatter(NullFormatter())
-    paper.write(figure, options.out, NAME, config, clock, **found)
+    paper.write(figure, options, NAME, config, clock, **found)
 
 
 if __name__ == "__main__":

@@ -108,7 +108,7 @@ def main() -> None:
     looks = {
         "two_terms_unclipped": ("two terms, from ε that ends at ξ = 0", paper.VISCOELASTIC, "-"),
         "two_terms_clipped": ("two terms, from ε that ends at F = 0", paper.VISCOELASTIC, ":"),
-        "ramirez_four_terms": ("four terms of Ramírez et al. 1999", "#e09f3e", "-"),
+        "ramirez_four_terms": ("four terms of Ramírez et al. 1999", paper.ELASTIC, "-"),
         "four_terms": ("four terms, corrected", paper.CONSTANT, "-"),
         "fast_law": ("the package's fast law, from F = 0", paper.INK, "-"),
     }
@@ -140,7 +140,7 @@ def main() -> None:
     print(f"orders of the error in beta: {orders}; 1 % reached at beta = {one_per_cent}")
     paper.write(
         figure,
-        options.out,
+        options,
         NAME,
         config,
         clock,

@@ -210,7 +210,7 @@ def main() -> None:
         ]
         printed = row["paper_relaxation"]
         print(f"{name}: tau_v/tau_E {', '.join(measured)}, paper {printed:.3f}")
-    paper.write(figure, options.out, NAME, config, clock, restitution=e, **found)
+    paper.write(figure, options, NAME, config, clock, restitution=e, **found)
 
 
 def exact_relaxation(gas: jaxgran.Gas) -> jax.Array:

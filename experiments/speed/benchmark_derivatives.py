@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.record import save
+from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads
 from jaxgran.data.curve import Particles
 
@@ -52,6 +52,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=REPEATS)
     parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    add_recording(parser)
     parser.add_argument("--memory-worker", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -75,12 +76,7 @@ def main() -> None:
     model = jaxgran.DSMC(stochastic)
     rows.append(measure(f"DSMC, N={stochastic}", gas, model, repeats, compiled=True))
     memory = measure_memory(fractions[0], soft, blocks)
-    if options.out:
-        save(
-            options.out,
-            rows=rows,
-            memory=memory,
-        )
+    write_results("benchmark_derivatives", options, options.out, rows=rows, memory=memory)
 
 
 def soft_spheres(start: Particles | None, size: int) -> jaxgran.SoftSpheres:

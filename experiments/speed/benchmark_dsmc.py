@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.record import save, seconds
+from experiments.support.record import add_recording, seconds, write_results
 from experiments.support.scenes import beads
 
 SIZES = (10_000, 100_000, 1_000_000)
@@ -38,6 +38,7 @@ def main() -> None:
     parser.add_argument("--precision", choices=("float64", "float32"), default="float64")
     parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", options.precision == "float64")
     sizes, collisions, repeats = options.sizes, COLLISIONS, REPEATS
@@ -57,15 +58,15 @@ def main() -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GiB")
     print("DynamO, quoted: " + ", ".join(f"{n} {rate} coll/s" for n, rate in DYNAMO.items()))
-    if options.out:
-        save(
-            options.out,
-            rows=rows,
-            peak_memory_GiB=peak,
-            dynamo_quoted_collisions_per_s=DYNAMO,
-            precision=options.precision,
-            dimension=options.dimension,
-        )
+    write_results(
+        "benchmark_dsmc",
+        options,
+        options.out,
+        rows=rows,
+        peak_memory_GiB=peak,
+        dynamo_quoted_collisions_per_s=DYNAMO,
+        dimension=options.dimension,
+    )
 
 
 def measure(size: int, dimension: int, collisions: float, repeats: int) -> dict:

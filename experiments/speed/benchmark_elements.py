@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 import jaxgran
-from experiments.support.record import save
+from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads
 
 NUM_HARD, NUM_DSMC = 4096, 100_000
@@ -46,6 +46,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--smoke", action="store_true", help="one short repeat")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     repeats, until = (1, 1.0) if options.smoke else (options.repeats, 10.0)
@@ -65,8 +66,7 @@ def main() -> None:
                 f" {row['ratio']:7.2f}",
                 flush=True,
             )
-    if options.out is not None:
-        save(options.out, rows=rows)
+    write_results("benchmark_elements", options, options.out, rows=rows)
 
 
 def measured(model, until: float, repeats: int) -> list[dict]:

@@ -27,7 +27,7 @@ from tqdm import tqdm
 import jaxgran
 from experiments.speed.benchmark_particles import STEPS_PER_CONTACT, lammps_ranks, time_lammps
 from experiments.support.clustering import follow
-from experiments.support.record import save
+from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads, hard_beads
 
 PACKINGS = {3: 0.1, 2: 0.2}
@@ -49,10 +49,11 @@ def main() -> None:
     parser.add_argument("--until", type=float, help="collisions of each of 50 000 disks")
     parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if options.until:
-        follow_disks((options.sizes or SIZES)[-1], options.until, options.out)
+        follow_disks((options.sizes or SIZES)[-1], options)
         return
     sizes, repeats = options.sizes or SIZES, REPEATS
     if options.smoke:
@@ -74,15 +75,13 @@ def main() -> None:
             print(line, flush=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GiB")
-    if options.out:
-        save(
-            options.out,
-            rows=rows,
-            peak_memory_GiB=peak,
-        )
+    million = "_million" if 1_000_000 in sizes else ""
+    name = f"benchmark_hard_spheres{million}"
+    write_results(name, options, options.out, rows=rows, peak_memory_GiB=peak)
 
 
-def follow_disks(size: int, until: float, out: Path | None) -> None:
+def follow_disks(size: int, options: argparse.Namespace) -> None:
+    until = options.until
     gas = hard_beads(PACKINGS[2], RESTITUTION, 2)
     with tqdm(total=until, unit="collisions", delay=1) as bar:
 
@@ -101,12 +100,8 @@ def follow_disks(size: int, until: float, out: Path | None) -> None:
     print(f"start {run['start_s']:.0f} s, run {run['run_s']:.0f} s with compilation, ", end="")
     regularised = run["regularised"][-1]
     print(f"{total / run['run_s']:.0f} collisions/s; regularised {regularised:.2g} per disk")
-    if out:
-        save(
-            out,
-            size=size,
-            **{name: np.asarray(x).tolist() for name, x in run.items() if name != "positions"},
-        )
+    found = {name: np.asarray(x).tolist() for name, x in run.items() if name != "positions"}
+    write_results("benchmark_hard_spheres_until", options, options.out, size=size, **found)
 
 
 def measure(

@@ -26,6 +26,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import jaxgran
+from experiments.support.record import add_recording, write_results
 from jaxgran.scene.geometry import sphere_surface
 from jaxgran.theory.averages import _AVERAGING_MATRICES, _NODES, SOFTNESS
 
@@ -188,7 +189,9 @@ def cold_starts() -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="a run of seconds instead of a minute")
-    smoke = parser.parse_args().smoke
+    add_recording(parser)
+    options = parser.parse_args()
+    smoke = options.smoke
     jax.config.update("jax_enable_x64", True)
     sweep = sweep_against_scipy(20 if smoke else NUM_CURVES, 2 if smoke else 50)
     derivative = derivative_cost(5 if smoke else 50)
@@ -196,6 +199,8 @@ def main() -> None:
     for title, row in (("sweep", sweep), ("derivative", derivative), ("cold", cold)):
         for name, value in row.items():
             print(f"{title:12}{name:34}{value:12.4g}")
+    results = {"sweep": sweep, "derivative": derivative, "cold": cold}
+    write_results("benchmark_kinetic_theory", options, None, **results)
     print(json.dumps({"device": jax.devices()[0].device_kind} | sweep | derivative | cold))
 
 

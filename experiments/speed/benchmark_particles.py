@@ -29,7 +29,7 @@ import jax
 import numpy as np
 
 import jaxgran
-from experiments.support.record import save
+from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads
 
 PACKING = 0.1
@@ -54,6 +54,7 @@ def main() -> None:
     parser.add_argument("--alone", action="store_true", help="without LAMMPS and the sweep")
     parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    add_recording(parser)
     parser.add_argument("--lammps-worker", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.lammps_worker:
@@ -84,14 +85,9 @@ def main() -> None:
         sweep = measure_sweep(*((50, 2) if options.smoke else (SWEEP_SIZE, SWEEP_GASES)), repeats)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GiB")
-    if options.out:
-        save(
-            options.out,
-            rows=rows,
-            sweep=sweep,
-            peak_memory_GiB=peak,
-            precision=options.precision,
-        )
+    million = "_million" if 1_000_000 in sizes else ""
+    name = f"benchmark_particles{million}"
+    write_results(name, options, options.out, rows=rows, sweep=sweep, peak_memory_GiB=peak)
 
 
 def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:

@@ -11,7 +11,9 @@ of an older run in the same folder.
 """
 
 import argparse
+import datetime
 import json
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,19 +26,20 @@ from matplotlib.ticker import FuncFormatter
 from tqdm import tqdm
 
 import jaxgran
-from experiments.support.record import save, seconds
+from experiments.support.record import (
+    DATA,
+    add_recording,
+    save,
+    seconds,
+    write_picture,
+    write_results,
+)
 from experiments.support.scenes import beads
 from jaxgran.data.header import header_number
+from jaxgran.plotting import COLOURS, INK, STYLES
 
-DATA_FOLDER = Path(__file__).parents[1] / "data"
 KEY = 1  # of the random numbers of the rows; the reference has another
-COLOURS = {
-    "kinetic theory": "#222222",
-    "DSMC": "#2a9d8f",
-    "hard spheres": "#20639b",
-    "soft spheres": "#d1495b",
-}
-"""Colours of the models, by their names."""
+MODELS = "kinetic theory", "DSMC", "hard spheres", "soft spheres"
 SIZES = {
     "dilute": (500, 2000, 8000),
     "dense": (500, 2000, 8000),
@@ -73,10 +76,11 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", nargs="+", choices=SIZES, default=list(SIZES))
-    names = [option(name) for name in COLOURS]
+    names = [option(name) for name in MODELS]
     parser.add_argument("--models", nargs="+", choices=names, default=names)
     parser.add_argument("--smoke", action="store_true", help="few rows, early times only")
     parser.add_argument("--out", type=Path, default=Path("results") / "speed_vs_error")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     stem = "speed_vs_error_smoke" if options.smoke else "speed_vs_error"
@@ -91,18 +95,23 @@ def main() -> None:
         runs = few_runs(scene.gas) if options.smoke else all_runs(scene.gas, SIZES[name])
         runs = [run for run in runs if option(run.model.name) in options.models]
         rows = [measure(scene, run) for run in tqdm(runs, disable=True if options.smoke else None)]
-        rows = sorted(kept + rows, key=lambda row: list(COLOURS).index(row["model"]))
+        rows = sorted(kept + rows, key=lambda row: MODELS.index(row["model"]))
         choice = jaxgran.choose_model(
             scene.gas, scene.times, num_particles=SIZES[name][-1], replicas=REPLICAS
         )
         estimates = {c.model.name: c.error for c in choice.candidates if c.error is not None}
-        found[name] = {"reference": scene.reference, "estimates": estimates, "rows": rows}
+        made = datetime.date.today().isoformat()
+        found[name] = {
+            "date": made,
+            "reference": scene.reference,
+            "estimates": estimates,
+            "rows": rows,
+        }
         print(table(name, found[name]))
         save(file, scenes=found, key=KEY, replicas=REPLICAS)
     found = {name: found[name] for name in SIZES if name in found}
-    draw(found, file.with_suffix(".png"))
-    text = "\n\n".join(table(name, results) for name, results in found.items())
-    file.with_suffix(".md").write_text(text + "\n", encoding="utf-8")
+    write_picture(draw(found), stem, options)
+    write_results("speed_vs_error", options, None, scenes=found, key=KEY, replicas=REPLICAS)
     print(f"written to {options.out}")
 
 
@@ -118,7 +127,7 @@ def title(name: str) -> str:
 
 def measured(name: str, smoke: bool) -> Scene:
     """A gas whose curve was measured in LAMMPS."""
-    curve, header = jaxgran.read_curve(DATA_FOLDER / f"lammps_cooling_{name}.csv")
+    curve, header = jaxgran.read_curve(DATA / f"lammps_cooling_{name}.csv")
     gas = jaxgran.read_gas(header).replace(dissipative_constant=header_number(header, "A"))
     assert curve.temperature_error is not None
     used = slice(1, 6 if smoke else None)  # at t = 0 nothing is measured
@@ -249,34 +258,50 @@ def table(name: str, results: dict) -> str:
     return "\n".join(lines)
 
 
-def draw(found: dict, path: Path) -> None:
-    figure = Figure(figsize=(4.4 * len(found), 4.6), layout="constrained")
+def draw(found: dict) -> Figure:
+    """Largest error over run time; the symbols grow with N."""
+    figure = Figure(figsize=(5.0 * len(found), 5.6), layout="constrained")
     grid = figure.subplots(1, len(found), sharey=True, squeeze=False)
     for axes, (name, results) in zip(grid[0], found.items(), strict=True):
         panel(axes, results["rows"])
-        axes.set(title=f"{name}\n(against {results['reference'].split(', ')[0]})")
-        axes.set(xlabel="run time without compilation, s")
-    grid[0][0].set(ylabel="largest error of T(t), %")
+        title = f"{name} gas, against {results['reference'].split(', ')[0]}"
+        axes.set_title(title, fontsize=11, loc="left")
+        axes.set(xlabel="run time without compilation (s)")
+        axes.spines[["top", "right"]].set_visible(False)
+    grid[0][0].set(ylabel="largest error of T(t) (%)")
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
-    figure.savefig(path, dpi=130)
+    return figure
 
 
 def panel(axes: Axes, rows: list[dict]) -> None:
-    for name, colour in COLOURS.items():
+    """Full points grow with N; hollow ones have the middle N and so many steps a contact.
+
+    Rows of the table that differ in something else (float32, the tolerance, DSMC's step, softer
+    spheres) are left out.
+    """
+    for name in MODELS:
         mine = [row for row in rows if row["model"] == name]
-        for double, marker in ((True, "o"), (False, "x")):
-            some = [row for row in mine if row["float64"] == double]
-            axes.errorbar(
-                [row["run_s"] for row in some],
-                [100 * row["error"] for row in some],
-                [100 * row["standard_error"] for row in some],
-                fmt=marker,
-                ms=5,
-                lw=0.8,
-                color=colour,
-                label=title(name) if double else None,
-            )
+        marker = STYLES[name][1]
+        by_size = [row for row in mine if is_usual(row)]
+        for k, row in enumerate(by_size):
+            last = k == len(by_size) - 1
+            point(axes, row, marker, 4 + 3 * k, COLOURS[name], title(name) if last else None)
+        line = {"color": COLOURS[name], "lw": 0.8, "alpha": 0.6}
+        axes.plot(*coordinates(by_size), **line)
+        steps = [row for row in mine if (found := steps_of(row)) and found != 40]
+        for row in steps:
+            point(axes, row, marker, 6, "none", None)
+            words = f"{steps_of(row)} steps"
+            at = tuple(float(x[0]) for x in coordinates([row]))
+            shift, side = ((-6, 0), "right") if row is steps[0] else ((6, -11), "left")
+            shift = (6, 4) if row is steps[-1] else shift
+            place = {"xytext": shift, "textcoords": "offset points", "fontsize": 8, "ha": side}
+            axes.annotate(words, at, color=COLOURS[name], **place)
+    numbers = {name: sizes_of(rows, name) for name in MODELS[1:]}
+    words = [f"N = {', '.join(map(str, numbers['soft spheres']))}"]
+    words.append(f"DSMC: {', '.join(map(str, numbers['DSMC']))}")
+    axes.text(0.02, 0.03, "\n".join(words), transform=axes.transAxes, fontsize=8.5, color=INK)
     # The Pareto front: rows for which no other is both faster and more accurate.
     best = np.inf
     front = []
@@ -285,11 +310,41 @@ def panel(axes: Axes, rows: list[dict]) -> None:
             best = row["error"]
             front.append(row)
     t, e = ([row[key] for row in front] for key in ("run_s", "error"))
-    axes.step(t, 100 * np.asarray(e), where="post", color="#8d99ae", lw=1, label="front")
-    axes.plot([], [], "x", color="#555555", label="float32")
-    axes.set(xscale="log", yscale="log")
+    look = {"color": COLOURS["guide"], "lw": 1, "zorder": 0}
+    axes.step(t, 100 * np.asarray(e), where="post", label="no model is faster and better", **look)
+    axes.set(xscale="log", yscale="log", ylim=(0.2, 60))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.grid(alpha=0.25)
+
+
+def point(axes: Axes, row: dict, marker: str, size: float, face: str, label) -> None:
+    """A row with its error bar."""
+    (x,), (y,) = coordinates([row])
+    colour = COLOURS[row["model"]]
+    look = {"fmt": marker, "ms": size, "mfc": face, "lw": 0.7, "color": colour, "label": label}
+    axes.errorbar(x, y, 100 * row["standard_error"], **look)
+
+
+def coordinates(rows: list[dict]) -> tuple[list[float], list[float]]:
+    return [row["run_s"] for row in rows], [100 * row["error"] for row in rows]
+
+
+def is_usual(row: dict) -> bool:
+    """Whether only N sets the row apart from others of its model."""
+    return (
+        row["float64"] and re.fullmatch(r"(N \d+(, 40 steps)?|rtol 1e-06)", row["knob"]) is not None
+    )
+
+
+def steps_of(row: dict) -> int | None:
+    """Steps a contact of a row in which nothing else is unusual."""
+    found = re.fullmatch(r"N \d+, (\d+) steps", row["knob"])
+    return int(found[1]) if found else None
+
+
+def sizes_of(rows: list[dict], name: str) -> list[int]:
+    """N of the usual rows of a model."""
+    mine = [row["knob"] for row in rows if row["model"] == name and is_usual(row)]
+    return [int(knob.split(",")[0].split()[1]) for knob in mine]
 
 
 if __name__ == "__main__":

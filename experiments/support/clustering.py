@@ -11,9 +11,11 @@ from scipy.optimize import root_scalar
 
 import jaxgran
 from experiments.support.scenes import beads
+from jaxgran.plotting import COLOURS as COLOURS_OF
 
 LAWS = ("constant", "viscoelastic")
-COLOURS = ("#20639b", "#d1495b")
+COLOURS = (COLOURS_OF["constant restitution"], COLOURS_OF["viscoelastic"])
+"""Of the laws."""
 
 PER_CELL = 20
 """Mean number of disks in the cells over which density and flow are measured.

@@ -13,9 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import save
+from experiments.support.record import add_recording, write_picture, write_results
+from jaxgran.plotting import COLOURS
 
-INK, ELASTIC, CONSTANT, VISCOELASTIC = "#222222", "#8d99ae", "#20639b", "#d1495b"
+INK, GUIDE, ELASTIC = (COLOURS[name] for name in ("measured", "guide", "elastic"))
+CONSTANT, VISCOELASTIC = (COLOURS[name] for name in ("constant restitution", "viscoelastic"))
 DPI = 110
 
 
@@ -44,15 +46,24 @@ def options(doc: str | None, name: str) -> argparse.Namespace:
     )
     parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, default=Path("results") / name)
+    add_recording(parser)
     jax.config.update("jax_enable_x64", True)
     return parser.parse_args()
 
 
-def write(figure: Figure, folder: Path, name: str, config: Any, clock: Clock, **found: Any) -> None:
+def write(
+    figure: Figure,
+    options: argparse.Namespace,
+    name: str,
+    config: Any,
+    clock: Clock,
+    **found: Any,
+) -> None:
     """Write the picture and, as JSON, its data; print where."""
-    folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / f"{name}.png", dpi=DPI)
-    save(folder / f"{name}.json", config=asdict(config), found=found, **clock.times)
+    folder = options.out
+    write_picture(figure, name, options, DPI)
+    results = {"config": asdict(config), "found": found, **clock.times}
+    write_results(name, options, folder / f"{name}.json", **results)
     print(f"{folder / name}.png and .json, {sum(clock.times.values()):.0f} s")
 
 
@@ -96,7 +107,7 @@ def caption(axes: Axes, title: str, **settings: Any) -> None:
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8, frameon=False)
+        axes.legend(fontsize=8, frameon=True, framealpha=0.85, edgecolor="none")
 
 
 def listed(values: Iterable[Any]) -> list[float]:

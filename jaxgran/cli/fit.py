@@ -135,8 +135,20 @@ def title_of(options: FitOptions, rows: list[dict], diagnosis) -> str:
     head = rows[0]
     answer = "not determined"
     if not np.isnan(head["estimate"]):
-        answer = f"{head['estimate']:.4g} ± {head['std_err']:.2g} {head['unit']}"
-    return f"{options.curve.stem}: {head['parameter']} = {answer}\n{diagnosis.verdict}"
+        answer = with_error(head["estimate"], head["std_err"], head["unit"])
+    name = options.curve.stem.replace("_", " ")
+    return f"{name}: {head['parameter']} = {answer}\n{diagnosis.verdict}"
+
+
+def with_error(value: float, error: float, unit: str) -> str:
+    """A value and its standard error as a person writes them: (2.959 ± 0.051)·10⁻⁶ s."""
+    power = int(np.floor(np.log10(abs(value)))) if value else 0
+    if not np.isfinite(error) or error <= 0 or -2 < power < 4:
+        return f"{value:.4g} ± {error:.2g} {unit}".strip()
+    digits = max(power - int(np.floor(np.log10(error))) + 1, 0)
+    raised = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    value, error = value / 10.0**power, error / 10.0**power
+    return f"({value:.{digits}f} ± {error:.{digits}f})·10{raised} {unit}".strip()
 
 
 def with_given_constant(gas, header, free: list[str]):

@@ -27,8 +27,8 @@ def test_clustering_leaves_haffs_law(tmp_path):
 def test_clusters_dissolve(tmp_path):
     done = run("paper/paper_clustering_dissolves.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "here" / "dissolves.png").stat().st_size > 20_000
-    record = json.loads((tmp_path / "here" / "dissolves.json").read_text())
+    assert (tmp_path / "here" / "paper_clustering_dissolves.png").stat().st_size > 20_000
+    record = json.loads((tmp_path / "here" / "paper_clustering_dissolves.json").read_text())
     # A box of 300 disks is as long as the initial L_c: no clusters form and T is that of kinetic
     # theory; ln T was measured 0.08 +- 0.05 above it after 60 collisions, at T/T_0 = 6e-6.
     gas = record["viscoelastic"]
@@ -99,7 +99,7 @@ def test_paper_is_reproduced(name, holds, tmp_path):
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / f"{name}.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / f"{name}.json").read_text())
-    assert record["config"] and record["versions"] and record["run_s"] > 0
+    assert record["config"] and record["made_by"]["packages"] and record["run_s"] > 0
     holds(record["found"])
 
 

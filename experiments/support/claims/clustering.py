@@ -12,10 +12,10 @@ BY_DENSITY = "unevenness over elastic by 2"
 
 def clustering(table: Table) -> None:
     haff = [np.exp(-(1 - e**2) / 2 * n) for n, e, _ in QUOTED]
-    run = table.whole("paper_clustering", "paper_clustering.json")
+    run = table.whole("paper_clustering")
     if run:
         onset(table, run, haff)
-    gas = table.whole("paper_clustering_dissolves", "dissolves.json")
+    gas = table.whole("paper_clustering_dissolves")
     if gas:
         dissolution(table, gas["viscoelastic"])
 

@@ -39,7 +39,7 @@ class Row:
 
 @dataclass
 class Table:
-    """The rows of the table, made from the JSON files in the folder `results`."""
+    """The rows of the table, made from the JSON files NAME.json in the folder `results`."""
 
     results: Path
     rows: list[Row] = field(default_factory=list)
@@ -49,12 +49,12 @@ class Table:
 
     def found(self, name: str) -> dict | None:
         """The entry "found" of the results of a script, or None if there are none."""
-        whole = self.whole(name, f"{name}.json")
+        whole = self.whole(name)
         return whole["found"] if whole else None
 
-    def whole(self, folder: str, file: str) -> dict | None:
-        """All results in a file, or None if there is no such file."""
-        path = self.results / folder / file
+    def whole(self, name: str) -> dict | None:
+        """All results of a script, or None if there are none."""
+        path = self.results / f"{name}.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     def markdown(self) -> str:
