@@ -1,79 +1,177 @@
-"""Write accuracy.md and speed.md, the tables of how wrong and how slow, from figures.json.
+"""Write every figure of the documents: the tables of how wrong and how slow, the gallery, README.
 
-A figure of these tables is changed in figures.json, after its command has been run, and nowhere
-else; a test compares the tables with what this script would write.
+    python experiments/documents.py
+
+The figures come from `experiments/figures/*.json`, which the scripts write when they are run with
+--record, and from nothing else. accuracy.md, speed.md, speed_vs_error.md, wrong_physics.md and
+interval_coverage.md are written whole; README.md and experiments/README.md between their marks
+`<!-- NAME -->` and `<!-- end of NAME -->`. A test compares all of them with what this would write.
 """
 
 import argparse
-import json
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
-HERE = Path(__file__).parent
+from experiments.fit import interval_coverage, wrong_physics
+from experiments.speed import speed_vs_error
+from experiments.support.record import EXPERIMENTS, figures
+from experiments.support.tables import accuracy, gallery, speed
+from experiments.support.tables.words import Row, between, of
 
-ACCURACY = """\
-Kinetic theory leaves out correlations, clustering and three-body contacts. Its self-diffusion is
-the first Sonine approximation, 1.7 % (3D) or 2.4 % (2D) low for dilute elastic spheres, and 0.85 φ
-lower for dense ones in boxes of some hundred spheres, more in larger ones. Errors of T of every
-model against its run time: [speed_vs_error.md](speed_vs_error.md).
-"""
-
-SPEED = """\
-## Speed against error
-
-[speed_vs_error.md](speed_vs_error.md) has the largest error of T over a whole curve, and the run
-time without compilation, of every model as its knob is turned
-([picture](pictures/speed_vs_error.png)). The dilute and the dense gas are LAMMPS' own curves,
-nothing fitted; the clustering gas (φ = .2, β = .5, t_c/τ_c = .02, to 60 τ_c) is held against
-12 × 12 000 soft spheres of 80 steps a contact. Models have four replicas of N particles. The
-largest of 30 to 60 noisy points is itself two of its standard errors where nothing is wrong; boxes
-of fewer particles are smaller boxes. The noise that `choose_model` estimates is that of shots and
-of the few waves of a growing flow, as runs of three gases in two boxes each scatter
-(`pytest -m "slow or not slow" tests/models/test_selection.py -k noise`).
-
-For a dilute gas in a box below L_c take kinetic theory: no model beats its 1.5 % by more than a
-fraction of its own noise and 1 %. Where contacts last or overlap, or the box is longer than L_c,
-take soft spheres with 10 to 20 steps a contact and spend the time on particles rather than on
-steps. Hard spheres of the same N take a seventh to two fifths of that time, and err by 2 to 3 %
-from N = 3000 on where contacts are short (the clustering gas), in the dense gas by 4 to 9 %.
-float32 costs no accuracy that shows here.
-"""
-
-HEADS = {"accuracy": ("How wrong", ACCURACY), "speed": ("How slow", SPEED)}
-"""Title and note of each document."""
-
-
-def document(name: str, figures: dict) -> str:
-    """The text of one document.
-
-    Args:
-        name: "accuracy" or "speed".
-        figures: contents of figures.json; a row may have its own version, machine or precision.
-    """
-    title, note = HEADS[name]
-    default = figures["made_by"]
-    lines = [
-        f"# {title}",
-        "",
-        f"Unless a row says otherwise: {default['machine']}, {default['precision']}, "
-        f"version {default['version']}. Written by",
-        "`python experiments/documents.py` from [figures.json](figures.json).",
-        "",
-        "| what | against | measured | command |",
-        "|---|---|---|---|",
-    ]
-    for row in figures[name]:
-        own = [str(row[key]) for key in default if key in row]
-        measured = row["measured"] + (f" ({', '.join(own)})" if own else "")
-        lines.append(f"| {row['what']} | {row['against']} | {measured} | `{row['command']}` |")
-    return "\n".join([*lines, "", note])
+ROOT = EXPERIMENTS.parent
+BY = "Written by `python experiments/documents.py` from [figures](figures)"
+MODELS = {
+    "kinetic theory": ("`KineticTheory()`", "N/A", 1e3, "ms"),
+    "DSMC": ("`DSMC(N)`", (10_000,), 1.0, "s, N = 10⁴"),
+    "hard spheres": ("`HardSpheres(N)`", (2000, 3000), 1.0, "s"),
+    "soft spheres": ("`SoftSpheres(N)`", (2000, 3000), 1.0, "s"),
+}
+"""Names, N, units of time and their words, of the models in the table of README.md."""
+USES = {
+    "kinetic theory": (
+        "dilute gases in boxes below L_c; fits",
+        "correlations, clusters, lasting contacts",
+    ),
+    "DSMC": ("any law, many decades of time", "positions: the same"),
+    "hard spheres": ("clusters, short contacts", "lasting contacts"),
+    "soft spheres": ("dense and soft gases", "rotation, walls, drag"),
+}
 
 
 def main() -> None:
-    """Write both documents."""
-    argparse.ArgumentParser(description=__doc__).parse_args()
-    figures = json.loads((HERE / "figures.json").read_text(encoding="utf-8"))
-    for name in HEADS:
-        (HERE / f"{name}.md").write_text(document(name, figures), encoding="utf-8")
+    """Write all documents."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
+    for path, text in documents().items():
+        path.write_text(text, encoding="utf-8")
+
+
+def documents() -> dict[Path, str]:
+    """What each document should contain, by its path."""
+    scenes = figures("speed_vs_error")["scenes"]
+    whole = {
+        "accuracy": table("How wrong", accuracy.ROWS, accuracy.NOTE),
+        "speed": table("How slow", speed.ROWS, speed.NOTE),
+        "speed_vs_error": "\n\n".join(
+            [
+                "# Speed against error",
+                f"{BY}`/speed_vs_error.json`.",
+                *(
+                    f"{speed_vs_error.table(name, scene)}\n\nMade: {scene['date']}."
+                    for name, scene in scenes.items()
+                ),
+            ]
+        )
+        + "\n",
+        "wrong_physics": wrong_physics.table(figures("wrong_physics")),
+        "interval_coverage": interval_coverage.table(figures("interval_coverage")),
+    }
+    written = {EXPERIMENTS / f"{name}.md": text for name, text in whole.items()}
+    parts = {"models": model_table(scenes), "dilute": printed("lammps_curves_dilute")}
+    for path, blocks in (
+        (ROOT / "README.md", parts),
+        (EXPERIMENTS / "README.md", {"gallery": gallery_text()}),
+    ):
+        written[path] = filled(path.read_text(encoding="utf-8"), blocks)
+    return written
+
+
+def filled(text: str, blocks: dict[str, str]) -> str:
+    """The text with each block between its marks."""
+    for name, block in blocks.items():
+        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+        if begin not in text or end not in text:
+            raise ValueError(f"the marks {begin.strip()} and {end} are missing; put them back")
+        head, _, rest = text.partition(begin)
+        text = f"{head}{begin}{block}\n{end}{rest.partition(end)[2]}"
+    return text
+
+
+def table(title: str, rows: Iterable[Row], note: str) -> str:
+    """A document with one table; the last column says when, and on what if not on two cores."""
+    lines = [
+        f"# {title}",
+        "",
+        f"{BY}. Version 0.1.0 on a two-core CPU in float64,",
+        "unless the last column says otherwise; it has the day on which the command was run.",
+        "",
+        "| what | against | measured | command | made |",
+        "|---|---|---|---|---|",
+    ]
+    for row in rows:
+        found = [figures(source) for source in row.source.split()]
+        cells = row.what, row.against, row.measured(*found), f"`{row.command}`", made(found)
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join([*lines, "", note])
+
+
+def made(found: list[dict]) -> str:
+    """The dates of some figures, and what is not usual of what made them."""
+    usual = {"version": "0.1.0", "machine": "two-core CPU", "precision": "float64"}
+    words = {
+        ", ".join([f["made_by"]["date"], *(f["made_by"][k] for k in usual if differs(f, k, usual))])
+        for f in found
+    }
+    return "; ".join(sorted(words))
+
+
+def differs(found: dict, key: str, usual: dict) -> bool:
+    return found["made_by"][key] != usual[key]
+
+
+def model_table(scenes: dict) -> str:
+    """README's table: which model when, how wrong, how fast."""
+    lines = [
+        "| model | for | leaves out | error of T | time, N = 2000 to 3000 |",
+        "|---|---|---|---|---|",
+    ]
+    for name, (code, sizes, unit, words) in MODELS.items():
+        rows = {scene: usual_rows(found["rows"], name, sizes) for scene, found in scenes.items()}
+        errors = {scene: [100 * row["error"] for row in some] for scene, some in rows.items()}
+        everywhere = [x for some in errors.values() for x in some]
+        seconds = between((unit * row["run_s"] for some in rows.values() for row in some), "{:.2g}")
+        if max(everywhere) > 10:
+            dense = between(errors["dense"] + errors["clustering"], "{:.0f}")
+            error = f"{between(errors['dilute'])} % where dilute, {dense} % where dense"
+        else:
+            error = f"{between(everywhere, '{:.0f}')} %"
+        use, omitted = USES[name]
+        lines.append(f"| {code} | {use} | {omitted} | {error} | {seconds} {words} |")
+    return "\n".join([*lines, '| `"auto"` | the cheapest within a tolerance | | 2 % asked | |'])
+
+
+def usual_rows(rows: list[dict], name: str, sizes) -> list[dict]:
+    """Rows of a model of these sizes, with nothing else unusual."""
+    mine = [row for row in of(rows, model=name) if speed_vs_error.is_usual(row)]
+    if name == "kinetic theory":
+        return mine
+    return [row for row in mine if int(re.findall(r"\d+", row["knob"])[0]) in sizes]
+
+
+def printed(name: str) -> str:
+    """Lines that a fit printed."""
+    return "\n".join(["```", *figures(name)["printed"], "```"])
+
+
+def gallery_text() -> str:
+    """A table of scripts for each group of questions."""
+    lines = []
+    for group, entries in gallery.ENTRIES.items():
+        lines += ["", f"## {group}", "", "| | question | finding | time |", "|---|---|---|---|"]
+        for entry in entries:
+            found = figures(entry.source) if entry.source else {}
+            finding = entry.finding(found)
+            if entry.table:
+                finding += f" ([table]({entry.table}))"
+            shown = ""
+            if entry.picture:
+                path = f"pictures/{entry.picture}"
+                shown = f'[<img src="{path}" width="180" alt="{entry.script}">]({path})'
+            script = f"[`{entry.script}`]({entry.script})"
+            lines.append(f"| {shown} | {entry.question}<br>{script} | {finding} | {entry.time} |")
+    return "\n".join(lines[1:])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """jaxgran: differentiable granular gases in JAX."""
 
 from jaxgran.checks.status import explain as explain_status
+from jaxgran.checks.validation import Domain
 from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.data.curve_file import read_curve, read_gas, read_priors, write_curve
 from jaxgran.data.drop_test import DropTest, read_drop_test
@@ -40,6 +41,7 @@ __all__ = [
     "CoolingCurve",
     "Course",
     "Diagnosis",
+    "Domain",
     "DrivenStart",
     "DropTest",
     "Fit",

@@ -33,11 +33,27 @@ CURVE = jaxgran.CoolingCurve(times=[0.1, 0.2, 0.3, 0.4], temperature=[4e-3, 3e-3
 SOFT = jaxgran.SoftSpheres(20)
 
 
-class NoDomains(RestitutionLaw):
+class NoRestitution(RestitutionLaw):
     """A law that lacks a member."""
 
+    coefficient: float = 0.9
+
+
+class InMetres(RestitutionLaw, ReducedLaw):
+    """A law that takes speeds in units of a reference speed for speeds in m/s."""
+
     def reduced(self, *, diameter, mass, speed):
-        raise NotImplementedError
+        return self
+
+    def restitution(self, normal_speed):
+        return jnp.exp(-normal_speed)
+
+
+class NotReduced(RestitutionLaw):
+    """A law whose reduced law is itself, which is none."""
+
+    def reduced(self, *, diameter, mass, speed):
+        return self
 
 
 class OfMass(RestitutionLaw, ReducedLaw):
@@ -95,7 +111,9 @@ REFUSED = [
     ("a negative beta", lambda: jaxgran.viscoelastic_restitution(-1.0), "beta must lie in"),
     ("an empty series", lambda: jaxgran.RestitutionSeries([], []), "same length, 1 or more"),
     ("a law's float named as the gas's", lambda: with_law(OfMass()), "'mass'.*rename it"),
-    ("a law without domains", lambda: NoDomains(), "domains"),
+    ("a law without restitution", lambda: NoRestitution(), "define restitution"),
+    ("a law in wrong units", lambda: with_law(InMetres()), "0.04979 at 0.3 m/s .* leave `reduced`"),
+    ("a law that is not reduced", lambda: with_law(NotReduced()), "must return a .*ReducedLaw"),
 ]
 
 

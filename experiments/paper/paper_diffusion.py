@@ -75,7 +75,7 @@ def main() -> None:
             (in_collisions, collisions, dsmc_collisions),
         ):
             axes.plot(x[far], spread[far], color=colors[name], label=f"{labels[name]}: theory")
-            axes.errorbar(at, mean, error, label="DSMC", **shown)
+            axes.errorbar(at, mean, error, **shown)
         where, local = paper.slope(tau, spread)
         at, exponents = paper.slope(measured, each)
         local_mean, local_error = paper.mean_and_error(exponents)
@@ -182,6 +182,8 @@ def cooling_window(delta: float, tau: np.ndarray) -> dict:
 def dress(panels) -> None:
     """Give the panels their titles and labels."""
     in_time, exponent, in_collisions, forms = panels
+    for axes in (in_time, exponent, in_collisions):
+        axes.plot([], [], "o", ms=3.5, color=paper.GUIDE, label="DSMC")
     spread, time = "⟨Δr²⟩ / (T$_0$ τ$_c$(0)²)", "time t / τ$_c$(0)"
     title = "In time: a straight line is log t"
     paper.caption(in_time, title, xlabel=time, ylabel=spread, xscale="log", ylim=(0, 9000))

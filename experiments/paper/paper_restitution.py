@@ -88,7 +88,7 @@ def main() -> None:
     left.plot(betas, unclipped, "--", color=paper.ELASTIC, label="same, ends at ξ = 0 (paper)")
     left.plot(betas, two, color=paper.VISCOELASTIC, label="paper, Eq. (1): two terms")
     five = series(betas, UNCLIPPED_SERIES)
-    left.plot(betas, five, ":", color=paper.CONSTANT, label="five terms")
+    left.plot(betas, five, ":", color=paper.INK, label="five terms")
     paper.caption(
         left,
         "One impact",
@@ -109,7 +109,7 @@ def main() -> None:
         "two_terms_unclipped": ("two terms, from ε that ends at ξ = 0", paper.VISCOELASTIC, "-"),
         "two_terms_clipped": ("two terms, from ε that ends at F = 0", paper.VISCOELASTIC, ":"),
         "ramirez_four_terms": ("four terms of Ramírez et al. 1999", paper.ELASTIC, "-"),
-        "four_terms": ("four terms, corrected", paper.CONSTANT, "-"),
+        "four_terms": ("four terms, corrected", paper.GUIDE, "-."),
         "fast_law": ("the package's fast law, from F = 0", paper.INK, "-"),
     }
     for name, error in errors.items():

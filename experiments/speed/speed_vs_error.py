@@ -293,11 +293,11 @@ def panel(axes: Axes, rows: list[dict]) -> None:
         for row in steps:
             point(axes, row, marker, 6, "none", None)
             words = f"{steps_of(row)} steps"
-            at = tuple(float(x[0]) for x in coordinates([row]))
+            (x,), (y,) = coordinates([row])
             shift, side = ((-6, 0), "right") if row is steps[0] else ((6, -11), "left")
             shift = (6, 4) if row is steps[-1] else shift
             place = {"xytext": shift, "textcoords": "offset points", "fontsize": 8, "ha": side}
-            axes.annotate(words, at, color=COLOURS[name], **place)
+            axes.annotate(words, (x, y), color=COLOURS[name], **place)
     numbers = {name: sizes_of(rows, name) for name in MODELS[1:]}
     words = [f"N = {', '.join(map(str, numbers['soft spheres']))}"]
     words.append(f"DSMC: {', '.join(map(str, numbers['DSMC']))}")

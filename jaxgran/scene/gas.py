@@ -20,6 +20,7 @@ from jaxgran.scene import elements
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
 from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise, optional
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
+from jaxgran.scene.law import check_units
 from jaxgran.scene.named_floats import NamedFloats, Place
 from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw, Viscoelastic
 
@@ -36,6 +37,7 @@ _PACKINGS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
 def _checked_law(law: UserLaw) -> RestitutionLaw:
     if not isinstance(law, RestitutionLaw):
         raise ValueError(f"law must be a restitution law such as jaxgran.Viscoelastic, got {law!r}")
+    check_units(law)
     return law
 
 

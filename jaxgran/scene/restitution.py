@@ -1,11 +1,9 @@
 """Laws of restitution: the ratio of the normal speeds after and before an impact, eps(v)."""
 
-from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from equinox import AbstractClassVar
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.checks.validation import (
@@ -19,93 +17,12 @@ from jaxgran.checks.validation import (
     truth_value,
 )
 from jaxgran.scene import contact
+from jaxgran.scene.law import ReducedLaw, RestitutionLaw
 from jaxgran.scene.restitution_table import (
     UNCLIPPED_SERIES,
     log_viscoelastic_restitution,
     viscoelastic_restitution,
 )
-
-
-class RestitutionLaw(eqx.Module):
-    """A law of restitution of a material, in SI units.
-
-    To add a law, define a subclass with float fields, their allowed ranges in `domains`, and
-    `reduced`, which returns a subclass of `ReducedLaw`. A class may be both. A missing member is
-    named by the TypeError that creating the law raises. No field may have the name of a float of
-    `jaxgran.Gas`.
-    """
-
-    domains: AbstractClassVar[dict[str, Domain]]
-    """Allowed range of every float field, by name; used for validation and for fits."""
-
-    lists: ClassVar[tuple[str, ...]] = ()
-    """Names of those fields that hold more than one number."""
-
-    advice: ClassVar[dict[str, str]] = {}
-    """What to do about a value outside its range, by name: a sentence for the error message."""
-
-    def __check_init__(self):
-        for name, domain in self.domains.items():
-            if not hasattr(self, name):
-                raise ValueError(
-                    f"domains of {type(self).__name__} has {name!r}, which is no field: give "
-                    "domains the names of its float fields"
-                )
-            domain.check(name, getattr(self, name), self.advice.get(name, ""))
-
-    @abstractmethod
-    def reduced(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> "ReducedLaw":
-        """The law for two equal spheres, in units of their diameter and of a reference speed.
-
-        Args:
-            diameter: sigma, m, > 0.
-            mass: m, kg, > 0, of either sphere.
-            speed: reference speed, m/s, > 0.
-        """
-
-    def on_wall(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> "ReducedLaw":
-        """The same for a sphere and a flat wall, where the law is that of the wall."""
-        return self.reduced(diameter=diameter, mass=mass, speed=speed)
-
-
-class ReducedLaw(eqx.Module):
-    """A law of restitution for two given spheres, in units of a length and a reference speed.
-
-    A subclass defines `restitution`.
-    """
-
-    num_nodes: ClassVar[int] = 40
-    """Number of Chebyshev nodes in ln T that resolve averages over the impacts of this law.
-
-    40 suffice for laws as steep as 1 - eps ~ v over 12 decades of time (relative error 1e-7 of the
-    cooling rate); flatter laws need fewer."""
-
-    @abstractmethod
-    def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Coefficient of restitution eps at a normal approach speed.
-
-        Args:
-            normal_speed: in units of the reference speed, > 0, any shape.
-
-        Returns:
-            eps, same shape.
-        """
-
-    def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """``1 - eps``; override it where it can be computed without cancellation for eps near 1.
-
-        Args: as `restitution`.
-        """
-        return 1 - self.restitution(normal_speed)
-
-    def impact_length(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """``X = (v^2/alpha)^(2/5)``, the length scale of the overlap, in diameters.
-
-        Zero for hard spheres, the default.
-
-        Args: as `restitution`.
-        """
-        return jnp.zeros_like(normal_speed)
 
 
 class ReducedViscoelastic(ReducedLaw):

@@ -123,6 +123,47 @@ def test_a_law_of_ones_own():
     assert jnp.all(jnp.diff(curve.temperature) < 0)
 
 
+class Plastic(jaxgran.RestitutionLaw):
+    """Losses begin at a yield speed; in m/s, and with no other member than its eps."""
+
+    yield_speed: float
+    power: float = 0.125
+
+    def restitution(self, normal_speed):
+        return (1 + (normal_speed / self.yield_speed) ** 2) ** -self.power
+
+
+def test_a_law_of_the_speed_alone_is_one_function():
+    law = Plastic(0.2)
+    gas = jaxgran.Gas(law, diameter=2e-3, mass=1e-5, packing_fraction=0.05, temperature=0.01)
+    np.testing.assert_allclose(gas.restitution(0.1), (1 + 0.25) ** -0.125, rtol=1e-12)
+    assert gas.value("yield_speed") == 0.2 and gas.value("power") == 0.125
+    # As if it had been given in reduced units by hand.
+    reduced = Plastic(0.2 / gas.impact_speed)
+    speeds = jnp.array([0.3, 1.0, 4.0])
+    found = gas.reduced_law.restitution(speeds)
+    np.testing.assert_allclose(found, reduced.restitution(speeds), rtol=1e-12)
+    np.testing.assert_allclose(gas.reduced_law.loss(speeds), 1 - found, rtol=1e-12)
+
+
+def test_a_law_may_give_one_number_for_all_speeds():
+    class Same(jaxgran.RestitutionLaw):
+        coefficient: float
+        domains = {"coefficient": jaxgran.Domain(0.0, 1.0)}
+
+        def restitution(self, normal_speed):
+            return self.coefficient
+
+    scene = {"diameter": 2e-3, "mass": 1e-5, "packing_fraction": 0.05, "temperature": 0.01}
+    own, haff = (jaxgran.Gas(law(0.9), **scene) for law in (Same, jaxgran.ConstantRestitution))
+    times = haff.mean_free_time * jnp.array([3.0, 100.0])
+    found = jaxgran.cool(own, times).temperature
+    # Both are solved to rtol 1e-6; own laws are tabulated at twice as many nodes.
+    np.testing.assert_allclose(found, jaxgran.cool(haff, times).temperature, rtol=1e-5)
+    with pytest.raises(ValueError, match=r"coefficient must lie in \(0, 1\), got 2"):
+        Same(2.0)
+
+
 @pytest.mark.parametrize(
     "build, message",
     [

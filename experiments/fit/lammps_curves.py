@@ -1,0 +1,78 @@
+"""Which A explains the two cooling curves that were measured in LAMMPS?
+
+    python experiments/fit/lammps_curves.py [--cases dilute dense ...] [--record] [--out DIR]
+
+Runs `jaxgran fit` on the curves of `data/`: kinetic theory on both, and soft spheres where they are
+asked for (minutes). With --record the figures and pictures of the documents are replaced; the
+pictures `fit_*.png` are made by nothing else.
+"""
+
+import argparse
+import contextlib
+import io
+import json
+import sys
+from pathlib import Path
+
+from experiments.support.record import DATA, PICTURES, add_recording, write_results
+from jaxgran.cli.app import main as command
+
+DILUTE, DENSE = (str(DATA / f"lammps_cooling_{name}.csv") for name in ("dilute", "dense"))
+SOFT = ["--model", "soft-spheres"]
+CASES = {
+    "dilute": [DILUTE],
+    "dense": [DENSE],
+    "dense_T0": [DENSE, "--free", "A", "T0"],
+    "dense_soft_spheres": [DENSE, *SOFT],
+    "dense_soft_spheres_T0": [DENSE, *SOFT, "--free", "A", "T0"],
+    "dilute_soft_spheres": [DILUTE, *SOFT, "--replicas", "2"],
+}
+QUICK = ("dilute", "dense", "dense_T0")
+SHOWN = ("dilute", "dense", "dense_soft_spheres")
+"""Cases whose picture is in the documents."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=QUICK)
+    parser.add_argument("--out", type=Path, default=Path("results") / "lammps_curves")
+    add_recording(parser)
+    options = parser.parse_args()
+    for case in options.cases:
+        folder = options.out / case
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said):
+            code = command(["fit", *CASES[case], "--out", str(folder), "--overwrite"])
+        print(said.getvalue())
+        if code:
+            return code
+        (record,), (picture,) = folder.glob("*.json"), folder.glob("*.png")
+        found = json.loads(record.read_text(encoding="utf-8"))
+        write_results(f"lammps_curves_{case}", options, None, **results(found, said.getvalue()))
+        if options.record and case in SHOWN:
+            (PICTURES / f"fit_{case}.png").write_bytes(picture.read_bytes())
+    return 0
+
+
+def results(found: dict, said: str) -> dict:
+    """What the documents quote: estimates, true values, verdict, and the lines of the table."""
+    rows = found["parameters"]
+    lines = said.splitlines()
+    first = next(i for i, line in enumerate(lines) if line.split()[:1] == ["estimate"])
+    budget = next(line for line in lines if line.startswith(f"error of {rows[0]['parameter']}"))
+    return {
+        "parameters": [
+            {key: row[key] for key in ("parameter", "unit", "estimate", "std_err", "low", "high")}
+            | {"true": row["header"]}
+            for row in rows
+        ],
+        "explains": found["explains"],
+        "reduced_chi2": found["reduced_chi2"],
+        "printed": [*lines[first : first + 1 + len(rows)], budget],
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

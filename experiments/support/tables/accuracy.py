@@ -1,0 +1,320 @@
+"""Rows of accuracy.md: how wrong."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from experiments.support.tables.words import Row, each, minus, percent, power
+
+NOTE = """\
+Kinetic theory leaves out correlations, clustering and three-body contacts. Its self-diffusion is
+the first Sonine approximation, 1.7 % (3D) or 2.4 % (2D) low for dilute elastic spheres, and 0.85 φ
+lower for dense ones in boxes of some hundred spheres, more in larger ones. Errors of T of every
+model against its run time: [speed_vs_error.md](speed_vs_error.md).
+"""
+
+
+def off_true(i: int = 0) -> Callable[[dict], str]:
+    """How far an estimate is from the true value, with its standard error."""
+
+    def words(found: dict) -> str:
+        row = found["parameters"][i]
+        miss, error = row["estimate"] / row["true"] - 1, row["std_err"] / row["true"]
+        return f"{percent(miss)} ± {100 * error:.1f} %"
+
+    return words
+
+
+def both(found: dict) -> str:
+    return f"A {off_true()(found)}, T₀ {off_true(1)(found)}"
+
+
+def projected(found: dict) -> str:
+    bias, error = found["projected_over_differences"]
+    pairs = (f"{percent(b)} ± {100 * e:.1f}" for b, e in zip(bias, error, strict=True))
+    return " / ".join(pairs) + " %"
+
+
+def plain(found: dict) -> str:
+    mean, error = found["d_ln_T_d_ln_A"]["plain"]
+    right = found["d_ln_T_d_ln_A"]["differences"][0]
+    words = (
+        minus(f"{m:.2g} ± {e:.1g} for {r:.2g}") for m, e, r in zip(mean, error, right, strict=False)
+    )
+    return f"{'; '.join(words)} at 1 / 3 / 10 collisions"
+
+
+def trajectory(found: dict) -> str:
+    rows = found["trajectory"]["rows"]
+    steps = each((row["steps"] for row in rows), "{}")
+    return f"{each((power(row['lammps']) for row in rows), '{}')} of the rms at {steps} steps"
+
+
+def impact(found: dict) -> str:
+    rows = [row for row in found["impact"]["head-on"]["rows"] if row["steps"] in (25, 50, 100)]
+    mean, scatter = ([power(abs(row[key])) for row in rows] for key in ("bias", "scatter"))
+    order = found["impact"]["head-on"]["order"]["bias"]
+    return f"mean {each(mean, '{}')} (order {order:.1f}), scatter {each(scatter, '{}')}"
+
+
+def worst(key: str) -> Callable[[dict], str]:
+    return lambda found: each((power(row["worst"]) for row in found[key]["rows"]), "{}")
+
+
+def lammps(found: dict) -> str:
+    curves = found["curves"]
+    cells = (f"{100 * curves[name]['largest_temperature_difference']:.1f}" for name in curves)
+    noise = (f"{100 * float(np.max(curves[name]['standard_error'])):.1f}" for name in curves)
+    names, count = " / ".join(curves), found["replicas"]
+    return f"{names}: {' / '.join(cells)} % at most ({count} replicas; standard error up to " + (
+        f"{' / '.join(noise)} %)"
+    )
+
+
+def drops(found: dict) -> str:
+    low, high = min(found["A_over_true"]), max(found["A_over_true"])
+    return f"{low:.2f} to {high:.2f} times; intervals hold it in {found['held']} of {found['runs']}"
+
+
+def posterior(found: dict) -> str:
+    row = found["dissipative_constant"]
+    return (
+        f"mean {percent(row['mean'] / row['fit'] - 1)} %, error bar "
+        f"{percent(row['std'] / row['fit_std'] - 1, 0)} % off the fit's; "
+        f"{found['samples_per_second']:.0f} samples a second"
+    )
+
+
+def test(name: str) -> Callable[[dict], str]:
+    return lambda found: found[name]
+
+
+FIT = "python experiments/fit/lammps_curves.py"
+HEALTH = "python experiments/accuracy/gradient_health.py --scenes"
+SOFT = "python experiments/accuracy/soft_sphere_accuracy.py"
+SLOW = "pytest -m slow -n 0 -s"
+DIFFUSION = 'pytest -m "slow or not slow" tests/models/test_hard_spheres.py -k published'
+AT = "at 1 / 3 / 10 / 30 / 100 collisions"
+SLOPE = "d ln T/d ln A through soft spheres"
+ROWS = (
+    Row(
+        "ε of one impact (ODE)",
+        "high-precision values, β ≤ 5",
+        "tests",
+        test("impact"),
+        "pytest tests/scene/test_contact.py",
+    ),
+    Row(
+        "fast ε(β), β ≤ 10⁴",
+        "the ODE",
+        "derive_restitution",
+        lambda f: power(f["largest"]["clipped"]["error"]),
+        "python experiments/accuracy/derive_restitution.py",
+    ),
+    Row(
+        "T(t), a₂, ⟨Δr²⟩ to 1000 mean free times",
+        "independent solution",
+        "tests",
+        test("kinetic_theory"),
+        "pytest tests/models/test_kinetic_theory.py",
+    ),
+    Row(
+        "Haff's law over 11 decades of time",
+        "closed form",
+        "tests",
+        test("haff"),
+        "pytest tests/theory/test_closed_forms.py",
+    ),
+    Row(
+        "d ln T/d ln A",
+        "reference table",
+        "tests",
+        test("derivative"),
+        "pytest tests/models/test_kinetic_theory.py",
+    ),
+    Row(
+        "95 % intervals of A and T₀",
+        "500 noisy curves",
+        "tests",
+        test("intervals"),
+        "pytest -m slow tests/fitting/test_fit.py -k intervals",
+    ),
+    Row(
+        "A of the dilute LAMMPS curve",
+        "true A",
+        "lammps_curves_dilute",
+        off_true(),
+        f"{FIT} --cases dilute",
+    ),
+    Row(
+        "A of the dense LAMMPS curve, which the diagnosis refuses; with T₀ free",
+        "true A",
+        "lammps_curves_dense lammps_curves_dense_T0",
+        lambda one, two: f"{off_true()(one)}; {off_true()(two)}",
+        f"{FIT} --cases dense dense_T0",
+    ),
+    Row(
+        "A of the dense LAMMPS curve, through soft spheres (8 runs, 3 replicas)",
+        "true A",
+        "lammps_curves_dense_soft_spheres",
+        off_true(),
+        f"{FIT} --cases dense_soft_spheres",
+    ),
+    Row(
+        "A and T₀ of the dense curve together, through soft spheres",
+        "true values",
+        "lammps_curves_dense_soft_spheres_T0",
+        both,
+        f"{FIT} --cases dense_soft_spheres_T0",
+    ),
+    Row(
+        "A of the dilute LAMMPS curve, through soft spheres (8 runs, 2 replicas)",
+        "true A",
+        "lammps_curves_dilute_soft_spheres",
+        off_true(),
+        f"{FIT} --cases dilute_soft_spheres",
+    ),
+    Row(
+        "error bar of A, φ and T₀ known within 4 and 1 %",
+        "posterior by NUTS",
+        "sample_posterior",
+        posterior,
+        "python experiments/fit/sample_posterior.py",
+    ),
+    Row(
+        "A of a drop tower's twin, 300 rough spheres between walls, told so",
+        "true A",
+        "drop_tower",
+        drops,
+        "python experiments/fit/drop_tower.py",
+    ),
+    Row(
+        f"{SLOPE}, dilute, {AT}",
+        "finite differences",
+        "gradient_health_dilute",
+        projected,
+        f"{HEALTH} dilute",
+    ),
+    Row(
+        f"{SLOPE}, dense (φ = .25, t_c/τ_c = .05), {AT}",
+        "finite differences",
+        "gradient_health_dense",
+        projected,
+        f"{HEALTH} dense",
+    ),
+    Row(
+        f"{SLOPE}, clustering (φ = .3, β = .2, box 1.7 L_c), {AT}: biased once there are clusters",
+        "finite differences",
+        "gradient_health_clustering",
+        projected,
+        f"{HEALTH} clustering",
+    ),
+    Row(
+        "d ln T/d ln A through hard spheres after 10 and 30 τ_c, (φ, β) = (.02, .2), (.2, .1); "
+        "(.2, .3) in a box of 1.2 L_c",
+        "finite differences",
+        "tests",
+        test("hard_derivatives"),
+        f"{SLOW} tests/tangents/test_impact.py -k against_differences",
+    ),
+    Row(
+        "d ln T/d ln A through hard spheres, φ = .01, β = .15, at 1 / 5 / 10 / 50 / 100 τ_c",
+        "reference table",
+        "tests",
+        test("hard_sensitivity"),
+        f"{SLOW} tests/tangents/test_impact.py -k sensitivity_table",
+    ),
+    Row(
+        f"{SLOPE}, dilute, by plain forward mode",
+        "finite differences",
+        "gradient_health_dilute",
+        plain,
+        f"{HEALTH} dilute",
+    ),
+    Row(
+        "soft spheres, velocities of 64 spheres after 2 τ_c",
+        "LAMMPS trajectory",
+        "soft_sphere_accuracy",
+        trajectory,
+        SOFT,
+    ),
+    Row(
+        "ε of one impact in soft spheres, 25 / 50 / 100 steps",
+        "the ODE",
+        "soft_sphere_accuracy",
+        impact,
+        SOFT,
+    ),
+    Row(
+        "energy ledger at 20 / 40 / 80 steps",
+        "closed, of the first energy",
+        "soft_sphere_accuracy",
+        worst("ledger"),
+        SOFT,
+    ),
+    Row(
+        "elastic energy over 100 τ_c at 20 / 40 / 80 steps",
+        "constant",
+        "soft_sphere_accuracy",
+        worst("elastic"),
+        SOFT,
+    ),
+    Row(
+        "T(t) of the LAMMPS gases, nothing fitted",
+        "LAMMPS, 3 replicas",
+        "compare_lammps",
+        lammps,
+        "python experiments/accuracy/compare_lammps.py",
+    ),
+    Row(
+        "D of elastic hard spheres, φ = .1 / .2 / .3, with the box's own term (Yeh & Hummer)",
+        "Erpenbeck & Wood 1991, infinite box",
+        "tests",
+        test("diffusion_published"),
+        DIFFUSION,
+    ),
+    Row(
+        "D of elastic hard spheres at N = 500, as it is",
+        "Speedy 1987",
+        "tests",
+        test("diffusion_500"),
+        DIFFUSION,
+    ),
+    Row(
+        "24 hard cases: limits of every law, density, size, unit, tolerance, fit and fault on the "
+        "way",
+        "right answers, or a clear error or status",
+        "hard_cases",
+        lambda f: "[table](hard_cases.md)",
+        "python experiments/accuracy/hard_cases.py --heavy",
+    ),
+    Row(
+        "T of DSMC, N = 10⁶, to 100 τ_c, β = .05 and .15",
+        "kinetic theory, which leaves out a₃",
+        "tests",
+        test("dsmc_million"),
+        f'{SLOW} tests/models/test_dsmc.py -k "million_particles_cool or theory_s_sonine"',
+    ),
+    Row(
+        "a₂ of DSMC at constant ε = .5, .8, .9 (3D), .5, .9 (2D), 1.6·10⁶ particles",
+        "tables of stochastic simulation",
+        "tests",
+        test("sonine"),
+        f"{SLOW} tests/models/test_dsmc.py -k sonine_coefficient",
+    ),
+    Row(
+        "memory of the first velocity after 1 τ_c (ε = .6), DSMC steps of .1 / .05",
+        "steps of .0125",
+        "tests",
+        test("dsmc_order"),
+        f"{SLOW} tests/models/test_dsmc.py -k order_of_the_step",
+    ),
+    Row(
+        "ln T of hard spheres between walls (2 mm beads, 50 mm cube, ε_w = .8, β = .15), N = 100 / "
+        "500 / 4000, at T/T₀ = .5, and at .006 / .04 / .1",
+        "DSMC, which takes the gas for mixed",
+        "tests",
+        test("walls"),
+        f"{SLOW} tests/models/test_hard_spheres_walls.py -k mixed",
+    ),
+)
