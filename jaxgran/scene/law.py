@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.checks.validation import ANY, Domain, number
@@ -170,7 +171,7 @@ def check_units(law: RestitutionLaw) -> None:
         ValueError: if it returns no `ReducedLaw`, or one whose eps depends on the units.
     """
     kind = type(law)
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(law))
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(law))
     if kind in _CHECKED or kind.reduced is RestitutionLaw.reduced or traced:
         return
     found = []
