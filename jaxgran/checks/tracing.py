@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, DTypeLike
@@ -27,3 +28,19 @@ def is_known(value: Any) -> bool:
     while isinstance(value, Tracer) and hasattr(value, "primal"):
         value = value.primal
     return not isinstance(value, Tracer)
+
+
+def lengthened(values: Array, size: int) -> Array:
+    """An array with its last value repeated until there are `size`."""
+    more = size - len(values)
+    if isinstance(values, Tracer):
+        return jnp.concatenate([values, jnp.broadcast_to(values[-1:], (more, *values.shape[1:]))])
+    # By NumPy: JAX would compile a program for each length.
+    return concrete(np.concatenate([values, np.repeat(np.asarray(values)[-1:], more, axis=0)]))
+
+
+def shortened(values: Array, size: int) -> Array:
+    """The first `size` values of an array."""
+    if isinstance(values, Tracer):
+        return values[:size]
+    return concrete(np.asarray(values)[:size])  # as above

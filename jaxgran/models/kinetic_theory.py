@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from jaxgran.checks import status, validation
+from jaxgran.checks.tracing import any_traced, lengthened, shortened
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import DEFAULTS, Run
 from jaxgran.models import checks
@@ -21,7 +22,15 @@ from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import ROUGH, Course
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
-from jaxgran.theory import averages, closed_forms, elements, moments, rate_table, steady
+from jaxgran.theory import (
+    averages,
+    closed_forms,
+    elements,
+    integration,
+    moments,
+    rate_table,
+    steady,
+)
 from jaxgran.theory.moments import Moments
 
 TOLERANCES = validation.Domain(0.0, 0.1)
@@ -68,7 +77,7 @@ class KineticTheory(AbstractModel):
     softness: validation.UserTruth = eqx.field(static=True, default=True)
     averages: str = eqx.field(static=True, default="exact")
     rtol: validation.UserFloat | None = eqx.field(static=True, default=None)
-    solver: Any = eqx.field(static=True, default=diffrax.Tsit5())
+    solver: Any = eqx.field(static=True, default=diffrax.Tsit5(scan_kind="lax"))
     max_steps: validation.UserCount = eqx.field(static=True, default=200_000)
 
     def __check_init__(self):
@@ -109,6 +118,8 @@ class KineticTheory(AbstractModel):
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError for a law that heats the gas or contacts too soft for the theory."""
+        if any_traced(gas):
+            return
         rate, factor = _at_start(gas, self._averages)
         if self.softness:
             checks.check_softness(gas, factor)
@@ -134,7 +145,10 @@ class KineticTheory(AbstractModel):
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
-        return self._simulate(gas, times)
+        size = times.size
+        padded = lengthened(times, integration.padded_length(size))
+        curve = self._simulate(gas, padded)
+        return jax.tree.map(lambda x: shortened(x, size) if x.ndim else x, curve)
 
     @eqx.filter_jit
     def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
@@ -148,15 +162,12 @@ class KineticTheory(AbstractModel):
         # the state costs little, and one linear rule then serves forward and reverse mode alike.
         @jax.custom_jvp
         def solve(parameters, times):
-            state, _, _, fault = self._solve(
-                parameters, unravel, times, gas.dimension, tangents=False
-            )
-            return state, fault
+            return self._solve(parameters, unravel, times, gas.dimension)
 
         @solve.defjvp
         def solve_jvp(at, along):
             parameters, times = at
-            solution = self._solve(parameters, unravel, times, gas.dimension)
+            solution = self._solve_along(parameters, unravel, times, gas.dimension)
             state, velocity, jacobian, fault = solution
             moved = jax.tree.map(lambda v, j: v * along[1] + along[0] @ j, velocity, jacobian)
             no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of a whole number
@@ -194,102 +205,94 @@ class KineticTheory(AbstractModel):
         options = {"softness": self.softness, "maxwellian": maxwellian}
         return moments.velocity(state, rates, scene, dimension, **options)
 
+    def _table(self, scene: ReducedScene, times: Array, dimension: int) -> rate_table.RateTable:
+        """The averages at all temperatures that the gas reaches."""
+        averages_of = partial(self._averages, scene.law, dimension=dimension)
+        num_nodes, bounds = scene.law.num_nodes, elements.fastest_cooling(scene, dimension)
+        return rate_table.RateTable.of(averages_of, times[-1], dimension, num_nodes, bounds)
+
+    def _start(self, scene: ReducedScene, times: Array, dimension: int) -> Array:
+        """The state at t = 0, as one array."""
+        first = Moments.at_start(scene, times)
+        if scene.prepared is None or not self.sonine:
+            return first
+        return first.at[1].set(steady.prepared_sonine(scene, times, dimension))
+
     def _solve(
-        self,
-        parameters: Array,
-        unravel: Callable[[Array], ReducedScene],
-        times: Array,
-        dimension: int,
-        tangents: bool = True,
+        self, parameters: Array, unravel: Callable[[Array], ReducedScene], times: Array, d: int
+    ) -> tuple[Moments, Int[Array, ""]]:
+        """The states, nan unless the status, which follows them, is ok."""
+        scene = unravel(parameters)
+        table = self._table(scene, times, d)
+
+        def velocity(row):
+            return self._velocity(row, table(row[0]), scene, d)
+
+        start = self._start(scene, times, d)
+        rows, fault = self._integrate(jax.vmap(velocity), start[None], parameters, times)
+        return Moments(*rows[:, 0].T), fault
+
+    def _solve_along(
+        self, parameters: Array, unravel: Callable[[Array], ReducedScene], times: Array, d: int
     ) -> tuple[Moments, Moments, Moments, Int[Array, ""]]:
         """States, their time derivatives and their derivatives in the parameters of the law.
 
         Last, a status; unless it is ok all of them are nan.
         """
-        directions = jnp.eye(parameters.size, dtype=times.dtype)[: None if tangents else 0]
-
-        def tabulate(parameters):
-            scene = unravel(parameters)
-            averages_of = partial(self._averages, scene.law, dimension=dimension)
-            num_nodes, bounds = scene.law.num_nodes, elements.fastest_cooling(scene, dimension)
-            return rate_table.RateTable.of(averages_of, times[-1], dimension, num_nodes, bounds)
+        directions = jnp.eye(parameters.size, dtype=times.dtype)
+        table, table_along = jax.linearize(
+            lambda parameters: self._table(unravel(parameters), times, d), parameters
+        )
+        table = table.with_slopes(jax.vmap(lambda x: table_along(x).coefficients)(directions))
 
         def velocity(state, rates, parameters):
-            return self._velocity(state, rates, unravel(parameters), dimension)
+            return self._velocity(state, rates, unravel(parameters), d)
 
-        table, table_along = jax.linearize(tabulate, parameters)
-        along = jax.vmap(lambda x: table_along(x).coefficients, out_axes=1)(directions)
-        tables_along = rate_table.RateTable(along, table.lowest, table.highest)
-        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
-
-        def rows_velocity(s, rows, args):
-            # s = ln(1 + t): a power law of time takes the same number of steps each decade.
+        def rows_velocity(rows):
             # Row 0 is the state; the others, its tangents, obey the linearised equation.
-            state, state_tangents = rows[0], rows[1:]
-            log_theta, ones = state[0], jnp.ones((), times.dtype)
-            rates, slope = jax.jvp(table, (log_theta,), (ones,))
+            rates, slope, *_ = at = table(rows[0, 0])
+            rate, linear = jax.linearize(velocity, rows[0], rates, parameters)
 
             def along(tangent, rates_along, direction):
-                rates_along = rates_along + slope * tangent[0]
-                at = (state, rates, parameters)
-                return jax.jvp(velocity, at, (tangent, rates_along, direction))[1]
+                return linear(tangent, rates_along + slope * tangent[0], direction)
 
-            rate = velocity(state, rates, parameters)
-            rates_along = jax.vmap(along)(state_tangents, tables_along(log_theta), directions)
-            both = jnp.concatenate([rate[None], rates_along]) * jnp.exp(s)
-            return jnp.where(known, both, 0.0)
+            return jnp.concatenate([rate[None], jax.vmap(along)(rows[1:], at[2:], directions)])
 
-        def at_start(parameters):
-            scene = unravel(parameters)
-            first = Moments.at_start(scene, times)
-            if scene.prepared is None or not self.sonine:
-                return first
-            return first.at[1].set(steady.prepared_sonine(scene, times, dimension))
-
-        start, start_along = jax.linearize(at_start, parameters)
+        start, start_along = jax.linearize(
+            lambda parameters: self._start(unravel(parameters), times, d), parameters
+        )
         first = jnp.concatenate([start[None], jax.vmap(start_along)(directions)])
-        rows, fault = self._integrate(rows_velocity, first, times, known)
-        states = rows[:, 0]
-        velocities = jax.vmap(lambda x: velocity(x, table(x[0]), parameters))(states)
-        jacobian = jnp.moveaxis(rows[:, 1:], 2, 0)
+        rows, fault = self._integrate(rows_velocity, first, parameters, times)
+        states, jacobian = rows[:, 0], jnp.moveaxis(rows[:, 1:], 2, 0)
+        velocities = jax.vmap(lambda x: velocity(x, table(x[0])[0], parameters))(states)
         jacobian = jnp.swapaxes(jacobian, 1, 2)
         return Moments(*states.T), Moments(*velocities.T), Moments(*jacobian), fault
 
     def _integrate(
-        self, rows_velocity: Callable, first: Array, times: Array, known: Array
+        self, velocity: Callable, first: Array, parameters: Array, times: Array
     ) -> tuple[Array, Int[Array, ""]]:
         """The rows at the given reduced times, shape (times, rows, states), and a status."""
+        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
         # A gas of nan keeps its state, so that its solver does not try ever shorter steps.
         times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=times.dtype))
-        s = jnp.log1p(times)
         rtol = self.rtol or (1e-9 if times.dtype == jnp.float64 else 1e-5)
         # Steps follow the state alone: its tangents are then those of the discrete solution.
         controller = diffrax.PIDController(
             rtol=rtol, atol=rtol, norm=lambda rows: optx.rms_norm(rows[0])
         )
-        if isinstance(self.solver, diffrax.AbstractImplicitSolver):
-            # Their dense output is only of third order: step onto every requested time instead.
-            controller = diffrax.ClipStepSizeController(controller, step_ts=s)
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(rows_velocity),
-            self.solver,
-            t0=jnp.zeros((), times.dtype),
-            t1=s[-1],
-            dt0=None,
-            y0=jnp.where(known, first, 0.0),
-            saveat=diffrax.SaveAt(ts=s),
-            stepsize_controller=controller,
-            adjoint=diffrax.ForwardMode(),
+        rows, ended = integration.values_at(
+            # s = ln(1 + t): a power law of time takes the same number of steps each decade.
+            lambda s, rows: jnp.where(known, velocity(rows) * jnp.exp(s), 0.0),
+            jnp.where(known, first, 0.0),
+            jnp.log1p(times),
+            solver=self.solver,
+            controller=controller,
             max_steps=self.max_steps,
-            throw=False,  # one gas of a batch must not end the others
         )
-        assert solution.ys is not None
-        ended = solution.result == diffrax.RESULTS.successful
-        finite = known & jnp.all(jnp.isfinite(solution.ys))
-        spent = solution.result == diffrax.RESULTS.max_steps_reached
-        fault = status.flag(status.STEPS_SPENT, spent)
-        fault |= status.flag(status.NOT_FINITE, ~spent & ~(ended & finite))
-        return jnp.where(fault == status.OK, solution.ys, jnp.nan), fault
+        finite = known & jnp.all(jnp.isfinite(rows))
+        fault = status.flag(status.STEPS_SPENT, ~ended)
+        fault |= status.flag(status.NOT_FINITE, ended & ~finite)
+        return jnp.where(fault == status.OK, rows, jnp.nan), fault
 
 
 @eqx.filter_jit

@@ -29,6 +29,12 @@ def _chebyshev(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
     return np.cos(angles), matrix
 
 
+@cache
+def _derivative(num_nodes: int) -> np.ndarray:
+    """Matrix from the coefficients of a Chebyshev series to those of its derivative."""
+    return np.pad(np.polynomial.chebyshev.chebder(np.eye(num_nodes)), ((0, 1), (0, 0)))
+
+
 class Bounds(NamedTuple):
     """Bounds of what the elements of a scene do to T, from which a `RateTable` takes its range.
 
@@ -111,6 +117,23 @@ class RateTable(eqx.Module):
         for row in self.coefficients[:0:-1]:
             last, before = row + 2 * x * last - before, last
         return self.coefficients[0] + x * last - before
+
+    def with_slopes(self, along: Float[Array, "directions nodes 3 3"]) -> "RateTable":
+        """This function of one gas, its slope and its derivatives as one function of ln(T/T_0).
+
+        Args:
+            along: coefficients of the derivatives of the function in some directions.
+
+        Returns:
+            A table of shape (2 + directions, 3, 3) at each temperature: the function, its
+            derivative in ln(T/T_0), and those given.
+        """
+        derivative = jnp.asarray(_derivative(len(self.coefficients)), self.lowest.dtype)
+        width = -self.lowest if self.highest is None else self.highest - self.lowest
+        slope = jnp.tensordot(derivative, self.coefficients, 1) * 2 / width
+        both = jnp.stack([self.coefficients, slope], axis=1)
+        further = jnp.moveaxis(along, 0, 1)
+        return RateTable(jnp.concatenate([both, further], 1), self.lowest, self.highest)
 
 
 def _lowest_log_temperature(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import jaxgran
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.theory import closed_forms
+from jaxgran.theory import closed_forms, integration
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
 # equations, clipped restitution, Gaussian start, no softness correction.
@@ -209,11 +209,25 @@ def test_bad_options_are_refused(beads):
 def test_values_do_not_recompile(beads):
     cool = KineticTheory._simulate.__wrapped__  # as it is inside its own jit
     checked = eqx.filter_jit(eqx.debug.assert_max_traces(cool, max_traces=1))
-    times = jnp.array([1.0, 2.0, 4.0])
+    times = jnp.geomspace(1.0, 4.0, integration.WINDOW)
     for a in (1e-7, 1e-6):
         for t0 in (0.01, 0.5):
             gas = beads(0.15).replace(dissipative_constant=a, temperature=t0)
             checked(HARD, gas, times * t0)
+
+
+def test_another_number_of_times_compiles_nothing(beads, caplog):
+    gas = beads(0.15)
+    times = np.geomspace(0.01, 10.0, 32)
+    half = jaxgran.cool(gas, times[1::2])
+    whole = jaxgran.cool(gas, times)
+    with jax.log_compiles():
+        for size in (1, 9, 15, 17, 31):
+            jaxgran.cool(gas, times[:size])
+    assert not [record for record in caplog.records if "ompil" in record.message]
+    # Both are interpolated within the same steps, by two programs.
+    np.testing.assert_allclose(half.temperature, whole.temperature[1::2], rtol=1e-12)
+    assert half.temperature.shape == half.displacement.shape == (16,)
 
 
 @pytest.mark.slow
