@@ -22,15 +22,8 @@ from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import ROUGH, Course
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
-from jaxgran.theory import (
-    averages,
-    closed_forms,
-    elements,
-    integration,
-    moments,
-    rate_table,
-    steady,
-)
+from jaxgran.theory import averages, closed_forms, elements, moments, rate_table, steady
+from jaxgran.theory.integration import padded_length, values_at
 from jaxgran.theory.moments import Moments
 
 TOLERANCES = validation.Domain(0.0, 0.1)
@@ -146,7 +139,7 @@ class KineticTheory(AbstractModel):
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
         size = times.size
-        padded = lengthened(times, integration.padded_length(size))
+        padded = lengthened(times, padded_length(size))
         curve = self._simulate(gas, padded)
         return jax.tree.map(lambda x: shortened(x, size) if x.ndim else x, curve)
 
@@ -280,7 +273,7 @@ class KineticTheory(AbstractModel):
         controller = diffrax.PIDController(
             rtol=rtol, atol=rtol, norm=lambda rows: optx.rms_norm(rows[0])
         )
-        rows, ended = integration.values_at(
+        rows, ended = values_at(
             # s = ln(1 + t): a power law of time takes the same number of steps each decade.
             lambda s, rows: jnp.where(known, velocity(rows) * jnp.exp(s), 0.0),
             jnp.where(known, first, 0.0),
