@@ -41,7 +41,7 @@ def padded_length(size: int) -> int:
 
 
 def values_at(
-    velocity: Callable[[Array, Array], Array],
+    velocity: Callable[[Any, Array], Array],
     start: Array,
     times: Float[Array, "times"],
     *,
@@ -66,13 +66,26 @@ def values_at(
         The states at those times, and whether the last time was reached within that number of
         steps; nan where the solver failed otherwise.
     """
-    term, last = diffrax.ODETerm(lambda t, y, args: velocity(t, y)), times[-1]
-    if not isinstance(solver, diffrax.AbstractERK):
-        return _by_diffrax(term, start, times, solver, controller, max_steps)
-    order = solver.error_order(term)
+    term = diffrax.ODETerm(lambda t, y, args: velocity(t, y))
+    if isinstance(solver, diffrax.AbstractERK):
+        return _by_steps(term, start, times, solver, controller, max_steps)
+    return _by_diffrax(term, start, times, solver, controller, max_steps)
+
+
+def _by_steps(
+    term: diffrax.ODETerm,
+    start: Array,
+    times: Array,
+    solver: diffrax.AbstractERK,
+    controller: diffrax.AbstractAdaptiveStepSizeController,
+    max_steps: int,
+) -> tuple[Array, Array]:
+    """The same by a loop over the steps of an explicit solver."""
+    last = times[-1]
+    order: Any = solver.error_order(term)
     zero, first = jnp.zeros((), times.dtype), jnp.asarray(FIRST_STEP, times.dtype)
     end, control = controller.init(term, zero, last, start, first, None, solver.func, order)
-    end = jnp.minimum(end, last)
+    end = jnp.minimum(jnp.asarray(end), last)
     begun = solver.init(term, zero, end, start, None)
     # As arrays, whose types do not change from step to step.
     begun, control = jax.tree.map(jnp.asarray, (begun, control))
@@ -99,7 +112,9 @@ def values_at(
         )
         near = jnp.where(end > last - 1e-3 * (end - t), last, end)  # no sliver of a last step
         control = jax.tree.map(jnp.asarray, control)
-        return _Progress(t, near, y, solver_state, control, values, known, at.steps + 1)
+        return _Progress(
+            jnp.asarray(t), near, y, solver_state, control, values, known, at.steps + 1
+        )
 
     done = jax.lax.while_loop(unfinished, step, progress)
     return done.values, done.t >= last
