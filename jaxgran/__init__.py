@@ -21,6 +21,7 @@ from jaxgran.models.selection import Choice, choose_model
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.contact import Impact, contact_force, elastic_constant, impact
 from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise
+from jaxgran.scene.friction import Frictional
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.restitution import (
@@ -45,6 +46,7 @@ __all__ = [
     "DrivenStart",
     "DropTest",
     "Fit",
+    "Frictional",
     "Gas",
     "HardSpheres",
     "Impact",

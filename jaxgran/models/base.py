@@ -15,7 +15,8 @@ from jaxgran.models.course import Course
 from jaxgran.scene.gas import Gas
 
 ELEMENTS = {
-    "surface": "rough spheres (surface)",
+    "surface": "rough spheres (surface=Rough)",
+    "friction": "friction between spheres (surface=Frictional)",
     "container": "walls (container)",
     "drag": "drag",
     "drive": "a drive (drive)",
@@ -25,6 +26,13 @@ ELEMENTS = {
 
 TAKE_IT = "KineticTheory(), DSMC(N) or HardSpheres(N), which take it"
 """What to use for an element that a model does not take."""
+
+TAKES = {
+    "friction": "SoftSpheres(N), which takes it, or surface=Rough(...) for instantaneous impacts",
+    "container": "KineticTheory(), DSMC(N), HardSpheres(N) or SoftSpheres(N), which take it",
+    "drag": "KineticTheory(), DSMC(N), HardSpheres(N) or SoftSpheres(N), which take it",
+}
+"""The same for elements that other models take."""
 
 
 class Omission(NamedTuple):
@@ -64,15 +72,16 @@ class AbstractModel(eqx.Module):
     """Relative accuracy of T_rot/T of rough spheres."""
 
     elements: ClassVar[tuple[str, ...]] = ()
-    """Names of the optional fields of a `Gas` that the model takes: see `Gas.elements`."""
+    """What the model takes besides smooth spheres in free flight: see `Gas.elements`."""
 
     def check_scene(self, gas: Gas) -> None:
         """`check`, after refusing the elements of a scene that the model does not take."""
         for name in gas.elements:
             if name not in self.elements:
                 raise ValueError(
-                    f"{type(self).__name__} does not take {ELEMENTS[name]}: use {TAKE_IT}, or "
-                    f"leave {name} out of the gas"
+                    f"{type(self).__name__} does not take {ELEMENTS[name]}: use "
+                    f"{TAKES.get(name, TAKE_IT)}, or "
+                    f"leave {'surface' if name == 'friction' else name} out of the gas"
                 )
         self.check(gas)
 

@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from jaxgran.checks import status
-from jaxgran.checks.tracing import is_known
+from jaxgran.checks.tracing import any_traced, is_known
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel, Omission
@@ -119,6 +119,25 @@ def beyond_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
             "KineticTheory()"
         )
     return beyond
+
+
+SAME_VOLUME = 0.02
+"""Relative difference of volumes up to which a container is that of N spheres of a gas."""
+
+
+def check_volume(gas: Gas, num_particles: int) -> None:
+    """Raise ValueError for a container too large or small for N spheres of a packing fraction."""
+    walls = gas.container
+    if walls is None or any_traced(walls.side, gas.packing_fraction, gas.diameter):
+        return
+    phi, sides = float(gas.packing_fraction), np.broadcast_to(walls.side, (gas.dimension,))
+    share = float(gas.box_side(num_particles) ** gas.dimension / np.prod(sides))
+    if abs(share - 1) > SAME_VOLUME:
+        raise ValueError(
+            f"{num_particles} spheres of packing_fraction {phi:.4g} need a container {share:.4g} "
+            f"times as large as that of side {np.asarray(walls.side)} m: give packing_fraction="
+            f"{phi * share:.4g} or {num_particles / share:.0f} particles"
+        )
 
 
 def refuse_checkpoint(model: AbstractModel, run: Run) -> None:

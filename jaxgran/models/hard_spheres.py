@@ -43,10 +43,6 @@ OVERLAP = 1e-9
 """Overlap in diameters up to which a given start is one of hard spheres."""
 
 
-SAME_VOLUME = 0.02
-"""Relative difference of volumes up to which a container is that of N spheres of a gas."""
-
-
 class HardPace(NamedTuple):
     """Static settings of the windows: see `HardDynamics`."""
 
@@ -202,17 +198,7 @@ def check_container(gas: Gas, walls: Walls, num_particles: int, start: bool) -> 
     """Raise ValueError for a container that is too large or small for N and phi, or a start."""
     if start:
         raise ValueError("HardSpheres takes no start in a container: leave start or container out")
-    if any_traced(walls.side, gas.packing_fraction, gas.diameter):
-        return
-    phi = float(gas.packing_fraction)
-    sides = jnp.broadcast_to(walls.side, (gas.dimension,))
-    share = float(gas.box_side(num_particles) ** gas.dimension / jnp.prod(sides))
-    if abs(share - 1) > SAME_VOLUME:
-        raise ValueError(
-            f"{num_particles} spheres of packing_fraction {phi:.4g} need a container {share:.4g} "
-            f"times as large as that of side {np.asarray(walls.side)} m: give packing_fraction="
-            f"{phi * share:.4g} or {num_particles / share:.0f} particles"
-        )
+    checks.check_volume(gas, num_particles)
 
 
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:

@@ -1,5 +1,6 @@
 """Selection of the cheapest model whose estimated error in a scene is small enough."""
 
+import dataclasses
 from collections.abc import Sequence
 from math import hypot
 from typing import Any, NamedTuple
@@ -172,14 +173,15 @@ def _verdict(model: AbstractModel, error: float, tolerance: float, enough: bool)
 
 
 def course_of(gas: Gas, end: float, num_particles: int | None = None) -> Course:
-    """The course of a gas from t = 0 to an end, s, as kinetic theory predicts it.
+    """The course of a gas from t = 0 to an end, s, as kinetic theory predicts it without friction.
 
     Raises:
         ValueError: for a gas so soft that the softness correction has no meaning.
         RuntimeError: if kinetic theory cannot follow the gas so far.
     """
     grid = jnp.linspace(0, jnp.log1p(end / gas.mean_free_time), COURSE_POINTS)
-    curve = KineticTheory().simulate(gas, jnp.expm1(grid) * gas.mean_free_time, Run())
+    known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
+    curve = KineticTheory().simulate(known, jnp.expm1(grid) * gas.mean_free_time, Run())
     course = course_along(gas, curve, num_particles)
     check_softness(gas, 1 - course.softness[0])
     fault = int(jnp.asarray(curve.status))
@@ -239,6 +241,7 @@ def _scene_in_words(course: Course, size: int, replicas: int) -> list[str]:
         f"instantaneous impacts, {_percent(corrected)} with kinetic theory's first correction.",
         _box_in_words(course),
         _noise_in_words(course, size, replicas),
+        *(["These estimates leave friction out."] if "friction" in course.gas.elements else []),
     ]
 
 

@@ -7,8 +7,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
-from jaxgran.checks.tracing import concrete
+from jaxgran.checks.tracing import any_traced, concrete
 from jaxgran.checks.validation import (
     POSITIVE,
     UserCount,
@@ -16,13 +17,17 @@ from jaxgran.checks.validation import (
     plain_number,
     python_number,
 )
-from jaxgran.data.curve import UserParticles
+from jaxgran.data.curve import Particles, UserParticles
+from jaxgran.models import checks
 from jaxgran.models.base import Omission
 from jaxgran.models.course import Course
 from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
 from jaxgran.particles.soft.block import SoftDynamics
-from jaxgran.particles.soft.scene import SoftScene
+from jaxgran.particles.soft.scene import SoftDrag, SoftScene, SoftSurface
+from jaxgran.particles.soft.walls import MARGIN, SoftWalls
+from jaxgran.scene.elements import StokesDrag, Walls
+from jaxgran.scene.friction import Frictional
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.restitution import Viscoelastic
 
@@ -96,6 +101,7 @@ class SoftSpheres(AbstractSpheres):
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 3.0
+    elements: ClassVar[tuple[str, ...]] = ("friction", "container", "drag")
 
     def __check_init__(self):
         self.check_counts(steps_per_contact=10)
@@ -117,6 +123,10 @@ class SoftSpheres(AbstractSpheres):
             )
         with jax.ensure_compile_time_eval():
             self.check_box(gas)
+            checks.check_volume(gas, self.num_particles)
+            if gas.container is not None:
+                check_walls(gas.container)
+                check_inside(gas.container, gas.dimension, self.start)
 
     def estimated_error(self, course: Course) -> float:
         """Time steps and noise: every contact is resolved."""
@@ -134,6 +144,19 @@ class SoftSpheres(AbstractSpheres):
         """The gas in units of its diameter, mass and first temperature."""
         return reduced_scene(gas, self.num_particles)
 
+    def beyond(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
+        """None: time is not transformed."""
+        return jnp.zeros(times.shape, bool)
+
+    def filled_side(self, scene: SoftScene) -> Array:
+        """Of the room that centres have."""
+        return scene.room
+
+    def held(self, scene: SoftScene) -> Any:
+        """The room between walls, and how often spheres meet there."""
+        walls = scene.walls
+        return () if walls is None else (scene.side, walls.sides, scene.collision_frequency)
+
     def dynamics(self, scene: SoftScene, plan: Plan) -> SoftDynamics:
         """How the spheres move."""
         projection = concrete(self.projection or np.inf, scene.side.dtype)
@@ -149,9 +172,10 @@ class SoftSpheres(AbstractSpheres):
         """Static sizes: capacities as measured for phi = .01 to .4 (disks: .5), t_c/tau_c = .003
         to .3."""
         d, n = dimension, self.replicas * self.num_particles
-        around = Neighbourhood.of(
-            float(scene.side), self.num_particles, self.replicas, d, self.listed_by_skin
-        )
+        room, ahead = float(scene.room), 1.0
+        around = Neighbourhood.of(room, self.num_particles, self.replicas, d, self.listed_by_skin)
+        if scene.walls is not None:  # a sweep goes along the first axis
+            ahead = max(1.0, room / float(scene.walls.sides[0] - 1))
         duration = Grid.of(n).up(float(scene.contact_duration))
         steps = self._steps_per_block(float(scene.contact_duration))
         block = steps / self.steps_per_contact
@@ -165,7 +189,8 @@ class SoftSpheres(AbstractSpheres):
         expected = around.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # In random places about as many pairs touch besides as would without correlation.
         extra = 1.3 * around.in_contact
-        sizes = capacities(expected, around.lookahead, spare or 1.2, extra, n)
+        lookahead = min(ahead * around.lookahead, self.num_particles)
+        sizes = capacities(expected, lookahead, spare or 1.2, extra, n)
         return Plan(self.replicas, SoftPace(self.steps_per_contact, steps), *sizes)
 
     def _steps_per_block(self, contact_duration: float) -> int:
@@ -174,15 +199,90 @@ class SoftSpheres(AbstractSpheres):
         return max(round(self.steps_per_contact / shorter), 8)
 
 
+def check_walls(walls: Walls) -> None:
+    """Raise ValueError for walls that have no force, or friction."""
+    if not isinstance(walls.restitution, Viscoelastic):
+        raise ValueError(
+            "SoftSpheres needs walls of the Viscoelastic law, which has a force (with A = 0 they "
+            f"are elastic); these have {type(walls.restitution).__name__}: use HardSpheres(N), "
+            "DSMC(N) or KineticTheory(), or Walls(side, restitution=jaxgran.Viscoelastic(...))"
+        )
+    if walls.tangential_restitution is not None:
+        raise ValueError(
+            "SoftSpheres takes smooth walls, tangential_restitution of the walls belongs to "
+            "impacts: use HardSpheres(N), or leave it out"
+        )
+
+
+def check_inside(walls: Walls, dimension: int, start: Particles | None) -> None:
+    """Raise ValueError for a start with a sphere whose centre is not within the walls."""
+    if start is None or any_traced(start.position, walls.side):
+        return
+    sides, place = np.broadcast_to(walls.side, (dimension,)), np.asarray(start.position)
+    outside = np.any((place < 0) | (place > sides), axis=-1)
+    if np.any(outside):
+        replica, i = np.argwhere(outside)[0]
+        raise ValueError(
+            f"sphere {i} of replica {replica} of the start is at {place[replica, i]} m, "
+            f"outside of the walls, which are at 0 and {sides} m: move it inside"
+        )
+
+
 def reduced_scene(gas: Gas, num_particles: int) -> SoftScene:
     """A gas of viscoelastic spheres in units of its diameter, mass and first temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
     law: Any = gas.law  # `SoftSpheres.check` refuses laws without a force
+    side, walls = gas.box_side(num_particles) / gas.diameter, None
+    if gas.container is not None:
+        walls = reduced_walls(gas, gas.container)
+        side = jnp.max(walls.sides) + MARGIN
     return SoftScene(
-        side=gas.box_side(num_particles) / gas.diameter,
+        side=side,
         alpha=gas.alpha * gas.diameter**0.5 * unit_time**2,
         dissipative_constant=law.dissipative_constant / unit_time,
         contact_duration=gas.contact_duration / unit_time,
-        collision_frequency=gas.collision_frequency * unit_time,
+        collision_frequency=reduced_frequency(gas, unit_time),
         clipped=law.clipped,
+        walls=walls,
+        drag=None if gas.drag is None else reduced_drag(gas, gas.drag),
+        surface=reduced_surface(gas),
+    )
+
+
+def reduced_walls(gas: Gas, container: Walls) -> SoftWalls:
+    """The walls of a gas in these units."""
+    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
+    law: Any = container.restitution  # `check_container` refuses others than Viscoelastic
+    alpha = law.of_wall().alpha(diameter=gas.diameter, mass=gas.mass)
+    return SoftWalls(
+        sides=jnp.broadcast_to(container.side, (gas.dimension,)) / gas.diameter,
+        alpha=alpha * gas.diameter**0.5 * unit_time**2,
+        dissipative_constant=law.dissipative_constant / unit_time,
+        clipped=law.clipped,
+    )
+
+
+def reduced_frequency(gas: Gas, unit_time: Float[Array, ""]) -> Float[Array, ""]:
+    """Collisions per particle and unit of time at T = 1."""
+    if gas.container is None:
+        return gas.collision_frequency * unit_time
+    # It does not depend on T_0, which derivatives are to see: see `SoftSpheres.held`.
+    still = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
+    return still.collision_frequency * gas.diameter / jnp.sqrt(still.temperature)
+
+
+def reduced_drag(gas: Gas, drag: StokesDrag) -> SoftDrag:
+    """The drag of a gas in these units."""
+    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
+    often = reduced_frequency(gas, unit_time)
+    return SoftDrag(drag.rate * unit_time / often, drag.rotational_rate * unit_time)
+
+
+def reduced_surface(gas: Gas) -> SoftSurface | None:
+    """The surface of the spheres of a gas in these units; None where they are smooth."""
+    of, T = gas.surface, gas.temperature
+    if not isinstance(of, Frictional):
+        return None
+    return SoftSurface(
+        of.tangential_damping, of.friction, of.inertia, of.rotational_temperature / T
     )

@@ -91,9 +91,17 @@ class AbstractSpheres(AbstractModel):
         """The time of the run at reduced times."""
         return times
 
+    def beyond(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
+        """Which times are too late for the clock."""
+        return checks.beyond_drag(gas, times)
+
     def filled_side(self, scene: Any) -> Array:
         """Side in diameters of a cube of the volume in which the spheres are."""
         return scene.side
+
+    def held(self, scene: Any) -> Any:
+        """Numbers of a scene in which the derivative of a run is not known."""
+        return ()
 
     def check_fit(self, names: tuple[str, ...]) -> None:
         """A given start has its own temperature and lengths, which then cannot be fitted."""
@@ -128,7 +136,7 @@ class AbstractSpheres(AbstractModel):
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
-        beyond = checks.beyond_drag(gas, times)
+        beyond = self.beyond(gas, times)
         gas = user_start.with_constant_temperature(self.start, gas)
         scene = self.scene(gas)
         inputs = Inputs(
@@ -142,7 +150,7 @@ class AbstractSpheres(AbstractModel):
             return self._outputs(inputs, directions, gas.dimension, run)
 
         if self.projected:
-            found = differentiable(outputs, lambda scene: scene.material)(inputs)
+            found = differentiable(outputs, lambda scene: scene.material, self.held)(inputs)
         else:
             found = outputs(inputs)
         return self._curve(gas, times, inputs.scene.side, found, beyond)

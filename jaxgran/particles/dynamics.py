@@ -92,6 +92,11 @@ class AbstractDynamics(eqx.Module):
         return None
 
     @property
+    def inertial(self) -> bool:
+        """Whether a run may be followed in any frame that moves at a constant velocity."""
+        return True
+
+    @property
     def preparing(self) -> "AbstractDynamics | None":
         """The same spheres in the steady state in which they begin; None if they just melt."""
         return None

@@ -76,9 +76,9 @@ class Simulation(NamedTuple):
     def drift(self) -> Array:
         """Velocity of the centre of mass of each particle's replica, in which the run is at rest.
 
-        Shape (n, d), or 0 for a random start.
+        Shape (n, d), or 0 for a random start, and where walls or drag are at rest.
         """
-        if self.inputs.start is None:
+        if self.inputs.start is None or not self.dynamics.inertial:
             return jnp.zeros(())
         velocity = self.inputs.start[1]
         return velocity - centred(velocity, self.dynamics.replicas).reshape(velocity.shape)

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from jaxgran.scene.elements import SPINS
+
 
 def at_start(
     key: PRNGKeyArray, shape: tuple[int, int, int], mean_square: Float[Array, ""]
@@ -14,6 +16,16 @@ def at_start(
     spins = jax.random.normal(key, shape, mean_square.dtype)
     size = jnp.sqrt(mean_square / jnp.mean(spins**2, axis=(1, 2), keepdims=True))
     return size * spins
+
+
+def maxwellian(
+    key: PRNGKeyArray, velocity: Float[Array, "n d"], replicas: int, mean_square: Float[Array, ""]
+) -> Float[Array, "n spins"]:
+    """Spins at t = 0 of all spheres of a run with this key, see `at_start`."""
+    n, d = velocity.shape
+    key = jax.random.fold_in(key, 2)  # 0 and 1 are of positions and velocities
+    shape = replicas, n // replicas, SPINS[d]
+    return at_start(key, shape, mean_square.astype(velocity.dtype)).reshape(n, SPINS[d])
 
 
 def twisted(

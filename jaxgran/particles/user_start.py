@@ -29,10 +29,14 @@ def check(start: UserParticles | None, gas: Gas, replicas: int, num_particles: i
             raise ValueError(f"start.{name} has shape {np.shape(values)}, not {shape}")
     other = is_of_other_box(start, gas, num_particles)
     if not isinstance(other, Tracer) and bool(other):
-        side = gas.box_side(num_particles)
+        side = box_side(gas, num_particles)
+        given, own = (
+            np.array2string(np.asarray(s / gas.diameter), precision=7)
+            for s in (start.box_side, side)
+        )
         raise ValueError(
-            f"start.box_side is {float(start.box_side / gas.diameter):.7g} diameters, that of the "
-            f"gas {float(side / gas.diameter):.7g}: change packing_fraction or the start"
+            f"start.box_side is {given} diameters, that of the gas {own}: change packing_fraction "
+            "or the start"
         )
 
 
@@ -40,8 +44,13 @@ def is_of_other_box(start: Particles | None, gas: Gas, num_particles: int) -> Bo
     """Whether there is a start and its box is not that of the gas."""
     if start is None:
         return jnp.array(False)
-    ratio = jax.lax.stop_gradient(start.box_side / gas.box_side(num_particles))
-    return ~(jnp.abs(ratio - 1) < SAME_BOX + 10 * jnp.finfo(ratio.dtype).eps)
+    ratio = jax.lax.stop_gradient(start.box_side / box_side(gas, num_particles))
+    return ~jnp.all(jnp.abs(ratio - 1) < SAME_BOX + 10 * jnp.finfo(ratio.dtype).eps)
+
+
+def box_side(gas: Gas, num_particles: int) -> Float[Array, "..."]:
+    """Side of the periodic box of a gas, or of its container, which may have d sides."""
+    return gas.box_side(num_particles) if gas.container is None else gas.container.side
 
 
 def with_constant_temperature(start: Particles | None, gas: Gas) -> Gas:

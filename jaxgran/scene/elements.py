@@ -28,13 +28,14 @@ else:
     UserWallLaw = Any
 
 
-def optional(kind: type) -> Any:
-    """An optional field of a `Gas`; it refuses what is not of the given kind."""
+def optional(*kinds: type) -> Any:
+    """An optional field of a `Gas`; it refuses what is of none of the kinds."""
 
     def checked(value: Any) -> Any:
-        if value is None or isinstance(value, kind):
+        if value is None or isinstance(value, kinds):
             return value
-        raise ValueError(f"expected a jaxgran.{kind.__name__} or None, got {value!r}")
+        allowed = ", ".join(f"a jaxgran.{kind.__name__}" for kind in kinds)
+        raise ValueError(f"expected {allowed} or None, got {value!r}")
 
     return eqx.field(converter=checked, default=None, kw_only=True)
 
@@ -212,7 +213,8 @@ def check(gas: Any) -> None:
             "out of the gas"
         )
     if gas.container is not None:
-        _check_walls(gas.container, gas.diameter, gas.dimension, rough=gas.surface is not None)
+        rough = isinstance(gas.surface, Rough)
+        _check_walls(gas.container, gas.diameter, gas.dimension, rough=rough)
 
 
 def _check_walls(walls: Walls, diameter: Array, dimension: int, rough: bool) -> None:

@@ -19,6 +19,7 @@ from jaxgran.checks.validation import (
 from jaxgran.scene import elements
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
 from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise, optional
+from jaxgran.scene.friction import Frictional
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
 from jaxgran.scene.law import check_units
 from jaxgran.scene.named_floats import NamedFloats, Place
@@ -55,7 +56,8 @@ class Gas(NamedFloats):
             (of the area if d = 2) that the spheres occupy.
         temperature: T_0 = <v^2>/d at t = 0, m^2/s^2, > 0, without the mass, as in the paper.
         dimension: d, 3, or 2 for spheres that move in a plane.
-        surface: `jaxgran.Rough` of spheres that rotate; None is smooth ones.
+        surface: of spheres that rotate: `jaxgran.Rough` where impacts are instantaneous,
+            `jaxgran.Frictional` where contacts last; None is smooth ones.
         container: `jaxgran.Walls`; None is periodic or unbounded.
         drag: `jaxgran.StokesDrag`; None is a vacuum.
         drive: `jaxgran.WhiteNoise`, which heats the gas; None lets it cool.
@@ -76,7 +78,7 @@ class Gas(NamedFloats):
     packing_fraction: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     temperature: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
-    surface: Rough | None = optional(Rough)
+    surface: Rough | Frictional | None = optional(Rough, Frictional)
     container: Walls | None = optional(Walls)
     drag: StokesDrag | None = optional(StokesDrag)
     drive: WhiteNoise | None = optional(WhiteNoise)
@@ -136,9 +138,11 @@ class Gas(NamedFloats):
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Names of the optional fields that this scene has."""
+        """Optional fields that this scene has, by name; "friction" is a surface=`Frictional`."""
         names = ("surface", "container", "drag", "drive", "preparation")
-        return tuple(name for name in names if getattr(self, name) is not None)
+        given = [name for name in names if getattr(self, name) is not None]
+        rubs = isinstance(self.surface, Frictional)
+        return tuple("friction" if rubs and name == "surface" else name for name in given)
 
     def check_single(self) -> None:
         """Check that this is one gas, not a batch of them outside of `jax.vmap`.

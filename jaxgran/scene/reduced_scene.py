@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxgran.scene.elements import Rough
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.restitution import ReducedLaw
 
@@ -88,7 +89,7 @@ def reduced_scene(gas: Gas) -> ReducedScene:
     """
     d, length, speed = gas.dimension, gas.path_length, gas.impact_speed
     surface = walls = drag = drive = None
-    if gas.surface is not None:
+    if isinstance(gas.surface, Rough):
         ratio = gas.surface.rotational_temperature / gas.temperature
         surface = ReducedRough(gas.surface.tangential_restitution, gas.surface.inertia, ratio)
     if gas.container is not None:

@@ -112,16 +112,18 @@ class Viscoelastic(RestitutionLaw):
         length = jnp.asarray((speed**2 / alpha) ** 0.4 / diameter)
         return ReducedViscoelastic(beta, length, self.clipped)
 
-    def on_wall(
-        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
-    ) -> ReducedViscoelastic:
-        """The law for a sphere and a flat wall of its material.
+    def of_wall(self) -> "Viscoelastic":
+        """The law of two spheres that collide as a sphere does with a flat wall of this material.
 
         ``alpha``, proportional to ``Y sqrt(R_eff)/m_eff``, is smaller by sqrt(2): the effective
         radius and mass are twice those of two spheres.
         """
-        softer = eqx.tree_at(lambda law: law.youngs_modulus, self, self.youngs_modulus / 2**0.5)
-        return softer.reduced(diameter=diameter, mass=mass, speed=speed)
+        return eqx.tree_at(lambda law: law.youngs_modulus, self, self.youngs_modulus / 2**0.5)
+
+    def on_wall(
+        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
+    ) -> ReducedViscoelastic:
+        return self.of_wall().reduced(diameter=diameter, mass=mass, speed=speed)
 
 
 class ConstantRestitution(RestitutionLaw, ReducedLaw):

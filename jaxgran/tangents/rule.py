@@ -77,7 +77,9 @@ class Outputs(NamedTuple):
 
 
 def differentiable(
-    run: Callable[..., Outputs], material: Callable[[Any], Any]
+    run: Callable[..., Outputs],
+    material: Callable[[Any], Any],
+    held: Callable[[Any], Any] = lambda scene: (),
 ) -> Callable[[Inputs], Outputs]:
     """A run with projected derivatives: one linear rule, for forward and reverse mode alike.
 
@@ -89,11 +91,12 @@ def differentiable(
             whose leaves hold the directions along a first axis. With directions the records of the
             run are those of `with_tangents`.
         material: the pytree of numbers of a scene, such as (alpha, A) or a reduced law.
+        held: those numbers of a scene in which the derivative is not known.
 
     Returns:
-        The run as a function of its inputs. Its derivative in positions and velocities of a start,
-        and its second derivatives, raise ValueError; derivatives of a_2 and of the last particles
-        are nan.
+        The run as a function of its inputs. Its derivative in positions and velocities of a start
+        and in numbers that are held, and its second derivatives, raise ValueError; derivatives of
+        a_2 and of the last particles are nan.
     """
 
     @jax.custom_jvp
@@ -105,6 +108,7 @@ def differentiable(
     def outputs_jvp(at: tuple[Inputs], along: tuple[Inputs]):
         (inputs,), (change,) = at, along
         _refuse_derivative_in_start(change)
+        _refuse_derivative_in(held(change.scene))
         inputs = first_order_only(inputs)
         directions, amounts = _directions(
             material(inputs.scene), material(change.scene), inputs.times.dtype
@@ -142,6 +146,15 @@ def _refuse_derivative_in_start(change: Inputs) -> None:
             "a derivative in the positions or velocities of a start was asked for, which chaos "
             "destroys after a few collisions; hold the start fixed with jax.lax.stop_gradient, or "
             "for a short run use SoftSpheres(projection=None)"
+        )
+
+
+def _refuse_derivative_in(changes: Any) -> None:
+    if not all(_is_zero(leaf) for leaf in jax.tree.leaves(changes, is_leaf=_is_zero)):
+        raise ValueError(
+            "a derivative in the side of a container, or in the diameter or packing_fraction of "
+            "the gas in it, was asked for, which is not known: hold them fixed with "
+            "jax.lax.stop_gradient, take differences of runs, or use KineticTheory()"
         )
 
 

@@ -22,7 +22,7 @@ mean free times. This is less noisy than projecting at fixed times, since no tim
 or counted twice where a fixed end time moves through the steps.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -63,8 +63,25 @@ class Rates(NamedTuple):
         return _ratio(self.met, self.could_meet) * temperature**0.5
 
 
+class ElementMaterial(NamedTuple):
+    """The numbers of walls and drag, or their tangents; None is what a scene does not have.
+
+    Attributes:
+        wall_alpha, wall_constant: alpha and A of contacts with walls.
+        drag: gamma.
+    """
+
+    wall_alpha: Any = None
+    wall_constant: Any = None
+    drag: Any = None
+
+    def of_walls(self) -> tuple[Any, Any]:
+        """(alpha, A) of contacts with walls."""
+        return self.wall_alpha, self.wall_constant
+
+
 class ThermalTangents(NamedTuple):
-    """Tangents of the state of a gas along p directions in (alpha, A).
+    """Tangents of the state of a gas along p directions in (alpha, A), and in walls and drag.
 
     Attributes:
         alpha, dissipative_constant: the directions.
@@ -79,6 +96,8 @@ class ThermalTangents(NamedTuple):
         damping: q delta of the trend.
         rates: of the gas.
         paths: tangents of the paths of the particles, up to the last projection.
+        elements: directions in walls and drag; None where the gas has neither.
+        drag: gamma; None without drag.
     """
 
     alpha: Float[Array, "p"]
@@ -94,6 +113,13 @@ class ThermalTangents(NamedTuple):
     damping: Float[Array, ""]
     rates: Rates
     paths: PathTangents
+    elements: ElementMaterial | None = None
+    drag: Float[Array, ""] | None = None
+
+    def cooling(self, temperature: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
+        """``-d ln T/dt`` at a temperature, by contacts and drag."""
+        by_contacts = self.rates.cooling(self.trend(temperature))
+        return by_contacts if self.drag is None else by_contacts + 2 * self.drag
 
     def trend(self, temperature: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
         """Dependence of the cooling rate on T, ``T^(3/5) / (1 + q delta T^(1/10))``.
@@ -108,6 +134,20 @@ class ThermalTangents(NamedTuple):
         alpha = self.alpha[:, None] - c * scene_alpha
         return alpha, self.dissipative_constant[:, None] + 0.5 * c * scene_constant
 
+    def of_elements(self, scene: ElementMaterial) -> ElementMaterial:
+        """The same of walls and drag, of which gamma is in units of a rate."""
+        along, c = self.elements, self.log_temperature
+        assert along is not None
+
+        def moved(direction: Any, power: float, value: Any) -> Any:
+            return None if value is None else direction[:, None] + power * c * value
+
+        return ElementMaterial(
+            wall_alpha=moved(along.wall_alpha, -1.0, scene.wall_alpha),
+            wall_constant=moved(along.wall_constant, 0.5, scene.wall_constant),
+            drag=moved(along.drag, -0.5, scene.drag),
+        )
+
 
 def at_start(
     alpha: Float[Array, "p"],
@@ -116,6 +156,8 @@ def at_start(
     replicas: int,
     interval: ArrayLike,
     damping: ArrayLike,
+    elements: ElementMaterial | None = None,
+    drag: Float[Array, ""] | None = None,
 ) -> ThermalTangents:
     """The tangents of an initial state, which does not depend on the parameters.
 
@@ -125,6 +167,7 @@ def at_start(
         replicas: number of boxes.
         interval: between projections, in mean free times.
         damping: q delta of `ThermalTangents.trend`.
+        elements, drag: as in `ThermalTangents`.
     """
     p, dtype = len(alpha), velocity.dtype
     zeros = jnp.zeros((p, replicas), dtype)
@@ -143,6 +186,8 @@ def at_start(
         damping=jnp.asarray(damping, dtype),
         rates=Rates.none(replicas, dtype),
         paths=PathTangents.at_start(p, replicas, dtype),
+        elements=elements,
+        drag=drag,
     )
 
 
@@ -182,7 +227,7 @@ def projected(tangents: ThermalTangents, velocity: Float[Array, "n d"]) -> Proje
             tangents.own_elapsed,
             gain,
             meeting=tangents.rates.collision(one),
-            cooling=_ratio(tangents.rates.cooling(tangents.trend(heat)), jnp.sqrt(heat)),
+            cooling=_ratio(tangents.cooling(heat), jnp.sqrt(heat)),
             dimension=d,
         ),
     )

@@ -6,13 +6,14 @@ it, which keeps them out of the derivative.
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from jaxgran.checks import status
+from jaxgran.particles import spins
 from jaxgran.particles.capacity import Capacity, longest_skin
 from jaxgran.particles.dynamics import (
     AbstractDynamics,
@@ -22,26 +23,23 @@ from jaxgran.particles.dynamics import (
     repeat_until,
 )
 from jaxgran.particles.neighbours import Pairs
-from jaxgran.particles.soft import candidates, linearised, steps
+from jaxgran.particles.soft import candidates, elements, linearised, steps, walls
 from jaxgran.particles.soft.candidates import Encounters
+from jaxgran.particles.soft.elements import ElementSums, Moving
 from jaxgran.particles.soft.energy import energy_error
+from jaxgran.particles.soft.followed import after_block, at_start
+from jaxgran.particles.soft.frame import agitation, rotational_temperature
 from jaxgran.particles.soft.observation import observe
 from jaxgran.particles.soft.progress import SoftProgress, SoftState
 from jaxgran.particles.soft.scene import SoftScene
 from jaxgran.particles.soft.steps import ContactWork
 from jaxgran.particles.state import (
     State,
-    centred,
     fastest,
-    kinetic_energy,
     later,
     rewrapped,
-    temperature,
     time_left,
 )
-from jaxgran.tangents import thermal
-from jaxgran.tangents.thermal import ThermalTangents
-from jaxgran.theory import closed_forms
 
 MAX_REFINE = 4096.0
 """Largest factor by which the step may become shorter than asked before the run fails."""
@@ -62,6 +60,8 @@ class _Stepped(NamedTuple):
     state: State
     work: ContactWork
     distance: Array  # square of the largest distance that a member moved
+    sums: ElementSums | None  # energies by walls and drag
+    hit_walls: Array | None  # particles that touched a wall without being expected to
 
 
 class SoftDynamics(AbstractDynamics):
@@ -87,16 +87,30 @@ class SoftDynamics(AbstractDynamics):
         return SoftState(zeros, jnp.ones((), dtype), jnp.zeros((), jnp.int32), zeros)
 
     def elastic(self) -> "SoftDynamics":
-        lossless = dataclasses.replace(self.scene, dissipative_constant=0.0 * self.scene.alpha)
-        return dataclasses.replace(self, scene=lossless)
+        return dataclasses.replace(self, scene=self.scene.lossless())
 
-    def with_tangents(self, state: State, directions: tuple[Array, Array]) -> State:
-        scene = self.scene
-        damping = closed_forms.COOLING_CORRECTION * scene.dissipative_constant * scene.alpha**0.4
-        along = thermal.at_start(
-            *directions, state.velocity, self.replicas, self.projection, damping
-        )
+    def with_tangents(self, state: State, directions: tuple[Any, ...]) -> State:
+        along = at_start(self.scene, state, directions, self.projection)
         return state._replace(tangents=along)
+
+    @property
+    def room(self) -> Array | None:
+        walls = self.scene.walls
+        return None if walls is None else walls.sides - 1
+
+    @property
+    def inertial(self) -> bool:
+        return self.scene.inertial
+
+    def seen(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
+        return velocity, state.own.spin
+
+    def drawn(self, state: State, key: PRNGKeyArray) -> State:
+        surface = self.scene.surface
+        if surface is None:
+            return state
+        spin = spins.maxwellian(key, state.velocity, self.replicas, surface.ratio / surface.inertia)
+        return state._replace(own=state.own._replace(spin=spin))
 
     def observe(self, state: State) -> dict[str, Array]:
         return observe(state, self.scene, self.replicas)
@@ -113,6 +127,9 @@ class SoftDynamics(AbstractDynamics):
         stored = steps.elastic_energy(jnp.where(touching, xi, 0.0), self.scene.alpha)
         replica = pairs.i // (len(state.position) // self.replicas)
         elastic = jnp.zeros_like(state.own.elastic).at[replica].add(stored)
+        if self.scene.walls is not None:
+            at_walls = walls.stored(self.scene.walls, state.position)
+            elastic += jnp.sum(at_walls.reshape(self.replicas, -1), axis=1)
         own = SoftProgress(
             extra=jnp.zeros(len(state.position), bool),
             widen=jnp.ones((), state.position.dtype),
@@ -141,12 +158,14 @@ class SoftDynamics(AbstractDynamics):
             more.extra,
             self.replicas,
             self.capacity[2:],
+            walls.near(self.scene.walls, old.position, old.velocity, duration),
         )
         stepped = self._stepped(old, chosen, duration)
         new = stepped.state
         new = later(new, duration, end, num_left <= 1)
         if old.tangents is not None:
-            new = new._replace(tangents=self._projected(new, chosen, stepped.work, duration))
+            along = after_block(new, chosen, stepped.work, stepped.sums, duration, self.scene)
+            new = new._replace(tangents=along)
         work = stepped.work
 
         # A sphere outside the chosen ones was hit, or one went farther than was looked.
@@ -156,9 +175,13 @@ class SoftDynamics(AbstractDynamics):
         extra = more.extra.at[hit].set(True, mode="drop")
         too_far = stepped.distance > reach**2
         again = jnp.any(surprise) | too_far
+        if stepped.hit_walls is not None:
+            extra = extra.at[stepped.hit_walls].set(True, mode="drop")
+            again |= jnp.any(stepped.hit_walls < len(old.position))
 
         moved = jnp.sqrt(jnp.max(jnp.sum((new.position - listed) ** 2, -1)))
-        error, allowed = energy_error(old, new, work, self._sums_over(chosen))
+        by_replica = partial(chosen.by_replica, replicas=self.replicas)
+        error, allowed = energy_error(self.scene, old, new, work, by_replica, stepped.sums)
         new = self._with_ledger(new, error)
         fault = self._fault(old, new, error, allowed, chosen, moved)
         done = (fault == status.OK) & ~again
@@ -179,9 +202,12 @@ class SoftDynamics(AbstractDynamics):
         of the hottest replica, with the energy in its contacts."""
         # With the energy in contacts, or a step would lengthen while all of it is stored there.
         stored = 2 * self.replicas / state.position.size * state.own.elastic
-        hottest = jnp.max(temperature(state.velocity, self.replicas) + stored)
+        hottest = jnp.max(agitation(self.scene, state.velocity, self.replicas) + stored)
+        if state.own.spin is not None:
+            spins = rotational_temperature(self.scene, state.own.spin, self.replicas)
+            hottest = jnp.maximum(hottest, jnp.max(spins))
         per_contact = self.steps_per_contact * state.own.refine
-        longest_step = self.scene.contact_duration * hottest**-0.1 / per_contact
+        longest_step = self.scene.shortest_contact * hottest**-0.1 / per_contact
         longest = self.steps_per_block * longest_step
         left = time_left(state, end)
         num_left = jnp.maximum(jnp.ceil(left / longest * (1 - 1e-9)), 1.0)
@@ -189,61 +215,36 @@ class SoftDynamics(AbstractDynamics):
 
     def _stepped(self, state: State, chosen: Encounters, duration: Array) -> _Stepped:
         """The state after the block, but for its time; tangents are followed, not projected."""
-        x, v = state.position, state.velocity
-        before = x.at[chosen.members].get(mode="fill", fill_value=0.0)
-        v_before = v.at[chosen.members].get(mode="fill", fill_value=0.0)
-        after, v_after, work, along = linearised.follow(
-            before, v_before, self.scene, chosen, duration, self.steps_per_block, state.tangents
+        everyone = Moving(state.position, state.velocity, state.own.spin)
+        before = elements.members_of(self.scene, everyone, chosen.members)
+        found = linearised.follow(
+            *(before, everyone, self.scene, chosen, duration, self.steps_per_block, state.tangents)
         )
-        by_replica = self._sums_over(chosen)
-        own = state.own._replace(elastic=by_replica(work.stored))
+
+        def put(values, new):
+            return values.at[chosen.members].set(new, mode="drop")
+
+        by_replica = partial(chosen.by_replica, replicas=self.replicas)
+        own = state.own._replace(elastic=by_replica(found.work.stored))
+        flown, dragged = elements.flown(self.scene, everyone, duration, self.scene.of_elements.drag)
         new = state._replace(
-            position=(x + v * duration).at[chosen.members].set(after, mode="drop"),
-            velocity=v.at[chosen.members].set(v_after, mode="drop"),
-            dissipated=state.dissipated + by_replica(work.dissipated),
-            collisions=state.collisions + by_replica(work.begun),
+            position=put(flown.x, found.x),
+            velocity=put(flown.v, found.v),
+            dissipated=state.dissipated + by_replica(found.work.dissipated),
+            collisions=state.collisions + by_replica(found.work.begun),
             own=own,
-            tangents=along,
+            tangents=found.along,
         )
-        return _Stepped(new, work, jnp.max(jnp.sum((after - before) ** 2, -1)))
-
-    def _sums_over(self, chosen: Encounters):
-        """A function from values of the chosen pairs to their sums over each replica."""
-
-        def by_replica(values):
-            return jnp.zeros(self.replicas, values.dtype).at[chosen.replica].add(values)
-
-        return by_replica
-
-    def _projected(
-        self, new: State, chosen: Encounters, work: ContactWork, duration: Array
-    ) -> ThermalTangents:
-        """The tangents after a block, projected if it is time to."""
-        along, by_replica = new.tangents, self._sums_over(chosen)
-        partners = chosen.members[jnp.stack([chosen.a, chosen.b], 1)]
-        ends = jnp.where(work.touching[:, None], partners, len(new.position))
-        velocity = centred(new.velocity, self.replicas).reshape(new.velocity.shape)
-        heat = temperature(velocity, self.replicas)
-        rates = thermal.remembered(
-            along.rates,
-            lost=by_replica(work.dissipated),
-            met=2 * self.replicas / len(new.position) * by_replica(work.begun),
-            energy=kinetic_energy(velocity, self.replicas) + new.own.elastic,
-            temperature=heat,
-            trend=along.trend(heat),
-            duration=duration,
-            collision_frequency=self.scene.collision_frequency,
-        )
-        free = jnp.ones_like(along.free).at[ends].set(False, mode="drop")
-        along = along._replace(
-            free=free,
-            rates=rates,
-            elapsed=along.elapsed + duration,
-            own_elapsed=along.own_elapsed + duration * jnp.sqrt(heat),
-        )
-        passed = along.elapsed * jnp.sqrt(jnp.mean(heat))
-        due = passed * self.scene.collision_frequency >= along.interval
-        return thermal.project(along, velocity, due)
+        sums = hit = None
+        if found.more is not None:
+            sums = ElementSums.of(found.more, chosen.members, dragged, self.replicas, len(flown.x))
+            spin = None if flown.spin is None else put(flown.spin, found.spin)
+            own = own._replace(elastic=own.elastic + sums.stored, spin=spin)
+            new = new._replace(own=own, dissipated=new.dissipated + sums.lost)
+            if chosen.sure is not None:
+                hit = jnp.where(found.more.touched & ~chosen.sure, chosen.members, len(flown.x))
+        moved = jnp.max(jnp.sum((found.x - before.x) ** 2, -1))
+        return _Stepped(new, found.work, moved, sums, hit)
 
     def _with_ledger(self, new: State, error: Float[Array, "replicas"]) -> State:
         """The state with the energy error of its last block, and its step, which recovers."""

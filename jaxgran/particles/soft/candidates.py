@@ -6,7 +6,7 @@ Units here: the diameter is 1.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from jaxgran.particles.compaction import rows_where
 from jaxgran.particles.neighbours import Pairs
@@ -24,6 +24,7 @@ class Encounters(NamedTuple):
             the selection can be hit by a contact of this pair.
         needed: number of rows that each array of the run would need, in the order of its
             capacities; where one exceeds the capacity, pairs or particles are missing.
+        sure: whether all neighbours of a member are included; None without walls.
     """
 
     members: Int[Array, "members"]
@@ -33,6 +34,11 @@ class Encounters(NamedTuple):
     replica: Int[Array, "contacts"]
     expected: Bool[Array, "contacts"]
     needed: Int[Array, "kinds"]
+    sure: Bool[Array, "members"] | None = None
+
+    def by_replica(self, values: Array, replicas: int) -> Shaped[Array, "replicas"]:
+        """Sums of values of the pairs over each replica."""
+        return jnp.zeros(replicas, values.dtype).at[self.replica].add(values)
 
 
 def select_encounters(
@@ -44,6 +50,7 @@ def select_encounters(
     extra: Bool[Array, "n"],
     replicas: int,
     capacities: tuple[int, int, int],
+    near_walls: Bool[Array, "n"] | None = None,
 ) -> Encounters:
     """The pairs that would touch in free flight, and the pairs near those.
 
@@ -55,6 +62,7 @@ def select_encounters(
         extra: particles that are known to touch another one besides.
         replicas: number of boxes, whose particles follow one another.
         capacities: for the near pairs, the contacts and the members.
+        near_walls: particles that may touch a wall, which are members even without a pair.
     """
     n = len(position)
     most_near, most_contacts, most_members = capacities
@@ -67,10 +75,10 @@ def select_encounters(
         return active.at[ends].set(True, mode="drop")
 
     # The particles that would touch, those near them, and all pairs near these.
-    active = spread(extra, touch)
+    active = spread(extra if near_walls is None else extra | near_walls, touch)
     active = spread(active, real & (active[i] | active[j]))
     chosen = real & (active[i] | active[j])
-    present = spread(jnp.zeros(n, bool), chosen)
+    present = spread(jnp.zeros(n, bool) if near_walls is None else extra | near_walls, chosen)
     rows, num_contacts = rows_where(chosen, most_contacts)
     real = jnp.arange(most_contacts) < num_contacts
     rows = jnp.where(real, rows, 0)
@@ -85,6 +93,7 @@ def select_encounters(
         replica=i // (n // replicas),
         expected=active[i] & active[j],
         needed=jnp.stack([pairs.count, pairs.lookahead, num_near, num_contacts, num_members]),
+        sure=None if near_walls is None else active.at[members].get(mode="fill", fill_value=True),
     )
 
 

@@ -5,6 +5,8 @@ from functools import partial
 import jax
 from jaxtyping import Array
 
+from jaxgran.particles import observables
+from jaxgran.particles.soft.frame import rotational_temperature
 from jaxgran.particles.soft.scene import SoftScene
 from jaxgran.particles.state import State, derivatives_of_records, records
 from jaxgran.tangents import rule, thermal
@@ -19,14 +21,30 @@ def observe(state: State, scene: SoftScene, replicas: int) -> dict[str, Array]:
     """
     values, travelled, velocity = records(state, scene.side, replicas)
     values["elastic_energy"] = state.own.elastic / velocity.shape[1]
+    if scene.walls is not None:  # which stop what moves as a whole, and keep spheres from going far
+        velocity = state.velocity.reshape(velocity.shape)
+        values["temperature"] = observables.temperature(velocity)
+        values["sonine"] = observables.sonine(velocity)
+        values["velocity_correlation"] = observables.velocity_correlation(
+            state.first_velocity.reshape(velocity.shape), velocity
+        )
+    if state.own.spin is not None:  # not so in the melt
+        values["rotational_temperature"] = rotational_temperature(scene, state.own.spin, replicas)
     along = state.tangents
     if along is None:
-        return values
+        return _known(values, scene)
     T, U = values["temperature"], values["elastic_energy"]
-    cooling, meeting = along.rates.cooling(along.trend(T)), along.rates.collision(T)
+    cooling, meeting = along.cooling(T), along.rates.collision(T)
     c, clock, paths = thermal.projected(along, velocity.reshape(state.velocity.shape))
     kept, rates = derivatives_of_records(values, travelled, velocity, c, paths, cooling, meeting)
     stiffer = (along.alpha / scene.alpha)[:, None]
     kept["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
     rates["elastic_energy"] = -1.4 * cooling * U
-    return rule.with_tangents(values, kept, rates, clock)
+    return rule.with_tangents(_known(values, scene), kept, rates, clock)
+
+
+def _known(values: dict[str, Array], scene: SoftScene) -> dict[str, Array]:
+    """The records without those that mean nothing in a scene: between walls no sphere goes far."""
+    if scene.walls is None:
+        return values
+    return {name: value for name, value in values.items() if name != "displacement"}

@@ -13,12 +13,14 @@ class SoftState(NamedTuple):
         refine: factor by which steps are shorter than asked.
         good: number of blocks since the step was last changed.
         drift: sum of the relative energy errors of all blocks.
+        spin: of spheres with friction; else None.
     """
 
     elastic: Float[Array, "replicas"]
     refine: Float[Array, ""]
     good: Int[Array, ""]
     drift: Float[Array, "replicas"]
+    spin: Float[Array, "n spins"] | None = None
 
 
 class SoftProgress(NamedTuple):

@@ -52,6 +52,62 @@ class ContactWork(NamedTuple):
     touching: Bool[Array, "contacts"]
 
 
+class PairKick(NamedTuple):
+    """What the normal forces of pairs do in a time step.
+
+    Attributes:
+        xi, normal, touching: of the pairs, see `overlap`.
+        force: normal force.
+        viscous: dissipative force per overlap rate.
+        v: velocities after it.
+        work: dissipated and exchanged energy as in `ContactWork`, in all steps of the block so far.
+    """
+
+    xi: Float[Array, "contacts"]
+    normal: Float[Array, "contacts d"]
+    touching: Bool[Array, "contacts"]
+    force: Float[Array, "contacts"]
+    viscous: Float[Array, "contacts"]
+    v: Float[Array, "members d"]
+    work: tuple[Float[Array, "contacts"], Float[Array, "contacts"]]
+
+
+def kicked(
+    x: Float[Array, "members d"],
+    v: Float[Array, "members d"],
+    alpha: ArrayLike,
+    rho: ArrayLike,
+    dissipative_constant: ArrayLike,
+    chosen: Encounters,
+    dt: ArrayLike,
+    clipped: bool,
+    work: tuple[Float[Array, "contacts"], Float[Array, "contacts"]],
+) -> PairKick:
+    """The kick of a time step, the implicit midpoint rule of `midpoint_rate`; see `follow`.
+
+    Args:
+        rho: elastic constant, ``alpha / 2``.
+        dt: time step.
+        work: `PairKick.work` of the steps before.
+    """
+    a, b = chosen.a, chosen.b
+    xi, normal, touching = overlap(x, a, b, chosen.offset)
+    xi_dot = -jnp.sum((v[a] - v[b]) * normal, -1)
+    rate = midpoint_rate(xi, xi_dot, alpha, dissipative_constant, dt)
+    force = contact_force(xi, rate, rho, dissipative_constant, clipped=clipped)
+    elastic = contact_force(xi, 0.0, rho, 0.0)
+    kick = (dt * force)[:, None] * normal
+    v = v.at[a].add(kick).at[b].add(-kick)
+    # The midpoint and the trapezoidal sum of sqrt(xi) xi_dot^2 err to opposite sides.
+    mean = xi_dot - dt * force
+    viscous = contact_force(xi, 1.0, rho, dissipative_constant) - elastic
+    lost = (force - elastic) * mean + 0.5 * viscous * (dt * force) ** 2
+    dissipated, exchanged = work
+    dissipated += dt * lost
+    exchanged += dt * elastic * jnp.abs(mean)
+    return PairKick(xi, normal, touching, force, viscous, v, (dissipated, exchanged))
+
+
 def follow(
     x: Float[Array, "members d"],
     v: Float[Array, "members d"],
@@ -64,8 +120,7 @@ def follow(
 ) -> tuple[Float[Array, "members d"], Float[Array, "members d"], ContactWork]:
     """Positions and velocities of the members of a block after its time steps.
 
-    Drift-kick-drift steps of equal length, second order; the kick is the implicit midpoint rule of
-    `midpoint_rate`.
+    Drift-kick-drift steps of equal length, second order; for the kick see `kicked`.
 
     Args:
         x, v: positions and velocities of the members.
@@ -80,22 +135,10 @@ def follow(
     a, b, offset = chosen.a, chosen.b, chosen.offset
 
     def step(_, carry):
-        x, v, dissipated, exchanged, begun, before = carry
-        xi, normal, touching = overlap(x, a, b, offset)
-        xi_dot = -jnp.sum((v[a] - v[b]) * normal, -1)
-        rate = midpoint_rate(xi, xi_dot, alpha, dissipative_constant, dt)
-        force = contact_force(xi, rate, rho, dissipative_constant, clipped=clipped)
-        elastic = contact_force(xi, 0.0, rho, 0.0)
-        kick = (dt * force)[:, None] * normal
-        v = v.at[a].add(kick).at[b].add(-kick)
-        # The midpoint and the trapezoidal sum of sqrt(xi) xi_dot^2 err to opposite sides.
-        mean = xi_dot - dt * force
-        viscous = contact_force(xi, 1.0, rho, dissipative_constant) - elastic
-        lost = (force - elastic) * mean + 0.5 * viscous * (dt * force) ** 2
-        dissipated += dt * lost
-        exchanged += dt * elastic * jnp.abs(mean)
-        begun += touching & ~before
-        return x + dt * v, v, dissipated, exchanged, begun, touching
+        x, v, *work, begun, before = carry
+        kick = kicked(x, v, alpha, rho, dissipative_constant, chosen, dt, clipped, (*work,))
+        begun += kick.touching & ~before
+        return x + dt * kick.v, kick.v, *kick.work, begun, kick.touching
 
     zeros, first = jnp.zeros(len(a), x.dtype), overlap(x, a, b, offset)[2]
     carry = x + 0.5 * dt * v, v, zeros, zeros, jnp.zeros(len(a), jnp.int32), first

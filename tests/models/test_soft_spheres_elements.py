@@ -1,0 +1,218 @@
+"""Soft spheres between walls, in a gas that drags, and with friction."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.models.soft_spheres import SoftSpheres
+from jaxgran.particles.soft.flight import SMALL, shortened
+from tests.conftest import glass_beads
+
+NUM = 100
+
+
+def soft(fraction=0.05, beta=0.15, num=NUM, law=None, **elements) -> jaxgran.Gas:
+    """Beads whose contacts last a given part of the mean free time; walls of N beads by law."""
+    gas = glass_beads(beta)
+    stiffer = (float(gas.contact_fraction) / fraction) ** 2.5
+    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
+    a = gas.value("dissipative_constant") * (beta / gas.thermal_beta if beta else 0.0)
+    gas = gas.replace(dissipative_constant=a)
+    if law is not None:
+        walls = jaxgran.Walls(gas.box_side(num), restitution=gas.law if law == "own" else law)
+        elements["container"] = walls
+    return dataclasses.replace(gas, **elements)
+
+
+def energy(gas, curve):
+    """Energy per particle with all that was lost, over that at t = 0."""
+    T = curve.temperature
+    if curve.rotational_temperature is not None:
+        T = T + curve.rotational_temperature
+    total = gas.dimension / 2 * gas.mass * T + curve.elastic_energy + curve.dissipated_energy
+    return np.asarray(total / total[0])
+
+
+SCENES = {
+    "walls": {"law": "own"},
+    "drag": {"drag": jaxgran.StokesDrag(0.3)},
+    "friction": {"surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=3e-3)},
+    "all": {
+        "law": "own",
+        "drag": jaxgran.StokesDrag(0.3, rotational_rate=0.5),
+        "surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=3e-3),
+    },
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["all", *(pytest.param(k, marks=pytest.mark.slow) for k in SCENES)]
+)
+def test_ledger_closes_and_all_stay_inside(name):
+    gas = soft(**SCENES[name])
+    times = np.array([0.0, 1, 5, 20]) * float(gas.mean_free_time)
+    curve = jaxgran.cool(gas, times, model=SoftSpheres(NUM, steps_per_contact=30))
+    # As in the smooth gas: the onset of contacts leaves some 1e-4, falling as dt^(3/2).
+    np.testing.assert_allclose(energy(gas, curve), 1.0, atol=5e-4)
+    assert curve.temperature[-1] < 0.3 * gas.temperature
+    assert (curve.rotational_temperature is None) == (gas.surface is None)
+    if gas.container is not None:
+        place, side = np.asarray(curve.particles.position), float(gas.container.side)
+        overlap = 0.05 * float(gas.diameter)  # elastic impacts at 5 sqrt(T) overlap by 4 %
+        edge = 0.5 * float(gas.diameter) - overlap
+        assert place.min() > edge and place.max() < side - edge
+        assert curve.displacement is None
+        assert float(curve.particles.box_side) == pytest.approx(side)
+        # Walls push: unlike in a periodic box the gas as a whole does not stay at rest.
+        momentum = np.abs(np.mean(curve.particles.velocity[0], axis=0))
+        assert np.max(momentum) > 1e-3 * np.sqrt(curve.temperature[-1])
+
+
+def two_spheres(gas, position, velocity, replicas=1):
+    shape = replicas, 2, gas.dimension
+    side = gas.box_side(2) if gas.container is None else gas.container.side
+    place, speed = (jnp.broadcast_to(jnp.asarray(a, float), shape) for a in (position, velocity))
+    return jaxgran.Particles(place, speed, jnp.asarray(side))
+
+
+def test_impact_on_a_wall_has_the_restitution_of_its_law():
+    # Another material than that of the spheres, at the corner: three walls at once.
+    law = jaxgran.Viscoelastic(2e9, 0.3, 4e-6)
+    gas = soft(1e-3, 0.0, num=2, law=law)
+    side, sigma = float(gas.container.side), float(gas.diameter)
+    velocity = np.array([[0.3, -0.1, 0.2], [0.0, 0.0, 0.0]])
+    gap = np.array([1e-4, 2e-4, 3e-4])
+    corner = np.array([side - sigma / 2, sigma / 2, side - sigma / 2]) - np.sign(velocity[0]) * gap
+    opposite = side - corner
+    start = two_spheres(gas, np.array([corner, opposite]), velocity)
+    model = SoftSpheres(2, start=start, steps_per_contact=100)
+    curve = jaxgran.cool(gas, [0.006], model=model)
+    after = np.asarray(curve.particles.velocity[0, 0])
+    expected = law.on_wall(diameter=gas.diameter, mass=gas.mass, speed=1.0)
+    eps = np.asarray(expected.restitution(jnp.abs(velocity[0])))
+    # At 100 steps of a contact at the mean speed, here 1/2 to 1 times as long: 1e-4 by the onset.
+    np.testing.assert_allclose(-after / velocity[0], eps, atol=5e-4)
+    assert np.all(eps < 0.99)
+    np.testing.assert_array_equal(curve.particles.velocity[0, 1], 0.0)
+    assert float(curve.collisions[-1]) == 0.0
+
+
+def test_flight_with_drag_is_exact():
+    rate = 3.0
+    gas = soft(1e-3, num=2, drag=jaxgran.StokesDrag(rate))
+    side = float(gas.box_side(2))
+    velocity = np.array([[0.01, 0.02, 0.0], [0.01, 0.02, 0.0]])  # side by side: they never meet
+    place = np.array([[0.25 * side] * 3, [0.75 * side] * 3])
+    times = np.array([0.01, 0.1, 0.3])
+    model = SoftSpheres(2, start=two_spheres(gas, place, velocity))
+    end = jaxgran.cool(gas, times, model=model).particles
+    fraction = (1 - np.exp(-rate * times[-1])) / rate
+    # Sums of some 1e3 blocks round to 1e-13.
+    np.testing.assert_allclose(end.velocity[0], velocity * np.exp(-rate * times[-1]), rtol=1e-11)
+    apart = end.position[0] - place - velocity * fraction
+    np.testing.assert_allclose(apart - side * np.round(apart / side), 0.0, atol=1e-12 * side)
+
+
+def test_elastic_gas_with_drag_cools_as_drag_alone():
+    # An elastic impact keeps energy: T exp(2 gamma t), with the energy of contacts, is constant.
+    gas = soft(0.02, 0.0, drag=jaxgran.StokesDrag(1.0))
+    times = np.array([0.1, 0.5, 1.0])
+    curve = jaxgran.cool(gas, times, model=SoftSpheres(NUM))
+    total = curve.temperature + 2 / 3 * curve.elastic_energy / gas.mass
+    # What is stored in contacts, 1 % of the energy, is not dragged meanwhile.
+    np.testing.assert_allclose(total / gas.temperature * np.exp(2 * times), 1.0, atol=0.02)
+    assert np.all(curve.collisions[-1] > 2)
+
+
+@pytest.mark.parametrize("z", [0.0, 1e-9, 0.99 * SMALL, 1.01 * SMALL, 2.0])
+def test_shortened_duration_and_its_derivative(z):
+    value, slope = jax.value_and_grad(lambda rate: shortened(rate, 2.0))(z / 2)
+    exact = 2 * (-np.expm1(-z) / z if z else 1.0)
+    small = -2.0 * (1 - 2 * z / 3 + z**2 / 4 - z**3 / 15 + z**4 / 72)
+    derivative = small if z < 0.1 else 4 * (np.exp(-z) * (1 + z) - 1) / z**2
+    assert float(value) == pytest.approx(exact, rel=1e-14)
+    assert float(slope) == pytest.approx(derivative, rel=1e-9)
+
+
+def oblique(surface, **settings):
+    """Two spheres that meet obliquely, with what they had and what they have after the impact."""
+    gas = soft(1e-5, num=2, surface=surface)  # so stiff that the normal does not turn
+    side, sigma = float(gas.box_side(2)), float(gas.diameter)
+    angle = 0.6
+    normal = np.array([np.cos(angle), np.sin(angle), 0.0])
+    velocity = np.array([[0.2, 0.0, 0.05], [0.0, 0.0, 0.0]])  # they meet after 50 us
+    place = (
+        side / 2 + np.array([-normal, normal]) * sigma / 2 - 5e-5 * velocity
+    )  # they meet in 50 us
+    start = two_spheres(gas, place, velocity)
+    model = SoftSpheres(2, start=start, steps_per_contact=100, **settings)
+    curve = jaxgran.cool(gas, [0.0, 2e-4], model=model)
+    assert float(curve.collisions[-1]) == 1.0
+    return gas, curve, normal, velocity
+
+
+def test_sliding_impact_obeys_coulomb_and_conserves_momentum():
+    # So slippery that it slides to the end: the tangential impulse is mu times the normal one.
+    mu = 0.05
+    gas, curve, normal, velocity = oblique(jaxgran.Frictional(1e4, mu, inertia=0.5))
+    after = np.asarray(curve.particles.velocity[0])
+    impulse = after[0] - velocity[0]
+    np.testing.assert_allclose(after.sum(0), velocity.sum(0), atol=1e-14)
+    along = impulse @ normal
+    sideways = np.linalg.norm(impulse - along * normal)
+    # The normal turns by 2e-5 during the contact.
+    assert sideways / abs(along) == pytest.approx(mu, rel=1e-3)
+    np.testing.assert_allclose(energy(gas, curve), 1.0, atol=2e-5)  # the onset at 100 steps
+
+
+def test_without_friction_frictional_spheres_are_smooth():
+    _, curve, *_ = oblique(jaxgran.Frictional(0.5, 0.0, rotational_temperature=1e-3))
+    _, smooth, *_ = oblique(None)
+    np.testing.assert_allclose(curve.particles.velocity, smooth.particles.velocity, atol=1e-13)
+    T_rot = np.asarray(curve.rotational_temperature)
+    np.testing.assert_allclose(T_rot, 1e-3, rtol=1e-12)  # spins go on
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"law": 0.9}, "needs walls of the Viscoelastic law.*use HardSpheres"),
+        ({"law": "own", "num": 120}, "spheres of packing_fraction 0.05 need a container 0.833"),
+        ({"surface": jaxgran.Rough(0.1)}, "does not take rough spheres.*DSMC"),
+    ],
+)
+def test_what_it_cannot_take_is_refused_in_words(change, message):
+    gas = soft(**change)
+    with pytest.raises(ValueError, match=message):
+        jaxgran.cool(gas, [0.1], model=SoftSpheres(NUM))
+
+
+def test_friction_is_refused_by_the_other_models():
+    gas = soft(surface=jaxgran.Frictional(0.5, 0.3))
+    for model in (jaxgran.KineticTheory(), jaxgran.DSMC(100), jaxgran.HardSpheres(100)):
+        name = type(model).__name__
+        with pytest.raises(ValueError, match=f"{name} does not take friction.*SoftSpheres.*Rough"):
+            jaxgran.cool(gas, [0.1], model=model)
+    with pytest.raises(ValueError, match="friction must lie in"):
+        jaxgran.Frictional(0.5, -0.1)
+    with pytest.raises(ValueError, match="tangential_damping must lie in"):
+        jaxgran.Frictional(-0.5, 0.1)
+
+
+def test_a_start_outside_of_the_walls_is_refused():
+    gas = soft(1e-3, num=2, law="own")
+    side = float(gas.container.side)
+    start = two_spheres(gas, [[-1e-4, 1e-2, 1e-2], [0.5 * side] * 3], 0.0)
+    with pytest.raises(ValueError, match="sphere 0 of replica 0 .* outside of the walls"):
+        jaxgran.cool(gas, [0.1], model=SoftSpheres(2, start=start))
+
+
+def test_the_model_for_friction_is_soft_spheres():
+    gas = soft(surface=jaxgran.Frictional(0.5, 0.3))
+    choice = jaxgran.choose_model(gas, np.array([1.0, 10.0]) * float(gas.mean_free_time))
+    assert isinstance(choice.model, SoftSpheres)
+    assert any("leave friction out" in reason for reason in choice.reasons)
