@@ -149,8 +149,8 @@ class SoftSpheres(AbstractSpheres):
         return jnp.zeros(times.shape, bool)
 
     def filled_side(self, scene: SoftScene) -> Array:
-        """Of the room that centres have."""
-        return scene.room
+        """Of the container, where there is one."""
+        return scene.filled_side
 
     def held(self, scene: SoftScene) -> Any:
         """The room between walls, and how often spheres meet there."""
@@ -172,10 +172,10 @@ class SoftSpheres(AbstractSpheres):
         """Static sizes: capacities as measured for phi = .01 to .4 (disks: .5), t_c/tau_c = .003
         to .3."""
         d, n = dimension, self.replicas * self.num_particles
-        room, ahead = float(scene.room), 1.0
-        around = Neighbourhood.of(room, self.num_particles, self.replicas, d, self.listed_by_skin)
+        filled, ahead = float(scene.filled_side), 1.0
+        around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
         if scene.walls is not None:  # a sweep goes along the first axis
-            ahead = max(1.0, room / float(scene.walls.sides[0] - 1))
+            ahead = max(1.0, filled / float(scene.walls.sides[0]))
         duration = Grid.of(n).up(float(scene.contact_duration))
         steps = self._steps_per_block(float(scene.contact_duration))
         block = steps / self.steps_per_contact

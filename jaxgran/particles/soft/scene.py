@@ -105,11 +105,11 @@ class SoftScene(eqx.Module):
         return jnp.minimum(self.contact_duration, on_wall)
 
     @property
-    def room(self) -> Float[Array, ""]:
-        """Side of the cube (square) that has as much room for centres."""
+    def filled_side(self) -> Float[Array, ""]:
+        """Side of a cube (square) of the volume in which the spheres are."""
         if self.walls is None:
             return self.side
-        return jnp.prod(self.walls.sides - 1) ** (1 / len(self.walls.sides))
+        return jnp.prod(self.walls.sides) ** (1 / len(self.walls.sides))
 
     def lossless(self) -> "SoftScene":
         """The same gas without losses: smooth spheres in a vacuum, between elastic walls."""
