@@ -56,8 +56,7 @@ class Gas(NamedFloats):
             (of the area if d = 2) that the spheres occupy.
         temperature: T_0 = <v^2>/d at t = 0, m^2/s^2, > 0, without the mass, as in the paper.
         dimension: d, 3, or 2 for spheres that move in a plane.
-        surface: of spheres that rotate: `jaxgran.Rough` where impacts are instantaneous,
-            `jaxgran.Frictional` where contacts last; None is smooth ones.
+        surface: `jaxgran.Rough`, or `jaxgran.Frictional` where contacts last; None is smooth.
         container: `jaxgran.Walls`; None is periodic or unbounded.
         drag: `jaxgran.StokesDrag`; None is a vacuum.
         drive: `jaxgran.WhiteNoise`, which heats the gas; None lets it cool.
@@ -140,9 +139,8 @@ class Gas(NamedFloats):
     def elements(self) -> tuple[str, ...]:
         """Optional fields that this scene has, by name; "friction" is a surface=`Frictional`."""
         names = ("surface", "container", "drag", "drive", "preparation")
-        given = [name for name in names if getattr(self, name) is not None]
-        rubs = isinstance(self.surface, Frictional)
-        return tuple("friction" if rubs and name == "surface" else name for name in given)
+        given = tuple(name for name in names if getattr(self, name) is not None)
+        return ("friction", *given[1:]) if isinstance(self.surface, Frictional) else given
 
     def check_single(self) -> None:
         """Check that this is one gas, not a batch of them outside of `jax.vmap`.

@@ -145,6 +145,40 @@ class _Sums(NamedTuple):
         return cls(pairs, pairs, begun, touching, members, members, members, touched)
 
 
+def _step(
+    now: Moving,
+    sums: _Sums,
+    own: tuple[ArrayLike, ArrayLike, ArrayLike],
+    material: ElementMaterial,
+    scene: SoftScene,
+    chosen: Encounters,
+    dt: ArrayLike,
+) -> tuple[Moving, _Sums]:
+    """A kick and a drift; `own` is (alpha, rho, A) of pairs."""
+    x, v, spin = now
+    kick = steps.kicked(x, v, *own, chosen, dt, scene.clipped, sums[:2])
+    v, (dissipated, exchanged) = kick.v, kick.work
+    if scene.walls is not None:
+        wall = walls.kicked(scene.walls, x, v, *material.of_walls(), dt)
+        v = wall.v
+        sums = sums._replace(
+            to_walls=sums.to_walls + wall.dissipated,
+            by_walls=sums.by_walls + wall.exchanged,
+            touched=sums.touched | wall.touching,
+        )
+    if scene.surface is not None and spin is not None:
+        rubbed = friction.kicked(scene.surface, spin, kick._replace(v=v), chosen, dt)
+        v, spin, dissipated = rubbed.v, rubbed.spin, dissipated + rubbed.dissipated
+    moved, dragged = flown(scene, Moving(x, v, spin), dt, material.drag)
+    return moved, sums._replace(
+        dissipated=dissipated,
+        exchanged=exchanged,
+        begun=sums.begun + (kick.touching & ~sums.before),
+        before=kick.touching,
+        to_drag=sums.to_drag + dragged,
+    )
+
+
 def follow(
     now: Moving,
     alpha: ArrayLike,
@@ -170,33 +204,10 @@ def follow(
         duration: of the block.
         num_steps: number of steps.
     """
-    rho, dt = 0.5 * alpha, duration / num_steps
+    dt, own = duration / num_steps, (alpha, 0.5 * alpha, dissipative_constant)
 
     def step(_, carry: tuple[Moving, _Sums]) -> tuple[Moving, _Sums]:
-        (x, v, spin), sums = carry
-        kick = steps.kicked(
-            *(x, v, alpha, rho, dissipative_constant, chosen, dt, scene.clipped), sums[:2]
-        )
-        v, (dissipated, exchanged) = kick.v, kick.work
-        if scene.walls is not None:
-            wall = walls.kicked(scene.walls, x, v, *material.of_walls(), dt)
-            v = wall.v
-            sums = sums._replace(
-                to_walls=sums.to_walls + wall.dissipated,
-                by_walls=sums.by_walls + wall.exchanged,
-                touched=sums.touched | wall.touching,
-            )
-        if scene.surface is not None and spin is not None:
-            rubbed = friction.kicked(scene.surface, spin, kick._replace(v=v), chosen, dt)
-            v, spin, dissipated = rubbed.v, rubbed.spin, dissipated + rubbed.dissipated
-        moved, dragged = flown(scene, Moving(x, v, spin), dt, material.drag)
-        return moved, sums._replace(
-            dissipated=dissipated,
-            exchanged=exchanged,
-            begun=sums.begun + (kick.touching & ~sums.before),
-            before=kick.touching,
-            to_drag=sums.to_drag + dragged,
-        )
+        return _step(*carry, own, material, scene, chosen, dt)
 
     first = steps.overlap(now.x, chosen.a, chosen.b, chosen.offset)[2]
     sums = _Sums.none(chosen, now.x, first)
