@@ -76,7 +76,7 @@ class DSMC(AbstractModel):
     step: UserFloat = eqx.field(static=True, default=0.05)
 
     stochastic: ClassVar[bool] = True
-    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag")
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive", "preparation")
     derivative_accuracy: ClassVar[float] = 0.01
 
     def __check_init__(self):

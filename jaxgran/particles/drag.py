@@ -41,6 +41,15 @@ def passed(drag: ReducedDrag, time: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(drag.rate > 0, -jnp.log1p(-drag.rate * time) / safe, time)
 
 
+def lasting(
+    drag: ReducedDrag, began: Float[Array, "..."], duration: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """The time that a transformed duration lasts, >= 0."""
+    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
+    share = drag.rate * duration / (1 - drag.rate * began)
+    return jnp.maximum(jnp.where(drag.rate > 0, -jnp.log1p(-share) / safe, duration), 0.0)
+
+
 def transformed(drag: ReducedDrag, times: Float[Array, "times"]) -> Float[Array, "times"]:
     """The transformed times of times."""
     safe = jnp.where(drag.rate > 0, drag.rate, 1.0)

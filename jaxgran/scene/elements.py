@@ -198,8 +198,8 @@ class DrivenStart(eqx.Module):
     """A gas that white noise has driven into a steady state at T_0; at t = 0 it is switched off.
 
     The velocities are then not Maxwellian: a_2 begins at that of the steady state, in which
-    ``da_2/dt = 0`` while the noise returns all that impacts, walls and drag take. Of smooth
-    spheres.
+    ``da_2/dt = 0`` while the noise returns all that impacts, on walls too, take. Of smooth spheres;
+    drag, where there is some, begins at t = 0.
 
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution.
     """

@@ -115,8 +115,8 @@ def _steady_ratio(speed: Array, sonine: Array, scene: ReducedScene, d: int) -> A
 
 
 def prepared_sonine(scene: ReducedScene, like: Array, d: int) -> Float[Array, ""]:
-    """a_2 at T_0 of a gas that white noise, which returns all that is lost there, has driven."""
-    undriven = scene._replace(drive=None)
+    """a_2 of a gas that white noise has driven at T_0, returning what impacts and walls take."""
+    undriven = scene._replace(drive=None, drag=None)
     zero = jnp.zeros((), like.dtype)
 
     def peaking(sonine: Array) -> Array:

@@ -139,15 +139,3 @@ def test_a_run_of_rough_spheres_is_resumed_and_compiles(tmp_path):
     smoother = gas.replace(tangential_restitution=-0.2)
     with pytest.raises(ValueError, match="surface"):
         jaxgran.cool(smoother, times, model=model, checkpoint=tmp_path / "run")
-
-
-def test_derivatives_with_elements_are_refused():
-    gas = dataclasses.replace(glass_beads(), **SCENES["rough"])
-    times = jnp.array([1.0, 4.0]) * gas.mean_free_time
-
-    def temperature(beta):
-        changed = gas.replace(tangential_restitution=beta)
-        return jaxgran.cool(changed, times, model=jaxgran.DSMC(100)).temperature
-
-    with pytest.raises(ValueError, match="DSMC runs with rough spheres.*KineticTheory"):
-        jax.jvp(temperature, (0.0,), (1.0,))

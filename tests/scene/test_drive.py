@@ -130,3 +130,94 @@ def test_the_choice_of_a_model_tells_the_error_of_a_steady_state():
 def test_the_header_of_a_curve_gives_the_strength():
     elements = read_elements({"drive_strength": "2.5e-4"})
     assert float(elements["drive"].strength) == 2.5e-4
+
+
+@pytest.mark.parametrize("eps", [0.5, 0.9])
+def test_the_steady_state_is_where_theory_comes_to_rest(eps):
+    gas = constant(eps)
+    steady, curve = jaxgran.steady_state(gas), driven(gas, [2000.0, 3000.0])
+    np.testing.assert_allclose(steady.temperature, curve.temperature[1], rtol=1e-8)
+    np.testing.assert_allclose(steady.sonine, curve.sonine[1], rtol=1e-6)  # of the solver's 1e-9
+    assert steady.rotational_temperature is None
+    slope = jax.grad(lambda x: jaxgran.steady_state(gas.replace(drive_strength=x)).temperature)
+    strength = gas.value("drive_strength")
+    assert float(slope(strength) * strength / steady.temperature) == pytest.approx(2 / 3, rel=1e-8)
+
+
+def test_the_steady_state_of_rough_viscoelastic_spheres_in_air(beads):
+    gas = dataclasses.replace(
+        beads(),
+        surface=jaxgran.Rough(0.2),
+        drag=jaxgran.StokesDrag(0.3),
+        drive=jaxgran.WhiteNoise(0.1),
+    )
+    steady, curve = jaxgran.steady_state(gas), driven(gas, [2000.0, 3000.0])
+    for name in ("temperature", "rotational_temperature"):
+        np.testing.assert_allclose(getattr(steady, name), getattr(curve, name)[1], rtol=1e-7)
+
+
+def test_what_has_no_steady_state_is_refused():
+    for gas in (constant(1.0), constant(0.9, rate=0.0)):
+        with pytest.raises(ValueError, match="no temperature is found"):
+            jaxgran.steady_state(gas)
+    with pytest.raises(ValueError, match="add drive=WhiteNoise"):
+        jaxgran.steady_state(dataclasses.replace(constant(0.9), drive=None))
+
+
+def prepared(eps) -> jaxgran.Gas:
+    return dataclasses.replace(constant(eps), drive=None, preparation=jaxgran.DrivenStart())
+
+
+@pytest.mark.parametrize("eps", [0.5, 0.8])
+def test_a_gas_that_was_driven_begins_in_its_steady_state(eps):
+    curve = driven(prepared(eps), [0.0, 5.0])
+    steady = jaxgran.steady_state(constant(eps))
+    # The steady a_2 of constant eps does not depend on T.
+    np.testing.assert_allclose(curve.sonine[0], steady.sonine, rtol=1e-7)
+    np.testing.assert_allclose(curve.temperature[0], 0.01, rtol=1e-12)
+    plain = driven(dataclasses.replace(prepared(eps), preparation=None), [0.0, 5.0])
+    assert float(plain.sonine[0]) == 0.0
+    assert float(curve.temperature[1]) != float(plain.temperature[1])
+    rough = {"surface": jaxgran.Rough(0.0)}
+    with pytest.raises(ValueError, match="preparation.*smooth spheres"):
+        dataclasses.replace(prepared(eps), **rough)
+
+
+def test_dsmc_begins_in_the_steady_state():
+    gas = prepared(0.5)
+    times = np.array([0.0, 5.0]) * float(gas.mean_free_time)
+    curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(20_000, replicas=2))
+    theory = jaxgran.cool(gas, times)
+    # a_2 of 40 000 particles scatters by sqrt(8/15/N) = .004; terms beyond a_2: .006 (eps = .5).
+    assert float(curve.sonine[0]) == pytest.approx(float(theory.sonine[0]), abs=0.018)
+    assert float(curve.sonine[0]) > 0.005
+    np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("eps", [0.5, 0.8])
+def test_particles_are_released_from_the_steady_state(eps):
+    gas = prepared(eps)
+    times = np.array([0.0, 0.5, 2.0, 5.0]) * float(gas.mean_free_time)
+    theory = jaxgran.cool(gas, times)
+    models = (jaxgran.DSMC(50_000, replicas=4), jaxgran.HardSpheres(500, replicas=32))
+    for model in models:
+        curve = jaxgran.cool(gas, times, model=model)
+        noise = np.sqrt(8 / 15 / (model.num_particles * model.replicas))
+        # Terms beyond a_2 are .006 at eps = .5; boxes of 500 spheres are not all of a gas.
+        assert np.all(np.abs(curve.sonine - theory.sonine) < 3 * noise + 0.008)
+        np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("eps", [0.5, 0.8])
+def test_dsmc_finds_the_steady_state_of_van_noije_and_ernst(eps, dimension):
+    gas = constant(eps, dimension, rate=(1 - eps**2) / dimension)
+    steady = jaxgran.steady_state(gas)
+    times = np.linspace(20.0, 60.0, 21) * float(gas.mean_free_time)
+    curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(20_000, replicas=4))
+    # 80 000 particles at some 10 times: .1 % of T, .001 of a_2, a few times; terms beyond a_2.
+    assert float(jnp.mean(curve.temperature)) == pytest.approx(float(steady.temperature), rel=0.01)
+    expected = sonine_of_van_noije_and_ernst(eps, dimension)
+    assert float(jnp.mean(curve.sonine)) == pytest.approx(expected, abs=0.006 + 0.1 * abs(expected))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from jaxgran.particles import kicks, spins
-from jaxgran.particles.drag import decay, passed
+from jaxgran.particles.drag import decay, lasting
 from jaxgran.particles.hard.scene import HardScene, Material
 from jaxgran.particles.state import State, temperature
 from jaxgran.scene.elements import SPINS
@@ -61,8 +61,8 @@ def heating(
     strength = scene.drive.strength * scene.collision_frequency
     if scene.drag is None:
         return strength * duration / 2
-    rates, end = scene.decay_rates, began + duration
-    time = passed(rates, end) - passed(rates, began)
+    rates = scene.decay_rates
+    time = lasting(rates, began, jnp.asarray(duration))
     return strength * time / 2 / decay(rates, began + place * duration).velocity ** 2
 
 

@@ -55,6 +55,9 @@ class HardTangents(NamedTuple):
         """Tangents of what both energies gain in impacts, see `ExchangeTangents.after`."""
 
         def energies(material: Material, velocity: Array, spin: Array) -> Array:
+            if scene.surface is not None and material.surface is not None:
+                # At a given energy spins are smaller where the inertia is larger.
+                spin = spin - 0.5 * jnp.log(material.surface.inertia / scene.surface.inertia)
             effect = effect_of(scene.with_material(material), impact.faster(velocity, spin))
             turned = jnp.zeros_like(effect.lost) if effect.turned is None else effect.turned
             return jnp.where(happens, jnp.stack([-effect.lost, turned]), 0.0)

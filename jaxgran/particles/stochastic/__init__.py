@@ -2,9 +2,10 @@
 
 - `collision_rule`: which candidate pairs collide, and what a collision does.
 - `pairing`: which pairs are drawn in a step.
-- `elements`: drag, rough spheres and walls.
-- `tangents`: in the parameters of the law.
+- `elements`: walls, a drive and drag.
+- `tangents`: in the parameters of the law; `exchange`: of a scene with elements.
 - `collisions`: one step of many collisions.
+- `start`: the state at t = 0.
 - `simulation`: a whole run as a pure function, and the parts of it that the host driver needs.
 
 May import the modules directly under `particles`, except for `driver`, `pure` and `simulation`, and

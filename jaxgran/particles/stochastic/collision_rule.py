@@ -24,6 +24,7 @@ class Outcome(NamedTuple):
         memory: ``sum (1 + eps)^2 (g.n)^2 / 4``, by which D/sqrt(T) decays.
         along: tangents of -loss and of memory in the parameters of the law.
         along_speed: their tangents in the logarithm of all speeds.
+        turned: increase of q sum s^2 of rough spheres.
         twist: change of the spins of both particles of each pair; None of smooth ones.
     """
 
@@ -34,6 +35,7 @@ class Outcome(NamedTuple):
     memory: Float[Array, ""]
     along: Float[Array, "2 P"]
     along_speed: Float[Array, "..."]  # (2,)
+    turned: Float[Array, ""] | float = 0.0
     twist: Float[Array, "pairs spins"] | None = None
 
 
@@ -106,8 +108,12 @@ def _rubbed(
     """The outcome with the tangential part of the impacts; see `jaxgran.Rough`."""
     found = rub(relative, spin, normal, hit, surface.eta, surface.inertia)
     lost = -2 * jnp.sum(found.kick * (found.sideways + found.kick))  # of translation alone
+    turned = 2 * surface.inertia * jnp.sum(found.twist * (spin + found.twist))
     return outcome._replace(
-        kick=outcome.kick + found.kick, loss=outcome.loss + lost, twist=found.twist
+        kick=outcome.kick + found.kick,
+        loss=outcome.loss + lost,
+        turned=turned,
+        twist=found.twist,
     )
 
 

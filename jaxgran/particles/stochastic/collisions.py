@@ -8,11 +8,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran.particles.drag import decay
+from jaxgran.particles.kicks import wrapped
 from jaxgran.particles.stochastic.collision_rule import Outcome, collide
-from jaxgran.particles.stochastic.elements import hit_walls
+from jaxgran.particles.stochastic.elements import Walled, heating, hit_walls, kicked, shortened
+from jaxgran.particles.stochastic.exchange import BeforeWalls, Candidates, Step, exchanged
 from jaxgran.particles.stochastic.pairing import CEILING, Scheme, draw
 from jaxgran.particles.stochastic.tangents import DSMCTangents, carried
 from jaxgran.scene.reduced_scene import ReducedScene
+from jaxgran.tangents.exchange import ExchangeTangents
 
 RECOUNTED = 32
 """Steps after which T is computed from the velocities again.
@@ -36,7 +39,7 @@ class DSMCState(NamedTuple):
         missed: number of collisions missed because of the `CEILING`.
         steps: number of steps.
         mobility: M = D / sqrt(T/T_0), followed together with the tangents.
-        tangents: in the parameters of the law.
+        tangents: in the parameters of the law, or of a scene with elements.
     """
 
     time: Float[Array, ""]
@@ -48,7 +51,7 @@ class DSMCState(NamedTuple):
     missed: Float[Array, "*replicas"]
     steps: UInt32[Array, "*replicas"]
     mobility: Float[Array, "*replicas"]
-    tangents: DSMCTangents
+    tangents: DSMCTangents | ExchangeTangents
 
 
 def _step(
@@ -65,14 +68,16 @@ def _step(
     a step is as accurate as at its end.
     """
     key = jax.random.fold_in(key, state.steps)
-    speed = jnp.sqrt(state.temperature)
-    dt = share * scheme.own_step / speed
-    particles, sums = _collided(state, key, dt, share, scene, scheme, tangents)
-    lost = sums.loss
+    dt = share * scheme.own_step / jnp.sqrt(state.temperature)
+    before, state = state, _kicked(state, key, dt, scene, scheme, 0.0)
+    exchanging = tangents and isinstance(state.tangents, ExchangeTangents)
+    particles, sums, pairs = _collided(
+        state, key, dt, share, scene, scheme, tangents and not exchanging
+    )
+    lost, walls = sums.loss, None
     if scene.walls is not None:
-        bounced = _bounced(state, key, dt, scene, scheme.dimension, particles)
-        before, particles = particles[:, : scheme.dimension], bounced
-        lost = lost + jnp.sum(before**2) - jnp.sum(bounced[:, : scheme.dimension] ** 2)
+        particles, hit, walls = _bounced(state, key, dt, scene, scheme.dimension, particles)
+        lost = lost + hit.lost
     energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
     temperature = state.temperature - lost / energy
     passed = state.clock_rest + dt
@@ -86,11 +91,44 @@ def _step(
         missed=state.missed + sums.missed,
         steps=state.steps + (share > 0).astype(state.steps.dtype),
     )
+    new = _kicked(new, key, dt, scene, scheme, 1.0)
     if not tangents:
         return new
+    if isinstance(before.tangents, ExchangeTangents):
+        ceiling = CEILING * jnp.sqrt(state.temperature)
+        step = Step(pairs, walls, ceiling, share, state.clock, dt, scheme.num_particles)
+        energies = _energies(before, scene, scheme.dimension)
+        along = exchanged(before.tangents, scene, energies, step, sums.num)
+        return new._replace(tangents=along)
     ds, left = share * scheme.own_step, energy * temperature
-    mobility, along = carried(state.tangents, state.mobility, scheme.dimension, sums, dt, ds, left)
+    mobility, along = carried(before.tangents, state.mobility, scheme.dimension, sums, dt, ds, left)
     return new._replace(mobility=mobility, tangents=along)
+
+
+def _kicked(
+    state: DSMCState,
+    key: PRNGKeyArray,
+    dt: Float[Array, ""],
+    scene: ReducedScene,
+    scheme: Scheme,
+    place: float,
+) -> DSMCState:
+    """The state after half of the kicks of a step, at its begin (place 0) or end (1)."""
+    if scene.drive is None:
+        return state
+    d = scheme.dimension
+    growth = heating(scene.drive, scene.drag, state.clock - place * dt, dt, place)
+    key = jax.random.fold_in(key, 2 + round(place))
+    at_rest = scene.walls is None
+    particles = kicked(state.particles, key, growth, state.clock, d, at_rest)
+    return state._replace(particles=particles, temperature=2 * jnp.mean(particles[:, :d] ** 2))
+
+
+def _energies(state: DSMCState, scene: ReducedScene, d: int) -> Float[Array, "2"]:
+    """sum v^2, and q sum s^2 of the spins that are kept."""
+    inertia = 0.0 if scene.surface is None else scene.surface.inertia
+    translation, rotation = state.particles[:, :d], state.particles[:, 2 * d :]
+    return jnp.stack([jnp.sum(translation**2), inertia * jnp.sum(rotation**2)])
 
 
 def _collided(
@@ -101,8 +139,8 @@ def _collided(
     scene: ReducedScene,
     scheme: Scheme,
     tangents: bool,
-) -> tuple[Float[Array, "N components"], Outcome]:
-    """The particles after a step, and sums over its collisions."""
+) -> tuple[Float[Array, "N components"], Outcome, tuple[Candidates, Candidates]]:
+    """The particles after a step, sums over its collisions, and the candidates."""
     d, first, second = scheme.dimension, scheme.first, scheme.second
     bits = jax.random.bits(key, (2, first + second + 2), jnp.uint32)
     i, j, k = draw(bits[:, -2:].ravel(), scheme)
@@ -122,15 +160,14 @@ def _collided(
         collide, ceiling=ceiling, share=share, scene=scene, tangents=tangents, slowed=slowed
     )
     rough = scene.surface is not None
-    one = rule(
-        v[:first] - v[first : 2 * first],
-        bits[:, :first],
-        spin=spin[:first] + spin[first : 2 * first] if rough else None,
-    )
+    firsts = v[:first] - v[first : 2 * first]
+    turning = spin[:first] + spin[first : 2 * first] if rough else None
+    one = rule(firsts, bits[:, :first], spin=turning)
     twice, again = one.kick[:second], one.twist
     if again is not None:
         again = spin[:second] + again[:second] + spin[2 * first :]
-    two = rule(v[:second] + twice - v[2 * first :], bits[:, first:-2], spin=again)
+    seconds = v[:second] + twice - v[2 * first :]
+    two = rule(seconds, bits[:, first:-2], spin=again)
     kicks = jnp.concatenate([twice + two.kick, one.kick[second:], -one.kick, -two.kick])
     changes = [kicks, -middle * kicks]
     if one.twist is not None and two.twist is not None:
@@ -138,7 +175,11 @@ def _collided(
         changes.append(jnp.concatenate([both, one.twist[second:], one.twist, two.twist]) / kept)
     sums = jax.tree.map(jnp.add, *(x._replace(kick=0.0, twist=None) for x in (one, two)))
     new = old + jnp.concatenate(changes, axis=-1)
-    return state.particles.at[index].set(new, **options), sums
+    pairs = (
+        Candidates(firsts, None if turning is None else turning / kept, bits[:, :first]),
+        Candidates(seconds, None if again is None else again / kept, bits[:, first:-2]),
+    )
+    return state.particles.at[index].set(new, **options), sums, pairs
 
 
 def _bounced(
@@ -148,21 +189,17 @@ def _bounced(
     scene: ReducedScene,
     d: int,
     particles: Float[Array, "N components"],
-) -> Float[Array, "N components"]:
-    """The particles after their impacts on walls in a step."""
-    assert scene.walls is not None
+) -> tuple[Float[Array, "N components"], Walled, BeforeWalls]:
+    """The particles after their impacts on walls in a step, those impacts, and before them."""
     velocity, spin, slowed, kept = particles[:, :d], particles[:, 2 * d :], 1.0, 1.0
     if scene.drag is not None:
         left = decay(scene.drag, state.clock + dt / 2)
         slowed, kept = left.velocity, left.spin
-    key = jax.random.fold_in(key, 1)
-    velocity, spin = hit_walls(scene.walls, scene.surface, key, velocity, spin * kept, dt, slowed)
-    return jnp.concatenate([velocity, particles[:, d : 2 * d], spin / kept], axis=-1)
-
-
-def wrapped(words: UInt32[Array, "2"]) -> PRNGKeyArray:
-    """Two 32-bit words as a key of threefry, whose numbers do not change under `jax.vmap`."""
-    return jax.random.wrap_key_data(words, impl="threefry2x32")
+    bits = jax.random.bits(jax.random.fold_in(key, 1), velocity.shape[:1], jnp.uint32)
+    axis = (state.steps % d).astype(jnp.int32)
+    hit = hit_walls(scene, bits, axis, velocity, spin * kept, dt, slowed)
+    after = jnp.concatenate([hit.velocity, particles[:, d : 2 * d], hit.spin / kept], axis=-1)
+    return after, hit, BeforeWalls(velocity, spin, bits, axis)
 
 
 def step(
@@ -213,9 +250,12 @@ def advance(
         tangents: whether tangents are followed.
     """
 
+    def length(state):
+        whole = scheme.own_step / jnp.sqrt(state.temperature)
+        return shortened(scene, state.temperature, state.clock, whole)
+
     def due(state):
-        left = (end - state.clock) - state.clock_rest
-        return scheme.own_step / jnp.sqrt(state.temperature) <= left
+        return length(state) <= (end - state.clock) - state.clock_rest
 
     def unfinished(carry):
         state, left = carry
@@ -224,6 +264,8 @@ def advance(
     def further(carry):
         state, left = carry
         share = due(state).astype(state.clock.dtype)
+        if scene.drive is not None:
+            share = share * length(state) * jnp.sqrt(state.temperature) / scheme.own_step
         return step(state, key, share, scene, scheme, tangents), left - 1
 
     state, _ = jax.lax.while_loop(unfinished, further, (state, max_steps))

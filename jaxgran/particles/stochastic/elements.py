@@ -1,51 +1,140 @@
-"""Walls in DSMC.
+"""Walls, a drive and drag in a step of DSMC.
 
 Spins are ``s = (sigma/2) w``, a velocity. Where there is drag, velocities, spins and time are
 transformed: see `jaxgran.particles.drag`.
 """
 
 from math import pi, sqrt
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
+from jaxgran.particles import kicks
+from jaxgran.particles.drag import Decay, decay, lasting
 from jaxgran.particles.spins import rub
-from jaxgran.scene.reduced_scene import ReducedRough, ReducedWalls
+from jaxgran.scene.reduced_scene import ReducedDrag, ReducedDrive, ReducedScene
+
+
+class Walled(NamedTuple):
+    """Particles after impacts on walls.
+
+    Attributes:
+        velocity, spin: of all.
+        lost: decrease of sum v^2.
+        turned: increase of q sum s^2.
+    """
+
+    velocity: Float[Array, "N d"]
+    spin: Float[Array, "N spins"]
+    lost: Float[Array, ""]
+    turned: Float[Array, ""]
 
 
 def hit_walls(
-    walls: ReducedWalls,
-    surface: ReducedRough | None,
-    key: PRNGKeyArray,
+    scene: ReducedScene,
+    bits: UInt32[Array, "N"],
+    axis: Int[Array, ""],
     velocity: Float[Array, "N d"],
     spin: Float[Array, "N spins"],
     ds: Float[Array, ""],
     slowed: Float[Array, ""] | float,
-) -> tuple[Float[Array, "N d"], Float[Array, "N spins"]]:
-    """Velocities and spins after a step in which particles meet walls, everywhere alike.
+) -> Walled:
+    """Particles after a step in which they meet walls, everywhere alike.
 
-    A sphere between two walls meets one of them ``|v| ds/(L - sigma)`` times in a step.
+    A sphere between two walls meets one of them ``|v| ds/(L - sigma)`` times in a step. The steps
+    take the axes in turns, and each does d times as much.
 
     Args:
-        walls, surface: in reduced units.
-        key: of random numbers.
+        scene: in reduced units.
+        bits: random ones.
+        axis: across which the walls are.
         velocity, spin: before.
         ds: length of the step.
         slowed: physical velocities over these.
     """
+    walls, surface = scene.walls, scene.surface
+    assert walls is not None
     n, d = velocity.shape
-    each = walls.frequency * sqrt(pi)  # over the speed
-    chance = jax.random.uniform(key, (n, d), velocity.dtype)
-    for k in range(d):
-        speed = jnp.abs(velocity[:, k])
-        hit = (chance[:, k] < each[k] * speed * ds) & (speed > 0)
-        eps = walls.law.restitution(jnp.where(hit, speed * slowed, 1.0))
-        axis = jnp.zeros((n, d), velocity.dtype).at[:, k].set(jnp.sign(velocity[:, k]))
-        push = jnp.where(hit, (1 + eps) * speed, 0.0)[:, None] * axis
-        if surface is not None and walls.beta is not None:
-            eta = surface.eta_on_wall(walls.beta)
-            found = rub(velocity, spin, axis, hit, eta, surface.inertia)
-            velocity, spin = velocity + found.kick, spin + found.twist
-        velocity = velocity - push
-    return velocity, spin
+    frequency = walls.frequency[axis]
+    each = frequency * (d * sqrt(pi)) * ds  # over the speed
+    across = (jnp.arange(d) == axis).astype(velocity.dtype)[None]
+    normal = jnp.sum(velocity * across, axis=1)
+    speed, outwards = jnp.abs(normal), jnp.sign(normal)[:, None] * across
+    hit = ((bits.astype(velocity.dtype) + 0.5) * 2.0**-32 < each * speed) & (speed > 0)
+    eps = walls.law.restitution(jnp.where(hit, speed * slowed, 1.0))
+    kick = -jnp.where(hit, (1 + eps) * speed, 0.0)[:, None] * outwards
+    twist = jnp.zeros_like(spin)
+    if surface is not None and walls.beta is not None:
+        eta = surface.eta_on_wall(walls.beta)
+        found = rub(velocity, spin, outwards, hit, eta, surface.inertia)
+        kick, twist = kick + found.kick, found.twist
+    # The number of impacts is not differentiable: they count for more where walls are nearer.
+    share = frequency / jax.lax.stop_gradient(frequency)
+    inertia = 0.0 if surface is None else surface.inertia
+    lost = -share * jnp.sum(kick * (2 * velocity + kick))
+    turned = share * inertia * jnp.sum(twist * (2 * spin + twist))
+    return Walled(velocity + kick, spin + twist, lost, turned)
+
+
+def left_by(drag: ReducedDrag | None, time: Float[Array, "..."]) -> Decay:
+    """What drag has left; all where there is none."""
+    if drag is None:
+        return Decay(*[jnp.ones_like(time)] * 3)
+    return decay(drag, time)
+
+
+def heating(
+    drive: ReducedDrive,
+    drag: ReducedDrag | None,
+    began: Float[Array, ""],
+    ds: Float[Array, ""],
+    place: float,
+) -> Float[Array, ""]:
+    """Growth of T/T_0 by half of the kicks of a step, made at its begin (place 0) or end (1)."""
+    if drag is None:
+        return drive.strength * jnp.maximum(ds, 0.0) / 2
+    return (
+        drive.strength
+        * lasting(drag, began, ds)
+        / 2
+        / decay(drag, began + place * ds).velocity ** 2
+    )
+
+
+def shortened(
+    scene: ReducedScene,
+    temperature: Float[Array, "*replicas"],
+    clock: Float[Array, "*replicas"],
+    ds: Float[Array, "*replicas"],
+) -> Float[Array, "*replicas"]:
+    """The length of a step, so short that the kicks of a drive are small beside the velocities."""
+    if scene.drive is None:
+        return ds
+    growth = scene.drive.strength / left_by(scene.drag, clock).velocity ** 3
+    safe = jnp.where(growth > 0, growth, 1.0)
+    return jnp.where(growth > 0, jnp.minimum(ds, kicks.LARGEST * temperature / safe), ds)
+
+
+def kicked(
+    particles: Float[Array, "N components"],
+    key: PRNGKeyArray,
+    growth: Float[Array, ""],
+    time: Float[Array, ""],
+    d: int,
+    at_rest: bool,
+) -> Float[Array, "N components"]:
+    """Particles after random kicks at a time, by which T/T_0 grows.
+
+    Args:
+        particles: v, x - v t and spins.
+        key: of the random numbers.
+        growth: of T/T_0.
+        time: t, as in x - v t.
+        d: dimension.
+        at_rest: whether the kicks leave the momentum as it is.
+    """
+    change = jnp.sqrt(growth / 2) * kicks.kicks(key, particles[:, :d], at_rest)
+    moved = [particles[:, :d] + change, particles[:, d : 2 * d] - time * change]
+    return jnp.concatenate([*moved, particles[:, 2 * d :]], axis=1)

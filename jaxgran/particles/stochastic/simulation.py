@@ -6,7 +6,6 @@ are in these units, and a key of random numbers is two 32-bit words.
 
 from collections.abc import Callable
 from functools import partial
-from math import sqrt
 from typing import Any
 
 import jax
@@ -16,14 +15,16 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, UInt32
 
 from jaxgran.checks import status
-from jaxgran.particles import drag, initial, observables, spins
+from jaxgran.particles import drag, observables
 from jaxgran.particles.stochastic import collisions
 from jaxgran.particles.stochastic.collisions import DSMCState
 from jaxgran.particles.stochastic.pairing import Scheme
+from jaxgran.particles.stochastic.start import at_start, has_elements
 from jaxgran.particles.stochastic.tangents import DSMCTangents
 from jaxgran.scene.elements import SPINS
-from jaxgran.scene.reduced_scene import ReducedScene
+from jaxgran.scene.reduced_scene import ReducedDrag, ReducedScene
 from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.tangents.exchange import ExchangeTangents
 from jaxgran.tangents.limits import first_order_only, unknown
 from jaxgran.theory import averages
 
@@ -32,39 +33,6 @@ MISSED = 1e-4
 
 CHUNK = 4_000_000
 """Candidate pairs of one call to compiled code by the host driver, which take about a second."""
-
-
-@partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
-def at_start(
-    key: UInt32[Array, "2"],
-    replicas: int,
-    scheme: Scheme,
-    num_parameters: int,
-    scene: ReducedScene | None = None,
-) -> DSMCState:
-    """Maxwellian velocities at t = 0, with tangents in so many parameters."""
-    d = scheme.dimension
-    key = jax.random.fold_in(collisions.wrapped(key), 2**32 - 1)
-    v = initial.velocities(key, replicas, scheme.num_particles, d).reshape(replicas, -1, d)
-    parts = [v / sqrt(2), jnp.zeros_like(v)]
-    if scene is not None and scene.surface is not None:
-        shape = (replicas, scheme.num_particles, SPINS[d])
-        key = jax.random.fold_in(key, 0)
-        mean_square = (scene.surface.ratio / (2 * scene.surface.inertia)).astype(v.dtype)
-        parts.append(spins.at_start(key, shape, mean_square))
-    each, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
-    return DSMCState(
-        time=jnp.zeros((), v.dtype),
-        clock=each,
-        clock_rest=each,
-        temperature=each + 1,
-        particles=jnp.concatenate(parts, axis=-1),
-        collisions=each,
-        missed=each,
-        steps=jnp.zeros(replicas, jnp.uint32),
-        mobility=each,
-        tangents=DSMCTangents(*[along] * len(DSMCTangents._fields)),
-    )
 
 
 @partial(jax.jit, static_argnames=("scheme", "tangents"))
@@ -122,6 +90,8 @@ def observe(
     values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
     if not tangents:
         return values
+    if isinstance(state.tangents, ExchangeTangents):
+        return {"values": values} | _exchanged(values, state, scene, scheme)
     walked = 2 * jnp.mean(jnp.sum(travelled * velocity, axis=-1), axis=-1)
     rates = _rates(values, scene.law, d) | {"displacement": walked}
     return {"values": values, "rates": rates, "along": _along(values, rates, state.tangents)}
@@ -143,6 +113,39 @@ def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array
         "sonine": 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment * speed,
         "velocity_correlation": -rates.relaxation * speed * values["velocity_correlation"],
         "collisions": averages.collision_rate(a2, d) * speed,
+    }
+
+
+def _exchanged(
+    values: dict[str, Array], state: DSMCState, scene: ReducedScene, scheme: Scheme
+) -> dict[str, dict[str, Array]]:
+    """ "rates" and "along" of a scene with elements, of T, T_rot and collisions.
+
+    Those in time are by the last direction, in which everything is sooner by the same share.
+    """
+    n, d, time = scheme.num_particles, scheme.dimension, state.time
+    assert isinstance(state.tangents, ExchangeTangents)
+    energies, collided = state.tangents
+
+    def logarithms(scene: ReducedScene, sooner: Array) -> Array:
+        if scene.drag is None:
+            return jnp.zeros(2)
+        rates = ReducedDrag(*(rate * (1 + sooner) for rate in scene.drag))
+        left = drag.decay(rates, time)
+        return jnp.log(jnp.stack([left.velocity, left.kept]))
+
+    log_left, pull = jax.vjp(logarithms, scene, jnp.zeros(()))
+    along_left = jax.vmap(lambda weights: ravel_pytree(pull(weights))[0])(jnp.eye(2))
+    along = {"collisions": 2 / n * collided}
+    for k, name in enumerate(("temperature", "rotational_temperature")):
+        if name in values:
+            size = n * (d, SPINS[d])[k] / 2
+            moved = jnp.exp(2 * log_left[k]) / size * energies[:, :, k]
+            along[name] = moved + 2 * along_left[k][None] * values[name][:, None]
+    after = jnp.where(time > 0, time, 1.0)
+    return {
+        "rates": {name: x[:, -1] / after for name, x in along.items()},
+        "along": {name: x[:, :-1] for name, x in along.items()},
     }
 
 
@@ -207,19 +210,18 @@ def differentiable_run(
     def solve_jvp(at, along):
         parameters, times, key = first_order_only(at)
         scene = unravel(parameters)
-        if any(element is not None for element in scene[1:]):
-            raise ValueError(
-                "derivatives of DSMC runs with rough spheres, walls or drag are not known: use "
-                "KineticTheory(), or differences of runs"
-            )
         out = run(scene, times, key, replicas=replicas, scheme=scheme, tangents=True)
         values = out["values"]
         tangents = {
             name: rate * along[1][:, None] + out["along"][name] @ along[0]
             for name, rate in out["rates"].items()
         }
-        in_time = out["rates"]["sonine"] * along[1][:, None]
-        tangents["sonine"] = in_time + unknown(in_time.shape, along[0])
+        if has_elements(scene):
+            for name in set(values) - set(tangents) - {"fault"}:
+                tangents[name] = unknown(values[name].shape, *along[:2])
+        else:
+            in_time = out["rates"]["sonine"] * along[1][:, None]
+            tangents["sonine"] = in_time + unknown(in_time.shape, along[0])
         return values, tangents | {"fault": np.zeros(values["fault"].shape, jax.dtypes.float0)}
 
     return solve(parameters, times, key)
