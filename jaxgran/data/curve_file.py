@@ -11,7 +11,7 @@ from jaxgran.data.curve import COLUMNS, MIN_POINTS, CoolingCurve
 from jaxgran.data.files import write_whole
 from jaxgran.data.header import header_count, header_number
 from jaxgran.data.quantities import STAND_INS, in_si, warn_of_units
-from jaxgran.data.scene_keys import read_elements, warn_of_unknown_keys
+from jaxgran.data.scene_keys import check_volume, read_elements, warn_of_unknown_keys
 from jaxgran.data.table import read_table
 from jaxgran.data.tracks import check_track_names, curve_of_tracks
 from jaxgran.scene.gas import Gas
@@ -119,7 +119,8 @@ def read_gas(header: dict[str, str]) -> Gas:
         are warned of.
 
     Raises:
-        ValueError: for a missing key, or a value that is no number or outside its range.
+        ValueError: for a missing key, a value that is no number or outside its range, and for what
+            `read_elements` refuses.
     """
     missing = [key for key in GAS_KEYS if key not in header]
     if missing:
@@ -138,6 +139,7 @@ def read_gas(header: dict[str, str]) -> Gas:
         dimension=header_count(header, "dimension") or 3,
         **read_elements(header),
     )
+    check_volume(header, gas)
     warn_of_units(gas)
     warn_of_unknown_keys(header, (*GAS_KEYS, "t0", *PRIOR_KEYS))
     return gas

@@ -4,12 +4,39 @@ import warnings
 from typing import Any
 
 from jaxgran.data.header import header_number
-from jaxgran.scene.elements import Rough, StokesDrag, Walls, WhiteNoise
+from jaxgran.scene.elements import (
+    SAME_VOLUME,
+    Rough,
+    StokesDrag,
+    Walls,
+    WhiteNoise,
+    share_of_container,
+)
+from jaxgran.scene.gas import Gas
 
 ROUGH_KEYS = ("beta_t", "reduced_inertia", "T_rot_0")
 WALL_KEYS = ("container_side", "wall_restitution", "wall_beta_t")
 DRAG_KEYS = ("gamma",)
 DRIVE_KEYS = ("drive_strength",)
+
+REFUSED_KEYS = {
+    "gravity": (
+        0.0,
+        "under gravity density and T change with height, and gases here are homogeneous",
+    ),
+    "polydispersity": (0.0, "grains of unequal masses have unequal temperatures, one T is too few"),
+    "diameter_2": (None, "grains of a mixture have a temperature for each kind, one T is too few"),
+    "density_2": (None, "grains of a mixture have a temperature for each kind, one T is too few"),
+    "aspect_ratio": (
+        1.0,
+        "rods and ellipsoids meet at a rate that depends on how they lie, and turn at impacts that "
+        "are smooth; here there are spheres",
+    ),
+    "cohesion": (0.0, "grains that stick lose all of their speed below some speed, and grow"),
+    "surface_energy": (0.0, "grains that stick lose all of their speed below some speed, and grow"),
+    "charge": (0.0, "charged grains are deflected without touching; here they fly freely"),
+}
+"""Keys of what no model here has: the value at which there is nothing of it, and the reason."""
 
 OTHER_KEYS = ("N", "A", "dimension", "replicas", "T_from", "length_unit", "time_unit") + (
     "localisation_error",
@@ -31,8 +58,10 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
             drives the gas drive_strength, m^2/s^3, of dT/dt = drive_strength.
 
     Raises:
-        ValueError: for a key that needs another one, or a value outside its range.
+        ValueError: for a key that needs another one, a value outside its range, and for what no
+            model here has: gravity, mixtures, rods, ellipsoids, cohesion and charges.
     """
+    _refuse(header)
     found = {key: header_number(header, key) for key in header if key in ELEMENT_KEYS}
     elements: dict[str, Any] = {}
     if _whole(found, ROUGH_KEYS, needed=("beta_t",)):
@@ -57,6 +86,30 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
 ELEMENT_KEYS = (*ROUGH_KEYS, *WALL_KEYS, *DRAG_KEYS, *DRIVE_KEYS)
 
 
+def _refuse(header: dict[str, str]) -> None:
+    for key, (nothing, reason) in REFUSED_KEYS.items():
+        if key in header and (nothing is None or header_number(header, key) != nothing):
+            advice = "" if nothing is None else f" (or {nothing:g}, where there is nothing of it)"
+            raise ValueError(
+                f"the header gives {key}: {reason}. No model of jaxgran takes it; fit a curve of "
+                f"equal spheres without it, and leave {key} out{advice}"
+            )
+
+
+def check_volume(header: dict[str, str], gas: Gas) -> None:
+    """Raise ValueError where N, eta, diameter and container_side of a header contradict."""
+    if gas.container is None or "N" not in header:
+        return
+    number = header_number(header, "N")
+    share = share_of_container(gas, number)
+    if abs(share - 1) > SAME_VOLUME:
+        raise ValueError(
+            f"N, eta and container_side contradict: {number:g} spheres in this container have eta "
+            f"= {float(gas.packing_fraction) * share:.4g}, the header gives "
+            f"{float(gas.packing_fraction):.4g}"
+        )
+
+
 def _whole(found: dict[str, float], keys: tuple[str, ...], needed: tuple[str, ...]) -> bool:
     given = [key for key in keys if key in found]
     missing = [key for key in needed if key not in found]
@@ -72,7 +125,7 @@ def warn_of_unknown_keys(header: dict[str, str], known: tuple[str, ...]) -> None
         header: of a curve.
         known: keys of the gas and of its priors.
     """
-    known = (*known, *ELEMENT_KEYS, *OTHER_KEYS, *PROVENANCE_KEYS)
+    known = (*known, *ELEMENT_KEYS, *OTHER_KEYS, *PROVENANCE_KEYS, *REFUSED_KEYS)
     unknown = [key for key in header if key.isidentifier() and key not in known]
     if unknown:
         warnings.warn(

@@ -14,6 +14,7 @@ from jaxgran.fitting.residuals import neighbour_correlation, runs_test
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
 from jaxgran.fitting.rivals import FURTHER, free_elements, ranges, rivals
 from jaxgran.models.base import Omission
+from jaxgran.models.checks import walls_in_words
 
 LARGEST_SCATTER = 0.3
 """Relative scatter of T about a model above which it does not explain a curve without errors."""
@@ -85,7 +86,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
 
     reasons = [
         _chance(result),
-        *_about_rivals(result, found),
+        *_about_rivals(result, found, num_particles),
         *_about_residuals(residuals, times, correlation, p_value),
         *_about_runs(runs),
         *(omission.words for omission in omissions),
@@ -178,9 +179,13 @@ def _about_runs(runs: tuple[int, float, float]) -> Iterator[str]:
         )
 
 
-def _about_rivals(result: Fit, found: tuple[Rival, ...]) -> Iterator[str]:
+def _about_rivals(
+    result: Fit, found: tuple[Rival, ...], num_particles: int | None
+) -> Iterator[str]:
     """The rivals that the curve asks for or allows, and what the first parameter would then be."""
     yield _assumptions(result)
+    if num_particles is not None and result.gas.container is None:
+        yield f"the box of {num_particles} spheres {walls_in_words(result.gas, num_particles)}"
     free = free_elements(result)
     if free:
         yield (

@@ -16,6 +16,7 @@ from jaxgran.checks.tracing import any_traced, is_known
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel, Omission
+from jaxgran.scene.elements import SAME_VOLUME, share_of_container
 from jaxgran.scene.gas import Gas
 from jaxgran.theory.averages import averages as exact_averages
 
@@ -121,17 +122,12 @@ def beyond_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
     return beyond
 
 
-SAME_VOLUME = 0.02
-"""Relative difference of volumes up to which a container is that of N spheres of a gas."""
-
-
 def check_volume(gas: Gas, num_particles: int) -> None:
     """Raise ValueError for a container too large or small for N spheres of a packing fraction."""
     walls = gas.container
     if walls is None or any_traced(walls.side, gas.packing_fraction, gas.diameter):
         return
-    phi, sides = float(gas.packing_fraction), np.broadcast_to(walls.side, (gas.dimension,))
-    share = float(gas.box_side(num_particles) ** gas.dimension / np.prod(sides))
+    phi, share = float(gas.packing_fraction), share_of_container(gas, num_particles)
     if abs(share - 1) > SAME_VOLUME:
         raise ValueError(
             f"{num_particles} spheres of packing_fraction {phi:.4g} need a container {share:.4g} "
@@ -195,6 +191,22 @@ def omitted_by_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Omissio
                 f"L_c = {critical / diameter:.3g}: the gas does not stay homogeneous"
             )
     return tuple(Omission(words, False, POSITIONS_NEEDED) for words in found)
+
+
+def walls_in_words(gas: Gas, num_particles: int) -> str:
+    """How long the box of N spheres is beside the mean free path, and what walls would be there.
+
+    A sphere of mean speed <v> meets walls ``2 d/L <|v_x|>/2`` times a second, with
+    ``<|v_x|>/<v> = 1/2`` (2/pi in a plane).
+    """
+    long = float(gas.box_side(num_particles) / gas.mean_free_path)
+    if gas.container is not None:
+        return f"has walls, {long:.2g} mean free paths apart"
+    often = gas.dimension / long * {2: 2 / np.pi, 3: 0.5}[gas.dimension]
+    return (
+        f"is {long:.2g} mean free paths long: if it has walls, spheres meet them {often:.2g} times "
+        "as often as others, and container=Walls(...) must be told"
+    )
 
 
 def replaced_where_traced(

@@ -50,6 +50,12 @@ class DSMC(AbstractModel):
     step draws disjoint random pairs, and then pairs that share a particle with those, as often as
     drawing one pair after the other would. Means over N particles have errors of O(1/N).
 
+    Takes all elements of a scene but friction: rough spheres; walls, which a homogeneous gas meets
+    everywhere alike; drag, exactly, by collisions in transformed time (`jaxgran.particles.drag`),
+    up to gamma t = 18 (8 in float32); a drive, half of whose kicks begin each step and half end it;
+    and a driven start, which is driven for 10 mean free times with what its collisions take.
+    Derivatives are then of T, T_rot and collisions (`jaxgran.tangents.exchange`), others are nan.
+
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
     The derivatives are estimates. They are taken at a fixed own time (dt = dtau / sqrt(T), so that
     the order of collisions does not depend on the speeds). The gas is assumed to remember its

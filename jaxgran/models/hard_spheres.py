@@ -65,6 +65,12 @@ class HardSpheres(AbstractSpheres):
     The gas starts from random positions and Maxwellian velocities of exactly T_0 and no momentum,
     after an elastic melt of 10 mean free times.
 
+    Takes all elements of a scene but friction: rough spheres; containers, cubes or boxes of given
+    sides, whose walls are met exactly, in place of the periodic box; drag, exactly, as impacts in
+    transformed time (`jaxgran.particles.drag`), up to gamma t = 18 (8 in float32); a drive, whose
+    kicks come at both ends of each window of some .05 mean free times; and a driven start, which is
+    driven for 10 mean free times with what its impacts take.
+
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer.
         replicas: independent boxes simulated side by side; two or more give error bars.
@@ -89,6 +95,11 @@ class HardSpheres(AbstractSpheres):
     known, and are nan. Second derivatives are refused. A run is followed in the frame in which each
     replica is at rest. With a given start T_0 is a unit only, and its derivative 0; the start takes
     part in a change of the diameter.
+
+    With elements derivatives of T, T_rot and collisions are known, in every float of the gas, and
+    those of all else are nan. The gas is then taken to remember its two energies
+    (`jaxgran.tangents.exchange`), and not where its spheres are: a derivative in what walls take
+    is 10 % larger than theory's for mixed gases.
 
     Raises:
         ValueError: for numbers out of range.

@@ -18,7 +18,7 @@ from jaxgran.checks.words import Rows, as_html, as_text
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.checks import check_softness, checked_gas
+from jaxgran.models.checks import check_softness, checked_gas, walls_in_words
 from jaxgran.models.course import Course
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.hard_spheres import HardSpheres
@@ -183,7 +183,7 @@ def course_of(gas: Gas, end: float, num_particles: int | None = None) -> Course:
     known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
     curve = KineticTheory().simulate(known, jnp.expm1(grid) * gas.mean_free_time, Run())
     course = course_along(gas, curve, num_particles)
-    check_softness(gas, 1 - course.softness[0])
+    check_softness(gas, 1 - np.max(course.softness))
     fault = int(jnp.asarray(curve.status))
     if fault != status.OK:
         raise RuntimeError(f"kinetic theory, which estimates the errors: {status.explain(fault)}")
@@ -256,7 +256,8 @@ def _box_in_words(course: Course) -> str:
     ratio = float(gas.box_side(course.num_particles) / gas.critical_box)
     return (
         f"{text} in a box of {ratio:.2g} L_c, where the flow comes to hold "
-        f"{_percent(course.flow_share.max())} of the energy, homogeneous models err by {error}."
+        f"{_percent(course.flow_share.max())} of the energy, homogeneous models err by {error}. "
+        f"The box {walls_in_words(gas, course.num_particles)}."
     )
 
 

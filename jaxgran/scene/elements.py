@@ -21,6 +21,9 @@ TANGENTIAL = Domain(-1.0, 1.0, low_allowed=True, high_allowed=True)
 SPINS = {2: 1, 3: 3}
 """d_rot: components of the angular velocity by dimension."""
 
+SAME_VOLUME = 0.02
+"""Relative difference of volumes up to which a container is that of N spheres of a gas."""
+
 if TYPE_CHECKING:
     UserWallLaw = RestitutionLaw | float
 else:
@@ -203,6 +206,12 @@ class DrivenStart(eqx.Module):
 
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution.
     """
+
+
+def share_of_container(gas: Any, num_particles: float) -> float:
+    """Volume that N spheres of a gas have, over that of its container; 1 if they agree."""
+    sides = np.broadcast_to(gas.container.side, (gas.dimension,))
+    return float(num_particles / gas.number_density) / float(np.prod(sides))
 
 
 def check(gas: Any) -> None:

@@ -126,7 +126,7 @@ def fastest_cooling(scene: ReducedScene, dimension: int) -> Bounds:
     """Upper bounds of the cooling by elements, and what heats the gas.
 
     The cooling is reached where the spheres do not rotate and walls stop them. The heat of rotation
-    counts where there is a drive.
+    is at most all that the spins have at first.
     """
     by_speed, constant = 0.0, 0.0
     one = jnp.ones(())
@@ -139,9 +139,10 @@ def fastest_cooling(scene: ReducedScene, dimension: int) -> Bounds:
         by_speed = by_speed + walls.cooling
     if scene.drag is not None:
         constant = 2 * scene.drag.rate
-    if scene.drive is None:
+    if scene.drive is None and scene.surface is None:
         return Bounds(by_speed, constant)
+    heating = jnp.zeros_like(one) if scene.drive is None else scene.drive.strength
     rotation = None
     if scene.surface is not None:
         rotation = SPINS[dimension] / dimension * scene.surface.ratio
-    return Bounds(by_speed, constant, scene.drive.strength, rotation)
+    return Bounds(by_speed, constant, heating, rotation)

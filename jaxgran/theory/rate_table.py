@@ -41,8 +41,8 @@ class Bounds(NamedTuple):
     Attributes:
         by_speed: an upper bound of a part of ``-d ln T/dt`` over sqrt(T/T_0).
         constant: of a part that does not depend on T.
-        heating: d(T/T_0)/dt by a drive; None where there is none.
-        rotation: T/T_0 that a driven gas could gain from the spins; None of smooth spheres.
+        heating: d(T/T_0)/dt by a drive; None where nothing heats.
+        rotation: T/T_0 that a gas could gain from the spins; None of smooth spheres.
     """
 
     by_speed: ArrayLike = 0.0
@@ -65,7 +65,7 @@ class RateTable(eqx.Module):
         coefficients: of the Chebyshev polynomials, shape (nodes, 3, 3), or (nodes, ..., 3, 3) for
             several such functions over the same range.
         lowest: lower end of the series in ln(T/T_0). The series must not be evaluated outside.
-        highest: the upper end of a driven gas; None is 0.
+        highest: the upper end of a gas that is heated; None is 0.
     """
 
     coefficients: Float[Array, "nodes ... 3 3"]

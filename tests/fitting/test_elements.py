@@ -50,7 +50,11 @@ def within(result, gas, name):
 
 @pytest.mark.parametrize(
     "model",
-    [THEORY, pytest.param(jaxgran.DSMC(10_000, replicas=4), marks=pytest.mark.slow)],
+    [
+        THEORY,
+        pytest.param(jaxgran.DSMC(10_000, replicas=4), marks=pytest.mark.slow),
+        pytest.param(jaxgran.HardSpheres(500, replicas=16), marks=pytest.mark.slow),
+    ],
 )
 def test_roughness_and_A_are_found_together(model):
     gas = dataclasses.replace(glass_beads(), surface=ROUGH)

@@ -4,8 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import jaxgran
+from jaxgran.scene.reduced_scene import reduced_scene
+from jaxgran.theory.averages import averages
+from jaxgran.theory.moments import Moments, velocity
 
 TAUS = np.geomspace(1.0, 300.0, 8)
 
@@ -234,3 +238,75 @@ def test_elements_are_read_from_a_header():
             jaxgran.read_gas(header | wrong)
     with pytest.warns(UserWarning, match="'friction' is not known.*known are eta"):
         jaxgran.read_gas(header | {"friction": "0.5", "A comment of some words": "x"})
+
+
+HEADER = {
+    "N": "200",
+    "eta": "0.0067",
+    "diameter": "0.002",
+    "density": "2500",
+    "Y": "5e7",
+    "nu": "0.22",
+    "T0": "0.01",
+}
+
+
+@pytest.mark.parametrize(
+    "key, value, reason",
+    [
+        ("gravity", "9.81", "density and T change with height"),
+        ("diameter_2", "0.004", "a temperature for each kind"),
+        ("polydispersity", "0.1", "unequal temperatures"),
+        ("aspect_ratio", "3", "rods and ellipsoids"),
+        ("cohesion", "1e-6", "stick"),
+        ("charge", "1e-12", "deflected without touching"),
+    ],
+)
+def test_a_header_of_what_no_model_takes_is_refused_with_the_reason(key, value, reason):
+    with pytest.raises(ValueError, match=f"{key}: .*{reason}"):
+        jaxgran.read_gas(HEADER | {key: value})
+
+
+def test_a_header_may_say_that_there_is_nothing_of_it():
+    gas = jaxgran.read_gas(HEADER | {"gravity": "0", "aspect_ratio": "1"})
+    assert gas.elements == ()
+
+
+def test_a_container_that_contradicts_N_and_eta_is_refused():
+    walls = {"wall_restitution": "0.9"}
+    with pytest.raises(ValueError, match="N, eta and container_side contradict.*eta = 0.0133"):
+        jaxgran.read_gas(HEADER | walls | {"container_side": "0.0397"})
+    fits = jaxgran.read_gas(HEADER | walls | {"container_side": "0.05"})
+    assert fits.container is not None
+
+
+def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
+    # T rises to 2 T_0 by the spins, far beyond a table that ends at T_0: beside the same equations
+    # without a table, integrated by another library.
+    gas = scene(beads(0.02), surface=jaxgran.Rough(0.5, rotational_temperature=0.1))
+    times = np.array([0.3, 1.0, 3.0]) * float(gas.mean_free_time)
+    curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False))
+    assert float(curve.temperature[2]) > 2 * float(gas.temperature)
+    reduced = reduced_scene(gas)
+
+    @jax.jit
+    def rate(state):
+        rates = averages(reduced.law, jnp.exp(state[0] / 2), 3)
+        return velocity(state, rates, reduced, 3, softness=False, maxwellian=False)
+
+    def rates(t, state):
+        return np.asarray(rate(jnp.asarray(state)))
+
+    ends = times * float(gas.impact_speed / gas.path_length)
+    first = np.asarray(Moments.at_start(reduced, jnp.zeros(())))
+    found = solve_ivp(rates, (0, ends[-1]), first, t_eval=ends, rtol=1e-10, atol=1e-12)
+    T = float(gas.temperature) * np.exp(found.y[0])
+    np.testing.assert_allclose(curve.temperature, T, rtol=1e-7)  # the table's 1e-9, the solvers'
+    np.testing.assert_allclose(curve.rotational_temperature, T * found.y[5], rtol=1e-7)
+
+
+def test_the_choice_of_a_model_says_how_near_walls_would_be(beads):
+    gas = beads(packing_fraction=0.01)
+    choice = jaxgran.choose_model(gas, [10 * float(gas.mean_free_time)], num_particles=200)
+    long = float(gas.box_side(200) / gas.mean_free_path)
+    assert any(f"is {long:.2g} mean free paths long: if it has walls" in r for r in choice.reasons)
