@@ -1,5 +1,8 @@
 """jaxgran: differentiable granular gases in JAX."""
 
+from importlib import import_module
+from typing import Any
+
 from jaxgran.checks.status import explain as explain_status
 from jaxgran.checks.validation import Domain
 from jaxgran.data.curve import CoolingCurve, Particles
@@ -86,5 +89,15 @@ __all__ = [
 ]
 
 
+_PICTURES = ("plot_curve", "plot_fit")
+"""Names of `jaxgran.plotting`, whose matplotlib is imported when the first of them is used."""
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PICTURES:
+        return getattr(import_module("jaxgran.plotting"), name)
+    raise AttributeError(f"module 'jaxgran' has no attribute {name!r}")
+
+
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, *_PICTURES]

@@ -1,10 +1,12 @@
-"""Pictures of fits; needs matplotlib (the `experiments` extra).
+"""Pictures of curves and fits; needs matplotlib (the extras `notebook` and `experiments`).
 
-May import `data` and `fitting`; is imported by experiments only.
+May import `data` and `fitting`. `jaxgran.plot_curve` and `jaxgran.plot_fit` are these, imported
+when they are first used.
 """
 
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +15,11 @@ from jaxgran.data.files import write_whole
 from jaxgran.fitting.result import Fit
 
 try:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 except ModuleNotFoundError as error:  # pragma: no cover
     raise ModuleNotFoundError(
-        'jaxgran.plotting needs matplotlib: pip install "jaxgran[experiments]"'
+        'jaxgran.plotting needs matplotlib: pip install "jaxgran[notebook]"'
     ) from error
 
 MOST_DRAWN = 1000
@@ -54,8 +57,81 @@ def colour_of(model: str) -> str:
     return COLOURS.get(model, "#5f5f5f")
 
 
-def plot_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> None:
-    """Draw the data with error bars, the fitted curve, power laws as guides, and the residuals.
+TEMPERATURE = r"temperature $T=\langle v^2\rangle/d$ (m$^2$/s$^2$)"
+
+
+def plot_curve(curve: CoolingCurve, axes: Axes | None = None, **style: Any) -> Axes:
+    """Draw T against t on logarithmic axes, with error bars where T has errors.
+
+    Args:
+        curve: measured or computed, one.
+        axes: of matplotlib, to draw in; by default the current ones of pyplot.
+        style: of matplotlib's lines, such as label="hard spheres", color="C1", fmt="o".
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: for several curves in one, as `jax.vmap` returns them.
+    """
+    if np.ndim(curve.times) != 1:
+        raise ValueError(
+            f"the times of this curve have shape {np.shape(curve.times)}: draw one at a time, as "
+            "jax.tree.map(lambda x: x[0], curves)"
+        )
+    axes = _current() if axes is None else axes
+    shown = _shown(curve.times)
+    t, T = (np.asarray(x)[shown] for x in (curve.times, curve.temperature))
+    error = None if curve.temperature_error is None else np.asarray(curve.temperature_error)[shown]
+    axes.errorbar(t, T, error, **({"lw": 1.8, "elinewidth": 1.0} | style))
+    axes.set(xscale="log", yscale="log", xlabel="time t (s)", ylabel=TEMPERATURE)
+    return axes
+
+
+def _current() -> Axes:
+    """The current axes of pyplot, which shows them in a notebook."""
+    from matplotlib import pyplot
+
+    return pyplot.gca()
+
+
+def plot_fit(result: Fit, curve: CoolingCurve, axes: Any = None) -> np.ndarray:
+    """Draw the measured T with error bars, the fitted one, power laws as guides, and the residuals.
+
+    Args:
+        result: of `jaxgran.fit`.
+        curve: the measured curve.
+        axes: two of matplotlib, for T and for the residuals; by default those of a new figure.
+
+    Returns:
+        Both axes, shape (2,).
+    """
+    if axes is None:
+        from matplotlib import pyplot
+
+        shapes = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1]}}
+        _, axes = pyplot.subplots(2, 1, figsize=(6.4, 6.4), layout="constrained", **shapes)
+    axes = np.asarray(axes)
+    if axes.shape != (2,):
+        raise ValueError(
+            f"axes must be two, for T and for the residuals, got shape {axes.shape}: make them by "
+            "matplotlib.pyplot.subplots(2, sharex=True)"
+        )
+    top, bottom = axes
+    fitted = result.model.name
+    measured, error = curve.temperature, curve.temperature_error
+    _draw(top, curve.times, measured, error, result.curve.temperature, fitted)
+    _draw_residuals(bottom, curve.times, result.residuals, fitted)
+    top.set_ylabel(TEMPERATURE)
+    T = np.asarray(curve.temperature)
+    top.set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
+    _draw_power_laws(top, result.curve)
+    top.legend(frameon=False, loc="lower left")
+    return axes
+
+
+def save_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> None:
+    """Write the picture of a fit: that of `plot_fit`, and T_rot and <dr^2> where they were fitted.
 
     Args:
         result: of `jaxgran.fit`.
@@ -90,26 +166,45 @@ def plot_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
         squeeze=False,
         gridspec_kw={"height_ratios": [3, 1]},
     )
-    wrapped = [textwrap.fill(line, 84) for line in title.splitlines()]
-    figure.suptitle("\n".join(wrapped), color=INK, fontsize=11)
+    plot_fit(result, curve, axes[:, 0])
     fitted = result.model.name
-    top, bottom = axes[:, 0]
-    measured, error = curve.temperature, curve.temperature_error
-    _draw(top, curve.times, measured, error, result.curve.temperature, fitted)
-    _draw_residuals(bottom, curve.times, result.residuals, fitted)
-    top.set_ylabel(r"temperature $T=\langle v^2\rangle/d$ (m$^2$/s$^2$)")
-    T = np.asarray(curve.temperature)
-    top.set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
-    _draw_power_laws(top, result.curve)
-    top.legend(frameon=False, loc="lower left")
     for (top, bottom), panel in zip(axes[:, 1:].T, further, strict=True):
         measured, error, computed, residuals, label, corner = panel
         _draw(top, curve.times, measured, error, computed, fitted)
         _draw_residuals(bottom, curve.times, residuals, fitted)
         top.set_ylabel(label)
         top.legend(frameon=False, loc=corner)
-    for axis in axes.flat:
-        axis.spines[["top", "right"]].set_visible(False)
+    _save(figure, title, path)
+
+
+def save_curves(curves: dict[str, tuple[CoolingCurve, CoolingCurve | None]], title: str, path):
+    """Write a picture of one curve or several: measured points, where there are, and computed ones.
+
+    Args:
+        curves: by label; a computed curve, or a measured one, and None or the one computed for it.
+        title: above the picture.
+        path: of the file; its suffix is the format, PNG without one.
+    """
+    figure = Figure(figsize=(8.0, 5.4), layout="constrained")
+    axes = figure.subplots()
+    shades = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#222222"]
+    markers = "osD^v<>"
+    for i, (label, (curve, computed)) in enumerate(curves.items()):
+        look = {"color": shades[i % len(shades)], "label": label}
+        if computed is None:
+            plot_curve(curve, axes, **look)
+            continue
+        plot_curve(curve, axes, fmt=markers[i % len(markers)], ms=3.5, lw=0, **look)
+        plot_curve(computed, axes, color=look["color"])
+    axes.legend(frameon=False, loc="lower left")
+    _save(figure, title, path)
+
+
+def _save(figure: Figure, title: str, path: str | Path) -> None:
+    wrapped = [textwrap.fill(line, 84) for line in title.splitlines()]
+    figure.suptitle("\n".join(wrapped), color=INK, fontsize=11)
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
     picture_format = Path(path).suffix.lstrip(".") or "png"
     write_whole(path, lambda f: figure.savefig(f, dpi=150, format=picture_format))
 

@@ -1,3 +1,5 @@
+import os
+
 import jax
 import pytest
 from jaxtyping import install_import_hook
@@ -7,6 +9,8 @@ from jaxtyping import install_import_hook
 with install_import_hook("jaxgran", "beartype.beartype"):
     import jaxgran
 
+os.environ["JAXGRAN_NO_CACHE"] = "1"  # of the user; a test has its own
+os.environ["MPLBACKEND"] = "agg"  # no window
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 

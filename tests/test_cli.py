@@ -1,6 +1,9 @@
 """The command line, in this process."""
 
 import json
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +11,13 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.cli import programs
 from jaxgran.cli.app import FREE, main
+from jaxgran.cli.models import MODELS, named
+from jaxgran.models.selection import default_models
+
+PNG = b"\x89PNG\r\n\x1a\n"
+"""The first bytes of a picture."""
 
 SCENE = "eta = 0.05\ndiameter = 2e-3\ndensity = 2500\nY = 5e7\nnu = 0.22\nT0 = 0.01\nA = 3e-6\n"
 
@@ -30,7 +39,8 @@ def test_cool_writes_the_curve_of_the_package(scene, capsys):
     gas = jaxgran.read_gas(header).replace(dissipative_constant=3e-6)
     expected = jaxgran.cool(gas, curve.times)
     assert jax.numpy.allclose(curve.temperature, expected.temperature, rtol=1e-12)  # 17 digits
-    assert "written  cooling.csv" in capsys.readouterr().out
+    assert "written  cooling.csv\n         cooling.png" in capsys.readouterr().out
+    assert (scene / "cooling.png").read_bytes()[:8] == PNG
     assert main(["cool", "scene.toml", "--until", "10"]) == 2
     assert "exists; name another --out" in capsys.readouterr().err
 
@@ -55,6 +65,7 @@ def test_choose_says_why(scene, capsys):
         (["cool", "scene.toml", "--until", "-1"], "--until must lie above"),
         (["cool", "scene.toml", "--until", "1", "--out", "nowhere/a.csv"], "cannot write"),
         (["cool", "scene.toml", "--until", "1", "--out", "folder", "--overwrite"], "cannot write"),
+        (["cool", "scene.toml", "--until", "1", "--out", "a.png"], "is the name of the picture"),
         (["cool", "units.toml", "--until", "1"], "a TOML scene is in SI"),
         (["cool", "bad.toml", "--until", "1"], "not TOML"),
         (["choose", "no_A.toml", "--until", "1"], "does not give A"),
@@ -105,6 +116,7 @@ def test_several_measurements_are_fitted_jointly(measured, capsys):
         pytest.approx(1.0)
     )
     assert set(record["separate"]["thin"]) == {"temperature"}
+    assert (measured / "a" / "thin-kinetic-theory.png").read_bytes()[:8] == PNG
 
 
 def test_a_contradicting_drop_test_is_named(measured, capsys):
@@ -140,7 +152,77 @@ def test_help_is_there(capsys, command):
     assert "Usage: jaxgran" in capsys.readouterr().out
 
 
+def test_every_model_has_its_name():
+    assert (*named(default_models(2)), "auto") == MODELS
+
+
 def test_every_parameter_of_a_fit_has_its_name():
     from jaxgran.cli.fit import PARAMETERS
 
     assert set(PARAMETERS) == set(FREE.__args__)
+
+
+def test_a_folder_without_permission_is_named(measured, capsys, monkeypatch):
+    monkeypatch.setattr("os.access", lambda *args: False)  # the tests may run as root
+    for command in (["fit", "thin.csv"], ["cool", "scene.toml", "--until", "1"]):
+        assert main(command) == 2
+        said, told = capsys.readouterr()
+        assert len(told.splitlines()) == 1 and "writ" in told and not said
+
+
+@pytest.mark.parametrize("variable, value", [("NO_COLOR", "1"), ("TERM", "dumb")])
+def test_a_terminal_without_colours_gets_none(capsys, monkeypatch, variable, value):
+    monkeypatch.setenv(variable, value)
+    assert main(["fit", "--help"]) == 0 and main(["melt"]) == 2
+    said, told = capsys.readouterr()
+    assert "\x1b" not in said + told
+
+
+@pytest.fixture
+def settings_of_jax(monkeypatch):
+    """What JAX keeps, as before after the test."""
+    monkeypatch.delenv(programs.SWITCH, raising=False)
+    monkeypatch.setenv("XLA_FLAGS", "")
+    names = (
+        "jax_compilation_cache_dir",
+        "jax_persistent_cache_min_compile_time_secs",
+        "jax_persistent_cache_min_entry_size_bytes",
+    )
+    before = {name: getattr(jax.config, name) for name in names}
+    jax.config.update("jax_compilation_cache_dir", None)
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def test_compiled_programs_are_kept_where_they_can_be(tmp_path, monkeypatch, settings_of_jax):
+    (tmp_path / "file").write_text("")
+    assert not programs.keep_programs(tmp_path / "file" / "programs")
+    assert jax.config.jax_compilation_cache_dir is None
+    monkeypatch.setenv(programs.SWITCH, "1")
+    assert not programs.keep_programs(tmp_path / "programs")
+    monkeypatch.setenv(programs.SWITCH, "0")
+    assert programs.keep_programs(tmp_path / "programs")
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "programs")
+    assert not programs.keep_programs(tmp_path / "others")  # one is set already
+
+
+@pytest.mark.slow
+def test_the_second_time_a_command_compiles_nothing(scene):
+    """In processes of their own, without a display; 10 s."""
+    environment = {"XDG_CACHE_HOME": str(scene), "PATH": os.environ["PATH"], "HOME": str(scene)}
+    environment |= {"PYTHONPATH": os.pathsep.join(sys.path)}
+    kept = scene / "jaxgran" / "programs"
+
+    def run(*more):
+        line = "import sys; from jaxgran.cli.app import main; sys.exit(main(sys.argv[1:]))"
+        command = [sys.executable, "-c", line, "cool", "scene.toml", "--until", "1", "--overwrite"]
+        done = subprocess.run(
+            [*command, *more], env=environment, cwd=scene, capture_output=True, text=True
+        )
+        assert done.returncode == 0 and not done.stderr
+        return {path.name for path in kept.glob("*-cache")}
+
+    assert not run("--no-cache")
+    first = run()
+    assert first and run() == first

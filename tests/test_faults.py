@@ -190,7 +190,9 @@ def test_a_picture_of_a_long_curve_draws_some_of_it(tmp_path):
     result = jaxgran.fit(GAS, curve)
     shown = plotting._shown(curve.times)
     assert 500 < shown.size <= plotting.MOST_DRAWN and {0, times.size - 1} <= set(shown)
-    plotting.plot_fit(result, curve, "long", tmp_path / "long.png")
+    with pytest.raises(ValueError, match=r"axes must be two.*shape \(3,\)"):
+        jaxgran.plot_fit(result, curve, np.zeros(3))
+    plotting.save_fit(result, curve, "long", tmp_path / "long.png")
     assert (tmp_path / "long.png").stat().st_size < 500_000
 
 
@@ -366,7 +368,8 @@ def two_spheres(gas, distance, speed):
     return jaxgran.Particles(position[None], velocity[None], side)
 
 
-@pytest.mark.parametrize("overlap", [pytest.param(1e-3, marks=pytest.mark.slow), 0.05])
+@pytest.mark.parametrize("overlap", [1e-3, 0.05])
+@pytest.mark.slow
 def test_soft_spheres_start_overlapped_and_at_rest(overlap):
     gas = GAS.replace(dissipative_constant=0.0, packing_fraction=0.02)
     start = two_spheres(gas, 1 - overlap, 0.0)

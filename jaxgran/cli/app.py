@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 import jax
 from cyclopts import App, CycloptsError, Parameter
 
-from jaxgran.cli.models import MODELS
+from jaxgran.cli.models import Model
+from jaxgran.cli.programs import keep_programs
 
 Several = Parameter(consume_multiple=True)
-Model = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres", "auto"]
 FREE = Literal[
     "A",
     "T0",
@@ -54,6 +54,8 @@ Args:
     out: folder to write to; by default a new one under results.
     overwrite: replace files in that folder.
     explain: print the error budget as a table, and say what each part is.
+    no_cache: compile everything anew; else compiled programs are kept in the user's cache
+        folder for the next time. So does the environment variable JAXGRAN_NO_CACHE=1.
 """
 """What `jaxgran fit --help` says."""
 
@@ -114,7 +116,10 @@ def _app(started: float, default_curve: Path | None) -> App:
         out: Path | None = None,
         overwrite: bool = False,
         explain: bool = False,
+        no_cache: bool = False,
     ) -> None:
+        if not no_cache:
+            keep_programs()
         from jaxgran.cli.fit import FitOptions, run_fit
         from jaxgran.cli.joint import run_joint
 
@@ -137,6 +142,3 @@ def _app(started: float, default_curve: Path | None) -> App:
     app.command(cool)
     app.command(choose)
     return app
-
-
-assert set(MODELS) == set(Model.__args__)

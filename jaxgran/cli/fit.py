@@ -25,7 +25,7 @@ from jaxgran.cli.report import (
 from jaxgran.data.files import write_whole
 from jaxgran.data.header import header_count, header_number
 from jaxgran.fitting.fit import free_by_default
-from jaxgran.plotting import plot_fit
+from jaxgran.plotting import save_fit
 
 PARAMETERS = {
     "A": ("dissipative_constant", "s"),
@@ -98,7 +98,7 @@ def run_fit(options: FitOptions, started: float) -> None:
     print_rivals(rows[0]["parameter"], diagnosis)
     print_verdict(diagnosis)
     picture.parent.mkdir(parents=True, exist_ok=True)
-    plot_fit(result, curve, title_of(options, rows, diagnosis), picture)
+    save_fit(result, curve, title_of(options, rows, diagnosis), picture)
     summary = {
         **{row["parameter"]: row["estimate"] for row in rows},
         **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},

@@ -1,5 +1,6 @@
 """The joint fit of several measured curves and drop tests of one material, from files."""
 
+import dataclasses
 import json
 import time
 from pathlib import Path
@@ -14,6 +15,7 @@ from jaxgran.data.drop_test import DropTest
 from jaxgran.data.files import write_whole
 from jaxgran.fitting.joint import JointFit
 from jaxgran.models.selection import default_models
+from jaxgran.plotting import save_curves
 
 OF_ONE_SCENE = {"temperature", "packing_fraction", "diameter", "rotational_temperature"} | {
     "wall_side",
@@ -33,7 +35,7 @@ def run_joint(
             f"--model {options.model}: several measurements are fitted with {MODELS[0]}; fit the "
             "curves one by one with other models"
         )
-    _, record = outputs(options)
+    picture, record = outputs(options)
     free = options.free or ["A", "T0"]
     names = [PARAMETERS[key][0] for key in free]
     shared = tuple(name for name in names if name not in OF_ONE_SCENE)
@@ -75,8 +77,28 @@ def run_joint(
     text = json.dumps(finite_or_null(summary | details), indent=2, allow_nan=False) + "\n"
     record.parent.mkdir(parents=True, exist_ok=True)
     write_whole(record, lambda f: f.write(text.encode()))
-    print(f"\nwritten  {record}\n")
+    says = "do not contradict" if found.agree else "contradict"
+    title = f"{', '.join(measurements)}: the measurements {says} each other"
+    save_curves(_fitted(found, measurements, model), title, picture)
+    print(f"\nwritten  {picture}\n         {record}\n")
     print(json.dumps(summary, allow_nan=False))
+
+
+def _fitted(found: JointFit, measurements: dict, model) -> dict:
+    """The measured curves by label, each with the one computed for it."""
+    curves = {}
+    for label, (gas, measured) in measurements.items():
+        if isinstance(measured, DropTest):
+            continue
+        own = {name: value for name, (value, _) in found.separate.get(label, {}).items()}
+        values = found.estimate | own
+        start = float(values.pop("t0", 0.0))
+        fitted = gas.replace(**{name: x for name, x in values.items() if name in gas.domains})
+        later = np.asarray(measured.times)
+        later = later[later >= start]
+        computed = jaxgran.cool(fitted, later - start, model=model)
+        curves[label] = measured, dataclasses.replace(computed, times=later)
+    return curves
 
 
 def _label(path: Path, taken: dict) -> str:

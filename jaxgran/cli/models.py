@@ -1,7 +1,7 @@
 """Models by the names that they have as arguments."""
 
 import warnings
-from typing import Any
+from typing import Any, Literal, get_args
 
 import jaxgran
 from jaxgran.models.base import AbstractModel
@@ -13,7 +13,11 @@ def named(models) -> dict[str, AbstractModel]:
     return {model.name.lower().replace(" ", "-"): model for model in models}
 
 
-MODELS = (*named(default_models(2)), "auto")
+Model = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres", "auto"]
+"""Arguments of --model. Written down, for making the models would start XLA, whose settings a
+command has still to choose (`jaxgran.cli.programs`)."""
+
+MODELS: tuple[str, ...] = get_args(Model)
 
 
 def model_of(options: Any, gas, curve, free, num_particles: int | None):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 import jaxgran
 from jaxgran.cli.models import named
+from jaxgran.cli.programs import keep_programs
 from jaxgran.data.files import check_writable, read_text
 from jaxgran.data.header import header_count, header_number
 from jaxgran.models.selection import NUM_PARTICLES, default_models
@@ -30,8 +31,9 @@ def cool(
     key: int = 0,
     out: Path = Path("cooling.csv"),
     overwrite: bool = False,
+    no_cache: bool = False,
 ) -> None:
-    """Compute the cooling curve of a scene and write it as CSV.
+    """Compute the cooling curve of a scene; write it as CSV, and its picture beside it.
 
     Args:
         scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI), or a curve's CSV file
@@ -41,23 +43,41 @@ def cool(
         particles: of a particle model, in each replica; by default the scene's N.
         replicas: of a particle model.
         key: of a particle model's random start.
-        out: file to write.
-        overwrite: replace that file.
+        out: CSV file to write; the picture has the same name, with .png.
+        overwrite: replace these files.
+        no_cache: compile everything anew, see `jaxgran fit --help`.
     """
+    from jaxgran.plotting import save_curves  # needs matplotlib
+
+    if not no_cache:
+        keep_programs()
+    picture = out.with_suffix(".png")
+    if picture == out:
+        raise ValueError(f"--out {out} is the name of the picture; give the CSV file another one")
     told = _read(scene, until)
-    if out.exists() and not overwrite:
-        raise ValueError(f"{out} exists; name another --out or say --overwrite")
-    check_writable(out)
+    for file in (out, picture):
+        if file.exists() and not overwrite:
+            raise ValueError(f"{file} exists; name another --out or say --overwrite")
+        check_writable(file)
     size = next(n for n in (particles, told.size, NUM_PARTICLES) if n is not None)
     chosen = named(default_models(size, replicas))[model]
     curve = jaxgran.cool(told.gas, told.times, model=chosen, key=jax.random.key(key))
     jaxgran.write_curve(out, curve, told.header, overwrite=overwrite)
     ratio = float(curve.temperature[-1] / curve.temperature[0])
     print(f"{model}: T falls to {ratio:.3g} of its first value in {told.times[-1]:.3g} s")
-    print(f"written  {out}")
+    title = f"{scene.stem}: {chosen.name}, T falls to {ratio:.3g} of its first value"
+    save_curves({chosen.name: (curve, None)}, title, picture)
+    print(f"written  {out}\n         {picture}")
 
 
-def choose(scene: Path, /, *, until: float | None = None, tolerance: float = 0.02) -> None:
+def choose(
+    scene: Path,
+    /,
+    *,
+    until: float | None = None,
+    tolerance: float = 0.02,
+    no_cache: bool = False,
+) -> None:
     """Say which model is the cheapest that is accurate enough for a scene, and why.
 
     Args:
@@ -65,7 +85,10 @@ def choose(scene: Path, /, *, until: float | None = None, tolerance: float = 0.0
             in a box, or a curve's CSV file whose header has them.
         until: last time, s; by default that of the CSV file.
         tolerance: relative error of T that is allowed.
+        no_cache: compile everything anew, see `jaxgran fit --help`.
     """
+    if not no_cache:
+        keep_programs()
     told = _read(scene, until)
     choice = jaxgran.choose_model(told.gas, told.times, tolerance, told.size)
     for reason in choice.reasons:

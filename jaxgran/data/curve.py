@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.checks.validation import listed_numbers
 from jaxgran.checks.words import Rows, as_html, as_text, said
+from jaxgran.data import tables
 
 MIN_POINTS = 3
 """The smallest number of times of a measured curve."""
@@ -110,6 +112,30 @@ class CoolingCurve(eqx.Module):
 
     def _repr_html_(self) -> str:
         return as_html(*self._words)
+
+    def to_xarray(self) -> Any:
+        """The curve as an `xarray.Dataset`, with units; needs the extra `notebook`.
+
+        Quantities have the dimension time, those of replicas, with the ending _of_replicas, replica
+        and time, positions and velocities replica, particle and axis.
+
+        Raises:
+            ValueError: for several curves in one, as `jax.vmap` returns them.
+            ModuleNotFoundError: without xarray.
+        """
+        return tables.dataset(self)
+
+    def to_pandas(self) -> Any:
+        """The curve as a `pandas.DataFrame`, a row for each time; needs the extra `notebook`.
+
+        Raises: as `to_xarray`.
+        """
+        return tables.frame(self)
+
+    def plot(self, axes: Any = None, **style: Any) -> Any:
+        """Draw T against t; see `jaxgran.plot_curve`."""
+        # A floor above, which needs matplotlib: looked for when a picture is asked for.
+        return import_module("jaxgran.plotting").plot_curve(self, axes, **style)
 
     @property
     def _words(self) -> tuple[str, Rows]:

@@ -22,6 +22,7 @@ def run(script, *arguments, cwd):
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
 
 
+@pytest.mark.slow
 def test_main_job_without_arguments(tmp_path):
     done = run("fit_cooling_curve.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

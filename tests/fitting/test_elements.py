@@ -118,6 +118,7 @@ def test_A_is_right_where_the_scene_is_known(elements):
     assert float(result.p_value) > 0.01
 
 
+@pytest.mark.slow
 def test_rivals_know_the_elements_of_the_scene():
     gas = dataclasses.replace(glass_beads(), container=jaxgran.Walls(0.05, restitution=0.8))
     curve = measured(gas)

@@ -79,7 +79,14 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", ["rough", "all", "viscoelastic walls"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("rough", marks=pytest.mark.slow),
+        "all",
+        pytest.param("viscoelastic walls", marks=pytest.mark.slow),
+    ],
+)
 def test_elements_cool_as_kinetic_theory_says(name):
     compare(glass_beads(), SCENES[name])
 
@@ -127,6 +134,7 @@ def test_smooth_walls_and_surfaces_leave_the_spins_alone():
     assert curve.displacement is None
 
 
+@pytest.mark.slow
 def test_a_run_of_rough_spheres_is_resumed_and_compiles(tmp_path):
     gas = dataclasses.replace(glass_beads(), **SCENES["all"])
     times = jnp.array([1.0, 4.0]) * gas.mean_free_time

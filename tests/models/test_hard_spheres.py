@@ -69,7 +69,7 @@ def serial(gas, start, end):
         pytest.param(2, 0.1, 0.9, marks=pytest.mark.slow),
         pytest.param(2, 0.6, 0.8, marks=pytest.mark.slow),
         (3, 0.02, jaxgran.Viscoelastic(5e7, 0.22, 1e-6)),
-        (3, 0.3, jaxgran.RestitutionSeries([-0.1], [0.2])),
+        pytest.param(3, 0.3, jaxgran.RestitutionSeries([-0.1], [0.2]), marks=pytest.mark.slow),
         pytest.param(3, 0.45, 1.0, marks=pytest.mark.slow),
         pytest.param(3, 0.2, 0.4, marks=pytest.mark.slow),
     ],

@@ -87,6 +87,7 @@ def run(gas, num_particles, replicas, taus, key=0, kind=jaxgran.HardSpheres):
     return jaxgran.cool(gas, times, model=model, key=jax.random.key(key))
 
 
+@pytest.mark.slow
 def test_smooth_surfaces_change_no_bit(beads):
     taus = [0.0, 2.0, 8.0]
     smooth = run(beads(), 200, 2, taus)

@@ -30,7 +30,10 @@ def run(gas, num_particles, replicas, taus):
 
 @pytest.mark.parametrize(
     "elements",
-    [{}, {"surface": jaxgran.Rough(0.2, rotational_temperature=3e-3), "rub": 0.3}],
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        {"surface": jaxgran.Rough(0.2, rotational_temperature=3e-3), "rub": 0.3},
+    ],
     ids=["smooth", "rough"],
 )
 def test_energy_is_conserved_and_all_stay_inside(elements):

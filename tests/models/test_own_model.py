@@ -172,6 +172,7 @@ class NoisyHaffLaw(HaffLaw):
         return jaxgran.CoolingCurve(times=times, temperature=mean, replicas=each)
 
 
+@pytest.mark.slow
 def test_a_stochastic_model_is_fitted_through_its_replicas():
     gas, free = gas_of(), ("coefficient", "temperature")
     curve = measured(gas, jax.random.key(3))

@@ -277,6 +277,7 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
         jaxgran.cool(gas, 2 * times, model=SoftSpheres(100), checkpoint=file)
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_give_the_same_numbers(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     times = np.array([0.3, 1.0]) * float(gas.mean_free_time)

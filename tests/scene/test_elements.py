@@ -123,6 +123,7 @@ ELEMENTS = {
 }
 
 
+@pytest.mark.slow
 def test_derivatives_in_the_floats_of_elements_are_those_of_differences(beads):
     gas = scene(beads(), **ELEMENTS)
     times = jnp.asarray(TAUS) * gas.mean_free_time

@@ -1,0 +1,80 @@
+"""Curves as tables of xarray and pandas, which are imported here when they are asked for."""
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+UNITS = {
+    "times": "s",
+    "temperature": "m^2/s^2",
+    "temperature_error": "m^2/s^2",
+    "displacement": "m^2",
+    "displacement_error": "m^2",
+    "sonine": "1",
+    "collisions": "1",
+    "diffusion": "m^2/s",
+    "rotational_temperature": "m^2/s^2",
+    "rotational_temperature_error": "m^2/s^2",
+    "velocity_correlation": "m^2/s^2",
+    "elastic_energy": "J",
+    "dissipated_energy": "J",
+    "regularised": "1",
+}
+"""Units of the quantities of a curve, by the names of its fields."""
+
+
+def _needed(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise ModuleNotFoundError(
+            f'this table needs {name}: pip install "jaxgran[notebook]"', name=name
+        ) from None
+
+
+def quantities(curve: Any) -> dict[str, np.ndarray]:
+    """What is known at each time, by name, without the times.
+
+    Raises:
+        ValueError: for several curves in one, as `jax.vmap` returns them.
+    """
+    if np.ndim(curve.times) != 1:
+        raise ValueError(
+            f"the times of this curve have shape {np.shape(curve.times)}: take one curve, as in "
+            "jax.tree.map(lambda x: x[0], curves)"
+        )
+    known = {name: getattr(curve, name, None) for name in UNITS if name != "times"}
+    return {name: np.asarray(values) for name, values in known.items() if values is not None}
+
+
+def dataset(curve: Any) -> Any:
+    """The `xarray.Dataset` of `CoolingCurve.to_xarray`."""
+    xarray = _needed("xarray")
+
+    def described(name: str, *dims: str, values: np.ndarray) -> tuple:
+        return dims, values, {"units": UNITS[name], "long_name": name.replace("_", " ")}
+
+    found = {name: described(name, "time", values=x) for name, x in quantities(curve).items()}
+    if curve.replicas is not None:
+        for name in found.keys() & UNITS.keys():
+            values = getattr(curve.replicas, name)
+            if values is not None:
+                each = described(name, "replica", "time", values=np.asarray(values))
+                found[f"{name}_of_replicas"] = each
+    if curve.particles is not None:
+        for name, unit in (("position", "m"), ("velocity", "m/s")):
+            values = np.asarray(getattr(curve.particles, name))
+            found[name] = (("replica", "particle", "axis"), values, {"units": unit})
+    time = described("times", "time", values=np.asarray(curve.times))
+    attributes = {} if curve.status is None else {"status": int(curve.status)}
+    return xarray.Dataset(found, coords={"time": time}, attrs=attributes)
+
+
+def frame(curve: Any) -> Any:
+    """The `pandas.DataFrame` of `CoolingCurve.to_pandas`."""
+    pandas = _needed("pandas")
+    columns = quantities(curve)
+    return pandas.DataFrame(columns, index=pandas.Index(np.asarray(curve.times), name="times"))

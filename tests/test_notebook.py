@@ -1,0 +1,81 @@
+"""Curves and fits as tables and pictures in a notebook."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib import pyplot
+
+import jaxgran
+from jaxgran.data.tables import UNITS
+
+
+@pytest.fixture(scope="module")
+def curve():
+    """Of two replicas of three particles, at four times, with numbers that tell them apart."""
+    times = jnp.array([0.0, 1.0, 2.0, 5.0])
+    each = jnp.array([[4.0, 3.0, 2.0, 1.0], [4.0, 2.0, 1.5, 0.5]])
+    place = jnp.arange(18.0).reshape(2, 3, 3)
+    return jaxgran.CoolingCurve.of_replicas(
+        times,
+        {"temperature": each, "collisions": each**2},
+        particles=jaxgran.Particles(place, -place, jnp.array(20.0)),
+        status=jnp.array(0),
+    )
+
+
+def test_a_dataset_has_names_dimensions_and_units(curve):
+    data = curve.to_xarray()
+    assert dict(data.sizes) == {"time": 4, "replica": 2, "particle": 3, "axis": 3}
+    np.testing.assert_array_equal(data.temperature.sel(time=1.0), 2.5)
+    assert data.temperature_of_replicas.dims == ("replica", "time")
+    np.testing.assert_array_equal(data.collisions_of_replicas[1], curve.replicas.collisions[1])
+    np.testing.assert_array_equal(data.velocity, curve.particles.velocity)
+    assert data.temperature.attrs["units"] == "m^2/s^2" and data.time.attrs["units"] == "s"
+    assert data.attrs["status"] == 0 and "sonine" not in data
+
+
+def test_a_frame_has_a_row_for_each_time(curve):
+    table = curve.to_pandas()
+    assert list(table.index) == [0.0, 1.0, 2.0, 5.0] and table.index.name == "times"
+    np.testing.assert_array_equal(table["temperature"], curve.temperature)
+    assert set(table.columns) == {"temperature", "temperature_error", "collisions"}
+
+
+def test_every_quantity_of_a_curve_has_its_unit(curve):
+    numbers = {name for name in vars(curve) if name not in ("replicas", "particles", "status")}
+    assert numbers == set(UNITS)
+
+
+def test_several_curves_in_one_are_refused(curve):
+    two = jax.tree.map(lambda x: jnp.stack([x, x]), curve)
+    for show in (two.to_xarray, two.to_pandas, two.plot):
+        with pytest.raises(ValueError, match="times of this curve have shape"):
+            show()
+
+
+@pytest.mark.parametrize("library", ["xarray", "pandas"])
+def test_a_missing_library_is_named(curve, library, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ModuleNotFoundError, match=f"needs {library}: pip install"):
+        getattr(curve, f"to_{library}")()
+
+
+def test_a_curve_is_drawn_in_given_axes(curve):
+    figure, axes = pyplot.subplots()
+    assert curve.plot(axes, label="mine") is axes
+    drawn = axes.containers[0].lines[0]
+    np.testing.assert_array_equal(drawn.get_xdata(), curve.times[1:])  # 0 has no logarithm
+    np.testing.assert_array_equal(drawn.get_ydata(), curve.temperature[1:])
+    assert axes.get_xscale() == axes.get_yscale() == "log"
+    assert axes.get_legend_handles_labels()[1] == ["mine"]
+    assert jaxgran.plot_curve(curve) is pyplot.gca()
+    pyplot.close("all")
+
+
+def test_what_is_drawn_is_imported_when_it_is_used():
+    assert {"plot_curve", "plot_fit"} <= set(dir(jaxgran))
+    with pytest.raises(AttributeError, match="no attribute 'plot_nothing'"):
+        _ = jaxgran.plot_nothing
