@@ -83,7 +83,8 @@ def plot_curve(curve: CoolingCurve, axes: Axes | None = None, **style: Any) -> A
     shown = _shown(curve.times)
     t, T = (np.asarray(x)[shown] for x in (curve.times, curve.temperature))
     error = None if curve.temperature_error is None else np.asarray(curve.temperature_error)[shown]
-    axes.errorbar(t, T, error, **({"lw": 1.8, "elinewidth": 1.0} | style))
+    look: dict[str, Any] = {"lw": 1.8, "elinewidth": 1.0} | style
+    axes.errorbar(t, T, error, **look)
     axes.set(xscale="log", yscale="log", xlabel="time t (s)", ylabel=TEMPERATURE)
     return axes
 

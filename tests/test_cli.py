@@ -188,7 +188,7 @@ def settings_of_jax(monkeypatch):
         "jax_persistent_cache_min_compile_time_secs",
         "jax_persistent_cache_min_entry_size_bytes",
     )
-    before = {name: getattr(jax.config, name) for name in names}
+    before = {name: jax.config.values[name] for name in names}
     jax.config.update("jax_compilation_cache_dir", None)
     yield
     for name, value in before.items():
@@ -198,12 +198,12 @@ def settings_of_jax(monkeypatch):
 def test_compiled_programs_are_kept_where_they_can_be(tmp_path, monkeypatch, settings_of_jax):
     (tmp_path / "file").write_text("")
     assert not programs.keep_programs(tmp_path / "file" / "programs")
-    assert jax.config.jax_compilation_cache_dir is None
+    assert jax.config.values["jax_compilation_cache_dir"] is None
     monkeypatch.setenv(programs.SWITCH, "1")
     assert not programs.keep_programs(tmp_path / "programs")
     monkeypatch.setenv(programs.SWITCH, "0")
     assert programs.keep_programs(tmp_path / "programs")
-    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "programs")
+    assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path / "programs")
     assert not programs.keep_programs(tmp_path / "others")  # one is set already
 
 

@@ -1,6 +1,7 @@
 """Curves and fits as tables and pictures in a notebook."""
 
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +67,7 @@ def test_a_missing_library_is_named(curve, library, monkeypatch):
 def test_a_curve_is_drawn_in_given_axes(curve):
     figure, axes = pyplot.subplots()
     assert curve.plot(axes, label="mine") is axes
-    drawn = axes.containers[0].lines[0]
+    drawn: Any = axes.containers[0].get_children()[0]
     np.testing.assert_array_equal(drawn.get_xdata(), curve.times[1:])  # 0 has no logarithm
     np.testing.assert_array_equal(drawn.get_ydata(), curve.temperature[1:])
     assert axes.get_xscale() == axes.get_yscale() == "log"

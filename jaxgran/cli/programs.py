@@ -24,7 +24,10 @@ def keep_programs(folder: Path | None = None) -> bool:
     Returns:
         Whether programs are kept in that folder.
     """
-    if os.environ.get(SWITCH, "0") != "0" or jax.config.jax_compilation_cache_dir is not None:
+    if (
+        os.environ.get(SWITCH, "0") != "0"
+        or jax.config.values["jax_compilation_cache_dir"] is not None
+    ):
         return False
     folder = user_cache_path("jaxgran") / "programs" if folder is None else folder
     try:
