@@ -31,6 +31,17 @@ COLUMNS = {
 }
 """Measured quantities: names of the columns of a file, and the fields of `CoolingCurve`."""
 
+FURTHER = {
+    "a2": "sonine",
+    "collisions": "collisions",
+    "D": "diffusion",
+    "velocity_correlation": "velocity_correlation",
+    "elastic_energy": "elastic_energy",
+    "dissipated_energy": "dissipated_energy",
+    "regularised": "regularised",
+}
+"""Columns of further quantities, which a fit does not use, and their fields; in SI."""
+
 
 class Particles(NamedTuple):
     """Positions and velocities of all particles of all replicas at one time.
@@ -195,6 +206,13 @@ class CoolingCurve(eqx.Module):
             values = getattr(self, field)
             if values is not None and not isinstance(values, Tracer):
                 _check_column(column, np.asarray(values), times, place)
+        for column, field in FURTHER.items():
+            values = getattr(self, field)
+            if values is not None and np.shape(values) != times.shape:
+                raise ValueError(
+                    f"{column} has shape {np.shape(values)}, but there are {times.size} times; "
+                    "give one value for each time"
+                )
         not_later = np.flatnonzero(np.diff(times) <= 0)
         if not_later.size:
             i = int(not_later[0]) + 1

@@ -7,7 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxgran.data.curve import COLUMNS, MIN_POINTS, CoolingCurve
+from jaxgran.data.curve import COLUMNS, FURTHER, MIN_POINTS, CoolingCurve
+from jaxgran.data.curve_archive import SUFFIX, read_archive, write_archive
 from jaxgran.data.files import write_whole
 from jaxgran.data.header import header_count, header_number
 from jaxgran.data.quantities import STAND_INS, in_si, warn_of_units
@@ -37,7 +38,7 @@ EXACT = 1e-4
 
 
 def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
-    """Read a measured cooling curve from a CSV file.
+    """Read a measured cooling curve from a CSV file, or any curve from an npz file.
 
     The file has header lines ``# key: value``, a line with the names of the columns, and rows of
     numbers::
@@ -53,7 +54,8 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
             or energy (see `jaxgran.data.quantities.STAND_INS`), with errors under the same name and
             _err. Header keys length_unit (m, cm, mm, um) and time_unit (s, ms, us, min) are those
             of the columns and of diameter, T0 and A; density and Y stay in SI. Or its columns are
-            id,t,x,y and z, tracks of particles (see `jaxgran.data.tracks.curve_of_tracks`).
+            id,t,x,y and z, tracks of particles (see `jaxgran.data.tracks.curve_of_tracks`). What
+            `write_curve` writes besides (a2, collisions, D, energies, whole npz files) is read too.
 
     Returns:
         The curve, and the header as a dictionary of strings, in SI; its entry T_from says how T was
@@ -63,6 +65,8 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
         ValueError: saying what is wrong, in which line, and what to do.
     """
     path = Path(path)
+    if path.suffix == SUFFIX:
+        return read_archive(path)
     table = read_table(path, "t,T[,T_err][,msd][,msd_err]", partial(_check_names, path))
     if "id" in table.columns:
         return curve_of_tracks(path, table)
@@ -76,7 +80,8 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
         columns, header = in_si(columns, header)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    fields: dict[str, Any] = {COLUMNS[name]: jnp.asarray(x) for name, x in columns.items()}
+    known = COLUMNS | FURTHER
+    fields: dict[str, Any] = {known[name]: jnp.asarray(x) for name, x in columns.items()}
     curve = CoolingCurve(**fields)
     curve.check(lambda i: f"{path}, line {lines[i]}")
     return curve, header
@@ -88,7 +93,7 @@ def _check_names(path: Path, i: int, names: list[str]) -> None:
         check_track_names(path, i, names)
         return
     stand_ins = [name for name in ("T", *STAND_INS) if name in names]
-    known = {*COLUMNS, *(f"{name}{end}" for name in STAND_INS for end in ("", "_err"))}
+    known = {*COLUMNS, *FURTHER, *(f"{name}{end}" for name in STAND_INS for end in ("", "_err"))}
     unknown = [name for name in names if name not in known]
     unknown += [f"{name}_err" for name in STAND_INS if f"{name}_err" in names and name not in names]
     missing = ([] if "t" in names else ["t"]) + ([] if stand_ins else ["T"])
@@ -188,14 +193,16 @@ def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
 def write_curve(
     path: str | Path, curve: CoolingCurve, header: dict[str, str], *, overwrite: bool = False
 ) -> None:
-    """Write a curve to a CSV file in the format that `read_curve` reads.
+    """Write a curve to a file that `read_curve` reads.
 
-    Numbers are written with 17 digits, so that they are read back without loss.
+    A CSV file holds every known quantity at each time, T_err, msd, a2, collisions, energies and so
+    on, with 17 digits, so that it is read back without loss, but neither single replicas nor
+    particles. A file whose name ends in .npz holds everything, bit for bit.
 
     Args:
-        path: the file.
-        curve: its t, T and, where known, T_err, msd and msd_err are written.
-        header: written as lines ``# key: value``.
+        path: the file; its suffix, .npz or another one, chooses the format.
+        curve: of one system; None of its arrays may be traced.
+        header: written as lines ``# key: value``, or as it is in an .npz file.
         overwrite: whether an existing file may be replaced.
 
     Raises:
@@ -205,7 +212,9 @@ def write_curve(
     path = Path(path)
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists; choose another name or say overwrite=True")
-    fields = {name: getattr(curve, field) for name, field in COLUMNS.items()}
+    if path.suffix == SUFFIX:
+        return write_archive(path, curve, header)
+    fields = {name: getattr(curve, field) for name, field in (COLUMNS | FURTHER).items()}
     present = {name: np.asarray(v) for name, v in fields.items() if v is not None}
     lines = [f"# {key}: {value}" for key, value in header.items()]
     lines.append(",".join(present))

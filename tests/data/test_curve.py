@@ -1,5 +1,8 @@
+import dataclasses
 from pathlib import Path
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +10,7 @@ from hypothesis import strategies as st
 
 import jaxgran
 from jaxgran.data.header import header_count
+from tests.conftest import glass_beads
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 HEADER = "# eta: 0.05\n# diameter: 0.002\n# density: 2500\n# Y: 5e7\n# nu: 0.22\n# T0: 0.01\n"
@@ -41,6 +45,31 @@ def test_round_trip(write, tmp_path):
     assert same == header
     np.testing.assert_array_equal(copy.temperature, curve.temperature)
     np.testing.assert_array_equal(copy.temperature_error, curve.temperature_error)  # pyright: ignore
+
+
+def test_everything_that_was_computed_is_kept(tmp_path):
+    gas = glass_beads()
+    times = gas.mean_free_time * jnp.array([1.0, 2.0, 3.0])
+    theory = jaxgran.cool(gas, times)
+    jaxgran.write_curve(tmp_path / "theory.csv", theory, {"N": "10"})
+    copy, header = jaxgran.read_curve(tmp_path / "theory.csv")
+    assert header == {"N": "10"}
+    # No field but the status, which says that nothing failed, may be lost.
+    for name, value in vars(dataclasses.replace(theory, status=None)).items():
+        np.testing.assert_array_equal(getattr(copy, name), value, err_msg=name)
+    spheres = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(20, replicas=2), progress=False)
+    jaxgran.write_curve(tmp_path / "spheres.npz", spheres, {"T0": "1 m"})
+    copy, header = jaxgran.read_curve(tmp_path / "spheres.npz")
+    assert header == {"T0": "1 m"} and eqx.tree_equal(copy, spheres)
+    assert copy.particles.position.shape == (2, 20, 3)
+
+
+def test_an_archive_of_something_else_is_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", a=np.ones(3))
+    with pytest.raises(ValueError, match="not a file that jaxgran.write_curve wrote"):
+        jaxgran.read_curve(tmp_path / "other.npz")
+    with pytest.raises(ValueError, match="no such file"):
+        jaxgran.read_curve(tmp_path / "none.npz")
 
 
 def test_nothing_is_written_over(write):

@@ -1,0 +1,45 @@
+"""The recipes run as they are printed, each in a process and a folder of its own."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TEXT = (Path(__file__).parents[2] / "experiments" / "recipes.md").read_text(encoding="utf-8")
+RECIPES = dict(re.findall(r"^## (.*?)\n.*?```python\n(.*?)```", TEXT, re.DOTALL | re.MULTILINE))
+WRITTEN = {
+    "A sweep and its heat map": "sweep.png",
+    "Snapshots and a film": "film.gif",
+    "Saving and loading everything": "run.npz",
+}
+SAID = {
+    "Your own data: energies in ms and mm": "Kinetic theory is compatible with this curve",
+    "Your own law of restitution": "0.972",
+    "Saving and loading everything": "two replicas (2, 100, 3) True",
+}
+
+
+def test_every_asked_recipe_is_there_and_short():
+    asked = "data", "law", "sweep", "film", "loading", "state", "cores", "GPU"
+    assert len(RECIPES) == len(asked)
+    for name, code in zip(asked, RECIPES, strict=True):
+        assert name in code
+    # A dozen lines each, without imports, blank ones and a file's content.
+    for name, code in RECIPES.items():
+        code = re.sub(r'""".*?"""', '""', code, flags=re.DOTALL)
+        lines = [x for x in code.splitlines() if x and not re.match(r"import|from|jax.config", x)]
+        assert len(lines) <= 12, f"{name}: {len(lines)} lines"
+
+
+@pytest.mark.slow  # half a minute, mostly compilation
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipe_runs(name, tmp_path):
+    (tmp_path / "recipe.py").write_text(RECIPES[name], encoding="utf-8")
+    command = [sys.executable, "-W", "error", "recipe.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert SAID.get(name, "") in done.stdout, done.stdout
+    if name in WRITTEN:
+        assert (tmp_path / WRITTEN[name]).stat().st_size > 1000
