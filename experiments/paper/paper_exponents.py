@@ -135,7 +135,7 @@ def main() -> None:
             ice.plot(speed[1:][old[1:]], expected[old[1:]], color=color, label="theory, Maxwellian")
             ice.errorbar(seen[aged], local_mean[aged], local_error[aged], label="DSMC", **dots)
             label = "−2/(1 + γ), γ = d ln⟨1 − ε²⟩ / d ln T$^{1/2}$"
-            ice.plot(speed[old], -2 / (1 + steepness[old]), ":", color=paper.CONSTANT, label=label)
+            ice.plot(speed[old], -2 / (1 + steepness[old]), ":", color=paper.GUIDE, label=label)
             off = np.abs(usual / theta - 1) < 0.03
             found["ice_by_kinetic_theory_fails_from"] = (
                 float(tau[~off][0]) if (~off).any() else None
