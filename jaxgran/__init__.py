@@ -1,4 +1,17 @@
-"""jaxgran: differentiable granular gases in JAX."""
+"""jaxgran: differentiable granular gases in JAX.
+
+Examples in the docstrings begin with these lines:
+
+>>> import dataclasses, jax, jax.numpy as jnp, jaxgran
+>>> jax.config.update("jax_enable_x64", True)
+>>> beads = jaxgran.Viscoelastic(youngs_modulus=5e7, poisson_ratio=0.22, dissipative_constant=3e-6)
+>>> gas = jaxgran.Gas(beads, diameter=2e-3, mass=1e-5, packing_fraction=0.05, temperature=0.01)
+>>> times = jnp.array([0.1, 0.3, 1.0, 3.0])  # s
+>>> cooled = jaxgran.cool(gas, times)
+>>> error = 0.01 * cooled.temperature
+>>> curve = jaxgran.CoolingCurve(times, cooled.temperature, temperature_error=error)
+>>> result = jaxgran.fit(gas, curve)  # of A
+"""
 
 from importlib import import_module
 from typing import Any

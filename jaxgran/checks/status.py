@@ -121,6 +121,9 @@ def explain(status: SupportsInt) -> str:
 
     Args:
         status: a whole number, such as `jaxgran.CoolingCurve.status`.
+
+    >>> jaxgran.explain_status(0)
+    'ok'
     """
     faults = [fault for fault in FAULTS if int(status) & fault.bit]
     return "; ".join(f"{f.meaning}: {f.advice}" for f in faults) or "ok"

@@ -33,6 +33,10 @@ class Domain(NamedTuple):
     Attributes:
         low, high: the ends; may be infinite.
         low_allowed, high_allowed: whether the end itself is an allowed value.
+
+    >>> positive = jaxgran.Domain(low=0.0)
+    >>> str(positive), bool(positive.contains(-1.0))
+    ('(0, inf)', False)
     """
 
     low: float = -np.inf

@@ -53,6 +53,11 @@ class Particles(NamedTuple):
             or d sides.
         angular_velocity: of rough spheres, 1/s, shape (replicas, N, 3), in a plane (replicas, N,
             1); None of smooth ones.
+
+    >>> side, apart = gas.box_side(2), jnp.array([[[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]]])
+    >>> start = jaxgran.Particles(apart, jnp.zeros((1, 2, 3)), side)
+    >>> start.position.shape  # replicas, N, d
+    (1, 2, 3)
     """
 
     position: Float[Array, "replicas N d"]
@@ -98,6 +103,10 @@ class CoolingCurve(eqx.Module):
         particles: the final state of a particle model.
         status: 0, or the faults of a run under `jax.jit` or `jax.vmap`, where nothing can be
             raised; values are then nan. `jaxgran.explain_status` puts it into words.
+
+    >>> measured = jaxgran.CoolingCurve(times=[0.1, 1.0, 3.0], temperature=[8e-3, 2e-3, 5e-4])
+    >>> measured.temperature.shape, measured.displacement is None
+    ((3,), True)
     """
 
     times: Float[Array, "times"] = _number_field()

@@ -63,6 +63,11 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
 
     Raises:
         ValueError: saying what is wrong, in which line, and what to do.
+
+    >>> jaxgran.write_curve("mine.csv", curve, {"eta": "0.05"}, overwrite=True)
+    >>> again, header = jaxgran.read_curve("mine.csv")
+    >>> header, again.times.shape
+    ({'eta': '0.05'}, (4,))
     """
     path = Path(path)
     if path.suffix == SUFFIX:
@@ -126,6 +131,11 @@ def read_gas(header: dict[str, str]) -> Gas:
     Raises:
         ValueError: for a missing key, a value that is no number or outside its range, and for what
             `read_elements` refuses.
+
+    >>> header = {"eta": "0.05", "diameter": "2e-3", "density": "2500", "T0": "0.01"}
+    >>> header |= {"Y": "5e7", "nu": "0.22"}
+    >>> float(jaxgran.read_gas(header).packing_fraction)
+    0.05
     """
     missing = [key for key in GAS_KEYS if key not in header]
     if missing:
@@ -162,6 +172,9 @@ def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
 
     Raises:
         ValueError: for an error without its value, or one that is no positive number.
+
+    >>> jaxgran.read_priors({"eta": "0.05", "eta_err": "0.002"})
+    {'packing_fraction': (0.05, 0.002)}
     """
     priors = {}
     if "t0" in header and "t0_err" not in header:
@@ -208,6 +221,10 @@ def write_curve(
     Raises:
         ValueError: if the file exists and `overwrite` is False.
         OSError: naming the path, if it cannot be written; an existing file is then unchanged.
+
+    >>> jaxgran.write_curve("all.npz", curve, {"note": "every array"}, overwrite=True)
+    >>> jaxgran.read_curve("all.npz")[1]["note"]
+    'every array'
     """
     path = Path(path)
     if path.exists() and not overwrite:

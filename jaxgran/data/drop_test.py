@@ -30,6 +30,10 @@ class DropTest(eqx.Module):
 
     Raises:
         ValueError: for a value out of its range, or lists of different lengths.
+
+    >>> drops = jaxgran.DropTest(speed=[0.1, 0.3], restitution=[0.92, 0.90], error=[0.01, 0.01])
+    >>> drops.speed.shape
+    (2,)
     """
 
     speed: UserNumber = eqx.field(converter=number)
@@ -66,6 +70,12 @@ def read_drop_test(path: str | Path, *, onto_plate: bool = False) -> DropTest:
 
     Raises:
         ValueError: saying what is wrong, in which line.
+
+    >>> from pathlib import Path
+    >>> rows = "v,eps,eps_err", "0.1,0.92,0.01", "0.3,0.90,0.01", "1.0,0.87,0.01"
+    >>> size = Path("drops.csv").write_text(chr(10).join(rows))
+    >>> jaxgran.read_drop_test("drops.csv").restitution.shape
+    (3,)
     """
     path, wanted = Path(path), ",".join(COLUMNS)
     rows: list[list[float]] = []

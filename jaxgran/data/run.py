@@ -13,6 +13,9 @@ class Run(NamedTuple):
         key: of the random numbers; None is `jax.random.key(0)`. Deterministic models ignore it.
         progress: show a progress bar on a terminal.
         checkpoint: file to which the run is saved and from which it is resumed; None for none.
+
+    >>> jaxgran.Run(progress=False).checkpoint is None
+    True
     """
 
     key: PRNGKeyArray | None = None

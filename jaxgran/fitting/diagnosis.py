@@ -46,6 +46,9 @@ class Diagnosis(NamedTuple):
         rivals: other laws of cooling compared with the fitted one, those that fit best first.
         ranges: the range of each free parameter, 95 %, SI, over all rivals that fit as well as the
             best: of a parameter that the rivals leave open this is much wider than its error.
+
+    >>> jaxgran.diagnose(result, curve).verdict[:40]
+    'Kinetic theory is compatible with this c'
     """
 
     explains: bool
@@ -65,6 +68,9 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         result: of `jaxgran.fit`, of one curve (not batched).
         curve: the measured curve.
         num_particles: N of the measured gas, if known.
+
+    >>> jaxgran.diagnose(result, curve).explains
+    True
     """
     if not isinstance(result, Fit) or not isinstance(curve, CoolingCurve):
         raise ValueError(

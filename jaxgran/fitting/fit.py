@@ -111,6 +111,10 @@ def fit(
             False and `curve.status` tells why.
 
     This docstring is long because the arguments mean different things to the two kinds of models.
+
+    >>> result = jaxgran.fit(gas.replace(dissipative_constant=0.0), curve)
+    >>> f"{float(result.estimate[0]):.3g} s"
+    '3e-06 s'
     """
     names = free_by_default(gas, curve) if free is None else free
     _check_request(gas, curve, names, max_steps, num_particles, replicas)

@@ -41,6 +41,10 @@ class JointFit(NamedTuple):
         p_value: probability of so large a decrease, of all together, by chance.
         agree: whether it is above 1 %: the measurements do not contradict each other.
         converged: whether the search reached its tolerance.
+
+    >>> joint = jaxgran.fit_jointly({"a": (gas, curve), "b": (gas, curve)})
+    >>> f"{float(joint.estimate['dissipative_constant']):.3g}"
+    '3e-06'
     """
 
     estimate: dict[str, Float[np.ndarray, "..."]]
@@ -81,6 +85,10 @@ def fit_jointly(
     Raises:
         ValueError: for unknown names, a curve without errors, or a stochastic model.
         RuntimeError: if the model cannot compute a curve where the search ends.
+
+    >>> joint = jaxgran.fit_jointly({"a": (gas, curve), "b": (gas, curve)})
+    >>> sorted(joint.weight), joint.agree
+    (['a', 'b'], True)
     """
     model = KineticTheory() if model is None else model
     _check(measurements, shared, separate, model)

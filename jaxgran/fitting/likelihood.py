@@ -48,6 +48,10 @@ def log_likelihood(
     Raises:
         ValueError: for a curve that cannot be one, a scene that the model cannot take, or a
             stochastic model, of which each call has other noise.
+
+    >>> other = gas.replace(dissipative_constant=4e-6)
+    >>> bool(jaxgran.log_likelihood(gas, curve) > jaxgran.log_likelihood(other, curve))
+    True
     """
     model = KineticTheory() if model is None else model
     _check(gas, curve, model, clock)

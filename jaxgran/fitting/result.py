@@ -61,6 +61,10 @@ class Fit(eqx.Module):
             stochastic model.
         converged: whether the search reached its tolerance; of a stochastic model, whether the last
             step was below 0.1 in the parameters' unbounded scale.
+
+    >>> A, error = result.value("dissipative_constant")
+    >>> f"{float(A):.3g} s", sorted(result.error_budget)
+    ('3e-06 s', ['measurement', 'model'])
     """
 
     names: tuple[str, ...] = eqx.field(static=True)

@@ -42,6 +42,9 @@ class Omission(NamedTuple):
         words: what, as the clause of a sentence.
         decisive: estimates of a fit cannot be trusted; else the scene is at the edge of validity.
         remedy: a sentence saying which model contains it.
+
+    >>> [omission.words for omission in jaxgran.KineticTheory().omissions(gas)]
+    []
     """
 
     words: str
@@ -58,6 +61,11 @@ class AbstractModel(eqx.Module):
     missing member is named by the TypeError that creating the model raises.
 
     `jaxgran.DSMC` is a short example; `tests/models/test_own_model.py` defines one in 25 lines.
+
+    >>> jaxgran.KineticTheory().name, jaxgran.DSMC(1000).stochastic
+    ('kinetic theory', True)
+    >>> isinstance(jaxgran.HardSpheres(100), jaxgran.AbstractModel)
+    True
     """
 
     stochastic: AbstractClassVar[bool]

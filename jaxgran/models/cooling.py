@@ -72,6 +72,10 @@ def cool(
         RuntimeError: if the run fails and `throw` is True, with what to do.
 
     This docstring is long because it documents every option of every model's run.
+
+    >>> curve = jaxgran.cool(gas, times)
+    >>> [round(float(T), 5) for T in curve.temperature]
+    [0.00783, 0.00522, 0.00203, 0.00053]
     """
     gas, times, key = checks.checked_gas(gas), checked_times(times), checks.checked_key(key)
     model = KineticTheory() if model is None else model

@@ -75,6 +75,10 @@ class DSMC(AbstractModel):
 
     Reference: G. A. Bird, Molecular Gas Dynamics (1994); J. M. Montanero & A. Santos, PRE 54, 438
     (1996) for dense gases; Brilliantov & Poeschel for the granular gas.
+
+    >>> spheres = jaxgran.cool(gas, times[:2], model=jaxgran.DSMC(1000), progress=False)
+    >>> f"{float(spheres.temperature[1]):.1g}"
+    '0.005'
     """
 
     num_particles: UserCount = eqx.field(static=True, converter=python_number)

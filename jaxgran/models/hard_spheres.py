@@ -103,6 +103,10 @@ class HardSpheres(AbstractSpheres):
 
     Raises:
         ValueError: for numbers out of range.
+
+    >>> model = jaxgran.HardSpheres(50, replicas=2)
+    >>> model.num_particles, model.stochastic
+    (50, True)
     """
 
     num_particles: UserCount = eqx.field(static=True, converter=python_number)

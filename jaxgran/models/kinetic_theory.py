@@ -64,6 +64,9 @@ class KineticTheory(AbstractModel):
     the first Sonine approximation: 1.7 % (3D), 2.4 % (2D) below the exact elastic value of a
     dilute gas; at packing fraction phi collisions are correlated, and D is greater by another
     0.85 phi.
+
+    >>> jaxgran.cool(gas, times, model=jaxgran.KineticTheory()).sonine.shape
+    (4,)
     """
 
     sonine: validation.UserTruth = eqx.field(static=True, default=True)

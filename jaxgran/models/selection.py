@@ -58,6 +58,10 @@ class Choice(NamedTuple):
         reasons: why, a sentence each, the verdict first.
         candidates: all models considered, cheapest first.
         error: estimated relative error of T of the chosen model.
+
+    >>> choice = jaxgran.choose_model(gas, times, num_particles=200)
+    >>> choice.model.name, choice.error < 0.02
+    ('kinetic theory', True)
     """
 
     model: AbstractModel
@@ -117,6 +121,10 @@ def choose_model(
         ValueError: for values out of range or being traced, a gas so soft that kinetic theory is
             meaningless, or a scene that no model can take.
         RuntimeError: if kinetic theory, which estimates the errors, cannot follow the gas so far.
+
+    >>> choice = jaxgran.choose_model(gas, times, num_particles=200)
+    >>> choice.reasons[0][:43]
+    'Kinetic theory: the cheapest model whose es'
     """
     _check_arguments(gas, times, tolerance)
     tolerance = float(tolerance)

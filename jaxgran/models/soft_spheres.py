@@ -90,6 +90,10 @@ class SoftSpheres(AbstractSpheres):
 
     Raises:
         ValueError: for numbers out of range.
+
+    >>> model = jaxgran.SoftSpheres(20, replicas=2, steps_per_contact=20)
+    >>> model.name, model.num_particles
+    ('soft spheres', 20)
     """
 
     num_particles: UserCount = eqx.field(static=True, converter=python_number)

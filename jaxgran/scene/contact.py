@@ -33,6 +33,9 @@ def elastic_constant(
         rho, N / m^(3/2).
 
     Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eq. (2) times m_eff.
+
+    >>> f"{float(jaxgran.elastic_constant(5e7, 0.22, 2e-3)):.3g}"
+    '7.83e+05'
     """
     y, nu, sigma = jnp.asarray(youngs_modulus), jnp.asarray(poisson_ratio), jnp.asarray(diameter)
     return 2 * y * jnp.sqrt(sigma / 4) / (3 * (1 - nu**2))
@@ -81,6 +84,10 @@ def contact_force(
         taken as 0.
 
     Reference: Brilliantov, Spahn, Hertzsch & Poeschel, Phys. Rev. E 53, 5382 (1996).
+
+    >>> rho = jaxgran.elastic_constant(5e7, 0.22, 2e-3)
+    >>> f"{float(jaxgran.contact_force(1e-6, 0.0, rho, 3e-6)):.3g} N"
+    '0.000783 N'
     """
     xi = jnp.asarray(overlap)
     touching = xi > 0
@@ -130,6 +137,9 @@ class Impact(NamedTuple):
         restitution: coefficient of restitution eps.
         duration: contact duration, in X/v.
         largest_overlap: in X.
+
+    >>> jaxgran.Impact._fields
+    ('restitution', 'duration', 'largest_overlap')
     """
 
     restitution: Float[Array, ""]
@@ -226,6 +236,10 @@ def impact(
 
     Raises:
         ValueError: for a negative beta, unless it is traced.
+
+    >>> found = jaxgran.impact(0.1)
+    >>> round(float(found.restitution), 4), round(float(found.duration), 3)
+    (0.8929, 3.157)
     """
     NOT_NEGATIVE.check("beta", beta, "It is 1.5 A alpha^0.4 v^0.2.")
     beta = jnp.asarray(beta, dtype=jnp.result_type(float))

@@ -66,6 +66,10 @@ class Rough(eqx.Module):
         ValueError: for a value outside its range.
 
     Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997).
+
+    >>> rough = dataclasses.replace(gas, surface=jaxgran.Rough(0.5, rotational_temperature=0.002))
+    >>> float(rough.value("tangential_restitution"))
+    0.5
     """
 
     tangential_restitution: Float[Array, ""] = eqx.field(converter=number)
@@ -108,6 +112,10 @@ class Walls(eqx.Module):
 
     Raises:
         ValueError: for a value outside its range.
+
+    >>> boxed = dataclasses.replace(gas, container=jaxgran.Walls(0.05, restitution=0.9))
+    >>> float(boxed.value("wall_side")), float(boxed.value("wall_coefficient"))
+    (0.05, 0.9)
     """
 
     side: Float[Array, "..."] = eqx.field(converter=number)
@@ -155,6 +163,10 @@ class StokesDrag(eqx.Module):
 
     Raises:
         ValueError: for a negative rate.
+
+    >>> wet = dataclasses.replace(gas, drag=jaxgran.StokesDrag(0.1))
+    >>> float(wet.value("drag_rate"))
+    0.1
     """
 
     rate: Float[Array, ""] = eqx.field(converter=number)
@@ -186,6 +198,10 @@ class WhiteNoise(eqx.Module):
         ValueError: for a negative strength.
 
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998).
+
+    >>> driven = dataclasses.replace(gas, drive=jaxgran.WhiteNoise(1e-3))
+    >>> float(driven.value("drive_strength"))
+    0.001
     """
 
     strength: Float[Array, ""] = eqx.field(converter=number)
@@ -205,6 +221,10 @@ class DrivenStart(eqx.Module):
     drag, where there is some, begins at t = 0.
 
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution.
+
+    >>> gentle = dataclasses.replace(gas, preparation=jaxgran.DrivenStart())
+    >>> type(gentle.preparation).__name__
+    'DrivenStart'
     """
 
 

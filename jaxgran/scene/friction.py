@@ -39,6 +39,11 @@ class Frictional(eqx.Module):
         ValueError: for a value outside its range.
 
     Reference: Luding, Granular Matter 10, 235 (2008), without the tangential spring.
+
+    >>> grains = jaxgran.Frictional(tangential_damping=0.5, friction=0.3)
+    >>> rubbing = dataclasses.replace(gas, surface=grains)
+    >>> float(rubbing.value("friction"))
+    0.3
     """
 
     tangential_damping: Float[Array, ""] = eqx.field(converter=number)

@@ -63,12 +63,11 @@ class Gas(NamedFloats):
         preparation: `jaxgran.DrivenStart` of smooth spheres that were driven before t = 0; None
             begins with Maxwellian velocities.
 
-    Floats of elements are known by name as those of the gas are: those of a container with the
-    prefix wall_, those of drag with drag_, those of a drive with drive_, as in
-    ``gas.replace(wall_coefficient=0.8)``.
+    Floats of elements are known by name as those of the gas are, with the prefix wall_, drag_ or
+    drive_, as in ``gas.replace(wall_coefficient=0.8)``. Values outside a range raise ValueError.
 
-    Raises:
-        ValueError: for a value outside its range.
+    >>> round(float(gas.mean_free_time), 4)
+    0.026
     """
 
     law: RestitutionLaw = eqx.field(converter=_checked_law)

@@ -28,6 +28,9 @@ def sphere_mass(diameter: UserNumber, density: UserNumber) -> Float[Array, "..."
 
     Raises:
         ValueError: for a value that is not positive or not a number.
+
+    >>> f"{float(jaxgran.sphere_mass(2e-3, 2500.0)):.3g} kg"
+    '1.05e-05 kg'
     """
     POSITIVE.check("diameter", diameter, "Give the diameter in metres.")
     POSITIVE.check("density", density, "Give the density of the material in kg/m^3.")

@@ -31,6 +31,14 @@ class RestitutionLaw(eqx.Module):
     ``domains = {"yield_speed": jaxgran.Domain(0.0)}``; without it any finite number is allowed. No
     field may have the name of a float of `jaxgran.Gas`. Kinetic theory needs an eps that is smooth
     in the speed. Where eps depends on the diameter or the mass too, override `reduced` instead.
+
+    >>> class Plastic(jaxgran.RestitutionLaw):
+    ...     yield_speed: float  # m/s
+    ...     def restitution(self, normal_speed):  # m/s
+    ...         return (1 + (normal_speed / self.yield_speed) ** 2) ** -0.125
+    >>> own = dataclasses.replace(gas, law=Plastic(0.2))
+    >>> round(float(own.restitution(0.1)), 4)
+    0.9725
     """
 
     domains: ClassVar[dict[str, Domain]] = {}
@@ -108,6 +116,10 @@ class ReducedLaw(eqx.Module):
     """A law of restitution for two given spheres, in units of a length and a reference speed.
 
     A subclass defines `restitution`.
+
+    >>> reduced = gas.reduced_law
+    >>> bool(jnp.isclose(reduced.restitution(jnp.ones(())), gas.restitution(gas.impact_speed)))
+    True
     """
 
     num_nodes: ClassVar[int] = 40

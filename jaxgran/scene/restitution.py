@@ -68,6 +68,10 @@ class Viscoelastic(RestitutionLaw):
     adhesion matters.
 
     Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eqs. (1)-(2).
+
+    >>> glass = jaxgran.Viscoelastic(5e7, poisson_ratio=0.22, dissipative_constant=3e-6)
+    >>> f"{float(glass.dissipative_constant):g} s"
+    '3e-06 s'
     """
 
     youngs_modulus: Float[Array, ""] = eqx.field(converter=number)
@@ -134,6 +138,10 @@ class ConstantRestitution(RestitutionLaw, ReducedLaw):
 
     Raises:
         ValueError: for e outside [0, 1].
+
+    >>> grains = jaxgran.ConstantRestitution(0.9)
+    >>> float(gas.replace(temperature=1.0).restitution(0.1)), float(grains.coefficient)
+    (0.9075542559594306, 0.9)
     """
 
     coefficient: Float[Array, ""] = eqx.field(converter=number)
@@ -164,6 +172,10 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
 
     Raises:
         ValueError: for shapes that differ or values that are not finite.
+
+    >>> law = jaxgran.RestitutionSeries(coefficients=[-0.1], exponents=[0.2])  # 1 - .1 v^(1/5)
+    >>> law.coefficients.shape
+    (1,)
     """
 
     coefficients: Float[Array, "terms"] = eqx.field(converter=number)

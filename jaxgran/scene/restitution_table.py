@@ -129,6 +129,10 @@ def viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[
         first two derivatives are finite down to beta = 0, where the first is -C1.
 
     Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eqs. (4)-(6).
+
+    >>> found = jaxgran.viscoelastic_restitution(jnp.array([0.0, 0.1, 1.0]))
+    >>> [round(float(eps), 4) for eps in found]
+    [1.0, 0.8929, 0.3939]
     """
     NOT_NEGATIVE.check("beta", beta, "It is (3/2) A alpha^(2/5) v^(1/5).")
     return jnp.exp(log_viscoelastic_restitution(beta, clipped=clipped))

@@ -32,6 +32,10 @@ class SteadyState(NamedTuple):
         temperature: T, m^2/s^2.
         sonine: a_2.
         rotational_temperature: T_rot, m^2/s^2, of rough spheres; None of smooth ones.
+
+    >>> driven = dataclasses.replace(gas, drive=jaxgran.WhiteNoise(1e-3))
+    >>> jaxgran.steady_state(driven)._fields
+    ('temperature', 'sonine', 'rotational_temperature')
     """
 
     temperature: Float[Array, ""]
@@ -53,6 +57,10 @@ def steady_state(gas: Gas) -> SteadyState:
 
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution, whose
     first order in a_2 this exceeds by terms of second order.
+
+    >>> driven = dataclasses.replace(gas, drive=jaxgran.WhiteNoise(1e-3))
+    >>> round(float(jaxgran.steady_state(driven).temperature), 5)
+    0.00127
     """
     if gas.drive is None:
         raise ValueError("a gas without drive has no steady state: add drive=WhiteNoise(strength)")
