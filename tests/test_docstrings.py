@@ -44,7 +44,7 @@ def test_a_wrong_example_is_found():
 @pytest.mark.slow
 def test_api_pages_are_made_without_a_warning(tmp_path):
     pytest.importorskip("pdoc")
-    command = [sys.executable, "-W", "error", "-m", "pdoc", "-d", "google", "--math"]
+    command = [sys.executable, "-W", "error", "-m", "pdoc", "-d", "google"]
     done = subprocess.run(
         [*command, "jaxgran", "-o", str(tmp_path)], capture_output=True, text=True, check=False
     )
