@@ -21,7 +21,7 @@ def write_archive(path: Path, curve: CoolingCurve, header: dict[str, str]) -> No
 
     Names of entries are those of the fields, as ``replicas.temperature``, ``particles.position``.
     """
-    arrays = {HEADER: np.array(json.dumps(header)), **_arrays(curve)}
+    arrays: dict[str, Any] = {HEADER: np.array(json.dumps(header)), **_arrays(curve)}
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
 
