@@ -3,9 +3,10 @@
     python experiments/documents.py
 
 The figures come from `experiments/figures/*.json`, which the scripts write when they are run with
---record, and from nothing else. accuracy.md, speed.md, speed_vs_error.md, wrong_physics.md and
-interval_coverage.md are written whole; README.md and experiments/README.md between their marks
-`<!-- NAME -->` and `<!-- end of NAME -->`. A test compares all of them with what this would write.
+--record, and from nothing else. accuracy.md, speed.md, speed_vs_error.md, wrong_physics.md,
+interval_coverage.md and paper_claims.md are written whole; README.md and experiments/README.md
+between their marks `<!-- NAME -->` and `<!-- end of NAME -->`. A test compares all of them with
+what this would write.
 """
 
 import argparse
@@ -14,8 +15,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from experiments.fit import interval_coverage, wrong_physics
+from experiments.paper import paper_claims
 from experiments.speed import speed_vs_error
-from experiments.support.record import EXPERIMENTS, figures
+from experiments.support.claims import table as claims_table
+from experiments.support.record import EXPERIMENTS, FIGURES, figures
 from experiments.support.tables import accuracy, gallery, speed
 from experiments.support.tables.words import Row, between, of
 
@@ -67,6 +70,7 @@ def documents() -> dict[Path, str]:
         + "\n",
         "wrong_physics": wrong_physics.table(figures("wrong_physics")),
         "interval_coverage": interval_coverage.table(figures("interval_coverage")),
+        "paper_claims": claims(),
     }
     written = {EXPERIMENTS / f"{name}.md": text for name, text in whole.items()}
     parts = {"models": model_table(scenes), "dilute": printed("lammps_curves_dilute")}
@@ -76,6 +80,12 @@ def documents() -> dict[Path, str]:
     ):
         written[path] = filled(path.read_text(encoding="utf-8"), blocks)
     return written
+
+
+def claims() -> str:
+    """The table of the paper's claims."""
+    rows = [claims_table.Row(**row) for row in figures("paper_claims")["rows"]]
+    return paper_claims.HEAD + claims_table.Table(FIGURES, rows).markdown()
 
 
 def filled(text: str, blocks: dict[str, str]) -> str:
