@@ -1,5 +1,6 @@
 """Fits of a curve by the fitted law and something besides, of a given amplitude."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,9 +11,12 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran.fitting.least_squares import least_squares
 from jaxgran.fitting.parameters import Parameters, size_of
 from jaxgran.fitting.priors import Priors
+from jaxgran.scene.elements import Rough
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.reduced_scene import reduced_scene
 from jaxgran.theory.table_of_times import (
     cooling_by_elements,
+    cooling_by_roughness,
     log_temperature,
     relaxed_cooling_rate,
 )
@@ -29,12 +33,14 @@ class Trial(NamedTuple):
             each impact, ``T^(1/2)``: constant restitution, walls, friction.
         drag: share of it that is linear drag, independent of T.
         floor: noise in T, over the last measured temperature.
+        rough: 1 + beta_t of rough spheres that do not rotate at t = 0.
         delay: time after t = 0 at which the clock was started, over the first cooling time.
     """
 
     constant: Float[Array, "*trials"]
     drag: Float[Array, "*trials"]
     floor: Float[Array, "*trials"]
+    rough: Float[Array, "*trials"]
     delay: Float[Array, "*trials"]
 
 
@@ -83,10 +89,8 @@ def fit_trials(
             rate = rate + cooling_by_elements(changed, log_theta, ratio)
         unsure = accuracy.astype(rate.dtype) * (mean + trend * (2 * log_theta / depth + 1))
         rate = rate * jnp.exp(unsure)
-        added = trial.constant * jnp.exp(log_theta / 2) + trial.drag
-        added = added / (1 - trial.constant - trial.drag) * rate[0]
         since = times - parameters.start(flat) + trial.delay / rate[0]
-        cooled = _continued(log_theta, rate + added, since)
+        cooled = _continued(log_theta, rate + _added(changed, trial, log_theta, rate), since)
         floor = jnp.log(jnp.maximum(trial.floor, jnp.finfo(rate.dtype).tiny))
         return jnp.logaddexp(jnp.log(changed.temperature) + cooled, floor + lowest)
 
@@ -110,6 +114,21 @@ def fit_trials(
     return jax.lax.map(fitted, trials)  # a batch of searches takes twice as long to compile
 
 
+def _added(
+    gas: Gas, trial: Trial, log_theta: Float[Array, "table"], rate: Float[Array, "table"]
+) -> Float[Array, "table"]:
+    """What a trial adds to the cooling rate of a gas."""
+    added = trial.constant * jnp.exp(log_theta / 2) + trial.drag
+    added = added / (1 - trial.constant - trial.drag) * rate[0]
+    if gas.surface is None:
+        added = added + cooling_by_roughness(_roughened(gas, trial), log_theta, rate + added)
+    return added
+
+
+def _roughened(gas: Gas, trial: Trial) -> Gas:
+    return dataclasses.replace(gas, surface=Rough(trial.rough - 1))
+
+
 def _continued(
     log_theta: Float[Array, "table"], rate: Float[Array, "table"], times: Float[Array, "times"]
 ) -> Float[Array, "times"]:
@@ -131,5 +150,10 @@ def _guess(gas: Gas, names: tuple[str, ...], trial: Trial) -> Gas:
     """The gas whose first cooling rate, with what is added, is about that of the fitted one."""
     if "dissipative_constant" not in names:
         return gas
-    A = gas.value("dissipative_constant") * (1 - trial.constant - trial.drag)
-    return gas.replace(dissipative_constant=A)
+    share = 1 - trial.constant - trial.drag
+    if gas.surface is None:
+        loss = 1 - gas.reduced_law.restitution(jnp.ones_like(gas.temperature)) ** 2
+        surface = reduced_scene(_roughened(gas, trial)).surface
+        assert surface is not None
+        share = share / (1 + 4 * surface.eta * (1 - surface.eta) / loss)
+    return gas.replace(dissipative_constant=gas.value("dissipative_constant") * share)

@@ -28,6 +28,9 @@ of the last temperature."""
 DRAG_SHARES = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
 """The same of drag, which gains on collisions as the gas cools."""
 
+ROUGHNESS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 1.9)
+"""1 + beta_t of rough spheres."""
+
 DELAYS = (0.003, 0.01, 0.03, 0.1, 0.3, -0.001, -0.003, -0.01, -0.03, -0.1, -0.3)
 """Errors of the start of the clock, over the first cooling time."""
 
@@ -158,6 +161,8 @@ def _kinds(result: Fit) -> list[Kind]:
         left = [cause for name, cause in causes.items() if name not in elements]
         words += f", as of {' or '.join(left)}" if left else ""
         kinds.insert(0, (words, "constant", SHARES))
+    if "surface" not in elements:
+        kinds.append(("rough grains, at rest in rotation at t = 0", "rough", ROUGHNESS))
     if "temperature" not in result.names and START not in (*result.names, *result.priors.names):
         kinds.append(("a wrong start of the clock, or a wrong T_0", "delay", DELAYS))
     return kinds

@@ -91,6 +91,41 @@ def cooling_by_elements(
     return jax.vmap(cooling)(log_theta, ratio) * gas.impact_speed / gas.path_length
 
 
+def cooling_by_roughness(
+    gas: Gas, log_theta: Float[Array, "nodes"], rate: Float[Array, "nodes"]
+) -> Float[Array, "nodes"]:
+    """What roughness adds to ``-d ln T/dt``, 1/s, of a gas whose rotation follows from its course.
+
+    ``d(T_rot/T)/ds = (dT_rot/dt)/(T L) + T_rot/T`` over ``s = -ln(T/T_0)``, from the T_rot of the
+    gas, with the whole cooling rate L; by steps from node to node, implicit in T_rot/T.
+
+    Args:
+        gas: of rough spheres.
+        log_theta: ln(T/T_0) at evenly spaced nodes, from 0 downwards.
+        rate: ``-d ln T/dt`` by all else there, 1/s.
+    """
+    alone = reduced_scene(gas)._replace(walls=None, drag=None, drive=None)
+    nothing, unit = jnp.zeros((), log_theta.dtype), gas.impact_speed / gas.path_length
+
+    def parts(log_theta, ratio):
+        at = elements.changes(alone, jnp.exp(log_theta / 2), ratio, nothing, gas.dimension)
+        return jnp.stack([at.cooling, at.rotation]) * unit
+
+    def along(ratio, node):
+        own, (cooling, rotation), (cooling_of_1, rotation_of_1) = node
+        loss = cooling + ratio * (cooling_of_1 - cooling)
+        whole = own + loss
+        decay = -(rotation_of_1 - rotation) / whole - 1
+        later = (ratio + step * rotation / whole) / (1 + step * decay)
+        return later, loss
+
+    step = log_theta[0] - log_theta[1]
+    # Both changes are linear in T_rot/T.
+    ends = [jax.vmap(parts, (0, None))(log_theta, nothing + ratio) for ratio in (0.0, 1.0)]
+    first = gas.value("rotational_temperature") / gas.temperature
+    return jax.lax.scan(along, first, (rate, *ends))[1]
+
+
 def log_temperature(
     log_theta: Float[Array, "nodes"], rate: Float[Array, "nodes"], times: Float[Array, "times"]
 ) -> Float[Array, "times"]:
