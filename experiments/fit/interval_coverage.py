@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.record import add_recording, write_results
+from experiments.support.record import add_recording, figures, write_results
 from experiments.support.scenes import beads
 
 BETA, CONTACT, END, POINTS = 0.18, 0.001, 100.0, 30
@@ -61,9 +61,22 @@ def main() -> None:
                 found = coverage(KINDS[name], number, phi, options.runs)
                 rows.append({"model": name, "num_particles": number, "phi": phi, **found})
                 print(row(rows[-1]), flush=True)
-    write_results("interval_coverage", options, None, rows=rows)
+                write_results("interval_coverage", options, None, rows=with_recorded(rows))
     if options.out is not None:
         options.out.write_text(table({"rows": rows}), encoding="utf-8")
+
+
+def with_recorded(rows: list[dict]) -> list[dict]:
+    """These rows, and the recorded ones of other gases, in the order of the table."""
+
+    def gas(row: dict) -> tuple:
+        return list(KINDS).index(row["model"]), row["num_particles"], row["phi"]
+
+    try:
+        recorded = figures("interval_coverage")["rows"]
+    except FileNotFoundError:
+        recorded = []
+    return sorted(({gas(x): x for x in (*recorded, *rows)}).values(), key=gas)
 
 
 def table(results: dict) -> str:

@@ -24,6 +24,7 @@ from jaxgran.cli.report import (
 )
 from jaxgran.data.files import write_whole
 from jaxgran.data.header import header_count, header_number
+from jaxgran.fitting.checks import unused_rotation
 from jaxgran.fitting.fit import free_by_default
 from jaxgran.plotting import save_fit
 
@@ -70,10 +71,10 @@ def names_of(floats: tuple[str, ...]) -> list[str]:
 
 def run_fit(options: FitOptions, started: float) -> None:
     """Fit, print, draw and write; `started` is when the clock of the whole job began."""
-    curve, header = jaxgran.read_curve(options.curve)
-    header |= settings(options.set)
-    with warnings.catch_warnings(record=True) as doubts:  # of units
+    with warnings.catch_warnings(record=True) as doubts:  # of units and of tracks
         warnings.simplefilter("always", UserWarning)
+        curve, header = jaxgran.read_curve(options.curve)
+        header |= settings(options.set)
         gas, priors = jaxgran.read_gas(header), jaxgran.read_priors(header)
     options.free = options.free or names_of(free_by_default(gas, curve))
     gas = with_given_constant(gas, header, options.free)
@@ -89,8 +90,9 @@ def run_fit(options: FitOptions, started: float) -> None:
     diagnosis = jaxgran.diagnose(result, curve, n)
     rows = rows_of(options, result, diagnosis, header)
     print_scene(options, gas, curve, header, result)
-    for doubt in doubts:
-        print(f"check    {doubt.message}")
+    unused = unused_rotation(gas, curve)
+    for doubt in [*(doubt.message for doubt in doubts), *([unused] if unused else [])]:
+        print(f"check    {doubt}")
     print_impacts(result.gas, float(curve.temperature[-1]), n)
     print_model(model_name, result, reasons)
     print_rows(rows)

@@ -13,6 +13,8 @@ from jaxgran.cli.models import MODELS, named
 from jaxgran.cli.output import environment, finite_or_null, outputs, settings
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.files import write_whole
+from jaxgran.data.header import header_count
+from jaxgran.fitting.few_replicas import smooth_errors
 from jaxgran.fitting.joint import JointFit
 from jaxgran.models.selection import default_models
 from jaxgran.plotting import save_curves
@@ -51,6 +53,7 @@ def run_joint(
         header |= settings(options.set)
         own = with_given_constant(jaxgran.read_gas(header), header, free)
         gas = own if gas is None else gas
+        curve, _ = smooth_errors(curve, header_count(header, "replicas") or 1)
         measurements[_label(path, measurements)] = own, curve
     for path in drops:  # of spheres like those of the first curve
         test = jaxgran.read_drop_test(path, onto_plate=onto_plate)

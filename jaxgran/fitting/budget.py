@@ -28,13 +28,16 @@ def in_scene(result: Fit, num_particles: int | None, replicas: int) -> Fit:
     """
     course = _course(result, num_particles)
     own = course.clock_error(result.model.rate_error(course))[-result.curve.times.size :]
-    # A deterministic model's clock was compared in a few scenes, and is not known better in others.
-    clock_error = jnp.maximum(jnp.asarray(own, result.clock_error.dtype), result.clock_error)
+    clock_error = jnp.asarray(own, result.clock_error.dtype)
     fitted = bool(result.priors.names) and not result.model.stochastic
-    moved = result.clock_gain @ jnp.sqrt(clock_error**2 - fitted * result.clock_error**2)
+    # What a clock that was fitted along, within `derivative_accuracy`, does not hold already.
+    beyond = jnp.maximum(clock_error**2 - fitted * result.clock_error**2, 0.0)
+    moved = result.clock_gain @ jnp.sqrt(beyond)
     covariances = dict(result.covariances)
     model = covariances["model"] if fitted else 0.0
     covariances["model"] = model + jnp.outer(moved, moved)
+    if result.model.stochastic:
+        covariances["slope"] = _by_slope(result)
     if num_particles is not None:
         chance = _by_chance(result, course, num_particles * replicas)
         covariances["few particles"] = _beyond(chance, covariances["measurement"])
@@ -69,6 +72,21 @@ def _by_chance(result: Fit, course: Course, num_particles: int) -> Float[Array, 
     common = np.minimum(gathered[:, None], gathered[None, :])
     gain = np.asarray(result.clock_gain) / np.where(times > 0, times, 1.0)[None]
     return jnp.asarray(gain @ common @ gain.T)
+
+
+def _by_slope(result: Fit) -> Float[Array, "p p"]:
+    """Covariance of the estimates by derivatives that are too large in a gas with a flow.
+
+    They are so by the share b in the mean over the points, by their weight: errors are larger by
+    1 + b than their derivatives say, and b of the last extrapolation is missing.
+    """
+    course = _course(result, getattr(result.model, "num_particles", None))
+    times = result.curve.times.size
+    bias = np.broadcast_to(result.model.derivative_error(course), course.time.shape)[-times:]
+    weights = np.sum(np.asarray(result.sensitivity)[:times] ** 2, axis=1)
+    b = float(np.sum(weights * bias) / max(np.sum(weights), np.finfo(float).tiny))
+    found = result.covariances["measurement"] + result.covariances["simulation"]
+    return ((1 + b) ** 2 - 1) * found + b**2 * jnp.outer(result.beyond, result.beyond)
 
 
 def _beyond(whole: Float[Array, "p p"], measured: Float[Array, "p p"]) -> Float[Array, "p p"]:

@@ -48,6 +48,22 @@ def _check_magnitudes(curve: CoolingCurve) -> None:
             )
 
 
+def unused_rotation(gas: Gas, curve: CoolingCurve) -> str | None:
+    """Why a fit does not use the T_rot of a curve; None if it does, or if there is none."""
+    if curve.rotational_temperature is None:
+        return None
+    if gas.surface is None:
+        return (
+            "the measured T_rot is not used, since the gas has no surface=jaxgran.Rough(...) "
+            "(header key beta_t)"
+        )
+    lacking = {"T_err": curve.temperature_error, "T_rot_err": curve.rotational_temperature_error}
+    names = [name for name, error in lacking.items() if error is None]
+    if names:
+        return f"the measured T_rot is not used, for want of {' and '.join(names)} to weigh it by"
+    return None
+
+
 @no_type_check
 def check_deterministic(model: AbstractModel, user: str) -> None:
     """Raise ValueError for a model whose every curve has other noise."""

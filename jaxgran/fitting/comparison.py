@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
+from jaxgran.fitting.checks import unused_rotation
 from jaxgran.fitting.guess import guess_of_start, halving_time
 from jaxgran.fitting.parameters import START, Parameters, size_of
 from jaxgran.fitting.priors import NO_PRIORS, Priors
@@ -226,9 +227,7 @@ def _begun_at_0(model: AbstractModel, gas: Gas, since: Float[Array, "times"]) ->
 def uses_rotation(gas: Gas, curve: CoolingCurve) -> bool:
     """Whether a fit uses a measured T_rot: where its errors are known, and those of T to weigh it
     with, and the spheres are rough."""
-    measured = curve.rotational_temperature, curve.rotational_temperature_error
-    known = None not in (*measured, curve.temperature_error)
-    return known and gas.surface is not None
+    return curve.rotational_temperature is not None and unused_rotation(gas, curve) is None
 
 
 def clock_of_few(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:

@@ -92,6 +92,7 @@ def _fit_at(
         gain=gains["measurement"] * comparison.weights["measurement"][None],
         clock_gain=clock_gain,
         sensitivity=jacobian[: comparison.num_measured, : comparison.num_free],
+        beyond=jnp.zeros(comparison.num_free, flat.dtype),
         start=comparison.estimates(first),
         gas=comparison.parameters.gas(comparison.of_gas(flat)),
         began=jnp.asarray(comparison.parameters.start(comparison.of_gas(flat)), flat.dtype),

@@ -13,7 +13,7 @@ from jaxgran.checks.tracing import any_traced
 from jaxgran.checks.validation import no_type_check, whole_number
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.budget import in_scene
-from jaxgran.fitting.checks import check_curve
+from jaxgran.fitting.checks import check_curve, unused_rotation
 from jaxgran.fitting.deterministic import SEARCHES, fit_deterministic
 from jaxgran.fitting.few_replicas import smooth_errors
 from jaxgran.fitting.guess import guess_from_data, halving_time
@@ -121,11 +121,8 @@ def fit(
     names, key, known = tuple(names), checked_key(key), Priors.of(gas, priors)
     if {START, "temperature"} <= {*names} and not {START, "temperature"} & {*known.names}:
         known = known.with_one(START, 0.0, WIDEST_START * halving_time(curve))
-    if curve.rotational_temperature is not None and gas.surface is None:
-        warnings.warn(
-            "the measured T_rot is not used, since the gas has no surface=jaxgran.Rough(...)",
-            stacklevel=2,
-        )
+    if unused := unused_rotation(gas, curve):
+        warnings.warn(unused, stacklevel=2)
     curve, of_errors = smooth_errors(curve, replicas)
     model = KineticTheory() if model is None else model
     _check_model(model, method, names, known)

@@ -37,6 +37,7 @@ class Simulated(NamedTuple):
         weights: of the residuals; 0 where not used.
         residuals: weighted, at `flat` extrapolated linearly from the simulations; 0 where not used.
         sensitivity: derivative of the weighted residuals.
+        beyond: `flat` less the mean of the simulations' parameters.
         gain: derivative of `flat` in each measured ln T; 0 where not used.
         error_covariance: covariance of `flat` by the errors of the measurement.
         noise_covariance: and by the noise of the simulations.
@@ -49,6 +50,7 @@ class Simulated(NamedTuple):
     weights: Float[np.ndarray, "times"]
     residuals: Float[np.ndarray, "times"]
     sensitivity: Float[np.ndarray, "times p"]
+    beyond: Float[np.ndarray, "p"]
     gain: Float[np.ndarray, "p times"]
     error_covariance: Float[np.ndarray, "p p"]
     noise_covariance: Float[np.ndarray, "p p"]
@@ -137,7 +139,8 @@ def by_simulation(
     weighted = _residuals_at(flat, near, measured, average.sigma, used)
     gain = np.zeros((len(flat), len(used)))
     gain[:, used] = average.gain
-    parts = gain, average.errors, average.noises
+    beyond = flat - np.mean([s.flat for s in near], axis=0)
+    parts = beyond, gain, average.errors, average.noises
     return Simulated(flat, curve, *weighted, *parts, len(simulations), settled)
 
 

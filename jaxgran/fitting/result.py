@@ -34,13 +34,16 @@ class Fit(eqx.Module):
             "model", the error of the model's clock, `clock_error`; "model of <dr^2>" and "model of
             T_rot", those of a factor common to all of these; one part for each of the `priors`,
             under its name; "few particles", what the chance of single collisions adds where N is
-            known; and "simulation", the noise of a stochastic model, estimated from its replicas.
+            known; and of a stochastic model "simulation", its noise, estimated from its replicas,
+            and "slope", what the bias of its derivatives in a gas with a flow does.
         clock_error: relative error of the model's clock, in this scene, at the measured times.
         gain: derivative of each estimate in each measured ln T, SI, shape (p, times).
         clock_gain: its change over a relative change of the model's clock at each time, SI, shape
             (p, times).
         sensitivity: derivative of the weighted residuals of T, and of <dr^2> if it was used, in the
             parameters' unbounded scale (the logarithm of a positive one), shape (residuals, p).
+        beyond: by how much the estimate lies beyond the mean of the simulations from which it was
+            extrapolated, SI, shape (p,); 0 of a deterministic model.
         start: the guess at which the search began, SI, shape (p,).
         gas: the fitted gas, with all floats that have priors.
         began: t0, the time at which the gas had T_0 and began to cool, s; 0 unless it was free.
@@ -75,6 +78,7 @@ class Fit(eqx.Module):
     gain: Float[Array, "p times"]
     clock_gain: Float[Array, "p times"]
     sensitivity: Float[Array, "residuals p"]
+    beyond: Float[Array, "p"]
     start: Float[Array, "p"]
     gas: Gas
     began: Float[Array, ""]

@@ -139,6 +139,7 @@ def _fit_of(
         gain=gain,
         clock_gain=-gain * slope[None],
         sensitivity=sensitivity,
+        beyond=scale @ jnp.asarray(found.beyond),
         start=parameters.estimates(first),
         gas=gas,
         began=jnp.zeros(()),

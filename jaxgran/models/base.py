@@ -126,6 +126,12 @@ class AbstractModel(eqx.Module):
         """
         return 0.0 if self.stochastic else self.derivative_accuracy
 
+    def derivative_error(self, course: Course) -> Float[np.ndarray, "times"] | float:
+        """Estimated relative error of the derivatives of ln T along a gas's course, beyond
+        `derivative_accuracy`: they are too large by it. The error bars of a fit contain it.
+        """
+        return 0.0
+
     @abstractmethod
     def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
         """What the model leaves out of a scene, the most serious first; () if nothing matters.

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from equinox import AbstractClassVar, AbstractVar
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
@@ -70,6 +71,10 @@ class AbstractSpheres(AbstractModel):
     @abstractmethod
     def projected(self) -> bool:
         """Whether derivatives are thermally projected."""
+
+    def derivative_error(self, course: Course) -> Float[np.ndarray, "times"]:
+        """Of projected derivatives, where the gas has a flow."""
+        return course.slope_error()
 
     @abstractmethod
     def scene(self, gas: Gas) -> Any:

@@ -1,9 +1,12 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.fitting.checks import unused_rotation
 from jaxgran.fitting.guess import guess_from_data
 from tests.conftest import glass_beads
 from tests.fitting.curves import measured, synthetic
@@ -269,3 +272,18 @@ def test_a_fit_is_shown_by_its_estimates():
     shown = jaxgran.fit(gas, curve, free=("dissipative_constant",))
     assert repr(shown).startswith("Fit of kinetic theory\n  dissipative_constant")
     assert "converged" in shown._repr_html_()
+
+
+def test_a_rotation_that_is_not_used_is_said():
+    gas = glass_beads(0.15)
+    rough = dataclasses.replace(gas, surface=jaxgran.Rough(0.0))
+    T = jnp.geomspace(0.01, 0.001, 8)
+    bare = jaxgran.CoolingCurve(jnp.arange(1.0, 9.0), T, rotational_temperature=0.1 * T)
+    assert "no surface" in str(unused_rotation(gas, bare))
+    assert "for want of T_err and T_rot_err" in str(unused_rotation(rough, bare))
+    known = dataclasses.replace(
+        bare, temperature_error=0.1 * T, rotational_temperature_error=0.1 * T
+    )
+    assert unused_rotation(rough, known) is None
+    with pytest.warns(UserWarning, match="for want of T_err and T_rot_err"):
+        jaxgran.fit(rough, bare)

@@ -33,6 +33,7 @@ CASES = [
     # what the curve contains, noise floor, true A over 3e-6, words, whether it must be noticed
     ("nothing", wrong_physics.nothing, 0.0, 1.0, "", False),
     ("rough", wrong_physics.rough(-0.5), 0.0, 1.0, "constant eps", False),
+    ("very rough", wrong_physics.rough(0.0), 0.0, 1.0, "rough grains, at rest", False),
     ("walls", wrong_physics.walls(0.8), 0.0, 1.0, "constant eps", False),
     # No A at all: any small one must be left possible.
     ("constant", wrong_physics.constant(0.8), 0.0, 0.05, "constant eps", True),
