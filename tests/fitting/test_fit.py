@@ -286,4 +286,5 @@ def test_a_rotation_that_is_not_used_is_said():
     )
     assert unused_rotation(rough, known) is None
     with pytest.warns(UserWarning, match="for want of T_err and T_rot_err"):
-        jaxgran.fit(rough, bare)
+        with pytest.raises(ValueError, match="method must be"):  # said before a long search
+            jaxgran.fit(rough, bare, method="none")
