@@ -150,7 +150,7 @@ def free_elements(result: Fit) -> tuple[str, ...]:
 
 def _kinds(result: Fit) -> list[Kind]:
     """The rivals that the fit can have."""
-    kinds = [
+    kinds: list[Kind] = [
         ("linear drag, as of air", "drag", DRAG_SHARES),
         ("a noise floor in T", "floor", SHARES),
     ]
