@@ -15,6 +15,7 @@ from jaxgran.cli.models import model_of, named
 from jaxgran.cli.output import environment, finite_or_null, outputs, plain, settings
 from jaxgran.cli.report import (
     print_budget,
+    print_doubts,
     print_impacts,
     print_model,
     print_rivals,
@@ -90,9 +91,7 @@ def run_fit(options: FitOptions, started: float) -> None:
     diagnosis = jaxgran.diagnose(result, curve, n)
     rows = rows_of(options, result, diagnosis, header)
     print_scene(options, gas, curve, header, result)
-    unused = unused_rotation(gas, curve)
-    for doubt in [*(doubt.message for doubt in doubts), *([unused] if unused else [])]:
-        print(f"check    {doubt}")
+    print_doubts(doubts, unused_rotation(gas, curve))
     print_impacts(result.gas, float(curve.temperature[-1]), n)
     print_model(model_name, result, reasons)
     print_rows(rows)

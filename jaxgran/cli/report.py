@@ -21,6 +21,12 @@ def print_scene(options: Any, gas, curve, header, result) -> None:
     )
 
 
+def print_doubts(warned, unused: str | None) -> None:
+    """Warnings of the input, and what of it was not used."""
+    for doubt in [*(warning.message for warning in warned), *([unused] if unused else [])]:
+        print(f"check    {doubt}")
+
+
 def print_impacts(gas, last_T: float, num_particles: int | None) -> None:
     """What the fitted A means: eps at the rms impact speeds of the first and of the last T."""
     first, last = (float(gas.restitution(np.sqrt(2 * T))) for T in (gas.temperature, last_T))

@@ -137,11 +137,17 @@ def by_simulation(
             if ended or len(simulations) == max_simulations:
                 break
     weighted = _residuals_at(flat, near, measured, average.sigma, used)
-    gain = np.zeros((len(flat), len(used)))
-    gain[:, used] = average.gain
+    gain = _spread(average.gain, used)
     beyond = flat - np.mean([s.flat for s in near], axis=0)
-    parts = beyond, gain, average.errors, average.noises
-    return Simulated(flat, curve, *weighted, *parts, len(simulations), settled)
+    parts = *weighted, beyond, gain, average.errors, average.noises
+    return Simulated(flat, curve, *parts, len(simulations), settled)
+
+
+def _spread(values: Float[np.ndarray, "p used"], used: Bool[np.ndarray, "times"]) -> np.ndarray:
+    """Values at all times, 0 where not used."""
+    spread = np.zeros((len(values), len(used)))
+    spread[:, used] = values
+    return spread
 
 
 def _simulated(

@@ -108,16 +108,15 @@ def _fit_of(
 ) -> Fit:
     """The fit in SI units of what a search found."""
     flat = jnp.asarray(found.flat)
-    residuals, sensitivity = jnp.asarray(found.residuals), jnp.asarray(found.sensitivity)
-    weights = jnp.asarray(found.weights)
-    used = residuals != 0
+    own = found.residuals, found.sensitivity, found.weights
+    residuals, sensitivity, weights = map(jnp.asarray, own)
+    used, scatter = residuals != 0, None
     degrees_of_freedom = jnp.sum(used) - flat.size
-    scatter = None
     if not errors_known:
         scatter = jnp.sqrt(jnp.sum(residuals**2) / degrees_of_freedom)
         residuals, sensitivity, weights = (x / scatter for x in (residuals, sensitivity, weights))
-    tested = [(residuals, degrees_of_freedom, of_errors)]
-    chance = misfit(tested, degrees_of_freedom, errors_known=errors_known)
+    tested = residuals, degrees_of_freedom, of_errors
+    chance = misfit([tested], degrees_of_freedom, errors_known=errors_known)
     scale = jax.jacfwd(parameters.estimates)(flat)
     gain = scale @ jnp.asarray(found.gain)
     gas = parameters.gas(flat)
