@@ -1,4 +1,4 @@
-"""What do rough spheres, walls and drag cost, over the smooth gas without them?
+"""What do rough spheres, walls, drag and a drive cost, over the smooth gas without them?
 
     python experiments/speed/benchmark_elements.py [--repeats 7] [--smoke] [--out FILE]
 
@@ -28,6 +28,7 @@ ELEMENTS = {
     "walls": {"container": None},  # of the size of the gas
     "rough, walls": {"surface": jaxgran.Rough(0.0, rotational_temperature=4e-3), "container": None},
     "drag": {"drag": jaxgran.StokesDrag(0.5)},
+    "drive": {"drive": None},  # of .02 T_0 in a mean free time
 }
 
 
@@ -36,6 +37,9 @@ def scene(elements: dict) -> jaxgran.Gas:
     if "container" in elements:
         side = float(gas.box_side(NUM_HARD))
         elements = elements | {"container": jaxgran.Walls(side, restitution=0.9)}
+    if "drive" in elements:
+        strength = 0.02 * gas.temperature / gas.mean_free_time
+        elements = elements | {"drive": jaxgran.WhiteNoise(strength)}
     return dataclasses.replace(gas, **elements)
 
 
