@@ -87,11 +87,20 @@ def first_cooling_rate(gas: Gas, averages: Callable = exact_averages) -> Float[A
     return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
 
 
-def check_softness(gas: Gas, factor: ArrayLike) -> None:
-    """Raise ValueError where the factor by which soft contacts slow the cooling is not positive."""
+def check_softness(gas: Gas, factor: ArrayLike, hottest: ArrayLike = 1.0) -> None:
+    """Raise ValueError where the factor by which soft contacts slow the cooling is not positive.
+
+    Args:
+        gas: the scene.
+        factor: at the highest temperature.
+        hottest: the square root of that temperature over T_0.
+    """
     if not isinstance(factor, Tracer) and np.any(np.asarray(factor) <= 0):
+        speed = float(np.max(np.asarray(hottest)))
+        overlap = float(np.max(gas.mean_overlap)) * speed**0.8
+        place = "T_0" if speed == 1 else f"{speed**2:.3g} T_0, to which the gas heats up"
         raise ValueError(
-            f"spheres overlap by {float(np.max(gas.mean_overlap)):.2g} diameters at T_0, where "
+            f"spheres overlap by {overlap:.2g} diameters at {place}, where "
             "the softness correction has no meaning; is youngs_modulus in Pa? If so use "
             "SoftSpheres, or KineticTheory(softness=False)"
         )

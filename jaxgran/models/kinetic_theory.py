@@ -116,9 +116,9 @@ class KineticTheory(AbstractModel):
         """Raise ValueError for a law that heats the gas or contacts too soft for the theory."""
         if any_traced(gas):
             return
-        rate, factor = _at_start(gas, self._averages)
+        rate, factor, hottest = _at_start(gas, self._averages)
         if self.softness:
-            checks.check_softness(gas, factor)
+            checks.check_softness(gas, factor, hottest)
         checks.check_cools(rate)
 
     def estimated_error(self, course: Course) -> float:
@@ -292,8 +292,10 @@ class KineticTheory(AbstractModel):
 
 
 @eqx.filter_jit
-def _at_start(gas: Gas, averages_of: Callable[..., Array]) -> tuple[Array, Array]:
-    """The first cooling rate and softness factor."""
-    one = jnp.ones_like(gas.temperature)
-    factor = averages.softness_factor(gas.reduced_law, one, gas.dimension)
-    return checks.first_cooling_rate(gas, averages_of), factor
+def _at_start(gas: Gas, averages_of: Callable[..., Array]) -> tuple[Array, Array, Array]:
+    """The first cooling rate, the softness factor where it is hottest, and sqrt(T/T_0) there."""
+    hottest = jnp.ones_like(gas.temperature)
+    if gas.drive is not None:
+        hottest = steady.hottest_speed(gas)
+    factor = averages.softness_factor(gas.reduced_law, hottest, gas.dimension)
+    return checks.first_cooling_rate(gas, averages_of), factor, hottest

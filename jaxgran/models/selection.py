@@ -191,7 +191,9 @@ def course_of(gas: Gas, end: float, num_particles: int | None = None) -> Course:
     known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
     curve = KineticTheory().simulate(known, jnp.expm1(grid) * gas.mean_free_time, Run())
     course = course_along(gas, curve, num_particles)
-    check_softness(gas, 1 - np.max(course.softness))
+    softest = int(np.argmax(course.softness))
+    hottest = np.exp(course.log_temperature[softest] / 2)
+    check_softness(gas, 1 - course.softness[softest], hottest)
     fault = int(jnp.asarray(curve.status))
     if fault != status.OK:
         raise RuntimeError(f"kinetic theory, which estimates the errors: {status.explain(fault)}")

@@ -81,24 +81,39 @@ def _solved(gas: Gas) -> tuple[Array, Array, Array, Array]:
     scene, d = reduced_scene(gas), gas.dimension
     assert scene.drive is not None
 
-    def balance(x: Array, scene: ReducedScene, softness: bool = True) -> Array:
-        return _rates(x[0], x[1], scene, d, softness)[:2] / jnp.exp(x[0] / 2)
+    def balance(x: Array, scene: ReducedScene) -> Array:
+        return _rates(x[0], x[1], scene, d)[:2] / jnp.exp(x[0] / 2)
 
-    def halved(_, ends):
-        middle = (ends[0] + ends[1]) / 2
-        # Without softness, whose first order has no meaning in a gas that is far too hot.
-        heats = balance(jnp.stack([middle, jnp.zeros_like(middle)]), scene, False)[0] > 0
-        return jnp.where(heats, middle, ends[0]), jnp.where(heats, ends[1], middle)
-
-    widest = jnp.full((), WIDEST, gas.temperature.dtype)
-    low, high = jax.lax.stop_gradient(jax.lax.fori_loop(0, 40, halved, (-widest, widest)))
-    first = jnp.stack([(low + high) / 2, jnp.zeros_like(low)])
+    low = _balanced(scene, gas.temperature, d)
+    first = jnp.stack([low, jnp.zeros_like(low)])
     tolerance = jnp.finfo(first.dtype).eps ** 0.75
     solver = optx.Newton(rtol=float(tolerance), atol=float(tolerance))
     x = optx.root_find(balance, solver, first, scene, throw=False, max_steps=32).value
     heating = scene.drive.strength / jnp.exp(1.5 * x[0])
     off = jnp.abs(balance(x, scene)[0]) / heating
     return x[0], x[1], _steady_ratio(jnp.exp(x[0] / 2), x[1], scene, d), off
+
+
+def _balanced(scene: ReducedScene, like: Array, d: int) -> Float[Array, ""]:
+    """ln T/T_0 at which Maxwellian losses balance a drive, within +- `WIDEST`.
+
+    Without softness, whose first order has no meaning in a gas that is far too hot.
+    """
+
+    def halved(_, ends):
+        middle = (ends[0] + ends[1]) / 2
+        heats = _rates(middle, jnp.zeros_like(middle), scene, d, softness=False)[0] > 0
+        return jnp.where(heats, middle, ends[0]), jnp.where(heats, ends[1], middle)
+
+    widest = jnp.full((), WIDEST, like.dtype)
+    low, high = jax.lax.fori_loop(0, 40, halved, (-widest, widest))
+    return jax.lax.stop_gradient((low + high) / 2)
+
+
+def hottest_speed(gas: Gas) -> Float[Array, ""]:
+    """sqrt(T/T_0) of the steady state of a driven gas, 1 if it cools, or if nothing balances."""
+    found = _balanced(reduced_scene(gas), gas.temperature, gas.dimension)
+    return jnp.where((found > 0) & (found < 0.99 * WIDEST), jnp.exp(found / 2), 1.0)
 
 
 def _rates(

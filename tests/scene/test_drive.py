@@ -221,3 +221,10 @@ def test_dsmc_finds_the_steady_state_of_van_noije_and_ernst(eps, dimension):
     assert float(jnp.mean(curve.temperature)) == pytest.approx(float(steady.temperature), rel=0.01)
     expected = sonine_of_van_noije_and_ernst(eps, dimension)
     assert float(jnp.mean(curve.sonine)) == pytest.approx(expected, abs=0.006 + 0.1 * abs(expected))
+
+
+def test_a_drive_that_heats_soft_spheres_too_far_is_refused(beads):
+    # At T_0 they overlap by .4 %, in the steady state by more than theory can correct.
+    gas = dataclasses.replace(beads(), drive=jaxgran.WhiteNoise(1e8))
+    with pytest.raises(ValueError, match="T_0, to which the gas heats up.*SoftSpheres"):
+        jaxgran.cool(gas, [1e-6])
