@@ -294,8 +294,7 @@ class KineticTheory(AbstractModel):
 @eqx.filter_jit
 def _at_start(gas: Gas, averages_of: Callable[..., Array]) -> tuple[Array, Array, Array]:
     """The first cooling rate, the softness factor where it is hottest, and sqrt(T/T_0) there."""
-    hottest = jnp.ones_like(gas.temperature)
-    if gas.drive is not None:
-        hottest = steady.hottest_speed(gas)
+    one = jnp.ones_like(gas.temperature)
+    hottest = one if gas.drive is None else steady.hottest_speed(gas)
     factor = averages.softness_factor(gas.reduced_law, hottest, gas.dimension)
     return checks.first_cooling_rate(gas, averages_of), factor, hottest
