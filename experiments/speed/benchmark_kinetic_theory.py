@@ -6,13 +6,15 @@
    solve_ivp (LSODA) on the same equations in NumPy at the same accuracy. The errors of both are
    relative to a solution with a tighter tolerance.
 2. One derivative, in forward and in reverse mode, compared with one solution without it.
-3. The time of `import jaxgran`, and of a whole fit by `fit_cooling_curve.py` in a new process.
+3. The first calls in a new process, which compile; the time of `import jaxgran`, and of a whole fit
+   by `fit_cooling_curve.py` in a new process, for the first time and again.
 
 Run times are medians of repeats, without compilation, which is given separately.
 """
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -172,18 +174,63 @@ def derivative_cost(repeats: int) -> dict[str, float]:
     return row
 
 
+FIRST_CALLS = """
+import json, time
+import jax, jax.numpy as jnp, jaxgran
+from experiments.speed.benchmark_kinetic_theory import scene
+jax.config.update("jax_enable_x64", True)
+gas, seconds = scene(), {}
+times = {n: jnp.geomspace(1e-3, 100.0, n) for n in (50, 60)}
+
+def log_temperature(a):
+    return jnp.log(jaxgran.cool(gas.replace(dissipative_constant=a), times[50]).temperature)
+
+for name, run in {
+    "cool": lambda: jaxgran.cool(gas, times[50]),
+    "cool_another_number_of_times": lambda: jaxgran.cool(gas, times[60]),
+    "jacfwd": lambda: jax.jacfwd(log_temperature)(3e-6),
+    "jacrev": lambda: jax.jacrev(log_temperature)(3e-6),
+    "vmap": lambda: jax.vmap(log_temperature)(jnp.geomspace(1e-6, 1e-5, 10)),
+}.items():
+    begin = time.perf_counter()
+    jax.block_until_ready(run())
+    seconds[f"first_{name}_s"] = time.perf_counter() - begin
+print(json.dumps(seconds))
+"""
+"""The first calls of a new process, one after the other; each compiles what it needs."""
+
+
 def cold_starts() -> dict[str, float]:
-    def seconds(*command):
+    """Seconds of new processes; nothing compiled is kept from before."""
+    bare = {k: v for k, v in os.environ.items() if not k.startswith("JAX")}
+    root = Path(__file__).parents[2]
+    bare["PYTHONPATH"] = os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
+
+    def seconds(*command, **more):
         begin = time.perf_counter()
-        subprocess.run([sys.executable, *command], check=True, capture_output=True)
+        subprocess.run([sys.executable, *command], check=True, capture_output=True, env=bare | more)
         return time.perf_counter() - begin
 
-    script = str(Path(__file__).parents[1] / "fit_cooling_curve.py")
+    done = [
+        subprocess.run(
+            [sys.executable, "-c", FIRST_CALLS],
+            check=True,
+            capture_output=True,
+            text=True,
+            env=bare,
+        )
+        for _ in range(3)
+    ]
+    first = [json.loads(one.stdout.splitlines()[-1]) for one in done]
+    row = {name: float(np.median([one[name] for one in first])) for name in first[0]}
+    script = str(root / "experiments" / "fit_cooling_curve.py")
     with tempfile.TemporaryDirectory() as folder:
-        job = seconds(script, "--out", folder)
-    bare = float(np.median([seconds("-c", "pass") for _ in range(3)]))
+        kept = {"XDG_CACHE_HOME": folder}
+        for name in ("main_job_s", "main_job_again_s"):  # the second time with kept programs
+            row[name] = seconds(script, "--out", folder, "--overwrite", **kept)
+    empty = float(np.median([seconds("-c", "pass") for _ in range(3)]))
     light = float(np.median([seconds("-c", "import jaxgran") for _ in range(3)]))
-    return {"import_s": light - bare, "main_job_s": job}
+    return row | {"import_s": light - empty}
 
 
 def main() -> None:
