@@ -228,7 +228,7 @@ class DrivenStart(eqx.Module):
     """
 
 
-def share_of_container(gas: Any, num_particles: float) -> float:
+def share_of_container(gas: Any, num_particles: int | float) -> float:
     """Volume that N spheres of a gas have, over that of its container; 1 if they agree."""
     sides = np.broadcast_to(gas.container.side, (gas.dimension,))
     return float(num_particles / gas.number_density) / float(np.prod(sides))
