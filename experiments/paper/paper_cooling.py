@@ -60,7 +60,9 @@ def main() -> None:
     found = {}
     for name, gas in gases.items():
         theory = jaxgran.cool(
-            gas, tau * gas.mean_free_time, model=jaxgran.KineticTheory(softness=False)
+            gas,
+            tau * gas.mean_free_time,
+            model=jaxgran.KineticTheory(softness=False, correlations=False),
         )
         theta = np.asarray(theory.temperature / gas.temperature)
         dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model, key=key)

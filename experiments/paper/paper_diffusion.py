@@ -61,7 +61,7 @@ def main() -> None:
     found = {}
     for name, gas in gases.items():
         unit = float(gas.temperature * gas.mean_free_time**2)
-        theory = jaxgran.KineticTheory(softness=False)
+        theory = jaxgran.KineticTheory(softness=False, correlations=False)
         of = jaxgran.cool(gas, tau * gas.mean_free_time, model=theory)
         dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model, key=key)
         spread, collisions, theta = columns(of, float(gas.temperature), unit)
@@ -151,7 +151,11 @@ def formulas(axes, tau: np.ndarray, spread: np.ndarray, delta: float) -> dict:
 def cooling_window(delta: float, tau: np.ndarray) -> dict:
     """Times at which the paper's conditions are met for a given delta, and what holds there."""
     gas = beads(0.05, 1.5 * 2**0.1 * delta)
-    curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=jaxgran.KineticTheory(softness=False))
+    curve = jaxgran.cool(
+        gas,
+        tau * gas.mean_free_time,
+        model=jaxgran.KineticTheory(softness=False, correlations=False),
+    )
     unit = float(gas.temperature * gas.mean_free_time**2)
     spread, collisions, theta = columns(curve, float(gas.temperature), unit)
     middle, local = paper.slope(tau, spread)

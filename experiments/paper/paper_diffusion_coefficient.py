@@ -118,7 +118,9 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio)
     last = config.last if name != "elastic" else min(config.last, 30.0)
     tau = np.geomspace(0.5, last, config.points)
     fine = np.geomspace(0.02, last, 400)
-    of = jaxgran.cool(gas, fine * tau_c, model=jaxgran.KineticTheory(softness=False))
+    of = jaxgran.cool(
+        gas, fine * tau_c, model=jaxgran.KineticTheory(softness=False, correlations=False)
+    )
     theta = np.asarray(of.temperature) / start
     size = config.correlation
     model, key = jaxgran.DSMC(size.num_particles, size.replicas), jax.random.key(size.seed + 1)

@@ -81,7 +81,9 @@ def theory(gas: jaxgran.Gas, lags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     The lags, in tau_E, must be so dense that the trapezoidal rule suffices.
     """
     times = lags * enskog_time(gas)
-    curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False))
+    curve = jaxgran.cool(
+        gas, times, model=jaxgran.KineticTheory(softness=False, correlations=False)
+    )
     theta = curve.temperature / gas.temperature
     nu = relaxation(gas.reduced_law, theta, curve.sonine, gas.dimension)[0]
     nu = np.asarray(nu * gas.impact_speed / gas.path_length)

@@ -85,6 +85,7 @@ class CoolingCurve(eqx.Module):
         temperature: T = <v^2>/d, m^2/s^2.
         displacement: mean square displacement <dr^2> since t = 0, m^2; None if unknown.
         sonine: a_2, second Sonine coefficient of the velocity distribution; None if unknown.
+        third_sonine: a_3, the third one; None if unknown.
         collisions: collisions per particle since t = 0; None if unknown.
         diffusion: self-diffusion coefficient D(t), m^2/s; None if unknown.
         temperature_error: standard error of T, m^2/s^2, of a measured or stochastic curve.
@@ -113,6 +114,7 @@ class CoolingCurve(eqx.Module):
     temperature: Float[Array, "... times"] = _number_field()
     displacement: Float[Array, "... times"] | None = _number_field(default=None)
     sonine: Float[Array, "... times"] | None = _number_field(default=None)
+    third_sonine: Float[Array, "... times"] | None = _number_field(default=None)
     collisions: Float[Array, "... times"] | None = _number_field(default=None)
     diffusion: Float[Array, "... times"] | None = _number_field(default=None)
     temperature_error: Float[Array, "... times"] | None = _number_field(default=None)

@@ -25,8 +25,8 @@ from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas
-from jaxgran.theory.averages import softness_factor
 from jaxgran.theory.shear_modes import flow_share
+from jaxgran.theory.softness import softness_factor
 
 NUM_PARTICLES = 4000
 """Particles of a particle model if no number is given."""
@@ -240,7 +240,7 @@ def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Arr
 
 def _scene_in_words(course: Course, size: int, replicas: int) -> list[str]:
     hard = course.error_of_temperature(course.lasting_contacts + course.softness)
-    corrected = course.error_of_temperature(course.lasting_contacts + course.second_order_softness)
+    corrected = course.error_of_temperature(course.crowded_contacts + course.second_order_softness)
     lowest, end = np.exp([course.log_temperature.min(), course.log_temperature[-1]])
     heated = course.gas.drive is not None and end > 1
     return [
@@ -256,7 +256,7 @@ def _scene_in_words(course: Course, size: int, replicas: int) -> list[str]:
 
 
 def _box_in_words(course: Course) -> str:
-    gas, error = course.gas, _percent(course.error_of_temperature(course.homogeneous))
+    gas, error = course.gas, _percent(course.error_of_temperature(course.correlated))
     text = f"At a packing fraction of {float(gas.packing_fraction):.2g}"
     if course.num_particles is None:
         return (

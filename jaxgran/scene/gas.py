@@ -24,6 +24,7 @@ from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
 from jaxgran.scene.law import check_units
 from jaxgran.scene.named_floats import NamedFloats, Place
 from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw, Viscoelastic
+from jaxgran.scene.shear import critical_length
 
 if TYPE_CHECKING:
     UserLaw = RestitutionLaw
@@ -277,16 +278,12 @@ class Gas(NamedFloats):
     def critical_box(self) -> Float[Array, ""]:
         """Critical length of the shear instability, ``L_c = 2 pi / k_c``, m, at t = 0.
 
-        A gas in a periodic box longer than L_c does not stay homogeneous. ``k_c sigma = n sigma^3
-        sqrt((32 pi / 15) (1 - eps^2))`` (3D) or ``n sigma^2 sqrt(pi (1 - eps^2))`` (2D), of a
-        dilute gas, with eps at `impact_speed`. Infinite for elastic spheres.
+        In a periodic box longer than L_c a flow grows at the expense of the heat; clusters come
+        later, when it is strong enough to sweep the spheres together. See
+        `jaxgran.scene.shear.critical_length`. Infinite for elastic spheres.
         """
-        eps = self.reduced_law.restitution(jnp.ones_like(self.temperature))
-        factor = 32 * pi / 15 if self.dimension == 3 else pi
-        density = self.number_density * self.diameter**self.dimension
-        inelastic = eps < 1
-        root = jnp.sqrt(factor * jnp.where(inelastic, 1 - eps**2, 1.0))
-        return jnp.where(inelastic, 2 * pi * self.diameter / (density * root), jnp.inf)
+        reduced = critical_length(self.reduced_law, self.packing_fraction, self.dimension)
+        return self.diameter * reduced
 
     def box_side(self, num_particles: int) -> Float[Array, ""]:
         """Side of the cube (of the square if d = 2) that contains N spheres of this gas, m.

@@ -55,3 +55,26 @@ def contact_value(packing_fraction: ArrayLike, dimension: int) -> Float[Array, "
     if dimension == 3:
         return (2 - phi) / (2 * (1 - phi) ** 3)
     return (1 - 7 * phi / 16) / (1 - phi) ** 2
+
+
+def contact_value_slopes(
+    packing_fraction: ArrayLike, dimension: int
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Logarithmic slopes of the pair correlation of hard spheres at contact.
+
+    Args: as `contact_value`.
+
+    Returns:
+        ``d ln g_2/d ln sigma = d phi g_2'/g_2`` at fixed number density, and ``-d ln g/d ln r`` at
+        r = sigma: in three dimensions Percus and Yevick's
+        ``(9/2) phi (1 + phi)/((1 - phi)^3 g_2)``; in two, to first order in phi,
+        ``(16/3 - 25/8) phi``, the excluded area of two disks at contact less what the first slope
+        has of it.
+    """
+    phi = jnp.asarray(packing_fraction)
+    g_2 = contact_value(phi, dimension)
+    if dimension == 3:
+        by_diameter = 3 * phi * (3 / (1 - phi) - 1 / (2 - phi))
+        return by_diameter, 4.5 * phi * (1 + phi) / ((1 - phi) ** 3 * g_2)
+    by_diameter = 2 * phi * (2 / (1 - phi) - 7 / (16 - 7 * phi))
+    return by_diameter, (16 / 3 - 25 / 8) * phi

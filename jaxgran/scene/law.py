@@ -155,6 +155,10 @@ class ReducedLaw(eqx.Module):
         """
         return jnp.zeros_like(normal_speed)
 
+    def dissipation(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """``beta = (3/2) A alpha^(2/5) v^(1/5)`` of viscoelastic spheres; 0 of others."""
+        return jnp.zeros_like(normal_speed)
+
 
 class LawInUnits(ReducedLaw):
     """A law that is a function of the speed alone, in units of a reference speed.

@@ -41,14 +41,17 @@ class ReducedViscoelastic(ReducedLaw):
     num_nodes: ClassVar[int] = 20
 
     def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        return viscoelastic_restitution(self.beta * normal_speed**0.2, clipped=self.clipped)
+        return viscoelastic_restitution(self.dissipation(normal_speed), clipped=self.clipped)
 
     def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        beta = self.beta * normal_speed**0.2
+        beta = self.dissipation(normal_speed)
         return -jnp.expm1(log_viscoelastic_restitution(beta, clipped=self.clipped))
 
     def impact_length(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         return self.length * normal_speed**0.8
+
+    def dissipation(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.beta * normal_speed**0.2
 
 
 class Viscoelastic(RestitutionLaw):

@@ -5,7 +5,7 @@ time ("reduced time") is their ratio. In these units the averages depend on the 
 dimension and T/T_0 only.
 """
 
-from collections.abc import Callable
+from functools import cache
 from math import pi, sqrt
 from typing import NamedTuple
 
@@ -14,36 +14,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.scene.geometry import sphere_surface
+from jaxgran.scene.impact_average import NODES, WEIGHTS
 from jaxgran.scene.restitution import ReducedLaw
-
-SOFTNESS = {2: 0.970, 3: 1.937}
-"""c in ``1 - c X_T/sigma``, the factor by which soft contacts reduce the cooling rate."""
-
-
-def _quadrature(num_nodes: int, top: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes g and weights for ``int_0^inf g exp(-g^2/2) f(g) dg``.
-
-    Gauss-Legendre in sqrt(g), since laws of restitution are smooth in small powers of g. The
-    integral beyond `top` is neglected.
-    """
-    x, w = np.polynomial.legendre.leggauss(num_nodes)
-    root = (x + 1) / 2
-    g = top * root**2
-    return g, w * top * root * g * np.exp(-(g**2) / 2)
-
-
-_NODES, _NODE_WEIGHTS = _quadrature(num_nodes=32, top=9.0)
-
-
-def impact_average(function: Callable[[Array], Array], like: Float[Array, ""]) -> Float[Array, ""]:
-    """``int_0^inf g exp(-g^2/2) f(g) dg``, the average over the normal speeds of impacts.
-
-    Args:
-        function: f, of an array of g.
-        like: a number of the precision that is wanted.
-    """
-    nodes, weights = (jnp.asarray(x, like.dtype) for x in (_NODES, _NODE_WEIGHTS))
-    return jnp.sum(weights * function(nodes))
+from jaxgran.theory import collision_integrals
 
 
 class Rates(NamedTuple):
@@ -71,91 +44,53 @@ class Rates(NamedTuple):
         return cls(*(averages[:, 0] + sonine * (averages[:, 1] + sonine * averages[:, 2])))
 
 
-def collision_rate(sonine: ArrayLike, dimension: int) -> Float[Array, "..."]:
+def collision_rate(
+    sonine: ArrayLike, dimension: int, third_sonine: ArrayLike = 0.0
+) -> Float[Array, "..."]:
     """Collisions per particle and per unit of reduced time, divided by sqrt(T/T_0).
 
-    ``S_d / sqrt(2 pi) (1 - a_2/16)``.
+    ``S_d / sqrt(2 pi) (1 - a_2/16 - a_3/64)``.
 
     Args:
         sonine: a_2, any shape.
         dimension: d.
+        third_sonine: a_3, the same shape.
     """
-    return sphere_surface(dimension) / sqrt(2 * pi) * (1 - jnp.asarray(sonine) / 16)
+    factor = 1 - jnp.asarray(sonine) / 16 - jnp.asarray(third_sonine) / 64
+    return sphere_surface(dimension) / sqrt(2 * pi) * factor
 
 
-def _integrands(e: float, g: np.ndarray, d: int) -> np.ndarray:
-    """Coefficients of 1, a_2, a_2^2 in the integrands of mu_2, mu_4, nu_v: shape (3, 3, nodes)."""
-    loss, gain = 1 - e**2, 1 + e**2
-    sonine_1 = (g**6 - 6 * g**4 + 3 * g**2) / 16
-    sonine_2 = (g**10 - 28 * g**8 + 210 * g**6 - 420 * g**4 + 105 * g**2) / 1024
-    cooling = [loss * g**2 / 2, loss * sonine_1 / 2, loss * sonine_2 / 2]
-    fourth_0 = loss * (gain * g**4 / 8 + (2 * d + 1) * g**2 / 4)
-    fourth_1 = (
-        loss * gain * g**8 / 128
-        + loss * (2 * d - 2 - 3 * e**2) * g**6 / 64
-        - loss * (8 * d - 47 - 3 * e**2) * g**4 / 128
-        + (1 + e) * (2 * d * e + 30 * d + 25 * e - 57) * g**2 / 64
-    )
-    slow, slower = 90 * d * e - 58 * d + 300 * e - 332, 48 * d * e + 208 * d + 867 * e - 1123
-    fourth_2 = (
-        loss * gain * g**12 / 8192
-        + loss * (2 * d - 14 * e**2 - 13) * g**10 / 4096
-        - loss * (40 * d - 105 * e**2 - 37) * g**8 / 4096
-        - (1 + e) * (slow - 105 * e**3 + 105 * e**2) * g**6 / 2048
-        + 5 * (1 + e) * (slower - 21 * e**3 + 21 * e**2) * g**4 / 8192
-        + 15 * (1 + e) * (2 * d * e - 66 * d - 47 * e + 111) * g**2 / 4096
-    )
-    relaxation = [(1 + e) * g**2 / d, (1 + e) * sonine_1 / d, (1 + e) * sonine_2 / d]
-    return np.array([cooling, [fourth_0, fourth_1, fourth_2], relaxation])
+@cache
+def averaging_matrix(dimension: int, order: int) -> np.ndarray:
+    """Matrix from the powers 0 to 6 of 1 - eps at the nodes to `averages`."""
+    changes = collision_integrals.changes(dimension, order, tuple(NODES))
+    return sphere_surface(dimension) / sqrt(8 * pi) * changes * WEIGHTS
 
 
-def _averaging_matrix(dimension: int) -> np.ndarray:
-    """Matrix from the powers 0 to 4 of 1 - eps at the nodes to `averages`: (3, 3, 5, nodes).
+def averages(
+    law: ReducedLaw, speed: Float[Array, ""], dimension: int, order: int = 2
+) -> Float[Array, "rows terms"]:
+    """Averages over the impacts of a Maxwell-Sonine gas, exact in eps(v).
 
-    The integrands are polynomials of fourth degree in eps, here found by interpolation.
-    """
-    samples = np.linspace(0, 2, 5)
-    values = np.stack([_integrands(1 - x, _NODES, dimension) for x in samples], axis=-2)
-    inverse = np.linalg.inv(np.vander(samples, increasing=True))
-    coefficients = np.einsum("ps,absn->abpn", inverse, values)
-    return sphere_surface(dimension) / sqrt(8 * pi) * coefficients * _NODE_WEIGHTS
-
-
-_AVERAGING_MATRICES = {d: _averaging_matrix(d) for d in (2, 3)}
-
-
-def averages(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[Array, "3 3"]:
-    """Averages over the impacts of a Maxwell-Sonine gas, exact in eps(v), to second order in a_2.
-
-    ``mu_p = -(S_d / 2 sqrt(2 pi)) int_0^inf g exp(-g^2/2) P_p(g, eps(g), a_2) dg`` by Gauss
-    quadrature with 32 nodes in sqrt(g): relative error below 1e-9 for the laws of this package.
+    ``mu_2p = (S_d / 2 sqrt(2 pi)) int_0^inf g exp(-g^2/2) L_p(g, eps(g)) dg`` with the loss L_p of
+    ``c_1^(2p) + c_2^(2p)`` in an impact, and likewise the relaxation of a labelled sphere's
+    velocity, by Gauss quadrature with 32 nodes in sqrt(g): relative error below 1e-9 for the laws
+    of this package.
 
     Args:
         law: law of restitution in units of `Gas.impact_speed`.
         speed: sqrt(T/T_0).
         dimension: d.
+        order: of the Sonine expansion: 2 follows a_2, 3 also a_3.
 
     Returns:
-        Coefficients of the polynomials in a_2, shape (3, 3): the rows are mu_2, mu_4 and nu_v, the
-        columns the coefficients of 1, a_2 and a_2^2; see `Rates`.
+        Coefficients of polynomials in a_2 (and a_3), whose columns `collision_integrals.TERMS`
+        lists. Order 2: mu_2, mu_4 and nu_v, shape (3, 3), see `Rates`. Order 3: mu_2, mu_4, mu_6
+        and nu_00, nu_01, nu_10, nu_11, shape (7, 6), see `jaxgran.theory.moments`.
 
-    Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution.
+    Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution; see
+    `jaxgran.theory.collision_integrals`.
     """
-    loss = law.loss(jnp.asarray(_NODES, speed.dtype) * speed)
-    powers = jnp.stack([jnp.ones_like(loss), loss, loss**2, loss**3, loss**4])
-    return jnp.tensordot(jnp.asarray(_AVERAGING_MATRICES[dimension], speed.dtype), powers, 2)
-
-
-def softness_factor(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[Array, ""]:
-    """Factor ``1 - c X_T/sigma`` by which soft contacts reduce the cooling rate.
-
-    ``X_T = (v^2/alpha)^(2/5)`` at the speed v = sqrt(2 T) is the length scale of the overlap, and
-    c = `SOFTNESS`. Valid to first order in X_T/sigma. Against soft-sphere simulations it corrects
-    errors of 0.9 %, 2.4 % and 8.2 % at X_T/sigma = .005, .02 and .06 to within 0.3 %.
-
-    Args:
-        law: law of restitution in units of the diameter and of `Gas.impact_speed`.
-        speed: sqrt(T/T_0).
-        dimension: d.
-    """
-    return 1 - SOFTNESS[dimension] * law.impact_length(speed)
+    loss = law.loss(jnp.asarray(NODES, speed.dtype) * speed)
+    powers = jnp.stack([loss**0 * 1.0, loss, *(loss**k for k in range(2, 7))])
+    return jnp.tensordot(jnp.asarray(averaging_matrix(dimension, order), speed.dtype), powers, 2)

@@ -35,7 +35,9 @@ SONINE_COEFFICIENT = 3 / 20 * C1 * _moment(2.2) * 1.5 * 2**0.1
 """s in ``a_2 = -s delta (T/T_0)^(1/10)``, to first order in delta, in 3D: 0.62395."""
 
 
-def paper_averages(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[Array, "3 3"]:
+def paper_averages(
+    law: ReducedLaw, speed: Float[Array, ""], dimension: int, order: int = 2
+) -> Float[Array, "3 3"]:
     """The paper's truncated averages: Maxwellian velocities, two terms of the restitution series.
 
     ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)``, and ``1/tau_v`` to order delta^2.
@@ -44,6 +46,7 @@ def paper_averages(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> 
         law: a `Viscoelastic` law in units of `Gas.impact_speed`.
         speed: sqrt(T/T_0).
         dimension: d; the paper has 3.
+        order: 2 alone.
 
     Returns:
         As `jaxgran.theory.averages.averages`; the rows are mu_2, 0 and nu_v, and only the first

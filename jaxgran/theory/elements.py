@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgran.scene.elements import SPINS
+from jaxgran.scene.impact_average import impact_average
 from jaxgran.scene.reduced_scene import ReducedRough, ReducedScene, ReducedWalls
-from jaxgran.theory.averages import collision_rate, impact_average
+from jaxgran.theory.averages import collision_rate
 from jaxgran.theory.rate_table import Bounds
 
 

@@ -62,20 +62,20 @@ class RateTable(eqx.Module):
     stage of the ODE solver.
 
     Attributes:
-        coefficients: of the Chebyshev polynomials, shape (nodes, 3, 3), or (nodes, ..., 3, 3) for
-            several such functions over the same range.
+        coefficients: of the Chebyshev polynomials, shape (nodes, rows, terms), or (nodes, ...,
+            rows, terms) for several such functions over the same range.
         lowest: lower end of the series in ln(T/T_0). The series must not be evaluated outside.
         highest: the upper end of a gas that is heated; None is 0.
     """
 
-    coefficients: Float[Array, "nodes ... 3 3"]
+    coefficients: Float[Array, "nodes ... rows terms"]
     lowest: Float[Array, ""]
     highest: Float[Array, ""] | None = None
 
     @classmethod
     def of(
         cls,
-        averages: Callable[[Float[Array, ""]], Float[Array, "3 3"]],
+        averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
         duration: Float[Array, ""],
         dimension: int,
         num_nodes: int,
@@ -102,7 +102,7 @@ class RateTable(eqx.Module):
         values = jax.vmap(averages)(speeds)
         return cls(jnp.tensordot(to_coefficients, values, 1), lowest, highest)
 
-    def __call__(self, log_theta: Float[Array, ""]) -> Float[Array, "... 3 3"]:
+    def __call__(self, log_theta: Float[Array, ""]) -> Float[Array, "... rows terms"]:
         """The averages at ln(T/T_0), as the function `averages` returns them.
 
         Args:
@@ -118,14 +118,14 @@ class RateTable(eqx.Module):
             last, before = row + 2 * x * last - before, last
         return self.coefficients[0] + x * last - before
 
-    def with_slopes(self, along: Float[Array, "directions nodes 3 3"]) -> "RateTable":
+    def with_slopes(self, along: Float[Array, "directions nodes rows terms"]) -> "RateTable":
         """This function of one gas, its slope and its derivatives as one function of ln(T/T_0).
 
         Args:
             along: coefficients of the derivatives of the function in some directions.
 
         Returns:
-            A table of shape (2 + directions, 3, 3) at each temperature: the function, its
+            A table of shape (2 + directions, rows, terms) at each temperature: the function, its
             derivative in ln(T/T_0), and those given.
         """
         derivative = jnp.asarray(_derivative(len(self.coefficients)), self.lowest.dtype)
@@ -137,7 +137,7 @@ class RateTable(eqx.Module):
 
 
 def _lowest_log_temperature(
-    averages: Callable[[Float[Array, ""]], Float[Array, "3 3"]],
+    averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
     duration: Float[Array, ""],
     dimension: int,
     bounds: Bounds,
@@ -168,7 +168,7 @@ def _lowest_log_temperature(
 
 
 def _highest_log_temperature(
-    averages: Callable[[Float[Array, ""]], Float[Array, "3 3"]],
+    averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
     duration: Float[Array, ""],
     dimension: int,
     heating: ArrayLike,

@@ -14,12 +14,6 @@ theory."""
 MAX_ENUMERATED_BOX = 6.0
 """Largest box, in L_c, whose waves are enumerated; larger boxes are scaled from it."""
 
-SHEAR_VISCOSITY = {2: (2.0, 1.0, 0.8729), 3: (4.0, 0.8, 0.7614)}
-"""b, a_1, a_2 of Enskog's ``eta g_2 / eta_0 = 1 + a_1 y + a_2 y^2`` with ``y = b phi g_2``.
-
-Reference: Gass 1971 (2D); Chapman & Cowling, Eq. 16.41.7 (3D).
-"""
-
 
 def flow_share(
     gas: Gas,
@@ -47,7 +41,7 @@ def flow_share(
 
     Reference: van Noije, Ernst, Brito & Orza, Phys. Rev. Lett. 79, 411 (1997).
     """
-    q_of_longest = (critical_box / float(gas.box_side(num_particles))) ** 2 / _dense_factor(gas)
+    q_of_longest = (critical_box / float(gas.box_side(num_particles))) ** 2
     longest = sqrt(1 / q_of_longest.min())
     if longest * sqrt(MAX_WAVENUMBER_SQUARED) < 1:
         none = np.zeros_like(q_of_longest)
@@ -70,17 +64,6 @@ def flow_share(
         variance.append(2 * (d - 1) * np.sum((num_waves * energy**2)[counted]))
     degrees = d * num_particles
     return np.minimum(np.array(flow) / degrees, 1.0), np.minimum(np.sqrt(variance) / degrees, 1.0)
-
-
-def _dense_factor(gas: Gas) -> float:
-    """k_c^2 of a dense gas over that of a dilute one.
-
-    k_c^2 is proportional to the collision frequency (g_2) over the viscosity.
-    """
-    g_2 = float(gas.contact_value)
-    b, first, second = SHEAR_VISCOSITY[gas.dimension]
-    y = b * float(gas.packing_fraction) * g_2
-    return g_2**2 / (1 + first * y + second * y**2)
 
 
 def _count_waves(most: int, dimension: int) -> Int[np.ndarray, "squares"]:

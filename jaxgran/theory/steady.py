@@ -16,7 +16,7 @@ from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
 from jaxgran.theory import elements
 from jaxgran.theory.averages import averages
-from jaxgran.theory.moments import velocity
+from jaxgran.theory.moments import Density, Moments, velocity
 
 WIDEST = 60.0
 """Largest |ln T/T_0| of a steady state."""
@@ -78,14 +78,14 @@ def steady_state(gas: Gas) -> SteadyState:
 @eqx.filter_jit
 def _solved(gas: Gas) -> tuple[Array, Array, Array, Array]:
     """ln T/T_0, a_2, T_rot/T, and by what share losses and drive differ."""
-    scene, d = reduced_scene(gas), gas.dimension
+    scene, density, d = reduced_scene(gas), Density.of(gas), gas.dimension
     assert scene.drive is not None
 
     def balance(x: Array, scene: ReducedScene) -> Array:
-        return _rates(x[0], x[1], scene, d)[:2] / jnp.exp(x[0] / 2)
+        return _rates(x, scene, density, d) / jnp.exp(x[0] / 2)
 
     low = _balanced(scene, gas.temperature, d)
-    first = jnp.stack([low, jnp.zeros_like(low)])
+    first = jnp.stack([low, jnp.zeros_like(low), jnp.zeros_like(low)])
     tolerance = jnp.finfo(first.dtype).eps ** 0.75
     solver = optx.Newton(rtol=float(tolerance), atol=float(tolerance))
     x = optx.root_find(balance, solver, first, scene, throw=False, max_steps=32).value
@@ -102,7 +102,8 @@ def _balanced(scene: ReducedScene, like: Array, d: int) -> Float[Array, ""]:
 
     def halved(_, ends):
         middle = (ends[0] + ends[1]) / 2
-        heats = _rates(middle, jnp.zeros_like(middle), scene, d, softness=False)[0] > 0
+        maxwellian = jnp.stack([middle, jnp.zeros_like(middle)])
+        heats = _rates(maxwellian, scene, Density(), d, softness=False)[0] > 0
         return jnp.where(heats, middle, ends[0]), jnp.where(heats, ends[1], middle)
 
     widest = jnp.full((), WIDEST, like.dtype)
@@ -117,15 +118,31 @@ def hottest_speed(gas: Gas) -> Float[Array, ""]:
 
 
 def _rates(
-    log_theta: Array, sonine: Array, scene: ReducedScene, d: int, softness: bool = True
-) -> Array:
-    """Rates of change of ln T and a_2, where T_rot/T is steady."""
-    speed, none = jnp.exp(log_theta / 2), jnp.zeros_like(log_theta)
-    state = [log_theta, sonine, none, none, none]
-    if scene.surface is not None:
-        state.append(_steady_ratio(speed, sonine, scene, d))
-    rates = averages(scene.law, speed, d)
-    return velocity(jnp.stack(state), rates, scene, d, softness=softness, maxwellian=False)
+    x: Float[Array, "variables"],
+    scene: ReducedScene,
+    density: Density,
+    d: int,
+    softness: bool = True,
+) -> Float[Array, "variables"]:
+    """Rates of change of ln T, a_2 and, if it is among them, a_3, where T_rot/T is steady.
+
+    So many collisions have been that all correlations have built up.
+    """
+    order = len(x)
+    speed, zero = jnp.exp(x[0] / 2), jnp.zeros_like(x[0])
+    rotation = None if scene.surface is None else _steady_ratio(speed, x[1], scene, d)
+    named: dict[str, Array] = dict(
+        zip(("log_temperature", "sonine", "third_sonine"), x, strict=False)
+    )
+    if order > 2:
+        named["diffusion_shape"] = zero
+    lasting = jnp.full_like(x[0], jnp.inf)
+    at = Moments(**named, diffusion=zero, displacement=zero, collisions=lasting, rotation=rotation)
+    state = jnp.stack([value for value in at if value is not None])
+    rates = averages(scene.law, speed, d, order)
+    options = {"order": order, "softness": softness, "maxwellian": False}
+    change = Moments.of(velocity(state, rates, scene, density, d, **options), order)
+    return jnp.stack([getattr(change, name) for name in list(named)[:order]])
 
 
 def _steady_ratio(speed: Array, sonine: Array, scene: ReducedScene, d: int) -> Array:
@@ -137,17 +154,23 @@ def _steady_ratio(speed: Array, sonine: Array, scene: ReducedScene, d: int) -> A
     return jnp.where(loss > 0, gain / jnp.where(loss > 0, loss, 1.0), 0.0)
 
 
-def prepared_sonine(scene: ReducedScene, like: Array, d: int) -> Float[Array, ""]:
-    """a_2 of a gas that white noise has driven at T_0, returning what impacts and walls take."""
+def prepared(
+    first: Float[Array, "moments"], scene: ReducedScene, density: Density, d: int, order: int
+) -> Float[Array, "moments"]:
+    """The moments at the start with a_2 (and a_3) of a gas that white noise has driven at T_0.
+
+    The noise has returned what impacts and walls took.
+    """
     undriven = scene._replace(drive=None, drag=None)
-    zero = jnp.zeros((), like.dtype)
 
     def peaking(sonine: Array) -> Array:
-        rate = _rates(zero, sonine, undriven, d)
-        return rate[1] + 2 * sonine * rate[0]
+        rate = _rates(jnp.concatenate([jnp.zeros_like(sonine[:1]), sonine]), undriven, density, d)
+        return rate[1:] + rate[0] * jnp.arange(2.0, order + 1, dtype=sonine.dtype) * sonine
 
-    sonine = zero
+    sonine = jnp.zeros(order - 1, first.dtype)
     for _ in range(_NEWTON_STEPS):
-        value, slope = jax.jvp(peaking, (sonine,), (jnp.ones_like(zero),))
-        sonine = sonine - value / slope
-    return sonine
+        sonine = sonine - jnp.linalg.solve(jax.jacfwd(peaking)(sonine), peaking(sonine))
+    at = Moments.of(first, order)._replace(sonine=sonine[0])
+    if order > 2:
+        at = at._replace(third_sonine=sonine[1])
+    return jnp.stack([value for value in at if value is not None])

@@ -1,3 +1,4 @@
+import dataclasses
 from functools import partial
 
 import jax
@@ -162,11 +163,14 @@ def test_each_model_has_its_scene(beads):
     assert isinstance(choice.model, jaxgran.KineticTheory) and choice.error < 0.02
     assert "the box is unknown" in " ".join(choice.reasons)
 
-    lossy = hard_gas(0.05, 0.01)  # far from Maxwellian: a_2 = 0.2
+    lossy = hard_gas(0.05, 0.01)  # far from Maxwellian, a_2 = 0.2, which kinetic theory follows
     choice = jaxgran.choose_model(lossy, over(lossy, 30), num_particles=None)
+    assert isinstance(choice.model, jaxgran.KineticTheory)
+    rough = rough_gas()
+    choice = jaxgran.choose_model(rough, over(rough, 30), 0.018, num_particles=None)
     assert isinstance(choice.model, jaxgran.DSMC) and choice.model.num_particles == 4000
     assert choice.candidates[3].error is None
-    assert choice.reasons[-1].startswith("Soft spheres: SoftSpheres needs the Viscoelastic law")
+    assert choice.reasons[-1].startswith("Soft spheres: SoftSpheres does not take rough")
 
     clustering = stiff(beads(0.15, packing_fraction=0.2), 1e-3, 0.6)
     request = clustering, over(clustering, 40)
@@ -242,10 +246,17 @@ def test_cool_chooses(beads):
     np.testing.assert_array_equal(chosen.temperature, jaxgran.cool(gas, times).temperature)
 
 
+def rough_gas():
+    """Spins and velocities are correlated, which kinetic theory leaves out."""
+    gas = hard_gas(0.9, 0.01)
+    surface = jaxgran.Rough(-0.2, rotational_temperature=float(gas.temperature))
+    return dataclasses.replace(gas, surface=surface)
+
+
 def test_cool_chooses_particles():
-    gas = hard_gas(0.05, 0.01)
+    gas = rough_gas()
     times = over(gas, 30)
-    chosen = jaxgran.cool(gas, times, model="auto", tolerance=0.02)
+    chosen = jaxgran.cool(gas, times, model="auto", tolerance=0.018)
     dsmc = jaxgran.cool(gas, times, model=jaxgran.DSMC(4000), progress=False)
     np.testing.assert_array_equal(chosen.temperature, dsmc.temperature)
 

@@ -75,7 +75,7 @@ def test_slopes_in_every_float_are_those_of_kinetic_theory():
         return map(np.asarray, slopes(jnp.zeros(len(FLOATS))))
 
     particles, ratio = jacobian(dilute_model(gas))
-    theory, expected = jacobian(jaxgran.KineticTheory(softness=False))
+    theory, expected = jacobian(jaxgran.KineticTheory(softness=False, correlations=False))
     # 8000 collisions scatter the rates by some 2 %, 2000 by 5 %.
     np.testing.assert_allclose(particles[0], theory[0], rtol=0.08, atol=0.03)
     np.testing.assert_allclose(particles[1], theory[1], rtol=0.08, atol=0.03)
@@ -104,7 +104,9 @@ def test_slope_is_that_of_the_sensitivity_table(beads):
 def test_fit_finds_what_made_the_curve():
     gas = glass_beads(**DILUTE)
     times = jnp.geomspace(0.5, 8.0, 10) * gas.mean_free_time
-    exact = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False)).temperature
+    exact = jaxgran.cool(
+        gas, times, model=jaxgran.KineticTheory(softness=False, correlations=False)
+    ).temperature
     curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
     # Temperature too, which makes this the program of the test before.
     free = "dissipative_constant", "temperature"

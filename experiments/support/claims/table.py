@@ -71,5 +71,7 @@ def cooled(delta: float, u, **options) -> tuple[jaxgran.Gas, jaxgran.CoolingCurv
     """Dilute viscoelastic beads of a given delta, cooled to the times u = 1 + t/tau_0."""
     gas = beads(0.05, 1.5 * 2**0.1 * delta)
     tau = (jnp.asarray(u) - 1) / (closed_forms.COOLING_RATE[3] * delta)
-    model = jaxgran.KineticTheory(softness=False, rtol=1e-11, **options)
+    model = jaxgran.KineticTheory(
+        softness=False, order=2, correlations=False, rtol=1e-11, **options
+    )
     return gas, jaxgran.cool(gas, tau * gas.mean_free_time, model=model)

