@@ -85,8 +85,7 @@ class KineticTheory(AbstractModel):
         validation.truth_value("correlations", self.correlations)
         if self.order not in (2, 3) or isinstance(self.order, bool | float):
             raise ValueError(
-                f"order must be 2 (a_2) or 3 (a_2 and a_3), got {self.order!r}; give sonine=False "
-                "for a gas that stays Maxwellian"
+                f"order must be 2 or 3, got {self.order!r}; sonine=False keeps a gas Maxwellian"
             )
         if self.averages not in ("exact", "paper"):
             raise ValueError(f'averages must be "exact" or "paper", got {self.averages!r}')
