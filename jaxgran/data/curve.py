@@ -33,6 +33,7 @@ COLUMNS = {
 
 FURTHER = {
     "a2": "sonine",
+    "a3": "third_sonine",
     "collisions": "collisions",
     "D": "diffusion",
     "velocity_correlation": "velocity_correlation",

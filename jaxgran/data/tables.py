@@ -12,6 +12,7 @@ UNITS = {
     "displacement": "m^2",
     "displacement_error": "m^2",
     "sonine": "1",
+    "third_sonine": "1",
     "collisions": "1",
     "diffusion": "m^2/s",
     "rotational_temperature": "m^2/s^2",

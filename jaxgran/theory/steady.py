@@ -60,7 +60,7 @@ def steady_state(gas: Gas) -> SteadyState:
 
     >>> driven = dataclasses.replace(gas, drive=jaxgran.WhiteNoise(1e-3))
     >>> round(float(jaxgran.steady_state(driven).temperature), 5)
-    0.00127
+    0.00128
     """
     if gas.drive is None:
         raise ValueError("a gas without drive has no steady state: add drive=WhiteNoise(strength)")

@@ -82,7 +82,9 @@ def test_fit_finds_what_made_the_curve(method):
         assert error < 0.01 * gas.value(name)
     assert np.all(result.error_budget["model"] > 0)
     diagnosis = jaxgran.diagnose(result, curve)
-    assert diagnosis.explains and diagnosis.verdict == "Haff law is compatible with this curve."
+    # Rough grains that begin at rest in rotation may be named besides: noise does not exclude them.
+    assert diagnosis.explains
+    assert diagnosis.verdict.startswith("Haff law is compatible with this curve")
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import jaxgran
 from jaxgran.scene.reduced_scene import reduced_scene
 from jaxgran.theory.averages import averages
-from jaxgran.theory.moments import Moments, velocity
+from jaxgran.theory.moments import Density, Moments, velocity
 
 TAUS = np.geomspace(1.0, 300.0, 8)
 
@@ -63,7 +63,7 @@ def test_the_temperatures_reach_the_ratio_of_the_literature(eps, beta, inertia):
     # state of inelastic rough spheres, Maxwellian.
     q, surface = inertia, jaxgran.Rough(beta, inertia=inertia, rotational_temperature=0.01)
     gas = constant(eps, surface=surface)
-    curve = cooled(gas, np.array([1e6]), sonine=False)
+    curve = cooled(gas, np.array([1e6]), sonine=False, correlations=False)
     c = (1 + q) ** 2 / (2 * q * (1 + beta) ** 2)
     c *= 1 - eps**2 - (1 - q) / (1 + q) * (1 - beta**2)
     expected = c + np.sqrt(1 + c**2)
@@ -286,20 +286,22 @@ def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
     # without a table, integrated by another library.
     gas = scene(beads(0.02), surface=jaxgran.Rough(0.5, rotational_temperature=0.1))
     times = np.array([0.3, 1.0, 3.0]) * float(gas.mean_free_time)
-    curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False))
+    model = jaxgran.KineticTheory(order=2, softness=False, correlations=False)
+    curve = jaxgran.cool(gas, times, model=model)
     assert float(curve.temperature[2]) > 2 * float(gas.temperature)
     reduced = reduced_scene(gas)
 
     @jax.jit
     def rate(state):
-        rates = averages(reduced.law, jnp.exp(state[0] / 2), 3)
-        return velocity(state, rates, reduced, 3, softness=False, maxwellian=False)
+        rates = averages(reduced.law, jnp.exp(state[0] / 2), 3, 2)
+        options = {"order": 2, "softness": False, "maxwellian": False}
+        return velocity(state, rates, reduced, Density(), 3, **options)
 
     def rates(t, state):
         return np.asarray(rate(jnp.asarray(state)))
 
     ends = times * float(gas.impact_speed / gas.path_length)
-    first = np.asarray(Moments.at_start(reduced, jnp.zeros(())))
+    first = np.asarray(Moments.at_start(reduced, jnp.zeros(()), order=2))
     found = solve_ivp(rates, (0, ends[-1]), first, t_eval=ends, rtol=1e-10, atol=1e-12)
     T = float(gas.temperature) * np.exp(found.y[0])
     np.testing.assert_allclose(curve.temperature, T, rtol=1e-7)  # the table's 1e-9, the solvers'
