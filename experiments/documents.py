@@ -38,7 +38,7 @@ USES = {
     ),
     "DSMC": ("any law, many decades of time", "positions: the same"),
     "hard spheres": ("clusters, short contacts", "lasting contacts"),
-    "soft spheres": ("dense and soft gases", "rotation, walls, drag"),
+    "soft spheres": ("dense and soft gases", "β_t of impacts (it has friction)"),
 }
 
 

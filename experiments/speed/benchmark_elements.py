@@ -1,6 +1,6 @@
 """What do rough spheres, walls, drag and a drive cost, over the smooth gas without them?
 
-    python experiments/speed/benchmark_elements.py [--repeats 7] [--smoke] [--out FILE]
+    python experiments/speed/benchmark_elements.py [--soft] [--repeats 7] [--smoke] [--out FILE]
 
 Beads (phi = .05, beta_T0 = .15) cool for some mean free times, with each element that a model
 takes. Prints seconds of a first run, the median of repeats in which all scenes take turns, and the
@@ -21,7 +21,8 @@ import jaxgran
 from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads
 
-NUM_HARD, NUM_DSMC = 4096, 100_000
+NUM_HARD, NUM_DSMC, NUM_SOFT = 4096, 100_000, 2000
+RUBBING = {"surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=4e-3)}
 ELEMENTS = {
     "smooth": {},
     "rough": {"surface": jaxgran.Rough(0.0, rotational_temperature=4e-3)},
@@ -29,14 +30,17 @@ ELEMENTS = {
     "rough, walls": {"surface": jaxgran.Rough(0.0, rotational_temperature=4e-3), "container": None},
     "drag": {"drag": jaxgran.StokesDrag(0.5)},
     "drive": {"drive": None},  # of .02 T_0 in a mean free time
+    "friction": RUBBING,
+    "friction, walls": RUBBING | {"container": None},
 }
 
 
-def scene(elements: dict) -> jaxgran.Gas:
-    gas = beads(packing_fraction=0.05, beta=0.15)
+def scene(elements: dict, soft: bool) -> jaxgran.Gas:
+    gas = beads(packing_fraction=0.05, beta=0.15, contact_fraction=0.02 if soft else None)
     if "container" in elements:
-        side = float(gas.box_side(NUM_HARD))
-        elements = elements | {"container": jaxgran.Walls(side, restitution=0.9)}
+        side = float(gas.box_side(NUM_SOFT if soft else NUM_HARD))
+        walls = jaxgran.Walls(side, restitution=gas.law if soft else 0.9)
+        elements = elements | {"container": walls}
     if "drive" in elements:
         strength = 0.02 * gas.temperature / gas.mean_free_time
         elements = elements | {"drive": jaxgran.WhiteNoise(strength)}
@@ -48,6 +52,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--soft", action="store_true", help="soft spheres instead")
     parser.add_argument("--smoke", action="store_true", help="one short repeat")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     add_recording(parser)
@@ -59,6 +64,8 @@ def main() -> None:
         jaxgran.DSMC(NUM_DSMC),
         jaxgran.HardSpheres(NUM_HARD),
     )
+    if options.soft:
+        models = (jaxgran.SoftSpheres(NUM_SOFT),)
     print(f"{jax.devices()[0].device_kind}, float64, {until:g} mean free times")
     print(f"{'model':>16} {'scene':>14} {'first run s':>12} {'run s':>9} {'ratio':>7}")
     rows = []
@@ -70,16 +77,15 @@ def main() -> None:
                 f" {row['ratio']:7.2f}",
                 flush=True,
             )
-    write_results("benchmark_elements", options, options.out, rows=rows)
+    name = "benchmark_elements_soft" if options.soft else "benchmark_elements"
+    write_results(name, options, options.out, rows=rows)
 
 
 def measured(model, until: float, repeats: int) -> list[dict]:
     """A row for each scene that the model takes; the scenes take turns."""
-    gases = {
-        name: scene(elements)
-        for name, elements in ELEMENTS.items()
-        if set(elements) <= set(model.elements)
-    }
+    soft = isinstance(model, jaxgran.SoftSpheres)
+    gases = {name: scene(elements, soft) for name, elements in ELEMENTS.items()}
+    gases = {name: gas for name, gas in gases.items() if set(gas.elements) <= set(model.elements)}
     times = np.linspace(0, until, 6)[1:]
     seconds: dict[str, list[float]] = {name: [] for name in gases}
     collisions = {}

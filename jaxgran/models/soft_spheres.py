@@ -65,6 +65,12 @@ class SoftSpheres(AbstractSpheres):
     The gas starts from random positions and Maxwellian velocities of exactly T_0 and no momentum,
     after an elastic melt of 10 mean free times. Steps lengthen as it cools.
 
+    A gas may have walls (`jaxgran.Walls` of a `jaxgran.Viscoelastic` law: the same force, with the
+    mass and the radius of one sphere), between which momentum is not conserved; drag
+    (`jaxgran.StokesDrag`), exact in the drift; and friction (`jaxgran.Frictional`). What they take
+    counts as dissipated. In a step the kicks of walls and of tangential forces follow the normal
+    ones of pairs; the order in the step stays 2.
+
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer.
         steps_per_contact: steps in the mean contact duration at the current temperature, >= 10.
@@ -84,9 +90,11 @@ class SoftSpheres(AbstractSpheres):
     frequency; that the box changes with it at fixed N, and with it the growth of flows, is left
     out. T is followed exactly but for the projection, the rest is estimated from it: the paths by
     the first Sonine order of diffusion (see `jaxgran.tangents.paths`), the velocity correlation in
-    time as decaying at 2/d of the collision rate. The derivatives of a_2 and of the final particles
-    are not known, and are nan. Second derivatives are refused. A run is followed in the frame in
-    which each replica is at rest. With a given start T_0 is a unit only, and its derivative 0.
+    time as decaying at 2/d of the collision rate. Walls and drag are followed like (alpha, A);
+    between walls the derivatives in lengths and the density are refused, with friction all. The
+    derivatives of a_2 and of the final particles are not known, and are nan. Second derivatives are
+    refused. A run is followed in the frame in which each replica is at rest. With a given start T_0
+    is a unit only, and its derivative 0.
 
     Raises:
         ValueError: for numbers out of range.
@@ -131,6 +139,12 @@ class SoftSpheres(AbstractSpheres):
             if gas.container is not None:
                 check_walls(gas.container)
                 check_inside(gas.container, gas.dimension, self.start)
+        spinning = self.start is not None and self.start.angular_velocity is not None
+        if gas.surface is not None and spinning:
+            raise ValueError(
+                "SoftSpheres draws the angular velocities of a start by rotational_temperature: "
+                "give start._replace(angular_velocity=None)"
+            )
 
     def estimated_error(self, course: Course) -> float:
         """Time steps and noise: every contact is resolved."""
@@ -270,23 +284,20 @@ def reduced_frequency(gas: Gas, unit_time: Float[Array, ""]) -> Float[Array, ""]
     """Collisions per particle and unit of time at T = 1."""
     if gas.container is None:
         return gas.collision_frequency * unit_time
-    # It does not depend on T_0, which derivatives are to see: see `SoftSpheres.held`.
+    # Not dependent on T_0, as derivatives are to see: `SoftSpheres.held`.
     still = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
     return still.collision_frequency * gas.diameter / jnp.sqrt(still.temperature)
 
 
 def reduced_drag(gas: Gas, drag: StokesDrag) -> SoftDrag:
     """The drag of a gas in these units."""
-    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    often = reduced_frequency(gas, unit_time)
-    return SoftDrag(drag.rate * unit_time / often, drag.rotational_rate * unit_time)
+    time = gas.diameter / jnp.sqrt(gas.temperature)
+    return SoftDrag(drag.rate * time / reduced_frequency(gas, time), drag.rotational_rate * time)
 
 
 def reduced_surface(gas: Gas) -> SoftSurface | None:
     """The surface of the spheres of a gas in these units; None where they are smooth."""
-    of, T = gas.surface, gas.temperature
-    if not isinstance(of, Frictional):
+    s, T = gas.surface, gas.temperature
+    if not isinstance(s, Frictional):
         return None
-    return SoftSurface(
-        of.tangential_damping, of.friction, of.inertia, of.rotational_temperature / T
-    )
+    return SoftSurface(s.tangential_damping, s.friction, s.inertia, s.rotational_temperature / T)

@@ -1,6 +1,7 @@
 """Soft spheres between walls, in a gas that drags, and with friction."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.particles.soft.flight import SMALL, shortened
 from tests.conftest import glass_beads
 
+DATA = Path(__file__).parents[2] / "experiments" / "data"
 NUM = 100
 
 
@@ -209,6 +211,12 @@ def test_a_start_outside_of_the_walls_is_refused():
     start = two_spheres(gas, [[-1e-4, 1e-2, 1e-2], [0.5 * side] * 3], 0.0)
     with pytest.raises(ValueError, match="sphere 0 of replica 0 .* outside of the walls"):
         jaxgran.cool(gas, [0.1], model=SoftSpheres(2, start=start))
+    spinning = two_spheres(soft(num=2), [[1e-3] * 3, [4e-3] * 3], 0.0)._replace(
+        angular_velocity=jnp.ones((1, 2, 3))
+    )
+    gas = soft(num=2, surface=jaxgran.Frictional(0.5, 0.3))
+    with pytest.raises(ValueError, match="draws the angular velocities of a start"):
+        jaxgran.cool(gas, [0.1], model=SoftSpheres(2, start=spinning))
 
 
 def test_the_model_for_friction_is_soft_spheres():
@@ -300,3 +308,32 @@ def test_derivatives_that_are_not_known_are_refused(name):
     logs, at = log_temperatures(rubbed, SoftSpheres(NUM), times, ["friction"])
     with pytest.raises(ValueError, match="with friction are not known: use differences"):
         jax.jacfwd(logs)(at)
+
+
+def test_follows_lammps_with_friction_between_walls_particle_by_particle():
+    # Written by `python experiments/accuracy/compare_lammps_elements.py --store`.
+    data = dict(np.load(DATA / "lammps_elements_n64.npz"))
+    law, wall = (
+        jaxgran.Viscoelastic(*(data[prefix + name] for name in jaxgran.Viscoelastic.domains))
+        for prefix in ("", "wall_")
+    )
+    gas = jaxgran.Gas(
+        law,
+        **{name: data[name] for name in ("diameter", "mass", "packing_fraction", "temperature")},
+        surface=jaxgran.Frictional(*(data[name] for name in jaxgran.Frictional.domains)),
+        container=jaxgran.Walls(data["wall_side"], restitution=wall),
+    )
+    first = (jnp.asarray(data[f"first_{name}"]) for name in ("position", "velocity"))
+    start = jaxgran.Particles(*first, gas.container.side)
+    model = SoftSpheres(64, steps_per_contact=200, start=start)
+    last = jaxgran.cool(gas, data["t"], model=model).particles
+    sigma, speed = float(gas.diameter), float(gas.temperature) ** 0.5
+    # The time steps leave 1e-4. LAMMPS takes sigma/2 for the distance to the contact in the slip:
+    # a share of the overlap, 1 %, of the spins, which hold .1 of the energy.
+    velocity = last.velocity[0] - data["velocity"][-1]
+    spin = (last.angular_velocity[0] - data["omega"][-1]) * sigma / 2
+    assert np.sqrt(np.mean(velocity**2)) < 1e-3 * speed
+    assert np.sqrt(np.mean(spin**2)) < 2e-3 * speed
+    assert np.max(np.abs(last.position[0] - data["position"][-1])) < 5e-4 * sigma
+    # Friction did something: as smooth spheres they end elsewhere.
+    assert np.sqrt(np.mean(data["omega"][-1] ** 2)) * sigma / 2 > 0.1 * speed

@@ -71,6 +71,12 @@ def lammps(found: dict) -> str:
     )
 
 
+def lammps_elements(found: dict) -> str:
+    rows = found["scenes"]
+    cells = (f"{name} {rows[name]['rms_velocity'][-1]:.0e}" for name in rows)
+    return ", ".join(cells)
+
+
 def drops(found: dict) -> str:
     low, high = min(found["A_over_true"]), max(found["A_over_true"])
     return f"{low:.2f} to {high:.2f} times; intervals hold it in {found['held']} of {found['runs']}"
@@ -265,6 +271,13 @@ ROWS = (
         "compare_lammps",
         lammps,
         "python experiments/accuracy/compare_lammps.py",
+    ),
+    Row(
+        "velocities with friction, with walls, after one mean free time, from the same start, rms",
+        "LAMMPS (granular, wall/gran), over √T₀",
+        "compare_lammps_elements",
+        lammps_elements,
+        "python experiments/accuracy/compare_lammps_elements.py",
     ),
     Row(
         "D of elastic hard spheres, φ = .1 / .2 / .3, with the box's own term (Yeh & Hummer)",

@@ -73,6 +73,11 @@ def lammps(f: dict) -> str:
     return f"Within {100 * found:.1f} % in the dense gas, with nothing fitted."
 
 
+def lammps_elements(f: dict) -> str:
+    most = max(row["rms_velocity"][-1] for row in f["scenes"].values())
+    return f"Velocities differ by at most {most:.0e} of √T₀ after a mean free time."
+
+
 def soft(f: dict) -> str:
     order = f["impact"]["head-on"]["order"]["bias"]
     return f"ε of an impact errs with the step to the power {order:.1f}."
@@ -242,6 +247,14 @@ ENTRIES = {
             lammps,
             "compare_lammps.png",
             "2 min",
+        ),
+        Entry(
+            "accuracy/compare_lammps_elements.py",
+            "Do friction and walls move spheres as in LAMMPS, particle by particle?",
+            "compare_lammps_elements",
+            lammps_elements,
+            "compare_lammps_elements.png",
+            "5 min",
         ),
         Entry(
             "accuracy/gradient_health.py",

