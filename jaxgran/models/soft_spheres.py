@@ -65,11 +65,10 @@ class SoftSpheres(AbstractSpheres):
     The gas starts from random positions and Maxwellian velocities of exactly T_0 and no momentum,
     after an elastic melt of 10 mean free times. Steps lengthen as it cools.
 
-    A gas may have walls (`jaxgran.Walls` of a `jaxgran.Viscoelastic` law: the same force, with the
-    mass and the radius of one sphere), between which momentum is not conserved; drag
-    (`jaxgran.StokesDrag`), exact in the drift; and friction (`jaxgran.Frictional`). What they take
-    counts as dissipated. In a step the kicks of walls and of tangential forces follow the normal
-    ones of pairs; the order in the step stays 2.
+    A gas may have walls (of a `jaxgran.Viscoelastic` law: the same force, with the mass and radius
+    of one sphere), where momentum is not conserved; drag, exact in the drift; and friction
+    (`jaxgran.Frictional`). What they take counts as dissipated. In a step the kicks of walls, then
+    of tangential forces, follow the normal ones of pairs.
 
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer.
@@ -139,11 +138,10 @@ class SoftSpheres(AbstractSpheres):
             if gas.container is not None:
                 check_walls(gas.container)
                 check_inside(gas.container, gas.dimension, self.start)
-        spinning = self.start is not None and self.start.angular_velocity is not None
-        if gas.surface is not None and spinning:
+        if gas.surface and self.start is not None and self.start.angular_velocity is not None:
             raise ValueError(
-                "SoftSpheres draws the angular velocities of a start by rotational_temperature: "
-                "give start._replace(angular_velocity=None)"
+                "SoftSpheres draws the angular velocities of a start: give it without them, as "
+                "start._replace(angular_velocity=None), and their rotational_temperature"
             )
 
     def estimated_error(self, course: Course) -> float:
@@ -249,7 +247,7 @@ def check_inside(walls: Walls, dimension: int, start: Particles | None) -> None:
 def reduced_scene(gas: Gas, num_particles: int) -> SoftScene:
     """A gas of viscoelastic spheres in units of its diameter, mass and first temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    law: Any = gas.law  # `SoftSpheres.check` refuses laws without a force
+    law: Any = gas.law  # `SoftSpheres.check` refuses others
     side, walls = gas.box_side(num_particles) / gas.diameter, None
     if gas.container is not None:
         walls = reduced_walls(gas, gas.container)
@@ -281,10 +279,9 @@ def reduced_walls(gas: Gas, container: Walls) -> SoftWalls:
 
 
 def reduced_frequency(gas: Gas, unit_time: Float[Array, ""]) -> Float[Array, ""]:
-    """Collisions per particle and unit of time at T = 1."""
+    """Collisions per particle and unit of time at T = 1; of no T_0 where `held` refuses others."""
     if gas.container is None:
         return gas.collision_frequency * unit_time
-    # Not dependent on T_0, as derivatives are to see: `SoftSpheres.held`.
     still = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
     return still.collision_frequency * gas.diameter / jnp.sqrt(still.temperature)
 
