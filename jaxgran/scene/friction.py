@@ -40,10 +40,6 @@ class Frictional(eqx.Module):
 
     Reference: Luding, Granular Matter 10, 235 (2008), without the tangential spring.
 
-    >>> frictional = dataclasses.replace(gas, surface=jaxgran.Frictional(0.5, friction=0.3))
-    >>> float(frictional.value("friction")), frictional.elements
-    (0.3, ('friction',))
-
     >>> grains = jaxgran.Frictional(tangential_damping=0.5, friction=0.3)
     >>> rubbing = dataclasses.replace(gas, surface=grains)
     >>> float(rubbing.value("friction"))
