@@ -5,9 +5,13 @@
 
 Each run is one realisation of N particles (beta_T0 = .18, t_c/tau_c = .001, followed for 100 mean
 free times, in which T falls to a few per cent): 30 values of T without errors, as one film of one
-experiment has them. Kinetic theory is fitted to each with A and T_0 free and N given. Prints the
-bias of ln A and its standard error, the scatter of ln A, the scatter that the error budget expects
-without the model's clock, which is the same in all runs, and the coverage by the whole budget.
+experiment has them. Kinetic theory is fitted to each with A and T_0 free and N given; to runs of
+DSMC, which draws the partners of each collision anew, kinetic theory of molecular chaos
+(`correlations=False`).
+
+Prints the bias of ln A and its standard error, the scatter of ln A, the scatter that the error
+budget expects without the model's clock, which is the same in all runs, and the coverage by the
+whole budget.
 """
 
 import argparse
@@ -28,6 +32,7 @@ KINDS = {
     "hard-spheres": jaxgran.HardSpheres,
     "soft-spheres": jaxgran.SoftSpheres,
 }
+THEORIES = {"dsmc": jaxgran.KineticTheory(correlations=False)}
 HEADINGS = (
     "runs of",
     "N",
@@ -58,7 +63,7 @@ def main() -> None:
     for name in options.models:
         for number in options.numbers:
             for phi in options.phis:
-                found = coverage(KINDS[name], number, phi, options.runs)
+                found = coverage(name, number, phi, options.runs)
                 rows.append({"model": name, "num_particles": number, "phi": phi, **found})
                 print(row(rows[-1]), flush=True)
                 write_results("interval_coverage", options, None, rows=with_recorded(rows))
@@ -84,11 +89,12 @@ def table(results: dict) -> str:
     return "\n".join([HEAD, *map(row, results["rows"])]) + "\n"
 
 
-def coverage(kind, num_particles: int, phi: float, runs: int) -> dict[str, float]:
-    """Statistics of the fits of single runs."""
+def coverage(name: str, num_particles: int, phi: float, runs: int) -> dict[str, float]:
+    """Statistics of the fits of single runs of a model, one of `KINDS`."""
     gas = beads(phi, BETA, CONTACT)
     times = jnp.geomspace(0.3, END, POINTS) * gas.mean_free_time
-    model = kind(num_particles, replicas=runs)
+    model = KINDS[name](num_particles, replicas=runs)
+    theory = THEORIES.get(name, jaxgran.KineticTheory())
     key = jax.random.key(num_particles)
     curve = jaxgran.cool(gas, times, model=model, key=key, progress=False)
     assert curve.replicas is not None
@@ -98,7 +104,7 @@ def coverage(kind, num_particles: int, phi: float, runs: int) -> dict[str, float
         single = jaxgran.CoolingCurve(times=times, temperature=T)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            result = jaxgran.fit(gas, single, num_particles=num_particles)
+            result = jaxgran.fit(gas, single, model=theory, num_particles=num_particles)
         parts = {name: float(part[0]) / truth for name, part in result.error_budget.items()}
         ratio.append(float(result.estimate[0]) / truth)
         error.append(float(result.standard_error[0]) / truth)

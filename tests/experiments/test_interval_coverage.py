@@ -2,14 +2,23 @@
 
 import pytest
 
-import jaxgran
 from experiments.fit import interval_coverage
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [jaxgran.DSMC, jaxgran.HardSpheres])
-def test_intervals_hold_the_truth(kind):
-    found = interval_coverage.coverage(kind, 100, 0.02, 200)
+@pytest.mark.parametrize("phi", [0.02, 0.05])
+@pytest.mark.parametrize(
+    ("model", "num_particles"),
+    [
+        ("dsmc", 100),
+        ("dsmc", 500),
+        ("hard-spheres", 100),
+        ("hard-spheres", 500),
+        ("soft-spheres", 500),
+    ],
+)
+def test_intervals_hold_the_truth(model, num_particles, phi):
+    found = interval_coverage.coverage(model, num_particles, phi, 200)
     # 200 runs: 95 +- 1.5 %. That of kinetic theory's clock is part of the error, but of no run of
     # DSMC, which makes the intervals there a little too wide.
     assert 0.92 <= found["coverage"] <= 0.985
