@@ -3,16 +3,17 @@
 Units as in `jaxgran.theory.averages`.
 """
 
-from functools import partial
 from math import sqrt
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgran.scene.elements import SPINS
 from jaxgran.scene.impact_average import impact_average
 from jaxgran.scene.reduced_scene import ReducedRough, ReducedScene, ReducedWalls
+from jaxgran.scene.wall_layer import MOST_IMPACTS, share_of_impacts
 from jaxgran.theory.averages import collision_rate
 from jaxgran.theory.rate_table import Bounds
 
@@ -55,8 +56,7 @@ def changes(
         own = _of_friction(scene.surface.eta, scene.surface.inertia, rate, ratio, dimension)
         total = _sum(total, own)
     if scene.walls is not None:
-        loss = impact_average(partial(_lost, scene.walls, speed), speed)
-        own = _of_walls(scene.walls, scene.surface, loss, speed, ratio, dimension)
+        own = _of_walls(scene.walls, scene.surface, speed, ratio, dimension)
         total = _sum(total, own)
     if scene.drag is not None:
         drag = scene.drag
@@ -94,27 +94,33 @@ def _of_friction(
 
 
 def _of_walls(
-    walls: ReducedWalls,
-    surface: ReducedRough | None,
-    loss: Array,
-    speed: Array,
-    ratio: Array | float,
-    d: int,
+    walls: ReducedWalls, surface: ReducedRough | None, speed: Array, ratio: Array | float, d: int
 ) -> Changes:
-    """Of impacts on walls that take a loss times T each, which all parts of a mixed gas meet alike.
+    """Of impacts on walls, which all parts of a mixed gas meet alike, see `share_of_impacts`.
 
     A wall takes ``(1 - eps^2) v_n^2/2``, of constant eps ``(1 - eps^2) T`` in the mean. By friction
     it takes from one sphere what the impact of two takes from both, of whose velocities each has
     half the mean square: as many impacts of spheres with half the eta of a wall, twice. Velocities
     are reversed, so that displacements are not those of a free gas.
     """
-    rate = jnp.sum(walls.frequency) * speed
+
+    def of_axis(frequency: Array) -> tuple[Array, Array]:
+        """Energy lost over T, and impacts, a unit of time and sqrt(T/T_0)."""
+
+        def share(g: Array) -> Array:
+            eps = walls.law.restitution(g * speed / sqrt(2))
+            return share_of_impacts(eps, frequency / collision_rate(0.0, d), d)
+
+        lost = impact_average(lambda g: share(g) * _lost(walls, speed, g), speed)
+        return frequency * lost, frequency * impact_average(share, speed)
+
+    lost, impacts = (speed * jnp.sum(x) for x in jax.vmap(of_axis)(walls.frequency))
     nothing = jnp.zeros_like(speed)
-    total = Changes(2 / d * rate * loss, nothing, nothing, nothing)
+    total = Changes(2 / d * lost, nothing, nothing, nothing)
     if surface is None or walls.beta is None:
         return total
     eta = surface.eta_on_wall(walls.beta) / 2
-    return _sum(total, _of_friction(eta, surface.inertia, 2 * rate, ratio, d))
+    return _sum(total, _of_friction(eta, surface.inertia, 2 * impacts, ratio, d))
 
 
 def _lost(walls: ReducedWalls, speed: Array, g: Array) -> Array:
@@ -126,7 +132,7 @@ def _lost(walls: ReducedWalls, speed: Array, g: Array) -> Array:
 def fastest_cooling(scene: ReducedScene, dimension: int) -> Bounds:
     """Upper bounds of the cooling by elements, and what heats the gas.
 
-    The cooling is reached where the spheres do not rotate and walls stop them. The heat of rotation
+    The cooling is that of spheres that do not rotate and that walls stop. The heat of rotation
     is at most all that the spins have at first.
     """
     by_speed, constant = 0.0, 0.0
@@ -136,8 +142,7 @@ def fastest_cooling(scene: ReducedScene, dimension: int) -> Bounds:
         own = _of_friction(scene.surface.eta, scene.surface.inertia, rate, 0.0, dimension)
         by_speed = by_speed + own.cooling
     if scene.walls is not None:
-        walls = _of_walls(scene.walls, scene.surface, one, one, 0.0, dimension)
-        by_speed = by_speed + walls.cooling
+        by_speed = by_speed + _stopped(scene.walls, scene.surface, dimension)
     if scene.drag is not None:
         constant = 2 * scene.drag.rate
     if scene.drive is None and scene.surface is None:
@@ -147,3 +152,14 @@ def fastest_cooling(scene: ReducedScene, dimension: int) -> Bounds:
     if scene.surface is not None:
         rotation = SPINS[dimension] / dimension * scene.surface.ratio
     return Bounds(by_speed, constant, heating, rotation)
+
+
+def _stopped(walls: ReducedWalls, surface: ReducedRough | None, d: int) -> Float[Array, ""]:
+    """An upper bound of the cooling by walls: that of walls which stop all spheres."""
+    often = walls.frequency / collision_rate(0.0, d)
+    share = share_of_impacts(jnp.zeros_like(often), often, d)
+    stopped = 2 / d * jnp.sum(walls.frequency * share)
+    if surface is None or walls.beta is None:
+        return stopped
+    eta, rate = surface.eta_on_wall(walls.beta) / 2, MOST_IMPACTS * jnp.sum(walls.frequency)
+    return stopped + _of_friction(eta, surface.inertia, 2 * rate, 0.0, d).cooling

@@ -6,12 +6,14 @@ spins and time are transformed: see `jaxgran.particles.drag`.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.particles.drag import Decay, decay
 from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.spins import Rub, rub
+from jaxgran.scene.wall_layer import share_of_impacts
 
 
 class Impact(NamedTuple):
@@ -84,6 +86,22 @@ def of_walls(scene: HardScene, impact: Impact, axis: Int[Array, "rows"]) -> Effe
         nothing = jnp.zeros_like(impact.spin)
         return effect._replace(twist=nothing, turned=nothing[:, 0])
     return _rubbed(effect, impact, left, surface.eta_on_wall(walls.beta), surface.inertia, shares=1)
+
+
+def of_walls_as_often(scene: HardScene, impact: Impact, axis: Int[Array, "rows"]) -> Effect:
+    """The effect of impacts on walls to a derivative: of more where walls are nearer or take more.
+
+    A derivative sees neither where walls are nor where spheres are; it knows how often a gas meets
+    them, see `share_of_impacts`.
+    """
+    assert scene.walls is not None
+    effect = of_walls(scene, impact, axis)
+    often = scene.walls.frequency[axis]
+    eps = -jnp.sum(effect.kick * impact.normal, -1) / impact.speed - 1
+    often = often * share_of_impacts(eps, often, impact.normal.shape[1])
+    share = often / jax.lax.stop_gradient(often)
+    turned = None if effect.turned is None else effect.turned * share
+    return effect._replace(lost=effect.lost * share, turned=turned)
 
 
 def _restitution(scene: HardScene, impact: Impact, left: Decay | None) -> Float[Array, "rows"]:

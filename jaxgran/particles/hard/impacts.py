@@ -267,7 +267,7 @@ def _bounced(
         turned = turned + jnp.where(hit, effect.turned, 0.0)
     gains = new.wall_gains
     if isinstance(along, HardTangents):
-        gains = gains + along.gains(scene, met, hit, partial(_as_often, scene.walls, axis=axis))
+        gains = gains + along.gains(scene, met, hit, partial(effects.of_walls_as_often, axis=axis))
     away = jnp.where(hit, jnp.sum((place - listed) ** 2, -1), 0.0)
     return new._replace(
         slots=Slots(x, v, jnp.where(hit, s, new.slots.last), spin),
@@ -280,19 +280,3 @@ def _bounced(
         pending=new.pending | jnp.any(hit),
         wall_gains=gains,
     )
-
-
-def _as_often(walls: HardWalls, scene: HardScene, impact: Impact, axis: Array) -> Effect:
-    """The effect of impacts on walls, of which there are more where walls are nearer.
-
-    Where they are, a derivative does not see; it knows the frequency of impacts on them.
-
-    Args:
-        walls: those of the run.
-        scene, impact, axis: as for `of_walls`, with the walls of a derivative.
-    """
-    assert scene.walls is not None
-    effect = effects.of_walls(scene, impact, axis)
-    share = (scene.walls.frequency / walls.frequency)[axis]
-    turned = None if effect.turned is None else effect.turned * share
-    return effect._replace(lost=effect.lost * share, turned=turned)

@@ -15,6 +15,8 @@ from jaxgran.particles import kicks
 from jaxgran.particles.drag import Decay, decay, lasting
 from jaxgran.particles.spins import rub
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedDrive, ReducedScene
+from jaxgran.scene.wall_layer import share_of_impacts
+from jaxgran.theory.averages import collision_rate
 
 
 class Walled(NamedTuple):
@@ -43,8 +45,9 @@ def hit_walls(
 ) -> Walled:
     """Particles after a step in which they meet walls, everywhere alike.
 
-    A sphere between two walls meets one of them ``|v| ds/(L - sigma)`` times in a step. The steps
-    take the axes in turns, and each does d times as much.
+    A sphere between two walls meets one of them ``|v| ds/(L - sigma)`` times in a step, times the
+    share that tells how dense the gas is before them (`share_of_impacts`). The steps take the axes
+    in turns, and each does d times as much.
 
     Args:
         scene: in reduced units.
@@ -62,19 +65,21 @@ def hit_walls(
     across = (jnp.arange(d) == axis).astype(velocity.dtype)[None]
     normal = jnp.sum(velocity * across, axis=1)
     speed, outwards = jnp.abs(normal), jnp.sign(normal)[:, None] * across
-    hit = ((bits.astype(velocity.dtype) + 0.5) * 2.0**-32 < each * speed) & (speed > 0)
-    eps = walls.law.restitution(jnp.where(hit, speed * slowed, 1.0))
+    eps = walls.law.restitution(jnp.where(speed > 0, speed * slowed, 1.0))
+    often = share_of_impacts(eps, frequency / collision_rate(0.0, d), d)
+    hit = ((bits.astype(velocity.dtype) + 0.5) * 2.0**-32 < often * each * speed) & (speed > 0)
     kick = -jnp.where(hit, (1 + eps) * speed, 0.0)[:, None] * outwards
     twist = jnp.zeros_like(spin)
     if surface is not None and walls.beta is not None:
         eta = surface.eta_on_wall(walls.beta)
         found = rub(velocity, spin, outwards, hit, eta, surface.inertia)
         kick, twist = kick + found.kick, found.twist
-    # The number of impacts is not differentiable: they count for more where walls are nearer.
-    share = frequency / jax.lax.stop_gradient(frequency)
+    # The number of impacts is not differentiable: they count for more where there are more.
+    share = frequency * often
+    share = share / jax.lax.stop_gradient(share)
     inertia = 0.0 if surface is None else surface.inertia
-    lost = -share * jnp.sum(kick * (2 * velocity + kick))
-    turned = share * inertia * jnp.sum(twist * (2 * spin + twist))
+    lost = -jnp.sum(share[:, None] * kick * (2 * velocity + kick))
+    turned = inertia * jnp.sum(share[:, None] * twist * (2 * spin + twist))
     return Walled(velocity + kick, spin + twist, lost, turned)
 
 
