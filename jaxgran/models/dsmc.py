@@ -51,8 +51,9 @@ class DSMC(AbstractModel):
     drawing one pair after the other would. Means over N particles have errors of O(1/N).
 
     Takes all elements of a scene but friction: rough spheres; walls, which a homogeneous gas meets
-    everywhere alike; drag, exactly, by collisions in transformed time (`jaxgran.particles.drag`),
-    up to gamma t = 18 (8 in float32); a drive, half of whose kicks begin each step and half end it;
+    everywhere alike, the more often the more they take (`jaxgran.scene.wall_layer`); drag, exactly,
+    by collisions in transformed time (`jaxgran.particles.drag`), up to gamma t = 18 (8 in float32);
+    a drive, half of whose kicks begin each step and half end it;
     and a driven start, which is driven for 10 mean free times with what its collisions take.
     Derivatives are then of T, T_rot and collisions (`jaxgran.tangents.exchange`), others are nan.
 

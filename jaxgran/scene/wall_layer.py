@@ -16,8 +16,8 @@ MOST_IMPACTS = 2.5
 
 
 def share_of_impacts(
-    eps: Float[Array, "*rows"], frequency: Float[Array, "*rows"], dimension: int
-) -> Float[Array, "*rows"]:
+    eps: Float[Array, "*#rows"], frequency: Float[Array, "*#rows"], dimension: int
+) -> Float[Array, "..."]:
     """Impacts on a wall of restitution eps over those on it in a gas that is everywhere alike.
 
         2/(1 + eps) * (1 + (3/2 - 2/pi)/(d + 2) (1 - eps^2)/(1 + Kn)) * sqrt(y)

@@ -103,12 +103,13 @@ def test_derivatives_are_those_of_theory(kind, name, elements):
     x = gas.value(name)
     found = derivative(logarithms(gas, name, model, taus), x)
     theory = derivative(logarithms(gas, name, jaxgran.KineticTheory(), taus), x)
-    # Theory itself is wrong by 5 % of T_rot/T of rough spheres, and takes a gas between walls for
-    # mixed, which hard spheres are not (10 % of the rate); some 10^4 collisions each scatter by
-    # 2 %, of the largest derivative.
+    # Theory itself is wrong by 5 % of T_rot/T of rough spheres, and by 2 % of the rate between
+    # walls; some 10^4 collisions each scatter by 2 %, of the largest derivative, and more where
+    # T_rot is coupled by little. Spins of hard spheres before rough walls are not those of a mixed
+    # gas: measured 22 % of the derivative of T_rot in beta_w.
     allowed = 0.05 + (0.05 if "surface" in elements else 0.0)
-    if kind == "HardSpheres" and "container" in elements:
-        allowed += 0.12
+    if kind == "HardSpheres" and name == "wall_tangential_restitution":
+        allowed += 0.17
     assert np.all(np.abs(found - theory) < allowed * np.max(np.abs(theory), axis=1)[:, None])
 
 
@@ -131,11 +132,9 @@ def test_derivatives_are_differences(kind, name, elements, step):
     found = derivative(of, x)
     difference = np.asarray(of(x + step) - of(x - step)) / (2 * step)
     # Of a difference, noise of ln T, .8/sqrt(N replicas), twice, over the step; and 3 % for its
-    # third order and for what the projection drops. That is more where the gas remembers that it is
-    # colder near walls: measured 14 to 15 % in hard spheres.
-    dropped = 0.18 if kind == "HardSpheres" and "container" in elements else 0.03
+    # third order and for what the projection drops.
     noise = 3 * 0.8 * np.sqrt(2 / (model.num_particles * model.replicas)) / (2 * step)
-    assert np.all(np.abs(found - difference) < noise + dropped * np.max(np.abs(difference)))
+    assert np.all(np.abs(found - difference) < noise + 0.03 * np.max(np.abs(difference)))
 
 
 def test_what_is_not_known_is_nan():

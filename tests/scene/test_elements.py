@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 import jaxgran
 from jaxgran.scene.reduced_scene import reduced_scene
+from jaxgran.scene.wall_layer import MOST_IMPACTS, share_of_impacts
 from jaxgran.theory.averages import averages
 from jaxgran.theory.moments import Density, Moments, velocity
 
@@ -79,17 +80,33 @@ def test_drag_alone_is_an_exponential():
 
 
 def test_walls_take_energy_as_haff_has_it():
-    # dT/dt = -(4/L) Z (1 - e^2) sqrt(T/(2 pi)) T in a cube of free width L - sigma.
+    # dT/dt = -(4/L) Z F (1 - e^2) sqrt(T/(2 pi)) T in a cube of free width L - sigma, where the
+    # layer before the wall brings 2/(1 + e) of the impacts, warmer by the heat that flows to it
+    # (.8634/5), and colder by its conduction over the width.
     gas = constant(1.0, container=jaxgran.Walls(0.05, restitution=0.8))
     curve = cooled(gas)
     phi = 0.02
     pressure = 1 + 4 * phi * (1 - phi / 2) / (1 - phi) ** 3
     assert float(gas.mean_free_path) < float(constant(1.0).mean_free_path)
     rate = 4 / 0.048 * pressure * 0.36 * (0.01 / (2 * np.pi)) ** 0.5
+    path = float(gas.mean_free_path) / 0.048 * pressure
+    drop = 0.2 * np.sqrt(2 / np.pi) / (6 * 75 / 64 * np.sqrt(2 * np.pi) * path)
+    cold = -drop / 2 + np.sqrt(1 + drop**2 / 4)
+    rate *= 2 / 1.8 * (1 + 0.8633802 / 5 * 0.36 / (1 + path)) * cold
     np.testing.assert_allclose(
         curve.temperature, 0.01 / (1 + rate * curve.times / 2) ** 2, rtol=1e-6
     )
     assert curve.displacement is None and curve.diffusion is None
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_elastic_walls_are_met_by_a_gas_everywhere_alike(dimension):
+    often = jnp.array([0.01, 0.1, 1.0])
+    share = [share_of_impacts(jnp.asarray(eps), often, dimension) for eps in (1.0, 0.9, 0.0)]
+    np.testing.assert_allclose(share[0], 1.0, rtol=1e-15)
+    assert np.all(share[1][1:] > 1.0) and np.all(share[2] < MOST_IMPACTS)
+    # Beyond 5 mean free paths the layer is cold; at .2 of them it is that of balanced pressure.
+    assert share[2][0] < 1.0 and share[1][2] == pytest.approx(2 / 1.9, rel=0.02)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
