@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 import jaxgran
-from experiments.fit import wrong_physics
 from jaxgran.fitting.rivals import ranges, rivals
 from tests.conftest import glass_beads
+from tests.fitting import closed_curves
 from tests.fitting.curves import synthetic
 
 FREE = ("dissipative_constant", "temperature")
 
 
 def curve_of(rates_of, floor=0.0, *, errors=True, seed=0):
-    """A curve of `wrong_physics` with 3 % noise."""
-    gas = wrong_physics.beads()
+    """A curve of `closed_curves` with 3 % noise."""
+    gas = closed_curves.beads()
     T_0 = float(gas.temperature)
-    times, values = wrong_physics.cooled(rates_of(gas), T_0, 0.02)
+    times, values = closed_curves.cooled(rates_of(gas), T_0, 0.02)
     t = np.geomspace(times[-1] / 300, times[-1], 30)
     T = np.interp(t, times, values) + floor * T_0
     T = T * np.exp(0.03 * np.random.default_rng(seed).standard_normal(30))
@@ -31,14 +31,14 @@ def curve_of(rates_of, floor=0.0, *, errors=True, seed=0):
 
 CASES = [
     # what the curve contains, noise floor, true A over 3e-6, words, whether it must be noticed
-    ("nothing", wrong_physics.nothing, 0.0, 1.0, "", False),
-    ("rough", wrong_physics.rough(-0.5), 0.0, 1.0, "constant eps", False),
-    ("very rough", wrong_physics.rough(0.0), 0.0, 1.0, "rough grains, at rest", False),
-    ("walls", wrong_physics.walls(0.8), 0.0, 1.0, "constant eps", False),
+    ("nothing", closed_curves.nothing, 0.0, 1.0, "", False),
+    ("rough", closed_curves.rough(-0.5), 0.0, 1.0, "constant eps", False),
+    ("very rough", closed_curves.rough(0.0), 0.0, 1.0, "rough grains, at rest", False),
+    ("walls", closed_curves.walls(0.8), 0.0, 1.0, "constant eps", False),
     # No A at all: any small one must be left possible.
-    ("constant", wrong_physics.constant(0.8), 0.0, 0.05, "constant eps", True),
-    ("drag", wrong_physics.drag(0.05), 0.0, 1.0, "drag", True),
-    ("floor", wrong_physics.nothing, 0.01, 1.0, "noise floor", True),
+    ("constant", closed_curves.constant(0.8), 0.0, 0.05, "constant eps", True),
+    ("drag", closed_curves.drag(0.05), 0.0, 1.0, "drag", True),
+    ("floor", closed_curves.nothing, 0.01, 1.0, "noise floor", True),
 ]
 
 
@@ -54,7 +54,7 @@ def test_the_range_contains_the_truth(rates_of, floor, true, words, noticed, err
     gas, curve = curve_of(rates_of, floor, errors=errors)
     result = jaxgran.fit(gas, curve, free=FREE)
     diagnosis = jaxgran.diagnose(result, curve)
-    low, high = (x[0] / wrong_physics.TRUE_A for x in diagnosis.ranges["dissipative_constant"])
+    low, high = (x[0] / closed_curves.TRUE_A for x in diagnosis.ranges["dissipative_constant"])
     assert low < true < high
     said = " ".join([diagnosis.verdict, *diagnosis.reasons])
     assert words in said and "equal, smooth spheres, far from walls, in vacuum" in said
@@ -66,14 +66,14 @@ def test_the_range_contains_the_truth(rates_of, floor, true, words, noticed, err
 
 
 def test_a_loss_that_is_not_told_apart_makes_a_an_upper_bound():
-    gas, curve = curve_of(wrong_physics.walls(0.8))
+    gas, curve = curve_of(closed_curves.walls(0.8))
     result = jaxgran.fit(gas, curve, free=FREE)
     found = {rival.name: rival for rival in rivals(result, curve)}
     loss = next(rival for name, rival in found.items() if "constant eps" in name)
     assert not loss.told_apart and loss.sharper > 2
     # The fit alone is wrong by many of its standard errors.
     a, error = result.value("dissipative_constant")
-    assert (a - wrong_physics.TRUE_A) / error > 10
+    assert (a - closed_curves.TRUE_A) / error > 10
     low, high = ranges(result, tuple(found.values()))["dissipative_constant"]
     assert low[0] <= loss.low[0] < 0.7 * a < a < high[0]
 
@@ -120,7 +120,7 @@ def test_a_gas_that_does_not_cool_has_no_rivals():
 
 
 def test_noise_of_simulations_widens_the_range():
-    gas, curve = curve_of(wrong_physics.nothing)
+    gas, curve = curve_of(closed_curves.nothing)
     result = jaxgran.fit(gas, curve, free=FREE)
     noise = 0.2 * result.estimate
     parts = result.covariances | {"simulation": jnp.diag(noise**2)}
@@ -137,11 +137,12 @@ def test_noise_of_simulations_widens_the_range():
 @pytest.mark.filterwarnings("ignore:fitting in float32")
 def test_both_precisions_in_one_process():
     """Constants of one precision must not enter a program of the other."""
-    _, curve = curve_of(wrong_physics.nothing)
+    _, curve = curve_of(closed_curves.nothing)
     found = {}
     for x64 in (True, False):
         with jax.enable_x64(x64):
-            gas, curve = wrong_physics.beads(), jax.tree.map(np.asarray, curve)
+            gas = closed_curves.beads()
+            curve = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), curve)
             result = jaxgran.fit(gas, curve, free=FREE)
             found[x64] = ranges(result, rivals(result, curve))["dissipative_constant"]
     # Float32 moves a profile's search by a part of its grid in the amplitude.
