@@ -50,14 +50,14 @@ def beads() -> jaxgran.Gas:
     )
 
 
-def measured(gas: jaxgran.Gas) -> tuple[np.ndarray, np.ndarray]:
+def measured(gas: jaxgran.Gas) -> tuple[jax.Array, jax.Array]:
     """Times until T has fallen to its last share, and T of hard spheres then."""
     course = jnp.geomspace(1e-2, 1e4, 400) * gas.mean_free_time
     T = jaxgran.cool(gas, course, model=THEORY).temperature / gas.temperature
     end = float(jnp.interp(-np.log(LAST), -jnp.log(T), course))
-    times = np.geomspace(end / 300, end, NUM_POINTS)
+    times = jnp.geomspace(end / 300, end, NUM_POINTS)
     model = jaxgran.HardSpheres(NUM_PARTICLES, replicas=REPLICAS)
-    return times, np.asarray(jaxgran.cool(gas, times, model=model, progress=False).temperature)
+    return times, jaxgran.cool(gas, times, model=model, progress=False).temperature
 
 
 def drag(gas: jaxgran.Gas) -> jaxgran.StokesDrag:
@@ -137,7 +137,7 @@ def row(name: str, other: dict, floor: float, draws: int) -> dict:
     found_so, held = [], 0
     for draw in range(draws):
         noise = np.random.default_rng(draw).standard_normal(NUM_POINTS)
-        T = exact * np.exp(NOISE * noise)
+        T = exact * jnp.exp(NOISE * noise)
         curve = jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=NOISE * T)
         free = ("dissipative_constant", "temperature")
         result = jaxgran.fit(gas, curve, model=THEORY, free=free)
