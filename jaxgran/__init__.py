@@ -48,6 +48,7 @@ from jaxgran.scene.restitution import (
     Viscoelastic,
 )
 from jaxgran.scene.restitution_table import viscoelastic_restitution
+from jaxgran.sweeps.sweep import sweep
 from jaxgran.theory.steady import SteadyState, steady_state
 
 __all__ = [
@@ -97,6 +98,7 @@ __all__ = [
     "read_priors",
     "sphere_mass",
     "steady_state",
+    "sweep",
     "viscoelastic_restitution",
     "write_curve",
 ]

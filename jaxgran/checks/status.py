@@ -84,6 +84,11 @@ OUT_OF_RANGE = Fault(
     "a float of the gas lies outside its range, or the times do not increase from 0 or later",
     "look at gas.domains, and sort the times",
 )
+NOT_TAKEN = Fault(
+    8192,
+    "the model does not take this gas",
+    "call jaxgran.cool for it alone, which says why",
+)
 FAULTS = (
     LIST_FULL,
     CONTACTS_FULL,
@@ -98,6 +103,7 @@ FAULTS = (
     BOX_TOO_SMALL,
     ENERGY_DRIFT,
     OUT_OF_RANGE,
+    NOT_TAKEN,
 )
 
 

@@ -25,14 +25,19 @@ UNITS = {
 """Units of the quantities of a curve, by the names of its fields."""
 
 
-def _needed(name: str) -> Any:
+def needed(name: str, extra: str = "notebook") -> Any:
+    """A module of an extra.
+
+    Raises:
+        ModuleNotFoundError: if it is not installed, naming the extra.
+    """
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
         if error.name != name:
             raise
         raise ModuleNotFoundError(
-            f'this table needs {name}: pip install "jaxgran[notebook]"', name=name
+            f'this needs {name}: pip install "jaxgran[{extra}]"', name=name
         ) from None
 
 
@@ -53,7 +58,7 @@ def quantities(curve: Any) -> dict[str, np.ndarray]:
 
 def dataset(curve: Any) -> Any:
     """The `xarray.Dataset` of `CoolingCurve.to_xarray`."""
-    xarray = _needed("xarray")
+    xarray = needed("xarray")
 
     def described(name: str, *dims: str, values: np.ndarray) -> tuple:
         return dims, values, {"units": UNITS[name], "long_name": name.replace("_", " ")}
@@ -76,6 +81,6 @@ def dataset(curve: Any) -> Any:
 
 def frame(curve: Any) -> Any:
     """The `pandas.DataFrame` of `CoolingCurve.to_pandas`."""
-    pandas = _needed("pandas")
+    pandas = needed("pandas")
     columns = quantities(curve)
     return pandas.DataFrame(columns, index=pandas.Index(np.asarray(curve.times), name="times"))

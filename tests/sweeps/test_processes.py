@@ -1,0 +1,73 @@
+"""Sweeps over several processes with two CPU devices each, on the loopback address."""
+
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxgran
+from tests.sweeps.process import TIMES, members
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(processes, store, number, die_at=-1):
+    """Exit codes, and the chunks that each process says it has written."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "tests.sweeps.process", str(port)]
+    rest = [str(x) for x in (processes, store, number, die_at)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT}
+    started = [subprocess.Popen([*command, str(i), *rest], **pipes) for i in range(processes)]
+    outputs = [process.communicate(timeout=300) for process in started]
+    chunks = [
+        [int(line.split()[1]) for line in out.splitlines() if line.startswith("chunk")]
+        for out, _ in outputs
+    ]
+    return [process.returncode for process in started], chunks, outputs
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return jaxgran.sweep(members(10), TIMES, chunk=2, progress=False)
+
+
+def check(store, expected):
+    # The same program on as many devices, but for the devices' number: the same numbers.
+    stored = jaxgran.sweep(members(10), TIMES, store=store, progress=False)
+    np.testing.assert_allclose(stored.temperature, expected.temperature, rtol=1e-12)
+    assert not np.any(stored.status)
+
+
+def test_a_process_is_killed_amid_a_chunk_and_the_sweep_resumed(tmp_path, expected):
+    store = tmp_path / "sweep.zarr"
+    codes, chunks, outputs = run(2, store, 10, die_at=3)
+    assert codes[1] == -signal.SIGKILL and codes[0] != 0
+    assert "another task died" in outputs[0][1]
+    assert chunks == [[0, 2, 4], [1]]
+    codes, again, _ = run(2, store, 10)
+    # None is lost and none made twice; chunk 3, of which half had been written, is made again.
+    assert codes == [0, 0] and again == [[], [3]]
+    check(store, expected)
+
+
+@pytest.mark.slow
+def test_two_processes_with_two_devices_each(tmp_path, expected):
+    store = tmp_path / "sweep.zarr"
+    codes, chunks, outputs = run(2, store, 10)
+    assert codes == [0, 0] and chunks == [[0, 2, 4], [1, 3]]
+    for out, _ in outputs:  # all devices, those of the process, and every member
+        assert "done 4 2 (10, 3)" in out
+    check(store, expected)
+
+
+@pytest.mark.slow
+def test_more_processes_than_members(tmp_path):
+    codes, chunks, outputs = run(3, tmp_path / "sweep.zarr", 2)
+    assert codes == [0, 0, 0] and sorted(sum(chunks, [])) == [0]
+    assert all("(2, 3)" in out for out, _ in outputs)
