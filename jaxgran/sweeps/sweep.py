@@ -84,6 +84,8 @@ def sweep(
             nothing is overwritten.
         OSError: if the store cannot be written.
 
+    This docstring is long because it says what becomes of the chunks of every process.
+
     >>> gases = jax.vmap(lambda a: gas.replace(dissipative_constant=a))(jnp.array([1e-6, 3e-6]))
     >>> jaxgran.sweep(gases, times, progress=False).temperature.shape
     (2, 4)
@@ -149,7 +151,7 @@ def _checked_chunk(chunk: Any, store: Any, model: AbstractModel, number: int) ->
         raise ValueError(f"store must be a path, got {store!r:.60}")
     if chunk is not None:
         return min(whole_number("chunk", chunk, 1), number)
-    if store is not None and (stored := stores.stored_chunk(store)) is not None:
+    if store is not None and (stored := stores.stored_chunk(Path(store))) is not None:
         return stored
     return min(CHUNKS[model.stochastic], -(-number // jax.process_count()))
 

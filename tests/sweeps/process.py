@@ -22,7 +22,7 @@ def members(number):
 TIMES = (0.1, 1.0, 10.0)
 
 
-def main(port, index, processes, store, number, die_at=-1):
+def main(port, index, processes, store, size, die_at=-1):
     jax.config.update("jax_num_cpu_devices", 2)
     jax.config.update("jax_enable_x64", True)
     # The time after which JAX ends the others if one has died.
@@ -34,15 +34,15 @@ def main(port, index, processes, store, number, die_at=-1):
 
     write = Store.write
 
-    def reported(self, chunk, records):
-        if chunk == die_at:
-            self.group["temperature"][self.rows(chunk)] = records["temperature"]
+    def reported(self, number, records):
+        if number == die_at:
+            self.group["temperature"][self.rows(number)] = records["temperature"]
             os.kill(os.getpid(), signal.SIGKILL)
-        write(self, chunk, records)
-        print("chunk", chunk, flush=True)
+        write(self, number, records)
+        print("chunk", number, flush=True)
 
     Store.write = reported
-    curve = jaxgran.sweep(members(number), TIMES, store=store, chunk=2, progress=False)
+    curve = jaxgran.sweep(members(size), TIMES, store=store, chunk=2, progress=False)
     print("done", jax.device_count(), jax.local_device_count(), curve.temperature.shape, flush=True)
 
 
