@@ -21,6 +21,7 @@ from jaxgran.checks.validation import Domain
 from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.data.curve_file import read_curve, read_gas, read_priors, write_curve
 from jaxgran.data.drop_test import DropTest, read_drop_test
+from jaxgran.data.particle_files import read_particles
 from jaxgran.data.run import Run
 from jaxgran.fitting.diagnosis import Diagnosis, diagnose
 from jaxgran.fitting.fit import fit
@@ -35,6 +36,7 @@ from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.selection import Choice, choose_model
 from jaxgran.models.soft_spheres import SoftSpheres
+from jaxgran.particles import observables
 from jaxgran.scene.contact import Impact, contact_force, elastic_constant, impact
 from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise
 from jaxgran.scene.friction import Frictional
@@ -92,9 +94,11 @@ __all__ = [
     "fit_jointly",
     "impact",
     "log_likelihood",
+    "observables",
     "read_curve",
     "read_drop_test",
     "read_gas",
+    "read_particles",
     "read_priors",
     "sphere_mass",
     "steady_state",

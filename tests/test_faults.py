@@ -18,7 +18,7 @@ from jaxgran import plotting
 from jaxgran.checks import status
 from jaxgran.checks.validation import ANY
 from jaxgran.data.run import Run
-from jaxgran.particles import driver
+from jaxgran.particles import driver, programs
 from jaxgran.particles import dynamics as moving
 from jaxgran.particles.dynamics import stretches
 from jaxgran.particles.interruption import in_thread, waited_for
@@ -251,7 +251,7 @@ def test_blocks_that_stand_still_end(kind, x64, monkeypatch):
         gas = glass_beads(0.3, packing_fraction=0.1)
         monkeypatch.setattr(moving, "SHORTEST_FLIGHT", 1e9)  # no flight is long enough
         monkeypatch.setattr(moving, "MOST_IDLE", 3)
-        monkeypatch.setattr(driver, "_PROGRAMS", type(driver._PROGRAMS)())
+        monkeypatch.setattr(programs, "_PROGRAMS", type(programs._PROGRAMS)())
         jax.clear_caches()
         curve = kind(20).simulate(gas, jnp.array([TAU]), Run())
         jax.clear_caches()

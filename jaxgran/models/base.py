@@ -76,6 +76,12 @@ class AbstractModel(eqx.Module):
     """Relative accuracy of a derivative of ln T in a parameter. Parameters whose effects differ by
     less count as undetermined."""
 
+    saves: ClassVar[bool] = False
+    """Whether curves have `CoolingCurve.saved` where a run asks for it: the model has particles."""
+
+    has_positions: ClassVar[bool] = False
+    """Whether it writes a trajectory where a run asks for it."""
+
     rotation_accuracy: ClassVar[float] = 0.07
     """Relative accuracy of T_rot/T of rough spheres."""
 

@@ -145,13 +145,14 @@ def check_volume(gas: Gas, num_particles: int) -> None:
         )
 
 
-def refuse_checkpoint(model: AbstractModel, run: Run) -> None:
-    """Raise ValueError for a checkpoint, where a model's run is compiled and can keep none."""
-    if run.checkpoint is not None:
-        raise ValueError(
-            f"inside jax.jit and jax.vmap {type(model).__name__} keeps no checkpoint: leave "
-            f"checkpoint out, got {str(run.checkpoint)!r}"
-        )
+def refuse_files(model: AbstractModel, run: Run) -> None:
+    """Raise ValueError for files, where a model's run is compiled and can write none."""
+    for name in ("checkpoint", "trajectory"):
+        if (path := getattr(run, name)) is not None:
+            raise ValueError(
+                f"inside jax.jit and jax.vmap {type(model).__name__} writes no {name}: leave "
+                f"{name} out, got {str(path)!r}"
+            )
 
 
 def omitted_by_instant_impacts(

@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray
 
 from jaxgran.checks import status
 from jaxgran.checks.validation import checked_times, no_type_check
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.data.files import check_writable
 from jaxgran.data.run import Run
 from jaxgran.models import checks
@@ -31,6 +31,8 @@ def cool(
     key: PRNGKeyArray | None = None,
     progress: bool = True,
     checkpoint: str | Path | None = None,
+    save: Callable[[Particles], Any] | Literal["particles"] | None = None,
+    trajectory: str | Path | None = None,
     throw: bool = True,
     tolerance: float | None = None,
     num_particles: int | None = None,
@@ -54,6 +56,16 @@ def cool(
         checkpoint: a file to which a particle model's run is saved each minute and when it is
             interrupted, and from which it is resumed; the resumed run gives the same numbers bit
             for bit. Not inside `jax.jit` and `jax.vmap`.
+        save: of a model with particles: a function that JAX can compile, of the `Particles` of one
+            replica (arrays of shape (N, d), SI), which returns arrays in any tree; see
+            `jaxgran.observables`. Its mean over replicas at each time is ``curve.saved``, its
+            standard error ``curve.saved_error``, and that of each replica
+            ``curve.replicas.saved``. "particles" keeps these themselves, all of them at all times.
+            Positions of DSMC, which has none, are nan.
+        trajectory: of a model with positions: a file, .gsd (OVITO, freud, VMD, HOOMD; needs the
+            extra `trajectories`) or .xyz (extended XYZ), to which the particles are written at each
+            time, as soon as it is reached; `jaxgran.read_particles` reads it. Of several replicas
+            that is one file each, ``name.0.gsd`` and so on. Not inside `jax.jit` and `jax.vmap`.
         throw: raise RuntimeError if the run fails. False returns the curve, nan from the failure
             on, and its ``status`` (`jaxgran.explain_status` puts it into words); inside compiled
             code, where nothing can be raised, that is always so.
@@ -64,10 +76,10 @@ def cool(
         `CoolingCurve` at those times.
 
     Raises:
-        ValueError: for times that are negative, unsorted, not finite or not a list, a scene that
-            the model cannot take, a checkpoint where none can be kept, or options of "auto" with
-            another model. Values being traced cannot be looked at: where they lie outside their
-            ranges the curve is nan, and its status says so.
+        ValueError: for times that are negative, unsorted, not finite or not a list, a trajectory
+            that exists already, a scene that the model cannot take, a checkpoint where none can be
+            kept, or options of "auto" with another model. Values being traced cannot be looked at:
+            where they lie outside their ranges the curve is nan, and its status says so.
         OSError: for a checkpoint that cannot be written.
         RuntimeError: if the run fails and `throw` is True, with what to do.
 
@@ -91,15 +103,43 @@ def cool(
             "in SoftSpheres(num_particles), or leave them out"
         )
     model = checks.checked_model(model)
+    _check_save(save, model)
+    if trajectory is not None:
+        _check_trajectory(trajectory, model)
     if checkpoint is not None:
         _check_checkpoint(checkpoint, model)
     model.check_scene(gas)
     gas, simulated, allowed = checks.replaced_where_traced(gas, times)
-    curve = model.simulate(gas, simulated, Run(key, progress, checkpoint))
+    curve = model.simulate(gas, simulated, Run(key, progress, checkpoint, save, trajectory))
     curve = checks.spoilt_unless(allowed, curve, times)
     if throw and curve.status is not None and not isinstance(curve.status, Tracer):
         _raise_if_failed(curve, gas)
     return curve
+
+
+def _check_save(save: Any, model: AbstractModel) -> None:
+    if save is None:
+        return
+    if not (callable(save) or save == "particles"):
+        raise ValueError(
+            'save must be a function of the particles of a replica, or "particles", got '
+            f"{save!r:.60}"
+        )
+    if not model.saves:
+        raise ValueError(
+            f"{type(model).__name__} has no particles of which something could be saved: leave "
+            "save out, or use DSMC(N), HardSpheres(N) or SoftSpheres(N)"
+        )
+
+
+def _check_trajectory(trajectory: Any, model: AbstractModel) -> None:
+    if not isinstance(trajectory, str | os.PathLike):
+        raise ValueError(f"trajectory must be a path, got {trajectory!r}")
+    if not model.has_positions:
+        raise ValueError(
+            f"{type(model).__name__} has no positions: leave trajectory out, or use HardSpheres(N) "
+            "or SoftSpheres(N)"
+        )
 
 
 def _check_checkpoint(checkpoint: Any, model: AbstractModel) -> None:

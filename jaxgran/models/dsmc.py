@@ -1,5 +1,6 @@
 """Direct simulation Monte Carlo: the velocities of a homogeneous gas, by random collisions."""
 
+from functools import partial
 from math import hypot
 from typing import ClassVar
 
@@ -25,6 +26,7 @@ from jaxgran.data.run import DEFAULTS, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import Course
+from jaxgran.particles import snapshot
 from jaxgran.particles.drag import transformed
 from jaxgran.particles.driver import follow
 from jaxgran.particles.interruption import waited_for
@@ -87,6 +89,7 @@ class DSMC(AbstractModel):
     step: UserFloat = eqx.field(static=True, default=0.05)
 
     stochastic: ClassVar[bool] = True
+    saves: ClassVar[bool] = True
     elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive", "preparation")
     derivative_accuracy: ClassVar[float] = 0.01
 
@@ -127,14 +130,26 @@ class DSMC(AbstractModel):
         scene, reduced = reduced_scene(gas), times * gas.impact_speed / gas.path_length
         if scene.drag is not None:
             reduced = transformed(scene.drag, reduced)
+        units = self._units(gas)
         if any_traced(gas, times, words):
-            checks.refuse_checkpoint(self, run)
+            checks.refuse_files(self, run)
+            options = {"units": units, "save": snapshot.function(run.save)}
             records = simulation.differentiable_run(
-                scene, reduced, words, replicas=self.replicas, scheme=scheme
+                scene, reduced, words, replicas=self.replicas, scheme=scheme, **options
             )
         else:
-            records = self._driven(scene, reduced, words, scheme, run)
-        return _curve(gas, times, records, beyond)
+            records = self._driven(scene, reduced, words, scheme, units, run)
+        curve, failed = _curve(gas, times, records, beyond)
+        size = self.replicas, self.num_particles
+        rough = gas.surface is not None
+        like = snapshot.shapes(units, size, gas.dimension, times.dtype, rough)
+        return snapshot.with_saved(curve, run.save, records, like, failed)
+
+    def _units(self, gas: Gas) -> snapshot.Units:
+        """Of what is seen of the particles, SI."""
+        side = gas.box_side(self.num_particles) if gas.container is None else gas.container.side
+        speed = gas.impact_speed
+        return snapshot.Units(gas.path_length, speed, 2 * speed / gas.diameter, side, gas.mass)
 
     def _driven(
         self,
@@ -142,6 +157,7 @@ class DSMC(AbstractModel):
         times: Float[Array, "times"],
         words: UInt32[Array, "2"],
         scheme: Scheme,
+        units: snapshot.Units,
         run: Run,
     ) -> dict[str, Array]:
         """The records of a run by the driver on the host, with progress and checkpoints."""
@@ -152,8 +168,11 @@ class DSMC(AbstractModel):
             start,
             np.asarray(times),
             lambda state, end: waited_for(advance(state, end)),
-            observe,
-            scene=described(scene=scene, times=times, key=words, scheme=scheme, model=self),
+            partial(observe, units=units, save=snapshot.function(run.save)),
+            shown=observe,
+            scene=described(
+                scene=scene, times=times, key=words, scheme=scheme, model=self, save=run.save
+            ),
             progress=run.progress,
             path=run.checkpoint,
         )
@@ -166,8 +185,9 @@ def _curve(
     times: Float[Array, "times"],
     records: dict[str, Array],
     beyond: Bool[Array, "times"],
-) -> CoolingCurve:
-    """The curve in SI units; each replica is nan from its first fault on, or beyond some time."""
+) -> tuple[CoolingCurve, Bool[Array, "replicas times"]]:
+    """The curve in SI units, and where it is nan: a replica is from its first fault on, and all
+    are beyond some time."""
     fault = records["fault"] | status.flag(status.OUT_OF_RANGE, beyond)[:, None]
     failed = jnp.cumsum(fault != status.OK, axis=0) > 0
     units = {
@@ -185,4 +205,5 @@ def _curve(
         for name, unit in units.items()
         if name in records
     }
-    return CoolingCurve.of_replicas(times, each, status=jnp.bitwise_or.reduce(fault, axis=None))
+    status_of_all = jnp.bitwise_or.reduce(fault, axis=None)
+    return CoolingCurve.of_replicas(times, each, status=status_of_all), failed.T

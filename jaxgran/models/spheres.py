@@ -19,7 +19,7 @@ from jaxgran.data.run import DEFAULTS, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.course import Course
-from jaxgran.particles import driver, initial, neighbours, pure, user_start
+from jaxgran.particles import driver, initial, neighbours, pure, snapshot, user_start
 from jaxgran.particles.capacity import Capacity, skin_adding
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.simulation import SMALLEST_BOX, Simulation
@@ -65,6 +65,8 @@ class AbstractSpheres(AbstractModel):
     listed_by_skin: AbstractClassVar[float]
 
     stochastic: ClassVar[bool] = True
+    saves: ClassVar[bool] = True
+    has_positions: ClassVar[bool] = True
     derivative_accuracy: ClassVar[float] = 0.02
 
     @property
@@ -150,6 +152,7 @@ class AbstractSpheres(AbstractModel):
             start=user_start.reduced(self.start, gas, differentiable=not self.projected),
             key=run.key,
         )
+        inputs = inputs._replace(units=self._units(gas, inputs.scene.side))
 
         def outputs(inputs: Inputs, directions: Any = None) -> Outputs:
             return self._outputs(inputs, directions, gas.dimension, run)
@@ -158,7 +161,13 @@ class AbstractSpheres(AbstractModel):
             found = differentiable(outputs, lambda scene: scene.material, self.held)(inputs)
         else:
             found = outputs(inputs)
-        return self._curve(gas, times, inputs.scene.side, found, beyond)
+        return self._curve(gas, times, inputs.units, found, beyond, run.save)
+
+    def _units(self, gas: Gas, side: Array) -> snapshot.Units:
+        """Of what is seen of the particles, SI."""
+        length, velocity = gas.diameter, jnp.sqrt(gas.temperature)
+        box_side = side * length if gas.container is None else gas.container.side
+        return snapshot.Units(length, velocity, 2 * velocity / length, box_side, gas.mass)
 
     def _outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
         """The run in reduced units: driven from the host if all numbers are known, else pure."""
@@ -174,11 +183,12 @@ class AbstractSpheres(AbstractModel):
             dimension=dimension,
             skin=skin,
             engine=self.neighbours,
+            save=snapshot.function(run.save),
         )
         if not any_traced(inputs):
             model = dataclasses.replace(self, start=None, plan=None)
             return driver.drive(sim, run, {"model": model, "pace": plan.pace})
-        checks.refuse_checkpoint(self, run)
+        checks.refuse_files(self, run)
         if self.neighbours == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap neighbours="jax-md" cannot find the pairs, as it sizes '
@@ -211,13 +221,14 @@ class AbstractSpheres(AbstractModel):
         self,
         gas: Gas,
         times: Float[Array, "times"],
-        side: Array,
+        units: snapshot.Units,
         out: Outputs,
         beyond: Bool[Array, "times"],
+        save: Any,
     ) -> CoolingCurve:
         """The curve in SI units, of records in units of diameter, mass and first temperature."""
         energy = gas.mass * gas.temperature
-        units = {
+        of_records = {
             "temperature": gas.temperature,
             "sonine": 1.0,
             "displacement": gas.diameter**2,
@@ -228,28 +239,21 @@ class AbstractSpheres(AbstractModel):
             "regularised": 1.0,
             "rotational_temperature": gas.temperature,
         }
-        each = {name: values.T * units[name] for name, values in out.records.items()}
+        known = [name for name in of_records if name in out.records]
+        each = {name: out.records[name].T * of_records[name] for name in known}
         # Where it could not be checked before.
         other = user_start.is_of_other_box(self.start, gas, self.num_particles)
         wrong = other | beyond
         each = {name: jnp.where(wrong[None], jnp.nan, values) for name, values in each.items()}
-        spin = out.spin
-        if spin is not None:
-            spin = spin.reshape(self.replicas, self.num_particles, -1)
-            spin = spin * (2 * jnp.sqrt(gas.temperature) / gas.diameter)
+        particles = snapshot.particles(units, self.replicas, out.position, out.velocity, out.spin)
         late = status.flag(status.OUT_OF_RANGE, jnp.any(beyond))
-        shape = self.replicas, self.num_particles, gas.dimension
-        return CoolingCurve.of_replicas(
+        curve = CoolingCurve.of_replicas(
             times,
             each,
-            particles=Particles(
-                position=out.position.reshape(shape) * gas.diameter,
-                velocity=out.velocity.reshape(shape) * jnp.sqrt(gas.temperature),
-                box_side=side * gas.diameter if gas.container is None else gas.container.side,
-                angular_velocity=spin,
-            ),
+            particles=particles,
             status=out.status | status.flag(status.OTHER_BOX, other) | late,
         )
+        return snapshot.with_saved(curve, save, out.records, particles, wrong[None])
 
     def check_counts(self, **least: int) -> None:
         """Raise ValueError where a whole number of the model is less than it must be."""

@@ -1,11 +1,9 @@
 """The host driver of particle runs: progress, checkpoints, interruption, arrays that grow.
 
-Around compiled functions that advance a state by a limited amount of work. For runs whose numbers
-are all known; the same run as a pure function is in `pure`.
+For runs whose numbers are all known; the same run as a pure function is in `pure`.
 """
 
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -14,27 +12,24 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from tqdm import tqdm
 
 from jaxgran.checks import status
-from jaxgran.checks.tracing import any_traced, concrete
+from jaxgran.checks.tracing import concrete
 from jaxgran.data import checkpoint
 from jaxgran.data.description import described
 from jaxgran.data.run import Run
-from jaxgran.particles import neighbours
+from jaxgran.data.trajectory import Sphere, Trajectory
+from jaxgran.particles import neighbours, programs
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.dynamics import MOST_IDLE, AbstractDynamics, stretches
-from jaxgran.particles.interruption import outside_of_transformations, waited_for
+from jaxgran.particles.dynamics import MOST_IDLE, AbstractDynamics
+from jaxgran.particles.interruption import waited_for
 from jaxgran.particles.simulation import SETTLED, Simulation
 from jaxgran.particles.state import State
 from jaxgran.tangents.rule import Outputs
 
 CHECKPOINT_SECONDS = 60.0
 """A checkpoint is written this often, and when the run is interrupted."""
-
-STRETCHES = 8
-"""Neighbour lists used in one call of compiled code; progress is shown between calls."""
 
 MOST_PAIRS = 100
 """Rows per particle beyond which an array does not grow any more."""
@@ -63,6 +58,8 @@ def follow(
     advance: Callable[[S, float], S],
     observe: Callable[[S], dict[str, jax.Array]],
     *,
+    write: Callable[[int, S], None] = lambda k, state: None,
+    shown: Callable[[S], dict[str, jax.Array]] | None = None,
     scene: dict[str, str] | None = None,
     progress: bool = True,
     label: str | None = None,
@@ -75,16 +72,16 @@ def follow(
         state: a pytree with a field `time`; where the run starts.
         times: increasing, not before the state's own.
         advance: takes a state towards a time, at most to it; raises `Failure` if it cannot.
-        observe: what to record, a dictionary of arrays; "temperature" is shown in the bar.
+        observe: what to record, a dictionary of arrays.
+        write: called with the number of a time and the state there.
+        shown: of its results "temperature" is shown in the bar; `observe` by default.
         scene: description of everything that fixes the result.
-        label: put before the bar.
-        progress: show a bar with T/T_0 and the time left, after a few seconds, on a terminal.
-        path: of the checkpoint; if the file exists the run is resumed from it. None for none.
+        progress, label: show a bar with T/T_0 and the time left, after some seconds, on a terminal.
+        path: of the checkpoint, from which the run is resumed if it exists; None for none.
         fault: the status before; unless it is ok nothing is done.
 
     Returns:
-        The last state; the records, stacked along a first axis of times, nan from a failure on;
-        and the status of the run.
+        The last state; the records with a first axis of times, nan from a failure on; the status.
     """
     done, state, records = _resumed(path, scene, state, _empty(observe(state), len(times)))
     saved, idle = time.monotonic(), 0
@@ -95,18 +92,17 @@ def follow(
 
     with _progress_bar(float(times[-1]), float(state.time), progress, label) as bar:
         try:
-            if fault != status.OK:
-                raise Failure(fault)
+            _raise_if(fault)
             while done < len(times):
                 while float(state.time) < times[done]:
                     before, state = state, advance(state, float(times[done]))
                     idle = _idle(idle, before, state)
-                    _show(bar, state, observe)
+                    _show(bar, state, shown or observe)
                     if time.monotonic() - saved > CHECKPOINT_SECONDS:
                         save()
                         saved = time.monotonic()
-                for name, value in observe(state).items():
-                    records[name][done] = value
+                _record(records, done, observe(state))
+                write(done, state)
                 done += 1
             save()
         except KeyboardInterrupt:
@@ -114,9 +110,24 @@ def follow(
             raise
         except Failure as failure:
             fault = failure.fault
-            for values in records.values():
-                values[done:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
+            _spoil(records, done)
     return state, records, fault
+
+
+def _raise_if(fault: int) -> None:
+    if fault != status.OK:
+        raise Failure(fault)
+
+
+def _record(records: dict[str, np.ndarray], done: int, observed: dict[str, jax.Array]) -> None:
+    for name, value in observed.items():
+        records[name][done] = value
+
+
+def _spoil(records: dict[str, np.ndarray], done: int) -> None:
+    """Nan from the time of a failure on; 0 where there is no nan."""
+    for values in records.values():
+        values[done:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
 
 
 def _idle(idle: int, before: S, state: S) -> int:
@@ -163,36 +174,6 @@ def _show(bar: tqdm, state: Any, observe: Callable[[Any], dict[str, jax.Array]])
         bar.set_postfix_str(f"T/T_0 = {ratio:.3g}", refresh=False)
 
 
-MOST_PROGRAMS = 32
-"""Compiled programs that are kept; beyond that the one unused for longest is released."""
-
-_PROGRAMS: OrderedDict[Any, jax.stages.Compiled] = OrderedDict()
-"""Programs of `stretches` by what they were compiled for. Unlike those that `jax.jit` keeps they
-are bounded in number, and shared by plain runs and those inside a rule of differentiation."""
-
-
-def _stretches(
-    dynamics: AbstractDynamics, state: State, end: np.ndarray, engine: str
-) -> tuple[State, Array, Array]:
-    """`STRETCHES` stretches, compiled for the types and the static fields of these arguments."""
-    leaves, structure = jax.tree.flatten((dynamics, state, end))
-
-    def some(leaves: list[Array]) -> tuple[State, Array, Array]:
-        dynamics, state, end = structure.unflatten(leaves)
-        return stretches(dynamics, state, end, engine, least=1, most=STRETCHES)
-
-    if any_traced(leaves):  # constants within a transformation of something else
-        return jax.jit(some)(leaves)
-    types = tuple((x.shape, x.dtype, getattr(x, "sharding", None)) for x in leaves)
-    key = engine, STRETCHES, structure, types
-    if key not in _PROGRAMS:
-        _PROGRAMS[key] = outside_of_transformations(lambda: jax.jit(some).lower(leaves).compile())
-        if len(_PROGRAMS) > MOST_PROGRAMS:
-            _PROGRAMS.popitem(last=False)
-    _PROGRAMS.move_to_end(key)
-    return _PROGRAMS[key](leaves)
-
-
 _GROWN: dict[Capacity, Capacity] = {}
 """What capacities came to be enlarged to: the next run begins with the larger ones, and neither
 fails on the way to them nor compiles again. Results do not depend on it."""
@@ -225,7 +206,7 @@ def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
     except Failure as failure:
         fault = failure.fault
     times = np.asarray(sim.inputs.times)
-    given = sim.inputs._asdict() | settings | {"directions": sim.directions}
+    given = sim.inputs._asdict() | settings | {"directions": sim.directions, "save": sim.save}
     scene = {} if run.checkpoint is None else described(**given)
 
     def advance(state: State, end: float) -> State:
@@ -235,14 +216,33 @@ def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
         state,
         times,
         advance,
-        dynamics.observe,
+        sim.observe,
+        shown=dynamics.observe,
         scene=scene,
         progress=run.progress,
         path=run.checkpoint,
+        write=_writer(sim, run),
         fault=fault,
     )
     arrays = {name: jnp.asarray(value) for name, value in records.items()}
     return sim.outputs(state, arrays, fault)
+
+
+def _writer(sim: Simulation, run: Run) -> Callable[[int, State], None]:
+    """Writes the particles at a time to the trajectory, if there is one."""
+    if run.trajectory is None:
+        return lambda k, state: None
+    resumed = run.checkpoint is not None and Path(run.checkpoint).exists()
+    trajectory = Trajectory(run.trajectory, sim.dynamics.replicas, resumed)
+    units = sim.inputs.units
+    sphere = Sphere(float(units.length), float(units.mass))
+    unit_time = float(units.length / units.velocity)
+
+    def write(k: int, state: State) -> None:
+        time = float(sim.inputs.times[k]) * unit_time
+        trajectory.write(k, time, sim.particles(state), sphere)
+
+    return write
 
 
 def _melt(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[State, int]:
@@ -293,7 +293,7 @@ def _some_stretches(
     """Several stretches in one compiled call, or one if the host finds the pairs."""
     if engine == "sweep":
         until = np.asarray(end, state.time.dtype)
-        state, fault, needed = waited_for(_stretches(dynamics, state, until, engine))
+        state, fault, needed = waited_for(programs.some_stretches(dynamics, state, until, engine))
         return state, int(fault), np.asarray(needed).tolist()
     now = waited_for(dynamics.stretch(state, end, engine))
     fault = int(now.status)

@@ -3,8 +3,11 @@
 Capacities are fixed beforehand; a run that exceeds them ends in nan and a status. There is no I/O.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from jaxgran.checks import status
 from jaxgran.particles import neighbours
@@ -35,8 +38,13 @@ def simulate(sim: Simulation) -> Outputs:
 
     def to(carry, end):
         state, fault, _ = stretches(dynamics, carry[0], end, engine, 0, None, carry[1])
-        records, bad = dynamics.observe(state), fault != status.OK
-        return (state, fault), jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), records)
+        records, bad = sim.observe(state), fault != status.OK
+        return (state, fault), jax.tree.map(partial(_spoilt_if, bad), records)
 
     (state, fault), records = jax.lax.scan(to, (state, fault), inputs.times)
     return sim.outputs(state, records, fault)
+
+
+def _spoilt_if(bad: Array, x: Array) -> Array:
+    """Nan where a run has failed; numbers that have no nan stay as they are."""
+    return jnp.where(bad, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x

@@ -4,13 +4,15 @@ A gas starts from random positions and Maxwellian velocities, melts elastically,
 exactly T_0 without momentum; or it starts from what a user gives.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
-from jaxgran.particles import initial, neighbours
+from jaxgran.data.curve import Particles
+from jaxgran.particles import initial, neighbours, snapshot
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.state import State, centred
@@ -41,6 +43,7 @@ class Simulation(NamedTuple):
         dimension: d.
         skin: of the first neighbour list.
         engine: who finds the pairs, see `neighbours.engine`.
+        save: a user's function of the particles of a replica; None for none.
     """
 
     dynamics: AbstractDynamics
@@ -51,6 +54,7 @@ class Simulation(NamedTuple):
     dimension: int
     skin: ArrayLike
     engine: str
+    save: Callable[[Particles], Any] | None = None
 
     @property
     def melts(self) -> bool:
@@ -85,16 +89,28 @@ class Simulation(NamedTuple):
 
     def outputs(self, state: State, records: dict[str, Array], fault: ArrayLike) -> Outputs:
         """The results of a run, in the frame in which the start was given."""
+        position, velocity, spin = self.seen(state, self.inputs.times[-1])
+        fault = jnp.asarray(fault, jnp.int32)
+        return Outputs(position, velocity, records, fault, spin)
+
+    def seen(self, state: State, time: Array) -> tuple[Array, Array, Array | None]:
+        """Positions in the box, velocities and spins, in the frame in which the start was given."""
         drift = self.drift
-        travelled = drift * self.inputs.times[-1]
         velocity, spin = self.dynamics.seen(state, state.velocity + drift)
-        return Outputs(
-            neighbours.wrap(self.dynamics.scene.side, state.position + travelled),
-            velocity,
-            records,
-            jnp.asarray(fault, jnp.int32),
-            spin,
-        )
+        inside = neighbours.wrap(self.dynamics.scene.side, state.position + drift * time)
+        return inside, velocity, spin
+
+    def observe(self, state: State) -> dict[str, Array]:
+        """The records of a state, and what a user's function makes of it."""
+        records = self.dynamics.observe(state)
+        if self.save is None:
+            return records
+        return records | snapshot.saved(self.save, self.particles(state))
+
+    def particles(self, state: State) -> Particles:
+        """The particles of a state in SI."""
+        seen = self.seen(state, state.time)
+        return snapshot.particles(self.inputs.units, self.dynamics.replicas, *seen)
 
     def first_state(self) -> State:
         """The state at the beginning of the melt, or of the run of a given start."""

@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
@@ -62,6 +63,13 @@ def unknown(shape: tuple[int, ...], *changes: Float[Array, "..."]) -> Float[Arra
     dtype = jnp.result_type(*changes)
     total = sum((jnp.sum(_indeterminate(x)) for x in changes), start=jnp.zeros((), dtype))
     return _indeterminate(jnp.broadcast_to(total, shape))
+
+
+def unknown_tangent(result: Array, *changes: Float[Array, "..."]) -> Any:
+    """`unknown` for a result of any type: integers have no tangent."""
+    if jnp.issubdtype(result.dtype, jnp.inexact):
+        return unknown(result.shape, *changes).astype(result.dtype)
+    return np.zeros(result.shape, jax.dtypes.float0)
 
 
 def _indeterminate(x: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -11,7 +11,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, DTypeLike, Float, Int, PRNGKeyArray
 
-from jaxgran.tangents.limits import first_order_only, unknown
+from jaxgran.tangents.limits import first_order_only, unknown, unknown_tangent
 
 _DENSITY_POWER = {"displacement": -2.0, "elastic_energy": 1.0}
 """Power of the collision frequency in a record at a fixed place in the sequence of collisions."""
@@ -51,12 +51,14 @@ class Inputs(NamedTuple):
         times: t at which to record.
         start: positions and velocities given by the user; None for random ones.
         key: of the random numbers; None for the default.
+        units: of what is saved of the particles, whose derivatives are not known.
     """
 
     scene: Any
     times: Float[Array, "times"]
     start: tuple[Array, Array] | None
     key: PRNGKeyArray | None
+    units: Any = None
 
 
 class Outputs(NamedTuple):
@@ -118,7 +120,7 @@ def differentiable(
         moved = _moved(out.records, amounts, denser, later, out.velocity.shape[1])
         changes = amounts, denser, later
         for name in set(_plain(out.records)) - set(moved) | {"sonine"}:
-            moved[name] = unknown(out.records[name].shape, *changes)
+            moved[name] = unknown_tangent(out.records[name], *changes)
         return out._replace(records=_plain(out.records)), Outputs(
             position=unknown(out.position.shape, *changes),
             velocity=unknown(out.velocity.shape, *changes),

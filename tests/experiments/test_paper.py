@@ -111,3 +111,14 @@ def test_claims_that_need_no_particles_hold(tmp_path):
     verdicts = {row["equation"]: row["verdict"] for row in rows}
     assert verdicts["39"] == "agree" and verdicts["41"] == "corrected"
     assert all(row["holds"] for row in rows)
+
+
+@pytest.mark.slow
+def test_a_film_is_made_of_a_trajectory(tmp_path):
+    done = run("paper/clustering_film.py", "--smoke", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for name in ("film.gif", "clustering_film.png", "run.gsd"):
+        assert (tmp_path / "here" / name).stat().st_size > 5_000
+    again = ("--trajectory", "here/run.gsd", "--out", "there")
+    done = run("paper/clustering_film.py", *again, cwd=tmp_path)
+    assert "film.gif, 4 frames" in done.stdout, done.stderr

@@ -547,7 +547,7 @@ def test_keeps_no_checkpoint_in_compiled_code():
         curve = jaxgran.cool(constant(eps), [1.0], model=DSMC(100), checkpoint="run.npz")
         return curve.temperature[0]
 
-    with pytest.raises(ValueError, match="DSMC keeps no checkpoint: leave checkpoint out"):
+    with pytest.raises(ValueError, match="DSMC writes no checkpoint: leave checkpoint out"):
         jax.grad(f)(0.6)
 
 

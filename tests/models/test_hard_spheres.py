@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.models.hard_spheres import HardSpheres, reduced_scene
-from jaxgran.particles import driver
+from jaxgran.particles import driver, programs
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.hard import windows
 from jaxgran.particles.neighbours import find_pairs
@@ -290,7 +290,7 @@ def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
     file = tmp_path / "run.npz"
     whole = jaxgran.cool(gas, times, model=HardSpheres(100, neighbours=by))
     monkeypatch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr(driver, "STRETCHES", 1)
+    monkeypatch.setattr(programs, "STRETCHES", 1)
     forward = driver._some_stretches
 
     def dies(dynamics, state, *args):
@@ -387,7 +387,7 @@ def test_jit_flags_the_start_of_another_gas():
     folded = dataclasses.replace(model, num_particles=50, plan=None)
     with pytest.raises(ValueError, match=r"has shape \(1, 100, 3\), not \(1, 50, 3\)"):
         jax.jit(partial(cooled, model=folded))(0.1)
-    with pytest.raises(ValueError, match="keeps no checkpoint: leave checkpoint out"):
+    with pytest.raises(ValueError, match="writes no checkpoint: leave checkpoint out"):
         jax.jit(partial(cooled, checkpoint="run.npz"))(0.1)
 
 

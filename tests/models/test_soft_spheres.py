@@ -8,7 +8,7 @@ import pytest
 
 import jaxgran
 from jaxgran.models.soft_spheres import SoftSpheres, reduced_scene
-from jaxgran.particles import driver
+from jaxgran.particles import driver, programs
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.observables import structure_factor
 
@@ -257,7 +257,7 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
     file = tmp_path / "run.npz"
     whole = jaxgran.cool(gas, times, model=SoftSpheres(100))
     monkeypatch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr(driver, "STRETCHES", 1)
+    monkeypatch.setattr(programs, "STRETCHES", 1)
     forward, left = driver._some_stretches, [12]
 
     def dies(*args):

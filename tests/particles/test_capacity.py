@@ -8,7 +8,7 @@ import pytest
 import jaxgran
 from jaxgran.checks import status
 from jaxgran.models import soft_spheres
-from jaxgran.particles import driver
+from jaxgran.particles import programs as compiled_programs
 from jaxgran.particles.capacity import Capacity, Grid, Neighbourhood
 
 
@@ -61,7 +61,7 @@ def test_thirty_densities_share_four_programs(beads, kind):
             compiled.append(duration)
 
     jax.monitoring.register_event_duration_secs_listener(count)
-    before, arrays = len(driver._PROGRAMS), []
+    before, arrays = len(compiled_programs._PROGRAMS), []
     try:
         for phi in np.linspace(0.05, 0.10, 30):
             gas = beads(packing_fraction=phi)
@@ -70,7 +70,7 @@ def test_thirty_densities_share_four_programs(beads, kind):
             arrays.append((len(compiled), sum(x.nbytes for x in jax.live_arrays())))
     finally:
         jax.monitoring.unregister_event_duration_listener(count)
-    programs = len(driver._PROGRAMS) - before
+    programs = len(compiled_programs._PROGRAMS) - before
     print(f"\n{kind.__name__}: {programs} programs, {len(compiled)} compilations in all")
     assert programs <= 4
     # Beside these, small functions are compiled for the first gas only.

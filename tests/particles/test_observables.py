@@ -5,14 +5,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import j1
+from scipy.stats import chi2
 
 from jaxgran.particles.observables import (
+    cell_density,
+    cell_velocity,
+    flow_spectrum,
     mean_square_displacement,
+    number_fluctuation,
     pair_correlation,
     sonine,
     structure_factor,
     temperature,
+    third_sonine,
     velocity_correlation,
+    velocity_distribution,
 )
 
 
@@ -169,3 +176,116 @@ def test_images_have_the_same_structure_factor(dimension):
     moved = structure_factor(position + rng.random((1, dimension)), side)[1]
     np.testing.assert_allclose(moved, shape, rtol=1e-10)
     np.testing.assert_allclose(structure_factor(jnp.asarray(position), jnp.asarray(side))[1], shape)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_third_sonine_of_known_distributions(dimension):
+    d = dimension
+    # All of one speed: <v^6> = <v^2>^3, and the definition by <c^6>.
+    one_speed = jnp.asarray(random_directions(1000, d))
+    a2 = -2 / (d + 2)
+    exact = 1 + 3 * a2 - d**2 / ((d + 2) * (d + 4))
+    assert third_sonine(one_speed) == pytest.approx(exact, rel=1e-12)  # round-off
+    maxwell = jax.random.normal(jax.random.key(0), (200_000, d))
+    # The norm of S_3 is d (d + 2) (d + 4) / 48: a_3 has the error sqrt(1 / (norm n)).
+    assert abs(third_sonine(maxwell)) < 4 * np.sqrt(48 / (d * (d + 2) * (d + 4) * 200_000))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_velocity_distribution_of_a_maxwellian_gas(dimension):
+    n, edges = 200_000, np.linspace(0, 2.5, 11)
+    v = 0.3 * jax.random.normal(jax.random.key(dimension), (n, dimension)) + 5.0
+    f = jax.jit(lambda v: velocity_distribution(v, edges))(v)
+    # Exact shares of the bins, of c^2, whose double is chi^2 of d degrees of freedom.
+    share = np.diff(chi2.cdf(2 * edges**2, dimension))
+    volume = {2: np.pi, 3: 4 / 3 * np.pi}[dimension] * np.diff(edges**dimension)
+    miss = (np.asarray(f) * volume - share) / np.sqrt(share / n)
+    assert np.sum(miss**2) < 10 + 4 * np.sqrt(20)  # chi^2 of ten bins
+
+
+def test_flow_spectrum_of_a_wave():
+    # A shear wave v_y = sin(k x) on a lattice: all of it is transverse, in the first shell, where
+    # it is two of the 2 d wave vectors; |j|^2 = N/4 for each of these.
+    points = lattice(8, 3) + 0.3
+    k, across, along = flow_spectrum(
+        jnp.asarray(points), jnp.asarray(np.sin(np.pi / 4 * points[:, :1]) * [[0.0, 1.0, 0.0]]), 8.0
+    )
+    np.testing.assert_allclose(k, np.pi / 4 * np.sqrt([1, 2, 3, 4]), rtol=1e-14)
+    np.testing.assert_allclose(across, [512 / 4 / 3 / 2, 0, 0, 0], rtol=1e-12, atol=1e-25)
+    np.testing.assert_allclose(along, 0.0, atol=1e-25)  # squares of round-off
+    sound = jnp.asarray(np.sin(np.pi / 4 * points[:, :1]) * [[1.0, 0.0, 0.0]])
+    _, across, along = flow_spectrum(jnp.asarray(points), sound, 8.0)
+    np.testing.assert_allclose(along, [512 / 4 / 3, 0, 0, 0], rtol=1e-12, atol=1e-25)
+    np.testing.assert_allclose(across, 0.0, atol=1e-25)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_flow_spectrum_of_independent_velocities_is_t(dimension):
+    def spectrum(key):
+        x, v = jax.random.split(key)
+        position = 3.7 * jax.random.uniform(x, (50, dimension))
+        return flow_spectrum(position, 2.0 * jax.random.normal(v, (50, dimension)), 3.7)[1:]
+
+    runs = 400
+    across, along = jax.vmap(spectrum)(jax.random.split(jax.random.key(0), runs))
+    # T = 4 less what the mean velocity takes, 1/50; a mode is exponential.
+    for found, modes in ((across, (dimension - 1) * 2), (along, 2)):
+        mean = jnp.mean(found, axis=0) / (4 * (1 - 1 / 50))
+        np.testing.assert_allclose(mean, 1.0, atol=4 / np.sqrt(modes * runs))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_cells(dimension):
+    points = jnp.asarray(lattice(4, dimension) + 0.5) / 2
+    density = cell_density(points, 2.0, 2)
+    assert density.shape == (2,) * dimension
+    np.testing.assert_array_equal(density, 1.0)
+    assert number_fluctuation(points, 2.0, 2) == 0
+    np.testing.assert_array_equal(cell_density(points - 6.0, 2.0, 2), 1.0)  # an image
+    shear = jnp.where(points[:, :1] < 1, 1.0, -1.0) * jnp.eye(dimension)[-1][None]
+    flow = cell_velocity(points, shear + 7.0, 2.0, 2)
+    sign = jnp.array([1.0, -1.0]).reshape((2,) + (1,) * (dimension - 1))
+    np.testing.assert_allclose(flow[..., -1], jnp.broadcast_to(sign, density.shape), rtol=1e-13)
+    np.testing.assert_allclose(flow[..., 0], 0.0, atol=1e-13)
+    one = points.at[:].set(0.1)  # all in the first cell, the others empty
+    clumped = (2**dimension - 1) * 2**dimension  # variance of the density, times the mean number
+    assert number_fluctuation(one, 2.0, 2) == pytest.approx(clumped, rel=1e-13)
+    assert jnp.sum(jnp.isnan(cell_velocity(one, shear, 2.0, 2)[..., 0])) == 2**dimension - 1
+
+
+def test_number_fluctuation_of_independent_particles():
+    position = jax.random.uniform(jax.random.key(0), (400, 1000, 3))
+    found = jax.vmap(lambda x: number_fluctuation(x, 1.0, 4))(position)
+    # 1 - 1/64 by the fixed sum; chi^2 of 63 degrees of freedom each.
+    assert jnp.mean(found) == pytest.approx(1 - 1 / 64, abs=4 * np.sqrt(2 / 63 / 400))
+
+
+def test_observables_compile_and_have_batches():
+    position, velocity = jax.random.uniform(jax.random.key(0), (2, 3, 100, 3))
+    edges = np.linspace(0.1, 0.5, 5)
+
+    def all_of(x, v, side):
+        g = pair_correlation(x, side, edges, centres=50)
+        return g, structure_factor(x, side), flow_spectrum(x, v, side), cell_density(x, side, 3)
+
+    both = jax.jit(jax.vmap(all_of, (0, 0, None)))(position, velocity, 1.0)
+    one = all_of(position[1], velocity[1], 1.0)
+    for batch, single in zip(jax.tree.leaves(both), jax.tree.leaves(one), strict=True):
+        np.testing.assert_allclose(batch[1], single, rtol=1e-12)  # round-off
+    # Beyond half of a side that could not be checked before.
+    assert jnp.isnan(jax.jit(lambda s: pair_correlation(position[0], s, edges))(0.9)[-1])
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda x: pair_correlation(x, 1.0, [0.2, 0.1]), "increasing numbers >= 0, got"),
+        (lambda x: pair_correlation(x, 1.0, [0.1, 0.2], centres=11), "from 1 to 10, got 11"),
+        (lambda x: structure_factor(x, 1.0, 0), "num_shells must be a whole number >= 1, got 0"),
+        (lambda x: cell_density(x, 1.0, 0), "cells must be a whole number >= 1, got 0"),
+        (lambda x: velocity_distribution(x, [0.1]), "two or more increasing numbers"),
+    ],
+)
+def test_bad_requests_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(jnp.ones((10, 3)))

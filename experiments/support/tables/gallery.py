@@ -132,6 +132,18 @@ def dissolves(f: dict) -> str:
     return f"Yes: unevenness peaks at {max(uneven):.0f}, ends at {uneven[-1]:.1f} times elastic."
 
 
+def film(f: dict) -> str:
+    flow, density = (
+        next(
+            n
+            for n, x in zip(f["collisions"], f[name], strict=True)
+            if sum(x[:3]) > 30 * sum(f[name][0][:3])
+        )
+        for name in ("across", "S")
+    )
+    return f"The flow is 30 times itself after {flow:.0f} collisions, S(k) after {density:.0f}."
+
+
 def cooling(f: dict) -> str:
     last = list(f["found"]["viscoelastic"]["exponent"].values())[-1]
     other = list(f["found"]["constant"]["exponent"].values())[-1]
@@ -452,6 +464,14 @@ ENTRIES = {
             "paper_clustering_dissolves",
             dissolves,
             "paper_clustering_dissolves.png",
+            "3 min",
+        ),
+        Entry(
+            "paper/clustering_film.py",
+            "What does a clustering gas look like, and what grows first?",
+            "clustering_film",
+            film,
+            "clustering_film.png",
             "3 min",
         ),
     ),

@@ -15,7 +15,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, UInt32
 
 from jaxgran.checks import status
-from jaxgran.particles import drag, observables
+from jaxgran.data.curve import Particles
+from jaxgran.particles import drag, observables, snapshot
+from jaxgran.particles.snapshot import Units
 from jaxgran.particles.stochastic import collisions
 from jaxgran.particles.stochastic.collisions import DSMCState
 from jaxgran.particles.stochastic.pairing import Scheme
@@ -25,7 +27,7 @@ from jaxgran.scene.elements import SPINS
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedScene
 from jaxgran.scene.restitution import ReducedLaw
 from jaxgran.tangents.exchange import ExchangeTangents
-from jaxgran.tangents.limits import first_order_only, unknown
+from jaxgran.tangents.limits import first_order_only, unknown, unknown_tangent
 from jaxgran.theory import averages
 
 MISSED = 1e-4
@@ -35,7 +37,7 @@ CHUNK = 4_000_000
 """Candidate pairs of one call to compiled code by the host driver, which take about a second."""
 
 
-@partial(jax.jit, static_argnames=("scheme", "tangents"))
+@partial(jax.jit, static_argnames=("scheme", "tangents", "save"))
 def observe(
     state: DSMCState,
     first: Float[Array, "replicas N d"],
@@ -44,6 +46,8 @@ def observe(
     *,
     scheme: Scheme,
     tangents: bool = False,
+    units: Units | None = None,
+    save: Callable[[Particles], Any] | None = None,
 ) -> dict[str, Any]:
     """The records of each replica at the time of a state, and the status of each, "fault".
 
@@ -55,19 +59,17 @@ def observe(
         scene, key, scheme: of the run.
         tangents: return three dictionaries instead: "values", the "rates" of their change with
             time, and "along", their tangents in the parameters of the law at this time.
+        units, save: of the particles, and a user's function of them.
     """
     left = (state.time - state.clock) - state.clock_rest
     share = left * jnp.sqrt(state.temperature) / scheme.own_step
     state = collisions.step(state, key, jnp.clip(share, 0.0, 1.0), scene, scheme, tangents)
     d = scheme.dimension
 
-    def centred(x):
-        return x - jnp.mean(x, axis=1, keepdims=True)
-
     velocity = state.particles[..., :d]
     if scene.walls is None:  # which stop what moves as a whole
-        velocity = centred(velocity)
-    travelled = centred(
+        velocity = _centred(velocity)
+    travelled = _centred(
         state.particles[..., d : 2 * d] + state.clock[:, None, None] * state.particles[..., :d]
     )
     theta = 2 * observables.temperature(velocity)
@@ -82,12 +84,11 @@ def observe(
         spin = jnp.mean(state.particles[..., 2 * d :] ** 2, axis=(1, 2))
         values["rotational_temperature"] = 2 * scene.surface.inertia * spin
     if scene.drag is not None:
-        left = drag.decay(scene.drag, state.time)
-        powers = {"temperature": left.velocity**2, "velocity_correlation": left.velocity}
-        powers["rotational_temperature"] = left.kept**2
-        values |= {name: powers[name] * values[name] for name in powers.keys() & values.keys()}
+        values |= _slowed(values, drag.decay(scene.drag, state.time))
     fast = status.flag(status.TOO_FAST, state.missed > MISSED * state.collisions + 1)
     values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
+    if save is not None and units is not None:
+        values |= snapshot.saved(save, _seen(state, scene, d, units))
     if not tangents:
         return values
     if isinstance(state.tangents, ExchangeTangents):
@@ -95,6 +96,31 @@ def observe(
     walked = 2 * jnp.mean(jnp.sum(travelled * velocity, axis=-1), axis=-1)
     rates = _rates(values, scene.law, d) | {"displacement": walked}
     return {"values": values, "rates": rates, "along": _along(values, rates, state.tangents)}
+
+
+def _centred(x: Float[Array, "replicas N d"]) -> Float[Array, "replicas N d"]:
+    return x - jnp.mean(x, axis=1, keepdims=True)
+
+
+def _slowed(values: dict[str, Array], left: drag.Decay) -> dict[str, Array]:
+    """Records in true velocities, of those that drag would not have slowed."""
+    powers = {"temperature": left.velocity**2, "velocity_correlation": left.velocity}
+    powers["rotational_temperature"] = left.kept**2
+    return {name: powers[name] * values[name] for name in powers.keys() & values.keys()}
+
+
+def _seen(state: DSMCState, scene: ReducedScene, d: int, units: Units) -> Particles:
+    """Particles in SI; positions, of which there are none, are nan."""
+    velocity, spin = state.particles[..., :d], state.particles[..., 2 * d :]
+    if scene.drag is not None:
+        left = drag.decay(scene.drag, state.time)
+        velocity, spin = velocity * left.velocity, spin * left.kept
+    return Particles(
+        position=jnp.full_like(velocity, jnp.nan),
+        velocity=velocity * units.velocity,
+        box_side=units.box_side,
+        angular_velocity=None if scene.surface is None else spin * units.spin,
+    )
 
 
 def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array]:
@@ -166,7 +192,7 @@ def _along(
     }
 
 
-@partial(jax.jit, static_argnames=("replicas", "scheme", "tangents"))
+@partial(jax.jit, static_argnames=("replicas", "scheme", "tangents", "save"))
 def run(
     scene: ReducedScene,
     times: Float[Array, "times"],
@@ -175,6 +201,8 @@ def run(
     replicas: int,
     scheme: Scheme,
     tangents: bool,
+    units: Units | None = None,
+    save: Callable[[Particles], Any] | None = None,
 ) -> dict[str, Any]:
     """The records of `observe` at all times, with a first axis of times. A pure function."""
     num_parameters = ravel_pytree(scene)[0].size if tangents else 0
@@ -185,7 +213,7 @@ def run(
     def to(state, end):
         options = {"scheme": scheme, "tangents": tangents}
         state = collisions.advance(state, end, scene, key, forever, **options)
-        return state, observe(state, first, scene, key, **options)
+        return state, observe(state, first, scene, key, units=units, save=save, **options)
 
     return jax.lax.scan(to, state, times)[1]
 
@@ -197,20 +225,24 @@ def differentiable_run(
     *,
     replicas: int,
     scheme: Scheme,
+    units: Units,
+    save: Callable[[Particles], Any] | None,
 ) -> dict[str, Array]:
     """`run` with one linear rule for forward and reverse mode, from tangents beside the state."""
     parameters, unravel = ravel_pytree(scene)
 
+    def simulated(parameters, times, key, units, tangents):
+        options = {"replicas": replicas, "scheme": scheme, "units": units, "save": save}
+        return run(unravel(parameters), times, key, tangents=tangents, **options)
+
     @jax.custom_jvp
-    def solve(parameters, times, key):
-        scene = unravel(parameters)
-        return run(scene, times, key, replicas=replicas, scheme=scheme, tangents=False)
+    def solve(parameters, times, key, units):
+        return simulated(parameters, times, key, units, False)
 
     @solve.defjvp
     def solve_jvp(at, along):
-        parameters, times, key = first_order_only(at)
-        scene = unravel(parameters)
-        out = run(scene, times, key, replicas=replicas, scheme=scheme, tangents=True)
+        scene, (parameters, times, key, units) = unravel(at[0]), first_order_only(at)
+        out = simulated(parameters, times, key, units, True)
         values = out["values"]
         tangents = {
             name: rate * along[1][:, None] + out["along"][name] @ along[0]
@@ -218,18 +250,24 @@ def differentiable_run(
         }
         if has_elements(scene):
             for name in set(values) - set(tangents) - {"fault"}:
-                tangents[name] = unknown(values[name].shape, *along[:2])
+                tangents[name] = unknown_tangent(values[name], *along[:2])
         else:
             in_time = out["rates"]["sonine"] * along[1][:, None]
             tangents["sonine"] = in_time + unknown(in_time.shape, along[0])
+            for name in set(values) - set(tangents) - {"fault"}:
+                tangents[name] = unknown_tangent(values[name], *along[:2])
         return values, tangents | {"fault": np.zeros(values["fault"].shape, jax.dtypes.float0)}
 
-    return solve(parameters, times, key)
+    return solve(parameters, times, key, units)
 
 
 def parts(
-    scene: ReducedScene, key: UInt32[Array, "2"], *, replicas: int, scheme: Scheme
-) -> tuple[DSMCState, Callable[[DSMCState, float], DSMCState], Callable[[DSMCState], dict]]:
+    scene: ReducedScene,
+    key: UInt32[Array, "2"],
+    *,
+    replicas: int,
+    scheme: Scheme,
+) -> tuple[DSMCState, Callable[[DSMCState, float], DSMCState], Callable[..., dict]]:
     """The parts of `run` that the host driver needs: a state, how to advance, and to observe it."""
     state = at_start(key, replicas, scheme, 0, scene)
     pairs = replicas * (scheme.first + scheme.second)

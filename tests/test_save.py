@@ -1,0 +1,161 @@
+"""What `cool(save=...)` makes of the particles on the way."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran import observables
+
+MODELS = [
+    jaxgran.SoftSpheres(100, replicas=2),
+    jaxgran.HardSpheres(100, replicas=2),
+    jaxgran.DSMC(100, replicas=2),
+]
+names = pytest.mark.parametrize("model", MODELS, ids=lambda model: type(model).__name__)
+
+
+def save(particles):
+    assert particles.velocity.shape == (100, 3)
+    k, S = observables.structure_factor(particles.position, particles.box_side, 2)
+    v = particles.velocity
+    return {"T": observables.temperature(v), "forward": jnp.sum(v[:, 0] > 0), "S": (k, S)}
+
+
+@pytest.fixture
+def gas(beads):
+    return beads(0.15)
+
+
+def times(gas):
+    return gas.mean_free_time * jnp.array([0.0, 1.0, 3.0])
+
+
+@names
+def test_is_of_the_particles_at_each_time(gas, model):
+    t = times(gas)
+    curve = jaxgran.cool(gas, t, model=model, save=save, progress=False)
+    plain = jaxgran.cool(gas, t, model=model, progress=False)
+    for name in ("temperature", "sonine", "collisions", "displacement", "status"):
+        np.testing.assert_array_equal(getattr(curve, name), getattr(plain, name))
+    # Round-off of the units; each replica is at rest.
+    np.testing.assert_allclose(curve.saved["T"], curve.temperature, rtol=1e-10)
+    np.testing.assert_allclose(curve.saved_error["T"][1:], curve.temperature_error[1:], rtol=1e-8)
+    np.testing.assert_allclose(curve.replicas.saved["T"], curve.replicas.temperature, rtol=1e-10)
+    forward = curve.replicas.saved["forward"]
+    assert forward.shape == (2, 3) and jnp.issubdtype(forward.dtype, jnp.integer)
+    np.testing.assert_allclose(curve.saved["forward"], jnp.mean(forward, axis=0))
+    k, S = curve.saved["S"]
+    if isinstance(model, jaxgran.DSMC):
+        assert jnp.all(jnp.isnan(S))  # no positions
+    else:
+        first = 2 * np.pi / gas.box_side(100)
+        np.testing.assert_allclose(k, first * np.sqrt([[1.0, 2.0]] * 3), rtol=1e-12)
+        last = curve.particles
+        own = [observables.structure_factor(x, last.box_side, 2)[1] for x in last.position]
+        np.testing.assert_allclose(curve.replicas.saved["S"][1][:, -1], own, rtol=1e-10)
+
+
+@names
+def test_compiles(gas, model):
+    sized = model if isinstance(model, jaxgran.DSMC) else model.sized_for(gas)
+    t = times(gas)[:2]
+    curve = jax.jit(lambda gas: jaxgran.cool(gas, t, model=sized, save=save))(gas)
+    np.testing.assert_allclose(curve.saved["T"], curve.temperature, rtol=1e-10)
+    if not isinstance(model, jaxgran.DSMC):
+        last = curve.particles
+        own = [observables.structure_factor(x, last.box_side, 2)[1] for x in last.position]
+        np.testing.assert_allclose(curve.replicas.saved["S"][1][:, -1], own, rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS[1:], ids=lambda model: type(model).__name__)
+def test_derivatives_of_the_curve_are_the_same(gas, model):
+    t = times(gas)[:2]
+
+    def curve(a, save):
+        return jaxgran.cool(
+            gas.replace(dissipative_constant=a), t, model=model, save=save, progress=False
+        )
+
+    a = gas.value("dissipative_constant")
+    saving, plain = jax.jacfwd(curve)(a, save), jax.jacfwd(curve)(a, None)
+    np.testing.assert_array_equal(saving.temperature, plain.temperature)
+    assert jnp.all(jnp.isnan(saving.saved["T"]))  # not known, and not taken for 0
+    slope = jax.grad(lambda a: curve(a, save).temperature[-1])(a)
+    np.testing.assert_allclose(slope, plain.temperature[-1], rtol=1e-9)
+
+
+def test_particles_themselves(gas):
+    t, model = times(gas), jaxgran.HardSpheres(100, replicas=2)
+    curve = jaxgran.cool(gas, t, model=model, save="particles", progress=False)
+    assert curve.saved.position.shape == curve.saved.velocity.shape == (3, 2, 100, 3)
+    assert curve.saved_error is None
+    np.testing.assert_array_equal(curve.saved.position[-1], curve.particles.position)
+    np.testing.assert_array_equal(curve.saved.velocity[-1], curve.particles.velocity)
+    # One of them is a start: the run goes on as it did, up to the chaos of two mean free times.
+    middle = jax.tree.map(lambda x: x[1], curve.saved)
+    cooler = gas.replace(temperature=curve.temperature[1])
+    later = jaxgran.cool(
+        cooler, t[2:] - t[1], model=dataclasses.replace(model, start=middle), progress=False
+    )
+    assert later.temperature[-1] == pytest.approx(float(curve.temperature[-1]), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_spins_of_rough_spheres(gas):
+    rough = dataclasses.replace(
+        gas, surface=jaxgran.Rough(tangential_restitution=-0.5, rotational_temperature=0.002)
+    )
+
+    def rotation(particles):
+        inertia = 0.4 * (gas.diameter / 2) ** 2  # over the mass
+        return inertia * jnp.mean(particles.angular_velocity**2)
+
+    for model in MODELS[1:]:
+        curve = jaxgran.cool(rough, times(gas), model=model, save=rotation, progress=False)
+        np.testing.assert_allclose(curve.saved, curve.rotational_temperature, rtol=1e-10)
+
+
+def test_a_run_is_resumed_with_what_it_saved(gas, tmp_path):
+    model, t = jaxgran.DSMC(100, replicas=2), times(gas)
+    run = {"model": model, "save": save, "progress": False}
+    whole = jaxgran.cool(gas, t, **run)
+    path = tmp_path / "run.npz"
+    jaxgran.cool(gas, t, checkpoint=path, **run)
+    again = jaxgran.cool(gas, t, checkpoint=path, **run)
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    other = run | {"save": lambda p: save(p)}
+    with pytest.raises(ValueError, match="save was .*test_save.save .* and is .*lambda"):
+        jaxgran.cool(gas, t, checkpoint=path, **other)
+
+
+def test_a_file_keeps_what_was_saved(gas, tmp_path):
+    curve = jaxgran.cool(gas, times(gas), model=MODELS[2], save=save, progress=False)
+    jaxgran.write_curve(tmp_path / "curve.npz", curve, {})
+    same, _ = jaxgran.read_curve(tmp_path / "curve.npz")
+    assert jax.tree.structure(same) == jax.tree.structure(curve)
+    for a, b in zip(jax.tree.leaves(curve), jax.tree.leaves(same), strict=True):
+        np.testing.assert_array_equal(a, b)
+    whole = jaxgran.cool(gas, times(gas), model=MODELS[2], save="particles", progress=False)
+    jaxgran.write_curve(tmp_path / "particles.npz", whole, {})
+    same, _ = jaxgran.read_curve(tmp_path / "particles.npz")
+    assert isinstance(same.saved, jaxgran.Particles)
+    np.testing.assert_array_equal(same.saved.velocity, whole.saved.velocity)
+
+
+@pytest.mark.parametrize(
+    "model, save, message",
+    [
+        (jaxgran.KineticTheory(), save, "KineticTheory has no particles"),
+        (MODELS[2], "velocities", 'a function of the particles of a replica, or "particles"'),
+        (MODELS[2], 3, "got 3"),
+    ],
+)
+def test_bad_requests_are_refused(gas, model, save, message):
+    with pytest.raises(ValueError, match=message):
+        jaxgran.cool(gas, times(gas), model=model, save=save)
