@@ -1,0 +1,272 @@
+"""By how much do correlated velocities slow the cooling of hard spheres?
+
+    python experiments/accuracy/measure_correlations.py [--full] [--record] [--smoke] [--out DIR]
+
+Hard spheres of constant restitution cool in boxes shorter than L_c from an elastic fluid. Their
+cooling rate over Enskog's, with a_2 and a_3 of kinetic theory, is found for each box from
+T^(-1/2), which Enskog's gas would let grow at a constant rate, and compared with
+`jaxgran.theory.correlations` and `jaxgran.theory.shear_modes`. Of elastic spheres the collision
+rate over Enskog's is found, and compared with the virial series; what it differs from 1 by belongs
+to equilibrium and is divided out. Finite N is allowed for: spheres without total momentum meet
+faster, energy is shared by few, and T^(-1/2) is not linear in it, ``1/(2N) - 3/(4dN) +
+3 (1 - eps^2)/(dN)`` of the cooling rate and ``-1/(2N) + 1/(4dN)`` of the collision rate, both but
+for the contact value of finite N, which they share.
+
+Without --full: eps = .7, .9, 1 and errors of some .2 %; with it eps = .7, .8, .9, .95, 1 and errors
+below .15 %.
+"""
+
+import argparse
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import jaxgran
+from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.scenes import hard_beads
+from jaxgran.plotting import COLOURS, INK
+from jaxgran.scene.geometry import contact_value
+from jaxgran.theory.correlations import built_up, strength
+from jaxgran.theory.shear_modes import flow_share
+
+MARKS = np.array([0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0])
+"""Collisions per particle at which T is recorded."""
+
+PLATEAU = 5
+"""Index of the mark from which on the correlations count as built up."""
+
+SIZES = {
+    (3, 0.05): (1000,),
+    (3, 0.1): (400,),
+    (3, 0.2): (140, 1200),
+    (3, 0.3): (110,),
+    (2, 0.05): (200,),
+    (2, 0.1): (100, 420),
+    (2, 0.2): (50,),
+    (2, 0.3): (36,),
+}
+"""N by dimension and phi: boxes of .6 to .8 L_c at eps = .7, and two of .9 L_c at eps = .9."""
+
+TOGETHER = 6000
+"""Spheres simulated side by side."""
+
+VIRIAL = {
+    3: (0.625, 0.2869495, 0.110252, 0.03888198, 0.01302354, 0.0041832, 0.0013094, 0.0004035),
+    2: (0.78200444, 0.53223181, 0.33355604, 0.1988425, 0.1148728, 0.0649930, 0.0362193, 0.0199537),
+}
+"""B_n/B_2^(n-1), n = 3 to 10: Clisby & McCoy, J. Stat. Phys. 122, 15 (2006)."""
+
+
+class Point(NamedTuple):
+    """A gas in boxes of N spheres."""
+
+    dimension: int
+    packing_fraction: float
+    restitution: float
+    num_particles: int
+
+    @property
+    def gas(self) -> jaxgran.Gas:
+        return hard_beads(self.packing_fraction, self.restitution, self.dimension)
+
+    @property
+    def box(self) -> float:
+        """Side in L_c."""
+        return float(self.gas.box_side(self.num_particles) / self.gas.critical_box)
+
+
+def virial_excess(phi: float, d: int) -> float:
+    """The contact value of elastic spheres by ten virial coefficients over Enskog's, less 1."""
+    y = 2 ** (d - 1) * phi  # B_2 n
+    series = 1 + sum(b * y**k for k, b in enumerate(VIRIAL[d], 1))
+    return series / float(contact_value(jnp.asarray(phi), d)) - 1
+
+
+@cache
+def enskog(point: Point) -> jaxgran.CoolingCurve:
+    """The curve without correlations, at the times of `MARKS`."""
+    gas, model = point.gas, jaxgran.KineticTheory(correlations=False)
+    tau = jnp.concatenate([jnp.zeros(1), jnp.geomspace(1e-2, 4e3, 600)]) * gas.mean_free_time
+    collisions = jaxgran.cool(gas, tau, model=model).collisions
+    assert collisions is not None
+    return jaxgran.cool(gas, jnp.interp(MARKS[1:], collisions, tau), model=model)
+
+
+def simulated(point: Point, impacts: float, seed: int) -> np.ndarray:
+    """Rate over Enskog's of each box between the marks, corrected for finite N, (boxes, marks)."""
+    n, d, theory = point.num_particles, point.dimension, enskog(point)
+    replicas = max(TOGETHER // n, 2)
+    model = jaxgran.HardSpheres(n, replicas=replicas)
+    found = []
+    for batch in range(max(1, round(impacts / (replicas * n * MARKS[-1] / 2)))):
+        key = jax.random.fold_in(jax.random.key(seed), batch)
+        curve = jaxgran.cool(point.gas, theory.times, model=model, key=key, progress=False)
+        each = curve.replicas
+        assert each is not None and each.collisions is not None and theory.collisions is not None
+        if point.restitution == 1:
+            found.append(np.diff(each.collisions, axis=1, prepend=0) / np.diff(MARKS))
+            continue
+        first = float(point.gas.temperature) ** -0.5
+        root, expected = (np.asarray(c.temperature) ** -0.5 for c in (each, theory))
+        steps = np.diff(root, axis=1, prepend=first) / np.diff(expected, prepend=first)
+        found.append(steps)
+    loss = 1 - point.restitution**2
+    few = (1 / 2 - 3 / (4 * d) + 3 * loss / d if loss else -1 / 2 + 1 / (4 * d)) / n
+    return np.concatenate(found) / (1 + few)
+
+
+def weighted(values: np.ndarray, first: int, elastic: bool, point: Point) -> np.ndarray:
+    """Mean over the marks from the first on, by the growth of what is observed."""
+    theory = enskog(point)
+    if elastic:
+        weights = np.diff(MARKS)[first:]
+    else:
+        root = np.append(
+            float(point.gas.temperature) ** -0.5, np.asarray(theory.temperature) ** -0.5
+        )
+        # By collisions, not by T^(-1/2): the last ones would outweigh all others.
+        weights = np.diff(np.log(root))[first:]
+    return values[..., first:] @ (weights / weights.sum())
+
+
+def measured(point: Point, impacts: float, equilibrium: dict, seed: int) -> dict:
+    """Rates of one gas and what theory says of them."""
+    each, elastic = simulated(point, impacts, seed), point.restitution == 1
+    boxes = len(each)
+    last = weighted(each, PLATEAU if not elastic else 0, elastic, point)
+    row = point._asdict() | {
+        "boxes": boxes,
+        "rate": float(last.mean()),
+        "error": float(last.std(ddof=1) / boxes**0.5),
+    }
+    d, phi = point.dimension, point.packing_fraction
+    if elastic:
+        return row | {"virial": virial_excess(phi, d)}
+    gas, theory = point.gas, enskog(point)
+    eq = equilibrium[d, phi, point.num_particles]
+    log_t = np.append(0.0, np.log(np.asarray(theory.temperature / gas.temperature)))
+    lc = np.full(log_t.size, float(gas.critical_box))
+    flow, _ = flow_share(gas, log_t, lc, point.num_particles)
+    # The cooling rate goes as T^(3/2) of the heat.
+    flow = 1.5 * (flow[1:] + flow[:-1]) / 2
+    middle = (MARKS[1:] + MARKS[:-1]) / 2
+    loss, h = 1 - point.restitution**2, float(strength(gas))
+    built = np.asarray(built_up(middle))
+    rate, error = row["rate"] / eq["rate"], np.hypot(row["error"], eq["error"])
+    share, grown = (float(weighted(x, PLATEAU, False, point)) for x in (flow, built))
+    course = each.mean(axis=0) / eq["rate"]
+    return row | {
+        "box": point.box,
+        "rate": rate,
+        "error": float(error),
+        "flow": share,
+        "theory": 1 - h * loss * grown - share,
+        "sigma": float((1 - h * loss * grown - share - rate) / error),
+        "h": float((1 - share - rate) / (loss * grown)),
+        "h_error": float(error / (loss * grown)),
+        "h_theory": h,
+        "course": course.tolist(),
+        "course_error": (each.std(axis=0, ddof=1) / boxes**0.5).tolist(),
+        "course_theory": (1 - h * loss * built - flow).tolist(),
+    }
+
+
+def build_up(rows: list[dict]) -> tuple[float, float]:
+    """N_0 of ``1 - exp(-N/N_0)`` that all courses share, net of the flow, and its error."""
+    middle = (MARKS[1:] + MARKS[:-1]) / 2
+    trial, lowest = np.geomspace(0.7, 20, 300), []
+    for n_0 in trial:
+        shape, total = -np.expm1(-middle / n_0), 0.0
+        for row in rows:
+            base = np.asarray(row["course_theory"]) + row["h_theory"] * np.asarray(
+                built_up(middle)
+            ) * (1 - row["restitution"] ** 2)
+            y, w = base - np.asarray(row["course"]), np.asarray(row["course_error"]) ** -2.0
+            a = np.sum(w * y * shape) / np.sum(w * shape**2)
+            total += np.sum(w * (y - a * shape) ** 2)
+        lowest.append(total)
+    chi = np.array(lowest) - min(lowest)
+    near = trial[chi < 1]
+    return float(trial[np.argmin(chi)]), float((near[-1] - near[0]) / 2)
+
+
+def said(row: dict) -> str:
+    name = (
+        f"{row['dimension']}D phi {row['packing_fraction']:<4g} eps {row['restitution']:<4g} "
+        f"N {row['num_particles']:<5d}"
+    )
+    rate = f"{row['rate']:.4f} +- {row['error']:.4f}"
+    if "virial" in row:
+        return f"{name} collision rate {rate}, virial series {1 + row['virial']:.4f}"
+    return (
+        f"{name} box {row['box']:.2f} L_c: rate {rate}, theory {row['theory']:.4f} "
+        f"({row['sigma']:+.1f} sigma; flow {row['flow']:.4f}); h {row['h']:.3f} +- "
+        f"{row['h_error']:.3f}, theory {row['h_theory']:.3f}"
+    )
+
+
+def draw(rows: list[dict]) -> Figure:
+    """h against phi, and how the rate falls with the number of collisions."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    for axes, d in zip(figure.subplots(1, 2, sharey=True), (3, 2), strict=True):
+        own = [r for r in rows if r["dimension"] == d and "h" in r]
+        for k, eps in enumerate(sorted({r["restitution"] for r in own})):
+            some = [r for r in own if r["restitution"] == eps]
+            x = [r["packing_fraction"] * (1 + 0.04 * (k - 1)) for r in some]
+            y, e = ([r[name] for r in some] for name in ("h", "h_error"))
+            marker, shade = "osv^D"[k], ("hard spheres", "elastic", "DSMC")[k % 3]
+            axes.errorbar(x, y, e, fmt=marker, ms=5, color=COLOURS[shade], label=f"ε = {eps:g}")
+        phi = np.linspace(1e-3, 0.32, 60)
+        h = [float(strength(hard_beads(p, 0.9, d))) for p in phi]
+        axes.plot(phi, h, "--", color=COLOURS["kinetic theory"], label="kinetic theory")
+        axes.axhline(0, color=INK, lw=0.8)
+        axes.set(xlabel="packing fraction φ", title=f"{'spheres' if d == 3 else 'disks'}")
+        axes.legend(frameon=False, loc="upper left")
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel("h, loss of rate over 1 − ε²")
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--full", action="store_true", help="the whole grid, errors below .15 %%")
+    parser.add_argument("--smoke", action="store_true", help="one gas, few impacts")
+    parser.add_argument("--out", type=Path, default=Path("results") / "measure_correlations")
+    add_recording(parser)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    impacts = 2e4 if options.smoke else 1.6e6 if options.full else 7e5
+    epsilons = (0.7, 0.8, 0.9, 0.95) if options.full else (0.7, 0.9)
+    rows, equilibrium = [], {}
+    for (d, phi), sizes in SIZES.items():
+        if options.smoke and (d, phi) != (3, 0.2):
+            continue
+        for k, n in enumerate(sizes):
+            for eps in (1.0, *(epsilons if k == 0 else (0.9,))):
+                row = measured(Point(d, phi, eps, n), impacts, equilibrium, seed=len(rows))
+                if eps == 1:
+                    equilibrium[d, phi, n] = row
+                rows.append(row)
+                print(said(row), flush=True)
+    cooled = [r for r in rows if "h" in r]
+    chi = float(np.mean([r["sigma"] ** 2 for r in cooled]))
+    apart = max(cooled, key=lambda r: abs(r["theory"] - r["rate"]))
+    n_0, error = build_up(cooled)
+    print(f"mean square of the differences {chi:.1f} sigma^2; largest {said(apart)}")
+    print(f"correlations arise in N_0 = {n_0:.1f} +- {error:.1f} collisions per particle")
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_picture(draw(rows), "measure_correlations", options)
+    path = options.out / "measure_correlations.json"
+    results = {"rows": rows, "marks": MARKS.tolist(), "build_up": [n_0, error], "chi_squared": chi}
+    write_results("measure_correlations", options, path, **results)
+
+
+if __name__ == "__main__":
+    main()
