@@ -1,92 +1,216 @@
-"""Are a_2, a_3 and D of kinetic theory those of direct simulation?
+"""Are a_2, a_3, D and T of kinetic theory those of direct simulation?
 
-    python experiments/accuracy/sonine_coefficients.py [--eps 0.5 0.9 ...] [--particles 200000]
+    python experiments/accuracy/sonine_coefficients.py [--record] [--smoke] [--out DIR]
 
-The homogeneous cooling state at constant eps, in two and three dimensions, by a direct simulation
-that is written here in NumPy and shares no code with jaxgran. Prints the simulated a_2 and a_3 with
-their standard errors, and what kinetic theory differs by.
+By a direct simulation in NumPy that shares no code with jaxgran (`experiments.support.boltzmann`):
+the homogeneous cooling state at constant eps, and the course of a viscoelastic gas from a
+Maxwellian start, in two and three dimensions. Prints what is simulated with its standard error, and
+what kinetic theory differs by.
 """
 
 import argparse
+from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.scenes import hard_beads
+from experiments.support.boltzmann import BLOCK, Boltzmann
+from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.scenes import beads, hard_beads
+from jaxgran.plotting import COLOURS, INK
 
-RELAXING, MEASURED = 20, 60  # collisions per particle, before and while a_2 and a_3 are recorded
-BLOCKS = 12
+EPSILONS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0)
+RELAXING = 20.0
+"""Collisions per sphere before the cooling state is recorded."""
 
+EFOLDS = 6.0
+"""Relaxation times of D in one window: of D exp(-6) are missing then, and are added."""
 
-def collide(velocity: np.ndarray, eps: float, rng: np.random.Generator) -> int:
-    """Random disjoint pairs, which collide with a probability that goes as their normal speed."""
-    n, d = velocity.shape
-    pairs = rng.permutation(n).reshape(2, -1)
-    normal = rng.standard_normal((n // 2, d))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    approach = np.sum((velocity[pairs[0]] - velocity[pairs[1]]) * normal, axis=1)
-    normal *= np.sign(approach)[:, None]
-    speed = np.abs(approach)
-    hit = rng.random(n // 2) * 6.0 < speed  # of a gas of T = 1: 3e-5 of pairs are faster than 6
-    kick = ((1 + eps) / 2 * speed[hit])[:, None] * normal[hit]
-    velocity[pairs[0][hit]] -= kick
-    velocity[pairs[1][hit]] += kick
-    return 2 * int(np.sum(hit))
+WINDOWS = 6
+LEAST = 90.0
+"""Collisions per sphere in all windows together, at least."""
 
+MARKS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
+"""Collisions per sphere at which a course is recorded."""
 
-def simulated(d: int, eps: float, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """a_2 and a_3 with their standard errors, from the scatter of blocks."""
-    rng = np.random.default_rng(seed)
-    velocity = rng.standard_normal((n, d))
-    collisions, records, found = 0, [], np.zeros(2)
-    while collisions < (RELAXING + MEASURED) * n:
-        velocity -= np.mean(velocity, axis=0)
-        velocity /= np.sqrt(np.mean(velocity**2))
-        before = collisions
-        while collisions - before < n // 4:
-            collisions += collide(velocity, eps, rng)
-        if collisions > RELAXING * n:
-            square = np.sum(velocity**2, axis=1)
-            square *= d / np.mean(square)
-            fourth, sixth = np.mean(square**2) / (d * (d + 2)), np.mean(square**3)
-            found = np.array([fourth - 1, 0.0])
-            found[1] = 1 + 3 * found[0] - sixth / (d * (d + 2) * (d + 4))
-            records.append(found)
-    blocks = np.array([np.mean(b, axis=0) for b in np.array_split(np.array(records), BLOCKS)])
-    return np.mean(blocks, axis=0), np.std(blocks, axis=0, ddof=1) / BLOCKS**0.5
+BETA = 0.15
+MODEL = jaxgran.KineticTheory(softness=False, correlations=False)
+NAMES = {"sonine": "a_2", "third_sonine": "a_3", "diffusion": "D"}
 
 
-def theory(d: int, eps: float) -> np.ndarray:
+def cooling_state(d: int, eps: float, blocks: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """a_2, a_3 and D n sigma^(d-1)/sqrt(2 T) with their errors, from the scatter of windows."""
+    gas = Boltzmann(eps, d, blocks, seed)
+    gas.run(RELAXING)
+    # Per collision D relaxes at this rate in the first Sonine approximation.
+    window = EFOLDS / ((1 + eps) ** 2 / (2 * d))
+    found = []
+    for _ in range(max(WINDOWS, round(LEAST / window))):
+        gas.forget()
+        samples = []
+        for _ in range(steps := round(window / 1.5)):
+            gas.run(window / steps)
+            samples.append(gas.moments[1:])
+        a2, a3, _ = np.mean(samples, axis=0)
+        found.append([a2, a3, samples[-1][-1] / -np.expm1(-EFOLDS)])
+    return np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / len(found) ** 0.5
+
+
+def theory_of_state(d: int, eps: float) -> np.ndarray:
+    """The same by kinetic theory."""
     gas = hard_beads(0.01, eps, d)
-    loss = (1 - eps**2) / (2 * d)
-    times = jnp.expm1(60 * loss * jnp.array([0.5, 1.0])) / loss * gas.mean_free_time
-    curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(correlations=False))
+    loss = max((1 - eps**2) / (2 * d), 1e-9)
+    times = jnp.expm1(80 * loss) / loss * jnp.array([0.5, 1.0]) * gas.mean_free_time
+    return in_units(gas, jaxgran.cool(gas, times, model=MODEL))[1:, -1]
+
+
+def in_units(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> np.ndarray:
+    """T/T_0, a_2, a_3 and D n sigma^(d-1)/sqrt(2 T), shape (4, times)."""
     assert curve.sonine is not None and curve.third_sonine is not None
-    return np.array([curve.sonine[-1], curve.third_sonine[-1]])
+    assert curve.diffusion is not None
+    theta = curve.temperature / gas.temperature
+    # Without the contact value, by which the path length is shorter.
+    reduced = curve.diffusion / gas.path_length / jnp.sqrt(2 * curve.temperature)
+    return np.stack([theta, curve.sonine, curve.third_sonine, reduced])
+
+
+def law_of(gas: jaxgran.Gas) -> Callable[[np.ndarray], np.ndarray]:
+    """eps of a normal speed in units of sqrt(T_0), from a table over its fourth root."""
+    per_unit = 40_000
+    g = (np.arange(2 * per_unit) / per_unit) ** 4
+    table = np.asarray(1 - gas.reduced_law.loss(jnp.asarray(g / 2**0.5)), np.float32)
+
+    def restitution(speed: np.ndarray) -> np.ndarray:
+        return table[(np.sqrt(np.sqrt(speed)) * per_unit + 0.5).astype(np.int32)]
+
+    return restitution
+
+
+def course(d: int, blocks: int, seeds: int) -> dict:
+    """A viscoelastic gas from a Maxwellian start, and theory at the same times."""
+    gas = beads(0.01, BETA, dimension=d)
+    runs = []
+    for seed in range(seeds):
+        own, rows = Boltzmann(law_of(gas), d, blocks, 100 + seed), []
+        for more in np.diff(MARKS, prepend=0.0):
+            own.run(more)
+            rows.append([own.time, *own.moments])
+        runs.append(rows)
+    found = np.array(runs)
+    # A time is random where N is given: theory is computed at each run's own times.
+    unit = float(gas.path_length / gas.impact_speed) * 2**0.5
+    off = np.stack(
+        [r[:, 1:].T - in_units(gas, jaxgran.cool(gas, r[:, 0] * unit, model=MODEL)) for r in found]
+    )
+    values = np.mean(found[..., 1:], axis=0).T
+    return {
+        "dimension": d,
+        "beta": BETA,
+        "collisions": list(MARKS),
+        "spheres": seeds * blocks * BLOCK,
+        "simulated": values.tolist(),
+        "off": (-np.mean(off, axis=0)).tolist(),
+        "error": (np.std(off, axis=0, ddof=1) / seeds**0.5).tolist(),
+    }
+
+
+def draw(states: list[dict], courses: list[dict]) -> Figure:
+    """What theory differs by, in per cent, for constant eps; and T of the courses."""
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    panels = figure.subplots(1, 3)
+    shades = {3: COLOURS["kinetic theory"], 2: COLOURS["soft spheres"]}
+    for axes, k, title in zip(
+        panels, (0, 2), ("a₂ at constant ε", "D at constant ε"), strict=False
+    ):
+        for d in (3, 2):
+            own = [s for s in states if s["dimension"] == d and not (k == 0 and s["eps"] == 1)]
+            own = [s for s in own if k or abs(s["simulated"][0]) > 0.01]
+            scale = [100 / abs(s["simulated"][k]) for s in own]
+            y = [s["off"][k] * f for s, f in zip(own, scale, strict=True)]
+            e = [s["error"][k] * f for s, f in zip(own, scale, strict=True)]
+            x = [s["eps"] for s in own]
+            axes.errorbar(
+                x, y, e, fmt="o-" if d == 3 else "s--", ms=4, color=shades[d], label=f"{d}D"
+            )
+        axes.set(xlabel="ε", title=title, ylabel="theory − simulation (%)")
+    for c in courses:
+        d = c["dimension"]
+        f = 100 / np.array(c["simulated"][0])
+        y, e = np.array(c["off"][0]) * f, np.array(c["error"][0]) * f
+        panels[2].errorbar(
+            c["collisions"],
+            y,
+            e,
+            fmt="o-" if d == 3 else "s--",
+            ms=4,
+            color=shades[d],
+            label=f"{d}D",
+        )
+    panels[2].set(
+        xlabel="collisions per particle",
+        xscale="log",
+        title=f"T of a viscoelastic gas, β = {BETA:g}",
+        ylabel="theory − simulation (%)",
+    )
+    for axes in panels:
+        axes.axhline(0, color=INK, lw=0.8)
+        axes.legend(frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def say_course(c: dict) -> None:
+    print(f"d = {c['dimension']}, viscoelastic, beta = {BETA:g}, {c['spheres']:.2g} spheres:")
+    for i, n in enumerate(c["collisions"]):
+        v, o, e = (np.array(c[name])[:, i] for name in ("simulated", "off", "error"))
+        print(
+            f"  {n:4.0f} collisions: T {100 * o[0] / v[0]:+.3f} +- {100 * e[0] / v[0]:.3f} %; "
+            + "; ".join(
+                f"{name} {v[k]:.5f} +- {e[k]:.5f}, theory {o[k]:+.5f}"
+                for k, name in enumerate(NAMES.values(), 1)
+            ),
+            flush=True,
+        )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--eps", type=float, nargs="+", default=[0.1, 0.4, 0.6, 0.85])
-    parser.add_argument("--particles", type=int, default=200_000)
+    parser.add_argument("--smoke", action="store_true", help="few spheres, two values of eps")
+    parser.add_argument("--out", type=Path, default=Path("results") / "sonine_coefficients")
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    blocks, epsilons = (32, (0.5, 1.0)) if options.smoke else (256, EPSILONS)
+    states = []
     for d in (3, 2):
-        for eps in options.eps:
-            value, error = simulated(d, eps, options.particles // 2 * 2, seed=1)
-            off = theory(d, eps) - value
+        for k, eps in enumerate(epsilons):
+            value, error = cooling_state(d, eps, blocks, seed=k)
+            off = theory_of_state(d, eps) - value
+            states.append(
+                {"dimension": d, "eps": eps, "simulated": value.tolist(), "off": off.tolist()}
+                | {"error": error.tolist()}
+            )
             print(
                 f"d = {d}, eps = {eps:g}: "
                 + "; ".join(
-                    f"a_{k} = {v:.5f} +- {e:.5f}, theory {o:+.5f} ({100 * o / v:+.1f} %)"
-                    for k, v, e, o in zip((2, 3), value, error, off, strict=True)
+                    f"{name} = {v:.5f} +- {e:.5f}, theory {o:+.5f} ({100 * o / abs(v):+.2f} %)"
+                    for name, v, e, o in zip(NAMES.values(), value, error, off, strict=True)
                 ),
                 flush=True,
             )
+    courses = []
+    for d in (3, 2):
+        courses.append(course(d, blocks, 2 if options.smoke else 8))
+        say_course(courses[-1])
+    write_picture(draw(states, courses), "sonine_coefficients", options)
+    path = options.out / "sonine_coefficients.json"
+    write_results("sonine_coefficients", options, path, states=states, courses=courses)
 
 
 if __name__ == "__main__":
