@@ -134,45 +134,59 @@ def weighted(values: np.ndarray, first: int, elastic: bool, point: Point) -> np.
     return values[..., first:] @ (weights / weights.sum())
 
 
-def measured(point: Point, impacts: float, equilibrium: dict, seed: int) -> dict:
-    """Rates of one gas and what theory says of them."""
+def measured(point: Point, impacts: float, seed: int) -> dict:
+    """Rates of one gas over Enskog's, from `PLATEAU` on and in their course."""
     each, elastic = simulated(point, impacts, seed), point.restitution == 1
-    boxes = len(each)
-    last = weighted(each, PLATEAU if not elastic else 0, elastic, point)
-    row = point._asdict() | {
-        "boxes": boxes,
-        "rate": float(last.mean()),
-        "error": float(last.std(ddof=1) / boxes**0.5),
+    late = weighted(each, 0 if elastic else PLATEAU, elastic, point)
+    few = len(each) ** 0.5
+    return point._asdict() | {
+        "boxes": len(each),
+        "rate": float(late.mean()),
+        "error": float(late.std(ddof=1) / few),
+        "course": each.mean(axis=0).tolist(),
+        "course_error": (each.std(axis=0, ddof=1) / few).tolist(),
     }
-    d, phi = point.dimension, point.packing_fraction
-    if elastic:
-        return row | {"virial": virial_excess(phi, d)}
+
+
+def compared(row: dict, elastic: dict) -> dict:
+    """The rates over those of elastic spheres, and what theory says of them.
+
+    The flow lowers the cooling rate, by which its waves then grow more slowly: L_c is longer by the
+    root of the rate over Enskog's, which is found by iteration.
+    """
+    point = Point(*(row[name] for name in Point._fields))
     gas, theory = point.gas, enskog(point)
-    eq = equilibrium[d, phi, point.num_particles]
     log_t = np.append(0.0, np.log(np.asarray(theory.temperature / gas.temperature)))
-    lc = np.full(log_t.size, float(gas.critical_box))
-    flow, _ = flow_share(gas, log_t, lc, point.num_particles)
-    # The cooling rate goes as T^(3/2) of the heat.
-    flow = 1.5 * (flow[1:] + flow[:-1]) / 2
-    middle = (MARKS[1:] + MARKS[:-1]) / 2
     loss, h = 1 - point.restitution**2, float(strength(gas))
-    built = np.asarray(built_up(middle))
-    rate, error = row["rate"] / eq["rate"], np.hypot(row["error"], eq["error"])
-    share, grown = (float(weighted(x, PLATEAU, False, point)) for x in (flow, built))
-    course = each.mean(axis=0) / eq["rate"]
+    built = np.asarray(built_up((MARKS[1:] + MARKS[:-1]) / 2))
+
+    def flow_at(rate: np.ndarray) -> np.ndarray:
+        longer = np.append(rate[0], (rate[1:] + rate[:-1]) / 2)
+        lc = float(gas.critical_box) / np.append(longer, rate[-1]) ** 0.5
+        share, _ = flow_share(gas, log_t, lc, point.num_particles)
+        return 1.5 * (share[1:] + share[:-1]) / 2  # the rate goes as T^(3/2) of the heat
+
+    expected = 1 - h * loss * built
+    for _ in range(30):
+        expected = (expected + 1 - h * loss * built - flow_at(expected)) / 2
+    flow = 1 - h * loss * built - expected
+    rate, error = row["rate"] / elastic["rate"], float(np.hypot(row["error"], elastic["error"]))
+    share, grown, theory_rate = (
+        float(weighted(x, PLATEAU, False, point)) for x in (flow, built, expected)
+    )
     return row | {
         "box": point.box,
         "rate": rate,
-        "error": float(error),
+        "error": error,
         "flow": share,
-        "theory": 1 - h * loss * grown - share,
-        "sigma": float((1 - h * loss * grown - share - rate) / error),
-        "h": float((1 - share - rate) / (loss * grown)),
-        "h_error": float(error / (loss * grown)),
+        "theory": theory_rate,
+        "sigma": (theory_rate - rate) / error,
+        "h": (1 - share - rate) / (loss * grown),
+        "h_error": error / (loss * grown),
         "h_theory": h,
-        "course": course.tolist(),
-        "course_error": (each.std(axis=0, ddof=1) / boxes**0.5).tolist(),
-        "course_theory": (1 - h * loss * built - flow).tolist(),
+        "course": (np.asarray(row["course"]) / elastic["rate"]).tolist(),
+        "course_theory": expected.tolist(),
+        "course_flow": flow.tolist(),
     }
 
 
@@ -183,10 +197,8 @@ def build_up(rows: list[dict]) -> tuple[float, float]:
     for n_0 in trial:
         shape, total = -np.expm1(-middle / n_0), 0.0
         for row in rows:
-            base = np.asarray(row["course_theory"]) + row["h_theory"] * np.asarray(
-                built_up(middle)
-            ) * (1 - row["restitution"] ** 2)
-            y, w = base - np.asarray(row["course"]), np.asarray(row["course_error"]) ** -2.0
+            y = 1 - np.asarray(row["course_flow"]) - np.asarray(row["course"])
+            w = np.asarray(row["course_error"]) ** -2.0
             a = np.sum(w * y * shape) / np.sum(w * shape**2)
             total += np.sum(w * (y - a * shape) ** 2)
         lowest.append(total)
@@ -244,15 +256,17 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     impacts = 2e4 if options.smoke else 1.6e6 if options.full else 7e5
     epsilons = (0.7, 0.8, 0.9, 0.95) if options.full else (0.7, 0.9)
-    rows, equilibrium = [], {}
+    rows, elastic = [], {}
     for (d, phi), sizes in SIZES.items():
         if options.smoke and (d, phi) != (3, 0.2):
             continue
         for k, n in enumerate(sizes):
             for eps in (1.0, *(epsilons if k == 0 else (0.9,))):
-                row = measured(Point(d, phi, eps, n), impacts, equilibrium, seed=len(rows))
+                row = measured(Point(d, phi, eps, n), impacts, seed=len(rows))
                 if eps == 1:
-                    equilibrium[d, phi, n] = row
+                    elastic = row = row | {"virial": virial_excess(phi, d)}
+                else:
+                    row = compared(row, elastic)
                 rows.append(row)
                 print(said(row), flush=True)
     cooled = [r for r in rows if "h" in r]

@@ -172,7 +172,7 @@ def main() -> None:
         "viscoelastic": (viscoelastic, paper.VISCOELASTIC, f"viscoelastic, β = {config.beta}"),
     }
     figure = paper.figure(
-        "Dissipation stretches the paths: velocities decay exponentially in collisions,"
+        "Dissipation stretches the paths: velocities decay nearly exponentially in collisions,"
         " more slowly in time",
         columns=3,
     )
@@ -200,7 +200,7 @@ def main() -> None:
     kinds = "● DSMC, □ hard, △ soft spheres, — theory"
     title = f"In time: slower than exp(−(t−t′)/τ$_v$(t′)), dashed\n{kinds}"
     paper.caption(decay, title, xlabel="(t − t′) / τ$_E$(t′)", xlim=(0, 9), **shared)
-    title = f"In collisions: exponential\n{kinds}"
+    title = f"In collisions: nearly exponential\n{kinds}"
     paper.caption(counted, title, xlabel="collisions per particle since t′", xlim=(0, 9), **shared)
     found["relaxation"] = relaxation_times(times, config)
     for name in gases:

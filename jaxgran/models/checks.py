@@ -198,7 +198,7 @@ def omitted_by_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Omissio
         if box > critical:
             found.append(
                 f"the box, {box / diameter:.3g} diameters, is above "
-                f"L_c = {critical / diameter:.3g}: the gas does not stay homogeneous"
+                f"L_c = {critical / diameter:.3g}: a flow grows, and clusters after it"
             )
     return tuple(Omission(words, False, POSITIONS_NEEDED) for words in found)
 

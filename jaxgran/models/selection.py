@@ -264,10 +264,11 @@ def _box_in_words(course: Course) -> str:
             "num_particles the box is unknown, and clustering is not estimated."
         )
     ratio = float(gas.box_side(course.num_particles) / gas.critical_box)
+    later = " Clusters come after the flow (see Gas.critical_box)." if ratio > 1 else ""
     return (
         f"{text} in a box of {ratio:.2g} L_c, where the flow comes to hold "
-        f"{_percent(course.flow_share.max())} of the energy, homogeneous models err by {error}. "
-        f"The box {walls_in_words(gas, course.num_particles)}."
+        f"{_percent(course.flow_share.max())} of the energy, homogeneous models err by {error}."
+        f"{later} The box {walls_in_words(gas, course.num_particles)}."
     )
 
 

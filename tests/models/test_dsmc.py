@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 import jaxgran
 from jaxgran.models.dsmc import DSMC
@@ -14,7 +13,6 @@ from jaxgran.particles import driver
 from jaxgran.particles.stochastic import collisions, simulation
 from jaxgran.particles.stochastic.pairing import Scheme, draw
 from jaxgran.scene.reduced_scene import ReducedScene
-from jaxgran.theory import averages as kinetics
 from tests.conftest import glass_beads
 
 # Hard spheres: kinetic theory without the correction for soft contacts.
@@ -47,13 +45,14 @@ def theory_and_dsmc(gas, n, **settings):
 
 
 def compare_all_but_temperature(theory, curve, n, tolerance):
-    # Elastic D is 1.8 % (2D 2.4 %) above the first Sonine order, less with dissipation.
+    # D in the second Sonine order is within .5 %; another .5 % for the steps of early times.
     excess = np.asarray(curve.displacement / theory.displacement - 1)
-    assert np.all(np.abs(excess - 0.005) < 0.015 + 3 * MSD_SCATTER / n**0.5)
+    assert np.all(np.abs(excess) < 0.01 + 3 * MSD_SCATTER / n**0.5)
     # a_2 forgets in some 2.5 mean free times: the mean over 80 errs by 1/4 of one value.
     late = TAUS >= 20
     a2, expected = np.mean(curve.sonine[late]), np.mean(theory.sonine[late])
-    assert abs(a2 - expected) < 0.15 * abs(expected) + 2 * SONINE_SCATTER / n**0.5 / 4
+    # Theory's is within 3 %.
+    assert abs(a2 - expected) < 0.03 * abs(expected) + 3 * SONINE_SCATTER / n**0.5 / 4
     # Collisions in the gas's own clock: as good as ln T.
     assert np.all(np.abs(curve.collisions / theory.collisions - 1)[1:] < tolerance)
 
@@ -77,11 +76,8 @@ def million(request):
 
 
 @pytest.mark.slow
-def test_a_million_particles_cool_as_kinetic_theory_says(million, request):
+def test_a_million_particles_cool_as_kinetic_theory_says(million):
     (beta, dimension), (theory, curve) = million
-    if dimension == 2:
-        reason = "theory without a_3 is .2 % low after 50 to 100 mean free times, whatever the step"
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
     off = np.asarray(curve.temperature / theory.temperature - 1)
     error = np.asarray(curve.temperature_error / curve.temperature)
     for tau in (10.0, 50.0, 100.0):
@@ -89,51 +85,8 @@ def test_a_million_particles_cool_as_kinetic_theory_says(million, request):
         print(f"\nbeta {beta}, {dimension}D, {tau:g} mean free times: T over theory", end=" ")
         print(f"{100 * off[at].item():+.3f} +- {100 * error[at].item():.3f} %", end="")
     print(f"; at most {100 * np.abs(off).max():.3f} %")
-    assert np.all(np.abs(off) < 0.002)
-
-
-def cooled_by_its_own_sonine(gas, theory, curve):
-    """T at the times of a curve, of kinetic theory's loss of energy at that curve's a_2."""
-    d, unit_time = gas.dimension, float(gas.path_length / gas.impact_speed)
-    times = np.asarray(curve.times) / unit_time
-    fine = np.geomspace(1e-3, times[-1], 600)
-    # What theory leaves out of a_2 changes slowly: it can be read between the times of the curve.
-    more = np.append(0.0, np.asarray(curve.sonine - theory.sonine))
-    more = np.interp(np.log1p(fine), np.log1p(np.append(0.0, times)), more)
-    sonine = np.asarray(jaxgran.cool(gas, fine * unit_time, model=THEORY).sonine) + more
-
-    @jax.jit
-    def slope(log_theta, a2):
-        speed = jnp.exp(log_theta / 2)
-        averages = kinetics.averages(gas.reduced_law, speed, d)
-        return -2 / d * kinetics.Rates.of(averages, a2).cooling * speed
-
-    solution = solve_ivp(
-        lambda t, y: [slope(y[0], np.interp(t, fine, sonine))],
-        (0.0, times[-1]),
-        [0.0],
-        t_eval=times,
-        rtol=1e-7,
-        max_step=times[-1] / 300,
-    )
-    return float(gas.temperature) * np.exp(solution.y[0])
-
-
-@pytest.mark.slow
-def test_what_is_left_of_the_temperature_is_theory_s_sonine(million):
-    # Without a_3 the theory's |a_2| is 5 to 15 % low, which cools by up to .2 % too much. At the
-    # gas's own a_2 .05 % are left; the scatter of T reaches .03 %.
-    (beta, dimension), (theory, curve) = million
-    gas = glass_beads(beta, dimension)
-    np.testing.assert_allclose(
-        cooled_by_its_own_sonine(gas, theory, theory), theory.temperature, rtol=1e-6
-    )
-    off = np.asarray(curve.temperature) / cooled_by_its_own_sonine(gas, theory, curve) - 1
-    late = TAUS >= 20
-    before = np.mean(curve.temperature[late] / theory.temperature[late] - 1)
-    print(f"\nbeta {beta}, {dimension}D, 20 to 100 mean free times: T over theory", end=" ")
-    print(f"{100 * before:+.3f} %, at the gas's own a_2 {100 * np.mean(off[late]):+.3f} %")
-    assert np.all(np.abs(off) < 0.001) and abs(np.mean(off[late])) < 0.0007
+    # .03 % are asked of the theory; besides, three times the scatter of 12 million.
+    assert np.all(np.abs(off) < 3e-4 + 3 * T_SCATTER / (12e6) ** 0.5)
 
 
 @pytest.mark.slow

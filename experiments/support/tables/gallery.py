@@ -153,8 +153,8 @@ def cooling(f: dict) -> str:
 def velocities(f: dict) -> str:
     row = f["found"]["viscoelastic"]
     return (
-        f"Exponentially in collisions, not in time; τ_v/τ_E is {row['dsmc']['relaxation']:.3f}, "
-        f"printed {row['paper_relaxation']:.3f}."
+        "Nearly exponentially in collisions, not in time; τ_v/τ_E is "
+        f"{row['dsmc']['relaxation']:.3f}, printed {row['paper_relaxation']:.3f}."
     )
 
 
