@@ -31,7 +31,7 @@ from experiments.support.record import add_recording, write_picture, write_resul
 from experiments.support.scenes import hard_beads
 from jaxgran.plotting import COLOURS, INK
 from jaxgran.scene.geometry import contact_value
-from jaxgran.theory.correlations import built_up, strength
+from jaxgran.theory.correlations import built_up, slowing
 from jaxgran.theory.shear_modes import flow_share
 
 MARKS = np.array([0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0])
@@ -148,6 +148,12 @@ def measured(point: Point, impacts: float, seed: int) -> dict:
     }
 
 
+def strength(phi: float, eps: float, d: int) -> float:
+    """h in ``1 - h (1 - eps^2)``, the rate over Enskog's by theory."""
+    loss = 1 - eps**2
+    return float(slowing(jnp.asarray(phi), jnp.asarray(loss), d)) / loss
+
+
 def compared(row: dict, elastic: dict) -> dict:
     """The rates over those of elastic spheres, and what theory says of them.
 
@@ -157,7 +163,8 @@ def compared(row: dict, elastic: dict) -> dict:
     point = Point(*(row[name] for name in Point._fields))
     gas, theory = point.gas, enskog(point)
     log_t = np.append(0.0, np.log(np.asarray(theory.temperature / gas.temperature)))
-    loss, h = 1 - point.restitution**2, float(strength(gas))
+    loss = 1 - point.restitution**2
+    h = strength(point.packing_fraction, point.restitution, point.dimension)
     built = np.asarray(built_up((MARKS[1:] + MARKS[:-1]) / 2))
 
     def flow_at(rate: np.ndarray) -> np.ndarray:
@@ -234,8 +241,9 @@ def draw(rows: list[dict]) -> Figure:
             marker, shade = "osv^D"[k], ("hard spheres", "elastic", "DSMC")[k % 3]
             axes.errorbar(x, y, e, fmt=marker, ms=5, color=COLOURS[shade], label=f"ε = {eps:g}")
         phi = np.linspace(1e-3, 0.32, 60)
-        h = [float(strength(hard_beads(p, 0.9, d))) for p in phi]
-        axes.plot(phi, h, "--", color=COLOURS["kinetic theory"], label="kinetic theory")
+        for eps, line in ((0.9, "-"), (0.7, "--")):
+            h, blue = [strength(p, eps, d) for p in phi], COLOURS["kinetic theory"]
+            axes.plot(phi, h, line, color=blue, label=f"kinetic theory, ε = {eps:g}")
         axes.axhline(0, color=INK, lw=0.8)
         axes.set(xlabel="packing fraction φ", title=f"{'spheres' if d == 3 else 'disks'}")
         axes.legend(frameon=False, loc="upper left")

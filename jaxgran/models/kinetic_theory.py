@@ -34,7 +34,7 @@ TOLERANCES = validation.Domain(0.0, 0.1)
 class KineticTheory(AbstractModel):
     """The homogeneous cooling gas, by Maxwell-Sonine kinetic theory; integrated with diffrax.
 
-    ``dT/dt = -(2/d) mu_2 T (1 - c X_T/sigma)/(1 + k X_T/sigma) (1 - h <1 - eps^2>)``,
+    ``dT/dt = -(2/d) mu_2 T (1 - c X_T/sigma)/(1 + k X_T/sigma) (1 - h)``,
     ``da_2/dt = (4/d) mu_2 (1 + a_2) - 4 mu_4/(d(d+2))``, ``da_3/dt = 3 da_2/dt - (6/d) mu_2 (1 +
     3 a_2 - a_3) + 8 mu_6/(d(d+2)(d+4))``, ``d<dr^2>/dt = 2 d D``, ``dN/dt = nu``, and two moments
     of labelled velocities for D, the first ``dD/dt = T - nu_v D``; all but T from 0, with averages

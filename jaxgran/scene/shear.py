@@ -16,6 +16,16 @@ Reference: Gass 1971 (2D); Chapman & Cowling, Eq. 16.41.7 (3D).
 """
 
 
+def unit_wavenumber(packing_fraction: Float[Array, ""], dimension: int) -> Float[Array, ""]:
+    """``k_c sigma/sqrt(I)``, I = <1 - eps^2>: see `critical_length`."""
+    g_2, phi = contact_value(packing_fraction, dimension), packing_fraction
+    b, first, second = SHEAR_VISCOSITY[dimension]
+    y = b * phi * g_2
+    dense = g_2**2 / (1 + first * y + second * y**2)
+    density = phi * dimension * 2**dimension / sphere_surface(dimension)
+    return density * jnp.sqrt((32 * pi / 15 if dimension == 3 else pi) * dense)
+
+
 def critical_length(
     law: ReducedLaw, packing_fraction: Float[Array, ""], dimension: int
 ) -> Float[Array, ""]:
@@ -30,18 +40,12 @@ def critical_length(
     Returns:
         L_c/sigma; infinite for elastic spheres.
     """
-    g_2, phi = contact_value(packing_fraction, dimension), packing_fraction
-    b, first, second = SHEAR_VISCOSITY[dimension]
-    y = b * phi * g_2
-    dense = g_2**2 / (1 + first * y + second * y**2)
 
     def lost(g: Array) -> Array:
         loss = law.loss(g)
         return g**2 / 2 * loss * (2 - loss)
 
-    factor = 32 * pi / 15 if dimension == 3 else pi
-    squared = factor * impact_average(lost, phi) * dense
-    inelastic = squared > 0
-    density = phi * dimension * 2**dimension / sphere_surface(dimension)
-    root = density * jnp.sqrt(jnp.where(inelastic, squared, 1.0))
+    loss = impact_average(lost, packing_fraction)
+    inelastic = loss > 0
+    root = unit_wavenumber(packing_fraction, dimension) * jnp.sqrt(jnp.where(inelastic, loss, 1.0))
     return jnp.where(inelastic, 2 * pi / root, jnp.inf)

@@ -14,7 +14,7 @@ from jaxgran.scene.geometry import sphere_surface
 from jaxgran.scene.reduced_scene import ReducedScene
 from jaxgran.theory import averages, elements
 from jaxgran.theory.collision_integrals import TERMS
-from jaxgran.theory.correlations import built_up, strength
+from jaxgran.theory.correlations import built_up, slowing
 from jaxgran.theory.softness import crowding, is_soft, softness_factor
 
 
@@ -64,7 +64,8 @@ class Density(NamedTuple):
 
     Attributes:
         crowding: k in ``1/(1 + k X_T/sigma)``, see `jaxgran.theory.softness.crowding`.
-        correlations: h in ``1 - h (1 - eps^2)``, see `jaxgran.theory.correlations.strength`.
+        correlations: the packing fraction, from which `jaxgran.theory.correlations.slowing` finds
+            what velocity correlations take.
     """
 
     crowding: Float[Array, ""] | None = None
@@ -74,7 +75,7 @@ class Density(NamedTuple):
     def of(cls, gas: Gas, softness: bool = True, correlations: bool = True) -> "Density":
         """The effects in a gas, unless left out."""
         soft = softness and is_soft(gas.reduced_law)
-        return cls(crowding(gas) if soft else None, strength(gas) if correlations else None)
+        return cls(crowding(gas) if soft else None, gas.packing_fraction if correlations else None)
 
 
 def velocity(
@@ -184,7 +185,7 @@ def _reduced(
         impacts = impacts / (1 + density.crowding * scene.law.impact_length(speed))
     if density.correlations is not None:
         inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
-        lost = density.correlations * inelasticity * built_up(at.collisions)
+        lost = slowing(density.correlations, inelasticity, d) * built_up(at.collisions)
         impacts = impacts * (1 - lost)
     return impacts
 
