@@ -1,10 +1,11 @@
-"""Which A explains the two cooling curves that were measured in LAMMPS?
+"""Which A explains the five cooling curves that were measured in LAMMPS?
 
     python experiments/fit/lammps_curves.py [--cases dilute dense ...] [--record] [--out DIR]
 
-Runs `jaxgran fit` on the curves of `data/`: kinetic theory on both, and soft spheres where they are
-asked for (minutes). With --record the figures and pictures of the documents are replaced; the
-pictures `fit_*.png` are made by nothing else.
+Runs `jaxgran fit` on the curves of `data/`: kinetic theory on all, and soft spheres where they are
+asked for (minutes); prints how far each A is from the true one, and the parts of its error. With
+--record the figures and pictures of the documents are replaced; the pictures `fit_*.png` are made
+by nothing else.
 """
 
 import argparse
@@ -17,17 +18,19 @@ from pathlib import Path
 from experiments.support.record import DATA, PICTURES, add_recording, write_results
 from jaxgran.cli.app import main as command
 
-DILUTE, DENSE = (str(DATA / f"lammps_cooling_{name}.csv") for name in ("dilute", "dense"))
+NAMES = ("dilute", "dense", "phi003", "phi010", "phi025")
+DILUTE, DENSE, *OTHERS = (str(DATA / f"lammps_cooling_{name}.csv") for name in NAMES)
 SOFT = ["--model", "soft-spheres"]
 CASES = {
     "dilute": [DILUTE],
     "dense": [DENSE],
     "dense_T0": [DENSE, "--free", "A", "T0"],
+    **{name: [curve] for name, curve in zip(NAMES[2:], OTHERS, strict=True)},
     "dense_soft_spheres": [DENSE, *SOFT],
     "dense_soft_spheres_T0": [DENSE, *SOFT, "--free", "A", "T0"],
     "dilute_soft_spheres": [DILUTE, *SOFT, "--replicas", "2"],
 }
-QUICK = ("dilute", "dense", "dense_T0")
+QUICK = (*NAMES, "dense_T0")
 SHOWN = ("dilute", "dense", "dense_soft_spheres")
 """Cases whose picture is in the documents."""
 
@@ -40,6 +43,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("results") / "lammps_curves")
     add_recording(parser)
     options = parser.parse_args()
+    summary = []
     for case in options.cases:
         folder = options.out / case
         said = io.StringIO()
@@ -50,9 +54,14 @@ def main() -> int:
             return code
         (record,), (picture,) = folder.glob("*.json"), folder.glob("*.png")
         found = json.loads(record.read_text(encoding="utf-8"))
-        write_results(f"lammps_curves_{case}", options, None, **results(found, said.getvalue()))
+        of = results(found, said.getvalue())
+        write_results(f"lammps_curves_{case}", options, None, **of)
+        row = of["parameters"][0]
+        miss, error = (100 * x / row["true"] for x in (row["estimate"], row["std_err"]))
+        summary.append(f"{case:<22} A {miss - 100:+.2f} +- {error:.2f} %; {of['printed'][-1]}")
         if options.record and case in SHOWN:
             (PICTURES / f"fit_{case}.png").write_bytes(picture.read_bytes())
+    print("\n".join(summary))
     return 0
 
 

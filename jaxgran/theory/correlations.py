@@ -8,11 +8,12 @@ from jaxtyping import Array, Float
 from jaxgran.scene.geometry import sphere_surface
 from jaxgran.scene.shear import unit_wavenumber
 
-SHORTEST = {2: (0.168, 3.49), 3: (0.922, 2.228)}
-"""a, b of ``K sigma = a + b phi``, the largest wavenumber of the modes of the flow, by dimension.
+SHORTEST = {2: (0.181, 3.10), 3: (0.926, 2.19)}
+"""a, b of ``K sigma = a + b phi``, up to which waves count, by dimension.
 
 Fitted to ``experiments/accuracy/measure_correlations.py``: hard spheres of eps = .7 and .9 at phi =
-.05 to .3, eighteen gases; chi^2 is 10 of 9 gases with two numbers, in each dimension.
+.05 to .3. With two numbers chi^2 is 7 (2D) and 10 (3D) of nine gases. Errors: 2D .05, .24; 3D .07,
+.32.
 """
 
 BUILD_UP = 4.0
@@ -23,7 +24,7 @@ LONGEST = 2.0
 `jaxgran.theory.shear_modes`."""
 
 TAIL = LONGEST + log((LONGEST - 1) / (LONGEST + 1)) / 2
-"""``LONGEST - int_LONGEST^inf (x^2/(x^2 - 1) - 1) dx``."""
+"""``LONGEST - int_LONGEST^inf (x^2/(x^2 - 1) - 1) dx``, what is missing of K/k_c."""
 
 
 def slowing(
@@ -32,14 +33,15 @@ def slowing(
     """Share of the cooling rate that velocity correlations take, once they have arisen.
 
     Spheres that have met move more in parallel than before, and some of them meet again: their
-    normal speed is then lower than that of strangers. As modes of the flow, a shear wave of
+    normal speed is then lower than that of strangers. In modes of the flow: a shear wave of
     wavenumber k > k_c is cooled by viscosity and not by impacts, and holds ``1/((k/k_c)^2 - 1)`` of
-    T above equipartition (`jaxgran.theory.shear_modes`), which does not take part in impacts. All
-    waves from 2 k_c, those shorter than L_c/2, to a shortest one, K, take
-    ``(3/2) (d - 1)/(d n) int d^dk/(2 pi)^d 1/((k/k_c)^2 - 1)`` of the rate, that is
-    ``k_c^2 (K - 1.451 k_c)/(2 pi^2 n)`` in 3D and ``3 k_c^2 ln((K^2/k_c^2 - 1)/3)/(16 pi n)`` in
-    2D. It is 0 for an elastic gas, whose collision rate is Enskog's but for .4 % at phi = .3, by
-    which the virial series exceeds it.
+    T above equipartition (`jaxgran.theory.shear_modes`), which takes no part in impacts. All waves
+    shorter than L_c/2 take ``(3/2) (d - 1)/(d n) int d^dk/(2 pi)^d 1/((k/k_c)^2 - 1)`` of the rate,
+    from 2 k_c on. Short waves are no waves of a fluid: of the leading term k_c^2/k^2, which they
+    make with any small I in proportion to it, as much is counted as a fluid would have up to K.
+    That is ``k_c^2 (K - 1.451 k_c)/(2 pi^2 n)`` in 3D and ``3 k_c^2 ln(K^2/(3 k_c^2))/(16 pi n)``
+    in 2D, at least 0. An elastic gas has none of it: its collision rate is Enskog's but for .4 % at
+    phi = .3, by which the virial series exceeds it.
 
     Args:
         packing_fraction: phi.
@@ -50,14 +52,14 @@ def slowing(
     a, b = SHORTEST[dimension]
     n = phi * dimension * 2**dimension / sphere_surface(dimension)  # in one diameter^d
     unit, shortest = unit_wavenumber(phi, dimension), a + b * phi
-    # Elastic spheres: without the bound derivatives in I were not finite.
-    critical = unit**2 * jnp.maximum(inelasticity, 1e-12)
+    # Elastic spheres: without the bound the root had no derivative.
+    critical = unit * jnp.sqrt(jnp.maximum(inelasticity, 1e-12))
     if dimension == 3:
-        taken = (shortest - TAIL * jnp.sqrt(critical)) / (2 * pi**2)
+        taken = jnp.maximum(shortest - TAIL * critical, 0.0) / (2 * pi**2)
     else:
-        ratio = (shortest**2 / critical - 1) / (LONGEST**2 - 1)
-        taken = 3 * jnp.log(jnp.maximum(ratio, 1.0)) / (16 * pi)
-    return unit**2 * inelasticity / n * jnp.maximum(taken, 0.0)
+        x = shortest / critical
+        taken = 3 * jnp.log(jnp.maximum(x**2 / (LONGEST**2 - 1), 1.0)) / (16 * pi)
+    return unit**2 * inelasticity / n * taken
 
 
 def built_up(collisions: Float[Array, "..."]) -> Float[Array, "..."]:
