@@ -87,7 +87,7 @@ def cool(
 
     >>> curve = jaxgran.cool(gas, times)
     >>> [round(float(T), 5) for T in curve.temperature]
-    [0.00783, 0.00524, 0.00205, 0.00053]
+    [0.00784, 0.00524, 0.00205, 0.00053]
     """
     gas, times, key = checks.checked_gas(gas), checked_times(times), checks.checked_key(key)
     model = KineticTheory() if model is None else model
