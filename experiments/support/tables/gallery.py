@@ -333,7 +333,7 @@ ENTRIES = {
             "sonine_coefficients",
             states,
             "sonine_coefficients.png",
-            "5 min",
+            "7 min",
         ),
         Entry(
             "accuracy/measure_correlations.py",
