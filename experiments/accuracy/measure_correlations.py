@@ -165,7 +165,7 @@ def compared(row: dict, elastic: dict) -> dict:
     log_t = np.append(0.0, np.log(np.asarray(theory.temperature / gas.temperature)))
     loss = 1 - point.restitution**2
     h = strength(point.packing_fraction, point.restitution, point.dimension)
-    built = np.asarray(built_up((MARKS[1:] + MARKS[:-1]) / 2))
+    built = np.asarray(built_up(jnp.asarray(MARKS[1:] + MARKS[:-1]) / 2))
 
     def flow_at(rate: np.ndarray) -> np.ndarray:
         longer = np.append(rate[0], (rate[1:] + rate[:-1]) / 2)
