@@ -12,9 +12,11 @@ from jaxgran.scene.elements import (
     WhiteNoise,
     share_of_container,
 )
+from jaxgran.scene.friction import Frictional
 from jaxgran.scene.gas import Gas
 
 ROUGH_KEYS = ("beta_t", "reduced_inertia", "T_rot_0")
+FRICTION_KEYS = ("tangential_damping", "friction")
 WALL_KEYS = ("container_side", "wall_restitution", "wall_beta_t")
 DRAG_KEYS = ("gamma",)
 DRIVE_KEYS = ("drive_strength",)
@@ -52,10 +54,12 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
 
     Args:
         header: where spheres are rough beta_t and, if they are not .4 and 0, reduced_inertia,
-            4 I/(m sigma^2), and T_rot_0, T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2; where there
-            are walls container_side, of a cube, m, wall_restitution and, of rough ones,
-            wall_beta_t; where there is drag gamma, 1/s, of dv/dt = -gamma v; where white noise
-            drives the gas drive_strength, m^2/s^3, of dT/dt = drive_strength.
+            4 I/(m sigma^2), and T_rot_0, T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2; where
+            contacts last and rub tangential_damping and friction (`jaxgran.Frictional`, numbers
+            without a unit) in place of beta_t; where there are walls container_side, of a cube, m,
+            wall_restitution and, of rough ones, wall_beta_t; where there is drag gamma, 1/s, of
+            dv/dt = -gamma v; where white noise drives the gas drive_strength, m^2/s^3, of
+            dT/dt = drive_strength.
 
     Raises:
         ValueError: for a key that needs another one, a value outside its range, and for what no
@@ -64,12 +68,9 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
     _refuse(header)
     found = {key: header_number(header, key) for key in header if key in ELEMENT_KEYS}
     elements: dict[str, Any] = {}
-    if _whole(found, ROUGH_KEYS, needed=("beta_t",)):
-        elements["surface"] = Rough(
-            found["beta_t"],
-            inertia=found.get("reduced_inertia", 0.4),
-            rotational_temperature=found.get("T_rot_0", 0.0),
-        )
+    surface = _surface(found)
+    if surface is not None:
+        elements["surface"] = surface
     if _whole(found, WALL_KEYS, needed=("container_side", "wall_restitution")):
         elements["container"] = Walls(
             found["container_side"],
@@ -83,7 +84,23 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
     return elements
 
 
-ELEMENT_KEYS = (*ROUGH_KEYS, *WALL_KEYS, *DRAG_KEYS, *DRIVE_KEYS)
+def _surface(found: dict[str, float]) -> Rough | Frictional | None:
+    inertia, rotation = found.get("reduced_inertia", 0.4), found.get("T_rot_0", 0.0)
+    if _whole(found, FRICTION_KEYS, needed=FRICTION_KEYS):
+        if "beta_t" in found:
+            raise ValueError(
+                "the header gives both beta_t, of impacts without duration, and friction, of "
+                "contacts that last: leave beta_t out for SoftSpheres(N), friction and "
+                "tangential_damping for the other models"
+            )
+        damping, friction = (found[key] for key in FRICTION_KEYS)
+        return Frictional(damping, friction, inertia=inertia, rotational_temperature=rotation)
+    if _whole(found, ROUGH_KEYS, needed=("beta_t",)):
+        return Rough(found["beta_t"], inertia=inertia, rotational_temperature=rotation)
+    return None
+
+
+ELEMENT_KEYS = (*ROUGH_KEYS, *FRICTION_KEYS, *WALL_KEYS, *DRAG_KEYS, *DRIVE_KEYS)
 
 
 def _refuse(header: dict[str, str]) -> None:

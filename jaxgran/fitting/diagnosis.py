@@ -19,7 +19,6 @@ from jaxgran.models.checks import walls_in_words
 LARGEST_SCATTER = 0.3
 """Relative scatter of T about a model above which it does not explain a curve without errors."""
 
-
 NOTHING = 0.01
 """Share of an estimate below which the low end of a range is next to nothing."""
 
@@ -233,6 +232,7 @@ def _or_further(rival: Rival) -> str:
 def _assumptions(result: Fit) -> str:
     elements = result.gas.elements
     spheres = "rough spheres of constant beta_t" if "surface" in elements else "smooth spheres"
+    spheres = "spheres of constant friction" if "friction" in elements else spheres
     where = [] if "container" in elements else ["far from walls"]
     where += [] if "drag" in elements else ["in vacuum"]
     where.append("at homogeneous density")

@@ -171,6 +171,25 @@ def test_sliding_impact_obeys_coulomb_and_conserves_momentum():
     np.testing.assert_allclose(energy(gas, curve), 1.0, atol=2e-5)  # the onset at 100 steps
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("mu", [100.0, 0.01], ids=["viscous", "sliding"])
+def test_steps_with_friction_are_of_second_order(mu):
+    # Within one contact, which has begun already: its onset would leave dt^(3/2).
+    gas = soft(1e-3, 0.3, num=2, surface=jaxgran.Frictional(0.5, mu))
+    sigma, along = float(gas.diameter), np.array([1.0, 0.0, 0.0])
+    apart = (1 - 0.5 * float(gas.mean_overlap)) * sigma * along
+    place = float(gas.box_side(2)) / 2 + np.array([-apart, apart]) / 2
+    start = two_spheres(gas, place, [[0.1, 0.06, 0.0], [-0.1, -0.06, 0.0]])
+    ends = []
+    for steps in (20, 40, 80):
+        model = SoftSpheres(2, start=start, steps_per_contact=steps)
+        end = jaxgran.cool(gas, [0.3 * float(gas.contact_duration)], model=model).particles
+        spin = np.asarray(end.angular_velocity[0, 0, 2:]) * sigma / 2
+        ends.append(np.concatenate([end.velocity[0, 0, :2], spin]))
+    # Terms of fourth order: 2 % of the error at 20 steps.
+    np.testing.assert_allclose((ends[0] - ends[1]) / (ends[1] - ends[2]), 4.0, rtol=0.04)
+
+
 def test_without_friction_frictional_spheres_are_smooth():
     _, curve, *_ = oblique(jaxgran.Frictional(0.5, 0.0, rotational_temperature=1e-3))
     _, smooth, *_ = oblique(None)

@@ -224,6 +224,9 @@ def test_bad_elements_are_refused(make, message):
         make()
 
 
+RUBBING = {"friction": "0.3", "tangential_damping": "0.5", "T_rot_0": "2e-3"}
+
+
 def test_elements_are_read_from_a_header():
     header = {
         "eta": "0.05",
@@ -251,11 +254,18 @@ def test_elements_are_read_from_a_header():
     for wrong, message in (
         ({"T_rot_0": "1"}, "gives T_rot_0 without beta_t"),
         ({"container_side": "0.05"}, "gives container_side without wall_restitution"),
+        ({"friction": "0.5"}, "gives friction without tangential_damping"),
+        (RUBBING | {"beta_t": "0"}, "both beta_t.*SoftSpheres"),
+        (RUBBING | {"friction": "-1"}, r"friction must lie in \[0, inf\)"),
     ):
         with pytest.raises(ValueError, match=message):
             jaxgran.read_gas(header | wrong)
-    with pytest.warns(UserWarning, match="'friction' is not known.*known are eta"):
-        jaxgran.read_gas(header | {"friction": "0.5", "A comment of some words": "x"})
+    with pytest.warns(UserWarning, match="'mu' is not known.*known are eta.*friction"):
+        jaxgran.read_gas(header | {"mu": "0.5", "A comment of some words": "x"})
+    gas = jaxgran.read_gas(header | RUBBING)
+    assert gas.elements == ("friction",)
+    found = [float(gas.value(name)) for name in ("tangential_damping", "friction", "inertia")]
+    assert found == [0.5, 0.3, 0.4] and float(gas.value("rotational_temperature")) == 2e-3
 
 
 HEADER = {
