@@ -19,6 +19,8 @@ from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.scene.elements import SAME_VOLUME, share_of_container
 from jaxgran.scene.gas import Gas
 from jaxgran.theory.averages import averages as exact_averages
+from jaxgran.theory.softness import softness_factor
+from jaxgran.theory.steady import hottest_speed
 
 CONTACT_LIMIT = 0.03
 """Contact duration over mean free time above which impacts are not instantaneous and binary."""
@@ -85,6 +87,15 @@ def first_cooling_rate(gas: Gas, averages: Callable = exact_averages) -> Float[A
     """``-d ln T/dt`` at t = 0, 1/s, of the Maxwellian gas; negative if the law heats it."""
     mu_2 = averages(gas.reduced_law, jnp.ones_like(gas.temperature), gas.dimension)[0, 0]
     return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
+
+
+@eqx.filter_jit
+def at_start(gas: Gas, averages: Callable) -> tuple[Array, Array, Array]:
+    """The first cooling rate, the softness factor where it is hottest, and sqrt(T/T_0) there."""
+    one = jnp.ones_like(gas.temperature)
+    hottest = one if gas.drive is None else hottest_speed(gas)
+    factor = softness_factor(gas.reduced_law, hottest, gas.dimension)
+    return first_cooling_rate(gas, averages), factor, hottest
 
 
 def check_softness(gas: Gas, factor: ArrayLike, hottest: ArrayLike = 1.0) -> None:

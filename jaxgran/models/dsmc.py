@@ -33,7 +33,8 @@ from jaxgran.particles.interruption import waited_for
 from jaxgran.particles.stochastic import simulation
 from jaxgran.particles.stochastic.pairing import Scheme
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
+from jaxgran.scene.reduced_scene import ReducedScene
+from jaxgran.theory.steady import scene_at_start
 
 LONGEST_STEP = 0.1
 """Most collisions per particle in one step: a particle can be drawn at most twice in it."""
@@ -127,7 +128,7 @@ class DSMC(AbstractModel):
         # Two words of any kind of key, for the kind that is used here.
         words = jax.random.bits(key, (2,), jnp.uint32)
         scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
-        scene, reduced = reduced_scene(gas), times * gas.impact_speed / gas.path_length
+        scene, reduced = scene_at_start(gas), times * gas.impact_speed / gas.path_length
         if scene.drag is not None:
             reduced = transformed(scene.drag, reduced)
         units = self._units(gas)

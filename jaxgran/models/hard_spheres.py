@@ -31,8 +31,8 @@ from jaxgran.particles.hard.windows import LEAST_IMPACTS, SPEED_MARGIN, HardDyna
 from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedDrive
-from jaxgran.scene.reduced_scene import reduced_scene as reduced
 from jaxgran.theory.averages import collision_rate
+from jaxgran.theory.steady import scene_at_start
 
 WINDOW_SHARE = 0.05
 """Impacts per particle in a window."""
@@ -221,7 +221,7 @@ def check_container(gas: Gas, walls: Walls, num_particles: int, start: bool) -> 
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:
     """A gas of hard spheres in units of its diameter, mass and first temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    side, scene = gas.box_side(num_particles) / gas.diameter, reduced(gas)
+    side, scene = gas.box_side(num_particles) / gas.diameter, scene_at_start(gas)
     nu = gas.collision_frequency
     walls = drag = drive = None
     if gas.container is not None and scene.walls is not None:

@@ -20,12 +20,10 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import ROUGH, Course
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced_scene import reduced_scene
 from jaxgran.theory import averages, closed_forms, steady
 from jaxgran.theory.homogeneous import Equations, Scene
 from jaxgran.theory.integration import padded_length, values_at
 from jaxgran.theory.moments import Density, Moments
-from jaxgran.theory.softness import softness_factor
 
 TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
@@ -43,6 +41,11 @@ class KineticTheory(AbstractModel):
     Leaves out clustering: right in boxes below L_c whose contacts are short. The averages assume
     that eps(v) is smooth: for a law with a kink, such as an eps capped at 1, use `jaxgran.DSMC`; T
     of ice, which becomes elastic at low speed, is 3 % off after some 1e5 mean free times.
+
+    Takes all elements of a scene but friction, of a gas that is everywhere alike: rough spheres,
+    with T_rot, whose spins and velocities are taken for independent; walls, with the denser layer
+    before them (`jaxgran.scene.wall_layer`); drag; a drive by white noise; and a driven start. Of
+    a gas between walls D and <dr^2> are left out.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
     Second derivatives are forward over forward or over reverse, as `jax.hessian`, not
@@ -123,7 +126,7 @@ class KineticTheory(AbstractModel):
         """Raise ValueError for a law that heats the gas or contacts too soft for the theory."""
         if any_traced(gas):
             return
-        rate, factor, hottest = _at_start(gas, self._averages)
+        rate, factor, hottest = checks.at_start(gas, self._averages)
         if self.softness:
             checks.check_softness(gas, factor, hottest)
         checks.check_cools(rate)
@@ -159,7 +162,7 @@ class KineticTheory(AbstractModel):
     @eqx.filter_jit
     def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
-        scene = reduced_scene(gas), Density.of(gas, self.softness, self.correlations)
+        scene = steady.scene_at_start(gas), Density.of(gas, self.softness, self.correlations)
         parameters, unravel = ravel_pytree(scene)
         if parameters.size == 0:  # a law of no floats: jax gives none of them a type of its own
             parameters, unravel = jnp.zeros(0, times.dtype), lambda _: scene
@@ -289,12 +292,3 @@ class KineticTheory(AbstractModel):
         fault = status.flag(status.STEPS_SPENT, ~ended)
         fault |= status.flag(status.NOT_FINITE, ended & ~finite)
         return jnp.where(fault == status.OK, rows, jnp.nan), fault
-
-
-@eqx.filter_jit
-def _at_start(gas: Gas, averages_of: Callable[..., Array]) -> tuple[Array, Array, Array]:
-    """The first cooling rate, the softness factor where it is hottest, and sqrt(T/T_0) there."""
-    one = jnp.ones_like(gas.temperature)
-    hottest = one if gas.drive is None else steady.hottest_speed(gas)
-    factor = softness_factor(gas.reduced_law, hottest, gas.dimension)
-    return checks.first_cooling_rate(gas, averages_of), factor, hottest

@@ -18,7 +18,7 @@ from jaxgran.checks.words import Rows, as_html, as_text
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.checks import check_softness, checked_gas, walls_in_words
+from jaxgran.models.checks import check_softness, check_volume, checked_gas, walls_in_words
 from jaxgran.models.course import Course
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.hard_spheres import HardSpheres
@@ -119,7 +119,8 @@ def choose_model(
 
     Raises:
         ValueError: for values out of range or being traced, a gas so soft that kinetic theory is
-            meaningless, or a scene that no model can take.
+            meaningless, a container that is not that of so many spheres, or a scene that no model
+            can take.
         RuntimeError: if kinetic theory, which estimates the errors, cannot follow the gas so far.
 
     >>> choice = jaxgran.choose_model(gas, times, num_particles=200)
@@ -128,6 +129,8 @@ def choose_model(
     """
     _check_arguments(gas, times, tolerance)
     tolerance = float(tolerance)
+    if num_particles is not None:
+        check_volume(gas, num_particles)
     size = NUM_PARTICLES if num_particles is None else num_particles
     models = default_models(size, replicas) if models is None else models
     course = course_of(gas, float(checked_times(times)[-1]), num_particles)

@@ -102,11 +102,17 @@ class AbstractDynamics(eqx.Module):
         return None
 
     def with_kicks(self, state: State, key: PRNGKeyArray) -> State:
-        """The state after the melt with random numbers for the kicks of `preparing`."""
+        """The state after the melt with what `preparing` needs: random numbers for kicks, spins."""
         return state
 
-    def drawn(self, state: State, key: PRNGKeyArray) -> State:
-        """The state at t = 0 with what else is random: spins; key is that of the run."""
+    def drawn(self, state: State, key: PRNGKeyArray, melted: State) -> State:
+        """The state at t = 0 with what else is random: spins, but for those of a preparation.
+
+        Args:
+            state: so far.
+            key: of the run.
+            melted: the state after the melt and the preparation.
+        """
         return state
 
     def seen(self, state: State, velocity: Array) -> tuple[Array, Array | None]:

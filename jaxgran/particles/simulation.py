@@ -133,7 +133,7 @@ class Simulation(NamedTuple):
         if self.melts:
             velocity = initial.settle(velocity, self.dynamics.replicas)
         state = self.dynamics.begin(melted.position, velocity, melted.skin)
-        state = self.dynamics.drawn(state, self.key)
+        state = self.dynamics.drawn(state, self.key, melted)
         if self.directions is None:
             return state
         return self.dynamics.with_tangents(state, self.directions)

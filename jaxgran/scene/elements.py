@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxgran.checks.tracing import is_known
 from jaxgran.checks.validation import FRACTION, NOT_NEGATIVE, POSITIVE, Domain, number
 from jaxgran.scene.restitution import ConstantRestitution, RestitutionLaw
 
@@ -217,8 +218,9 @@ class DrivenStart(eqx.Module):
     """A gas that white noise has driven into a steady state at T_0; at t = 0 it is switched off.
 
     The velocities are then not Maxwellian: a_2 begins at that of the steady state, in which
-    ``da_2/dt = 0`` while the noise returns all that impacts, on walls too, take. Of smooth spheres;
-    drag, where there is some, begins at t = 0.
+    ``da_2/dt = 0`` while the noise returns all that impacts, on walls too, take. Of rough spheres
+    T_rot begins where ``dT_rot/dt = 0``, and their rotational_temperature is to be left out. Drag,
+    where there is some, begins at t = 0.
 
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution.
 
@@ -237,10 +239,12 @@ def share_of_container(gas: Any, num_particles: int | float) -> float:
 def check(gas: Any) -> None:
     """Raise ValueError for elements of a gas that do not go together, or not with its spheres."""
     if gas.preparation is not None and gas.surface is not None:
-        raise ValueError(
-            "preparation=DrivenStart() is known of smooth spheres: leave preparation or surface "
-            "out of the gas"
-        )
+        rotation = gas.surface.rotational_temperature
+        if is_known(rotation) and np.any(np.asarray(rotation) != 0):
+            raise ValueError(
+                "preparation=DrivenStart() determines T_rot at t = 0: leave rotational_temperature "
+                f"or preparation out of the gas, got {np.asarray(rotation)} m^2/s^2"
+            )
     if gas.container is not None:
         rough = isinstance(gas.surface, Rough)
         _check_walls(gas.container, gas.diameter, gas.dimension, rough=rough)

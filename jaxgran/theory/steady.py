@@ -154,6 +154,19 @@ def _steady_ratio(speed: Array, sonine: Array, scene: ReducedScene, d: int) -> A
     return jnp.where(loss > 0, gain / jnp.where(loss > 0, loss, 1.0), 0.0)
 
 
+def scene_at_start(gas: Gas) -> ReducedScene:
+    """The scene of a gas, with T_rot/T of a steady state where white noise has driven it at T_0.
+
+    There is ``dT_rot/dt = 0`` by impacts, on walls too; drag begins at t = 0.
+    """
+    scene = reduced_scene(gas)
+    if scene.prepared is None or scene.surface is None:
+        return scene
+    undriven, like = scene._replace(drive=None, drag=None), jnp.ones_like(gas.temperature)
+    ratio = _steady_ratio(like, jnp.zeros_like(like), undriven, gas.dimension)
+    return scene._replace(surface=scene.surface._replace(ratio=ratio))
+
+
 def prepared(
     first: Float[Array, "moments"], scene: ReducedScene, density: Density, d: int, order: int
 ) -> Float[Array, "moments"]:

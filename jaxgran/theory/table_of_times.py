@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import reduced_scene
 from jaxgran.theory import averages, elements
+from jaxgran.theory.steady import scene_at_start
 
 NUM_NODES = 192
 """Temperatures of the table of times."""
@@ -81,7 +82,7 @@ def cooling_by_elements(
         log_theta: ln(T/T_0).
         ratio: T_rot/T there; without meaning for smooth spheres.
     """
-    scene = reduced_scene(gas)
+    scene = scene_at_start(gas)
     nothing = jnp.zeros((), log_theta.dtype)
 
     def cooling(log_theta, ratio):

@@ -178,9 +178,42 @@ def test_a_gas_that_was_driven_begins_in_its_steady_state(eps):
     plain = driven(dataclasses.replace(prepared(eps), preparation=None), [0.0, 5.0])
     assert float(plain.sonine[0]) == 0.0
     assert float(curve.temperature[1]) != float(plain.temperature[1])
-    rough = {"surface": jaxgran.Rough(0.0)}
-    with pytest.raises(ValueError, match="preparation.*smooth spheres"):
-        dataclasses.replace(prepared(eps), **rough)
+    spinning = {"surface": jaxgran.Rough(0.0, rotational_temperature=1e-3)}
+    with pytest.raises(ValueError, match="determines T_rot at t = 0: leave rotational_temperature"):
+        dataclasses.replace(prepared(eps), **spinning)
+
+
+def rough(eps, beta) -> jaxgran.Gas:
+    return dataclasses.replace(prepared(eps), surface=jaxgran.Rough(beta))
+
+
+@pytest.mark.parametrize("beta", [-0.5, 0.5])
+def test_rough_spheres_that_were_driven_begin_with_the_steady_rotation(beta):
+    curve = driven(rough(0.8, beta), [0.0, 5.0])
+    # dT_rot/dt = 0 of Huthmann & Zippelius: T_rot/T = eta/(1 - eta/q).
+    eta = 0.4 * (1 + beta) / 2.8
+    ratio = eta / (1 - eta / 0.4)
+    np.testing.assert_allclose(curve.rotational_temperature[0], 0.01 * ratio, rtol=1e-12)
+    steady = jaxgran.steady_state(dataclasses.replace(constant(0.8), surface=jaxgran.Rough(beta)))
+    np.testing.assert_allclose(curve.sonine[0], steady.sonine, rtol=1e-6)
+    slope = jax.grad(lambda b: driven(rough(0.8, b), [0.0]).rotational_temperature[0])(beta)
+    in_eta = 1 / (1 - eta / 0.4) ** 2 * 0.4 / 2.8
+    np.testing.assert_allclose(slope, 0.01 * in_eta, rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beta", [-0.5, 0.5])
+def test_rough_particles_are_released_from_the_steady_state(beta):
+    gas = rough(0.8, beta)
+    times = np.array([0.0, 0.5, 2.0, 5.0]) * float(gas.mean_free_time)
+    theory = jaxgran.cool(gas, times)
+    for model in (jaxgran.DSMC(50_000, replicas=2), jaxgran.HardSpheres(500, replicas=32)):
+        curve = jaxgran.cool(gas, times, model=model)
+        np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.02)
+        # Spins and velocities are correlated: up to 7 % of T_rot, see test_dsmc_elements.py.
+        found = np.asarray(curve.rotational_temperature / theory.rotational_temperature)
+        print(f"\n{model.name}, beta_t = {beta}: T_rot over that of theory {found}")
+        np.testing.assert_allclose(found, 1.0, rtol=0.07)
 
 
 def test_dsmc_begins_in_the_steady_state():

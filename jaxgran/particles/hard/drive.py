@@ -106,7 +106,8 @@ def restored(
     A gas that is driven so comes into the steady state of white noise.
     """
     n, d = state.velocity.shape
-    variance = 2 * lost / (n // replicas * d)
+    # By chance the spins of rough spheres give more than impacts take: velocities are then scaled.
+    variance = 2 * jnp.maximum(lost, 0.0) / (n // replicas * d)
     state = kicked(state, scene, replicas, variance)
     each = state.velocity.reshape(replicas, -1)
     size = jnp.sqrt(jnp.mean(each**2, axis=1, keepdims=True))

@@ -92,6 +92,7 @@ class HardDynamics(AbstractDynamics):
         return dataclasses.replace(self, scene=scene, restores=True)
 
     def with_kicks(self, state: State, key: PRNGKeyArray) -> State:
+        state = first_draw(state, self.scene, self.replicas, key)
         return state._replace(own=state.own._replace(key=counted(jax.random.fold_in(key, 4))))
 
     @property
@@ -99,8 +100,11 @@ class HardDynamics(AbstractDynamics):
         walls = self.scene.walls
         return None if walls is None else walls.sides - 1
 
-    def drawn(self, state: State, key: PRNGKeyArray) -> State:
-        return first_draw(state, self.scene, self.replicas, key)
+    def drawn(self, state: State, key: PRNGKeyArray, melted: State) -> State:
+        state = first_draw(state, self.scene, self.replicas, key)
+        if melted.own.spin is None:
+            return state
+        return state._replace(own=state.own._replace(spin=melted.own.spin))
 
     def seen(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
         spin, drag = state.own.spin, self.scene.drag

@@ -105,7 +105,7 @@ class SoftDynamics(AbstractDynamics):
     def seen(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
         return velocity, state.own.spin
 
-    def drawn(self, state: State, key: PRNGKeyArray) -> State:
+    def drawn(self, state: State, key: PRNGKeyArray, melted: State) -> State:
         surface = self.scene.surface
         if surface is None:
             return state

@@ -69,7 +69,7 @@ def prepared(
     state: DSMCState, key: PRNGKeyArray, scene: ReducedScene, scheme: Scheme
 ) -> Float[Array, "replicas N components"]:
     """The particles in the steady state of white noise that returns what impacts take."""
-    losing, d = ReducedScene(scene.law, walls=scene.walls), scheme.dimension
+    losing, d = ReducedScene(scene.law, scene.surface, scene.walls), scheme.dimension
     rate = averages.collision_rate(0.0, d) * scheme.own_step
     words = jax.random.bits(jax.random.fold_in(key, 1), (2,), jnp.uint32)
     share = jnp.ones(len(state.clock), state.clock.dtype)
@@ -81,7 +81,9 @@ def prepared(
         kick = jax.vmap(elements.kicked, (0, 0, 0, None, None, None))
         hot = kick(after.particles, keys, growth, jnp.zeros(()), d, scene.walls is None)
         velocity = initial.settle(hot[..., :d].reshape(-1, d), len(share)) / sqrt(2)
-        particles = state.particles.at[..., :d].set(velocity.reshape(hot[..., :d].shape))
+        velocity = velocity.reshape(hot[..., :d].shape)
+        parts = [velocity, jnp.zeros_like(velocity), hot[..., 2 * d :]]
+        particles = jnp.concatenate(parts, axis=-1)
         return after._replace(particles=particles, temperature=share)
 
     steps = jnp.ceil(PREPARED / rate).astype(jnp.int32)
