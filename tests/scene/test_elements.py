@@ -306,6 +306,8 @@ def test_a_container_that_contradicts_N_and_eta_is_refused():
         jaxgran.read_gas(HEADER | walls | {"container_side": "0.0397"})
     fits = jaxgran.read_gas(HEADER | walls | {"container_side": "0.05"})
     assert fits.container is not None
+    with pytest.raises(ValueError, match="100 spheres of packing_fraction 0.0067 need a container"):
+        jaxgran.choose_model(fits, [1.0], num_particles=100)
 
 
 def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
