@@ -29,7 +29,9 @@ def test_a_search_that_was_cut_short_is_said_to_be():
 def test_dense_measured_curve_is_not_explained():
     gas, curve, a_true, n, _ = measured("dense")
     result = jaxgran.fit(gas, curve)
-    assert 0.7 < result.estimate[0] / a_true < 0.85  # the known failure of kinetic theory here
+    # The known failure of kinetic theory here: 5 to 20 % off, many standard errors of the curve.
+    assert 0.8 < result.estimate[0] / a_true < 0.95
+    assert a_true - result.estimate[0] > 3 * result.error_budget["measurement"][0]
     diagnosis = jaxgran.diagnose(result, curve, n)
     assert not diagnosis.explains
     assert "does not explain this curve" in diagnosis.verdict
