@@ -230,8 +230,8 @@ class HardDynamics(AbstractDynamics):
         impacts, lost = by_replica(work.impacts) // 2, by_replica(work.dissipated)
         wanted = max(0.5 * self.share * len(state.position), LEAST_IMPACTS)
         found = jnp.sum(impacts)
-        if work.bounces is not None:
-            found = found + jnp.sum(work.bounces)
+        if work.bounces is not None:  # of one sphere, and not of two
+            found = found + jnp.sum(work.bounces) / 2
         ratio = (wanted / jnp.maximum(found, 1)) ** WINDOW_EXPONENT
         ratio = jnp.clip(ratio, 0.5, 1.5)
         slots, own = work.slots, state.own
