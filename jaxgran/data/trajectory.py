@@ -50,7 +50,7 @@ class Trajectory:
             raise ValueError(f"a trajectory ends in {' or '.join(FORMATS)}, got {str(path)!r}")
         self.append, count = FORMATS[path.suffix]
         several = replicas > 1
-        names = [path.with_suffix(f".{k}{path.suffix}") for k in range(replicas)]
+        names = [file_of_replica(path, k) for k in range(replicas)]
         self.paths = names if several else [path]
         for file in self.paths:
             check_writable(file)
@@ -152,3 +152,9 @@ def _frames_of_xyz(path: Path) -> int:
 
 
 FORMATS = {GSD: (_append_gsd, _frames_of_gsd), XYZ: (_append_xyz, _frames_of_xyz)}
+
+
+def file_of_replica(path: str | Path, k: int) -> Path:
+    """The file of replica k of several."""
+    path = Path(path)
+    return path.with_suffix(f".{k}{path.suffix}")

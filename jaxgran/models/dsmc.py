@@ -1,5 +1,6 @@
 """Direct simulation Monte Carlo: the velocities of a homogeneous gas, by random collisions."""
 
+import dataclasses
 from functools import partial
 from math import hypot
 from typing import ClassVar
@@ -26,7 +27,7 @@ from jaxgran.data.run import DEFAULTS, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import Course
-from jaxgran.particles import snapshot
+from jaxgran.particles import side_by_side, snapshot
 from jaxgran.particles.drag import transformed
 from jaxgran.particles.driver import follow
 from jaxgran.particles.interruption import waited_for
@@ -124,9 +125,7 @@ class DSMC(AbstractModel):
         A run fails if too many pairs meet faster than the ceiling of the collision rate.
         """
         beyond = checks.beyond_drag(gas, times)
-        key = jax.random.key(0) if run.key is None else run.key
-        # Two words of any kind of key, for the kind that is used here.
-        words = jax.random.bits(key, (2,), jnp.uint32)
+        words = _words(run)
         scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
         scene, reduced = scene_at_start(gas), times * gas.impact_speed / gas.path_length
         if scene.drag is not None:
@@ -138,6 +137,14 @@ class DSMC(AbstractModel):
             records = simulation.differentiable_run(
                 scene, reduced, words, replicas=self.replicas, scheme=scheme, **options
             )
+        elif on := side_by_side.devices(self.replicas):
+            alone = dataclasses.replace(self, replicas=1)
+
+            def one(k: int, run: Run) -> dict[str, Array]:
+                return alone._driven(scene, reduced, _words(run), scheme, units, run)
+
+            runs = side_by_side.side_by_side(one, self.replicas, run, on)
+            records = side_by_side.joined_records(runs)
         else:
             records = self._driven(scene, reduced, words, scheme, units, run)
         curve, failed = _curve(gas, times, records, beyond)
@@ -179,6 +186,12 @@ class DSMC(AbstractModel):
         )
         records["fault"][np.isnan(records["temperature"])] |= fault  # of the driver itself
         return {name: jnp.asarray(value) for name, value in records.items()}
+
+
+def _words(run: Run) -> UInt32[Array, "2"]:
+    """Two words of any kind of key, for the kind that is used here."""
+    key = jax.random.key(0) if run.key is None else run.key
+    return jax.random.bits(key, (2,), jnp.uint32)
 
 
 def _curve(

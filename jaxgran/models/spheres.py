@@ -20,6 +20,7 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.course import Course
 from jaxgran.particles import driver, initial, neighbours, pure, snapshot, user_start
+from jaxgran.particles import side_by_side as beside
 from jaxgran.particles.capacity import Capacity, skin_adding
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.simulation import SMALLEST_BOX, Simulation
@@ -171,6 +172,14 @@ class AbstractSpheres(AbstractModel):
 
     def _outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
         """The run in reduced units: driven from the host if all numbers are known, else pure."""
+        if not any_traced(inputs) and (on := beside.devices(self.replicas)):
+            alone = dataclasses.replace(self, replicas=1, start=None, plan=None)
+
+            def one(k: int, run: Run) -> Outputs:
+                own = beside.inputs_of(inputs, k, self.num_particles, run)
+                return alone._outputs(own, directions, dimension, run)
+
+            return beside.joined(beside.side_by_side(one, self.replicas, run, on))
         plan = self._settled_plan(inputs.scene, dimension)
         side = self.filled_side(inputs.scene)
         skin = skin_adding(self.listed_by_skin, self.num_particles, side, dimension)

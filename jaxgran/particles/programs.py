@@ -37,9 +37,9 @@ def some_stretches(
         return jax.jit(some)(leaves)
     types = tuple((x.shape, x.dtype, getattr(x, "sharding", None)) for x in leaves)
     key = engine, STRETCHES, structure, types
-    if key not in _PROGRAMS:
-        _PROGRAMS[key] = outside_of_transformations(lambda: jax.jit(some).lower(leaves).compile())
-        if len(_PROGRAMS) > MOST_PROGRAMS:
-            _PROGRAMS.popitem(last=False)
-    _PROGRAMS.move_to_end(key)
-    return _PROGRAMS[key](leaves)
+    if (program := _PROGRAMS.pop(key, None)) is None:  # in one step: there are threads
+        program = outside_of_transformations(lambda: jax.jit(some).lower(leaves).compile())
+    _PROGRAMS[key] = program
+    if len(_PROGRAMS) > MOST_PROGRAMS:
+        _PROGRAMS.popitem(last=False)
+    return program(leaves)

@@ -1,0 +1,97 @@
+"""How much faster are two replicas on two CPU devices than on one core?
+
+    python experiments/speed/benchmark_replicas.py [--size 4096] [--smoke] [--out FILE] [--record]
+
+The same two replicas are run in three processes: on one core; on all cores with one device, where
+the replicas stand in one array; and on two CPU devices, one replica on each. Soft and hard spheres
+melt for 10 mean free times and cool for 2, DSMC cools for 60. Times are medians without
+compilation, and a melt counts as 10 collisions per particle.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from experiments.support.record import EXPERIMENTS, add_recording, seconds, write_results
+
+CASES = ("one core", "one device", "two devices")
+MODELS = ("SoftSpheres", "HardSpheres", "DSMC")
+REPEATS = 3
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--size", type=int, default=4096, help="particles of a replica")
+    parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
+    add_recording(parser)
+    options = parser.parse_args()
+    if options.smoke:
+        options.size = 100
+    if options.measure:
+        case, model = options.measure
+        print(json.dumps(measure(case, model, options.size, 1 if options.smoke else REPEATS)))
+        return
+    jax.config.update("jax_enable_x64", True)
+    rows = []
+    for model in MODELS[-1:] if options.smoke else MODELS:
+        row: dict = {"model": model, "num_particles": options.size, "replicas": 2}
+        row |= {case: alone(case, model, options) for case in CASES}
+        row["ratio"] = row[CASES[2]]["collisions_per_s"] / row[CASES[0]]["collisions_per_s"]
+        rows.append(row)
+        rates = ", ".join(f"{case} {row[case]['collisions_per_s']:.0f}" for case in CASES)
+        print(f"{model}: collisions/s {rates}; two devices {row['ratio']:.2f} times one core")
+    write_results("benchmark_replicas", options, options.out, rows=rows)
+
+
+def alone(case: str, model: str, options: argparse.Namespace) -> dict:
+    """What a process of its own measures."""
+    command = [sys.executable, __file__, "--size", str(options.size), "--measure", case, model]
+    command += ["--smoke"] if options.smoke else []
+    environment = dict(os.environ)
+    folders = [str(EXPERIMENTS.parent), environment.get("PYTHONPATH", "")]
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, folders))
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def measure(case: str, name: str, size: int, repeats: int) -> dict:
+    if case == "one core":
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    if case == "two devices":
+        jax.config.update("jax_num_cpu_devices", 2)
+    jax.config.update("jax_enable_x64", True)
+    import jaxgran
+    from experiments.support.scenes import beads
+
+    gas = beads(0.1, 0.15, contact_fraction=0.01)
+    model = getattr(jaxgran, name)(size, replicas=2)
+    times = np.array([60.0 if name == "DSMC" else 2.0]) * float(gas.mean_free_time)
+
+    def cooled():
+        collisions = jaxgran.cool(gas, times, model=model, progress=False).collisions
+        assert collisions is not None
+        return collisions
+
+    compile_s, run_s = seconds(cooled, repeats)
+    collisions = float(cooled()[-1]) + (0 if name == "DSMC" else 10)
+    return {
+        "compile_s": compile_s,
+        "run_s": run_s,
+        "collisions_per_s": collisions * size / run_s,
+    }
+
+
+if __name__ == "__main__":
+    main()

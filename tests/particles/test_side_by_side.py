@@ -1,0 +1,106 @@
+"""Replicas as runs of their own. One device stands for two, but for one test in another process."""
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.data.run import Run
+from jaxgran.particles import side_by_side
+from jaxgran.particles.interruption import waited_for
+
+TIMES = jnp.array([0.01, 0.03])
+MODELS = {"DSMC": 200, "HardSpheres": 20, "SoftSpheres": 20}
+
+
+@pytest.fixture
+def two_devices(monkeypatch):
+    device = jax.devices()[0]
+    monkeypatch.setattr(side_by_side, "devices", lambda n: (device,) * 2 if n > 1 else ())
+
+
+def cool(gas, name, replicas, **options):
+    model = getattr(jaxgran, name)(MODELS[name], replicas=replicas)
+    return jaxgran.cool(gas, TIMES, model=model, progress=False, **options)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_replica_is_the_same_whoever_runs_beside_it(name, beads, two_devices):
+    gas, key = beads(packing_fraction=0.1), jax.random.key(4)
+    two, three = cool(gas, name, 2, key=key), cool(gas, name, 3, key=key)
+    for field in ("temperature", "collisions", "displacement"):
+        each = [np.asarray(getattr(curve.replicas, field)) for curve in (two, three)]
+        np.testing.assert_array_equal(each[0], each[1][:2])
+    alone = cool(gas, name, 1, key=jax.random.fold_in(key, 1))
+    np.testing.assert_array_equal(two.replicas.temperature[1], alone.temperature)
+    if two.particles is not None:
+        np.testing.assert_array_equal(two.particles.velocity, three.particles.velocity[:2])
+        np.testing.assert_array_equal(two.particles.position[1], alone.particles.position[0])
+    assert two.temperature_error.shape == TIMES.shape
+
+
+def test_a_start_is_parted_and_derivatives_are_of_the_same_runs(beads, two_devices):
+    gas = beads(packing_fraction=0.1)
+    start = cool(gas, "HardSpheres", 2).particles
+    model = jaxgran.HardSpheres(MODELS["HardSpheres"], replicas=2, start=start)
+
+    def temperature(a):
+        changed = gas.replace(dissipative_constant=a)
+        return jaxgran.cool(changed, TIMES, model=model, progress=False).replicas.temperature
+
+    a = gas.value("dissipative_constant")
+    values, slopes = jax.jvp(temperature, (a,), (a,))
+    np.testing.assert_array_equal(values, temperature(a))
+    assert slopes.shape == (2, 2) and np.all(slopes[:, -1] < 0)
+    for k in range(2):
+        part = start._replace(
+            position=start.position[k : k + 1], velocity=start.velocity[k : k + 1]
+        )
+        one = jaxgran.HardSpheres(MODELS["HardSpheres"], start=part)
+        alone = jaxgran.cool(gas, TIMES, model=one, progress=False)
+        np.testing.assert_array_equal(values[k], alone.temperature)
+
+
+def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
+    gas, path = beads(packing_fraction=0.1), tmp_path / "run.ckpt"
+    curve = cool(gas, "DSMC", 2, checkpoint=path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.ckpt.0", "run.ckpt.1"]
+    np.testing.assert_array_equal(
+        cool(gas, "DSMC", 2, checkpoint=path).temperature, curve.temperature
+    )
+    path.touch()
+    with pytest.raises(ValueError, match="written with one CPU device"):
+        cool(gas, "DSMC", 2, checkpoint=path)
+
+
+def test_an_error_of_one_ends_the_others_and_is_raised():
+    begun, devices = threading.Barrier(2), (jax.devices()[0],) * 2
+
+    def one(k, run):
+        begun.wait(timeout=20)
+        if k == 0:
+            raise RuntimeError("of the first")
+        while True:  # until it is told to stop
+            waited_for(jnp.zeros(()))
+
+    with pytest.raises(RuntimeError, match="of the first"):
+        side_by_side.side_by_side(one, 2, Run(), devices)
+
+
+def test_replicas_stand_in_one_array_where_there_is_one_device_or_a_chosen_one():
+    assert side_by_side.devices(1) == () and side_by_side.devices(2) == ()
+
+
+@pytest.mark.slow  # two devices need a process of their own, which compiles for each
+@pytest.mark.parametrize("name", MODELS)
+def test_two_real_devices(name):
+    command = [sys.executable, "-m", "tests.particles.two_devices", name]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    assert "independent on 2 devices" in done.stdout, done.stderr
