@@ -4,8 +4,9 @@
 
 The same two replicas are run in three processes: on one core; on all cores with one device, where
 the replicas stand in one array; and on two CPU devices, one replica on each. Soft and hard spheres
-melt for 10 mean free times and cool for 2, DSMC cools for 60. Times are medians without
-compilation, and a melt counts as 10 collisions per particle.
+melt for 10 mean free times, and cool for as long as makes a run of some tenths of a second, as DSMC
+does in a gas that dissipates little. Times are medians without compilation, and a melt counts as 10
+collisions per particle.
 """
 
 import argparse
@@ -22,6 +23,9 @@ from experiments.support.record import EXPERIMENTS, add_recording, seconds, writ
 
 CASES = ("one core", "one device", "two devices")
 MODELS = ("SoftSpheres", "HardSpheres", "DSMC")
+COOLING = {"SoftSpheres": 5.0, "HardSpheres": 20.0, "DSMC": 500.0}
+"""Mean free times of cooling."""
+
 REPEATS = 3
 
 
@@ -75,9 +79,9 @@ def measure(case: str, name: str, size: int, repeats: int) -> dict:
     import jaxgran
     from experiments.support.scenes import beads
 
-    gas = beads(0.1, 0.15, contact_fraction=0.01)
+    gas = beads(0.1, 0.01 if name == "DSMC" else 0.15, contact_fraction=0.01)
     model = getattr(jaxgran, name)(size, replicas=2)
-    times = np.array([60.0 if name == "DSMC" else 2.0]) * float(gas.mean_free_time)
+    times = np.array([COOLING[name]]) * float(gas.mean_free_time)
 
     def cooled():
         collisions = jaxgran.cool(gas, times, model=model, progress=False).collisions

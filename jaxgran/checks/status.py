@@ -89,6 +89,11 @@ NOT_TAKEN = Fault(
     "the model does not take this gas",
     "call jaxgran.cool for it alone, which says why",
 )
+NO_ROOM = Fault(
+    16384,
+    "spheres at random places still overlap after many pushes apart",
+    "lower the packing fraction, or give your own start",
+)
 FAULTS = (
     LIST_FULL,
     CONTACTS_FULL,
@@ -104,6 +109,7 @@ FAULTS = (
     ENERGY_DRIFT,
     OUT_OF_RANGE,
     NOT_TAKEN,
+    NO_ROOM,
 )
 
 

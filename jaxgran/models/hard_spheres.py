@@ -146,7 +146,7 @@ class HardSpheres(AbstractSpheres):
             return  # looked at when it runs
         start, side = self.start, self.start.box_side / gas.diameter
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
-        closest = float(user_start.closest(position, side, self.replicas, 8 * len(position)))
+        closest = float(user_start.closest(position, side, self.replicas, (8 * len(position), 0)))
         if closest < 1 - user_start.overlap_by_rounding(position, side, OVERLAP):
             raise ValueError(
                 f"two spheres of the start are {closest:.9g} diameters apart, hard spheres must "

@@ -7,12 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
-from jaxgran.checks.tracing import any_traced, concrete
+from jaxgran.checks.tracing import concrete
 from jaxgran.particles.neighbours import vesin_search
 
 PACKING_LIMIT = {2: 0.65, 3: 0.48}
 """Largest packing fraction of a random start, which is a fluid; hard disks and spheres freeze at
 slightly larger ones."""
+
+GAP = 1e-3
+"""Smallest distance between the surfaces to which a pair is pushed apart."""
+
+MOST_PUSHES = 20_000
+"""Pushes of all pairs after which to give up."""
 
 
 def velocities(
@@ -52,6 +58,8 @@ def positions(
 ) -> Float[Array, "particles d"]:
     """Random positions of unit spheres without overlap in periodic boxes, computed on the host.
 
+    `jaxgran.particles.relaxation` does the same in compiled code, with other random gaps.
+
     The spheres are first placed at uniform random points. Then all overlapping pairs are pushed
     apart, both spheres by the same distance, and again until no overlap is left. For a dilute gas
     the result is close to equilibrium; a dense gas should be melted afterwards.
@@ -72,14 +80,14 @@ def positions(
         RuntimeError: if overlaps are left after many pushes, which means that the packing is too
             dense.
     """
-    shape = (replicas * num_particles, dimension)
-    uniform = jax.random.uniform(key, shape, jnp.result_type(float))
-    host = _OverlapRemoval(replicas)
+    uniform = uniform_points(key, replicas * num_particles, dimension)
     within = () if room is None else (room,)
-    if not any_traced(uniform, side, *within):
-        return concrete(host(uniform, side, *within))
-    out = jax.ShapeDtypeStruct(shape, uniform.dtype)
-    return jax.pure_callback(host, out, uniform, side, *within, vmap_method="sequential")
+    return concrete(_OverlapRemoval(replicas)(uniform, side, *within))
+
+
+def uniform_points(key: PRNGKeyArray, number: int, dimension: int) -> Float[Array, "particles d"]:
+    """Uniform random points in [0, 1)."""
+    return jax.random.uniform(key, (number, dimension), jnp.result_type(float))
 
 
 class _OverlapRemoval(NamedTuple):
@@ -87,13 +95,12 @@ class _OverlapRemoval(NamedTuple):
 
     Attributes:
         replicas: number of boxes.
-        gap: smallest distance between the surfaces to which a pair is pushed apart.
-        max_pushes: number of pushes of all pairs after which to give up.
+        gap, max_pushes: as `GAP` and `MOST_PUSHES`.
     """
 
     replicas: int
-    gap: float = 1e-3
-    max_pushes: int = 20_000
+    gap: float = GAP
+    max_pushes: int = MOST_PUSHES
 
     def __call__(self, uniform, side, room=None):
         uniform, side = np.asarray(uniform), float(side)
@@ -108,7 +115,7 @@ class _OverlapRemoval(NamedTuple):
     ) -> Float[np.ndarray, "n d"]:
         cutoff, built, random = min(1.4, side / 2), None, np.random.default_rng(len(x))
         volume = side ** x.shape[1] if room is None else float(np.prod(room + 1))
-        largest_gap = _largest_gap(len(x), x.shape[1], volume)
+        at_random = float(largest_gap(len(x), x.shape[1], volume))
         i = j = np.empty(0, int)
         for _ in range(self.max_pushes):
             moved = np.inf if built is None else np.sqrt(np.max(np.sum((x - built) ** 2, axis=1)))
@@ -125,7 +132,7 @@ class _OverlapRemoval(NamedTuple):
             apart, distance = apart[close], distance[close]
             # Coincident points part along the first axis.
             apart[distance == 0, 0] = distance[distance == 0] = 1e-9
-            target = 1 + self.gap + largest_gap * random.random(len(distance))
+            target = 1 + self.gap + at_random * random.random(len(distance))
             push = (0.5 * (target - distance) / distance)[:, None] * apart
             for axis in range(x.shape[1]):
                 x[:, axis] += np.bincount(i[close], push[:, axis], len(x))
@@ -138,13 +145,13 @@ class _OverlapRemoval(NamedTuple):
         )
 
 
-def _largest_gap(n: int, d: int, volume: float) -> float:
+def largest_gap(n: int, d: int, volume: ArrayLike) -> Float[Array, ""]:
     """Largest gap that is added at random between pushed pairs.
 
     With equal gaps all these pairs would touch again at the same moment.
     """
-    filled = n / volume * {2: np.pi / 4, 3: np.pi / 6}[d]
-    return 0.1 * max(0.0, 1 - 1.5 * filled / PACKING_LIMIT[d])
+    filled = n / jnp.asarray(volume) * {2: np.pi / 4, 3: np.pi / 6}[d]
+    return 0.1 * jnp.maximum(0.0, 1 - 1.5 * filled / PACKING_LIMIT[d])
 
 
 def _wrapped(x: Float[np.ndarray, "n d"], side: float) -> Float[np.ndarray, "n d"]:

@@ -69,8 +69,9 @@ def wrap(side: ArrayLike, position: Float[Array, "... d"]) -> Float[Array, "... 
 def engine(name: str, ahead: int = 0, traced: bool = False) -> str:
     """The builder of neighbour lists to use: `name`, or for "auto" the fastest, as measured.
 
-    The fastest is jax-md on a GPU, outside of compiled code. On a CPU and in compiled code it is a
-    sweep up to a look-ahead of `MOST_AHEAD`, and vesin beyond.
+    The fastest is jax-md on a GPU, outside of compiled code. On a CPU it is a sweep up to a
+    look-ahead of `MOST_AHEAD`, and vesin beyond. In compiled code it is a sweep, which calls
+    nothing on the host.
 
     Args:
         name: one of `ENGINES`.
@@ -89,8 +90,7 @@ def engine(name: str, ahead: int = 0, traced: bool = False) -> str:
         return name
     if jax.default_backend() != "cpu" and not traced:
         return "jax-md"
-    most = 2 * MOST_AHEAD if traced else MOST_AHEAD  # traced: capacities are twice the need
-    return "sweep" if ahead <= most else "vesin"
+    return "sweep" if traced or ahead <= MOST_AHEAD else "vesin"
 
 
 def find_pairs(

@@ -23,7 +23,7 @@ def simulate(sim: Simulation) -> Outputs:
     side = dynamics.scene.side
     # In a smaller box a new neighbour list is at once stale, and stretches would not end.
     fault = status.flag(status.BOX_TOO_SMALL, side < SMALLEST_BOX)
-    state = sim.first_state()
+    state, fault = sim.compiled_first_state(fault)
     if sim.melts:
         melting = dynamics.elastic().with_capacity(sim.melt_capacity)
         state, fault, _ = stretches(melting, state, sim.melt_time, engine, 0, None, fault)

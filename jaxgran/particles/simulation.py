@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from jaxgran.data.curve import Particles
-from jaxgran.particles import initial, neighbours, snapshot
+from jaxgran.particles import initial, neighbours, relaxation, snapshot
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.state import State, centred
@@ -117,12 +117,35 @@ class Simulation(NamedTuple):
         if self.inputs.start is not None:
             position, velocity = self.inputs.start
             return self.dynamics.begin(position, velocity - self.drift, self.skin)
-        places, speeds = jax.random.split(self.key)
-        size = self.dynamics.replicas, self.num_particles, self.dimension
-        side, room = self.dynamics.scene.side, self.dynamics.room
-        position = initial.positions(places, side, *size, room)
-        position = position if room is None else position + 0.5
-        return self.dynamics.begin(position, initial.velocities(speeds, *size), self.skin)
+        places, _ = jax.random.split(self.key)
+        return self._at_random(initial.positions(places, *self._box))
+
+    def compiled_first_state(self, fault: Array) -> tuple[State, Array]:
+        """The same without a call to the host, and the status, from that before."""
+        if self.inputs.start is not None:
+            return self.first_state(), fault
+        places, _ = jax.random.split(self.key)
+        side, *size, room = self._box
+        lists = self.melt_capacity.pairs, self.melt_capacity.lookahead
+        sizes = size[0], size[1], size[2]
+        found, fault = relaxation.positions(places, side, sizes, self.skin, lists, room, fault)
+        return self._at_random(found), fault
+
+    @property
+    def _box(self) -> tuple[Array, int, int, int, Array | None]:
+        """Side, replicas, particles in each, dimension and room."""
+        dynamics = self.dynamics
+        size = dynamics.replicas, self.num_particles, self.dimension
+        return dynamics.scene.side, *size, dynamics.room
+
+    def _at_random(self, position: Array) -> State:
+        """The state of random velocities at given positions."""
+        _, speeds = jax.random.split(self.key)
+        position = position if self.dynamics.room is None else position + 0.5
+        velocity = initial.velocities(
+            speeds, self.dynamics.replicas, self.num_particles, self.dimension
+        )
+        return self.dynamics.begin(position, velocity, self.skin)
 
     def cooling_state(self, melted: State) -> State:
         """The state at t = 0, from that at the end of the melt; with tangents if they are wanted.

@@ -80,15 +80,22 @@ def reduced(
 
 
 def closest(
-    position: Float[Array, "n d"], side: ArrayLike, replicas: int, num_pairs: int
+    position: Float[Array, "n d"],
+    side: ArrayLike,
+    replicas: int,
+    capacity: tuple[int, int],
+    by: str = "vesin",
 ) -> Float[Array, ""]:
     """The least distance between two spheres, in diameters; 1 if none is below.
 
-    `num_pairs` is the number of overlapping pairs that can be looked at.
+    Args:
+        position, side, replicas, by: as in `neighbours.find_pairs`.
+        capacity: numbers of overlapping pairs, and of particles that a sweep looks ahead.
     """
-    pairs = neighbours.find_pairs(position, side, 1.0, replicas=replicas, capacity=num_pairs)
+    found = neighbours.search(position, side, 1.0, replicas, capacity, by)
+    pairs = neighbours.with_offsets(position, side, found)
     apart = position[pairs.i] - position[pairs.j] - pairs.offset
-    real = jnp.arange(num_pairs) < pairs.count
+    real = jnp.arange(capacity[0]) < pairs.count
     square = jnp.where(real, jnp.sum(apart * apart, -1), 1.0)
     return jnp.sqrt(jnp.min(square, initial=1.0))
 

@@ -235,6 +235,14 @@ def test_particle_benchmark_runs(tmp_path):
 
 
 @pytest.mark.slow
+def test_benchmark_of_replicas_runs(tmp_path):
+    done = run("speed/benchmark_replicas.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    assert row["ratio"] > 0 and row["two devices"]["run_s"] > 0
+
+
+@pytest.mark.slow
 def test_stochastic_benchmark_runs(tmp_path):
     done = run("speed/benchmark_dsmc.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

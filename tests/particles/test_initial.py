@@ -47,16 +47,6 @@ def test_dilute_positions_fill_the_box_evenly():
     assert np.sum((counts - n / 27) ** 2) / (n / 27) < 26 + 5 * 7
 
 
-def test_positions_under_jit_and_vmap():
-    def place(side):
-        return positions(jax.random.key(4), side, 2, 20, 2)
-
-    sides = jnp.array([6.0, 8.0])
-    swept = jax.jit(jax.vmap(place))(sides)
-    for k in range(2):
-        np.testing.assert_array_equal(swept[k], place(sides[k]))
-
-
 def test_two_spheres_in_the_smallest_box():
     x = np.asarray(positions(jax.random.key(5), 2.0, 20, 2, 3))
     assert np.all(x >= 0) and np.all(x < 2.0)

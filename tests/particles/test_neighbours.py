@@ -253,12 +253,12 @@ def test_displacement_is_the_shortest():
 def test_engine_follows_the_device_and_the_gas(monkeypatch):
     assert engine("vesin", 1) == "vesin" and engine("sweep", 10**6) == "sweep"
     assert engine("jax-md") == "jax-md"
-    for device, dense, traced in (("cpu", "vesin", "vesin"), ("gpu", "jax-md", "vesin")):
+    for device, dense in (("cpu", "vesin"), ("gpu", "jax-md")):
         monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
         assert engine("auto", MOST_AHEAD + 1) == dense
         assert engine("auto", MOST_AHEAD) == ("sweep" if device == "cpu" else "jax-md")
-        assert engine("auto", 2 * MOST_AHEAD, traced=True) == "sweep"
-        assert engine("auto", 2 * MOST_AHEAD + 1, traced=True) == traced
+        # Compiled code calls nothing on the host.
+        assert engine("auto", 10 * MOST_AHEAD, traced=True) == "sweep"
 
 
 def test_unknown_engines_are_refused():

@@ -45,6 +45,11 @@ def drop(f: dict) -> str:
     return f"Told of walls and roughness, its interval holds A in {f['held']} of {f['runs']} runs."
 
 
+def devices(f: dict) -> str:
+    ratios = between((row["ratio"] for row in f["rows"]), "{:.2f}")
+    return f"Two replicas are {ratios} times as fast as on one core."
+
+
 def coverage(f: dict) -> str:
     return f"In {between((100 * row['coverage'] for row in f['rows']), '{:.0f}')} % of single runs."
 
@@ -369,6 +374,15 @@ ENTRIES = {
             theory,
             "",
             "40 s",
+            "speed.md",
+        ),
+        Entry(
+            "speed/benchmark_replicas.py",
+            "How much do two CPU devices help?",
+            "benchmark_replicas",
+            devices,
+            "",
+            "3 min",
             "speed.md",
         ),
         Entry(

@@ -94,6 +94,10 @@ def dsmc(found: dict) -> str:
     return f"{each(rates)} million collisions/s"
 
 
+def replicas(found: dict) -> str:
+    return ", ".join(f"{row['model']} {row['ratio']:.2f}×" for row in found["rows"])
+
+
 def sweep(found: dict) -> str:
     row = found["sweep"]
     return f"{row['ratio_scipy_over_vmap']:.0f}× faster ({row['vmap_run_s']:.2f} s)"
@@ -229,6 +233,13 @@ ROWS = (
         "benchmark_dsmc",
         dsmc,
         "python experiments/speed/benchmark_dsmc.py",
+    ),
+    Row(
+        "two replicas of N = 4096 on two CPU devices, collisions a second",
+        "the same on one core",
+        "benchmark_replicas",
+        replicas,
+        "python experiments/speed/benchmark_replicas.py",
     ),
     Row(
         "rough spheres, walls: hard spheres, N = 4096",

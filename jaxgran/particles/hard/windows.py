@@ -127,7 +127,7 @@ class HardDynamics(AbstractDynamics):
 
     def check_start(self, state: State) -> Int[Array, ""]:
         x, side = state.position, self.scene.side
-        closest = user_start.closest(x, side, self.replicas, self.capacity.pairs)
+        closest = user_start.closest(x, side, self.replicas, self.capacity[:2], "sweep")
         tolerance = user_start.overlap_by_rounding(x, side, self.overlap)
         return status.flag(status.OVERLAPPING, closest < 1 - tolerance)
 
