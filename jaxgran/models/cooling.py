@@ -42,7 +42,8 @@ def cool(
     The model is a description; `key`, `progress`, `checkpoint` and `throw` are options of this run.
     Called with known numbers, a particle model is run from the host, which enlarges its arrays
     where they are too small, shows progress and writes checkpoints. Called inside `jax.jit`,
-    `jax.vmap` or a derivative it is a pure function of arrays.
+    `jax.vmap` or a derivative it is a pure function of arrays, which calls nothing on the host; a
+    random start then is another one of the same kind.
 
     Args:
         gas: the scene; its floats may be traced, differentiated and batched with `jax.vmap`.
@@ -51,11 +52,13 @@ def cool(
             cheapest whose estimated error is small enough; `jaxgran.choose_model` says which, and
             why.
         key: of the random numbers of a particle model. Without one it is `jax.random.key(0)`: two
-            such calls return the same numbers.
+            such calls return the same numbers. Where there are several CPU devices each replica is
+            a run of its own on one of them, with the key ``fold_in(key, k)``.
         progress: show a progress bar on a terminal during a run of some seconds.
         checkpoint: a file to which a particle model's run is saved each minute and when it is
             interrupted, and from which it is resumed; the resumed run gives the same numbers bit
-            for bit. Not inside `jax.jit` and `jax.vmap`.
+            for bit. Not inside `jax.jit` and `jax.vmap`. Replicas on several CPU devices have a
+            file each, with the endings .0, .1, ...
         save: of a model with particles: a function that JAX can compile, of the `Particles` of one
             replica (arrays of shape (N, d), SI), which returns arrays in any tree; see
             `jaxgran.observables`. Its mean over replicas at each time is ``curve.saved``, its

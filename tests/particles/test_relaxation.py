@@ -61,7 +61,7 @@ def test_dilute_spheres_stay_where_they_are_put():
 def test_spheres_stay_within_their_room():
     side, room = 8.0, jnp.array([3.0, 4.0, 5.5])
     x, fault = positions(jax.random.key(0), side, (1, 50, 3), 0.4, (1000, 60), room)
-    assert fault == status.OK and np.all((x >= 0) & (x <= room))
+    assert fault == status.OK and np.all((x >= 0) & (x <= room[None]))
     assert closest(np.asarray(x), side, periodic=False) >= 1 + initial.GAP / 2
 
 
