@@ -79,6 +79,20 @@ def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
         cool(gas, "DSMC", 2, checkpoint=path)
 
 
+def test_what_is_saved_and_written_is_that_of_each_replica(beads, two_devices, tmp_path):
+    gas, key = beads(packing_fraction=0.1), jax.random.key(4)
+    files = {"save": fastest, "trajectory": tmp_path / "run.xyz"}
+    two = cool(gas, "HardSpheres", 2, key=key, **files)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.0.xyz", "run.1.xyz"]
+    alone = cool(gas, "HardSpheres", 1, key=jax.random.fold_in(key, 1), save=fastest)
+    np.testing.assert_array_equal(two.replicas.saved[1], alone.replicas.saved[0])
+    assert two.saved.shape == (2, 2)  # times, and the two numbers of `fastest`
+
+
+def fastest(particles):
+    return jnp.sort(jnp.sum(particles.velocity**2, axis=1))[-2:]
+
+
 def test_an_error_of_one_ends_the_others_and_is_raised():
     begun, devices = threading.Barrier(2), (jax.devices()[0],) * 2
 
