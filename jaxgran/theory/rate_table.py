@@ -112,6 +112,11 @@ class RateTable(eqx.Module):
             x = 2 * (1 - log_theta / self.lowest) - 1
         else:
             x = 2 * (log_theta - self.lowest) / (self.highest - self.lowest) - 1
+        if self.coefficients.ndim > 3:  # of many functions a product with a matrix is faster
+            polynomials = [jnp.ones_like(x), x]
+            for _ in range(2, len(self.coefficients)):
+                polynomials.append(2 * x * polynomials[-1] - polynomials[-2])
+            return jnp.tensordot(jnp.stack(polynomials), self.coefficients, 1)
         # Clenshaw's recurrence, from the highest term down.
         last = before = jnp.zeros_like(self.coefficients[0])
         for row in self.coefficients[:0:-1]:

@@ -76,7 +76,7 @@ def memory(table: Table) -> None:
             f"printed {row['paper'][-1]:.3f} (ε = {e:.2f})",
             "DSMC, hard spheres",
             "corrected",
-            abs(row["by_slope"][-1] / row["by_slope_theory"][-1] - 1) < 0.03,
+            abs(row["by_slope"][-1] / row["by_slope_theory"][-1] - 1) < 0.01,
             "the gas cools while it remembers: dD/dt = T − D/τ_v, T τ_E 4/(1 + ε)² for constant ε",
         )
         worst = np.abs(np.array(row["by_slope"]) / np.array(row["by_slope_theory"]) - 1).max()
