@@ -199,12 +199,14 @@ def test_a_picture_of_a_long_curve_draws_some_of_it(tmp_path):
 # --- derivatives ---------------------------------------------------------------------------------
 
 MODELS = [
-    pytest.param(jaxgran.SoftSpheres(20, replicas=2), marks=pytest.mark.slow),
-    pytest.param(jaxgran.HardSpheres(20, replicas=2), marks=pytest.mark.slow),
+    jaxgran.SoftSpheres(20, replicas=2),
+    jaxgran.HardSpheres(20, replicas=2),
     jaxgran.DSMC(20, replicas=2),
 ]
 
 
+# What is not known is nan in the default tests of derivatives with elements, too.
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_what_is_not_known_has_no_derivative(model):
     def curve(log_scale):
@@ -380,7 +382,8 @@ def test_soft_spheres_start_overlapped_and_at_rest(overlap):
     np.testing.assert_allclose(total, total[0], rtol=3e-3)
 
 
-@pytest.mark.parametrize("beta", [pytest.param(300.0, marks=pytest.mark.slow), 1e4])
+@pytest.mark.slow
+@pytest.mark.parametrize("beta", [300.0, 1e4])
 def test_heavily_damped_impacts_end(beta):
     gas = glass_beads(beta, packing_fraction=0.02)
     start = two_spheres(gas, 1.05, 0.1)

@@ -25,7 +25,7 @@ from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import MOST_IDLE, AbstractDynamics
 from jaxgran.particles.interruption import waited_for
 from jaxgran.particles.simulation import SETTLED, Simulation
-from jaxgran.particles.state import State
+from jaxgran.particles.state import State, empty_records, spoil
 from jaxgran.tangents.rule import Outputs
 
 CHECKPOINT_SECONDS = 60.0
@@ -83,7 +83,7 @@ def follow(
     Returns:
         The last state; the records with a first axis of times, nan from a failure on; the status.
     """
-    done, state, records = _resumed(path, scene, state, _empty(observe(state), len(times)))
+    done, state, records = _resumed(path, scene, state, empty_records(observe(state), len(times)))
     saved, idle = time.monotonic(), 0
 
     def save():
@@ -110,7 +110,7 @@ def follow(
             raise
         except Failure as failure:
             fault = failure.fault
-            _spoil(records, done)
+            spoil(records, done)
     return state, records, fault
 
 
@@ -124,24 +124,12 @@ def _record(records: dict[str, np.ndarray], done: int, observed: dict[str, jax.A
         records[name][done] = value
 
 
-def _spoil(records: dict[str, np.ndarray], done: int) -> None:
-    """Nan from the time of a failure on; 0 where there is no nan."""
-    for values in records.values():
-        values[done:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
-
-
 def _idle(idle: int, before: S, state: S) -> int:
     """How often in a row the time has not advanced; Failure if too often."""
     idle = idle + 1 if float(state.time) <= float(before.time) else 0
     if idle >= MOST_IDLE:
         raise Failure(status.STALLED.bit)
     return idle
-
-
-def _empty(observed: dict[str, jax.Array], num_times: int) -> dict[str, np.ndarray]:
-    """Records at so many times, of the shapes and types of those at one time."""
-    each = {name: np.asarray(value) for name, value in observed.items()}
-    return {name: np.zeros((num_times, *v.shape), v.dtype) for name, v in each.items()}
 
 
 def _resumed(
@@ -202,7 +190,7 @@ def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
     state = sim.cooling_state(state)
     try:
         if fault == status.OK:  # counts the energy in contacts
-            state = _advance(state, 0.0, dynamics, dynamics.capacity, engine)
+            state = _advance(state, 0.0, dynamics, dynamics.capacity, engine, run.progress)
     except Failure as failure:
         fault = failure.fault
     times = np.asarray(sim.inputs.times)
@@ -210,7 +198,7 @@ def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
     scene = {} if run.checkpoint is None else described(**given)
 
     def advance(state: State, end: float) -> State:
-        return _advance(state, end, dynamics, dynamics.capacity, engine)
+        return _advance(state, end, dynamics, dynamics.capacity, engine, run.progress)
 
     state, records, fault = follow(
         state,
@@ -253,21 +241,27 @@ def _melt(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[S
     def advance(state: State, end: float) -> State:
         crowded = float(state.time) < settled
         capacity = sim.melt_capacity if crowded else elastic.capacity
-        return _advance(state, end, elastic, capacity, engine)
+        return _advance(state, end, elastic, capacity, engine, progress)
 
     end = np.asarray([sim.melt_time])
     state, _, fault = follow(state, end, advance, elastic.observe, progress=progress, label="melt")
     steady = sim.dynamics.preparing
     if steady is None or fault != status.OK:
         return state, fault
-    prepare = partial(_advance, dynamics=steady, capacity=steady.capacity, engine=engine)
+    kept = {"capacity": steady.capacity, "engine": engine, "progress": progress}
+    prepare = partial(_advance, dynamics=steady, **kept)
     state, end = steady.with_kicks(state, sim.key), np.asarray([sim.prepared_time])
     state, _, fault = follow(state, end, prepare, steady.observe, progress=progress, label="melt")
     return state, fault
 
 
 def _advance(
-    state: State, end: float, dynamics: AbstractDynamics, capacity: Capacity, engine: str
+    state: State,
+    end: float,
+    dynamics: AbstractDynamics,
+    capacity: Capacity,
+    engine: str,
+    progress: bool,
 ) -> State:
     """Some stretches towards an end, in arrays that grow from a given capacity.
 
@@ -277,7 +271,7 @@ def _advance(
     while True:
         room = _GROWN.get(capacity, capacity)
         roomy = dynamics if dynamics.capacity == room else dynamics.with_capacity(room)
-        state, fault, needed = _some_stretches(roomy, state, end, engine)
+        state, fault, needed = _some_stretches(roomy, state, end, engine, progress)
         if fault == status.OK:
             return state
         full = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
@@ -288,12 +282,14 @@ def _advance(
 
 
 def _some_stretches(
-    dynamics: AbstractDynamics, state: State, end: float, engine: str
+    dynamics: AbstractDynamics, state: State, end: float, engine: str, progress: bool
 ) -> tuple[State, int, list[int]]:
     """Several stretches in one compiled call, or one if the host finds the pairs."""
     if engine == "sweep":
         until = np.asarray(end, state.time.dtype)
-        state, fault, needed = waited_for(programs.some_stretches(dynamics, state, until, engine))
+        state, fault, needed = waited_for(
+            programs.some_stretches(dynamics, state, until, engine, progress)
+        )
         return state, int(fault), np.asarray(needed).tolist()
     now = waited_for(dynamics.stretch(state, end, engine))
     fault = int(now.status)

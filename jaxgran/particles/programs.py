@@ -1,6 +1,9 @@
 """Compiled programs of the host driver, which are kept."""
 
+import sys
 from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -15,6 +18,22 @@ from jaxgran.particles.state import State
 STRETCHES = 8
 """Neighbour lists used in one call of compiled code; progress is shown between calls."""
 
+COMPILING = "compiling ..."
+
+
+@contextmanager
+def compiling(progress: bool) -> Iterator[None]:
+    """Say "compiling ..." on a terminal as long as the block lasts; the progress bar follows."""
+    shown = progress and sys.stderr.isatty()
+    if shown:
+        print(f"\r{COMPILING}", end="", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        if shown:
+            print(f"\r{' ' * len(COMPILING)}\r", end="", file=sys.stderr, flush=True)
+
+
 MOST_PROGRAMS = 32
 """Compiled programs that are kept; beyond that the one unused for longest is released."""
 
@@ -24,7 +43,7 @@ are bounded in number, and shared by plain runs and those inside a rule of diffe
 
 
 def some_stretches(
-    dynamics: AbstractDynamics, state: State, end: np.ndarray, engine: str
+    dynamics: AbstractDynamics, state: State, end: np.ndarray, engine: str, progress: bool = False
 ) -> tuple[State, Array, Array]:
     """`STRETCHES` stretches, compiled for the types and the static fields of these arguments."""
     leaves, structure = jax.tree.flatten((dynamics, state, end))
@@ -38,7 +57,8 @@ def some_stretches(
     types = tuple((x.shape, x.dtype, getattr(x, "sharding", None)) for x in leaves)
     key = engine, STRETCHES, structure, types
     if (program := _PROGRAMS.pop(key, None)) is None:  # in one step: there are threads
-        program = outside_of_transformations(lambda: jax.jit(some).lower(leaves).compile())
+        with compiling(progress):
+            program = outside_of_transformations(lambda: jax.jit(some).lower(leaves).compile())
     _PROGRAMS[key] = program
     if len(_PROGRAMS) > MOST_PROGRAMS:
         _PROGRAMS.popitem(last=False)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxgran.particles import neighbours, observables
@@ -173,3 +174,15 @@ def derivatives_of_records(
         "collisions": meeting,
     }
     return kept, rates
+
+
+def empty_records(observed: dict[str, jax.Array], num_times: int) -> dict[str, np.ndarray]:
+    """Records at so many times, of the shapes and types of those at one time."""
+    each = {name: np.asarray(value) for name, value in observed.items()}
+    return {name: np.zeros((num_times, *v.shape), v.dtype) for name, v in each.items()}
+
+
+def spoil(records: dict[str, np.ndarray], done: int) -> None:
+    """Nan from the time of a failure on; 0 where there is no nan."""
+    for values in records.values():
+        values[done:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0

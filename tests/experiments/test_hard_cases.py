@@ -30,6 +30,7 @@ LONG = (
     "stiff and",
     "fits:",
     "one member",
+    "faults on the way",
 )
 """Beginnings of the names of further cases that take long."""
 

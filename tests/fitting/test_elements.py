@@ -85,6 +85,7 @@ def test_a_T_rot_that_theory_misses_as_a_whole_is_no_misfit():
     assert within(result, gas, "dissipative_constant")
 
 
+@pytest.mark.slow
 def test_T_alone_does_not_tell_roughness_from_A():
     gas = dataclasses.replace(glass_beads(), surface=ROUGH)
     curve = measured(gas)

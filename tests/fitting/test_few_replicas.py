@@ -106,6 +106,7 @@ def test_runs(signs, runs, mean, chance):
     assert found[2] == pytest.approx(chance, rel=0.02, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_runs_are_told():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(3))

@@ -78,17 +78,27 @@ def test_a_gas_begun_before_the_file_is_found(measured):
     assert abs(float(t0) + first) < 3 * float(deviation)
 
 
-@pytest.mark.parametrize("law", ["viscoelastic", pytest.param("constant", marks=pytest.mark.slow)])
-def test_t0_and_the_first_temperature_are_not_found_together(measured, law):
+def fitted_together(gas, curve, name):
+    with pytest.warns(UserWarning, match="temperature and t0: .*a gas forgets how hot it began"):
+        both = jaxgran.fit(gas, curve, free=(name, "temperature", "t0"))
+    assert both.undetermined() == ("temperature", "t0") and bool(both.converged)
+    assert repr(both).count("not determined") == 2
+    return both
+
+
+def test_t0_and_the_first_temperature_are_not_found_together(measured):
+    fitted_together(*measured, A)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["viscoelastic", "constant"])
+def test_what_is_not_found_leaves_the_constant_of_the_material(measured, law):
     gas, curve = measured
     name = A
     if law == "constant":
         gas = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
         name, curve = "coefficient", synthetic(gas, jax.random.key(0))
-    with pytest.warns(UserWarning, match="temperature and t0: .*a gas forgets how hot it began"):
-        both = jaxgran.fit(gas, curve, free=(name, "temperature", "t0"))
-    assert both.undetermined() == ("temperature", "t0") and bool(both.converged)
-    assert repr(both).count("not determined") == 2
+    both = fitted_together(gas, curve, name)
     # The constant of the material does not depend on where the course begins.
     alone = jaxgran.fit(gas, curve, free=(name, "temperature"))
     error = float(alone.error_budget["measurement"][0])

@@ -44,6 +44,7 @@ def test_laws_see_the_speeds_that_drag_has_left():
     np.testing.assert_allclose(of_pairs(scene, impact).lost, (1 - eps**2) * speed**2 / 8, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_drag_takes_energy_of_perfectly_rough_spheres_at_its_rate_alone():
     # In a box of three sides: impacts, on walls too, keep the energy, drag takes exp(-2 gamma t).
     sides = np.array([0.02, 0.03, 0.05])

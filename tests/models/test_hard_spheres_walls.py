@@ -135,7 +135,8 @@ def test_containers_that_do_not_fit_are_refused():
 
 def test_starts_between_walls_are_refused():
     gas = contained(50)
-    curve = jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(50))
+    place = np.argwhere(np.ones((4, 4, 4)))[None, :50] * SIDE / 4
+    start = jaxgran.Particles(place, np.zeros_like(place), SIDE)
     with pytest.raises(ValueError, match="takes no start in a container"):
-        again = jaxgran.HardSpheres(50, start=curve.particles)
+        again = jaxgran.HardSpheres(50, start=start)
         jaxgran.cool(gas, [1e-3], model=again)

@@ -270,7 +270,12 @@ def log_temperatures(gas, model, times, names):
 @pytest.mark.parametrize(
     "elements, names",
     [
-        pytest.param({"law": "own"}, ["dissipative_constant", "wall_dissipative_constant"], id="w"),
+        pytest.param(
+            {"law": "own"},
+            ["dissipative_constant", "wall_dissipative_constant"],
+            id="w",
+            marks=pytest.mark.slow,
+        ),
         pytest.param({"drag": jaxgran.StokesDrag(1.0)}, ["drag_rate"], id="drag"),
     ],
 )

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
+import jaxgran
 from jaxgran.checks import status
 from jaxgran.data import checkpoint
 from jaxgran.particles import driver
 from jaxgran.particles.driver import Failure, follow
+from jaxgran.particles.programs import compiling
+from tests.conftest import glass_beads
 
 TIMES = np.array([0.0, 0.3, 1.0, 1.1, 2.5])
 STEPS = 2 + 3 + 1 + 6  # of at most 0.25, from time to time
@@ -228,6 +231,30 @@ def test_no_bar_without_a_terminal(eager, capsys):
 
 def test_no_bar_for_a_moment(capsys):
     assert shown(Terminal(), capsys).strip() == ""
+
+
+def test_compiling_is_said_until_the_program_runs():
+    with redirect_stderr(Terminal()) as stream, compiling(progress=True):
+        assert stream.getvalue() == "\rcompiling ..."
+    assert stream.getvalue().split("\r")[-2:] == [" " * 13, ""]  # removed, for the bar
+
+
+@pytest.mark.parametrize("stream, progress", [(Terminal(), False), (io.StringIO(), True)])
+def test_compiling_is_not_said_where_no_bar_would_be(stream, progress):
+    with redirect_stderr(stream), compiling(progress):
+        pass
+    assert stream.getvalue() == ""
+
+
+@pytest.mark.slow
+def test_a_run_says_that_it_compiles_once():
+    said = []
+    for _ in range(2):
+        model = jaxgran.HardSpheres(23)
+        with redirect_stderr(Terminal()) as stream:
+            jaxgran.cool(glass_beads(), [1e-3], model=model)
+        said.append("compiling ..." in stream.getvalue())
+    assert said == [True, False]
 
 
 def test_the_bar_goes_on_where_the_run_was(tmp_path, eager, capsys):
