@@ -65,7 +65,9 @@ Measured: hard spheres in a cube of 25 diameters, eps_w = .8, beta = .15, N = 10
 free paths of 1.3, .25 and .02 sides): ln T is .023, .013 and .013 higher than that of DSMC when T
 has fallen to .5, and .07, .01 and .04 higher when it has fallen to .006, .04, .1. The loss of
 elastic spheres to walls of eps_w = .9, .8, .6 is within 3.5 % (mean free paths of .09 to 1.2
-sides), to .3 6 % higher. With elastic walls N = 500 agree within 2 +- 1 %.
+sides), to .3 6 % higher. With elastic walls N = 500 agree within 2 +- 1 %. Rough spheres between
+rough walls (N = 300, eps_w = .85, beta_t = 0): T is 8 % higher than that of theory when it has
+fallen to .06, T_rot/T 13 % lower (3 % lower than that of DSMC).
 """
 
 ROUGH = 0.01
