@@ -386,6 +386,14 @@ ENTRIES = {
             "speed.md",
         ),
         Entry(
+            "speed/benchmark_compilation.py",
+            "How long does the first run of each particle model compile?",
+            "",
+            lambda f: "Prints seconds and programs of each; none are recorded yet.",
+            "",
+            "2 min",
+        ),
+        Entry(
             "speed/benchmark_dsmc.py",
             "How fast is DSMC?",
             "benchmark_dsmc",
