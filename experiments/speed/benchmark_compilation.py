@@ -39,12 +39,12 @@ def first_run(name: str, num: int) -> dict[str, float]:
         model = kind(num, start=jaxgran.cool(gas, times, model=model, progress=False).particles)
     compiled: list[float] = []
 
-    def listen(event: str, duration: float, **_) -> None:
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event == EVENT:
-            compiled.append(duration)
+            compiled.append(duration_secs)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
-    took = []
+    took, row = [], {}
     for _ in range(2):
         begin = time.perf_counter()
         jax.block_until_ready(jaxgran.cool(gas, times, model=model, progress=False).temperature)
