@@ -13,7 +13,8 @@ from tests.fitting.curves import synthetic
 def test_fit_through_dsmc_agrees_with_kinetic_theory(beads):
     gas = beads(0.15)
     times = jnp.geomspace(0.3, 30.0, 20) * gas.mean_free_time
-    exact = jaxgran.cool(gas, times).temperature
+    chaos = jaxgran.KineticTheory(correlations=False)  # as DSMC has it
+    exact = jaxgran.cool(gas, times, model=chaos).temperature
     curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
     model = jaxgran.DSMC(5000, replicas=3)
     result = jaxgran.fit(gas, curve, model=model, progress=False)
@@ -21,7 +22,8 @@ def test_fit_through_dsmc_agrees_with_kinetic_theory(beads):
     true = gas.value("dissipative_constant")
     # Kinetic theory and DSMC differ by 0.2 % in T, which is some 0.4 % in A.
     assert abs(estimate / true - 1) < 2 * error / true + 0.004
-    assert error < 0.02 * true
+    # A cooling rate without correlations is taken to be 1 % off here, A by 1.7 times as much.
+    assert error < 0.03 * true
     assert 0 < result.error_budget["simulation"][0] < error
     assert "DSMC" in jaxgran.diagnose(result, curve).verdict
 
