@@ -125,6 +125,7 @@ def test_a_contradicting_drop_test_is_named(measured, capsys):
     assert not answer["agree"] and answer["p_value"] < 1e-4 and "contradict each other" in said
 
 
+@pytest.mark.slow
 def test_the_budget_is_explained(measured, capsys):
     assert main(["fit", "thin.csv", "--free", "A", "--explain", "--out", "c"]) == 0
     said, _ = _answer(capsys)

@@ -74,6 +74,7 @@ def test_p_values_are_those_of_students_t():
     assert np.mean(p_values(smoothed=False) < 0.01) > 0.8
 
 
+@pytest.mark.slow
 def test_fit_and_likelihood_use_them():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(0))

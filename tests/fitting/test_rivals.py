@@ -42,7 +42,7 @@ CASES = [
 ]
 
 
-OFTEN, QUICK, SLOW = ("nothing", "walls", "constant"), (), pytest.mark.slow
+OFTEN, QUICK, SLOW = ("walls", "constant"), (), pytest.mark.slow
 
 
 @pytest.mark.parametrize("errors", [True, pytest.param(False, marks=pytest.mark.slow)])

@@ -74,6 +74,7 @@ def test_drag_takes_energy_of_perfectly_rough_spheres_at_its_rate_alone():
     assert float(T) == pytest.approx(float(curve.temperature[-1]), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_white_noise_heats_by_its_strength_and_keeps_momentum():
     gas = of_constant(1.0)
     strength = 0.05 * gas.temperature / gas.mean_free_time

@@ -69,6 +69,7 @@ def test_checkpoints_are_of_stochastic_models(tmp_path):
         jaxgran.cool(gas, [1.0], model=HaffLaw(), checkpoint=tmp_path / "run.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["levenberg-marquardt", "lbfgs"])
 def test_fit_finds_what_made_the_curve(method):
     gas = gas_of()

@@ -187,6 +187,7 @@ def rough(eps, beta) -> jaxgran.Gas:
     return dataclasses.replace(prepared(eps), surface=jaxgran.Rough(beta))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beta", [-0.5, 0.5])
 def test_rough_spheres_that_were_driven_begin_with_the_steady_rotation(beta):
     curve = driven(rough(0.8, beta), [0.0, 5.0])

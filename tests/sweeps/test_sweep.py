@@ -71,6 +71,7 @@ def test_only_some_floats_have_an_axis(gas, gases):
     np.testing.assert_allclose(curves.temperature[1], curve.temperature, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_particles_with_replicas_and_keys(gas):
     model, keys = jaxgran.DSMC(200, replicas=2), jax.random.split(jax.random.key(3), 3)
     curves = sweep(gas, model=model, key=keys, chunk=2)

@@ -67,6 +67,7 @@ def test_cooling_state_agrees_with_direct_simulation(dimension):
     np.testing.assert_allclose(found[2][0] / first, {2: 1.0238, 3: 1.0172}[dimension], atol=2e-4)
 
 
+@pytest.mark.slow
 def test_elastic_relaxation_of_a2_and_a3():
     # Elastic spheres in 3D: mu_4 linear in a_2 is 4 sqrt(2 pi) a_2 (van Noije & Ernst 1998).
     g = np.linspace(0.0, 9.0, 4001)
