@@ -1,6 +1,6 @@
 """What does a fit of A say where the curve contains physics that it does not know?
 
-    python experiments/fit/wrong_physics.py [--draws 20] [--record] [--out FILE]
+    python experiments/fit/wrong_physics.py [--draws 20] [--rows walls] [--record] [--out FILE]
 
 Makes cooling curves of 2 mm beads (phi = .05, A = 3e-6 s; 30 points, 3 % noise) that contain rough
 grains, walls, drag, a noise floor or a constant eps besides or instead, fits A and T_0 with kinetic
@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.record import add_recording, write_results
+from experiments.support.record import add_recording, figures, write_results
 from jaxgran.models.checks import first_cooling_rate
 
 TRUE_A = 3e-6
@@ -94,6 +94,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--draws", type=int, default=20, help="of the noise (default: 20)")
+    parser.add_argument("--rows", default="", help="only those whose name contains this")
     parser.add_argument("--out", type=Path, help="a file for the table")
     add_recording(parser)
     options = parser.parse_args()
@@ -101,11 +102,21 @@ def main() -> None:
     print(HEAD)
     rows = []
     for name, other, floor in SCENES:
+        if options.rows not in name:
+            continue
         rows.append(row(name, other, floor, options.draws))
         print(line(rows[-1]), flush=True)
-    write_results("wrong_physics", options, None, rows=rows)
+    write_results(
+        "wrong_physics", options, None, rows=with_recorded(rows) if options.rows else rows
+    )
     if options.out is not None:
         options.out.write_text(table({"rows": rows}), encoding="utf-8")
+
+
+def with_recorded(rows: list[dict]) -> list[dict]:
+    """These rows, and the recorded ones of other curves, in the order of the table."""
+    known = {row["name"]: row for row in [*figures("wrong_physics")["rows"], *rows]}
+    return [known[name] for name, *_ in SCENES if name in known]
 
 
 def table(results: dict) -> str:
