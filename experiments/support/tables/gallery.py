@@ -150,10 +150,9 @@ def film(f: dict) -> str:
 
 
 def compilation(f: dict) -> str:
-    soft, hard, dsmc = (f[name]["first_s"] for name in ("SoftSpheres", "HardSpheres", "DSMC"))
-    return (
-        f"{soft:.0f} s of soft, {hard:.0f} s of hard spheres, {dsmc:.0f} s of DSMC, runs included."
-    )
+    rows = f["rows"]
+    soft, hard, dsmc = (rows[name]["first_s"] for name in ("SoftSpheres", "HardSpheres", "DSMC"))
+    return f"Soft spheres {soft:.0f} s, hard spheres {hard:.0f} s, DSMC {dsmc:.0f} s, run included."
 
 
 def cooling(f: dict) -> str:
