@@ -135,9 +135,13 @@ def _check_save(save: Any, model: AbstractModel) -> None:
         )
 
 
+def _check_path(name: str, path: Any) -> None:
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"{name} must be a path, got {path!r}")
+
+
 def _check_trajectory(trajectory: Any, model: AbstractModel) -> None:
-    if not isinstance(trajectory, str | os.PathLike):
-        raise ValueError(f"trajectory must be a path, got {trajectory!r}")
+    _check_path("trajectory", trajectory)
     if not model.has_positions:
         raise ValueError(
             f"{type(model).__name__} has no positions: leave trajectory out, or use HardSpheres(N) "
@@ -146,8 +150,7 @@ def _check_trajectory(trajectory: Any, model: AbstractModel) -> None:
 
 
 def _check_checkpoint(checkpoint: Any, model: AbstractModel) -> None:
-    if not isinstance(checkpoint, str | os.PathLike):
-        raise ValueError(f"checkpoint must be a path, got {checkpoint!r}")
+    _check_path("checkpoint", checkpoint)
     if not model.stochastic:
         raise ValueError(
             f"{type(model).__name__} has no run to be saved: leave checkpoint out, got "

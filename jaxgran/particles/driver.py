@@ -183,6 +183,7 @@ def drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
 
 
 def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
+    write = _writer(sim, run)  # a file that cannot be is told before the melt
     dynamics, fault, state = sim.dynamics, status.OK, sim.first_state()
     engine = neighbours.engine(sim.engine, dynamics.capacity.lookahead)
     if sim.melts and not (run.checkpoint is not None and Path(run.checkpoint).exists()):
@@ -209,7 +210,7 @@ def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
         scene=scene,
         progress=run.progress,
         path=run.checkpoint,
-        write=_writer(sim, run),
+        write=write,
         fault=fault,
     )
     arrays = {name: jnp.asarray(value) for name, value in records.items()}

@@ -64,12 +64,11 @@ class Density(NamedTuple):
 
     Attributes:
         crowding: k in ``1/(1 + k X_T/sigma)``, see `jaxgran.theory.softness.crowding`.
-        correlations: the packing fraction, from which `jaxgran.theory.correlations.slowing` finds
-            what velocity correlations take.
+        packing_fraction: of correlated velocities, see `jaxgran.theory.correlations.slowing`.
     """
 
     crowding: Float[Array, ""] | None = None
-    correlations: Float[Array, ""] | None = None
+    packing_fraction: Float[Array, ""] | None = None
 
     @classmethod
     def of(cls, gas: Gas, softness: bool = True, correlations: bool = True) -> "Density":
@@ -183,9 +182,9 @@ def _reduced(
         impacts = impacts * softness_factor(scene.law, speed, d)
     if density.crowding is not None:
         impacts = impacts / (1 + density.crowding * scene.law.impact_length(speed))
-    if density.correlations is not None:
+    if density.packing_fraction is not None:
         inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
-        lost = slowing(density.correlations, inelasticity, d) * built_up(at.collisions)
+        lost = slowing(density.packing_fraction, inelasticity, d) * built_up(at.collisions)
         impacts = impacts * (1 - lost)
     return impacts
 

@@ -10,6 +10,7 @@ import pytest
 
 import experiments.fit_cooling_curve as fit_cooling_curve
 import jaxgran
+from experiments.support.record import figures
 from jaxgran.cli.models import MODELS, model_of
 from jaxgran.cli.output import finite_or_null
 
@@ -207,14 +208,19 @@ def test_main_job_reads_the_header_a_not(tmp_path):
     (tmp_path / "other.csv").write_text(text)
     done = run("fit_cooling_curve.py", "other.csv", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert 6.0e-5 < json.loads(done.stdout.splitlines()[-1])["A"] < 7.5e-5
+    (recorded,) = figures("lammps_curves_dense")["parameters"]
+    # Of the same fit with the header as it is, to the solver's tolerance of 1e-8, many times over.
+    found = json.loads(done.stdout.splitlines()[-1])["A"]
+    assert found == pytest.approx(recorded["estimate"], rel=1e-4)
 
 
 @pytest.mark.slow
 def test_own_model_runs(tmp_path):
     done = run("fit/own_model.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "Haff law is compatible with this curve" in done.stdout
+    # A loss that grows as spins warm up is hardly told from a larger constant one.
+    verdict = "Haff law is compatible with this curve, which does not exclude rough grains, at rest"
+    assert verdict in done.stdout
 
 
 @pytest.mark.slow
