@@ -70,7 +70,7 @@ PARTS = {
     "measurement": "errors of the points, with the correlation of neighbours",
     "model": "the model's clock in this scene",
     "few particles": "chance of the collisions of N particles",
-    "slope": "derivatives through particles that are too large where the gas has a flow",
+    "slope": "derivatives through particles: too large where the gas has a flow, or noisy",
     "simulation": "noise of the simulations that the fit made",
 }
 """What a part of the error budget is; the others are named after what is uncertain."""

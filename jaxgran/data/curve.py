@@ -40,6 +40,8 @@ FURTHER = {
     "elastic_energy": "elastic_energy",
     "dissipated_energy": "dissipated_energy",
     "regularised": "regularised",
+    "flow_share": "flow_share",
+    "derivative_bias": "derivative_bias",
 }
 """Columns of further quantities, which a fit does not use, and their fields; in SI."""
 
@@ -101,6 +103,10 @@ class CoolingCurve(eqx.Module):
             where nothing drives the gas: what drag takes counts as dissipated.
         regularised: impacts per particle, of hard spheres, that were made elastic to prevent
             inelastic collapse.
+        flow_share: share of the kinetic energy in the longest waves of the flow, of spheres in
+            periodic boxes: see `jaxgran.observables.flow_share`.
+        derivative_bias: by which share a projected derivative of ln T is too large, as estimated
+            from this share in boxes longer than L_c (`jaxgran.models.flow_bias`).
         replicas: the curve of each replica, with arrays of shape (replicas, times).
         particles: the final state of a particle model.
         saved: what `cool(save=...)` made of the particles at each time, first axes (times, ...),
@@ -130,6 +136,8 @@ class CoolingCurve(eqx.Module):
     elastic_energy: Float[Array, "... times"] | None = _number_field(default=None)
     dissipated_energy: Float[Array, "... times"] | None = _number_field(default=None)
     regularised: Float[Array, "... times"] | None = _number_field(default=None)
+    flow_share: Float[Array, "... times"] | None = _number_field(default=None)
+    derivative_bias: Float[Array, "... times"] | None = _number_field(default=None)
     replicas: "CoolingCurve | None" = None
     particles: Particles | None = None
     saved: Any = None

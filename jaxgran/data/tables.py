@@ -21,6 +21,8 @@ UNITS = {
     "elastic_energy": "J",
     "dissipated_energy": "J",
     "regularised": "1",
+    "flow_share": "1",
+    "derivative_bias": "1",
 }
 """Units of the quantities of a curve, by the names of its fields."""
 

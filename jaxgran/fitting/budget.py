@@ -1,6 +1,7 @@
 """Errors that follow from the fitted gas: of its model's clock there, and of few particles."""
 
 import dataclasses
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,9 @@ from jaxgran.models.course import Course
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.selection import course_along
 from jaxgran.scene.gas import Gas
+
+WORTH_SAYING = 0.05
+"""Relative error of the derivatives of a fit from which on a diagnosis speaks of it."""
 
 
 def in_scene(result: Fit, num_particles: int | None, replicas: int) -> Fit:
@@ -77,16 +81,46 @@ def _by_chance(result: Fit, course: Course, num_particles: int) -> Float[Array, 
 def _by_slope(result: Fit) -> Float[Array, "p p"]:
     """Covariance of the estimates by derivatives that are too large in a gas with a flow.
 
-    They are so by the share b in the mean over the points, by their weight: errors are larger by
-    1 + b than their derivatives say, and b of the last extrapolation is missing.
+    They are so by the share b: errors are larger by 1 + b than their derivatives say, and b of the
+    last extrapolation is missing.
     """
-    course = _course(result, getattr(result.model, "num_particles", None))
-    times = result.curve.times.size
-    bias = np.broadcast_to(result.model.derivative_error(course), course.time.shape)[-times:]
-    weights = np.sum(np.asarray(result.sensitivity)[:times] ** 2, axis=1)
-    b = float(np.sum(weights * bias) / max(np.sum(weights), np.finfo(float).tiny))
+    b = abs(bias_of_slope(result))
     found = result.covariances["measurement"] + result.covariances["simulation"]
     return ((1 + b) ** 2 - 1) * found + b**2 * jnp.outer(result.beyond, result.beyond)
+
+
+def bias_of_slope(result: Fit) -> float:
+    """By which share the derivatives of a fit through particles are too large, in the mean over the
+    points by their weight: as the flow of the last run tells, or else as the model estimates it."""
+    bias = result.curve.derivative_bias
+    if bias is None:
+        course = _course(result, getattr(result.model, "num_particles", None))
+        bias = np.broadcast_to(result.model.derivative_error(course), course.time.shape)
+    times = result.curve.times.size
+    weights = np.sum(np.asarray(result.sensitivity)[:times] ** 2, axis=1)
+    whole = max(np.sum(weights), np.finfo(float).tiny)
+    return float(np.sum(weights * np.asarray(bias)[-times:]) / whole)
+
+
+def slope_in_words(result: Fit) -> Iterator[str]:
+    """A clause about derivatives through particles that are wrong by more than `WORTH_SAYING`."""
+    b = bias_of_slope(result) if result.model.stochastic else 0.0
+    if abs(b) < WORTH_SAYING:
+        return
+    if getattr(result.model, "differences", None) is not None:
+        yield (
+            f"its derivatives, differences of runs, have a noise of {100 * b:.2g} % by estimate, "
+            "which the error bar contains: more replicas have less"
+        )
+        return
+    share = result.curve.flow_share
+    held = "" if share is None else f", which holds up to {100 * float(jnp.max(share)):.2g} % of "
+    held += "the energy" if held else ""
+    yield (
+        f"its projected derivatives are too large by {100 * b:.2g} % by estimate, because of the "
+        f"flow{held}: the error bar contains it; {type(result.model).__name__}(..., "
+        "differences=0.3) has derivatives without this bias"
+    )
 
 
 def _beyond(whole: Float[Array, "p p"], measured: Float[Array, "p p"]) -> Float[Array, "p p"]:

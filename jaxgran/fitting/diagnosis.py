@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.amplitudes import ASKED, Rival
+from jaxgran.fitting.budget import slope_in_words
 from jaxgran.fitting.residuals import neighbour_correlation, runs_test
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
 from jaxgran.fitting.rivals import FURTHER, free_elements, ranges, rivals
@@ -25,7 +26,6 @@ NOTHING = 0.01
 STEADY = 3.0
 """Correlation of neighbouring residuals, in standard errors of it for independent ones, from which
 on a curve without errors is not explained."""
-
 
 RAREST_RUNS = 0.00135
 """The same of the runs of one sign: the chance of 3 standard errors."""
@@ -88,7 +88,6 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     omissions = result.model.omissions(result.gas, num_particles)
     found = rivals(result, curve) if converged and np.isfinite(result.chi2) else ()
     limits = ranges(result, found) if found else {}
-
     reasons = [
         _chance(result),
         *_about_rivals(result, found, num_particles),
@@ -96,6 +95,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         *_about_runs(runs),
         *(omission.words for omission in omissions),
         *_about_search(result),
+        *slope_in_words(result),
     ]
     verdict = _verdict(result, misfit, omissions, found, limits)
     in_runs = runs[2] < SIGNIFICANCE and converged and not misfit

@@ -35,7 +35,7 @@ class Fit(eqx.Module):
             T_rot", those of a factor common to all of these; one part for each of the `priors`,
             under its name; "few particles", what the chance of single collisions adds where N is
             known; and of a stochastic model "simulation", its noise, estimated from its replicas,
-            and "slope", what the bias of its derivatives in a gas with a flow does.
+            and "slope", what the bias of its derivatives, or their noise, does.
         clock_error: relative error of the model's clock, in this scene, at the measured times.
         gain: derivative of each estimate in each measured ln T, SI, shape (p, times).
         clock_gain: its change over a relative change of the model's clock at each time, SI, shape

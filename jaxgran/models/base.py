@@ -134,7 +134,7 @@ class AbstractModel(eqx.Module):
 
     def derivative_error(self, course: Course) -> Float[np.ndarray, "times"] | float:
         """Estimated relative error of the derivatives of ln T along a gas's course, beyond
-        `derivative_accuracy`: they are too large by it. The error bars of a fit contain it.
+        `derivative_accuracy`: they may be too large by it. The error bars of a fit contain it.
         """
         return 0.0
 

@@ -16,6 +16,8 @@ from jaxgran.checks.tracing import any_traced, is_known
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
 from jaxgran.models.base import AbstractModel, Omission
+from jaxgran.particles import initial
+from jaxgran.particles.simulation import SMALLEST_BOX
 from jaxgran.scene.elements import SAME_VOLUME, share_of_container
 from jaxgran.scene.gas import Gas
 from jaxgran.theory.averages import averages as exact_averages
@@ -267,3 +269,21 @@ def spoilt_unless(
     )
     fault = fault if curve.status is None else jnp.where(allowed, curve.status, fault)
     return dataclasses.replace(spoilt, times=times, status=fault)
+
+
+def check_room(gas: Gas, num_particles: int, random: bool) -> None:
+    """Raise ValueError for a gas too dense for a random start, or a box too small."""
+    if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
+        return
+    limit, phi = initial.PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
+    if phi > limit and random:
+        raise ValueError(
+            f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g}; "
+            "lower it, or give your own start"
+        )
+    side = float(jnp.min(gas.box_side(num_particles) / gas.diameter))
+    if side < SMALLEST_BOX:
+        raise ValueError(
+            f"the box is {side:.3g} diameters long, at least {SMALLEST_BOX} are needed to tell "
+            "a sphere from its image; use more particles or a lower packing_fraction"
+        )

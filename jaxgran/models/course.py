@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxgran.models.flow_bias import MISSING_HEAT, PREDICTED, slope_bias
 from jaxgran.scene.gas import Gas
 
 ENSKOG = (0.005, 0.1)
@@ -79,20 +80,6 @@ NOISE = 0.8
 
 Measured: hard spheres, N = 1000 (48 replicas) and 4000 (16), phi = .1 and .2, beta = .3 to .5, up
 to 5 mean free times: .6 to 1.1, .82 in the mean.
-"""
-
-MISSING_HEAT = 1.6
-"""Relative error of the cooling rate over the share of energy that is flow instead of heat: the
-rate of viscoelastic spheres goes as T^(8/5)."""
-
-
-FLOW_OF_SLOPE = 1.8, 0.14
-"""Relative error of a projected derivative of ln T in A, ``a c (1 + (c/b)^4)``, over the relative
-error c of the clock of a model that takes the flow for heat.
-
-Measured: by finite differences, soft spheres, phi = .3, beta = .2, N = 1000, 3, 10, 30, 100 mean
-free times: 2.6, 6.9, 16, 78 % too large (this: 2.6, 6.8, 16, 83 %); hard spheres, phi = .2,
-beta = .3, N = 500, 10 and 30: 14.5, 14.6 % (10, 23 %).
 """
 
 
@@ -182,9 +169,17 @@ class Course(NamedTuple):
             return np.zeros(self.time.shape)
         if float(self.gas.box_side(self.num_particles)) <= float(self.gas.critical_box):
             return np.zeros(self.time.shape)
-        factor, scale = FLOW_OF_SLOPE
-        clock = self.clock_error(MISSING_HEAT * self.flow_share)
-        return factor * clock * (1 + (clock / scale) ** 4)
+        return slope_bias(self.clock_error(PREDICTED * MISSING_HEAT * self.flow_share))
+
+    def noise_of_differences(self, step: float, noise: float) -> Float[np.ndarray, "times"]:
+        """Relative standard error of a derivative of ln T by differences of runs.
+
+        ``s / (sqrt(2) h |d ln T/d ln A|)`` for a step h and a standard error s of ln T, with the
+        derivative of a gas that depends on the product of A and t, ``d ln T/d ln t``.
+        """
+        slope = np.abs(self.time * np.gradient(self.log_temperature, self.time))
+        error = noise / (np.sqrt(2) * step)
+        return error / np.maximum(slope, error)  # nothing is known where it exceeds the slope
 
     @property
     def mixing(self) -> float:

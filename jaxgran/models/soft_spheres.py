@@ -21,13 +21,12 @@ from jaxgran.data.curve import Particles, UserParticles
 from jaxgran.models import checks
 from jaxgran.models.base import Omission
 from jaxgran.models.course import Course
+from jaxgran.models.reduced_soft import reduced_scene
 from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
 from jaxgran.particles.soft.block import SoftDynamics
-from jaxgran.particles.soft.scene import SoftDrag, SoftScene, SoftSurface
-from jaxgran.particles.soft.walls import MARGIN, SoftWalls
-from jaxgran.scene.elements import StokesDrag, Walls
-from jaxgran.scene.friction import Frictional
+from jaxgran.particles.soft.scene import SoftScene
+from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.restitution import Viscoelastic
 
@@ -81,6 +80,10 @@ class SoftSpheres(AbstractSpheres):
         projection: mean free times between thermal projections of a derivative, > 0; from 0.02 to
             0.5 they agree (see `jaxgran.tangents.thermal`). None for the plain derivative, which is
             exact, and useless after 3 to 5 collisions per particle.
+        differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
+            differences of whole runs (`jaxgran.tangents.differences`), 0.3 for most uses: two more
+            runs for each of A and alpha, noise, and no bias in a gas that clusters. None for
+            projected derivatives.
         plan: static sizes of arrays, see `sized_for`.
 
     Derivatives of T, collisions, <dr^2> and the energies are taken in every float of the gas,
@@ -92,7 +95,9 @@ class SoftSpheres(AbstractSpheres):
     time as decaying at 2/d of the collision rate. Walls and drag are followed like (alpha, A);
     between walls the derivatives in lengths and the density are refused, with friction all. The
     derivatives of a_2 and of the final particles are not known, and are nan. Second derivatives are
-    refused. A run is followed in the frame in which each replica is at rest. With a given start T_0
+    refused. In boxes above L_c derivatives are too large by some share, which the curve estimates
+    (``derivative_bias``); `differences` avoids that. A run is followed in the frame in which each
+    replica is at rest. With a given start T_0
     is a unit only, and its derivative 0.
 
     Raises:
@@ -109,6 +114,7 @@ class SoftSpheres(AbstractSpheres):
     start: UserParticles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
     projection: UserFloat | None = eqx.field(static=True, default=PROJECTION)
+    differences: UserFloat | None = eqx.field(static=True, default=None)
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 3.0
@@ -122,7 +128,7 @@ class SoftSpheres(AbstractSpheres):
 
     @property
     def projected(self) -> bool:
-        """Whether derivatives are thermally projected."""
+        """Whether derivatives are not the plain ones."""
         return self.projection is not None
 
     def check(self, gas: Gas) -> None:
@@ -242,59 +248,3 @@ def check_inside(walls: Walls, dimension: int, start: Particles | None) -> None:
             f"sphere {i} of replica {replica} of the start is at {place[replica, i]} m, "
             f"outside of the walls, which are at 0 and {sides} m: move it inside"
         )
-
-
-def reduced_scene(gas: Gas, num_particles: int) -> SoftScene:
-    """A gas of viscoelastic spheres in units of its diameter, mass and first temperature."""
-    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    law: Any = gas.law  # `SoftSpheres.check` refuses others
-    side, walls = gas.box_side(num_particles) / gas.diameter, None
-    if gas.container is not None:
-        walls = reduced_walls(gas, gas.container)
-        side = jnp.max(walls.sides) + MARGIN
-    return SoftScene(
-        side=side,
-        alpha=gas.alpha * gas.diameter**0.5 * unit_time**2,
-        dissipative_constant=law.dissipative_constant / unit_time,
-        contact_duration=gas.contact_duration / unit_time,
-        collision_frequency=reduced_frequency(gas, unit_time),
-        clipped=law.clipped,
-        walls=walls,
-        drag=None if gas.drag is None else reduced_drag(gas, gas.drag),
-        surface=reduced_surface(gas),
-    )
-
-
-def reduced_walls(gas: Gas, container: Walls) -> SoftWalls:
-    """The walls of a gas in these units."""
-    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    law: Any = container.restitution  # `check_container` refuses others than Viscoelastic
-    alpha = law.of_wall().alpha(diameter=gas.diameter, mass=gas.mass)
-    return SoftWalls(
-        sides=jnp.broadcast_to(container.side, (gas.dimension,)) / gas.diameter,
-        alpha=alpha * gas.diameter**0.5 * unit_time**2,
-        dissipative_constant=law.dissipative_constant / unit_time,
-        clipped=law.clipped,
-    )
-
-
-def reduced_frequency(gas: Gas, unit_time: Float[Array, ""]) -> Float[Array, ""]:
-    """Collisions per particle and unit of time at T = 1; of no T_0 where `held` refuses others."""
-    if gas.container is None:
-        return gas.collision_frequency * unit_time
-    still = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
-    return still.collision_frequency * gas.diameter / jnp.sqrt(still.temperature)
-
-
-def reduced_drag(gas: Gas, drag: StokesDrag) -> SoftDrag:
-    """The drag of a gas in these units."""
-    time = gas.diameter / jnp.sqrt(gas.temperature)
-    return SoftDrag(drag.rate * time / reduced_frequency(gas, time), drag.rotational_rate * time)
-
-
-def reduced_surface(gas: Gas) -> SoftSurface | None:
-    """The surface of the spheres of a gas in these units; None where they are smooth."""
-    s, T = gas.surface, gas.temperature
-    if not isinstance(s, Frictional):
-        return None
-    return SoftSurface(s.tangential_damping, s.friction, s.inertia, s.rotational_temperature / T)

@@ -1,6 +1,7 @@
 """What models of spheres in periodic boxes share: checks, array sizes, runs and curves."""
 
 import dataclasses
+import math
 from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -8,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from equinox import AbstractClassVar, AbstractVar
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.checks import status
@@ -16,16 +16,17 @@ from jaxgran.checks.tracing import any_traced
 from jaxgran.checks.validation import POSITIVE, no_type_check, plain_number, whole_number
 from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.data.run import DEFAULTS, Run
-from jaxgran.models import checks
+from jaxgran.models import checks, derivatives
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.course import Course
-from jaxgran.particles import driver, initial, neighbours, pure, snapshot, user_start
+from jaxgran.models.flow_bias import slope_bias_of_run
+from jaxgran.particles import driver, neighbours, pure, snapshot, user_start
 from jaxgran.particles import side_by_side as beside
 from jaxgran.particles.capacity import Capacity, skin_adding
 from jaxgran.particles.dynamics import AbstractDynamics
-from jaxgran.particles.simulation import SMALLEST_BOX, Simulation
+from jaxgran.particles.simulation import Simulation
 from jaxgran.scene.gas import Gas
-from jaxgran.tangents.rule import Inputs, Outputs, differentiable
+from jaxgran.tangents.rule import Inputs, Outputs
 
 S = TypeVar("S", bound="AbstractSpheres")
 
@@ -54,6 +55,7 @@ class AbstractSpheres(AbstractModel):
         replicas: independent boxes.
         start: positions and velocities given by a user; None for random ones.
         neighbours: who finds the pairs.
+        differences: step of derivatives by differences; None for projected ones.
         plan: static sizes, where `sized_for` has settled them.
         listed_by_skin: pairs per particle that the skin adds to a neighbour list.
     """
@@ -62,6 +64,7 @@ class AbstractSpheres(AbstractModel):
     replicas: AbstractVar[int]
     start: AbstractVar[Particles | None]
     neighbours: AbstractVar[str]
+    differences: AbstractVar[float | None]
     plan: AbstractVar[Plan | None]
     listed_by_skin: AbstractClassVar[float]
 
@@ -73,11 +76,13 @@ class AbstractSpheres(AbstractModel):
     @property
     @abstractmethod
     def projected(self) -> bool:
-        """Whether derivatives are thermally projected."""
+        """Whether derivatives are projected, or by differences, and not plain."""
 
     def derivative_error(self, course: Course) -> Float[np.ndarray, "times"]:
-        """Of projected derivatives, where the gas has a flow."""
-        return course.slope_error()
+        """Of projected derivatives, where the gas has a flow; of differences their noise."""
+        if self.differences is None:
+            return course.slope_error()
+        return course.noise_of_differences(self.differences, math.hypot(*self.noise(course)))
 
     @abstractmethod
     def scene(self, gas: Gas) -> Any:
@@ -155,13 +160,11 @@ class AbstractSpheres(AbstractModel):
         )
         inputs = inputs._replace(units=self._units(gas, inputs.scene.side))
 
-        def outputs(inputs: Inputs, directions: Any = None) -> Outputs:
+        def outputs(inputs: Inputs, directions: Any = None, run: Run = run) -> Outputs:
             return self._outputs(inputs, directions, gas.dimension, run)
 
-        if self.projected:
-            found = differentiable(outputs, lambda scene: scene.material, self.held)(inputs)
-        else:
-            found = outputs(inputs)
+        how = self.differences, self.projected, self.held
+        found = derivatives.with_rule(outputs, run, *how)(inputs)
         return self._curve(gas, times, inputs.units, found, beyond, run.save)
 
     def _units(self, gas: Gas, side: Array) -> snapshot.Units:
@@ -246,6 +249,7 @@ class AbstractSpheres(AbstractModel):
             "dissipated_energy": energy,
             "collisions": 1.0,
             "regularised": 1.0,
+            "flow_share": 1.0,
             "rotational_temperature": gas.temperature,
         }
         known = [name for name in of_records if name in out.records]
@@ -261,32 +265,29 @@ class AbstractSpheres(AbstractModel):
             each,
             particles=particles,
             status=out.status | status.flag(status.OTHER_BOX, other) | late,
+            derivative_bias=self._bias(gas, times, each.get("flow_share")),
         )
         return snapshot.with_saved(curve, save, out.records, particles, wrong[None])
+
+    def _bias(self, gas: Gas, times: Array, flow_share: Array | None) -> Array | None:
+        """Estimated bias of projected derivatives, 0 in a box below L_c, which has no flow."""
+        if flow_share is None or self.differences is not None or not self.projected:
+            return None
+        longer = gas.box_side(self.num_particles) > gas.critical_box
+        return jnp.where(longer, slope_bias_of_run(times, jnp.mean(flow_share, axis=0)), 0.0)
 
     def check_counts(self, **least: int) -> None:
         """Raise ValueError where a whole number of the model is less than it must be."""
         for name, lowest in ({"num_particles": 2, "replicas": 1} | least).items():
             whole_number(name, getattr(self, name), lowest)
         neighbours.engine(self.neighbours)
+        derivatives.check_step(self.differences, self.projected)
 
     def check_box(self, gas: Gas) -> None:
         """Raise ValueError for a gas too dense, a box too small, or a start not of this gas."""
         user_start.check(self.start, gas, self.replicas, self.num_particles)
-        if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
-            return
-        limit, phi = initial.PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
-        if phi > limit and self.start is None:
-            raise ValueError(
-                f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g}; "
-                "lower it, or give your own start"
-            )
-        side = float(jnp.min(gas.box_side(self.num_particles) / gas.diameter))
-        if side < SMALLEST_BOX:
-            raise ValueError(
-                f"the box is {side:.3g} diameters long, at least {SMALLEST_BOX} are needed to tell "
-                "a sphere from its image; use more particles or a lower packing_fraction"
-            )
+        derivatives.check_gas(self.differences, gas)
+        checks.check_room(gas, self.num_particles, random=self.start is None)
 
     def noise(self, course: Course) -> tuple[float, float]:
         """Standard errors of ln T by shot noise and by the chance amplitudes of a flow."""

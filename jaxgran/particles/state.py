@@ -4,6 +4,7 @@ Units here: diameter, mass and first temperature are 1. All particles of all box
 array, replica after replica (n = replicas * N rows).
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -124,6 +125,7 @@ def records(
     velocity = centred(state.velocity, replicas)
     travelled = centred(state.position - state.origin + side * state.image, replicas)
     num_particles = velocity.shape[1]
+    position = state.position.reshape(velocity.shape)
     values = {
         "temperature": observables.temperature(velocity),
         "sonine": observables.sonine(velocity),
@@ -133,6 +135,7 @@ def records(
         ),
         "dissipated_energy": state.dissipated / num_particles,
         "collisions": 2 / num_particles * state.collisions,
+        "flow_share": jax.vmap(partial(observables.flow_share, side=side))(position, velocity),
     }
     return values, travelled, velocity
 

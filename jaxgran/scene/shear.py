@@ -26,6 +26,21 @@ def unit_wavenumber(packing_fraction: Float[Array, ""], dimension: int) -> Float
     return density * jnp.sqrt((32 * pi / 15 if dimension == 3 else pi) * dense)
 
 
+def mean_loss(law: ReducedLaw, like: Float[Array, ""]) -> Float[Array, ""]:
+    """``I = <1 - eps^2>``, weighted by the energy of the normal motion, at the reference speed.
+
+    Args:
+        law: of restitution.
+        like: a number of the precision that is wanted.
+    """
+
+    def lost(g: Array) -> Array:
+        loss = law.loss(g)
+        return g**2 / 2 * loss * (2 - loss)
+
+    return impact_average(lost, like)
+
+
 def critical_length(
     law: ReducedLaw, packing_fraction: Float[Array, ""], dimension: int
 ) -> Float[Array, ""]:
@@ -40,12 +55,7 @@ def critical_length(
     Returns:
         L_c/sigma; infinite for elastic spheres.
     """
-
-    def lost(g: Array) -> Array:
-        loss = law.loss(g)
-        return g**2 / 2 * loss * (2 - loss)
-
-    loss = impact_average(lost, packing_fraction)
+    loss = mean_loss(law, packing_fraction)
     inelastic = loss > 0
     root = unit_wavenumber(packing_fraction, dimension) * jnp.sqrt(jnp.where(inelastic, loss, 1.0))
     return jnp.where(inelastic, 2 * pi / root, jnp.inf)

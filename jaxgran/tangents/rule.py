@@ -13,6 +13,9 @@ from jaxtyping import Array, DTypeLike, Float, Int, PRNGKeyArray
 
 from jaxgran.tangents.limits import first_order_only, unknown, unknown_tangent
 
+_UNKNOWN = {"sonine", "flow_share"}
+"""Records whose derivatives are not known."""
+
 _DENSITY_POWER = {"displacement": -2.0, "elastic_energy": 1.0}
 """Power of the collision frequency in a record at a fixed place in the sequence of collisions."""
 
@@ -119,7 +122,7 @@ def differentiable(
         denser, later = _changes_of_clock(inputs, change)
         moved = _moved(out.records, amounts, denser, later, out.velocity.shape[1])
         changes = amounts, denser, later
-        for name in set(_plain(out.records)) - set(moved) | {"sonine"}:
+        for name in set(_plain(out.records)) - set(moved) | _UNKNOWN & set(out.records):
             moved[name] = unknown_tangent(out.records[name], *changes)
         return out._replace(records=_plain(out.records)), Outputs(
             position=unknown(out.position.shape, *changes),

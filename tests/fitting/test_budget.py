@@ -1,5 +1,7 @@
 """The whole error of an estimate, part by part."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 import jaxgran
 from experiments.support.scenes import beads as beads_of
+from jaxgran.fitting.budget import bias_of_slope, in_scene, slope_in_words
 from jaxgran.models.selection import course_of
 from tests.conftest import glass_beads
 from tests.fitting.curves import measured, synthetic
@@ -184,6 +187,46 @@ def test_derivatives_through_a_flow_are_known_worse():
     assert float(gas.box_side(100)) < float(gas.critical_box)
     assert not np.any(jaxgran.SoftSpheres(100).derivative_error(small))
     assert jaxgran.DSMC(1000).derivative_error(course_of(gas, end, 1000)) == 0
+
+
+def test_a_diagnosis_tells_the_bias_of_the_derivatives():
+    """From the run of the fit itself: larger errors, and words."""
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(0))
+    result = jaxgran.fit(gas, curve)
+    bias = jnp.linspace(0.0, 0.3, curve.times.size)
+    share = jnp.full(curve.times.size, 0.25)
+    ran = dataclasses.replace(result.curve, derivative_bias=bias, flow_share=share)
+    nothing = jnp.zeros((1, 1))
+    covariances = result.covariances | {"simulation": nothing}
+    fitted = dataclasses.replace(
+        result,
+        model=jaxgran.HardSpheres(500, replicas=2),
+        curve=ran,
+        covariances=covariances,
+        beyond=jnp.zeros(1),
+    )
+    weights = result.sensitivity[:, 0] ** 2
+    expected = float(jnp.sum(weights * bias) / jnp.sum(weights))
+    assert 0.1 < expected < 0.3
+    assert bias_of_slope(fitted) == pytest.approx(expected, rel=1e-12)
+    whole = in_scene(fitted, 500, 1)
+    assert relative(whole, "slope") == pytest.approx(
+        relative(fitted, "measurement") * np.sqrt((1 + expected) ** 2 - 1), rel=1e-9
+    )
+    (words,) = slope_in_words(fitted)
+    assert f"{100 * expected:.2g} %" in words and "25 % of the energy" in words
+    assert "HardSpheres(..., differences=0.3)" in words
+    assert words in jaxgran.diagnose(fitted, curve).reasons
+    unbiased = dataclasses.replace(fitted, curve=dataclasses.replace(ran, derivative_bias=0 * bias))
+    assert not list(slope_in_words(unbiased)) and not list(slope_in_words(result))
+    # Without the energy of a flow, by the course of the gas: of differences their noise.
+    unknown = dataclasses.replace(ran, derivative_bias=None)
+    noisy = dataclasses.replace(
+        fitted, curve=unknown, model=jaxgran.HardSpheres(50, replicas=2, differences=0.1)
+    )
+    (words,) = slope_in_words(noisy)
+    assert "differences of runs, have a noise of" in words
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from jaxgran.particles.observables import (
     cell_density,
     cell_velocity,
+    flow_share,
     flow_spectrum,
     mean_square_displacement,
     number_fluctuation,
@@ -232,6 +233,31 @@ def test_flow_spectrum_of_independent_velocities_is_t(dimension):
     for found, modes in ((across, (dimension - 1) * 2), (along, 2)):
         mean = jnp.mean(found, axis=0) / (4 * (1 - 1 / 50))
         np.testing.assert_allclose(mean, 1.0, atol=4 / np.sqrt(modes * runs))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_flow_share(dimension):
+    """All of a wave, a part of a wave that is added to heat, nothing of heat alone."""
+    n, waves = 8**dimension, {2: 4, 3: 9}[dimension]
+    points = jnp.asarray(lattice(8, dimension) + 0.3)
+    wave = jnp.zeros(points.shape).at[:, 1].set(jnp.sin(jnp.pi / 4 * points[:, 0]))
+    even = 2 * waves / n  # by equipartition
+    assert float(flow_share(points, wave, 8.0)) == pytest.approx(1 - even, abs=1e-12)
+    short = jnp.zeros(points.shape).at[:, 1].set(jnp.sin(jnp.pi / 2 * points[:, 0]))
+    assert float(flow_share(points, short, 8.0)) == pytest.approx(-even, abs=1e-12)
+    assert float(flow_share(points, 0 * wave, 8.0)) == pytest.approx(-even, abs=1e-12)
+
+    def of_heat(key):
+        x, v = jax.random.split(key)
+        position, heat = jax.random.uniform(x, points.shape), jax.random.normal(v, points.shape)
+        return flow_share(position, heat, 1.0)
+
+    runs = 400
+    found = jax.vmap(of_heat)(jax.random.split(jax.random.key(0), runs))
+    spread = 2 * np.sqrt(waves / dimension) / n
+    assert float(jnp.std(found)) == pytest.approx(spread, rel=4 / np.sqrt(2 * runs) + 2 / n)
+    # The mean velocity takes 1/n of the energy, not of the waves.
+    assert abs(float(jnp.mean(found))) < 4 * spread / np.sqrt(runs) + even / n
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -64,7 +64,7 @@ def _observed_elements(
         velocity = state.velocity.reshape(velocity.shape)
         values["temperature"] = observables.temperature(velocity)
         values["sonine"] = observables.sonine(velocity)
-        del values["displacement"]
+        del values["displacement"], values["flow_share"]
     slowed = kept = jnp.ones(())
     if scene.drag is not None:
         slowed, _, kept = decay(scene.decay_rates, state.time + state.time_rest)

@@ -2,11 +2,13 @@
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.particles.hard.walls import HardWalls
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedDrive, ReducedRough
 from jaxgran.scene.restitution import ReducedLaw
+from jaxgran.scene.shear import mean_loss
 
 
 class Material(NamedTuple):
@@ -74,8 +76,15 @@ class HardScene(NamedTuple):
         _, law, beta, frequency = self.walls
         return found._replace(wall_law=law, wall_beta=beta, wall_frequency=frequency)
 
-    def with_material(self, material: Material) -> "HardScene":
+    def log_loss(self, material: ReducedLaw) -> Float[Array, ""]:
+        """ln of ``I/(1 - I)`` with the share I of the normal energy that impacts take."""
+        lost = mean_loss(material, self.side)
+        return jnp.log(lost) - jnp.log1p(-lost)
+
+    def with_material(self, material: Any) -> "HardScene":
         """The same scene with other numbers of its material."""
+        if not self.has_elements:
+            return self._replace(law=material)
         walls = self.walls
         if walls is not None:
             law: Any = material.wall_law

@@ -19,11 +19,12 @@ from jaxgran.particles.observables.moments import (
     third_sonine,
     velocity_correlation,
 )
-from jaxgran.particles.observables.waves import flow_spectrum, structure_factor
+from jaxgran.particles.observables.waves import flow_share, flow_spectrum, structure_factor
 
 __all__ = [
     "cell_density",
     "cell_velocity",
+    "flow_share",
     "flow_spectrum",
     "mean_square_displacement",
     "number_fluctuation",

@@ -10,6 +10,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.particles.observables.moments import centred
 
+FLOW_SHELLS = 2
+"""Lengths of wave vectors that count as flow: k = 2 pi / side, and sqrt(2) times that."""
+
 
 def structure_factor(
     position: Float[Array | np.ndarray, "particles d"], side: ArrayLike, num_shells: int = 4
@@ -66,6 +69,34 @@ def flow_spectrum(
     along = jnp.abs(jnp.sum(current * unit, axis=1)) ** 2
     across = (jnp.sum(jnp.abs(current) ** 2, axis=1) - along) / (d - 1)
     return _lengths(waves, shells, side), _by_shell(across, shells), _by_shell(along, shells)
+
+
+def flow_share(
+    position: Float[Array, "particles d"],
+    velocity: Float[Array, "particles d"],
+    side: ArrayLike,
+    num_shells: int = FLOW_SHELLS,
+) -> Float[Array, ""]:
+    """Share of the kinetic energy in the flow: in its longest waves, above equipartition.
+
+    ``(sum |j(k)|^2 - d T M) / (d N T / 2)`` with j of `flow_spectrum`, over M wave vectors, one of
+    each pair k and -k. 0 on average where velocities are independent; its standard deviation is
+    then ``2 sqrt(M / d) / N``.
+
+    Args: as `flow_spectrum`.
+
+    >>> share = observables.flow_share(position, velocity, 1.0)
+    >>> bool(abs(share) < 0.02)
+    True
+    """
+    num_particles, d = position.shape
+    waves, _ = _waves(d, num_shells)
+    v = centred(velocity)
+    current = jax.vmap(lambda x: _amplitudes(position, x, waves, side), 1, 1)(v)
+    # Where nothing moves there is no flow.
+    energy = jnp.sum(v**2)
+    moving = jnp.where(energy > 0, energy, 1.0)
+    return 2 * jnp.sum(jnp.abs(current) ** 2) / moving - 2 * len(waves) / num_particles
 
 
 def _waves(d: int, num_shells: int) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -44,7 +44,9 @@ def observe(state: State, scene: SoftScene, replicas: int) -> dict[str, Array]:
 
 
 def _known(values: dict[str, Array], scene: SoftScene) -> dict[str, Array]:
-    """The records without those that mean nothing in a scene: between walls no sphere goes far."""
+    """The records without those that mean nothing in a scene: between walls no sphere goes far, and
+    there are no periodic waves."""
     if scene.walls is None:
         return values
-    return {name: value for name, value in values.items() if name != "displacement"}
+    unknown = "displacement", "flow_share"
+    return {name: value for name, value in values.items() if name not in unknown}

@@ -82,6 +82,16 @@ class SoftScene(eqx.Module):
         drag = None if self.drag is None else self.drag.per_collision
         return *own, self._of_elements(drag)
 
+    def with_material(self, material: tuple[Array, Array]) -> "SoftScene":
+        """The same scene of smooth spheres in free flight with another (alpha, A)."""
+        alpha, constant = material
+        return dataclasses.replace(self, alpha=alpha, dissipative_constant=constant)
+
+    def log_loss(self, material: tuple[Array, Array]) -> Float[Array, ""]:
+        """ln of an impact's loss, up to a constant: of ``A alpha^(2/5)``, which it is as."""
+        alpha, constant = material
+        return jnp.log(constant) + 0.4 * jnp.log(alpha)
+
     @property
     def of_elements(self) -> ElementMaterial:
         """The numbers of walls and drag."""

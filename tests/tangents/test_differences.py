@@ -1,0 +1,212 @@
+"""Derivatives by differences of whole runs."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.data.run import Run
+from jaxgran.models.flow_bias import slope_bias, slope_bias_of_run
+from jaxgran.tangents.differences import by_differences
+from jaxgran.tangents.rule import Inputs, Outputs, differentiable, with_tangents
+from tests.conftest import glass_beads
+from tests.models.test_hard_spheres import hard_gas
+from tests.models.test_soft_spheres import soft_beads
+
+TIMES = jnp.array([0.0, 1e-3, 0.3, 2.0, 50.0])
+
+
+class Haff(NamedTuple):
+    """A gas that cools as viscoelastic spheres do, by Haff's law, of the material (alpha, A)."""
+
+    alpha: jax.Array
+    constant: jax.Array
+    collision_frequency: jax.Array = jnp.ones(())
+
+    @property
+    def material(self):
+        return self.alpha, self.constant
+
+    def with_material(self, material):
+        return self._replace(alpha=material[0], constant=material[1])
+
+    def log_loss(self, material):
+        return 0.4 * jnp.log(material[0]) + jnp.log(material[1])
+
+
+def temperature(alpha, constant, t):
+    return (1 + constant * alpha**0.4 * t) ** (-5 / 3)
+
+
+def run(inputs: Inputs, directions=None) -> Outputs:
+    """The course of that gas, as a run of two replicas; it knows its derivative in time."""
+
+    def at(t):
+        T = temperature(*inputs.scene.material, t) * jnp.ones(2)
+        records = {"temperature": T, "collisions": jnp.log1p(inputs.scene.constant * t) * T**0}
+        if directions is None:
+            return records
+        p = len(directions[0])
+        rates = {"temperature": jax.grad(temperature, 2)(*inputs.scene.material, t) * T**0}
+        return with_tangents(records, {}, rates, jnp.zeros((p, 2)))
+
+    nothing = jnp.zeros((2, 1))
+    status = jnp.zeros((), jnp.int32)
+    return Outputs(nothing, nothing, jax.vmap(at)(inputs.times), status)
+
+
+def of_haff(step):
+    rule = differentiable(by_differences(run, run, step), lambda scene: scene.material)
+
+    def records(numbers, times=TIMES):
+        return rule(Inputs(Haff(*numbers), times, None, None)).records
+
+    return records
+
+
+AT = jnp.array([3.0, 0.2])
+
+
+@pytest.mark.parametrize("step", [0.1, 0.5])
+def test_a_gas_of_haff_has_its_derivative_for_any_step(step):
+    slopes = jax.jacfwd(of_haff(step))(AT)
+    expected = jax.jacfwd(lambda x: temperature(*x, TIMES))(AT)
+    found = np.asarray(slopes["temperature"])
+    # g loses digits where T is near 1.
+    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-11, atol=1e-14)
+    # In the time, too, which the run itself knows.
+    in_time = jax.jvp(lambda t: of_haff(step)(AT, t), (TIMES,), (jnp.ones_like(TIMES),))[1]
+    by_theory = jax.vmap(jax.grad(temperature, 2), (None, None, 0))(*AT, TIMES)
+    np.testing.assert_allclose(in_time["temperature"][:, 0], by_theory, rtol=1e-12)
+    # Other records are differences in ln A, that of a logarithm too large by its third derivative.
+    exact = 0.2 * TIMES / (1 + 0.2 * TIMES)
+    got = 0.2 * slopes["collisions"][:, 0, 1]
+    np.testing.assert_allclose(got, exact, rtol=1.001 * (np.sinh(step) / step - 1), atol=1e-14)
+
+
+def test_reverse_mode_and_jit_of_it_agree_with_forward_mode():
+    f = of_haff(0.3)
+
+    def total(x):
+        return jnp.sum(f(x)["temperature"] * jnp.arange(1.0, 6.0)[:, None])
+
+    forward = jax.jacfwd(total)(AT)
+    for derivative in (jax.grad(total), jax.jit(jax.grad(total)), jax.jit(jax.jacfwd(total))):
+        np.testing.assert_allclose(derivative(AT), forward, rtol=1e-12)
+
+
+def test_a_fault_of_any_run_is_one_of_the_derivative():
+    def failing(inputs):
+        return run(inputs)._replace(status=jnp.asarray(4, jnp.int32))
+
+    found = by_differences(run, failing, 0.3)
+    inputs = Inputs(Haff(*AT), TIMES, None, None)
+    assert int(found(inputs, (jnp.ones(1), jnp.zeros(1))).status) == 4
+    assert int(found(inputs).status) == 0
+
+
+def sliced(gas, model, times, name):
+    """T of each replica over T_0, as a function of the logarithm of a number of the gas."""
+    value = gas.value(name)
+
+    def of(log_scale):
+        changed = gas.replace(**{name: value * jnp.exp(log_scale)})
+        return model.simulate(changed, times, Run()).replicas.temperature / gas.temperature
+
+    return of
+
+
+def in_g(more, less, base, span):
+    """The derivative of T by hand."""
+    g = [np.log(T**-0.6 - 1) for T in (more, less)]
+    return -base * (1 - base**0.6) / 0.6 * (g[0] - g[1]) / span
+
+
+def test_soft_spheres_have_the_difference_of_two_runs(beads):
+    gas = soft_beads(beads, 0.05, 0.3, packing_fraction=0.15)
+    times = jnp.array([0.5, 3.0]) * gas.mean_free_time
+    settings = {"num_particles": 30, "replicas": 2, "steps_per_contact": 12}
+    f = sliced(gas, jaxgran.SoftSpheres(**settings, differences=0.3), times, "dissipative_constant")
+    value, slope = jax.jvp(f, (0.0,), (1.0,))
+    plain = sliced(gas, jaxgran.SoftSpheres(**settings), times, "dissipative_constant")
+    more, less, base = map(np.asarray, (plain(0.3), plain(-0.3), plain(0.0)))
+    np.testing.assert_array_equal(value, base)
+    # exp(0.3) times A, computed in two ways: the runs round differently, which chaos grows.
+    np.testing.assert_allclose(slope, in_g(more, less, base, 0.6), rtol=1e-6)
+    reverse = jax.grad(lambda x: jnp.sum(f(x)))(0.0)
+    np.testing.assert_allclose(reverse, jnp.sum(slope), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_hard_spheres_have_the_slopes_of_haff_by_differences():
+    e = 0.8
+    gas = hard_gas(e, 0.05)
+    times = jnp.array([1.0, 3.0]) * gas.mean_free_time
+    model = jaxgran.HardSpheres(400, replicas=16, differences=0.3)
+    f = sliced(gas, model, times, "coefficient")
+    base = np.asarray(f(0.0))
+    slope = np.asarray(jax.jvp(f, (0.0,), (1.0,))[1]) / base / e  # d ln T/d e
+    mean, error = slope.mean(axis=0), slope.std(axis=0, ddof=1) / 4
+    expected = 4 * e / (1 - e**2) * (1 - np.sqrt(base.mean(axis=0)))
+    print(f"\nby differences {mean} +- {error}, Haff {expected}")
+    # a_2 depends on e, which changes the rate by 1 %; Haff's law in g bends by .5 %.
+    assert np.all(np.abs(mean / expected - 1) < 0.015 + 3 * error / expected)
+
+
+def test_what_differences_do_not_know_is_refused():
+    gas = glass_beads(0.15)
+    for kind in (jaxgran.SoftSpheres, jaxgran.HardSpheres):
+        for step in (0.0, 0.6, -0.1):
+            with pytest.raises(ValueError, match=r"differences must lie in \(0, 0.5\]"):
+                kind(50, differences=step)
+        dragged = dataclasses.replace(gas, drag=jaxgran.StokesDrag(1.0))
+        with pytest.raises(
+            ValueError, match="smooth spheres in free flight, and this gas has drag"
+        ):
+            kind(50, differences=0.3).check_scene(dragged)
+    with pytest.raises(ValueError, match="two kinds of derivative"):
+        jaxgran.SoftSpheres(50, differences=0.3, projection=None)
+    elastic = gas.replace(dissipative_constant=0.0)
+    model = jaxgran.SoftSpheres(30, steps_per_contact=12, differences=0.3)
+    with pytest.raises(ValueError, match="this gas has no loss"):
+        jax.jvp(
+            lambda a: (
+                model.simulate(
+                    elastic.replace(dissipative_constant=a), jnp.array([1e-3]), Run()
+                ).temperature
+            ),
+            (0.0,),
+            (1.0,),
+        )
+
+
+def test_the_bias_follows_from_the_energy_of_the_flow():
+    share, times = jnp.full(200, 0.05), jnp.linspace(0.0, 2.0, 200)
+    got = slope_bias_of_run(times, share)
+    np.testing.assert_allclose(got[1:], slope_bias(jnp.full(199, 1.6 * 0.05)), rtol=1e-12)
+    assert got[0] == 0
+    # Up to a first time that is not 0 the flow grows: half of it is missing.
+    got = slope_bias_of_run(times[1:], share[1:])
+    clock = 1.6 * 0.05 * (1 - 0.5 * times[1] / times[1:])
+    np.testing.assert_allclose(got, slope_bias(clock), rtol=1e-12)
+    at_last = slope_bias_of_run(times[-1:], share[-1:])
+    np.testing.assert_allclose(at_last, slope_bias(jnp.full(1, 0.04)), rtol=1e-12)
+
+
+def test_the_curve_tells_the_bias_where_the_gas_has_a_flow():
+    """0 in a box below L_c; above it, from the flow of the run itself."""
+    gas = glass_beads(0.5, packing_fraction=0.2)
+    times = jnp.geomspace(0.3, 30.0, 12) * gas.mean_free_time
+    small, large = (
+        jaxgran.cool(gas, times, model=jaxgran.HardSpheres(n, replicas=2)) for n in (64, 500)
+    )
+    assert gas.box_side(64) < gas.critical_box < gas.box_side(500)
+    assert np.all(small.derivative_bias == 0)
+    expected = slope_bias_of_run(times, jnp.mean(large.replicas.flow_share, axis=0))
+    np.testing.assert_array_equal(large.derivative_bias, expected)
+    # Vortices hold .06 of the energy at last; heat alone scatters it by .005.
+    assert large.flow_share[-1] > 0.03 and large.derivative_bias[-1] > 0.03
