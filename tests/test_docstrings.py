@@ -28,7 +28,14 @@ def names():
     return run(jaxgran.__doc__, {}, "jaxgran")
 
 
-@pytest.mark.parametrize("name", jaxgran.__all__)
+# Each compiles a fit of several curves, all rivals, or a run of soft spheres, for its example alone.
+LONG = ("Diagnosis", "JointFit", "diagnose", "fit_jointly", "read_particles")
+NAMES = [
+    pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in jaxgran.__all__
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_public_docstring_has_an_example_that_runs(name, names, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(getattr(jaxgran, name).__doc__, dict(names), name)

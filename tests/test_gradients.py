@@ -131,6 +131,7 @@ def test_elastic_limit():
     )
 
 
+@pytest.mark.slow
 def test_haff_sensitivity_in_closed_form():
     gas = gases(3)["constant"]
     times = TAUS * gas.mean_free_time

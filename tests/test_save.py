@@ -1,6 +1,7 @@
 """What `cool(save=...)` makes of the particles on the way."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,11 @@ MODELS = [
     jaxgran.HardSpheres(100, replicas=2),
     jaxgran.DSMC(100, replicas=2),
 ]
-names = pytest.mark.parametrize("model", MODELS, ids=lambda model: type(model).__name__)
+slow = partial(pytest.param, marks=pytest.mark.slow)
+
+
+def name_of(model):
+    return type(model).__name__
 
 
 def save(particles):
@@ -34,7 +39,7 @@ def times(gas):
     return gas.mean_free_time * jnp.array([0.0, 1.0, 3.0])
 
 
-@names
+@pytest.mark.parametrize("model", [slow(MODELS[0]), *MODELS[1:]], ids=name_of)
 def test_is_of_the_particles_at_each_time(gas, model):
     t = times(gas)
     curve = jaxgran.cool(gas, t, model=model, save=save, progress=False)
@@ -59,7 +64,7 @@ def test_is_of_the_particles_at_each_time(gas, model):
         np.testing.assert_allclose(curve.replicas.saved["S"][1][:, -1], own, rtol=1e-10)
 
 
-@names
+@pytest.mark.parametrize("model", [slow(MODELS[0]), MODELS[1], slow(MODELS[2])], ids=name_of)
 def test_compiles(gas, model):
     sized = model if isinstance(model, jaxgran.DSMC) else model.sized_for(gas)
     t = times(gas)[:2]

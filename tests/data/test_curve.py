@@ -57,6 +57,15 @@ def test_everything_that_was_computed_is_kept(tmp_path):
     # No field but the status, which says that nothing failed, may be lost.
     for name, value in vars(dataclasses.replace(theory, status=None)).items():
         np.testing.assert_array_equal(getattr(copy, name), value, err_msg=name)
+    jaxgran.write_curve(tmp_path / "theory.npz", theory, {"T0": "1 m"})
+    copy, header = jaxgran.read_curve(tmp_path / "theory.npz")
+    assert header == {"T0": "1 m"} and eqx.tree_equal(copy, theory)
+
+
+@pytest.mark.slow  # a program of particles is compiled
+def test_everything_of_a_particle_run_is_kept(tmp_path):
+    gas = glass_beads()
+    times = gas.mean_free_time * jnp.array([1.0, 2.0, 3.0])
     spheres = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(20, replicas=2), progress=False)
     jaxgran.write_curve(tmp_path / "spheres.npz", spheres, {"T0": "1 m"})
     copy, header = jaxgran.read_curve(tmp_path / "spheres.npz")

@@ -116,10 +116,11 @@ def result():
 
 @pytest.mark.parametrize("too_large, said", [(1.0, False), (3.0, True)])
 def test_errors_that_are_too_large_are_named(too_large, said):
-    # 30 residuals of a third of their errors: chi^2 is 3 of 28 degrees of freedom.
+    # 40 residuals of a third of their errors: chi^2 is 4 of 39 degrees of freedom. As many points
+    # as `result` has, so that one program fits both.
     gas = glass_beads()
-    curve = jaxgran.cool(gas, jnp.geomspace(0.1, 10.0, 30))
-    noise = 0.02 * np.random.default_rng(3).normal(size=30)
+    curve = jaxgran.cool(gas, jnp.geomspace(0.1, 10.0, 40))
+    noise = 0.02 * np.random.default_rng(3).normal(size=40)
     T = curve.temperature * jnp.exp(noise)
     error = 0.02 * too_large * T
     measured = jaxgran.CoolingCurve(curve.times, T, temperature_error=error)

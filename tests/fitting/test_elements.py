@@ -72,6 +72,7 @@ def test_roughness_and_A_are_found_together(model):
     assert "not looked for beside tangential_restitution" in said
 
 
+@pytest.mark.slow
 def test_a_T_rot_that_theory_misses_as_a_whole_is_no_misfit():
     # Theory knows T_rot within 7 %: a common factor of 1.05 is within that, errors are 2 %.
     gas = dataclasses.replace(glass_beads(), surface=ROUGH)
@@ -132,6 +133,7 @@ def test_rivals_know_the_elements_of_the_scene():
     assert low < float(gas.value("dissipative_constant")) < high
 
 
+@pytest.mark.slow
 def test_a_measured_T_rot_of_smooth_spheres_is_said_to_be_unused(beads):
     gas = dataclasses.replace(glass_beads(), surface=ROUGH)
     with pytest.warns(UserWarning, match="T_rot.*is not used.*surface"):

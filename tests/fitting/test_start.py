@@ -86,6 +86,7 @@ def fitted_together(gas, curve, name):
     return both
 
 
+@pytest.mark.slow
 def test_t0_and_the_first_temperature_are_not_found_together(measured):
     fitted_together(*measured, A)
 

@@ -122,6 +122,7 @@ def compare(gas, elements):
     assert curve.rotational_temperature_error is not None
 
 
+@pytest.mark.slow
 def test_smooth_walls_and_surfaces_leave_the_spins_alone():
     surface = jaxgran.Rough(-1.0, rotational_temperature=2e-3)
     walls = jaxgran.Walls(0.05, restitution=0.8)

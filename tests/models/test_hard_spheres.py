@@ -309,6 +309,7 @@ def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
         jaxgran.cool(gas, 2 * times, model=HardSpheres(100, neighbours=by), checkpoint=file)
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_give_the_same_numbers():
     gas = hard_gas(0.8, 0.1)
     start = jaxgran.cool(gas, [0.0], model=HardSpheres(100)).particles

@@ -253,6 +253,7 @@ def rough_gas():
     return dataclasses.replace(gas, surface=surface)
 
 
+@pytest.mark.slow
 def test_cool_chooses_particles():
     gas = rough_gas()
     times = over(gas, 30)

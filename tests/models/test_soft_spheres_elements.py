@@ -119,6 +119,7 @@ def test_flight_with_drag_is_exact():
     np.testing.assert_allclose(apart - side * np.round(apart / side), 0.0, atol=1e-12 * side)
 
 
+@pytest.mark.slow
 def test_elastic_gas_with_drag_cools_as_drag_alone():
     # An elastic impact keeps energy: T exp(2 gamma t), with the energy of contacts, is constant.
     gas = soft(0.02, 0.0, drag=jaxgran.StokesDrag(1.0))
@@ -190,6 +191,7 @@ def test_steps_with_friction_are_of_second_order(mu):
     np.testing.assert_allclose((ends[0] - ends[1]) / (ends[1] - ends[2]), 4.0, rtol=0.04)
 
 
+@pytest.mark.slow
 def test_without_friction_frictional_spheres_are_smooth():
     _, curve, *_ = oblique(jaxgran.Frictional(0.5, 0.0, rotational_temperature=1e-3))
     _, smooth, *_ = oblique(None)
@@ -245,6 +247,7 @@ def test_the_model_for_friction_is_soft_spheres():
     assert any("leave friction out" in reason for reason in choice.reasons)
 
 
+@pytest.mark.slow
 def test_boxes_of_three_sides_contain_the_gas():
     gas = soft()
     sides = float(gas.box_side(NUM)) * np.array([2.0, 1.0, 0.5])
@@ -267,6 +270,7 @@ def log_temperatures(gas, model, times, names):
     return logs, jnp.log(jnp.stack([gas.value(name) for name in names]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "elements, names",
     [
@@ -334,6 +338,7 @@ def test_derivatives_that_are_not_known_are_refused(name):
         jax.jacfwd(logs)(at)
 
 
+@pytest.mark.slow
 def test_follows_lammps_with_friction_between_walls_particle_by_particle():
     # Written by `python experiments/accuracy/compare_lammps_elements.py --store`.
     data = dict(np.load(DATA / "lammps_elements_n64.npz"))

@@ -79,7 +79,8 @@ def compare(dimension, replicas, side, cutoff, by):
 
 
 # Each sweep is compiled for its shapes.
-WAYS = [("vesin", f) for f in (0.15, 1 / 3, 0.4999, 0.5)] + [("sweep", f) for f in (0.15, 0.5)]
+WAYS = [("vesin", f) for f in (0.15, 1 / 3, 0.4999, 0.5)]
+WAYS += [("sweep", 0.5), pytest.param("sweep", 0.15, marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -173,6 +174,7 @@ def test_a_capacity_that_is_exceeded_is_reported():
         assert search(capacity=len(expected)).count == len(expected)
 
 
+@pytest.mark.slow
 def test_lists_of_jax_md_grow_with_the_gas():
     # A gas that has clumped since has the same shape, so the list kept for it is too small.
     rng = np.random.default_rng(2)
@@ -363,6 +365,7 @@ def test_planes_of_a_lattice_are_in_reach_under_jit(beads):
     assert count == 3 * 25**3 and 1200 < ahead <= most
 
 
+@pytest.mark.slow
 def test_very_many_disks_are_in_reach(beads):
     # In order of x only by a coarse number, as the index takes most of its bits.
     gas = beads(packing_fraction=0.1, dimension=2)

@@ -82,6 +82,7 @@ def test_one_point_for_all_is_parted(monkeypatch):
     assert closest(np.asarray(x), 8.0) >= 1 + initial.GAP / 2
 
 
+@pytest.mark.slow
 def test_boxes_of_several_sides_under_vmap():
     sides = jnp.array([side_of(0.1, 3), side_of(0.3, 3)])
     keys = jax.random.split(jax.random.key(2), 2)

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -16,6 +17,7 @@ from jaxgran.particles import side_by_side
 from jaxgran.particles.interruption import waited_for
 
 TIMES = jnp.array([0.01, 0.03])
+slow = partial(pytest.param, marks=pytest.mark.slow)
 MODELS = {"DSMC": 200, "HardSpheres": 20, "SoftSpheres": 20}
 
 
@@ -30,7 +32,7 @@ def cool(gas, name, replicas, **options):
     return jaxgran.cool(gas, TIMES, model=model, progress=False, **options)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", ["HardSpheres", *(slow(x) for x in ("DSMC", "SoftSpheres"))])
 def test_a_replica_is_the_same_whoever_runs_beside_it(name, beads, two_devices):
     gas, key = beads(packing_fraction=0.1), jax.random.key(4)
     two, three = cool(gas, name, 2, key=key), cool(gas, name, 3, key=key)
@@ -45,6 +47,7 @@ def test_a_replica_is_the_same_whoever_runs_beside_it(name, beads, two_devices):
     assert two.temperature_error.shape == TIMES.shape
 
 
+@pytest.mark.slow
 def test_a_start_is_parted_and_derivatives_are_of_the_same_runs(beads, two_devices):
     gas = beads(packing_fraction=0.1)
     start = cool(gas, "HardSpheres", 2).particles

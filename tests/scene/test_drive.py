@@ -93,6 +93,7 @@ def test_the_derivative_in_the_strength():
     assert float(forward[2]) == pytest.approx(2 / 3, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_drag_alone_balances_the_drive():
     # dT/dt = strength - 2 gamma T
     gas = dataclasses.replace(constant(1.0), drag=jaxgran.StokesDrag(0.1))
@@ -144,6 +145,7 @@ def test_the_steady_state_is_where_theory_comes_to_rest(eps):
     assert float(slope(strength) * strength / steady.temperature) == pytest.approx(2 / 3, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_the_steady_state_of_rough_viscoelastic_spheres_in_air(beads):
     gas = dataclasses.replace(
         beads(),
@@ -168,6 +170,7 @@ def prepared(eps) -> jaxgran.Gas:
     return dataclasses.replace(constant(eps), drive=None, preparation=jaxgran.DrivenStart())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("eps", [0.5, 0.8])
 def test_a_gas_that_was_driven_begins_in_its_steady_state(eps):
     curve = driven(prepared(eps), [0.0, 5.0])
