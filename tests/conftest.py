@@ -1,4 +1,8 @@
 import os
+import shutil
+import tempfile
+from functools import partial
+from pathlib import Path
 
 import jax
 import pytest
@@ -8,11 +12,28 @@ from jaxtyping import install_import_hook
 # pytrees of tracers annotations hold for one member.
 with install_import_hook("jaxgran", "beartype.beartype"):
     import jaxgran
+    from jaxgran.cli.programs import SWITCH, keep_programs
 
-os.environ["JAXGRAN_NO_CACHE"] = "1"  # of the user; a test has its own
+PROGRAMS = "JAXGRAN_TEST_PROGRAMS"
+"""An environment variable: the folder of programs compiled in this run of the tests."""
+
 os.environ["MPLBACKEND"] = "agg"  # no window
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_configure(config):
+    """What one file or worker has compiled serves the others, in this run of the tests alone."""
+    if not hasattr(config, "workerinput"):
+        os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxgran-tests-")
+        config.add_cleanup(partial(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True))
+        if config.option.markexpr == "not slow":
+            # Tests mostly compile. The slow ones run what users run, with all optimisation.
+            flags = os.environ.get("XLA_FLAGS", "")
+            os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=0 {flags}".strip()
+    os.environ[SWITCH] = "0"
+    keep_programs(Path(os.environ[PROGRAMS]))
+    os.environ[SWITCH] = "1"  # the user's own; a test has its own
 
 
 def glass_beads(beta: float = 0.15, dimension: int = 3, **values) -> jaxgran.Gas:
