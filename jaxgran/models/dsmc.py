@@ -170,7 +170,7 @@ class DSMC(AbstractModel):
     ) -> dict[str, Array]:
         """The records of a run by the driver on the host, with progress and checkpoints."""
         start, advance, observe = simulation.parts(
-            scene, words, replicas=self.replicas, scheme=scheme
+            scene, words, replicas=self.replicas, scheme=scheme, donate=run.checkpoint is None
         )
         _, records, fault = follow(
             start,

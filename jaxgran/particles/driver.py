@@ -19,13 +19,12 @@ from jaxgran.checks.tracing import concrete
 from jaxgran.data import checkpoint
 from jaxgran.data.description import described
 from jaxgran.data.run import Run
-from jaxgran.data.trajectory import Sphere, Trajectory
 from jaxgran.particles import neighbours, programs
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import MOST_IDLE, AbstractDynamics
 from jaxgran.particles.interruption import waited_for
 from jaxgran.particles.simulation import SETTLED, Simulation
-from jaxgran.particles.state import State, empty_records, spoil
+from jaxgran.particles.state import State, empty_records, owned, spoil
 from jaxgran.tangents.rule import Outputs
 
 CHECKPOINT_SECONDS = 60.0
@@ -36,11 +35,12 @@ MOST_PAIRS = 100
 
 
 class Failure(Exception):
-    """A run that cannot go on, with its status."""
+    """A run that cannot go on, with its status, and its last good state where that is not the one
+    from before the call."""
 
-    def __init__(self, fault: int):
+    def __init__(self, fault: int, state: Any = None):
         super().__init__(status.explain(fault))
-        self.fault = fault
+        self.fault, self.state = fault, state
 
 
 @runtime_checkable
@@ -94,9 +94,9 @@ def follow(
         try:
             _raise_if(fault)
             while done < len(times):
-                while float(state.time) < times[done]:
-                    before, state = state, advance(state, float(times[done]))
-                    idle = _idle(idle, before, state)
+                while (now := float(state.time)) < times[done]:
+                    state = advance(state, float(times[done]))
+                    idle = _idle(idle, now, state)
                     _show(bar, state, shown or observe)
                     if time.monotonic() - saved > CHECKPOINT_SECONDS:
                         save()
@@ -110,6 +110,7 @@ def follow(
             raise
         except Failure as failure:
             fault = failure.fault
+            state = state if failure.state is None else failure.state
             spoil(records, done)
     return state, records, fault
 
@@ -124,9 +125,9 @@ def _record(records: dict[str, np.ndarray], done: int, observed: dict[str, jax.A
         records[name][done] = value
 
 
-def _idle(idle: int, before: S, state: S) -> int:
+def _idle(idle: int, before: float, state: S) -> int:
     """How often in a row the time has not advanced; Failure if too often."""
-    idle = idle + 1 if float(state.time) <= float(before.time) else 0
+    idle = idle + 1 if float(state.time) <= before else 0
     if idle >= MOST_IDLE:
         raise Failure(status.STALLED.bit)
     return idle
@@ -183,24 +184,26 @@ def drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
 
 
 def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
-    write = _writer(sim, run)  # a file that cannot be is told before the melt
+    write = sim.writer(run)  # a file that cannot be is told before the melt
     dynamics, fault, state = sim.dynamics, status.OK, sim.first_state()
     engine = neighbours.engine(sim.engine, dynamics.capacity.lookahead)
+    # An interruption saves the state from before the call under way, which then is not donated.
+    donate = run.checkpoint is None
     if sim.melts and not (run.checkpoint is not None and Path(run.checkpoint).exists()):
         state, fault = _melt(sim, state, engine, run.progress)
-    state = sim.cooling_state(state)
+    state = owned(sim.cooling_state(state))
+
+    def advance(state: State, end: float) -> State:
+        return _advance(state, end, dynamics, dynamics.capacity, engine, run.progress, donate)
+
     try:
         if fault == status.OK:  # counts the energy in contacts
-            state = _advance(state, 0.0, dynamics, dynamics.capacity, engine, run.progress)
+            state = advance(state, 0.0)
     except Failure as failure:
-        fault = failure.fault
+        fault, state = failure.fault, failure.state
     times = np.asarray(sim.inputs.times)
     given = sim.inputs._asdict() | settings | {"directions": sim.directions, "save": sim.save}
     scene = {} if run.checkpoint is None else described(**given)
-
-    def advance(state: State, end: float) -> State:
-        return _advance(state, end, dynamics, dynamics.capacity, engine, run.progress)
-
     state, records, fault = follow(
         state,
         times,
@@ -217,23 +220,6 @@ def _drive(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
     return sim.outputs(state, arrays, fault)
 
 
-def _writer(sim: Simulation, run: Run) -> Callable[[int, State], None]:
-    """Writes the particles at a time to the trajectory, if there is one."""
-    if run.trajectory is None:
-        return lambda k, state: None
-    resumed = run.checkpoint is not None and Path(run.checkpoint).exists()
-    trajectory = Trajectory(run.trajectory, sim.dynamics.replicas, resumed)
-    units = sim.inputs.units
-    sphere = Sphere(float(units.length), float(units.mass))
-    unit_time = float(units.length / units.velocity)
-
-    def write(k: int, state: State) -> None:
-        time = float(sim.inputs.times[k]) * unit_time
-        trajectory.write(k, time, sim.particles(state), sphere)
-
-    return write
-
-
 def _melt(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[State, int]:
     """The state after elastic motion, and what prepares it else, and the status."""
     elastic = sim.dynamics.elastic()
@@ -244,14 +230,15 @@ def _melt(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[S
         capacity = sim.melt_capacity if crowded else elastic.capacity
         return _advance(state, end, elastic, capacity, engine, progress)
 
-    end = np.asarray([sim.melt_time])
+    state, end = owned(state), np.asarray([sim.melt_time])
     state, _, fault = follow(state, end, advance, elastic.observe, progress=progress, label="melt")
     steady = sim.dynamics.preparing
     if steady is None or fault != status.OK:
         return state, fault
     kept = {"capacity": steady.capacity, "engine": engine, "progress": progress}
     prepare = partial(_advance, dynamics=steady, **kept)
-    state, end = steady.with_kicks(state, sim.key), np.asarray([sim.prepared_time])
+    state = owned(steady.with_kicks(state, sim.key))
+    end = np.asarray([sim.prepared_time])
     state, _, fault = follow(state, end, prepare, steady.observe, progress=progress, label="melt")
     return state, fault
 
@@ -263,8 +250,11 @@ def _advance(
     capacity: Capacity,
     engine: str,
     progress: bool,
+    donate: bool = True,
 ) -> State:
     """Some stretches towards an end, in arrays that grow from a given capacity.
+
+    With `donate` the state given may be deleted: after a failure the last good one takes its place.
 
     Raises:
         Failure: if something else goes wrong.
@@ -272,24 +262,32 @@ def _advance(
     while True:
         room = _GROWN.get(capacity, capacity)
         roomy = dynamics if dynamics.capacity == room else dynamics.with_capacity(room)
-        state, fault, needed = _some_stretches(roomy, state, end, engine, progress)
+        state, fault, needed = _some_stretches(roomy, state, end, engine, progress, donate)
         if fault == status.OK:
             return state
         full = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
         if not full or max(needed) > MOST_PAIRS * len(state.position):
-            raise Failure(fault)
+            raise Failure(fault, state)
         # That stretch is made again as a whole: a list made on the way has another order.
         _GROWN[capacity] = room.grown(needed)
 
 
 def _some_stretches(
-    dynamics: AbstractDynamics, state: State, end: float, engine: str, progress: bool
+    dynamics: AbstractDynamics,
+    state: State,
+    end: float,
+    engine: str,
+    progress: bool,
+    donate: bool,
 ) -> tuple[State, int, list[int]]:
-    """Several stretches in one compiled call, or one if the host finds the pairs."""
+    """Several stretches in one compiled call, or one if the host finds the pairs.
+
+    That one begins again from the state given if it fails, which then is never donated.
+    """
     if engine == "sweep":
         until = np.asarray(end, state.time.dtype)
         state, fault, needed = waited_for(
-            programs.some_stretches(dynamics, state, until, engine, progress)
+            programs.some_stretches(dynamics, state, until, engine, progress, donate)
         )
         return state, int(fault), np.asarray(needed).tolist()
     now = waited_for(dynamics.stretch(state, end, engine))

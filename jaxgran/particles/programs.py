@@ -43,23 +43,35 @@ are bounded in number, and shared by plain runs and those inside a rule of diffe
 
 
 def some_stretches(
-    dynamics: AbstractDynamics, state: State, end: np.ndarray, engine: str, progress: bool = False
+    dynamics: AbstractDynamics,
+    state: State,
+    end: np.ndarray,
+    engine: str,
+    progress: bool = False,
+    donate: bool = False,
 ) -> tuple[State, Array, Array]:
-    """`STRETCHES` stretches, compiled for the types and the static fields of these arguments."""
-    leaves, structure = jax.tree.flatten((dynamics, state, end))
+    """`STRETCHES` stretches, compiled for the types and the static fields of these arguments.
 
-    def some(leaves: list[Array]) -> tuple[State, Array, Array]:
-        dynamics, state, end = structure.unflatten(leaves)
+    With `donate` the new state is written over the given one, which must be `owned` and is deleted.
+    """
+    kept, rest = jax.tree.flatten((dynamics, end))
+    moving, of_state = jax.tree.flatten(state)
+
+    def some(moving: list[Array], kept: list[Array]) -> tuple[State, Array, Array]:
+        dynamics, end = rest.unflatten(kept)
+        state = of_state.unflatten(moving)
         return stretches(dynamics, state, end, engine, least=1, most=STRETCHES)
 
+    leaves = moving, kept
     if any_traced(leaves):  # constants within a transformation of something else
-        return jax.jit(some)(leaves)
-    types = tuple((x.shape, x.dtype, getattr(x, "sharding", None)) for x in leaves)
-    key = engine, STRETCHES, structure, types
+        return jax.jit(some)(*leaves)
+    types = tuple((x.shape, x.dtype, getattr(x, "sharding", None)) for x in (*moving, *kept))
+    key = engine, STRETCHES, rest, of_state, types, donate
     if (program := _PROGRAMS.pop(key, None)) is None:  # in one step: there are threads
+        jitted = jax.jit(some, donate_argnums=0 if donate else ())
         with compiling(progress):
-            program = outside_of_transformations(lambda: jax.jit(some).lower(leaves).compile())
+            program = outside_of_transformations(lambda: jitted.lower(*leaves).compile())
     _PROGRAMS[key] = program
     if len(_PROGRAMS) > MOST_PROGRAMS:
         _PROGRAMS.popitem(last=False)
-    return program(leaves)
+    return program(*leaves)

@@ -5,6 +5,7 @@ exactly T_0 without momentum; or it starts from what a user gives.
 """
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from jaxgran.data.curve import Particles
+from jaxgran.data.run import Run
+from jaxgran.data.trajectory import Sphere, Trajectory
 from jaxgran.particles import initial, neighbours, relaxation, snapshot
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics
@@ -111,6 +114,22 @@ class Simulation(NamedTuple):
         """The particles of a state in SI."""
         seen = self.seen(state, state.time)
         return snapshot.particles(self.inputs.units, self.dynamics.replicas, *seen)
+
+    def writer(self, run: Run) -> Callable[[int, State], None]:
+        """Writes the particles at a time, by its number, to the trajectory, if there is one."""
+        if run.trajectory is None:
+            return lambda k, state: None
+        resumed = run.checkpoint is not None and Path(run.checkpoint).exists()
+        trajectory = Trajectory(run.trajectory, self.dynamics.replicas, resumed)
+        units = self.inputs.units
+        sphere = Sphere(float(units.length), float(units.mass))
+        unit_time = float(units.length / units.velocity)
+
+        def write(k: int, state: State) -> None:
+            time = float(self.inputs.times[k]) * unit_time
+            trajectory.write(k, time, self.particles(state), sphere)
+
+        return write
 
     def first_state(self) -> State:
         """The state at the beginning of the melt, or of the run of a given start."""

@@ -5,7 +5,7 @@ array, replica after replica (n = replicas * N rows).
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxgran.particles import neighbours, observables
 from jaxgran.tangents.paths import PathTangents
+
+S = TypeVar("S")
 
 
 class State(NamedTuple):
@@ -72,6 +74,11 @@ def at_start(
         skin=jnp.asarray(skin, dtype),
         own=own,
     )
+
+
+def owned(state: S) -> S:
+    """The same state in buffers of its own, none of them twice, which may be donated."""
+    return jax.tree.map(jnp.copy, state)
 
 
 def time_left(state: State, end: ArrayLike) -> Array:

@@ -227,8 +227,7 @@ def step(
     return state._replace(temperature=temperature)
 
 
-@partial(jax.jit, static_argnames=("scheme", "tangents"))
-def advance(
+def _advanced(
     state: DSMCState,
     end: Float[Array, ""],
     scene: ReducedScene,
@@ -271,3 +270,10 @@ def advance(
     state, _ = jax.lax.while_loop(unfinished, further, (state, max_steps))
     time = jnp.where(jnp.any(due(state)), jnp.min(state.clock), end)
     return state._replace(time=jnp.maximum(time, state.time))
+
+
+advance = jax.jit(_advanced, static_argnames=("scheme", "tangents"))
+advance_in_place = jax.jit(
+    _advanced, static_argnames=("scheme", "tangents"), donate_argnames="state"
+)
+"""`advance` that writes over the state given, which is deleted."""

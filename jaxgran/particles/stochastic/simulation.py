@@ -18,6 +18,7 @@ from jaxgran.checks import status
 from jaxgran.data.curve import Particles
 from jaxgran.particles import drag, observables, snapshot
 from jaxgran.particles.snapshot import Units
+from jaxgran.particles.state import owned
 from jaxgran.particles.stochastic import collisions
 from jaxgran.particles.stochastic.collisions import DSMCState
 from jaxgran.particles.stochastic.pairing import Scheme
@@ -267,15 +268,20 @@ def parts(
     *,
     replicas: int,
     scheme: Scheme,
+    donate: bool,
 ) -> tuple[DSMCState, Callable[[DSMCState, float], DSMCState], Callable[..., dict]]:
-    """The parts of `run` that the host driver needs: a state, how to advance, and to observe it."""
-    state = at_start(key, replicas, scheme, 0, scene)
+    """The parts of `run` that the host driver needs: a state, how to advance, and to observe it.
+
+    With `donate` a state is deleted when it is advanced.
+    """
+    state = owned(at_start(key, replicas, scheme, 0, scene))
     pairs = replicas * (scheme.first + scheme.second)
     max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
     first = state.particles[..., : scheme.dimension]
 
     def advance(state: DSMCState, end: float) -> DSMCState:
+        further = collisions.advance_in_place if donate else collisions.advance
         end_array = jnp.asarray(end, state.clock.dtype)
-        return collisions.advance(state, end_array, scene, key, max_steps, scheme=scheme)
+        return further(state, end_array, scene, key, max_steps, scheme=scheme)
 
     return state, advance, partial(observe, first=first, scene=scene, key=key, scheme=scheme)

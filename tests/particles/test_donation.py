@@ -1,0 +1,89 @@
+"""The driver gives the buffers of a state away where that state is not needed any more."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.checks import status
+from jaxgran.data.run import Run
+from jaxgran.particles import driver, programs
+from jaxgran.particles.capacity import Capacity
+from jaxgran.particles.stochastic import collisions
+
+TIMES = jnp.array([0.01, 0.03])
+MODELS = {
+    "DSMC": jaxgran.DSMC(100, replicas=2),
+    "HardSpheres": jaxgran.HardSpheres(20, replicas=2),
+    "SoftSpheres": jaxgran.SoftSpheres(20, replicas=2),
+}
+
+
+@pytest.fixture
+def given(monkeypatch):
+    """The states that compiled code was given."""
+    states = []
+
+    def watched(module, name, place):
+        forward = getattr(module, name)
+
+        def call(*args, **options):
+            states.append(args[place])
+            return forward(*args, **options)
+
+        monkeypatch.setattr(module, name, call)
+
+    watched(programs, "some_stretches", 1)
+    watched(collisions, "advance", 0)
+    watched(collisions, "advance_in_place", 0)
+    return states
+
+
+def deleted(states):
+    return {leaf.is_deleted() for state in states for leaf in jax.tree.leaves(state)}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_states_are_donated_and_results_the_same(name, beads, given, tmp_path):
+    gas = beads(packing_fraction=0.1)
+    plain = jaxgran.cool(gas, TIMES, model=MODELS[name])
+    assert given and deleted(given) == {True}
+    given.clear()
+    # An interrupted run saves the state from before the call under way: none is donated.
+    kept = jaxgran.cool(gas, TIMES, model=MODELS[name], checkpoint=tmp_path / "run")
+    last = given[-1]
+    assert deleted([last]) == {False}
+    jax.tree.map(np.testing.assert_array_equal, plain, kept)
+
+
+@pytest.mark.parametrize("name", ["HardSpheres", "SoftSpheres"])
+def test_a_start_of_the_user_is_not_donated(name, beads, given):
+    gas = beads(packing_fraction=0.1)
+    start = jaxgran.cool(gas, TIMES, model=MODELS[name]).particles
+    # In units of the run already, so that no unit makes another array of it.
+    unit = gas.replace(diameter=1.0, temperature=1.0)
+    scaled = start._replace(
+        position=start.position / gas.diameter,
+        velocity=start.velocity / jnp.sqrt(gas.temperature),
+        box_side=start.box_side / gas.diameter,
+    )
+    model = getattr(jaxgran, name)(20, replicas=2, start=scaled)
+    given.clear()
+    first = jaxgran.cool(unit, 100 * TIMES, model=model)
+    assert deleted(given) == {True} and deleted([scaled]) == {False}
+    again = jaxgran.cool(unit, 100 * TIMES, model=model)
+    np.testing.assert_array_equal(first.temperature, again.temperature)
+
+
+def test_a_run_that_fails_returns_its_last_good_state(beads, monkeypatch):
+    gas = beads(packing_fraction=0.1)
+    monkeypatch.setattr(driver, "MOST_PAIRS", 0)  # no array may grow
+    tiny = MODELS["HardSpheres"].sized_for(gas).plan
+    assert tiny is not None
+    plan = tiny._replace(capacity=Capacity(*(4,) * len(Capacity._fields)))
+    model = jaxgran.HardSpheres(20, replicas=2, plan=plan)
+    curve = model.simulate(gas, TIMES, Run())
+    assert int(curve.status) & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
+    assert np.all(np.isnan(curve.temperature))
+    assert curve.particles is not None and np.all(np.isfinite(curve.particles.velocity))
