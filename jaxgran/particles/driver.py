@@ -125,7 +125,7 @@ def _record(records: dict[str, np.ndarray], done: int, observed: dict[str, jax.A
         records[name][done] = value
 
 
-def _idle(idle: int, before: float, state: S) -> int:
+def _idle(idle: int, before: float, state: _Timed) -> int:
     """How often in a row the time has not advanced; Failure if too often."""
     idle = idle + 1 if float(state.time) <= before else 0
     if idle >= MOST_IDLE:
