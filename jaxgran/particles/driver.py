@@ -109,8 +109,7 @@ def follow(
             save()
             raise
         except Failure as failure:
-            fault = failure.fault
-            state = state if failure.state is None else failure.state
+            fault, state = failure.fault, failure.state or state
             spoil(records, done)
     return state, records, fault
 
