@@ -31,8 +31,11 @@ EFOLDS = 6.0
 """Relaxation times of D in one window: of D exp(-6) are missing then, and are added."""
 
 WINDOWS = 6
-LEAST = 90.0
-"""Collisions per sphere in all windows together, at least."""
+LEAST = {3: 90.0, 2: 360.0}
+"""Collisions per sphere in all windows together, at least, by dimension: D scatters more in 2D."""
+
+SEEDS = {3: 8, 2: 32}
+"""Runs of a course."""
 
 MARKS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
 """Collisions per sphere at which a course is recorded."""
@@ -49,7 +52,7 @@ def cooling_state(d: int, eps: float, blocks: int, seed: int) -> tuple[np.ndarra
     # Per collision D relaxes at this rate in the first Sonine approximation.
     window = EFOLDS / ((1 + eps) ** 2 / (2 * d))
     found = []
-    for _ in range(max(WINDOWS, round(LEAST / window))):
+    for _ in range(max(WINDOWS, round(LEAST[d] / window))):
         gas.forget()
         samples = []
         for _ in range(steps := round(window / 1.5)):
@@ -206,7 +209,7 @@ def main() -> None:
             )
     courses = []
     for d in (3, 2):
-        courses.append(course(d, blocks, 2 if options.smoke else 8))
+        courses.append(course(d, blocks, 2 if options.smoke else SEEDS[d]))
         say_course(courses[-1])
     write_picture(draw(states, courses), "sonine_coefficients", options)
     path = options.out / "sonine_coefficients.json"

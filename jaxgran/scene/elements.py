@@ -245,6 +245,13 @@ def check(gas: Any) -> None:
                 "preparation=DrivenStart() determines T_rot at t = 0: leave rotational_temperature "
                 f"or preparation out of the gas, got {np.asarray(rotation)} m^2/s^2"
             )
+    if gas.drag is not None and gas.surface is None:
+        rate = gas.drag.rotational_rate
+        if is_known(rate) and np.any(np.asarray(rate) != 0):
+            raise ValueError(
+                "rotational_rate of the drag slows spins, which smooth spheres do not have, got "
+                f"{np.asarray(rate)} 1/s: add surface=jaxgran.Rough(...), or leave it out"
+            )
     if gas.container is not None:
         rough = isinstance(gas.surface, Rough)
         _check_walls(gas.container, gas.diameter, gas.dimension, rough=rough)

@@ -175,19 +175,10 @@ def test_derivatives_in_the_floats_of_elements_are_those_of_differences(beads):
         )
 
 
-@pytest.mark.parametrize("name", ELEMENTS)
-def test_other_models_refuse_what_they_do_not_take(beads, name):
-    if name == "container":
-        elements = {name: jaxgran.Walls(0.05, restitution=0.8)}
-    else:
-        elements = {name: ELEMENTS[name]}
-    gas = scene(beads(), **elements)
-    times = TAUS * float(gas.mean_free_time)
-    refusing = {"surface": jaxgran.SoftSpheres(100)}
-    for model in [refusing[name]] if name in refusing else []:
-        kind = type(model).__name__
-        with pytest.raises(ValueError, match=f"{kind} does not take .*{name}.*KineticTheory"):
-            jaxgran.cool(gas, times, model=model)
+def test_soft_spheres_refuse_a_rough_surface_and_name_the_model_that_takes_it(beads):
+    gas = scene(beads(), surface=ELEMENTS["surface"])
+    with pytest.raises(ValueError, match="SoftSpheres does not take .*surface.*KineticTheory"):
+        jaxgran.cool(gas, TAUS * float(gas.mean_free_time), model=jaxgran.SoftSpheres(100))
 
 
 @pytest.mark.parametrize(
@@ -214,6 +205,10 @@ def test_other_models_refuse_what_they_do_not_take(beads, name):
                 container=jaxgran.Walls(0.1, restitution=0.9, tangential_restitution=0.0),
             ),
             "needs rough spheres: add surface",
+        ),
+        (
+            lambda: constant(0.9, drag=jaxgran.StokesDrag(0.1, rotational_rate=0.2)),
+            "rotational_rate of the drag slows spins, which smooth spheres do not have",
         ),
         (lambda: constant(0.9, surface=0.5), "expected a jaxgran.Rough, a jaxgran.Frictional or"),
         (lambda: constant(0.9, drag=0.5), "expected a jaxgran.StokesDrag or None, got 0.5"),
