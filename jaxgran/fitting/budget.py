@@ -13,6 +13,7 @@ from jaxgran.data.run import Run
 from jaxgran.fitting.parameters import Parameters
 from jaxgran.fitting.priors import Priors
 from jaxgran.fitting.result import Fit
+from jaxgran.models.base import AbstractModel
 from jaxgran.models.course import Course
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.selection import course_along
@@ -34,7 +35,7 @@ def in_scene(result: Fit, num_particles: int | None, replicas: int) -> Fit:
     own = course.clock_error(result.model.rate_error(course))[-result.curve.times.size :]
     clock_error = jnp.asarray(own, result.clock_error.dtype)
     fitted = bool(result.priors.names) and not result.model.stochastic
-    # What a clock that was fitted along, within `derivative_accuracy`, does not hold already.
+    # What a clock that was fitted along, within its error at a first guess, does not hold yet.
     beyond = jnp.maximum(clock_error**2 - fitted * result.clock_error**2, 0.0)
     moved = result.clock_gain @ jnp.sqrt(beyond)
     covariances = dict(result.covariances)
@@ -46,6 +47,22 @@ def in_scene(result: Fit, num_particles: int | None, replicas: int) -> Fit:
         chance = _by_chance(result, course, num_particles * replicas)
         covariances["few particles"] = _beyond(chance, covariances["measurement"])
     return dataclasses.replace(result, clock_error=clock_error, covariances=covariances)
+
+
+def clock_accuracy(
+    guess: Gas, curve: CoolingCurve, model: AbstractModel, num_particles: int | None = None
+) -> Float[Array, "times"]:
+    """Relative accuracy of a model's clock in the scene of a curve, at each of its times.
+
+    Args:
+        guess: the gas, about.
+        curve: at whose times.
+        model: a deterministic one.
+        num_particles: N of each measured run, if known.
+    """
+    times = jnp.concatenate([jnp.zeros(int(curve.times[0] > 0)), curve.times])
+    course = course_along(guess, model.simulate(guess, times, Run()), num_particles)
+    return jnp.asarray(course.clock_error(model.rate_error(course))[-curve.times.size :])
 
 
 def _course(result: Fit, num_particles: int | None) -> Course:

@@ -41,6 +41,7 @@ class Comparison:
         accuracies: relative accuracy of the model's T_rot ("rotation") and <dr^2> ("displacement"),
             where they are used.
         clock_of_few: factor by which the measured gas cools faster because its N are few.
+        clock_accuracy: relative accuracy of the model's clock, for the priors of its errors.
         scatter: relative error of T where the curve has none; else None.
     """
 
@@ -52,6 +53,7 @@ class Comparison:
     weights: dict[str, Array]
     accuracies: dict[str, Float[Array, ""] | float]
     clock_of_few: Float[Array, ""] | float
+    clock_accuracy: Float[Array, "..."] | float
     scatter: Float[Array, ""] | None = None
 
     @classmethod
@@ -64,8 +66,12 @@ class Comparison:
         num_particles: Float[Array, ""] | None,
         replicas: Float[Array, ""] | float = 1.0,
         priors: Priors = NO_PRIORS,
+        clock_accuracy: Float[Array, "..."] | None = None,
     ) -> "Comparison":
-        """Compare T and, where errors are known on both sides, T_rot and <dr^2>."""
+        """Compare T and, where errors are known on both sides, T_rot and <dr^2>.
+
+        Without a `clock_accuracy` it is the model's ``derivative_accuracy``.
+        """
         T, T_error = curve.temperature, curve.temperature_error
         weights = {"measurement": _weights(T, T if T_error is None else T_error)}
         accuracies: dict[str, Float[Array, ""] | float] = {}
@@ -89,7 +95,8 @@ class Comparison:
         parameters = Parameters(gas, varied, halving_time(curve))
         num_free = sum(size_of(gas, name) for name in names)
         faster = 1.0 if num_particles is None else clock_of_few(gas, num_particles)
-        return cls(curve, model, parameters, num_free, priors, weights, accuracies, faster)
+        sure = model.derivative_accuracy if clock_accuracy is None else clock_accuracy
+        return cls(curve, model, parameters, num_free, priors, weights, accuracies, faster, sure)
 
     def scaled(self, flat: Float[Array, "q"]) -> "Comparison":
         """The same with the scatter of ln T at some parameters for its error."""
@@ -124,7 +131,7 @@ class Comparison:
         mean, trend = errors = flat[self.of_gas(flat).size :][:2]
         log_T = jnp.log(self.curve.temperature)
         along = 2 * (log_T - log_T[0]) / (log_T[-1] - log_T[0]) - 1
-        own = jnp.exp(self.model.derivative_accuracy * (mean + trend * along))
+        own = jnp.exp(self.clock_accuracy * (mean + trend * along))
         return self.clock_of_few * own, errors
 
     def estimates(self, flat: Float[Array, "q"]) -> Float[Array, "p"]:

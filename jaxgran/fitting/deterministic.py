@@ -33,13 +33,16 @@ def fit_deterministic(
     max_steps: int = 100,
     priors: Priors = NO_PRIORS,
     of_errors: dict[str, Float[Array, ""]] | None = None,
+    clock_accuracy: Float[Array, "times"] | None = None,
 ) -> Fit:
     """Fit through a deterministic model, from the best of some guesses.
 
     Args, returns: as `jaxgran.fit`; of_errors are the degrees of freedom of the errors, see
-    `jaxgran.fitting.few_replicas.smooth_errors`.
+    `jaxgran.fitting.few_replicas.smooth_errors`; clock_accuracy is the relative accuracy of the
+    model's clock at each time, which is fitted along where there are priors.
     """
-    comparison = Comparison.of(gas, curve, model, names, num_particles, replicas, priors)
+    known = num_particles, replicas, priors, clock_accuracy
+    comparison = Comparison.of(gas, curve, model, names, *known)
     first = comparison.best(guesses)
     search = SEARCHES[method]
     flat, iterations, converged = search(comparison.residuals, first, max_steps)
@@ -78,8 +81,8 @@ def _fit_at(
     known = comparison.curve.temperature_error is not None
     chance = misfit(tested, degrees_of_freedom, errors_known=known)
     clock_gain = _clock_gain(comparison.split(clock_slope), gains)
-    accuracy = comparison.model.derivative_accuracy
-    clock_error = jnp.full(comparison.curve.times.shape, accuracy, flat.dtype)
+    shape = comparison.curve.times.shape
+    clock_error = jnp.broadcast_to(jnp.asarray(comparison.clock_accuracy, flat.dtype), shape)
     moved = clock_gain @ clock_error
     covariances = {"model": jnp.outer(moved, moved)}
     covariances |= _covariances(comparison, gains, parts["measurement"], chance.inflation)

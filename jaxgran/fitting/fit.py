@@ -12,7 +12,7 @@ from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
 from jaxgran.checks.validation import no_type_check, whole_number
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.budget import in_scene
+from jaxgran.fitting.budget import clock_accuracy, in_scene
 from jaxgran.fitting.checks import check_curve, unused_rotation
 from jaxgran.fitting.deterministic import SEARCHES, fit_deterministic
 from jaxgran.fitting.few_replicas import smooth_errors
@@ -136,7 +136,10 @@ def fit(
         steps = 100 if max_steps is None else max_steps
         # As arrays: other numbers share the compiled program.
         N = None if num_particles is None else jnp.asarray(float(num_particles))
-        search = N, jnp.asarray(float(replicas)), method, steps, known, of_errors
+        clock = None
+        if known.names and not any_traced(curve, gas):  # the clock is then fitted along
+            clock = clock_accuracy(guesses[0], curve, model, num_particles)
+        search = N, jnp.asarray(float(replicas)), method, steps, known, of_errors, clock
         result = fit_deterministic(gas, curve, model, names, guesses, *search)
     if not any_traced(result.chi2, curve, gas):
         _check_computed(result)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.run import Run
+from jaxgran.fitting.budget import clock_accuracy
 from jaxgran.fitting.checks import check_curve, check_deterministic
 from jaxgran.fitting.comparison import Comparison
 from jaxgran.fitting.guess import guess_from_data, guess_of_start, halving_time
@@ -21,7 +21,6 @@ from jaxgran.fitting.result import SIGNIFICANCE
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.selection import course_along
 from jaxgran.scene.gas import Gas
 
 MOST_STEPS = 100
@@ -94,7 +93,12 @@ def fit_jointly(
     _check(measurements, shared, separate, model)
     labels, pairs = tuple(measurements), tuple(measurements.values())
     names = tuple(shared), tuple(separate)
-    clocks = [_clock_error(gas, data, sum(names, ()), model) for gas, data in pairs]
+    clocks = [
+        jnp.zeros(())
+        if isinstance(data, DropTest)
+        else jnp.max(clock_accuracy(guess_from_data(gas, data, sum(names, ())), data, model))
+        for gas, data in pairs
+    ]
     found = _search(pairs, *names, model, clocks)
     if not all(np.all(np.isfinite(part)) for part in found[1]):
         raise RuntimeError("the model could not compute a curve where the joint search ended")
@@ -135,18 +139,6 @@ def _check(measurements, shared, separate, model) -> None:
                 f"the curve of {label!r} has no errors, by which measurements are weighed: give "
                 "temperature_error (jaxgran.fit tells the scatter of a single curve)"
             )
-
-
-def _clock_error(
-    gas: Gas, data: CoolingCurve | DropTest, names: tuple[str, ...], model: AbstractModel
-) -> Float[Array, ""]:
-    """Relative error of the model's clock in the scene of a curve; 0 for a drop test."""
-    if isinstance(data, DropTest):
-        return jnp.zeros(())
-    guess = guess_from_data(gas, data, names)
-    times = jnp.concatenate([jnp.zeros(int(data.times[0] > 0)), data.times])
-    course = course_along(guess, model.simulate(guess, times, Run()))
-    return jnp.asarray(float(np.max(course.clock_error(model.rate_error(course)))))
 
 
 @eqx.filter_jit

@@ -60,6 +60,10 @@ def test_inputs_are_propagated(names, part, slope):
     alone = jaxgran.fit(gas, curve, free=A)
     # The input is not known better than before: A stays where it was.
     assert abs(result.estimate[0] / alone.estimate[0] - 1) < 0.2 * relative(result, part)
+    # The clock is fitted along, within its error in this scene. A curve narrows it, and its trend
+    # adds to the error of its mean.
+    ratio = relative(result, "model") / relative(alone, "model")
+    assert 0.8 < ratio < 1.15, ratio
     low, high = jaxgran.diagnose(result, curve).ranges["dissipative_constant"]
     assert low < a_true < high
 
