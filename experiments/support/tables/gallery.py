@@ -344,7 +344,7 @@ ENTRIES = {
             "sonine_coefficients",
             states,
             "sonine_coefficients.png",
-            "7 min",
+            "20 min",
         ),
         Entry(
             "accuracy/measure_correlations.py",
