@@ -161,7 +161,7 @@ def draw(states: list[dict], courses: list[dict]) -> Figure:
     )
     for axes in panels:
         axes.axhline(0, color=INK, lw=0.8)
-        axes.legend(frameon=False, loc="lower left" if axes is panels[2] else "upper right")
+        axes.legend(frameon=False, loc="upper left" if axes is panels[2] else "upper right")
         axes.spines[["top", "right"]].set_visible(False)
     return figure
 
