@@ -31,6 +31,7 @@ from jaxgran.particles import side_by_side, snapshot
 from jaxgran.particles.drag import transformed
 from jaxgran.particles.driver import follow
 from jaxgran.particles.interruption import waited_for
+from jaxgran.particles.programs import compiling, first_time
 from jaxgran.particles.stochastic import simulation
 from jaxgran.particles.stochastic.pairing import Scheme
 from jaxgran.scene.gas import Gas
@@ -169,14 +170,19 @@ class DSMC(AbstractModel):
         run: Run,
     ) -> dict[str, Array]:
         """The records of a run by the driver on the host, with progress and checkpoints."""
-        start, advance, observe = simulation.parts(
-            scene, words, replicas=self.replicas, scheme=scheme, donate=run.checkpoint is None
-        )
+        new = first_time((scheme, self.replicas, jax.tree.structure(scene), times.dtype))
+        with compiling(run.progress and new):
+            start, advance, observe = simulation.parts(
+                scene, words, replicas=self.replicas, scheme=scheme, donate=run.checkpoint is None
+            )
+            recorded = partial(observe, units=units, save=snapshot.function(run.save))
+            if new:  # compiled by a call that goes no step; a state that is given away is a copy
+                jax.block_until_ready(recorded(advance(jax.tree.map(jnp.copy, start), 0.0)))
         _, records, fault = follow(
             start,
             np.asarray(times),
             lambda state, end: waited_for(advance(state, end)),
-            partial(observe, units=units, save=snapshot.function(run.save)),
+            recorded,
             shown=observe,
             scene=described(
                 scene=scene, times=times, key=words, scheme=scheme, model=self, save=run.save

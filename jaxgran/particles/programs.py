@@ -2,7 +2,7 @@
 
 import sys
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -32,6 +32,16 @@ def compiling(progress: bool) -> Iterator[None]:
     finally:
         if shown:
             print(f"\r{' ' * len(COMPILING)}\r", end="", file=sys.stderr, flush=True)
+
+
+_MET: set[Hashable] = set()
+
+
+def first_time(program: Hashable) -> bool:
+    """Whether this process is told of a program for the first time, and so has it to compile."""
+    new = program not in _MET
+    _MET.add(program)
+    return new
 
 
 MOST_PROGRAMS = 32
