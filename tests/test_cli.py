@@ -119,6 +119,7 @@ def test_several_measurements_are_fitted_jointly(measured, capsys):
     assert (measured / "a" / "thin-kinetic-theory.png").read_bytes()[:8] == PNG
 
 
+@pytest.mark.slow
 def test_a_contradicting_drop_test_is_named(measured, capsys):
     assert main(["fit", "thin.csv", "--drop-test", "others.csv", "--free", "A", "--out", "b"]) == 0
     said, answer = _answer(capsys)

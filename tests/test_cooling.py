@@ -50,7 +50,9 @@ def test_a_failed_run_returns_its_status(beads, monkeypatch):
     assert status.has(curve.status, status.TOO_FAST) and np.isnan(curve.temperature[-1])
 
 
-@pytest.mark.parametrize("kind", [jaxgran.HardSpheres, jaxgran.SoftSpheres])
+@pytest.mark.parametrize(
+    "kind", [jaxgran.HardSpheres, pytest.param(jaxgran.SoftSpheres, marks=pytest.mark.slow)]
+)
 def test_a_run_of_spheres_that_fails_keeps_what_it_has(beads, kind):
     gas = beads(0.15, packing_fraction=0.05)
     side = gas.box_side(2)

@@ -29,7 +29,7 @@ def names():
 
 
 # Each compiles a fit of several curves, all rivals, or a run of spheres, for its example alone.
-LONG = ("Diagnosis", "JointFit", "diagnose", "fit_jointly", "read_particles")
+LONG = ("Diagnosis", "JointFit", "diagnose", "fit_jointly", "impact", "read_particles")
 NAMES = [
     pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in jaxgran.__all__
 ]

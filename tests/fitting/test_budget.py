@@ -193,6 +193,7 @@ def test_derivatives_through_a_flow_are_known_worse():
     assert jaxgran.DSMC(1000).derivative_error(course_of(gas, end, 1000)) == 0
 
 
+@pytest.mark.slow
 def test_a_diagnosis_tells_the_bias_of_the_derivatives():
     """From the run of the fit itself: larger errors, and words."""
     gas = glass_beads(0.15)

@@ -119,6 +119,7 @@ def test_a_gas_that_does_not_cool_has_no_rivals():
     assert diagnosis.rivals == () and diagnosis.ranges == {}
 
 
+@pytest.mark.slow
 def test_noise_of_simulations_widens_the_range():
     gas, curve = curve_of(closed_curves.nothing)
     result = jaxgran.fit(gas, curve, free=FREE)

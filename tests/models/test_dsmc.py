@@ -99,10 +99,10 @@ def test_a_million_particles_spread_as_kinetic_theory_says(million):
     "eps, dimension, a2, error",
     [
         (0.5, 3, 0.0476, 4e-4),
-        (0.8, 3, -0.0145, 3e-4),
-        (0.9, 3, -0.0152, 2e-4),
+        pytest.param(0.8, 3, -0.0145, 3e-4, marks=pytest.mark.slow),
+        pytest.param(0.9, 3, -0.0152, 2e-4, marks=pytest.mark.slow),
         (0.5, 2, 0.0733, 4e-4),
-        (0.9, 2, -0.0301, 3e-4),
+        pytest.param(0.9, 2, -0.0301, 3e-4, marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.parametrize("replicas", [1, pytest.param(16, marks=pytest.mark.slow)])

@@ -52,7 +52,7 @@ ALL = ("surface", "container", "drag", "drive")
 @pytest.mark.parametrize(
     "kind, elements",
     [
-        ("DSMC", ("drag",)),
+        pytest.param("DSMC", ("drag",), marks=pytest.mark.slow),
         pytest.param("DSMC", ALL, marks=pytest.mark.slow),
         pytest.param("HardSpheres", ALL, marks=pytest.mark.slow),
     ],

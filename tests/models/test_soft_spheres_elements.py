@@ -326,6 +326,7 @@ def test_derivatives_are_those_of_differences_and_of_theory(elements, names):
         np.testing.assert_allclose(found[i], expected[i], atol=0.01, rtol=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["wall_side", "packing_fraction", "diameter"])
 def test_derivatives_that_are_not_known_are_refused(name):
     gas, times = soft(law="own"), [1e-3]

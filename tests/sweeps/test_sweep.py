@@ -238,6 +238,7 @@ def test_ragged_batches_and_unknown_names_are_refused(gas, gases):
         sweep(jax.vmap(lambda T: gas.replace(temperature=T))(jnp.array([-1.0, -2.0])))
 
 
+@pytest.mark.slow
 def test_lists_have_the_axis_of_members_before_their_own():
     law = jaxgran.RestitutionSeries((-0.1, -0.1), (0.0, 0.2))
     gas = jaxgran.Gas(law, diameter=2e-3, mass=1e-5, packing_fraction=0.05, temperature=0.01)
@@ -248,6 +249,7 @@ def test_lists_have_the_axis_of_members_before_their_own():
     np.testing.assert_allclose(curves.temperature[2], alone.temperature, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_wall_sides_that_may_be_of_one_box_or_of_three(gas):
     walls = jaxgran.Walls([0.05, 0.06, 0.07], restitution=0.9)
     box = dataclasses.replace(gas, container=walls)

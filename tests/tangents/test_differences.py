@@ -126,6 +126,7 @@ def in_g(more, less, base, span):
     return -base * (1 - base**0.6) / 0.6 * (g[0] - g[1]) / span
 
 
+@pytest.mark.slow  # with all optimisation, under which the two programs round alike
 def test_soft_spheres_have_the_difference_of_two_runs(beads):
     gas = soft_beads(beads, 0.05, 0.3, packing_fraction=0.15)
     times = jnp.array([0.5, 3.0]) * gas.mean_free_time
