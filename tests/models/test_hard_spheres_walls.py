@@ -48,7 +48,7 @@ def test_energy_is_conserved_and_all_stay_inside(elements):
     place = np.asarray(curve.particles.position)
     assert place.min() > 1e-3 * (1 - 1e-9) and place.max() < (SIDE - 1e-3) * (1 + 1e-9)
     assert float(curve.particles.box_side) == pytest.approx(SIDE)
-    assert curve.displacement is None
+    assert curve.displacement is None and curve.flow_share is None
     apart = place[0][:, None] - place[0][None]
     distance = np.linalg.norm(apart, axis=-1) + np.eye(len(apart))
     assert distance.min() > 2e-3 * (1 - 1e-8)

@@ -67,7 +67,7 @@ def test_ledger_closes_and_all_stay_inside(name):
         overlap = 0.05 * float(gas.diameter)  # elastic impacts at 5 sqrt(T) overlap by 4 %
         edge = 0.5 * float(gas.diameter) - overlap
         assert place.min() > edge and place.max() < side - edge
-        assert curve.displacement is None
+        assert curve.displacement is None and curve.flow_share is None
         assert float(curve.particles.box_side) == pytest.approx(side)
         # Walls push: unlike in a periodic box the gas as a whole does not stay at rest.
         momentum = np.abs(np.mean(curve.particles.velocity[0], axis=0))

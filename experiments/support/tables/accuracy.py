@@ -35,6 +35,22 @@ def projected(found: dict) -> str:
     return " / ".join(pairs) + " %"
 
 
+def in_flow(scene: str) -> Callable[[dict], str]:
+    """Errors of derivatives where they are no larger than the derivative itself."""
+
+    def words(found: dict) -> str:
+        one = found["scenes"][scene]
+        known = [i for i, error in enumerate(one["bias"][1]) if error < 0.5]
+        told = " / ".join(percent(one["derivative_bias"][i]) for i in known)
+        parts = [
+            " / ".join(f"{percent(one[key][0][i])} ± {100 * one[key][1][i]:.1f}" for i in known)
+            for key in ("bias", "bias_of_differences")
+        ]
+        return f"projected {parts[0]} %, told {told} %; by differences {parts[1]} %"
+
+    return words
+
+
 def plain(found: dict) -> str:
     mean, error = found["d_ln_T_d_ln_A"]["plain"]
     right = found["d_ln_T_d_ln_A"]["differences"][0]
@@ -226,7 +242,18 @@ ROWS = (
         "finite differences",
         "tests",
         test("hard_derivatives"),
-        f"{SLOW} tests/tangents/test_impact.py -k against_differences",
+        f"{SLOW} tests/tangents/test_impact.py -k 'against_differences or biases'",
+    ),
+    *(
+        Row(
+            f"d ln T/d ln A through hard {kind} in a box of {box} L_c, at 3 / 10 / 30 / 100 "
+            "collisions, projected and by differences of 32 replicas",
+            "finite differences of more runs",
+            "derivatives_in_flows",
+            in_flow(scene),
+            f"python experiments/accuracy/derivatives_in_flows.py --scenes {scene}",
+        )
+        for scene, kind, box in (("hard", "spheres", "1.1"), ("disks", "disks", "2"))
     ),
     Row(
         "d ln T/d ln A through hard spheres, φ = .01, β = .15, at 1 / 5 / 10 / 50 / 100 τ_c",

@@ -73,6 +73,14 @@ def health(f: dict) -> str:
     return f"To {max(abs(100 * x) for x in bias):.0f} % until 100 collisions; not in clusters."
 
 
+def in_flows(f: dict) -> str:
+    found = f["scenes"]["hard"]
+    bias = [100 * x for x in found["bias"][0]]
+    left = max(abs(100 * x) for x in found["bias_of_differences"][0])
+    too_large = between(bias, "{:.0f}")
+    return f"Projected ones are {too_large} % too large, differences within {left:.0f} %."
+
+
 def lammps(f: dict) -> str:
     found = f["curves"]["dense"]["largest_temperature_difference"]
     return f"Within {100 * found:.1f} % in the dense gas, with nothing fitted."
@@ -303,6 +311,15 @@ ENTRIES = {
             health,
             "gradient_health.png",
             "12 min; clustering 100 min",
+            "accuracy.md",
+        ),
+        Entry(
+            "accuracy/derivatives_in_flows.py",
+            "Are derivatives right where a gas has a flow, or does the curve say?",
+            "derivatives_in_flows",
+            in_flows,
+            "derivatives_in_flows.png",
+            "5 min",
             "accuracy.md",
         ),
         Entry(
