@@ -52,12 +52,14 @@ def cool(
             cheapest whose estimated error is small enough; `jaxgran.choose_model` says which, and
             why.
         key: of the random numbers of a particle model. Without one it is `jax.random.key(0)`: two
-            such calls return the same numbers. Where there are several CPU devices each replica is
-            a run of its own on one of them, with the key ``fold_in(key, k)``.
+            such calls return the same numbers. Where there are several CPU devices, and on one for
+            8192 spheres and more, each replica is a run of its own, with the key
+            ``fold_in(key, k)``, and the same whoever runs beside it; others stand in one array, and
+            spheres then share the lengths of their steps and the lives of their neighbour lists.
         progress: show a progress bar on a terminal during a run of some seconds.
         checkpoint: a file to which a particle model's run is saved each minute and when it is
             interrupted, and from which it is resumed; the resumed run gives the same numbers bit
-            for bit. Not inside `jax.jit` and `jax.vmap`. Replicas on several CPU devices have a
+            for bit. Not inside `jax.jit` and `jax.vmap`. Replicas that are runs of their own have a
             file each, with the endings .0, .1, ...
         save: of a model with particles: a function that JAX can compile, of the `Particles` of one
             replica (arrays of shape (N, d), SI), which returns arrays in any tree; see

@@ -71,7 +71,7 @@ class DSMC(AbstractModel):
     refused.
 
     Args:
-        num_particles: N, >= 2.
+        num_particles: N, >= 2, on one device.
         replicas: independent gases that are simulated together; two or more give error bars.
         step: collisions per particle in one step, in (0, 0.1]. A step has one pair at least, which
             is 0.5/N and in a gas of some ten particles longer than asked.

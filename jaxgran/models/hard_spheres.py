@@ -72,8 +72,10 @@ class HardSpheres(AbstractSpheres):
     driven for 10 mean free times with what its impacts take.
 
     Args:
-        num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer.
-        replicas: independent boxes simulated side by side; two or more give error bars.
+        num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer. It lives on
+            one device: the guide says how large it may be.
+        replicas: independent boxes; two or more give error bars. See `key` of `jaxgran.cool` for
+            what they share.
         contact_time: in mean free times of the homogeneous gas at the current temperature, in
             [0, 0.1]; 0 is the pure hard sphere, which may collapse.
         start: positions and velocities to begin with instead of random ones; their box must be

@@ -70,9 +70,11 @@ class SoftSpheres(AbstractSpheres):
     of tangential forces, follow the normal ones of pairs.
 
     Args:
-        num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer.
+        num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer. It lives on
+            one device: the guide says how large it may be.
         steps_per_contact: steps in the mean contact duration at the current temperature, >= 10.
-        replicas: independent boxes simulated side by side; two or more give error bars.
+        replicas: independent boxes; two or more give error bars. See `key` of `jaxgran.cool` for
+            what they share.
         start: positions and velocities to begin with instead of random ones; their box must be
             that of the gas.
         neighbours: who finds the pairs: "sweep" (compiled with the rest), "vesin" (on the host),

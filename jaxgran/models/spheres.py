@@ -175,7 +175,7 @@ class AbstractSpheres(AbstractModel):
 
     def _outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
         """The run in reduced units: driven from the host if all numbers are known, else pure."""
-        if not any_traced(inputs) and (on := beside.devices(self.replicas)):
+        if not any_traced(inputs) and (on := beside.devices(self.replicas, self.num_particles)):
             alone = dataclasses.replace(self, replicas=1, start=None, plan=None)
 
             def one(k: int, run: Run) -> Outputs:

@@ -250,6 +250,17 @@ def test_benchmark_of_replicas_runs(tmp_path):
 
 
 @pytest.mark.slow
+def test_benchmark_of_a_million_runs(tmp_path):
+    done = run("speed/benchmark_million.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "figures.json").read_text())["rows"]
+    # A sphere's state is 13 numbers, and no array of a run has a thousand numbers for a sphere; the
+    # few spheres of a smoke run carry the memory of the compiler.
+    assert row["strong"] > 0 and row["weak"] > 0 and row["bytes_per_particle"] > 13 * 8
+    assert row["clusters"]["collisions"][-1] > 5 and len(row["clusters"]["unevenness"]) == 14
+
+
+@pytest.mark.slow
 def test_stochastic_benchmark_runs(tmp_path):
     done = run("speed/benchmark_dsmc.py", "--smoke", "--out", "figures.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -24,7 +24,7 @@ MODELS = {"DSMC": 200, "HardSpheres": 20, "SoftSpheres": 20}
 @pytest.fixture
 def two_devices(monkeypatch):
     device = jax.devices()[0]
-    monkeypatch.setattr(side_by_side, "devices", lambda n: (device,) * 2 if n > 1 else ())
+    monkeypatch.setattr(side_by_side, "devices", lambda n, *_: (device,) * 2 if n > 1 else ())
 
 
 def cool(gas, name, replicas, **options):
@@ -78,7 +78,7 @@ def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
         cool(gas, "DSMC", 2, checkpoint=path).temperature, curve.temperature
     )
     path.touch()
-    with pytest.raises(ValueError, match="written with one CPU device"):
+    with pytest.raises(ValueError, match="written by replicas in one array"):
         cool(gas, "DSMC", 2, checkpoint=path)
 
 
@@ -112,6 +112,28 @@ def test_an_error_of_one_ends_the_others_and_is_raised():
 
 def test_replicas_stand_in_one_array_where_there_is_one_device_or_a_chosen_one():
     assert side_by_side.devices(1) == () and side_by_side.devices(2) == ()
+    many = side_by_side.MANY
+    assert side_by_side.devices(2, many - 1) == side_by_side.devices(1, many) == ()
+    assert side_by_side.devices(2, many) == tuple(jax.devices())
+    with jax.default_device(jax.devices()[0]):
+        assert side_by_side.devices(2, many) == ()
+
+
+@pytest.mark.parametrize("name", ["HardSpheres", "SoftSpheres"])
+def test_large_replicas_on_one_device_run_in_turn(name, beads, monkeypatch):
+    monkeypatch.setattr(side_by_side, "MANY", MODELS[name])
+    gas, key = beads(packing_fraction=0.1), jax.random.key(4)
+    two = cool(gas, name, 2, key=key)
+    alone = cool(gas, name, 1, key=jax.random.fold_in(key, 1))
+    np.testing.assert_array_equal(two.replicas.temperature[1], alone.temperature)
+
+
+def test_replicas_of_dsmc_share_nothing_in_one_array(beads):
+    gas, key = beads(packing_fraction=0.1), jax.random.key(4)
+    two, three = cool(gas, "DSMC", 2, key=key), cool(gas, "DSMC", 3, key=key)
+    for field in ("temperature", "collisions", "displacement"):
+        each = [np.asarray(getattr(curve.replicas, field)) for curve in (two, three)]
+        np.testing.assert_array_equal(each[0], each[1][:2])
 
 
 @pytest.mark.slow  # two devices need a process of their own, which compiles for each

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from experiments.support.tables import million
 from experiments.support.tables.words import Row, between, each, of, thousands
 
 NOTE = """\
@@ -55,10 +56,6 @@ def hard(found: dict) -> str:
 def disks(found: dict) -> str:
     rows = of(found["rows"], dimension=2)
     return f"{each((thousands(row['collisions_per_s']) for row in rows), '{}')} collisions/s"
-
-
-def million(found: dict) -> str:
-    return f"{disks(found)}, {found['peak_memory_GiB']:.1f} GiB at the peak"
 
 
 def slopes(found: dict) -> str:
@@ -172,26 +169,13 @@ ROWS = (
         HARD,
     ),
     Row(
-        "10⁶ hard disks, φ = .2",
-        "",
-        "benchmark_hard_spheres_million",
-        million,
-        f"{HARD} --dimensions 2 --sizes 1000000",
-    ),
-    Row(
         "50 000 hard disks, φ = .2, ε = .9, into clusters, 100 collisions each",
         "",
         "benchmark_hard_spheres_until",
         lambda f: f"{f['run_s']:.0f} s with compilation",
         f"{HARD} --until 100",
     ),
-    Row(
-        "10⁶ soft spheres",
-        "",
-        "benchmark_particles_million",
-        lambda f: f"{f['peak_memory_GiB']:.1f} GiB at the peak",
-        f"{SOFT} --sizes 1000000 --fractions .01 --repeats 1 --alone",
-    ),
+    *million.ROWS,
     Row(
         "1000 curves of 5 decades, vmap",
         "SciPy LSODA loop, same accuracy",
