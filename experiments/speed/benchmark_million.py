@@ -73,6 +73,7 @@ def main() -> None:
         case, model = options.measure
         print(json.dumps(measure(case, model, options.size)))
         return
+    jax.config.update("jax_enable_x64", True)  # as in the processes that measure
     rows = []
     for model in options.models:
         cases = options.cases or (*SCALING, *([CLUSTERS] if model in UNTIL else []))

@@ -25,7 +25,7 @@ def of_each(words: Callable[[dict], str], *needed: str) -> Callable[[dict], str]
 def of_a_collision(row: dict) -> str:
     case = row["two cores"]
     peak = case["peak_GiB"]
-    return f"{1e6 * case['s_per_collision']:.2g} µs a collision, {peak:.1f} GiB at the peak"
+    return f"{1e6 * case['s_per_collision']:.3g} µs a collision, {peak:.1f} GiB at the peak"
 
 
 def into_clusters(row: dict) -> str:
