@@ -191,7 +191,7 @@ def draw(results: dict) -> Figure:
         title = f"{WORDS[name]} in a box of {found['box_over_critical']:.1f} $L_c$"
         axes.set_title(title, fontsize=10, loc="left")
         axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].legend(frameon=False, fontsize=9, loc="lower left")
+    figure.axes[0].legend(frameon=False, fontsize=9, loc="upper right")
     return figure
 
 
