@@ -58,6 +58,7 @@ def times_of(gas: jaxgran.Gas, model: jaxgran.HardSpheres, last: float) -> np.nd
     """Times up to that at which a particle has collided so often, by a run."""
     times = float(gas.mean_free_time) * np.geomspace(0.3, 60 * last, POINTS)
     counts = jaxgran.cool(gas, times, model=model, progress=False).collisions
+    assert counts is not None
     end = np.exp(np.interp(np.log(last), np.log(counts), np.log(times)))
     return np.geomspace(times[0], end, POINTS)
 
@@ -77,6 +78,7 @@ def examine(name: str, smoke: bool) -> dict:
         changed = gas.replace(dissipative_constant=constant * jnp.exp(log_scale))
         key = jax.random.key(seed)
         curve = jaxgran.cool(changed, times, model=model, key=key, progress=False)
+        assert curve.replicas is not None
         return jnp.log(curve.replicas.temperature), curve
 
     def forward(model, seed=0):
