@@ -20,7 +20,9 @@ Measured by differences of runs after 3, 10, 30, 100 collisions: soft spheres, p
 beta = .2, N = 1000 (1.4 L_c), 3, 7, 16, 78 +- 1, 1, 1, 3 % too large (this: 3, 6, 19, 80 %); hard
 spheres, phi = .2, beta = .3, N = 500 (1.1 L_c), 7, 17, 18, 21 +- 2, 3, 3, 3 % (3, 9, 28, 21 %);
 hard disks, phi = .25, beta = .3, N = 300 (2 L_c), 9, 21, 77 +- 4, 6, 30 % (4, 16, 670 %), after
-which ln T does not depend on A any more, and the projected derivative says -1.7.
+which ln T does not depend on A any more, and the projected derivative says -1.7. Fitted to these
+runs; ``experiments/accuracy/derivatives_in_flows.py`` has measured the last two again since, with
+smaller errors.
 """
 
 PREDICTED = 0.65
