@@ -18,8 +18,6 @@ import datetime
 import json
 import os
 import resource
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -28,8 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.support.apart import alone
 from experiments.support.clustering import PER_CELL, crossing, viscoelastic_like
-from experiments.support.record import EXPERIMENTS, FIGURES, add_recording, figures, write_results
+from experiments.support.record import FIGURES, add_recording, figures, write_results
 from experiments.support.scenes import beads, hard_beads
 
 NAME = "benchmark_million"
@@ -82,7 +81,7 @@ def main() -> None:
         for case in cases:
             if case == CLUSTERS and model not in UNTIL:
                 continue
-            row[case] = alone(case, model, options)
+            row[case] = alone(__file__, "--size", str(options.size), "--measure", case, model)
             print(f"{model}, {case}: {words(row[case])}", flush=True)
         rows.append(row | derived(row))
         print(f"{model}: {derived(row)}", flush=True)
@@ -124,18 +123,6 @@ def derived(row: dict) -> dict:
         found["bytes_per_particle"] = each
         found["largest"] = {str(gb): gb * 1e9 / each for gb in DEVICES_GB}
     return found
-
-
-def alone(case: str, model: str, options: argparse.Namespace) -> dict:
-    """What a process of its own measures."""
-    command = [sys.executable, __file__, "--size", str(options.size), "--measure", case, model]
-    environment = dict(os.environ)
-    folders = [str(EXPERIMENTS.parent), environment.get("PYTHONPATH", "")]
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, folders))
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def peak_memory() -> float:

@@ -12,14 +12,13 @@ collisions per particle.
 import argparse
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from experiments.support.record import EXPERIMENTS, add_recording, seconds, write_results
+from experiments.support.apart import alone
+from experiments.support.record import add_recording, seconds, write_results
 
 CASES = ("one core", "one device", "two devices")
 MODELS = ("SoftSpheres", "HardSpheres", "DSMC")
@@ -49,25 +48,13 @@ def main() -> None:
     rows = []
     for model in MODELS[-1:] if options.smoke else MODELS:
         row: dict = {"model": model, "num_particles": options.size, "replicas": 2}
-        row |= {case: alone(case, model, options) for case in CASES}
+        size = ["--size", str(options.size), *(["--smoke"] if options.smoke else [])]
+        row |= {case: alone(__file__, *size, "--measure", case, model) for case in CASES}
         row["ratio"] = row[CASES[2]]["collisions_per_s"] / row[CASES[0]]["collisions_per_s"]
         rows.append(row)
         rates = ", ".join(f"{case} {row[case]['collisions_per_s']:.0f}" for case in CASES)
         print(f"{model}: collisions/s {rates}; two devices {row['ratio']:.2f} times one core")
     write_results("benchmark_replicas", options, options.out, rows=rows)
-
-
-def alone(case: str, model: str, options: argparse.Namespace) -> dict:
-    """What a process of its own measures."""
-    command = [sys.executable, __file__, "--size", str(options.size), "--measure", case, model]
-    command += ["--smoke"] if options.smoke else []
-    environment = dict(os.environ)
-    folders = [str(EXPERIMENTS.parent), environment.get("PYTHONPATH", "")]
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, folders))
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def measure(case: str, name: str, size: int, repeats: int) -> dict:
