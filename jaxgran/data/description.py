@@ -16,14 +16,16 @@ import numpy as np
 SHORT = 4
 """Arrays of at most so many numbers are described by their values, longer ones by a digest."""
 
-_OWN = ("jaxgran.", "equinox.", "builtins", "typing", "abc")
+_OWN = ("jaxgran.", "equinox.", "builtins", "typing", "abc", "collections.abc")
 
 
 def described(**parts: Any) -> dict[str, str]:
     """A description of each number and each choice of some objects, by name.
 
     Two runs whose descriptions agree return the same numbers. Arrays are described by type, shape
-    and values, classes and functions from outside of jaxgran by name and source code.
+    and values, classes and functions from outside of jaxgran by name and source code, functions
+    also by their defaults and the variables of a surrounding function that they use. What they take
+    from their module is not seen.
 
     Args:
         parts: modules, named tuples, containers, arrays and plain values, by name.
@@ -44,11 +46,16 @@ def differences(old: dict[str, str], new: dict[str, str]) -> list[str]:
     ]
 
 
-def _entries(name: str, value: Any) -> Iterator[tuple[str, str]]:
+def _entries(name: str, value: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[str, str]]:
+    """Descriptions of a value and its parts; `above` are the functions that it is a part of."""
+    value = inspect.unwrap(value) if callable(value) else value  # what jax.jit has wrapped
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         yield name, _array(value)
     elif isinstance(value, types.FunctionType | types.MethodType):
         yield name, f"{value.__module__}.{value.__qualname__} {_digest(_code(value))}"
+        if value not in above:
+            for child, part in _kept(value):
+                yield from _entries(f"{name}.{child}", part, (*above, value))
     else:
         children = _children(value)
         if children is None:
@@ -56,7 +63,7 @@ def _entries(name: str, value: Any) -> Iterator[tuple[str, str]]:
             return
         yield name, _class(type(value))
         for child, part in children:
-            yield from _entries(f"{name}.{child}", part)
+            yield from _entries(f"{name}.{child}", part, above)
 
 
 def _children(value: Any) -> list[tuple[str, Any]] | None:
@@ -73,6 +80,17 @@ def _children(value: Any) -> list[tuple[str, Any]] | None:
     if isinstance(value, functools.partial):
         return [("function", value.func), ("args", value.args), ("keywords", value.keywords)]
     return None
+
+
+def _kept(function: Any) -> list[tuple[str, Any]]:
+    """What a function keeps from where it was made, by name: defaults and its closure."""
+    plain = getattr(function, "__func__", function)
+    kept = [(f"default {k}", part) for k, part in enumerate(plain.__defaults__ or ())]
+    kept += [(f"default {name}", part) for name, part in (plain.__kwdefaults__ or {}).items()]
+    if plain is not function:
+        kept.append(("self", function.__self__))
+    cells = zip(plain.__code__.co_freevars, plain.__closure__ or (), strict=True)
+    return kept + [(name, cell.cell_contents) for name, cell in cells]
 
 
 def _array(value: Any) -> str:

@@ -2,7 +2,7 @@
 
 import re
 from abc import abstractmethod
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -98,6 +98,21 @@ class AbstractModel(eqx.Module):
                     f"leave {'surface' if name == 'friction' else name} out of the gas"
                 )
         self.check(gas)
+
+    def check_save(self, save: Any) -> None:
+        """Raise ValueError for something to save that is no function, or of no particles."""
+        if save is None:
+            return
+        if not (callable(save) or save == "particles"):
+            raise ValueError(
+                'save must be a function of the particles of a replica, or "particles", got '
+                f"{save!r:.60}"
+            )
+        if not self.saves:
+            raise ValueError(
+                f"{type(self).__name__} has no particles of which something could be saved: leave "
+                "save out, or use DSMC(N), HardSpheres(N) or SoftSpheres(N)"
+            )
 
     @abstractmethod
     def check(self, gas: Gas) -> None:

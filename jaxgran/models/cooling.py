@@ -108,7 +108,7 @@ def cool(
             "in SoftSpheres(num_particles), or leave them out"
         )
     model = checks.checked_model(model)
-    _check_save(save, model)
+    model.check_save(save)
     if trajectory is not None:
         _check_trajectory(trajectory, model)
     if checkpoint is not None:
@@ -120,21 +120,6 @@ def cool(
     if throw and curve.status is not None and not isinstance(curve.status, Tracer):
         _raise_if_failed(curve, gas)
     return curve
-
-
-def _check_save(save: Any, model: AbstractModel) -> None:
-    if save is None:
-        return
-    if not (callable(save) or save == "particles"):
-        raise ValueError(
-            'save must be a function of the particles of a replica, or "particles", got '
-            f"{save!r:.60}"
-        )
-    if not model.saves:
-        raise ValueError(
-            f"{type(model).__name__} has no particles of which something could be saved: leave "
-            "save out, or use DSMC(N), HardSpheres(N) or SoftSpheres(N)"
-        )
 
 
 def _check_path(name: str, path: Any) -> None:

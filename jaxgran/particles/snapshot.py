@@ -82,7 +82,28 @@ def saved(save: Callable[[Particles], Any], found: Particles) -> dict[str, Array
 def _of_each(save: Callable[[Particles], Any], found: Particles) -> Any:
     spins = None if found.angular_velocity is None else 0
     axes: Any = Particles(0, 0, None, spins)  # type: ignore[arg-type]
-    return jax.vmap(save, (axes,))(found)
+    return jax.vmap(lambda of_one: _numbers(save(of_one)), (axes,))(found)
+
+
+def _numbers(tree: Any) -> Any:
+    """What a user's function returns, as arrays.
+
+    Raises:
+        ValueError: for nothing, and for something else than numbers.
+    """
+    if not jax.tree.leaves(tree):
+        raise ValueError(f"save must return arrays, in any tree, got {tree!r:.60} from it")
+    return jax.tree.map(_number, tree)
+
+
+def _number(leaf: Any) -> Array:
+    try:
+        array = jnp.asarray(leaf)
+    except TypeError:
+        raise ValueError(f"save must return numbers, got {leaf!r:.60} from it") from None
+    if jnp.issubdtype(array.dtype, jax.dtypes.extended):
+        raise ValueError(f"save must return numbers, got an array of {array.dtype} from it")
+    return array
 
 
 def with_saved(

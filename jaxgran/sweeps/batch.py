@@ -107,6 +107,8 @@ def batched(gases: Any, key: Any) -> Batch:
 def _kind(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"a {type(value).__name__}: stack the floats of its gases into one Gas"
+    if isinstance(value, dict):
+        return "a dict: take jax.vmap(lambda a: gas.replace(dissipative_constant=a))(values)"
     return type(value).__name__
 
 

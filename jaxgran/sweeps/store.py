@@ -17,16 +17,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxgran.data.description import differences
-from jaxgran.data.tables import UNITS, needed
-from jaxgran.scene import gas_words
-from jaxgran.sweeps.batch import INITIAL, Batch
-from jaxgran.sweeps.program import OF_REPLICAS, STATUS, Records, joined
+from jaxgran.data.tables import needed
+from jaxgran.sweeps.batch import Batch
+from jaxgran.sweeps.layout import empty, labels
+from jaxgran.sweeps.program import Records, joined
 
 FORMAT = 1
 """Of the group."""
 
-MEMBER, TIME, REPLICA, CHUNK = "member", "time", "replica", "chunk"
-FINISHED = "finished"
+CHUNK, FINISHED = "chunk", "finished"
 MOST_NAMED = 4
 """Differences that are named in an error."""
 
@@ -53,8 +52,12 @@ class Store(NamedTuple):
         return slice(number * self.chunk, min((number + 1) * self.chunk, self.num_members))
 
     def finished(self) -> np.ndarray:
-        """Whether each chunk has been written, by whichever process."""
-        return np.asarray(self.group[FINISHED][:]) != 0
+        """Whether each chunk has been written, by whichever process.
+
+        Raises:
+            ValueError: if that is not known any more.
+        """
+        return _values(self.path, self.group[FINISHED]) != 0
 
     def write(self, number: int, records: Records) -> None:
         """Write a chunk, and then that it is finished."""
@@ -112,6 +115,7 @@ def opened(
     shapes: Records,
     description: dict[str, str],
     chunk: int,
+    whole: bool = False,
 ) -> Store:
     """The store of a sweep, made now if there is none.
 
@@ -122,6 +126,7 @@ def opened(
         shapes: types and shapes of the records of one member.
         description: all that determines the results.
         chunk: members of a chunk.
+        whole: whether the particles themselves are saved.
 
     Raises:
         ValueError: for a folder or file that is something else, the store of another sweep or of
@@ -131,16 +136,51 @@ def opened(
     """
     path = Path(path)
     if _absent(path):
-        _make(path, batch, times, shapes, description, chunk)
+        _make(path, batch, times, shapes, description, chunk, whole)
     group = _opened(path)
     _check_same(path, dict(group.attrs), description)
-    absent = [name for name in (*shapes, FINISHED) if name not in group]
-    if absent:
-        raise ValueError(
-            f"{path} has no array {absent[0]!r} and is not whole: copy the store again, or name "
-            "another one"
-        )
+    for name, found in labels(batch, times).items():
+        stored = _values(path, _array(path, group, name, found[1]))
+        if not np.array_equal(stored, found[1], equal_nan=True):
+            raise _not_whole(path, f"other values in {name!r}")
+    for name, of_one in shapes.items():
+        _array(path, group, name, of_one, len(batch))
+    _array(path, group, FINISHED, _flags(len(batch), chunk))
     return Store(path, group, tuple(sorted(shapes)), len(batch), chunk)
+
+
+def _array(path: Path, group: Any, name: str, like: Any, *members: int) -> Any:
+    """An array of a store, of the type and shape that it must have.
+
+    Raises:
+        ValueError: if there is no such array.
+    """
+    try:
+        found = group[name]
+        kind = (found.shape, found.dtype)
+    except Exception as error:  # whatever zarr raises where something is lost or cut off
+        raise _not_whole(path, f"no array {name!r} ({error})") from None
+    if kind != ((*members, *like.shape), like.dtype):
+        raise _not_whole(path, f"an array {name!r} of {kind[1]} and shape {kind[0]}")
+    return found
+
+
+def _values(path: Path, array: Any) -> np.ndarray:
+    try:
+        return np.asarray(array[...])
+    except Exception as error:  # whatever a codec raises for a file that was cut off
+        raise _not_whole(path, f"a damaged array {array.basename!r} ({error})") from None
+
+
+def _not_whole(path: Path, has: str) -> ValueError:
+    return ValueError(
+        f"{path} has {has} and is not whole: copy the store again, or name another one"
+    )
+
+
+def _flags(num_members: int, chunk: int) -> np.ndarray:
+    """A digest for each chunk, 0 before it is finished."""
+    return np.zeros(-(-num_members // chunk), np.uint64)
 
 
 def _absent(path: Path) -> bool:
@@ -150,9 +190,12 @@ def _absent(path: Path) -> bool:
 def _opened(path: Path) -> Any:
     zarr = needed("zarr", "sweep")
     try:
+        if path.is_file():
+            raise ValueError("it is a file")
         group = zarr.open_group(str(path), mode="r+", use_consolidated=False)
         attributes = dict(group.attrs)
-        if not {"format", "version", "chunk", "description"} <= attributes.keys():
+        chunk, described = attributes.get("chunk"), attributes.get("description")
+        if not (isinstance(chunk, int) and chunk > 0 and isinstance(described, dict)):
             raise ValueError("its attributes do not describe a sweep")
     except Exception as error:  # whatever zarr raises for a folder that holds something else
         raise ValueError(
@@ -163,11 +206,12 @@ def _opened(path: Path) -> Any:
 
 def _check_same(path: Path, attributes: dict[str, Any], description: dict[str, str]) -> None:
     own = version("jaxgran")
-    if (attributes["format"], attributes["version"]) != (FORMAT, own):
+    version_of, form = attributes.get("version"), attributes.get("format")
+    if (form, version_of) != (FORMAT, own):
         raise ValueError(
-            f"{path} was written by jaxgran {attributes['version']} in format "
-            f"{attributes['format']}, this is {own} with format {FORMAT}, which may compute other "
-            "numbers: finish the sweep with that version, or name another store"
+            f"{path} was written by jaxgran {version_of} in format {form}, this is {own} with "
+            f"format {FORMAT}, which may compute other numbers: finish the sweep "
+            "with that version, or name another store"
         )
     differ = differences(attributes["description"], description)
     if differ:
@@ -185,6 +229,7 @@ def _make(
     shapes: Records,
     description: dict[str, str],
     chunk: int,
+    whole: bool,
 ) -> None:
     """Make the group with all labels and no chunk, at once; leave it if another was faster."""
     zarr = needed("zarr", "sweep")
@@ -193,7 +238,7 @@ def _make(
     try:
         partial.chmod(0o777 & ~_umask())
         group = zarr.open_group(str(partial), mode="w", zarr_format=3)
-        for name, (dims, values, attributes) in _labels(batch, times).items():
+        for name, (dims, values, attributes) in labels(batch, times).items():
             array = group.create_array(
                 name,
                 shape=values.shape,
@@ -203,12 +248,12 @@ def _make(
             )
             array[...] = values
         for name, of_one in shapes.items():
-            _empty(group, name, of_one, len(batch), chunk)
+            empty(group, name, of_one, len(batch), chunk, whole)
         group.create_array(
             FINISHED,
-            shape=(-(-len(batch) // chunk),),
+            shape=_flags(len(batch), chunk).shape,
             chunks=(1,),
-            dtype="uint64",
+            dtype=np.uint64,
             fill_value=0,
             dimension_names=(CHUNK,),
             attributes={"long_name": "digest of the values of a finished chunk, else 0"},
@@ -234,43 +279,6 @@ def _make(
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-
-
-def _labels(batch: Batch, times: np.ndarray) -> dict[str, Any]:
-    """Coordinates: dimensions, values and attributes, by name."""
-    found = {
-        MEMBER: ((MEMBER,), np.arange(len(batch)), {}),
-        TIME: ((TIME,), times, {"units": UNITS["times"]}),
-    }
-    for name, (values, of_members) in batch.labels().items():
-        dims = (MEMBER,) if of_members else ()
-        dims += tuple(f"{name}_{k}" for k in range(values.ndim - len(dims)))  # of a list
-        found[name] = (
-            dims,
-            values,
-            {"units": gas_words.UNITS.get(name.removeprefix(INITIAL), "1")},
-        )
-    return found
-
-
-def _empty(group: Any, name: str, of_one: Any, num_members: int, chunk: int) -> None:
-    """An array of nan (of the status: 0), in chunks of members."""
-    if name == STATUS:
-        dims, attributes = (), {"long_name": "faults, see jaxgran.explain_status"}
-    else:
-        quantity = name.removesuffix(OF_REPLICAS)
-        dims = (TIME,) if quantity == name else (REPLICA, TIME)
-        attributes = {"units": UNITS[quantity], "long_name": name.replace("_", " ")}
-    floats = np.issubdtype(of_one.dtype, np.floating)
-    group.create_array(
-        name,
-        shape=(num_members, *of_one.shape),
-        chunks=(chunk, *of_one.shape),
-        dtype=of_one.dtype,
-        fill_value=np.nan if floats else 0,
-        dimension_names=(MEMBER, *dims),
-        attributes=attributes,
-    )
 
 
 def _digest(records: Records) -> np.uint64:

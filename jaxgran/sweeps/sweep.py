@@ -5,7 +5,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran.checks.validation import checked_times, no_type_check, whole_number
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.data.description import described
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
@@ -22,7 +22,7 @@ from jaxgran.models.spheres import AbstractSpheres
 from jaxgran.scene.gas import Gas
 from jaxgran.sweeps import store as stores
 from jaxgran.sweeps.batch import Batch, batched, first_valid, refusal
-from jaxgran.sweeps.program import Program, Records, curves, failed, joined
+from jaxgran.sweeps.program import Program, Records, curves, failed, joined, records_of
 
 CHUNKS = {False: 1024, True: 16}
 """Members of a chunk of a deterministic and of a stochastic model."""
@@ -38,6 +38,7 @@ def sweep(
     *,
     model: AbstractModel | None = None,
     key: PRNGKeyArray | None = None,
+    save: Callable[[Particles], Any] | Literal["particles"] | None = None,
     store: str | Path | None = None,
     chunk: int | None = None,
     progress: bool = True,
@@ -65,6 +66,13 @@ def sweep(
         key: of the random numbers, from which each member has its own by
             `jax.random.fold_in`; or a row of keys, one for each member. By default
             `jax.random.key(0)`. A member's key does not depend on the number of members.
+        save: of a model with particles: a function of the particles of one replica of a member, or
+            "particles", as in `jaxgran.cool`. Its values, with a first axis of members, are
+            ``curves.saved``, ``curves.saved_error`` and ``curves.replicas.saved``; in the store
+            they are arrays named by their places, as "saved.S.0", "saved_error.S.0" and
+            "saved_of_replicas.S.0", with dimensions member, time and "saved.S.0.axis0" and so on
+            (of particles: replica, particle, axis). Whole numbers and booleans of a member that is
+            not taken are 0.
         store: a folder, made as a Zarr group that `xarray.open_zarr` reads, with dimensions member
             and time, swept floats and units as labels; chunks are written as they end. If it is the
             store of the same sweep, only what is missing is computed. Needs the extra `sweep`, and
@@ -80,7 +88,8 @@ def sweep(
     Raises:
         ValueError: for a batch whose floats have leading axes of different lengths, floats outside
             their range in all members, a model that takes none of them, several processes without a
-            store, or a store of another sweep, of another version of jaxgran, or half written;
+            store, something to save that is no function of particles or has no names, or a store
+            of another sweep, of another version of jaxgran, or half written;
             nothing is overwritten.
         OSError: if the store cannot be written.
 
@@ -92,9 +101,13 @@ def sweep(
     """
     times, batch = checked_times(times), batched(gases, key)
     model = checks.checked_model(KineticTheory() if model is None else model)
+    model.check_save(save)
     chunk = _checked_chunk(chunk, store, model, len(batch))
     valid = first_valid(batch, model)
-    program = Program.of(model, times, chunk, _to_hold(batch, model))
+    program = Program.of(model, times, chunk, _to_hold(batch, model), save)
+    like = None
+    if store is not None or save is not None:
+        like = program.like(batch.member(valid), batch.keys[0])
 
     def computed(number: int) -> Records:
         members = np.arange(number * chunk, min((number + 1) * chunk, len(batch)))
@@ -107,14 +120,15 @@ def sweep(
                 "store, a folder that all of them see"
             )
         chunks = [computed(number) for number in _bar(range(-(-len(batch) // chunk)), progress)]
-        return curves(joined(chunks), times)
+        return curves(joined(chunks), times, like)
+    asked = {} if save is None else {"save": save}
     description = described(
-        gases=batch.gases, keys=batch.keys, times=times, model=model, chunk=chunk
+        gases=batch.gases, keys=batch.keys, times=times, model=model, chunk=chunk, **asked
     )
-    shapes = program.shapes(batch.member(valid), batch.keys[0])
-    kept = stores.opened(store, batch, np.asarray(times), shapes, description, chunk)
+    shapes, whole = jax.eval_shape(records_of, like), save == "particles"
+    kept = stores.opened(store, batch, np.asarray(times), shapes, description, chunk, whole)
     _finish(kept, computed, progress)
-    return curves(kept.read_all(), times)
+    return curves(kept.read_all(), times, like)
 
 
 def _finish(kept: stores.Store, computed: Callable[[int], Records], progress: bool) -> None:

@@ -316,3 +316,29 @@ def test_descriptions_are_of_values_not_of_objects():
     assert differences(described(law=one), described(law=law(3)(np.sqrt)))
     assert not any("0x" in words for words in described(law=one, f=lambda x: x).values())
     assert described(a=object()) == described(a=object())
+
+
+def observable(number, factor=1.0):
+    def save(particles, power=2):
+        return factor * number * particles**power
+
+    return save
+
+
+def recursive():
+    def again(x):
+        return again(x - 1) if x > 0 else x
+
+    return again
+
+
+def test_descriptions_of_functions_hold_what_they_keep():
+    assert described(save=observable(3)) == described(save=observable(3))
+    (words,) = differences(described(save=observable(3)), described(save=observable(4)))
+    assert words == "save.number was 3 and is 4"
+    assert differences(described(save=observable(3)), described(save=observable(3, 2.0)))
+    assert "save.default 0" in described(save=observable(3))
+    # What jax.jit has wrapped is the function.
+    assert described(save=jax.jit(observable(3))) == described(save=observable(3))
+    assert differences(described(save=jax.jit(observable(3))), described(save=jax.jit(recursive())))
+    assert described(save=recursive()) == described(save=recursive())

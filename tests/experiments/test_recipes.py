@@ -11,7 +11,7 @@ TEXT = (Path(__file__).parents[2] / "experiments" / "recipes.md").read_text(enco
 RECIPES = dict(re.findall(r"^## (.*?)\n.*?```python\n(.*?)```", TEXT, re.DOTALL | re.MULTILINE))
 WRITTEN = {
     "A sweep and its heat map": "sweep.png",
-    "Snapshots and a film": "film.gif",
+    "Snapshots, observables and a film": "film.gif",
     "Saving and loading everything": "run.npz",
 }
 SAID = {

@@ -182,34 +182,108 @@ def test_store_of_another_sweep_is_refused(gases, stored, tmp_path, changed, mes
     assert files(path) == before
 
 
-def test_store_of_another_version_half_written_or_something_else_is_refused(
-    gases, stored, tmp_path
+def attributes(**changed):
+    def change(path):
+        header = json.loads((path / "zarr.json").read_text())
+        header["attributes"] |= changed
+        (path / "zarr.json").write_text(json.dumps(header))
+
+    return change
+
+
+def header_of(name, **changed):
+    def change(path):
+        path = path / name / "zarr.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | changed))
+
+    return change
+
+
+def cut(name):
+    def change(path):
+        (path / name).write_bytes((path / name).read_bytes()[:-9])
+
+    return change
+
+
+def one_bit(path):
+    values = path / "temperature" / "c" / "1" / "0"
+    held = bytearray(values.read_bytes())
+    held[-9] ^= 1
+    values.write_bytes(held)
+
+
+def gone(name):
+    return lambda path: (
+        shutil.rmtree(path / name) if (path / name).is_dir() else ((path / name).unlink())
+    )
+
+
+HALF = r"copy.zarr: chunk 1 \(members 2 to 3\) is half written or was changed"
+NO_STORE = "copy.zarr is no store of a sweep .*: name another folder, or remove it"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (cut("temperature/c/1/0"), HALF),
+        (gone("temperature/c/1/0"), HALF),
+        (one_bit, HALF),
+        (gone("temperature"), "no array 'temperature' .* is not whole: copy the store again"),
+        (cut("temperature/zarr.json"), "no array 'temperature' .* is not whole"),
+        (header_of("temperature", shape=[4, 3]), r"'temperature' of float64 and shape \(4, 3\)"),
+        (header_of("diffusion", data_type="float32"), "an array 'diffusion' of float32"),
+        (header_of("finished", shape=[2]), r"an array 'finished' of uint64 and shape \(2,\)"),
+        (cut("finished/c/1"), "a damaged array 'finished' .* is not whole"),
+        (gone("dissipative_constant"), "no array 'dissipative_constant'"),
+        (gone("time/c/0"), "other values in 'time'"),
+        (attributes(version="0.0.9"), "written by jaxgran 0.0.9 .*: finish the sweep with that"),
+        (attributes(format=2), "in format 2, this is .* with format 1, .*or name another store"),
+        (attributes(chunk="two"), NO_STORE),
+        (attributes(chunk=0), NO_STORE),
+        (attributes(description=[1]), NO_STORE),
+        (cut("zarr.json"), NO_STORE),
+        (gone("zarr.json"), NO_STORE),
+    ],
+)
+def test_stores_of_another_version_or_half_written_are_refused(
+    gases, stored, tmp_path, change, message
 ):
     path = copied(stored, tmp_path)
-    values = path / "temperature" / "c" / "1" / "0"
-    values.write_bytes(values.read_bytes()[:-9])
-    with pytest.raises(ValueError, match=r"copy.zarr: chunk 1 \(members 2 to 3\) is half written"):
-        sweep(gases, store=path)
-    values.unlink()
-    with pytest.raises(ValueError, match="chunk 1 .* half written"):
-        sweep(gases, store=path)
-    shutil.rmtree(path / "temperature")
-    with pytest.raises(ValueError, match="no array 'temperature'"):
-        sweep(gases, store=path)
-    header = json.loads((path / "zarr.json").read_text())
-    header["attributes"]["version"] = "0.0.9"
-    (path / "zarr.json").write_text(json.dumps(header))
-    with pytest.raises(ValueError, match="written by jaxgran 0.0.9"):
-        sweep(gases, store=path)
-    (path / "zarr.json").unlink()
+    change(path)
     before = files(path)
-    with pytest.raises(ValueError, match="no store of a sweep"):
+    with pytest.raises(ValueError, match=message):
         sweep(gases, store=path)
     assert files(path) == before
-    with pytest.raises(ValueError, match="no store of a sweep"):
-        sweep(gases, store=next(iter(before)))
+
+
+def test_what_is_no_store_is_refused_and_left_alone(gases, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="notes.txt is no store of a sweep .it is a file"):
+        sweep(gases, store=tmp_path / "notes.txt")
+    with pytest.raises(ValueError, match="is no store of a sweep .No group found"):
+        sweep(gases, store=tmp_path)
+    assert files(tmp_path) == {tmp_path / "notes.txt": b"mine"}
     with pytest.raises(ValueError, match="store must be a path, got 3"):
         sweep(gases, store=3)
+
+
+def test_mistakes_are_told_before_a_store_is_made(gas, gases, tmp_path):
+    path = tmp_path / "sweep.zarr"
+    wrong = [
+        ({"times": (1.0, 0.1)}, "times must increase, got 0.1 after 1"),
+        ({"model": "auto"}, "model must be a model, .* got 'auto'"),
+        ({"chunk": "2"}, "chunk must be a whole number >= 1"),
+        ({"gases": {"dissipation": A}}, "a dict: take jax.vmap"),
+        ({"save": lambda p: p.velocity}, "KineticTheory has no particles"),
+        ({"save": "velocities", "model": jaxgran.DSMC(100)}, 'or "particles", got'),
+    ]
+    for options, message in wrong:
+        with pytest.raises(ValueError, match=message):
+            sweep(**({"gases": gases, "store": path} | options))
+    with pytest.raises(TypeError, match="parameters"):
+        sweep(gases, parameters={"dissipation": A})
+    assert not any(tmp_path.iterdir())
 
 
 def test_ragged_batches_and_unknown_names_are_refused(gas, gases):
