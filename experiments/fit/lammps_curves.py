@@ -1,4 +1,4 @@
-"""Which A explains the five cooling curves that were measured in LAMMPS?
+"""Which A explains the six cooling curves that were measured in LAMMPS?
 
     python experiments/fit/lammps_curves.py [--cases dilute dense ...] [--record] [--out DIR]
 
@@ -18,7 +18,7 @@ from pathlib import Path
 from experiments.support.record import DATA, PICTURES, add_recording, write_results
 from jaxgran.cli.app import main as command
 
-NAMES = ("dilute", "dense", "phi003", "phi010", "phi025")
+NAMES = ("dilute", "dense", "phi003", "phi003_large", "phi010", "phi025")
 DILUTE, DENSE, *OTHERS = (str(DATA / f"lammps_cooling_{name}.csv") for name in NAMES)
 SOFT = ["--model", "soft-spheres"]
 CASES = {

@@ -122,6 +122,9 @@ CLUSTERING = beads(0.3, 0.2, 0.05)
 BOX = float(CLUSTERING.box_side(1000) / CLUSTERING.critical_box)
 """Side of the box of `gradient_health.py`'s clustering gas, in L_c."""
 
+OTHERS = ("phi003", "phi003_large", "phi010", "phi025")
+"""Curves of `make_lammps_curves.py`."""
+
 ROWS = (
     Row(
         "ε of one impact (ODE)",
@@ -171,6 +174,14 @@ ROWS = (
         "lammps_curves_dilute",
         off_true(),
         f"{FIT} --cases dilute",
+    ),
+    Row(
+        "A of LAMMPS curves of other gases, which theory was never adjusted to: φ = .03 with "
+        "N = 1000 and with N = 4000, φ = .1, φ = .25",
+        "true A",
+        " ".join(f"lammps_curves_{name}" for name in OTHERS),
+        lambda *found: "; ".join(off_true()(one) for one in found),
+        f"{FIT} --cases {' '.join(OTHERS)}",
     ),
     Row(
         "A of the dense LAMMPS curve, which the diagnosis refuses; with T₀ free",

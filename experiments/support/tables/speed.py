@@ -81,9 +81,22 @@ def memory(found: dict) -> str:
 def elements(model: str) -> Callable[[dict], str]:
     def words(found: dict) -> str:
         rows = [r for r in found["rows"] if r["model"] == model and r["scene"] != "smooth"]
-        return ", ".join(f"{row['scene']} {row['ratio']:.2f}×" for row in rows)
+        return ", ".join(
+            f"{row['scene']} {row['ratio']:.2f}×"
+            + (
+                ""
+                if row["ratio_of_contacts"] == row["ratio"]
+                else f" ({row['ratio_of_contacts']:.2f}×)"
+            )
+            for row in rows
+        )
 
     return words
+
+
+def versions(found: dict) -> str:
+    rows = [row for row in found["rows"] if row["model"] in ("DSMC", "HardSpheres", "SoftSpheres")]
+    return " / ".join(f"{row['ratio']:.2f} ± {row['error']:.2f}" for row in rows)
 
 
 def dsmc(found: dict) -> str:
@@ -227,14 +240,28 @@ ROWS = (
     ),
     Row(
         "rough spheres, walls: hard spheres, N = 4096",
-        "smooth, for each collision",
+        "smooth, for each collision (for each contact, walls' counted)",
         "benchmark_elements",
         elements("hard spheres"),
         "python experiments/speed/benchmark_elements.py",
     ),
     Row(
+        "walls, drag, friction: soft spheres, N = 2000",
+        "smooth, for each collision (for each contact, walls' counted)",
+        "benchmark_elements_soft",
+        elements("soft spheres"),
+        "python experiments/speed/benchmark_elements.py --soft",
+    ),
+    Row(
+        "a smooth periodic gas: DSMC N = 10⁵, hard spheres N = 4096, soft spheres N = 2000",
+        "the same before scenes had elements, in turns",
+        "benchmark_versions",
+        versions,
+        "python experiments/speed/benchmark_versions.py CHECKOUT",
+    ),
+    Row(
         "rough spheres, walls, drag: DSMC, N = 10⁵",
-        "smooth, for each collision",
+        "smooth, for each collision (for each contact, walls' counted)",
         "benchmark_elements",
         elements("DSMC"),
         "python experiments/speed/benchmark_elements.py",
