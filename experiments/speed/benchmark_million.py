@@ -191,7 +191,7 @@ def short(gas: jaxgran.Gas, name: str, size: int, replicas: int) -> dict:
         made = float(curve.collisions[-1])
         return time.perf_counter() - begin, made
 
-    first_s, _ = cooled(0.1 * SHORT[name])
+    first_s, _ = cooled(SHORT[name])  # also finds the capacities, which may take compilations
     set_up_s, _ = cooled(0.0)
     run_s, made = cooled(SHORT[name])
     pairs = made * size * replicas / 2
