@@ -1,12 +1,13 @@
 """Write every figure of the documents: the tables of how wrong and how slow, the gallery, README.
 
-    python experiments/documents.py
+    python experiments/documents.py [--pictures]
 
 The figures come from `experiments/figures/*.json`, which the scripts write when they are run with
---record, and from nothing else. accuracy.md, speed.md, speed_vs_error.md, wrong_physics.md,
-interval_coverage.md and paper_claims.md are written whole; README.md and experiments/README.md
+--record, and from nothing else. accuracy.md, speed.md, speed_vs_error.md, hard_cases.md,
+wrong_physics.md, interval_coverage.md and paper_claims.md are written whole; README.md and experiments/README.md
 between their marks `<!-- NAME -->` and `<!-- end of NAME -->`. A test compares all of them with
-what this would write.
+what this would write. With --pictures the pictures that show nothing but figures
+(`support/dot_plots.py`) are drawn, too.
 """
 
 import argparse
@@ -14,11 +15,13 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from experiments.accuracy import hard_cases
 from experiments.fit import interval_coverage, wrong_physics
 from experiments.paper import paper_claims
 from experiments.speed import speed_vs_error
 from experiments.support.claims import table as claims_table
-from experiments.support.record import EXPERIMENTS, FIGURES, figures
+from experiments.support.dot_plots import PLOTS, drawn
+from experiments.support.record import EXPERIMENTS, FIGURES, PICTURES, figures
 from experiments.support.tables import accuracy, gallery, speed
 from experiments.support.tables.words import Row, between, of
 
@@ -44,9 +47,13 @@ USES = {
 
 def main() -> None:
     """Write all documents."""
-    argparse.ArgumentParser(
+    parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    ).parse_args()
+    )
+    parser.add_argument("--pictures", action="store_true", help="draw the pictures of figures, too")
+    if parser.parse_args().pictures:
+        for name, plot in PLOTS.items():
+            drawn(plot(figures(name))).savefig(PICTURES / f"{name}.png", dpi=110)
     for path, text in documents().items():
         path.write_text(text, encoding="utf-8")
 
@@ -68,6 +75,7 @@ def documents() -> dict[Path, str]:
             ]
         )
         + "\n",
+        "hard_cases": hard_cases.table(figures("hard_cases")["cases"]),
         "wrong_physics": wrong_physics.table(figures("wrong_physics")),
         "interval_coverage": interval_coverage.table(figures("interval_coverage")),
         "paper_claims": claims(),

@@ -1,21 +1,24 @@
 """Where do the coefficients of the fitted restitution law come from, and how accurate is it?
 
-    python experiments/accuracy/derive_restitution.py [--record]
+    python experiments/accuracy/derive_restitution.py [--record] [--out DIR]
 
 Solves the equation of motion of an impact for some 200 values of beta and fits
 ``ln eps + decay ln(1 + kappa beta)`` by ``beta P(z) / Q(z)``, z = sqrt(beta). The fit minimises the
 largest error (Lawson's reweighting of a linearised least-squares fit). Prints the coefficients that
-``jaxgran/scene/restitution_table.py`` contains.
+``jaxgran/scene/restitution_table.py`` contains, and draws eps and the error of the package's law.
 """
 
 import argparse
+from pathlib import Path
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 
-from experiments.support.record import add_recording, write_results
+from experiments.support.record import add_recording, write_picture, write_results
+from jaxgran.plotting import COLOURS
 from jaxgran.scene.contact import impact
-from jaxgran.scene.restitution_table import C1
+from jaxgran.scene.restitution_table import C1, viscoelastic_restitution
 
 ROUNDS = 300
 
@@ -63,6 +66,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--out", type=Path, default=Path("results") / "derive_restitution")
     add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -82,6 +86,26 @@ def main() -> None:
         for title, powers, values in (("P", powers_p, p), ("Q", powers_q, q)):
             print("  " + title, {k: float(v) for k, v in zip(powers, values, strict=True)})
     write_results("derive_restitution", options, None, largest=largest)
+    write_picture(draw(), "derive_restitution", options)
+
+
+def draw() -> Figure:
+    """eps by the equation of motion, and the relative error of the package's fit."""
+    figure = Figure(figsize=(7.5, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for clipped, words, style in ((True, "force clipped at 0", "-"), (False, "unclipped", "--")):
+        beta, exact = samples(clipped)
+        law = np.asarray(viscoelastic_restitution(beta, clipped=clipped))
+        left.plot(beta, exact, style, color=COLOURS["viscoelastic"], label=words)
+        right.plot(beta, np.abs(law / exact - 1), style, color=COLOURS["viscoelastic"], lw=1)
+    left.set(xscale="log", yscale="log", xlabel=r"$\beta$", ylabel=r"$\varepsilon$")
+    left.legend(frameon=False)
+    right.set(xscale="log", yscale="log", xlabel=r"$\beta$", ylabel="error of the fitted law")
+    right.set_ylim(1e-14, 1e-6)
+    for axes in (left, right):
+        axes.set_xlim(1e-4, 3e4)
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
 
 
 if __name__ == "__main__":

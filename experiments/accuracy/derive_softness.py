@@ -1,21 +1,26 @@
 """Derive c(beta), by which soft contacts of two spheres slow the cooling, and fit it.
 
-    python experiments/accuracy/derive_softness.py
+    python experiments/accuracy/derive_softness.py [--record] [--out DIR]
 
 An impact is followed in the variables of `jaxgran.scene.contact.impact` with its derivative
 in an outward acceleration, the centrifugal one of an oblique impact. Prints c/(d - 1) at some beta,
-the coefficients of `jaxgran.theory.softness` and the largest relative error of the fit.
+the coefficients of `jaxgran.theory.softness` and the largest relative error of the fit, and draws
+both.
 """
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
+from experiments.support.record import add_recording, write_picture
+from jaxgran.plotting import COLOURS, INK
 from jaxgran.theory.softness import MEAN_OVERLAP, softness
 
 BETAS = np.geomspace(1e-3, 8.0, 40)
@@ -42,9 +47,12 @@ def impact(beta: float) -> tuple[float, float]:
 
 
 def main() -> None:
-    argparse.ArgumentParser(
+    parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    ).parse_args()
+    )
+    parser.add_argument("--out", type=Path, default=Path("results") / "derive_softness")
+    add_recording(parser)
+    options = parser.parse_args()
     nodes = np.concatenate([[1e-4], np.geomspace(1e-3, 12, 70)])
     loss, slope = np.array([impact(beta) for beta in nodes]).T
     loss, slope = (CubicSpline(np.sqrt(nodes), x / nodes) for x in (loss, slope))
@@ -68,6 +76,23 @@ def main() -> None:
     print(f"largest error of this fit {np.max(np.abs(fit(found, BETAS) / c - 1)):.1e}")
     error = np.max(np.abs(np.asarray(softness(jnp.asarray(BETAS), 2)) / c - 1))
     print(f"largest error of jaxgran.theory.softness.softness {error:.1e}")
+    write_picture(draw(c), "derive_softness", options)
+
+
+def draw(c: np.ndarray) -> Figure:
+    """c/(d - 1) at BETAS by quadrature, and by the package's fit."""
+    figure = Figure(figsize=(5.5, 3.6), layout="constrained")
+    axes = figure.subplots()
+    fine = np.geomspace(BETAS[0], BETAS[-1], 300)
+    colour = COLOURS["kinetic theory"]
+    axes.plot(fine, np.asarray(softness(jnp.asarray(fine), 2)), color=colour, label="the fit")
+    axes.plot(BETAS, c, "o", color=INK, ms=3.5, label="impacts followed, averaged")
+    axes.axhline(MEAN_OVERLAP, color=COLOURS["guide"], ls="--", lw=1)
+    axes.text(BETAS[0], MEAN_OVERLAP, r" $\beta\to 0$", color=COLOURS["guide"], va="bottom")
+    axes.set(xscale="log", xlabel=r"$\beta_T$", ylabel=r"$c/(d-1)$", ylim=(0, 1.1))
+    axes.legend(frameon=False, loc="lower left")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
 
 
 if __name__ == "__main__":

@@ -82,7 +82,7 @@ def main() -> int:
         records[case.name] = described | {"seconds": seconds, "rows": each}
         in_order = [records[c.name] for c in CASES if c.name in records]
         save(record, cases=in_order)
-        text = _table(in_order)
+        text = table(in_order)
         write_whole(options.out / "hard_cases.md", lambda f, text=text: f.write(text.encode()))
     write_results("hard_cases", options, None, cases=[records[c.name] for c in cases])
     print(f"\n{failed} rows failed; {options.out}")
@@ -94,7 +94,8 @@ def _plain(row: Row) -> dict:
     return row._asdict() | numbers
 
 
-def _table(records: list[dict]) -> str:
+def table(records: list[dict]) -> str:
+    """The table of hard_cases.md, from the cases that were recorded."""
     lines = [_cells(COLUMNS), _cells(["---"] * len(COLUMNS))]
     for record in records:
         described = [record[name] for name in ("case", "elsewhere", "here")]

