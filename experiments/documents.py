@@ -6,8 +6,8 @@ The figures come from `experiments/figures/*.json`, which the scripts write when
 --record, and from nothing else. accuracy.md, speed.md, speed_vs_error.md, hard_cases.md,
 wrong_physics.md, interval_coverage.md and paper_claims.md are written whole; README.md and
 experiments/README.md between their marks `<!-- NAME -->` and `<!-- end of NAME -->`. A test
-compares all of them with what this would write. With --pictures the pictures that show nothing but figures
-(`support/dot_plots.py`) are drawn, too.
+compares all of them with what this would write. With --pictures the pictures that
+show nothing but figures (`support/dot_plots.py`) are drawn, too.
 """
 
 import argparse
