@@ -1,6 +1,7 @@
 """Kinetic theory: the homogeneous gas as seven ordinary differential equations."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import diffrax
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
@@ -27,6 +29,14 @@ from jaxgran.theory.moments import Density, Moments
 
 TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
+
+
+def _raveled(leaves: list[Array], dtype: Any) -> Float[Array, "parameters"]:
+    return jnp.concatenate([jnp.zeros(0, dtype), *map(jnp.ravel, leaves)])
+
+
+def _is_zero(tangent: Any) -> bool:
+    return isinstance(tangent, SymbolicZero)
 
 
 class KineticTheory(AbstractModel):
@@ -163,26 +173,33 @@ class KineticTheory(AbstractModel):
     def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
         scene = steady.scene_at_start(gas), Density.of(gas, self.softness, self.correlations)
-        parameters, unravel = ravel_pytree(scene)
-        if parameters.size == 0:  # a law of no floats: jax gives none of them a type of its own
-            parameters, unravel = jnp.zeros(0, times.dtype), lambda _: scene
+        leaves, structure = jax.tree.flatten(scene)
+        leaves = [jnp.asarray(x, times.dtype) for x in leaves]
+        _, unravel = ravel_pytree(structure.unflatten(leaves))
 
-        # In reduced units the gas has one or two parameters: following all their tangents beside
-        # the state costs little, and one linear rule then serves forward and reverse mode alike.
+        # In reduced units the gas has few parameters: following the tangents of those that move
+        # beside the state costs little, and one linear rule serves forward and reverse mode alike.
         @jax.custom_jvp
-        def solve(parameters, times):
-            return self._solve(parameters, unravel, times, gas.dimension)
+        def solve(leaves, times):
+            return self._solve(_raveled(leaves, times.dtype), unravel, times, gas.dimension)
 
-        @solve.defjvp
+        @partial(solve.defjvp, symbolic_zeros=True)
         def solve_jvp(at, along):
-            parameters, times = at
-            solution = self._solve_along(parameters, unravel, times, gas.dimension)
+            leaves, times = at
+            parameters = _raveled(leaves, times.dtype)
+            moving = [np.full(x.size, not _is_zero(x)) for x in along[0]]
+            each = np.eye(parameters.size)[np.concatenate([np.zeros(0, bool), *moving])]
+            directions = jnp.asarray(each, times.dtype)
+            solution = self._solve_along(parameters, unravel, times, directions, gas.dimension)
             state, velocity, jacobian, fault = solution
-            moved = jax.tree.map(lambda v, j: v * along[1] + along[0] @ j, velocity, jacobian)
+            by = _raveled([x for x in along[0] if not _is_zero(x)], times.dtype)
+            moved = jax.tree.map(lambda j: by @ j, jacobian)
+            if not _is_zero(along[1]):
+                moved = jax.tree.map(lambda m, v: m + v * along[1], moved, velocity)
             no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of a whole number
             return (state, fault), (moved, no_tangent)
 
-        state, fault = solve(parameters, times / unit_time)
+        state, fault = solve(leaves, times / unit_time)
         theta = jnp.exp(state.log_temperature)
         length = gas.path_length
         # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
@@ -230,13 +247,18 @@ class KineticTheory(AbstractModel):
         return Moments.of(rows[:, 0].T, equations.order), fault
 
     def _solve_along(
-        self, parameters: Array, unravel: Callable[[Array], Scene], times: Array, d: int
+        self,
+        parameters: Array,
+        unravel: Callable[[Array], Scene],
+        times: Array,
+        directions: Float[Array, "directions parameters"],
+        d: int,
     ) -> tuple[Moments, Moments, Moments, Int[Array, ""]]:
-        """States, their time derivatives and their derivatives in the parameters of the law.
+        """States, their time derivatives and their derivatives along directions of the parameters.
 
         Last, a status; unless it is ok all of them are nan.
         """
-        directions, equations = jnp.eye(parameters.size, dtype=times.dtype), self._equations(d)
+        equations = self._equations(d)
         order = equations.order
         table, table_along = jax.linearize(
             lambda parameters: equations.table(unravel(parameters), times[-1]), parameters
