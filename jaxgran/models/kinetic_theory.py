@@ -1,7 +1,6 @@
 """Kinetic theory: the homogeneous gas as seven ordinary differential equations."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, ClassVar
 
 import diffrax
@@ -9,10 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jax.custom_derivatives import SymbolicZero
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxgran.checks import status, validation
 from jaxgran.checks.tracing import any_traced, lengthened, shortened
@@ -23,20 +19,13 @@ from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import ROUGH, Course
 from jaxgran.scene.gas import Gas
 from jaxgran.theory import averages, closed_forms, steady
-from jaxgran.theory.homogeneous import Equations, Scene
-from jaxgran.theory.integration import padded_length, values_at
-from jaxgran.theory.moments import Density, Moments
+from jaxgran.theory.homogeneous import Equations
+from jaxgran.theory.integration import padded_length
+from jaxgran.theory.moments import Density
+from jaxgran.theory.solution import Integrator, moments_at
 
 TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
-
-
-def _raveled(leaves: list[Array], dtype: Any) -> Float[Array, "parameters"]:
-    return jnp.concatenate([jnp.zeros(0, dtype), *map(jnp.ravel, leaves)])
-
-
-def _is_zero(tangent: Any) -> bool:
-    return isinstance(tangent, SymbolicZero)
 
 
 class KineticTheory(AbstractModel):
@@ -173,33 +162,10 @@ class KineticTheory(AbstractModel):
     def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
         scene = steady.scene_at_start(gas), Density.of(gas, self.softness, self.correlations)
-        leaves, structure = jax.tree.flatten(scene)
-        leaves = [jnp.asarray(x, times.dtype) for x in leaves]
-        _, unravel = ravel_pytree(structure.unflatten(leaves))
-
-        # In reduced units the gas has few parameters: following the tangents of those that move
-        # beside the state costs little, and one linear rule serves forward and reverse mode alike.
-        @jax.custom_jvp
-        def solve(leaves, times):
-            return self._solve(_raveled(leaves, times.dtype), unravel, times, gas.dimension)
-
-        @partial(solve.defjvp, symbolic_zeros=True)
-        def solve_jvp(at, along):
-            leaves, times = at
-            parameters = _raveled(leaves, times.dtype)
-            moving = [np.full(x.size, not _is_zero(x)) for x in along[0]]
-            each = np.eye(parameters.size)[np.concatenate([np.zeros(0, bool), *moving])]
-            directions = jnp.asarray(each, times.dtype)
-            solution = self._solve_along(parameters, unravel, times, directions, gas.dimension)
-            state, velocity, jacobian, fault = solution
-            by = _raveled([x for x in along[0] if not _is_zero(x)], times.dtype)
-            moved = jax.tree.map(lambda j: by @ j, jacobian)
-            if not _is_zero(along[1]):
-                moved = jax.tree.map(lambda m, v: m + v * along[1], moved, velocity)
-            no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of a whole number
-            return (state, fault), (moved, no_tangent)
-
-        state, fault = solve(leaves, times / unit_time)
+        rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
+        integrator = Integrator(self.solver, rtol, self.max_steps)
+        equations = self._equations(gas.dimension)
+        state, fault = moments_at(scene, times / unit_time, equations, integrator)
         theta = jnp.exp(state.log_temperature)
         length = gas.path_length
         # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
@@ -231,86 +197,3 @@ class KineticTheory(AbstractModel):
         maxwellian = not self.sonine or self.averages == "paper"
         order = 2 if maxwellian else self.order
         return Equations(dimension, order, maxwellian, self.softness, self._averages)
-
-    def _solve(
-        self, parameters: Array, unravel: Callable[[Array], Scene], times: Array, d: int
-    ) -> tuple[Moments, Int[Array, ""]]:
-        """The states, nan unless the status, which follows them, is ok."""
-        scene, equations = unravel(parameters), self._equations(d)
-        table = equations.table(scene, times[-1])
-
-        def velocity(row):
-            return equations.velocity(row, table(row[0]), scene)
-
-        start = equations.start(scene, times)
-        rows, fault = self._integrate(jax.vmap(velocity), start[None], parameters, times)
-        return Moments.of(rows[:, 0].T, equations.order), fault
-
-    def _solve_along(
-        self,
-        parameters: Array,
-        unravel: Callable[[Array], Scene],
-        times: Array,
-        directions: Float[Array, "directions parameters"],
-        d: int,
-    ) -> tuple[Moments, Moments, Moments, Int[Array, ""]]:
-        """States, their time derivatives and their derivatives along directions of the parameters.
-
-        Last, a status; unless it is ok all of them are nan.
-        """
-        equations = self._equations(d)
-        order = equations.order
-        table, table_along = jax.linearize(
-            lambda parameters: equations.table(unravel(parameters), times[-1]), parameters
-        )
-        table = table.with_slopes(jax.vmap(lambda x: table_along(x).coefficients)(directions))
-
-        def velocity(state, rates, parameters):
-            return equations.velocity(state, rates, unravel(parameters))
-
-        def rows_velocity(rows):
-            # Row 0 is the state; the others, its tangents, obey the linearised equation.
-            rates, slope, *_ = at = table(rows[0, 0])
-            rate, linear = jax.linearize(velocity, rows[0], rates, parameters)
-
-            def along(tangent, rates_along, direction):
-                return linear(tangent, rates_along + slope * tangent[0], direction)
-
-            return jnp.concatenate([rate[None], jax.vmap(along)(rows[1:], at[2:], directions)])
-
-        start, start_along = jax.linearize(
-            lambda parameters: equations.start(unravel(parameters), times), parameters
-        )
-        first = jnp.concatenate([start[None], jax.vmap(start_along)(directions)])
-        rows, fault = self._integrate(rows_velocity, first, parameters, times)
-        states, jacobian = rows[:, 0], jnp.moveaxis(rows[:, 1:], 2, 0)
-        velocities = jax.vmap(lambda x: velocity(x, table(x[0])[0], parameters))(states)
-        jacobian = jnp.swapaxes(jacobian, 1, 2)
-        state, rate, slope = (Moments.of(x, order) for x in (states.T, velocities.T, jacobian))
-        return state, rate, slope, fault
-
-    def _integrate(
-        self, velocity: Callable, first: Array, parameters: Array, times: Array
-    ) -> tuple[Array, Int[Array, ""]]:
-        """The rows at the given reduced times, shape (times, rows, states), and a status."""
-        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
-        # A gas of nan keeps its state, so that its solver does not try ever shorter steps.
-        times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=times.dtype))
-        rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
-        # Steps follow the state alone: its tangents are then those of the discrete solution.
-        controller = diffrax.PIDController(
-            rtol=rtol, atol=rtol, norm=lambda rows: optx.rms_norm(rows[0][:5])
-        )
-        rows, ended = values_at(
-            # s = ln(1 + t): a power law of time takes the same number of steps each decade.
-            lambda s, rows: jnp.where(known, velocity(rows) * jnp.exp(s), 0.0),
-            jnp.where(known, first, 0.0),
-            jnp.log1p(times),
-            solver=self.solver,
-            controller=controller,
-            max_steps=self.max_steps,
-        )
-        finite = known & jnp.all(jnp.isfinite(rows))
-        fault = status.flag(status.STEPS_SPENT, ~ended)
-        fault |= status.flag(status.NOT_FINITE, ended & ~finite)
-        return jnp.where(fault == status.OK, rows, jnp.nan), fault
