@@ -15,7 +15,6 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from experiments.accuracy import hard_cases
 from experiments.fit import interval_coverage, wrong_physics
 from experiments.paper import paper_claims
 from experiments.speed import speed_vs_error
@@ -75,7 +74,6 @@ def documents() -> dict[Path, str]:
             ]
         )
         + "\n",
-        "hard_cases": hard_cases.table(figures("hard_cases")["cases"]),
         "wrong_physics": wrong_physics.table(figures("wrong_physics")),
         "interval_coverage": interval_coverage.table(figures("interval_coverage")),
         "paper_claims": claims(),

@@ -290,7 +290,6 @@ PLOTS: dict[str, Callable[[dict], DotPlot]] = {
     "wrong_physics": wrong_physics,
     "interval_coverage": interval_coverage,
     "fit_head_to_head": fit_head_to_head,
-    "hard_cases": hard_cases,
     "benchmark_kinetic_theory": benchmark_kinetic_theory,
     "benchmark_replicas": benchmark_replicas,
     "benchmark_million": benchmark_million,

@@ -350,7 +350,7 @@ ENTRIES = {
             "In which limits do simulations fail, and does jaxgran?",
             "hard_cases",
             lambda f: "24 limits: right answers within tolerances, or clear errors.",
-            "hard_cases.png",
+            "",
             "9 to 18 min",
             "hard_cases.md",
         ),
