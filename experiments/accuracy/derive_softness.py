@@ -88,7 +88,7 @@ def draw(c: np.ndarray) -> Figure:
     axes.plot(fine, np.asarray(softness(jnp.asarray(fine), 2)), color=colour, label="the fit")
     axes.plot(BETAS, c, "o", color=INK, ms=3.5, label="impacts followed, averaged")
     axes.axhline(MEAN_OVERLAP, color=COLOURS["guide"], ls="--", lw=1)
-    axes.text(BETAS[0], MEAN_OVERLAP, r" $\beta\to 0$", color=COLOURS["guide"], va="bottom")
+    axes.text(BETAS[-1], MEAN_OVERLAP + 0.02, r"$\beta\to 0$", color=COLOURS["guide"], ha="right")
     axes.set(xscale="log", xlabel=r"$\beta_T$", ylabel=r"$c/(d-1)$", ylim=(0, 1.1))
     axes.legend(frameon=False, loc="lower left")
     axes.spines[["top", "right"]].set_visible(False)

@@ -25,6 +25,9 @@ from jaxgran.data.header import header_number
 from jaxgran.plotting import COLOURS, INK
 
 
+NAME = "make_lammps_curves"
+
+
 class Scene(NamedTuple):
     """A gas of viscoelastic spheres in SI units, and how LAMMPS follows it."""
 
@@ -74,7 +77,7 @@ def main() -> None:
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if options.draw:
-        draw().savefig(PICTURES / "make_lammps_curves.png", dpi=130)
+        draw().savefig(PICTURES / f"{NAME}.png", dpi=130)
         return
     for name in options.scenes:
         scene = SCENES[name]
@@ -176,7 +179,7 @@ def draw() -> Figure:
         theory = np.asarray(jaxgran.cool(gas, curve.times).temperature / gas.temperature)
         tau = np.asarray(curve.times / gas.mean_free_time)
         measured = np.asarray(curve.temperature / gas.temperature)
-        words = f"$\varphi$ = {float(gas.packing_fraction):g}, N = {header_number(header, 'N'):g}"
+        words = f"φ = {float(gas.packing_fraction):g}, N = {header_number(header, 'N'):g}"
         axes.plot(tau[1:], theory[1:], color=COLOURS["kinetic theory"], lw=1)
         axes.plot(tau[1:], measured[1:], "osD^vP"[k], color=INK, mfc="white", ms=4, label=words)
     axes.plot([], [], color=COLOURS["kinetic theory"], lw=1, label="kinetic theory")

@@ -273,16 +273,16 @@ def benchmark_elements(found: dict) -> DotPlot:
 
 
 def benchmark_versions(found: dict) -> DotPlot:
-    dots = [
-        Dot(
-            named(row["model"]),
-            row["ratio"],
-            row["ratio"] - row["error"],
-            row["ratio"] + row["error"],
-            named(row["model"]),
-        )
-        for row in found["rows"]
-    ]
+    dots = []
+    for row in found["rows"]:
+        what, *first = row["model"].split(", ")
+        theory = what not in NAMES
+        slope = theory and what != "KineticTheory"
+        words = f"kinetic theory, {what} derivative" if slope else named(what)
+        label = ", ".join(["kinetic theory" if what == "KineticTheory" else words, *first])
+        x, error = row["ratio"], row["error"]
+        model = "kinetic theory" if theory else named(what)
+        dots.append(Dot(label, x, x - error, x + error, model))
     return DotPlot(dots, "time now over time before", (1.0, "as before"))
 
 
