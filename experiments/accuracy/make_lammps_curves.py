@@ -24,7 +24,6 @@ from experiments.support.record import DATA, PICTURES
 from jaxgran.data.header import header_number
 from jaxgran.plotting import COLOURS, INK
 
-
 NAME = "make_lammps_curves"
 
 
