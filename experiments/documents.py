@@ -15,7 +15,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from experiments.fit import interval_coverage, wrong_physics
+from experiments.accuracy import flow_memory
+from experiments.fit import coverage_in_clusters, interval_coverage, wrong_physics
 from experiments.paper import paper_claims
 from experiments.speed import speed_vs_error
 from experiments.support.claims import table as claims_table
@@ -60,8 +61,19 @@ def main() -> None:
 def documents() -> dict[Path, str]:
     """What each document should contain, by its path."""
     scenes = figures("speed_vs_error")["scenes"]
+    memories = figures("flow_memory")
     whole = {
-        "accuracy": table("How wrong", accuracy.ROWS, accuracy.NOTE),
+        "accuracy": "\n".join(
+            [
+                table("How wrong", accuracy.ROWS, accuracy.NOTE),
+                accuracy.MEMORIES,
+                flow_memory.table(memories),
+                "",
+                f"`python experiments/accuracy/flow_memory.py`. Made: {made([memories])}.",
+                "",
+                accuracy.MEMORIES_MEAN,
+            ]
+        ),
         "speed": table("How slow", speed.ROWS, speed.NOTE),
         "speed_vs_error": "\n\n".join(
             [
@@ -75,7 +87,15 @@ def documents() -> dict[Path, str]:
         )
         + "\n",
         "wrong_physics": wrong_physics.table(figures("wrong_physics")),
-        "interval_coverage": interval_coverage.table(figures("interval_coverage")),
+        "interval_coverage": "\n".join(
+            [
+                interval_coverage.table(figures("interval_coverage")),
+                interval_coverage.IN_CLUSTERS,
+                "",
+                coverage_in_clusters.table(figures("coverage_in_clusters")),
+                "",
+            ]
+        ),
         "paper_claims": claims(),
     }
     written = {EXPERIMENTS / f"{name}.md": text for name, text in whole.items()}

@@ -12,7 +12,9 @@ d ln T / d ln A of three gases after 1, 3, 10, 30 and 100 collisions per particl
 - kinetic theory;
 
 and how the projected derivative depends on the interval between projections. Standard errors are
-over replicas. Prints tables, draws a picture and writes a JSON file. Scenes of an older JSON file
+over replicas. Two more gases with a flow, disks and hard spheres, are those of
+`derivatives_in_flows.py`; what else a projection may keep there is measured by `flow_memory.py`.
+Prints tables, draws a picture and writes a JSON file. Scenes of an older JSON file
 that are not asked for are kept in both. With --late-differences all results of a scene are kept
 except the finite differences at the late times, which are computed again.
 """

