@@ -20,6 +20,11 @@ The derivative at a fixed time is the derivative at a fixed place in the sequenc
 the rate of change of the gas times the tangent of the clock. The rates are averaged over the last
 mean free times. This is less noisy than projecting at fixed times, since no time step is left out
 or counted twice where a fixed end time moves through the steps.
+
+In a box longer than L_c a gas remembers its flow too, and these derivatives are too large. What
+else a projection may keep there is measured by ``experiments/accuracy/flow_memory.py``: nothing
+that was tried is right at 100 collisions a particle, so nothing is kept; use
+`jaxgran.tangents.differences`.
 """
 
 from typing import Any, NamedTuple

@@ -102,7 +102,9 @@ def memories(f: dict) -> str:
     if right:
         return f"{right[0][0].upper()}{right[0][1:]}, within 10 % until 100 collisions."
     two = 100 * abs(over_reference(rows["energy and stress, 2"])[30.0][0])
-    return f"None of {len(rows)} until 100; energy and stress of two bands within {two:.0f} % at 30."
+    return (
+        f"None of {len(rows)} until 100; energy and stress of two bands within {two:.0f} % at 30."
+    )
 
 
 def lammps(f: dict) -> str:

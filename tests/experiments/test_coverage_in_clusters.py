@@ -1,0 +1,28 @@
+"""The measured runs of a clustering gas, and the statistics of their fits."""
+
+import numpy as np
+import pytest
+
+from experiments.fit import coverage_in_clusters
+
+
+def test_measured_runs_cool():
+    times, runs = coverage_in_clusters.measured()
+    assert runs.shape == (coverage_in_clusters.MOST, coverage_in_clusters.POINTS) == (20, 30)
+    assert np.all(np.diff(times) > 0) and times[0] > 0
+    # T_0 is .01 m^2/s^2; 30 collisions with beta_T0 = .2 leave a few per cent.
+    assert np.all(runs[:, 0] < 0.01) and np.all(runs[:, -1] < 0.06 * 0.01)
+    assert len({*runs[:, -1]}) == len(runs)  # each from a start of its own
+
+
+def test_statistics_of_fits():
+    fits = [
+        {"ratio": ratio, "error": 0.1, "parts": {"measurement": 0.1, "model": 0.0}}
+        for ratio in (0.9, 1.1, 1.19, 1.2)
+    ]
+    found = coverage_in_clusters.summary(fits)
+    assert (found["runs"], found["held"]) == (4, 3)  # 1.96 standard errors hold all but the last
+    assert found["expected_scatter"] == pytest.approx(0.1)
+    assert found["bias"] == pytest.approx(np.mean(np.log([0.9, 1.1, 1.19, 1.2])))
+    table = coverage_in_clusters.table(found | {"fits": fits, "box_over_critical": 1.4})
+    assert "| 3 of 4 |" in table and "measurement 10.0 |" in table
