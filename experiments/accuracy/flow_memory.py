@@ -173,18 +173,19 @@ def table(results: dict) -> str:
     """The table of all memories that were measured, for the documents."""
     head = [f"{n:.0f} collisions" for n in COLLISIONS]
     lines = [
-        f"| besides T, what a projection keeps | {' | '.join(head)} | over differences, % |",
-        "|---|" + "---|" * (len(head) + 1),
+        f"| kept besides T | {' | '.join(head)} | over differences, % | boxes |",
+        "|---|" + "---|" * (len(head) + 2),
     ]
     reference = {n: f"{m:.3f} ± {e:.3f}" for n, m, e in results["reference"]}
     cells = (reference.get(n, "") for n in COLLISIONS)
-    lines.append(f"| *differences of many runs* | {' | '.join(cells)} | |")
+    lines.append(f"| *differences of many runs* | {' | '.join(cells)} | | |")
     for name, row in results["memories"].items():
         columns = zip(*row["d_ln_T_d_ln_A"], strict=True)
         cells = [f"{m:+.3f} ± {e:.3f}" for m, e in columns]
         cells += [""] * (len(COLLISIONS) - len(cells))
         off = " / ".join(f"{100 * b:+.0f} ± {100 * e:.0f}" for b, e in over_reference(row).values())
-        lines.append(f"| {'nothing' if name == 'T' else name} | {' | '.join(cells)} | {off} |")
+        cells = ["nothing" if name == "T" else name, *cells, off, str(row["num_boxes"])]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join([*lines[:2], *map(minus, lines[2:])])
 
 
@@ -210,7 +211,7 @@ def draw(rows: dict) -> Figure:
     axes.set(xscale="log", xlabel="collisions per particle", ylabel="d ln T / d ln A")
     axes.set_xticks(COLLISIONS, [f"{x:.0f}" for x in COLLISIONS])
     axes.minorticks_off()
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(frameon=False, fontsize=9, loc="upper left")
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 

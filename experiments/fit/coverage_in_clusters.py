@@ -1,6 +1,6 @@
 """How often does a 95 % interval of A hold the truth where a gas clusters?
 
-    python experiments/fit/coverage_in_clusters.py [--runs 20] [--measure] [--record] [--out FILE]
+    python experiments/fit/coverage_in_clusters.py [--runs 20] [--measure] [--record] [--out DIR]
 
 Each measured curve is one LAMMPS run of 1000 spheres (phi = .3, beta_T0 = .2, t_c/tau_c = .05, in a
 box of 1.4 L_c) from a start of its own, followed for 90 mean free times, in which a sphere collides
@@ -21,10 +21,18 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.accuracy.make_lammps_curves import Scene, simulate
-from experiments.support.record import DATA, add_recording, figures, save, write_results
+from experiments.support.dot_plots import Dot, DotPlot, drawn
+from experiments.support.record import (
+    DATA,
+    add_recording,
+    figures,
+    write_picture,
+    write_results,
+)
 from experiments.support.scenes import beads
 
 PHI, BETA, CONTACT, SIZE = 0.3, 0.2, 0.05, 1000
@@ -40,7 +48,7 @@ def main() -> None:
     )
     parser.add_argument("--runs", type=int, default=MOST, help="how many of the measured runs")
     parser.add_argument("--measure", action="store_true", help="make the LAMMPS runs anew")
-    parser.add_argument("--out", type=Path, help="file for the results")
+    parser.add_argument("--out", type=Path, default=Path("results") / "coverage_in_clusters")
     add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -56,9 +64,9 @@ def main() -> None:
         print(line(number, fits[-1]), flush=True)
         results = {"box_over_critical": float(gas.box_side(SIZE) / gas.critical_box)}
         results |= summary(fits) | {"fits": fits}
-        write_results("coverage_in_clusters", options, None, **results)
-        if options.out is not None:
-            save(options.out, **results)
+        file = options.out / "coverage_in_clusters.json"
+        write_results("coverage_in_clusters", options, file, **results)
+    write_picture(draw(fits), "coverage_in_clusters", options)
     print(words(summary(fits)))
 
 
@@ -176,6 +184,21 @@ def table(found: dict) -> str:
     )
     rows = (heads, ("---",) * len(heads), cells)
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def draw(fits: list[dict]) -> Figure:
+    """Each estimate with its interval of 95 %."""
+    dots = [
+        Dot(
+            f"run {number}",
+            fit["ratio"],
+            fit["ratio"] - NORMAL * fit["error"],
+            fit["ratio"] + NORMAL * fit["error"],
+            "soft spheres",
+        )
+        for number, fit in enumerate(fits)
+    ]
+    return drawn(DotPlot(dots, "A over the true A", (1.0, "true A")))
 
 
 def words(found: dict) -> str:
