@@ -13,6 +13,7 @@ from jaxtyping import install_import_hook
 with install_import_hook("jaxgran", "beartype.beartype"):
     import jaxgran
     from jaxgran.cli.programs import SWITCH, keep_programs
+    from jaxgran.kept_programs import keep_in
 
 PROGRAMS = "JAXGRAN_TEST_PROGRAMS"
 """An environment variable: the folder of programs compiled in this run of the tests."""
@@ -33,6 +34,7 @@ def pytest_configure(config):
             os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=0 {flags}".strip()
     os.environ[SWITCH] = "0"
     keep_programs(Path(os.environ[PROGRAMS]))
+    keep_in(None)  # every function is traced, as some tests change what is called in it
     os.environ[SWITCH] = "1"  # the user's own; a test has its own
 
 

@@ -14,6 +14,7 @@ import jaxgran
 from jaxgran.cli import programs
 from jaxgran.cli.app import FREE, main
 from jaxgran.cli.models import MODELS, named
+from jaxgran.kept_programs import keep_in
 from jaxgran.models.selection import default_models
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -193,6 +194,7 @@ def settings_of_jax(monkeypatch):
     before = {name: jax.config.values[name] for name in names}
     jax.config.update("jax_compilation_cache_dir", None)
     yield
+    keep_in(None)
     for name, value in before.items():
         jax.config.update(name, value)
 

@@ -1,4 +1,4 @@
-"""How long does the first run of each particle model compile?
+"""How long do the first run of each particle model and the first fit compile?
 
     python experiments/speed/benchmark_compilation.py [--smoke]
 
@@ -6,13 +6,19 @@ Each row is a new process without a cache of compiled programs: the seconds of t
 `jaxgran.cool` and of the same call again, the seconds that XLA compiles, and the number of
 programs, among them those of single operations on arrays. "HardSpheres from a start" goes on from
 the particles of a run of the same process; its first call is that of the second run.
+
+"jaxgran fit" is the main job, `python experiments/fit_cooling_curve.py`, as a user waits for it,
+from the start of Python to its end, with the picture: for the first time, with an empty cache
+folder of the command, and the median of three later times, each a process of its own.
 """
 
 import argparse
 import json
 import os
+import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -23,6 +29,8 @@ import jaxgran
 from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads
 
+ROOT = Path(__file__).parents[2]
+JOB = ROOT / "experiments" / "fit_cooling_curve.py"
 NUM = 2000
 EVENT = "/jax/core/compile/backend_compile_duration"
 ROWS = ("SoftSpheres", "HardSpheres", "HardSpheres from a start", "DSMC")
@@ -56,17 +64,33 @@ def first_run(name: str, num: int) -> dict[str, float]:
 
 def in_new_process(name: str, num: int) -> dict[str, float]:
     """The same in a process of its own, without a cache."""
-    bare = {k: v for k, v in os.environ.items() if not k.startswith("JAX")}
-    root = Path(__file__).parents[2]
-    bare["PYTHONPATH"] = os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, __file__, "--row", name, "--num", str(num)],
         check=True,
         capture_output=True,
         text=True,
-        env=bare,
+        env=_bare(),
     )
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def main_job() -> dict[str, float]:
+    """Seconds of the fit of the measured curve: the first time, and the median of later ones."""
+    took = []
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(JOB), "--out", folder, "--overwrite"]
+        environment = _bare() | {"XDG_CACHE_HOME": folder}
+        for _ in range(4):
+            begin = time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True, env=environment)
+            took.append(time.perf_counter() - begin)
+    return {"first_s": took[0], "again_s": statistics.median(took[1:])}
+
+
+def _bare() -> dict[str, str]:
+    """The environment without settings of JAX and of its caches."""
+    bare = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", "XLA"))}
+    return bare | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 
 
 def main() -> None:
@@ -84,8 +108,11 @@ def main() -> None:
     for name in names:
         rows[name] = in_new_process(name, num)
         print(f"{name:26}", *(f"{k} {v:8.3g}" for k, v in rows[name].items()))
-    write_results("benchmark_compilation", options, None, num_particles=num, rows=rows)
-    print(json.dumps(rows))
+    job = {} if options.smoke else main_job()
+    print(f"{'jaxgran fit':26}", *(f"{k} {v:8.3g}" for k, v in job.items()))
+    results = {"num_particles": num, "rows": rows, "main_job": job}
+    write_results("benchmark_compilation", options, None, **results)
+    print(json.dumps(rows | {"jaxgran fit": job}))
 
 
 if __name__ == "__main__":

@@ -121,7 +121,6 @@ def _app(started: float, default_curve: Path | None) -> App:
         if not no_cache:
             keep_programs()
         from jaxgran.cli.fit import FitOptions, run_fit
-        from jaxgran.cli.joint import run_joint
 
         if not curves and default_curve is not None:
             curves = (default_curve,)
@@ -131,6 +130,8 @@ def _app(started: float, default_curve: Path | None) -> App:
         options = FitOptions(curves[0], *told, out, overwrite, explain)
         drops = list(drop_test or [])
         if len(curves) + len(drops) > 1:
+            from jaxgran.cli.joint import run_joint
+
             run_joint(list(curves), drops, onto_plate, options, started)
         else:
             run_fit(options, started)

@@ -13,6 +13,7 @@ import numpy as np
 import jaxgran
 from jaxgran.cli.models import model_of, named
 from jaxgran.cli.output import environment, finite_or_null, outputs, plain, settings
+from jaxgran.cli.pictures import plotting_later
 from jaxgran.cli.report import (
     print_budget,
     print_doubts,
@@ -27,7 +28,6 @@ from jaxgran.data.files import write_whole
 from jaxgran.data.header import header_count, header_number
 from jaxgran.fitting.checks import unused_rotation
 from jaxgran.fitting.fit import free_by_default
-from jaxgran.plotting import save_fit
 
 PARAMETERS = {
     "A": ("dissipative_constant", "s"),
@@ -82,6 +82,7 @@ def run_fit(options: FitOptions, started: float) -> None:
     n = header_count(header, "N")
     replicas = header_count(header, "replicas") or 1
     picture, record = outputs(options)
+    plotting = plotting_later()
     free = tuple(PARAMETERS[key][0] for key in options.free)
     model, reasons = model_of(options, gas, curve, free, n)
     (model_name,) = named([model])
@@ -99,7 +100,8 @@ def run_fit(options: FitOptions, started: float) -> None:
     print_rivals(rows[0]["parameter"], diagnosis)
     print_verdict(diagnosis)
     picture.parent.mkdir(parents=True, exist_ok=True)
-    save_fit(result, curve, title_of(options, rows, diagnosis), picture)
+    title = title_of(options, rows, diagnosis)
+    plotting.result().save_fit(result, curve, title, picture)
     summary = {
         **{row["parameter"]: row["estimate"] for row in rows},
         **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},
@@ -167,10 +169,10 @@ def with_given_constant(gas, header, free: list[str]):
 
 def timed_fit(options: FitOptions, gas, curve, model, asked: dict[str, Any]):
     """The fit, seconds of the first and of the last time that it was made."""
+    key = jax.random.key(options.key) if model.stochastic else None
 
     def fit():
         begin = time.perf_counter()
-        key = jax.random.key(options.key)
         result = jaxgran.fit(gas, curve, model=model, key=key, **asked)
         jax.block_until_ready(result.chi2)
         return result, time.perf_counter() - begin

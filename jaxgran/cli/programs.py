@@ -7,6 +7,8 @@ from pathlib import Path
 import jax
 from platformdirs import user_cache_path
 
+from jaxgran.kept_programs import keep_in
+
 SWITCH = "JAXGRAN_NO_CACHE"
 """An environment variable: set to anything but 0, nothing is kept."""
 
@@ -40,6 +42,7 @@ def keep_programs(folder: Path | None = None) -> bool:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    keep_in(folder)
     return True
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 import jaxgran
 from jaxgran.cli.models import named
+from jaxgran.cli.pictures import plotting_later
 from jaxgran.cli.programs import keep_programs
 from jaxgran.data.files import check_writable, read_text
 from jaxgran.data.header import header_count, header_number
@@ -47,8 +48,6 @@ def cool(
         overwrite: replace these files.
         no_cache: compile everything anew, see `jaxgran fit --help`.
     """
-    from jaxgran.plotting import save_curves  # needs matplotlib
-
     if not no_cache:
         keep_programs()
     picture = out.with_suffix(".png")
@@ -59,6 +58,7 @@ def cool(
         if file.exists() and not overwrite:
             raise ValueError(f"{file} exists; name another --out or say --overwrite")
         check_writable(file)
+    plotting = plotting_later()
     size = next(n for n in (particles, told.size, NUM_PARTICLES) if n is not None)
     chosen = named(default_models(size, replicas))[model]
     curve = jaxgran.cool(told.gas, told.times, model=chosen, key=jax.random.key(key))
@@ -66,7 +66,7 @@ def cool(
     ratio = float(curve.temperature[-1] / curve.temperature[0])
     print(f"{model}: T falls to {ratio:.3g} of its first value in {told.times[-1]:.3g} s")
     title = f"{scene.stem}: {chosen.name}, T falls to {ratio:.3g} of its first value"
-    save_curves({chosen.name: (curve, None)}, title, picture)
+    plotting.result().save_curves({chosen.name: (curve, None)}, title, picture)
     print(f"written  {out}\n         {picture}")
 
 

@@ -2,11 +2,12 @@
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
@@ -33,20 +34,21 @@ def in_scene(result: Fit, num_particles: int | None, replicas: int) -> Fit:
     """
     course = _course(result, num_particles)
     own = course.clock_error(result.model.rate_error(course))[-result.curve.times.size :]
-    clock_error = jnp.asarray(own, result.clock_error.dtype)
+    clock_error = np.asarray(own, result.clock_error.dtype)
     fitted = bool(result.priors.names) and not result.model.stochastic
     # What a clock that was fitted along, within its error at a first guess, does not hold yet.
-    beyond = jnp.maximum(clock_error**2 - fitted * result.clock_error**2, 0.0)
-    moved = result.clock_gain @ jnp.sqrt(beyond)
-    covariances = dict(result.covariances)
+    beyond = np.maximum(clock_error**2 - fitted * np.asarray(result.clock_error) ** 2, 0.0)
+    moved = np.asarray(result.clock_gain) @ np.sqrt(beyond)
+    covariances = {name: np.asarray(part) for name, part in result.covariances.items()}
     model = covariances["model"] if fitted else 0.0
-    covariances["model"] = model + jnp.outer(moved, moved)
+    covariances["model"] = model + np.outer(moved, moved)
     if result.model.stochastic:
-        covariances["slope"] = _by_slope(result)
+        covariances["slope"] = np.asarray(_by_slope(result))
     if num_particles is not None:
         chance = _by_chance(result, course, num_particles * replicas)
         covariances["few particles"] = _beyond(chance, covariances["measurement"])
-    return dataclasses.replace(result, clock_error=clock_error, covariances=covariances)
+    parts = {name: jnp.asarray(part) for name, part in covariances.items()}
+    return dataclasses.replace(result, clock_error=jnp.asarray(clock_error), covariances=parts)
 
 
 def clock_accuracy(
@@ -60,39 +62,45 @@ def clock_accuracy(
         model: a deterministic one.
         num_particles: N of each measured run, if known.
     """
-    times = jnp.concatenate([jnp.zeros(int(curve.times[0] > 0)), curve.times])
+    times = np.asarray(curve.times)
+    times = jnp.asarray(np.concatenate([np.zeros(int(times[0] > 0), times.dtype), times]))
     course = course_along(guess, model.simulate(guess, times, Run()), num_particles)
     return jnp.asarray(course.clock_error(model.rate_error(course))[-curve.times.size :])
 
 
 def _course(result: Fit, num_particles: int | None) -> Course:
     """The course of the fitted gas, when it began and at the measured times after it."""
-    curve = result.curve
-    times = jnp.maximum(curve.times - result.began, 0.0)
-    before = jnp.zeros(int(times[0] > 0), times.dtype)
+    curve, times = result.curve, _since_start(result)
+    before = np.zeros(int(times[0] > 0), times.dtype)
 
-    def whole(values: Array | None, first: Array) -> Array | None:
-        return None if values is None else jnp.concatenate([before + first, values])
+    def whole(values: ArrayLike, first: Any = 0.0) -> Array:
+        return jnp.asarray(np.concatenate([before + np.asarray(first), np.asarray(values)]))
 
     along = CoolingCurve(
-        times=jnp.concatenate([before, times]),
-        temperature=jnp.concatenate([before + result.gas.temperature, curve.temperature]),
-        sonine=whole(curve.sonine, jnp.zeros(())),
-        collisions=whole(curve.collisions, jnp.zeros(())),
+        times=whole(times),
+        temperature=whole(curve.temperature, result.gas.temperature),
+        sonine=None if curve.sonine is None else whole(curve.sonine),
+        collisions=None if curve.collisions is None else whole(curve.collisions),
     )
     return course_along(result.gas, along, num_particles)
 
 
-def _by_chance(result: Fit, course: Course, num_particles: int) -> Float[Array, "p p"]:
+def _since_start(result: Fit) -> Float[np.ndarray, "times"]:
+    """The measured times after the start of the cooling; 0 before."""
+    times = np.asarray(result.curve.times)
+    return np.maximum(times - np.asarray(result.began, times.dtype), 0.0)
+
+
+def _by_chance(result: Fit, course: Course, num_particles: int) -> Float[np.ndarray, "p p"]:
     """Covariance of the estimates by the chance of single collisions of N particles.
 
     The delays of the clock at two times have in common what was gathered until the earlier one.
     """
-    times = np.asarray(jnp.maximum(result.curve.times - result.began, 0.0))
+    times = _since_start(result)
     gathered = course.chance_of_clock(num_particles)[-times.size :]
     common = np.minimum(gathered[:, None], gathered[None, :])
     gain = np.asarray(result.clock_gain) / np.where(times > 0, times, 1.0)[None]
-    return jnp.asarray(gain @ common @ gain.T)
+    return gain @ common @ gain.T
 
 
 def _by_slope(result: Fit) -> Float[Array, "p p"]:
@@ -140,11 +148,13 @@ def slope_in_words(result: Fit) -> Iterator[str]:
     )
 
 
-def _beyond(whole: Float[Array, "p p"], measured: Float[Array, "p p"]) -> Float[Array, "p p"]:
+def _beyond(
+    whole: Float[np.ndarray, "p p"], measured: Float[np.ndarray, "p p"]
+) -> Float[np.ndarray, "p p"]:
     """What a covariance adds to that of measured errors, which may hold it already."""
-    share = 1 - jnp.diag(measured) / jnp.maximum(jnp.diag(whole), jnp.finfo(whole.dtype).tiny)
-    factor = jnp.sqrt(jnp.clip(share, 0.0, 1.0))
-    return whole * jnp.outer(factor, factor)
+    share = 1 - np.diag(measured) / np.maximum(np.diag(whole), np.finfo(whole.dtype).tiny)
+    factor = np.sqrt(np.clip(share, 0.0, 1.0))
+    return np.asarray(whole * np.outer(factor, factor), measured.dtype)
 
 
 def effects_on_temperature(

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -13,6 +12,7 @@ from jaxgran.fitting.least_squares import least_squares, quasi_newton
 from jaxgran.fitting.priors import NO_PRIORS, Priors
 from jaxgran.fitting.residuals import correlation_factor, neighbour_correlation
 from jaxgran.fitting.result import Fit, misfit
+from jaxgran.kept_programs import kept
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
@@ -20,7 +20,7 @@ SEARCHES = {"levenberg-marquardt": least_squares, "lbfgs": quasi_newton}
 """Minimisers by the name of the method."""
 
 
-@eqx.filter_jit
+@kept
 def fit_deterministic(
     gas: Gas,
     curve: CoolingCurve,

@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxgran.checks.validation import number
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.residuals import neighbour_correlation
+from jaxgran.kept_programs import kept
 
 QUANTITIES = {
     "measurement": "temperature",
@@ -49,15 +51,22 @@ def smooth_errors(
         values, error = getattr(curve, field), getattr(curve, f"{field}_error")
         if values is None or error is None:
             continue
-        used = (values > 0) & (error > 0)
-        share = jnp.where(used, error, 1.0) / jnp.where(used, values, 1.0)
-        expected, own = _course(share**2, used)
-        smooth[f"{field}_error"] = jnp.where(used, values * jnp.sqrt(expected), 0.0)
-        degrees[name] = (replicas - 1) * jnp.maximum(own, 1.0)
+        found = _smoothed(values, error, number(replicas))
+        smooth[f"{field}_error"], degrees[name] = found
     return replace(curve, **smooth), degrees
 
 
-@jax.jit
+@kept
+def _smoothed(
+    values: Float[Array, "n"], error: Float[Array, "n"], replicas: Float[Array, ""]
+) -> tuple[Float[Array, "n"], Float[Array, ""]]:
+    """Smooth errors of values, and their degrees of freedom."""
+    used = (values > 0) & (error > 0)
+    share = jnp.where(used, error, 1.0) / jnp.where(used, values, 1.0)
+    expected, own = _course(share**2, used)
+    return jnp.where(used, values * jnp.sqrt(expected), 0.0), (replicas - 1) * jnp.maximum(own, 1.0)
+
+
 def _course(
     variance: Float[Array, "n"], used: Bool[Array, "n"]
 ) -> tuple[Float[Array, "n"], Float[Array, ""]]:

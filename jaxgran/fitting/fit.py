@@ -10,7 +10,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxgran.checks import status
 from jaxgran.checks.tracing import any_traced
-from jaxgran.checks.validation import no_type_check, whole_number
+from jaxgran.checks.validation import no_type_check, number, whole_number
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.budget import clock_accuracy, in_scene
 from jaxgran.fitting.checks import check_curve, unused_rotation
@@ -135,11 +135,11 @@ def fit(
         model.check_scene(guesses[-1])
         steps = 100 if max_steps is None else max_steps
         # As arrays: other numbers share the compiled program.
-        N = None if num_particles is None else jnp.asarray(float(num_particles))
+        N = None if num_particles is None else number(num_particles)
         clock = None
         if known.names and not any_traced(curve, gas):  # the clock is then fitted along
             clock = clock_accuracy(guesses[0], curve, model, num_particles)
-        search = N, jnp.asarray(float(replicas)), method, steps, known, of_errors, clock
+        search = N, number(replicas), method, steps, known, of_errors, clock
         result = fit_deterministic(gas, curve, model, names, guesses, *search)
     if not any_traced(result.chi2, curve, gas):
         _check_computed(result)
@@ -178,9 +178,9 @@ def _check_request(
     for name in free:
         domain_of(gas, name)
     whole_number("replicas", replicas, 1)
-    for name, number in (("max_steps", max_steps), ("num_particles", num_particles)):
-        if number is not None and not (isinstance(number, int | np.integer) and number >= 1):
-            raise ValueError(f"{name} must be a whole number >= 1, or None, got {number!r}")
+    for name, given in (("max_steps", max_steps), ("num_particles", num_particles)):
+        if given is not None and not (isinstance(given, int | np.integer) and given >= 1):
+            raise ValueError(f"{name} must be a whole number >= 1, or None, got {given!r}")
     size, points = sum(size_of(gas, name) for name in free), curve.times.shape[-1]
     if curve.temperature_error is not None and not isinstance(curve.temperature_error, Tracer):
         points = int(np.sum(np.asarray(curve.temperature_error) > 0))

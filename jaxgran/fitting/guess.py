@@ -5,6 +5,7 @@ from jaxtyping import Array, Float
 
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.parameters import START
+from jaxgran.kept_programs import kept
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.restitution import ConstantRestitution, Viscoelastic
 from jaxgran.theory import closed_forms
@@ -23,6 +24,13 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         curve: the measured curve.
         free: names of the free parameters.
     """
+    guessed = _guessed(gas, curve, free)
+    return gas.replace(**{name: guessed.value(name) for name in free if name != START})
+
+
+@kept
+def _guessed(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
+    """The same, of unchecked values."""
     power, line = _power_and_line(gas, curve)
     scale = curve.temperature[0]
     origin = (gas.temperature / scale) ** -power

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from jaxgran.fitting.guess import guess_from_data, guess_of_start, halving_time
 from jaxgran.fitting.least_squares import least_squares
 from jaxgran.fitting.parameters import START, Parameters, domain_of, size_of
 from jaxgran.fitting.result import SIGNIFICANCE
+from jaxgran.kept_programs import kept
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -141,7 +141,7 @@ def _check(measurements, shared, separate, model) -> None:
             )
 
 
-@eqx.filter_jit
+@kept
 def _search(
     pairs: tuple[tuple[Gas, CoolingCurve | DropTest], ...],
     shared: tuple[str, ...],

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -11,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran.fitting.least_squares import least_squares
 from jaxgran.fitting.parameters import Parameters, size_of
 from jaxgran.fitting.priors import Priors
+from jaxgran.kept_programs import kept
 from jaxgran.scene.elements import Rough
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import reduced_scene
@@ -53,7 +53,7 @@ class Profile(NamedTuple):
     residuals: Float[Array, "trials times"]
 
 
-@eqx.filter_jit
+@kept
 def fit_trials(
     gas: Gas,
     began: Float[Array, ""],

@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.checks.tracing import any_traced, concrete
 from jaxgran.checks.words import Rows, as_html, as_text, said
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.parameters import START, size_of
@@ -99,7 +100,10 @@ class Fit(eqx.Module):
     @property
     def covariance(self) -> Float[Array, "p p"]:
         """Covariance of the estimates, SI: the sum of all parts."""
-        return sum(self.covariances.values(), jnp.zeros_like(self.covariances["measurement"]))
+        parts = [*self.covariances.values()]
+        if any_traced(parts):
+            return sum(parts[1:], parts[0])
+        return concrete(np.sum(np.stack(parts), axis=0))  # by NumPy: nothing is compiled
 
     @property
     def standard_error(self) -> Float[Array, "p"]:
@@ -137,7 +141,10 @@ class Fit(eqx.Module):
         if name not in self.names:
             raise ValueError(f"{name!r} was not free; free were {', '.join(self.names)}")
         i = self.names.index(name)
-        return self.estimate[..., i], self.standard_error[..., i]
+        found = self.estimate, self.standard_error
+        if any_traced(found):
+            return found[0][..., i], found[1][..., i]
+        return concrete(np.asarray(found[0])[..., i]), concrete(np.asarray(found[1])[..., i])
 
     def undetermined(self) -> tuple[str, ...]:
         """Parameters of which the curve determines no value, or only a combination; () if none.
@@ -159,7 +166,10 @@ def _unit(name: str) -> str:
 
 
 def _deviations(covariance: Float[Array, "p p"]) -> Float[Array, "p"]:
-    return jnp.sqrt(jnp.diagonal(covariance, axis1=-2, axis2=-1))
+    if any_traced(covariance):
+        return jnp.sqrt(jnp.diagonal(covariance, axis1=-2, axis2=-1))
+    with np.errstate(invalid="ignore"):  # nan, as JAX has it
+        return concrete(np.sqrt(np.diagonal(np.asarray(covariance), axis1=-2, axis2=-1)))
 
 
 class Misfit(NamedTuple):

@@ -62,7 +62,7 @@ def rivals(result: Fit, curve: CoolingCurve) -> tuple[Rival, ...]:
     fitted = measured - residuals / np.where(weights > 0, weights, 1.0)
     ratios, T_rot = np.zeros_like(measured), result.curve.rotational_temperature
     if T_rot is not None:
-        ratios = np.asarray(T_rot / result.curve.temperature)
+        ratios = np.asarray(T_rot) / np.asarray(result.curve.temperature)
     columns = _padded(np.asarray(curve.times), measured, weights, fitted)
     rows = columns[0].size - ratios.size
     columns[3] = np.pad(fitted, (0, rows), "edge")
@@ -90,7 +90,7 @@ def _profile(result: Fit, kinds: list[Kind], columns: list[np.ndarray]) -> Profi
         result.names,
         *map(jnp.asarray, columns),
         trials=_trials(kinds),
-        accuracy=jnp.max(result.clock_error),
+        accuracy=jnp.asarray(np.max(result.clock_error)),
         priors=result.priors,
     )
     return jax.tree.map(np.asarray, profile)
@@ -175,7 +175,7 @@ def _trials(kinds: list[Kind]) -> Trial:
         own = np.zeros((len(amplitudes), len(Trial._fields)))
         own[:, Trial._fields.index(field)] = amplitudes
         rows += list(own)
-    return Trial(*jnp.asarray(np.array(rows).T))
+    return Trial(*map(jnp.asarray, np.array(rows).T))
 
 
 def _padded(times: np.ndarray, *columns: np.ndarray) -> list[np.ndarray]:

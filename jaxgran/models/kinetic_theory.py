@@ -14,6 +14,7 @@ from jaxgran.checks import status, validation
 from jaxgran.checks.tracing import any_traced, lengthened, shortened
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import DEFAULTS, Run
+from jaxgran.kept_programs import kept
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import ROUGH, Course
@@ -158,7 +159,7 @@ class KineticTheory(AbstractModel):
         curve = self._simulate(gas, padded)
         return jax.tree.map(lambda x: shortened(x, size) if x.ndim else x, curve)
 
-    @eqx.filter_jit
+    @kept
     def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
         scene = steady.scene_at_start(gas), Density.of(gas, self.softness, self.correlations)

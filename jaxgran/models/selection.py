@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from math import hypot
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jaxgran.checks.validation import POSITIVE, checked_times, no_type_check, pl
 from jaxgran.checks.words import Rows, as_html, as_text
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
+from jaxgran.kept_programs import kept
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import check_softness, check_volume, checked_gas, walls_in_words
 from jaxgran.models.course import Course
@@ -208,10 +208,11 @@ def course_along(gas: Gas, curve: CoolingCurve, num_particles: int | None = None
 
     a_2 and the collisions are taken for 0 where the curve does not have them.
     """
-    nothing = jnp.zeros_like(curve.temperature)
+    temperature = np.asarray(curve.temperature)
+    nothing = np.zeros_like(temperature)
     values = {
         "time": curve.times,
-        "log_temperature": jnp.log(curve.temperature / gas.temperature),
+        "log_temperature": np.log(temperature / np.asarray(gas.temperature)),
         "collisions": nothing if curve.collisions is None else curve.collisions,
         "sonine": nothing if curve.sonine is None else curve.sonine,
     }
@@ -224,7 +225,7 @@ def course_along(gas: Gas, curve: CoolingCurve, num_particles: int | None = None
     return Course(gas, num_particles, **values, flow_share=flow, flow_scatter=scatter)
 
 
-@eqx.filter_jit
+@kept
 def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Array, "times"]]:
     """Contacts and the critical box at each temperature."""
 

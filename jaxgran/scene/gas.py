@@ -16,6 +16,7 @@ from jaxgran.checks.validation import (
     number,
     whole_number,
 )
+from jaxgran.kept_programs import kept_in_one
 from jaxgran.scene import elements
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
 from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise, optional
@@ -177,6 +178,7 @@ class Gas(NamedFloats):
         return 1 / (meeting * self.diameter ** (self.dimension - 1))
 
     @property
+    @kept_in_one
     def mean_free_path(self) -> Float[Array, ""]:
         """``1 / (sqrt(2) pi n g_2 sigma^2)`` (3D) or ``1 / (2 sqrt(2) n g_2 sigma)`` (2D), m."""
         return self.path_length / (2**0.5 * (pi if self.dimension == 3 else 2))
@@ -187,6 +189,7 @@ class Gas(NamedFloats):
         return jnp.sqrt(2 * self.temperature)
 
     @property
+    @kept_in_one
     def collision_frequency(self) -> Float[Array, ""]:
         """Collisions per particle per second of a Maxwellian gas at t = 0.
 
@@ -196,6 +199,7 @@ class Gas(NamedFloats):
         return sphere_surface(self.dimension) * jnp.sqrt(self.temperature / pi) / self.path_length
 
     @property
+    @kept_in_one
     def mean_free_time(self) -> Float[Array, ""]:
         """Mean free time at t = 0, ``tau_c(0) = 1 / nu_0``, s; the paper's Eq. (12)."""
         return 1 / self.collision_frequency
@@ -218,8 +222,12 @@ class Gas(NamedFloats):
             ValueError: for a speed that is not positive.
         """
         POSITIVE.check("normal_speed", normal_speed, "Give the normal approach speed in m/s.")
+        return self._restitution(number(normal_speed))
+
+    @kept_in_one
+    def _restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         law = self.law.reduced(diameter=self.diameter, mass=self.mass, speed=number(1.0))
-        return law.restitution(number(normal_speed))
+        return law.restitution(normal_speed)
 
     def _viscoelastic(self, quantity: str) -> Viscoelastic:
         if not isinstance(self.law, Viscoelastic):
@@ -235,12 +243,14 @@ class Gas(NamedFloats):
         return self._viscoelastic("alpha").alpha(diameter=self.diameter, mass=self.mass)
 
     @property
+    @kept_in_one
     def delta(self) -> Float[Array, ""]:
         """The paper's small parameter, ``delta = A alpha^(2/5) T_0^(1/10)``."""
         law = self._viscoelastic("delta")
         return law.dissipative_constant * self.alpha**0.4 * self.temperature**0.1
 
     @property
+    @kept_in_one
     def thermal_beta(self) -> Float[Array, ""]:
         """beta of an impact at `impact_speed`, ``beta_T0 = (3/2) A alpha^(2/5) (2 T_0)^(1/10)``."""
         return 1.5 * 2**0.1 * self.delta
@@ -256,6 +266,7 @@ class Gas(NamedFloats):
         return ELASTIC_CONTACT_TIME * 2**-0.1 * gamma(0.9) * length / self.impact_speed
 
     @property
+    @kept_in_one
     def contact_fraction(self) -> Float[Array, ""]:
         """Mean contact duration over mean free time, t_c/tau_c.
 
@@ -264,6 +275,7 @@ class Gas(NamedFloats):
         return self.contact_duration * self.collision_frequency
 
     @property
+    @kept_in_one
     def mean_overlap(self) -> Float[Array, ""]:
         """Mean of the largest overlap of the impacts at t = 0 if they were elastic, in diameters.
 
@@ -275,6 +287,7 @@ class Gas(NamedFloats):
         return ELASTIC_OVERLAP * 2**0.4 * gamma(1.4) * length
 
     @property
+    @kept_in_one
     def critical_box(self) -> Float[Array, ""]:
         """Critical length of the shear instability, ``L_c = 2 pi / k_c``, m, at t = 0.
 
@@ -295,4 +308,8 @@ class Gas(NamedFloats):
             num_particles: N, >= 1.
         """
         num_particles = whole_number("num_particles", num_particles, 1)
+        return self._side_of_box(number(num_particles))
+
+    @kept_in_one
+    def _side_of_box(self, num_particles: Float[Array, ""]) -> Float[Array, ""]:
         return (num_particles / self.number_density) ** (1 / self.dimension)

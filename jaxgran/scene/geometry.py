@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.checks.validation import POSITIVE, UserNumber, number
+from jaxgran.kept_programs import kept_in_one
 
 CLOSE_PACKING = {2: pi / (2 * 3**0.5), 3: pi / (3 * 2**0.5)}
 """Packing fraction of the densest packing of equal disks (2) and of equal spheres (3)."""
@@ -34,7 +35,14 @@ def sphere_mass(diameter: UserNumber, density: UserNumber) -> Float[Array, "..."
     """
     POSITIVE.check("diameter", diameter, "Give the diameter in metres.")
     POSITIVE.check("density", density, "Give the density of the material in kg/m^3.")
-    return pi / 6 * number(density) * number(diameter) ** 3
+    return _sphere_mass(number(diameter), number(density))
+
+
+@kept_in_one
+def _sphere_mass(
+    diameter: Float[Array, "..."], density: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    return pi / 6 * density * diameter**3
 
 
 def contact_value(packing_fraction: ArrayLike, dimension: int) -> Float[Array, "..."]:

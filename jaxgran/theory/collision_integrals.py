@@ -16,8 +16,8 @@ from math import pi
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # whose scipy.special is imported when it is first used
 from jaxtyping import Float
-from scipy.special import eval_genlaguerre, roots_genlaguerre
 
 SAMPLES = 7
 """Values of eps from which the polynomials in 1 - eps, of sixth degree, are found."""
@@ -73,7 +73,7 @@ class _Impacts(NamedTuple):
 @cache
 def _impacts(dimension: int) -> _Impacts:
     along, weight = np.polynomial.hermite_e.hermegauss(_ALONG)
-    square, weight_of_square = roots_genlaguerre(_ACROSS, (dimension - 3) / 2)
+    square, weight_of_square = scipy.special.roots_genlaguerre(_ACROSS, (dimension - 3) / 2)
     if dimension == 2:
         cosine = np.array([-1.0, 1.0])
     else:
@@ -95,7 +95,7 @@ def _squares(at: _Impacts, g: float) -> tuple[np.ndarray, np.ndarray]:
 def _distribution(square: np.ndarray, dimension: int, highest: int) -> np.ndarray:
     """1, S_2, ... up to S_highest at the squares of velocities."""
     orders = [0, *range(2, highest + 1)]
-    return np.stack([eval_genlaguerre(k, dimension / 2 - 1, square) for k in orders])
+    return np.stack([scipy.special.eval_genlaguerre(k, dimension / 2 - 1, square) for k in orders])
 
 
 def _of_terms(bilinear: np.ndarray, dimension: int, order: int) -> np.ndarray:
@@ -164,7 +164,9 @@ def _changes(
     losses = [one**p + other**p - after**p - other_after**p for p in range(1, order + 1)]
     # The scalar product of a velocity before and after.
     kept = one - (1 + eps) / 2 * g * (at.centre + g / 2)
-    of_label = [lambda x, j=j: eval_genlaguerre(j, dimension / 2, x) for j in range(order - 1)]
+    of_label = [
+        lambda x, j=j: scipy.special.eval_genlaguerre(j, dimension / 2, x) for j in range(order - 1)
+    ]
     relaxation = [
         4 / dimension * (one * s_j(one) - kept * s_j(after)) * s_k(one)
         for s_j in of_label
