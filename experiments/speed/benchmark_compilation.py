@@ -1,4 +1,4 @@
-"""How long do the first run of each particle model and the first fit compile?
+"""How long does the first run of each particle model, or a fit, compile?
 
     python experiments/speed/benchmark_compilation.py [--smoke]
 
