@@ -34,6 +34,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 DEPENDENCIES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "lineax", "optimistix")
 """Packages whose code is in the programs."""
 
+QUICKLY: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
+"""Options of XLA: on a CPU its emitters of fusions take half of the time of a compilation, and the
+programs of fits run as fast without."""
+
 MOST_KEPT = 100
 """Files of a folder; beyond that the one unused for longest is removed."""
 
@@ -143,7 +147,10 @@ def _made(function: Callable, outline: Any, arrays: list, file: Path) -> Program
     of_arrays.__name__ = function.__name__
     lowered = jax.jit(of_arrays).lower(arrays)
     with _no_other_cache():
-        compiled = lowered.compile()
+        try:
+            compiled = lowered.compile(compiler_options=QUICKLY)
+        except (RuntimeError, ValueError):  # an XLA that has no such option
+            compiled = lowered.compile()
     program = Program(compiled, results[-1])
     try:
         payload = pickle.dumps((serialize(compiled)[0], compiled.out_tree.num_leaves, results[-1]))

@@ -17,6 +17,12 @@ def plotting_later() -> "Future[ModuleType]":
     if find_spec("matplotlib") is None:
         import_module(PLOTTING)  # raises, and says what to install
     pool = ThreadPoolExecutor(1)
-    module = pool.submit(import_module, PLOTTING)
+    module = pool.submit(_plotting)
     pool.shutdown(wait=False)
+    return module
+
+
+def _plotting() -> ModuleType:
+    module = import_module(PLOTTING)
+    module.read_fonts()
     return module

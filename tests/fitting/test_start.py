@@ -86,7 +86,6 @@ def fitted_together(gas, curve, name):
     return both
 
 
-@pytest.mark.slow
 def test_t0_and_the_first_temperature_are_not_found_together(measured):
     fitted_together(*measured, A)
 

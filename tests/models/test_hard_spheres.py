@@ -283,8 +283,7 @@ def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("by", ["sweep", "vesin"])
+@pytest.mark.parametrize("by", ["sweep", pytest.param("vesin", marks=pytest.mark.slow)])
 def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
     gas = hard_gas(0.8, 0.1)
     times = np.array([0.3, 1.0, 2.0]) * float(gas.mean_free_time)

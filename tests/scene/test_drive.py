@@ -74,7 +74,6 @@ def test_one_steady_state_from_below_and_from_above(law, beads):
     np.testing.assert_allclose(ends, ends[0], rtol=3e-8)
 
 
-@pytest.mark.slow
 def test_the_derivative_in_the_strength():
     gas = constant(0.8, rate=0.05)
     times = np.array([3.0, 30.0, 300.0]) * float(gas.mean_free_time)
@@ -221,7 +220,6 @@ def test_rough_particles_are_released_from_the_steady_state(beta):
         np.testing.assert_allclose(found, 1.0, rtol=0.07)
 
 
-@pytest.mark.slow
 def test_dsmc_begins_in_the_steady_state():
     gas = prepared(0.5)
     times = np.array([0.0, 5.0]) * float(gas.mean_free_time)
