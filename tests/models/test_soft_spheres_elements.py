@@ -247,6 +247,7 @@ def test_the_model_for_friction_is_soft_spheres():
     assert any("leave friction out" in reason for reason in choice.reasons)
 
 
+@pytest.mark.slow
 def test_boxes_of_three_sides_contain_the_gas():
     gas = soft()
     sides = float(gas.box_side(NUM)) * np.array([2.0, 1.0, 0.5])
@@ -269,6 +270,7 @@ def log_temperatures(gas, model, times, names):
     return logs, jnp.log(jnp.stack([gas.value(name) for name in names]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "elements, names",
     [
