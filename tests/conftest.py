@@ -12,8 +12,8 @@ from jaxtyping import install_import_hook
 # pytrees of tracers annotations hold for one member.
 with install_import_hook("jaxgran", "beartype.beartype"):
     import jaxgran
+    from jaxgran.checks.kept_programs import keep_in
     from jaxgran.cli.programs import SWITCH, keep_programs
-    from jaxgran.kept_programs import keep_in
 
 PROGRAMS = "JAXGRAN_TEST_PROGRAMS"
 """An environment variable: the folder of programs compiled in this run of the tests."""

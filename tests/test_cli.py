@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.checks.kept_programs import keep_in
 from jaxgran.cli import programs
 from jaxgran.cli.app import FREE, main
 from jaxgran.cli.models import MODELS, named
-from jaxgran.kept_programs import keep_in
 from jaxgran.models.selection import default_models
 
 PNG = b"\x89PNG\r\n\x1a\n"

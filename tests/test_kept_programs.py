@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran import kept_programs
-from jaxgran.kept_programs import keep_in, kept, kept_in_one
+from jaxgran.checks import kept_programs
+from jaxgran.checks.kept_programs import keep_in, kept, kept_in_one
 
 
 class Found(NamedTuple):
@@ -81,7 +81,7 @@ def test_the_source_is_read(tmp_path, monkeypatch):
     before = kept_programs._source()
     assert before == kept_programs._source()
     (tmp_path / "more.py").write_text("")
-    monkeypatch.setattr(kept_programs, "__file__", str(tmp_path / "kept_programs.py"))
+    monkeypatch.setattr(kept_programs, "__file__", str(tmp_path / "checks" / "kept_programs.py"))
     empty = kept_programs._source()
     (tmp_path / "more.py").write_text("x = 1")
     assert len({before, empty, kept_programs._source()}) == 3

@@ -81,8 +81,7 @@ def run_fit(options: FitOptions, started: float) -> None:
     gas = with_given_constant(gas, header, options.free)
     n = header_count(header, "N")
     replicas = header_count(header, "replicas") or 1
-    picture, record = outputs(options)
-    plotting = plotting_later()
+    (picture, record), plotting = outputs(options), plotting_later()
     free = tuple(PARAMETERS[key][0] for key in options.free)
     model, reasons = model_of(options, gas, curve, free, n)
     (model_name,) = named([model])
@@ -100,8 +99,7 @@ def run_fit(options: FitOptions, started: float) -> None:
     print_rivals(rows[0]["parameter"], diagnosis)
     print_verdict(diagnosis)
     picture.parent.mkdir(parents=True, exist_ok=True)
-    title = title_of(options, rows, diagnosis)
-    plotting.result().save_fit(result, curve, title, picture)
+    plotting.result().save_fit(result, curve, title_of(options, rows, diagnosis), picture)
     summary = {
         **{row["parameter"]: row["estimate"] for row in rows},
         **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},

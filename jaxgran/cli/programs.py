@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 from platformdirs import user_cache_path
 
-from jaxgran.kept_programs import keep_in
+from jaxgran.checks.kept_programs import keep_in
 
 SWITCH = "JAXGRAN_NO_CACHE"
 """An environment variable: set to anything but 0, nothing is kept."""

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.checks.kept_programs import kept
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.comparison import QUANTITIES, Comparison
 from jaxgran.fitting.least_squares import least_squares, quasi_newton
 from jaxgran.fitting.priors import NO_PRIORS, Priors
 from jaxgran.fitting.residuals import correlation_factor, neighbour_correlation
 from jaxgran.fitting.result import Fit, misfit
-from jaxgran.kept_programs import kept
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.validation import number
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.residuals import neighbour_correlation
-from jaxgran.kept_programs import kept
 
 QUANTITIES = {
     "measurement": "temperature",

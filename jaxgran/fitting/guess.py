@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxgran.checks.kept_programs import kept
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.parameters import START
-from jaxgran.kept_programs import kept
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.restitution import ConstantRestitution, Viscoelastic
 from jaxgran.theory import closed_forms

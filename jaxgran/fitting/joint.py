@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
@@ -17,7 +18,6 @@ from jaxgran.fitting.guess import guess_from_data, guess_of_start, halving_time
 from jaxgran.fitting.least_squares import least_squares
 from jaxgran.fitting.parameters import START, Parameters, domain_of, size_of
 from jaxgran.fitting.result import SIGNIFICANCE
-from jaxgran.kept_programs import kept
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas
 from jaxgran.models.kinetic_theory import KineticTheory

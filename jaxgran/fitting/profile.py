@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxgran.checks.kept_programs import kept
 from jaxgran.fitting.least_squares import least_squares
 from jaxgran.fitting.parameters import Parameters, size_of
 from jaxgran.fitting.priors import Priors
-from jaxgran.kept_programs import kept
 from jaxgran.scene.elements import Rough
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import reduced_scene

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxgran.kept_programs import kept
+from jaxgran.checks.kept_programs import kept
 
 FEWEST = 4
 """Residuals below which no correlation is estimated."""

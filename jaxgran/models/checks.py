@@ -12,10 +12,10 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from jaxgran.checks import status
+from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.tracing import any_traced, is_known
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
-from jaxgran.kept_programs import kept
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.particles import initial
 from jaxgran.particles.simulation import SMALLEST_BOX

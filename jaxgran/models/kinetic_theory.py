@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.checks import status, validation
+from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.tracing import any_traced, lengthened, shortened
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import DEFAULTS, Run
-from jaxgran.kept_programs import kept
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Omission
 from jaxgran.models.course import ROUGH, Course

@@ -12,11 +12,11 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.checks import status
+from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.validation import POSITIVE, checked_times, no_type_check, plain_number
 from jaxgran.checks.words import Rows, as_html, as_text
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
-from jaxgran.kept_programs import kept
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import check_softness, check_volume, checked_gas, walls_in_words
 from jaxgran.models.course import Course

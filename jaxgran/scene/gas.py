@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxgran.checks.kept_programs import kept_property
 from jaxgran.checks.validation import (
     POSITIVE,
     Domain,
@@ -16,13 +17,12 @@ from jaxgran.checks.validation import (
     number,
     whole_number,
 )
-from jaxgran.kept_programs import kept_in_one
 from jaxgran.scene import elements
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
 from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise, optional
 from jaxgran.scene.friction import Frictional
-from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
-from jaxgran.scene.law import check_units
+from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, side_of_box, sphere_surface
+from jaxgran.scene.law import check_units, restitution_at
 from jaxgran.scene.named_floats import NamedFloats, Place
 from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw, Viscoelastic
 from jaxgran.scene.shear import critical_length
@@ -151,7 +151,7 @@ class Gas(NamedFloats):
         """
         self._check_single((*self.law.lists, "wall_side"))
 
-    @property
+    @kept_property
     def number_density(self) -> Float[Array, ""]:
         """Number density n, m^-d."""
         volume_of_sphere = (
@@ -177,8 +177,7 @@ class Gas(NamedFloats):
             meeting = meeting * self.container.more_collisions(self.diameter, self.dimension)
         return 1 / (meeting * self.diameter ** (self.dimension - 1))
 
-    @property
-    @kept_in_one
+    @kept_property
     def mean_free_path(self) -> Float[Array, ""]:
         """``1 / (sqrt(2) pi n g_2 sigma^2)`` (3D) or ``1 / (2 sqrt(2) n g_2 sigma)`` (2D), m."""
         return self.path_length / (2**0.5 * (pi if self.dimension == 3 else 2))
@@ -188,8 +187,7 @@ class Gas(NamedFloats):
         """``sqrt(2 T_0)``, m/s, the rms of a component of the relative velocity of two spheres."""
         return jnp.sqrt(2 * self.temperature)
 
-    @property
-    @kept_in_one
+    @kept_property
     def collision_frequency(self) -> Float[Array, ""]:
         """Collisions per particle per second of a Maxwellian gas at t = 0.
 
@@ -198,8 +196,7 @@ class Gas(NamedFloats):
         """
         return sphere_surface(self.dimension) * jnp.sqrt(self.temperature / pi) / self.path_length
 
-    @property
-    @kept_in_one
+    @kept_property
     def mean_free_time(self) -> Float[Array, ""]:
         """Mean free time at t = 0, ``tau_c(0) = 1 / nu_0``, s; the paper's Eq. (12)."""
         return 1 / self.collision_frequency
@@ -222,12 +219,7 @@ class Gas(NamedFloats):
             ValueError: for a speed that is not positive.
         """
         POSITIVE.check("normal_speed", normal_speed, "Give the normal approach speed in m/s.")
-        return self._restitution(number(normal_speed))
-
-    @kept_in_one
-    def _restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        law = self.law.reduced(diameter=self.diameter, mass=self.mass, speed=number(1.0))
-        return law.restitution(normal_speed)
+        return restitution_at(self.law, self.diameter, self.mass, number(normal_speed))
 
     def _viscoelastic(self, quantity: str) -> Viscoelastic:
         if not isinstance(self.law, Viscoelastic):
@@ -242,15 +234,13 @@ class Gas(NamedFloats):
         """Elastic constant over effective mass, m^(-1/2) s^(-2); viscoelastic spheres only."""
         return self._viscoelastic("alpha").alpha(diameter=self.diameter, mass=self.mass)
 
-    @property
-    @kept_in_one
+    @kept_property
     def delta(self) -> Float[Array, ""]:
         """The paper's small parameter, ``delta = A alpha^(2/5) T_0^(1/10)``."""
         law = self._viscoelastic("delta")
         return law.dissipative_constant * self.alpha**0.4 * self.temperature**0.1
 
-    @property
-    @kept_in_one
+    @kept_property
     def thermal_beta(self) -> Float[Array, ""]:
         """beta of an impact at `impact_speed`, ``beta_T0 = (3/2) A alpha^(2/5) (2 T_0)^(1/10)``."""
         return 1.5 * 2**0.1 * self.delta
@@ -265,8 +255,7 @@ class Gas(NamedFloats):
         length = self.reduced_law.impact_length(jnp.ones_like(self.temperature)) * self.diameter
         return ELASTIC_CONTACT_TIME * 2**-0.1 * gamma(0.9) * length / self.impact_speed
 
-    @property
-    @kept_in_one
+    @kept_property
     def contact_fraction(self) -> Float[Array, ""]:
         """Mean contact duration over mean free time, t_c/tau_c.
 
@@ -274,8 +263,7 @@ class Gas(NamedFloats):
         """
         return self.contact_duration * self.collision_frequency
 
-    @property
-    @kept_in_one
+    @kept_property
     def mean_overlap(self) -> Float[Array, ""]:
         """Mean of the largest overlap of the impacts at t = 0 if they were elastic, in diameters.
 
@@ -286,8 +274,7 @@ class Gas(NamedFloats):
         length = self.reduced_law.impact_length(jnp.ones_like(self.temperature))
         return ELASTIC_OVERLAP * 2**0.4 * gamma(1.4) * length
 
-    @property
-    @kept_in_one
+    @kept_property
     def critical_box(self) -> Float[Array, ""]:
         """Critical length of the shear instability, ``L_c = 2 pi / k_c``, m, at t = 0.
 
@@ -308,8 +295,4 @@ class Gas(NamedFloats):
             num_particles: N, >= 1.
         """
         num_particles = whole_number("num_particles", num_particles, 1)
-        return self._side_of_box(number(num_particles))
-
-    @kept_in_one
-    def _side_of_box(self, num_particles: Float[Array, ""]) -> Float[Array, ""]:
-        return (num_particles / self.number_density) ** (1 / self.dimension)
+        return side_of_box(number(num_particles), self.number_density, self.dimension)

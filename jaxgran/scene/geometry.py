@@ -5,8 +5,8 @@ from math import gamma, pi
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxgran.checks.kept_programs import kept_in_one
 from jaxgran.checks.validation import POSITIVE, UserNumber, number
-from jaxgran.kept_programs import kept_in_one
 
 CLOSE_PACKING = {2: pi / (2 * 3**0.5), 3: pi / (3 * 2**0.5)}
 """Packing fraction of the densest packing of equal disks (2) and of equal spheres (3)."""
@@ -43,6 +43,14 @@ def _sphere_mass(
     diameter: Float[Array, "..."], density: Float[Array, "..."]
 ) -> Float[Array, "..."]:
     return pi / 6 * density * diameter**3
+
+
+@kept_in_one
+def side_of_box(
+    num_particles: Float[Array, ""], number_density: Float[Array, "..."], dimension: int
+) -> Float[Array, "..."]:
+    """Side of the cube (of the square if d = 2) of N particles of a number density."""
+    return (num_particles / number_density) ** (1 / dimension)
 
 
 def contact_value(packing_fraction: ArrayLike, dimension: int) -> Float[Array, "..."]:

@@ -12,6 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxgran.checks.kept_programs import kept_in_one
 from jaxgran.checks.validation import ANY, Domain, number
 
 UNITS = (
@@ -178,6 +179,15 @@ class LawInUnits(ReducedLaw):
     def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         found = self.law.loss(normal_speed * self.speed)
         return jnp.broadcast_to(found, jnp.shape(normal_speed))
+
+
+@kept_in_one
+def restitution_at(
+    law: RestitutionLaw, diameter: Array, mass: Array, normal_speed: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """eps of spheres at speeds in m/s."""
+    reduced = law.reduced(diameter=diameter, mass=mass, speed=number(1.0))
+    return reduced.restitution(normal_speed)
 
 
 def check_units(law: RestitutionLaw) -> None:

@@ -11,7 +11,7 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxgran.kept_programs import kept
+from jaxgran.checks.kept_programs import kept
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
 from jaxgran.theory import elements

@@ -4,8 +4,8 @@ JAX's persistent cache keeps what XLA has compiled, and finds it by the lowered 
 lowering remain, which take longer than the rest of a second fit. What is kept here is found by the
 arguments of the function and the code that it is of.
 
-May import `checks`. Is imported by floors above, for functions that take seconds to trace; the
-commands say where files are kept (`jaxgran.cli.programs`), and without that nothing is.
+For functions that take seconds to trace. The commands say where files are kept
+(`jaxgran.cli.programs`), and without that nothing is.
 """
 
 import functools
@@ -85,6 +85,11 @@ def kept_in_one(function: Function) -> Function:
     In a process that keeps programs each operation on a number would be one more to be found.
     """
     return _kept(function, function)
+
+
+def kept_property(function: Callable[[Any], Any]) -> Any:
+    """A property whose function is `kept_in_one`."""
+    return property(kept_in_one(function))
 
 
 def _kept(function: Function, otherwise: Callable) -> Function:
@@ -251,7 +256,7 @@ def _surroundings() -> tuple[str, ...]:
 def _source() -> str:
     """A digest of all modules of this package."""
     digest = hashlib.sha256()
-    for file in sorted(Path(__file__).parent.rglob("*.py")):
+    for file in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(file.read_bytes())
     return digest.hexdigest()
 
