@@ -61,7 +61,7 @@ STEPS_SPENT = Fault(
 )
 OVERLAPPING = Fault(
     256,
-    "two spheres of the initial state overlap, which hard spheres must not",
+    "two spheres of the initial state overlap, or a sphere and a wall, which hard spheres must not",
     "move them apart, or leave out start for a random initial state",
 )
 OTHER_BOX = Fault(

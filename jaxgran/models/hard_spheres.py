@@ -28,7 +28,6 @@ from jaxgran.particles.drag import transformed
 from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.hard.walls import MARGIN, HardWalls
 from jaxgran.particles.hard.windows import LEAST_IMPACTS, SPEED_MARGIN, HardDynamics
-from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedDrive
 from jaxgran.theory.averages import collision_rate
@@ -79,7 +78,8 @@ class HardSpheres(AbstractSpheres):
         contact_time: in mean free times of the homogeneous gas at the current temperature, in
             [0, 0.1]; 0 is the pure hard sphere, which may collapse.
         start: positions and velocities to begin with instead of random ones; their box must be
-            that of the gas, and no spheres may overlap.
+            that of the gas, and no spheres may overlap. In a container positions are coordinates
+            from a corner, and centres a radius or more from each wall.
         neighbours: who finds the pairs: "sweep" (compiled with the rest), "vesin" (on the host),
             "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
@@ -100,8 +100,8 @@ class HardSpheres(AbstractSpheres):
     through Enskog's collision frequency; that the box changes with it at fixed N, and with the box
     the growth of flows, is left out. The derivatives of a_2 and of the final particles are not
     known, and are nan. Second derivatives are refused. A run is followed in the frame in which each
-    replica is at rest. With a given start T_0 is a unit only, and its derivative 0; the start takes
-    part in a change of the diameter.
+    replica is at rest, unless there are walls or drag. With a given start T_0 is a unit only, and
+    its derivative 0; the start takes part in a change of the diameter.
 
     With elements derivatives of T, T_rot and collisions are known, in every float of the gas, and
     those of all else are nan. The gas is then taken to remember its two energies
@@ -146,13 +146,20 @@ class HardSpheres(AbstractSpheres):
         with jax.ensure_compile_time_eval():
             self.check_box(gas)
             self._check_overlap(gas)
-        if gas.container is not None:
-            check_container(gas, gas.container, self.num_particles, self.start is not None)
+            checks.check_volume(gas, self.num_particles)
+            if gas.container is not None:
+                radius = gas.diameter * (0.5 - OVERLAP)
+                user_start.check_inside(self.start, gas.container, radius, gas.dimension)
+        if self.start is not None and self.start.angular_velocity is not None:
+            raise ValueError(
+                "HardSpheres draws the angular velocities of a start: give it without them, as "
+                "start._replace(angular_velocity=None), and their rotational_temperature"
+            )
 
     def _check_overlap(self, gas: Gas) -> None:
         if self.start is None or any_traced(gas, self.start):
             return  # looked at when it runs
-        start, side = self.start, self.start.box_side / gas.diameter
+        start, side = self.start, reduced_scene(gas, self.num_particles).side
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
         closest = float(user_start.closest(position, side, self.replicas, (8 * len(position), 0)))
         if closest < 1 - user_start.overlap_by_rounding(position, side, OVERLAP):
@@ -217,13 +224,6 @@ class HardSpheres(AbstractSpheres):
             ahead = min(ahead * max(1.0, filled / float(scene.walls.sides[0])), self.num_particles)
         sizes = capacities(expected, ahead, spare or 1.15, extra, n)
         return Plan(self.replicas, HardPace(share), *sizes)
-
-
-def check_container(gas: Gas, walls: Walls, num_particles: int, start: bool) -> None:
-    """Raise ValueError for a container that is too large or small for N and phi, or a start."""
-    if start:
-        raise ValueError("HardSpheres takes no start in a container: leave start or container out")
-    checks.check_volume(gas, num_particles)
 
 
 def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:

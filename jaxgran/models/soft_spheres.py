@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.checks.tracing import any_traced, concrete
+from jaxgran.checks.tracing import concrete
 from jaxgran.checks.validation import (
     POSITIVE,
     UserCount,
@@ -17,12 +17,13 @@ from jaxgran.checks.validation import (
     plain_number,
     python_number,
 )
-from jaxgran.data.curve import Particles, UserParticles
+from jaxgran.data.curve import UserParticles
 from jaxgran.models import checks
 from jaxgran.models.base import Omission
 from jaxgran.models.course import Course
 from jaxgran.models.reduced_soft import reduced_scene
 from jaxgran.models.spheres import AbstractSpheres, Plan
+from jaxgran.particles import user_start
 from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
 from jaxgran.particles.soft.block import SoftDynamics
 from jaxgran.particles.soft.scene import SoftScene
@@ -145,7 +146,7 @@ class SoftSpheres(AbstractSpheres):
             checks.check_volume(gas, self.num_particles)
             if gas.container is not None:
                 check_walls(gas.container)
-                check_inside(gas.container, gas.dimension, self.start)
+                user_start.check_inside(self.start, gas.container, 0.0, gas.dimension)
         if gas.surface and self.start is not None and self.start.angular_velocity is not None:
             raise ValueError(
                 "SoftSpheres draws the angular velocities of a start: give it without them, as "
@@ -235,18 +236,4 @@ def check_walls(walls: Walls) -> None:
         raise ValueError(
             "SoftSpheres takes smooth walls, tangential_restitution of the walls belongs to "
             "impacts: use HardSpheres(N), or leave it out"
-        )
-
-
-def check_inside(walls: Walls, dimension: int, start: Particles | None) -> None:
-    """Raise ValueError for a start with a sphere whose centre is not within the walls."""
-    if start is None or any_traced(start.position, walls.side):
-        return
-    sides, place = np.broadcast_to(walls.side, (dimension,)), np.asarray(start.position)
-    outside = np.any((place < 0) | (place > sides), axis=-1)
-    if np.any(outside):
-        replica, i = np.argwhere(outside)[0]
-        raise ValueError(
-            f"sphere {i} of replica {replica} of the start is at {place[replica, i]} m, "
-            f"outside of the walls, which are at 0 and {sides} m: move it inside"
         )

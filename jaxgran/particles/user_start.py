@@ -6,8 +6,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from jaxgran.checks.tracing import any_traced
 from jaxgran.data.curve import Particles, UserParticles
 from jaxgran.particles import neighbours
+from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
 
 SAME_BOX = 1e-6
@@ -37,6 +39,31 @@ def check(start: UserParticles | None, gas: Gas, replicas: int, num_particles: i
         raise ValueError(
             f"start.box_side is {given} diameters, that of the gas {own}: change packing_fraction "
             "or the start"
+        )
+
+
+def check_inside(start: Particles | None, walls: Walls, least: ArrayLike, dimension: int) -> None:
+    """Raise ValueError for a start with a sphere that does not stand between the walls.
+
+    Args:
+        start: as given by the user.
+        walls: at 0 and at each side.
+        least: distance of centres from them, m.
+        dimension: d.
+    """
+    if start is None or any_traced(start.position, walls.side, least):
+        return
+    least = float(np.asarray(least))
+    sides, place = np.broadcast_to(walls.side, (dimension,)), np.asarray(start.position)
+    outside = np.any((place < least) | (place > sides - least), axis=-1)
+    if np.any(outside):
+        replica, i = np.argwhere(outside)[0]
+        where = "outside of the walls"
+        if np.all((place[replica, i] >= 0) & (place[replica, i] <= sides)):
+            where = f"less than its radius, {least:.6g} m, from a wall"
+        raise ValueError(
+            f"sphere {i} of replica {replica} of the start is at {place[replica, i]} m, {where}: "
+            f"they are at 0 and {sides} m; move it inside"
         )
 
 

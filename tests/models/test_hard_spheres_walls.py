@@ -2,11 +2,13 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.checks import status
 from jaxgran.models.course import WALLS
 from tests.conftest import glass_beads
 
@@ -133,10 +135,62 @@ def test_containers_that_do_not_fit_are_refused():
         jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(200))
 
 
-def test_starts_between_walls_are_refused():
-    gas = contained(50)
-    place = np.argwhere(np.ones((4, 4, 4)))[None, :50] * SIDE / 4
-    start = jaxgran.Particles(place, np.zeros_like(place), SIDE)
-    with pytest.raises(ValueError, match="takes no start in a container"):
-        again = jaxgran.HardSpheres(50, start=start)
-        jaxgran.cool(gas, [1e-3], model=again)
+def lattice(side=SIDE):
+    """50 spheres at rest on a lattice with 12.5 mm between them, off the walls."""
+    place = (np.argwhere(np.ones((4, 4, 4)))[None, :50] + 0.5) * SIDE / 4
+    return jaxgran.Particles(place, np.zeros_like(place), side)
+
+
+@pytest.mark.parametrize("box", [SIDE, [SIDE, 0.8 * SIDE, 1.25 * SIDE]], ids=["cube", "box"])
+def test_a_run_goes_on_from_its_own_particles(box):
+    gas = contained(50, 0.8)
+    gas = dataclasses.replace(gas, container=jaxgran.Walls(box, restitution=0.8))
+    times = jnp.array([0.1, 0.2])  # some bounces, and few impacts that would let paths part
+    whole = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(50), save="particles")
+    middle = jax.tree.map(lambda x: x[0], whole.saved)
+    cooler = gas.replace(temperature=whole.temperature[0])
+    later = jaxgran.HardSpheres(50, start=middle)
+    curve = jaxgran.cool(cooler, times[1:] - times[0], model=later)
+    assert float(whole.temperature[1]) < 0.99 * float(whole.temperature[0])
+    np.testing.assert_allclose(curve.temperature[-1], whole.temperature[1], rtol=1e-6)
+    last = curve.particles
+    np.testing.assert_allclose(last.position, whole.particles.position, atol=1e-6 * SIDE)
+
+
+def test_what_does_not_stand_between_the_walls_is_refused():
+    gas, start = contained(50), lattice()
+
+    def moved(place):
+        position = start.position.copy()
+        position[0, 7] = place
+        return jaxgran.HardSpheres(50, start=start._replace(position=position))
+
+    middle = SIDE / 4
+    with pytest.raises(ValueError, match="sphere 7 of replica 0 .* outside of the walls.* 0.05"):
+        jaxgran.cool(gas, [1e-3], model=moved([-1e-4, middle, middle]))
+    near = moved([middle, SIDE - 0.9e-3, middle])
+    with pytest.raises(ValueError, match="less than its radius, 0.001 m, from a wall"):
+        jaxgran.cool(gas, [1e-3], model=near)
+    jaxgran.cool(gas, [1e-3], model=moved([middle, SIDE - 1e-3, middle]))  # it touches the wall
+    with pytest.raises(ValueError, match="start.box_side is .* diameters, that of the gas"):
+        wrong = jaxgran.HardSpheres(50, start=lattice(1.1 * SIDE))
+        jaxgran.cool(gas, [1e-3], model=wrong)
+    spinning = start._replace(angular_velocity=np.ones((1, 50, 3)))
+    with pytest.raises(ValueError, match="HardSpheres draws the angular velocities of a start"):
+        jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(50, start=spinning))
+
+
+@pytest.mark.slow  # another program
+def test_a_start_beyond_a_wall_has_a_status_where_it_cannot_be_looked_at():
+    gas, start = contained(50), lattice()
+    model = jaxgran.HardSpheres(50).sized_for(gas)
+
+    @jax.jit
+    def faults(position):
+        own = dataclasses.replace(model, start=start._replace(position=position))
+        return jaxgran.cool(gas, [1e-3], model=own).status
+
+    assert faults(jnp.asarray(start.position)) == 0
+    beyond = start.position.copy()
+    beyond[0, 7, 1] = 0.9e-3
+    assert faults(jnp.asarray(beyond)) == status.OVERLAPPING.bit

@@ -74,11 +74,10 @@ class HardDynamics(AbstractDynamics):
         rate = self.scene.collision_frequency
         if self.scene.walls is not None:
             rate = rate + 2 / jnp.min(self.scene.walls.sides - 1)
-        window = self.share / (8 * rate)
         return HardState(
             age=jnp.full(num_rows, jnp.inf, dtype),
             regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
-            window=jnp.asarray(window, dtype),
+            window=jnp.asarray(self.share / (8 * rate), dtype),
         )
 
     def elastic(self) -> "HardDynamics":
@@ -88,8 +87,7 @@ class HardDynamics(AbstractDynamics):
     def preparing(self) -> "HardDynamics | None":
         if self.scene.prepared is None:
             return None
-        scene = self.scene.by_impacts(elastic=False)
-        return dataclasses.replace(self, scene=scene, restores=True)
+        return dataclasses.replace(self, scene=self.scene.by_impacts(elastic=False), restores=True)
 
     def with_kicks(self, state: State, key: PRNGKeyArray) -> State:
         state = first_draw(state, self.scene, self.replicas, key)
@@ -99,6 +97,10 @@ class HardDynamics(AbstractDynamics):
     def room(self) -> Array | None:
         walls = self.scene.walls
         return None if walls is None else walls.sides - 1
+
+    @property
+    def inertial(self) -> bool:
+        return self.scene.walls is None and self.scene.drag is None
 
     def drawn(self, state: State, key: PRNGKeyArray, melted: State) -> State:
         state = first_draw(state, self.scene, self.replicas, key)
@@ -129,6 +131,9 @@ class HardDynamics(AbstractDynamics):
         x, side = state.position, self.scene.side
         closest = user_start.closest(x, side, self.replicas, self.capacity[:2], "sweep")
         tolerance = user_start.overlap_by_rounding(x, side, self.overlap)
+        if self.scene.walls is not None:  # a sphere and its image beyond a wall
+            image = 2 * jnp.min(jnp.minimum(x, self.scene.walls.sides[None] - x))
+            closest = jnp.minimum(closest, image)
         return status.flag(status.OVERLAPPING, closest < 1 - tolerance)
 
     def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, ArrayLike]:
@@ -232,8 +237,7 @@ class HardDynamics(AbstractDynamics):
         found = jnp.sum(impacts)
         if work.bounces is not None:  # of one sphere, and not of two
             found = found + jnp.sum(work.bounces) / 2
-        ratio = (wanted / jnp.maximum(found, 1)) ** WINDOW_EXPONENT
-        ratio = jnp.clip(ratio, 0.5, 1.5)
+        ratio = jnp.clip((wanted / jnp.maximum(found, 1)) ** WINDOW_EXPONENT, 0.5, 1.5)
         slots, own = work.slots, state.own
         regularised = own.regularised + by_replica(work.regularised) // 2
         # The last, short window before an end says nothing about the rate of impacts.
@@ -268,8 +272,7 @@ class HardDynamics(AbstractDynamics):
         fresh = state.time == began.time  # else a new list is all that an outrun skin needs
         shorten = status.has(now.status, status.SKIN_OUTRUN) & fresh
         # Only where the capacity sufficed, so that this does not depend on a resumed run's.
-        crowded = now.needed[0] > CROWDED * len(state.position)
-        crowded &= now.status == status.OK
+        crowded = (now.needed[0] > CROWDED * len(state.position)) & (now.status == status.OK)
         shorter = jnp.maximum(0.8 * state.skin, jnp.minimum(state.skin, SHORTEST_SKIN))
         beyond = status.LIST_FULL.bit | status.CONTACTS_FULL.bit
         beyond |= status.NOT_FINITE.bit | status.STALLED.bit
