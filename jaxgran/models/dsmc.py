@@ -58,7 +58,8 @@ class DSMC(AbstractModel):
     Takes all elements of a scene but friction: rough spheres; walls, which a homogeneous gas meets
     everywhere alike, the more often the more they take (`jaxgran.scene.wall_layer`); drag, exactly,
     by collisions in transformed time (`jaxgran.particles.drag`), up to gamma t = 18 (8 in float32);
-    a drive, half of whose kicks begin each step and half end it;
+    a drive, half of whose kicks begin each step and half end it, in turns for portions of all
+    particles (`jaxgran.particles.stochastic.portions`);
     and a driven start, which is driven for 10 mean free times with what its collisions take.
     Derivatives are then of T, T_rot and collisions (`jaxgran.tangents.exchange`), others are nan.
 
@@ -178,15 +179,17 @@ class DSMC(AbstractModel):
             recorded = partial(observe, units=units, save=snapshot.function(run.save))
             if new:  # compiled by a call that goes no step; a state that is given away is a copy
                 jax.block_until_ready(recorded(advance(jax.tree.map(jnp.copy, start), 0.0)))
+        description = {}
+        if run.checkpoint is not None:
+            fixed = {"scene": scene, "times": times, "key": words, "scheme": scheme, "model": self}
+            description = described(**fixed, save=run.save)
         _, records, fault = follow(
             start,
             np.asarray(times),
             lambda state, end: waited_for(advance(state, end)),
             recorded,
             shown=observe,
-            scene=described(
-                scene=scene, times=times, key=words, scheme=scheme, model=self, save=run.save
-            ),
+            scene=description,
             progress=run.progress,
             path=run.checkpoint,
         )

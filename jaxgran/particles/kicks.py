@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 LARGEST = 0.05
 """Largest growth of T by the kicks of one step, over T."""
@@ -13,7 +13,12 @@ def wrapped(words: Array) -> PRNGKeyArray:
     return jax.random.wrap_key_data(words, impl="threefry2x32")
 
 
-def kicks(key: PRNGKeyArray, velocity: Float[Array, "N d"], at_rest: bool) -> Float[Array, "N d"]:
+def kicks(
+    key: PRNGKeyArray,
+    velocity: Float[Array, "N d"],
+    at_rest: bool,
+    counted: Bool[Array, "N"] | None = None,
+) -> Float[Array, "N d"]:
     """Random kicks of variance 1 for each component, of the shape of velocities.
 
     Each is the number of ones in 16 random bits, whose fourth moment is 4 % below that of a
@@ -24,10 +29,15 @@ def kicks(key: PRNGKeyArray, velocity: Float[Array, "N d"], at_rest: bool) -> Fl
         velocity: of the particles of one replica.
         at_rest: whether the kicks together leave the momentum as it is; they are then enlarged by
             ``sqrt(N/(N - 1))``, so that their mean square is 1 again.
+        counted: which particles are kicked; all by default. Those that are not have any value.
     """
     bits = jax.random.bits(key, velocity.shape, jnp.uint16)
     found = 0.5 * (jax.lax.population_count(bits).astype(velocity.dtype) - 8)
     if not at_rest:
         return found
-    n = len(velocity)
-    return (n / (n - 1)) ** 0.5 * (found - jnp.mean(found, axis=0, keepdims=True))
+    if counted is None:
+        n = len(velocity)
+        return (n / (n - 1)) ** 0.5 * (found - jnp.mean(found, axis=0, keepdims=True))
+    n = jnp.maximum(jnp.sum(counted), 2).astype(velocity.dtype)
+    mean = jnp.sum(jnp.where(counted[:, None], found, 0.0), axis=0, keepdims=True) / n
+    return jnp.sqrt(n / (n - 1)) * (found - mean)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxgran.checks.tracing import any_traced
+from jaxgran.particles import cores
 from jaxgran.particles.dynamics import AbstractDynamics, stretches
 from jaxgran.particles.interruption import outside_of_transformations
 from jaxgran.particles.state import State
@@ -80,7 +81,8 @@ def some_stretches(
     if (program := _PROGRAMS.pop(key, None)) is None:  # in one step: there are threads
         jitted = jax.jit(some, donate_argnums=0 if donate else ())
         with compiling(progress):
-            program = outside_of_transformations(lambda: jitted.lower(*leaves).compile())
+            options = cores.options()
+            program = outside_of_transformations(lambda: jitted.lower(*leaves).compile(options))
     _PROGRAMS[key] = program
     if len(_PROGRAMS) > MOST_PROGRAMS:
         _PROGRAMS.popitem(last=False)

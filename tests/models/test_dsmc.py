@@ -305,19 +305,19 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
     whole = jaxgran.cool(gas, times, model=DSMC(1000, replicas=2))
     monkeypatch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(simulation, "CHUNK", 1)
-    advance, left = collisions.advance, [4]
+    advancing, left = collisions.advancing, [4]
 
     def dies(*args, **kwargs):
         left[0] -= 1
         if left[0] < 0:
             raise MemoryError("killed")
-        return advance(*args, **kwargs)
+        return advancing(False)(*args, **kwargs)
 
-    monkeypatch.setattr(collisions, "advance", dies)
+    monkeypatch.setattr(collisions, "advancing", lambda donate: dies)
     with pytest.raises(MemoryError):
         jaxgran.cool(gas, times, model=DSMC(1000, replicas=2), checkpoint=file)
     assert file.exists()
-    monkeypatch.setattr(collisions, "advance", advance)
+    monkeypatch.setattr(collisions, "advancing", advancing)
     resumed = jaxgran.cool(gas, times, model=DSMC(1000, replicas=2), checkpoint=file)
     for name in ("temperature", "sonine", "displacement", "collisions", "velocity_correlation"):
         np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))

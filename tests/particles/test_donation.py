@@ -25,18 +25,16 @@ def given(monkeypatch):
     """The states that compiled code was given."""
     states = []
 
-    def watched(module, name, place):
-        forward = getattr(module, name)
-
+    def watched(forward, place):
         def call(*args, **options):
             states.append(args[place])
             return forward(*args, **options)
 
-        monkeypatch.setattr(module, name, call)
+        return call
 
-    watched(programs, "some_stretches", 1)
-    watched(collisions, "advance", 0)
-    watched(collisions, "advance_in_place", 0)
+    advancing = collisions.advancing
+    monkeypatch.setattr(programs, "some_stretches", watched(programs.some_stretches, 1))
+    monkeypatch.setattr(collisions, "advancing", lambda donate: watched(advancing(donate), 0))
     return states
 
 

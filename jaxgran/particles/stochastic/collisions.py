@@ -1,17 +1,20 @@
 """One step of direct simulation Monte Carlo: random collisions of a homogeneous gas."""
 
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
+from jaxgran.particles import cores
 from jaxgran.particles.drag import decay
 from jaxgran.particles.kicks import wrapped
+from jaxgran.particles.stochastic import portions
 from jaxgran.particles.stochastic.collision_rule import Outcome, collide
-from jaxgran.particles.stochastic.elements import Walled, heating, hit_walls, kicked, shortened
-from jaxgran.particles.stochastic.exchange import BeforeWalls, Candidates, Step, exchanged
+from jaxgran.particles.stochastic.elements import Walled, heating, hit_walls, left_by, shortened
+from jaxgran.particles.stochastic.exchange import Candidates, Step, energies_of, exchanged, of_walls
 from jaxgran.particles.stochastic.pairing import CEILING, Scheme, draw
 from jaxgran.particles.stochastic.tangents import DSMCTangents, carried
 from jaxgran.scene.reduced_scene import ReducedScene
@@ -57,7 +60,9 @@ class DSMCState(NamedTuple):
 def _step(
     state: DSMCState,
     key: PRNGKeyArray,
+    turns: Int[Array, ""] | None,
     share: Float[Array, ""],
+    most: Int[Array, ""] | None,
     scene: ReducedScene,
     scheme: Scheme,
     tangents: bool,
@@ -69,15 +74,18 @@ def _step(
     """
     key = jax.random.fold_in(key, state.steps)
     dt = share * scheme.own_step / jnp.sqrt(state.temperature)
-    before, state = state, _kicked(state, key, dt, scene, scheme, 0.0)
+    kicked = partial(_kicked, key=key, dt=dt, turns=turns, most=most, scene=scene, scheme=scheme)
+    before, state = state, kicked(state, clock=state.clock, place=0)
     exchanging = tangents and isinstance(state.tangents, ExchangeTangents)
     particles, sums, pairs = _collided(
         state, key, dt, share, scene, scheme, tangents and not exchanging
     )
-    lost, walls = sums.loss, None
+    lost, met = sums.loss, None
     if scene.walls is not None:
         particles, hit, walls = _bounced(state, key, dt, scene, scheme.dimension, particles)
         lost = lost + hit.lost
+        if exchanging:
+            met = of_walls(walls, scene, state.clock + dt / 2)
     energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
     temperature = state.temperature - lost / energy
     passed = state.clock_rest + dt
@@ -91,13 +99,13 @@ def _step(
         missed=state.missed + sums.missed,
         steps=state.steps + (share > 0).astype(state.steps.dtype),
     )
-    new = _kicked(new, key, dt, scene, scheme, 1.0)
+    new = kicked(new, clock=state.clock, place=1)
     if not tangents:
         return new
     if isinstance(before.tangents, ExchangeTangents):
         ceiling = CEILING * jnp.sqrt(state.temperature)
-        step = Step(pairs, walls, ceiling, share, state.clock, dt, scheme.num_particles)
-        energies = _energies(before, scene, scheme.dimension)
+        step = Step(pairs, met, ceiling, share, state.clock, dt, scheme.num_particles)
+        energies = energies_of(before.particles, scene, scheme.dimension)
         along = exchanged(before.tangents, scene, energies, step, sums.num)
         return new._replace(tangents=along)
     ds, left = share * scheme.own_step, energy * temperature
@@ -109,26 +117,25 @@ def _kicked(
     state: DSMCState,
     key: PRNGKeyArray,
     dt: Float[Array, ""],
+    turns: Int[Array, ""] | None,
+    most: Int[Array, ""] | None,
     scene: ReducedScene,
     scheme: Scheme,
-    place: float,
+    clock: Float[Array, ""],
+    place: int,
 ) -> DSMCState:
     """The state after half of the kicks of a step, at its begin (place 0) or end (1)."""
-    if scene.drive is None:
+    if scene.drive is None or turns is None or most is None:
         return state
     d = scheme.dimension
-    growth = heating(scene.drive, scene.drag, state.clock - place * dt, dt, place)
-    key = jax.random.fold_in(key, 2 + round(place))
+    growth = heating(scene.drive, scene.drag, clock, dt, float(place))
+    key = jax.random.fold_in(key, 2 + place)
+    halves = 2 * state.steps + place
     at_rest = scene.walls is None
-    particles = kicked(state.particles, key, growth, state.clock, d, at_rest)
-    return state._replace(particles=particles, temperature=2 * jnp.mean(particles[:, :d] ** 2))
-
-
-def _energies(state: DSMCState, scene: ReducedScene, d: int) -> Float[Array, "2"]:
-    """sum v^2, and q sum s^2 of the spins that are kept."""
-    inertia = 0.0 if scene.surface is None else scene.surface.inertia
-    translation, rotation = state.particles[:, :d], state.particles[:, 2 * d :]
-    return jnp.stack([jnp.sum(translation**2), inertia * jnp.sum(rotation**2)])
+    particles, grown = portions.kicked(
+        state.particles, key, turns, most, halves, growth, state.clock, d, at_rest
+    )
+    return state._replace(particles=particles, temperature=state.temperature + grown)
 
 
 def _collided(
@@ -189,17 +196,20 @@ def _bounced(
     scene: ReducedScene,
     d: int,
     particles: Float[Array, "N components"],
-) -> tuple[Float[Array, "N components"], Walled, BeforeWalls]:
-    """The particles after their impacts on walls in a step, those impacts, and before them."""
-    velocity, spin, slowed, kept = particles[:, :d], particles[:, 2 * d :], 1.0, 1.0
-    if scene.drag is not None:
-        left = decay(scene.drag, state.clock + dt / 2)
-        slowed, kept = left.velocity, left.spin
-    bits = jax.random.bits(jax.random.fold_in(key, 1), velocity.shape[:1], jnp.uint32)
+) -> tuple[Float[Array, "N components"], Walled, Callable[..., Walled]]:
+    """The particles after their impacts on walls in a step, those impacts, and the impacts as a
+    function of the scene, of factors of velocities and spins, and of what drag has left."""
+    velocity, spin = particles[:, :d], particles[:, 2 * d :]
+    left = left_by(scene.drag, state.clock + dt / 2)
+    bits = jax.random.bits(jax.random.fold_in(key, 1), velocity.shape[:1], jnp.uint16)
     axis = (state.steps % d).astype(jnp.int32)
-    hit = hit_walls(scene, bits, axis, velocity, spin * kept, dt, slowed)
-    after = jnp.concatenate([hit.velocity, particles[:, d : 2 * d], hit.spin / kept], axis=-1)
-    return after, hit, BeforeWalls(velocity, spin, bits, axis)
+
+    def hit(scene: ReducedScene, faster: Array, turning: Array, slowed: Array) -> Walled:
+        return hit_walls(scene, bits, axis, velocity * faster, spin * turning, dt, slowed)
+
+    found = hit(scene, jnp.ones(()), left.spin, left.velocity)
+    kept = [found.velocity, particles[:, d : 2 * d], found.spin / left.spin]
+    return jnp.concatenate(kept, axis=-1), found, hit
 
 
 def step(
@@ -213,9 +223,11 @@ def step(
     """A share, 0 to 1, of the next step of each replica."""
     replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(wrapped(key), replicas)
-    one = partial(_step, scene=scene, scheme=scheme, tangents=tangents)
+    turns = portions.turns(state.temperature, state.clock, share, scene, scheme)
+    most = None if turns is None else jnp.max(turns)
+    one = partial(_step, most=most, scene=scene, scheme=scheme, tangents=tangents)
     axes = jax.tree.map(lambda _: 0, state)._replace(time=None)
-    state = jax.vmap(one, (axes, 0, 0), axes)(state, keys, share)
+    state = jax.vmap(one, (axes, 0, 0, 0), axes)(state, keys, turns, share)
     due = state.steps % RECOUNTED == 0
 
     def recounted(temperature):
@@ -251,7 +263,7 @@ def _advanced(
 
     def length(state):
         whole = scheme.own_step / jnp.sqrt(state.temperature)
-        return shortened(scene, state.temperature, state.clock, whole)
+        return shortened(scene, state.temperature, state.clock, whole, scheme.dimension)
 
     def due(state):
         return length(state) <= (end - state.clock) - state.clock_rest
@@ -263,7 +275,7 @@ def _advanced(
     def further(carry):
         state, left = carry
         share = due(state).astype(state.clock.dtype)
-        if scene.drive is not None:
+        if scene.drive is not None or scene.walls is not None:
             share = share * length(state) * jnp.sqrt(state.temperature) / scheme.own_step
         return step(state, key, share, scene, scheme, tangents), left - 1
 
@@ -273,7 +285,14 @@ def _advanced(
 
 
 advance = jax.jit(_advanced, static_argnames=("scheme", "tangents"))
-advance_in_place = jax.jit(
-    _advanced, static_argnames=("scheme", "tangents"), donate_argnames="state"
-)
-"""`advance` that writes over the state given, which is deleted."""
+
+
+@cache
+def advancing(donate: bool) -> Callable[..., DSMCState]:
+    """`advance` as the host driver calls it, which may write over the state given, and so delete
+    it."""
+    static, given = ("scheme", "tangents"), "state" if donate else ()
+    options = cores.options()
+    return jax.jit(
+        _advanced, static_argnames=static, donate_argnames=given, compiler_options=options
+    )

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
 
 from jaxgran.particles import kicks
 from jaxgran.particles.drag import Decay, decay, lasting
@@ -17,6 +17,10 @@ from jaxgran.particles.spins import rub
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedDrive, ReducedScene
 from jaxgran.scene.wall_layer import share_of_impacts
 from jaxgran.theory.averages import collision_rate
+
+REACH = 3.5
+"""Speed along an axis, in sqrt(2 T), up to which impacts on walls are as frequent as they should
+be; one of 1e6 particles is faster."""
 
 
 class Walled(NamedTuple):
@@ -36,7 +40,7 @@ class Walled(NamedTuple):
 
 def hit_walls(
     scene: ReducedScene,
-    bits: UInt32[Array, "N"],
+    bits: UInt[Array, "N"],
     axis: Int[Array, ""],
     velocity: Float[Array, "N d"],
     spin: Float[Array, "N spins"],
@@ -51,7 +55,7 @@ def hit_walls(
 
     Args:
         scene: in reduced units.
-        bits: random ones.
+        bits: 16 random ones each.
         axis: across which the walls are.
         velocity, spin: before.
         ds: length of the step.
@@ -67,7 +71,8 @@ def hit_walls(
     speed, outwards = jnp.abs(normal), jnp.sign(normal)[:, None] * across
     eps = walls.law.restitution(jnp.where(speed > 0, speed * slowed, 1.0))
     often = share_of_impacts(eps, frequency / collision_rate(0.0, d), d)
-    hit = ((bits.astype(velocity.dtype) + 0.5) * 2.0**-32 < often * each * speed) & (speed > 0)
+    chance = (bits.astype(velocity.dtype) + 0.5) * 2.0**-16
+    hit = (chance < often * each * speed) & (speed > 0)
     kick = -jnp.where(hit, (1 + eps) * speed, 0.0)[:, None] * outwards
     twist = jnp.zeros_like(spin)
     if surface is not None and walls.beta is not None:
@@ -83,6 +88,24 @@ def hit_walls(
     return Walled(velocity + kick, spin + twist, lost, turned)
 
 
+def fastest_share(
+    scene: ReducedScene,
+    temperature: Float[Array, "*replicas"],
+    slowed: Float[Array, "*replicas"] | float,
+    ds: Float[Array, "*replicas"],
+    d: int,
+) -> Float[Array, "*replicas"]:
+    """The probability that a sphere of the speed `REACH` meets a wall in a step, that has its turn
+    in each."""
+    walls = scene.walls
+    assert walls is not None
+    speed = REACH * jnp.sqrt(temperature)
+    eps = walls.law.restitution(speed * slowed)[..., None]
+    frequency = jnp.broadcast_to(walls.frequency, (*eps.shape[:-1], d))
+    often = share_of_impacts(eps, frequency / collision_rate(0.0, d), d)
+    return jnp.max(often * frequency, axis=-1) * (d * sqrt(pi)) * speed * ds
+
+
 def left_by(drag: ReducedDrag | None, time: Float[Array, "..."]) -> Decay:
     """What drag has left; all where there is none."""
     if drag is None:
@@ -93,10 +116,10 @@ def left_by(drag: ReducedDrag | None, time: Float[Array, "..."]) -> Decay:
 def heating(
     drive: ReducedDrive,
     drag: ReducedDrag | None,
-    began: Float[Array, ""],
-    ds: Float[Array, ""],
+    began: Float[Array, "*replicas"],
+    ds: Float[Array, "*replicas"],
     place: float,
-) -> Float[Array, ""]:
+) -> Float[Array, "*replicas"]:
     """Growth of T/T_0 by half of the kicks of a step, made at its begin (place 0) or end (1)."""
     if drag is None:
         return drive.strength * jnp.maximum(ds, 0.0) / 2
@@ -113,8 +136,13 @@ def shortened(
     temperature: Float[Array, "*replicas"],
     clock: Float[Array, "*replicas"],
     ds: Float[Array, "*replicas"],
+    d: int,
 ) -> Float[Array, "*replicas"]:
-    """The length of a step, so short that the kicks of a drive are small beside the velocities."""
+    """The length of a step, so short that a sphere meets one wall at most, and that the kicks of a
+    drive are small beside the velocities."""
+    if scene.walls is not None:
+        slowed = left_by(scene.drag, clock).velocity
+        ds = ds / jnp.maximum(fastest_share(scene, temperature, slowed, ds, d), 1.0)
     if scene.drive is None:
         return ds
     growth = scene.drive.strength / left_by(scene.drag, clock).velocity ** 3

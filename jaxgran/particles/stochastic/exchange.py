@@ -4,15 +4,18 @@ See `jaxgran.tangents.exchange`. Energies here are sum v^2 of translation, and q
 spins that are kept.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Float, UInt32
 
+from jaxgran.particles.drag import Decay
 from jaxgran.particles.stochastic.collision_rule import collide
-from jaxgran.particles.stochastic.elements import heating, hit_walls, left_by
+from jaxgran.particles.stochastic.elements import Walled, heating, left_by
 from jaxgran.scene.elements import SPINS
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedScene
 from jaxgran.tangents.exchange import ExchangeTangents
@@ -32,13 +35,17 @@ class Candidates(NamedTuple):
     bits: UInt32[Array, "2 pairs"]
 
 
-class BeforeWalls(NamedTuple):
-    """Velocities and kept spins before impacts on walls, random bits, and across which axis."""
+class Gained(NamedTuple):
+    """What both energies gain, and its tangents.
 
-    velocity: Float[Array, "N d"]
-    spin: Float[Array, "N spins"]
-    bits: UInt32[Array, "N"]
-    axis: Int[Array, ""]
+    Attributes:
+        gains: of translation and rotation.
+        along: in the parameters of the scene, in time, and in the logarithms of all velocities and
+            of all spins.
+    """
+
+    gains: Float[Array, "2"]
+    along: Float[Array, "changes 2"]
 
 
 class Step(NamedTuple):
@@ -46,14 +53,14 @@ class Step(NamedTuple):
 
     Attributes:
         pairs: candidates.
-        walls: before impacts on them; None without walls.
+        walls: what impacts on them bring; None without walls.
         ceiling, share: as for `collide`.
         began, ds: time at its begin, and its length.
         particles: N.
     """
 
     pairs: tuple[Candidates, Candidates]
-    walls: BeforeWalls | None
+    walls: Gained | None
     ceiling: Float[Array, ""]
     share: Float[Array, ""]
     began: Float[Array, ""]
@@ -81,6 +88,15 @@ def energies_at_start(
     return ExchangeTangents(many, many[:, :, 0] * 0)
 
 
+def energies_of(
+    particles: Float[Array, "N components"], scene: ReducedScene, d: int
+) -> Float[Array, "2"]:
+    """sum v^2, and q sum s^2 of the spins that are kept."""
+    inertia = 0.0 if scene.surface is None else scene.surface.inertia
+    translation, rotation = particles[:, :d], particles[:, 2 * d :]
+    return jnp.stack([jnp.sum(translation**2), inertia * jnp.sum(rotation**2)])
+
+
 def exchanged(
     old: ExchangeTangents,
     scene: ReducedScene,
@@ -97,22 +113,53 @@ def exchanged(
         step: what happens.
         collisions: their number.
     """
-    zero = jnp.zeros_like(step.ds)
+    pairs = _gained(partial(_impacts, step=step), scene, step.ds)
+    kicks = _gained(lambda scene, v, s, sooner: _kicks(scene, sooner, step), scene, step.ds)
+    # Kicks do not depend on the speeds, which make impacts more frequent.
+    kicks = kicks._replace(along=kicks.along.at[-2].add(-kicks.gains))
+    all_of = jax.tree.map(jnp.add, pairs, kicks)
+    if step.walls is not None:
+        all_of = jax.tree.map(jnp.add, all_of, step.walls)
+    return old.after(before, all_of.gains, all_of.along, collisions)
+
+
+def of_walls(hit: Callable[..., Walled], scene: ReducedScene, middle: Float[Array, ""]) -> Gained:
+    """What impacts on walls bring, at the middle of a step: `hit` of `_bounced`."""
 
     def by(scene, velocity, spin, sooner):
-        return _impacts(scene, velocity, spin, sooner, step), _kicks(scene, sooner, step)
+        scene, left, faster, turning = _scaled(scene, velocity, spin, sooner, middle)
+        found = hit(scene, faster, turning, left.velocity)
+        return jnp.stack([-found.lost, found.turned / left.spin**2])
 
-    (impacts, kicks), pull = jax.vjp(by, scene, zero, zero, zero)
+    return _gained(by, scene, middle)
+
+
+def _gained(
+    by: Callable[..., Float[Array, "2"]], scene: ReducedScene, like: Float[Array, ""]
+) -> Gained:
+    """Gains as a function of the scene, the logarithms of velocities and spins, and of time."""
+    zero = jnp.zeros_like(like)
+    gains, pull = jax.vjp(by, scene, zero, zero, zero)
 
     def row(weights):
-        in_scene, *others = pull((weights, weights))
+        in_scene, *others = pull(weights)
         return jnp.concatenate([ravel_pytree(in_scene)[0], jnp.stack(others)])
 
     slopes = jax.vmap(row)(jnp.eye(2, dtype=zero.dtype)).T
-    along = jnp.concatenate([slopes[:-3], slopes[-1:], slopes[-3:-1]])
-    # Kicks do not depend on the speeds, which make impacts more frequent.
-    along = along.at[-2].add(-kicks)
-    return old.after(before, impacts + kicks, along, collisions)
+    return Gained(gains, jnp.concatenate([slopes[:-3], slopes[-1:], slopes[-3:-1]]))
+
+
+def _scaled(
+    scene: ReducedScene, velocity: Array, spin: Array, sooner: Array, middle: Array
+) -> tuple[ReducedScene, Decay, Array, Array]:
+    """The scene and what drag has left, if all is sooner; factors of velocities and of spins."""
+    scene = scene._replace(drag=_sooner(scene, sooner))
+    left = left_by(scene.drag, middle)
+    faster, turning = jnp.exp(velocity), left.spin * jnp.exp(spin)
+    if scene.surface is not None:  # at a given energy spins are smaller where the inertia is larger
+        inertia = scene.surface.inertia
+        turning = turning * jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
+    return scene, left, faster, turning
 
 
 def _sooner(scene: ReducedScene, share: Array) -> ReducedDrag | None:
@@ -125,13 +172,9 @@ def _impacts(
     scene: ReducedScene, velocity: Array, spin: Array, sooner: Array, step: Step
 ) -> Float[Array, "2"]:
     """What both energies gain by impacts, with velocities and spins greater by factors exp(...)."""
-    scene = scene._replace(drag=_sooner(scene, sooner))
-    left = left_by(scene.drag, step.began + step.ds / 2)
+    middle = step.began + step.ds / 2
+    scene, left, faster, turning = _scaled(scene, velocity, spin, sooner, middle)
     slowed = None if scene.drag is None else left.velocity
-    faster, turning = jnp.exp(velocity), left.spin * jnp.exp(spin)
-    if scene.surface is not None:  # at a given energy spins are smaller where the inertia is larger
-        inertia = scene.surface.inertia
-        turning = turning * jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
     total = jnp.zeros(2, step.ds.dtype)
     for pairs in step.pairs:
         spins = None if pairs.spin is None else pairs.spin * turning
@@ -146,11 +189,6 @@ def _impacts(
             slowed=slowed,
         )
         total = total + jnp.stack([-found.loss, found.turned / left.spin**2])
-    if step.walls is not None:
-        v, s, bits, axis = step.walls
-        slow = 1.0 if slowed is None else slowed
-        hit = hit_walls(scene, bits, axis, v * faster, s * turning, step.ds, slow)
-        total = total + jnp.stack([-hit.lost, hit.turned / left.spin**2])
     return total
 
 

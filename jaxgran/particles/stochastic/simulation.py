@@ -278,9 +278,9 @@ def parts(
     pairs = replicas * (scheme.first + scheme.second)
     max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
     first = state.particles[..., : scheme.dimension]
+    further = collisions.advancing(donate)
 
     def advance(state: DSMCState, end: float) -> DSMCState:
-        further = collisions.advance_in_place if donate else collisions.advance
         end_array = jnp.asarray(end, state.clock.dtype)
         return further(state, end_array, scene, key, max_steps, scheme=scheme)
 

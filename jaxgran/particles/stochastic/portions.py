@@ -1,0 +1,128 @@
+"""A drive in a step of DSMC, which acts on portions of the particles in turns.
+
+The kicks of a drive in one step are far smaller than the velocities. So each half of a step kicks
+a portion of all particles, with the variance of all steps until it has its turn again: the energy
+that a step brings is the same, and costs as much less. How much may be brought in one turn limits
+the number of portions, see `turns`, down to all particles in each half of a step.
+
+Impacts on walls cannot be left to turns: a sphere that has lost speed at a wall comes to the next
+one later, by which the loss of turns a mean free time apart is .9 % of T too large.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
+
+from jaxgran.particles import kicks
+from jaxgran.particles.stochastic.elements import heating
+from jaxgran.particles.stochastic.pairing import Scheme
+from jaxgran.scene.reduced_scene import ReducedScene
+
+MOST = 16
+"""Portions of many particles."""
+
+LEAST_ROWS = 16
+"""Particles of a portion, whose kicks together leave its momentum as it is."""
+
+
+class Portion(NamedTuple):
+    """Some neighbouring rows of the particles.
+
+    Attributes:
+        first: the first of them.
+        counted: which of them belong to the portion.
+    """
+
+    first: Int[Array, ""]
+    counted: Bool[Array, "rows"]
+
+    def of(self, particles: Float[Array, "N components"]) -> Float[Array, "rows components"]:
+        """Its rows."""
+        return jax.lax.dynamic_slice_in_dim(particles, self.first, len(self.counted))
+
+    def written(self, particles: Float[Array, "N components"], rows: Array) -> Array:
+        """All particles with new rows."""
+        return jax.lax.dynamic_update_slice_in_dim(particles, rows, self.first, 0)
+
+
+def number(num_particles: int) -> int:
+    """The number of portions."""
+    return max(min(MOST, num_particles // LEAST_ROWS), 1)
+
+
+def portion(index: Int[Array, ""], num_particles: int, active: Bool[Array, ""]) -> Portion:
+    """A portion of particles, each of which belongs to one."""
+    n, parts = num_particles, number(num_particles)
+    begin, end = index * n // parts, (index + 1) * n // parts
+    rows = -(-n // parts)
+    first = jnp.minimum(begin, n - rows)
+    row = first + jnp.arange(rows, dtype=first.dtype)
+    return Portion(first, (row >= begin) & (row < end) & active)
+
+
+def turns(
+    temperature: Float[Array, "*replicas"],
+    clock: Float[Array, "*replicas"],
+    share: Float[Array, "*replicas"],
+    scene: ReducedScene,
+    scheme: Scheme,
+) -> Int[Array, "*replicas"] | None:
+    """Portions that are kicked in half of a share of a step, so many that T of none grows by more
+    than `kicks.LARGEST`; None without a drive.
+
+    Particles whose turns are w T apart have at one time temperatures that differ by so much, by
+    which a_2 of all is too large by ``w^2/12``: 2e-4 at most.
+    """
+    if scene.drive is None:
+        return None
+    parts = number(scheme.num_particles)
+    ds = share * scheme.own_step / jnp.sqrt(temperature)
+    growth = heating(scene.drive, scene.drag, clock, ds, 0.0)
+    needed = parts * growth / (kicks.LARGEST * jnp.where(temperature > 0, temperature, 1.0))
+    return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
+
+
+def kicked(
+    particles: Float[Array, "N components"],
+    key: PRNGKeyArray,
+    turns: Int[Array, ""],
+    most: Int[Array, ""],
+    half_steps: UInt32[Array, ""],
+    growth: Float[Array, ""],
+    time: Float[Array, ""],
+    d: int,
+    at_rest: bool,
+) -> tuple[Float[Array, "N components"], Float[Array, ""]]:
+    """The particles of one replica after half of the kicks of a step, and how much T/T_0 has grown.
+
+    Args:
+        particles: v, x - v t and spins.
+        key: of this half of the step.
+        turns: portions that have their turn.
+        most: the largest number of turns of all replicas, which share the loop.
+        half_steps: number of halves before.
+        growth: of T/T_0, on average.
+        time: t, as in x - v t.
+        d: dimension.
+        at_rest: whether the kicks leave the momentum as it is.
+    """
+    n, parts = len(particles), number(len(particles))
+    size = jnp.sqrt(growth / 2 * (parts / turns))
+
+    def turn(i: Int[Array, ""], done: tuple[Array, Array]) -> tuple[Array, Array]:
+        particles, gained = done
+        index = ((turns * half_steps.astype(jnp.int32) + i) & (2**30 - 1)) % parts
+        own = portion(index, n, i < turns)
+        rows = own.of(particles)
+        v = rows[:, :d]
+        kick = kicks.kicks(jax.random.fold_in(key, i), v, at_rest, own.counted)
+        kick = jnp.where(own.counted[:, None], size * kick, 0.0)
+        after = [v + kick, rows[:, d : 2 * d] - time * kick, rows[:, 2 * d :]]
+        particles = own.written(particles, jnp.concatenate(after, axis=-1))
+        return particles, gained + jnp.sum(kick * (2 * v + kick))
+
+    zero = jnp.zeros((), particles.dtype)
+    particles, gained = jax.lax.fori_loop(0, most, turn, (particles, zero))
+    return particles, 2 * gained / (n * d)
