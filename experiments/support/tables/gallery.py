@@ -189,8 +189,8 @@ def compilation(f: dict) -> str:
     rows = f["rows"]
     soft, hard, dsmc = (rows[name]["first_s"] for name in ("SoftSpheres", "HardSpheres", "DSMC"))
     first, again = f["main_job"]["first_s"], f["main_job"]["again_s"]
-    runs = f"Soft spheres {soft:.0f} s, hard spheres {hard:.0f} s, DSMC {dsmc:.0f} s"
-    return f"{runs}; `jaxgran fit` {first:.0f} s, again {again:.1f} s."
+    runs = f"Soft, hard spheres, DSMC {soft:.0f}, {hard:.0f}, {dsmc:.0f} s"
+    return f"{runs}; fit {first:.0f} s, again {again:.1f} s."
 
 
 def cooling(f: dict) -> str:
