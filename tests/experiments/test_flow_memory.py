@@ -97,9 +97,10 @@ def test_kinetic_viscosity_of_enskog():
 
 
 def test_bounds_take_both_times():
-    def row(at_30, at_100):
-        return {"collisions": [30.0, 100.0], "d_ln_T_d_ln_A": [[at_30, at_100], [0.01, 0.01]]}
+    def row(at_30, at_100, error=0.01):
+        return {"collisions": [30.0, 100.0], "d_ln_T_d_ln_A": [[at_30, at_100], [0.01, error]]}
 
     assert flow_memory.within_bounds(row(-0.979, -0.811))
     assert not flow_memory.within_bounds(row(-1.05, -0.811))
     assert not flow_memory.within_bounds(row(-0.979, -0.7))
+    assert not flow_memory.within_bounds(row(-0.979, -0.811, error=0.2))

@@ -24,7 +24,7 @@ which scales the flow that the gas has in them; "stress" is the stress that this
 """
 
 MEMORIES_MEAN = """\
-A flow that is kept takes away most of the bias at 30 collisions. At 100 no memory is shown to be
+Two bands of a kept flow take the bias at 30 collisions away. At 100 no memory is shown to be
 right to 10 %: on average what is kept makes the derivative too small, and the boxes differ by more
 than the bound. So projections of the package keep T alone, and `differences=` is what a clustering
 gas needs. Standard errors of two boxes are rough. Memories that the script knows and that are not
