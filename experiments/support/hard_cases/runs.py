@@ -315,7 +315,7 @@ def one_of_a_batch_fails() -> list[Row]:
         some = gas.value(FREE) * jnp.array([1.0, jnp.nan, 0.5])
         values, codes = jax.jit(jax.vmap(simulated))(some)
         rows.append(flagged(model, "float64", values, codes, 1, "outside its range"))
-        alone = [simulated(x)[0] for x in some[::2]]
+        alone = [jax.jit(simulated)(x)[0] for x in some[::2]]
         error = worst(values[::2], np.asarray(alone))
         rows.append(Row(f"{model}, others", "float64", error, allowed))
     return rows
