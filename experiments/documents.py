@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from experiments.accuracy import flow_memory
+from experiments.accuracy import flow_memory, hard_cases
 from experiments.fit import coverage_in_clusters, interval_coverage, wrong_physics
 from experiments.paper import paper_claims
 from experiments.speed import speed_vs_error
@@ -86,6 +86,7 @@ def documents() -> dict[Path, str]:
             ]
         )
         + "\n",
+        "hard_cases": hard_cases.table(figures("hard_cases")["cases"]),
         "wrong_physics": wrong_physics.table(figures("wrong_physics")),
         "interval_coverage": "\n".join(
             [

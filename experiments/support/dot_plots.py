@@ -57,7 +57,7 @@ NAMES = {"dsmc": "DSMC", "DSMC": "DSMC"} | {
 """Models as a person would write them."""
 
 
-def named(model: str) -> str:
+def _named(model: str) -> str:
     return NAMES.get(model, model)
 
 
@@ -75,14 +75,8 @@ def drawn(plot: DotPlot) -> Figure:
     if plot.reference is not None:
         at, words = plot.reference
         axes.axvline(at, color=COLOURS["guide"], ls="--", lw=1, zorder=1)
-        axes.text(
-            *(at, -0.75, words),
-            color=COLOURS["guide"],
-            ha="center",
-            va="bottom",
-            fontsize=8,
-            clip_on=False,
-        )
+        style = {"ha": "center", "va": "bottom", "fontsize": 8, "clip_on": False}
+        axes.text(at, -0.75, words, color=COLOURS["guide"], **style)
     if plot.logarithmic:
         axes.set_xscale("log")
     axes.set_yticks(range(len(labels)), labels, fontsize=8)
@@ -119,9 +113,9 @@ def interval_coverage(found: dict) -> DotPlot:
     for row in found["rows"]:
         p, n = row["coverage"], row["runs"]
         error = (p * (1 - p) / n) ** 0.5
-        label = f"{named(row['model'])}, N = {row['num_particles']}, φ = {row['phi']:g}"
+        label = f"{_named(row['model'])}, N = {row['num_particles']}, φ = {row['phi']:g}"
         low, high = (100 * (p + k * error) for k in (-1, 1))
-        dots.append(Dot(label, 100 * p, low, high, named(row["model"])))
+        dots.append(Dot(label, 100 * p, low, high, _named(row["model"])))
     return DotPlot(dots, "runs whose 95 % interval holds A, %", (95.0, "95 %"))
 
 
@@ -177,11 +171,11 @@ def benchmark_kinetic_theory(found: dict) -> DotPlot:
 
 def ratios(rows: Iterable[tuple[str, float, str]], axis: str, words: str) -> DotPlot:
     """Ratios held against 1."""
-    return DotPlot([Dot(label, x, model=named(m)) for label, x, m in rows], axis, (1.0, words))
+    return DotPlot([Dot(label, x, model=_named(m)) for label, x, m in rows], axis, (1.0, words))
 
 
 def benchmark_replicas(found: dict) -> DotPlot:
-    rows = [(named(row["model"]), row["ratio"], row["model"]) for row in found["rows"]]
+    rows = [(_named(row["model"]), row["ratio"], row["model"]) for row in found["rows"]]
     return ratios(rows, "collisions a second on two CPU devices, over one core", "one core")
 
 
@@ -189,9 +183,9 @@ def benchmark_million(found: dict) -> DotPlot:
     cases = ("one core", "two cores", "half on one core", "two devices")
     dots = [
         Dot(
-            f"{named(row['model'])}, {case}",
+            f"{_named(row['model'])}, {case}",
             1e6 * row[case]["s_per_collision"],
-            model=named(row["model"]),
+            model=_named(row["model"]),
         )
         for row in found["rows"]
         for case in cases
@@ -203,7 +197,7 @@ def benchmark_million(found: dict) -> DotPlot:
 def benchmark_compilation(found: dict) -> DotPlot:
     dots = []
     for name, row in found["rows"].items():
-        model = named(name.split()[0])
+        model = _named(name.split()[0])
         label = name.replace(name.split()[0], model, 1)
         dots += [
             Dot(label, row["first_s"], model=model),
@@ -252,7 +246,7 @@ def benchmark_derivatives(found: dict) -> DotPlot:
     for row in found["rows"]:
         model, *scene = row["title"].split(", ")
         rows += [
-            (", ".join([named(model), *scene, way]), cost["ratio"], model)
+            (", ".join([_named(model), *scene, way]), cost["ratio"], model)
             for way, cost in row["ways"].items()
             if way != "plain"
         ]
@@ -278,15 +272,16 @@ def benchmark_versions(found: dict) -> DotPlot:
         what, *first = row["model"].split(", ")
         theory = what not in NAMES
         slope = theory and what != "KineticTheory"
-        words = f"kinetic theory, {what} derivative" if slope else named(what)
+        words = f"kinetic theory, {what} derivative" if slope else _named(what)
         label = ", ".join(["kinetic theory" if what == "KineticTheory" else words, *first])
         x, error = row["ratio"], row["error"]
-        model = "kinetic theory" if theory else named(what)
+        model = "kinetic theory" if theory else _named(what)
         dots.append(Dot(label, x, x - error, x + error, model))
     return DotPlot(dots, "time now over time before", (1.0, "as before"))
 
 
 PLOTS: dict[str, Callable[[dict], DotPlot]] = {
+    "hard_cases": hard_cases,
     "wrong_physics": wrong_physics,
     "interval_coverage": interval_coverage,
     "fit_head_to_head": fit_head_to_head,

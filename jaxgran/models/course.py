@@ -17,12 +17,12 @@ by 0 +- .6 %, .5 +- .6 %, 1.3 +- .8 % at phi = .02, .05, .1, that of LAMMPS by 1
 fluctuations leave over at phi = .2, .3, .4 is 1.2, 2.8, 2.4 %.
 """
 
-CORRELATED = (0.003, 0.02)
-"""The same of a rate with velocity correlations (`jaxgran.theory.correlations`).
+CORRELATED = {2: (0.003, 0.045), 3: (0.003, 0.02)}
+"""The same of a rate with velocity correlations (`jaxgran.theory.correlations`), by dimension.
 
-Measured in event-driven runs, net of the flow below twice k_c: what is left over is .1 to .3 % at
-phi = .05 and .1, up to .6 % at .2 and .3, and Enskog's collision rate of elastic spheres is off by
-.1 to .4 %. A of LAMMPS curves that were not used for it is .6 % low at phi = .1.
+As `experiments/accuracy/measure_correlations.py --full` finds: in 3D at most .4 % is left over at
+phi = .05 and .1, .5 % at .2 and .9 % at .3, in 2D .5, .4, .8 and 1.7 %, each at eps = .8, of which
+nothing was fitted.
 """
 
 CONTACT = 0.3
@@ -198,7 +198,7 @@ class Course(NamedTuple):
     @property
     def correlated(self) -> Float[np.ndarray, "times"]:
         """The same of a rate with velocity correlations."""
-        return self._of_density(CORRELATED)
+        return self._of_density(CORRELATED[self.gas.dimension])
 
     def _of_density(self, error: tuple[float, float]) -> Float[np.ndarray, "times"]:
         own = error[0] + error[1] * float(self.gas.packing_fraction)

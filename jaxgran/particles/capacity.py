@@ -149,9 +149,10 @@ def capacities(
     pairs, near, contacts, members = (
         int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
     )
+    lookahead = int(spare * lookahead + 5 * lookahead**0.5) + 64  # lattice planes need most
     if num_particles <= ALL_PAIRS:  # few are all near in a box so small
         pairs = near = max(pairs, num_particles * (num_particles - 1) // 2)
-    lookahead = int(spare * lookahead + 5 * lookahead**0.5) + 64  # lattice planes need most
+        contacts = max(contacts, 6 * num_particles)
     rows = int(num_particles * extra)
     more_near, more_contacts = (min(kind + rows, pairs) for kind in (near, contacts))
     run = Capacity(pairs, lookahead, near, contacts, min(members, num_particles))

@@ -13,8 +13,8 @@ SHORTEST = {2: (0.181, 3.10), 3: (0.926, 2.19)}
 
 Fitted to ``experiments/accuracy/measure_correlations.py``: hard spheres of eps = .7 and .9 at phi =
 .05 to .3. With two numbers chi^2 is 7 (2D) and 10 (3D) of nine gases. Errors: 2D .05, .24; 3D .07,
-.32. With --full gases of eps = .8 and .95, to which nothing was fitted, agree within their errors in
-3D; disks of phi >= .2 cool up to 1.5 % faster than this says at eps = .8.
+.32. With --full gases of eps = .95, to which nothing was fitted, agree in 3D, but those of eps =
+.8 and phi >= .2 cool up to 1 % faster than this says, and disks of phi >= .2 up to 2 %.
 """
 
 BUILD_UP = 4.0

@@ -140,7 +140,7 @@ CLUSTERING = beads(0.3, 0.2, 0.05)
 BOX = float(CLUSTERING.box_side(1000) / CLUSTERING.critical_box)
 """Side of the box of `gradient_health.py`'s clustering gas, in L_c."""
 
-OTHERS = ("phi003", "phi010", "phi025")
+OTHERS = ("phi003", "phi003_large", "phi010", "phi025")
 """Curves of `make_lammps_curves.py`."""
 
 ROWS = (
@@ -194,7 +194,8 @@ ROWS = (
         f"{FIT} --cases dilute",
     ),
     Row(
-        "A of LAMMPS curves of other gases, which theory was never adjusted to: φ = .03, .1, .25",
+        "A of LAMMPS curves of other gases, which theory was never adjusted to: φ = .03 with "
+        "N = 1000 and with N = 4000, φ = .1, φ = .25",
         "true A",
         " ".join(f"lammps_curves_{name}" for name in OTHERS),
         lambda *found: "; ".join(off_true()(one) for one in found),
