@@ -148,7 +148,7 @@ def hard_cases(found: dict) -> DotPlot:
         if shares:
             name = case["case"] if len(case["case"]) < 56 else case["case"][:53] + "..."
             dots.append(Dot(name, float(np.median(shares)), min(shares), max(shares)))
-    axis = "error over the error allowed (median, and range of models, precisions, derivatives)"
+    axis = "error over the error allowed: median and range of the rows"
     return DotPlot(dots, axis, (1.0, "allowed"), logarithmic=True)
 
 
