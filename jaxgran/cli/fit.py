@@ -48,6 +48,10 @@ PARAMETERS = {
 }
 
 
+LARGEST_KEY = 2**63
+"""Of whole numbers that make a key of random numbers."""
+
+
 @dataclass
 class FitOptions:
     """What the command `fit` is told; see its help."""
@@ -167,6 +171,8 @@ def with_given_constant(gas, header, free: list[str]):
 
 def timed_fit(options: FitOptions, gas, curve, model, asked: dict[str, Any]):
     """The fit, seconds of the first and of the last time that it was made."""
+    if abs(options.key) >= LARGEST_KEY:
+        raise ValueError(f"--key {options.key} is too large: give a whole number below 2^63")
     key = jax.random.key(options.key) if model.stochastic else None
 
     def fit():

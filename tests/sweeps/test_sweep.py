@@ -92,7 +92,8 @@ def test_one_key_gives_each_member_its_own_whatever_their_number(gas, gases):
     curves = sweep(same, model=model, key=key, chunk=2)
     assert len(np.unique(curves.temperature[:, -1])) == len(A)
     fewer = sweep(jax.tree.map(lambda x: x[:2], same), model=model, key=key, chunk=1)
-    np.testing.assert_array_equal(fewer.temperature, curves.temperature[:2])
+    # Programs for other numbers of members may add in another order; other keys differ by per cent.
+    np.testing.assert_allclose(fewer.temperature, curves.temperature[:2], rtol=1e-13)
 
 
 def test_store_has_labels_and_units_for_xarray(stored, gases):
