@@ -61,6 +61,11 @@ def test_a_start_of_the_user_is_not_donated(name, beads, given):
     start = jaxgran.cool(gas, TIMES, model=MODELS[name]).particles
     # In units of the run already, so that no unit makes another array of it.
     unit = gas.replace(diameter=1.0, temperature=1.0)
+    # Contacts as long, in mean free times, and impacts as dissipative, as before.
+    longer = float(unit.contact_fraction / gas.contact_fraction) ** 2.5
+    unit = unit.replace(youngs_modulus=longer * unit.value("youngs_modulus"))
+    less = gas.thermal_beta / unit.thermal_beta
+    unit = unit.replace(dissipative_constant=less * unit.value("dissipative_constant"))
     scaled = start._replace(
         position=start.position / gas.diameter,
         velocity=start.velocity / jnp.sqrt(gas.temperature),
