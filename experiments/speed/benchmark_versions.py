@@ -21,6 +21,7 @@ from pathlib import Path
 
 from experiments.support.record import EXPERIMENTS, add_recording, write_results
 
+# Its scene is written out, as other versions have theirs in other places.
 MEASURE = """
 import json, sys, time
 import jax, numpy as np

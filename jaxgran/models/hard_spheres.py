@@ -36,6 +36,9 @@ from jaxgran.theory.steady import scene_at_start
 WINDOW_SHARE = 0.05
 """Impacts per particle in a window."""
 
+LONGER = 1.5
+"""How much longer windows of `LEAST_IMPACTS` grow than they should: (8/2)^0.3 after one of two."""
+
 CONTACT_TIMES = Domain(0.0, 0.1, low_allowed=True, high_allowed=True)
 
 OVERLAP = 1e-9
@@ -212,12 +215,13 @@ class HardSpheres(AbstractSpheres):
         around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
         share = max(WINDOW_SHARE, 2 * LEAST_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
-        reach = 2 * fastest * share / around.collision_frequency
+        longest = share if share == WINDOW_SHARE else LONGER * share
+        reach = 2 * fastest * longest / around.collision_frequency
         packed = 0.9 + 0.45 * around.in_contact / 2 ** (d - 1)
         near = packed * around.contact_value * around.in_contact * ((1 + reach) ** d - 1)
         near = min(near, around.listed)
-        chosen = min((0.65 + 0.35 * near) * share, around.listed)
-        expected = around.listed, near, chosen, 1.25 * share
+        chosen = min((0.65 + 0.35 * near) * longest, around.listed)
+        expected = around.listed, near, chosen, 1.25 * longest
         extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # in random places more are near
         ahead = around.lookahead
         if scene.walls is not None:  # a sweep goes along the first axis

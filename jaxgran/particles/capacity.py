@@ -23,10 +23,6 @@ SMALL = 500
 """Particles of all replicas below which a run takes less time than a compilation."""
 
 
-ALL_PAIRS = 64
-"""Particles of all replicas up to which there is room for every pair."""
-
-
 class Grid(NamedTuple):
     """The geometric grid of densities and contact durations for which capacities are computed.
 
@@ -150,9 +146,6 @@ def capacities(
         int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
     )
     lookahead = int(spare * lookahead + 5 * lookahead**0.5) + 64  # lattice planes need most
-    if num_particles <= ALL_PAIRS:  # few are all near in a box so small
-        pairs = near = max(pairs, num_particles * (num_particles - 1) // 2)
-        contacts = max(contacts, 6 * num_particles)
     rows = int(num_particles * extra)
     more_near, more_contacts = (min(kind + rows, pairs) for kind in (near, contacts))
     run = Capacity(pairs, lookahead, near, contacts, min(members, num_particles))

@@ -1,5 +1,7 @@
 """Kinetic theory against the reference solutions, and its numerics over many decades."""
 
+from functools import partial
+
 import diffrax
 import equinox as eqx
 import jax
@@ -11,7 +13,8 @@ from hypothesis import strategies as st
 
 import jaxgran
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.theory import closed_forms, integration
+from jaxgran.theory import closed_forms, integration, solution, steady
+from jaxgran.theory.moments import Density
 from jaxgran.theory.softness import crowding, softness
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
@@ -60,6 +63,41 @@ def test_sensitivity_table(beads):
     # Asked: 1e-3. Reached: 5e-5, the last digit of the table.
     for derivative in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(derivative(log_temperature)(log_a), table, rtol=1e-4)
+
+
+def test_tangents_of_what_moves_alone_are_followed(beads, monkeypatch):
+    followed, solve_along = [], solution._solve_along
+
+    def watched(parameters, unravel, times, directions, *rest):
+        followed.append(directions)
+        return solve_along(parameters, unravel, times, directions, *rest)
+
+    monkeypatch.setattr(solution, "_solve_along", watched)
+    gas = beads()
+    scene = steady.scene_at_start(gas), Density.of(gas)
+    equations = KineticTheory()._equations(gas.dimension)
+    integrator = solution.Integrator(diffrax.Tsit5(scan_kind="lax"), 1e-8, 10_000)
+    times = jnp.geomspace(1.0, 100.0, integration.WINDOW)
+    leaves, structure = jax.tree.flatten(scene)
+
+    def log_temperature(k, x, times):
+        moved = structure.unflatten([*leaves[:k], x, *leaves[k + 1 :]])
+        return solution.moments_at(moved, times, equations, integrator)[0].log_temperature
+
+    for k, leaf in enumerate(leaves):
+        one = partial(log_temperature, k, times=times)
+        slope = jax.jvp(one, (leaf,), (jnp.ones_like(leaf),))[1]
+        np.testing.assert_array_equal(followed.pop(), np.eye(len(leaves))[k : k + 1])
+        h = 1e-3 * leaf
+        # The differences err by h^2 and by the tolerance over h.
+        differences = (one(leaf + h) - one(leaf - h)) / (2 * h)
+        np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-4 / float(leaf))
+    # Of times alone nothing but the state is followed.
+    at = partial(log_temperature, 0, leaves[0])
+    later = jax.jvp(at, (times,), (times,))[1]
+    assert followed.pop().shape == (0, len(leaves))
+    differences = (at(1.001 * times) - at(times / 1.001)) / (2 * np.log(1.001))
+    np.testing.assert_allclose(later, differences, rtol=1e-4, atol=1e-5)
 
 
 def test_twelve_decades_of_cooling(beads):
