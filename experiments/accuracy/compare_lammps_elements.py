@@ -3,11 +3,11 @@
     python experiments/accuracy/compare_lammps_elements.py [--particles 500] [--store] [--out DIR]
 
 The same start is followed in LAMMPS (`pair_style granular` with viscous tangential forces and
-Coulomb's limit, `fix wall/gran` for walls) and in jaxgran, for one mean free time. Prints the
-differences of the velocities at several times, and of T and T_rot. LAMMPS has sigma/2 in place of
-the distance to the contact in the slip, so that spheres with friction differ by their overlap: a
-stiffer gas agrees better. LAMMPS is the extra `lammps`. ``--store`` writes a short trajectory of 64
-spheres for the tests. Writes a picture and a JSON file.
+Coulomb's limit, `fix wall/gran` for walls, which rub too) and in jaxgran, for one mean free time.
+Prints the differences of the velocities at several times, and of T and T_rot. LAMMPS has sigma/2 in
+place of the distance to the contact in the slip, so that spheres with friction differ by their
+overlap: a stiffer gas agrees better. LAMMPS is the extra `lammps`. ``--store`` writes a short
+trajectory of 64 spheres for the tests. Writes a picture and a JSON file.
 """
 
 import argparse
@@ -25,6 +25,7 @@ from experiments.support.record import DATA, add_recording, write_picture, write
 from experiments.support.scenes import beads
 
 FRICTION = {"tangential_damping": 0.6, "friction": 0.3}
+OF_WALLS = {"tangential_damping": 0.8, "friction": 0.4}
 TIMES = np.array([0.1, 0.25, 0.5, 0.75, 1.0])  # mean free times
 STEPS = 400  # per contact, of both codes
 
@@ -34,6 +35,7 @@ SCENES = {  # contact duration in mean free times, friction, walls
     "friction, ten times as stiff": (0.02, True, False),
     "walls": (0.05, False, True),
     "walls and friction": (0.05, True, True),
+    "walls and friction, ten times as stiff": (0.02, True, True),
 }
 
 
@@ -62,6 +64,7 @@ def main() -> None:
         particles=options.particles,
         steps_per_contact=STEPS,
         friction=FRICTION,
+        friction_of_walls=OF_WALLS,
     )
     print(f"written to {options.out}")
 
@@ -69,17 +72,19 @@ def main() -> None:
 def scene(name: str, num: int) -> jaxgran.Gas:
     duration, rubs, contained = SCENES[name]
     gas = beads(packing_fraction=0.15, beta=0.3, contact_fraction=duration)
+    elements: dict[str, Any] = {}
+    if rubs:
+        elements["surface"] = jaxgran.Frictional(**FRICTION)
     if contained:
-        walls = jaxgran.Walls(gas.box_side(num), restitution=gas.law)
-        gas = dataclasses.replace(gas, container=walls)
-    return dataclasses.replace(gas, surface=jaxgran.Frictional(**FRICTION) if rubs else None)
+        rubbing = OF_WALLS if rubs else {}
+        walls = jaxgran.Walls(gas.box_side(num), restitution=gas.law, **rubbing)
+        elements["container"] = walls
+    return dataclasses.replace(gas, **elements)
 
 
 def compare(name: str, num: int) -> dict:
     gas = scene(name, num)
-    smooth = dataclasses.replace(gas, surface=None)
-    start = jaxgran.cool(smooth, [0.0], model=jaxgran.SoftSpheres(num)).particles
-    assert start is not None
+    start = drawn(gas, num)
     times = TIMES * float(gas.mean_free_time)
     lammps = trajectory(gas, start, times, STEPS)
     ours = [followed(gas, start, times[:i], num) for i in range(1, len(times) + 1)]
@@ -109,6 +114,15 @@ def compare(name: str, num: int) -> dict:
         words = " ".join(f"{v:.1e}" for v in value) if isinstance(value, list) else f"{value:.2e}"
         print(f"    {key:>24} {words}")
     return found
+
+
+def drawn(gas: jaxgran.Gas, num: int) -> jaxgran.Particles:
+    """A start of a gas, without rotation."""
+    walls = gas.container and jaxgran.Walls(gas.container.side, restitution=gas.law)
+    smooth = dataclasses.replace(gas, surface=None, container=walls)
+    start = jaxgran.cool(smooth, [0.0], model=jaxgran.SoftSpheres(num)).particles
+    assert start is not None
+    return start
 
 
 def relative(T, velocity: np.ndarray, factor: float) -> float:
@@ -180,8 +194,8 @@ def contact(gas: jaxgran.Gas, law, walls: bool) -> str:
     rho = float(own.alpha(diameter=gas.diameter, mass=gas.mass)) * m_eff
     stiffness = rho / radius**0.5
     damping = 1.5 * float(law.dissipative_constant) * rho / (m_eff * radius**0.5)
-    surface = None if walls else gas.surface  # walls are smooth
-    rub = "0 0" if surface is None else f"{FRICTION['tangential_damping']} {FRICTION['friction']}"
+    values = OF_WALLS if walls else FRICTION
+    rub = "0 0" if gas.surface is None else " ".join(str(value) for value in values.values())
     return (
         f"hertz {stiffness!r} {damping!r} tangential linear_nohistory {rub} "
         "damping viscoelastic limit_damping"
@@ -191,7 +205,7 @@ def contact(gas: jaxgran.Gas, law, walls: bool) -> str:
 def picture(rows: dict[str, dict], options: argparse.Namespace) -> None:
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     axes = figure.subplots()
-    for (name, row), mark in zip(rows.items(), "osD^v", strict=True):
+    for (name, row), mark in zip(rows.items(), "osD^vP", strict=True):
         axes.plot(TIMES, row["rms_velocity"], f"{mark}-", ms=4, label=name)
     axes.set(
         yscale="log",
@@ -206,9 +220,8 @@ def picture(rows: dict[str, dict], options: argparse.Namespace) -> None:
 def store(file: Path) -> None:
     """A trajectory of 64 spheres with friction between walls, for the tests."""
     gas = scene("walls and friction", 64)
-    smooth = dataclasses.replace(gas, surface=None)
-    start = jaxgran.cool(smooth, [0.0], model=jaxgran.SoftSpheres(64)).particles
-    assert start is not None and isinstance(gas.law, jaxgran.Viscoelastic)
+    start = drawn(gas, 64)
+    assert isinstance(gas.law, jaxgran.Viscoelastic)
     times = np.array([0.25, 0.5]) * float(gas.mean_free_time)
     lammps = trajectory(gas, start, times, 1000)
     first = {"first_position": start.position, "first_velocity": start.velocity}

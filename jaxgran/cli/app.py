@@ -27,6 +27,8 @@ FREE = Literal[
     "container_side",
     "wall_restitution",
     "wall_beta_t",
+    "tangential_damping",
+    "friction",
     "gamma",
     "drive_strength",
 ]

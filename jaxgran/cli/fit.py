@@ -43,6 +43,8 @@ PARAMETERS = {
     "container_side": ("wall_side", "m"),
     "wall_restitution": ("wall_coefficient", ""),
     "wall_beta_t": ("wall_tangential_restitution", ""),
+    "tangential_damping": ("tangential_damping", ""),
+    "friction": ("friction", ""),
     "gamma": ("drag_rate", "1/s"),
     "drive_strength": ("drive_strength", "m^2/s^3"),
 }

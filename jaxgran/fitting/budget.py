@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
+from jaxgran.fitting.gauss_newton import log_temperatures
 from jaxgran.fitting.parameters import Parameters
 from jaxgran.fitting.priors import Priors
 from jaxgran.fitting.result import Fit
@@ -157,27 +158,40 @@ def _beyond(
     return np.asarray(whole * np.outer(factor, factor), measured.dtype)
 
 
-def effects_on_temperature(
-    gas: Gas, priors: Priors, times: Float[Array, "times"]
-) -> tuple[Float[Array, "times"], dict[str, Float[Array, "times size"]]]:
-    """How ln T of kinetic theory changes with its clock, and by one standard error of each prior.
+def effects(
+    gas: Gas, priors: Priors, computed: CoolingCurve, rotation: bool
+) -> tuple[Float[Array, "points"], dict[str, Float[Array, "points size"]]]:
+    """How ln T, and ln T_rot if a fit uses it, change with the clock and with each prior.
+
+    By kinetic theory; of T_rot of spheres with friction, which it does not know, the change with
+    the clock is that along the computed curve.
+
+    Args:
+        gas: which was fitted.
+        priors: of the fit.
+        computed: its curve.
+        rotation: whether the fit uses T_rot.
 
     Returns:
         ``d ln T/d ln t``, and for each prior the changes by one standard error of its numbers.
     """
-    model, varied = KineticTheory(), priors.also_free(())
-    parameters = Parameters(gas, varied)
+    model, varied, times = KineticTheory(), priors.also_free(()), computed.times
+    parameters, known = Parameters(gas, varied), "friction" not in gas.elements
 
-    def log_temperature(flat: Array, clock: Array) -> Array:
+    def logarithms(flat: Array, clock: Array) -> Array:
         since = (times - parameters.start(flat)) * clock
-        computed = model.simulate(parameters.gas(flat), since, Run())
-        return jnp.log(computed.temperature)
+        found = model.simulate(parameters.gas(flat), since, Run())
+        return log_temperatures(found, rotation and known)
 
     flat, clock = parameters.flat(gas), jnp.ones_like(times)
-    slope = jax.jvp(lambda x: log_temperature(flat, x), (clock,), (clock,))[1]
+    slope = jax.jvp(lambda x: logarithms(flat, x), (clock,), (clock,))[1]
+    if rotation and not known:
+        own = np.log(np.asarray(computed.rotational_temperature))
+        along = np.gradient(own, np.asarray(times)) * np.asarray(times)
+        slope = jnp.concatenate([slope, jnp.asarray(along, slope.dtype)])
     if not varied:
         return slope, {}
-    by_parameter = jax.jacfwd(log_temperature)(flat, clock)
+    by_parameter = jax.jacfwd(logarithms)(flat, clock)
     by_residual = jax.jacfwd(lambda x: priors.residuals(parameters.gas(x), parameters.start(x)))(
         flat
     )

@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgran.checks.kept_programs import kept
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.comparison import QUANTITIES, Comparison
-from jaxgran.fitting.least_squares import least_squares, quasi_newton
+from jaxgran.fitting.least_squares import deepest, least_squares, quasi_newton
+from jaxgran.fitting.minima import Minima, starts
 from jaxgran.fitting.priors import NO_PRIORS, Priors
 from jaxgran.fitting.residuals import correlation_factor, neighbour_correlation
 from jaxgran.fitting.result import Fit, misfit
@@ -45,13 +46,20 @@ def fit_deterministic(
     comparison = Comparison.of(gas, curve, model, names, *known)
     first = comparison.best(guesses)
     search = SEARCHES[method]
-    flat, iterations, converged = search(comparison.residuals, first, max_steps)
+    several = first[None]
+    if "rotation" in comparison.weights:
+        here = comparison.of_gas(first)
+        several = starts(comparison.parameters, here, first[here.size :])
+    found = deepest(comparison.residuals, search, several, max_steps)
+    flat, iterations, converged = found[0]
     if curve.temperature_error is None:
         comparison = comparison.scaled(flat)
         if priors.names:  # which now have their right weight beside the curve
             flat, more, converged = search(comparison.residuals, flat, max_steps)
             comparison, iterations = comparison.scaled(flat), iterations + more
-    return _fit_at(comparison, names, of_errors or {}, first, flat, iterations, converged)
+    result = _fit_at(comparison, names, of_errors or {}, first, flat, iterations, converged)
+    others = jax.vmap(comparison.estimates)(found[1].flats)
+    return dataclasses.replace(result, minima=Minima(others, found[1].chi2))
 
 
 def _fit_at(

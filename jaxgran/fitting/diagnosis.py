@@ -11,6 +11,7 @@ from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.amplitudes import ASKED, Rival
 from jaxgran.fitting.budget import slope_in_words
+from jaxgran.fitting.reasons import about_residuals, about_runs, about_search, chance
 from jaxgran.fitting.residuals import neighbour_correlation, runs_test
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
 from jaxgran.fitting.rivals import FURTHER, free_elements, ranges, rivals
@@ -89,19 +90,19 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     found = rivals(result, curve) if converged and np.isfinite(result.chi2) else ()
     limits = ranges(result, found) if found else {}
     reasons = [
-        _chance(result),
+        chance(result),
         *_about_rivals(result, found, num_particles),
-        *_about_residuals(residuals, times, correlation, p_value),
-        *_about_runs(runs),
+        *about_residuals(residuals, times, correlation, p_value),
+        *about_runs(runs),
         *(omission.words for omission in omissions),
-        *_about_search(result),
+        *about_search(result),
         *slope_in_words(result),
     ]
     verdict = _verdict(result, misfit, omissions, found, limits)
     in_runs = runs[2] < SIGNIFICANCE and converged and not misfit
     verdict += " Its residuals come in runs of one sign." if in_runs else ""
     explains = converged and not misfit and not any(o.decisive for o in omissions)
-    explains &= not any(rival.asked for rival in found)
+    explains &= not any(rival.asked for rival in found) and not len(result.as_good())
     return Diagnosis(explains, verdict, tuple(reasons), correlation, runs[2], found, limits)
 
 
@@ -121,67 +122,6 @@ def _is_misfit(
     expected = np.sqrt(2 / (result.gas.dimension * num_particles)) if num_particles else 0.0
     steady = correlation > STEADY / np.sqrt(residuals.size) or runs_p_value < RAREST_RUNS
     return scatter > LARGEST_SCATTER or bool(steady and scatter > 2 * expected)
-
-
-def _chance(result: Fit) -> str:
-    reduced, p_value = float(result.reduced_chi2), float(result.p_value)
-    if result.scatter is not None:
-        scatter = 100 * float(np.asarray(result.scatter))
-        return (
-            f"the curve carries no errors; the residuals scatter by {scatter:.2g} % of T, taken as "
-            "the error"
-        )
-    chance = f"{100 * p_value:.2g}" if p_value < 0.99 else "over 99"
-    return (
-        f"reduced chi^2 is {reduced:.3g} for {int(result.degrees_of_freedom)} degrees of freedom "
-        f"(probability by chance: {chance} %)"
-    )
-
-
-def _about_residuals(
-    residuals: Float[np.ndarray, "used"],
-    times: Float[np.ndarray, "used"],
-    correlation: float,
-    p_value: float,
-) -> Iterator[str]:
-    """Correlation and outliers.
-
-    Args:
-        residuals: over their errors, where they have a weight.
-        times: t, s, of the residuals.
-        correlation: of neighbouring residuals.
-        p_value: of the fit, nan if the errors are unknown.
-    """
-    if correlation > 2 / np.sqrt(residuals.size):
-        text = f"neighbouring residuals are correlated (coefficient {correlation:.2f})"
-        if p_value < SIGNIFICANCE:
-            early, middle, late = (float(p.mean()) for p in np.array_split(residuals, 3))
-            yield (
-                f"{text} and drift: the measured gas is hotter (+) or colder (-) than the model by "
-                f"{early:+.1f}, {middle:+.1f}, {late:+.1f} standard errors on average in the first,"
-                " second and last third"
-            )
-        else:
-            yield f"{text}, as points of the same runs are: the error is increased for it"
-    if p_value > 1 - SIGNIFICANCE:
-        share = float(np.sqrt(np.mean(residuals**2)))
-        yield (
-            f"residuals scatter by {share:.2g} of the errors of T, less than chance allows: these "
-            "errors are too large, or the points share theirs"
-        )
-    far = np.abs(residuals) > 5
-    if not np.isnan(p_value) and 0 < far.sum() <= max(2, residuals.size // 20):
-        at = ", ".join(f"t = {t:.3g} s" for t in times[far])
-        yield f"far outliers at {at}: check their error bars"
-
-
-def _about_runs(runs: tuple[int, float, float]) -> Iterator[str]:
-    number, expected, chance = runs
-    if chance < SIGNIFICANCE:
-        yield (
-            f"residuals change their sign seldom: {number} runs of one sign, where independent "
-            f"ones have {expected:.3g} (probability by chance: {100 * chance:.2g} %)"
-        )
 
 
 def _about_rivals(
@@ -231,28 +171,12 @@ def _or_further(rival: Rival) -> str:
 
 def _assumptions(result: Fit) -> str:
     elements = result.gas.elements
-    spheres = "rough spheres of constant beta_t" if "surface" in elements else "smooth spheres"
-    spheres = "spheres of constant friction" if "friction" in elements else spheres
+    spheres = ", rough spheres of constant beta_t" if "surface" in elements else ", smooth spheres"
+    spheres = " spheres of constant friction" if "friction" in elements else spheres
     where = [] if "container" in elements else ["far from walls"]
     where += [] if "drag" in elements else ["in vacuum"]
     where.append("at homogeneous density")
-    return f"this rests on equal, {spheres}, {', '.join(where)}"
-
-
-def _about_search(result: Fit) -> Iterator[str]:
-    """Convergence, noise of simulations and undetermined parameters."""
-    if not bool(result.converged):
-        yield "the search stopped early: allow more max_steps or free fewer parameters"
-    noise = result.error_budget.get("simulation")
-    if noise is not None:
-        share = np.asarray(noise / result.standard_error)
-        yield (
-            f"{int(result.iterations)} simulations were run; their own noise is "
-            f"{100 * float(np.max(share)):.0f} % of the error bar at most"
-        )
-    group = result.undetermined()
-    if group:
-        yield f"this curve does not determine {' and '.join(group)}"
+    return f"this rests on equal{spheres}, {', '.join(where)}"
 
 
 def _verdict(
@@ -274,6 +198,8 @@ def _verdict(
     name = result.model.name
     if not bool(result.converged):
         return "The search did not converge: do not trust its estimates."
+    if len(result.as_good()) and not misfit:
+        return "Other parameters fit this curve as well: do not trust these estimates."
     plural = name.endswith("s")
     name = name[:1].upper() + name[1:]
     decisive = any(omission.decisive for omission in omissions)

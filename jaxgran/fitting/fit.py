@@ -17,6 +17,7 @@ from jaxgran.fitting.checks import check_curve, unused_rotation
 from jaxgran.fitting.deterministic import SEARCHES, fit_deterministic
 from jaxgran.fitting.few_replicas import smooth_errors
 from jaxgran.fitting.guess import guess_from_data, halving_time
+from jaxgran.fitting.minima import minima_in_words
 from jaxgran.fitting.parameters import START, domain_of, size_of
 from jaxgran.fitting.priors import Priors
 from jaxgran.fitting.result import Fit
@@ -48,15 +49,15 @@ def fit(
 ) -> Fit:
     """Estimate floats of a gas from its measured cooling curve.
 
-    Minimises ``chi^2 = sum [(ln T_measured - ln T_model) / (T_err/T)]^2``, plus the same sum for
-    <dr^2> where that is measured with a known error, over the free floats in a scale without bounds
-    (the logarithm of a positive one). Points with an error of 0 (a prepared state at t = 0) have no
-    weight. <dr^2> is compared to within the model's accuracy (kinetic theory in 3D: 1.7 %), which
-    applies both to each point and to a common factor of the diffusive part.
+    Minimises ``chi^2 = sum [(ln T_measured - ln T_model) / (T_err/T)]^2``, plus the same sums for
+    <dr^2> and for T_rot where they are measured with a known error, over the free floats in a scale
+    without bounds (the logarithm of a positive one). Points with an error of 0 (a prepared state at
+    t = 0) have no weight. <dr^2> is compared to within the model's accuracy (kinetic theory in 3D:
+    1.7 %), which applies both to each point and to a common factor of the diffusive part.
 
     A deterministic model is fitted by least squares; this works under `jax.vmap` and `jax.jit`. A
-    stochastic one is fitted to T alone, by Gauss-Newton steps on one simulation each, beginning at
-    the result of kinetic theory's fit (or at `start`). The errors then include the noise of the
+    stochastic one is fitted to T and T_rot by Gauss-Newton steps on one simulation each, beginning
+    at the result of kinetic theory's fit (or at `start`). The errors then include the noise of the
     simulations, estimated from their replicas. A derivative that is biased by some per cent slows
     the search and scales the standard error by as much, but does not move the answer, which is
     where the residuals vanish.
@@ -125,7 +126,7 @@ def fit(
         warnings.warn(unused, stacklevel=2)
     curve, of_errors = smooth_errors(curve, replicas)
     model = KineticTheory() if model is None else model
-    _check_model(model, method, names, known)
+    _check_model(model, method, names, known, gas)
     if model.stochastic:
         steps = 8 if max_steps is None else max_steps
         options = key, progress, steps, known, of_errors
@@ -192,7 +193,9 @@ def _check_request(
 
 
 @no_type_check
-def _check_model(model: AbstractModel, method: str, names: tuple[str, ...], priors: Priors) -> None:
+def _check_model(
+    model: AbstractModel, method: str, names: tuple[str, ...], priors: Priors, gas: Gas
+) -> None:
     if method not in SEARCHES:
         known = " or ".join(f'"{name}"' for name in SEARCHES)
         raise ValueError(f"method must be {known}, got {method!r}")
@@ -208,6 +211,11 @@ def _check_model(model: AbstractModel, method: str, names: tuple[str, ...], prio
         raise ValueError(
             f"{START} is fitted through kinetic theory only: find it so, subtract it from the "
             f"curve's times, and leave it out of free and priors for {type(model).__name__}"
+        )
+    if model.stochastic and priors.names and "friction" in gas.elements:
+        raise ValueError(
+            "the errors of priors are propagated by kinetic theory's derivatives, which does not "
+            "know friction: leave priors out, or add the parameters that they are of to free"
         )
     both = [name for name in priors.names if name in names]
     if model.stochastic and both:
@@ -244,11 +252,16 @@ def _warn(result: Fit) -> None:
         )
     group = result.undetermined()
     if group:
-        why = "in a gas of hard spheres A and Y enter as A Y^(2/5) alone"
+        why = "it hardly depends on it"
+        if len(group) > 1:
+            why = "it depends on a combination of them only"
         if START in group:
-            why = "a gas forgets how hot it began"
+            why += " (a gas forgets how hot it began)"
+        elif {"dissipative_constant", "youngs_modulus"} <= {*group}:
+            why += " (in a gas of hard spheres A and Y enter as A Y^(2/5) alone)"
         warnings.warn(
-            f"the curve does not determine {' and '.join(group)}: it depends on a combination of "
-            f"them only ({why}); free fewer",
+            f"the curve does not determine {' and '.join(group)}: {why}; free fewer",
             stacklevel=3,
         )
+    if others := minima_in_words(result.names, result.as_good()):
+        warnings.warn(f"{others}: the curve does not tell them apart", stacklevel=3)

@@ -28,8 +28,19 @@ NOISE_WINDOW = 9
 """Neighbouring times over which the variance between replicas is averaged."""
 
 
+def log_temperatures(curve: CoolingCurve, rotation: bool) -> Float[Array, "*replicas points"]:
+    """ln T at all times, and after it ln T_rot if a search uses it."""
+    values = [jnp.log(curve.temperature)]
+    if rotation:
+        assert curve.rotational_temperature is not None
+        values.append(jnp.log(curve.rotational_temperature))
+    return jnp.concatenate(values, axis=-1)
+
+
 class Simulated(NamedTuple):
     """Result of a search through simulations, of p parameters in their unbounded scale.
+
+    Points are those of `log_temperatures`.
 
     Attributes:
         flat: the estimate.
@@ -38,33 +49,32 @@ class Simulated(NamedTuple):
         residuals: weighted, at `flat` extrapolated linearly from the simulations; 0 where not used.
         sensitivity: derivative of the weighted residuals.
         beyond: `flat` less the mean of the simulations' parameters.
-        gain: derivative of `flat` in each measured ln T; 0 where not used.
-        error_covariance: covariance of `flat` by the errors of the measurement.
-        noise_covariance: and by the noise of the simulations.
+        gain: derivative of `flat` in each measured value; 0 where not used.
+        noise_covariance: covariance of `flat` by the noise of the simulations.
         num_simulations: how many were made.
         converged: whether the last step was below `NEAR`.
     """
 
     flat: Float[np.ndarray, "p"]
     computed: CoolingCurve
-    weights: Float[np.ndarray, "times"]
-    residuals: Float[np.ndarray, "times"]
-    sensitivity: Float[np.ndarray, "times p"]
+    weights: Float[np.ndarray, "points"]
+    residuals: Float[np.ndarray, "points"]
+    sensitivity: Float[np.ndarray, "points p"]
     beyond: Float[np.ndarray, "p"]
-    gain: Float[np.ndarray, "p times"]
-    error_covariance: Float[np.ndarray, "p p"]
+    gain: Float[np.ndarray, "p points"]
     noise_covariance: Float[np.ndarray, "p p"]
     num_simulations: int
     converged: bool
 
 
 class _Simulation(NamedTuple):
-    """One simulation at some parameters, at the times that are used."""
+    """One simulation at some parameters, at the points that are used."""
 
     flat: Float[np.ndarray, "p"]
-    log_temperature: Float[np.ndarray, "used"]
-    slope: Float[np.ndarray, "used p"]  # derivative of log_temperature
-    deviation: Float[np.ndarray, "replicas used"]  # of each replica's ln T from their mean
+    values: Float[np.ndarray, "used"]
+    slope: Float[np.ndarray, "used p"]  # derivative of the values
+    deviation: Float[np.ndarray, "replicas used"]  # of each replica's values from their mean
+    variance: Float[np.ndarray, "used"]  # of the mean over replicas
 
 
 class _Average(NamedTuple):
@@ -72,7 +82,7 @@ class _Average(NamedTuple):
 
     flat: Float[np.ndarray, "p"]
     sigma: Float[np.ndarray, "used"]  # standard error of each residual; 1 if errors are unknown
-    gain: Float[np.ndarray, "p used"]  # derivative of `flat` in the measured ln T
+    gain: Float[np.ndarray, "p used"]  # derivative of `flat` in the measured values
     errors: Float[np.ndarray, "p p"]  # covariance of `flat` by the errors of the measurement
     noises: Float[np.ndarray, "p p"]  # and by the noise of the simulations
 
@@ -84,10 +94,11 @@ class _Average(NamedTuple):
 def by_simulation(
     simulate: Callable[[Array, int], CoolingCurve],
     first: Float[np.ndarray, "p"],
-    measured: Float[np.ndarray, "times"],
-    error: Float[np.ndarray, "times"],
-    used: Bool[np.ndarray, "times"],
+    measured: Float[np.ndarray, "points"],
+    error: Float[np.ndarray, "points"],
+    used: Bool[np.ndarray, "points"],
     *,
+    rotation: bool = False,
     resolution: float,
     max_simulations: int,
     progress: bool,
@@ -100,27 +111,27 @@ def by_simulation(
     the answer is estimated from the changes that single replicas would make to it. The search ends
     when a step is below `NEAR` and the noise is below `QUIET` of the standard error.
 
-    A derivative that is wrong by some per cent slows the search and scales the standard error by as
-    much, but does not move the answer, which is where the residuals vanish.
+    For wrong derivatives see `jaxgran.fit`.
 
     Args:
         simulate: makes a cooling curve, with replicas, of the parameters and a number that differs
             between simulations.
         first: the initial guess.
-        measured, error: ln T and its standard error, which is 0 everywhere if it is not known.
-        used: the times that have a weight.
+        measured, error: values of `log_temperatures` and their standard errors, which are 0
+            everywhere if they are not known.
+        used: the points that have a weight.
+        rotation: whether T_rot is used beside T.
         resolution: singular values of the sensitivity below this share of the largest are ignored:
             the parameters do not move in those directions.
         max_simulations: the most simulations.
         progress: show a bar.
     """
     flat, measured, error = np.asarray(first, float), measured[used], error[used]
-    known = bool(error.any())
-    simulations: list[_Simulation] = []
+    known, simulations = bool(error.any()), []
     hidden = None if progress else True  # None hides the bar where there is no terminal
     with tqdm(total=max_simulations, disable=hidden, desc="fit", unit="simulation") as bar:
         while True:
-            simulation, curve = _simulated(simulate, flat, len(simulations), used)
+            simulation, curve = _simulated(simulate, flat, len(simulations), used, rotation)
             simulations.append(simulation)
             near = [s for s in simulations if np.abs(s.flat - flat).max() < NEAR]
             average = _average(near, measured, error if known else None, resolution)
@@ -137,14 +148,13 @@ def by_simulation(
             if ended or len(simulations) == max_simulations:
                 break
     weighted = _residuals_at(flat, near, measured, average.sigma, used)
-    gain = _spread(average.gain, used)
     beyond = flat - np.mean([s.flat for s in near], axis=0)
-    parts = *weighted, beyond, gain, average.errors, average.noises
+    parts = *weighted, beyond, _spread(average.gain, used), average.noises
     return Simulated(flat, curve, *parts, len(simulations), settled)
 
 
-def _spread(values: Float[np.ndarray, "p used"], used: Bool[np.ndarray, "times"]) -> np.ndarray:
-    """Values at all times, 0 where not used."""
+def _spread(values: Float[np.ndarray, "p used"], used: Bool[np.ndarray, "points"]) -> np.ndarray:
+    """Values at all points, 0 where not used."""
     spread = np.zeros((len(values), len(used)))
     spread[:, used] = values
     return spread
@@ -154,20 +164,25 @@ def _simulated(
     simulate: Callable[[Array, int], CoolingCurve],
     flat: Float[np.ndarray, "p"],
     number: int,
-    used: Bool[np.ndarray, "times"],
+    used: Bool[np.ndarray, "points"],
+    rotation: bool,
 ) -> tuple[_Simulation, CoolingCurve]:
     """One simulation with its derivatives, and its curve."""
 
-    def log_temperature(flat):
+    def values_of(flat):
         curve = simulate(flat, number)
-        value = jnp.log(curve.temperature)
+        value = log_temperatures(curve, rotation)
         return value, (value, curve)
 
-    slope, (value, curve) = jax.jacfwd(log_temperature, has_aux=True)(jnp.asarray(flat))
+    slope, (value, curve) = jax.jacfwd(values_of, has_aux=True)(jnp.asarray(flat))
     replicas: Any = curve.replicas  # checked by the caller
-    each = np.log(np.asarray(replicas.temperature))[:, used]
+    each = np.asarray(log_temperatures(replicas, rotation))
+    parts = np.split(each, 1 + rotation, axis=1), np.split(used, 1 + rotation)
+    kept = [part[:, some] for part, some in zip(*parts, strict=True)]
+    kept = [part - part.mean(axis=0) for part in kept]
+    variance = np.concatenate([_variance(part) for part in kept])
     value, slope = np.asarray(value)[used], np.asarray(slope)[used]
-    return _Simulation(flat, value, slope, each - each.mean(axis=0)), curve
+    return _Simulation(flat, value, slope, np.concatenate(kept, axis=1), variance), curve
 
 
 def _average(
@@ -180,16 +195,16 @@ def _average(
 
     Args:
         near: the simulations.
-        measured, error: ln T and its standard error, None if it is not known.
+        measured, error: the values and their standard errors, None if these are not known.
         resolution: see `by_simulation`.
     """
-    noise = np.sqrt(np.mean([_variance(s.deviation) for s in near], axis=0) / len(near))
+    noise = np.sqrt(np.mean([s.variance for s in near], axis=0) / len(near))
     sigma = np.ones_like(measured) if error is None else np.hypot(error, noise)
     ends, scatter = [], []
     for simulation in near:
         sensitivity = simulation.slope / sigma[:, None]
         inverse = np.linalg.pinv(sensitivity, rcond=resolution)
-        ends.append(simulation.flat + inverse @ ((measured - simulation.log_temperature) / sigma))
+        ends.append(simulation.flat + inverse @ ((measured - simulation.values) / sigma))
         replicas = len(simulation.deviation)
         moved = (simulation.deviation / sigma) @ inverse.T / (replicas * (replicas - 1)) ** 0.5
         scatter.append(moved.T @ moved)
@@ -215,11 +230,11 @@ def _residuals_at(
     near: list[_Simulation],
     measured: Float[np.ndarray, "used"],
     sigma: Float[np.ndarray, "used"],
-    used: Bool[np.ndarray, "times"],
-) -> tuple[Float[np.ndarray, "times"], Float[np.ndarray, "times"], Float[np.ndarray, "times p"]]:
+    used: Bool[np.ndarray, "points"],
+) -> tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"], Float[np.ndarray, "points p"]]:
     """Weights, weighted residuals, extrapolated from each simulation and averaged, and their
     derivative."""
-    each = [measured - s.log_temperature - s.slope @ (flat - s.flat) for s in near]
+    each = [measured - s.values - s.slope @ (flat - s.flat) for s in near]
     slope = np.mean([s.slope for s in near], axis=0)
     weights, residuals = np.zeros(len(used)), np.zeros(len(used))
     sensitivity = np.zeros((len(used), len(flat)))

@@ -1,6 +1,7 @@
 """Minimisers of a sum of squared residuals that have no noise."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,6 +18,7 @@ TOLERANCE = 1e-7
 Residuals = Callable[[Float[Array, "p"]], Float[Array, "residuals"]]
 Minimum = tuple[Float[Array, "p"], Int[Array, ""], Bool[Array, ""]]
 """Where a search ended, after how many iterations, and whether it converged."""
+Search = Callable[[Residuals, Float[Array, "p"], int], Minimum]
 
 
 def at_rest(residuals: Float[Array, "n"], jacobian: Float[Array, "n p"]) -> Bool[Array, ""]:
@@ -96,6 +98,38 @@ def quasi_newton(residuals: Residuals, first: Float[Array, "p"], max_steps: int)
         throw=False,
     )
     return _minimum(solution)
+
+
+class Ends(NamedTuple):
+    """Where searches ended, and chi^2 there; infinite where it is not known."""
+
+    flats: Float[Array, "starts p"]
+    chi2: Float[Array, "starts"]
+
+
+def deepest(
+    residuals: Residuals, search: Search, starts: Float[Array, "starts p"], max_steps: int
+) -> tuple[Minimum, Ends]:
+    """The deepest of the minima that a search finds from several starts, with the steps of all.
+
+    Args:
+        residuals: function of the parameters.
+        search: `least_squares` or `quasi_newton`.
+        starts: initial guesses.
+        max_steps: the most iterations from each.
+    """
+
+    def one(start: Array) -> tuple[Minimum, Array]:
+        found = search(residuals, start, max_steps)
+        chi2 = jnp.sum(residuals(found[0]) ** 2)
+        return found, jnp.where(jnp.isnan(chi2), jnp.inf, chi2)
+
+    if len(starts) == 1:
+        found, chi2 = one(starts[0])
+        return found, Ends(found[0][None], chi2[None])
+    (flats, steps, converged), chi2 = jax.lax.map(one, starts)
+    best = jnp.argmin(chi2)
+    return (flats[best], jnp.sum(steps), converged[best]), Ends(flats, chi2)
 
 
 def _minimum(solution: optx.Solution) -> Minimum:

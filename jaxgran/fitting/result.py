@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgran.checks.tracing import any_traced, concrete
 from jaxgran.checks.words import Rows, as_html, as_text, said
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.minima import Minima
 from jaxgran.fitting.parameters import START, size_of
 from jaxgran.fitting.priors import Priors
 from jaxgran.models.base import AbstractModel
@@ -65,6 +66,8 @@ class Fit(eqx.Module):
             stochastic model.
         converged: whether the search reached its tolerance; of a stochastic model, whether the last
             step was below 0.1 in the parameters' unbounded scale.
+        minima: minima of chi^2 that were found, of which this is the deepest; None of a stochastic
+            model.
 
     >>> A, error = result.value("dissipative_constant")
     >>> f"{float(A):.3g} s", sorted(result.error_budget)
@@ -96,6 +99,7 @@ class Fit(eqx.Module):
     p_value: Float[Array, ""]
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
+    minima: Minima | None = None
 
     @property
     def covariance(self) -> Float[Array, "p p"]:
@@ -145,6 +149,14 @@ class Fit(eqx.Module):
         if any_traced(found):
             return found[0][..., i], found[1][..., i]
         return concrete(np.asarray(found[0])[..., i]), concrete(np.asarray(found[1])[..., i])
+
+    def as_good(self) -> Float[np.ndarray, "others p"]:
+        """Estimates at other minima that the curve does not tell from this one: see
+        `jaxgran.fitting.minima.Minima.as_good`. Of one fit, not of a batch."""
+        if self.minima is None:
+            return np.zeros((0, len(self.estimate)))
+        unit = max(float(self.reduced_chi2), 1.0)
+        return self.minima.as_good(self.estimate, self.standard_error, self.chi2, unit)
 
     def undetermined(self) -> tuple[str, ...]:
         """Parameters of which the curve determines no value, or only a combination; () if none.

@@ -1,16 +1,20 @@
 """Fits through a stochastic model, whose noise becomes part of the errors."""
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxgran.checks.tracing import any_traced
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
-from jaxgran.fitting.budget import effects_on_temperature
+from jaxgran.fitting.budget import effects
+from jaxgran.fitting.comparison import uses_rotation
 from jaxgran.fitting.deterministic import fit_deterministic
-from jaxgran.fitting.gauss_newton import Simulated, by_simulation
+from jaxgran.fitting.gauss_newton import Simulated, by_simulation, log_temperatures
 from jaxgran.fitting.guess import guess_from_data
 from jaxgran.fitting.parameters import Parameters
 from jaxgran.fitting.priors import NO_PRIORS, Priors
@@ -60,22 +64,37 @@ def fit_stochastic(
         _check_replicas(model, computed)
         return computed
 
-    T = np.asarray(curve.temperature)
+    rotation = uses_rotation(gas, curve)
     errors_known = curve.temperature_error is not None
-    error = np.asarray(curve.temperature_error / T) if errors_known else np.zeros_like(T)
-    used = error > 0 if errors_known else np.ones(T.shape, bool)
+    error, used = _errors_of(curve, rotation)
     found = by_simulation(
         simulate,
         np.asarray(first),
-        np.log(T),
+        np.asarray(log_temperatures(curve, rotation)),
         error,
-        used & (np.asarray(curve.times) > 0),
+        used,
+        rotation=rotation,
         resolution=model.derivative_accuracy,
         max_simulations=max_simulations,
         progress=progress,
     )
-    degrees = (of_errors or {}).get("measurement")
-    return _fit_of(model, parameters, names, first, found, priors, errors_known, degrees)
+    of = model, parameters, names, first, found, priors
+    return _fit_of(*of, error if errors_known else None, of_errors or {})
+
+
+def _errors_of(
+    curve: CoolingCurve, rotation: bool
+) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:
+    """Relative errors of T, and of T_rot if it is used, and the points that have a weight."""
+    pairs: list[tuple[Any, Any]] = [(curve.temperature, curve.temperature_error)]
+    if rotation:
+        pairs.append((curve.rotational_temperature, curve.rotational_temperature_error))
+    values = np.concatenate([np.asarray(value) for value, _ in pairs])
+    used = (np.tile(np.asarray(curve.times), len(pairs)) > 0) & (values > 0)
+    if curve.temperature_error is None:
+        return np.zeros_like(values), used
+    errors = np.concatenate([np.asarray(error) for _, error in pairs])
+    return errors / np.where(values > 0, values, 1.0), used & (errors > 0)
 
 
 def _check_replicas(model: AbstractModel, computed: CoolingCurve) -> None:
@@ -89,11 +108,20 @@ def _check_replicas(model: AbstractModel, computed: CoolingCurve) -> None:
 
 def _guess_of_kinetic_theory(gas: Gas, curve: CoolingCurve, names: tuple[str, ...]) -> Gas:
     """The result of kinetic theory's fit of those parameters that it can determine."""
-    known = tuple(n for n in names if n in ("dissipative_constant", "coefficient", "temperature"))
+    found_by_theory = {"dissipative_constant", "coefficient", "temperature"}
+    if uses_rotation(gas, curve):
+        found_by_theory |= {"tangential_restitution", "rotational_temperature"}
+    known = tuple(name for name in names if name in found_by_theory)
     if not known:
         return gas
-    guesses = [guess_from_data(gas, curve, known)]
-    return fit_deterministic(gas, curve, KineticTheory(), known, guesses).gas
+    plain = gas
+    if "friction" in gas.elements:  # which theory does not know
+        plain = dataclasses.replace(gas, surface=None)
+        curve = dataclasses.replace(curve, rotational_temperature=None)
+        curve = dataclasses.replace(curve, rotational_temperature_error=None)
+    guesses = [guess_from_data(plain, curve, known)]
+    found = fit_deterministic(plain, curve, KineticTheory(), known, guesses).gas
+    return gas.replace(**{name: found.value(name) for name in known})
 
 
 def _fit_of(
@@ -103,40 +131,40 @@ def _fit_of(
     first: Float[Array, "p"],
     found: Simulated,
     priors: Priors,
-    errors_known: bool,
-    of_errors: Float[Array, ""] | None,
+    error: Float[np.ndarray, "points"] | None,
+    of_errors: dict[str, Float[Array, ""]],
 ) -> Fit:
     """The fit in SI units of what a search found."""
-    flat = jnp.asarray(found.flat)
+    flat, num_times = jnp.asarray(found.flat), found.computed.times.size
     own = found.residuals, found.sensitivity, found.weights
     residuals, sensitivity, weights = map(jnp.asarray, own)
-    used, scatter = residuals != 0, None
-    degrees_of_freedom = jnp.sum(used) - flat.size
-    if not errors_known:
+    degrees_of_freedom, scatter = jnp.sum(residuals != 0) - flat.size, None
+    if error is None:
         scatter = jnp.sqrt(jnp.sum(residuals**2) / degrees_of_freedom)
         residuals, sensitivity, weights = (x / scatter for x in (residuals, sensitivity, weights))
-    tested = residuals, degrees_of_freedom, of_errors
-    chance = misfit([tested], degrees_of_freedom, errors_known=errors_known)
+    of_T, of_rotation = residuals[:num_times], residuals[num_times:]
+    used = of_T != 0
+    tested = [(of_T, jnp.sum(used) - flat.size, of_errors.get("measurement"))]
+    if of_rotation.size:
+        tested.append((of_rotation, jnp.sum(of_rotation != 0), of_errors.get("rotation")))
+    chance = misfit(tested, degrees_of_freedom, errors_known=error is not None)
     scale = jax.jacfwd(parameters.estimates)(flat)
     gain = scale @ jnp.asarray(found.gain)
-    gas = parameters.gas(flat)
-    slope, changes = effects_on_temperature(gas, priors, found.computed.times)
-    measured = scale @ found.error_covariance @ scale.T * (1.0 if scatter is None else scatter**2)
-    factor = correlation_factor(neighbour_correlation(residuals, used)) ** 2
-    moved = {name: gain @ change for name, change in changes.items()}
-    covariances = {
-        "measurement": chance.inflation * factor * measured,
-        **{name: change @ change.T for name, change in moved.items()},
-        "simulation": scale @ found.noise_covariance @ scale.T,
-    }
+    gas, rotation = parameters.gas(flat), of_rotation.size > 0
+    slope, changes = effects(gas, priors, found.computed, rotation)
+    shares = gain * (scatter if error is None else jnp.asarray(error)[None])
+    measured = chance.inflation * _of_errors(shares, of_T, used)
+    covariances = {"measurement": measured, "simulation": scale @ found.noise_covariance @ scale.T}
+    covariances |= {name: gain @ x @ x.T @ gain.T for name, x in changes.items()}
+    delays = -gain * slope[None]
     return Fit(
         names=names,
         model=model,
         estimate=parameters.estimates(flat),
         covariances=covariances,
         clock_error=jnp.zeros(used.shape),
-        gain=gain,
-        clock_gain=-gain * slope[None],
+        gain=gain[:, :num_times],
+        clock_gain=sum(jnp.split(delays, slope.size // num_times, axis=1), start=jnp.zeros(())),
         sensitivity=sensitivity,
         beyond=scale @ jnp.asarray(found.beyond),
         start=parameters.estimates(first),
@@ -144,10 +172,10 @@ def _fit_of(
         began=jnp.zeros(()),
         priors=priors,
         curve=found.computed,
-        weights=weights,
-        residuals=residuals,
+        weights=weights[:num_times],
+        residuals=of_T,
         displacement_residuals=None,
-        rotation_residuals=None,
+        rotation_residuals=of_rotation if of_rotation.size else None,
         scatter=scatter,
         chi2=chance.chi2,
         degrees_of_freedom=degrees_of_freedom,
@@ -156,3 +184,12 @@ def _fit_of(
         iterations=jnp.asarray(found.num_simulations),
         converged=jnp.asarray(found.converged),
     )
+
+
+def _of_errors(
+    shares: Float[Array, "p points"], residuals: Float[Array, "times"], used: Bool[Array, "times"]
+) -> Float[Array, "p p"]:
+    """Covariance by errors of T, with that of neighbouring ones, and of T_rot, if it was used."""
+    factor = correlation_factor(neighbour_correlation(residuals, used)) ** 2
+    by_T, by_rotation = shares[:, : residuals.size], shares[:, residuals.size :]
+    return factor * by_T @ by_T.T + by_rotation @ by_rotation.T

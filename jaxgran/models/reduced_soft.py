@@ -44,6 +44,8 @@ def reduced_walls(gas: Gas, container: Walls) -> SoftWalls:
         alpha=alpha * gas.diameter**0.5 * unit_time**2,
         dissipative_constant=law.dissipative_constant / unit_time,
         clipped=law.clipped,
+        damping=container.tangential_damping,
+        friction=container.friction,
     )
 
 
@@ -58,7 +60,8 @@ def reduced_frequency(gas: Gas, unit_time: Float[Array, ""]) -> Float[Array, ""]
 def reduced_drag(gas: Gas, drag: StokesDrag) -> SoftDrag:
     """The drag of a gas in these units."""
     time = gas.diameter / jnp.sqrt(gas.temperature)
-    return SoftDrag(drag.rate * time / reduced_frequency(gas, time), drag.rotational_rate * time)
+    per_collision = time / reduced_frequency(gas, time)
+    return SoftDrag(drag.rate * per_collision, drag.rotational_rate * per_collision)
 
 
 def reduced_surface(gas: Gas) -> SoftSurface | None:

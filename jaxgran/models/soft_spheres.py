@@ -66,9 +66,9 @@ class SoftSpheres(AbstractSpheres):
     after an elastic melt of 10 mean free times. Steps lengthen as it cools.
 
     A gas may have walls (of a `jaxgran.Viscoelastic` law: the same force, with the mass and radius
-    of one sphere), where momentum is not conserved; drag, exact in the drift; and friction
-    (`jaxgran.Frictional`). What they take counts as dissipated. In a step the kicks of walls, then
-    of tangential forces, follow the normal ones of pairs.
+    of one sphere), where momentum is not conserved; drag, exact in the drift; and friction, also of
+    walls (`jaxgran.Frictional`). What they take counts as dissipated. In a step the kicks of walls,
+    then of tangential forces, follow the normal ones of pairs.
 
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer. It lives on
@@ -95,9 +95,11 @@ class SoftSpheres(AbstractSpheres):
     frequency; that the box changes with it at fixed N, and with it the growth of flows, is left
     out. T is followed exactly but for the projection, the rest is estimated from it: the paths by
     the first Sonine order of diffusion (see `jaxgran.tangents.paths`), the velocity correlation in
-    time as decaying at 2/d of the collision rate. Walls and drag are followed like (alpha, A);
-    between walls the derivatives in lengths and the density are refused, with friction all. The
-    derivatives of a_2 and of the final particles are not known, and are nan. Second derivatives are
+    time as decaying at 2/d of the collision rate. Walls, drag and friction are followed like
+    (alpha, A), and T_rot beside T (`jaxgran.tangents.rotation`); between walls the derivatives in
+    lengths and the density are refused. Not known, and nan, are the derivatives of a_2 and of the
+    final particles, with friction those of <dr^2> and the velocity correlation, and the one in a
+    rotational_temperature of 0. Second derivatives are
     refused. In boxes above L_c derivatives are too large by some share, which the curve estimates
     (``derivative_bias``); `differences` avoids that. A run is followed in the frame in which each
     replica is at rest. With a given start T_0
@@ -225,7 +227,7 @@ class SoftSpheres(AbstractSpheres):
 
 
 def check_walls(walls: Walls) -> None:
-    """Raise ValueError for walls that have no force, or friction."""
+    """Raise ValueError for walls that have no force."""
     if not isinstance(walls.restitution, Viscoelastic):
         raise ValueError(
             "SoftSpheres needs walls of the Viscoelastic law, which has a force (with A = 0 they "
@@ -234,6 +236,7 @@ def check_walls(walls: Walls) -> None:
         )
     if walls.tangential_restitution is not None:
         raise ValueError(
-            "SoftSpheres takes smooth walls, tangential_restitution of the walls belongs to "
-            "impacts: use HardSpheres(N), or leave it out"
+            "tangential_restitution of the walls belongs to impacts without duration: give "
+            "SoftSpheres tangential_damping and friction of the walls in its place, or use "
+            "HardSpheres(N)"
         )

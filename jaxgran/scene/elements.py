@@ -100,6 +100,10 @@ def _wall_law(law: UserWallLaw) -> RestitutionLaw:
     return ConstantRestitution(law)
 
 
+def _number_or_none(value: Any) -> Array | None:
+    return None if value is None else number(value)
+
+
 class Walls(eqx.Module):
     """Flat walls around the gas, at rest: a cube (square), or a box of given sides.
 
@@ -110,9 +114,11 @@ class Walls(eqx.Module):
         side: of the cube, m, or d sides; the centres of the spheres have a diameter less.
         restitution: of impacts on the walls: a number in [0, 1], or a law of restitution.
         tangential_restitution: of rough spheres (`Rough`), in [-1, 1]; None is smooth walls.
+        tangential_damping, friction: x_t and mu of contacts of rubbing spheres (`Frictional`) with
+            the walls, >= 0, with l the distance of a centre from the wall; None is smooth walls.
 
     Raises:
-        ValueError: for a value outside its range.
+        ValueError: for a value outside its range, or one of x_t and mu without the other.
 
     >>> boxed = dataclasses.replace(gas, container=jaxgran.Walls(0.05, restitution=0.9))
     >>> float(boxed.value("wall_side")), float(boxed.value("wall_coefficient"))
@@ -122,21 +128,38 @@ class Walls(eqx.Module):
     side: Float[Array, "..."] = eqx.field(converter=number)
     restitution: RestitutionLaw = eqx.field(converter=_wall_law, kw_only=True)
     tangential_restitution: Float[Array, ""] | None = eqx.field(
-        converter=lambda x: None if x is None else number(x), default=None, kw_only=True
+        converter=_number_or_none, default=None, kw_only=True
+    )
+    tangential_damping: Float[Array, ""] | None = eqx.field(
+        converter=_number_or_none, default=None, kw_only=True
+    )
+    friction: Float[Array, ""] | None = eqx.field(
+        converter=_number_or_none, default=None, kw_only=True
     )
 
     def __check_init__(self):
-        POSITIVE.check("side of the walls", self.side, "Give it in metres.")
-        if self.tangential_restitution is not None:
-            TANGENTIAL.check("tangential_restitution of the walls", self.tangential_restitution)
+        for name, domain in self.domains.items():
+            advice = "Give it in metres." if name == "side" else ""
+            domain.check(f"{name} of the walls", getattr(self, name), advice)
+        if (self.tangential_damping is None) != (self.friction is None):
+            given, missing = "tangential_damping", "friction"
+            if self.tangential_damping is None:
+                given, missing = missing, given
+            raise ValueError(
+                f"the walls have {given} and no {missing}, and their tangential force needs both: "
+                f"give {missing} too, or leave {given} out"
+            )
 
     @property
     def domains(self) -> dict[str, Domain]:
         """Allowed range of each float that is not one of the law."""
-        own = {"side": POSITIVE}
-        if self.tangential_restitution is not None:
-            own["tangential_restitution"] = TANGENTIAL
-        return own
+        optional = {
+            "tangential_restitution": TANGENTIAL,
+            "tangential_damping": NOT_NEGATIVE,
+            "friction": NOT_NEGATIVE,
+        }
+        given = {name: d for name, d in optional.items() if getattr(self, name) is not None}
+        return {"side": POSITIVE} | given
 
     def more_collisions(self, diameter: Array, dimension: int) -> Float[Array, ""]:
         """Collision frequency over that of spheres without walls of the same mean density.
@@ -253,20 +276,24 @@ def check(gas: Any) -> None:
                 f"{np.asarray(rate)} 1/s: add surface=jaxgran.Rough(...), or leave it out"
             )
     if gas.container is not None:
-        rough = isinstance(gas.surface, Rough)
-        _check_walls(gas.container, gas.diameter, gas.dimension, rough=rough)
+        _check_walls(gas.container, gas.surface, gas.diameter, gas.dimension)
 
 
-def _check_walls(walls: Walls, diameter: Array, dimension: int, rough: bool) -> None:
-    """Raise ValueError for walls that cannot contain the spheres of a gas."""
+def _check_walls(walls: Walls, surface: Any, diameter: Array, dimension: int) -> None:
+    """Raise ValueError for walls that cannot contain the spheres of a gas, or rub them."""
     if np.ndim(walls.side) > 0 and np.shape(walls.side) != (dimension,):
         raise ValueError(
             f"side of the walls must be one number or {dimension}, got shape {np.shape(walls.side)}"
         )
     least = Domain(low=2.1)
     least.check("side of the walls, over the diameter,", walls.side / diameter, "Enlarge it.")
-    if walls.tangential_restitution is not None and not rough:
+    if walls.tangential_restitution is not None and not isinstance(surface, Rough):
         raise ValueError(
             "tangential_restitution of the walls needs rough spheres: add "
             "surface=jaxgran.Rough(...)"
+        )
+    if walls.friction is not None and (surface is None or isinstance(surface, Rough)):
+        raise ValueError(
+            "friction of the walls needs spheres that rub: add surface=jaxgran.Frictional(...), or "
+            "use tangential_restitution with surface=jaxgran.Rough(...)"
         )

@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, DTypeLike, Float
 
 from jaxgran.scene.restitution import ReducedLaw
 from jaxgran.tangents.paths import PathTangents
-from jaxgran.tangents.thermal import Rates
+from jaxgran.tangents.rates import Rates
 
 
 class ImpactTangents(NamedTuple):

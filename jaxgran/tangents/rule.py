@@ -11,6 +11,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, DTypeLike, Float, Int, PRNGKeyArray
 
+from jaxgran.scene.elements import SPINS
 from jaxgran.tangents.limits import first_order_only, unknown, unknown_tangent
 
 _UNKNOWN = {"sonine", "flow_share"}
@@ -228,6 +229,8 @@ def _moved(
     if "dissipated_energy" not in moved:
         return moved
     # The energy balance holds in the tangents, too.
-    elastic = moved.get("elastic_energy", 0.0)
-    moved["dissipated_energy"] = -0.5 * dimension * moved["temperature"] - elastic
+    inside = moved.get("elastic_energy", 0.0)
+    if "rotational_temperature" in moved:
+        inside = inside + 0.5 * SPINS[dimension] * moved["rotational_temperature"]
+    moved["dissipated_energy"] = -0.5 * dimension * moved["temperature"] - inside
     return moved

@@ -31,41 +31,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxgran.tangents.paths import PathTangents
-
-MEMORY = 5.0
-"""Mean free times over which the rates of cooling and of collision are averaged."""
-
-
-class Rates(NamedTuple):
-    """Exponentially weighted sums, by replica, from which rates are estimated.
-
-    Attributes:
-        lost: energy lost.
-        could_lose: energy that would have been lost, had the cooling rate been the trend itself.
-        met: collisions per particle.
-        could_meet: collisions per particle, had their rate been ``T^(1/2)``.
-    """
-
-    lost: Float[Array, "replicas"]
-    could_lose: Float[Array, "replicas"]
-    met: Float[Array, "replicas"]
-    could_meet: Float[Array, "replicas"]
-
-    @classmethod
-    def none(cls, replicas: int, dtype: DTypeLike) -> "Rates":
-        """The sums before the first collision."""
-        return cls(*[jnp.zeros(replicas, dtype)] * 4)
-
-    def cooling(self, trend: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
-        """``-d ln T/dt``, given its trend, which is its dependence on T in an arbitrary unit."""
-        return _ratio(self.lost, self.could_lose) * trend
-
-    def collision(self, temperature: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
-        """Collisions per particle and time, proportional to ``T^(1/2)``."""
-        return _ratio(self.met, self.could_meet) * temperature**0.5
+from jaxgran.tangents.rates import Rates, ratio
+from jaxgran.tangents.rotation import RotationTangents
 
 
 class ElementMaterial(NamedTuple):
@@ -74,11 +44,13 @@ class ElementMaterial(NamedTuple):
     Attributes:
         wall_alpha, wall_constant: alpha and A of contacts with walls.
         drag: gamma.
+        spin_drag: rate at which spins slow down.
     """
 
     wall_alpha: Any = None
     wall_constant: Any = None
     drag: Any = None
+    spin_drag: Any = None
 
     def of_walls(self) -> tuple[Any, Any]:
         """(alpha, A) of contacts with walls."""
@@ -103,6 +75,7 @@ class ThermalTangents(NamedTuple):
         paths: tangents of the paths of the particles, up to the last projection.
         elements: directions in walls and drag; None where the gas has neither.
         drag: gamma; None without drag.
+        rotation: tangents of spins; None of spheres that do not rub.
     """
 
     alpha: Float[Array, "p"]
@@ -120,6 +93,7 @@ class ThermalTangents(NamedTuple):
     paths: PathTangents
     elements: ElementMaterial | None = None
     drag: Float[Array, ""] | None = None
+    rotation: RotationTangents | None = None
 
     def cooling(self, temperature: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
         """``-d ln T/dt`` at a temperature, by contacts and drag."""
@@ -151,6 +125,7 @@ class ThermalTangents(NamedTuple):
             wall_alpha=moved(along.wall_alpha, -1.0, scene.wall_alpha),
             wall_constant=moved(along.wall_constant, 0.5, scene.wall_constant),
             drag=moved(along.drag, -0.5, scene.drag),
+            spin_drag=moved(along.spin_drag, -0.5, scene.spin_drag),
         )
 
 
@@ -222,7 +197,7 @@ def projected(tangents: ThermalTangents, velocity: Float[Array, "n d"]) -> Proje
     each = velocity.reshape(replicas, -1)
     v = jnp.where(tangents.free[:, None], velocity, 0.0).reshape(replicas, -1)
     rest = tangents.velocity.reshape(len(c), *v.shape)
-    gain = _ratio(2 * jnp.sum(rest * v[None], -1), jnp.sum(v * v, -1)[None])
+    gain = ratio(2 * jnp.sum(rest * v[None], -1), jnp.sum(v * v, -1)[None])
     heat = jnp.mean(each * each, -1)
     one = jnp.ones_like(heat)
     return Projection(
@@ -232,14 +207,17 @@ def projected(tangents: ThermalTangents, velocity: Float[Array, "n d"]) -> Proje
             tangents.own_elapsed,
             gain,
             meeting=tangents.rates.collision(one),
-            cooling=_ratio(tangents.cooling(heat), jnp.sqrt(heat)),
+            cooling=ratio(tangents.cooling(heat), jnp.sqrt(heat)),
             dimension=d,
         ),
     )
 
 
 def project(
-    tangents: ThermalTangents, velocity: Float[Array, "n d"], due: ArrayLike
+    tangents: ThermalTangents,
+    velocity: Float[Array, "n d"],
+    due: ArrayLike,
+    spin: Float[Array, "n spins"] | None = None,
 ) -> ThermalTangents:
     """The tangents after a thermal projection now, or unchanged unless it is due."""
     new = projected(tangents, velocity)
@@ -251,47 +229,14 @@ def project(
     held = jnp.where(due, kept, tangents.velocity)
     old = Projection(tangents.log_temperature, tangents.clock, tangents.paths)
     now = jax.tree.map(lambda new, old: jnp.where(due, new, old), new, old)
+    rotation = tangents.rotation
+    if rotation is not None and spin is not None:
+        rotation = rotation.projected(spin, gain, tangents.free, due)
     return tangents._replace(
+        rotation=rotation,
         **now._asdict(),
         position=jnp.where(dropped, 0.0, tangents.position),
         velocity=jnp.where(dropped, 0.0, held),
         elapsed=jnp.where(due, 0.0, tangents.elapsed),
         own_elapsed=jnp.where(due, 0.0, tangents.own_elapsed),
     )
-
-
-def remembered(
-    rates: Rates,
-    lost: Float[Array, "replicas"],
-    met: Float[Array, "replicas"],
-    energy: Float[Array, "replicas"],
-    temperature: Float[Array, "replicas"],
-    trend: Float[Array, "replicas"],
-    duration: ArrayLike,
-    collision_frequency: ArrayLike,
-) -> Rates:
-    """The exponentially weighted sums after a further time.
-
-    Args:
-        rates: the sums before.
-        lost: energy lost in this time.
-        met: collisions per particle that began in it.
-        energy: of the gas.
-        temperature: of the gas.
-        trend: the dependence of the cooling rate on T, at this temperature.
-        duration: of this time.
-        collision_frequency: at T = 1.
-    """
-    passed = duration * jnp.sqrt(temperature)
-    old = jnp.exp(-passed * collision_frequency / MEMORY)
-    return Rates(
-        lost=old * rates.lost + lost,
-        could_lose=old * rates.could_lose + energy * trend * duration,
-        met=old * rates.met + met,
-        could_meet=old * rates.could_meet + passed,
-    )
-
-
-def _ratio(above: Array, below: Array) -> Array:
-    """The ratio, 0 where the denominator is 0."""
-    return jnp.where(below != 0, above / jnp.where(below != 0, below, 1.0), 0.0)

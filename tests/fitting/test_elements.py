@@ -72,6 +72,27 @@ def test_roughness_and_A_are_found_together(model):
     assert "not looked for beside tangential_restitution" in said
 
 
+def test_of_two_minima_in_beta_t_the_deeper_one_is_found_and_said_where_as_deep():
+    # Rotation takes most energy at some beta_t: on both sides of it T and T_rot look alike, with
+    # half of A on the other side.
+    gas = dataclasses.replace(glass_beads(), surface=ROUGH).replace(tangential_restitution=-0.5)
+    names, other = FREE[:2], gas.replace(tangential_restitution=0.3)
+    curve = measured(gas)
+    result = jaxgran.fit(other, curve, free=names)
+    assert all(within(result, gas, name) for name in names)
+    assert result.minima.chi2.shape == (4,) and not len(result.as_good())
+    assert jaxgran.diagnose(result, curve).explains
+    assert np.ptp(result.minima.chi2) > 9.0
+    gas = gas.replace(tangential_restitution=-0.42)
+    curve = measured(gas, error=0.05)
+    with pytest.warns(UserWarning, match="chi.2 has another minimum as good, at dissipative"):
+        result = jaxgran.fit(other, curve, free=names)
+    assert float(result.as_good()[0, 0] / result.estimate[0]) < 0.7
+    found = jaxgran.diagnose(result, curve)
+    assert not found.explains and "Other parameters fit this curve as well" in found.verdict
+    assert any("has another minimum as good" in reason for reason in found.reasons)
+
+
 def test_a_T_rot_that_theory_misses_as_a_whole_is_no_misfit():
     # Theory knows T_rot within 7 %: a common factor of 1.05 is within that, errors are 2 %.
     gas = dataclasses.replace(glass_beads(), surface=ROUGH)

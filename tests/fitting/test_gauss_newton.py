@@ -1,5 +1,7 @@
 """Gauss-Newton through noisy simulations, on a stand-in whose parameters are known."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -85,6 +87,33 @@ def test_what_the_curve_does_not_tell_stays_where_it_was():
     found = searched(simulate, exact(np.array([0.3, 0.0])), first=(0.1, 0.1))
     assert found.flat[0] - found.flat[1] == pytest.approx(0.0, abs=1e-9)
     assert found.flat.sum() == pytest.approx(0.3, abs=0.02)
+
+
+def test_two_quantities_tell_what_one_does_not():
+    # T depends on the sum of two parameters, T_rot on the second one alone.
+    def simulate(flat, run):
+        T = simulator()(jnp.stack([flat[0] + flat[1], jnp.zeros(())]), run)
+        T_rot = simulator(seed=50)(jnp.stack([flat[1], jnp.zeros(())]), run)
+        each = dataclasses.replace(T.replicas, rotational_temperature=T_rot.replicas.temperature)
+        return dataclasses.replace(T, rotational_temperature=T_rot.temperature, replicas=each)
+
+    measured = np.concatenate([exact(np.array([x, 0.0])) for x in (0.1, -0.2)])
+    found = by_simulation(
+        simulate,
+        np.zeros(2),
+        measured,
+        np.tile(ERROR, 2),
+        np.ones(2 * TIMES.size, bool),
+        rotation=True,
+        resolution=0.01,
+        max_simulations=8,
+        progress=False,
+    )
+    np.testing.assert_allclose(found.flat, [0.3, -0.2], atol=0.03)
+    assert found.residuals.shape == (2 * TIMES.size,)
+    # T_rot does not depend on the first parameter, which is what remains of T.
+    np.testing.assert_allclose(found.sensitivity[TIMES.size :, 0], 0.0, atol=1e-12)
+    assert np.all(found.noise_covariance.diagonal() > 0)
 
 
 def test_without_errors_the_scatter_is_all():

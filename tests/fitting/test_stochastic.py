@@ -1,5 +1,7 @@
 """Fits through particle models."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,6 +61,60 @@ def test_the_key_is_that_of_the_simulations(beads):
     same, other = (jaxgran.fit(gas, curve, **options, key=jax.random.key(k)) for k in (0, 1))
     np.testing.assert_array_equal(default.estimate, same.estimate)
     assert default.estimate[0] != other.estimate[0]
+
+
+def with_rotation(gas, model, error=0.02, end=30.0):
+    """A curve of T and T_rot of a model."""
+    times = np.geomspace(0.3, end, 30) * float(gas.mean_free_time)
+    found = jaxgran.cool(gas, times, model=model, key=jax.random.key(5), progress=False)
+    return jaxgran.CoolingCurve(
+        times=times,
+        temperature=found.temperature,
+        temperature_error=error * found.temperature,
+        rotational_temperature=found.rotational_temperature,
+        rotational_temperature_error=error * found.rotational_temperature,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "surface, model, free",
+    [
+        (
+            jaxgran.Rough(0.0, rotational_temperature=3e-3),
+            jaxgran.DSMC(10_000, replicas=4),
+            "tangential_restitution",
+        ),
+        (
+            jaxgran.Frictional(0.5, 0.3, rotational_temperature=3e-3),
+            jaxgran.SoftSpheres(500, replicas=8, steps_per_contact=20),
+            "tangential_damping",
+        ),
+    ],
+    ids=["rough", "friction"],
+)
+def test_T_rot_is_fitted_beside_T(beads, surface, model, free):
+    gas = dataclasses.replace(beads(0.15), surface=surface)
+    if free == "tangential_damping":  # contacts that last a twentieth of the mean free time
+        stiff = (float(gas.contact_fraction) / 0.05) ** 2.5
+        gas = gas.replace(youngs_modulus=stiff * gas.value("youngs_modulus"))
+        constant = gas.value("dissipative_constant") * 0.15 / gas.thermal_beta
+        gas = gas.replace(dissipative_constant=constant)
+    curve, names = with_rotation(gas, model), ("dissipative_constant", free)
+    guess = gas.replace(**{free: gas.value(free) - 0.3})
+    result = jaxgran.fit(guess, curve, free=names, model=model, progress=False)
+    print(f"\n{result}")
+    assert bool(result.converged) and result.rotation_residuals is not None
+    for name in names:
+        estimate, error = result.value(name)
+        assert abs(float(estimate) - float(gas.value(name))) < 3 * float(error)
+    # Both are known to some per cent; from T alone they are not told apart.
+    assert float(result.standard_error[0] / result.estimate[0]) < 0.1
+    assert float(result.standard_error[1]) < 0.06
+    with_priors = {"priors": {"packing_fraction": (0.05, 0.002)}, "model": model}
+    if free == "tangential_damping":
+        with pytest.raises(ValueError, match="kinetic theory's derivatives, which does not know"):
+            jaxgran.fit(guess, curve, free=names, **with_priors)
 
 
 def test_fit_through_particles_refuses_what_it_cannot_do(beads):

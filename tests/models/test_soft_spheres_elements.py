@@ -49,13 +49,22 @@ SCENES = {
         "surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=3e-3),
     },
 }
+RUBBING_WALLS = {"tangential_damping": 0.8, "friction": 0.4}
+
+
+def with_all(num=NUM) -> jaxgran.Gas:
+    """Rubbing spheres, that walls of three sides rub too, in a gas that drags."""
+    gas = soft(num=num, **SCENES["all"])
+    sides = float(gas.box_side(num)) * np.array([1.25, 1.0, 0.8])
+    walls = jaxgran.Walls(sides, restitution=gas.law, **RUBBING_WALLS)
+    return dataclasses.replace(gas, container=walls)
 
 
 @pytest.mark.parametrize(
     "name", ["all", *(pytest.param(k, marks=pytest.mark.slow) for k in SCENES)]
 )
 def test_ledger_closes_and_all_stay_inside(name):
-    gas = soft(**SCENES[name])
+    gas = with_all() if name == "all" else soft(**SCENES[name])
     times = np.array([0.0, 1, 5, 20]) * float(gas.mean_free_time)
     curve = jaxgran.cool(gas, times, model=SoftSpheres(NUM, steps_per_contact=30))
     # As in the smooth gas: the onset of contacts leaves some 1e-4, falling as dt^(3/2).
@@ -63,12 +72,12 @@ def test_ledger_closes_and_all_stay_inside(name):
     assert curve.temperature[-1] < 0.3 * gas.temperature
     assert (curve.rotational_temperature is None) == (gas.surface is None)
     if gas.container is not None:
-        place, side = np.asarray(curve.particles.position), float(gas.container.side)
+        place, side = np.asarray(curve.particles.position), np.asarray(gas.container.side)
         overlap = 0.05 * float(gas.diameter)  # elastic impacts at 5 sqrt(T) overlap by 4 %
         edge = 0.5 * float(gas.diameter) - overlap
-        assert place.min() > edge and place.max() < side - edge
+        assert np.all(place > edge) and np.all(place < side - edge)
         assert curve.displacement is None and curve.flow_share is None
-        assert float(curve.particles.box_side) == pytest.approx(side)
+        np.testing.assert_allclose(curve.particles.box_side, side)
         # Walls push: unlike in a periodic box the gas as a whole does not stay at rest.
         momentum = np.abs(np.mean(curve.particles.velocity[0], axis=0))
         assert np.max(momentum) > 1e-3 * np.sqrt(curve.temperature[-1])
@@ -172,6 +181,26 @@ def test_sliding_impact_obeys_coulomb_and_conserves_momentum():
     np.testing.assert_allclose(energy(gas, curve), 1.0, atol=2e-5)  # the onset at 100 steps
 
 
+def test_a_wall_on_which_a_sphere_slides_obeys_coulomb():
+    # As above, on a wall alone; the other sphere is at rest in the middle.
+    mu, q = 0.05, 0.5
+    gas = soft(1e-5, num=2, law="own", surface=jaxgran.Frictional(0.0, 0.0, inertia=q))
+    walls = dataclasses.replace(gas.container, tangential_damping=1e4, friction=mu)
+    gas = dataclasses.replace(gas, container=walls)
+    side, sigma = float(walls.side), float(gas.diameter)
+    velocity = np.array([[0.2, 0.0, 0.15], [0.0, 0.0, 0.0]])
+    first = np.array([side - sigma / 2, 0.25 * side, 0.5 * side]) - 5e-5 * velocity[0]
+    start = two_spheres(gas, [first, [0.3 * side, 0.75 * side, 0.5 * side]], velocity)
+    curve = jaxgran.cool(gas, [0.0, 2e-4], model=SoftSpheres(2, start=start, steps_per_contact=100))
+    impulse = np.asarray(curve.particles.velocity[0, 0]) - velocity[0]
+    assert impulse[2] / impulse[0] == pytest.approx(mu, rel=1e-9)
+    assert impulse[1] == 0.0 and impulse[0] < -0.2
+    # The torque of the same force: I w = l n x F, with l = sigma/2 less the overlap, 2e-5 of it.
+    spin = np.asarray(curve.particles.angular_velocity[0, 0]) * sigma / 2
+    np.testing.assert_allclose(spin, [0.0, -impulse[2] / q, 0.0], rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(energy(gas, curve), 1.0, atol=2e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mu", [100.0, 0.01], ids=["viscous", "sliding"])
 def test_steps_with_friction_are_of_second_order(mu):
@@ -226,6 +255,22 @@ def test_friction_is_refused_by_the_other_models():
         jaxgran.Frictional(-0.5, 0.1)
 
 
+def test_walls_that_cannot_rub_are_refused():
+    law = glass_beads().law
+    with pytest.raises(ValueError, match="have friction and no tangential_damping.*give tang"):
+        jaxgran.Walls(0.1, restitution=law, friction=0.1)
+    with pytest.raises(ValueError, match="friction of the walls must lie in"):
+        jaxgran.Walls(0.1, restitution=law, tangential_damping=0.5, friction=-0.1)
+    walls = jaxgran.Walls(0.1, restitution=law, **RUBBING_WALLS)
+    for surface in (None, jaxgran.Rough(0.1)):
+        with pytest.raises(ValueError, match="friction of the walls needs spheres that rub"):
+            soft(container=walls, surface=surface)
+    walls = jaxgran.Walls(soft().box_side(NUM), restitution=law, tangential_restitution=0.5)
+    gas = soft(container=walls, surface=jaxgran.Rough(0.1))
+    with pytest.raises(ValueError, match="SoftSpheres tangential_damping and friction of the wal"):
+        SoftSpheres(NUM).check(gas)
+
+
 def test_a_start_outside_of_the_walls_is_refused():
     gas = soft(1e-3, num=2, law="own")
     side = float(gas.container.side)
@@ -247,21 +292,6 @@ def test_the_model_for_friction_is_soft_spheres():
     assert any("leave friction out" in reason for reason in choice.reasons)
 
 
-@pytest.mark.slow
-def test_boxes_of_three_sides_contain_the_gas():
-    gas = soft()
-    sides = float(gas.box_side(NUM)) * np.array([2.0, 1.0, 0.5])
-    gas = dataclasses.replace(gas, container=jaxgran.Walls(sides, restitution=gas.law))
-    times = np.array([0.0, 1, 3]) * float(gas.mean_free_time)
-    curve = jaxgran.cool(gas, times, model=SoftSpheres(NUM, steps_per_contact=30))
-    np.testing.assert_allclose(energy(gas, curve), 1.0, atol=5e-4)
-    place, edge = np.asarray(curve.particles.position[0]), 0.45 * float(gas.diameter)
-    assert np.all(place > edge) and np.all(place < sides - edge)
-    # In a run of some flights across the longest side the gas fills it.
-    assert np.all(np.ptp(place, axis=0) > 0.8 * (sides - float(gas.diameter)))
-    np.testing.assert_allclose(curve.particles.box_side, sides)
-
-
 def log_temperatures(gas, model, times, names):
     def logs(values):
         changed = gas.replace(**dict(zip(names, jnp.exp(values), strict=True)))
@@ -270,26 +300,76 @@ def log_temperatures(gas, model, times, names):
     return logs, jnp.log(jnp.stack([gas.value(name) for name in names]))
 
 
+RUBBED = [
+    "dissipative_constant",
+    "tangential_damping",
+    "friction",
+    "inertia",
+    "rotational_temperature",
+    "wall_dissipative_constant",
+    "wall_tangential_damping",
+    "wall_friction",
+    "drag_rate",
+    "drag_rotational_rate",
+]
+
+
+def both_temperatures(gas, model, times, names):
+    """ln T and ln T_rot as a function of the logarithms of some floats, and these."""
+
+    def logs(values):
+        changed = gas.replace(**dict(zip(names, jnp.exp(values), strict=True)))
+        curve = jaxgran.cool(changed, times, model=model)
+        return jnp.log(jnp.stack([curve.temperature, curve.rotational_temperature]))
+
+    return logs, jnp.log(jnp.stack([gas.value(name) for name in names]))
+
+
+def test_derivatives_before_a_projection_are_exact():
+    num, h = 30, 1e-6
+    gas = with_all(num)
+    times = np.array([0.1, 0.2]) * float(gas.mean_free_time)  # before chaos
+    model = SoftSpheres(num, projection=100.0, steps_per_contact=100)
+    logs, at = both_temperatures(gas, model, times, RUBBED)
+    found = np.asarray(jax.jacfwd(logs)(at))
+    np.testing.assert_allclose(jax.jacrev(logs)(at), found, rtol=1e-10, atol=1e-15)
+    each = [logs(at + move) - logs(at - move) for move in h * np.eye(len(at))]
+    expected = np.stack(each, axis=-1) / (2 * h)
+    # Differences contain those of the time step, some 1e-4. T_rot is that of all spheres; from T
+    # the tangents leave out spheres in contact, of which there are many so soon.
+    np.testing.assert_allclose(found[1], expected[1], rtol=0.02, atol=2e-4)
+    assert np.all(np.abs(np.delete(expected[1, 1], RUBBED.index("drag_rate"))) > 1e-3)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "elements, names",
-    [
-        pytest.param(
-            {"law": "own"},
-            ["dissipative_constant", "wall_dissipative_constant"],
-            id="w",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param({"drag": jaxgran.StokesDrag(1.0)}, ["drag_rate"], id="drag"),
-    ],
-)
-def test_reverse_derivatives_are_the_forward_ones(elements, names):
-    gas = soft(**elements)
-    times = np.array([0.5, 1.5]) * float(gas.mean_free_time)
-    logs, at = log_temperatures(gas, SoftSpheres(NUM, steps_per_contact=20), times, names)
-    forward = jax.jacfwd(logs)(at)
-    assert np.all(forward < -1e-3)
-    np.testing.assert_allclose(jax.jacrev(logs)(at), forward, rtol=1e-10)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_derivatives_with_friction_are_those_of_differences(dimension):
+    num, replicas, step = 500, 32, 0.4
+    gas = with_all(num) if dimension == 3 else in_a_plane()
+    times = np.array([1.0, 5.0, 20.0]) * float(gas.mean_free_time)
+    model = SoftSpheres(num, replicas=replicas, steps_per_contact=20)
+    names = [name for name in RUBBED if name in gas.domains]
+    logs, at = both_temperatures(gas, model, times, names)
+    found = np.moveaxis(np.asarray(jax.jacfwd(logs)(at)), -1, 0)
+    for i, name in enumerate(names):
+        move = step * np.eye(len(names))[i]
+        differences = np.asarray(logs(at + move) - logs(at - move)) / (2 * step)
+        print(f"\n{name}:\n{found[i]}, differences\n{differences}")
+        # ln T of 16000 particles scatters by .006, ln T_rot by .007: differences by .013 and .016
+        # at least, two standard errors of which are allowed.
+        np.testing.assert_allclose(found[i], differences, atol=0.03, rtol=0.05)
+
+
+def in_a_plane() -> jaxgran.Gas:
+    """Disks that rub."""
+    gas = glass_beads(0.15, dimension=2, packing_fraction=0.1)
+    stiffer = (float(gas.contact_fraction) / 0.05) ** 2.5
+    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
+    gas = gas.replace(
+        dissipative_constant=gas.value("dissipative_constant") * 0.15 / gas.thermal_beta
+    )
+    surface = jaxgran.Frictional(0.5, 0.3, inertia=0.5, rotational_temperature=3e-3)
+    return dataclasses.replace(gas, surface=surface)
 
 
 @pytest.mark.slow
@@ -333,10 +413,6 @@ def test_derivatives_that_are_not_known_are_refused(name):
     logs, at = log_temperatures(gas, SoftSpheres(NUM).sized_for(gas), times, [name])
     with pytest.raises(ValueError, match="side of a container.*not known.*KineticTheory"):
         jax.eval_shape(jax.jacfwd(logs), at)
-    rubbed = soft(**SCENES["friction"])
-    logs, at = log_temperatures(rubbed, SoftSpheres(NUM), times, ["friction"])
-    with pytest.raises(ValueError, match="with friction are not known: use differences"):
-        jax.jacfwd(logs)(at)
 
 
 @pytest.mark.slow
@@ -351,7 +427,12 @@ def test_follows_lammps_with_friction_between_walls_particle_by_particle():
         law,
         **{name: data[name] for name in ("diameter", "mass", "packing_fraction", "temperature")},
         surface=jaxgran.Frictional(*(data[name] for name in jaxgran.Frictional.domains)),
-        container=jaxgran.Walls(data["wall_side"], restitution=wall),
+        container=jaxgran.Walls(
+            data["wall_side"],
+            restitution=wall,
+            tangential_damping=data["wall_tangential_damping"],
+            friction=data["wall_friction"],
+        ),
     )
     first = (jnp.asarray(data[f"first_{name}"]) for name in ("position", "velocity"))
     start = jaxgran.Particles(*first, gas.container.side)

@@ -17,7 +17,7 @@ from jaxgran.particles.hard.scene import HardScene
 from jaxgran.particles.hard.tangents import HardTangents
 from jaxgran.particles.state import State, kinetic_energy, temperature
 from jaxgran.tangents.impact import ImpactTangents
-from jaxgran.tangents.thermal import remembered
+from jaxgran.tangents.rates import remembered
 
 
 def projected_after(

@@ -164,7 +164,8 @@ class SoftDynamics(AbstractDynamics):
         new = stepped.state
         new = later(new, duration, end, num_left <= 1)
         if old.tangents is not None:
-            along = after_block(new, chosen, stepped.work, stepped.sums, duration, self.scene)
+            spin = old.own.spin
+            along = after_block(new, spin, chosen, stepped.work, stepped.sums, duration, self.scene)
             new = new._replace(tangents=along)
         work = stepped.work
 
@@ -226,7 +227,7 @@ class SoftDynamics(AbstractDynamics):
 
         by_replica = partial(chosen.by_replica, replicas=self.replicas)
         own = state.own._replace(elastic=by_replica(found.work.stored))
-        flown, dragged = elements.flown(self.scene, everyone, duration, self.scene.of_elements.drag)
+        flown, dragged = elements.flown(self.scene, everyone, duration, self.scene.of_elements)
         new = state._replace(
             position=put(flown.x, found.x),
             velocity=put(flown.v, found.v),

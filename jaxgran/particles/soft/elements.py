@@ -102,27 +102,28 @@ def members_of(scene: SoftScene, everyone: Moving, slots: Int[Array, "members"])
 
 
 def flown(
-    scene: SoftScene, now: Moving, duration: ArrayLike, rate: ArrayLike | None
+    scene: SoftScene, now: Moving, duration: ArrayLike, material: ElementMaterial
 ) -> tuple[Moving, ArrayLike]:
     """Spheres after a flight, and the energy that each lost to drag.
 
     Args:
-        scene: for the drag of spins.
+        scene: for the inertia of spins.
         now: the spheres.
         duration: of the flight; negative backwards.
-        rate: of drag, one number or one for each sphere; None without drag.
+        material: with the rates of drag, one number or one for each sphere; None without drag.
     """
-    x, v, spin = now
-    if rate is None or scene.drag is None:
+    (x, v, spin), rate = now, material.drag
+    if rate is None:
         return Moving(x + v * duration, v, spin), 0.0
     path, left = shortened(rate, duration), slower(rate, duration)
     path, left = (f[:, None] if jnp.ndim(f) else f for f in (path, left))
     lost = lost_to_drag(jnp.sum(v * v, -1), rate, duration)
     x, v = x + v * path, v * left
     if spin is not None and scene.surface is not None:
-        slowing, q = scene.drag.rotational_rate, scene.surface.inertia
+        slowing, q = material.spin_drag, scene.surface.inertia
         lost = lost + q * lost_to_drag(jnp.sum(spin * spin, -1), slowing, duration)
-        spin = spin * slower(slowing, duration)
+        left = slower(slowing, duration)
+        spin = spin * (left[:, None] if jnp.ndim(left) else left)
     return Moving(x, v, spin), lost
 
 
@@ -166,10 +167,14 @@ def _step(
             by_walls=sums.by_walls + wall.exchanged,
             touched=sums.touched | wall.touching,
         )
+        if scene.walls.friction is not None and scene.surface is not None and spin is not None:
+            by_wall = friction.kicked_by_walls(scene.walls, scene.surface, spin, wall, dt)
+            v, spin = by_wall.v, by_wall.spin
+            sums = sums._replace(to_walls=sums.to_walls + by_wall.dissipated)
     if scene.surface is not None and spin is not None:
         rubbed = friction.kicked(scene.surface, spin, kick._replace(v=v), chosen, dt)
         v, spin, dissipated = rubbed.v, rubbed.spin, dissipated + rubbed.dissipated
-    moved, dragged = flown(scene, Moving(x, v, spin), dt, material.drag)
+    moved, dragged = flown(scene, Moving(x, v, spin), dt, material)
     return moved, sums._replace(
         dissipated=dissipated,
         exchanged=exchanged,
@@ -192,8 +197,8 @@ def follow(
     """The members of a block after its time steps, as `steps.follow` for smooth spheres.
 
     Drift-kick-drift steps of equal length, second order. The drift is exact, with drag too; the
-    kick is by the normal forces of pairs, then by those of walls, then by tangential forces, each
-    an implicit midpoint rule at fixed positions.
+    kick is by the normal forces of pairs, then by those of walls, then by tangential forces of
+    walls and of pairs, each an implicit midpoint rule at fixed positions.
 
     Args:
         now: the members; empty slots are at rest inside the container.
@@ -213,10 +218,10 @@ def follow(
     sums = _Sums.none(chosen, now.x, first)
     if scene.walls is not None:
         sums = sums._replace(touched=jnp.any(walls.overlaps(scene.walls, now.x).xi > 0, axis=-1))
-    now, dragged = flown(scene, now, 0.5 * dt, material.drag)
+    now, dragged = flown(scene, now, 0.5 * dt, material)
     sums = sums._replace(to_drag=sums.to_drag + dragged)
     now, sums = jax.lax.fori_loop(0, num_steps, step, (now, sums))
-    now, dragged = flown(scene, now, -0.5 * dt, material.drag)
+    now, dragged = flown(scene, now, -0.5 * dt, material)
     sums = sums._replace(to_drag=sums.to_drag + dragged)
     return now, *_work(now.x, alpha, material, scene, chosen, sums, first)
 

@@ -11,15 +11,17 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran.particles.soft.candidates import Encounters
 from jaxgran.particles.soft.scene import SoftSurface
 from jaxgran.particles.soft.steps import PairKick
+from jaxgran.particles.soft.walls import SoftWalls, WallKick
 from jaxgran.particles.spins import torque, twisted
 
 
 class Rubbed(NamedTuple):
-    """Velocities and spins after the tangential kick of a time step, and the energy lost in it."""
+    """Velocities and spins after the tangential kick of a time step, and the energy lost in it, of
+    each contact or member."""
 
     v: Float[Array, "members d"]
     spin: Float[Array, "members spins"]
-    dissipated: Float[Array, "contacts"]
+    dissipated: Float[Array, "..."]
 
 
 def tangential_kick(
@@ -87,3 +89,37 @@ def kicked(
         spin=spin.at[a].add(twist).at[b].add(twist),
         dissipated=lost,
     )
+
+
+def kicked_by_walls(
+    walls: SoftWalls,
+    surface: SoftSurface,
+    spin: Float[Array, "members spins"],
+    normal: WallKick,
+    dt: ArrayLike,
+) -> Rubbed:
+    """The tangential kicks of a time step by walls, one axis after the other.
+
+    Args:
+        walls: which rub.
+        surface: of the spheres.
+        spin: of the members.
+        normal: the normal kicks.
+        dt: time step.
+    """
+    assert walls.damping is not None and walls.friction is not None
+    v, lost = normal.v, jnp.zeros(len(spin), spin.dtype)
+    for axis, along in enumerate(jnp.eye(v.shape[1], dtype=v.dtype)):
+        towards = normal.overlaps.outwards[:, axis, None] * along[None]
+        lever = 1 - 2 * normal.overlaps.xi[:, axis]  # distance from the wall
+        sideways = v * (1 - along)[None]
+        kick, taken = tangential_kick(
+            sideways + lever[:, None] * twisted(spin, towards),
+            walls.damping * normal.viscous[:, axis],
+            walls.friction * normal.force[:, axis],
+            1 + lever**2 / surface.inertia,
+            dt,
+        )
+        v, lost = v + kick, lost + taken
+        spin = spin + (lever / surface.inertia)[:, None] * torque(towards, kick)
+    return Rubbed(v, spin, lost)

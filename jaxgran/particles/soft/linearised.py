@@ -1,5 +1,6 @@
 """Time steps of soft spheres together with the tangents of all particles."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from jaxgran.particles.soft.candidates import Encounters
 from jaxgran.particles.soft.elements import ElementWork, Moving
 from jaxgran.particles.soft.scene import SoftScene
 from jaxgran.particles.soft.steps import ContactWork
+from jaxgran.tangents.rotation import RubbingMaterial
 from jaxgran.tangents.thermal import ElementMaterial, ThermalTangents
 
 
@@ -60,16 +62,33 @@ def follow(
     take = partial(
         _taken,
         scene=scene,
-        spin=now.spin,
         settings={"chosen": chosen, "duration": duration, "num_steps": num_steps},
     )
-    x, v, own = now.x, now.v, (scene.alpha, scene.dissipative_constant)
     if along is None or len(along.alpha) == 0:
-        (x, v), (spin, work, more) = take(x, v, *own, scene.of_elements)
+        own = scene.alpha, scene.dissipative_constant
+        (x, v, spin), (work, more) = take(now, *own, scene.of_elements, scene.rubbing)
         return Followed(x, v, spin, work, more, along)
-    one = jnp.ones(len(chosen.a), x.dtype)
-    of_members = partial(_of_members, size=len(x))
-    at = x, v, scene.alpha * one, scene.dissipative_constant * one, of_members(scene.of_elements)
+    tangents, x, v, spin, work, more = _pushed(take, now, everyone, scene, chosen, duration, along)
+    rotation = along.rotation
+    if rotation is not None:
+        rotation = rotation._replace(spin=tangents.spin)
+    along = along._replace(position=tangents.x, velocity=tangents.v, rotation=rotation)
+    return Followed(x, v, spin, work, more, along)
+
+
+def _pushed(
+    take: Callable[..., tuple[Moving, tuple[ContactWork, ElementWork | None]]],
+    now: Moving,
+    everyone: Moving,
+    scene: SoftScene,
+    chosen: Encounters,
+    duration: Array,
+    along: ThermalTangents,
+) -> tuple[Any, ...]:
+    """The tangents of all particles after a block; and the members, and energies, as `follow`."""
+    one, of_members = jnp.ones(len(chosen.a), now.x.dtype), partial(_of_members, size=len(now.x))
+    own = scene.alpha, scene.dissipative_constant
+    at = now, *(number * one for number in own), of_members(scene.of_elements), scene.rubbing
     rows = jax.vmap(lambda rest: rest.at[chosen.members].get(mode="fill", fill_value=0.0))
     material = (tangent[:, chosen.replica] for tangent in along.material(*own))
     further, each = ElementMaterial(), ElementMaterial()
@@ -77,41 +96,47 @@ def follow(
         each = along.of_elements(scene.of_elements)
         size = len(along.free) // along.log_temperature.shape[1]
         replica = jnp.minimum(chosen.members // size, along.log_temperature.shape[1] - 1)
-        further = jax.vmap(of_members)(jax.tree.map(lambda x: x[:, replica], each))
+        further = jax.vmap(of_members, axis_size=len(along.alpha))(
+            jax.tree.map(lambda x: x[:, replica], each)
+        )
 
     def push(*tangent):
         return jax.jvp(take, at, tangent, has_aux=True)
 
-    (x, v), (dx, dv), (spin, work, more) = jax.vmap(push, out_axes=(None, 0, None))(
-        rows(along.position), rows(along.velocity), *material, further
+    rotation = along.rotation
+    tangents = Moving(along.position, along.velocity, None if rotation is None else rotation.spin)
+    rubbing = None if rotation is None else rotation.directions
+    (x, v, spin), moved, (work, more) = jax.vmap(push, out_axes=(None, 0, None))(
+        jax.tree.map(rows, tangents), *material, further, rubbing
     )
     put = jax.vmap(lambda rest, new: rest.at[chosen.members].set(new, mode="drop"))
     if each.drag is None:
-        flown, kept = along.position + duration * along.velocity, along.velocity
+        flown = tangents._replace(x=along.position + duration * along.velocity)
     else:
-        flown, kept = _flown(along, everyone, scene, duration, each.drag)
-    along = along._replace(position=put(flown, dx), velocity=put(kept, dv))
-    return Followed(x, v, spin, work, more, along)
+        flown = _flown(tangents, everyone, scene, duration, each)
+    return jax.tree.map(put, flown, moved), x, v, spin, work, more
 
 
 def _flown(
-    along: ThermalTangents,
-    everyone: Moving,
-    scene: SoftScene,
-    duration: Array,
-    drag: Float[Array, "p replicas"],
-) -> tuple[Array, Array]:
-    """The tangents of all particles after a flight with drag, whose tangents are given."""
+    tangents: Moving, everyone: Moving, scene: SoftScene, duration: Array, each: ElementMaterial
+) -> Moving:
+    """The tangents of all particles after a flight with drag, whose tangents are given by replica.
 
-    def fly(x, v, rate):
-        return elements.flown(scene, Moving(x, v, None), duration, rate)[0][:2]
+    Those of the inertia do not matter: it is not in the equation of a free spin.
+    """
+    here = scene.of_elements
 
-    def push(dx, dv, change):
-        each = jnp.repeat(change, len(everyone.x) // len(change))
-        rate = jnp.broadcast_to(scene.of_elements.drag, each.shape)
-        return jax.jvp(fly, (everyone.x, everyone.v, rate), (dx, dv, each))[1]
+    def fly(now: Moving, drag: Array, spin_drag: Array | None) -> Moving:
+        rates = ElementMaterial(drag=drag, spin_drag=spin_drag)
+        return elements.flown(scene, now, duration, rates)[0]
 
-    return jax.vmap(push)(along.position, along.velocity, drag)
+    def push(tangent: Moving, drag: Array, spin_drag: Array | None) -> Moving:
+        own = (here.drag, here.spin_drag), (drag, spin_drag)
+        change = jax.tree.map(lambda x: jnp.repeat(x, len(everyone.x) // len(x)), own[1])
+        rates = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(everyone.x),)), own[0])
+        return jax.jvp(fly, (everyone, *rates), (tangent, *change))[1]
+
+    return jax.vmap(push)(tangents, each.drag, each.spin_drag)
 
 
 def _of_members(material: ElementMaterial, size: int) -> ElementMaterial:
@@ -119,26 +144,23 @@ def _of_members(material: ElementMaterial, size: int) -> ElementMaterial:
 
     each = jax.tree.map(lambda value: jnp.broadcast_to(value, (size,)), material)
     columns = jax.tree.map(lambda value: value[:, None], each)
-    return columns._replace(drag=each.drag)
+    return columns._replace(drag=each.drag, spin_drag=each.spin_drag)
 
 
 def _taken(
-    x: Array,
-    v: Array,
+    now: Moving,
     alpha: Any,
     dissipative_constant: Any,
     material: ElementMaterial,
+    rubbing: RubbingMaterial | None,
     scene: SoftScene,
-    spin: Array | None,
     settings: dict[str, Any],
-) -> tuple[tuple[Array, Array], tuple[Array | None, ContactWork, ElementWork | None]]:
-    """Positions and velocities after the steps of a block; spins, and energies."""
+) -> tuple[Moving, tuple[ContactWork, ElementWork | None]]:
+    """The members after the steps of a block; and energies."""
+    own = alpha, dissipative_constant
     if scene.plain:
-        x, v, work = steps.follow(
-            x, v, alpha, dissipative_constant, clipped=scene.clipped, **settings
-        )
-        return (x, v), (None, work, None)
-    now, work, more = elements.follow(
-        Moving(x, v, spin), alpha, dissipative_constant, material, scene, **settings
-    )
-    return (now.x, now.v), (now.spin, work, more)
+        x, v, work = steps.follow(now.x, now.v, *own, clipped=scene.clipped, **settings)
+        return Moving(x, v, None), (work, None)
+    scene = scene.with_rubbing(rubbing)
+    now, work, more = elements.follow(now, *own, material, scene, **settings)
+    return now, (work, more)

@@ -40,7 +40,27 @@ def observe(state: State, scene: SoftScene, replicas: int) -> dict[str, Array]:
     stiffer = (along.alpha / scene.alpha)[:, None]
     kept["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
     rates["elastic_energy"] = -1.4 * cooling * U
-    return rule.with_tangents(_known(values, scene), kept, rates, clock)
+    values, unknown = _known(values, scene), {}
+    if along.rotation is not None:
+        known = "rotational_temperature"
+        kept[known], rates[known] = _of_rotation(state, scene, values)
+        # The paths are known of smooth spheres.
+        names = {"displacement", "velocity_correlation"} & set(values)
+        unknown = {name: values.pop(name) for name in names}
+    return rule.with_tangents(values, kept, rates, clock) | unknown
+
+
+def _of_rotation(state: State, scene: SoftScene, values: dict[str, Array]) -> tuple[Array, Array]:
+    """Derivatives of T_rot along the directions at a fixed place, and in time."""
+    along, spin, T = state.tangents, state.own.spin, values["temperature"]
+    assert scene.surface is not None and spin is not None
+    rotation, T_rot = along.rotation, values["rotational_temperature"]
+    logs = rotation.log_temperature(spin, scene.surface.inertia, along.log_temperature)
+    d, d_rot = state.velocity.shape[1], spin.shape[1]
+    rate = d / d_rot * rotation.turned.now * scene.collision_frequency * T**1.5
+    if (slowing := scene.of_elements.spin_drag) is not None:
+        rate -= 2 * slowing * T_rot
+    return logs * T_rot[None], rate
 
 
 def _known(values: dict[str, Array], scene: SoftScene) -> dict[str, Array]:

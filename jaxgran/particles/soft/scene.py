@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgran.particles.soft.walls import SoftWalls
+from jaxgran.tangents.rotation import RubbingMaterial
 from jaxgran.tangents.thermal import ElementMaterial
 
 
@@ -16,11 +17,11 @@ class SoftDrag(NamedTuple):
 
     Attributes:
         per_collision: gamma over the collision frequency at T = 1.
-        rotational_rate: of spins.
+        rotational_per_collision: the same of spins.
     """
 
     per_collision: Float[Array, ""]
-    rotational_rate: Float[Array, ""]
+    rotational_per_collision: Float[Array, ""]
 
 
 class SoftSurface(NamedTuple):
@@ -75,12 +76,13 @@ class SoftScene(eqx.Module):
     @property
     def material(self) -> tuple[Any, ...]:
         """The numbers that derivatives are followed in: (alpha, A) and, where there are some, those
-        of walls and drag, of which gamma is over the collision frequency; or their tangents."""
+        of walls and drag, of which rates are over the collision frequency, and of friction; or
+        their tangents."""
         own = self.alpha, self.dissipative_constant
-        if self.inertial:
+        if self.plain:
             return own
-        drag = None if self.drag is None else self.drag.per_collision
-        return *own, self._of_elements(drag)
+        found = *own, self._of_elements(self.drag)
+        return found if self.surface is None else (*found, self.rubbing)
 
     def with_material(self, material: tuple[Array, Array]) -> "SoftScene":
         """The same scene of smooth spheres in free flight with another (alpha, A)."""
@@ -96,14 +98,40 @@ class SoftScene(eqx.Module):
     def of_elements(self) -> ElementMaterial:
         """The numbers of walls and drag."""
         drag = self.drag
-        return self._of_elements(
-            None if drag is None else drag.per_collision * self.collision_frequency
-        )
+        if drag is not None:
+            drag = SoftDrag(*(rate * self.collision_frequency for rate in drag))
+        return self._of_elements(drag)
 
-    def _of_elements(self, drag: Any) -> ElementMaterial:
+    def _of_elements(self, drag: SoftDrag | None) -> ElementMaterial:
+        rates = {}
+        if drag is not None:
+            rates["drag"] = drag.per_collision
+            if self.surface is not None:
+                rates["spin_drag"] = drag.rotational_per_collision
         if self.walls is None:
-            return ElementMaterial(drag=drag)
-        return ElementMaterial(self.walls.alpha, self.walls.dissipative_constant, drag)
+            return ElementMaterial(**rates)
+        return ElementMaterial(self.walls.alpha, self.walls.dissipative_constant, **rates)
+
+    @property
+    def rubbing(self) -> RubbingMaterial | None:
+        """The numbers of friction; None of smooth spheres."""
+        if self.surface is None:
+            return None
+        found = RubbingMaterial(*self.surface)
+        if self.walls is None:
+            return found
+        walls = self.walls
+        return found._replace(wall_damping=walls.damping, wall_friction=walls.friction)
+
+    def with_rubbing(self, material: RubbingMaterial | None) -> "SoftScene":
+        """The same scene with other numbers of friction."""
+        if material is None:
+            return self
+        *surface, damping, friction = material
+        walls = self.walls
+        if walls is not None:
+            walls = dataclasses.replace(walls, damping=damping, friction=friction)
+        return dataclasses.replace(self, surface=SoftSurface(*surface), walls=walls)
 
     @property
     def shortest_contact(self) -> Float[Array, ""]:
@@ -125,7 +153,10 @@ class SoftScene(eqx.Module):
         """The same gas without losses: smooth spheres in a vacuum, between elastic walls."""
         walls, drag = self.walls, self.drag
         if walls is not None:
-            walls = dataclasses.replace(walls, dissipative_constant=0.0 * walls.alpha)
+            none = 0.0 * walls.alpha
+            walls = dataclasses.replace(
+                walls, dissipative_constant=none, damping=None, friction=None
+            )
         if drag is not None:
             drag = SoftDrag(*(0.0 * rate for rate in drag))
         zero = 0.0 * self.alpha

@@ -26,12 +26,15 @@ class SoftWalls(eqx.Module):
         alpha: elastic constant over effective mass, which is that of the sphere.
         dissipative_constant: A of contacts with walls.
         clipped: as for spheres.
+        damping, friction: x_t and mu; None where the walls are smooth.
     """
 
     sides: Float[Array, "d"]
     alpha: Float[Array, ""]
     dissipative_constant: Float[Array, ""]
     clipped: bool = eqx.field(static=True, default=True)
+    damping: Float[Array, ""] | None = None
+    friction: Float[Array, ""] | None = None
 
 
 class Overlaps(NamedTuple):
@@ -75,13 +78,16 @@ class WallKick(NamedTuple):
 
     Attributes:
         v: velocities after it.
-        force: normal force across each axis.
+        overlaps: before it.
+        force, viscous: normal force across each axis, and the change of it by a unit of speed.
         dissipated, exchanged: as in `steps.ContactWork`, of each sphere.
         touching: whether a sphere touches a wall.
     """
 
     v: Float[Array, "n d"]
+    overlaps: Overlaps
     force: Float[Array, "n d"]
+    viscous: Float[Array, "n d"]
     dissipated: Float[Array, "n"]
     exchanged: Float[Array, "n"]
     touching: Bool[Array, "n"]
@@ -115,7 +121,9 @@ def kicked(
     lost = (force - elastic) * mean + 0.5 * viscous * half**2
     return WallKick(
         v=v - dt * force * outwards,
+        overlaps=Overlaps(xi, outwards),
         force=force,
+        viscous=viscous,
         dissipated=dt * jnp.sum(lost, axis=-1),
         exchanged=dt * jnp.sum(elastic * jnp.abs(mean), axis=-1),
         touching=jnp.any(xi > 0, axis=-1),
