@@ -2,8 +2,9 @@
 
 - `collision_rule`: which candidate pairs collide, and what a collision does.
 - `pairing`: which pairs are drawn in a step.
-- `elements`: walls, a drive and drag.
+- `elements`: walls, a drive and drag; `portions`: of the particles, which they act on in a step.
 - `tangents`: in the parameters of the law; `exchange`: of a scene with elements.
+- `state`: of a run.
 - `collisions`: one step of many collisions.
 - `start`: the state at t = 0.
 - `simulation`: a whole run as a pure function, and the parts of it that the host driver needs.

@@ -14,9 +14,17 @@ from jaxgran.particles.kicks import wrapped
 from jaxgran.particles.stochastic import portions
 from jaxgran.particles.stochastic.collision_rule import Outcome, collide
 from jaxgran.particles.stochastic.elements import Walled, heating, hit_walls, left_by, shortened
-from jaxgran.particles.stochastic.exchange import Candidates, Step, energies_of, exchanged, of_walls
+from jaxgran.particles.stochastic.exchange import (
+    Candidates,
+    Gained,
+    Step,
+    energies_of,
+    exchanged,
+    of_walls,
+)
 from jaxgran.particles.stochastic.pairing import CEILING, Scheme, draw
-from jaxgran.particles.stochastic.tangents import DSMCTangents, carried
+from jaxgran.particles.stochastic.state import DSMCState
+from jaxgran.particles.stochastic.tangents import carried
 from jaxgran.scene.reduced_scene import ReducedScene
 from jaxgran.tangents.exchange import ExchangeTangents
 
@@ -28,41 +36,24 @@ and in float32 they would dominate T once it has fallen to 1e-7 of its first val
 """
 
 
-class DSMCState(NamedTuple):
-    """R replicas of N particles. Units: the impact speed sqrt(2 T_0) and the path length.
+class Portions(NamedTuple):
+    """How many portions of the particles take part in a step; None without what they take part in.
 
     Attributes:
-        time: which all replicas have reached.
-        clock: start of the step of each replica that ends beyond `time`.
-        clock_rest: what rounding has left out of `clock`, a compensated sum.
-        temperature: T/T_0, updated by the losses and recomputed every `RECOUNTED` steps.
-        particles: the 2 d components of v and of x - v t, which only collisions change, and the
-            spins of rough spheres. With drag they are transformed: see `jaxgran.particles.drag`.
-        collisions: number of pairs that collided.
-        missed: number of collisions missed because of the `CEILING`.
-        steps: number of steps.
-        mobility: M = D / sqrt(T/T_0), followed together with the tangents.
-        tangents: in the parameters of the law, or of a scene with elements.
+        kicks: of a drive, in half of the step.
+        walls: impacts on walls.
     """
 
-    time: Float[Array, ""]
-    clock: Float[Array, "*replicas"]
-    clock_rest: Float[Array, "*replicas"]
-    temperature: Float[Array, "*replicas"]
-    particles: Float[Array, "*replicas N components"]
-    collisions: Float[Array, "*replicas"]
-    missed: Float[Array, "*replicas"]
-    steps: UInt32[Array, "*replicas"]
-    mobility: Float[Array, "*replicas"]
-    tangents: DSMCTangents | ExchangeTangents
+    kicks: Int[Array, "*replicas"] | None
+    walls: Int[Array, "*replicas"] | None
 
 
 def _step(
     state: DSMCState,
     key: PRNGKeyArray,
-    turns: Int[Array, ""] | None,
+    some: Portions,
     share: Float[Array, ""],
-    most: Int[Array, ""] | None,
+    most: Portions,
     scene: ReducedScene,
     scheme: Scheme,
     tangents: bool,
@@ -74,18 +65,18 @@ def _step(
     """
     key = jax.random.fold_in(key, state.steps)
     dt = share * scheme.own_step / jnp.sqrt(state.temperature)
-    kicked = partial(_kicked, key=key, dt=dt, turns=turns, most=most, scene=scene, scheme=scheme)
+    kicked = partial(_kicked, key=key, dt=dt, scene=scene, scheme=scheme)
+    kicked = partial(kicked, turns=(some.kicks, most.kicks))
     before, state = state, kicked(state, clock=state.clock, place=0)
     exchanging = tangents and isinstance(state.tangents, ExchangeTangents)
     particles, sums, pairs = _collided(
         state, key, dt, share, scene, scheme, tangents and not exchanging
     )
     lost, met = sums.loss, None
-    if scene.walls is not None:
-        particles, hit, walls = _bounced(state, key, dt, scene, scheme.dimension, particles)
-        lost = lost + hit.lost
-        if exchanging:
-            met = of_walls(walls, scene, state.clock + dt / 2)
+    if some.walls is not None and most.walls is not None:
+        bounced = partial(_bounced, drawn=(some.walls, most.walls), scene=scene, d=scheme.dimension)
+        particles, to_walls, met = bounced(state, key, dt, particles, tangents=exchanging)
+        lost = lost + to_walls
     energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
     temperature = state.temperature - lost / energy
     passed = state.clock_rest + dt
@@ -117,15 +108,16 @@ def _kicked(
     state: DSMCState,
     key: PRNGKeyArray,
     dt: Float[Array, ""],
-    turns: Int[Array, ""] | None,
-    most: Int[Array, ""] | None,
+    turns: tuple[Int[Array, ""] | None, Int[Array, ""] | None],
     scene: ReducedScene,
     scheme: Scheme,
     clock: Float[Array, ""],
     place: int,
 ) -> DSMCState:
-    """The state after half of the kicks of a step, at its begin (place 0) or end (1)."""
-    if scene.drive is None or turns is None or most is None:
+    """The state after half of the kicks of a step, at its begin (place 0) or end (1); `turns` are
+    portions of this replica and the most of any."""
+    own, most = turns
+    if scene.drive is None or own is None or most is None:
         return state
     d = scheme.dimension
     growth = heating(scene.drive, scene.drag, clock, dt, float(place))
@@ -133,7 +125,7 @@ def _kicked(
     halves = 2 * state.steps + place
     at_rest = scene.walls is None
     particles, grown = portions.kicked(
-        state.particles, key, turns, most, halves, growth, state.clock, d, at_rest
+        state.particles, key, own, most, halves, growth, state.clock, d, at_rest
     )
     return state._replace(particles=particles, temperature=state.temperature + grown)
 
@@ -193,23 +185,32 @@ def _bounced(
     state: DSMCState,
     key: PRNGKeyArray,
     dt: Float[Array, ""],
+    particles: Float[Array, "N components"],
+    drawn: tuple[Int[Array, ""], Int[Array, ""]],
     scene: ReducedScene,
     d: int,
-    particles: Float[Array, "N components"],
-) -> tuple[Float[Array, "N components"], Walled, Callable[..., Walled]]:
-    """The particles after their impacts on walls in a step, those impacts, and the impacts as a
-    function of the scene, of factors of velocities and spins, and of what drag has left."""
-    velocity, spin = particles[:, :d], particles[:, 2 * d :]
+    tangents: bool,
+) -> tuple[Float[Array, "N components"], Float[Array, ""], Gained | None]:
+    """The particles after their impacts on walls in a step, the decrease of sum v^2, and with
+    tangents what both energies gain."""
     left = left_by(scene.drag, state.clock + dt / 2)
-    bits = jax.random.bits(jax.random.fold_in(key, 1), velocity.shape[:1], jnp.uint16)
-    axis = (state.steps % d).astype(jnp.int32)
+    axis, one = (state.steps % d).astype(jnp.int32), jnp.ones(())
 
-    def hit(scene: ReducedScene, faster: Array, turning: Array, slowed: Array) -> Walled:
-        return hit_walls(scene, bits, axis, velocity * faster, spin * turning, dt, slowed)
+    def meet(rows: Array, chance: Array) -> tuple[Array, tuple[Array, Gained | None]]:
+        velocity, spin = rows[:, :d], rows[:, 2 * d :]
 
-    found = hit(scene, jnp.ones(()), left.spin, left.velocity)
-    kept = [found.velocity, particles[:, d : 2 * d], found.spin / left.spin]
-    return jnp.concatenate(kept, axis=-1), found, hit
+        def hit(scene: ReducedScene, faster: Array, turning: Array, slowed: Array) -> Walled:
+            return hit_walls(scene, chance, axis, velocity * faster, spin * turning, dt, slowed)
+
+        found = hit(scene, one, left.spin, left.velocity)
+        gained = of_walls(hit, scene, state.clock + dt / 2) if tangents else None
+        after = [found.velocity, rows[:, d : 2 * d], found.spin / left.spin]
+        return jnp.concatenate(after, axis=-1), (found.lost, gained)
+
+    shapes = jax.eval_shape(meet, particles[:1], particles[:1, 0])[1]
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    bounced = portions.bounced(particles, jax.random.fold_in(key, 1), *drawn, meet, none)
+    return bounced[0], *bounced[1]
 
 
 def step(
@@ -223,11 +224,12 @@ def step(
     """A share, 0 to 1, of the next step of each replica."""
     replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(wrapped(key), replicas)
-    turns = portions.turns(state.temperature, state.clock, share, scene, scheme)
-    most = None if turns is None else jnp.max(turns)
+    now = state.temperature, state.clock, share, scene, scheme
+    some = Portions(portions.turns(*now), portions.drawn(*now))
+    most = jax.tree.map(jnp.max, some)
     one = partial(_step, most=most, scene=scene, scheme=scheme, tangents=tangents)
     axes = jax.tree.map(lambda _: 0, state)._replace(time=None)
-    state = jax.vmap(one, (axes, 0, 0, 0), axes)(state, keys, turns, share)
+    state = jax.vmap(one, (axes, 0, 0, 0), axes)(state, keys, some, share)
     due = state.steps % RECOUNTED == 0
 
     def recounted(temperature):

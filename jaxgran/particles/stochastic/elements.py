@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxgran.particles import kicks
 from jaxgran.particles.drag import Decay, decay, lasting
@@ -24,10 +24,10 @@ be; one of 1e6 particles is faster."""
 
 
 class Walled(NamedTuple):
-    """Particles after impacts on walls.
+    """Some particles after impacts on walls.
 
     Attributes:
-        velocity, spin: of all.
+        velocity, spin: of each.
         lost: decrease of sum v^2.
         turned: increase of q sum s^2.
     """
@@ -40,7 +40,7 @@ class Walled(NamedTuple):
 
 def hit_walls(
     scene: ReducedScene,
-    bits: UInt[Array, "N"],
+    chance: Float[Array, "N"],
     axis: Int[Array, ""],
     velocity: Float[Array, "N d"],
     spin: Float[Array, "N spins"],
@@ -55,7 +55,7 @@ def hit_walls(
 
     Args:
         scene: in reduced units.
-        bits: 16 random ones each.
+        chance: a random number for each; it meets a wall if this is less than that many times.
         axis: across which the walls are.
         velocity, spin: before.
         ds: length of the step.
@@ -71,7 +71,6 @@ def hit_walls(
     speed, outwards = jnp.abs(normal), jnp.sign(normal)[:, None] * across
     eps = walls.law.restitution(jnp.where(speed > 0, speed * slowed, 1.0))
     often = share_of_impacts(eps, frequency / collision_rate(0.0, d), d)
-    chance = (bits.astype(velocity.dtype) + 0.5) * 2.0**-16
     hit = (chance < often * each * speed) & (speed > 0)
     kick = -jnp.where(hit, (1 + eps) * speed, 0.0)[:, None] * outwards
     twist = jnp.zeros_like(spin)

@@ -1,24 +1,29 @@
-"""A drive in a step of DSMC, which acts on portions of the particles in turns.
+"""A drive and walls in a step of DSMC, which act on portions of the particles.
 
 The kicks of a drive in one step are far smaller than the velocities. So each half of a step kicks
 a portion of all particles, with the variance of all steps until it has its turn again: the energy
 that a step brings is the same, and costs as much less. How much may be brought in one turn limits
 the number of portions, see `turns`, down to all particles in each half of a step.
 
-Impacts on walls cannot be left to turns: a sphere that has lost speed at a wall comes to the next
-one later, by which the loss of turns a mean free time apart is .9 % of T too large.
+Walls are met by portions that are drawn anew in each step, and so are met by a sphere that moves as
+it does now: by turns, a mean free time apart, spheres that have lost speed would not come later,
+and the loss be .9 % of T too large. As many portions are drawn as the fastest spheres need, see
+`drawn`, and a sphere of them meets a wall the more often.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran.particles import kicks
-from jaxgran.particles.stochastic.elements import heating
+from jaxgran.particles.stochastic.elements import fastest_share, heating, left_by
 from jaxgran.particles.stochastic.pairing import Scheme
 from jaxgran.scene.reduced_scene import ReducedScene
+
+T = TypeVar("T")
 
 MOST = 16
 """Portions of many particles."""
@@ -82,6 +87,58 @@ def turns(
     growth = heating(scene.drive, scene.drag, clock, ds, 0.0)
     needed = parts * growth / (kicks.LARGEST * jnp.where(temperature > 0, temperature, 1.0))
     return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
+
+
+def drawn(
+    temperature: Float[Array, "*replicas"],
+    clock: Float[Array, "*replicas"],
+    share: Float[Array, "*replicas"],
+    scene: ReducedScene,
+    scheme: Scheme,
+) -> Int[Array, "*replicas"] | None:
+    """Portions that may meet walls in a share of a step, so many that one of the fastest spheres
+    does so at most once; None without walls."""
+    if scene.walls is None:
+        return None
+    parts = number(scheme.num_particles)
+    ds = share * scheme.own_step / jnp.sqrt(temperature)
+    slowed = left_by(scene.drag, clock).velocity
+    most = fastest_share(scene, temperature, slowed, ds, scheme.dimension)
+    return jnp.clip(jnp.ceil(parts * most), 1, parts).astype(jnp.int32)
+
+
+def bounced(
+    particles: Float[Array, "N components"],
+    key: PRNGKeyArray,
+    drawn: Int[Array, ""],
+    most: Int[Array, ""],
+    meet: Callable[[Array, Array], tuple[Array, T]],
+    none: T,
+) -> tuple[Float[Array, "N components"], T]:
+    """The particles of one replica after their impacts on walls in a step, and sums over these.
+
+    Args:
+        particles: of the replica.
+        key: of the step.
+        drawn: portions that may meet walls.
+        most: the largest number of these of all replicas, which share the loop.
+        meet: function of particles and of a random number for each; returns them after impacts of
+            those whose number is smaller than the impacts that they have in the step, and what is
+            summed.
+        none: sums of no impacts.
+    """
+    n, parts = len(particles), number(len(particles))
+    which = (jax.random.bits(jax.random.fold_in(key, MOST), (), jnp.uint16) % parts).astype(jnp.int32)
+
+    def some(i: Int[Array, ""], done: tuple[Array, T]) -> tuple[Array, T]:
+        particles, sums = done
+        own = portion((which + i) % parts, n, i < drawn)
+        bits = jax.random.bits(jax.random.fold_in(key, i), own.counted.shape, jnp.uint16)
+        chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
+        rows, more = meet(own.of(particles), jnp.where(own.counted, chance, jnp.inf))
+        return own.written(particles, rows), jax.tree.map(jnp.add, sums, more)
+
+    return jax.lax.fori_loop(0, most, some, (particles, none))
 
 
 def kicked(

@@ -20,9 +20,9 @@ from jaxgran.particles import drag, observables, snapshot
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import owned
 from jaxgran.particles.stochastic import collisions
-from jaxgran.particles.stochastic.collisions import DSMCState
 from jaxgran.particles.stochastic.pairing import Scheme
 from jaxgran.particles.stochastic.start import at_start, has_elements
+from jaxgran.particles.stochastic.state import DSMCState
 from jaxgran.particles.stochastic.tangents import DSMCTangents
 from jaxgran.scene.elements import SPINS
 from jaxgran.scene.reduced_scene import ReducedDrag, ReducedScene

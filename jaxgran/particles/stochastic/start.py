@@ -9,9 +9,9 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 
 from jaxgran.particles import initial, spins
 from jaxgran.particles.stochastic import collisions, elements
-from jaxgran.particles.stochastic.collisions import DSMCState
 from jaxgran.particles.stochastic.exchange import energies_at_start
 from jaxgran.particles.stochastic.pairing import Scheme
+from jaxgran.particles.stochastic.state import DSMCState
 from jaxgran.particles.stochastic.tangents import DSMCTangents
 from jaxgran.scene.elements import SPINS
 from jaxgran.scene.reduced_scene import ReducedScene
