@@ -128,7 +128,8 @@ def bounced(
         none: sums of no impacts.
     """
     n, parts = len(particles), number(len(particles))
-    which = (jax.random.bits(jax.random.fold_in(key, MOST), (), jnp.uint16) % parts).astype(jnp.int32)
+    bits = jax.random.bits(jax.random.fold_in(key, MOST), (), jnp.uint16)
+    which = (bits % parts).astype(jnp.int32)
 
     def some(i: Int[Array, ""], done: tuple[Array, T]) -> tuple[Array, T]:
         particles, sums = done
