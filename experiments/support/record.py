@@ -25,7 +25,7 @@ EXPERIMENTS = Path(__file__).parents[1]
 DATA = EXPERIMENTS / "data"
 PICTURES = EXPERIMENTS / "pictures"
 FIGURES = EXPERIMENTS / "figures"
-PACKAGES = ("jaxgran", "jax", "jax-md", "diffrax", "optimistix", "vesin", "numpy", "scipy")
+PACKAGES = ("jaxgran", "jax", "jax-md", "diffrax", "optimistix", "numpy", "scipy")
 COUNTS = {1: "one", 2: "two", 4: "four", 8: "eight", 16: "sixteen"}
 BEGAN = time.perf_counter()
 

@@ -83,7 +83,7 @@ class HardSpheres(AbstractSpheres):
         start: positions and velocities to begin with instead of random ones; their box must be
             that of the gas, and no spheres may overlap. In a container positions are coordinates
             from a corner, and centres a radius or more from each wall.
-        neighbours: who finds the pairs: "sweep" (compiled with the rest), "vesin" (on the host),
+        neighbours: who finds the pairs: "sweep" (compiled with the rest), "scipy" (on the host),
             "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
             differences of whole runs (`jaxgran.tangents.differences`), 0.3 for most uses: two more

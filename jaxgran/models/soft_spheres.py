@@ -78,7 +78,7 @@ class SoftSpheres(AbstractSpheres):
             what they share.
         start: positions and velocities to begin with instead of random ones; their box must be
             that of the gas.
-        neighbours: who finds the pairs: "sweep" (compiled with the rest), "vesin" (on the host),
+        neighbours: who finds the pairs: "sweep" (compiled with the rest), "scipy" (on the host),
             "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
         projection: mean free times between thermal projections of a derivative, > 0; from 0.02 to
             0.5 they agree (see `jaxgran.tangents.thermal`). None for the plain derivative, which is

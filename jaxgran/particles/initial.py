@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from jaxgran.checks.tracing import concrete
-from jaxgran.particles.neighbours import vesin_search
+from jaxgran.particles.neighbours import tree_search
 
 PACKING_LIMIT = {2: 0.65, 3: 0.48}
 """Largest packing fraction of a random start, which is a fluid; hard disks and spheres freeze at
@@ -165,7 +165,7 @@ def _listed(
     """The pairs closer than a cutoff."""
     capacity = 16 * len(inside)
     while True:
-        i, j, count = vesin_search(inside, side, cutoff, 1, capacity)
+        i, j, count = tree_search(inside, side, cutoff, 1, capacity)
         if count <= capacity:
             return i[:count], j[:count]
         capacity = int(1.5 * count)

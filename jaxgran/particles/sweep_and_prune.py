@@ -64,7 +64,7 @@ def sweep(
         raise ValueError(
             f"a sweep over {replicas * n} particles cannot look {ahead} particles ahead: its "
             f"indices have 32 bits, which allow {(2**31 - 1) // (replicas * n) * _WORD} ahead; use "
-            "neighbours='vesin' or 'jax-md'"
+            "neighbours='scipy' or 'jax-md'"
         )
     unit = position.reshape(replicas, n, position.shape[-1]) / side
     unit = jnp.where(unit >= 1, 0.0, unit)  # by rounding

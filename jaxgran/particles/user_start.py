@@ -111,7 +111,7 @@ def closest(
     side: ArrayLike,
     replicas: int,
     capacity: tuple[int, int],
-    by: str = "vesin",
+    by: str = "scipy",
 ) -> Float[Array, ""]:
     """The least distance between two spheres, in diameters; 1 if none is below.
 

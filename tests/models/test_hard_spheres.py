@@ -283,7 +283,7 @@ def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
 
 
-@pytest.mark.parametrize("by", ["sweep", pytest.param("vesin", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("by", ["sweep", pytest.param("scipy", marks=pytest.mark.slow)])
 def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
     gas = hard_gas(0.8, 0.1)
     times = np.array([0.3, 1.0, 2.0]) * float(gas.mean_free_time)
@@ -523,7 +523,7 @@ def test_a_skin_full_of_spheres_is_shortened(monkeypatch):
 
     monkeypatch.setattr(windows.HardDynamics, "stretch", watched)
     end = 2.0
-    curve = jaxgran.cool(gas, [end], model=HardSpheres(size, start=start, neighbours="vesin"))
+    curve = jaxgran.cool(gas, [end], model=HardSpheres(size, start=start, neighbours="scipy"))
     assert skins[-1] < skins[0] and min(skins) >= windows.SHORTEST_SKIN
     _, _, counts, _ = serial(gas, start, end)
     assert counts.sum() > 50 and round(float(curve.collisions[0]) * size) == counts.sum()

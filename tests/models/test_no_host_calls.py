@@ -46,7 +46,7 @@ def test_lowered_program_calls_nothing_on_the_host(name, beads):
 
 def test_a_call_would_be_found(beads):
     gas = beads(packing_fraction=0.1)
-    by_host = lowered(gas, jaxgran.HardSpheres(30, neighbours="vesin"))
+    by_host = lowered(gas, jaxgran.HardSpheres(30, neighbours="scipy"))
     assert HOST.search(by_host.as_text()) is not None
 
 

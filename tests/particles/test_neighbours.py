@@ -16,7 +16,7 @@ from jaxgran.particles.neighbours import (
     displacement,
     engine,
     find_pairs,
-    vesin_search,
+    tree_search,
     wrap,
 )
 from jaxgran.particles.sweep_and_prune import sweep, unsorted
@@ -79,7 +79,7 @@ def compare(dimension, replicas, side, cutoff, by):
 
 
 # Each sweep is compiled for its shapes.
-WAYS = [("vesin", f) for f in (0.15, 1 / 3, 0.4999, 0.5)]
+WAYS = [("scipy", f) for f in (0.15, 1 / 3, 0.4999, 0.5)]
 WAYS += [("sweep", 0.5), pytest.param("sweep", 0.15, marks=pytest.mark.slow)]
 
 
@@ -109,7 +109,7 @@ def test_jax_md_finds_what_brute_force_finds(dimension, replicas, fraction):
 def test_points_of_a_grid(points, dimension, cutoff):
     position = np.array(points, float)[:, :dimension] / 8
     expected = brute_force(position, 1.0, cutoff)
-    for by in ("vesin", "sweep"):
+    for by in ("scipy", "sweep"):
         on_a_grid(position, expected, cutoff, by)
 
 
@@ -122,7 +122,7 @@ def on_a_grid(position, expected, cutoff, by):
             np.testing.assert_array_equal(apart, expected[int(i), int(j)])  # eighths are exact
 
 
-COMPILED = pytest.mark.parametrize("by", ["vesin", "sweep"])
+COMPILED = pytest.mark.parametrize("by", ["scipy", "sweep"])
 
 
 @COMPILED
@@ -164,7 +164,7 @@ def test_a_capacity_that_is_exceeded_is_reported():
     position = awkward(2, 2, 3.7)
     cutoff = 3.7 * 0.15
     expected = brute_force(position, 3.7, cutoff, 2)
-    for by in ("vesin", "sweep", "jax-md"):
+    for by in ("scipy", "sweep", "jax-md"):
         search = partial(find_pairs, jnp.asarray(position), 3.7, cutoff, replicas=2, by=by)
         for capacity in (1, len(expected) // 4, len(expected) - 1):
             pairs = search(capacity=capacity)
@@ -253,9 +253,9 @@ def test_displacement_is_the_shortest():
 
 
 def test_engine_follows_the_device_and_the_gas(monkeypatch):
-    assert engine("vesin", 1) == "vesin" and engine("sweep", 10**6) == "sweep"
+    assert engine("scipy", 1) == "scipy" and engine("sweep", 10**6) == "sweep"
     assert engine("jax-md") == "jax-md"
-    for device, dense in (("cpu", "vesin"), ("gpu", "jax-md")):
+    for device, dense in (("cpu", "scipy"), ("gpu", "jax-md")):
         monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
         assert engine("auto", MOST_AHEAD + 1) == dense
         assert engine("auto", MOST_AHEAD) == ("sweep" if device == "cpu" else "jax-md")
@@ -264,16 +264,16 @@ def test_engine_follows_the_device_and_the_gas(monkeypatch):
 
 
 def test_unknown_engines_are_refused():
-    message = "neighbours must be one of auto, sweep, vesin, jax-md, got 'kd'"
+    message = "neighbours must be one of auto, sweep, scipy, jax-md, got 'kd'"
     with pytest.raises(ValueError, match=message):
         engine("kd")
 
 
 @pytest.mark.parametrize("side, n", [(500.0, 20_000), (5000.0, 2000)])
 def test_wide_planes(side, n):
-    # More cells than vesin allows: a layer of them alone would end the process.
+    # Thousands of diameters across.
     position = np.random.default_rng(0).uniform(0, side, (n, 2))
-    i, j, count = vesin_search(position, side, 1.4, 1, 2 * n)
+    i, j, count = tree_search(position, side, 1.4, 1, 2 * n)
     found = np.sort(np.stack([i[:count], j[:count]], axis=1), axis=1)
     expected = KDTree(position, boxsize=side).query_pairs(1.4)
     assert set(map(tuple, found.tolist())) == expected
