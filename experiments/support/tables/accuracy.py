@@ -24,11 +24,12 @@ which scales the flow that the gas has in them; "stress" is the stress that this
 """
 
 MEMORIES_MEAN = """\
-Two bands of a kept flow take the bias at 30 collisions away. At 100 no memory is shown to be
-right to 10 %: on average what is kept makes the derivative too small, and the boxes differ by more
-than the bound. So projections of the package keep T alone, and `differences=` is what a clustering
-gas needs. Standard errors of two boxes are rough. Memories that the script knows and that are not
-in the table have not been measured by it.
+Two bands of a kept flow take the bias at 30 collisions away, whether they are kept wave by wave or
+as one amplitude each. At 100 none is right to 10 %: what is kept makes the derivative too small, or
+of the wrong sign, and stress, heat and density mend only part of that. To project spheres in
+contact too, which conserves momentum, makes it too small from the start. Displacements that are
+fitted or carried are lost to chaos. So projections of the package keep T alone, and `differences=`
+is what a clustering gas needs.
 """
 
 
