@@ -4,7 +4,7 @@
 
 The same two replicas are run in three processes: on one core; on all cores with one device, where
 the replicas stand in one array; and on two CPU devices, one replica on each. Soft and hard spheres
-melt for 10 mean free times, and cool for as long as makes a run of some tenths of a second, as DSMC
+melt for 10 mean free times, and cool for as long as makes a run of one to two seconds, as DSMC
 does in a gas that dissipates little. Times are medians without compilation, and a melt counts as 10
 collisions per particle.
 """
@@ -22,7 +22,7 @@ from experiments.support.record import add_recording, seconds, write_results
 
 CASES = ("one core", "one device", "two devices")
 MODELS = ("SoftSpheres", "HardSpheres", "DSMC")
-COOLING = {"SoftSpheres": 5.0, "HardSpheres": 20.0, "DSMC": 500.0}
+COOLING = {"SoftSpheres": 25.0, "HardSpheres": 100.0, "DSMC": 500.0}
 """Mean free times of cooling."""
 
 REPEATS = 3

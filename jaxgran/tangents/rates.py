@@ -38,39 +38,34 @@ class Rates(NamedTuple):
         return ratio(self.met, self.could_meet) * temperature**0.5
 
 
-class Drift(NamedTuple):
-    """A ratio that drifts, as the value now of a straight line through its past.
+class Line(NamedTuple):
+    """A ratio that depends linearly on another number x, both of which drift.
 
-    The past fades exponentially, as in `Rates`. T_rot/T may change by a large part of
-    itself in that time, and its mean would lag behind.
+    The past fades exponentially, as in `Rates`. Where x stands still the ratio is its mean.
 
     Attributes:
-        below, below_age, below_square: sums of the denominator, times 1, the age and its square.
-        above, above_age: the same of the numerator.
+        below, below_x, below_square: sums of the denominator, times 1, x and its square.
+        above, above_x: the same of the numerator.
     """
 
     below: Float[Array, "replicas"]
-    below_age: Float[Array, "replicas"]
+    below_x: Float[Array, "replicas"]
     below_square: Float[Array, "replicas"]
     above: Float[Array, "replicas"]
-    above_age: Float[Array, "replicas"]
+    above_x: Float[Array, "replicas"]
 
-    def after(self, passed: Array, kept: Array, above: Array, below: Array) -> "Drift":
-        """With a further time, in which older sums age by it and lose weight by a factor."""
-        b, b1, b2, a, a1 = self
-        aged = b, b1 + passed * b, b2 + 2 * passed * b1 + passed**2 * b, a, a1 + passed * a
-        b, b1, b2, a, a1 = (kept * x for x in aged)
-        return Drift(b + below, b1, b2, a + above, a1)
+    def after(self, kept: Array, above: Array, below: Array, x: Array) -> "Line":
+        """With a further time, in which older sums lose weight by a factor."""
+        more = Line(below, x * below, x**2 * below, above, x * above)
+        return Line(*(kept * old + new for old, new in zip(self, more, strict=True)))
 
-    @property
-    def now(self) -> Float[Array, "replicas"]:
-        """The ratio; 0 where nothing is known."""
-        determinant = self.below * self.below_square - self.below_age**2
-        line = determinant > 1e-6 * self.below * self.below_square
-        at_zero = self.below_square * self.above - self.below_age * self.above_age
-        known = self.below > 0
-        mean = jnp.where(known, self.above / jnp.where(known, self.below, 1.0), 0.0)
-        return jnp.where(line, at_zero / jnp.where(line, determinant, 1.0), mean)
+    def at(self, x: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
+        """The ratio at x; 0 where nothing is known."""
+        mean, centre = ratio(self.above, self.below), ratio(self.below_x, self.below)
+        square = self.below_square - centre * self.below_x
+        known = square > 1e-12 * self.below_square
+        slope = ratio(self.above_x - centre * self.above, jnp.where(known, square, 0.0))
+        return mean + slope * (x - centre)
 
 
 def remembered(

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jaxgran.tangents.rates import Drift
+from jaxgran.tangents.rates import Line
 
 
 class RubbingMaterial(NamedTuple):
@@ -37,12 +37,12 @@ class RotationTangents(NamedTuple):
         directions: in the numbers of friction.
         spin: tangents of the spins, without the part (c/2) s.
         turned: energy that rotation gained in contacts in a mean free time, over that of
-            translation.
+            translation, which depends on the ratio of both.
     """
 
     directions: RubbingMaterial
     spin: Float[Array, "p n spins"]
-    turned: Drift
+    turned: Line
 
     @classmethod
     def at_start(
@@ -58,7 +58,7 @@ class RotationTangents(NamedTuple):
         along = directions.ratio
         faster = jnp.where(along == 0, 0.0, along / ratio) - directions.inertia / inertia
         zeros = jnp.zeros(replicas, spin.dtype)
-        return cls(directions, 0.5 * faster[:, None, None] * spin[None], Drift(*[zeros] * 5))
+        return cls(directions, 0.5 * faster[:, None, None] * spin[None], Line(*[zeros] * 5))
 
     def projected(
         self,

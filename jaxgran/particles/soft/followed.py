@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran.particles.soft.candidates import Encounters
 from jaxgran.particles.soft.elements import ElementSums
 from jaxgran.particles.soft.frame import at_rest, heat
+from jaxgran.particles.soft.frame import rotational_temperature as heat_of_spins
 from jaxgran.particles.soft.scene import SoftScene
 from jaxgran.particles.soft.steps import ContactWork
 from jaxgran.particles.state import State, kinetic_energy
@@ -72,8 +73,9 @@ def after_block(
         lost += turned
         passed = duration * jnp.sqrt(warmth) * scene.collision_frequency
         kept = jnp.exp(-passed / rates.MEMORY)
-        drift = along.rotation.turned.after(passed, kept, turned, energy * passed)
-        along = along._replace(rotation=along.rotation._replace(turned=drift))
+        share = rates.ratio(heat_of_spins(scene, new.own.spin, replicas), warmth)
+        line = along.rotation.turned.after(kept, turned, energy * passed, share)
+        along = along._replace(rotation=along.rotation._replace(turned=line))
     found = rates.remembered(
         along.rates,
         lost=lost,

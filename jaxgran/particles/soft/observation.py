@@ -10,6 +10,7 @@ from jaxgran.particles.soft.frame import rotational_temperature
 from jaxgran.particles.soft.scene import SoftScene
 from jaxgran.particles.state import State, derivatives_of_records, records
 from jaxgran.tangents import rule, thermal
+from jaxgran.tangents.rates import ratio
 
 
 @partial(jax.jit, static_argnames="replicas")
@@ -57,7 +58,7 @@ def _of_rotation(state: State, scene: SoftScene, values: dict[str, Array]) -> tu
     rotation, T_rot = along.rotation, values["rotational_temperature"]
     logs = rotation.log_temperature(spin, scene.surface.inertia, along.log_temperature)
     d, d_rot = state.velocity.shape[1], spin.shape[1]
-    rate = d / d_rot * rotation.turned.now * scene.collision_frequency * T**1.5
+    rate = d / d_rot * rotation.turned.at(ratio(T_rot, T)) * scene.collision_frequency * T**1.5
     if (slowing := scene.of_elements.spin_drag) is not None:
         rate -= 2 * slowing * T_rot
     return logs * T_rot[None], rate

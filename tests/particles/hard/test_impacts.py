@@ -24,7 +24,7 @@ def test_disturbances_go_from_sphere_to_sphere_as_far_as_they_can():
     start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(n)).particles
     x, v = start.position.reshape(n, 3), start.velocity.reshape(n, 3)
     pairs = find_pairs(x, start.box_side, 2.0, capacity=10 * n)
-    real, bound, end = jnp.arange(10 * n) < pairs.count, 5.0, 0.05
+    real, bound, end = jnp.arange(10 * n) < pairs.count, 5.0, 0.04
     rows = Rows(pairs.i, pairs.j, pairs.offset, jnp.full(10 * n, bound), real)
     *_, final = first_impacts(Slots(x, v, jnp.zeros(n)), rows, end)
 
