@@ -328,16 +328,17 @@ def both_temperatures(gas, model, times, names):
 def test_derivatives_before_a_projection_are_exact():
     num, h = 30, 1e-6
     gas = with_all(num)
-    times = np.array([0.1, 0.2]) * float(gas.mean_free_time)  # before chaos
+    times = np.array([0.2, 0.4]) * float(gas.mean_free_time)  # before chaos
     model = SoftSpheres(num, projection=100.0, steps_per_contact=100)
     logs, at = both_temperatures(gas, model, times, RUBBED)
     found = np.asarray(jax.jacfwd(logs)(at))
     np.testing.assert_allclose(jax.jacrev(logs)(at), found, rtol=1e-10, atol=1e-15)
     each = [logs(at + move) - logs(at - move) for move in h * np.eye(len(at))]
     expected = np.stack(each, axis=-1) / (2 * h)
-    # Differences contain those of the time step, some 1e-4. T_rot is that of all spheres; from T
-    # the tangents leave out spheres in contact, of which there are many so soon.
-    np.testing.assert_allclose(found[1], expected[1], rtol=0.02, atol=2e-4)
+    # Differences contain those of the time step and of the onset of contacts, some per cent of what
+    # so few contacts do. T_rot is that of all spheres; from T the tangents leave out spheres in
+    # contact, of which there are many so soon.
+    np.testing.assert_allclose(found[1], expected[1], rtol=0.06, atol=2e-4)
     assert np.all(np.abs(np.delete(expected[1, 1], RUBBED.index("drag_rate"))) > 1e-3)
 
 
