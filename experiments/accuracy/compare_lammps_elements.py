@@ -203,7 +203,7 @@ def contact(gas: jaxgran.Gas, law, walls: bool) -> str:
 
 
 def picture(rows: dict[str, dict], options: argparse.Namespace) -> None:
-    figure = Figure(figsize=(7, 4.6), layout="constrained")
+    figure = Figure(figsize=(7, 5.4), layout="constrained")
     axes = figure.subplots()
     for (name, row), mark in zip(rows.items(), "osD^vP", strict=True):
         axes.plot(TIMES, row["rms_velocity"], f"{mark}-", ms=4, label=name)
@@ -213,7 +213,7 @@ def picture(rows: dict[str, dict], options: argparse.Namespace) -> None:
         ylabel="difference of velocities, rms, over √T₀",
         title="Soft spheres and LAMMPS from the same start",
     )
-    axes.legend(frameon=False)
+    figure.legend(frameon=False, loc="outside lower center", ncols=2, fontsize=9)
     write_picture(figure, "compare_lammps_elements", options)
 
 
