@@ -58,8 +58,10 @@ def fit_deterministic(
             flat, more, converged = search(comparison.residuals, flat, max_steps)
             comparison, iterations = comparison.scaled(flat), iterations + more
     result = _fit_at(comparison, names, of_errors or {}, first, flat, iterations, converged)
-    others = jax.vmap(comparison.estimates)(found[1].flats)
-    return dataclasses.replace(result, minima=Minima(others, found[1].chi2))
+    if len(several) == 1:
+        return result
+    estimates = jax.vmap(comparison.estimates)(found[1].flats)
+    return dataclasses.replace(result, minima=Minima(estimates, found[1].chi2))
 
 
 def _fit_at(

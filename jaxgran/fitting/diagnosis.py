@@ -11,7 +11,7 @@ from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.amplitudes import ASKED, Rival
 from jaxgran.fitting.budget import slope_in_words
-from jaxgran.fitting.reasons import about_residuals, about_runs, about_search, chance
+from jaxgran.fitting.reasons import about_chance, about_residuals, about_runs, about_search
 from jaxgran.fitting.residuals import neighbour_correlation, runs_test
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
 from jaxgran.fitting.rivals import FURTHER, free_elements, ranges, rivals
@@ -90,7 +90,7 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
     found = rivals(result, curve) if converged and np.isfinite(result.chi2) else ()
     limits = ranges(result, found) if found else {}
     reasons = [
-        chance(result),
+        about_chance(result),
         *_about_rivals(result, found, num_particles),
         *about_residuals(residuals, times, correlation, p_value),
         *about_runs(runs),

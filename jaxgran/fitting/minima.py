@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from jaxgran.fitting.parameters import Parameters
 
@@ -39,7 +39,7 @@ class Minima(NamedTuple):
 
     Attributes:
         estimates: of the free parameters, SI.
-        chi2: there.
+        chi2: there, of all residuals, those of priors too.
     """
 
     estimates: Float[Array, "starts p"]
@@ -49,17 +49,17 @@ class Minima(NamedTuple):
         self,
         estimate: Float[Array, "p"],
         standard_error: Float[Array, "p"],
-        chi2: ArrayLike,
         unit: float,
     ) -> Float[np.ndarray, "others p"]:
         """The estimates at minima that are not told from the deepest one: chi^2 is larger by less
         than `AS_GOOD`, and a parameter differs by more than its square root in standard errors.
 
         Args:
-            estimate, standard_error, chi2: of the deepest one.
+            estimate, standard_error: of the deepest one.
             unit: of chi^2, where errors turned out to be larger than they were said to be.
         """
-        near = np.asarray(self.chi2) - np.asarray(chi2) < AS_GOOD * unit
+        chi2 = np.asarray(self.chi2)
+        near = chi2 - np.min(chi2) < AS_GOOD * unit
         away = np.asarray(self.estimates) - np.asarray(estimate)
         apart = np.max(np.abs(away) / np.asarray(standard_error), axis=1) > AS_GOOD**0.5
         found: list[np.ndarray] = []

@@ -9,7 +9,7 @@ from jaxgran.fitting.minima import minima_in_words
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
 
 
-def chance(result: Fit) -> str:
+def about_chance(result: Fit) -> str:
     reduced, p_value = float(result.reduced_chi2), float(result.p_value)
     if result.scatter is not None:
         scatter = 100 * float(np.asarray(result.scatter))

@@ -66,8 +66,8 @@ class Fit(eqx.Module):
             stochastic model.
         converged: whether the search reached its tolerance; of a stochastic model, whether the last
             step was below 0.1 in the parameters' unbounded scale.
-        minima: minima of chi^2 that were found, of which this is the deepest; None of a stochastic
-            model.
+        minima: minima of chi^2 that were found, of which this is the deepest, where it was searched
+            from several starts; else None.
 
     >>> A, error = result.value("dissipative_constant")
     >>> f"{float(A):.3g} s", sorted(result.error_budget)
@@ -156,7 +156,7 @@ class Fit(eqx.Module):
         if self.minima is None:
             return np.zeros((0, len(self.estimate)))
         unit = max(float(self.reduced_chi2), 1.0)
-        return self.minima.as_good(self.estimate, self.standard_error, self.chi2, unit)
+        return self.minima.as_good(self.estimate, self.standard_error, unit)
 
     def undetermined(self) -> tuple[str, ...]:
         """Parameters of which the curve determines no value, or only a combination; () if none.

@@ -1,6 +1,6 @@
 """Rates of a gas, as averages over its last mean free times."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, DTypeLike, Float
@@ -54,10 +54,11 @@ class Line(NamedTuple):
     above: Float[Array, "replicas"]
     above_x: Float[Array, "replicas"]
 
-    def after(self, kept: Array, above: Array, below: Array, x: Array) -> "Line":
-        """With a further time, in which older sums lose weight by a factor."""
+    def after(self, passed: Array, above: Array, below: Array, x: Array) -> "Line":
+        """With what came in a further time, in mean free times."""
         more = Line(below, x * below, x**2 * below, above, x * above)
-        return Line(*(kept * old + new for old, new in zip(self, more, strict=True)))
+        left = weight_after(passed)
+        return Line(*(left * old + new for old, new in zip(self, more, strict=True)))
 
     def at(self, x: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
         """The ratio at x; 0 where nothing is known."""
@@ -66,6 +67,11 @@ class Line(NamedTuple):
         known = square > 1e-12 * self.below_square
         slope = ratio(self.above_x - centre * self.above, jnp.where(known, square, 0.0))
         return mean + slope * (x - centre)
+
+
+def weight_after(passed: Any) -> Array:
+    """What sums of the past are left by a further time, in mean free times."""
+    return jnp.exp(-passed / MEMORY)
 
 
 def remembered(
@@ -91,7 +97,7 @@ def remembered(
         collision_frequency: at T = 1.
     """
     passed = duration * jnp.sqrt(temperature)
-    old = jnp.exp(-passed * collision_frequency / MEMORY)
+    old = weight_after(passed * collision_frequency)
     return Rates(
         lost=old * rates.lost + lost,
         could_lose=old * rates.could_lose + energy * trend * duration,

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from jaxgran.tangents import rates
 from jaxgran.tangents.rates import Line
 
 
@@ -96,7 +97,5 @@ def along_spin(
 ) -> Float[Array, "p replicas"]:
     """The part of each replica's rest along its spins, over them; 0 where none rotates."""
     each = spin.reshape(replicas, -1)
-    square = jnp.sum(each * each, -1)
-    rotates = square > 0
     found = jnp.sum(rest.reshape(len(rest), *each.shape) * each[None], -1)
-    return jnp.where(rotates[None], found / jnp.where(rotates, square, 1.0)[None], 0.0)
+    return rates.ratio(found, jnp.sum(each * each, -1)[None])

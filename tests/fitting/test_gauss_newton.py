@@ -111,6 +111,8 @@ def test_two_quantities_tell_what_one_does_not():
     )
     np.testing.assert_allclose(found.flat, [0.3, -0.2], atol=0.03)
     assert found.residuals.shape == (2 * TIMES.size,)
+    # The noise of the mean of four replicas in two runs or more is less than the errors.
+    assert np.all((found.weights > 0.5 / ERROR[0]) & (found.weights < 1 / ERROR[0]))
     # T_rot does not depend on the first parameter, which is what remains of T.
     np.testing.assert_allclose(found.sensitivity[TIMES.size :, 0], 0.0, atol=1e-12)
     assert np.all(found.noise_covariance.diagonal() > 0)

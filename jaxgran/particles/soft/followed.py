@@ -8,8 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.particles.soft.candidates import Encounters
 from jaxgran.particles.soft.elements import ElementSums
-from jaxgran.particles.soft.frame import at_rest, heat
-from jaxgran.particles.soft.frame import rotational_temperature as heat_of_spins
+from jaxgran.particles.soft.frame import at_rest, heat, rotational_temperature
 from jaxgran.particles.soft.scene import SoftScene
 from jaxgran.particles.soft.steps import ContactWork
 from jaxgran.particles.state import State, kinetic_energy
@@ -29,8 +28,9 @@ def at_start(
     if more:
         along, *more = more
         # Rates, of which the material has those over the collision frequency.
-        rates = {"drag": along.drag, "spin_drag": along.spin_drag}
-        along = along._replace(**jax.tree.map(lambda rate: rate * scene.collision_frequency, rates))
+        of_drag = {"drag": along.drag, "spin_drag": along.spin_drag}
+        of_drag = jax.tree.map(lambda rate: rate * scene.collision_frequency, of_drag)
+        along = along._replace(**of_drag)
     found = thermal.at_start(
         *(alpha, constant, state.velocity, replicas, interval, damping, along, drag)
     )
@@ -72,9 +72,8 @@ def after_block(
         turned = _turned(scene, spin, new.own.spin, duration, replicas)
         lost += turned
         passed = duration * jnp.sqrt(warmth) * scene.collision_frequency
-        kept = jnp.exp(-passed / rates.MEMORY)
-        share = rates.ratio(heat_of_spins(scene, new.own.spin, replicas), warmth)
-        line = along.rotation.turned.after(kept, turned, energy * passed, share)
+        share = rates.ratio(rotational_temperature(scene, new.own.spin, replicas), warmth)
+        line = along.rotation.turned.after(passed, turned, energy * passed, share)
         along = along._replace(rotation=along.rotation._replace(turned=line))
     found = rates.remembered(
         along.rates,

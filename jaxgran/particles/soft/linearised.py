@@ -66,14 +66,15 @@ def follow(
     )
     if along is None or len(along.alpha) == 0:
         own = scene.alpha, scene.dissipative_constant
-        (x, v, spin), (work, more) = take(now, *own, scene.of_elements, scene.rubbing)
-        return Followed(x, v, spin, work, more, along)
-    tangents, x, v, spin, work, more = _pushed(take, now, everyone, scene, chosen, duration, along)
+        moved, energies = take(now, *own, scene.of_elements, scene.rubbing)
+        return Followed(*moved, *energies, along)
+    run = take, now, everyone, scene, chosen, duration, along
+    moved, energies, tangents = _pushed(*run)
     rotation = along.rotation
     if rotation is not None:
         rotation = rotation._replace(spin=tangents.spin)
     along = along._replace(position=tangents.x, velocity=tangents.v, rotation=rotation)
-    return Followed(x, v, spin, work, more, along)
+    return Followed(*moved, *energies, along)
 
 
 def _pushed(
@@ -84,8 +85,8 @@ def _pushed(
     chosen: Encounters,
     duration: Array,
     along: ThermalTangents,
-) -> tuple[Any, ...]:
-    """The tangents of all particles after a block; and the members, and energies, as `follow`."""
+) -> tuple[Moving, tuple[ContactWork, ElementWork | None], Moving]:
+    """The members after a block, the energies, and the tangents of all particles."""
     one, of_members = jnp.ones(len(chosen.a), now.x.dtype), partial(_of_members, size=len(now.x))
     own = scene.alpha, scene.dissipative_constant
     at = now, *(number * one for number in own), of_members(scene.of_elements), scene.rubbing
@@ -106,7 +107,7 @@ def _pushed(
     rotation = along.rotation
     tangents = Moving(along.position, along.velocity, None if rotation is None else rotation.spin)
     rubbing = None if rotation is None else rotation.directions
-    (x, v, spin), moved, (work, more) = jax.vmap(push, out_axes=(None, 0, None))(
+    moved, along_moved, energies = jax.vmap(push, out_axes=(None, 0, None))(
         jax.tree.map(rows, tangents), *material, further, rubbing
     )
     put = jax.vmap(lambda rest, new: rest.at[chosen.members].set(new, mode="drop"))
@@ -114,7 +115,7 @@ def _pushed(
         flown = tangents._replace(x=along.position + duration * along.velocity)
     else:
         flown = _flown(tangents, everyone, scene, duration, each)
-    return jax.tree.map(put, flown, moved), x, v, spin, work, more
+    return moved, energies, jax.tree.map(put, flown, along_moved)
 
 
 def _flown(

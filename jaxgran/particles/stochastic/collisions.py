@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,24 +35,12 @@ and in float32 they would dominate T once it has fallen to 1e-7 of its first val
 """
 
 
-class Portions(NamedTuple):
-    """How many portions of the particles take part in a step; None without what they take part in.
-
-    Attributes:
-        kicks: of a drive, in half of the step.
-        walls: impacts on walls.
-    """
-
-    kicks: Int[Array, "*replicas"] | None
-    walls: Int[Array, "*replicas"] | None
-
-
 def _step(
     state: DSMCState,
     key: PRNGKeyArray,
-    some: Portions,
+    some: portions.Portions,
     share: Float[Array, ""],
-    most: Portions,
+    most: portions.Portions,
     scene: ReducedScene,
     scheme: Scheme,
     tangents: bool,
@@ -224,8 +211,7 @@ def step(
     """A share, 0 to 1, of the next step of each replica."""
     replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(wrapped(key), replicas)
-    now = state.temperature, state.clock, share, scene, scheme
-    some = Portions(portions.turns(*now), portions.drawn(*now))
+    some = portions.of_step(state.temperature, state.clock, share, scene, scheme)
     most = jax.tree.map(jnp.max, some)
     one = partial(_step, most=most, scene=scene, scheme=scheme, tangents=tangents)
     axes = jax.tree.map(lambda _: 0, state)._replace(time=None)

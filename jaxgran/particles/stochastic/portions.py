@@ -3,12 +3,12 @@
 The kicks of a drive in one step are far smaller than the velocities. So each half of a step kicks
 a portion of all particles, with the variance of all steps until it has its turn again: the energy
 that a step brings is the same, and costs as much less. How much may be brought in one turn limits
-the number of portions, see `turns`, down to all particles in each half of a step.
+the number of portions, down to all particles in each half of a step.
 
 Walls are met by portions that are drawn anew in each step, and so are met by a sphere that moves as
 it does now: by turns, a mean free time apart, spheres that have lost speed would not come later,
-and the loss be .9 % of T too large. As many portions are drawn as the fastest spheres need, see
-`drawn`, and a sphere of them meets a wall the more often.
+and the loss be .9 % of T too large. As many portions are drawn as the fastest spheres need, and a
+sphere of them meets a wall the more often.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from jaxgran.particles.stochastic.elements import fastest_share, heating, left_b
 from jaxgran.particles.stochastic.pairing import Scheme
 from jaxgran.scene.reduced_scene import ReducedScene
 
-T = TypeVar("T")
+Sums = TypeVar("Sums")
 
 MOST = 16
 """Portions of many particles."""
@@ -67,44 +67,48 @@ def portion(index: Int[Array, ""], num_particles: int, active: Bool[Array, ""]) 
     return Portion(first, (row >= begin) & (row < end) & active)
 
 
-def turns(
-    temperature: Float[Array, "*replicas"],
-    clock: Float[Array, "*replicas"],
-    share: Float[Array, "*replicas"],
-    scene: ReducedScene,
-    scheme: Scheme,
-) -> Int[Array, "*replicas"] | None:
-    """Portions that are kicked in half of a share of a step, so many that T of none grows by more
-    than `kicks.LARGEST`; None without a drive.
+class Portions(NamedTuple):
+    """How many portions of the particles take part in a step; None without what they take part in.
 
-    Particles whose turns are w T apart have at one time temperatures that differ by so much, by
-    which a_2 of all is too large by ``w^2/12``: 2e-4 at most.
+    Attributes:
+        kicks: of a drive, in half of the step.
+        walls: impacts on walls.
     """
-    if scene.drive is None:
-        return None
-    parts = number(scheme.num_particles)
-    ds = share * scheme.own_step / jnp.sqrt(temperature)
-    growth = heating(scene.drive, scene.drag, clock, ds, 0.0)
-    needed = parts * growth / (kicks.LARGEST * jnp.where(temperature > 0, temperature, 1.0))
-    return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
+
+    kicks: Int[Array, "*replicas"] | None
+    walls: Int[Array, "*replicas"] | None
 
 
-def drawn(
+def of_step(
     temperature: Float[Array, "*replicas"],
     clock: Float[Array, "*replicas"],
     share: Float[Array, "*replicas"],
     scene: ReducedScene,
     scheme: Scheme,
-) -> Int[Array, "*replicas"] | None:
-    """Portions that may meet walls in a share of a step, so many that one of the fastest spheres
-    does so at most once; None without walls."""
-    if scene.walls is None:
-        return None
+) -> Portions:
+    """The portions that take part in a share of a step.
+
+    So many are kicked in half of it that T of none grows by more than `kicks.LARGEST`: particles
+    whose turns are w T apart have at one time temperatures that differ by so much, by which a_2 of
+    all is too large by ``w^2/12``, 2e-4 at most. So many may meet walls that one of the fastest
+    spheres does so at most once.
+    """
     parts = number(scheme.num_particles)
     ds = share * scheme.own_step / jnp.sqrt(temperature)
-    slowed = left_by(scene.drag, clock).velocity
-    most = fastest_share(scene, temperature, slowed, ds, scheme.dimension)
-    return jnp.clip(jnp.ceil(parts * most), 1, parts).astype(jnp.int32)
+
+    def at_least(needed: Array) -> Array:
+        return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
+
+    kicked = walled = None
+    if scene.drive is not None:
+        growth = heating(scene.drive, scene.drag, clock, ds, 0.0)
+        safe = jnp.where(temperature > 0, temperature, 1.0)
+        kicked = at_least(parts * growth / (kicks.LARGEST * safe))
+    if scene.walls is not None:
+        slowed = left_by(scene.drag, clock).velocity
+        most = fastest_share(scene, temperature, slowed, ds, scheme.dimension)
+        walled = at_least(parts * most)
+    return Portions(kicked, walled)
 
 
 def bounced(
@@ -112,9 +116,9 @@ def bounced(
     key: PRNGKeyArray,
     drawn: Int[Array, ""],
     most: Int[Array, ""],
-    meet: Callable[[Array, Array], tuple[Array, T]],
-    none: T,
-) -> tuple[Float[Array, "N components"], T]:
+    meet: Callable[[Array, Array], tuple[Array, Sums]],
+    none: Sums,
+) -> tuple[Float[Array, "N components"], Sums]:
     """The particles of one replica after their impacts on walls in a step, and sums over these.
 
     Args:
@@ -131,7 +135,7 @@ def bounced(
     bits = jax.random.bits(jax.random.fold_in(key, MOST), (), jnp.uint16)
     which = (bits % parts).astype(jnp.int32)
 
-    def some(i: Int[Array, ""], done: tuple[Array, T]) -> tuple[Array, T]:
+    def some(i: Int[Array, ""], done: tuple[Array, Sums]) -> tuple[Array, Sums]:
         particles, sums = done
         own = portion((which + i) % parts, n, i < drawn)
         bits = jax.random.bits(jax.random.fold_in(key, i), own.counted.shape, jnp.uint16)
