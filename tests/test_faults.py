@@ -25,7 +25,7 @@ from jaxgran.particles.interruption import in_thread, waited_for
 from jaxgran.particles.soft import block
 from jaxgran.particles.state import later
 from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 GAS = glass_beads(0.3, packing_fraction=0.1)
 TAU = float(GAS.mean_free_time)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 GAS = glass_beads(0.3, packing_fraction=0.1)
 TIMES = np.array([0.3, 1.0]) * float(GAS.mean_free_time)

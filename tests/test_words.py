@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 
 def test_a_gas_is_shown_with_units():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import jaxgran
 from jaxgran.data.header import header_count
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 HEADER = "# eta: 0.05\n# diameter: 0.002\n# density: 2500\n# Y: 5e7\n# nu: 0.22\n# T0: 0.01\n"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 HEADER = {"eta": "0.05", "diameter": "0.002", "density": "2500", "Y": "5e7", "nu": "0.22"}
 HEADER |= {"T0": "0.01"}

@@ -1,5 +1,7 @@
 """The waves of a flow that the measured memories keep of a tangent."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,7 +71,7 @@ def test_gradient_is_that_of_the_field(gas):
 def test_a_change_that_is_kept_is_found_again(gas, name):
     x, v = gas
     memory = flow_memory.MEMORIES[name]
-    kept, _ = columns(memory, x, v, jnp.asarray(SIDE), RELAXATION)
+    kept, _ = jax.jit(partial(columns, memory))(x, v, jnp.asarray(SIDE), RELAXATION)
     amounts = jnp.asarray(np.random.default_rng(2).normal(size=(2, len(kept))))
     rest = jnp.einsum("pa,and->pnd", amounts, kept)
     again = jnp.einsum("pa,and->pnd", fit(kept, rest, jnp.ones(NUMBER)), kept)

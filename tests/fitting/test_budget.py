@@ -11,7 +11,7 @@ import jaxgran
 from experiments.support.scenes import beads as beads_of
 from jaxgran.fitting.budget import bias_of_slope, in_scene, slope_in_words
 from jaxgran.models.selection import course_of
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
 
 A = ("dissipative_constant",)

@@ -11,7 +11,7 @@ import pytest
 import jaxgran
 from jaxgran.models.base import Omission
 from jaxgran.models.selection import default_models
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting.comparison import clock_of_few
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 THEORY = jaxgran.KineticTheory()
 

@@ -9,7 +9,7 @@ import jaxgran
 from jaxgran.fitting.few_replicas import smooth_errors
 from jaxgran.fitting.residuals import runs_test
 from jaxgran.fitting.result import misfit
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 from tests.fitting.curves import synthetic
 
 R, N = 3, 40

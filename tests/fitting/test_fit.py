@@ -8,7 +8,7 @@ import pytest
 import jaxgran
 from jaxgran.fitting.checks import unused_rotation
 from jaxgran.fitting.guess import guess_from_data
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
 
 

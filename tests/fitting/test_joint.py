@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 from tests.fitting.curves import synthetic
 
 A = ("dissipative_constant",)

@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting.rivals import ranges, rivals
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 from tests.fitting import closed_curves
 from tests.fitting.curves import synthetic
 

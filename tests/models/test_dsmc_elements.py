@@ -10,7 +10,7 @@ import pytest
 import jaxgran
 from jaxgran.particles.stochastic.collision_rule import collide
 from jaxgran.scene.reduced_scene import ReducedRough, ReducedScene
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 
 @pytest.mark.parametrize("eps, beta", [(0.8, 0.3), (0.8, -1.0), (1.0, 1.0), (1.0, -1.0)])

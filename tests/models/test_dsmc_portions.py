@@ -8,7 +8,7 @@ import pytest
 
 import jaxgran
 from jaxgran.particles.stochastic import portions
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 
 @pytest.mark.parametrize("n", [2, 15, 31, 257, 1000, 4096])

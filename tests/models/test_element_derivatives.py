@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 N = 500
 

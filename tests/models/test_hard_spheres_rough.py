@@ -11,7 +11,7 @@ import jaxgran
 from jaxgran.particles.hard.effects import Impact, of_pairs
 from jaxgran.particles.hard.scene import HardScene
 from jaxgran.scene.reduced_scene import ReducedRough
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 
 def rough(gas, *values, **settings) -> jaxgran.Gas:

@@ -10,7 +10,7 @@ import pytest
 import jaxgran
 from jaxgran.checks import status
 from jaxgran.models.course import WALLS
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 SIDE = 0.05
 

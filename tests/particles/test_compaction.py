@@ -1,8 +1,11 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.particles.compaction import rows_where
+from jaxgran.particles import compaction
+
+rows_where = jax.jit(compaction.rows_where, static_argnums=1)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 1.0])

@@ -14,7 +14,7 @@ from jaxgran.data import checkpoint
 from jaxgran.particles import driver
 from jaxgran.particles.driver import Failure, follow
 from jaxgran.particles.programs import compiling
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 TIMES = np.array([0.0, 0.3, 1.0, 1.1, 2.5])
 STEPS = 2 + 3 + 1 + 6  # of at most 0.25, from time to time

@@ -9,7 +9,7 @@ import jaxgran
 from jaxgran import observables
 from jaxgran.checks import status
 from jaxgran.sweeps.store import Store
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 TIMES = (0.05, 0.1)
 MODEL = jaxgran.DSMC(50, replicas=2)

@@ -13,7 +13,7 @@ from jaxgran.data.run import Run
 from jaxgran.models.flow_bias import slope_bias, slope_bias_of_run
 from jaxgran.tangents.differences import by_differences
 from jaxgran.tangents.rule import Inputs, Outputs, differentiable, with_tangents
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 from tests.models.test_hard_spheres import hard_gas
 from tests.models.test_soft_spheres import soft_beads
 

@@ -12,7 +12,7 @@ import jaxgran
 from jaxgran.data.run import Run
 from jaxgran.scene.restitution import ConstantRestitution, ReducedViscoelastic, RestitutionSeries
 from jaxgran.tangents.impact import ImpactTangents
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 from tests.models.test_dsmc import SENSITIVITY
 from tests.models.test_hard_spheres import hard_gas
 from tests.tangents.test_thermal import FLOATS, log_temperature

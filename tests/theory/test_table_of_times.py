@@ -13,7 +13,7 @@ from jaxgran.theory.table_of_times import (
     log_temperature,
     relaxed_cooling_rate,
 )
-from tests.conftest import glass_beads
+from tests.beads import glass_beads
 
 SLOW = pytest.mark.slow
 
