@@ -1,5 +1,6 @@
 """Curves and fits as tables and pictures in a notebook."""
 
+import dataclasses
 import sys
 from typing import Any
 
@@ -36,6 +37,21 @@ def test_a_dataset_has_names_dimensions_and_units(curve):
     np.testing.assert_array_equal(data.velocity, curve.particles.velocity)
     assert data.temperature.attrs["units"] == "m^2/s^2" and data.time.attrs["units"] == "s"
     assert data.attrs["status"] == 0 and "sonine" not in data
+
+
+def test_a_dataset_has_what_was_saved(curve):
+    each = jnp.arange(16.0).reshape(2, 4, 2)  # replicas, times, and an axis of the user's
+    data = curve.with_saved({"S": [each, each[..., 0]]}).to_xarray()
+    assert data["saved.S.0"].dims == ("time", "saved.S.0.axis0")
+    assert data["saved_of_replicas.S.1"].dims == ("replica", "time")
+    np.testing.assert_array_equal(data["saved.S.0"], each.mean(0))
+    np.testing.assert_allclose(data["saved_error.S.1"], 8 / 2)
+    with pytest.raises(ValueError, match="the key 'a.b': keys name arrays"):
+        curve.with_saved({"a.b": each}).to_xarray()
+    whole = jaxgran.Particles(*(jnp.ones((4, 2, 3, 3)) for _ in range(2)), 2 * jnp.ones(4))
+    data = dataclasses.replace(curve, saved=whole).to_xarray()
+    assert data["saved.position"].dims == ("time", "replica", "particle", "axis")
+    assert data["saved.velocity"].attrs["units"] == "m/s"
 
 
 def test_a_frame_has_a_row_for_each_time(curve):

@@ -154,10 +154,13 @@ class CoolingCurve(eqx.Module):
         """The curve as an `xarray.Dataset`, with units; needs the extra `notebook`.
 
         Quantities have the dimension time, those of replicas, with the ending _of_replicas, replica
-        and time, positions and velocities replica, particle and axis.
+        and time, positions and velocities replica, particle and axis. What ``save=`` made of the
+        particles is named by its place, as ``saved.S.0``, with its standard error in
+        ``saved_error.S.0`` and that of each replica in ``saved_of_replicas.S.0``.
 
         Raises:
-            ValueError: for several curves in one, as `jax.vmap` returns them.
+            ValueError: for several curves in one, as `jax.vmap` returns them, and where a key of a
+                saved dictionary holds "." or "/".
             ModuleNotFoundError: without xarray.
         """
         return tables.dataset(self)

@@ -76,9 +76,23 @@ def dataset(curve: Any) -> Any:
         for name, unit in (("position", "m"), ("velocity", "m/s")):
             values = np.asarray(getattr(curve.particles, name))
             found[name] = (("replica", "particle", "axis"), values, {"units": unit})
+    found |= _saved(curve)
     time = described("times", "time", values=np.asarray(curve.times))
     attributes = {} if curve.status is None else {"status": int(curve.status)}
     return xarray.Dataset(found, coords={"time": time}, attrs=attributes)
+
+
+def _saved(curve: Any) -> dict[str, tuple]:
+    """What ``save=`` made of the particles, by name: dimensions, values and attributes."""
+    from jaxgran.data import curve as curves  # which imports this module
+    from jaxgran.data import saved
+
+    whole, found = isinstance(curve.saved, curves.Particles), {}
+    for name, leaf in saved.leaves(curve).items():
+        unit = saved.unit(name, whole)
+        attributes = {} if unit is None else {"units": unit}
+        found[name] = saved.dimensions(name, np.ndim(leaf), whole), np.asarray(leaf), attributes
+    return found
 
 
 def frame(curve: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -42,6 +43,7 @@ def slope_bias(clock: A) -> A:
     return factor * clock * (1 + (clock / scale) ** 2)
 
 
+@jax.jit
 def slope_bias_of_run(
     times: Float[Array, "times"], flow_share: Float[Array, "times"]
 ) -> Float[Array, "times"]:

@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxgran.data import saved
+from jaxgran.data.saved import OF_REPLICAS, REPLICA, TIME
 from jaxgran.data.tables import UNITS
 from jaxgran.scene import gas_words
-from jaxgran.sweeps import saved
 from jaxgran.sweeps.batch import INITIAL, Batch
 from jaxgran.sweeps.program import STATUS, unknown
-from jaxgran.sweeps.saved import OF_REPLICAS, REPLICA, TIME
 
 MEMBER = "member"
 

@@ -13,7 +13,9 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxgran.checks import status
+from jaxgran.data import saved
 from jaxgran.data.curve import CoolingCurve, Particles
+from jaxgran.data.saved import OF_REPLICAS
 from jaxgran.data.tables import UNITS
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.cooling import cool
@@ -21,9 +23,7 @@ from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.interruption import waited_for
 from jaxgran.scene.gas import Gas
-from jaxgran.sweeps import saved
 from jaxgran.sweeps.batch import Keys
-from jaxgran.sweeps.saved import OF_REPLICAS
 
 DEVICE = "device"
 """The axis of the mesh."""

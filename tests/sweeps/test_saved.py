@@ -125,7 +125,7 @@ def test_members_that_are_not_taken_are_nan_or_0(gases):
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (lambda p: {"a.b": p.velocity}, "the key 'a.b': in a sweep keys name arrays"),
+        (lambda p: {"a.b": p.velocity}, "the key 'a.b': keys name arrays"),
         (lambda p: {"a/b": p.velocity}, "the key 'a/b'"),
         (lambda p: jax.random.key(1), "must return numbers, got an array of key"),
         (lambda p: "words", "must return numbers, got 'words'"),

@@ -1,4 +1,4 @@
-"""What `save` makes of the particles of members: arrays by name, and their dimensions."""
+"""What `save` makes of the particles: arrays by name, and their dimensions."""
 
 import dataclasses
 from typing import Any
@@ -97,7 +97,7 @@ def _name(part: str, path: tuple[Any, ...]) -> str:
     for key in keys:
         if "." in key or "/" in key:
             raise ValueError(
-                f"save returns a dictionary with the key {key!r}: in a sweep keys name arrays of "
-                'the store, leave "." and "/" out'
+                f"save returns a dictionary with the key {key!r}: keys name arrays of a store "
+                'or of an xarray.Dataset, leave "." and "/" out'
             )
     return ".".join([part, *keys])
