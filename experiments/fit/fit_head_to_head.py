@@ -162,8 +162,12 @@ def stochastic(options: argparse.Namespace) -> Problem:
     model, other = (jaxgran.DSMC(size, replicas=replicas) for replicas in (2, 8))
     key = jax.random.key(KEY + 1)
     made = jaxgran.cool(gas, curve.times, model=other, key=key, progress=False)
+    assert made.temperature_error is not None
+    later = made.times > 0  # all replicas start from the same temperature
     curve = jaxgran.CoolingCurve(
-        made.times, made.temperature, temperature_error=made.temperature_error
+        made.times[later],
+        made.temperature[later],
+        temperature_error=made.temperature_error[later],
     )
     return Problem(gas, curve, model, f"DSMC, N = {size}, 2 replicas; curve: 8 others")
 

@@ -175,7 +175,7 @@ def test_replicas_are_the_runs_they_stand_for(beads):
 def test_cools_as_kinetic_theory_with_softness_says(beads, dimension):
     # Already in .8 L_c of two dimensions the waves of the flow keep T 3 to 4 % higher.
     gas = soft_beads(beads, 0.02, 0.25, dimension, packing_fraction={2: 0.05, 3: 0.04}[dimension])
-    n, replicas = {2: (100, 36), 3: (1000, 4)}[dimension]
+    n, replicas = {2: (100, 36), 3: (800, 5)}[dimension]
     assert gas.box_side(n) < 0.5 * gas.critical_box
     theory = jaxgran.cool(gas, np.geomspace(0.1, 1000, 200) * float(gas.mean_free_time))
     end = float(
@@ -200,13 +200,15 @@ def test_clusters_above_the_critical_box_only(beads):
     gas = soft_beads(beads, 0.03, 0.5, dimension=2, packing_fraction=0.2)
     end = [40 * float(gas.mean_free_time)]
     shapes = {}
-    for n, replicas in ((50, 20), (2000, 1)):
+    for n, replicas in ((50, 120), (2000, 1)):
         model = SoftSpheres(n, replicas=replicas, steps_per_contact=20)
         curve = jaxgran.cool(gas, end, model=model)
         boxes = curve.particles.position
         shapes[n] = np.mean([structure_factor(x, curve.particles.box_side)[1] for x in boxes], 0)
     assert gas.box_side(50) < gas.critical_box < 0.3 * gas.box_side(2000)
-    assert np.all(shapes[50] < 1)  # a homogeneous fluid's compressibility at phi = .2 is .42
+    # A homogeneous fluid's compressibility at phi = .2 is .42. The longest waves in a box of .87 L_c
+    # have .81(6), of which 20 replicas would scatter by .12.
+    assert np.all(shapes[50] < 1)
     assert shapes[2000].max() > 3
 
 
