@@ -206,8 +206,8 @@ def test_clusters_above_the_critical_box_only(beads):
         boxes = curve.particles.position
         shapes[n] = np.mean([structure_factor(x, curve.particles.box_side)[1] for x in boxes], 0)
     assert gas.box_side(50) < gas.critical_box < 0.3 * gas.box_side(2000)
-    # A homogeneous fluid's compressibility at phi = .2 is .42. The longest waves in a box of .87 L_c
-    # have .81(6), of which 20 replicas would scatter by .12.
+    # A homogeneous fluid's compressibility at phi = .2 is .42. The longest waves of a box of
+    # .87 L_c have .81(6), of which 20 replicas would scatter by .12.
     assert np.all(shapes[50] < 1)
     assert shapes[2000].max() > 3
 

@@ -316,7 +316,7 @@ ENTRIES = {
             "fit_head_to_head",
             heads,
             "fit_head_to_head.png",
-            "22 min",
+            "8 min",
             "speed.md",
         ),
         Entry(
