@@ -1,13 +1,16 @@
 """The examples of the public docstrings run, and the API pages are made from them."""
 
 import doctest
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import jaxgran
 
+README = Path(__file__).parents[1] / "README.md"
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
@@ -51,12 +54,16 @@ def test_a_wrong_example_is_found():
 @pytest.mark.slow
 def test_api_pages_are_made_without_a_warning(tmp_path):
     pytest.importorskip("pdoc")
-    command = [sys.executable, "-W", "error", "-m", "pdoc", "-d", "google"]
-    done = subprocess.run(
-        [*command, "jaxgran", "-o", str(tmp_path)], capture_output=True, text=True, check=False
-    )
+    (printed,) = re.findall(r"&& pdoc (.*)`", README.read_text(encoding="utf-8"))
+    command = [sys.executable, "-W", "error", "-m", "pdoc", *printed.split(), "-o", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "Warn" not in done.stderr and "Warn" not in done.stdout, done.stderr
-    page = (tmp_path / "jaxgran.html").read_text(encoding="utf-8")
-    for name in jaxgran.__all__:
-        assert f'id="{name}"' in page, f"{name} is not on the page"
+    observables = "jaxgran/particles/observables"
+    for page, names in (
+        ("jaxgran", set(jaxgran.__all__) - {"observables"}),
+        (observables, jaxgran.observables.__all__),
+    ):
+        text = (tmp_path / f"{page}.html").read_text(encoding="utf-8")
+        for name in names:
+            assert f'id="{name}"' in text, f"{name} is not on the page {page}"

@@ -171,7 +171,8 @@ def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict 
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "start.npz"
-        np.savez(file, fraction=fraction, **start._asdict())
+        known = {name: x for name, x in start._asdict().items() if x is not None}
+        np.savez(file, fraction=fraction, **known)
         for count in blocks:
             command = [sys.executable, __file__, "--memory-worker", str(file), str(count)]
             out = subprocess.run(command, check=True, capture_output=True, text=True).stdout

@@ -81,21 +81,15 @@ def exponents_follow_gamma(found):
     "name, holds",
     [
         ("paper_restitution", series_is_that_of_impacts),
-        pytest.param("paper_cooling", cools_as_theory, marks=pytest.mark.slow),
-        pytest.param(
-            "paper_velocity_correlation", dissipation_lengthens_the_memory, marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "paper_diffusion_coefficient",
-            diffusion_is_not_that_of_the_paper,
-            marks=pytest.mark.slow,
-        ),
-        pytest.param("paper_diffusion", spreads_as_theory, marks=pytest.mark.slow),
-        pytest.param("paper_exponents", exponents_follow_gamma, marks=pytest.mark.slow),
+        ("paper_cooling", cools_as_theory),
+        ("paper_velocity_correlation", dissipation_lengthens_the_memory),
+        ("paper_diffusion_coefficient", diffusion_is_not_that_of_the_paper),
+        ("paper_diffusion", spreads_as_theory),
+        ("paper_exponents", exponents_follow_gamma),
     ],
 )
 def test_paper_is_reproduced(name, holds, tmp_path):
-    done = run(f"{name}.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run(f"paper/{name}.py", "--smoke", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / f"{name}.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / f"{name}.json").read_text())

@@ -96,14 +96,15 @@ def test_drag_and_drive_agree_with_dsmc_and_theory(name):
     gas = glass_beads(packing_fraction=0.02)
     rate = 0.02 / float(gas.mean_free_time)
     drive = jaxgran.WhiteNoise(0.02 * gas.temperature / gas.mean_free_time)
+    rough, surface = name == "rough", jaxgran.Rough(0.3, rotational_temperature=4e-3)
     elements = [
-        {"drag": jaxgran.StokesDrag(rate, rotational_rate=2 * rate)},
+        {"drag": jaxgran.StokesDrag(rate, rotational_rate=2 * rate if rough else 0.0)},
         {"drive": drive},
         {"drag": jaxgran.StokesDrag(rate), "drive": drive},
     ]
     for each in elements:
-        if name == "rough":
-            each["surface"] = jaxgran.Rough(0.3, rotational_temperature=4e-3)
+        if rough:
+            each["surface"] = surface
         scene = dataclasses.replace(gas, **each)
         taus = [1.0, 5.0, 20.0, 60.0]
         hard = run(scene, 500, 16, taus)
