@@ -14,8 +14,11 @@ QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=fals
 without them it compiles a fit in 1.9 s in place of 5.1 s (jaxlib 0.10.1)."""
 
 MOST_MAPS = 12_000
-"""Memory maps of a process from which on it forgets what it has compiled. Linux gives 65530, of
-which thousands of compiled functions take tens each."""
+"""Memory maps of a process from which on it forgets what it has compiled, after a file. Linux gives
+65530, of which thousands of compiled functions take tens each."""
+
+FAR_TOO_MANY = 40_000
+"""The same after each test: XLA crashes, without a word, where it gets no further map."""
 
 
 def pytest_configure(config):
@@ -62,8 +65,19 @@ def beads():
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled_code():
     yield
+    _forget_beyond(MOST_MAPS)
+
+
+@pytest.fixture(autouse=True)
+def forget_within_a_file(request):
+    yield
+    if request.node.get_closest_marker("slow"):
+        _forget_beyond(FAR_TOO_MANY)
+
+
+def _forget_beyond(most: int):
     maps = Path("/proc/self/maps")
-    if not maps.exists() or len(maps.read_bytes().splitlines()) > MOST_MAPS:
+    if not maps.exists() or len(maps.read_bytes().splitlines()) > most:
         import jax
 
         jax.clear_caches()

@@ -60,10 +60,22 @@ def restitution(table: Table) -> None:
         abs(hertz - 3.21806546) < 1e-7,
     )
     table.add(
-        "5", "C₁ = 1.15344", f"{C1:.9f}", "closed form, ODE", "agree", abs(C1 - 1.15344) < 1e-5
+        "5",
+        "C₁ = 1.15344",
+        f"{C1:.9f}",
+        "closed form, ODE",
+        "agree",
+        abs(C1 - 1.15344) < 1e-5,
+        ratios=[("C₁", C1, 1.15344)],
     )
     table.add(
-        "6", "C₂ = 0.79826", f"{C2:.9f}", "closed form, ODE", "agree", abs(C2 - 0.79826) < 1e-5
+        "6",
+        "C₂ = 0.79826",
+        f"{C2:.9f}",
+        "closed form, ODE",
+        "agree",
+        abs(C2 - 0.79826) < 1e-5,
+        ratios=[("C₂", C2, 0.79826)],
     )
 
 
@@ -85,6 +97,15 @@ def remarks(table: Table) -> None:
             "agree",
             all(abs(r["last_exponent_of_theory"] - r["paper_exponent"]) < 0.03 for r in seen),
             "ice has no single γ: elastic below 0.01 cm/s",
+            [
+                (
+                    f"exponent of T(t), {name}",
+                    run[name]["last_exponent_of_theory"],
+                    run[name]["paper_exponent"],
+                )
+                for name in run
+                if name.startswith("γ")
+            ],
         )
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     gas = jaxgran.read_gas(header)

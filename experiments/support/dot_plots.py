@@ -280,6 +280,18 @@ def benchmark_versions(found: dict) -> DotPlot:
     return DotPlot(dots, "time now over time before", (1.0, "as before"))
 
 
+def paper_claims(found: dict) -> DotPlot:
+    dots = []
+    for row in found["rows"]:
+        for words, ratio, error in row["ratios"]:
+            label = words if row["equation"] == "text" else f"Eq. {row['equation']}: {words}"
+            ends = (None, None) if error is None else (ratio - error, ratio + error)
+            dots.append(Dot(label, ratio, *ends, hollow=row["verdict"] == "corrected"))
+    axis = "number found here over the paper's"
+    kinds = "agrees within its accuracy", "the paper's is corrected"
+    return DotPlot(dots, axis, (1.0, "as printed"), kinds=kinds)
+
+
 PLOTS: dict[str, Callable[[dict], DotPlot]] = {
     "hard_cases": hard_cases,
     "wrong_physics": wrong_physics,
@@ -295,5 +307,6 @@ PLOTS: dict[str, Callable[[dict], DotPlot]] = {
     "benchmark_derivatives": benchmark_derivatives,
     "benchmark_elements": benchmark_elements,
     "benchmark_versions": benchmark_versions,
+    "paper_claims": paper_claims,
 }
 """Pictures by the name of the figures, and of the picture."""

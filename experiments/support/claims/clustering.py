@@ -45,6 +45,10 @@ def onset(table: Table, run: dict, haff: list) -> None:
         ),
         "N_c is a matter of definition: 10 % above Haff's law of the same time comes at "
         f"{early[0]:.0f} and {early[1]:.0f}",
+        [
+            (f"N_c, ε = {e:g}", left["N"][0], n, left["N"][1])
+            for left, (n, e, _) in zip(found[BY_TIME], QUOTED, strict=True)
+        ],
     )
     # N at which T has the quoted value, by the slope of ln T between the two departures.
     shifts = []
@@ -64,6 +68,10 @@ def onset(table: Table, run: dict, haff: list) -> None:
         f"{off[0]:+.0f} % and {off[1]:+.0f} % off, as much as {shifts[0]:+.1f} of 70 and "
         f"{shifts[1]:+.1f} of 23 collisions: within the definition of N_c, whose two here differ "
         f"by {spread[0]:.0f} and {spread[1]:.0f}; they are no values of Haff's law",
+        [
+            (f"T/T₀ at N_c, ε = {e:g}", T[0], quoted, T[1])
+            for T, (_, e, quoted) in zip(cooler, QUOTED, strict=True)
+        ],
     )
     ratio = clocks[BY_TIME], clocks[BY_NUMBER], clocks[BY_DENSITY]
     table.add(

@@ -31,6 +31,7 @@ def cooling(table: Table) -> None:
             "agree",
             abs(last + 5 / 3) < 0.05,
             "asymptotically",
+            [("exponent of T(t), viscoelastic", last, -5 / 3, row["exponent_error"][-1])],
         )
     slope = jax.grad(
         lambda x: jnp.log(jaxgran.KineticTheory().cooling_rate(gas.replace(temperature=x)))
@@ -43,6 +44,7 @@ def cooling(table: Table) -> None:
         "theory",
         "agree",
         abs(power - 0.6) < 1e-3,
+        ratios=[("exponent of 1/τ₀ in T₀", power, 0.6)],
     )
     spheres = table.found("paper_velocity_correlation")
     if spheres and "hard_spheres" in spheres["elastic"]:
@@ -55,6 +57,7 @@ def cooling(table: Table) -> None:
             "hard spheres",
             "agree",
             abs(ratio - 1) < 0.02,
+            ratios=[("1/τ_c at η = 0.05", ratio, 1.0)],
         )
     spread = table.found("paper_diffusion")
     if spread:
@@ -97,6 +100,7 @@ def series(table: Table, gas: jaxgran.Gas) -> None:
         "agree",
         abs(c / first - 1) < 1e-3,
         "of a Maxwellian gas",
+        [("first coefficient of 1/τ_v", c, first)],
     )
     table.add(
         "36",
@@ -145,6 +149,7 @@ def formulas(table: Table) -> None:
         off < 0.01,
         "the homogeneous solution −2qδu^{−8/3} is missing; a₂ and a₁ change with the Sonine a₂, "
         f"which makes a₁ {2 * (q + 0.24 * s):.3f}",
+        [("T(0), δ = 0.093", 1.0, first), ("a₁", 2 * (q + 0.24 * s), 2 * q)],
     )
     rate = closed_forms.COOLING_RATE[3]
     table.add(
@@ -155,6 +160,7 @@ def formulas(table: Table) -> None:
         "agree",
         abs(rate - 0.831928) < 1e-5,
         "the paper's digits are those of C₁ = 1.15344",
+        [("τ_c(0)/(δτ₀)", rate, 0.831928)],
     )
     if run:
         row = run["constant"]
@@ -168,6 +174,7 @@ def formulas(table: Table) -> None:
             "agree",
             abs(last + 2) < 0.01,
             "the difference is a₂",
+            [("exponent of T(t), constant ε", last, -2.0, row["exponent_error"][-1])],
         )
 
 

@@ -39,17 +39,19 @@ def memory(table: Table) -> None:
         decay = (1 + e) / 3  # of ln of the correlation in one collision
         i = int(np.argmin(np.abs(np.array(row["lags"]) - 4.0)))
         exponential = np.exp(-decay * row["collisions"][i])
+        printed = float(np.exp(-4 / run["constant"]["paper_relaxation"]))
         off = (row["correlation"][i] - exponential) / row["error"][i]
         table.add(
             "22, 24",
             "⟨v(t′)·v(t)⟩ = 3T exp(−(t − t′)/τ_v(t′))",
             f"after 4 τ_E (ε = {e:.2f}) {row['correlation'][i]:.4f} ± {row['error'][i]:.4f}, "
-            f"printed {np.exp(-4 / run['constant']['paper_relaxation']):.4f}, exp(−∫dt/τ_v) "
+            f"printed {printed:.4f}, exp(−∫dt/τ_v) "
             f"{exponential:.4f} ({off:+.0f} σ)",
             "DSMC, hard spheres",
             "corrected",
             abs(row["correlation"][i] / exponential - 1) < 0.05,
             "nearly exponential in collisions; in time (1 + γ₀t/τ_c)^{−2/(1−ε)} for constant ε",
+            [(f"⟨v(0)·v(4τ_E)⟩, ε = {e:.2f}", row["correlation"][i], printed, row["error"][i])],
         )
         rows = run["relaxation"]["constant"]
         e = 1 - rows["lost"][-1]
@@ -63,6 +65,7 @@ def memory(table: Table) -> None:
             abs(rows["measured"][-1] / rows["paper"][-1] - 1) < 0.02,
             "of a Maxwellian start; 1/τ_v of the cooling state is "
             f"{100 * _relaxation_of_cooling_state(e):.1f} % greater at the same T (theory)",
+            [(f"τ_v, ε = {e:.1f}", rows["measured"][-1], rows["paper"][-1], rows["error"][-1])],
         )
     run = table.found("paper_diffusion_coefficient")
     if run:
@@ -78,6 +81,14 @@ def memory(table: Table) -> None:
             "corrected",
             abs(row["by_slope"][-1] / row["by_slope_theory"][-1] - 1) < 0.01,
             "the gas cools while it remembers: dD/dt = T − D/τ_v, T τ_E 4/(1 + ε)² for constant ε",
+            [
+                (
+                    f"D/(T τ_E), ε = {e:.2f}",
+                    row["by_slope"][-1],
+                    row["paper"][-1],
+                    row["by_slope_error"][-1],
+                )
+            ],
         )
         worst = np.abs(np.array(row["by_slope"]) / np.array(row["by_slope_theory"]) - 1).max()
         table.add(
@@ -120,6 +131,7 @@ def diffusion(table: Table) -> None:
         "corrected",
         abs(a_3[0] / ours - 1) < 0.01,
         "memory adds c once more, a₂ adds 0.267; −q′δu^{−11/6} keeps T(0) = T₀",
+        [("a₃", ours, q + c)],
     )
     n, g_2 = gas.number_density, gas.contact_value
     printed = float(8 / 3 * pi**0.5 * gas.diameter**2 * g_2 * n * gas.temperature**0.5)
@@ -150,6 +162,7 @@ def diffusion(table: Table) -> None:
             "corrected",
             off < 1e-4,
             "the factor 6 and the constant hide the power law",
+            [("exponent of ⟨Δr²⟩(t)", row["exponent"][-1], 1 / 6, row["exponent_error"][-1])],
         )
         constant = run["constant"]
         x, y = np.log(constant["tau"]), np.array(constant["displacement"])
@@ -201,4 +214,5 @@ def diffusion(table: Table) -> None:
         "agree",
         abs(power + 10) < 3,
         "asymptotically; exact for constant ε",
+        [("exponent of T(N)", power, -10.0)],
     )

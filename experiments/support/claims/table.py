@@ -26,6 +26,8 @@ class Row:
         verdict: "agree" or "corrected".
         holds: whether the numbers support the verdict.
         why: a reason or a limit.
+        ratios: of numbers, what is found here over what the paper prints: words, ratio, and its
+            standard error, or None if it has none.
     """
 
     equation: str
@@ -35,6 +37,7 @@ class Row:
     verdict: str
     holds: bool = True
     why: str = ""
+    ratios: list[tuple[str, float, float | None]] = field(default_factory=list)
 
 
 @dataclass
@@ -44,8 +47,13 @@ class Table:
     results: Path
     rows: list[Row] = field(default_factory=list)
 
-    def add(self, equation, claim, ours, checked, verdict, holds=True, why="") -> None:
-        self.rows.append(Row(equation, claim, ours, checked, verdict, bool(holds), why))
+    def add(self, equation, claim, ours, checked, verdict, holds=True, why="", ratios=()) -> None:
+        """Add a row; ratios are given as (words, found, printed) or with the error of the found."""
+        found = []
+        for words, here, printed, *error in ratios:
+            spread = abs(float(error[0] / printed)) if error else None
+            found.append((words, float(here / printed), spread))
+        self.rows.append(Row(equation, claim, ours, checked, verdict, bool(holds), why, found))
 
     def found(self, name: str) -> dict | None:
         """The entry "found" of the results of a script, or None if there are none."""

@@ -536,7 +536,7 @@ ENTRIES = {
             "Which claims of the paper hold, equation by equation?",
             "paper_claims",
             claims,
-            "",
+            "paper_claims.png",
             "15 s",
             "paper_claims.md",
         ),
