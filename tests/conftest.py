@@ -20,10 +20,42 @@ MOST_MAPS = 12_000
 FAR_TOO_MANY = 40_000
 """The same after each test: XLA crashes, without a word, where it gets no further map."""
 
+FOUND: dict[str, list[dict]] = {}
+"""What tests found in this session, by the name of the file that would keep it."""
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--record",
+        action="store_true",
+        help="keep what tests with the marker `figures` find in experiments/figures/tests, from "
+        "which experiments/accuracy.md is made; in one process (-n 0)",
+    )
+
+
+@pytest.fixture
+def record():
+    """Keep numbers that a document quotes: called at the end of a test, when all has held."""
+
+    def keep(name, **numbers):
+        FOUND.setdefault(name, []).append(numbers)
+
+    return keep
+
+
+def pytest_sessionfinish(session, exitstatus):
+    if session.config.option.record and exitstatus == 0:
+        from experiments.support.record import FIGURES, save
+
+        for name, rows in FOUND.items():
+            save(FIGURES / "tests" / f"{name}.json", rows=rows)
+
 
 def pytest_configure(config):
     """What one file or worker has compiled serves the others, in this run of the tests alone."""
     worker = hasattr(config, "workerinput")
+    if config.option.record and (worker or getattr(config.option, "dist", "no") != "no"):
+        raise pytest.UsageError("--record needs all tests in one process: add -n 0")
     if not worker:
         os.environ["MPLBACKEND"] = "agg"  # no window
         os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxgran-tests-")
@@ -65,7 +97,7 @@ def beads():
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled_code():
     yield
-    _forget_beyond(MOST_MAPS)
+    _forget_beyond(MOST_MAPS, where_unknown=True)
 
 
 @pytest.fixture(autouse=True)
@@ -75,9 +107,10 @@ def forget_within_a_file(request):
         _forget_beyond(FAR_TOO_MANY)
 
 
-def _forget_beyond(most: int):
+def _forget_beyond(most: int, where_unknown: bool = False):
     maps = Path("/proc/self/maps")
-    if not maps.exists() or len(maps.read_bytes().splitlines()) > most:
+    count = len(maps.read_bytes().splitlines()) if maps.exists() else None
+    if where_unknown if count is None else count > most:
         import jax
 
         jax.clear_caches()

@@ -39,7 +39,9 @@ def test_a_changed_figure_is_found(monkeypatch):
     assert {"README.md", "speed_vs_error.md"} <= stale
 
 
-@pytest.mark.parametrize("path", sorted(EXPERIMENTS.glob("figures/*.json")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted(EXPERIMENTS.glob("figures/**/*.json")), ids=lambda p: p.stem
+)
 def test_figures_say_what_made_them(path):
     made = json.loads(path.read_text(encoding="utf-8"))["made_by"]
     assert re.fullmatch(r"\d{4}-\d\d-\d\d|before dates were recorded", made["date"])

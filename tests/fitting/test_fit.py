@@ -60,7 +60,8 @@ def test_starts_far_away_reach_the_same_answer():
 
 
 @pytest.mark.slow
-def test_intervals_cover_the_truth():
+@pytest.mark.figures
+def test_intervals_cover_the_truth(record):
     # 500 noisy curves: a 95 % interval must cover in 93 to 97 % (2 standard errors of 500 trials).
     gas = glass_beads(0.15)
     names = ("dissipative_constant", "temperature")
@@ -79,6 +80,7 @@ def test_intervals_cover_the_truth():
     assert jnp.all(converged)
     assert jnp.all((coverage >= 0.93) & (coverage <= 0.97)), coverage
     np.testing.assert_allclose(jnp.mean(reduced), 1.0, atol=0.04)  # 38 d.o.f., 500 curves: 0.01
+    record("intervals", coverage=coverage.tolist())
 
 
 @pytest.mark.slow

@@ -76,7 +76,8 @@ def million(request):
 
 
 @pytest.mark.slow
-def test_a_million_particles_cool_as_kinetic_theory_says(million):
+@pytest.mark.figures
+def test_a_million_particles_cool_as_kinetic_theory_says(million, record):
     (beta, dimension), (theory, curve) = million
     off = np.asarray(curve.temperature / theory.temperature - 1)
     error = np.asarray(curve.temperature_error / curve.temperature)
@@ -87,6 +88,9 @@ def test_a_million_particles_cool_as_kinetic_theory_says(million):
     print(f"; at most {100 * np.abs(off).max():.3f} %")
     # .03 % are asked of the theory; besides, three times the scatter of 12 million.
     assert np.all(np.abs(off) < 3e-4 + 3 * T_SCATTER / (12e6) ** 0.5)
+    some = np.isin(TAUS, (10.0, 50.0, 100.0))
+    numbers = {"off": off[some].tolist(), "error": error[some].tolist()}
+    record("dsmc_million", beta=beta, dimension=dimension, **numbers)
 
 
 @pytest.mark.slow
@@ -105,8 +109,10 @@ def test_a_million_particles_spread_as_kinetic_theory_says(million):
         pytest.param(0.9, 2, -0.0301, 3e-4, marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("replicas", [1, pytest.param(16, marks=pytest.mark.slow)])
-def test_sonine_coefficient_of_constant_restitution(eps, dimension, a2, error, replicas):
+@pytest.mark.parametrize(
+    "replicas", [1, pytest.param(16, marks=[pytest.mark.slow, pytest.mark.figures])]
+)
+def test_sonine_coefficient_of_constant_restitution(eps, dimension, a2, error, replicas, record):
     gas, size = constant(eps, dimension), 50_000 if replicas == 1 else 100_000
     n = size * replicas
     cooling = (1 - eps**2) / dimension
@@ -122,6 +128,8 @@ def test_sonine_coefficient_of_constant_restitution(eps, dimension, a2, error, r
     # The table's own moments give the factor; noise of ln T over 40 collision times.
     expected = -cooling * (1 + a2 / 4)
     assert slope == pytest.approx(expected, rel=0.002 + 3 * T_SCATTER / n**0.5 / (cooling * 40))
+    if replicas > 1:
+        record("sonine", eps=eps, dimension=dimension, found=found, known=a2, known_error=error)
 
 
 def test_elastic_gas_keeps_its_energy_and_its_maxwellian():
@@ -219,7 +227,8 @@ def test_the_step_is_second_order(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_order_of_the_step(monkeypatch):
+@pytest.mark.figures
+def test_the_order_of_the_step(monkeypatch, record):
     # The same memory, of 6.4 million particles at each step: pairs that may share a particle make
     # a step second order; with half of them, or none, it would be first order.
     gas, n, replicas = constant(0.6), 400_000, 16
@@ -255,6 +264,9 @@ def test_the_order_of_the_step(monkeypatch):
             off, error = miss[shared, step]
             # The second order of a step of .1 adds up to a fifth.
             assert off == pytest.approx(slope * step, abs=0.2 * abs(slope) * step + 3 * error)
+    for (shared, step), (off, error) in miss.items():
+        numbers = {"off": float(off), "error": float(error)}
+        record("dsmc_order", shared=shared, step=step, **numbers)
 
 
 @pytest.mark.slow

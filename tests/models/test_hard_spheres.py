@@ -162,8 +162,9 @@ def diffusion(packing_fraction, size, replicas, begin):
 
 
 @pytest.mark.slow
+@pytest.mark.figures
 @pytest.mark.parametrize("packing_fraction", [0.1, 0.2, 0.3])
-def test_diffuses_in_an_infinite_box_as_published(packing_fraction):
+def test_diffuses_in_an_infinite_box_as_published(packing_fraction, record):
     # A periodic box lowers D by 2.84 T / (6 pi eta L) to first order in 1/L (Yeh & Hummer, J. Phys.
     # Chem. B 108 (2004) 15873), for 4096 spheres by 3 to 6 %; boxes of 500 err from it by another
     # 2 %. Without that D is what Erpenbeck & Wood found (Phys. Rev. A 43 (1991) 4254; their fit's
@@ -179,16 +180,21 @@ def test_diffuses_in_an_infinite_box_as_published(packing_fraction):
     infinite = 1.01896 * first_sonine * (1 + 0.054034 * y + 6.3656 * y**2 - 10.9425 * y**3)
     np.testing.assert_allclose(D + box, infinite, atol=2 * error + 0.01 * infinite)
     assert first_sonine + 3 * error < D
+    off = float((D + box) / infinite - 1), float(error / infinite)
+    record("diffusion_published", phi=packing_fraction, off=off[0], error=off[1])
 
 
 @pytest.mark.slow
+@pytest.mark.figures
 @pytest.mark.parametrize("packing_fraction", [0.1, 0.2, 0.3])
-def test_boxes_of_500_diffuse_as_published(packing_fraction):
+def test_boxes_of_500_diffuse_as_published(packing_fraction, record):
     # Speedy's formula (Mol. Phys. 62 (1987) 509) is met by boxes of 500 as they are.
     _, D, error = diffusion(packing_fraction, 500, 64, 20)
     n = 6 / np.pi * packing_fraction
     speedy = 3 / (8 * n * np.pi**0.5) * (1 - n / 1.09) * (1 + n**2 * (0.4 - 0.83 * n**2))
     np.testing.assert_allclose(D, speedy, atol=2 * error + 0.01 * speedy)
+    off = float(D / speedy - 1), float(error / speedy)
+    record("diffusion_500", phi=packing_fraction, off=off[0], error=off[1])
 
 
 @pytest.mark.slow

@@ -96,8 +96,9 @@ def test_elastic_walls_cool_as_dsmc():
 
 
 @pytest.mark.slow
+@pytest.mark.figures
 @pytest.mark.parametrize("num", [100, 500, 4000])
-def test_mixed_gas_between_lossy_walls(num):
+def test_mixed_gas_between_lossy_walls(num, record):
     # Near walls that take much the gas is colder and denser; theory's estimate of that is
     # course.WALLS of the rate of cooling, so of ln T.
     gas = contained(num, 0.8)
@@ -115,6 +116,7 @@ def test_mixed_gas_between_lossy_walls(num):
     fallen = np.abs(np.log(np.asarray(dsmc.temperature / gas.temperature)))
     print(f"\nN = {num}: at T/T_0 = {np.exp(-fallen)} ln T is {off} +- {error} off")
     assert np.all(np.abs(off) < WALLS * fallen + 3 * error)
+    record("walls", num_particles=num, off=off.tolist(), error=error.tolist())
 
 
 def test_viscoelastic_walls_bounce_by_their_own_law():

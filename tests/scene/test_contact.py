@@ -21,13 +21,15 @@ REFERENCE = [
 solve = jax.jit(impact, static_argnames=("clipped", "rtol"))
 
 
+@pytest.mark.figures
 @pytest.mark.parametrize("beta, unclipped, clipped, duration", REFERENCE)
-def test_impact_reproduces_reference(beta, unclipped, clipped, duration):
+def test_impact_reproduces_reference(beta, unclipped, clipped, duration, record):
     result = solve(beta)
     # The solver's rtol is 1e-11; the reference has 13 digits (eps) and 11 (time).
     np.testing.assert_allclose(result.restitution, clipped, rtol=2e-11)
     np.testing.assert_allclose(result.duration, duration, rtol=5e-11)
     np.testing.assert_allclose(solve(beta, clipped=False).restitution, unclipped, rtol=2e-11)
+    record("impact", beta=beta, error=abs(float(result.restitution) / clipped - 1))
 
 
 def test_elastic_impact():

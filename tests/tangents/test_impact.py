@@ -87,7 +87,8 @@ def test_slopes_in_every_float_are_those_of_kinetic_theory():
 
 
 @pytest.mark.slow
-def test_slope_is_that_of_the_sensitivity_table(beads):
+@pytest.mark.figures
+def test_slope_is_that_of_the_sensitivity_table(beads, record):
     gas, n, replicas = beads(0.15, packing_fraction=0.01), 1000, 8
     assert gas.box_side(n) < gas.critical_box
     times = np.array(list(SENSITIVITY)) * float(gas.mean_free_time)
@@ -98,6 +99,7 @@ def test_slope_is_that_of_the_sensitivity_table(beads):
     print(f"\nslopes over those of the table: {ratio} +- {spread}")
     # Enskog's clock, on which the table is, is off by .5 % and a tenth of the packing fraction.
     assert np.all(np.abs(ratio - 1) < 0.006 + 3 * spread)
+    record("hard_sensitivity", off=(ratio - 1).tolist(), error=spread.tolist())
 
 
 @pytest.mark.slow
@@ -223,16 +225,20 @@ def over_differences(beads, beta, packing, replicas):
 
 
 @pytest.mark.slow
+@pytest.mark.figures
 @pytest.mark.parametrize("beta, packing", [(0.2, 0.02), (0.1, 0.2)])
-def test_projected_slope_against_differences(beads, beta, packing):
+def test_projected_slope_against_differences(beads, beta, packing, record):
     bias, spread, told = over_differences(beads, beta, packing, 32)
     # The difference itself bends by 2 % of h^2 at this step.
     assert np.all(np.abs(bias) < np.maximum(0.05, 2 * spread))
     assert np.all(told == 0)  # below L_c
+    off, error = bias.tolist(), spread.tolist()
+    record("hard_derivatives", phi=packing, beta=beta, off=off, error=error, told=told.tolist())
 
 
 @pytest.mark.slow
-def test_a_flow_biases_the_projected_slope_as_the_curve_says(beads):
+@pytest.mark.figures
+def test_a_flow_biases_the_projected_slope_as_the_curve_says(beads, record):
     """In 1.1 L_c flows keep T 4 to 9 % above kinetic theory's; how that depends on A is lost to a
     memory of T alone, and differences in its place keep it (`tests.tangents.test_differences`)."""
     bias, spread, told = over_differences(beads, 0.3, 0.2, 96)
@@ -240,3 +246,5 @@ def test_a_flow_biases_the_projected_slope_as_the_curve_says(beads):
     # The estimate is within a factor of 2 in all gases in which it was measured, 2.5 at 3 times.
     ratio = np.abs(np.log(told / bias))
     assert np.all(ratio < np.log(2) + 2 * spread / bias)
+    off, error = bias.tolist(), spread.tolist()
+    record("hard_derivatives", phi=0.2, beta=0.3, off=off, error=error, told=told.tolist())

@@ -126,15 +126,79 @@ def posterior(found: dict) -> str:
     )
 
 
-def test(name: str) -> Callable[[dict], str]:
-    return lambda found: found[name]
+def largest(*names: str) -> Callable[[dict], str]:
+    """The largest errors of all rows of a test; names of several are written before them."""
+
+    def words(found: dict) -> str:
+        errors = {name: max(row[name] for row in found["rows"]) for name in names or ("error",)}
+        symbols = {"error": "", "temperature": "T ", "displacement": "⟨Δr²⟩ "}
+        return ", ".join(f"{symbols[name]}{power(error)}" for name, error in errors.items())
+
+    return words
+
+
+def off_in(row: dict, digits: int = 1) -> str:
+    """How far the numbers of a row are off, in per cent: -0.1 ± 0.2 / +0.3 ± 0.2."""
+    misses = zip(np.atleast_1d(row["off"]), np.atleast_1d(row["error"]), strict=True)
+    pairs = (f"{percent(off, digits)} ± {100 * error:.{digits}f}" for off, error in misses)
+    return " / ".join(pairs)
+
+
+def offs(found: dict) -> str:
+    return " / ".join(off_in(row) for row in found["rows"]) + " %"
+
+
+def intervals(found: dict) -> str:
+    (row,) = found["rows"]
+    return "cover " + " and ".join(f"{100 * share:.1f}" for share in row["coverage"]) + " %"
+
+
+def hard_derivatives(found: dict) -> str:
+    *below, above = found["rows"]
+    told = " / ".join(f"{100 * share:.0f}" for share in above["told"])
+    return (
+        f"{'; '.join(off_in(row) for row in below)} %; {off_in(above)} % in the box above L_c, "
+        f"where flows hold energy and the curve tells a bias of {told} %"
+    )
+
+
+def dsmc_million(found: dict) -> str:
+    def scene(row: dict) -> str:
+        return f"{row['dimension']}D, β = {row['beta']:g}: {off_in(row, 3)} %"
+
+    return "; ".join(map(scene, found["rows"]))
+
+
+def sonine(found: dict) -> str:
+    rows = found["rows"]
+    known = (f"{row['known']:.4f}({1e4 * row['known_error']:.0f})" for row in rows)
+    return minus(", ".join(f"{row['found']:.4f}" for row in rows) + " for " + ", ".join(known))
+
+
+def dsmc_order(found: dict) -> str:
+    def order(shared: float, errors: bool) -> str:
+        rows = [row for row in found["rows"] if row["shared"] == shared]
+        tails = (f" ± {row['error']:.4f}" if errors else "" for row in rows)
+        return " / ".join(minus(f"{r['off']:+.4f}{t}") for r, t in zip(rows, tails, strict=True))
+
+    return (
+        f"{order(1.0, True)} (second order; first order without pairs that share a particle: "
+        f"{order(0.0, False)})"
+    )
+
+
+def walls(found: dict) -> str:
+    def at(i: int) -> str:
+        pairs = ((row["off"][i], row["error"][i]) for row in found["rows"])
+        return " / ".join(minus(f"{off:+.3f} ± {error:.3f}") for off, error in pairs)
+
+    return f"{at(0)}, and {at(1)}"
 
 
 FIT = "python experiments/fit/lammps_curves.py"
 HEALTH = "python experiments/accuracy/gradient_health.py --scenes"
 SOFT = "python experiments/accuracy/soft_sphere_accuracy.py"
-SLOW = "pytest -m slow -n 0 -s"
-DIFFUSION = 'pytest -m "slow or not slow" tests/models/test_hard_spheres.py -k published'
+FOUND = "pytest -n 0 -m figures --record"
 AT = "at 1 / 3 / 10 / 30 / 100 collisions"
 SLOPE = "d ln T/d ln A through soft spheres"
 CLUSTERING = beads(0.3, 0.2, 0.05)
@@ -148,9 +212,9 @@ ROWS = (
     Row(
         "ε of one impact (ODE)",
         "high-precision values, β ≤ 5",
-        "tests",
-        test("impact"),
-        "pytest tests/scene/test_contact.py",
+        "tests/impact",
+        largest(),
+        f"{FOUND} tests/scene/test_contact.py",
     ),
     Row(
         "fast ε(β), β ≤ 10⁴",
@@ -162,30 +226,30 @@ ROWS = (
     Row(
         "T(t), a₂, ⟨Δr²⟩ to 1000 mean free times",
         "independent solution",
-        "tests",
-        test("kinetic_theory"),
-        "pytest tests/models/test_kinetic_theory.py",
+        "tests/kinetic_theory",
+        largest("temperature", "displacement"),
+        f"{FOUND} tests/models/test_kinetic_theory.py",
     ),
     Row(
         "Haff's law over 11 decades of time",
         "closed form",
-        "tests",
-        test("haff"),
-        "pytest tests/theory/test_closed_forms.py",
+        "tests/haff",
+        largest(),
+        f"{FOUND} tests/theory/test_closed_forms.py",
     ),
     Row(
         "d ln T/d ln A",
         "reference table",
-        "tests",
-        test("derivative"),
-        "pytest tests/models/test_kinetic_theory.py",
+        "tests/derivative",
+        largest(),
+        f"{FOUND} tests/models/test_kinetic_theory.py",
     ),
     Row(
         "95 % intervals of A and T₀",
         "500 noisy curves",
-        "tests",
-        test("intervals"),
-        "pytest -m slow tests/fitting/test_fit.py -k intervals",
+        "tests/intervals",
+        intervals,
+        f"{FOUND} tests/fitting/test_fit.py",
     ),
     Row(
         "A of the dilute LAMMPS curve",
@@ -268,11 +332,11 @@ ROWS = (
     ),
     Row(
         "d ln T/d ln A through hard spheres after 10 and 30 τ_c, (φ, β) = (.02, .2), (.2, .1); "
-        "(.2, .3) in a box of 1.2 L_c",
+        "(.2, .3) in a box of 1.1 L_c",
         "finite differences",
-        "tests",
-        test("hard_derivatives"),
-        f"{SLOW} tests/tangents/test_impact.py -k 'against_differences or biases'",
+        "tests/hard_derivatives",
+        hard_derivatives,
+        f"{FOUND} tests/tangents/test_impact.py",
     ),
     *(
         Row(
@@ -288,9 +352,9 @@ ROWS = (
     Row(
         "d ln T/d ln A through hard spheres, φ = .01, β = .15, at 1 / 5 / 10 / 50 / 100 τ_c",
         "reference table",
-        "tests",
-        test("hard_sensitivity"),
-        f"{SLOW} tests/tangents/test_impact.py -k sensitivity_table",
+        "tests/hard_sensitivity",
+        offs,
+        f"{FOUND} tests/tangents/test_impact.py",
     ),
     Row(
         f"{SLOPE}, dilute, by plain forward mode",
@@ -342,18 +406,18 @@ ROWS = (
         "python experiments/accuracy/compare_lammps_elements.py",
     ),
     Row(
-        "D of elastic hard spheres, φ = .1 / .2 / .3, with the box's own term (Yeh & Hummer)",
+        "D of 4096 elastic hard spheres, φ = .1 / .2 / .3, with the box's own term (Yeh & Hummer)",
         "Erpenbeck & Wood 1991, infinite box",
-        "tests",
-        test("diffusion_published"),
-        DIFFUSION,
+        "tests/diffusion_published",
+        offs,
+        f"{FOUND} tests/models/test_hard_spheres.py",
     ),
     Row(
-        "D of elastic hard spheres at N = 500, as it is",
+        "D of 500 elastic hard spheres, φ = .1 / .2 / .3, as it is",
         "Speedy 1987",
-        "tests",
-        test("diffusion_500"),
-        DIFFUSION,
+        "tests/diffusion_500",
+        offs,
+        f"{FOUND} tests/models/test_hard_spheres.py",
     ),
     Row(
         "24 hard cases: limits of every law, density, size, unit, tolerance, fit and fault on the "
@@ -364,32 +428,32 @@ ROWS = (
         "python experiments/accuracy/hard_cases.py --heavy",
     ),
     Row(
-        "T of DSMC, N = 10⁶, to 100 τ_c, β = .05 and .15",
+        "T of DSMC, N = 12·10⁶, at 10 / 50 / 100 τ_c",
         "kinetic theory",
-        "tests",
-        test("dsmc_million"),
-        f'{SLOW} tests/models/test_dsmc.py -k "million_particles_cool or theory_s_sonine"',
+        "tests/dsmc_million",
+        dsmc_million,
+        f"{FOUND} tests/models/test_dsmc.py",
     ),
     Row(
         "a₂ of DSMC at constant ε = .5, .8, .9 (3D), .5, .9 (2D), 1.6·10⁶ particles",
         "tables of stochastic simulation",
-        "tests",
-        test("sonine"),
-        f"{SLOW} tests/models/test_dsmc.py -k sonine_coefficient",
+        "tests/sonine",
+        sonine,
+        f"{FOUND} tests/models/test_dsmc.py",
     ),
     Row(
         "memory of the first velocity after 1 τ_c (ε = .6), DSMC steps of .1 / .05",
         "steps of .0125",
-        "tests",
-        test("dsmc_order"),
-        f"{SLOW} tests/models/test_dsmc.py -k order_of_the_step",
+        "tests/dsmc_order",
+        dsmc_order,
+        f"{FOUND} tests/models/test_dsmc.py",
     ),
     Row(
         "ln T of hard spheres between walls (2 mm beads, 50 mm cube, ε_w = .8, β = .15), N = 100 / "
         "500 / 4000, at T/T₀ = .5, and at .006 / .04 / .1",
         "DSMC, which takes the gas for mixed",
-        "tests",
-        test("walls"),
-        f"{SLOW} tests/models/test_hard_spheres_walls.py -k mixed",
+        "tests/walls",
+        walls,
+        f"{FOUND} tests/models/test_hard_spheres_walls.py",
     ),
 )
