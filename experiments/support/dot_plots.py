@@ -203,7 +203,10 @@ def benchmark_compilation(found: dict) -> DotPlot:
             Dot(label, row["first_s"], model=model),
             Dot(label, row["again_s"], model=model, hollow=True),
         ]
-    kinds = "first run in a process", "again"
+    command, label = found["main_job"], "jaxgran fit, in a new process each"
+    dots.append(Dot(label, command["first_s"], model="kinetic theory"))
+    dots.append(Dot(label, command["again_s"], model="kinetic theory", hollow=True))
+    kinds = "first run", "again"
     return DotPlot(dots, "seconds", logarithmic=True, kinds=kinds)
 
 
