@@ -63,7 +63,12 @@ def pytest_configure(config):
         if config.option.markexpr == "not slow":
             # Tests mostly compile. The slow ones run what users run, with all optimisation.
             os.environ["XLA_FLAGS"] = f"{QUICKLY} {os.environ.get('XLA_FLAGS', '')}".strip()
-    if worker or getattr(config.option, "dist", "no") == "no":
+
+
+@pytest.hookimpl(trylast=True)  # after what measures the coverage of lines has begun
+def pytest_sessionstart(session):
+    config = session.config
+    if hasattr(config, "workerinput") or getattr(config.option, "dist", "no") == "no":
         _import()  # not where workers do it, who wait until then
 
 
