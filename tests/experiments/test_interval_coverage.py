@@ -24,7 +24,7 @@ def test_intervals_hold_the_truth(model, num_particles, phi):
     # 600 runs: 95 +- .9 %, a bias to .04; 200: 1.5 %, .07. That of kinetic theory's clock is part
     # of the error, but of no run of DSMC, which makes the intervals there a little too wide. The
     # bias is a fifth of the error at most, by two standard errors of the mean. (Of 500 hard spheres
-    # at phi = .02 it is .21 +- .02 by 1800 runs: .5 % of A, as much as theory's clock may err.)
+    # at phi = .02 it is .20 +- .02 by 2400 runs: .4 % of A, as much as theory's clock may err.)
     assert 0.92 <= found["coverage"] <= 0.985
     assert abs(found["bias_over_error"]) < 0.2 + 2 / found["runs"] ** 0.5
     assert found["scatter"] == pytest.approx(found["expected_scatter"], rel=0.15)
