@@ -290,7 +290,7 @@ ENTRIES = {
             "interval_coverage",
             coverage,
             "interval_coverage.png",
-            "4 min",
+            "30 min",
             "interval_coverage.md",
         ),
         Entry(
