@@ -59,24 +59,16 @@ def restitution(table: Table) -> None:
         "agree",
         abs(hertz - 3.21806546) < 1e-7,
     )
-    table.add(
-        "5",
-        "C₁ = 1.15344",
-        f"{C1:.9f}",
-        "closed form, ODE",
-        "agree",
-        abs(C1 - 1.15344) < 1e-5,
-        ratios=[("C₁", C1, 1.15344)],
-    )
-    table.add(
-        "6",
-        "C₂ = 0.79826",
-        f"{C2:.9f}",
-        "closed form, ODE",
-        "agree",
-        abs(C2 - 0.79826) < 1e-5,
-        ratios=[("C₂", C2, 0.79826)],
-    )
+    for equation, name, value, printed in (("5", "C₁", C1, 1.15344), ("6", "C₂", C2, 0.79826)):
+        table.add(
+            equation,
+            f"{name} = {printed}",
+            f"{value:.9f}",
+            "closed form, ODE",
+            "agree",
+            abs(value - printed) < 1e-5,
+            ratios=[(name, value, printed)],
+        )
 
 
 def remarks(table: Table) -> None:

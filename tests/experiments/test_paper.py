@@ -4,8 +4,16 @@ import json
 
 import pytest
 
+from experiments.support.claims.table import Table
 from jaxgran.scene.restitution_table import C1, C2
 from tests.experiments.test_experiments import run
+
+
+def test_claims_keep_what_is_found_over_what_is_printed(tmp_path):
+    table = Table(tmp_path)
+    ratios = [("exponent", -1.5, -2.0, 0.1), ("constant", 3.0, 2.0)]
+    table.add("1", "claim", "ours", "checked", "agree", ratios=ratios)
+    assert table.rows[0].ratios == [("exponent", 0.75, 0.05), ("constant", 1.5, None)]
 
 
 @pytest.mark.slow
