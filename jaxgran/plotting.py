@@ -5,7 +5,6 @@ when they are first used.
 """
 
 import textwrap
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -200,13 +199,6 @@ def save_curves(curves: dict[str, tuple[CoolingCurve, CoolingCurve | None]], tit
         plot_curve(computed, axes, color=look["color"])
     axes.legend(frameon=False, loc="lower left")
     _save(figure, title, path)
-
-
-def read_fonts() -> None:
-    """Draw an empty picture: matplotlib reads its fonts and the like for the first one."""
-    figure = Figure(figsize=(1.0, 1.0))
-    figure.subplots().set(xscale="log", yscale="log", title="$t^{-2}$")
-    figure.savefig(BytesIO(), format="png")
 
 
 def _save(figure: Figure, title: str, path: str | Path) -> None:

@@ -83,13 +83,10 @@ def _import():
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_rank_promotion", "raise")
     with install_import_hook("jaxgran", "beartype.beartype"):
-        from jaxgran.checks.kept_programs import keep_in
-        from jaxgran.cli.programs import SWITCH, keep_programs
+        import jaxgran  # noqa: F401
+        from jaxgran.cli.programs import use_compilation_cache
 
-    os.environ[SWITCH] = "0"
-    keep_programs(Path(os.environ[PROGRAMS]))
-    keep_in(None)  # every function is traced, as some tests change what is called in it
-    os.environ[SWITCH] = "1"  # the user's own; a test has its own
+    assert use_compilation_cache(Path(os.environ[PROGRAMS]))
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import jax
 from cyclopts import App, CycloptsError, Parameter
 
 from jaxgran.cli.models import Model
-from jaxgran.cli.programs import keep_programs
+from jaxgran.cli.programs import use_compilation_cache
 
 Several = Parameter(consume_multiple=True)
 FREE = Literal[
@@ -121,7 +121,7 @@ def _app(started: float, default_curve: Path | None) -> App:
         no_cache: bool = False,
     ) -> None:
         if not no_cache:
-            keep_programs()
+            use_compilation_cache()
         from jaxgran.cli.fit import FitOptions, run_fit
 
         if not curves and default_curve is not None:

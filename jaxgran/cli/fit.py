@@ -11,9 +11,9 @@ import jax
 import numpy as np
 
 import jaxgran
+from jaxgran import plotting
 from jaxgran.cli.models import model_of, named
 from jaxgran.cli.output import environment, finite_or_null, outputs, plain, settings
-from jaxgran.cli.pictures import plotting_later
 from jaxgran.cli.report import (
     print_budget,
     print_doubts,
@@ -87,7 +87,7 @@ def run_fit(options: FitOptions, started: float) -> None:
     gas = with_given_constant(gas, header, options.free)
     n = header_count(header, "N")
     replicas = header_count(header, "replicas") or 1
-    (picture, record), plotting = outputs(options), plotting_later()
+    picture, record = outputs(options)
     free = tuple(PARAMETERS[key][0] for key in options.free)
     model, reasons = model_of(options, gas, curve, free, n)
     (model_name,) = named([model])
@@ -105,7 +105,7 @@ def run_fit(options: FitOptions, started: float) -> None:
     print_rivals(rows[0]["parameter"], diagnosis)
     print_verdict(diagnosis)
     picture.parent.mkdir(parents=True, exist_ok=True)
-    plotting.result().save_fit(result, curve, title_of(options, rows, diagnosis), picture)
+    plotting.save_fit(result, curve, title_of(options, rows, diagnosis), picture)
     summary = {
         **{row["parameter"]: row["estimate"] for row in rows},
         **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},

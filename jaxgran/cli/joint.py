@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 import jaxgran
+from jaxgran import plotting
 from jaxgran.cli.fit import PARAMETERS, FitOptions, with_given_constant
 from jaxgran.cli.models import MODELS, named
 from jaxgran.cli.output import environment, finite_or_null, outputs, settings
-from jaxgran.cli.pictures import plotting_later
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.files import write_whole
 from jaxgran.data.header import header_count
@@ -38,7 +38,6 @@ def run_joint(
             "curves one by one with other models"
         )
     picture, record = outputs(options)
-    plotting = plotting_later()
     free = options.free or ["A", "T0"]
     names = [PARAMETERS[key][0] for key in free]
     shared = tuple(name for name in names if name not in OF_ONE_SCENE)
@@ -83,7 +82,7 @@ def run_joint(
     write_whole(record, lambda f: f.write(text.encode()))
     says = "do not contradict" if found.agree else "contradict"
     title = f"{', '.join(measurements)}: the measurements {says} each other"
-    plotting.result().save_curves(_fitted(found, measurements, model), title, picture)
+    plotting.save_curves(_fitted(found, measurements, model), title, picture)
     print(f"\nwritten  {picture}\n         {record}\n")
     print(json.dumps(summary, allow_nan=False))
 

@@ -1,4 +1,4 @@
-"""Compiled programs that the commands keep for the next time, in the user's cache folder."""
+"""The compilation cache of the commands, in the user's cache folder."""
 
 import os
 import platform
@@ -7,52 +7,55 @@ from pathlib import Path
 import jax
 from platformdirs import user_cache_path
 
-from jaxgran.checks.kept_programs import keep_in
-
 SWITCH = "JAXGRAN_NO_CACHE"
-"""An environment variable: set to anything but 0, nothing is kept."""
+"""An environment variable: set to anything but 0, it disables the compilation cache."""
 
 
-def keep_programs(folder: Path | None = None) -> bool:
-    """Let JAX keep what it compiles in this process, and take what it kept before.
+def use_compilation_cache(folder: Path | None = None) -> bool:
+    """Let JAX keep the programs that this process compiles, and load those it kept before.
 
-    Nothing is kept if `SWITCH` says so, if a folder of JAX's own is set
-    (JAX_COMPILATION_CACHE_DIR), or if the folder cannot be written to. Programs are found again by
-    what they compute, the versions of JAX and XLA, and the processor.
+    The cache is not used if `SWITCH` disables it, if JAX has a cache folder already
+    (JAX_COMPILATION_CACHE_DIR), or if the folder is not the user's alone: its files are programs
+    that JAX runs.
 
     Args:
-        folder: by default that of this command in the user's cache folder.
+        folder: created with access for the user alone; by default that of this command in the
+            user's cache folder.
 
     Returns:
-        Whether programs are kept in that folder.
+        Whether the cache is used.
     """
-    if (
-        os.environ.get(SWITCH, "0") != "0"
-        or jax.config.values["jax_compilation_cache_dir"] is not None
-    ):
+    disabled = os.environ.get(SWITCH, "0") != "0"
+    if disabled or jax.config.jax_compilation_cache_dir is not None:
         return False
-    folder = user_cache_path("jaxgran") / "programs" if folder is None else folder
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    if not os.access(folder, os.W_OK | os.X_OK):
+    folder = user_cache_path("jaxgran") / "compiled" if folder is None else folder
+    if not _is_private(folder):
         return False
     _compile_for_avx2()
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    keep_in(folder)
     return True
 
 
-def _compile_for_avx2() -> None:
-    """Compile for AVX2, so that kept programs are loaded without a page of warnings.
+def _is_private(folder: Path) -> bool:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.stat()
+    except OSError:
+        return False
+    if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & 0o077):
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
 
-    For newer instructions XLA adds to a program hints for tuning (prefer-no-gather,
-    prefer-no-scatter), which it takes for features of the processor when it loads the program, does
-    not find, and warns of (openxla/xla, issue 44565). XLA reads this variable when it starts, with
-    the first array.
+
+def _compile_for_avx2() -> None:
+    """Compile for AVX2, so that JAX loads cached programs without a page of warnings.
+
+    For newer instructions XLA adds tuning hints to a program (prefer-no-gather,
+    prefer-no-scatter). When XLA loads the program it takes them for features of the processor, does
+    not find them, and warns (openxla/xla, issue 44565). XLA reads this variable when it starts,
+    with the first array.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if platform.machine().lower() in ("x86_64", "amd64") and "xla_cpu_max_isa" not in flags:

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 
 import jaxgran
 from jaxgran.cli.models import named
-from jaxgran.cli.pictures import plotting_later
-from jaxgran.cli.programs import keep_programs
+from jaxgran.cli.programs import use_compilation_cache
 from jaxgran.data.files import check_writable, read_text
 from jaxgran.data.header import header_count, header_number
 from jaxgran.models.selection import NUM_PARTICLES, default_models
@@ -49,7 +48,7 @@ def cool(
         no_cache: compile everything anew, see `jaxgran fit --help`.
     """
     if not no_cache:
-        keep_programs()
+        use_compilation_cache()
     picture = out.with_suffix(".png")
     if picture == out:
         raise ValueError(f"--out {out} is the name of the picture; give the CSV file another one")
@@ -58,7 +57,8 @@ def cool(
         if file.exists() and not overwrite:
             raise ValueError(f"{file} exists; name another --out or say --overwrite")
         check_writable(file)
-    plotting = plotting_later()
+    from jaxgran import plotting  # needs matplotlib, which `choose` does without
+
     size = next(n for n in (particles, told.size, NUM_PARTICLES) if n is not None)
     chosen = named(default_models(size, replicas))[model]
     curve = jaxgran.cool(told.gas, told.times, model=chosen, key=jax.random.key(key))
@@ -66,7 +66,7 @@ def cool(
     ratio = float(curve.temperature[-1] / curve.temperature[0])
     print(f"{model}: T falls to {ratio:.3g} of its first value in {told.times[-1]:.3g} s")
     title = f"{scene.stem}: {chosen.name}, T falls to {ratio:.3g} of its first value"
-    plotting.result().save_curves({chosen.name: (curve, None)}, title, picture)
+    plotting.save_curves({chosen.name: (curve, None)}, title, picture)
     print(f"written  {out}\n         {picture}")
 
 
@@ -88,7 +88,7 @@ def choose(
         no_cache: compile everything anew, see `jaxgran fit --help`.
     """
     if not no_cache:
-        keep_programs()
+        use_compilation_cache()
     told = _read(scene, until)
     choice = jaxgran.choose_model(told.gas, told.times, tolerance, told.size)
     for reason in choice.reasons:

@@ -2,11 +2,11 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran.checks.kept_programs import kept
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.comparison import QUANTITIES, Comparison
 from jaxgran.fitting.least_squares import deepest, least_squares, quasi_newton
@@ -21,7 +21,7 @@ SEARCHES = {"levenberg-marquardt": least_squares, "lbfgs": quasi_newton}
 """Minimisers by the name of the method."""
 
 
-@kept
+@eqx.filter_jit
 def fit_deterministic(
     gas: Gas,
     curve: CoolingCurve,

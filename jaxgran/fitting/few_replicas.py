@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.validation import number
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.residuals import neighbour_correlation
@@ -56,7 +56,7 @@ def smooth_errors(
     return replace(curve, **smooth), degrees
 
 
-@kept
+@eqx.filter_jit
 def _smoothed(
     values: Float[Array, "n"], error: Float[Array, "n"], replicas: Float[Array, ""]
 ) -> tuple[Float[Array, "n"], Float[Array, ""]]:

@@ -1,9 +1,9 @@
 """Initial guesses of parameters from the measured curve."""
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxgran.checks.kept_programs import kept
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.parameters import START
 from jaxgran.scene.gas import Gas
@@ -28,7 +28,7 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
     return gas.replace(**{name: guessed.value(name) for name in free if name != START})
 
 
-@kept
+@eqx.filter_jit
 def _guessed(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
     """The same, of unchecked values."""
     power, line = _power_and_line(gas, curve)

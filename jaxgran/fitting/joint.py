@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.validation import no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
@@ -141,7 +141,7 @@ def _check(measurements, shared, separate, model) -> None:
             )
 
 
-@kept
+@eqx.filter_jit
 def _search(
     pairs: tuple[tuple[Gas, CoolingCurve | DropTest], ...],
     shared: tuple[str, ...],

@@ -3,11 +3,11 @@
 import dataclasses
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.checks.kept_programs import kept
 from jaxgran.fitting.least_squares import least_squares
 from jaxgran.fitting.parameters import Parameters, size_of
 from jaxgran.fitting.priors import Priors
@@ -53,7 +53,7 @@ class Profile(NamedTuple):
     residuals: Float[Array, "trials times"]
 
 
-@kept
+@eqx.filter_jit
 def fit_trials(
     gas: Gas,
     began: Float[Array, ""],

@@ -2,11 +2,10 @@
 
 from math import erfc, sqrt
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
-
-from jaxgran.checks.kept_programs import kept
 
 FEWEST = 4
 """Residuals below which no correlation is estimated."""
@@ -18,7 +17,7 @@ STRONGEST = 0.95
 """Largest correlation that is taken over from an estimate."""
 
 
-@kept
+@eqx.filter_jit
 def neighbour_correlation(
     residuals: Num[Array, "n"], used: Bool[Array, "n"] | None = None
 ) -> Float[Array, ""]:
@@ -72,7 +71,7 @@ def correlation_factor(correlation: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.sqrt((1 + positive) / (1 - positive))
 
 
-@kept
+@eqx.filter_jit
 def chi2_scale(
     residuals: Num[Array, "n"], num_parameters: Int[Array, ""] | int
 ) -> Float[Array, ""]:

@@ -12,7 +12,6 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from jaxgran.checks import status
-from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.tracing import any_traced, is_known
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import Run
@@ -85,14 +84,14 @@ def check_cools(rate: ArrayLike) -> None:
         )
 
 
-@kept
+@eqx.filter_jit
 def first_cooling_rate(gas: Gas, averages: Callable = exact_averages) -> Float[Array, ""]:
     """``-d ln T/dt`` at t = 0, 1/s, of the Maxwellian gas; negative if the law heats it."""
     mu_2 = averages(gas.reduced_law, jnp.ones_like(gas.temperature), gas.dimension)[0, 0]
     return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
 
 
-@kept
+@eqx.filter_jit
 def at_start(gas: Gas, averages: Callable) -> tuple[Array, Array, Array]:
     """The first cooling rate, the softness factor where it is hottest, and sqrt(T/T_0) there."""
     one = jnp.ones_like(gas.temperature)

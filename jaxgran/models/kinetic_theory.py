@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.checks import status, validation
-from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.tracing import any_traced, lengthened, shortened
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run import DEFAULTS, Run
@@ -159,7 +158,7 @@ class KineticTheory(AbstractModel):
         curve = self._simulate(gas, padded)
         return jax.tree.map(lambda x: shortened(x, size) if x.ndim else x, curve)
 
-    @kept
+    @eqx.filter_jit
     def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
         scene = steady.scene_at_start(gas), Density.of(gas, self.softness, self.correlations)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from math import hypot
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,6 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.checks import status
-from jaxgran.checks.kept_programs import kept
 from jaxgran.checks.validation import POSITIVE, checked_times, no_type_check, plain_number
 from jaxgran.checks.words import Rows, as_html, as_text
 from jaxgran.data.curve import CoolingCurve
@@ -225,7 +225,7 @@ def course_along(gas: Gas, curve: CoolingCurve, num_particles: int | None = None
     return Course(gas, num_particles, **values, flow_share=flow, flow_scatter=scatter)
 
 
-@kept
+@eqx.filter_jit
 def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Array, "times"]]:
     """Contacts and the critical box at each temperature."""
 

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxgran.checks.kept_programs import kept_property
 from jaxgran.checks.validation import (
     POSITIVE,
     Domain,
@@ -151,7 +150,7 @@ class Gas(NamedFloats):
         """
         self._check_single((*self.law.lists, "wall_side"))
 
-    @kept_property
+    @property
     def number_density(self) -> Float[Array, ""]:
         """Number density n, m^-d."""
         volume_of_sphere = (
@@ -177,7 +176,7 @@ class Gas(NamedFloats):
             meeting = meeting * self.container.more_collisions(self.diameter, self.dimension)
         return 1 / (meeting * self.diameter ** (self.dimension - 1))
 
-    @kept_property
+    @property
     def mean_free_path(self) -> Float[Array, ""]:
         """``1 / (sqrt(2) pi n g_2 sigma^2)`` (3D) or ``1 / (2 sqrt(2) n g_2 sigma)`` (2D), m."""
         return self.path_length / (2**0.5 * (pi if self.dimension == 3 else 2))
@@ -187,7 +186,7 @@ class Gas(NamedFloats):
         """``sqrt(2 T_0)``, m/s, the rms of a component of the relative velocity of two spheres."""
         return jnp.sqrt(2 * self.temperature)
 
-    @kept_property
+    @property
     def collision_frequency(self) -> Float[Array, ""]:
         """Collisions per particle per second of a Maxwellian gas at t = 0.
 
@@ -196,7 +195,7 @@ class Gas(NamedFloats):
         """
         return sphere_surface(self.dimension) * jnp.sqrt(self.temperature / pi) / self.path_length
 
-    @kept_property
+    @property
     def mean_free_time(self) -> Float[Array, ""]:
         """Mean free time at t = 0, ``tau_c(0) = 1 / nu_0``, s; the paper's Eq. (12)."""
         return 1 / self.collision_frequency
@@ -234,13 +233,13 @@ class Gas(NamedFloats):
         """Elastic constant over effective mass, m^(-1/2) s^(-2); viscoelastic spheres only."""
         return self._viscoelastic("alpha").alpha(diameter=self.diameter, mass=self.mass)
 
-    @kept_property
+    @property
     def delta(self) -> Float[Array, ""]:
         """The paper's small parameter, ``delta = A alpha^(2/5) T_0^(1/10)``."""
         law = self._viscoelastic("delta")
         return law.dissipative_constant * self.alpha**0.4 * self.temperature**0.1
 
-    @kept_property
+    @property
     def thermal_beta(self) -> Float[Array, ""]:
         """beta of an impact at `impact_speed`, ``beta_T0 = (3/2) A alpha^(2/5) (2 T_0)^(1/10)``."""
         return 1.5 * 2**0.1 * self.delta
@@ -255,7 +254,7 @@ class Gas(NamedFloats):
         length = self.reduced_law.impact_length(jnp.ones_like(self.temperature)) * self.diameter
         return ELASTIC_CONTACT_TIME * 2**-0.1 * gamma(0.9) * length / self.impact_speed
 
-    @kept_property
+    @property
     def contact_fraction(self) -> Float[Array, ""]:
         """Mean contact duration over mean free time, t_c/tau_c.
 
@@ -263,7 +262,7 @@ class Gas(NamedFloats):
         """
         return self.contact_duration * self.collision_frequency
 
-    @kept_property
+    @property
     def mean_overlap(self) -> Float[Array, ""]:
         """Mean of the largest overlap of the impacts at t = 0 if they were elastic, in diameters.
 
@@ -274,7 +273,7 @@ class Gas(NamedFloats):
         length = self.reduced_law.impact_length(jnp.ones_like(self.temperature))
         return ELASTIC_OVERLAP * 2**0.4 * gamma(1.4) * length
 
-    @kept_property
+    @property
     def critical_box(self) -> Float[Array, ""]:
         """Critical length of the shear instability, ``L_c = 2 pi / k_c``, m, at t = 0.
 

@@ -5,7 +5,6 @@ from math import gamma, pi
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.checks.kept_programs import kept_in_one
 from jaxgran.checks.validation import POSITIVE, UserNumber, number
 
 CLOSE_PACKING = {2: pi / (2 * 3**0.5), 3: pi / (3 * 2**0.5)}
@@ -35,17 +34,9 @@ def sphere_mass(diameter: UserNumber, density: UserNumber) -> Float[Array, "..."
     """
     POSITIVE.check("diameter", diameter, "Give the diameter in metres.")
     POSITIVE.check("density", density, "Give the density of the material in kg/m^3.")
-    return _sphere_mass(number(diameter), number(density))
+    return pi / 6 * number(density) * number(diameter) ** 3
 
 
-@kept_in_one
-def _sphere_mass(
-    diameter: Float[Array, "..."], density: Float[Array, "..."]
-) -> Float[Array, "..."]:
-    return pi / 6 * density * diameter**3
-
-
-@kept_in_one
 def side_of_box(
     num_particles: Float[Array, ""], number_density: Float[Array, "..."], dimension: int
 ) -> Float[Array, "..."]:

@@ -12,7 +12,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.checks.kept_programs import kept_in_one
 from jaxgran.checks.validation import ANY, Domain, number
 
 UNITS = (
@@ -181,7 +180,6 @@ class LawInUnits(ReducedLaw):
         return jnp.broadcast_to(found, jnp.shape(normal_speed))
 
 
-@kept_in_one
 def restitution_at(
     law: RestitutionLaw, diameter: Array, mass: Array, normal_speed: Float[Array, "..."]
 ) -> Float[Array, "..."]:

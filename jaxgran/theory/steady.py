@@ -5,13 +5,13 @@ Units as in `jaxgran.theory.averages`, where not of a gas.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxgran.checks.kept_programs import kept
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced_scene import ReducedScene, reduced_scene
 from jaxgran.theory import elements
@@ -75,7 +75,7 @@ def steady_state(gas: Gas) -> SteadyState:
     return SteadyState(temperature, sonine, rotational)
 
 
-@kept
+@eqx.filter_jit
 def _solved(gas: Gas) -> tuple[Array, Array, Array, Array]:
     """ln T/T_0, a_2, T_rot/T, and by what share losses and drive differ."""
     scene, density, d = reduced_scene(gas), Density.of(gas), gas.dimension
