@@ -18,9 +18,9 @@ import sys
 import time
 from pathlib import Path
 
-started = time.perf_counter()
+from jaxgran.cli.main import main as command
 
-from jaxgran.cli.app import main as command  # noqa: E402
+started = time.perf_counter()
 
 DEFAULT_CURVE = Path(__file__).parent / "data" / "lammps_cooling_dilute.csv"
 

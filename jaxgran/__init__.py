@@ -16,42 +16,44 @@ Examples in the docstrings begin with these lines:
 from importlib import import_module
 from typing import Any
 
-from jaxgran.checks.status import explain as explain_status
-from jaxgran.checks.validation import Domain
-from jaxgran.data.curve import CoolingCurve, Particles
-from jaxgran.data.curve_file import read_curve, read_gas, read_priors, write_curve
-from jaxgran.data.drop_test import DropTest, read_drop_test
-from jaxgran.data.particle_files import read_particles
-from jaxgran.data.run import Run
-from jaxgran.fitting.diagnosis import Diagnosis, diagnose
-from jaxgran.fitting.fit import fit
-from jaxgran.fitting.joint import JointFit, fit_jointly
-from jaxgran.fitting.likelihood import log_likelihood
+from jaxgran._utils.status import explain as explain_status
+from jaxgran._utils.validation import Domain
+from jaxgran.data.curve import CoolingCurve, Particles, Run
+from jaxgran.data.curve_file import (
+    DropTest,
+    read_curve,
+    read_drop_test,
+    read_gas,
+    read_priors,
+    write_curve,
+)
+from jaxgran.data.particles import read_particles
+from jaxgran.fitting.diagnosis import Diagnosis, diagnose, log_likelihood
+from jaxgran.fitting.fit import JointFit, fit, fit_jointly
 from jaxgran.fitting.result import Fit
-from jaxgran.models.base import AbstractModel, Omission
-from jaxgran.models.cooling import cool
-from jaxgran.models.course import Course
+from jaxgran.models.base import AbstractModel, Limitation
+from jaxgran.models.choose import Choice, choose_model
+from jaxgran.models.cool import cool
 from jaxgran.models.dsmc import DSMC
+from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.selection import Choice, choose_model
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.particles import observables
 from jaxgran.scene.contact import Impact, contact_force, elastic_constant, impact
-from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise
-from jaxgran.scene.friction import Frictional
+from jaxgran.scene.elements import DrivenStart, Frictional, Rough, StokesDrag, Walls, WhiteNoise
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
-from jaxgran.scene.restitution import (
+from jaxgran.scene.laws import (
     ConstantRestitution,
     ReducedLaw,
     RestitutionLaw,
     RestitutionSeries,
     Viscoelastic,
+    viscoelastic_restitution,
 )
-from jaxgran.scene.restitution_table import viscoelastic_restitution
-from jaxgran.sweeps.sweep import sweep
-from jaxgran.theory.steady import SteadyState, steady_state
+from jaxgran.sweep import sweep
+from jaxgran.theory.equations import SteadyState, steady_state
 
 __all__ = [
     "DSMC",
@@ -59,7 +61,7 @@ __all__ = [
     "Choice",
     "ConstantRestitution",
     "CoolingCurve",
-    "Course",
+    "ErrorModel",
     "Diagnosis",
     "Domain",
     "DrivenStart",
@@ -71,7 +73,7 @@ __all__ = [
     "Impact",
     "JointFit",
     "KineticTheory",
-    "Omission",
+    "Limitation",
     "Particles",
     "ReducedLaw",
     "RestitutionLaw",

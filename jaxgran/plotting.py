@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.files import write_whole
+from jaxgran.data.files import write_atomically
 from jaxgran.fitting.result import Fit
 
 try:
@@ -22,7 +22,7 @@ except ModuleNotFoundError as error:  # pragma: no cover
         'jaxgran.plotting needs matplotlib: pip install "jaxgran[notebook]"'
     ) from error
 
-MOST_DRAWN = 1000
+MAX_DRAWN = 1000
 """Points that are drawn of a longer curve, evenly spaced in the logarithm of time."""
 
 COLOURS = {
@@ -207,7 +207,7 @@ def _save(figure: Figure, title: str, path: str | Path) -> None:
     for axes in figure.axes:
         axes.spines[["top", "right"]].set_visible(False)
     picture_format = Path(path).suffix.lstrip(".") or "png"
-    write_whole(path, lambda f: figure.savefig(f, dpi=150, format=picture_format))
+    write_atomically(path, lambda f: figure.savefig(f, dpi=150, format=picture_format))
 
 
 def _draw(axis, times, measured, error, computed, fitted: str) -> None:
@@ -215,7 +215,7 @@ def _draw(axis, times, measured, error, computed, fitted: str) -> None:
     shown = _shown(times)
     t, measured, computed = (np.asarray(x)[shown] for x in (times, measured, computed))
     error = None if error is None else np.asarray(error)[shown]
-    label = "measured" if len(times) <= MOST_DRAWN else f"measured: {t.size} of {len(times)}"
+    label = "measured" if len(times) <= MAX_DRAWN else f"measured: {t.size} of {len(times)}"
     axis.errorbar(t, measured, error, fmt="o", ms=3.5, color=INK, label=label, zorder=2)
     axis.plot(t, computed, color=colour_of(fitted), lw=1.8, label=f"{fitted}, fitted", zorder=3)
     axis.set(xscale="log", yscale="log")
@@ -225,10 +225,10 @@ def _shown(times) -> np.ndarray:
     """Indices of the times that are drawn: those after 0, or `MOST_DRAWN` of them."""
     times = np.asarray(times)
     (shown,) = np.nonzero(times > 0)
-    if shown.size <= MOST_DRAWN:
+    if shown.size <= MAX_DRAWN:
         return shown
     t = times[shown]
-    return shown[np.unique(np.searchsorted(t[:-1], np.geomspace(t[0], t[-1], MOST_DRAWN)))]
+    return shown[np.unique(np.searchsorted(t[:-1], np.geomspace(t[0], t[-1], MAX_DRAWN)))]
 
 
 def _draw_residuals(axis, times, residuals, fitted: str) -> None:

@@ -84,7 +84,7 @@ def _import():
     jax.config.update("jax_numpy_rank_promotion", "raise")
     with install_import_hook("jaxgran", "beartype.beartype"):
         import jaxgran  # noqa: F401
-        from jaxgran.cli.programs import use_compilation_cache
+        from jaxgran.cli.common import use_compilation_cache
 
     assert use_compilation_cache(Path(os.environ[PROGRAMS]))
 

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.cli import programs
-from jaxgran.cli.app import FREE, main
-from jaxgran.cli.models import MODELS, named
-from jaxgran.models.selection import default_models
+from jaxgran.cli.common import MODELS, SWITCH, models_by_name, use_compilation_cache
+from jaxgran.cli.main import FREE, main
+from jaxgran.models.choose import default_models
 
 PNG = b"\x89PNG\r\n\x1a\n"
 """The first bytes of a picture."""
@@ -155,7 +154,7 @@ def test_help_is_there(capsys, command):
 
 
 def test_every_model_has_its_name():
-    assert (*named(default_models(2)), "auto") == MODELS
+    assert (*models_by_name(default_models(2)), "auto") == MODELS
 
 
 def test_every_parameter_of_a_fit_has_its_name():
@@ -183,9 +182,9 @@ def test_a_terminal_without_colours_gets_none(capsys, monkeypatch, variable, val
 @pytest.fixture
 def no_cache_yet(monkeypatch):
     """JAX's settings as in a new process, and as before after the test."""
-    monkeypatch.delenv(programs.SWITCH, raising=False)
+    monkeypatch.delenv(SWITCH, raising=False)
     monkeypatch.setenv("XLA_FLAGS", "")
-    before = jax.config.jax_compilation_cache_dir
+    before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", None)
     yield
     jax.config.update("jax_compilation_cache_dir", before)
@@ -193,22 +192,22 @@ def no_cache_yet(monkeypatch):
 
 def test_compilation_cache_is_used_where_it_can_be(tmp_path, monkeypatch, no_cache_yet):
     (tmp_path / "file").write_text("")
-    assert not programs.use_compilation_cache(tmp_path / "file" / "programs")
-    assert jax.config.jax_compilation_cache_dir is None
-    monkeypatch.setenv(programs.SWITCH, "1")
-    assert not programs.use_compilation_cache(tmp_path / "programs")
-    monkeypatch.setenv(programs.SWITCH, "0")
-    assert programs.use_compilation_cache(tmp_path / "programs")
+    assert not use_compilation_cache(tmp_path / "file" / "programs")
+    assert jax.config.values["jax_compilation_cache_dir"] is None
+    monkeypatch.setenv(SWITCH, "1")
+    assert not use_compilation_cache(tmp_path / "programs")
+    monkeypatch.setenv(SWITCH, "0")
+    assert use_compilation_cache(tmp_path / "programs")
     assert (tmp_path / "programs").stat().st_mode & 0o777 == 0o700
-    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "programs")
-    assert not programs.use_compilation_cache(tmp_path / "others")  # one is set already
+    assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path / "programs")
+    assert not use_compilation_cache(tmp_path / "others")  # one is set already
 
 
 def test_programs_that_others_can_write_are_not_run(tmp_path, no_cache_yet):
     (tmp_path / "shared").mkdir()
     (tmp_path / "shared").chmod(0o777)
-    assert not programs.use_compilation_cache(tmp_path / "shared")
-    assert jax.config.jax_compilation_cache_dir is None
+    assert not use_compilation_cache(tmp_path / "shared")
+    assert jax.config.values["jax_compilation_cache_dir"] is None
 
 
 @pytest.mark.slow
@@ -219,7 +218,7 @@ def test_the_second_time_a_command_compiles_nothing(scene):
     cache = scene / "jaxgran" / "compiled"
 
     def run(*more):
-        line = "import sys; from jaxgran.cli.app import main; sys.exit(main(sys.argv[1:]))"
+        line = "import sys; from jaxgran.cli.main import main; sys.exit(main(sys.argv[1:]))"
         command = [sys.executable, "-c", line, "cool", "scene.toml", "--until", "1", "--overwrite"]
         done = subprocess.run(
             [*command, *more], env=environment, cwd=scene, capture_output=True, text=True

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.checks import status
-from jaxgran.particles.stochastic import collisions
+from jaxgran._utils import status
+from jaxgran.particles.dsmc import collisions
 
 OPTIONS = ("key", "progress", "checkpoint", "throw")
 MODELS = (jaxgran.KineticTheory, jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres)

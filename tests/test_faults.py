@@ -15,16 +15,16 @@ import pytest
 
 import jaxgran
 from jaxgran import plotting
-from jaxgran.checks import status
-from jaxgran.checks.validation import ANY
-from jaxgran.data.run import Run
-from jaxgran.particles import driver, programs
+from jaxgran._utils import status
+from jaxgran._utils.validation import ANY
+from jaxgran.data.curve import Run
 from jaxgran.particles import dynamics as moving
-from jaxgran.particles.dynamics import stretches
-from jaxgran.particles.interruption import in_thread, waited_for
-from jaxgran.particles.soft import block
-from jaxgran.particles.state import later
-from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw
+from jaxgran.particles import run
+from jaxgran.particles.dynamics import run_segments
+from jaxgran.particles.run import _PROGRAMS, block_until_ready, in_thread, run_through_times
+from jaxgran.particles.soft.dynamics import DRIFT_TOLERANCE
+from jaxgran.particles.state import advance_time
+from jaxgran.scene.laws import ReducedLaw, RestitutionLaw
 from tests.beads import glass_beads
 
 GAS = glass_beads(0.3, packing_fraction=0.1)
@@ -189,7 +189,7 @@ def test_a_picture_of_a_long_curve_draws_some_of_it(tmp_path):
     curve = jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=0.02 * T)
     result = jaxgran.fit(GAS, curve)
     shown = plotting._shown(curve.times)
-    assert 500 < shown.size <= plotting.MOST_DRAWN and {0, times.size - 1} <= set(shown)
+    assert 500 < shown.size <= plotting.MAX_DRAWN and {0, times.size - 1} <= set(shown)
     with pytest.raises(ValueError, match=r"axes must be two.*shape \(3,\)"):
         jaxgran.plot_fit(result, curve, np.zeros(3))
     plotting.save_fit(result, curve, "long", tmp_path / "long.png")
@@ -239,7 +239,7 @@ class Standing:
 
 
 def test_a_run_that_stands_still_ends():
-    state, records, fault = driver.follow(
+    state, records, fault = run_through_times(
         Standing(), np.ones(1), lambda s, end: s, lambda s: {"temperature": jnp.ones(())}
     )
     assert fault == status.STALLED.bit and np.isnan(records["temperature"])
@@ -251,9 +251,9 @@ def test_a_run_that_stands_still_ends():
 def test_blocks_that_stand_still_end(kind, x64, monkeypatch):
     with jax.enable_x64(x64):
         gas = glass_beads(0.3, packing_fraction=0.1)
-        monkeypatch.setattr(moving, "SHORTEST_FLIGHT", 1e9)  # no flight is long enough
-        monkeypatch.setattr(moving, "MOST_IDLE", 3)
-        monkeypatch.setattr(programs, "_PROGRAMS", type(programs._PROGRAMS)())
+        monkeypatch.setattr(moving, "MIN_FLIGHT", 1e9)  # no flight is long enough
+        monkeypatch.setattr(moving, "MAX_IDLE", 3)
+        monkeypatch.setattr(run, "_PROGRAMS", type(_PROGRAMS)())
         jax.clear_caches()
         curve = kind(20).simulate(gas, jnp.array([TAU]), Run())
         jax.clear_caches()
@@ -267,7 +267,7 @@ def some_seconds():
 
 
 @pytest.mark.parametrize(
-    "wait", [lambda: in_thread(lambda: time.sleep(20)), lambda: waited_for(some_seconds())]
+    "wait", [lambda: in_thread(lambda: time.sleep(20)), lambda: block_until_ready(some_seconds())]
 )
 def test_waiting_can_be_interrupted(wait):
     some_seconds.lower().compile()
@@ -300,20 +300,20 @@ def soft_spheres(gas=GAS, replicas=1):
 @pytest.mark.slow
 def test_a_shortened_step_recovers():
     dynamics, state = soft_spheres()
-    state = state._replace(own=state.own._replace(refine=jnp.asarray(4.0)))
+    state = state._replace(internal=state.internal._replace(refine=jnp.asarray(4.0)))
     end = jnp.asarray(3.0)
-    after, fault, _ = jax.jit(lambda s: stretches(dynamics, s, end, "sweep", 1, None))(state)
-    assert fault == status.OK and after.own.refine == 1 and after.time == end
-    assert np.all(np.abs(after.own.drift) < 1e-3)  # over some 600 blocks
+    after, fault, _ = jax.jit(lambda s: run_segments(dynamics, s, end, "sweep", 1, None))(state)
+    assert fault == status.OK and after.internal.refine == 1 and after.time == end
+    assert np.all(np.abs(after.internal.drift) < 1e-3)  # over some 600 blocks
 
 
 @pytest.mark.slow
 def test_small_energy_errors_add_up():
     dynamics, state = soft_spheres()
-    drift = jnp.full(1, 0.5 * block.DRIFT_TOLERANCE)
+    drift = jnp.full(1, 0.5 * DRIFT_TOLERANCE)
     for factor, fault in ((1, status.OK), (3, status.ENERGY_DRIFT.bit)):
-        begun = state._replace(own=state.own._replace(drift=factor * drift))
-        run = jax.jit(lambda s: stretches(dynamics, s, jnp.asarray(1.0), "sweep", 1, None))
+        begun = state._replace(internal=state.internal._replace(drift=factor * drift))
+        run = jax.jit(lambda s: run_segments(dynamics, s, jnp.asarray(1.0), "sweep", 1, None))
         assert run(begun)[1] == fault
 
 
@@ -326,7 +326,7 @@ def test_the_clock_of_single_precision_keeps_time():
     end = jnp.float32(1e9)
     after = jax.jit(
         lambda s: jax.lax.fori_loop(
-            0, count, lambda _, s: later(s, jnp.float32(step), end, jnp.asarray(False)), s
+            0, count, lambda _, s: advance_time(s, jnp.float32(step), end, jnp.asarray(False)), s
         )
     )(single)
     assert after.time.dtype == jnp.float32
@@ -423,7 +423,7 @@ def test_checkpoints_know_their_law(tmp_path):
 
 OWN_LAW = """
 import sys, jax, jax.numpy as jnp, jaxgran
-from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw
+from jaxgran.scene.laws import ReducedLaw, RestitutionLaw
 jax.config.update("jax_enable_x64", True)
 def slow(v): return FACTOR * jnp.ones_like(v)
 class Own(RestitutionLaw, ReducedLaw):

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.record import DATA, add_recording, write_picture, write_results
-from jaxgran.data.header import header_number
+from jaxgran.data.files import header_number
 from jaxgran.plotting import COLOURS, INK
 
 SCENES = ("dilute", "dense")

@@ -76,8 +76,8 @@ def scene(name: str, num: int) -> jaxgran.Gas:
     if rubs:
         elements["surface"] = jaxgran.Frictional(**FRICTION)
     if contained:
-        rubbing = OF_WALLS if rubs else {}
-        walls = jaxgran.Walls(gas.box_side(num), restitution=gas.law, **rubbing)
+        friction_material = OF_WALLS if rubs else {}
+        walls = jaxgran.Walls(gas.box_side(num), restitution=gas.law, **friction_material)
         elements["container"] = walls
     return dataclasses.replace(gas, **elements)
 

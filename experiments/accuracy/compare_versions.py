@@ -55,6 +55,9 @@ grains = jg.Frictional(20.0, 0.3)
 soft_walls = jg.Walls(side, restitution=jg.Viscoelastic(5e7, 0.22, 1e-6))
 
 
+def flow(particles):
+    return jg.observables.flow_share(particles.position, particles.velocity, particles.box_side)
+
 def fitted():
     curve, header = jg.read_curve(sys.argv[1])
     gas = jg.read_gas(header)
@@ -65,7 +68,8 @@ def fitted_by_particles():
     gas = beads()
     curve = cool(gas, 20.0, jg.DSMC(2000, replicas=2))
     start = gas.replace(dissipative_constant=1.2 * gas.value("dissipative_constant"))
-    return jg.fit(start, curve, model=jg.DSMC(1000, replicas=2), key=jax.random.key(1), progress=False)
+    model = jg.DSMC(1000, replicas=2)
+    return jg.fit(start, curve, model=model, key=jax.random.key(1), progress=False)
 
 def fitted_jointly():
     gases = {str(phi): beads(packing_fraction=phi) for phi in (0.02, 0.1)}
@@ -83,7 +87,7 @@ CASE = {
     "DSMC, rough, walls, drag, drive": lambda: cool(
         beads(surface=rough, container=walls, drag=drag, drive=noise), 5.0, jg.DSMC(500)),
     "hard spheres": lambda: (
-        cool(beads(0.3), 20.0, jg.HardSpheres(200, replicas=2), save=lambda p: jg.observables.flow_share(p.position, p.velocity, p.box_side)),
+        cool(beads(0.3), 20.0, jg.HardSpheres(200, replicas=2), save=flow),
         slope(beads(0.3), 5.0, jg.HardSpheres(200))),
     "hard spheres, rough, walls, drag": lambda: cool(
         beads(surface=rough, container=walls, drag=drag), 5.0, jg.HardSpheres(200)),
@@ -125,7 +129,9 @@ def main() -> int:
     before, now = (arrays_of(folder) for folder in (options.checkout, EXPERIMENTS.parent))
     rows = []
     for case in dict.fromkeys(key.partition("/")[0] for key in [*before, *now]):
-        pair = [{k: x for k, x in each.items() if k.startswith(case + "/")} for each in (before, now)]
+        pair = [
+            {k: x for k, x in each.items() if k.startswith(case + "/")} for each in (before, now)
+        ]
         number = f"{len(pair[1])} arrays"
         if pair[0].keys() != pair[1].keys():
             number, difference = f"{len(pair[0])} and {number}", float("inf")

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from experiments.support.record import add_recording, write_picture, write_results
 from jaxgran.plotting import COLOURS
 from jaxgran.scene.contact import impact
-from jaxgran.scene.restitution_table import C1, viscoelastic_restitution
+from jaxgran.scene.laws import C1, viscoelastic_restitution
 
 ROUNDS = 300
 

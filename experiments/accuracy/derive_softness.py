@@ -4,7 +4,7 @@
 
 An impact is followed in the variables of `jaxgran.scene.contact.impact` with its derivative
 in an outward acceleration, the centrifugal one of an oblique impact. Prints c/(d - 1) at some beta,
-the coefficients of `jaxgran.theory.softness` and the largest relative error of the fit, and draws
+the coefficients of `jaxgran.theory.equations` and the largest relative error of the fit, and draws
 both.
 """
 
@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from experiments.support.record import add_recording, write_picture
 from jaxgran.plotting import COLOURS, INK
-from jaxgran.theory.softness import MEAN_OVERLAP, softness
+from jaxgran.theory.equations import MEAN_OVERLAP, softness
 
 BETAS = np.geomspace(1e-3, 8.0, 40)
 
@@ -75,7 +75,7 @@ def main() -> None:
     print("numerator", found[:2], "denominator", found[2:])
     print(f"largest error of this fit {np.max(np.abs(fit(found, BETAS) / c - 1)):.1e}")
     error = np.max(np.abs(np.asarray(softness(jnp.asarray(BETAS), 2)) / c - 1))
-    print(f"largest error of jaxgran.theory.softness.softness {error:.1e}")
+    print(f"largest error of jaxgran.theory.equations.softness {error:.1e}")
     write_picture(draw(c), "derive_softness", options)
 
 

@@ -23,7 +23,7 @@ from experiments.support.hard_cases.impacts import IMPACTS
 from experiments.support.hard_cases.rows import Row
 from experiments.support.hard_cases.runs import RUNS
 from experiments.support.record import add_recording, save, write_results
-from jaxgran.data.files import write_whole
+from jaxgran.data.files import write_atomically
 
 CASES = [*IMPACTS, *GASES, *RUNS]
 SMOKE = "order flips"
@@ -83,7 +83,7 @@ def main() -> int:
         in_order = [records[c.name] for c in CASES if c.name in records]
         save(record, cases=in_order)
         text = table(in_order)
-        write_whole(options.out / "hard_cases.md", lambda f, text=text: f.write(text.encode()))
+        write_atomically(options.out / "hard_cases.md", lambda f, text=text: f.write(text.encode()))
     write_results("hard_cases", options, None, cases=[records[c.name] for c in cases])
     print(f"\n{failed} rows failed; {options.out}")
     return int(failed > 0)

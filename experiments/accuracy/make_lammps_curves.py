@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 import jaxgran
 from experiments.support.lammps_library import new_lammps
 from experiments.support.record import DATA, PICTURES
-from jaxgran.data.header import header_number
+from jaxgran.data.files import header_number
 from jaxgran.plotting import COLOURS, INK
 
 NAME = "make_lammps_curves"

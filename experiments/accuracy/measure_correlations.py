@@ -5,7 +5,7 @@
 Hard spheres of constant restitution cool in boxes shorter than L_c from an elastic fluid. Their
 cooling rate over Enskog's, with a_2 and a_3 of kinetic theory, is found for each box from
 T^(-1/2), which Enskog's gas would let grow at a constant rate, and compared with
-`jaxgran.theory.correlations` and `jaxgran.theory.shear_modes`. Of elastic spheres the collision
+`jaxgran.theory.equations` and `jaxgran.models.error_model`. Of elastic spheres the collision
 rate over Enskog's is found, and compared with the virial series; what it differs from 1 by belongs
 to equilibrium and is divided out. Finite N is allowed for: spheres without total momentum meet
 faster, energy is shared by few, and T^(-1/2) is not linear in it, ``1/(2N) - 3/(4dN) +
@@ -30,10 +30,10 @@ from matplotlib.figure import Figure
 import jaxgran
 from experiments.support.record import add_recording, write_picture, write_results
 from experiments.support.scenes import hard_beads
+from jaxgran.models.error_model import flow_share
 from jaxgran.plotting import COLOURS, INK
 from jaxgran.scene.geometry import contact_value
-from jaxgran.theory.correlations import built_up, slowing
-from jaxgran.theory.shear_modes import flow_share
+from jaxgran.theory.equations import built_up, slowing
 
 MARKS = np.array([0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0])
 """Collisions per particle at which T is recorded."""

@@ -93,7 +93,7 @@ def law_of(gas: jaxgran.Gas) -> Callable[[np.ndarray], np.ndarray]:
     return restitution
 
 
-def course(d: int, blocks: int, seeds: int) -> dict:
+def error_model(d: int, blocks: int, seeds: int) -> dict:
     """A viscoelastic gas from a Maxwellian start, and theory at the same times."""
     gas = beads(0.01, BETA, dimension=d)
     runs = []
@@ -209,7 +209,7 @@ def main() -> None:
             )
     courses = []
     for d in (3, 2):
-        courses.append(course(d, blocks, 2 if options.smoke else SEEDS[d]))
+        courses.append(error_model(d, blocks, 2 if options.smoke else SEEDS[d]))
         say_course(courses[-1])
     write_picture(draw(states, courses), "sonine_coefficients", options)
     path = options.out / "sonine_coefficients.json"

@@ -108,7 +108,7 @@ def main() -> int:
     )
     add_recording(parser)
     options = parser.parse_args()
-    began, gas = time.perf_counter(), scene()
+    start_time, gas = time.perf_counter(), scene()
     A = float(gas.value("dissipative_constant"))
     print("T_rot/T = 2/3 alone leaves a line of pairs (constant eps, Maxwellian):")
     for eps, betas in allowed_pairs():
@@ -152,7 +152,7 @@ def main() -> int:
         smooth_undetermined=none,
         smooth_over_true=[float(s.estimate[0]) / A for s, _ in rows if not s.undetermined()],
     )
-    print(f"{time.perf_counter() - began:.0f} s")
+    print(f"{time.perf_counter() - start_time:.0f} s")
     return 0
 
 

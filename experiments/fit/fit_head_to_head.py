@@ -35,7 +35,7 @@ import scipy.optimize
 
 import jaxgran
 from experiments.support.record import DATA, add_recording, write_results
-from jaxgran.data.header import header_number
+from jaxgran.data.files import header_number
 
 try:
     import cma  # type: ignore[import-not-found]
@@ -248,11 +248,11 @@ def watched(
             visit(gas)
             return model.simulate(gas, times, run)
 
-        def estimated_error(self, course):
-            return model.estimated_error(course)
+        def estimated_error(self, error_model):
+            return model.estimated_error(error_model)
 
-        def omissions(self, gas, num_particles=None):
-            return model.omissions(gas, num_particles)
+        def limitations(self, gas, num_particles=None):
+            return model.limitations(gas, num_particles)
 
     return Watched()
 

@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 from experiments.support.record import DATA, PICTURES, add_recording, write_results
-from jaxgran.cli.app import main as command
+from jaxgran.cli.main import main as command
 
 NAMES = ("dilute", "dense", "phi003", "phi003_large", "phi010", "phi025")
 DILUTE, DENSE, *OTHERS = (str(DATA / f"lammps_cooling_{name}.csv") for name in NAMES)

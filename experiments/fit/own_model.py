@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 import jaxgran
 from experiments.support.record import add_recording, write_picture
 from experiments.support.scenes import hard_beads
-from jaxgran.theory.closed_forms import haff
+from jaxgran.theory.equations import haff
 
 
 class HaffLaw(jaxgran.AbstractModel):
@@ -37,11 +37,13 @@ class HaffLaw(jaxgran.AbstractModel):
         T = gas.temperature * haff(tau, gas.value("coefficient"), gas.dimension)
         return jaxgran.CoolingCurve(times=times, temperature=T)
 
-    def estimated_error(self, course):
+    def estimated_error(self, error_model):
         # a_2 changes the cooling rate by the share 3 a_2 / 16.
-        return course.error_of_temperature(course.homogeneous + 3 / 16 * np.abs(course.sonine))
+        return error_model.error_of_temperature(
+            error_model.homogeneous + 3 / 16 * np.abs(error_model.sonine)
+        )
 
-    def omissions(self, gas, num_particles=None):
+    def limitations(self, gas, num_particles=None):
         if float(gas.value("coefficient")) > 0.7:
             return ()
         remedy = "This scene needs kinetic theory, which follows a_2."

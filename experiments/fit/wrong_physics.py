@@ -52,9 +52,9 @@ def beads() -> jaxgran.Gas:
 
 def measured(gas: jaxgran.Gas) -> tuple[jax.Array, jax.Array]:
     """Times until T has fallen to its last share, and T of hard spheres then."""
-    course = jnp.geomspace(1e-2, 1e4, 400) * gas.mean_free_time
-    T = jaxgran.cool(gas, course, model=THEORY).temperature / gas.temperature
-    end = float(jnp.interp(-np.log(LAST), -jnp.log(T), course))
+    error_model = jnp.geomspace(1e-2, 1e4, 400) * gas.mean_free_time
+    T = jaxgran.cool(gas, error_model, model=THEORY).temperature / gas.temperature
+    end = float(jnp.interp(-np.log(LAST), -jnp.log(T), error_model))
     times = jnp.geomspace(end / 300, end, NUM_POINTS)
     model = jaxgran.HardSpheres(NUM_PARTICLES, replicas=REPLICAS)
     return times, jaxgran.cool(gas, times, model=model, progress=False).temperature

@@ -21,9 +21,9 @@ from experiments.support.claims.cooling import cooling
 from experiments.support.claims.diffusion import diffusion, equilibrium, memory
 from experiments.support.claims.table import Row, Table
 from experiments.support.record import DATA, FIGURES, add_recording, write_results
-from jaxgran.data.header import header_number
+from jaxgran.data.files import header_number
 from jaxgran.scene.contact import impact
-from jaxgran.scene.restitution_table import C1, C2
+from jaxgran.scene.laws import C1, C2
 
 HEAD = """# The paper's claims
 

@@ -15,7 +15,7 @@ import numpy as np
 import jaxgran
 from experiments.support import paper
 from experiments.support.scenes import beads, hard_beads
-from jaxgran.theory import closed_forms
+from jaxgran.theory.equations import COOLING_RATE, haff, paper_temperature
 
 NAME = "paper_cooling"
 
@@ -93,9 +93,9 @@ def main() -> None:
             found["exponent_within_1_per_cent_from"] = paper.from_here(late, where)
             found["closed_forms"] = formulas(right, tau, theta, float(gas.delta))
         else:
-            haff = np.asarray(closed_forms.haff(tau, e))
-            right.plot(tau, haff / theta - 1, color=colors[name], label="Haff, Eq. (44)")
-            found["haff"] = paper.listed(haff[::12] / theta[::12] - 1)
+            expected = np.asarray(haff(tau, e))
+            right.plot(tau, expected / theta - 1, color=colors[name], label="Haff, Eq. (44)")
+            found["haff"] = paper.listed(expected[::12] / theta[::12] - 1)
     paper.caption(
         left,
         "Temperature",
@@ -139,15 +139,15 @@ def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
 
 def formulas(axes, tau: np.ndarray, theta: np.ndarray, delta: float) -> dict:
     """Relative errors of the paper's closed forms of T(t), drawn, and at some times."""
-    u = 1 + closed_forms.COOLING_RATE[3] * delta * tau
+    u = 1 + COOLING_RATE[3] * delta * tau
     t = jnp.asarray(tau)
     forms = {
         "Eq. (10): u$^{-5/3}$": (u ** (-5 / 3), ":"),
         "Eq. (38) as printed, to order δ": (
-            closed_forms.paper_temperature(t, delta, corrected=False),
+            paper_temperature(t, delta, corrected=False),
             "--",
         ),
-        "Eq. (38) corrected, to order δ$^2$": (closed_forms.paper_temperature(t, delta), "-"),
+        "Eq. (38) corrected, to order δ$^2$": (paper_temperature(t, delta), "-"),
     }
     rows = {}
     for label, (values, style) in forms.items():

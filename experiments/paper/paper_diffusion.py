@@ -17,7 +17,7 @@ import numpy as np
 import jaxgran
 from experiments.support import paper
 from experiments.support.scenes import beads, hard_beads
-from jaxgran.theory import closed_forms
+from jaxgran.theory.equations import COOLING_RATE, paper_averages, paper_displacement
 
 NAME = "paper_diffusion"
 
@@ -132,12 +132,12 @@ def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
 
 def formulas(axes, tau: np.ndarray, spread: np.ndarray, delta: float) -> dict:
     """Relative errors of the closed forms of <dr^2>(t), drawn, and at some times."""
-    rate = closed_forms.COOLING_RATE[3] * delta
+    rate = COOLING_RATE[3] * delta
     u, t = 1 + rate * tau, jnp.asarray(tau)
     of = {
         "leading: u$^{1/6}$ − 1": (54 / rate * (u ** (1 / 6) - 1), ":"),
-        "Eq. (40) integrated": (closed_forms.paper_displacement(t, delta, corrected=False), "--"),
-        "corrected, to order δ": (closed_forms.paper_displacement(t, delta), "-"),
+        "Eq. (40) integrated": (paper_displacement(t, delta, corrected=False), "--"),
+        "corrected, to order δ": (paper_displacement(t, delta), "-"),
     }
     rows = {}
     shown = tau > 3
@@ -162,7 +162,7 @@ def cooling_window(delta: float, tau: np.ndarray) -> dict:
     # tau_c |dT/dt| / T is the share of T lost in a collision, -d ln T/dN.
     lost = -np.diff(np.log(theta)) / np.diff(collisions)
     relaxed = np.asarray(curve.diffusion) / (1.5 * unit / float(gas.mean_free_time))
-    averages = jax.vmap(lambda x: closed_forms.paper_averages(gas.reduced_law, x, 3)[2, 0])
+    averages = jax.vmap(lambda x: paper_averages(gas.reduced_law, x, 3)[2, 0])
     slowing = np.asarray(averages(jnp.sqrt(jnp.asarray(theta))))
     t_tau_v = np.sqrt(theta) * float(np.sqrt(32 * np.pi) / 3) / slowing
     first, last = 1 / delta, delta ** (-11 / 5)

@@ -24,7 +24,7 @@ from experiments.paper.paper_velocity_correlation import (
 from experiments.paper.paper_velocity_correlation import Config as Correlation
 from experiments.support import paper
 from experiments.support.scenes import beads, hard_beads
-from jaxgran.theory import closed_forms
+from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, RELAXATION_CORRECTION
 
 NAME = "paper_diffusion_coefficient"
 
@@ -67,8 +67,8 @@ def main() -> None:
     }
     tau = np.geomspace(0.3, config.last, 200)
     delta = float(viscoelastic.delta)
-    u = 1 + closed_forms.COOLING_RATE[3] * delta * tau
-    a_3 = closed_forms.COOLING_CORRECTION + closed_forms.RELAXATION_CORRECTION
+    u = 1 + COOLING_RATE[3] * delta * tau
+    a_3 = COOLING_CORRECTION + RELAXATION_CORRECTION
     printed = u ** (-5 / 6) + a_3 * delta / u
     fall.plot(tau, printed, "--", lw=1, color=paper.VISCOELASTIC, label="Eq. (40), to order δ")
     paper.caption(

@@ -21,7 +21,7 @@ from matplotlib.ticker import NullFormatter
 import jaxgran
 from experiments.support import paper
 from experiments.support.scenes import beads
-from jaxgran.checks.validation import POSITIVE, Domain, number
+from jaxgran._utils.validation import POSITIVE, Domain, number
 
 SHADES = ("#084594", "#2171b5", "#6baed6", "#bdc9e1")
 """From the smallest gamma to the largest: one colour from dark to light, which has no other use."""

@@ -15,13 +15,7 @@ import numpy as np
 
 from experiments.support import paper
 from jaxgran.scene.contact import impact
-from jaxgran.scene.restitution_table import (
-    C1,
-    C2,
-    C_CLIP,
-    UNCLIPPED_SERIES,
-    viscoelastic_restitution,
-)
+from jaxgran.scene.laws import C1, C2, C_CLIP, UNCLIPPED_SERIES, viscoelastic_restitution
 
 NAME = "paper_restitution"
 PRINTED = (1.15344, 0.79826)

@@ -23,8 +23,8 @@ from scipy.integrate import simpson
 import jaxgran
 from experiments.support import paper
 from experiments.support.scenes import beads, hard_beads
-from jaxgran.theory import closed_forms
-from jaxgran.theory.averages import Rates, averages, collision_rate
+from jaxgran.theory.averages import Rates, collision_rate, impact_moments
+from jaxgran.theory.equations import paper_averages
 
 NAME = "paper_velocity_correlation"
 SPHERES = {"hard_spheres": jaxgran.HardSpheres, "soft_spheres": jaxgran.SoftSpheres}
@@ -69,7 +69,7 @@ def relaxation(law, theta, sonine, dimension: int):
     """nu_v and the collision rate, in reduced units, at the temperatures theta = T/T_0."""
 
     def one(theta, sonine):
-        rates = Rates.of(averages(law, jnp.sqrt(theta), dimension), sonine)
+        rates = Rates.of(impact_moments(law, jnp.sqrt(theta), dimension), sonine)
         return jnp.stack([rates.relaxation, collision_rate(sonine, dimension)])
 
     return (jax.vmap(one)(theta, sonine) * jnp.sqrt(theta)[:, None]).T
@@ -226,7 +226,7 @@ def printed_relaxation(gas: jaxgran.Gas) -> jax.Array:
     if isinstance(gas.law, jaxgran.ConstantRestitution):
         return 2 / (1 + gas.law.coefficient)
     one = jnp.ones(())
-    nu = closed_forms.paper_averages(gas.reduced_law, one, gas.dimension)[2, 0]
+    nu = paper_averages(gas.reduced_law, one, gas.dimension)[2, 0]
     return 2 / 3 * collision_rate(0.0, gas.dimension) / nu
 
 

@@ -29,8 +29,7 @@ from scipy.integrate import solve_ivp
 
 import jaxgran
 from experiments.support.record import add_recording, write_results
-from jaxgran.scene.geometry import sphere_surface
-from jaxgran.scene.impact_average import NODES
+from jaxgran.scene.geometry import NODES, sphere_surface
 from jaxgran.theory.averages import averaging_matrix
 
 NUM_CURVES = 1000
@@ -106,8 +105,8 @@ def scipy_curve(gas: jaxgran.Gas, a: float, times: np.ndarray) -> np.ndarray:
 
 def numpy_restitution(beta: np.ndarray) -> np.ndarray:
     """The rational fit of the clipped restitution law, in NumPy."""
-    from jaxgran.scene.restitution_table import _CLIPPED as fit
-    from jaxgran.scene.restitution_table import C1
+    from jaxgran.scene.laws import _CLIPPED as fit
+    from jaxgran.scene.laws import C1
 
     z = np.sqrt(beta)
     p = fit.decay * fit.kappa - C1 + beta * np.polynomial.polynomial.polyval(z, fit.p)

@@ -35,7 +35,7 @@ from experiments.support.record import (
     write_results,
 )
 from experiments.support.scenes import beads
-from jaxgran.data.header import header_number
+from jaxgran.data.files import header_number
 from jaxgran.plotting import COLOURS, INK, STYLES
 
 KEY = 1  # of the random numbers of the rows; the reference has another

@@ -14,11 +14,15 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from experiments.support.flow_waves import Memory, columns, fit
-from jaxgran.particles.soft import block, followed
-from jaxgran.particles.soft.frame import at_rest
-from jaxgran.particles.soft.scene import SoftScene
+from jaxgran.gradients.tangents import ThermalTangents
+from jaxgran.particles.soft import dynamics
+from jaxgran.particles.soft.dynamics import (
+    initial_soft_tangents,
+    peculiar_velocity,
+    tangents_after_block,
+)
+from jaxgran.particles.soft.forces import SoftScene
 from jaxgran.particles.state import State
-from jaxgran.tangents.thermal import ThermalTangents
 
 
 class Carried(NamedTuple):
@@ -41,7 +45,7 @@ def projecting(memory: Memory) -> Iterator[None]:
     """
 
     def at_start(*arguments: Any) -> ThermalTangents:
-        along = followed.at_start(*arguments)
+        along = initial_soft_tangents(*arguments)
         own = Carried(along.interval, jnp.zeros_like(along.position))
         return along._replace(interval=own)  # type: ignore[arg-type]
 
@@ -49,8 +53,8 @@ def projecting(memory: Memory) -> Iterator[None]:
         return _projected(new, more, memory)
 
     with (
-        mock.patch.object(block, "at_start", at_start),
-        mock.patch.object(block, "after_block", after_block),
+        mock.patch.object(dynamics, "initial_soft_tangents", at_start),
+        mock.patch.object(dynamics, "tangents_after_block", after_block),
     ):
         yield
 
@@ -60,9 +64,9 @@ def _projected(new: State, more: tuple[Any, ...], memory: Memory) -> ThermalTang
     along, scene = new.tangents, more[-1]
     own: Any = along.interval
     never = along._replace(interval=jnp.full((), jnp.inf))
-    along = followed.after_block(new._replace(tangents=never), *more)
+    along = tangents_after_block(new._replace(tangents=never), *more)
     replicas = along.log_temperature.shape[1]
-    velocity = at_rest(scene, new.velocity, replicas)
+    velocity = peculiar_velocity(scene, new.velocity, replicas)
     warmth = jnp.mean(velocity**2)
     passed = along.elapsed * jnp.sqrt(warmth) * scene.collision_frequency
     found = jax.lax.cond(

@@ -19,7 +19,7 @@ from typing import Any
 
 import jax
 
-from jaxgran.data.files import write_whole
+from jaxgran.data.files import write_atomically
 
 EXPERIMENTS = Path(__file__).parents[1]
 DATA = EXPERIMENTS / "data"
@@ -83,7 +83,7 @@ def save(path: Path, **results) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"made_by": made_by()} | results, indent=1) + "\n"
-    write_whole(path, lambda f: f.write(text.encode()))
+    write_atomically(path, lambda f: f.write(text.encode()))
 
 
 def made_by() -> dict[str, Any]:

@@ -1,9 +1,18 @@
-"""Cooling curves: one type for measured and for simulated ones, and its validation."""
+"""Cooling curves: one type for measured and for simulated ones, and its validation.
 
+The options of one run, as opposed to the description of a model.
+
+Curves as tables of xarray and pandas, which are imported here when they are asked for.
+
+What `save` makes of the particles: arrays by name, and their dimensions.
+"""
+
+import dataclasses
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -11,11 +20,132 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxgran.checks.validation import listed_numbers
-from jaxgran.checks.words import Rows, as_html, as_text, said
-from jaxgran.data import tables
+from jaxgran._utils.formatting import Rows, format_quantity, html_table, text_table
+from jaxgran._utils.validation import array_if_listed
+
+
+class Run(NamedTuple):
+    """The options of one run. `jaxgran.cool` makes it from its arguments.
+
+    Attributes:
+        key: of the random numbers; None is `jax.random.key(0)`. Deterministic models ignore it.
+        progress: show a progress bar on a terminal.
+        checkpoint: file to which the run is saved and from which it is resumed; None for none.
+        save: a function of the particles of each replica, or "particles", whose value at each time
+            is `CoolingCurve.saved`; None for nothing.
+        trajectory: file to which the particles are written at each time; None for none.
+
+    >>> jaxgran.Run(progress=False).checkpoint is None
+    True
+    """
+
+    key: PRNGKeyArray | None = None
+    progress: bool = False
+    checkpoint: str | Path | None = None
+    save: Callable[..., Any] | str | None = None
+    trajectory: str | Path | None = None
+
+
+DEFAULTS = Run()
+"""A silent run with the default random numbers, not saved."""
+
+
+QUANTITY_UNITS = {
+    "times": "s",
+    "temperature": "m^2/s^2",
+    "temperature_error": "m^2/s^2",
+    "displacement": "m^2",
+    "displacement_error": "m^2",
+    "sonine": "1",
+    "third_sonine": "1",
+    "collisions": "1",
+    "diffusion": "m^2/s",
+    "rotational_temperature": "m^2/s^2",
+    "rotational_temperature_error": "m^2/s^2",
+    "velocity_correlation": "m^2/s^2",
+    "elastic_energy": "J",
+    "dissipated_energy": "J",
+    "regularised": "1",
+    "flow_share": "1",
+    "derivative_bias": "1",
+}
+"""Units of the quantities of a curve, by the names of its fields."""
+
+
+def import_extra(name: str, extra: str = "notebook") -> Any:
+    """A module of an extra.
+
+    Raises:
+        ModuleNotFoundError: if it is not installed, naming the extra.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise ModuleNotFoundError(
+            f'this needs {name}: pip install "jaxgran[{extra}]"', name=name
+        ) from None
+
+
+def quantities(curve: Any) -> dict[str, np.ndarray]:
+    """What is known at each time, by name, without the times.
+
+    Raises:
+        ValueError: for several curves in one, as `jax.vmap` returns them.
+    """
+    if np.ndim(curve.times) != 1:
+        raise ValueError(
+            f"the times of this curve have shape {np.shape(curve.times)}: take one curve, as in "
+            "jax.tree.map(lambda x: x[0], curves)"
+        )
+    known = {name: getattr(curve, name, None) for name in QUANTITY_UNITS if name != "times"}
+    return {name: np.asarray(values) for name, values in known.items() if values is not None}
+
+
+def to_dataset(curve: Any) -> Any:
+    """The `xarray.Dataset` of `CoolingCurve.to_xarray`."""
+    xarray = import_extra("xarray")
+
+    def described(name: str, *dims: str, values: np.ndarray) -> tuple:
+        return dims, values, {"units": QUANTITY_UNITS[name], "long_name": name.replace("_", " ")}
+
+    found = {name: described(name, "time", values=x) for name, x in quantities(curve).items()}
+    if curve.replicas is not None:
+        for name in found.keys() & QUANTITY_UNITS.keys():
+            values = getattr(curve.replicas, name)
+            if values is not None:
+                each = described(name, "replica", "time", values=np.asarray(values))
+                found[f"{name}_of_replicas"] = each
+    if curve.particles is not None:
+        for name, unit in (("position", "m"), ("velocity", "m/s")):
+            values = np.asarray(getattr(curve.particles, name))
+            found[name] = (("replica", "particle", "axis"), values, {"units": unit})
+    found |= _saved_variables(curve)
+    time = described("times", "time", values=np.asarray(curve.times))
+    attributes = {} if curve.status is None else {"status": int(curve.status)}
+    return xarray.Dataset(found, coords={"time": time}, attrs=attributes)
+
+
+def _saved_variables(curve: Any) -> dict[str, tuple]:
+    """What ``save=`` made of the particles, by name: dimensions, values and attributes."""
+
+    whole, found = isinstance(curve.saved, Particles), {}
+    for name, leaf in saved_arrays(curve).items():
+        unit = saved_unit(name, whole)
+        attributes = {} if unit is None else {"units": unit}
+        found[name] = saved_dimensions(name, np.ndim(leaf), whole), np.asarray(leaf), attributes
+    return found
+
+
+def to_frame(curve: Any) -> Any:
+    """The `pandas.DataFrame` of `CoolingCurve.to_pandas`."""
+    pandas = import_extra("pandas")
+    columns = quantities(curve)
+    return pandas.DataFrame(columns, index=pandas.Index(np.asarray(curve.times), name="times"))
+
 
 MIN_POINTS = 3
 """The smallest number of times of a measured curve."""
@@ -31,7 +161,7 @@ COLUMNS = {
 }
 """Measured quantities: names of the columns of a file, and the fields of `CoolingCurve`."""
 
-FURTHER = {
+COMPUTED_COLUMNS = {
     "a2": "sonine",
     "a3": "third_sonine",
     "collisions": "collisions",
@@ -75,7 +205,7 @@ else:
     # A run-time type checker lets everything pass, so that a wrong type is reported in words.
     UserParticles = Any
 
-_number_field = partial(eqx.field, converter=listed_numbers)
+_number_field = partial(eqx.field, converter=array_if_listed)
 
 
 class CoolingCurve(eqx.Module):
@@ -106,7 +236,7 @@ class CoolingCurve(eqx.Module):
         flow_share: share of the kinetic energy in the longest waves of the flow, of spheres in
             periodic boxes: see `jaxgran.observables.flow_share`.
         derivative_bias: by which share a projected derivative of ln T is too large, as estimated
-            from this share in boxes longer than L_c (`jaxgran.models.flow_bias`).
+            from this share in boxes longer than L_c (`jaxgran.models.error_model`).
         replicas: the curve of each replica, with arrays of shape (replicas, times).
         particles: the final state of a particle model.
         saved: what `cool(save=...)` made of the particles at each time, first axes (times, ...),
@@ -145,10 +275,10 @@ class CoolingCurve(eqx.Module):
     status: Int[Array, ""] | None = None
 
     def __repr__(self) -> str:
-        return as_text(*self._words)
+        return text_table(*self._words)
 
     def _repr_html_(self) -> str:
-        return as_html(*self._words)
+        return html_table(*self._words)
 
     def to_xarray(self) -> Any:
         """The curve as an `xarray.Dataset`, with units; needs the extra `notebook`.
@@ -163,14 +293,14 @@ class CoolingCurve(eqx.Module):
                 saved dictionary holds "." or "/".
             ModuleNotFoundError: without xarray.
         """
-        return tables.dataset(self)
+        return to_dataset(self)
 
     def to_pandas(self) -> Any:
         """The curve as a `pandas.DataFrame`, a row for each time; needs the extra `notebook`.
 
         Raises: as `to_xarray`.
         """
-        return tables.frame(self)
+        return to_frame(self)
 
     def plot(self, axes: Any = None, **style: Any) -> Any:
         """Draw T against t; see `jaxgran.plot_curve`."""
@@ -182,15 +312,15 @@ class CoolingCurve(eqx.Module):
         """Title and rows of a short account of the curve."""
         first = last = ratio = ""
         if not any(isinstance(x, Tracer) for x in (self.times, self.temperature)):
-            first, last = (said(np.asarray(self.times)[..., i], "s") for i in (0, -1))
+            first, last = (format_quantity(np.asarray(self.times)[..., i], "s") for i in (0, -1))
             T = np.asarray(self.temperature)
-            ratio = said(T[..., -1] / T[..., 0])
+            ratio = format_quantity(T[..., -1] / T[..., 0])
             first, last = f", t = {first}", f" to {last}"
         known = [f.name for f in fields(self) if getattr(self, f.name) is not None]
         rows = [("T over its first value", ratio or "traced")]
         rows += [("known", ", ".join(name for name in known if name not in ("times", "status")))]
         if self.status is not None:
-            rows.append(("status", said(self.status)))
+            rows.append(("status", format_quantity(self.status)))
         return f"CoolingCurve of {np.shape(self.times)[-1]} times{first}{last}", rows
 
     @classmethod
@@ -249,7 +379,7 @@ class CoolingCurve(eqx.Module):
             values = getattr(self, field)
             if values is not None and not isinstance(values, Tracer):
                 _check_column(column, np.asarray(values), times, place)
-        for column, field in FURTHER.items():
+        for column, field in COMPUTED_COLUMNS.items():
             values = getattr(self, field)
             if values is not None and np.shape(values) != times.shape:
                 raise ValueError(
@@ -288,3 +418,101 @@ def _check_column(
             + ("" if column == "T" else " (zero is allowed in a first row at t = 0 only)")
             + "; correct or remove this row"
         )
+
+
+TIME, REPLICA = "time", "replica"
+SAVED = "saved"
+OF_REPLICAS = "_of_replicas"
+"""The ending of the names of records that have an axis of replicas."""
+
+_MEAN, _ERROR, _EACH = SAVED, f"{SAVED}_error", f"{SAVED}{OF_REPLICAS}"
+
+_PARTICLE_DIMENSIONS = {
+    "position": (REPLICA, "particle", "axis"),
+    "velocity": (REPLICA, "particle", "axis"),
+    "angular_velocity": (REPLICA, "particle", "rotation_axis"),
+    "box_side": ("axis",),
+}
+"""Dimensions after the time, where the particles themselves are saved."""
+
+_PARTICLE_UNITS = {"position": "m", "velocity": "m/s", "angular_velocity": "1/s", "box_side": "m"}
+
+Leaves = dict[str, Any]
+"""Arrays by name."""
+
+
+def is_saved(name: str) -> bool:
+    """Whether a record is one of these."""
+    return name.partition(".")[0] in (_MEAN, _ERROR, _EACH)
+
+
+def saved_arrays(curve: CoolingCurve) -> Leaves:
+    """The arrays that a curve has saved, named by their places: ``saved.S.0``.
+
+    The standard error is ``saved_error.S.0``, and that of each replica
+    ``saved_of_replicas.S.0``.
+    """
+    return {
+        _saved_name(part, path): leaf
+        for part, tree in _saved_parts(curve).items()
+        for path, leaf in jax.tree.flatten_with_path(tree)[0]
+    }
+
+
+def with_saved_arrays(curve: CoolingCurve, like: CoolingCurve, found: Leaves) -> CoolingCurve:
+    """A curve with these arrays in the trees in which another one has them."""
+    trees = {}
+    for part, tree in _saved_parts(like).items():
+        paths, structure = jax.tree.flatten_with_path(tree)
+        trees[part] = jax.tree.unflatten(
+            structure, [found[_saved_name(part, path)] for path, _ in paths]
+        )
+    if _EACH in trees:
+        assert curve.replicas is not None
+        replicas = dataclasses.replace(curve.replicas, saved=trees.pop(_EACH))
+        curve = dataclasses.replace(curve, replicas=replicas)
+    return dataclasses.replace(curve, **trees)
+
+
+def saved_dimensions(name: str, ndim: int, whole: bool) -> tuple[str, ...]:
+    """Labels of the axes of one member's array.
+
+    Args:
+        name: of `leaves`.
+        ndim: number of its axes.
+        whole: whether the particles themselves are saved.
+    """
+    part, _, place = name.partition(".")
+    if whole:
+        return (TIME, *_PARTICLE_DIMENSIONS[place][: ndim - 1])
+    first = (REPLICA, TIME) if part == _EACH else (TIME,)
+    own = f"{SAVED}.{place}" if place else SAVED
+    return *first, *(f"{own}.axis{k}" for k in range(ndim - len(first)))
+
+
+def saved_unit(name: str, whole: bool) -> str | None:
+    """The unit of an array; None where a user's function determines it."""
+    return _PARTICLE_UNITS[name.partition(".")[2]] if whole else None
+
+
+def _saved_parts(curve: CoolingCurve) -> dict[str, Any]:
+    """The trees of a curve that hold what was saved, by the beginnings of their names."""
+    each = None if curve.replicas is None else curve.replicas.saved
+    trees = {_MEAN: curve.saved, _ERROR: curve.saved_error, _EACH: each}
+    return {part: tree for part, tree in trees.items() if tree is not None}
+
+
+def _saved_name(part: str, path: tuple[Any, ...]) -> str:
+    """The name of an array at a place in a tree.
+
+    Raises:
+        ValueError: for a key of a dictionary that would make it ambiguous.
+    """
+    keys = [jax.tree_util.keystr((key,), simple=True) for key in path]
+    for key in keys:
+        if "." in key or "/" in key:
+            raise ValueError(
+                f"save returns a dictionary with the key {key!r}: keys name arrays of a store "
+                'or of an xarray.Dataset, leave "." and "/" out'
+            )
+    return ".".join([part, *keys])

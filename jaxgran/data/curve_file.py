@@ -1,23 +1,779 @@
-"""Files of measured cooling curves: CSV with a header that describes the gas."""
+"""Files of measured cooling curves: CSV with a header that describes the gas.
 
+Whole curves in a file: every quantity, each replica, the final particles and the header.
+
+Measured coefficients of restitution of single impacts.
+
+What a column of a file means, and in which units: conversion to T and to SI.
+
+Elements of a scene in the header of a curve: roughness, walls, drag and a drive.
+
+Tracks of particles, as a camera gives them, to a cooling curve.
+"""
+
+import json
+import warnings
+import zipfile
 from functools import partial
+from math import pi
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from jaxgran.data.curve import COLUMNS, FURTHER, MIN_POINTS, CoolingCurve
-from jaxgran.data.curve_archive import SUFFIX, read_archive, write_archive
-from jaxgran.data.files import write_whole
-from jaxgran.data.header import header_count, header_number
-from jaxgran.data.quantities import STAND_INS, in_si, warn_of_units
-from jaxgran.data.scene_keys import check_volume, read_elements, warn_of_unknown_keys
-from jaxgran.data.table import read_table
-from jaxgran.data.tracks import check_track_names, curve_of_tracks
+from jaxgran._utils.validation import POSITIVE, Domain, UserNumber, UserTruth, check_bool, number
+from jaxgran.data.curve import COLUMNS, COMPUTED_COLUMNS, MIN_POINTS, CoolingCurve, Particles
+from jaxgran.data.files import (
+    Table,
+    header_count,
+    header_number,
+    number_row,
+    read_table,
+    read_text,
+    write_atomically,
+)
+from jaxgran.scene.elements import (
+    SAME_VOLUME,
+    Frictional,
+    Rough,
+    StokesDrag,
+    Walls,
+    WhiteNoise,
+    share_of_container,
+)
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
-from jaxgran.scene.restitution import Viscoelastic
+from jaxgran.scene.laws import ConstantRestitution, Viscoelastic
+
+SUFFIX = ".npz"
+KEY = "key:"
+"""Before a key of a dictionary in the name of an entry."""
+
+HEADER = "header"
+"""The entry that holds the header, as JSON; all others are arrays."""
+
+
+def write_archive(path: Path, curve: CoolingCurve, header: dict[str, str]) -> None:
+    """Write all arrays of a curve, without loss, to an npz file.
+
+    Names of entries are those of the fields, as ``replicas.temperature``, ``particles.position``,
+    and, of what was saved, of the places in its tree: ``saved.key:g.0``. Lists come back as tuples.
+    """
+    arrays: dict[str, Any] = {HEADER: np.array(json.dumps(header)), **_arrays(curve)}
+    write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def read_archive(path: Path) -> tuple[CoolingCurve, dict[str, str]]:
+    """Read what `write_archive` wrote.
+
+    Raises:
+        ValueError: if the file is none of these.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(str(arrays.pop(HEADER)))
+        return _curve(arrays), header
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; check the path") from None
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"{path}: not a file that jaxgran.write_curve wrote ({error}); give one, or a CSV file"
+        ) from None
+
+
+def _arrays(part: Any, prefix: str = "") -> dict[str, np.ndarray]:
+    """Arrays of a curve, its particles and what it saved, by name; None is left out.
+
+    Raises:
+        ValueError: for something saved that is no array, dictionary, tuple, list or `Particles`.
+    """
+    if part is None:
+        return {}
+    children = _children(part)
+    if children is not None:
+        nested = (_arrays(value, f"{prefix}.{name}") for name, value in children.items())
+        return {name: array for found in nested for name, array in found.items()}
+    if not isinstance(part, jax.Array | np.ndarray | np.generic | float | int):
+        raise ValueError(
+            f"{prefix[1:]} is of type {type(part).__name__}: let `save` return arrays in "
+            "dictionaries, tuples or lists"
+        )
+    return {prefix[1:]: np.asarray(part)}
+
+
+def _children(part: Any) -> dict[str, Any] | None:
+    """What a container holds, by names that tell its type; None if it is none."""
+    if isinstance(part, CoolingCurve):
+        return dict(vars(part))
+    if isinstance(part, Particles):
+        return part._asdict()
+    if isinstance(part, dict):
+        return {f"{KEY}{name}": value for name, value in part.items()}
+    if isinstance(part, list) or (isinstance(part, tuple) and not hasattr(part, "_fields")):
+        return {str(k): value for k, value in enumerate(part)}
+    return None
+
+
+def _curve(arrays: dict[str, np.ndarray]) -> CoolingCurve:
+    builders = {"replicas": _curve, "particles": _tree, "saved": _tree, "saved_error": _tree}
+    return CoolingCurve(
+        **{name: builders.get(name, _tree)(inner) for name, inner in _grouped(arrays).items()}
+    )
+
+
+def _tree(arrays: dict[str, np.ndarray]) -> Any:
+    """An array, or a dictionary, a tuple or `Particles` of arrays."""
+    if "" in arrays:
+        return jnp.asarray(arrays[""])
+    children = {name: _tree(inner) for name, inner in _grouped(arrays).items()}
+    if all(name.startswith(KEY) for name in children):
+        return {name.removeprefix(KEY): child for name, child in children.items()}
+    if all(name.isdigit() for name in children):
+        return tuple(children[str(k)] for k in range(len(children)))
+    return Particles(**children)
+
+
+def _grouped(arrays: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """Arrays by the first part of their names, and then by the rest."""
+    groups: dict[str, dict[str, np.ndarray]] = {}
+    for name, array in arrays.items():
+        first, _, rest = name.partition(".")
+        groups.setdefault(first, {})[rest] = array
+    return groups
+
+
+DROP_TEST_COLUMNS = ("v", "eps", "eps_err")
+RESTITUTION = Domain(0.0, 1.0, high_allowed=True)
+
+
+class DropTest(eqx.Module):
+    """Coefficients of restitution of single impacts at some normal speeds.
+
+    They depend on ``A Y^(2/5)``, as the cooling of a gas of hard spheres does, and on nothing that
+    a cooling curve needs besides.
+
+    Args:
+        speed: normal relative speed before each impact, m/s, shape (n,), > 0.
+        restitution: eps, shape (n,), in (0, 1].
+        error: standard error of each eps, shape (n,), > 0.
+        onto_plate: whether a sphere falls onto a thick plate of its own material, by which
+            ``alpha`` is smaller by sqrt(2), or two equal spheres meet.
+
+    Raises:
+        ValueError: for a value out of its range, or lists of different lengths.
+
+    >>> drops = jaxgran.DropTest(speed=[0.1, 0.3], restitution=[0.92, 0.90], error=[0.01, 0.01])
+    >>> drops.speed.shape
+    (2,)
+    """
+
+    speed: UserNumber = eqx.field(converter=number)
+    restitution: UserNumber = eqx.field(converter=number)
+    error: UserNumber = eqx.field(converter=number)
+    onto_plate: UserTruth = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        check_bool("onto_plate", self.onto_plate)
+        POSITIVE.check("speed", self.speed, "Give normal speeds in m/s.")
+        RESTITUTION.check("restitution", self.restitution, "eps is what is left of the speed.")
+        POSITIVE.check("error", self.error, "Give the standard error of each eps.")
+        shapes = [np.shape(x) for x in (self.speed, self.restitution, self.error)]
+        if len(shapes[0]) != 1 or len(set(shapes)) > 1 or shapes[0] == (0,):
+            raise ValueError(
+                "speed, restitution and error must be lists of one length, of one impact at least; "
+                f"got shapes {', '.join(map(str, shapes))}"
+            )
+
+    def residuals(self, gas: Gas) -> Float[Array, "n"]:
+        """(measured - computed eps) over the error, for spheres of a gas."""
+        reduced = gas.law.on_wall if self.onto_plate else gas.law.reduced
+        law = reduced(diameter=gas.diameter, mass=gas.mass, speed=jnp.ones(()))
+        computed = law.restitution(jnp.asarray(self.speed))
+        return (jnp.asarray(self.restitution) - computed) / jnp.asarray(self.error)
+
+
+def read_drop_test(path: str | Path, *, onto_plate: bool = False) -> DropTest:
+    """Read a drop test from a CSV file with a line of names, v,eps,eps_err, and rows of numbers.
+
+    Args:
+        path: the file; v in m/s. Lines that begin with # are left out.
+        onto_plate: see `DropTest`.
+
+    Raises:
+        ValueError: saying what is wrong, in which line.
+
+    >>> from pathlib import Path
+    >>> rows = "v,eps,eps_err", "0.1,0.92,0.01", "0.3,0.90,0.01", "1.0,0.87,0.01"
+    >>> size = Path("drops.csv").write_text(chr(10).join(rows))
+    >>> jaxgran.read_drop_test("drops.csv").restitution.shape
+    (3,)
+    """
+    path, wanted = Path(path), ",".join(DROP_TEST_COLUMNS)
+    rows: list[list[float]] = []
+    names: list[str] = []
+    for i, line in enumerate(read_text(path, wanted).splitlines(), start=1):
+        line = line.strip()
+        if not line or line.startswith("#"):
+            continue
+        if names:
+            rows.append(number_row(path, i, line, names))
+            continue
+        names = [name.strip() for name in line.split(",")]
+        if sorted(names) != sorted(DROP_TEST_COLUMNS):
+            raise ValueError(
+                f"{path}, line {i}: the columns are {', '.join(names)}; name them {wanted}"
+            )
+    if not rows:
+        raise ValueError(f"{path}: no rows of numbers under {wanted}")
+    columns = dict(zip(names, np.array(rows).T, strict=True))
+    try:
+        return DropTest(columns["v"], columns["eps"], columns["eps_err"], onto_plate)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+"""Units that the header keys ``length_unit`` and ``time_unit`` may name, in SI."""
+
+DIMENSIONS = {
+    "t": (0, 1),
+    "T": (2, -2),
+    "msd": (2, 0),
+    "D": (2, -1),
+    "velocity_correlation": (2, -2),
+    "x": (1, 0),
+    "y": (1, 0),
+    "z": (1, 0),
+    "localisation_error": (1, 0),
+    "T_rot": (2, -2),
+    "mean_speed": (1, -1),
+    "vx2": (2, -2),
+    "v2_xy": (2, -2),
+    "diameter": (1, 0),
+    "diameter_err": (1, 0),
+    "T0": (2, -2),
+    "T0_err": (2, -2),
+    "t0": (0, 1),
+    "t0_err": (0, 1),
+    "T_rot_0": (2, -2),
+    "container_side": (1, 0),
+    "gamma": (0, -1),
+    "A": (0, 1),
+}
+"""Powers of length and time in columns, with their errors, and header values; all others are SI."""
+
+STAND_INS = {
+    "mean_speed": "mean speed <|v|>",
+    "vx2": "mean square <v_x^2> of one component of the velocity",
+    "v2_xy": "mean square <v_x^2 + v_y^2> of two components, as a camera sees them",
+    "energy": "translational energy of a particle (m/2) <v^2>, in J",
+}
+"""Columns from which T = <v^2>/d is computed, and what they are."""
+
+
+USUAL = {
+    "diameter": (1e-7, 0.1, "m"),
+    "temperature": (0.0, 900.0, "m^2/s^2, a thermal speed of 30 m/s"),
+    "youngs_modulus": (1e3, 1e13, "Pa"),
+}
+"""Least and largest values of a granular gas that are not warned of, and their unit."""
+
+
+def warn_of_units(gas: Gas) -> None:
+    """Warn of values that no granular gas has, mostly slips of units."""
+    for name, (least, largest, unit) in USUAL.items():
+        value = float(gas.value(name))
+        if not least <= value <= largest:
+            warnings.warn(
+                f"{name} is {value:.3g}, outside {least:g} to {largest:g} {unit}: check its unit; "
+                "files may name theirs by length_unit and time_unit",
+                stacklevel=3,
+            )
+
+
+def in_si(
+    columns: dict[str, np.ndarray], header: dict[str, str]
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Columns and header in SI, T in place of what stands in for it.
+
+    The header's units are then gone from it, and its entry T_from says how T was computed.
+
+    Raises:
+        ValueError: for a unit that is not known, or an energy of particles of unknown mass.
+    """
+    units = _unit(header, "length_unit", LENGTHS), _unit(header, "time_unit", TIMES)
+    named = ("length_unit", "time_unit")
+    header = {key: value for key, value in header.items() if key not in named}
+    for key in DIMENSIONS.keys() & header.keys():
+        factor = _power(units, key)
+        if factor != 1 and (value := _number(header[key])) is not None:
+            header[key] = repr(factor * value)
+    columns = {name: _power(units, name) * column for name, column in columns.items()}
+    for name in STAND_INS.keys() & columns.keys():
+        values = columns.pop(name)
+        error = columns.pop(f"{name}_err", None)
+        columns["T"], power, header["T_from"] = temperature_from_column(name, values, header)
+        if error is not None:
+            share = np.divide(error, values, out=np.zeros_like(error), where=values != 0)
+            columns["T_err"] = power * columns["T"] * share
+    return columns, header
+
+
+def _power(units: tuple[float, float], name: str) -> float:
+    length, time = DIMENSIONS.get(name.removesuffix("_err"), (0, 0))
+    return units[0] ** length * units[1] ** time
+
+
+def _unit(header: dict[str, str], key: str, units: dict[str, float]) -> float:
+    name = header.get(key, next(iter(units)))
+    if name not in units:
+        raise ValueError(f"header line {key}: {name!r} is not known; use {', '.join(units)}")
+    return units[name]
+
+
+def _number(text: str) -> float | None:
+    """The number that a text is; None if it is none, which is said where it is used."""
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def temperature_from_column(
+    name: str, values: np.ndarray, header: dict[str, str]
+) -> tuple[np.ndarray, float, str]:
+    """T = <v^2>/d of a column that stands in for it, for isotropic Maxwellian velocities.
+
+    Args:
+        name: of the column, one of `STAND_INS`.
+        values: in SI.
+        header: with dimension (3 if it is left out) and, for an energy, diameter and density.
+
+    Returns:
+        T, m^2/s^2; the power of the column in it; and the equation, in words.
+
+    Raises:
+        ValueError: for an energy of particles of unknown mass.
+    """
+    three = _number(header.get("dimension", "3")) == 3
+    if name == "mean_speed":
+        factor, words = (pi / 8, "pi/8") if three else (2 / pi, "2/pi")
+        return factor * values**2, 2.0, f"T = ({words}) mean_speed^2, of Maxwellian velocities"
+    if name == "vx2":
+        return values, 1.0, "T = vx2, of isotropic velocities"
+    if name == "v2_xy":
+        return values / 2, 1.0, "T = v2_xy / 2, of isotropic velocities"
+    diameter, density = (_number(header.get(key, "")) for key in ("diameter", "density"))
+    if diameter is None or density is None:
+        raise ValueError(
+            "a column energy needs the mass of a particle: add diameter and density to the header, "
+            "or give T = <v^2>/d itself"
+        )
+    mass = float(sphere_mass(diameter, density))
+    d = 3 if three else 2
+    return 2 * values / (d * mass), 1.0, f"T = 2 energy / ({d} m), of energies in J per particle"
+
+
+ROUGH_KEYS = ("beta_t", "reduced_inertia", "T_rot_0")
+FRICTION_KEYS = ("tangential_damping", "friction")
+WALL_KEYS = ("container_side", "wall_restitution", "wall_beta_t")
+DRAG_KEYS = ("gamma",)
+DRIVE_KEYS = ("drive_strength",)
+
+REFUSED_KEYS = {
+    "gravity": (
+        0.0,
+        "under gravity density and T change with height, and gases here are homogeneous",
+    ),
+    "polydispersity": (0.0, "grains of unequal masses have unequal temperatures, one T is too few"),
+    "diameter_2": (None, "grains of a mixture have a temperature for each kind, one T is too few"),
+    "density_2": (None, "grains of a mixture have a temperature for each kind, one T is too few"),
+    "aspect_ratio": (
+        1.0,
+        "rods and ellipsoids meet at a rate that depends on how they lie, and turn at impacts that "
+        "are smooth; here there are spheres",
+    ),
+    "cohesion": (0.0, "grains that stick lose all of their speed below some speed, and grow"),
+    "surface_energy": (0.0, "grains that stick lose all of their speed below some speed, and grow"),
+    "charge": (0.0, "charged grains are deflected without touching; here they fly freely"),
+}
+"""Keys of what no model here has: the value at which there is nothing of it, and the reason."""
+
+OTHER_KEYS = ("N", "A", "dimension", "replicas", "T_from", "length_unit", "time_unit") + (
+    "localisation_error",
+)
+"""Keys that say something besides the gas and its elements."""
+
+PROVENANCE_KEYS = ("units", "points", "end_tau", "melt_tau", "steps_per_contact", "source")
+"""Keys that say how a curve was made, and that nothing depends on."""
+
+
+def read_elements(header: dict[str, str]) -> dict[str, Any]:
+    """The elements that a header describes, as `jaxgran.Gas` takes them.
+
+    Args:
+        header: where spheres are rough beta_t and, if they are not .4 and 0, reduced_inertia,
+            4 I/(m sigma^2), and T_rot_0, T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2; where
+            contacts last and rub tangential_damping and friction (`jaxgran.Frictional`, numbers
+            without a unit) in place of beta_t; where there are walls container_side, of a cube, m,
+            wall_restitution and, of rough ones, wall_beta_t; where there is drag gamma, 1/s, of
+            dv/dt = -gamma v; where white noise drives the gas drive_strength, m^2/s^3, of
+            dT/dt = drive_strength.
+
+    Raises:
+        ValueError: for a key that needs another one, a value outside its range, and for what no
+            model here has: gravity, mixtures, rods, ellipsoids, cohesion and charges.
+    """
+    _refuse(header)
+    found = {key: header_number(header, key) for key in header if key in ELEMENT_KEYS}
+    elements: dict[str, Any] = {}
+    surface = _surface(found)
+    if surface is not None:
+        elements["surface"] = surface
+    if _whole(found, WALL_KEYS, needed=("container_side", "wall_restitution")):
+        elements["container"] = Walls(
+            found["container_side"],
+            restitution=found["wall_restitution"],
+            tangential_restitution=found.get("wall_beta_t"),
+        )
+    if "gamma" in found:
+        elements["drag"] = StokesDrag(found["gamma"])
+    if "drive_strength" in found:
+        elements["drive"] = WhiteNoise(found["drive_strength"])
+    return elements
+
+
+def _surface(found: dict[str, float]) -> Rough | Frictional | None:
+    inertia, rotation = found.get("reduced_inertia", 0.4), found.get("T_rot_0", 0.0)
+    if _whole(found, FRICTION_KEYS, needed=FRICTION_KEYS):
+        if "beta_t" in found:
+            raise ValueError(
+                "the header gives both beta_t, of impacts without duration, and friction, of "
+                "contacts that last: leave beta_t out for SoftSpheres(N), friction and "
+                "tangential_damping for the other models"
+            )
+        damping, friction = (found[key] for key in FRICTION_KEYS)
+        return Frictional(damping, friction, inertia=inertia, rotational_temperature=rotation)
+    if _whole(found, ROUGH_KEYS, needed=("beta_t",)):
+        return Rough(found["beta_t"], inertia=inertia, rotational_temperature=rotation)
+    return None
+
+
+ELEMENT_KEYS = (*ROUGH_KEYS, *FRICTION_KEYS, *WALL_KEYS, *DRAG_KEYS, *DRIVE_KEYS)
+
+
+def _refuse(header: dict[str, str]) -> None:
+    for key, (nothing, reason) in REFUSED_KEYS.items():
+        if key in header and (nothing is None or header_number(header, key) != nothing):
+            advice = "" if nothing is None else f" (or {nothing:g}, where there is nothing of it)"
+            raise ValueError(
+                f"the header gives {key}: {reason}. No model of jaxgran takes it; fit a curve of "
+                f"equal spheres without it, and leave {key} out{advice}"
+            )
+
+
+def check_volume(header: dict[str, str], gas: Gas) -> None:
+    """Raise ValueError where N, eta, diameter and container_side of a header contradict."""
+    if gas.container is None or "N" not in header:
+        return
+    number = header_number(header, "N")
+    share = share_of_container(gas, number)
+    if abs(share - 1) > SAME_VOLUME:
+        raise ValueError(
+            f"N, eta and container_side contradict: {number:g} spheres in this container have eta "
+            f"= {float(gas.packing_fraction) * share:.4g}, the header gives "
+            f"{float(gas.packing_fraction):.4g}"
+        )
+
+
+def _whole(found: dict[str, float], keys: tuple[str, ...], needed: tuple[str, ...]) -> bool:
+    given = [key for key in keys if key in found]
+    missing = [key for key in needed if key not in found]
+    if given and missing:
+        raise ValueError(f"the header gives {given[0]} without {missing[0]}; add {missing[0]}")
+    return bool(given)
+
+
+def warn_of_unknown_keys(header: dict[str, str], known: tuple[str, ...]) -> None:
+    """Warn of header keys that nothing is made of. Comments that are no single word are not keys.
+
+    Args:
+        header: of a curve.
+        known: keys of the gas and of its priors.
+    """
+    known = (*known, *ELEMENT_KEYS, *OTHER_KEYS, *PROVENANCE_KEYS, *REFUSED_KEYS)
+    unknown = [key for key in header if key.isidentifier() and key not in known]
+    if unknown:
+        warnings.warn(
+            f"the header key {unknown[0]!r} is not known, and nothing is made of it"
+            + (f"; neither are {', '.join(unknown[1:])}" if unknown[1:] else "")
+            + f": known are {', '.join(known)}",
+            stacklevel=3,
+        )
+
+
+COORDINATES = ("x", "y", "z")
+
+MIN_TRACKS = 3
+"""Particles that leave a scatter where the drift is removed and one of them is left out."""
+
+MAX_SHARE = 0.3
+"""Share of T that may be missing by impacts, or added by localisation, without a warning."""
+
+STEPS = 50
+"""Of the iteration for T from the displacements, which gains a factor of 2 or more in each."""
+
+
+class Tracks(NamedTuple):
+    """Positions of the same particles in every frame.
+
+    Attributes:
+        times: of the frames, s, increasing.
+        positions: m, shape (frames, particles, coordinates).
+    """
+
+    times: Float[np.ndarray, "frames"]
+    positions: Float[np.ndarray, "frames particles coordinates"]
+
+
+def check_track_names(path: Path, i: int, names: list[str]) -> None:
+    """ValueError unless the columns in line i are id, t, x, y and, in three dimensions, z."""
+    wanted = [["id", "t", *COORDINATES[:d]] for d in (2, 3)]
+    if sorted(names) not in [sorted(each) for each in wanted]:
+        raise ValueError(
+            f"{path}, line {i}: the columns are {', '.join(names)}; tracks of particles have "
+            f"{' or '.join(','.join(each) for each in wanted)}, each once"
+        )
+
+
+def curve_of_tracks(path: Path, table: Table) -> tuple[CoolingCurve, dict[str, str]]:
+    """T(t) of particles whose positions are known in frames.
+
+    Velocities are differences over neighbouring frames, ``u = (x(t_2) - x(t_1))/(t_2 - t_1)``, and
+    belong to the middle of the two times, to second order in the share by which T falls meanwhile.
+    The drift, the mean velocity of all tracked particles between the two frames, is removed:
+    ``T = sum (u - <u>)^2 / (d (n - 1))`` of n particles and d coordinates, which is times
+    ``(N - 1)/N`` in a gas of N particles (header key N) without walls, whose momentum is 0 in
+    truth. Two coordinates of a three-dimensional gas stand for all three.
+
+    Two biases of u^2 are removed where the header says enough. The standard error of one coordinate
+    of a position, ``localisation_error``, adds ``2 error^2/(t_2 - t_1)^2`` to T; the error itself
+    is not corrected in the jackknife, which it widens. Impacts between frames bend the paths: with
+    the velocity autocorrelation ``exp(-nu_v t)`` T is too small by
+    ``2 (exp(-x) - 1 + x)/x^2 = 1 - x/3 + ...``, ``x = nu_v (t_2 - t_1)``; nu_v is Enskog's of
+    elastic spheres, ``(2/d)`` of their collision frequency, from eta, diameter and T.
+
+    T_err is the jackknife error over particles, which leaves out one at a time. It is that of T of
+    the gas from which these particles are a sample; those of neighbouring times are correlated, as
+    the particles are the same.
+
+    Args:
+        path: of the file, for messages.
+        table: its columns id, t, x, y and z; rows in any order in which the times of each particle
+            increase. Positions are unwrapped: a particle that leaves a periodic box goes on.
+
+    Returns:
+        The curve, and the header, whose entry T_from says how T was computed.
+
+    Raises:
+        ValueError: for fewer than 3 particles or 4 frames, for times that do not increase, a
+            particle twice in a frame, or one that is missing in a frame: naming the line.
+    """
+    try:
+        columns, header = in_si(table.columns, table.header)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    tracks = _tracks(path, columns, table.lines)
+    duration = np.diff(tracks.times)
+    velocity = np.diff(tracks.positions, axis=0) / duration[:, None, None]
+    share, notes = _share_of_all(path, tracks, header)
+    T, error = _temperature_and_error(velocity)
+    T, error = share * T, share * error
+    T, words = _without_localisation(path, T, duration, header)
+    notes += words
+    T_true, words = _without_impacts(path, T, duration, header)
+    notes += words
+    curve = CoolingCurve(
+        times=jnp.asarray((tracks.times[1:] + tracks.times[:-1]) / 2),
+        temperature=jnp.asarray(T_true),
+        temperature_error=jnp.asarray(error * T_true / T),
+    )
+    header["T_from"] = f"T = <(u - <u>)^2>/d, u over neighbouring frames; {'; '.join(notes)}"
+    curve.check(f"{path}: T between frames {{0}} and the next".format)
+    return curve, header
+
+
+def _tracks(path: Path, columns: dict[str, np.ndarray], lines: list[int]) -> Tracks:
+    """The positions by frame and particle."""
+    t, names = columns["t"], [name for name in COORDINATES if name in columns]
+    whole = columns["id"] == np.round(columns["id"])
+    if not np.all(whole):
+        i = int(np.argmin(whole))
+        raise ValueError(
+            f"{path}, line {lines[i]}: id is {columns['id'][i]:g}; number the particles"
+        )
+    ids, particle = np.unique(columns["id"].astype(int), return_inverse=True)
+    times, frame = np.unique(t, return_inverse=True)
+    if len(ids) < MIN_TRACKS:
+        raise ValueError(
+            f"{path}, line {lines[-1] if lines else 1}: the tracks end, of {len(ids)} particle(s); "
+            f"at least {MIN_TRACKS} are needed to remove their drift and estimate errors"
+        )
+    if len(times) <= MIN_POINTS:
+        raise ValueError(
+            f"{path}, line {lines[-1]}: the tracks end, of {len(times)} frames; at least "
+            f"{MIN_POINTS + 1} are needed: record for longer"
+        )
+    row = _rows(path, particle, frame, (ids, times), lines)
+    _check_order(path, particle, t, ids, lines)
+    positions = np.stack([columns[name] for name in names], axis=1)
+    return Tracks(times, positions[row])
+
+
+def _rows(
+    path: Path,
+    particle: np.ndarray,
+    frame: np.ndarray,
+    values: tuple[np.ndarray, np.ndarray],
+    lines: list[int],
+) -> np.ndarray:
+    """The row of each particle in each frame, shape (frames, particles); each stands once."""
+    ids, times = values
+    row = np.full((len(times), len(ids)), len(lines))
+    np.minimum.at(row, (frame, particle), np.arange(len(lines)))  # the first of several
+    again = row[frame, particle] != np.arange(len(lines))
+    if np.any(again):
+        i = int(np.argmax(again))
+        raise ValueError(
+            f"{path}, line {lines[i]}: particle {ids[particle[i]]} at t = {times[frame[i]]:g} s is "
+            f"given again, after line {lines[row[frame[i], particle[i]]]}; remove one"
+        )
+    missing = row == len(lines)
+    if np.any(missing):
+        k, j = (int(index[0]) for index in np.nonzero(missing))
+        near = row[k - 1, j] if k else row[:, j].min()
+        raise ValueError(
+            f"{path}, line {lines[near]}: particle {ids[j]} stands here, and is missing in the "
+            f"frame at t = {times[k]:g} s; remove its track, or keep the frames that all particles "
+            "share"
+        )
+    return row
+
+
+def _check_order(
+    path: Path, particle: np.ndarray, t: np.ndarray, ids: np.ndarray, lines: list[int]
+) -> None:
+    """ValueError unless the times of each particle increase down the file."""
+    order = np.argsort(particle, kind="stable")
+    back = (np.diff(t[order]) < 0) & (np.diff(particle[order]) == 0)
+    if np.any(back):
+        i = int(order[1:][back].min())
+        raise ValueError(
+            f"{path}, line {lines[i]}: t is {t[i]:g} s, earlier than that of particle "
+            f"{ids[particle[i]]} before; sort the rows of each particle by time"
+        )
+
+
+def _temperature_and_error(
+    velocity: Float[np.ndarray, "times n d"],
+) -> tuple[Float[np.ndarray, "times"], Float[np.ndarray, "times"]]:
+    """The variance of a velocity component, drift removed, and its jackknife error."""
+    _, n, d = velocity.shape
+    centred = velocity - velocity.mean(axis=1, keepdims=True)
+    square = np.sum(centred**2, axis=2)
+    # Without particle i the others have the mean -u_i/(n - 1), in the frame of all.
+    left = square.sum(axis=1, keepdims=True) - square * n / (n - 1)
+    each = left / (d * (n - 2))
+    error = np.sqrt((n - 1) * np.var(each, axis=1))
+    return square.sum(axis=1) / (d * (n - 1)), error
+
+
+def _share_of_all(path: Path, tracks: Tracks, header: dict[str, str]) -> tuple[float, list[str]]:
+    """(N - 1)/N where N is known and momentum is conserved, and words for what was taken."""
+    n, d = tracks.positions.shape[1:]
+    dimension = header_count(header, "dimension") or 3
+    if d > dimension:
+        raise ValueError(
+            f"{path}: a gas of dimension {dimension} has no tracks with {d} coordinates; correct "
+            "the header or leave out z"
+        )
+    projected = ["two of three coordinates, of isotropic velocities"] if d < dimension else []
+    N = header_count(header, "N")
+    if N is None:
+        return 1.0, [f"drift of {n} particles removed", *projected]
+    if n > N:
+        raise ValueError(f"{path}: the header gives N = {N}, but {n} particles are tracked")
+    free = "container_side" not in header
+    return (N - 1) / N if free else 1.0, [f"drift of {n} of {N} particles removed", *projected]
+
+
+def _without_localisation(
+    path: Path, T: Float[np.ndarray, "times"], duration: np.ndarray, header: dict[str, str]
+) -> tuple[Float[np.ndarray, "times"], list[str]]:
+    """T without the scatter of measured positions, and words for it."""
+    if "localisation_error" not in header:
+        return T, ["errors of positions not known (localisation_error)"]
+    error = header_number(header, "localisation_error")
+    if error < 0:
+        raise ValueError(f"{path}: header line localisation_error: must be >= 0, got {error:g}")
+    added = 2 * (error / duration) ** 2
+    if np.any(added >= T):
+        k = int(np.argmax(added >= T))
+        raise ValueError(
+            f"{path}: between frames {k} and {k + 1} particles move no further than "
+            f"localisation_error = {error:g} m; leave out the frames from there on, or take frames "
+            "further apart"
+        )
+    share = float(np.max(added / T))
+    _warn(path, share, "leave out the last frames", "localisation_error adds", "to")
+    return T - added, [f"localisation_error removed, at most {100 * share:.2g} % of T"]
+
+
+def _without_impacts(
+    path: Path, T: Float[np.ndarray, "times"], duration: np.ndarray, header: dict[str, str]
+) -> tuple[Float[np.ndarray, "times"], list[str]]:
+    """T with what impacts between frames took from it, and words for it."""
+    if not {"eta", "diameter"} <= header.keys():
+        return T, ["impacts between frames not corrected (eta and diameter are not given)"]
+    gas = Gas(
+        ConstantRestitution(1.0),
+        diameter=header_number(header, "diameter"),
+        mass=1.0,
+        packing_fraction=header_number(header, "eta"),
+        temperature=1.0,
+        dimension=header_count(header, "dimension") or 3,
+        **read_elements(header),
+    )
+    rate = 2 / gas.dimension * float(gas.collision_frequency) * duration
+    true = T
+    for _ in range(STEPS):
+        true = T / _persistence(rate * np.sqrt(true))
+    share = float(np.max(1 - T / true))
+    _warn(path, share, "take frames closer together", "impacts between frames take", "from")
+    return true, [f"impacts between frames corrected, at most {100 * share:.2g} % of T"]
+
+
+def _persistence(x: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
+    """``2 (exp(-x) - 1 + x)/x^2``, the share of T in displacements over x relaxation times."""
+    small = x < 1e-3
+    safe = np.where(small, 1.0, x)
+    return np.where(small, 1 - x / 3, 2 * (np.expm1(-safe) + safe) / safe**2)
+
+
+def _warn(path: Path, share: float, advice: str, what: str, where: str) -> None:
+    if share > MAX_SHARE:
+        warnings.warn(
+            f"{path}: {what} up to {100 * share:.2g} % {where} T, which a correction makes up for "
+            f"roughly only: {advice}",
+            stacklevel=6,
+        )
+
 
 GAS_KEYS = ("eta", "diameter", "density", "Y", "nu", "T0")
 """Keys of the header that `read_gas` needs."""
@@ -51,10 +807,10 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
     Args:
         path: the file. Its columns are t (s) and T (m^2/s^2) and, where measured, T_err (m^2/s^2),
             msd and msd_err (m^2), in any order. In place of T there may be mean_speed, vx2, v2_xy
-            or energy (see `jaxgran.data.quantities.STAND_INS`), with errors under the same name and
+            or energy (see `jaxgran.data.curve_file.STAND_INS`), with errors under the same name and
             _err. Header keys length_unit (m, cm, mm, um) and time_unit (s, ms, us, min) are those
             of the columns and of diameter, T0 and A; density and Y stay in SI. Or its columns are
-            id,t,x,y and z, tracks of particles (see `jaxgran.data.tracks.curve_of_tracks`). What
+            id,t,x,y and z, tracks of particles (see `jaxgran.data.curve_file.curve_of_tracks`). What
             `write_curve` writes besides (a2, collisions, D, energies, whole npz files) is read too.
 
     Returns:
@@ -85,7 +841,7 @@ def read_curve(path: str | Path) -> tuple[CoolingCurve, dict[str, str]]:
         columns, header = in_si(columns, header)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    known = COLUMNS | FURTHER
+    known = COLUMNS | COMPUTED_COLUMNS
     fields: dict[str, Any] = {known[name]: jnp.asarray(x) for name, x in columns.items()}
     curve = CoolingCurve(**fields)
     curve.check(lambda i: f"{path}, line {lines[i]}")
@@ -98,7 +854,11 @@ def _check_names(path: Path, i: int, names: list[str]) -> None:
         check_track_names(path, i, names)
         return
     stand_ins = [name for name in ("T", *STAND_INS) if name in names]
-    known = {*COLUMNS, *FURTHER, *(f"{name}{end}" for name in STAND_INS for end in ("", "_err"))}
+    known = {
+        *COLUMNS,
+        *COMPUTED_COLUMNS,
+        *(f"{name}{end}" for name in STAND_INS for end in ("", "_err")),
+    }
     unknown = [name for name in names if name not in known]
     unknown += [f"{name}_err" for name in STAND_INS if f"{name}_err" in names and name not in names]
     missing = ([] if "t" in names else ["t"]) + ([] if stand_ins else ["T"])
@@ -122,7 +882,7 @@ def read_gas(header: dict[str, str]) -> Gas:
     Args:
         header: eta (the packing fraction), diameter (m), density (of the material, kg/m^3), Y
             (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension, as `read_curve` returns them; and
-            of rough spheres, walls and drag what `jaxgran.data.scene_keys.read_elements` takes.
+            of rough spheres, walls and drag what `jaxgran.data.curve_file.read_elements` takes.
 
     Returns:
         A gas of viscoelastic spheres. Values that no granular gas has, and keys that are not known,
@@ -231,10 +991,10 @@ def write_curve(
         raise ValueError(f"{path} exists; choose another name or say overwrite=True")
     if path.suffix == SUFFIX:
         return write_archive(path, curve, header)
-    fields = {name: getattr(curve, field) for name, field in (COLUMNS | FURTHER).items()}
+    fields = {name: getattr(curve, field) for name, field in (COLUMNS | COMPUTED_COLUMNS).items()}
     present = {name: np.asarray(v) for name, v in fields.items() if v is not None}
     lines = [f"# {key}: {value}" for key, value in header.items()]
     lines.append(",".join(present))
     lines += [",".join(f"{x:.17g}" for x in row) for row in zip(*present.values(), strict=True)]
     text = "\n".join(lines) + "\n"
-    write_whole(path, lambda f: f.write(text.encode()))
+    write_atomically(path, lambda f: f.write(text.encode()))

@@ -1,4 +1,9 @@
-"""Atomic writing of files."""
+"""Atomic writing of files.
+
+Numbers in the header of a curve.
+
+Tables of numbers in CSV files, with a header.
+"""
 
 import errno
 import os
@@ -6,12 +11,52 @@ import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+
+MAX_COUNT = 10**12
+"""The largest whole number of a header."""
 
 
-def write_whole(path: str | Path, write: Callable[[Any], Any]) -> None:
+def header_number(header: dict[str, str], key: str) -> float:
+    """The value of a key in the header of a curve, as a number.
+
+    Raises:
+        ValueError: if the value is not a finite number.
+        KeyError: if there is no such key.
+    """
+    try:
+        number = float(header[key])
+    except ValueError:
+        number = float("nan")
+    if not np.isfinite(number):
+        raise ValueError(f"header line {key}: {header[key]!r} is not a finite number")
+    return number
+
+
+def header_count(header: dict[str, str], key: str) -> int | None:
+    """The value of a key in the header of a curve, such as N, as a positive whole number.
+
+    Returns:
+        The number, or None if there is no such key.
+
+    Raises:
+        ValueError: if the value is not a positive whole number.
+    """
+    if key not in header:
+        return None
+    number = header_number(header, key)
+    if not (1 <= number <= MAX_COUNT and number.is_integer()):
+        raise ValueError(
+            f"header line {key}: must be a whole number from 1 to {MAX_COUNT:g}, got "
+            f"{header[key]!r}"
+        )
+    return int(number)
+
+
+def write_atomically(path: str | Path, write: Callable[[Any], Any]) -> None:
     """Write a file atomically: it replaces `path` only once it is complete.
 
     An existing file keeps its permissions, a new one gets those that the user gives new files. A
@@ -115,3 +160,56 @@ def number_row(path: Path, i: int, line: str, names: list[str]) -> list[float]:
             f"got {line!r}; correct or remove this row"
         )
     return values
+
+
+class Table(NamedTuple):
+    """The content of a file.
+
+    Attributes:
+        header: values of its lines ``# key: value``.
+        columns: their numbers by name.
+        lines: where each row stands, counted from 1.
+    """
+
+    header: dict[str, str]
+    columns: dict[str, Float[np.ndarray, "rows"]]
+    lines: list[int]
+
+
+def read_table(path: Path, wanted: str, check_names: Callable[[int, list[str]], None]) -> Table:
+    """Read header lines ``# key: value``, a line of names, and rows of finite numbers.
+
+    Args:
+        path: the file.
+        wanted: the names of its columns, for messages.
+        check_names: is given the line of the names and the names, and raises ValueError.
+
+    Raises:
+        ValueError: saying what is wrong, in which line, and what to do.
+    """
+    header: dict[str, str] = {}
+    names: list[str] = []
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    for i, line in enumerate(read_text(path, wanted).splitlines(), start=1):
+        line = line.strip()
+        if line.startswith("#"):
+            key, colon, value = line[1:].partition(":")
+            if colon:
+                _add(path, i, header, key.strip(), value.strip())
+        elif line and not names:
+            names = [name.strip() for name in line.split(",")]
+            check_names(i, names)
+        elif line:
+            rows.append(number_row(path, i, line, names))
+            lines.append(i)
+    values = np.array(rows, dtype=float).reshape(len(rows), len(names))
+    return Table(header, dict(zip(names, values.T, strict=True)), lines)
+
+
+def _add(path: Path, i: int, header: dict[str, str], key: str, value: str) -> None:
+    if key in header:
+        raise ValueError(
+            f"{path}, line {i}: {key} is given again, as {value} after {header[key]}; remove one"
+        )
+    header[key] = value

@@ -12,7 +12,7 @@
 - `joint`: one fit of several curves and drop tests.
 - `likelihood`: `log_likelihood`, the same residuals for samplers.
 - `result`: `Fit`, what a fit returns, and goodness of fit.
-- `rivals`: what else could have made the curve, and the range of the parameters then; uses
+- `alternatives`: what else could have made the curve, and the range of the parameters then; uses
   `profile`, fits of the law and something besides, of a given amplitude, and `amplitudes`, what
   these say of one rival.
 - `residuals`: statistics of residuals; `few_replicas`: errors that few replicas leave uncertain.

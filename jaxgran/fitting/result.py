@@ -1,4 +1,7 @@
-"""The result of a fit: estimates, their errors, and goodness of fit."""
+"""The result of a fit: estimates, their errors, and goodness of fit.
+
+Minima of chi^2 besides the deepest one.
+"""
 
 from typing import NamedTuple
 
@@ -9,15 +12,84 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran.checks.tracing import any_traced, concrete
-from jaxgran.checks.words import Rows, as_html, as_text, said
+from jaxgran._utils.formatting import Rows, format_quantity, html_table, text_table
+from jaxgran._utils.tracing import any_traced, concrete
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.minima import Minima
-from jaxgran.fitting.parameters import START, size_of
-from jaxgran.fitting.priors import Priors
+from jaxgran.fitting.parameters import START_TIME, Parameters, Priors, size_of
 from jaxgran.models.base import AbstractModel
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.gas_words import UNITS
+from jaxgran.scene.gas import FLOAT_UNITS, Gas
+
+DEGENERATE_CHI2 = 9.0
+"""Difference of chi^2 up to which two minima count as equally good: three standard errors."""
+
+SEVERAL, ROUGHNESSES = "tangential_restitution", (-0.6, 0.0, 0.6)
+"""A parameter in which chi^2 has several minima where T_rot is measured, and where to search."""
+
+
+def search_starts(
+    parameters: Parameters, first: Float[Array, "p"], beside: Float[Array, "_"]
+) -> Float[Array, "starts q"]:
+    """Where to search for minima of chi^2: from the first guess and, where beta_t is free, from
+    several beta_t. There are minima on both sides of the beta_t at which rotation takes most.
+
+    Args:
+        parameters: those of the gas.
+        first: the first guess of these.
+        beside: further parameters of the search.
+    """
+    flats = first[None]
+    if SEVERAL in parameters.names:
+        gas, start_time = parameters.gas(first), parameters.start(first)
+        others = [gas.replace(**{SEVERAL: beta}) for beta in ROUGHNESSES]
+        flats = jnp.stack([first, *(parameters.flat(other, start_time) for other in others)])
+    return jnp.concatenate([flats, jnp.tile(beside, (len(flats), 1))], axis=1)
+
+
+class Minima(NamedTuple):
+    """Minima of chi^2 at which searches from several starts ended.
+
+    Attributes:
+        estimates: of the free parameters, SI.
+        chi2: there, of all residuals, those of priors too.
+    """
+
+    estimates: Float[Array, "starts p"]
+    chi2: Float[Array, "starts"]
+
+    def degenerate_solutions(
+        self,
+        estimate: Float[Array, "p"],
+        standard_error: Float[Array, "p"],
+        unit: float,
+    ) -> Float[np.ndarray, "others p"]:
+        """The estimates at minima that are not told from the deepest one: chi^2 is larger by less
+        than `AS_GOOD`, and a parameter differs by more than its square root in standard errors.
+
+        Args:
+            estimate, standard_error: of the deepest one.
+            unit: of chi^2, where errors turned out to be larger than they were said to be.
+        """
+        chi2 = np.asarray(self.chi2)
+        near = chi2 - np.min(chi2) < DEGENERATE_CHI2 * unit
+        away = np.asarray(self.estimates) - np.asarray(estimate)
+        apart = np.max(np.abs(away) / np.asarray(standard_error), axis=1) > DEGENERATE_CHI2**0.5
+        found: list[np.ndarray] = []
+        for other in np.asarray(self.estimates)[near & apart]:
+            if not any(np.allclose(other, known, rtol=1e-3) for known in found):
+                found.append(other)
+        return np.array(found).reshape(-1, away.shape[1])
+
+
+def describe_minima(names: tuple[str, ...], others: Float[np.ndarray, "others p"]) -> str | None:
+    """A clause about minima that are as good as that of a fit; None if there are none."""
+    if not len(others):
+        return None
+    sets = (
+        ", ".join(f"{name} = {value:.3g}" for name, value in zip(names, other, strict=False))
+        for other in others
+    )
+    return f"chi^2 has another minimum as good, at {' and at '.join(sets)}"
+
 
 SIGNIFICANCE = 0.01
 """Level of significance of the chi^2 test: below it a model does not explain the curve."""
@@ -82,10 +154,10 @@ class Fit(eqx.Module):
     gain: Float[Array, "p times"]
     clock_gain: Float[Array, "p times"]
     sensitivity: Float[Array, "residuals p"]
-    beyond: Float[Array, "p"]
+    extrapolation: Float[Array, "p"]
     start: Float[Array, "p"]
     gas: Gas
-    began: Float[Array, ""]
+    start_time: Float[Array, ""]
     priors: Priors
     curve: CoolingCurve
     weights: Float[Array, "times"]
@@ -123,10 +195,10 @@ class Fit(eqx.Module):
         return {name: _deviations(part) for name, part in self.covariances.items()}
 
     def __repr__(self) -> str:
-        return as_text(*self._words)
+        return text_table(*self._words)
 
     def _repr_html_(self) -> str:
-        return as_html(*self._words)
+        return html_table(*self._words)
 
     @property
     def _words(self) -> tuple[str, Rows]:
@@ -134,9 +206,14 @@ class Fit(eqx.Module):
         known = not isinstance(self.sensitivity, Tracer) and self.sensitivity.ndim == 2
         rows, open_to = [], self.undetermined() if known else ()
         for name in self.names:
-            estimate, error = (said(x, _unit(name)) for x in self.value(name))
+            estimate, error = (format_quantity(x, _unit(name)) for x in self.value(name))
             rows.append((name, "not determined" if name in open_to else f"{estimate} +- {error}"))
-        rows.append(("reduced chi^2", f"{said(self.reduced_chi2)}, p = {said(self.p_value)}"))
+        rows.append(
+            (
+                "reduced chi^2",
+                f"{format_quantity(self.reduced_chi2)}, p = {format_quantity(self.p_value)}",
+            )
+        )
         rows.append(("converged", str(self.converged)))
         return f"Fit of {self.model.name}", rows
 
@@ -150,13 +227,13 @@ class Fit(eqx.Module):
             return found[0][..., i], found[1][..., i]
         return concrete(np.asarray(found[0])[..., i]), concrete(np.asarray(found[1])[..., i])
 
-    def as_good(self) -> Float[np.ndarray, "others p"]:
+    def degenerate_solutions(self) -> Float[np.ndarray, "others p"]:
         """Estimates at other minima that the curve does not tell from this one: see
-        `jaxgran.fitting.minima.Minima.as_good`. Of one fit, not of a batch."""
+        `jaxgran.fitting.result.Minima.degenerate_solutions`. Of one fit, not of a batch."""
         if self.minima is None:
             return np.zeros((0, len(self.estimate)))
         unit = max(float(self.reduced_chi2), 1.0)
-        return self.minima.as_good(self.estimate, self.standard_error, unit)
+        return self.minima.degenerate_solutions(self.estimate, self.standard_error, unit)
 
     def undetermined(self) -> tuple[str, ...]:
         """Parameters of which the curve determines no value, or only a combination; () if none.
@@ -174,7 +251,7 @@ class Fit(eqx.Module):
 
 
 def _unit(name: str) -> str:
-    return "s" if name == START else UNITS.get(name, "")
+    return "s" if name == START_TIME else FLOAT_UNITS.get(name, "")
 
 
 def _deviations(covariance: Float[Array, "p p"]) -> Float[Array, "p"]:

@@ -9,9 +9,8 @@ import numpy as np
 from equinox import AbstractClassVar
 from jaxtyping import Array, Float
 
-from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.run import Run
-from jaxgran.models.course import Course
+from jaxgran.data.curve import CoolingCurve, Run
+from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas
 
 ELEMENTS = {
@@ -27,7 +26,7 @@ ELEMENTS = {
 TAKE_IT = "KineticTheory(), DSMC(N) or HardSpheres(N), which take it"
 """What to use for an element that a model does not take."""
 
-TAKES = {
+SUPPORTED_BY = {
     "friction": "SoftSpheres(N), which takes it, or surface=Rough(...) for instantaneous impacts",
     "container": "KineticTheory(), DSMC(N), HardSpheres(N) or SoftSpheres(N), which take it",
     "drag": "KineticTheory(), DSMC(N), HardSpheres(N) or SoftSpheres(N), which take it",
@@ -35,7 +34,7 @@ TAKES = {
 """The same for elements that other models take."""
 
 
-class Omission(NamedTuple):
+class Limitation(NamedTuple):
     """Something that a model leaves out and a scene contains.
 
     Attributes:
@@ -94,7 +93,7 @@ class AbstractModel(eqx.Module):
             if name not in self.elements:
                 raise ValueError(
                     f"{type(self).__name__} does not take {ELEMENTS[name]}: use "
-                    f"{TAKES.get(name, TAKE_IT)}, or "
+                    f"{SUPPORTED_BY.get(name, TAKE_IT)}, or "
                     f"leave {'surface' if name == 'friction' else name} out of the gas"
                 )
         self.check(gas)
@@ -136,10 +135,10 @@ class AbstractModel(eqx.Module):
         """
 
     @abstractmethod
-    def estimated_error(self, course: Course) -> float:
+    def estimated_error(self, error_model: ErrorModel) -> float:
         """Estimated relative error of T at the worst time of a gas's course, noise included."""
 
-    def rate_error(self, course: Course) -> Float[np.ndarray, "times"] | float:
+    def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"] | float:
         """Estimated relative error of the cooling rate along a gas's course, without noise.
 
         The error bars of a fit contain it. By default `derivative_accuracy`, or 0 for a stochastic
@@ -147,14 +146,14 @@ class AbstractModel(eqx.Module):
         """
         return 0.0 if self.stochastic else self.derivative_accuracy
 
-    def derivative_error(self, course: Course) -> Float[np.ndarray, "times"] | float:
+    def derivative_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"] | float:
         """Estimated relative error of the derivatives of ln T along a gas's course, beyond
         `derivative_accuracy`: they may be too large by it. The error bars of a fit contain it.
         """
         return 0.0
 
     @abstractmethod
-    def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
+    def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """What the model leaves out of a scene, the most serious first; () if nothing matters.
 
         Args:

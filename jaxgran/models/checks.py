@@ -11,18 +11,16 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from jaxgran.checks import status
-from jaxgran.checks.tracing import any_traced, is_known
-from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.run import Run
-from jaxgran.models.base import AbstractModel, Omission
-from jaxgran.particles import initial
-from jaxgran.particles.simulation import SMALLEST_BOX
+from jaxgran._utils import status
+from jaxgran._utils.tracing import any_traced, is_known
+from jaxgran.data.curve import CoolingCurve, Run
+from jaxgran.models.base import AbstractModel, Limitation
+from jaxgran.particles.run import MIN_BOX
+from jaxgran.particles.setup import PACKING_LIMIT
 from jaxgran.scene.elements import SAME_VOLUME, share_of_container
 from jaxgran.scene.gas import Gas
-from jaxgran.theory.averages import averages as exact_averages
-from jaxgran.theory.softness import softness_factor
-from jaxgran.theory.steady import hottest_speed
+from jaxgran.theory.averages import impact_moments as exact_averages
+from jaxgran.theory.equations import hottest_speed, softness_factor
 
 CONTACT_LIMIT = 0.03
 """Contact duration over mean free time above which impacts are not instantaneous and binary."""
@@ -49,7 +47,7 @@ def checked_gas(gas: Any) -> Gas:
     return gas
 
 
-LIST = "there are KineticTheory(), DSMC(N), HardSpheres(N) and SoftSpheres(N)"
+MODEL_LIST = "there are KineticTheory(), DSMC(N), HardSpheres(N) and SoftSpheres(N)"
 """The models of this package, in an error."""
 
 
@@ -59,9 +57,9 @@ def checked_model(model: Any) -> AbstractModel:
         return model
     if isinstance(model, type) and issubclass(model, AbstractModel):
         raise ValueError(
-            f"model must be a model, got the class {model.__name__}: make one of it; {LIST}"
+            f"model must be a model, got the class {model.__name__}: make one of it; {MODEL_LIST}"
         )
-    raise ValueError(f"model must be a model, of which {LIST}; got {model!r:.60}")
+    raise ValueError(f"model must be a model, of which {MODEL_LIST}; got {model!r:.60}")
 
 
 def checked_key(key: Any) -> PRNGKeyArray | None:
@@ -92,7 +90,7 @@ def first_cooling_rate(gas: Gas, averages: Callable = exact_averages) -> Float[A
 
 
 @eqx.filter_jit
-def at_start(gas: Gas, averages: Callable) -> tuple[Array, Array, Array]:
+def initial_cooling(gas: Gas, averages: Callable) -> tuple[Array, Array, Array]:
     """The first cooling rate, the softness factor where it is hottest, and sqrt(T/T_0) there."""
     one = jnp.ones_like(gas.temperature)
     hottest = one if gas.drive is None else hottest_speed(gas)
@@ -119,12 +117,12 @@ def check_softness(gas: Gas, factor: ArrayLike, hottest: ArrayLike = 1.0) -> Non
         )
 
 
-def longest_drag(dtype: Any) -> float:
+def max_drag_exponent(dtype: Any) -> float:
     """Largest gamma t up to which particle models follow drag: ``1 - gamma s`` is rounded."""
     return float(-0.5 * np.log(np.finfo(dtype).eps))
 
 
-def beyond_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
+def unreachable_with_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
     """Which times are too late for particle models to follow drag.
 
     Raises:
@@ -132,7 +130,7 @@ def beyond_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
     """
     if gas.drag is None:
         return jnp.zeros(times.shape, bool)
-    most = longest_drag(times.dtype)
+    most = max_drag_exponent(times.dtype)
     beyond = gas.drag.rate * times > most
     if is_known(beyond) and np.any(np.asarray(beyond)):
         raise ValueError(
@@ -168,9 +166,9 @@ def refuse_files(model: AbstractModel, run: Run) -> None:
             )
 
 
-def omitted_by_instant_impacts(
+def limitations_of_instant_impacts(
     gas: Gas, beyond: str = "which instantaneous impacts leave out"
-) -> tuple[Omission, ...]:
+) -> tuple[Limitation, ...]:
     """What a model of instantaneous, binary impacts leaves out of a scene.
 
     Args:
@@ -185,10 +183,10 @@ def omitted_by_instant_impacts(
         )
     if overlap > OVERLAP_LIMIT:
         found.append(f"spheres overlap by {100 * overlap:.2g} % of a diameter, {beyond}")
-    return tuple(Omission(words, True, SOFT_SPHERES_NEEDED) for words in found)
+    return tuple(Limitation(words, True, SOFT_SPHERES_NEEDED) for words in found)
 
 
-def omitted_by_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Omission, ...]:
+def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Limitation, ...]:
     """What a model of a homogeneous, uncorrelated gas leaves out of a scene.
 
     Args:
@@ -213,10 +211,10 @@ def omitted_by_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Omissio
                 f"the box, {box / diameter:.3g} diameters, is above "
                 f"L_c = {critical / diameter:.3g}: a flow grows, and clusters after it"
             )
-    return tuple(Omission(words, False, POSITIONS_NEEDED) for words in found)
+    return tuple(Limitation(words, False, POSITIONS_NEEDED) for words in found)
 
 
-def walls_in_words(gas: Gas, num_particles: int) -> str:
+def describe_walls(gas: Gas, num_particles: int) -> str:
     """How long the box of N spheres is beside the mean free path, and what walls would be there.
 
     A sphere of mean speed <v> meets walls ``2 d/L <|v_x|>/2`` times a second, with
@@ -232,7 +230,7 @@ def walls_in_words(gas: Gas, num_particles: int) -> str:
     )
 
 
-def replaced_where_traced(
+def valid_where_traced(
     gas: Gas, times: Float[Array, "times"]
 ) -> tuple[Gas, Float[Array, "times"], Bool[Array, ""] | None]:
     """A gas and times that every model can take, where traced ones lie outside their ranges.
@@ -257,7 +255,7 @@ def replaced_where_traced(
     return gas, times, allowed
 
 
-def spoilt_unless(
+def nan_unless(
     allowed: Bool[Array, ""] | None, curve: CoolingCurve, times: Float[Array, "times"]
 ) -> CoolingCurve:
     """The curve, nan and with a status unless all was allowed."""
@@ -271,19 +269,19 @@ def spoilt_unless(
     return dataclasses.replace(spoilt, times=times, status=fault)
 
 
-def check_room(gas: Gas, num_particles: int, random: bool) -> None:
+def check_packing(gas: Gas, num_particles: int, random: bool) -> None:
     """Raise ValueError for a gas too dense for a random start, or a box too small."""
     if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
         return
-    limit, phi = initial.PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
+    limit, phi = PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
     if phi > limit and random:
         raise ValueError(
             f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g}; "
             "lower it, or give your own start"
         )
     side = float(jnp.min(gas.box_side(num_particles) / gas.diameter))
-    if side < SMALLEST_BOX:
+    if side < MIN_BOX:
         raise ValueError(
-            f"the box is {side:.3g} diameters long, at least {SMALLEST_BOX} are needed to tell "
+            f"the box is {side:.3g} diameters long, at least {MIN_BOX} are needed to tell "
             "a sphere from its image; use more particles or a lower packing_fraction"
         )

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
-from jaxgran.checks import status
-from jaxgran.checks.tracing import any_traced
-from jaxgran.checks.validation import (
+from jaxgran._utils import status
+from jaxgran._utils.tracing import any_traced
+from jaxgran._utils.validation import (
     Domain,
     UserCount,
     UserFloat,
@@ -21,24 +21,29 @@ from jaxgran.checks.validation import (
     python_number,
     whole_number,
 )
-from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.description import described
-from jaxgran.data.run import DEFAULTS, Run
+from jaxgran.data.checkpoint import describe_run
+from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
 from jaxgran.models import checks
-from jaxgran.models.base import AbstractModel, Omission
-from jaxgran.models.course import Course
-from jaxgran.particles import side_by_side, snapshot
-from jaxgran.particles.drag import transformed
-from jaxgran.particles.driver import follow
-from jaxgran.particles.interruption import waited_for
-from jaxgran.particles.programs import compiling, first_time
-from jaxgran.particles.stochastic import simulation
-from jaxgran.particles.stochastic.pairing import Scheme
+from jaxgran.models.base import AbstractModel, Limitation
+from jaxgran.models.error_model import ErrorModel
+from jaxgran.particles import snapshot
+from jaxgran.particles.dsmc.collisions import Scheme
+from jaxgran.particles.dsmc.run import differentiable_run, host_run_parts
+from jaxgran.particles.run import (
+    block_until_ready,
+    compiling,
+    join_records,
+    needs_compilation,
+    replica_devices,
+    run_replicas,
+    run_through_times,
+)
+from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced_scene import ReducedScene
-from jaxgran.theory.steady import scene_at_start
+from jaxgran.scene.reduced import ReducedScene
+from jaxgran.theory.equations import scene_at_start
 
-LONGEST_STEP = 0.1
+MAX_STEP = 0.1
 """Most collisions per particle in one step: a particle can be drawn at most twice in it."""
 
 
@@ -56,12 +61,12 @@ class DSMC(AbstractModel):
     drawing one pair after the other would. Means over N particles have errors of O(1/N).
 
     Takes all elements of a scene but friction: rough spheres; walls, which a homogeneous gas meets
-    everywhere alike, the more often the more they take (`jaxgran.scene.wall_layer`); drag, exactly,
-    by collisions in transformed time (`jaxgran.particles.drag`), up to gamma t = 18 (8 in float32);
+    everywhere alike, the more often the more they take (`jaxgran.scene.elements`); drag, exactly,
+    by collisions in transformed time (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32);
     a drive, half of whose kicks begin each step and half end it, in turns for portions of all
-    particles (`jaxgran.particles.stochastic.portions`);
+    particles (`jaxgran.particles.dsmc.collisions`);
     and a driven start, which is driven for 10 mean free times with what its collisions take.
-    Derivatives are then of T, T_rot and collisions (`jaxgran.tangents.exchange`), others are nan.
+    Derivatives are then of T, T_rot and collisions (`jaxgran.gradients.tangents`), others are nan.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
     The derivatives are estimates. They are taken at a fixed own time (dt = dtau / sqrt(T), so that
@@ -100,56 +105,61 @@ class DSMC(AbstractModel):
     def __check_init__(self):
         whole_number("num_particles", self.num_particles, 2)
         whole_number("replicas", self.replicas, 1)
-        allowed = Domain(0.0, LONGEST_STEP, high_allowed=True)
+        allowed = Domain(0.0, MAX_STEP, high_allowed=True)
         plain_number("step", self.step, allowed, "A particle collides at most twice in a step.")
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError for a law of restitution that heats the gas."""
         checks.check_cools(checks.first_cooling_rate(gas))
 
-    def estimated_error(self, course: Course) -> float:
+    def estimated_error(self, error_model: ErrorModel) -> float:
         """Error of Enskog's rate, lasting and soft contacts, and the shot noise of all replicas."""
-        noise = course.shot_noise(self.num_particles * self.replicas)
-        return hypot(course.error_of_temperature(self.rate_error(course)), noise)
+        noise = error_model.shot_noise(self.num_particles * self.replicas)
+        return hypot(error_model.error_of_temperature(self.rate_error(error_model)), noise)
 
-    def rate_error(self, course: Course) -> Float[np.ndarray, "times"]:
+    def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
         """Error of Enskog's rate, and of contacts that last and are soft."""
-        return course.homogeneous + course.lasting_contacts + course.softness + course.mixing
+        return (
+            error_model.homogeneous
+            + error_model.lasting_contacts
+            + error_model.softness
+            + error_model.mixing
+        )
 
-    def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
+    def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Contacts that last, correlated collisions and boxes in which a flow grows."""
-        lasting = checks.omitted_by_instant_impacts(gas)
-        return lasting + checks.omitted_by_homogeneity(gas, num_particles)
+        lasting = checks.limitations_of_instant_impacts(gas)
+        return lasting + checks.limitations_of_homogeneity(gas, num_particles)
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`.
 
         A run fails if too many pairs meet faster than the ceiling of the collision rate.
         """
-        beyond = checks.beyond_drag(gas, times)
-        words = _words(run)
+        unreachable_times = checks.unreachable_with_drag(gas, times)
+        words = _key_words(run)
         scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
         scene, reduced = scene_at_start(gas), times * gas.impact_speed / gas.path_length
         if scene.drag is not None:
-            reduced = transformed(scene.drag, reduced)
+            reduced = transformed_times(scene.drag, reduced)
         units = self._units(gas)
         if any_traced(gas, times, words):
             checks.refuse_files(self, run)
             options = {"units": units, "save": snapshot.function(run.save)}
-            records = simulation.differentiable_run(
+            records = differentiable_run(
                 scene, reduced, words, replicas=self.replicas, scheme=scheme, **options
             )
-        elif on := side_by_side.devices(self.replicas):
+        elif on := replica_devices(self.replicas):
             alone = dataclasses.replace(self, replicas=1)
 
             def one(k: int, run: Run) -> dict[str, Array]:
-                return alone._driven(scene, reduced, _words(run), scheme, units, run)
+                return alone._driven(scene, reduced, _key_words(run), scheme, units, run)
 
-            runs = side_by_side.side_by_side(one, self.replicas, run, on)
-            records = side_by_side.joined_records(runs)
+            runs = run_replicas(one, self.replicas, run, on)
+            records = join_records(runs)
         else:
             records = self._driven(scene, reduced, words, scheme, units, run)
-        curve, failed = _curve(gas, times, records, beyond)
+        curve, failed = _curve(gas, times, records, unreachable_times)
         size = self.replicas, self.num_particles
         rough = gas.surface is not None
         like = snapshot.shapes(units, size, gas.dimension, times.dtype, rough)
@@ -171,9 +181,9 @@ class DSMC(AbstractModel):
         run: Run,
     ) -> dict[str, Array]:
         """The records of a run by the driver on the host, with progress and checkpoints."""
-        new = first_time((scheme, self.replicas, jax.tree.structure(scene), times.dtype))
+        new = needs_compilation((scheme, self.replicas, jax.tree.structure(scene), times.dtype))
         with compiling(run.progress and new):
-            start, advance, observe = simulation.parts(
+            start, advance, observe = host_run_parts(
                 scene, words, replicas=self.replicas, scheme=scheme, donate=run.checkpoint is None
             )
             recorded = partial(observe, units=units, save=snapshot.function(run.save))
@@ -182,11 +192,11 @@ class DSMC(AbstractModel):
         description = {}
         if run.checkpoint is not None:
             fixed = {"scene": scene, "times": times, "key": words, "scheme": scheme, "model": self}
-            description = described(**fixed, save=run.save)
-        _, records, fault = follow(
+            description = describe_run(**fixed, save=run.save)
+        _, records, fault = run_through_times(
             start,
             np.asarray(times),
-            lambda state, end: waited_for(advance(state, end)),
+            lambda state, end: block_until_ready(advance(state, end)),
             recorded,
             shown=observe,
             scene=description,
@@ -197,7 +207,7 @@ class DSMC(AbstractModel):
         return {name: jnp.asarray(value) for name, value in records.items()}
 
 
-def _words(run: Run) -> UInt32[Array, "2"]:
+def _key_words(run: Run) -> UInt32[Array, "2"]:
     """Two words of any kind of key, for the kind that is used here."""
     key = jax.random.key(0) if run.key is None else run.key
     return jax.random.bits(key, (2,), jnp.uint32)
@@ -207,11 +217,11 @@ def _curve(
     gas: Gas,
     times: Float[Array, "times"],
     records: dict[str, Array],
-    beyond: Bool[Array, "times"],
+    unreachable_times: Bool[Array, "times"],
 ) -> tuple[CoolingCurve, Bool[Array, "replicas times"]]:
     """The curve in SI units, and where it is nan: a replica is from its first fault on, and all
     are beyond some time."""
-    fault = records["fault"] | status.flag(status.OUT_OF_RANGE, beyond)[:, None]
+    fault = records["fault"] | status.flag(status.OUT_OF_RANGE, unreachable_times)[:, None]
     failed = jnp.cumsum(fault != status.OK, axis=0) > 0
     units = {
         "temperature": gas.temperature,

@@ -9,39 +9,34 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran.checks.tracing import any_traced
-from jaxgran.checks.validation import (
-    Domain,
-    UserCount,
-    UserFloat,
-    plain_number,
-    python_number,
-)
+from jaxgran._utils.tracing import any_traced
+from jaxgran._utils.validation import Domain, UserCount, UserFloat, plain_number, python_number
 from jaxgran.data.curve import UserParticles
 from jaxgran.models import checks
-from jaxgran.models.base import Omission
-from jaxgran.models.course import Course
+from jaxgran.models.base import Limitation
+from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.spheres import AbstractSpheres, Plan
-from jaxgran.particles import neighbours, user_start
+from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Neighbourhood, capacities
-from jaxgran.particles.drag import transformed
-from jaxgran.particles.hard.scene import HardScene
-from jaxgran.particles.hard.walls import MARGIN, HardWalls
-from jaxgran.particles.hard.windows import LEAST_IMPACTS, SPEED_MARGIN, HardDynamics
+from jaxgran.particles.hard.dynamics import MIN_IMPACTS, SPEED_MARGIN, HardDynamics
+from jaxgran.particles.hard.impacts import HardScene
+from jaxgran.particles.hard.prediction import MARGIN, HardWalls
+from jaxgran.particles.setup import check_inside, min_distance, overlap_by_rounding
+from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced_scene import ReducedDrag, ReducedDrive
+from jaxgran.scene.reduced import ReducedDrag, ReducedDrive
 from jaxgran.theory.averages import collision_rate
-from jaxgran.theory.steady import scene_at_start
+from jaxgran.theory.equations import scene_at_start
 
 WINDOW_SHARE = 0.05
 """Impacts per particle in a window."""
 
-LONGER = 1.5
+SKIN_GROWTH = 1.5
 """How much longer windows of `LEAST_IMPACTS` grow than they should: (8/2)^0.3 after one of two."""
 
 CONTACT_TIMES = Domain(0.0, 0.1, low_allowed=True, high_allowed=True)
 
-OVERLAP = 1e-9
+ALLOWED_OVERLAP = 1e-9
 """Overlap in diameters up to which a given start is one of hard spheres."""
 
 
@@ -69,7 +64,7 @@ class HardSpheres(AbstractSpheres):
 
     Takes all elements of a scene but friction: rough spheres; containers, cubes or boxes of given
     sides, whose walls are met exactly, in place of the periodic box; drag, exactly, as impacts in
-    transformed time (`jaxgran.particles.drag`), up to gamma t = 18 (8 in float32); a drive, whose
+    transformed time (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32); a drive, whose
     kicks come at both ends of each window of some .05 mean free times; and a driven start, which is
     driven for 10 mean free times with what its impacts take.
 
@@ -86,19 +81,19 @@ class HardSpheres(AbstractSpheres):
         neighbours: who finds the pairs: "sweep" (compiled with the rest), "scipy" (on the host),
             "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.tangents.differences`), 0.3 for most uses: two more
+            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses: two more
             runs for each number of the law, noise, and no bias in a gas that clusters. None for
             projected derivatives.
         plan: static sizes of arrays, see `sized_for`.
 
     Derivatives of T, collisions, <dr^2> and the dissipated energy are taken in every float of the
     gas and in the times, forward and reverse alike, whatever the law. They are thermally projected
-    at every impact (see `jaxgran.tangents.impact`): the gas is taken to remember its temperature
+    at every impact (see `jaxgran.gradients.tangents`): the gas is taken to remember its temperature
     only, and to continue to cool at the rate of its last 5 mean free times. Against finite
     differences d ln T/d ln A is right within 5 % in boxes shorter than L_c, but 14 % too large
     after 10 mean free times where flows have begun to hold energy (phi = .2, beta = .3, 1.1 L_c):
     the curve's ``derivative_bias`` estimates by how much, and `differences` avoids it.
-    The paths are followed by the first Sonine order of diffusion (see `jaxgran.tangents.paths`),
+    The paths are followed by the first Sonine order of diffusion (see `jaxgran.gradients.tangents`),
     the velocity correlation in time as decaying at 2/d of the collision rate. The density acts
     through Enskog's collision frequency; that the box changes with it at fixed N, and with the box
     the growth of flows, is left out. The derivatives of a_2 and of the final particles are not
@@ -108,8 +103,8 @@ class HardSpheres(AbstractSpheres):
 
     With elements derivatives of T, T_rot and collisions are known, in every float of the gas, and
     those of all else are nan. The gas is then taken to remember its two energies
-    (`jaxgran.tangents.exchange`), and not where its spheres are, but that it is the denser before
-    walls the more they take (`jaxgran.scene.wall_layer`). Beside differences (N = 500, eps_w = .8)
+    (`jaxgran.gradients.tangents`), and not where its spheres are, but that it is the denser before
+    walls the more they take (`jaxgran.scene.elements`). Beside differences (N = 500, eps_w = .8)
     a derivative in eps_w is right within 2 %; that of T_rot in beta_t of rough walls, before which
     spins differ from those in the middle, is up to 20 % too small.
 
@@ -151,8 +146,8 @@ class HardSpheres(AbstractSpheres):
             self._check_overlap(gas)
             checks.check_volume(gas, self.num_particles)
             if gas.container is not None:
-                radius = gas.diameter * (0.5 - OVERLAP)
-                user_start.check_inside(self.start, gas.container, radius, gas.dimension)
+                radius = gas.diameter * (0.5 - ALLOWED_OVERLAP)
+                check_inside(self.start, gas.container, radius, gas.dimension)
         if self.start is not None and self.start.angular_velocity is not None:
             raise ValueError(
                 "HardSpheres draws the angular velocities of a start: give it without them, as "
@@ -162,35 +157,35 @@ class HardSpheres(AbstractSpheres):
     def _check_overlap(self, gas: Gas) -> None:
         if self.start is None or any_traced(gas, self.start):
             return  # looked at when it runs
-        start, side = self.start, reduced_scene(gas, self.num_particles).side
+        start, side = self.start, reduced_hard_scene(gas, self.num_particles).side
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
-        closest = float(user_start.closest(position, side, self.replicas, (8 * len(position), 0)))
-        if closest < 1 - user_start.overlap_by_rounding(position, side, OVERLAP):
+        closest = float(min_distance(position, side, self.replicas, (8 * len(position), 0)))
+        if closest < 1 - overlap_by_rounding(position, side, ALLOWED_OVERLAP):
             raise ValueError(
                 f"two spheres of the start are {closest:.9g} diameters apart, hard spheres must "
                 "not overlap; move them apart, or leave start out for a random one"
             )
 
-    def estimated_error(self, course: Course) -> float:
+    def estimated_error(self, error_model: ErrorModel) -> float:
         """Contacts that last and overlap, and noise."""
-        contacts = course.error_of_temperature(self.rate_error(course))
-        return math.hypot(contacts, *self.noise(course))
+        contacts = error_model.error_of_temperature(self.rate_error(error_model))
+        return math.hypot(contacts, *self.noise(error_model))
 
-    def rate_error(self, course: Course) -> Float[np.ndarray, "times"]:
+    def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
         """Error of contacts that last and overlap."""
-        return course.lasting_contacts + course.softness
+        return error_model.lasting_contacts + error_model.softness
 
-    def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
+    def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Contacts that last."""
-        return checks.omitted_by_instant_impacts(gas)
+        return checks.limitations_of_instant_impacts(gas)
 
     def scene(self, gas: Gas) -> HardScene:
         """The gas in units of its diameter, mass and first temperature."""
-        return reduced_scene(gas, self.num_particles, self.contact_time)
+        return reduced_hard_scene(gas, self.num_particles, self.contact_time)
 
     def dynamics(self, scene: HardScene, plan: Plan) -> HardDynamics:
         """How the spheres move."""
-        return HardDynamics(scene, plan.replicas, plan.capacity, plan.pace.share, OVERLAP)
+        return HardDynamics(scene, plan.replicas, plan.capacity, plan.pace.share, ALLOWED_OVERLAP)
 
     def pace_fixed(self) -> dict[str, Any]:
         """Settings that a plan repeats."""
@@ -198,7 +193,7 @@ class HardSpheres(AbstractSpheres):
 
     def clock(self, scene: HardScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
         """The transformed times of drag."""
-        return times if scene.drag is None else transformed(scene.decay_rates, times)
+        return times if scene.drag is None else transformed_times(scene.decay_rates, times)
 
     def filled_side(self, scene: HardScene) -> Array:
         """Of the container, where there is one."""
@@ -213,9 +208,9 @@ class HardSpheres(AbstractSpheres):
         d, n = dimension, self.replicas * self.num_particles
         filled = float(self.filled_side(scene))
         around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
-        share = max(WINDOW_SHARE, 2 * LEAST_IMPACTS / n)
+        share = max(WINDOW_SHARE, 2 * MIN_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
-        longest = share if share == WINDOW_SHARE else LONGER * share
+        longest = share if share == WINDOW_SHARE else SKIN_GROWTH * share
         reach = 2 * fastest * longest / around.collision_frequency
         packed = 0.9 + 0.45 * around.in_contact / 2 ** (d - 1)
         near = packed * around.contact_value * around.in_contact * ((1 + reach) ** d - 1)
@@ -230,7 +225,7 @@ class HardSpheres(AbstractSpheres):
         return Plan(self.replicas, HardPace(share), *sizes)
 
 
-def reduced_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:
+def reduced_hard_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:
     """A gas of hard spheres in units of its diameter, mass and first temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
     side, scene = gas.box_side(num_particles) / gas.diameter, scene_at_start(gas)

@@ -10,19 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran.checks import status, validation
-from jaxgran.checks.tracing import any_traced, lengthened, shortened
-from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.run import DEFAULTS, Run
+from jaxgran._utils import status, validation
+from jaxgran._utils.tracing import any_traced, pad_to, truncate_to
+from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
 from jaxgran.models import checks
-from jaxgran.models.base import AbstractModel, Omission
-from jaxgran.models.course import ROUGH, Course
+from jaxgran.models.base import AbstractModel, Limitation
+from jaxgran.models.error_model import ROUGHNESS_ERROR, ErrorModel
 from jaxgran.scene.gas import Gas
-from jaxgran.theory import averages, closed_forms, steady
-from jaxgran.theory.homogeneous import Equations
-from jaxgran.theory.integration import padded_length
-from jaxgran.theory.moments import Density
-from jaxgran.theory.solution import Integrator, moments_at
+from jaxgran.theory import averages
+from jaxgran.theory.equations import Density, Equations, paper_averages, scene_at_start
+from jaxgran.theory.solver import Integrator, moments_at, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
@@ -36,14 +33,14 @@ class KineticTheory(AbstractModel):
     3 a_2 - a_3) + 8 mu_6/(d(d+2)(d+4))``, ``d<dr^2>/dt = 2 d D``, ``dN/dt = nu``, and two moments
     of labelled velocities for D, the first ``dD/dt = T - nu_v D``; all but T from 0, with averages
     exact in eps(v) (`jaxgran.theory.averages.averages`). c and k are those of contacts that last
-    (`jaxgran.theory.softness`), h that of correlated velocities (`jaxgran.theory.correlations`).
+    (`jaxgran.theory.equations`), h that of correlated velocities (`jaxgran.theory.equations`).
     Leaves out clustering: right in boxes below L_c whose contacts are short. The averages assume
     that eps(v) is smooth: for a law with a kink, such as an eps capped at 1, use `jaxgran.DSMC`; T
     of ice, which becomes elastic at low speed, is 3 % off after some 1e5 mean free times.
 
     Takes all elements of a scene but friction, of a gas that is everywhere alike: rough spheres,
     with T_rot, whose spins and velocities are taken for independent; walls, with the denser layer
-    before them (`jaxgran.scene.wall_layer`); drag; a drive by white noise; and a driven start. Of
+    before them (`jaxgran.scene.elements`); drag; a drive by white noise; and a driven start. Of
     a gas between walls D and <dr^2> are left out.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
@@ -82,9 +79,9 @@ class KineticTheory(AbstractModel):
     max_steps: validation.UserCount = eqx.field(static=True, default=200_000)
 
     def __check_init__(self):
-        validation.truth_value("sonine", self.sonine)
-        validation.truth_value("softness", self.softness)
-        validation.truth_value("correlations", self.correlations)
+        validation.check_bool("sonine", self.sonine)
+        validation.check_bool("softness", self.softness)
+        validation.check_bool("correlations", self.correlations)
         if self.order not in (2, 3) or isinstance(self.order, bool | float):
             raise ValueError(
                 f"order must be 2 or 3, got {self.order!r}; sonine=False keeps a gas Maxwellian"
@@ -125,43 +122,45 @@ class KineticTheory(AbstractModel):
         """Raise ValueError for a law that heats the gas or contacts too soft for the theory."""
         if any_traced(gas):
             return
-        rate, factor, hottest = checks.at_start(gas, self._averages)
+        rate, factor, hottest = checks.initial_cooling(gas, self._averages)
         if self.softness:
             checks.check_softness(gas, factor, hottest)
         checks.check_cools(rate)
 
-    def estimated_error(self, course: Course) -> float:
+    def estimated_error(self, error_model: ErrorModel) -> float:
         """Of its cooling rate: see `rate_error`."""
-        return course.error_of_temperature(self.rate_error(course))
+        return error_model.error_of_temperature(self.rate_error(error_model))
 
-    def rate_error(self, course: Course) -> Float[np.ndarray, "times"]:
+    def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
         """What correlations, lasting contacts and the Sonine terms beyond a_3 leave over."""
-        rate = course.correlated if self.correlations else course.homogeneous
+        rate = error_model.correlated if self.correlations else error_model.homogeneous
         if self.softness:
-            rate = rate + course.crowded_contacts + course.second_order_softness
+            rate = rate + error_model.crowded_contacts + error_model.second_order_softness
         else:
-            rate = rate + course.lasting_contacts + course.softness
-        elements = course.mixing + (0.0 if course.gas.surface is None else ROUGH)
-        return rate + course.truncation(self.order) + elements
+            rate = rate + error_model.lasting_contacts + error_model.softness
+        elements = error_model.mixing + (
+            0.0 if error_model.gas.surface is None else ROUGHNESS_ERROR
+        )
+        return rate + error_model.truncation(self.order) + elements
 
-    def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
+    def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Contacts that last, correlated collisions and boxes in which a flow grows."""
         beyond = "beyond the first-order softness correction"
-        return checks.omitted_by_instant_impacts(gas, beyond) + checks.omitted_by_homogeneity(
-            gas, num_particles
-        )
+        return checks.limitations_of_instant_impacts(
+            gas, beyond
+        ) + checks.limitations_of_homogeneity(gas, num_particles)
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
         size = times.size
-        padded = lengthened(times, padded_length(size))
+        padded = pad_to(times, padded_length(size))
         curve = self._simulate(gas, padded)
-        return jax.tree.map(lambda x: shortened(x, size) if x.ndim else x, curve)
+        return jax.tree.map(lambda x: truncate_to(x, size) if x.ndim else x, curve)
 
     @eqx.filter_jit
     def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
-        scene = steady.scene_at_start(gas), Density.of(gas, self.softness, self.correlations)
+        scene = scene_at_start(gas), Density.of(gas, self.softness, self.correlations)
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
         integrator = Integrator(self.solver, rtol, self.max_steps)
         equations = self._equations(gas.dimension)
@@ -191,7 +190,7 @@ class KineticTheory(AbstractModel):
     @property
     def _averages(self) -> Callable[..., Array]:
         """The averages over impacts, a function of law, speed and dimension."""
-        return averages.averages if self.averages == "exact" else closed_forms.paper_averages
+        return averages.impact_moments if self.averages == "exact" else paper_averages
 
     def _equations(self, dimension: int) -> Equations:
         maxwellian = not self.sonine or self.averages == "paper"

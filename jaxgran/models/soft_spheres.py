@@ -1,4 +1,7 @@
-"""Soft spheres: every contact resolved in time, in a periodic box."""
+"""Soft spheres: every contact resolved in time, in a periodic box.
+
+A gas of soft spheres in units of its diameter, mass and first temperature.
+"""
 
 import math
 from typing import Any, ClassVar, NamedTuple
@@ -9,32 +12,85 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.checks.tracing import concrete
-from jaxgran.checks.validation import (
-    POSITIVE,
-    UserCount,
-    UserFloat,
-    plain_number,
-    python_number,
-)
+from jaxgran._utils.tracing import concrete
+from jaxgran._utils.validation import POSITIVE, UserCount, UserFloat, plain_number, python_number
 from jaxgran.data.curve import UserParticles
 from jaxgran.models import checks
-from jaxgran.models.base import Omission
-from jaxgran.models.course import Course
-from jaxgran.models.reduced_soft import reduced_scene
+from jaxgran.models.base import Limitation
+from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.spheres import AbstractSpheres, Plan
-from jaxgran.particles import user_start
 from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
-from jaxgran.particles.soft.block import SoftDynamics
-from jaxgran.particles.soft.scene import SoftScene
-from jaxgran.scene.elements import Walls
+from jaxgran.particles.setup import check_inside
+from jaxgran.particles.soft.dynamics import SoftDynamics
+from jaxgran.particles.soft.forces import MARGIN, SoftDrag, SoftScene, SoftSurface, SoftWalls
+from jaxgran.scene.elements import Frictional, StokesDrag, Walls
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.restitution import Viscoelastic
+from jaxgran.scene.laws import Viscoelastic
+
+
+def reduced_soft_scene(gas: Gas, num_particles: int) -> SoftScene:
+    """A gas of viscoelastic spheres in units of its diameter, mass and first temperature."""
+    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
+    law: Any = gas.law  # `SoftSpheres.check` refuses others
+    side, walls = gas.box_side(num_particles) / gas.diameter, None
+    if gas.container is not None:
+        walls = reduced_walls(gas, gas.container)
+        side = jnp.max(walls.sides) + MARGIN
+    return SoftScene(
+        side=side,
+        alpha=gas.alpha * gas.diameter**0.5 * unit_time**2,
+        dissipative_constant=law.dissipative_constant / unit_time,
+        contact_duration=gas.contact_duration / unit_time,
+        collision_frequency=reduced_frequency(gas, unit_time),
+        clipped=law.clipped,
+        walls=walls,
+        drag=None if gas.drag is None else reduced_drag(gas, gas.drag),
+        surface=reduced_surface(gas),
+    )
+
+
+def reduced_walls(gas: Gas, container: Walls) -> SoftWalls:
+    """The walls of a gas in these units."""
+    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
+    law: Any = container.restitution  # `check_container` refuses others than Viscoelastic
+    alpha = law.of_wall().alpha(diameter=gas.diameter, mass=gas.mass)
+    return SoftWalls(
+        sides=jnp.broadcast_to(container.side, (gas.dimension,)) / gas.diameter,
+        alpha=alpha * gas.diameter**0.5 * unit_time**2,
+        dissipative_constant=law.dissipative_constant / unit_time,
+        clipped=law.clipped,
+        damping=container.tangential_damping,
+        friction=container.friction,
+    )
+
+
+def reduced_frequency(gas: Gas, unit_time: Float[Array, ""]) -> Float[Array, ""]:
+    """Collisions per particle and unit of time at T = 1; of no T_0 where `non_differentiable` refuses others."""
+    if gas.container is None:
+        return gas.collision_frequency * unit_time
+    still = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
+    return still.collision_frequency * gas.diameter / jnp.sqrt(still.temperature)
+
+
+def reduced_drag(gas: Gas, drag: StokesDrag) -> SoftDrag:
+    """The drag of a gas in these units."""
+    time = gas.diameter / jnp.sqrt(gas.temperature)
+    per_collision = time / reduced_frequency(gas, time)
+    return SoftDrag(drag.rate * per_collision, drag.rotational_rate * per_collision)
+
+
+def reduced_surface(gas: Gas) -> SoftSurface | None:
+    """The surface of the spheres of a gas in these units; None where they are smooth."""
+    s, T = gas.surface, gas.temperature
+    if not isinstance(s, Frictional):
+        return None
+    return SoftSurface(s.tangential_damping, s.friction, s.inertia, s.rotational_temperature / T)
+
 
 PROJECTION = 0.1
 """Mean free times between thermal projections of a derivative."""
 
-FASTEST = 4.8
+MAX_SPEED = 4.8
 """Speed of the fastest of some thousand spheres, in sqrt(T)."""
 
 BLOCK_FLIGHT = 0.08
@@ -43,7 +99,7 @@ BLOCK_FLIGHT = 0.08
 BLOCK_LENGTHS = Grid(ratio=1.2, spare=1.0)
 """Grid of the lengths of blocks, in mean contact durations: each length is compiled anew."""
 
-INTEGRATION = 0.001
+INTEGRATION_ERROR = 0.001
 """Relative error of T by the time steps: eps is right to 1e-4."""
 
 
@@ -81,10 +137,10 @@ class SoftSpheres(AbstractSpheres):
         neighbours: who finds the pairs: "sweep" (compiled with the rest), "scipy" (on the host),
             "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
         projection: mean free times between thermal projections of a derivative, > 0; from 0.02 to
-            0.5 they agree (see `jaxgran.tangents.thermal`). None for the plain derivative, which is
+            0.5 they agree (see `jaxgran.gradients.tangents`). None for the plain derivative, which is
             exact, and useless after 3 to 5 collisions per particle.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.tangents.differences`), 0.3 for most uses: two more
+            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses: two more
             runs for each of A and alpha, noise, and no bias in a gas that clusters. None for
             projected derivatives.
         plan: static sizes of arrays, see `sized_for`.
@@ -94,9 +150,9 @@ class SoftSpheres(AbstractSpheres):
     only. The first two are followed by tangents; the density acts through Enskog's collision
     frequency; that the box changes with it at fixed N, and with it the growth of flows, is left
     out. T is followed exactly but for the projection, the rest is estimated from it: the paths by
-    the first Sonine order of diffusion (see `jaxgran.tangents.paths`), the velocity correlation in
+    the first Sonine order of diffusion (see `jaxgran.gradients.tangents`), the velocity correlation in
     time as decaying at 2/d of the collision rate. Walls, drag and friction are followed like
-    (alpha, A), and T_rot beside T (`jaxgran.tangents.rotation`); between walls the derivatives in
+    (alpha, A), and T_rot beside T (`jaxgran.gradients.tangents`); between walls the derivatives in
     lengths and the density are refused. Not known, and nan, are the derivatives of a_2 and of the
     final particles, with friction those of <dr^2> and the velocity correlation, and the one in a
     rotational_temperature of 0. Second derivatives are
@@ -148,30 +204,30 @@ class SoftSpheres(AbstractSpheres):
             checks.check_volume(gas, self.num_particles)
             if gas.container is not None:
                 check_walls(gas.container)
-                user_start.check_inside(self.start, gas.container, 0.0, gas.dimension)
+                check_inside(self.start, gas.container, 0.0, gas.dimension)
         if gas.surface and self.start is not None and self.start.angular_velocity is not None:
             raise ValueError(
                 "SoftSpheres draws the angular velocities of a start: give it without them, as "
                 "start._replace(angular_velocity=None), and their rotational_temperature"
             )
 
-    def estimated_error(self, course: Course) -> float:
+    def estimated_error(self, error_model: ErrorModel) -> float:
         """Time steps and noise: every contact is resolved."""
-        return math.hypot(INTEGRATION, *self.noise(course))
+        return math.hypot(INTEGRATION_ERROR, *self.noise(error_model))
 
-    def rate_error(self, course: Course) -> float:
+    def rate_error(self, error_model: ErrorModel) -> float:
         """Error of time steps."""
-        return INTEGRATION
+        return INTEGRATION_ERROR
 
-    def omissions(self, gas: Gas, num_particles: int | None = None) -> tuple[Omission, ...]:
+    def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Nothing that a scene contains."""
         return ()
 
     def scene(self, gas: Gas) -> SoftScene:
         """The gas in units of its diameter, mass and first temperature."""
-        return reduced_scene(gas, self.num_particles)
+        return reduced_soft_scene(gas, self.num_particles)
 
-    def beyond(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
+    def unreachable_times(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
         """None: time is not transformed."""
         return jnp.zeros(times.shape, bool)
 
@@ -179,7 +235,7 @@ class SoftSpheres(AbstractSpheres):
         """Of the container, where there is one."""
         return scene.filled_side
 
-    def held(self, scene: SoftScene) -> Any:
+    def non_differentiable(self, scene: SoftScene) -> Any:
         """The room between walls, and how often spheres meet there."""
         walls = scene.walls
         return () if walls is None else (scene.side, walls.sides, scene.collision_frequency)
@@ -206,7 +262,7 @@ class SoftSpheres(AbstractSpheres):
         duration = Grid.of(n).up(float(scene.contact_duration))
         steps = self._steps_per_block(float(scene.contact_duration))
         block = steps / self.steps_per_contact
-        flight = FASTEST * duration * block
+        flight = MAX_SPEED * duration * block
         near = 0.75 * around.in_contact * around.contact_value * ((1 + 5 * flight) ** d - 1)
         near = near * around.listed / (near + around.listed)
         # Contacts that exist and that begin in a block, and the pairs near them.
@@ -222,7 +278,7 @@ class SoftSpheres(AbstractSpheres):
 
     def _steps_per_block(self, contact_duration: float) -> int:
         """A block is at most a contact long, and shorter where spheres fly far in that time."""
-        shorter = BLOCK_LENGTHS.up(max(1.0, FASTEST * contact_duration / BLOCK_FLIGHT))
+        shorter = BLOCK_LENGTHS.up(max(1.0, MAX_SPEED * contact_duration / BLOCK_FLIGHT))
         return max(round(self.steps_per_contact / shorter), 8)
 
 

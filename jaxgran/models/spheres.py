@@ -1,8 +1,13 @@
-"""What models of spheres in periodic boxes share: checks, array sizes, runs and curves."""
+"""What models of spheres in periodic boxes share: checks, array sizes, runs and curves.
+
+How the derivatives of models of spheres are taken: projected, by differences, or plainly.
+"""
 
 import dataclasses
 import math
 from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
@@ -11,22 +16,78 @@ import numpy as np
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.checks import status
-from jaxgran.checks.tracing import any_traced
-from jaxgran.checks.validation import POSITIVE, no_type_check, plain_number, whole_number
-from jaxgran.data.curve import CoolingCurve, Particles
-from jaxgran.data.run import DEFAULTS, Run
-from jaxgran.models import checks, derivatives
+from jaxgran._utils import status
+from jaxgran._utils.tracing import any_traced
+from jaxgran._utils.validation import POSITIVE, Domain, no_type_check, plain_number, whole_number
+from jaxgran.data.curve import DEFAULTS, CoolingCurve, Particles, Run
+from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable
+from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.course import Course
-from jaxgran.models.flow_bias import slope_bias_of_run
-from jaxgran.particles import driver, neighbours, pure, snapshot, user_start
-from jaxgran.particles import side_by_side as beside
+from jaxgran.models.error_model import ErrorModel, slope_bias_of_run
+from jaxgran.particles import neighbours, snapshot
+from jaxgran.particles import run as beside
 from jaxgran.particles.capacity import Capacity, skin_adding
 from jaxgran.particles.dynamics import AbstractDynamics
-from jaxgran.particles.simulation import Simulation
+from jaxgran.particles.run import Simulation, simulate_on_host, simulate_traced
+from jaxgran.particles.setup import (
+    check_start,
+    has_other_box,
+    reduced_start,
+    with_constant_temperature,
+)
 from jaxgran.scene.gas import Gas
-from jaxgran.tangents.rule import Inputs, Outputs
+
+DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
+"""Steps of differences: the lower one of alpha must leave it positive."""
+
+
+def check_difference_step(differences: Any, projected: bool) -> None:
+    """Raise ValueError for a step of differences out of range, or beside plain derivatives."""
+    if differences is None:
+        return
+    advice = "In the logarithm of an impact's loss: 0.3, or None for projected derivatives."
+    plain_number("differences", differences, DIFFERENCE_STEPS, advice)
+    if not projected:
+        raise ValueError(
+            f"differences = {differences} and projection = None ask for two kinds of derivative: "
+            "leave one of them out"
+        )
+
+
+def check_gas_for_differences(differences: float | None, gas: Gas) -> None:
+    """Raise ValueError for a gas whose derivatives are not known by differences."""
+    if differences is not None and gas.elements:
+        raise ValueError(
+            "derivatives by differences are known for smooth spheres in free flight, and this gas "
+            f"has {', '.join(gas.elements)}: leave differences out of the model, or take "
+            "differences of runs yourself"
+        )
+
+
+def with_derivative_rule(
+    outputs: Callable[..., Outputs],
+    run: Run,
+    differences: float | None,
+    projected: bool,
+    non_differentiable: Callable[[Any], Any],
+) -> Callable[[Inputs], Outputs]:
+    """A run with its rule of differentiation.
+
+    Args:
+        outputs: the run, of inputs, directions, and options.
+        run: the options.
+        differences: step of differences of whole runs; None for none.
+        projected: whether derivatives are projected; if not they are plain.
+        held: see `jaxgran.gradients.rule.differentiable`.
+    """
+    outputs = partial(outputs, run=run)
+    if not projected:
+        return outputs
+    if differences is not None:
+        further = partial(outputs, run=Run(run.key, run.progress))  # which write no files
+        outputs = by_differences(outputs, further, differences)
+    return differentiable(outputs, lambda scene: scene.material, non_differentiable)
+
 
 S = TypeVar("S", bound="AbstractSpheres")
 
@@ -44,7 +105,7 @@ class Plan(NamedTuple):
     replicas: int
     pace: Any
     capacity: Capacity
-    melt_capacity: Capacity
+    equilibration_capacity: Capacity
 
 
 class AbstractSpheres(AbstractModel):
@@ -78,11 +139,13 @@ class AbstractSpheres(AbstractModel):
     def projected(self) -> bool:
         """Whether derivatives are projected, or by differences, and not plain."""
 
-    def derivative_error(self, course: Course) -> Float[np.ndarray, "times"]:
+    def derivative_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
         """Of projected derivatives, where the gas has a flow; of differences their noise."""
         if self.differences is None:
-            return course.slope_error()
-        return course.noise_of_differences(self.differences, math.hypot(*self.noise(course)))
+            return error_model.slope_error()
+        return error_model.noise_of_differences(
+            self.differences, math.hypot(*self.noise(error_model))
+        )
 
     @abstractmethod
     def scene(self, gas: Gas) -> Any:
@@ -104,15 +167,15 @@ class AbstractSpheres(AbstractModel):
         """The time of the run at reduced times."""
         return times
 
-    def beyond(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
+    def unreachable_times(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
         """Which times are too late for the clock."""
-        return checks.beyond_drag(gas, times)
+        return checks.unreachable_with_drag(gas, times)
 
     def filled_side(self, scene: Any) -> Array:
         """Side in diameters of a cube of the volume in which the spheres are."""
         return scene.side
 
-    def held(self, scene: Any) -> Any:
+    def non_differentiable(self, scene: Any) -> Any:
         """Numbers of a scene in which the derivative of a run is not known."""
         return ()
 
@@ -149,13 +212,13 @@ class AbstractSpheres(AbstractModel):
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
-        beyond = self.beyond(gas, times)
-        gas = user_start.with_constant_temperature(self.start, gas)
+        unreachable_times = self.unreachable_times(gas, times)
+        gas = with_constant_temperature(self.start, gas)
         scene = self.scene(gas)
         inputs = Inputs(
             scene=scene,
             times=self.clock(scene, times * jnp.sqrt(gas.temperature) / gas.diameter),
-            start=user_start.reduced(self.start, gas, differentiable=not self.projected),
+            start=reduced_start(self.start, gas, differentiable=not self.projected),
             key=run.key,
         )
         inputs = inputs._replace(units=self._units(gas, inputs.scene.side))
@@ -163,9 +226,9 @@ class AbstractSpheres(AbstractModel):
         def outputs(inputs: Inputs, directions: Any = None, run: Run = run) -> Outputs:
             return self._outputs(inputs, directions, gas.dimension, run)
 
-        how = self.differences, self.projected, self.held
-        found = derivatives.with_rule(outputs, run, *how)(inputs)
-        return self._curve(gas, times, inputs.units, found, beyond, run.save)
+        how = self.differences, self.projected, self.non_differentiable
+        found = with_derivative_rule(outputs, run, *how)(inputs)
+        return self._curve(gas, times, inputs.units, found, unreachable_times, run.save)
 
     def _units(self, gas: Gas, side: Array) -> snapshot.Units:
         """Of what is seen of the particles, SI."""
@@ -175,20 +238,22 @@ class AbstractSpheres(AbstractModel):
 
     def _outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
         """The run in reduced units: driven from the host if all numbers are known, else pure."""
-        if not any_traced(inputs) and (on := beside.devices(self.replicas, self.num_particles)):
+        if not any_traced(inputs) and (
+            on := beside.replica_devices(self.replicas, self.num_particles)
+        ):
             alone = dataclasses.replace(self, replicas=1, start=None, plan=None)
 
             def one(k: int, run: Run) -> Outputs:
-                own = beside.inputs_of(inputs, k, self.num_particles, run)
+                own = beside.replica_inputs(inputs, k, self.num_particles, run)
                 return alone._outputs(own, directions, dimension, run)
 
-            return beside.joined(beside.side_by_side(one, self.replicas, run, on))
+            return beside.join_outputs(beside.run_replicas(one, self.replicas, run, on))
         plan = self._settled_plan(inputs.scene, dimension)
         side = self.filled_side(inputs.scene)
         skin = skin_adding(self.listed_by_skin, self.num_particles, side, dimension)
         sim = Simulation(
             dynamics=self.dynamics(inputs.scene, plan),
-            melt_capacity=plan.melt_capacity,
+            equilibration_capacity=plan.equilibration_capacity,
             inputs=inputs,
             directions=directions,
             num_particles=self.num_particles,
@@ -199,14 +264,14 @@ class AbstractSpheres(AbstractModel):
         )
         if not any_traced(inputs):
             model = dataclasses.replace(self, start=None, plan=None)
-            return driver.drive(sim, run, {"model": model, "pace": plan.pace})
+            return simulate_on_host(sim, run, {"model": model, "pace": plan.pace})
         checks.refuse_files(self, run)
         if self.neighbours == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap neighbours="jax-md" cannot find the pairs, as it sizes '
                 "its cells from known numbers: leave neighbours out"
             )
-        return pure.simulate(sim)
+        return simulate_traced(sim)
 
     def _settled_plan(self, scene: Any, dimension: int) -> Plan:
         """The model's plan, or one made now, if all numbers that it depends on are known."""
@@ -235,7 +300,7 @@ class AbstractSpheres(AbstractModel):
         times: Float[Array, "times"],
         units: snapshot.Units,
         out: Outputs,
-        beyond: Bool[Array, "times"],
+        unreachable_times: Bool[Array, "times"],
         save: Any,
     ) -> CoolingCurve:
         """The curve in SI units, of records in units of diameter, mass and first temperature."""
@@ -255,11 +320,11 @@ class AbstractSpheres(AbstractModel):
         known = [name for name in of_records if name in out.records]
         each = {name: out.records[name].T * of_records[name] for name in known}
         # Where it could not be checked before.
-        other = user_start.is_of_other_box(self.start, gas, self.num_particles)
-        wrong = other | beyond
+        other = has_other_box(self.start, gas, self.num_particles)
+        wrong = other | unreachable_times
         each = {name: jnp.where(wrong[None], jnp.nan, values) for name, values in each.items()}
         particles = snapshot.particles(units, self.replicas, out.position, out.velocity, out.spin)
-        late = status.flag(status.OUT_OF_RANGE, jnp.any(beyond))
+        late = status.flag(status.OUT_OF_RANGE, jnp.any(unreachable_times))
         curve = CoolingCurve.of_replicas(
             times,
             each,
@@ -280,16 +345,16 @@ class AbstractSpheres(AbstractModel):
         """Raise ValueError where a whole number of the model is less than it must be."""
         for name, lowest in ({"num_particles": 2, "replicas": 1} | least).items():
             whole_number(name, getattr(self, name), lowest)
-        neighbours.engine(self.neighbours)
-        derivatives.check_step(self.differences, self.projected)
+        neighbours.choose_engine(self.neighbours)
+        check_difference_step(self.differences, self.projected)
 
     def check_box(self, gas: Gas) -> None:
         """Raise ValueError for a gas too dense, a box too small, or a start not of this gas."""
-        user_start.check(self.start, gas, self.replicas, self.num_particles)
-        derivatives.check_gas(self.differences, gas)
-        checks.check_room(gas, self.num_particles, random=self.start is None)
+        check_start(self.start, gas, self.replicas, self.num_particles)
+        check_gas_for_differences(self.differences, gas)
+        checks.check_packing(gas, self.num_particles, random=self.start is None)
 
-    def noise(self, course: Course) -> tuple[float, float]:
+    def noise(self, error_model: ErrorModel) -> tuple[float, float]:
         """Standard errors of ln T by shot noise and by the chance amplitudes of a flow."""
         total = self.num_particles * self.replicas
-        return course.shot_noise(total), course.flow_noise(self.replicas)
+        return error_model.shot_noise(total), error_model.flow_noise(self.replicas)

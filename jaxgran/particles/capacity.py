@@ -12,14 +12,14 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxgran.checks import status
-from jaxgran.particles.sweep_and_prune import unsorted
+from jaxgran._utils import status
+from jaxgran.particles.neighbours import unsorted
 from jaxgran.scene.geometry import contact_value, sphere_surface
 
-FEW = 128
+FEW_PARTICLES = 128
 """Rows whose run time costs less than one more compilation."""
 
-SMALL = 500
+SMALL_NUMBER = 500
 """Particles of all replicas below which a run takes less time than a compilation."""
 
 
@@ -40,7 +40,7 @@ class Grid(NamedTuple):
     @classmethod
     def of(cls, num_particles: int) -> "Grid":
         """The grid for a number of particles of all replicas."""
-        if num_particles < SMALL:
+        if num_particles < SMALL_NUMBER:
             return cls(1.5, 1.4)
         return cls(1.03, 1.03**-0.5)
 
@@ -151,7 +151,7 @@ def capacities(
     run = Capacity(pairs, lookahead, near, contacts, min(members, num_particles))
     more_members = min(members + 2 * rows, num_particles)
     melt = Capacity(pairs, lookahead, more_near, more_contacts, more_members)
-    return (melt if rows <= FEW else run), melt
+    return (melt if rows <= FEW_PARTICLES else run), melt
 
 
 def skin_adding(more: float, num_particles: int, side: ArrayLike, dimension: int) -> Array:

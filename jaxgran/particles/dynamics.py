@@ -12,16 +12,16 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from jaxgran.checks import status
+from jaxgran._utils import status
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.neighbours import Found, Pairs
-from jaxgran.particles.state import State, at_start
+from jaxgran.particles.state import State, initial_state
 
-MOST_IDLE = 1000
+MAX_IDLE = 1000
 """Blocks, or neighbour lists, in a row that may advance the time by nothing."""
 
-SHORTEST_FLIGHT = 1e-15
+MIN_FLIGHT = 1e-15
 """Flight of the fastest sphere, in diameters, below which a block advances the time by nothing."""
 
 
@@ -40,7 +40,7 @@ class Progress(NamedTuple):
     stale: Bool[Array, ""]
     status: Int[Array, ""]
     needed: Int[Array, "kinds"]
-    own: Any
+    internal: Any
 
 
 class AbstractDynamics(eqx.Module):
@@ -57,8 +57,8 @@ class AbstractDynamics(eqx.Module):
     capacity: AbstractVar[Capacity]
 
     @abstractmethod
-    def own_state(self, num_rows: int, dtype: Any) -> Any:
-        """`State.own` at t = 0."""
+    def initial_internal(self, num_rows: int, dtype: Any) -> Any:
+        """`State.internal` at t = 0."""
 
     @abstractmethod
     def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, Array]:
@@ -71,12 +71,12 @@ class AbstractDynamics(eqx.Module):
         """Follow the spheres to an end, or until the neighbour list is stale or a block fails."""
 
     @abstractmethod
-    def mend(self, now: Progress, began: State) -> tuple[State, Int[Array, ""]]:
+    def recover(self, now: Progress, began: State) -> tuple[State, Int[Array, ""]]:
         """The state with settings that avoid a failure, and the status of what cannot be mended."""
 
     @abstractmethod
     def observe(self, state: State) -> dict[str, Array]:
-        """The records of a state; with tangents, those of `jaxgran.tangents.rule`, too."""
+        """The records of a state; with tangents, those of `jaxgran.gradients.rule`, too."""
 
     @abstractmethod
     def elastic(self) -> "AbstractDynamics":
@@ -105,7 +105,7 @@ class AbstractDynamics(eqx.Module):
         """The state after the melt with what `preparing` needs: random numbers for kicks, spins."""
         return state
 
-    def drawn(self, state: State, key: PRNGKeyArray, melted: State) -> State:
+    def sample_spins(self, state: State, key: PRNGKeyArray, melted: State) -> State:
         """The state at t = 0 with what else is random: spins, but for those of a preparation.
 
         Args:
@@ -115,7 +115,7 @@ class AbstractDynamics(eqx.Module):
         """
         return state
 
-    def seen(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
+    def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
         """True velocities, from those of a state's kind, and spins, where spheres have some."""
         return velocity, None
 
@@ -125,14 +125,14 @@ class AbstractDynamics(eqx.Module):
 
     def begin(self, position: Array, velocity: Array, skin: ArrayLike) -> State:
         """The state at t = 0 of given positions and velocities."""
-        own = self.own_state(len(position), position.dtype)
-        return at_start(position, velocity, self.scene.side, skin, self.replicas, own)
+        internal = self.initial_internal(len(position), position.dtype)
+        return initial_state(position, velocity, self.scene.side, skin, self.replicas, internal)
 
     def with_capacity(self, capacity: Capacity) -> "AbstractDynamics":
         """The same spheres in arrays of other lengths."""
         return dataclasses.replace(self, capacity=capacity)
 
-    def stretch(self, state: State, end: ArrayLike, engine: str) -> Progress:
+    def run_segment(self, state: State, end: ArrayLike, engine: str) -> Progress:
         """A new neighbour list, blocks until it is stale, and what can be mended of a failure.
 
         The state is the last good one. A status that is not ok cannot be mended here: an array is
@@ -145,7 +145,9 @@ class AbstractDynamics(eqx.Module):
         """
         began, listed, until = self.prepare(state, end)
         cutoff, room = 1 + began.skin, self.capacity[:2]
-        found = neighbours.search(listed, self.scene.side, cutoff, self.replicas, room, engine)
+        found = neighbours.search_pairs(
+            listed, self.scene.side, cutoff, self.replicas, room, engine
+        )
         return _until_stale(self, began, listed, found, until)
 
 
@@ -155,15 +157,15 @@ def _until_stale(
 ) -> Progress:
     pairs = neighbours.with_offsets(listed, dynamics.scene.side, found)
     now = dynamics.advance(began, listed, pairs, until)
-    state, fault = dynamics.mend(now, began)
+    state, fault = dynamics.recover(now, began)
     return now._replace(state=state, status=fault)
 
 
-def first_progress(state: State, pairs: Pairs, capacity: Capacity, own: Any) -> Progress:
+def first_progress(state: State, pairs: Pairs, capacity: Capacity, internal: Any) -> Progress:
     """Before the first block within a neighbour list."""
     zero = jnp.zeros((), jnp.int32)
     needed = jnp.stack([pairs.count, pairs.lookahead, zero, zero, zero])
-    return Progress(state, jnp.zeros((), bool), capacity.exceeded_by(needed), needed, own)
+    return Progress(state, jnp.zeros((), bool), capacity.exceeded_by(needed), needed, internal)
 
 
 def kept_if(good: Array, new: State, old: State) -> State:
@@ -189,7 +191,7 @@ def repeat_until(
         old, idle = carry
         new = block(old)
         idle = jnp.where(_passed(old.state, new.state) > shortest, 0, idle + 1)
-        stalled = status.flag(status.STALLED, idle >= MOST_IDLE)
+        stalled = status.flag(status.STALLED, idle >= MAX_IDLE)
         return new._replace(status=new.status | stalled), idle
 
     return jax.lax.while_loop(unfinished, further, (first, jnp.zeros((), jnp.int32)))[0]
@@ -203,10 +205,10 @@ def _passed(old: State, new: State) -> Float[Array, ""]:
 def _shortest(state: State) -> Float[Array, ""]:
     """The time in which the fastest sphere of a state flies `SHORTEST_FLIGHT`; 0 at rest."""
     speed = jnp.sqrt(jnp.max(jnp.sum(state.velocity * state.velocity, -1)))
-    return jnp.where(speed > 0, SHORTEST_FLIGHT / jnp.where(speed > 0, speed, 1.0), 0.0)
+    return jnp.where(speed > 0, MIN_FLIGHT / jnp.where(speed > 0, speed, 1.0), 0.0)
 
 
-def stretches(
+def run_segments(
     dynamics: AbstractDynamics,
     state: State,
     end: ArrayLike,
@@ -230,9 +232,9 @@ def stretches(
 
     def further(carry):
         made, idle, state, _, needed = carry
-        now = dynamics.stretch(state, end, engine)
+        now = dynamics.run_segment(state, end, engine)
         idle = jnp.where(_passed(state, now.state) > _shortest(state), 0, idle + 1)
-        fault = now.status | status.flag(status.STALLED, idle >= MOST_IDLE)
+        fault = now.status | status.flag(status.STALLED, idle >= MAX_IDLE)
         kept = jax.tree.map(partial(jnp.where, now.status == status.OK), now.state, state)
         return made + 1, idle, kept, fault, jnp.maximum(needed, now.needed)
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.data.curve import CoolingCurve, Particles
-from jaxgran.scene.elements import SPINS
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 
 PREFIX = "saved:"
 """Before the number of a leaf of what was saved, in the names of records."""
@@ -55,7 +55,7 @@ def shapes(
 ) -> Particles:
     """Shapes of the particles of some replicas of N, and their box."""
     each = jax.ShapeDtypeStruct((*size, dimension), dtype)
-    spins = jax.ShapeDtypeStruct((*size, SPINS[dimension]), dtype) if rough else None
+    spins = jax.ShapeDtypeStruct((*size, NUM_SPIN_COMPONENTS[dimension]), dtype) if rough else None
     return Particles(each, each, units.box_side, spins)  # type: ignore[arg-type]
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.checks.validation import NOT_NEGATIVE
+from jaxgran._utils.validation import NOT_NEGATIVE
 
 ELASTIC_CONTACT_TIME = 3.21806546
 """Duration of an elastic Hertz impact in units of ``X/v = (alpha^2 v)^(-1/5)``."""

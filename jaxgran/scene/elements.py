@@ -2,9 +2,13 @@
 a drive.
 
 Each is an optional field of `Gas`; a program of a scene without it does not contain it.
+
+Friction of spheres whose contacts last: a tangential force with Coulomb's limit.
+
+The gas before a wall that takes energy, which is not that in the middle of the box.
 """
 
-from math import pi
+from math import pi, sqrt
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
@@ -12,14 +16,123 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran.checks.tracing import is_known
-from jaxgran.checks.validation import FRACTION, NOT_NEGATIVE, POSITIVE, Domain, number
-from jaxgran.scene.restitution import ConstantRestitution, RestitutionLaw
+from jaxgran._utils.tracing import is_known
+from jaxgran._utils.validation import FRACTION, NOT_NEGATIVE, POSITIVE, Domain, number
+from jaxgran.scene.laws import ConstantRestitution, RestitutionLaw
+
+
+class Frictional(eqx.Module):
+    """Spheres that rotate, by a tangential force at contact: viscous, and at most Coulomb's.
+
+    The surfaces slip with ``u_t``, the tangential part of
+    ``u = v_i - v_j - l (w_i + w_j) x n`` with the unit vector n from j to i, angular velocities w
+    and half the distance of the centres, ``l = (sigma - xi)/2``. The force on i is
+
+        F_t = -min(x_t (3/2) A rho sqrt(xi) |u_t|, mu F_n) u_t/|u_t|
+
+    with the normal force F_n of `jaxgran.contact_force`, and the torque on both spheres is
+    ``-l n x F_t``: energy is lost at the rate ``|F_t| |u_t|``, and the angular momentum of a pair
+    is conserved. There is no memory of the slip, and so no static friction.
+
+    This is ``tangential linear_nohistory x_t mu`` of ``pair_style granular`` in LAMMPS, which
+    however has sigma/2 in place of l in the slip: velocities differ by the share xi/sigma of those
+    of rotation.
+
+    `jaxgran.SoftSpheres` takes it. Models of instantaneous impacts have `jaxgran.Rough` instead.
+
+    Args:
+        tangential_damping: x_t, tangential over normal damping, >= 0.
+        friction: mu, Coulomb's coefficient, >= 0.
+        inertia: q = 4 I/(m sigma^2), in (0, 1]: 2/5 of a solid sphere, 2/3 of a hollow one, 1/2 of
+            a disk.
+        rotational_temperature: T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2, >= 0, with d_rot = 3
+            (1 in a plane).
+
+    Raises:
+        ValueError: for a value outside its range.
+
+    Reference: Luding, Granular Matter 10, 235 (2008), without the tangential spring.
+
+    >>> grains = jaxgran.Frictional(tangential_damping=0.5, friction=0.3)
+    >>> rubbing = dataclasses.replace(gas, surface=grains)
+    >>> float(rubbing.value("friction"))
+    0.3
+    """
+
+    tangential_damping: Float[Array, ""] = eqx.field(converter=number)
+    friction: Float[Array, ""] = eqx.field(converter=number)
+    inertia: Float[Array, ""] = eqx.field(converter=number, default=0.4)
+    rotational_temperature: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+
+    domains: ClassVar[dict[str, Domain]] = {
+        "tangential_damping": NOT_NEGATIVE,
+        "friction": NOT_NEGATIVE,
+        "inertia": Domain(0.0, 1.0, high_allowed=True),
+        "rotational_temperature": NOT_NEGATIVE,
+    }
+
+    def __check_init__(self):
+        advice = {
+            "tangential_damping": "It is over the normal damping: 0 to 1 is usual.",
+            "friction": "It is Coulomb's coefficient: glass has 0.1 to 0.5.",
+            "inertia": "It is 4 I/(m sigma^2): 0.4 for solid spheres.",
+            "rotational_temperature": "Give I <w^2>/(d_rot m) at t = 0 in m^2/s^2.",
+        }
+        for name, domain in self.domains.items():
+            domain.check(name, getattr(self, name), advice[name])
+
+
+CONDUCTIVITY = {2: 2 / sqrt(pi), 3: 75 / (64 * sqrt(pi))}
+"""Heat conductivity of a dilute gas of elastic spheres, times ``sigma^(d-1) / (k sqrt(k T/m))``."""
+
+CROSS_SECTION = {2: 2.0, 3: pi}
+"""Of two spheres, over ``sigma^(d-1)``: the mean free path is ``1/(sqrt(2) n`` this one``)``."""
+
+MOST_IMPACTS = 2.5
+"""An upper bound of `share_of_impacts`, for any wall."""
+
+
+def share_of_impacts(
+    eps: Float[Array, "*#rows"], frequency: Float[Array, "*#rows"], dimension: int
+) -> Float[Array, "..."]:
+    """Impacts on a wall of restitution eps over those on it in a gas that is everywhere alike.
+
+        2/(1 + eps) * (1 + (3/2 - 2/pi)/(d + 2) (1 - eps^2)/(1 + Kn)) * sqrt(y)
+
+    - Spheres bring the momentum M to the wall and take eps M from it; both together are the
+      pressure of the gas, within a few sound times. So 2/(1 + eps) times as many come as from a
+      gas at rest: the gas is denser before the wall.
+    - Those that come were last hit where it is warmer (first order of Chapman and Enskog in the
+      flow of heat q), but for those that have crossed the box, of mean free path Kn times its
+      width W.
+    - In a box of many mean free paths heat must be conducted to the wall. In a gas that cools
+      everywhere at one rate T is a parabola, at the wall ``q W/(6 kappa)`` below its mean, and
+      its ratio to it is ``y = 1 - a sqrt(y)`` with
+      ``a = (1 - eps) n W sqrt(2 T/pi) T/(6 kappa T)``.
+
+    Measured, see `jaxgran.models.error_model.WALL_ERROR`: within 3.5 % for eps from .6 to .9 and Kn from .09
+    to 1.2. Where the spheres meet walls only (Kn >> 1) there is no pressure to balance, and it
+    is too large; so it is in the first sound times.
+
+    Args:
+        eps: restitution of the wall at the speed of an impact.
+        frequency: impacts of a sphere on the two walls across an axis, over its impacts on
+            others, in a gas that is everywhere alike.
+        dimension: d.
+    """
+    # Mean speed over that along one axis, of two walls: frequency = <|v_x|>/(W nu).
+    knudsen = {2: pi / 2, 3: 2.0}[dimension] * frequency
+    to_wall = (1.5 - 2 / pi) / (dimension + 2) * (1 - eps**2) / (1 + knudsen)
+    path = 1 / (sqrt(2) * CROSS_SECTION[dimension])  # n sigma^(d-1) times the mean free path
+    a = sqrt(2 / pi) * path / (6 * CONDUCTIVITY[dimension]) * (1 - eps) / knudsen
+    cold = 2 / (a + jnp.sqrt(a**2 + 4))
+    return 2 / (1 + eps) * (1 + to_wall) * cold
+
 
 TANGENTIAL = Domain(-1.0, 1.0, low_allowed=True, high_allowed=True)
 """Coefficients of tangential restitution: -1 is a smooth surface, 1 a perfectly rough one."""
 
-SPINS = {2: 1, 3: 3}
+NUM_SPIN_COMPONENTS = {2: 1, 3: 3}
 """d_rot: components of the angular velocity by dimension."""
 
 SAME_VOLUME = 0.02
@@ -32,7 +145,7 @@ else:
     UserWallLaw = Any
 
 
-def optional(*kinds: type) -> Any:
+def optional_element(*kinds: type) -> Any:
     """An optional field of a `Gas`; it refuses what is of none of the kinds."""
 
     def checked(value: Any) -> Any:
@@ -259,7 +372,7 @@ def share_of_container(gas: Any, num_particles: int | float) -> float:
     return float(num_particles / gas.number_density) / float(np.prod(sides))
 
 
-def check(gas: Any) -> None:
+def check_elements(gas: Any) -> None:
     """Raise ValueError for elements of a gas that do not go together, or not with its spheres."""
     if gas.preparation is not None and gas.surface is not None:
         rotation = gas.surface.rotational_temperature

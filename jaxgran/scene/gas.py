@@ -1,14 +1,27 @@
-"""The scene: a homogeneous gas of equal spheres, and the physical scales that follow from it."""
+"""The scene: a homogeneous gas of equal spheres, and the physical scales that follow from it.
 
+A gas in short words.
+
+The floats of a module and of its parts, by name.
+
+The shear instability of a cooling gas: the shortest wave of a flow that outlives the heat.
+"""
+
+from abc import abstractmethod
 from collections.abc import Iterator
+from functools import reduce
 from math import gamma, pi
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxgran.checks.validation import (
+from jaxgran._utils.formatting import Rows, format_quantity, html_table, text_table
+from jaxgran._utils.validation import (
     POSITIVE,
     Domain,
     UserNumber,
@@ -18,13 +31,190 @@ from jaxgran.checks.validation import (
 )
 from jaxgran.scene import elements
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
-from jaxgran.scene.elements import DrivenStart, Rough, StokesDrag, Walls, WhiteNoise, optional
-from jaxgran.scene.friction import Frictional
-from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, side_of_box, sphere_surface
-from jaxgran.scene.law import check_units, restitution_at
-from jaxgran.scene.named_floats import NamedFloats, Place
-from jaxgran.scene.restitution import ReducedLaw, RestitutionLaw, Viscoelastic
-from jaxgran.scene.shear import critical_length
+from jaxgran.scene.elements import (
+    DrivenStart,
+    Frictional,
+    Rough,
+    StokesDrag,
+    Walls,
+    WhiteNoise,
+    optional_element,
+)
+from jaxgran.scene.geometry import (
+    CLOSE_PACKING,
+    contact_value,
+    impact_average,
+    side_of_box,
+    sphere_surface,
+)
+from jaxgran.scene.laws import ReducedLaw, RestitutionLaw, Viscoelastic, check_units, restitution_at
+
+FLOAT_UNITS = {
+    "diameter": "m",
+    "mass": "kg",
+    "temperature": "m^2/s^2",
+    "youngs_modulus": "Pa",
+    "dissipative_constant": "s",
+    "rotational_temperature": "m^2/s^2",
+    "wall_side": "m",
+    "drag_rate": "1/s",
+    "drag_rotational_rate": "1/s",
+    "drive_strength": "m^2/s^3",
+}
+"""Units of the floats of a gas that have one."""
+
+
+def describe_floats(gas: Any) -> Rows:
+    """Every float with its unit, and, of a single gas of known numbers, the scales that follow."""
+    rows = [
+        (name, format_quantity(gas.value(name), FLOAT_UNITS.get(name, ""))) for name in gas.domains
+    ]
+    leaves = jax.tree.leaves(gas)
+    if any(isinstance(leaf, Tracer) or np.ndim(leaf) > 0 for leaf in leaves):
+        return rows
+    rows.append(("mean free time", format_quantity(gas.mean_free_time, "s")))
+    if hasattr(gas.law, "dissipative_constant"):
+        rows.append(("beta", format_quantity(gas.thermal_beta, "at v = sqrt(2 T_0)")))
+        rows.append(("t_c/tau_c", format_quantity(gas.contact_fraction)))
+    return rows
+
+
+def describe_scene(gas: Any) -> str:
+    """The law, the dimension and the elements."""
+    elements = "".join(f", with {name}" for name in gas.elements)
+    return f"Gas of {type(gas.law).__name__} spheres, d = {gas.dimension}{elements}"
+
+
+S = TypeVar("S", bound="NamedFloats")
+
+
+class Place(NamedTuple):
+    """Where a float is: attributes, one within the other; and its allowed range."""
+
+    path: tuple[str, ...]
+    domain: Domain
+
+
+class NamedFloats(eqx.Module):
+    """A module whose floats, those of its parts included, can be read and replaced by name."""
+
+    def __repr__(self) -> str:
+        return text_table(describe_scene(self), describe_floats(self))
+
+    def _repr_html_(self) -> str:
+        return html_table(describe_scene(self), describe_floats(self))
+
+    def __getattr__(self, name: str) -> Any:
+        # Only for names that are no attributes: floats of parts are read as they are replaced.
+        if not name.startswith("_") and "law" in vars(self) and name in self._places:
+            return self.value(name)
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+    @property
+    @abstractmethod
+    def _places(self) -> dict[str, Place]:
+        """Where each float is."""
+
+    @property
+    def domains(self) -> dict[str, Domain]:
+        """Allowed range of every float, by name."""
+        return {name: place.domain for name, place in self._places.items()}
+
+    def value(self, name: str) -> Float[Array, "..."]:
+        """The value of a float, by name.
+
+        Raises:
+            ValueError: for an unknown name.
+        """
+        places = self._places
+        if name not in places:
+            raise ValueError(f"no float {name!r} in this gas; it has {', '.join(places)}")
+        return reduce(getattr, places[name].path, self)
+
+    def replace(self: S, **values: UserNumber) -> S:
+        """A copy with other values of some floats: ``gas.replace(dissipative_constant=1e-6)``.
+
+        Args:
+            values: by name.
+
+        Raises:
+            ValueError: for an unknown name or a value outside its range.
+        """
+        places = self._places
+        for name, value in values.items():
+            self.value(name)
+            places[name].domain.check(name, value)
+
+        def get(module):
+            return [reduce(getattr, places[name].path, module) for name in values]
+
+        return eqx.tree_at(get, self, [number(value) for value in values.values()])
+
+    def _check_single(self, lists: tuple[str, ...]) -> None:
+        """Raise ValueError for a batch; `lists` are the floats that hold more than one number."""
+        if all(jnp.shape(leaf) == () for leaf in jax.tree.leaves(self)):
+            return
+        for name in self._places:
+            shape = jnp.shape(self.value(name))
+            if shape != () and name not in lists:
+                raise ValueError(
+                    f"{name} of the gas has shape {shape}, and one number is allowed: take many "
+                    "gases with jax.vmap(lambda gas: jaxgran.cool(gas, times))(gases), or call "
+                    "this for one gas at a time"
+                )
+
+
+SHEAR_VISCOSITY = {2: (2.0, 1.0, 0.8729), 3: (4.0, 0.8, 0.7614)}
+"""b, a_1, a_2 of Enskog's ``eta g_2 / eta_0 = 1 + a_1 y + a_2 y^2`` with ``y = b phi g_2``.
+
+Reference: Gass 1971 (2D); Chapman & Cowling, Eq. 16.41.7 (3D).
+"""
+
+
+def unit_wavenumber(packing_fraction: Float[Array, ""], dimension: int) -> Float[Array, ""]:
+    """``k_c sigma/sqrt(I)``, I = <1 - eps^2>: see `critical_length`."""
+    g_2, phi = contact_value(packing_fraction, dimension), packing_fraction
+    b, first, second = SHEAR_VISCOSITY[dimension]
+    y = b * phi * g_2
+    dense = g_2**2 / (1 + first * y + second * y**2)
+    density = phi * dimension * 2**dimension / sphere_surface(dimension)
+    return density * jnp.sqrt((32 * pi / 15 if dimension == 3 else pi) * dense)
+
+
+def mean_loss(law: ReducedLaw, like: Float[Array, ""]) -> Float[Array, ""]:
+    """``I = <1 - eps^2>``, weighted by the energy of the normal motion, at the reference speed.
+
+    Args:
+        law: of restitution.
+        like: a number of the precision that is wanted.
+    """
+
+    def lost(g: Array) -> Array:
+        loss = law.loss(g)
+        return g**2 / 2 * loss * (2 - loss)
+
+    return impact_average(lost, like)
+
+
+def critical_length(
+    law: ReducedLaw, packing_fraction: Float[Array, ""], dimension: int
+) -> Float[Array, ""]:
+    """L_c = 2 pi/k_c in diameters, at the reference speed sqrt(2 T) of the law.
+
+    The energy of a wave of shear flow decays at the rate ``2 eta k^2/rho``, heat at the cooling
+    rate: equal at k_c. ``k_c sigma = n sigma^3 sqrt((32 pi/15) I f)`` (3D) or
+    ``n sigma^2 sqrt(pi I f)`` (2D) with ``I = <1 - eps^2>``, weighted by the energy of the normal
+    motion, and ``f = g_2^2/(1 + a_1 y + a_2 y^2)`` of a dense gas, by Enskog's viscosity of elastic
+    spheres in the first Sonine approximation.
+
+    Returns:
+        L_c/sigma; infinite for elastic spheres.
+    """
+    loss = mean_loss(law, packing_fraction)
+    inelastic = loss > 0
+    root = unit_wavenumber(packing_fraction, dimension) * jnp.sqrt(jnp.where(inelastic, loss, 1.0))
+    return jnp.where(inelastic, 2 * pi / root, jnp.inf)
+
 
 if TYPE_CHECKING:
     UserLaw = RestitutionLaw
@@ -77,11 +267,11 @@ class Gas(NamedFloats):
     packing_fraction: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     temperature: Float[Array, ""] = eqx.field(converter=number, kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
-    surface: Rough | Frictional | None = optional(Rough, Frictional)
-    container: Walls | None = optional(Walls)
-    drag: StokesDrag | None = optional(StokesDrag)
-    drive: WhiteNoise | None = optional(WhiteNoise)
-    preparation: DrivenStart | None = optional(DrivenStart)
+    surface: Rough | Frictional | None = optional_element(Rough, Frictional)
+    container: Walls | None = optional_element(Walls)
+    drag: StokesDrag | None = optional_element(StokesDrag)
+    drive: WhiteNoise | None = optional_element(WhiteNoise)
+    preparation: DrivenStart | None = optional_element(DrivenStart)
 
     _domains: ClassVar[dict[str, Domain]] = {
         "diameter": POSITIVE,
@@ -110,7 +300,7 @@ class Gas(NamedFloats):
                 value = getattr(self, name)
                 domain.check(name, value, self._advice[name])
                 check_normal(name, value)
-        elements.check(self)
+        elements.check_elements(self)
 
     @property
     def _places(self) -> dict[str, Place]:
@@ -282,7 +472,7 @@ class Gas(NamedFloats):
         dimensions, T departs by 5 % after 20 (phi = .245, eps = .9) and 5 (.05, .6) collisions
         per particle, and density fluctuations reach twice those of an elastic fluid after 55 and 7
         (``experiments/paper/paper_clustering.py``); in shorter boxes later or never. See
-        `jaxgran.scene.shear.critical_length`. Infinite for elastic spheres.
+        `jaxgran.scene.gas.critical_length`. Infinite for elastic spheres.
         """
         reduced = critical_length(self.reduced_law, self.packing_fraction, self.dimension)
         return self.diameter * reduced

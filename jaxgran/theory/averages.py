@@ -3,20 +3,378 @@
 Units: `Gas.impact_speed`, sqrt(2 T_0), and `Gas.path_length`, 1 / (n g_2 sigma^(d-1)); the unit of
 time ("reduced time") is their ratio. In these units the averages depend on the reduced law, the
 dimension and T/T_0 only.
+
+How one impact changes the velocity moments of a gas, averaged over all but its normal speed.
+
+Two spheres meet with the normal speed g. What else their velocities are, the velocity of their
+centre along the normal and across it and their relative velocity across it, is distributed as in a
+Maxwellian gas times ``(1 + a_2 S_2 + a_3 S_3 + a_4 S_4)`` for each sphere. The averages over it are
+integrals of polynomials with Gaussian weights, here done by Gauss quadrature, which is exact for
+them. Velocities c are in units of sqrt(2 T), S_k are the Laguerre polynomials L_k^(d/2 - 1)(c^2).
+
+References: Brilliantov & Poeschel, Europhys. Lett. 74, 424 (2006), and Santos & Montanero, Granular
+Matter 11, 157 (2009), for mu_2, mu_4, mu_6 with a_3 at constant eps; Garzo & Montanero, Phys. Rev.
+E 69, 021301 (2004), for the second Sonine approximation of D.
+
+A table of the averages over impacts for the temperatures that a gas reaches.
+
+Units as in `jaxgran.theory.averages`.
 """
 
+from collections.abc import Callable
 from functools import cache
 from math import pi, sqrt
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # whose scipy.special is imported when it is first used
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.scene.geometry import sphere_surface
-from jaxgran.scene.impact_average import NODES, WEIGHTS
-from jaxgran.scene.restitution import ReducedLaw
-from jaxgran.theory import collision_integrals
+from jaxgran.scene.geometry import NODES, WEIGHTS, sphere_surface
+from jaxgran.scene.laws import ReducedLaw
+
+SAMPLES = 7
+"""Values of eps from which the polynomials in 1 - eps, of sixth degree, are found."""
+
+# Nodes that integrate polynomials of degree 18 in the velocities exactly.
+_ALONG, _ACROSS, _ANGLES = 10, 5, 6
+
+CLOSURE = {2: (0.1127, 0.2725, 4.1658, -2.8628), 3: (0.0667, 0.2452, 4.8105, -1.4002)}
+"""p, q, r, s of ``a_4 = p a_2 + q a_3 + r a_2^2 + s a_2 a_3`` by dimension.
+
+The Sonine series of an inelastic gas is asymptotic, since its velocity distribution falls off
+exponentially: cut off behind a_3 it gives an a_2 that is 6 % (3D) and 11 % (2D) too small at
+eps = .5 and 28 % and 40 % at 0, and cut off behind a_4 one that is too large. The term in a_2^2 is
+that of a gas whose temperature varies in space or time. The numbers were chosen so that a_2 and a_3
+of the homogeneous cooling state agree with direct simulation by a code of its own (constant eps
+from 0 to .95); ``experiments/accuracy/sonine_coefficients.py`` tells how well they do for other
+gases.
+"""
+
+
+class Terms(NamedTuple):
+    """Powers of a_2 and a_3 of the columns of a matrix of averages."""
+
+    sonine: tuple[int, ...]
+    third_sonine: tuple[int, ...]
+
+
+TERMS = {
+    2: Terms((0, 1, 2), (0, 0, 0)),
+    3: Terms((0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)),
+}
+"""1, a_2, a_2^2 of a gas followed to a_2; and 1, a_2, a_3, a_2^2, a_2 a_3, a_3^2."""
+
+
+class _Impacts(NamedTuple):
+    """Velocities before impacts of one normal speed, and the weights of the average over them.
+
+    Attributes:
+        centre: velocity of the centre along the normal.
+        centre_across: square of the part of it across.
+        relative_across: square of the relative velocity across.
+        product: scalar product of the two last vectors.
+        weights: with the sum 1.
+    """
+
+    centre: Float[np.ndarray, "nodes"]
+    centre_across: Float[np.ndarray, "nodes"]
+    relative_across: Float[np.ndarray, "nodes"]
+    product: Float[np.ndarray, "nodes"]
+    weights: Float[np.ndarray, "nodes"]
+
+
+@cache
+def _impacts(dimension: int) -> _Impacts:
+    along, weight = np.polynomial.hermite_e.hermegauss(_ALONG)
+    square, weight_of_square = scipy.special.roots_genlaguerre(_ACROSS, (dimension - 3) / 2)
+    if dimension == 2:
+        cosine = np.array([-1.0, 1.0])
+    else:
+        cosine = np.cos((np.arange(_ANGLES) + 0.5) * pi / _ANGLES)
+    n, u, w, c = np.meshgrid(along / 2, square / 2, 2 * square, cosine, indexing="ij")
+    weights = np.einsum("a,b,c->abc", weight, weight_of_square, weight_of_square)
+    weights = np.repeat(weights[..., None], cosine.size, axis=-1)
+    values = (n, u, w, np.sqrt(u * w) * c, weights / weights.sum())
+    return _Impacts(*(x.ravel() for x in values))
+
+
+def _squares(at: _Impacts, g: float) -> tuple[np.ndarray, np.ndarray]:
+    """Squares of the two velocities, whose relative normal velocity is g."""
+    mean = at.centre**2 + at.centre_across + at.relative_across / 4 + g**2 / 4
+    half = at.centre * g + at.product
+    return mean + half, mean - half
+
+
+def _distribution(square: np.ndarray, dimension: int, highest: int) -> np.ndarray:
+    """1, S_2, ... up to S_highest at the squares of velocities."""
+    orders = [0, *range(2, highest + 1)]
+    return np.stack([scipy.special.eval_genlaguerre(k, dimension / 2 - 1, square) for k in orders])
+
+
+def _of_terms(bilinear: np.ndarray, dimension: int, order: int) -> np.ndarray:
+    """Coefficients of `TERMS` out of those of the products a_i a_j, with a_4 by its closure."""
+    pairs = bilinear + np.swapaxes(bilinear, -1, -2)
+    one, square = pairs[..., 0, :], bilinear[..., 1, 1]
+    if order == 2:
+        return np.stack([bilinear[..., 0, 0], one[..., 1], square], axis=-1)
+    fourth = one[..., 3, None] * np.asarray(CLOSURE[dimension])
+    terms = [
+        bilinear[..., 0, 0],
+        one[..., 1] + fourth[..., 0],
+        one[..., 2] + fourth[..., 1],
+        square + fourth[..., 2],
+        pairs[..., 1, 2] + fourth[..., 3],
+        bilinear[..., 2, 2],
+    ]
+    return np.stack(terms, axis=-1)
+
+
+@cache
+def collision_changes(
+    dimension: int, order: int, speeds: tuple[float, ...]
+) -> Float[np.ndarray, "..."]:
+    """Mean changes of velocity moments by impacts, as polynomials in 1 - eps and the Sonine terms.
+
+    Args:
+        dimension: d.
+        order: of the Sonine expansion, 2 (a_2) or 3 (a_2 and a_3).
+        speeds: normal speeds g in units of sqrt(2 T).
+
+    Returns:
+        Shape (rows, terms, 7 powers of 1 - eps, speeds). The first `order` rows are losses, minus
+        the change of ``c_1^(2p) + c_2^(2p)`` for p = 1 to order. The others are the relaxation of
+        the velocity of a labelled sphere, minus the change of ``(4/d) c.c' S_j(c'^2)`` with the
+        weight ``S_k(c^2)``, S_j = L_j^(d/2), for (j, k) from (0, 0) to (order - 2, order - 2), row
+        by row. Columns as in `TERMS`.
+    """
+    at, epsilons = _impacts(dimension), 1 - np.linspace(0, 2, SAMPLES)
+    highest = 2 if order == 2 else 4
+    sampled = np.stack(
+        [
+            np.stack([_changes(at, g, e, dimension, order, highest) for e in epsilons], axis=-1)
+            for g in speeds
+        ],
+        axis=-1,
+    )
+    inverse = np.linalg.inv(np.vander(1 - epsilons, increasing=True))
+    powers = np.einsum("ps,rtsn->rtpn", inverse, _of_terms_first(sampled, dimension, order))
+    powers[0, :, 0] = 0.0  # elastic impacts keep the energy, and a Maxwellian gas as it is
+    powers[:order, 0, 0] = 0.0
+    return powers
+
+
+def _of_terms_first(sampled: np.ndarray, dimension: int, order: int) -> np.ndarray:
+    bilinear = np.moveaxis(sampled, (1, 2), (-2, -1))
+    return np.moveaxis(_of_terms(bilinear, dimension, order), -1, 1)
+
+
+def _changes(
+    at: _Impacts, g: float, eps: float, dimension: int, order: int, highest: int
+) -> Float[np.ndarray, "rows i j"]:
+    """The rows of `changes` at one g and eps, by the pairs of Sonine polynomials of the spheres."""
+    one, other = _squares(at, g)
+    after, other_after = _squares(at, -eps * g)
+    first = _distribution(one, dimension, highest) * at.weights
+    second = _distribution(other, dimension, highest)
+    losses = [one**p + other**p - after**p - other_after**p for p in range(1, order + 1)]
+    # The scalar product of a velocity before and after.
+    kept = one - (1 + eps) / 2 * g * (at.centre + g / 2)
+    of_label = [
+        lambda x, j=j: scipy.special.eval_genlaguerre(j, dimension / 2, x) for j in range(order - 1)
+    ]
+    relaxation = [
+        4 / dimension * (one * s_j(one) - kept * s_j(after)) * s_k(one)
+        for s_j in of_label
+        for s_k in of_label
+    ]
+    rows = np.stack(losses + relaxation)
+    return np.einsum("rn,in,jn->rij", rows, first, second, optimize=True)
+
+
+_SCAN_POINTS = 16
+"""Temperatures at which the cooling rate is computed to find the ends of a `RateTable`."""
+
+
+@cache
+def _chebyshev(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Chebyshev nodes in [-1, 1], and the matrix from values at them to coefficients."""
+    angles = (np.arange(num_nodes) + 0.5) * pi / num_nodes
+    matrix = 2 / num_nodes * np.cos(np.outer(np.arange(num_nodes), angles))
+    matrix[0] /= 2
+    return np.cos(angles), matrix
+
+
+@cache
+def _derivative(num_nodes: int) -> np.ndarray:
+    """Matrix from the coefficients of a Chebyshev series to those of its derivative."""
+    return np.pad(np.polynomial.chebyshev.chebder(np.eye(num_nodes)), ((0, 1), (0, 0)))
+
+
+class Bounds(NamedTuple):
+    """Bounds of what the elements of a scene do to T, from which a `RateTable` takes its range.
+
+    Attributes:
+        by_speed: an upper bound of a part of ``-d ln T/dt`` over sqrt(T/T_0).
+        constant: of a part that does not depend on T.
+        heating: d(T/T_0)/dt by a drive; None where nothing heats.
+        rotation: T/T_0 that a gas could gain from the spins; None of smooth spheres.
+    """
+
+    by_speed: ArrayLike = 0.0
+    constant: ArrayLike = 0.0
+    heating: ArrayLike | None = None
+    rotation: ArrayLike | None = None
+
+
+NO_ELEMENTS = Bounds()
+"""Of smooth spheres without walls, drag and drive."""
+
+
+class RateTable(eqx.Module):
+    """The function `averages` of one gas as a Chebyshev series in ln T.
+
+    The averages are smooth in ln T, so that a few quadratures in advance replace one in every
+    stage of the ODE solver.
+
+    Attributes:
+        coefficients: of the Chebyshev polynomials, shape (nodes, rows, terms), or (nodes, ...,
+            rows, terms) for several such functions over the same range.
+        lowest: lower end of the series in ln(T/T_0). The series must not be evaluated outside.
+        highest: the upper end of a gas that is heated; None is 0.
+    """
+
+    coefficients: Float[Array, "nodes ... rows terms"]
+    lowest: Float[Array, ""]
+    highest: Float[Array, ""] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
+        duration: Float[Array, ""],
+        dimension: int,
+        num_nodes: int,
+        bounds: Bounds = NO_ELEMENTS,
+    ) -> "RateTable":
+        """The series for all temperatures that a gas reaches in a given time.
+
+        Args:
+            averages: the function to be tabulated, of sqrt(T/T_0).
+            duration: reduced time.
+            dimension: d.
+            num_nodes: number of terms; see `ReducedLaw.num_nodes`.
+            bounds: of what the elements of the scene do to T.
+        """
+        lowest = _lowest_log_temperature(averages, duration, dimension, bounds)
+        nodes, to_coefficients = (jnp.asarray(x, lowest.dtype) for x in _chebyshev(num_nodes))
+        if bounds.heating is None:
+            highest, speeds = None, jnp.exp(lowest * (1 - nodes) / 4)
+        else:
+            highest = _highest_log_temperature(
+                averages, duration, dimension, bounds.heating, bounds.rotation
+            )
+            speeds = jnp.exp(highest / 2 + (lowest - highest) * (1 - nodes) / 4)
+        values = jax.vmap(averages)(speeds)
+        return cls(jnp.tensordot(to_coefficients, values, 1), lowest, highest)
+
+    def __call__(self, log_theta: Float[Array, ""]) -> Float[Array, "... rows terms"]:
+        """The averages at ln(T/T_0), as the function `averages` returns them.
+
+        Args:
+            log_theta: ln(T/T_0), from `lowest` to `highest`.
+        """
+        if self.highest is None:
+            x = 2 * (1 - log_theta / self.lowest) - 1
+        else:
+            x = 2 * (log_theta - self.lowest) / (self.highest - self.lowest) - 1
+        if self.coefficients.ndim > 3:  # of many functions a product with a matrix is faster
+            polynomials = [jnp.ones_like(x), x]
+            for _ in range(2, len(self.coefficients)):
+                polynomials.append(2 * x * polynomials[-1] - polynomials[-2])
+            return jnp.tensordot(jnp.stack(polynomials), self.coefficients, 1)
+        # Clenshaw's recurrence, from the highest term down.
+        last = before = jnp.zeros_like(self.coefficients[0])
+        for row in self.coefficients[:0:-1]:
+            last, before = row + 2 * x * last - before, last
+        return self.coefficients[0] + x * last - before
+
+    def with_slopes(self, along: Float[Array, "directions nodes rows terms"]) -> "RateTable":
+        """This function of one gas, its slope and its derivatives as one function of ln(T/T_0).
+
+        Args:
+            along: coefficients of the derivatives of the function in some directions.
+
+        Returns:
+            A table of shape (2 + directions, rows, terms) at each temperature: the function, its
+            derivative in ln(T/T_0), and those given.
+        """
+        derivative = jnp.asarray(_derivative(len(self.coefficients)), self.lowest.dtype)
+        width = -self.lowest if self.highest is None else self.highest - self.lowest
+        slope = jnp.tensordot(derivative, self.coefficients, 1) * 2 / width
+        both = jnp.stack([self.coefficients, slope], axis=1)
+        further = jnp.moveaxis(along, 0, 1)
+        return RateTable(jnp.concatenate([both, further], 1), self.lowest, self.highest)
+
+
+def _lowest_log_temperature(
+    averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
+    duration: Float[Array, ""],
+    dimension: int,
+    bounds: Bounds,
+) -> Float[Array, ""]:
+    """A lower bound of ln(T/T_0) after a reduced time, negative and not far below the true value.
+
+    The first bound is Haff's law for e = 0 with 10 % added to the rate. A law with small losses at
+    low speed cools much less; a series over the whole range would lose digits. Therefore the time
+    to cool is bounded from below by integrating the law's own rate, with 10 % added, over
+    `_SCAN_POINTS` temperatures, and the range is cut off one point below what is reached.
+    """
+    duration, bounds = jax.lax.stop_gradient((duration, bounds))
+    by_speed, constant = bounds.by_speed, bounds.constant
+    collisions = sphere_surface(dimension) / sqrt(2 * pi)
+    haff = 1.1 * collisions / (2 * dimension) + by_speed / 2
+    bound = -2 * jnp.log1p(haff * duration) - constant * duration
+    scan = bound * jnp.linspace(0, 1, _SCAN_POINTS, dtype=bound.dtype)
+    speeds = jnp.exp(scan / 2)
+    loss = jax.lax.stop_gradient(jax.vmap(averages)(speeds)[:, 0, 0])
+    rate = 2.2 / dimension * loss * speeds + by_speed * speeds + constant
+    if bounds.heating is not None:
+        rate = rate - bounds.heating / speeds**2
+    rate = jnp.maximum(rate, jnp.finfo(bound.dtype).tiny)
+    earliest = jnp.cumsum(-jnp.diff(scan) / jnp.maximum(rate[1:], rate[:-1]))
+    reached = jnp.min(jnp.where(earliest < duration, scan[1:], 0.0))
+    lowest = reached + scan[1]
+    return jnp.minimum(jnp.maximum(lowest, bound), -1e-3)
+
+
+def _highest_log_temperature(
+    averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
+    duration: Float[Array, ""],
+    dimension: int,
+    heating: ArrayLike,
+    rotation: ArrayLike | None,
+) -> Float[Array, ""]:
+    """An upper bound of ln(T/T_0) of a driven gas within a reduced time, positive.
+
+    The first bound has no losses, ``T_0 + xi_0^2 t`` and all the heat of rotation. Smooth spheres
+    are not heated beyond the temperature at which their impacts, with half of the losses to spare
+    for a_2 and soft contacts, take what the drive gives; the range is cut off one of `_SCAN_POINTS`
+    temperatures above it.
+    """
+    duration, heating, rotation = jax.lax.stop_gradient((duration, heating, rotation))
+    bound = jnp.log1p(heating * duration + (0.0 if rotation is None else rotation))
+    if rotation is None:
+        scan = bound * jnp.linspace(0, 1, _SCAN_POINTS, dtype=bound.dtype)
+        speeds = jnp.exp(scan / 2)
+        loss = jax.lax.stop_gradient(jax.vmap(averages)(speeds)[:, 0, 0])
+        balanced = loss / dimension * speeds >= heating / speeds**2
+        stop = jnp.min(jnp.where(balanced, scan, bound))
+        bound = jnp.minimum(bound, stop + scan[1])
+    return jnp.maximum(bound, 1e-3)
 
 
 class Rates(NamedTuple):
@@ -63,11 +421,11 @@ def collision_rate(
 @cache
 def averaging_matrix(dimension: int, order: int) -> np.ndarray:
     """Matrix from the powers 0 to 6 of 1 - eps at the nodes to `averages`."""
-    changes = collision_integrals.changes(dimension, order, tuple(NODES))
+    changes = collision_changes(dimension, order, tuple(NODES))
     return sphere_surface(dimension) / sqrt(8 * pi) * changes * WEIGHTS
 
 
-def averages(
+def impact_moments(
     law: ReducedLaw, speed: Float[Array, ""], dimension: int, order: int = 2
 ) -> Float[Array, "rows terms"]:
     """Averages over the impacts of a Maxwell-Sonine gas, exact in eps(v).
@@ -86,10 +444,10 @@ def averages(
     Returns:
         Coefficients of polynomials in a_2 (and a_3), whose columns `collision_integrals.TERMS`
         lists. Order 2: mu_2, mu_4 and nu_v, shape (3, 3), see `Rates`. Order 3: mu_2, mu_4, mu_6
-        and nu_00, nu_01, nu_10, nu_11, shape (7, 6), see `jaxgran.theory.moments`.
+        and nu_00, nu_01, nu_10, nu_11, shape (7, 6), see `jaxgran.theory.equations`.
 
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution; see
-    `jaxgran.theory.collision_integrals`.
+    `jaxgran.theory.averages`.
     """
     loss = law.loss(jnp.asarray(NODES, speed.dtype) * speed)
     powers = jnp.stack([loss**0 * 1.0, loss, *(loss**k for k in range(2, 7))])

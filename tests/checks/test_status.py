@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.checks import status
-from jaxgran.checks.status import FAULTS, LIST_FULL, NOT_FINITE, OK, STALLED, explain, flag, has
+from jaxgran._utils import status
+from jaxgran._utils.status import FAULTS, LIST_FULL, NOT_FINITE, OK, STALLED, explain, flag, has
 
 
 def test_every_fault_has_a_bit_of_its_own():

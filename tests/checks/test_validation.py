@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxgran.checks.validation import ANY, FRACTION, POSITIVE, Domain, checked_times, number
+from jaxgran._utils.validation import ANY, FRACTION, POSITIVE, Domain, checked_times, number
 
 
 def test_numbers_are_strongly_typed():

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from jaxgran.data import checkpoint, files
-from jaxgran.data.checkpoint import load, save
-from jaxgran.data.description import described, differences
-from jaxgran.data.files import write_whole
+from jaxgran.data.checkpoint import describe_run, differences, load, save
+from jaxgran.data.files import write_atomically
 
 ABC = {"name": "abc"}
 
@@ -218,7 +217,7 @@ def test_a_full_disk_keeps_the_old_file(path, monkeypatch, stage):
     if stage != "write":
         monkeypatch.setattr(files.os, stage, full)
     with pytest.raises(OSError, match="No space left") as error:
-        write_whole(path, write)
+        write_atomically(path, write)
     assert error.value.errno == errno.ENOSPC and str(path) in str(error.value)
     assert path.read_bytes() == before
     assert [file.name for file in path.parent.iterdir()] == ["run.eqx"]
@@ -234,14 +233,14 @@ def test_any_end_of_writing_keeps_the_old_file(path, what):
         raise what
 
     with pytest.raises(what):
-        write_whole(path, write)
+        write_atomically(path, write)
     assert path.read_bytes() == before
     same_bits(load(path, ABC, state()), state())
 
 
 def test_what_is_written_is_whole(path):
-    write_whole(path, lambda file: file.write(b"first"))
-    write_whole(str(path), lambda file: file.write(b"second"))
+    write_atomically(path, lambda file: file.write(b"first"))
+    write_atomically(str(path), lambda file: file.write(b"second"))
     assert path.read_bytes() == b"second"
     assert [file.name for file in path.parent.iterdir()] == ["run.eqx"]
 
@@ -287,7 +286,7 @@ def test_descriptions_tell_everything_apart():
         {"key": key(0)},
         jax.random.split(key(0), 2),
     ]
-    words = [described(run=tree) for tree in trees]
+    words = [describe_run(run=tree) for tree in trees]
     for i, first in enumerate(words):
         for j, second in enumerate(words):
             assert (first == second) == (i == j), (first, second)
@@ -308,14 +307,14 @@ def test_descriptions_are_of_values_not_of_objects():
     first, second = (
         (Model(jnp.arange(3.0)), jax.random.key(5), {"x": 1.5, "y": "text"}) for _ in range(2)
     )
-    assert described(a=first) == described(a=second)
-    assert described(a=jnp.arange(3.0)) == described(a=np.arange(3.0))
-    assert described(a=np.arange(6.0)[::2]) == described(a=np.array([0.0, 2.0, 4.0]))
+    assert describe_run(a=first) == describe_run(a=second)
+    assert describe_run(a=jnp.arange(3.0)) == describe_run(a=np.arange(3.0))
+    assert describe_run(a=np.arange(6.0)[::2]) == describe_run(a=np.array([0.0, 2.0, 4.0]))
     one, two = (law(3)(np.square) for _ in range(2))
-    assert described(law=one) == described(law=two)
-    assert differences(described(law=one), described(law=law(3)(np.sqrt)))
-    assert not any("0x" in words for words in described(law=one, f=lambda x: x).values())
-    assert described(a=object()) == described(a=object())
+    assert describe_run(law=one) == describe_run(law=two)
+    assert differences(describe_run(law=one), describe_run(law=law(3)(np.sqrt)))
+    assert not any("0x" in words for words in describe_run(law=one, f=lambda x: x).values())
+    assert describe_run(a=object()) == describe_run(a=object())
 
 
 def observable(number, factor=1.0):
@@ -333,12 +332,14 @@ def recursive():
 
 
 def test_descriptions_of_functions_hold_what_they_keep():
-    assert described(save=observable(3)) == described(save=observable(3))
-    (words,) = differences(described(save=observable(3)), described(save=observable(4)))
+    assert describe_run(save=observable(3)) == describe_run(save=observable(3))
+    (words,) = differences(describe_run(save=observable(3)), describe_run(save=observable(4)))
     assert words == "save.number was 3 and is 4"
-    assert differences(described(save=observable(3)), described(save=observable(3, 2.0)))
-    assert "save.default 0" in described(save=observable(3))
+    assert differences(describe_run(save=observable(3)), describe_run(save=observable(3, 2.0)))
+    assert "save.default 0" in describe_run(save=observable(3))
     # What jax.jit has wrapped is the function.
-    assert described(save=jax.jit(observable(3))) == described(save=observable(3))
-    assert differences(described(save=jax.jit(observable(3))), described(save=jax.jit(recursive())))
-    assert described(save=recursive()) == described(save=recursive())
+    assert describe_run(save=jax.jit(observable(3))) == describe_run(save=observable(3))
+    assert differences(
+        describe_run(save=jax.jit(observable(3))), describe_run(save=jax.jit(recursive()))
+    )
+    assert describe_run(save=recursive()) == describe_run(save=recursive())

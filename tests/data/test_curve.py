@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
-from jaxgran.data.header import header_count
+from jaxgran.data.files import header_count
 from tests.beads import glass_beads
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"

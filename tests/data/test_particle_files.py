@@ -8,8 +8,7 @@ import pytest
 
 import jaxgran
 from experiments.support.lammps_library import new_lammps
-from jaxgran.data.trajectory import Sphere, Trajectory
-from jaxgran.particles import driver
+from jaxgran.data.particles import Sphere, Trajectory
 
 gsd_hoomd = pytest.importorskip("gsd.hoomd")
 
@@ -126,7 +125,7 @@ def test_a_run_writes_its_trajectory(beads, tmp_path, monkeypatch):
     jaxgran.cool(gas, t, **options, **run)
     assert (tmp_path / "run.0.xyz").read_text().splitlines() == lines
     with pytest.raises(ValueError, match=r"run.0.xyz exists"):  # before it melts
-        monkeypatch.setattr(driver, "_melt", None)
+        monkeypatch.setattr(run, "_equilibrate", None)
         jaxgran.cool(gas, t, **options, trajectory=path)
 
 

@@ -11,8 +11,7 @@ import pytest
 import experiments.fit_cooling_curve as fit_cooling_curve
 import jaxgran
 from experiments.support.record import figures
-from jaxgran.cli.models import MODELS, model_of
-from jaxgran.cli.output import finite_or_null
+from jaxgran.cli.common import MODELS, choose_or_make_model, finite_or_null
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 DENSE = EXPERIMENTS / "data" / "lammps_cooling_dense.csv"
@@ -81,7 +80,7 @@ def test_auto_judges_the_box_that_was_measured():
         options = argparse.Namespace(
             model="auto", tolerance=0.02, particles=particles, replicas=3, key=0
         )
-        model, reasons = model_of(options, gas, curve, free, size)
+        model, reasons = choose_or_make_model(options, gas, curve, free, size)
         assert isinstance(model, jaxgran.SoftSpheres)
         assert model.num_particles == (particles or size)
         assert f"in a box of {ratio:.2g} L_c" in " ".join(reasons)
@@ -99,11 +98,11 @@ def test_auto_judges_the_box_that_was_measured():
 def test_models_are_found_by_their_names(name, model):
     assert name in MODELS
     options = argparse.Namespace(model=name, particles=100, replicas=3, curve="curve.csv")
-    assert model_of(options, None, None, (), None) == (model, ())
+    assert choose_or_make_model(options, None, None, (), None) == (model, ())
     options.particles = None
     if model.stochastic:
         with pytest.raises(ValueError, match="curve.csv does not say N: give --particles"):
-            model_of(options, None, None, (), None)
+            choose_or_make_model(options, None, None, (), None)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from experiments.support.claims.table import Table
-from jaxgran.scene.restitution_table import C1, C2
+from jaxgran.scene.laws import C1, C2
 from tests.experiments.test_experiments import run
 
 

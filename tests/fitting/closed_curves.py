@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from jaxgran.theory.table_of_times import relaxed_cooling_rate
+from jaxgran.fitting.alternatives import relaxed_cooling_rate
 
 TRUE_A = 3e-6
 STEPS = 4000

@@ -9,8 +9,8 @@ import pytest
 
 import jaxgran
 from experiments.support.scenes import beads as beads_of
-from jaxgran.fitting.budget import bias_of_slope, in_scene, slope_in_words
-from jaxgran.models.selection import course_of
+from jaxgran.fitting.error_budget import bias_of_slope, describe_slope_bias, with_scene_errors
+from jaxgran.models.choose import error_model_of
 from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
 
@@ -196,13 +196,15 @@ def test_derivatives_through_a_flow_are_known_worse():
     gas = beads_of(0.3, 0.2, 0.05)
     end = 3000 * float(gas.mean_free_time)
     for model in (jaxgran.SoftSpheres(1000), jaxgran.HardSpheres(1000)):
-        course = course_of(gas, end, 1000)
-        bias = np.interp(list(measured), course.collisions, model.derivative_error(course))
+        error_model = error_model_of(gas, end, 1000)
+        bias = np.interp(
+            list(measured), error_model.collisions, model.derivative_error(error_model)
+        )
         assert np.all(np.abs(np.log(bias / np.array(list(measured.values())))) < np.log(2))
-    small = course_of(gas, end, 100)
+    small = error_model_of(gas, end, 100)
     assert float(gas.box_side(100)) < float(gas.critical_box)
     assert not np.any(jaxgran.SoftSpheres(100).derivative_error(small))
-    assert jaxgran.DSMC(1000).derivative_error(course_of(gas, end, 1000)) == 0
+    assert jaxgran.DSMC(1000).derivative_error(error_model_of(gas, end, 1000)) == 0
 
 
 @pytest.mark.slow
@@ -221,28 +223,28 @@ def test_a_diagnosis_tells_the_bias_of_the_derivatives():
         model=jaxgran.HardSpheres(500, replicas=2),
         curve=ran,
         covariances=covariances,
-        beyond=jnp.zeros(1),
+        extrapolation=jnp.zeros(1),
     )
     weights = result.sensitivity[:, 0] ** 2
     expected = float(jnp.sum(weights * bias) / jnp.sum(weights))
     assert 0.1 < expected < 0.3
     assert bias_of_slope(fitted) == pytest.approx(expected, rel=1e-12)
-    whole = in_scene(fitted, 500, 1)
+    whole = with_scene_errors(fitted, 500, 1)
     assert relative(whole, "slope") == pytest.approx(
         relative(fitted, "measurement") * np.sqrt((1 + expected) ** 2 - 1), rel=1e-9
     )
-    (words,) = slope_in_words(fitted)
+    (words,) = describe_slope_bias(fitted)
     assert f"{100 * expected:.2g} %" in words and "25 % of the energy" in words
     assert "HardSpheres(..., differences=0.3)" in words
     assert words in jaxgran.diagnose(fitted, curve).reasons
     unbiased = dataclasses.replace(fitted, curve=dataclasses.replace(ran, derivative_bias=0 * bias))
-    assert not list(slope_in_words(unbiased)) and not list(slope_in_words(result))
+    assert not list(describe_slope_bias(unbiased)) and not list(describe_slope_bias(result))
     # Without the energy of a flow, by the course of the gas: of differences their noise.
     unknown = dataclasses.replace(ran, derivative_bias=None)
     noisy = dataclasses.replace(
         fitted, curve=unknown, model=jaxgran.HardSpheres(50, replicas=2, differences=0.1)
     )
-    (words,) = slope_in_words(noisy)
+    (words,) = describe_slope_bias(noisy)
     assert "differences of runs, have a noise of" in words
 
 

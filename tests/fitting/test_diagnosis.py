@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.models.base import Omission
-from jaxgran.models.selection import default_models
+from jaxgran.models.base import Limitation
+from jaxgran.models.choose import default_models
 from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
 
@@ -44,13 +44,13 @@ def test_dense_measured_curve_is_not_explained():
 def test_a_good_scene_omits_nothing():
     gas = glass_beads(0.09)
     for model in default_models(4000):
-        assert model.omissions(gas, 4000) == ()
+        assert model.limitations(gas, 4000) == ()
 
 
 def test_every_model_says_what_it_omits():
     gas, _, a, n, _ = measured("dense")
     gas = gas.replace(dissipative_constant=a)
-    theory, dsmc, hard, soft = (model.omissions(gas, n) for model in default_models(n))
+    theory, dsmc, hard, soft = (model.limitations(gas, n) for model in default_models(n))
     assert [omission.decisive for omission in theory] == [True, True, False]
     assert "softness correction" in theory[1].words and "above L_c" in theory[2].words
     assert dsmc[2] == theory[2] and "instantaneous impacts leave out" in dsmc[1].words
@@ -60,14 +60,14 @@ def test_every_model_says_what_it_omits():
 class Stub(jaxgran.KineticTheory):
     """Kinetic theory that says to omit what it is told."""
 
-    told: tuple[Omission, ...] = ()
+    told: tuple[Limitation, ...] = ()
 
-    def omissions(self, gas, num_particles=None):
+    def limitations(self, gas, num_particles=None):
         return self.told
 
 
-EDGE = Omission("the gas is dense", False, "Take positions.")
-DECISIVE = Omission("contacts last", True, "Take contacts.")
+EDGE = Limitation("the gas is dense", False, "Take positions.")
+DECISIVE = Limitation("contacts last", True, "Take contacts.")
 GOOD, BAD = 0.5, 0.001
 NOT_EXPLAINED = "Stub does not explain this curve: do not trust its estimates."
 
@@ -99,12 +99,12 @@ NOT_EXPLAINED = "Stub does not explain this curve: do not trust its estimates."
         ((DECISIVE, EDGE), BAD, False, f"{NOT_EXPLAINED} Take contacts."),
     ],
 )
-def test_verdicts(result, omissions, p_value, explains, verdict):
+def test_verdicts(result, limitations, p_value, explains, verdict):
     fitted, curve = result
-    fitted = dataclasses.replace(fitted, model=Stub(told=omissions), p_value=jnp.asarray(p_value))
+    fitted = dataclasses.replace(fitted, model=Stub(told=limitations), p_value=jnp.asarray(p_value))
     diagnosis = jaxgran.diagnose(fitted, curve)
     assert diagnosis.explains == explains and re.fullmatch(verdict, diagnosis.verdict)
-    assert {omission.words for omission in omissions} <= set(diagnosis.reasons)
+    assert {omission.words for omission in limitations} <= set(diagnosis.reasons)
 
 
 @pytest.fixture(scope="module")

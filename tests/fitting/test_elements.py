@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.comparison import clock_of_few
+from jaxgran.fitting.residuals import clock_of_few
 from tests.beads import glass_beads
 
 THEORY = jaxgran.KineticTheory()
@@ -80,14 +80,14 @@ def test_of_two_minima_in_beta_t_the_deeper_one_is_found_and_said_where_as_deep(
     curve = measured(gas)
     result = jaxgran.fit(other, curve, free=names)
     assert all(within(result, gas, name) for name in names)
-    assert result.minima.chi2.shape == (4,) and not len(result.as_good())
+    assert result.minima.chi2.shape == (4,) and not len(result.degenerate_solutions())
     assert jaxgran.diagnose(result, curve).explains
     assert np.ptp(result.minima.chi2) > 9.0
     gas = gas.replace(tangential_restitution=-0.42)
     curve = measured(gas, error=0.05)
     with pytest.warns(UserWarning, match="chi.2 has another minimum as good, at dissipative"):
         result = jaxgran.fit(other, curve, free=names)
-    assert float(result.as_good()[0, 0] / result.estimate[0]) < 0.7
+    assert float(result.degenerate_solutions()[0, 0] / result.estimate[0]) < 0.7
     found = jaxgran.diagnose(result, curve)
     assert not found.explains and "Other parameters fit this curve as well" in found.verdict
     assert any("has another minimum as good" in reason for reason in found.reasons)
@@ -147,8 +147,8 @@ def test_rivals_know_the_elements_of_the_scene():
     curve = measured(gas)
     result = jaxgran.fit(gas, curve, free=("dissipative_constant", "temperature"))
     diagnosis = jaxgran.diagnose(result, curve)
-    assert not any(rival.asked for rival in diagnosis.rivals)
-    names = [rival.name for rival in diagnosis.rivals]
+    assert not any(rival.preferred for rival in diagnosis.alternatives)
+    names = [rival.name for rival in diagnosis.alternatives]
     assert "a further loss at constant eps, as of rough grains" in names
     low, high = diagnosis.ranges["dissipative_constant"]
     assert low < float(gas.value("dissipative_constant")) < high

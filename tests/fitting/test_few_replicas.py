@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.few_replicas import smooth_errors
-from jaxgran.fitting.residuals import runs_test
+from jaxgran.fitting.residuals import runs_test, smooth_errors
 from jaxgran.fitting.result import misfit
 from tests.beads import glass_beads
 from tests.fitting.curves import synthetic

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.checks import unused_rotation
-from jaxgran.fitting.guess import guess_from_data
+from jaxgran.fitting.parameters import guess_from_data
+from jaxgran.fitting.residuals import unused_rotation
 from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.gauss_newton import by_simulation
+from jaxgran.fitting.stochastic import search_by_simulation
 from tests.fitting.curves import TIMES, TRUTH, exact
 
 ERROR = np.full(TIMES.shape, 0.005)
@@ -41,7 +41,7 @@ def simulator(bias=1.0, noise=0.01, replicas=4, seed=0):
 def searched(simulate, measured, first=(0.0, 0.0), max_simulations=8, **settings):
     settings = {"resolution": 0.01, "progress": False, "error": ERROR} | settings
     used = np.ones(TIMES.size, bool)
-    return by_simulation(
+    return search_by_simulation(
         simulate,
         np.array(first),
         np.asarray(measured),
@@ -98,7 +98,7 @@ def test_two_quantities_tell_what_one_does_not():
         return dataclasses.replace(T, rotational_temperature=T_rot.temperature, replicas=each)
 
     measured = np.concatenate([exact(np.array([x, 0.0])) for x in (0.1, -0.2)])
-    found = by_simulation(
+    found = search_by_simulation(
         simulate,
         np.zeros(2),
         measured,

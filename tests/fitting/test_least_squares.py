@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.fitting.least_squares import at_rest, least_squares, quasi_newton
+from jaxgran.fitting.optimise import is_converged, least_squares, quasi_newton
 from tests.fitting.curves import TIMES, TRUTH, exact
 
 
@@ -18,7 +18,7 @@ def test_rest_is_told_in_standard_errors(off, expected):
         best, *_ = np.linalg.lstsq(jacobian, residuals, rcond=None)
         standard_error = 0.3 * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
         moved = residuals - jacobian @ (best + off * standard_error)
-        assert bool(at_rest(jnp.asarray(moved), jnp.asarray(jacobian))) == expected
+        assert bool(is_converged(jnp.asarray(moved), jnp.asarray(jacobian))) == expected
 
 
 def test_least_squares_end_in_rough_sums():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.rivals import ranges, rivals
+from jaxgran.fitting.alternatives import compare_alternatives, ranges_over_alternatives
 from tests.beads import glass_beads
 from tests.fitting import closed_curves
 from tests.fitting.curves import synthetic
@@ -59,7 +59,7 @@ def test_the_range_contains_the_truth(rates_of, floor, true, words, noticed, err
     said = " ".join([diagnosis.verdict, *diagnosis.reasons])
     assert words in said and "equal, smooth spheres, far from walls, in vacuum" in said
     if noticed:
-        assert not diagnosis.explains and f"asks for {diagnosis.rivals[0].name}" in said
+        assert not diagnosis.explains and f"asks for {diagnosis.alternatives[0].name}" in said
     if words == "":
         # 0.46 here, 0.41 without errors: what a constant loss leaves open at 3 % noise.
         assert diagnosis.explains and high - low < 0.8
@@ -68,13 +68,13 @@ def test_the_range_contains_the_truth(rates_of, floor, true, words, noticed, err
 def test_a_loss_that_is_not_told_apart_makes_a_an_upper_bound():
     gas, curve = curve_of(closed_curves.walls(0.8))
     result = jaxgran.fit(gas, curve, free=FREE)
-    found = {rival.name: rival for rival in rivals(result, curve)}
+    found = {rival.name: rival for rival in compare_alternatives(result, curve)}
     loss = next(rival for name, rival in found.items() if "constant eps" in name)
-    assert not loss.told_apart and loss.sharper > 2
+    assert not loss.distinguishable and loss.error_reduction_needed > 2
     # The fit alone is wrong by many of its standard errors.
     a, error = result.value("dissipative_constant")
     assert (a - closed_curves.TRUE_A) / error > 10
-    low, high = ranges(result, tuple(found.values()))["dissipative_constant"]
+    low, high = ranges_over_alternatives(result, tuple(found.values()))["dissipative_constant"]
     assert low[0] <= loss.low[0] < 0.7 * a < a < high[0]
 
 
@@ -116,7 +116,7 @@ def test_a_gas_that_does_not_cool_has_no_rivals():
     )
     result = jaxgran.fit(gas, curve, free=("temperature",))
     diagnosis = jaxgran.diagnose(result, curve)
-    assert diagnosis.rivals == () and diagnosis.ranges == {}
+    assert diagnosis.alternatives == () and diagnosis.ranges == {}
 
 
 @pytest.mark.slow
@@ -127,7 +127,8 @@ def test_noise_of_simulations_widens_the_range():
     parts = result.covariances | {"simulation": jnp.diag(noise**2)}
     noisy = dataclasses.replace(result, covariances=parts)
     (low, high), (lower, higher) = (
-        ranges(fit, rivals(fit, curve))["dissipative_constant"] for fit in (result, noisy)
+        ranges_over_alternatives(fit, compare_alternatives(fit, curve))["dissipative_constant"]
+        for fit in (result, noisy)
     )
     # Beside it the fit's own error, 2 %, is small; low itself is of another amplitude.
     np.testing.assert_allclose(higher - result.estimate[0], 1.96 * noise[0], rtol=0.1)
@@ -145,6 +146,8 @@ def test_both_precisions_in_one_process():
             gas = closed_curves.beads()
             curve = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), curve)
             result = jaxgran.fit(gas, curve, free=FREE)
-            found[x64] = ranges(result, rivals(result, curve))["dissipative_constant"]
+            found[x64] = ranges_over_alternatives(result, compare_alternatives(result, curve))[
+                "dissipative_constant"
+            ]
     # Float32 moves a profile's search by a part of its grid in the amplitude.
     np.testing.assert_allclose(found[False], found[True], rtol=0.02)

@@ -40,9 +40,9 @@ def test_t0_takes_up_a_late_clock(measured):
     # Two searches, each to 1e-2 of a standard error.
     np.testing.assert_allclose(later.estimate[0], early.estimate[0], rtol=1e-4)
     error = float(later.value("t0")[1])
-    assert float(later.began - early.began) == pytest.approx(late, abs=0.02 * error)
+    assert float(later.start_time - early.start_time) == pytest.approx(late, abs=0.02 * error)
     # The gas itself began at 0; the curve is theory's own, so that the error is the measurement's.
-    assert abs(float(early.began)) < 3 * float(early.error_budget["measurement"][1])
+    assert abs(float(early.start_time)) < 3 * float(early.error_budget["measurement"][1])
     assert early.undetermined() == () and f"{late:.0e}"[0] in repr(later)
     # Without t0 the same curve is not explained.
     assert float(jaxgran.fit(gas, shifted(curve, late)).p_value) < 1e-6
@@ -115,7 +115,7 @@ def test_a_prior_of_t0_widens_a(measured):
     loose = {"t0": (0.0, float(curve.times[10]))}
     result = jaxgran.fit(gas, curve, priors=loose)
     assert "t0" in result.error_budget and result.names == (A,)
-    assert abs(float(result.began)) < 0.2 * float(curve.times[10])  # the curve knows it better
+    assert abs(float(result.start_time)) < 0.2 * float(curve.times[10])  # the curve knows it better
     bare = jaxgran.fit(gas, curve)
     assert result.error_budget["t0"][0] < bare.error_budget["measurement"][0]
 

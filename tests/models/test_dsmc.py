@@ -9,10 +9,10 @@ import pytest
 
 import jaxgran
 from jaxgran.models.dsmc import DSMC
-from jaxgran.particles import driver
-from jaxgran.particles.stochastic import collisions, simulation
-from jaxgran.particles.stochastic.pairing import Scheme, draw
-from jaxgran.scene.reduced_scene import ReducedScene
+from jaxgran.particles.dsmc import collisions, run
+from jaxgran.particles.dsmc.collisions import Scheme, draw
+from jaxgran.particles.dsmc.run import initial_dsmc_state
+from jaxgran.scene.reduced import ReducedScene
 from tests.beads import glass_beads
 
 # Hard spheres: kinetic theory without the correction for soft contacts.
@@ -150,7 +150,7 @@ def test_elastic_gas_keeps_its_energy_and_its_maxwellian():
 
 def state_after(gas, scheme, steps, replicas=1, key=0):
     key = jax.random.key_data(jax.random.key(key))
-    state = simulation.at_start(key, replicas, scheme, 0)
+    state = initial_dsmc_state(key, replicas, scheme, 0)
     step = jax.jit(collisions.step, static_argnums=(4, 5))
     share = jnp.ones(replicas)
     for _ in range(steps):
@@ -315,8 +315,8 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
     times = np.array([0.3, 2.0, 4.0]) * float(gas.mean_free_time)
     file = tmp_path / "run.npz"
     whole = jaxgran.cool(gas, times, model=DSMC(1000, replicas=2))
-    monkeypatch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr(simulation, "CHUNK", 1)
+    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(run, "CHUNK", 1)
     advancing, left = collisions.advancing, [4]
 
     def dies(*args, **kwargs):

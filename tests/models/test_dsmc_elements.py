@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.stochastic.collision_rule import collide
-from jaxgran.scene.reduced_scene import ReducedRough, ReducedScene
+from jaxgran.particles.dsmc.collisions import collide
+from jaxgran.scene.reduced import ReducedRough, ReducedScene
 from tests.beads import glass_beads
 
 
@@ -35,18 +35,22 @@ def test_impacts_follow_the_rule_of_rough_spheres(dimension, eps, beta):
         False,
         spin=jnp.asarray(spin.sum(0)),
     )
-    kick, twist = np.asarray(out.kick), np.asarray(out.twist)
+    kick, spin_change = np.asarray(out.kick), np.asarray(out.spin_change)
     hit = np.any(kick != 0, axis=-1)
     assert 50 < hit.sum() < n
-    assert np.all(twist[~hit] == 0)
-    kick, twist, v, spin = kick[hit], twist[hit], v[:, hit], spin[:, hit]
+    assert np.all(spin_change[~hit] == 0)
+    kick, spin_change, v, spin = kick[hit], spin_change[hit], v[:, hit], spin[:, hit]
     if d == 2:  # the same in three dimensions
         kick, v = (np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, 1)]) for x in (kick, v))
-        twist, spin = (np.pad(x, [(0, 0)] * (x.ndim - 1) + [(2, 0)]) for x in (twist, spin))
+        spin_change, spin = (
+            np.pad(x, [(0, 0)] * (x.ndim - 1) + [(2, 0)]) for x in (spin_change, spin)
+        )
     # The normal follows from the torque on both spheres, (1/q) n x kick, if there is one.
-    after, spun = v + np.array([kick, -kick]), spin + twist[None]
+    after, spun = v + np.array([kick, -kick]), spin + spin_change[None]
     energy = [np.sum(x**2) / 2 + q * np.sum(s**2) / 2 for x, s in ((v, spin), (after, spun))]
-    tangential = q * twist  # n x kick: of the size of the tangential kick, perpendicular to it
+    tangential = (
+        q * spin_change
+    )  # n x kick: of the size of the tangential kick, perpendicular to it
     np.testing.assert_allclose(np.sum(tangential * kick, -1), 0, atol=1e-12)
     eta = q * (1 + beta) / (2 * (1 + q))
     pushed = np.sum(kick**2, -1) - np.sum(tangential**2, -1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.stochastic import portions
+from jaxgran.particles.dsmc.collisions import MIN_ROWS, num_portions, portion_of
 from tests.beads import glass_beads
 
 
@@ -16,13 +16,13 @@ def test_every_particle_belongs_to_one_portion(n):
     rows = jnp.arange(float(n))[:, None]
     count, yes = np.zeros(n, int), jnp.ones((), bool)
     sizes = []
-    for k in range(portions.number(n)):
-        part = portions.portion(jnp.asarray(k), n, yes)
+    for k in range(num_portions(n)):
+        part = portion_of(jnp.asarray(k), n, yes)
         chosen = np.asarray(part.of(rows), int)[np.asarray(part.counted), 0]
         count[chosen] += 1
         sizes.append(len(chosen))
     assert np.all(count == 1)
-    assert max(sizes) - min(sizes) <= 1 and min(sizes) >= min(n, portions.LEAST_ROWS) - 1
+    assert max(sizes) - min(sizes) <= 1 and min(sizes) >= min(n, MIN_ROWS) - 1
 
 
 def elastic(strength, **elements) -> jaxgran.Gas:

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.models.hard_spheres import HardSpheres, reduced_scene
-from jaxgran.particles import driver, programs
+from jaxgran.models.hard_spheres import HardSpheres, reduced_hard_scene
+from jaxgran.particles import run
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.hard import windows
+from jaxgran.particles.hard.dynamics import MIN_SKIN, HardDynamics
 from jaxgran.particles.neighbours import find_pairs
+from jaxgran.particles.run import _run_segments
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 
@@ -301,19 +302,19 @@ def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
     times = np.array([0.3, 1.0, 2.0]) * float(gas.mean_free_time)
     file = tmp_path / "run.npz"
     whole = jaxgran.cool(gas, times, model=HardSpheres(100, neighbours=by))
-    monkeypatch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr(programs, "STRETCHES", 1)
-    forward = driver._some_stretches
+    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(run, "SEGMENTS_PER_CALL", 1)
+    forward = _run_segments
 
     def dies(dynamics, state, *args):
         if file.exists() and state.time > times[0]:
             raise MemoryError("killed")
         return forward(dynamics, state, *args)
 
-    monkeypatch.setattr(driver, "_some_stretches", dies)
+    monkeypatch.setattr(run, "_run_segments", dies)
     with pytest.raises(MemoryError):
         jaxgran.cool(gas, times, model=HardSpheres(100, neighbours=by), checkpoint=file)
-    monkeypatch.setattr(driver, "_some_stretches", forward)
+    monkeypatch.setattr(run, "_run_segments", forward)
     resumed = jaxgran.cool(gas, times, model=HardSpheres(100, neighbours=by), checkpoint=file)
     np.testing.assert_array_equal(resumed.temperature, whole.temperature)
     np.testing.assert_array_equal(resumed.particles.position, whole.particles.position)
@@ -367,7 +368,7 @@ def test_a_random_start_melts_under_jit(dimension, packing_fraction, size):
 def test_arrays_fit_what_they_hold(dimension, packing_fraction, monkeypatch):
     # Rows cost time whether they are used or not. A seventh is spare, and estimates of so different
     # gases by one formula are up to twice what is needed; one kind at phi = .01 is 2.6 times that.
-    used, forward = [], driver._some_stretches
+    used, forward = [], _run_segments
 
     def watched(dynamics, *others):
         *now, needed = forward(dynamics, *others)
@@ -375,7 +376,7 @@ def test_arrays_fit_what_they_hold(dimension, packing_fraction, monkeypatch):
             used.append(np.asarray(needed) / np.array(dynamics.capacity))
         return *now, needed
 
-    monkeypatch.setattr(driver, "_some_stretches", watched)
+    monkeypatch.setattr(run, "_run_segments", watched)
     gas = hard_gas(0.9, packing_fraction, dimension)
     jaxgran.cool(gas, [5 * float(gas.mean_free_time)], model=HardSpheres(4000))
     fullest = np.max(used, axis=0)
@@ -494,7 +495,7 @@ def test_refuses_what_it_cannot_do():
 
 def test_scene_is_in_reduced_units(beads):
     gas = beads(packing_fraction=0.1)
-    scene = reduced_scene(gas, 100)
+    scene = reduced_hard_scene(gas, 100)
     assert float(100 * np.pi / 6 / scene.side**3) == pytest.approx(0.1)
     speed = float(gas.collision_frequency * gas.diameter / jnp.sqrt(gas.temperature))
     assert float(scene.collision_frequency) == pytest.approx(speed)
@@ -527,15 +528,15 @@ def test_a_skin_full_of_spheres_is_shortened(monkeypatch):
     place = 1.3 * np.stack(np.meshgrid(np.arange(8), np.arange(8)), -1).reshape(1, size, 2)
     velocity = np.asarray(np.random.default_rng(3).normal(size=(1, size, 2)))
     start = jaxgran.Particles(*map(jnp.asarray, (place + 0.2 * side, velocity, side)))
-    skins, stretch = [], windows.HardDynamics.stretch
+    skins, run_segment = [], HardDynamics.run_segment
 
     def watched(self, state, *others):
         skins.append(float(state.skin))
-        return stretch(self, state, *others)
+        return run_segment(self, state, *others)
 
-    monkeypatch.setattr(windows.HardDynamics, "stretch", watched)
+    monkeypatch.setattr(HardDynamics, "stretch", watched)
     end = 2.0
     curve = jaxgran.cool(gas, [end], model=HardSpheres(size, start=start, neighbours="scipy"))
-    assert skins[-1] < skins[0] and min(skins) >= windows.SHORTEST_SKIN
+    assert skins[-1] < skins[0] and min(skins) >= MIN_SKIN
     _, _, counts, _ = serial(gas, start, end)
     assert counts.sum() > 50 and round(float(curve.collisions[0]) * size) == counts.sum()

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.hard.effects import Impact, of_pairs
-from jaxgran.particles.hard.scene import HardScene
-from jaxgran.scene.reduced_scene import ReducedDrag
+from jaxgran.particles.hard.impacts import HardScene, Impact, pair_effect
+from jaxgran.scene.reduced import ReducedDrag
 from tests.beads import glass_beads
 
 
@@ -41,7 +40,9 @@ def test_laws_see_the_speeds_that_drag_has_left():
     normal = jnp.tile(jnp.array([1.0, 0.0, 0.0]), (n, 1))
     impact = Impact(time, normal, speed[:, None] * normal, speed, None, jnp.zeros(n, bool))
     eps = law.restitution(speed * (1 - gamma * time) / 2**0.5)
-    np.testing.assert_allclose(of_pairs(scene, impact).lost, (1 - eps**2) * speed**2 / 8, rtol=1e-9)
+    np.testing.assert_allclose(
+        pair_effect(scene, impact).lost, (1 - eps**2) * speed**2 / 8, rtol=1e-9
+    )
 
 
 @pytest.mark.slow

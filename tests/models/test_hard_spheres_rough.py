@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.hard.effects import Impact, of_pairs
-from jaxgran.particles.hard.scene import HardScene
-from jaxgran.scene.reduced_scene import ReducedRough
+from jaxgran.particles.hard.impacts import HardScene, Impact, pair_effect
+from jaxgran.scene.reduced import ReducedRough
 from tests.beads import glass_beads
 
 
@@ -38,7 +37,7 @@ def test_impacts_keep_angular_momentum_and_follow_the_rule(dimension, beta):
     scene = HardScene(
         *[zero] * 5, surface=ReducedRough(jnp.asarray(beta), jnp.asarray(q), zero)
     )._replace(law=jaxgran.ConstantRestitution(eps))
-    effect = of_pairs(
+    effect = pair_effect(
         scene,
         Impact(
             time=jnp.zeros(n),
@@ -49,10 +48,10 @@ def test_impacts_keep_angular_momentum_and_follow_the_rule(dimension, beta):
             elastic=jnp.zeros(n, bool),
         ),
     )
-    change, twist = np.zeros((n, 3)), np.zeros((n, 3))
-    change[:, shown], twist[:, turning] = effect.kick, effect.twist
+    change, spin_change = np.zeros((n, 3)), np.zeros((n, 3))
+    change[:, shown], spin_change[:, turning] = effect.kick, effect.spin_change
     after = v + np.stack([change, -change])
-    spun = omega + 2 * twist[None]
+    spun = omega + 2 * spin_change[None]
 
     def at_contact(v, omega):
         return v[0] - v[1] - 0.5 * np.cross(omega[0] + omega[1], normal)
@@ -67,18 +66,18 @@ def test_impacts_keep_angular_momentum_and_follow_the_rule(dimension, beta):
     np.testing.assert_allclose(parts(behind)[1], -beta * parts(before)[1], atol=1e-12)
     # Angular momentum about the point of contact.
     lever = np.stack([0.5 * normal, -0.5 * normal])
-    turned = np.cross(lever, after - v) + q / 4 * (spun - omega)
-    np.testing.assert_allclose(turned.sum(0), 0, atol=1e-12)
-    np.testing.assert_allclose(turned, 0, atol=1e-12)  # of each sphere alone
+    rotational_gain = np.cross(lever, after - v) + q / 4 * (spun - omega)
+    np.testing.assert_allclose(rotational_gain.sum(0), 0, atol=1e-12)
+    np.testing.assert_allclose(rotational_gain, 0, atol=1e-12)  # of each sphere alone
     translation, rotation = (
         [c * np.sum(x**2, (0, 2)) for x in pair]
         for c, pair in ((0.5, (v, after)), (q / 8, (omega, spun)))
     )
     np.testing.assert_allclose(translation[0] - translation[1], 2 * effect.lost, atol=1e-12)
-    np.testing.assert_allclose(rotation[1] - rotation[0], 2 * effect.turned, atol=1e-12)
+    np.testing.assert_allclose(rotation[1] - rotation[0], 2 * effect.rotational_gain, atol=1e-12)
     normal_part, slip = (np.sum(x**2, -1) for x in parts(before))
     lost = 0.25 * (1 - eps**2) * normal_part + 0.25 * q / (1 + q) * (1 - beta**2) * slip
-    np.testing.assert_allclose(2 * (effect.lost - effect.turned), lost, atol=1e-12)
+    np.testing.assert_allclose(2 * (effect.lost - effect.rotational_gain), lost, atol=1e-12)
 
 
 def run(gas, num_particles, replicas, taus, key=0, kind=jaxgran.HardSpheres):

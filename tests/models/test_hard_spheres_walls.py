@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.checks import status
-from jaxgran.models.course import WALLS
+from jaxgran._utils import status
+from jaxgran.models.error_model import WALL_ERROR
 from tests.beads import glass_beads
 
 SIDE = 0.05
@@ -115,7 +115,7 @@ def test_mixed_gas_between_lossy_walls(num, record):
     error = np.asarray(hard.temperature_error / hard.temperature)
     fallen = np.abs(np.log(np.asarray(dsmc.temperature / gas.temperature)))
     print(f"\nN = {num}: at T/T_0 = {np.exp(-fallen)} ln T is {off} +- {error} off")
-    assert np.all(np.abs(off) < WALLS * fallen + 3 * error)
+    assert np.all(np.abs(off) < WALL_ERROR * fallen + 3 * error)
     record("walls", num_particles=num, off=off.tolist(), error=error.tolist())
 
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 import jaxgran
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.theory import closed_forms, integration, solution, steady
-from jaxgran.theory.moments import Density
-from jaxgran.theory.softness import crowding, softness
+from jaxgran.theory import solver
+from jaxgran.theory.equations import Density, crowding, paper_temperature, scene_at_start, softness
+from jaxgran.theory.solver import WINDOW, Integrator, _solve_along, moments_at
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
 # equations, clipped restitution, Gaussian start, no softness correction.
@@ -75,23 +75,23 @@ def test_sensitivity_table(beads, record):
 
 
 def test_tangents_of_what_moves_alone_are_followed(beads, monkeypatch):
-    followed, solve_along = [], solution._solve_along
+    followed, solve_along = [], _solve_along
 
     def watched(parameters, unravel, times, directions, *rest):
         followed.append(directions)
         return solve_along(parameters, unravel, times, directions, *rest)
 
-    monkeypatch.setattr(solution, "_solve_along", watched)
+    monkeypatch.setattr(solver, "_solve_along", watched)
     gas = beads()
-    scene = steady.scene_at_start(gas), Density.of(gas)
+    scene = scene_at_start(gas), Density.of(gas)
     equations = KineticTheory()._equations(gas.dimension)
-    integrator = solution.Integrator(diffrax.Tsit5(scan_kind="lax"), 1e-8, 10_000)
-    times = jnp.geomspace(1.0, 100.0, integration.WINDOW)
+    integrator = Integrator(diffrax.Tsit5(scan_kind="lax"), 1e-8, 10_000)
+    times = jnp.geomspace(1.0, 100.0, WINDOW)
     leaves, structure = jax.tree.flatten(scene)
 
     def log_temperature(k, x, times, leaves=tuple(leaves)):
         moved = structure.unflatten([*leaves[:k], x, *leaves[k + 1 :]])
-        return solution.moments_at(moved, times, equations, integrator)[0].log_temperature
+        return moments_at(moved, times, equations, integrator)[0].log_temperature
 
     @jax.jit
     def at(leaves, times):
@@ -187,7 +187,7 @@ def test_stiff_solver_for_nearly_elastic_gases(beads):
     times = jnp.geomspace(1.0, 1e9, 20) * gas.mean_free_time
     model = jaxgran.KineticTheory(solver=diffrax.Kvaerno5(), rtol=1e-7)
     curve = jaxgran.cool(gas, times, model=model)
-    formula = closed_forms.paper_temperature(times / gas.mean_free_time, gas.delta)
+    formula = paper_temperature(times / gas.mean_free_time, gas.delta)
     # The expansion is right to delta here; softness 0.8 % of the rate, a_2 less.
     np.testing.assert_allclose(curve.temperature / gas.temperature, formula, rtol=0.03)
 
@@ -267,7 +267,7 @@ def test_bad_options_are_refused(beads):
 def test_values_do_not_recompile(beads):
     cool = KineticTheory._simulate.__wrapped__  # as it is inside its own jit
     checked = eqx.filter_jit(eqx.debug.assert_max_traces(cool, max_traces=1))
-    times = jnp.geomspace(1.0, 4.0, integration.WINDOW)
+    times = jnp.geomspace(1.0, 4.0, WINDOW)
     for a in (1e-7, 1e-6):
         for t0 in (0.01, 0.5):
             gas = beads(0.15).replace(dissipative_constant=a, temperature=t0)

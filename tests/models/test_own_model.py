@@ -11,7 +11,7 @@ import pytest
 
 import jaxgran
 from experiments.fit.own_model import HaffLaw
-from jaxgran.theory import closed_forms
+from jaxgran.theory.equations import haff
 
 MEMBERS = sorted(
     jaxgran.AbstractModel.__abstractmethods__ | jaxgran.AbstractModel.__abstractclassvars__
@@ -31,9 +31,7 @@ def times_of(gas, num=40):
 def measured(gas, key=None):
     """A curve by Haff's law with errors of 1 %, and noise of that size where a key is given."""
     times = times_of(gas)
-    T = gas.temperature * closed_forms.haff(
-        gas.collision_frequency * times, gas.value("coefficient")
-    )
+    T = gas.temperature * haff(gas.collision_frequency * times, gas.value("coefficient"))
     noise = 0.0 if key is None else 0.01 * jax.random.normal(key, times.shape)
     return jaxgran.CoolingCurve(
         times=times, temperature=T * jnp.exp(noise), temperature_error=0.01 * T

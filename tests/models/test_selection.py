@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.models.soft_spheres import INTEGRATION
+from jaxgran.models.soft_spheres import INTEGRATION_ERROR
 from tests.fitting.curves import measured
 
 
@@ -127,7 +127,7 @@ def test_noise_is_that_of_runs(beads, phi, beta, n, duration, scatter):
 
     def noise(replicas):
         estimate = errors(gas, times, num_particles=n, replicas=replicas)
-        return (estimate["soft spheres"] ** 2 - INTEGRATION**2) ** 0.5
+        return (estimate["soft spheres"] ** 2 - INTEGRATION_ERROR**2) ** 0.5
 
     # So many runs tell it to 10 % (N = 1000) and 18 %; shot noise differs by as much.
     assert noise(1) == pytest.approx(scatter, rel=0.3)
@@ -205,7 +205,7 @@ def test_no_energy_lost_no_error():
 
 def test_the_beginning_needs_the_cheapest(beads):
     choice = jaxgran.choose_model(beads(0.15), [0.0])
-    assert [c.error for c in choice.candidates] == [0.0, 0.0, 0.0, INTEGRATION]
+    assert [c.error for c in choice.candidates] == [0.0, 0.0, 0.0, INTEGRATION_ERROR]
     assert isinstance(choice.model, jaxgran.KineticTheory)
     assert "4000 particles have a noise of 0 % in T." in choice.reasons
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.models.soft_spheres import SoftSpheres, reduced_scene
-from jaxgran.particles import driver, programs
+from jaxgran.models.soft_spheres import SoftSpheres, reduced_soft_scene
+from jaxgran.particles import run
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.observables import structure_factor
+from jaxgran.particles.run import _run_segments
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 
@@ -261,9 +262,9 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
     times = np.array([0.3, 1.0, 2.0]) * float(gas.mean_free_time)
     file = tmp_path / "run.npz"
     whole = jaxgran.cool(gas, times, model=SoftSpheres(100))
-    monkeypatch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr(programs, "STRETCHES", 1)
-    forward, left = driver._some_stretches, [12]
+    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(run, "SEGMENTS_PER_CALL", 1)
+    forward, left = _run_segments, [12]
 
     def dies(*args):
         left[0] -= 1
@@ -271,10 +272,10 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
             raise MemoryError("killed")
         return forward(*args)
 
-    monkeypatch.setattr(driver, "_some_stretches", dies)
+    monkeypatch.setattr(run, "_run_segments", dies)
     with pytest.raises(MemoryError):
         jaxgran.cool(gas, times, model=SoftSpheres(100), checkpoint=file)
-    monkeypatch.setattr(driver, "_some_stretches", forward)
+    monkeypatch.setattr(run, "_run_segments", forward)
     resumed = jaxgran.cool(gas, times, model=SoftSpheres(100), checkpoint=file)
     np.testing.assert_array_equal(resumed.temperature, whole.temperature)
     np.testing.assert_array_equal(resumed.particles.position, whole.particles.position)
@@ -319,7 +320,7 @@ def test_a_dense_random_start_melts_under_jit(beads):
 def test_arrays_fit_what_they_hold(beads, packing, fraction, monkeypatch):
     # Rows cost time whether they are used or not. A fifth is spare, and estimates of so different
     # gases by one formula are up to twice what is needed.
-    used, forward = [], driver._some_stretches
+    used, forward = [], _run_segments
 
     def watched(dynamics, *others):
         *now, needed = forward(dynamics, *others)
@@ -327,7 +328,7 @@ def test_arrays_fit_what_they_hold(beads, packing, fraction, monkeypatch):
             used.append(np.asarray(needed) / np.array(dynamics.capacity))
         return *now, needed
 
-    monkeypatch.setattr(driver, "_some_stretches", watched)
+    monkeypatch.setattr(run, "_run_segments", watched)
     gas = soft_beads(beads, fraction, 0.15, packing_fraction=packing)
     times = [3 * float(gas.mean_free_time)]
     jaxgran.cool(gas, times, model=SoftSpheres(8000, steps_per_contact=40))
@@ -444,7 +445,7 @@ def test_a_settled_capacity_is_enough_for_a_dense_gas(beads, packing_fraction, m
 
 def test_scene_is_in_reduced_units(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
-    scene = reduced_scene(gas, 100)
+    scene = reduced_soft_scene(gas, 100)
     assert float(scene.contact_duration * scene.collision_frequency) == pytest.approx(0.05)
     assert float(100 * np.pi / 6 / scene.side**3) == pytest.approx(0.1)
 

@@ -10,10 +10,9 @@ import pytest
 from scipy.linalg import hadamard
 
 import jaxgran
-from jaxgran.models.reduced_soft import reduced_scene
-from jaxgran.models.soft_spheres import SoftSpheres
-from jaxgran.particles import user_start
-from jaxgran.particles.soft.flight import SMALL, shortened
+from jaxgran.models.soft_spheres import SoftSpheres, reduced_soft_scene
+from jaxgran.particles.setup import reduced_start
+from jaxgran.particles.soft.forces import SERIES_BELOW, flight_time
 from tests.beads import glass_beads
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
@@ -143,9 +142,9 @@ def test_elastic_gas_with_drag_cools_as_drag_alone():
     assert np.all(curve.collisions[-1] > 2)
 
 
-@pytest.mark.parametrize("z", [0.0, 1e-9, 0.99 * SMALL, 1.01 * SMALL, 2.0])
+@pytest.mark.parametrize("z", [0.0, 1e-9, 0.99 * SERIES_BELOW, 1.01 * SERIES_BELOW, 2.0])
 def test_shortened_duration_and_its_derivative(z):
-    value, slope = jax.value_and_grad(lambda rate: shortened(rate, 2.0))(z / 2)
+    value, slope = jax.value_and_grad(lambda rate: flight_time(rate, 2.0))(z / 2)
     exact = 2 * (-np.expm1(-z) / z if z else 1.0)
     small = -2.0 * (1 - 2 * z / 3 + z**2 / 4 - z**3 / 15 + z**4 / 72)
     derivative = small if z < 0.1 else 4 * (np.exp(-z) * (1 + z) - 1) / z**2
@@ -365,23 +364,23 @@ def test_tangents_of_spins_are_exact_between_projections():
 
     def material(logs):
         changed = gas.replace(**dict(zip(floats, values * jnp.exp(logs), strict=True)))
-        return reduced_scene(changed, num).material
+        return reduced_soft_scene(changed, num).material
 
-    scene = reduced_scene(gas, num)
+    scene = reduced_soft_scene(gas, num)
     directions = jax.tree.map(
         lambda x: jnp.moveaxis(x, -1, 0), jax.jacfwd(material)(jnp.zeros(len(floats)))
     )
     never = dataclasses.replace(model, projection=1e3)
     dynamics = never.dynamics(scene, never.plan)
-    reduced = user_start.reduced(start, gas, differentiable=False)
+    reduced = reduced_start(start, gas, differentiable=False)
     assert reduced is not None
     position, velocity = reduced
     state = dynamics.begin(position, velocity, 0.4)
-    state = dynamics.drawn(state, jax.random.key(0), state)
+    state = dynamics.sample_spins(state, jax.random.key(0), state)
     state = dynamics.with_tangents(state, directions)
     until = end * float(jnp.sqrt(gas.temperature) / gas.diameter)
     while float(state.time) < until:
-        now = dynamics.stretch(state, until, "sweep")
+        now = dynamics.run_segment(state, until, "sweep")
         assert int(now.status) == 0
         state = now.state
     found = state.tangents.rotation.spin

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.checks import status
+from jaxgran._utils import status
 from jaxgran.models import soft_spheres
-from jaxgran.particles import programs as compiled_programs
+from jaxgran.particles import run as compiled_programs
 from jaxgran.particles.capacity import Capacity, Grid, Neighbourhood
 
 
@@ -96,7 +96,7 @@ def test_a_loop_over_the_material_shares_programs(beads, kind):
 def test_a_block_is_no_longer_than_a_contact_or_a_flight(duration):
     # In a block the fastest sphere flies BLOCK_FLIGHT at most, unless a block has its least steps.
     steps = jaxgran.SoftSpheres(200)._steps_per_block(duration)
-    longest = min(40.0, 40 * soft_spheres.BLOCK_FLIGHT / (soft_spheres.FASTEST * duration))
+    longest = min(40.0, 40 * soft_spheres.BLOCK_FLIGHT / (soft_spheres.MAX_SPEED * duration))
     assert 8 <= steps <= max(round(longest), 8)
     assert steps >= min(longest / soft_spheres.BLOCK_LENGTHS.ratio - 0.5, 40)  # 0.5 by rounding
 

@@ -3,9 +3,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.particles import compaction
+from jaxgran.particles.neighbours import rows_where
 
-rows_where = jax.jit(compaction.rows_where, static_argnums=1)
+rows_where = jax.jit(rows_where, static_argnums=1)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 1.0])

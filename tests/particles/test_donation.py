@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.checks import status
-from jaxgran.data.run import Run
-from jaxgran.particles import driver, programs
+from jaxgran._utils import status
+from jaxgran.data.curve import Run
+from jaxgran.particles import run
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.stochastic import collisions
+from jaxgran.particles.dsmc import collisions
+from jaxgran.particles.run import compiled_segments
 
 TIMES = jnp.array([0.01, 0.03])
 MODELS = {
@@ -33,7 +34,7 @@ def given(monkeypatch):
         return call
 
     advancing = collisions.advancing
-    monkeypatch.setattr(programs, "some_stretches", watched(programs.some_stretches, 1))
+    monkeypatch.setattr(run, "compiled_segments", watched(compiled_segments, 1))
     monkeypatch.setattr(collisions, "advancing", lambda donate: watched(advancing(donate), 0))
     return states
 
@@ -81,7 +82,7 @@ def test_a_start_of_the_user_is_not_donated(name, beads, given):
 
 def test_a_run_that_fails_returns_its_last_good_state(beads, monkeypatch):
     gas = beads(packing_fraction=0.1)
-    monkeypatch.setattr(driver, "MOST_PAIRS", 0)  # no array may grow
+    monkeypatch.setattr(run, "MAX_PAIRS_EACH", 0)  # no array may grow
     tiny = MODELS["HardSpheres"].sized_for(gas).plan
     assert tiny is not None
     plan = tiny._replace(capacity=Capacity(*(4,) * len(Capacity._fields)))

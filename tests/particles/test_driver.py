@@ -9,11 +9,10 @@ import pytest
 from tqdm import tqdm
 
 import jaxgran
-from jaxgran.checks import status
+from jaxgran._utils import status
 from jaxgran.data import checkpoint
-from jaxgran.particles import driver
-from jaxgran.particles.driver import Failure, follow
-from jaxgran.particles.programs import compiling
+from jaxgran.particles import run
+from jaxgran.particles.run import RunFailure, compiling, run_through_times, time
 from tests.beads import glass_beads
 
 TIMES = np.array([0.0, 0.3, 1.0, 1.1, 2.5])
@@ -56,7 +55,7 @@ class Calls:
 
 def quiet(*args, **options):
     """The last state and the records of a run that does not fail."""
-    *found, fault = follow(*args, progress=False, **options)
+    *found, fault = run_through_times(*args, progress=False, **options)
     assert fault == status.OK
     return tuple(found)
 
@@ -124,7 +123,7 @@ def test_a_run_may_be_interrupted_often(tmp_path):
 
 
 def test_a_run_that_dies_loses_little(tmp_path, monkeypatch):
-    monkeypatch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
     path = tmp_path / "run.npz"
     whole = quiet(start(), TIMES, advance, observe)
     with pytest.raises(MemoryError):
@@ -137,7 +136,7 @@ def test_a_run_that_dies_loses_little(tmp_path, monkeypatch):
 
 def test_checkpoints_are_as_seldom_as_said(tmp_path, monkeypatch):
     now, saves = [0.0], []
-    monkeypatch.setattr(driver.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
     monkeypatch.setattr(checkpoint, "save", lambda *args: saves.append(now[0]))
 
     def slow(state, until):
@@ -205,12 +204,12 @@ class Terminal(io.StringIO):
 @pytest.fixture
 def eager(monkeypatch):
     """Bars are drawn at once."""
-    monkeypatch.setattr(driver, "tqdm", lambda **kw: tqdm(**(kw | {"delay": 0, "mininterval": 0})))
+    monkeypatch.setattr(run, "tqdm", lambda **kw: tqdm(**(kw | {"delay": 0, "mininterval": 0})))
 
 
 def shown(stream, capsys, **settings):
     with redirect_stderr(stream):
-        follow(start(), TIMES, advance, observe, label="toy", **settings)
+        run_through_times(start(), TIMES, advance, observe, label="toy", **settings)
     assert capsys.readouterr() == ("", "")  # nothing elsewhere
     return stream.getvalue()
 
@@ -269,9 +268,9 @@ def test_the_bar_goes_on_where_the_run_was(tmp_path, eager, capsys):
 def test_a_failure_leaves_nan_and_a_status():
     def fails(state, until):
         if state.time >= 1.0:
-            raise Failure(status.NOT_FINITE.bit)
+            raise RunFailure(status.NOT_FINITE.bit)
         return advance(state, until)
 
-    state, records, fault = follow(start(), TIMES, fails, observe, progress=False)
+    state, records, fault = run_through_times(start(), TIMES, fails, observe, progress=False)
     assert fault == status.NOT_FINITE.bit and state.time == 1.0
     assert np.all(np.isfinite(records["total"][:3])) and np.all(np.isnan(records["total"][3:]))

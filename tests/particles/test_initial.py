@@ -3,8 +3,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.particles.initial import _OverlapRemoval, positions, settle, velocities
 from jaxgran.particles.observables import sonine, temperature
+from jaxgran.particles.setup import (
+    _OverlapRemoval,
+    host_positions,
+    maxwellian_velocities,
+    normalise_velocities,
+)
 
 BALL = {2: np.pi / 4, 3: np.pi / 6}
 
@@ -23,7 +28,7 @@ def smallest_distance(x, side):
 def test_spheres_do_not_overlap(dimension, packing):
     n, replicas = 500, 2
     side = box_side(packing, n, dimension)
-    x = np.asarray(positions(jax.random.key(1), side, replicas, n, dimension))
+    x = np.asarray(host_positions(jax.random.key(1), side, replicas, n, dimension))
     assert x.shape == (replicas * n, dimension)
     assert np.all(x >= 0) and np.all(x < side)
     boxes = x.reshape(replicas, n, dimension)
@@ -33,7 +38,7 @@ def test_spheres_do_not_overlap(dimension, packing):
 
 def test_the_key_fixes_the_positions():
     first, same, other = (
-        np.asarray(positions(jax.random.key(seed), 6.0, 1, 100, 3)) for seed in (1, 1, 2)
+        np.asarray(host_positions(jax.random.key(seed), 6.0, 1, 100, 3)) for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(first, same)
     assert not np.any(first == other)
@@ -41,14 +46,14 @@ def test_the_key_fixes_the_positions():
 
 def test_dilute_positions_fill_the_box_evenly():
     n, side = 4000, 60.0
-    x = np.asarray(positions(jax.random.key(3), side, 1, n, 3))
+    x = np.asarray(host_positions(jax.random.key(3), side, 1, n, 3))
     counts = np.histogramdd(x, bins=3 * [np.linspace(0, side, 4)])[0]
     # 27 cells; chi^2 of independent points is 26 +- 7, of spheres slightly less.
     assert np.sum((counts - n / 27) ** 2) / (n / 27) < 26 + 5 * 7
 
 
 def test_two_spheres_in_the_smallest_box():
-    x = np.asarray(positions(jax.random.key(5), 2.0, 20, 2, 3))
+    x = np.asarray(host_positions(jax.random.key(5), 2.0, 20, 2, 3))
     assert np.all(x >= 0) and np.all(x < 2.0)
     assert all(smallest_distance(pair, 2.0) > 1 for pair in x.reshape(20, 2, 3))
 
@@ -68,7 +73,7 @@ def test_too_dense_is_refused(dimension, packing):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_velocities_are_maxwellian(dimension):
     n, replicas = 5000, 20
-    v = velocities(jax.random.key(6), replicas, n, dimension)
+    v = maxwellian_velocities(jax.random.key(6), replicas, n, dimension)
     assert v.shape == (replicas * n, dimension)
     boxes = v.reshape(replicas, n, dimension)
     np.testing.assert_allclose(jnp.mean(boxes, axis=1), 0.0, atol=1e-15)  # round-off
@@ -82,7 +87,9 @@ def test_velocities_are_maxwellian(dimension):
 
 
 def test_the_key_fixes_the_velocities():
-    first, same, other = (velocities(jax.random.key(seed), 2, 50, 3) for seed in (1, 1, 2))
+    first, same, other = (
+        maxwellian_velocities(jax.random.key(seed), 2, 50, 3) for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(first, same)
     assert not np.any(first == other)
     assert not np.any(first[:50] == first[50:])
@@ -90,20 +97,20 @@ def test_the_key_fixes_the_velocities():
 
 def test_settling_forgets_mean_and_scale():
     v = jax.random.normal(jax.random.key(7), (60, 3))
-    settled = settle(v, 3)
+    settled = normalise_velocities(v, 3)
     for other in (settled, 4.0 * v + 1.0):
-        np.testing.assert_allclose(settle(other, 3), settled, atol=1e-14)  # round-off
-    alone = settle(v[20:40], 1)
+        np.testing.assert_allclose(normalise_velocities(other, 3), settled, atol=1e-14)  # round-off
+    alone = normalise_velocities(v[20:40], 1)
     np.testing.assert_allclose(settled[20:40], alone, atol=1e-14)
 
 
 @pytest.mark.parametrize("n", [-1, 0, 1])
 def test_too_few_particles_are_refused(n):
     with pytest.raises(ValueError, match=f"num_particles must be at least 2, got {n}"):
-        velocities(jax.random.key(0), 1, n, 3)
+        maxwellian_velocities(jax.random.key(0), 1, n, 3)
 
 
 def test_two_velocities_are_opposite():
-    v = velocities(jax.random.key(8), 1, 2, 3)
+    v = maxwellian_velocities(jax.random.key(8), 1, 2, 3)
     np.testing.assert_allclose(v[0], -v[1], atol=1e-15)  # round-off
     np.testing.assert_allclose(jnp.sum(v[0] ** 2), 3.0, rtol=1e-14)

@@ -12,14 +12,15 @@ from scipy.spatial import KDTree
 import jaxgran
 from jaxgran.particles.capacity import within_reach
 from jaxgran.particles.neighbours import (
-    MOST_AHEAD,
+    MAX_LOOKAHEAD,
+    choose_engine,
     displacement,
-    engine,
     find_pairs,
+    sweep,
     tree_search,
+    unsorted,
     wrap,
 )
-from jaxgran.particles.sweep_and_prune import sweep, unsorted
 
 # In boxes of less than three cutoffs jax-md itself warns about its integers.
 jax_md_warns = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")
@@ -253,20 +254,20 @@ def test_displacement_is_the_shortest():
 
 
 def test_engine_follows_the_device_and_the_gas(monkeypatch):
-    assert engine("scipy", 1) == "scipy" and engine("sweep", 10**6) == "sweep"
-    assert engine("jax-md") == "jax-md"
+    assert choose_engine("scipy", 1) == "scipy" and choose_engine("sweep", 10**6) == "sweep"
+    assert choose_engine("jax-md") == "jax-md"
     for device, dense in (("cpu", "scipy"), ("gpu", "jax-md")):
         monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
-        assert engine("auto", MOST_AHEAD + 1) == dense
-        assert engine("auto", MOST_AHEAD) == ("sweep" if device == "cpu" else "jax-md")
+        assert choose_engine("auto", MAX_LOOKAHEAD + 1) == dense
+        assert choose_engine("auto", MAX_LOOKAHEAD) == ("sweep" if device == "cpu" else "jax-md")
         # Compiled code calls nothing on the host.
-        assert engine("auto", 10 * MOST_AHEAD, traced=True) == "sweep"
+        assert choose_engine("auto", 10 * MAX_LOOKAHEAD, traced=True) == "sweep"
 
 
 def test_unknown_engines_are_refused():
     message = "neighbours must be one of auto, sweep, scipy, jax-md, got 'kd'"
     with pytest.raises(ValueError, match=message):
-        engine("kd")
+        choose_engine("kd")
 
 
 @pytest.mark.parametrize("side, n", [(500.0, 20_000), (5000.0, 2000)])

@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.checks import status
-from jaxgran.particles import initial
-from jaxgran.particles.relaxation import positions
+from jaxgran._utils import status
+from jaxgran.particles.setup import GAP, relaxed_positions, uniform_points
 from jaxgran.scene.geometry import sphere_surface
 
 N, REPLICAS = 60, 2
@@ -20,12 +19,12 @@ def side_of(packing, dimension):
 
 @jax.jit
 def in_a_box(key, side):
-    return positions(key, side, (REPLICAS, N, 3), 0.4, (1000, 120))
+    return relaxed_positions(key, side, (REPLICAS, N, 3), 0.4, (1000, 120))
 
 
 @jax.jit
 def in_a_square(key, side):
-    return positions(key, side, (REPLICAS, N, 2), 0.4, (1000, 120))
+    return relaxed_positions(key, side, (REPLICAS, N, 2), 0.4, (1000, 120))
 
 
 def closest(x, side, periodic=True):
@@ -45,7 +44,7 @@ def test_no_spheres_overlap_and_boxes_differ(place, dimension, packing):
     assert fault == status.OK and np.all((x >= 0) & (x < side))
     boxes = np.asarray(x).reshape(REPLICAS, N, dimension)
     # All are pushed to 1 + GAP, and taken as apart from half of the gap on.
-    assert all(closest(box, side) >= 1 + initial.GAP / 2 for box in boxes)
+    assert all(closest(box, side) >= 1 + GAP / 2 for box in boxes)
     assert np.max(np.abs(boxes[0] - boxes[1])) > 1
     np.testing.assert_array_equal(place(jax.random.key(1), side)[0], x)
 
@@ -54,32 +53,32 @@ def test_dilute_spheres_stay_where_they_are_put():
     # Pushes move few: most places are the uniform ones that the host begins with, too.
     side = side_of(0.02, 3)
     x, _ = in_a_box(jax.random.key(1), side)
-    places = side * initial.uniform_points(jax.random.key(1), REPLICAS * N, 3)
+    places = side * uniform_points(jax.random.key(1), REPLICAS * N, 3)
     assert np.mean(np.all(np.abs(x - places) < 1e-12, axis=1)) > 0.7
 
 
 def test_spheres_stay_within_their_room():
     side, room = 8.0, jnp.array([3.0, 4.0, 5.5])
-    x, fault = positions(jax.random.key(0), side, (1, 50, 3), 0.4, (1000, 60), room)
+    x, fault = relaxed_positions(jax.random.key(0), side, (1, 50, 3), 0.4, (1000, 60), room)
     assert fault == status.OK and np.all((x >= 0) & (x <= room[None]))
-    assert closest(np.asarray(x), side, periodic=False) >= 1 + initial.GAP / 2
+    assert closest(np.asarray(x), side, periodic=False) >= 1 + GAP / 2
 
 
 def test_where_there_is_no_room_or_the_list_is_full_the_status_says_so(monkeypatch):
-    monkeypatch.setattr("jaxgran.particles.relaxation.MOST_PUSHES", 50)
-    _, fault = positions(jax.random.key(0), side_of(0.8, 3), (1, N, 3), 0.3, (2000, 60))
+    monkeypatch.setattr("jaxgran.particles.setup.MAX_PUSHES", 50)
+    _, fault = relaxed_positions(jax.random.key(0), side_of(0.8, 3), (1, N, 3), 0.3, (2000, 60))
     assert fault == status.NO_ROOM.bit
-    _, fault = positions(jax.random.key(0), side_of(0.4, 3), (1, N, 3), 0.3, (20, 60))
+    _, fault = relaxed_positions(jax.random.key(0), side_of(0.4, 3), (1, N, 3), 0.3, (20, 60))
     assert fault == status.LIST_FULL.bit
-    x, fault = positions(jax.random.key(0), 1.0, (1, N, 3), 0.3, (20, 60), None, 1024)
+    x, fault = relaxed_positions(jax.random.key(0), 1.0, (1, N, 3), 0.3, (20, 60), None, 1024)
     assert fault == 1024 and np.all(np.isfinite(x))
 
 
 def test_one_point_for_all_is_parted(monkeypatch):
-    monkeypatch.setattr("jaxgran.particles.relaxation.uniform_points", lambda *_: jnp.ones((3, 3)))
-    x, fault = positions(jax.random.key(3), 8.0, (1, 3, 3), 0.4, (50, 3))
+    monkeypatch.setattr("jaxgran.particles.setup.uniform_points", lambda *_: jnp.ones((3, 3)))
+    x, fault = relaxed_positions(jax.random.key(3), 8.0, (1, 3, 3), 0.4, (50, 3))
     assert fault == status.OK
-    assert closest(np.asarray(x), 8.0) >= 1 + initial.GAP / 2
+    assert closest(np.asarray(x), 8.0) >= 1 + GAP / 2
 
 
 @pytest.mark.slow

@@ -12,9 +12,14 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.run import Run
-from jaxgran.particles import side_by_side
-from jaxgran.particles.interruption import waited_for
+from jaxgran.data.curve import Run
+from jaxgran.particles import run
+from jaxgran.particles.run import (
+    MIN_SPHERES_PER_RUN,
+    block_until_ready,
+    replica_devices,
+    run_replicas,
+)
 
 TIMES = jnp.array([0.01, 0.03])
 slow = partial(pytest.param, marks=pytest.mark.slow)
@@ -24,7 +29,7 @@ MODELS = {"DSMC": 200, "HardSpheres": 20, "SoftSpheres": 20}
 @pytest.fixture
 def two_devices(monkeypatch):
     device = jax.devices()[0]
-    monkeypatch.setattr(side_by_side, "devices", lambda n, *_: (device,) * 2 if n > 1 else ())
+    monkeypatch.setattr(run, "replica_devices", lambda n, *_: (device,) * 2 if n > 1 else ())
 
 
 def cool(gas, name, replicas, **options):
@@ -104,24 +109,24 @@ def test_an_error_of_one_ends_the_others_and_is_raised():
         if k == 0:
             raise RuntimeError("of the first")
         while True:  # until it is told to stop
-            waited_for(jnp.zeros(()))
+            block_until_ready(jnp.zeros(()))
 
     with pytest.raises(RuntimeError, match="of the first"):
-        side_by_side.side_by_side(one, 2, Run(), devices)
+        run_replicas(one, 2, Run(), devices)
 
 
 def test_replicas_stand_in_one_array_where_there_is_one_device_or_a_chosen_one():
-    assert side_by_side.devices(1) == () and side_by_side.devices(2) == ()
-    many = side_by_side.MANY
-    assert side_by_side.devices(2, many - 1) == side_by_side.devices(1, many) == ()
-    assert side_by_side.devices(2, many) == tuple(jax.devices())
+    assert replica_devices(1) == () and replica_devices(2) == ()
+    many = MIN_SPHERES_PER_RUN
+    assert replica_devices(2, many - 1) == replica_devices(1, many) == ()
+    assert replica_devices(2, many) == tuple(jax.devices())
     with jax.default_device(jax.devices()[0]):
-        assert side_by_side.devices(2, many) == ()
+        assert replica_devices(2, many) == ()
 
 
 @pytest.mark.parametrize("name", ["HardSpheres", "SoftSpheres"])
 def test_large_replicas_on_one_device_run_in_turn(name, beads, monkeypatch):
-    monkeypatch.setattr(side_by_side, "MANY", MODELS[name])
+    monkeypatch.setattr(run, "MIN_SPHERES_PER_RUN", MODELS[name])
     gas, key = beads(packing_fraction=0.1), jax.random.key(4)
     two = cool(gas, name, 2, key=key)
     alone = cool(gas, name, 1, key=jax.random.fold_in(key, 1))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.scene_keys import read_elements
+from jaxgran.data.curve_file import read_elements
 
 RATE = 3e-3  # of the drive, T_0 per mean free time
 

@@ -7,10 +7,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxgran
-from jaxgran.scene.reduced_scene import reduced_scene
-from jaxgran.scene.wall_layer import MOST_IMPACTS, share_of_impacts
-from jaxgran.theory.averages import averages
-from jaxgran.theory.moments import Density, Moments, velocity
+from jaxgran.scene.elements import MOST_IMPACTS, share_of_impacts
+from jaxgran.scene.reduced import reduced_scene
+from jaxgran.theory.averages import impact_moments
+from jaxgran.theory.equations import Density, Moments, moment_rates
 
 TAUS = np.geomspace(1.0, 300.0, 8)
 
@@ -317,9 +317,9 @@ def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
 
     @jax.jit
     def rate(state):
-        rates = averages(reduced.law, jnp.exp(state[0] / 2), 3, 2)
+        rates = impact_moments(reduced.law, jnp.exp(state[0] / 2), 3, 2)
         options = {"order": 2, "softness": False, "maxwellian": False}
-        return velocity(state, rates, reduced, Density(), 3, **options)
+        return moment_rates(state, rates, reduced, Density(), 3, **options)
 
     def rates(t, state):
         return np.asarray(rate(jnp.asarray(state)))

@@ -6,9 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
-from jaxgran.scene import restitution_table
 from jaxgran.scene.contact import impact
-from jaxgran.scene.restitution_table import viscoelastic_restitution
+from jaxgran.scene.laws import C1, C2, C_CLIP, UNCLIPPED_SERIES, viscoelastic_restitution
 
 solve = jax.jit(jax.vmap(lambda b: impact(b).restitution))
 solve_unclipped = jax.jit(jax.vmap(lambda b: impact(b, clipped=False).restitution))
@@ -16,8 +15,8 @@ solve_unclipped = jax.jit(jax.vmap(lambda b: impact(b, clipped=False).restitutio
 
 def test_constants():
     # Closed forms, Ramirez et al. 1999 and Brilliantov & Poeschel.
-    assert abs(restitution_table.C1 - 1.153448858095289) < 1e-15
-    assert abs(restitution_table.C2 - 0.798266560944795) < 1e-15
+    assert abs(C1 - 1.153448858095289) < 1e-15
+    assert abs(C2 - 0.798266560944795) < 1e-15
 
 
 @pytest.mark.slow
@@ -58,22 +57,20 @@ def test_fast_law_at_zero():
         def law(b, clipped=clipped):
             return viscoelastic_restitution(b, clipped=clipped)
 
-        np.testing.assert_allclose(jax.grad(law)(0.0), -restitution_table.C1, rtol=1e-12)
+        np.testing.assert_allclose(jax.grad(law)(0.0), -C1, rtol=1e-12)
         # The fits fix the slope at 0, the curvature only to their own accuracy.
-        np.testing.assert_allclose(
-            jax.grad(jax.grad(law))(0.0), 2 * restitution_table.C2, rtol=2e-3
-        )
+        np.testing.assert_allclose(jax.grad(jax.grad(law))(0.0), 2 * C2, rtol=2e-3)
 
 
 def test_fast_law_series():
     # eps + C1 b - C2 b^2 - ... of the series, at beta small enough for the next term to be 1e-7.
     beta = 0.01
-    unclipped = sum(c * beta ** (k + 1) for k, c in enumerate(restitution_table.UNCLIPPED_SERIES))
+    unclipped = sum(c * beta ** (k + 1) for k, c in enumerate(UNCLIPPED_SERIES))
     fast = viscoelastic_restitution(beta, clipped=False)
     np.testing.assert_allclose(fast, 1 + unclipped, atol=1e-8)
     difference = viscoelastic_restitution(beta) - fast
     # Next term .0614 relative: (.461 - 0) beta^(1/2) / (4/15); measured .0829.
-    np.testing.assert_allclose(difference, restitution_table.C_CLIP * beta**2.5, rtol=0.2)
+    np.testing.assert_allclose(difference, C_CLIP * beta**2.5, rtol=0.2)
 
 
 def test_float32():

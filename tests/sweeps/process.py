@@ -30,7 +30,7 @@ def main(port, index, processes, store, size, die_at=-1):
     address = f"127.0.0.1:{port}"
     jax.distributed.initialize(address, processes, index, heartbeat_timeout_seconds=seconds)
     import jaxgran
-    from jaxgran.sweeps.store import Store
+    from jaxgran.sweep import Store
 
     write = Store.write
 

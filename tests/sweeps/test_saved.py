@@ -7,8 +7,8 @@ import pytest
 
 import jaxgran
 from jaxgran import observables
-from jaxgran.checks import status
-from jaxgran.sweeps.store import Store
+from jaxgran._utils import status
+from jaxgran.sweep import Store
 from tests.beads import glass_beads
 
 TIMES = (0.05, 0.1)
@@ -117,7 +117,7 @@ def test_members_that_are_not_taken_are_nan_or_0(gases):
     bad = jax.vmap(lambda gas, phi: gas.replace(packing_fraction=phi))(gases, dense)
     with pytest.warns(UserWarning, match="the first of them 1"):
         curves = sweep(bad, save=save, chunk=2)
-    assert list(curves.status) == [0, status.NOT_TAKEN.bit, 0]
+    assert list(curves.status) == [0, status.UNSUPPORTED.bit, 0]
     assert np.isnan(curves.saved["T"][1]).all() and np.isfinite(curves.saved["T"][::2]).all()
     assert np.all(curves.replicas.saved["forward"][1] == 0)
 

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.checks import status
+from jaxgran._utils import status
 from jaxgran.models.spheres import Plan
-from jaxgran.sweeps.program import Program
-from jaxgran.sweeps.store import Store
+from jaxgran.sweep import Program, Store
 
 TIMES = (0.1, 1.0, 10.0)
 A = jnp.geomspace(1e-6, 1e-5, 5)
@@ -145,7 +144,7 @@ def test_members_that_a_model_does_not_take_are_nan(gases):
     dense = bad(jnp.array([0.05, 0.6, 0.1]))
     with pytest.warns(UserWarning, match="members 0 to 2 .* first of them 1: .*too dense"):
         curves = sweep(dense, (0.01,), model=jaxgran.HardSpheres(50))
-    assert list(curves.status) == [0, status.NOT_TAKEN.bit, 0]
+    assert list(curves.status) == [0, status.UNSUPPORTED.bit, 0]
     assert np.isnan(curves.temperature[1]).all() and np.all(curves.temperature[::2] > 0)
     assert "does not take" in jaxgran.explain_status(curves.status[1])
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.run import Run
-from jaxgran.models.flow_bias import slope_bias, slope_bias_of_run
-from jaxgran.tangents.differences import by_differences
-from jaxgran.tangents.rule import Inputs, Outputs, differentiable, with_tangents
+from jaxgran.data.curve import Run
+from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable, with_tangents
+from jaxgran.models.error_model import slope_bias, slope_bias_of_run
 from tests.beads import glass_beads
 from tests.models.test_hard_spheres import hard_gas
 from tests.models.test_soft_spheres import soft_beads

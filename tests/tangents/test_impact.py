@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.run import Run
-from jaxgran.scene.restitution import ConstantRestitution, ReducedViscoelastic, RestitutionSeries
-from jaxgran.tangents.impact import ImpactTangents
+from jaxgran.data.curve import Run
+from jaxgran.gradients.tangents import ImpactTangents
+from jaxgran.scene.laws import ConstantRestitution, ReducedViscoelastic, RestitutionSeries
 from tests.beads import glass_beads
 from tests.models.test_dsmc import SENSITIVITY
 from tests.models.test_hard_spheres import hard_gas

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.models.soft_spheres import SoftSpheres, reduced_scene
-from jaxgran.tangents import thermal
+from jaxgran.gradients.tangents import initial_tangents, projected
+from jaxgran.models.soft_spheres import SoftSpheres, reduced_soft_scene
 from tests.models.test_soft_spheres import soft_beads
 
 
@@ -32,14 +32,14 @@ def followed(gas, position, velocity, replicas, end, interval, steps=40, sensiti
     """A state in reduced units after some time, with its tangent in (alpha, A)."""
     num = len(position) // replicas
     model = SoftSpheres(num, replicas=replicas, steps_per_contact=steps).sized_for(gas, spare=4.0)
-    scene = reduced_scene(gas, num)
+    scene = reduced_soft_scene(gas, num)
     dynamics = model.dynamics(scene, model.plan)
     state = dynamics.begin(jnp.asarray(position), jnp.asarray(velocity), 0.4)
     directions = [jnp.array([x]) for x in sensitive_to]
-    along = thermal.at_start(*directions, state.velocity, replicas, interval, 0.0)
+    along = initial_tangents(*directions, state.velocity, replicas, interval, 0.0)
     state = state._replace(tangents=along)
     while float(state.time) < end:
-        now = dynamics.stretch(state, end, "sweep")
+        now = dynamics.run_segment(state, end, "sweep")
         assert int(now.status) == 0
         state = now.state
     return state, scene
@@ -74,14 +74,14 @@ def test_one_impact_has_the_slope_of_its_law(beads, beta, angle):
     # 1.5 rad grazes: the normal speed is 7 % of the speed.
     gas = soft_beads(beads, 1e-7, beta, packing_fraction=0.02)
     gaps = 1e-4 * (1 + np.arange(16) / 16)
-    scene = reduced_scene(gas, 2)
+    scene = reduced_soft_scene(gas, 2)
     position, velocity = pairs_that_meet(gas, angle, gaps)
     end = 6 * float(scene.contact_duration) / np.cos(angle) ** 0.2 + 2e-4
     # Projected many times during contact, only before and after it, and not at all.
     for interval in (1e-9, 1e-4, 1e3):
         state, scene = followed(gas, position, velocity, len(gaps), end, interval)
         assert bool(jnp.all(state.tangents.free))
-        c = thermal.projected(state.tangents, state.velocity).log_temperature
+        c = projected(state.tangents, state.velocity).log_temperature
         got = float(jnp.mean(c) * scene.dissipative_constant)
         speed = 2.0 * float(jnp.sqrt(gas.temperature))
         # The onset's sqrt(xi) in steps of t_c/40 leaves 1e-3 of a slope on average over its phase.
@@ -96,7 +96,7 @@ def test_the_tangent_is_exact_between_projections(beads):
     start = jaxgran.cool(gas.replace(dissipative_constant=0.0), times, model=model).particles
     position = np.asarray(start.position[0] / gas.diameter)
     velocity = np.asarray(start.velocity[0] / jnp.sqrt(gas.temperature))
-    scene = reduced_scene(gas, 100)
+    scene = reduced_soft_scene(gas, 100)
     end = 0.8 / float(scene.collision_frequency)
 
     def plain(constant):
@@ -238,7 +238,7 @@ def test_elastic_limit(beads):
 @pytest.mark.slow
 def test_touching_two_and_three_bodies_have_finite_slopes(beads):
     gas = soft_beads(beads, 0.02, 0.2, packing_fraction=0.02)
-    scene = reduced_scene(gas, 3)
+    scene = reduced_soft_scene(gas, 3)
     side = float(scene.side)
     middle = np.full(3, side / 2)
     e = np.eye(3)

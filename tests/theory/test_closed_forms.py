@@ -6,7 +6,20 @@ import pytest
 
 import jaxgran
 from jaxgran.theory import averages as kinetics
-from jaxgran.theory import closed_forms
+from jaxgran.theory.equations import (
+    COOLING_CORRECTION,
+    COOLING_RATE,
+    EXPANSION_P,
+    EXPANSION_R,
+    SONINE_COEFFICIENT,
+    constant_displacement,
+    haff,
+    haff_collisions,
+    paper_averages,
+    paper_displacement,
+    paper_temperature,
+    two_term_time,
+)
 
 
 def hard_gas(e: float, dimension: int = 3) -> jaxgran.Gas:
@@ -16,10 +29,10 @@ def hard_gas(e: float, dimension: int = 3) -> jaxgran.Gas:
 
 def test_constants_of_the_expansion():
     # Checked values of the corrected expansion; the third series coefficient has nine digits.
-    np.testing.assert_allclose(closed_forms.COOLING_RATE[3], 0.831934150151502, rtol=1e-14)
-    np.testing.assert_allclose(closed_forms.COOLING_CORRECTION, 2.301752786151829, rtol=1e-14)
-    np.testing.assert_allclose(closed_forms.EXPANSION_P, 0.5661271900235634, rtol=1e-14)
-    np.testing.assert_allclose(closed_forms.EXPANSION_R, 4.142724172222288, rtol=1e-9)
+    np.testing.assert_allclose(COOLING_RATE[3], 0.831934150151502, rtol=1e-14)
+    np.testing.assert_allclose(COOLING_CORRECTION, 2.301752786151829, rtol=1e-14)
+    np.testing.assert_allclose(EXPANSION_P, 0.5661271900235634, rtol=1e-14)
+    np.testing.assert_allclose(EXPANSION_R, 4.142724172222288, rtol=1e-9)
 
 
 @pytest.mark.parametrize("e", [0.99, 0.9, 0.5, 0.0])
@@ -30,7 +43,7 @@ def test_haff(e, record):
     model = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-9)
     curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
     # Asked: 1e-8. The solver's rtol is 1e-9 and its error adds up over eleven decades.
-    exact = closed_forms.haff(tau, e)
+    exact = haff(tau, e)
     np.testing.assert_allclose(curve.temperature, exact, rtol=1e-8)
     record("haff", eps=e, error=float(jnp.max(jnp.abs(curve.temperature / exact - 1))))
 
@@ -41,10 +54,10 @@ def test_two_term_solution(beads):
     model = jaxgran.KineticTheory(softness=False, averages="paper", correlations=False)
     curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
     theta = curve.temperature / gas.temperature
-    exact = closed_forms.two_term_time(theta, gas.delta)
+    exact = two_term_time(theta, gas.delta)
     np.testing.assert_allclose(exact, tau, rtol=2e-8)  # five thirds of the error of T
     with pytest.raises(ValueError, match=r"delta must lie in \(0, 0.4345\), got 0.5"):
-        closed_forms.two_term_time(0.5, 0.5)
+        two_term_time(0.5, 0.5)
 
 
 @pytest.mark.slow
@@ -68,39 +81,39 @@ def test_expansion_is_right_to_its_order(beads):
             tau = jnp.geomspace(0.01, 1e4, 40) / delta
             model = jaxgran.KineticTheory(sonine=False, softness=False, correlations=False)
             theta = jaxgran.cool(gas, tau * gas.mean_free_time, model=model).temperature / 0.01
-            formula = closed_forms.paper_temperature(tau, delta, clipped=clipped)
+            formula = paper_temperature(tau, delta, clipped=clipped)
             ratios.append(float(jnp.max(jnp.abs(formula / theta - 1))) / delta**2.5)
         assert max(ratios) < 2.0, ratios
 
 
 def test_printed_expansion_breaks_the_initial_condition():
     # The reason for the correction: at t = 0 the printed form is off by 2 q delta.
-    printed = closed_forms.paper_temperature(0.0, 0.1, corrected=False)
-    np.testing.assert_allclose(printed, 1 + 2 * closed_forms.COOLING_CORRECTION * 0.1, rtol=1e-12)
-    np.testing.assert_allclose(closed_forms.paper_temperature(0.0, 0.1), 1.0, rtol=1e-12)
+    printed = paper_temperature(0.0, 0.1, corrected=False)
+    np.testing.assert_allclose(printed, 1 + 2 * COOLING_CORRECTION * 0.1, rtol=1e-12)
+    np.testing.assert_allclose(paper_temperature(0.0, 0.1), 1.0, rtol=1e-12)
 
 
 def test_paper_averages_are_the_first_two_terms(beads):
     gas = beads(0.002)
     law = gas.reduced_law
-    exact = kinetics.averages(law, jnp.ones(()), 3)[:, 0]
-    paper = closed_forms.paper_averages(law, jnp.ones(()), 3)[:, 0]
+    exact = kinetics.impact_moments(law, jnp.ones(()), 3)[:, 0]
+    paper = paper_averages(law, jnp.ones(()), 3)[:, 0]
     # The next term of 1 - eps^2 is O(beta^(3/2)) relative to the first: 0.23 * 9e-5.
     np.testing.assert_allclose(paper[0], exact[0], rtol=5e-5)
     np.testing.assert_allclose(paper[2], exact[2], rtol=1e-7)
     with pytest.raises(ValueError, match="Viscoelastic law, got ConstantRestitution"):
-        closed_forms.paper_averages(jaxgran.ConstantRestitution(0.9), jnp.ones(()), 3)
+        paper_averages(jaxgran.ConstantRestitution(0.9), jnp.ones(()), 3)
 
 
 def test_velocity_relaxation_as_printed(beads):
     # The paper's Eq. (32) with its own coefficients: 1 - 3/4 Gamma(21/10) C1 delta 4^.1 + ...
     from math import gamma
 
-    from jaxgran.scene.restitution_table import C1
+    from jaxgran.scene.laws import C1
 
     gas = beads(0.15)
-    paper = closed_forms.paper_averages(gas.reduced_law, jnp.ones(()), 3)[2, 0]
-    elastic = closed_forms.paper_averages(beads(0.0).reduced_law, jnp.ones(()), 3)[2, 0]
+    paper = paper_averages(gas.reduced_law, jnp.ones(()), 3)[2, 0]
+    elastic = paper_averages(beads(0.0).reduced_law, jnp.ones(()), 3)[2, 0]
     small = float(gas.delta) * 4**0.1
     printed = 1 - 0.75 * gamma(2.1) * C1 * small + 27 / 40 * gamma(2.2) * C1**2 * small**2
     np.testing.assert_allclose(paper / elastic, printed, rtol=1e-12)
@@ -113,8 +126,8 @@ def test_displacement_of_constant_restitution():
         tau = jnp.geomspace(0.01, 1e6, 50)
         model = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-9)
         curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
-        collisions = closed_forms.haff_collisions(tau, e, d)
-        formula = closed_forms.constant_displacement(collisions, e, d) * gas.mean_free_time**2
+        collisions = haff_collisions(tau, e, d)
+        formula = constant_displacement(collisions, e, d) * gas.mean_free_time**2
         # The solver's atol is its rtol, too: of the ballistic start it sees less.
         np.testing.assert_allclose(curve.collisions, collisions, rtol=1e-7)
         np.testing.assert_allclose(curve.displacement, formula, rtol=1e-6)
@@ -126,17 +139,15 @@ def test_first_order_of_viscoelastic_gas(beads):
     u = jnp.asarray([10.0, 1e2, 1e4, 1e6])
     for delta in (1e-4, 1e-3):
         gas = beads(1.5 * 2**0.1 * delta)
-        tau = (u - 1) / (closed_forms.COOLING_RATE[3] * delta)
+        tau = (u - 1) / (COOLING_RATE[3] * delta)
         model = jaxgran.KineticTheory(softness=False, order=2, correlations=False, rtol=1e-11)
         curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
-        leading = 54 / (closed_forms.COOLING_RATE[3] * delta) * (u ** (1 / 6) - 1)
+        leading = 54 / (COOLING_RATE[3] * delta) * (u ** (1 / 6) - 1)
         unit = gas.temperature * gas.mean_free_time**2
         exact = curve.displacement / unit - leading
-        formula = closed_forms.paper_displacement(tau, delta) - leading
+        formula = paper_displacement(tau, delta) - leading
         np.testing.assert_allclose(exact, formula, rtol=0.3 * delta**0.5)
-        kurtosis = (
-            -closed_forms.SONINE_COEFFICIENT * delta * (curve.temperature / gas.temperature) ** 0.1
-        )
+        kurtosis = -SONINE_COEFFICIENT * delta * (curve.temperature / gas.temperature) ** 0.1
         np.testing.assert_allclose(curve.sonine, kurtosis, rtol=2 * delta**0.5)
-        printed = closed_forms.paper_displacement(tau, delta, corrected=False) - leading
+        printed = paper_displacement(tau, delta, corrected=False) - leading
         assert jnp.all(jnp.abs(printed / exact - 1) > 0.1)

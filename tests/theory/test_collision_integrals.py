@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.theory import collision_integrals
+from jaxgran.theory.averages import SAMPLES, collision_changes
 
 # a_2, a_3, D n sigma^(d-1)/sqrt(2 T) of the homogeneous cooling state: direct simulation by a code
 # of its own in C, 1e5 particles over 25 relaxations of D. Errors: a_2 1e-4 (1.7e-4 for small eps),
@@ -71,11 +71,11 @@ def test_cooling_state_agrees_with_direct_simulation(dimension):
 def test_elastic_relaxation_of_a2_and_a3():
     # Elastic spheres in 3D: mu_4 linear in a_2 is 4 sqrt(2 pi) a_2 (van Noije & Ernst 1998).
     g = np.linspace(0.0, 9.0, 4001)
-    matrix = collision_integrals.changes(3, 3, tuple(g))[..., 0, :]
+    matrix = collision_changes(3, 3, tuple(g))[..., 0, :]
     averages = 4 * np.pi / np.sqrt(8 * np.pi) * np.trapezoid(matrix * g * np.exp(-(g**2) / 2), g)
     np.testing.assert_allclose(averages[0], 0.0, atol=1e-12)  # energy is kept
     # Order 2 without the closure, by the same route.
-    second = collision_integrals.changes(3, 2, tuple(g))[..., 0, :]
+    second = collision_changes(3, 2, tuple(g))[..., 0, :]
     linear = np.trapezoid(second[1, 1] * g * np.exp(-(g**2) / 2), g)
     np.testing.assert_allclose(
         linear * 4 * np.pi / np.sqrt(8 * np.pi), 4 * np.sqrt(2 * np.pi), rtol=1e-5
@@ -104,8 +104,8 @@ def test_changes_agree_with_sampled_impacts(dimension, eps):
         for k in (False, True):
             lost = square[0] * (s1[0] if j else 1) - kept * (s1[2] if j else 1)
             sampled.append(dot * lost * (s1[0] if k else 1))
-    powers = (1 - eps) ** np.arange(collision_integrals.SAMPLES)
-    exact = np.einsum("rpn,p->r", collision_integrals.changes(dimension, 3, (g,))[:, 0], powers)
+    powers = (1 - eps) ** np.arange(SAMPLES)
+    exact = np.einsum("rpn,p->r", collision_changes(dimension, 3, (g,))[:, 0], powers)
     for value, samples in zip(exact, sampled, strict=True):
         error = np.std(samples) / n**0.5
         assert abs(np.mean(samples) - value) < 4 * error + 1e-9

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 
 import jaxgran
-from jaxgran.theory.correlations import SHORTEST, built_up, slowing
+from jaxgran.theory.equations import SHORTEST, built_up, slowing
 
 
 def disks_or_spheres(eps, phi, dimension):

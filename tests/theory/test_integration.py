@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.theory import integration
+from jaxgran.theory.solver import FIRST_STEP, integrate_at, padded_length
 
 TIMES = np.linspace(0.0, 5.0, 64)
 
 
 def solved(velocity, start, times, rtol=1e-9, max_steps=1000):
-    return integration.values_at(
+    return integrate_at(
         velocity,
         jnp.asarray(start),
         jnp.asarray(times),
@@ -26,7 +26,7 @@ def solved(velocity, start, times, rtol=1e-9, max_steps=1000):
 
 @pytest.mark.parametrize("size, length", [(1, 16), (16, 16), (17, 32), (50, 64), (65, 128)])
 def test_lengths_are_on_a_geometric_grid(size, length):
-    assert integration.padded_length(size) == length
+    assert padded_length(size) == length
 
 
 @pytest.mark.parametrize("rtol", [1e-4, 1e-9])
@@ -44,7 +44,7 @@ def test_an_oscillation_is_that_of_diffrax_and_of_the_closed_form(rtol):
         diffrax.Tsit5(),
         t0=0.0,
         t1=5.0,
-        dt0=integration.FIRST_STEP,
+        dt0=FIRST_STEP,
         y0=jnp.array([1.0, 0.0]),
         saveat=diffrax.SaveAt(ts=TIMES),
         stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.theory.table_of_times import (
+from jaxgran.fitting.alternatives import (
     cooling_by_roughness,
-    log_temperature,
+    log_temperature_by_quadrature,
     relaxed_cooling_rate,
 )
 from tests.beads import glass_beads
@@ -30,7 +30,7 @@ def test_is_that_of_kinetic_theory(beta, dimension):
     def course(log_scale):
         A = gas.value("dissipative_constant") * jnp.exp(log_scale)
         nodes, rate = relaxed_cooling_rate(gas.replace(dissipative_constant=A), jnp.asarray(18.0))
-        return log_temperature(nodes, rate, times)
+        return log_temperature_by_quadrature(nodes, rate, times)
 
     # a_2 has not relaxed in the first collisions, by which the clock is off.
     found, slope = jax.jvp(course, (0.0,), (1.0,))
@@ -44,10 +44,10 @@ def test_haffs_law_exactly():
     nodes = -12.0 * jnp.linspace(0.0, 1.0, 192)
     times = jnp.geomspace(1e-3, 100.0, 50)
     # Trapezoids between nodes 12/191 apart err by 2 to 4e-4.
-    found = log_temperature(nodes, 2 * jnp.exp(nodes / 2), times)
+    found = log_temperature_by_quadrature(nodes, 2 * jnp.exp(nodes / 2), times)
     np.testing.assert_allclose(found, -2 * jnp.log1p(times), atol=5e-4)
     # A rate that does not depend on T: an exponential.
-    found = log_temperature(nodes, jnp.full(192, 3.0), jnp.linspace(0.0, 3.0, 20))
+    found = log_temperature_by_quadrature(nodes, jnp.full(192, 3.0), jnp.linspace(0.0, 3.0, 20))
     np.testing.assert_allclose(found, -3 * jnp.linspace(0.0, 3.0, 20), atol=5e-4)
 
 
@@ -59,7 +59,7 @@ def test_rotation_follows_from_the_course(beads, beta):
     log_theta, rate = relaxed_cooling_rate(gas, jnp.asarray(6.0))
     whole = rate + cooling_by_roughness(rough, log_theta, rate)
     times = jnp.geomspace(0.1, 80.0, 8) * gas.mean_free_time
-    found = jnp.exp(log_temperature(log_theta, whole, times))
+    found = jnp.exp(log_temperature_by_quadrature(log_theta, whole, times))
     enskog = jaxgran.KineticTheory(order=2, correlations=False)
     expected = jaxgran.cool(rough, times, model=enskog).temperature / gas.temperature
     # a_2 relaxes at once here: up to .3 %. Without rotation T falls by 30 % (beta_t = -.8) more.

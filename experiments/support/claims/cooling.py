@@ -9,9 +9,16 @@ import numpy as np
 import jaxgran
 from experiments.support.claims.table import SMALL, Table, cooled
 from experiments.support.scenes import beads
-from jaxgran.scene.restitution_table import C1
-from jaxgran.theory import closed_forms
-from jaxgran.theory.averages import averages, collision_rate
+from jaxgran.scene.laws import C1
+from jaxgran.theory.averages import collision_rate, impact_moments
+from jaxgran.theory.equations import (
+    COOLING_CORRECTION,
+    COOLING_RATE,
+    RELAXATION_CORRECTION,
+    SONINE_COEFFICIENT,
+    paper_averages,
+    paper_temperature,
+)
 
 
 def cooling(table: Table) -> None:
@@ -83,14 +90,14 @@ def cooling(table: Table) -> None:
 
 def series(table: Table, gas: jaxgran.Gas) -> None:
     """The coefficients of Eqs. (32) and (36)."""
-    q, s = closed_forms.COOLING_CORRECTION, closed_forms.SONINE_COEFFICIENT
-    rates = jnp.asarray([averages(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)])
+    q, s = COOLING_CORRECTION, SONINE_COEFFICIENT
+    rates = jnp.asarray([impact_moments(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)])
     paper_rates = jnp.asarray(
-        [closed_forms.paper_averages(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)]
+        [paper_averages(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)]
     )
     elastic = 2 / 3 * float(collision_rate(0.0, 3))
     c = float((1 - rates[1] / elastic) / SMALL)
-    first, second = closed_forms.RELAXATION_CORRECTION, 27 / 40 * gamma(2.2) * C1**2 * 4**0.2
+    first, second = RELAXATION_CORRECTION, 27 / 40 * gamma(2.2) * C1**2 * 4**0.2
     table.add(
         "32",
         f"1/τ_v = (1 − {first:.4f} δ θ^{{1/10}} + {second:.4f} δ² θ^{{1/5}})/τ_E",
@@ -116,7 +123,7 @@ def series(table: Table, gas: jaxgran.Gas) -> None:
 
 def sonine(table: Table, early: jaxgran.CoolingCurve) -> None:
     """The Sonine coefficient a_2, which the paper takes as zero."""
-    s = closed_forms.SONINE_COEFFICIENT
+    s = SONINE_COEFFICIENT
     assert early.sonine is not None
     a_2 = float(early.sonine[1]) / SMALL / 10 ** (-1 / 6)
     table.add(
@@ -132,13 +139,13 @@ def sonine(table: Table, early: jaxgran.CoolingCurve) -> None:
 
 def formulas(table: Table) -> None:
     """The paper's closed forms of T(t)."""
-    q, s = closed_forms.COOLING_CORRECTION, closed_forms.SONINE_COEFFICIENT
-    first = float(closed_forms.paper_temperature(0.0, 0.093, corrected=False))
+    q, s = COOLING_CORRECTION, SONINE_COEFFICIENT
+    first = float(paper_temperature(0.0, 0.093, corrected=False))
     run = table.found("paper_cooling")
     u = np.geomspace(1.01, 1e9, 50)
     gas, curve = cooled(0.093, u)
-    tau = jnp.asarray(u - 1) / (closed_forms.COOLING_RATE[3] * 0.093)
-    formula = closed_forms.paper_temperature(tau, 0.093)
+    tau = jnp.asarray(u - 1) / (COOLING_RATE[3] * 0.093)
+    formula = paper_temperature(tau, 0.093)
     off = float(jnp.abs(formula * gas.temperature / curve.temperature - 1).max())
     table.add(
         "38",
@@ -151,7 +158,7 @@ def formulas(table: Table) -> None:
         f"which makes a₁ {2 * (q + 0.24 * s):.3f}",
         [("T(0), δ = 0.093", 1.0, first), ("a₁", 2 * (q + 0.24 * s), 2 * q)],
     )
-    rate = closed_forms.COOLING_RATE[3]
+    rate = COOLING_RATE[3]
     table.add(
         "39",
         "τ_c(0)/(δτ₀) = 0.831928",
@@ -182,6 +189,4 @@ def _two_terms_off(delta: float) -> float:
     """Relative error of the relaxation rate by the two terms of Eq. (32)."""
     law = beads(0.05, 1.5 * 2**0.1 * delta).reduced_law
     one = jnp.ones(())
-    return float(
-        abs(closed_forms.paper_averages(law, one, 3)[2, 0] / averages(law, one, 3)[2, 0] - 1)
-    )
+    return float(abs(paper_averages(law, one, 3)[2, 0] / impact_moments(law, one, 3)[2, 0] - 1))

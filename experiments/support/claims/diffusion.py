@@ -8,8 +8,14 @@ import numpy as np
 import jaxgran
 from experiments.support.claims.table import SMALL, Table, cooled
 from experiments.support.scenes import hard_beads
-from jaxgran.theory import closed_forms, collision_integrals
-from jaxgran.theory.averages import averages
+from jaxgran.theory.averages import TERMS, impact_moments
+from jaxgran.theory.equations import (
+    COOLING_CORRECTION,
+    COOLING_RATE,
+    RELAXATION_CORRECTION,
+    SONINE_COEFFICIENT,
+    paper_displacement,
+)
 
 
 def equilibrium(table: Table) -> None:
@@ -107,8 +113,8 @@ def _relaxation_of_cooling_state(eps: float) -> float:
     gas, model = hard_beads(0.01, eps), jaxgran.KineticTheory(correlations=False)
     curve = jaxgran.cool(gas, jnp.array([1e3, 1e4]) * gas.mean_free_time, model=model)
     a2, a3 = np.asarray(curve.sonine)[-1], np.asarray(curve.third_sonine)[-1]
-    row = np.asarray(averages(gas.reduced_law, jnp.ones(()), 3, order=3))[3]
-    powers = zip(*collision_integrals.TERMS[3], strict=True)
+    row = np.asarray(impact_moments(gas.reduced_law, jnp.ones(()), 3, order=3))[3]
+    powers = zip(*TERMS[3], strict=True)
     return float(sum(c * a2**i * a3**j for c, (i, j) in zip(row, powers, strict=True)) / row[0] - 1)
 
 
@@ -118,9 +124,9 @@ def diffusion(table: Table) -> None:
     u, d_0 = np.array([1e4, 1e6]), 1.5 * float(gas.temperature * gas.mean_free_time)
     a_3 = (np.asarray(curve.diffusion) / d_0 - u ** (-5 / 6)) * u / SMALL
     q, c, s = (
-        closed_forms.COOLING_CORRECTION,
-        closed_forms.RELAXATION_CORRECTION,
-        closed_forms.SONINE_COEFFICIENT,
+        COOLING_CORRECTION,
+        RELAXATION_CORRECTION,
+        SONINE_COEFFICIENT,
     )
     ours = q + 0.24 * s + 2 * c + 3 / 16 * s
     table.add(
@@ -146,8 +152,8 @@ def diffusion(table: Table) -> None:
         "inverted",
     )
     exact = np.asarray(curve.displacement) / float(gas.temperature * gas.mean_free_time**2)
-    tau = jnp.asarray(u - 1) / (closed_forms.COOLING_RATE[3] * SMALL)
-    off = float(np.abs(np.asarray(closed_forms.paper_displacement(tau, SMALL)) / exact - 1).max())
+    tau = jnp.asarray(u - 1) / (COOLING_RATE[3] * SMALL)
+    off = float(np.abs(np.asarray(paper_displacement(tau, SMALL)) / exact - 1).max())
     run = table.found("paper_diffusion")
     if run:
         row = run["viscoelastic"]
@@ -189,7 +195,7 @@ def diffusion(table: Table) -> None:
         )
     gas, curve = cooled(0.093, [1e2, 1e6, 1e12])
     theta = np.asarray(curve.temperature / gas.temperature)
-    leading = 54 / (closed_forms.COOLING_RATE[3] * 0.093) * (theta**-0.1 - 1)
+    leading = 54 / (COOLING_RATE[3] * 0.093) * (theta**-0.1 - 1)
     ratio = (
         leading * float(gas.temperature * gas.mean_free_time**2) / np.asarray(curve.displacement)
     )

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 import jaxgran
 from experiments.support.scenes import beads
-from jaxgran.theory import closed_forms
+from jaxgran.theory.equations import COOLING_RATE
 
 SMALL = 1e-4
 """delta at which first-order coefficients are measured."""
@@ -78,7 +78,7 @@ class Table:
 def cooled(delta: float, u, **options) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
     """Dilute viscoelastic beads of a given delta, cooled to the times u = 1 + t/tau_0."""
     gas = beads(0.05, 1.5 * 2**0.1 * delta)
-    tau = (jnp.asarray(u) - 1) / (closed_forms.COOLING_RATE[3] * delta)
+    tau = (jnp.asarray(u) - 1) / (COOLING_RATE[3] * delta)
     model = jaxgran.KineticTheory(
         softness=False, order=2, correlations=False, rtol=1e-11, **options
     )

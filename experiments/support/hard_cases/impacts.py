@@ -25,9 +25,9 @@ from experiments.support.hard_cases.rows import (
 )
 from experiments.support.scenes import beads
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.simulation import SMALLEST_BOX
+from jaxgran.particles.run import MIN_BOX
 from jaxgran.scene import contact
-from jaxgran.scene.restitution_table import C1, viscoelastic_restitution
+from jaxgran.scene.laws import C1, viscoelastic_restitution
 
 HARD, SOFT = jaxgran.HardSpheres, jaxgran.SoftSpheres
 
@@ -351,7 +351,7 @@ def _coincident_soft():
 def smallest_box() -> list[Row]:
     """Two spheres that collide with each other and each other's images in the smallest box."""
     rows = []
-    phi = float(2 * np.pi / 6 / (SMALLEST_BOX * (1 + 1e-6)) ** 3)
+    phi = float(2 * np.pi / 6 / (MIN_BOX * (1 + 1e-6)) ** 3)
     for name in PRECISIONS:
         with precision(name):
             gas = unit_gas(jaxgran.ConstantRestitution(1.0), phi)

@@ -8,7 +8,7 @@
 - `drive`: random kicks.
 - `tangents`, `following`: derivatives at each impact, and after a window.
 - `windows`: from window to window.
-- `own_state`: what hard spheres have besides the state of all spheres.
+- `initial_internal`: what hard spheres have besides the state of all spheres.
 - `observation`: the records.
 
 May import the modules directly under `particles`, except for `driver`, `pure` and `simulation`, and

@@ -1,0 +1,298 @@
+"""Selection of the cheapest model whose estimated error in a scene is small enough."""
+
+import dataclasses
+from collections.abc import Sequence
+from math import hypot
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran._utils import status
+from jaxgran._utils.formatting import Rows, html_table, text_table
+from jaxgran._utils.validation import POSITIVE, checked_times, no_type_check, plain_number
+from jaxgran.data.curve import CoolingCurve, Run
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.checks import check_softness, check_volume, checked_gas, describe_walls
+from jaxgran.models.dsmc import DSMC
+from jaxgran.models.error_model import ErrorModel, flow_share
+from jaxgran.models.hard_spheres import HardSpheres
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.soft_spheres import SoftSpheres
+from jaxgran.scene.gas import Gas
+from jaxgran.theory.equations import softness_factor
+
+NUM_PARTICLES = 4000
+"""Particles of a particle model if no number is given."""
+
+NUM_TIMES = 65
+"""Times at which the course of a gas is sampled."""
+
+
+class Candidate(NamedTuple):
+    """A model that was considered for a scene.
+
+    Attributes:
+        model: the model.
+        error: its estimated relative error of T at the worst of the times, at most 1, which means
+            that nothing is known of T; None if the model cannot take the scene.
+        refusal: why it cannot take the scene; None if it can.
+    """
+
+    model: AbstractModel
+    error: float | None
+    refusal: str | None
+
+
+class Choice(NamedTuple):
+    """The model chosen for a scene.
+
+    Attributes:
+        model: ready to be given to `jaxgran.cool` or `jaxgran.fit`.
+        reasons: why, a sentence each, the verdict first.
+        candidates: all models considered, cheapest first.
+        error: estimated relative error of T of the chosen model.
+
+    >>> choice = jaxgran.choose_model(gas, times, num_particles=200)
+    >>> choice.model.name, choice.error < 0.02
+    ('kinetic theory', True)
+    """
+
+    model: AbstractModel
+    reasons: tuple[str, ...]
+    candidates: tuple[Candidate, ...]
+    error: float
+
+    def __repr__(self) -> str:
+        return text_table(*self._words())
+
+    def _repr_html_(self) -> str:
+        return html_table(*self._words())
+
+    def _words(self) -> tuple[str, Rows]:
+        title = f"Choice: {self.model.name}, T within {100 * self.error:.2g} % by estimate"
+        return title, [(f"{i}.", reason) for i, reason in enumerate(self.reasons, start=1)]
+
+
+def default_models(num_particles: int, replicas: int = 1) -> tuple[AbstractModel, ...]:
+    """The models of this package, cheapest first."""
+    kinds = (DSMC, HardSpheres, SoftSpheres)
+    return KineticTheory(), *(kind(num_particles, replicas=replicas) for kind in kinds)
+
+
+@no_type_check
+def choose_model(
+    gas: Gas,
+    times: ArrayLike | Sequence[float],
+    tolerance: float = 0.02,
+    num_particles: int | None = None,
+    *,
+    replicas: int = 1,
+    models: Sequence[AbstractModel] | None = None,
+) -> Choice:
+    """The cheapest model whose estimated error of T is within a tolerance.
+
+    A model whose cooling rate errs by a share e(t) errs in T by ``|d ln T/dt| int_0^t e dt'``. The
+    share adds up from Enskog's collision frequency, from contacts that last and overlap, and, in a
+    box of known size, from the flow that grows in it, whose energy kinetic theory and DSMC count as
+    heat, which cools. Particle models have noise. Each model estimates its own error
+    (`jaxgran.AbstractModel.estimated_error`).
+
+    Args:
+        gas: the scene.
+        times: t, s, as given to `jaxgran.cool`; they tell how long the gas is followed.
+        tolerance: relative error of T allowed, > 0.
+        num_particles: N of the gas, if known: gives the box, and the number of particles of a
+            particle model (4000 if unknown). Without it the gas is taken to stay homogeneous.
+        replicas: of a particle model.
+        models: the models to choose from, cheapest first; by default those of this package.
+
+    Returns:
+        `Choice`: the model, reasons in words, all candidates with their estimated errors. If no
+        model is accurate enough, the most accurate one; the first reason says so.
+
+    Raises:
+        ValueError: for values out of range or being traced, a gas so soft that kinetic theory is
+            meaningless, a container that is not that of so many spheres, or a scene that no model
+            can take.
+        RuntimeError: if kinetic theory, which estimates the errors, cannot follow the gas so far.
+
+    >>> choice = jaxgran.choose_model(gas, times, num_particles=200)
+    >>> choice.reasons[0][:43]
+    'Kinetic theory: the cheapest model whose es'
+    """
+    _check_arguments(gas, times, tolerance)
+    tolerance = float(tolerance)
+    if num_particles is not None:
+        check_volume(gas, num_particles)
+    size = NUM_PARTICLES if num_particles is None else num_particles
+    models = default_models(size, replicas) if models is None else models
+    error_model = error_model_of(gas, float(checked_times(times)[-1]), num_particles)
+    candidates = tuple(_candidate(model, error_model) for model in models)
+    possible = [(c.error, c) for c in candidates if c.error is not None]
+    if not possible:
+        refusals = "; ".join(str(c.refusal) for c in candidates)
+        raise ValueError(f"no model can take this scene: {refusals}")
+    good = [(error, c) for error, c in possible if error <= tolerance]
+    error, best = good[0] if good else min(possible, key=lambda pair: pair[0])
+    reasons = [
+        _verdict(best.model, error, tolerance, enough=bool(good)),
+        *_describe_scene(error_model, size, replicas),
+        *(f"{_capitalised(c.model.name)}: {c.refusal}." for c in candidates if c.refusal),
+    ]
+    return Choice(best.model, tuple(reasons), candidates, error)
+
+
+def _check_arguments(gas: Any, times: Any, tolerance: Any) -> None:
+    checked_gas(gas)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, times))):
+        raise ValueError(
+            "a model cannot be chosen for values being traced by jax.jit, jax.grad or jax.vmap: "
+            "call choose_model outside, and give its model to cool"
+        )
+    plain_number("tolerance", tolerance, POSITIVE, "0.02 allows T to err by 2 %.")
+
+
+def _candidate(model: AbstractModel, error_model: ErrorModel) -> Candidate:
+    try:
+        model.check_scene(error_model.gas)
+    except ValueError as refusal:
+        return Candidate(model, None, str(refusal))
+    return Candidate(model, min(model.estimated_error(error_model), 1.0), None)
+
+
+def _verdict(model: AbstractModel, error: float, tolerance: float, enough: bool) -> str:
+    name, share = _capitalised(model.name), _percent(error)
+    if enough:
+        return (
+            f"{name}: the cheapest model whose estimated error of T, {share}, is within "
+            f"{_percent(tolerance)}."
+        )
+    verdict = (
+        f"{name}: the closest; no model is within {_percent(tolerance)}, and its estimated error "
+        f"of T is {share}."
+    )
+    if model.stochastic:
+        verdict += " More particles or replicas have less noise."
+    return verdict
+
+
+def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> ErrorModel:
+    """The course of a gas from t = 0 to an end, s, as kinetic theory predicts it without friction.
+
+    Raises:
+        ValueError: for a gas so soft that the softness correction has no meaning.
+        RuntimeError: if kinetic theory cannot follow the gas so far.
+    """
+    grid = jnp.linspace(0, jnp.log1p(end / gas.mean_free_time), NUM_TIMES)
+    known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
+    curve = KineticTheory().simulate(known, jnp.expm1(grid) * gas.mean_free_time, Run())
+    error_model = error_model_along(gas, curve, num_particles)
+    softest = int(np.argmax(error_model.softness))
+    hottest = np.exp(error_model.log_temperature[softest] / 2)
+    check_softness(gas, 1 - error_model.softness[softest], hottest)
+    fault = int(jnp.asarray(curve.status))
+    if fault != status.OK:
+        raise RuntimeError(f"kinetic theory, which estimates the errors: {status.explain(fault)}")
+    return error_model
+
+
+def error_model_along(
+    gas: Gas, curve: CoolingCurve, num_particles: int | None = None
+) -> ErrorModel:
+    """The course of a gas along its cooling curve, which begins at t = 0.
+
+    a_2 and the collisions are taken for 0 where the curve does not have them.
+    """
+    temperature = np.asarray(curve.temperature)
+    nothing = np.zeros_like(temperature)
+    values = {
+        "time": curve.times,
+        "log_temperature": np.log(temperature / np.asarray(gas.temperature)),
+        "collisions": nothing if curve.collisions is None else curve.collisions,
+        "sonine": nothing if curve.sonine is None else curve.sonine,
+    }
+    scales = _scales(gas, curve.temperature)
+    values = {name: np.asarray(value, float) for name, value in (values | scales).items()}
+    critical, flow = values.pop("critical_box"), np.zeros_like(values["time"])
+    scatter = flow
+    if num_particles is not None:
+        flow, scatter = flow_share(gas, values["log_temperature"], critical, num_particles)
+    return ErrorModel(gas, num_particles, **values, flow_share=flow, flow_scatter=scatter)
+
+
+@eqx.filter_jit
+def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Array, "times"]]:
+    """Contacts and the critical box at each temperature."""
+
+    def scales(temperature):
+        now = gas.replace(temperature=temperature)
+        factor = softness_factor(now.reduced_law, jnp.ones_like(temperature), now.dimension)
+        return {
+            "contact_fraction": now.contact_fraction,
+            "overlap": now.mean_overlap,
+            "softness": 1 - factor,
+            "critical_box": now.critical_box,
+        }
+
+    return jax.vmap(scales)(temperature)
+
+
+def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[str]:
+    hard = error_model.error_of_temperature(error_model.lasting_contacts + error_model.softness)
+    corrected = error_model.error_of_temperature(
+        error_model.crowded_contacts + error_model.second_order_softness
+    )
+    lowest, end = np.exp([error_model.log_temperature.min(), error_model.log_temperature[-1]])
+    heated = error_model.gas.drive is not None and end > 1
+    return [
+        f"T {f'rises to {end:.2g}' if heated else f'falls to {lowest:.2g}'} T_0 in "
+        f"{error_model.collisions[-1]:.3g} collisions per particle.",
+        f"Contacts last {_percent(error_model.contact_fraction.max())} of the mean free time and overlap"
+        f" by {_percent(error_model.overlap.max())} of a diameter: T errs by {_percent(hard)} with "
+        f"instantaneous impacts, {_percent(corrected)} with kinetic theory's first correction.",
+        _describe_box(error_model),
+        _describe_noise(error_model, size, replicas),
+        *(
+            ["These estimates leave friction out."]
+            if "friction" in error_model.gas.elements
+            else []
+        ),
+    ]
+
+
+def _describe_box(error_model: ErrorModel) -> str:
+    gas, error = error_model.gas, _percent(error_model.error_of_temperature(error_model.correlated))
+    text = f"At a packing fraction of {float(gas.packing_fraction):.2g}"
+    if error_model.num_particles is None:
+        return (
+            f"{text} a gas that stays homogeneous leaves an error of {error}; without "
+            "num_particles the box is unknown, and clustering is not estimated."
+        )
+    ratio = float(gas.box_side(error_model.num_particles) / gas.critical_box)
+    later = " Clusters come after the flow (see Gas.critical_box)." if ratio > 1 else ""
+    return (
+        f"{text} in a box of {ratio:.2g} L_c, where the flow comes to hold "
+        f"{_percent(error_model.flow_share.max())} of the energy, homogeneous models err by {error}."
+        f"{later} The box {describe_walls(gas, error_model.num_particles)}."
+    )
+
+
+def _describe_noise(error_model: ErrorModel, size: int, replicas: int) -> str:
+    noise, flowing = error_model.shot_noise(size * replicas), error_model.flow_noise(replicas)
+    text = f"{size * replicas} particles have a noise of {_percent(noise)} in T"
+    if flowing <= noise / 10:
+        return f"{text}."
+    return f"{text}, {_percent(hypot(noise, flowing))} with the chance amplitudes of the flow."
+
+
+def _capitalised(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"

@@ -1,0 +1,158 @@
+"""The one verb: cool a gas."""
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import ArrayLike, PRNGKeyArray
+
+from jaxgran._utils import status
+from jaxgran._utils.validation import checked_times, no_type_check
+from jaxgran.data.curve import CoolingCurve, Particles, Run
+from jaxgran.data.files import check_writable
+from jaxgran.models import checks
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.choose import choose_model
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.scene.gas import Gas
+
+
+@no_type_check
+def cool(
+    gas: Gas,
+    times: ArrayLike | Sequence[float],
+    *,
+    model: AbstractModel | Literal["auto"] | None = None,
+    key: PRNGKeyArray | None = None,
+    progress: bool = True,
+    checkpoint: str | Path | None = None,
+    save: Callable[[Particles], Any] | Literal["particles"] | None = None,
+    trajectory: str | Path | None = None,
+    throw: bool = True,
+    tolerance: float | None = None,
+    num_particles: int | None = None,
+) -> CoolingCurve:
+    """How the gas cools and spreads from its initial temperature at t = 0.
+
+    The model is a description; `key`, `progress`, `checkpoint` and `throw` are options of this run.
+    Called with known numbers, a particle model is run from the host, which enlarges its arrays
+    where they are too small, shows progress and writes checkpoints. Called inside `jax.jit`,
+    `jax.vmap` or a derivative it is a pure function of arrays, which calls nothing on the host; a
+    random start then is another one of the same kind.
+
+    Args:
+        gas: the scene; its floats may be traced, differentiated and batched with `jax.vmap`.
+        times: t, s, increasing and >= 0, shape (times,); need not start at 0.
+        model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`. "auto" takes the
+            cheapest whose estimated error is small enough; `jaxgran.choose_model` says which, and
+            why.
+        key: of the random numbers of a particle model. Without one it is `jax.random.key(0)`: two
+            such calls return the same numbers. Where there are several CPU devices, and on one for
+            8192 spheres and more, each replica is a run of its own, with the key
+            ``fold_in(key, k)``, and the same whoever runs beside it; others stand in one array, and
+            spheres then share the lengths of their steps and the lives of their neighbour lists.
+        progress: show a progress bar on a terminal during a run of some seconds.
+        checkpoint: a file to which a particle model's run is saved each minute and when it is
+            interrupted, and from which it is resumed; the resumed run gives the same numbers bit
+            for bit. Not inside `jax.jit` and `jax.vmap`. Replicas that are runs of their own have a
+            file each, with the endings .0, .1, ...
+        save: of a model with particles: a function that JAX can compile, of the `Particles` of one
+            replica (arrays of shape (N, d), SI), which returns arrays in any tree; see
+            `jaxgran.observables`. Its mean over replicas at each time is ``curve.saved``, its
+            standard error ``curve.saved_error``, and that of each replica
+            ``curve.replicas.saved``. "particles" keeps these themselves, all of them at all times.
+            Positions of DSMC, which has none, are nan.
+        trajectory: of a model with positions: a file, .gsd (OVITO, freud, VMD, HOOMD; needs the
+            extra `trajectories`) or .xyz (extended XYZ), to which the particles are written at each
+            time, as soon as it is reached; `jaxgran.read_particles` reads it. Of several replicas
+            that is one file each, ``name.0.gsd`` and so on. Not inside `jax.jit` and `jax.vmap`.
+        throw: raise RuntimeError if the run fails. False returns the curve, nan from the failure
+            on, and its ``status`` (`jaxgran.explain_status` puts it into words); inside compiled
+            code, where nothing can be raised, that is always so.
+        tolerance: for "auto" only, relative error of T allowed; 0.02 by default.
+        num_particles: for "auto" only, N of the gas, if known.
+
+    Returns:
+        `CoolingCurve` at those times.
+
+    Raises:
+        ValueError: for times that are negative, unsorted, not finite or not a list, a trajectory
+            that exists already, a scene that the model cannot take, a checkpoint where none can be
+            kept, or options of "auto" with another model. Values being traced cannot be looked at:
+            where they lie outside their ranges the curve is nan, and its status says so.
+        OSError: for a checkpoint that cannot be written.
+        RuntimeError: if the run fails and `throw` is True, with what to do.
+
+    This docstring is long because it documents every option of every model's run.
+
+    >>> curve = jaxgran.cool(gas, times)
+    >>> [round(float(T), 5) for T in curve.temperature]
+    [0.00784, 0.00524, 0.00205, 0.00053]
+    """
+    gas, times, key = checks.checked_gas(gas), checked_times(times), checks.checked_key(key)
+    model = KineticTheory() if model is None else model
+    if model == "auto":
+        tolerance = 0.02 if tolerance is None else tolerance
+        choice = choose_model(gas, times, tolerance, num_particles)
+        if choice.error > tolerance:
+            warnings.warn(choice.reasons[0], stacklevel=2)
+        model = choice.model
+    elif not (tolerance is None and num_particles is None):
+        raise ValueError(
+            'tolerance and num_particles go with model="auto"; give them to the model instead, as '
+            "in SoftSpheres(num_particles), or leave them out"
+        )
+    model = checks.checked_model(model)
+    model.check_save(save)
+    if trajectory is not None:
+        _check_trajectory(trajectory, model)
+    if checkpoint is not None:
+        _check_checkpoint(checkpoint, model)
+    model.check_scene(gas)
+    gas, simulated, allowed = checks.valid_where_traced(gas, times)
+    curve = model.simulate(gas, simulated, Run(key, progress, checkpoint, save, trajectory))
+    curve = checks.nan_unless(allowed, curve, times)
+    if throw and curve.status is not None and not isinstance(curve.status, Tracer):
+        _raise_if_failed(curve, gas)
+    return curve
+
+
+def _check_path(name: str, path: Any) -> None:
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"{name} must be a path, got {path!r}")
+
+
+def _check_trajectory(trajectory: Any, model: AbstractModel) -> None:
+    _check_path("trajectory", trajectory)
+    if not model.has_positions:
+        raise ValueError(
+            f"{type(model).__name__} has no positions: leave trajectory out, or use HardSpheres(N) "
+            "or SoftSpheres(N)"
+        )
+
+
+def _check_checkpoint(checkpoint: Any, model: AbstractModel) -> None:
+    _check_path("checkpoint", checkpoint)
+    if not model.stochastic:
+        raise ValueError(
+            f"{type(model).__name__} has no run to be saved: leave checkpoint out, got "
+            f"{str(checkpoint)!r}"
+        )
+    check_writable(os.fspath(checkpoint))
+
+
+def _raise_if_failed(curve: CoolingCurve, gas: Gas) -> None:
+    fault = int(np.bitwise_or.reduce(np.asarray(curve.status), axis=None))
+    if fault == status.OK:
+        return
+    known = np.isfinite(np.asarray(curve.temperature))
+    reached = ""
+    if np.any(known):
+        last = int(np.flatnonzero(known)[-1])
+        ratio = float(curve.temperature[last] / gas.temperature)
+        reached = f"stopped after t = {curve.times[last]:.3g} s, T/T_0 = {ratio:.3g}: "
+    raise RuntimeError(reached + status.explain(fault))

@@ -1,0 +1,375 @@
+"""A DSMC run: its initial state, its records, and the run as a pure function.
+
+Units here: the impact speed sqrt(2 T_0) and the path length. Laws of restitution are reduced, times
+are in these units, and a key of random numbers is two 32-bit words.
+
+The state of a DSMC run at t = 0.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from math import sqrt
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PRNGKeyArray, UInt32
+
+from jaxgran._utils import status
+from jaxgran.data.curve import Particles
+from jaxgran.gradients.rule import first_order_only, nan_tangent, nan_tangent_like
+from jaxgran.gradients.tangents import ExchangeTangents
+from jaxgran.particles import observables, snapshot
+from jaxgran.particles.dsmc import collisions
+from jaxgran.particles.dsmc.collisions import (
+    DSMCState,
+    DSMCTangents,
+    Scheme,
+    initial_exchange_tangents,
+    kick_all,
+)
+from jaxgran.particles.setup import maxwellian_velocities, normalise_velocities
+from jaxgran.particles.snapshot import Units
+from jaxgran.particles.state import (
+    DragDecay,
+    drag_decay,
+    maxwellian_spins,
+    threefry_key,
+    with_own_buffers,
+)
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
+from jaxgran.scene.laws import ReducedLaw
+from jaxgran.scene.reduced import ReducedDrag, ReducedScene
+from jaxgran.theory import averages
+
+DRIVE_TIME = 10.0
+"""Mean free times in the steady state in which a gas begins."""
+
+
+@partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
+def initial_dsmc_state(
+    key: UInt32[Array, "2"],
+    replicas: int,
+    scheme: Scheme,
+    num_parameters: int,
+    scene: ReducedScene | None = None,
+) -> DSMCState:
+    """Maxwellian velocities at t = 0, with tangents in so many parameters."""
+    d = scheme.dimension
+    key = jax.random.fold_in(threefry_key(key), 2**32 - 1)
+    v = maxwellian_velocities(key, replicas, scheme.num_particles, d).reshape(replicas, -1, d)
+    parts = [v / sqrt(2), jnp.zeros_like(v)]
+    if scene is not None and scene.surface is not None:
+        shape = (replicas, scheme.num_particles, NUM_SPIN_COMPONENTS[d])
+        key = jax.random.fold_in(key, 0)
+        mean_square = (scene.surface.ratio / (2 * scene.surface.inertia)).astype(v.dtype)
+        parts.append(maxwellian_spins(key, shape, mean_square))
+    each, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
+    tangents = DSMCTangents(*[along] * len(DSMCTangents._fields))
+    if scene is not None and num_parameters and has_elements(scene):
+        tangents = initial_exchange_tangents(
+            scene, num_parameters, scheme.num_particles, d, replicas
+        )
+    state = DSMCState(
+        time=jnp.zeros((), v.dtype),
+        clock=each,
+        clock_rest=each,
+        temperature=each + 1,
+        particles=jnp.concatenate(parts, axis=-1),
+        collisions=each,
+        missed=each,
+        steps=jnp.zeros(replicas, jnp.uint32),
+        mobility=each,
+        tangents=tangents,
+    )
+    if scene is None or scene.prepared is None:
+        return state
+    return state._replace(particles=steady_start(state, key, scene, scheme))
+
+
+def has_elements(scene: ReducedScene) -> bool:
+    """Whether there is more than smooth spheres in free flight that begin as a Maxwellian gas."""
+    return any(element is not None for element in scene[1:])
+
+
+def steady_start(
+    state: DSMCState, key: PRNGKeyArray, scene: ReducedScene, scheme: Scheme
+) -> Float[Array, "replicas N components"]:
+    """The particles in the steady state of white noise that returns what impacts take."""
+    losing, d = ReducedScene(scene.law, scene.surface, scene.walls), scheme.dimension
+    rate = averages.collision_rate(0.0, d) * scheme.own_step
+    words = jax.random.bits(jax.random.fold_in(key, 1), (2,), jnp.uint32)
+    share = jnp.ones(len(state.clock), state.clock.dtype)
+
+    def further(i, now):
+        after = collisions.step(now, words, share, losing, scheme, False)
+        growth = jnp.maximum(1 - after.temperature, 0.0)
+        keys = jax.random.split(jax.random.fold_in(threefry_key(words), i), len(share))
+        kick = jax.vmap(kick_all, (0, 0, 0, None, None, None))
+        hot = kick(after.particles, keys, growth, jnp.zeros(()), d, scene.walls is None)
+        velocity = normalise_velocities(hot[..., :d].reshape(-1, d), len(share)) / sqrt(2)
+        velocity = velocity.reshape(hot[..., :d].shape)
+        parts = [velocity, jnp.zeros_like(velocity), hot[..., 2 * d :]]
+        particles = jnp.concatenate(parts, axis=-1)
+        return after._replace(particles=particles, temperature=share)
+
+    steps = jnp.ceil(DRIVE_TIME / rate).astype(jnp.int32)
+    return jax.lax.fori_loop(0, steps, further, state).particles
+
+
+ALLOWED_MISSED = 1e-4
+"""Share of collisions missed because of the ceiling of the collision rate that fails a run."""
+
+CHUNK = 4_000_000
+"""Candidate pairs of one call to compiled code by the host driver, which take about a second."""
+
+
+@partial(jax.jit, static_argnames=("scheme", "tangents", "save"))
+def dsmc_records(
+    state: DSMCState,
+    first: Float[Array, "replicas N d"],
+    scene: ReducedScene,
+    key: UInt32[Array, "2"],
+    *,
+    scheme: Scheme,
+    tangents: bool = False,
+    units: Units | None = None,
+    save: Callable[[Particles], Any] | None = None,
+) -> dict[str, Any]:
+    """The records of each replica at the time of a state, and the status of each, "fault".
+
+    The next step of each replica is done in part, up to this time, and then discarded.
+
+    Args:
+        state: of the gas.
+        first: velocities at t = 0.
+        scene, key, scheme: of the run.
+        tangents: return three dictionaries instead: "values", the "rates" of their change with
+            time, and "along", their tangents in the parameters of the law at this time.
+        units, save: of the particles, and a user's function of them.
+    """
+    left = (state.time - state.clock) - state.clock_rest
+    share = left * jnp.sqrt(state.temperature) / scheme.own_step
+    state = collisions.step(state, key, jnp.clip(share, 0.0, 1.0), scene, scheme, tangents)
+    d = scheme.dimension
+
+    velocity = state.particles[..., :d]
+    if scene.walls is None:  # which stop what moves as a whole
+        velocity = _centred(velocity)
+    travelled = _centred(
+        state.particles[..., d : 2 * d] + state.clock[:, None, None] * state.particles[..., :d]
+    )
+    theta = 2 * observables.temperature(velocity)
+    values = {
+        "temperature": theta,
+        "sonine": observables.sonine(velocity),
+        "displacement": observables.mean_square_displacement(travelled),
+        "velocity_correlation": 2 * observables.velocity_correlation(first, velocity),
+        "collisions": 2 / scheme.num_particles * state.collisions,
+    }
+    if scene.surface is not None:
+        spin = jnp.mean(state.particles[..., 2 * d :] ** 2, axis=(1, 2))
+        values["rotational_temperature"] = 2 * scene.surface.inertia * spin
+    if scene.drag is not None:
+        values |= _without_drag(values, drag_decay(scene.drag, state.time))
+    fast = status.flag(status.TOO_FAST, state.missed > ALLOWED_MISSED * state.collisions + 1)
+    values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
+    if save is not None and units is not None:
+        values |= snapshot.saved(save, _to_particles(state, scene, d, units))
+    if not tangents:
+        return values
+    if isinstance(state.tangents, ExchangeTangents):
+        return {"values": values} | _exchanged(values, state, scene, scheme)
+    walked = 2 * jnp.mean(jnp.sum(travelled * velocity, axis=-1), axis=-1)
+    rates = _rates(values, scene.law, d) | {"displacement": walked}
+    return {"values": values, "rates": rates, "along": _along(values, rates, state.tangents)}
+
+
+def _centred(x: Float[Array, "replicas N d"]) -> Float[Array, "replicas N d"]:
+    return x - jnp.mean(x, axis=1, keepdims=True)
+
+
+def _without_drag(values: dict[str, Array], left: DragDecay) -> dict[str, Array]:
+    """Records in true velocities, of those that drag would not have slowed."""
+    powers = {"temperature": left.velocity**2, "velocity_correlation": left.velocity}
+    powers["rotational_temperature"] = left.kept**2
+    return {name: powers[name] * values[name] for name in powers.keys() & values.keys()}
+
+
+def _to_particles(state: DSMCState, scene: ReducedScene, d: int, units: Units) -> Particles:
+    """Particles in SI; positions, of which there are none, are nan."""
+    velocity, spin = state.particles[..., :d], state.particles[..., 2 * d :]
+    if scene.drag is not None:
+        left = drag_decay(scene.drag, state.time)
+        velocity, spin = velocity * left.velocity, spin * left.kept
+    return Particles(
+        position=jnp.full_like(velocity, jnp.nan),
+        velocity=velocity * units.velocity,
+        box_side=units.box_side,
+        angular_velocity=None if scene.surface is None else spin * units.spin,
+    )
+
+
+def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array]:
+    """Rates of change with time of all records but <dr^2>, of the Maxwell-Sonine distribution."""
+    theta, a2 = values["temperature"], values["sonine"]
+    speed = jnp.sqrt(theta)
+
+    @jax.vmap
+    def rates_of(speed, a2):
+        return averages.Rates.of(averages.impact_moments(law, speed, d), a2)
+
+    rates = rates_of(speed, a2)
+    cooling = 2 / d * rates.cooling * speed
+    return {
+        "temperature": -cooling * theta,
+        "sonine": 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment * speed,
+        "velocity_correlation": -rates.relaxation * speed * values["velocity_correlation"],
+        "collisions": averages.collision_rate(a2, d) * speed,
+    }
+
+
+def _exchanged(
+    values: dict[str, Array], state: DSMCState, scene: ReducedScene, scheme: Scheme
+) -> dict[str, dict[str, Array]]:
+    """ "rates" and "along" of a scene with elements, of T, T_rot and collisions.
+
+    Those in time are by the last direction, in which everything is sooner by the same share.
+    """
+    n, d, time = scheme.num_particles, scheme.dimension, state.time
+    assert isinstance(state.tangents, ExchangeTangents)
+    energies, collided = state.tangents
+
+    def logarithms(scene: ReducedScene, sooner: Array) -> Array:
+        if scene.drag is None:
+            return jnp.zeros(2)
+        rates = ReducedDrag(*(rate * (1 + sooner) for rate in scene.drag))
+        left = drag_decay(rates, time)
+        return jnp.log(jnp.stack([left.velocity, left.kept]))
+
+    log_left, pull = jax.vjp(logarithms, scene, jnp.zeros(()))
+    along_left = jax.vmap(lambda weights: ravel_pytree(pull(weights))[0])(jnp.eye(2))
+    along = {"collisions": 2 / n * collided}
+    for k, name in enumerate(("temperature", "rotational_temperature")):
+        if name in values:
+            size = n * (d, NUM_SPIN_COMPONENTS[d])[k] / 2
+            moved = jnp.exp(2 * log_left[k]) / size * energies[:, :, k]
+            along[name] = moved + 2 * along_left[k][None] * values[name][:, None]
+    after = jnp.where(time > 0, time, 1.0)
+    return {
+        "rates": {name: x[:, -1] / after for name, x in along.items()},
+        "along": {name: x[:, :-1] for name, x in along.items()},
+    }
+
+
+def _along(
+    values: dict[str, Array], rates: dict[str, Array], tangents: DSMCTangents
+) -> dict[str, Array]:
+    """Tangents of the records at a fixed time, from those at a fixed own time and the clock's."""
+    theta, c = values["temperature"], tangents.log_temperature
+    correlation = values["velocity_correlation"]
+    at_own_time = {
+        "temperature": theta[:, None] * c,
+        "velocity_correlation": correlation[:, None] * (c / 2 + tangents.persistence),
+        "displacement": tangents.displacement,
+    }
+    return {
+        name: at_own_time.get(name, 0.0) - rate[:, None] * tangents.clock
+        for name, rate in rates.items()
+    }
+
+
+@partial(jax.jit, static_argnames=("replicas", "scheme", "tangents", "save"))
+def run_traced(
+    scene: ReducedScene,
+    times: Float[Array, "times"],
+    key: UInt32[Array, "2"],
+    *,
+    replicas: int,
+    scheme: Scheme,
+    tangents: bool,
+    units: Units | None = None,
+    save: Callable[[Particles], Any] | None = None,
+) -> dict[str, Any]:
+    """The records of `observe` at all times, with a first axis of times. A pure function."""
+    num_parameters = ravel_pytree(scene)[0].size if tangents else 0
+    state = initial_dsmc_state(key, replicas, scheme, num_parameters, scene)
+    first = state.particles[..., : scheme.dimension]
+    forever = jnp.asarray(2**31 - 1, jnp.int32)
+
+    def to(state, end):
+        options = {"scheme": scheme, "tangents": tangents}
+        state = collisions.advance(state, end, scene, key, forever, **options)
+        return state, dsmc_records(state, first, scene, key, units=units, save=save, **options)
+
+    return jax.lax.scan(to, state, times)[1]
+
+
+def differentiable_run(
+    scene: ReducedScene,
+    times: Float[Array, "times"],
+    key: UInt32[Array, "2"],
+    *,
+    replicas: int,
+    scheme: Scheme,
+    units: Units,
+    save: Callable[[Particles], Any] | None,
+) -> dict[str, Array]:
+    """`run` with one linear rule for forward and reverse mode, from tangents beside the state."""
+    parameters, unravel = ravel_pytree(scene)
+
+    def simulated(parameters, times, key, units, tangents):
+        options = {"replicas": replicas, "scheme": scheme, "units": units, "save": save}
+        return run_traced(unravel(parameters), times, key, tangents=tangents, **options)
+
+    @jax.custom_jvp
+    def solve(parameters, times, key, units):
+        return simulated(parameters, times, key, units, False)
+
+    @solve.defjvp
+    def solve_jvp(at, along):
+        scene, (parameters, times, key, units) = unravel(at[0]), first_order_only(at)
+        out = simulated(parameters, times, key, units, True)
+        values = out["values"]
+        tangents = {
+            name: rate * along[1][:, None] + out["along"][name] @ along[0]
+            for name, rate in out["rates"].items()
+        }
+        if has_elements(scene):
+            for name in set(values) - set(tangents) - {"fault"}:
+                tangents[name] = nan_tangent_like(values[name], *along[:2])
+        else:
+            in_time = out["rates"]["sonine"] * along[1][:, None]
+            tangents["sonine"] = in_time + nan_tangent(in_time.shape, along[0])
+            for name in set(values) - set(tangents) - {"fault"}:
+                tangents[name] = nan_tangent_like(values[name], *along[:2])
+        return values, tangents | {"fault": np.zeros(values["fault"].shape, jax.dtypes.float0)}
+
+    return solve(parameters, times, key, units)
+
+
+def host_run_parts(
+    scene: ReducedScene,
+    key: UInt32[Array, "2"],
+    *,
+    replicas: int,
+    scheme: Scheme,
+    donate: bool,
+) -> tuple[DSMCState, Callable[[DSMCState, float], DSMCState], Callable[..., dict]]:
+    """The parts of `run` that the host driver needs: a state, how to advance, and to observe it.
+
+    With `donate` a state is deleted when it is advanced.
+    """
+    state = with_own_buffers(initial_dsmc_state(key, replicas, scheme, 0, scene))
+    pairs = replicas * (scheme.first + scheme.second)
+    max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
+    first = state.particles[..., : scheme.dimension]
+    further = collisions.advancing(donate)
+
+    def advance(state: DSMCState, end: float) -> DSMCState:
+        end_array = jnp.asarray(end, state.clock.dtype)
+        return further(state, end_array, scene, key, max_steps, scheme=scheme)
+
+    return state, advance, partial(dsmc_records, first=first, scene=scene, key=key, scheme=scheme)

@@ -1,0 +1,579 @@
+"""Laws of restitution: the ratio of the normal speeds after and before an impact, eps(v).
+
+What a law of restitution is: the base classes of those in `restitution` and of a user's own.
+
+Coefficient of restitution of viscoelastic spheres: its series and a rational fit to it.
+"""
+
+import dataclasses
+import inspect
+from abc import abstractmethod
+from math import gamma, pi, sqrt
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran._utils.validation import (
+    ANY,
+    FRACTION,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Domain,
+    UserTruth,
+    check_bool,
+    number,
+)
+from jaxgran.scene import contact
+
+REDUCED_UNITS = (
+    "a reduced law is given speeds in units of `speed`: leave `reduced` out and let "
+    "restitution(self, normal_speed) take m/s, or divide the law's speeds by `speed`"
+)
+_CHECKED: set[type] = set()
+
+
+class RestitutionLaw(eqx.Module):
+    """A law of restitution of a material, in SI units.
+
+    A law of one's own is a subclass with `restitution(self, normal_speed)`, eps at normal approach
+    speeds in m/s, and a field for each of its numbers, annotated ``float``, in any units that
+    `restitution` understands. Fields become JAX arrays: they can be fitted, swept and
+    differentiated by name. `domains` may give the allowed range of a field, as
+    ``domains = {"yield_speed": jaxgran.Domain(0.0)}``; without it any finite number is allowed. No
+    field may have the name of a float of `jaxgran.Gas`. Kinetic theory needs an eps that is smooth
+    in the speed. Where eps depends on the diameter or the mass too, override `reduced` instead.
+
+    >>> class Plastic(jaxgran.RestitutionLaw):
+    ...     yield_speed: float  # m/s
+    ...     def restitution(self, normal_speed):  # m/s
+    ...         return (1 + (normal_speed / self.yield_speed) ** 2) ** -0.125
+    >>> own = dataclasses.replace(gas, law=Plastic(0.2))
+    >>> round(float(own.restitution(0.1)), 4)
+    0.9725
+    """
+
+    domains: ClassVar[dict[str, Domain]] = {}
+    """Allowed range of every float field, by name; used for validation and for fits."""
+
+    lists: ClassVar[tuple[str, ...]] = ()
+    """Names of those fields that hold more than one number."""
+
+    advice: ClassVar[dict[str, str]] = {}
+    """What to do about a value outside its range, by name: a sentence for the error message."""
+
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        numbers = _number_fields(cls)
+        if "domains" not in vars(cls):
+            cls.domains = {**cls.domains, **dict.fromkeys(numbers, ANY)}
+        for name in numbers:
+            default = vars(cls).get(name, dataclasses.MISSING)
+            if not isinstance(default, dataclasses.Field):
+                setattr(cls, name, eqx.field(converter=number, default=default))
+
+    def __check_init__(self):
+        kind, base = type(self), RestitutionLaw
+        if kind.reduced is base.reduced and kind.restitution is base.restitution:
+            raise ValueError(
+                f"{kind.__name__} has no restitution: define restitution(self, normal_speed), "
+                "which returns eps at normal approach speeds in m/s"
+            )
+        for name, domain in self.domains.items():
+            if not hasattr(self, name):
+                raise ValueError(
+                    f"domains of {kind.__name__} has {name!r}, which is no field: give domains the "
+                    "names of its float fields"
+                )
+            domain.check(name, getattr(self, name), self.advice.get(name, ""))
+
+    def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Coefficient of restitution eps, where it depends on nothing but the speed.
+
+        Args:
+            normal_speed: normal approach speed, m/s, > 0, any shape.
+
+        Returns:
+            eps, same shape, or one number for all speeds.
+        """
+        raise NotImplementedError(
+            f"eps of {type(self).__name__} depends on the spheres: see jaxgran.Gas.restitution"
+        )
+
+    def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """``1 - eps``; override it where it can be computed without cancellation for eps near 1.
+
+        Args: as `restitution`.
+        """
+        return 1 - self.restitution(normal_speed)
+
+    def reduced(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> "ReducedLaw":
+        """The law for two equal spheres, in units of their diameter and of a reference speed.
+
+        By default `restitution` at the speeds in m/s, the same for all spheres.
+
+        Args:
+            diameter: sigma, m, > 0.
+            mass: m, kg, > 0, of either sphere.
+            speed: reference speed, m/s, > 0.
+        """
+        return LawInUnits(self, jnp.asarray(speed))
+
+    def on_wall(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> "ReducedLaw":
+        """The same for a sphere and a flat wall, where the law is that of the wall."""
+        return self.reduced(diameter=diameter, mass=mass, speed=speed)
+
+
+class ReducedLaw(eqx.Module):
+    """A law of restitution for two given spheres, in units of a length and a reference speed.
+
+    A subclass defines `restitution`.
+
+    >>> reduced = gas.reduced_law
+    >>> bool(jnp.isclose(reduced.restitution(jnp.ones(())), gas.restitution(gas.impact_speed)))
+    True
+    """
+
+    num_nodes: ClassVar[int] = 40
+    """Number of Chebyshev nodes in ln T that resolve averages over the impacts of this law.
+
+    40 suffice for laws as steep as 1 - eps ~ v over 12 decades of time (relative error 1e-7 of the
+    cooling rate); flatter laws need fewer."""
+
+    @abstractmethod
+    def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Coefficient of restitution eps at a normal approach speed.
+
+        Args:
+            normal_speed: in units of the reference speed, > 0, any shape.
+
+        Returns:
+            eps, same shape.
+        """
+
+    def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """``1 - eps``; override it where it can be computed without cancellation for eps near 1.
+
+        Args: as `restitution`.
+        """
+        return 1 - self.restitution(normal_speed)
+
+    def impact_length(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """``X = (v^2/alpha)^(2/5)``, the length scale of the overlap, in diameters.
+
+        Zero for hard spheres, the default.
+
+        Args: as `restitution`.
+        """
+        return jnp.zeros_like(normal_speed)
+
+    def dissipation(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """``beta = (3/2) A alpha^(2/5) v^(1/5)`` of viscoelastic spheres; 0 of others."""
+        return jnp.zeros_like(normal_speed)
+
+
+class LawInUnits(ReducedLaw):
+    """A law that is a function of the speed alone, in units of a reference speed.
+
+    Attributes:
+        law: takes speeds in m/s.
+        speed: the reference speed, m/s.
+    """
+
+    law: RestitutionLaw
+    speed: Float[Array, ""]
+
+    def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        found = self.law.restitution(normal_speed * self.speed)
+        return jnp.broadcast_to(found, jnp.shape(normal_speed))
+
+    def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        found = self.law.loss(normal_speed * self.speed)
+        return jnp.broadcast_to(found, jnp.shape(normal_speed))
+
+
+def restitution_at(
+    law: RestitutionLaw, diameter: Array, mass: Array, normal_speed: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """eps of spheres at speeds in m/s."""
+    reduced = law.reduced(diameter=diameter, mass=mass, speed=number(1.0))
+    return reduced.restitution(normal_speed)
+
+
+def check_units(law: RestitutionLaw) -> None:
+    """Check, once for each class of law, that `reduced` returns a law in the units it is told.
+
+    Raises:
+        ValueError: if it returns no `ReducedLaw`, or one whose eps depends on the units.
+    """
+    kind = type(law)
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(law))
+    own = kind.__module__.startswith(f"{__package__}.")  # those of this package, which are tested
+    if own or kind in _CHECKED or kind.reduced is RestitutionLaw.reduced or traced:
+        return
+    found = []
+    with jax.ensure_compile_time_eval():
+        for unit in (0.1, 1.0):
+            reduced = law.reduced(diameter=1e-3, mass=1e-6, speed=jnp.asarray(unit))
+            if not isinstance(reduced, ReducedLaw):
+                raise ValueError(
+                    f"{kind.__name__}.reduced must return a jaxgran.ReducedLaw, got "
+                    f"{type(reduced).__name__}; {REDUCED_UNITS}"
+                )
+            found.append(np.asarray(reduced.restitution(jnp.array([0.03, 0.3]) / unit), float))
+    one, other = found
+    if np.all(np.isfinite(found)) and np.max(np.abs(one - other)) > 1e-3:
+        raise ValueError(
+            f"{kind.__name__}.reduced gives eps = {one[1]:.4g} at 0.3 m/s in units of 0.1 m/s and "
+            f"{other[1]:.4g} in units of 1 m/s; {REDUCED_UNITS}"
+        )
+    _CHECKED.add(kind)
+
+
+def _number_fields(cls: type) -> list[str]:
+    """Names of the fields that a class adds and that are annotated as numbers or arrays."""
+    kinds = (float, jax.Array, Array, "float", "jax.Array", "Array")
+    return [name for name, kind in inspect.get_annotations(cls).items() if kind in kinds]
+
+
+C1 = gamma(3 / 5) * sqrt(pi) / (2 ** (1 / 5) * 5 ** (2 / 5) * gamma(21 / 10))
+"""First coefficient of the restitution series, 1.153448858; Brilliantov & Poeschel, Eq. (5)."""
+
+C2 = 3 / 5 * C1**2
+"""Second coefficient of the restitution series, 0.798266561; Brilliantov & Poeschel, Eq. (6)."""
+
+UNCLIPPED_SERIES = (-C1, C2, -0.522882568, 0.348742675, -0.233098132)
+"""Coefficients of beta, beta^2, ... if contact ends at zero overlap, the paper's convention."""
+
+C_CLIP = 4 / 15
+"""Coefficient of beta^(5/2), the lowest term that changes if contact ends at zero force."""
+
+
+class _RationalFit(NamedTuple):
+    # eps = (1 + kappa beta)^(-decay) exp(beta P / Q). The power is the asymptotic decay for heavy
+    # damping. P = decay kappa - C1 + beta p(x) and Q = 1 + beta q(x), with x = sqrt(beta) or
+    # x = beta and coefficients in ascending order, were fitted to `contact.impact` by
+    # experiments/accuracy/derive_restitution.py. There is no odd power of sqrt(beta) below the
+    # beta^(5/2) of the series, so that the first two derivatives at beta = 0 are finite.
+    kappa: float
+    decay: float
+    in_sqrt_beta: bool
+    p: tuple[float, ...]
+    q: tuple[float, ...]
+
+
+_CLIPPED = _RationalFit(
+    kappa=0.7,
+    decay=5 / 3,
+    in_sqrt_beta=True,
+    p=(
+        -0.2645544275974496,
+        0.2662489993348014,
+        -0.13891254348909338,
+        0.056252769400273614,
+        -0.06687792761144479,
+        -0.026658507899730673,
+        -0.0007599914400559866,
+    ),
+    q=(
+        0.8100120942728318,
+        0.0,
+        0.34839933904496506,
+        0.18475467752620237,
+        0.39206416580007863,
+        0.3897068203711826,
+        0.22360126211067868,
+        0.08224151259197285,
+        0.002344580847926078,
+    ),
+)
+
+_UNCLIPPED = _RationalFit(
+    kappa=0.7,
+    decay=5.0,
+    in_sqrt_beta=False,
+    p=(
+        -2.1330761561766067,
+        0.8581838820848968,
+        -0.14743926285178546,
+        -0.019055706594629386,
+        0.02292264625997086,
+        -0.009161977151659381,
+        0.0024213697097119936,
+        -0.00040636956570282444,
+        3.687239511277726e-05,
+        -5.992074134500146e-07,
+    ),
+    q=(
+        -0.4436713336028546,
+        -0.036043841852944625,
+        0.11564821628375116,
+        -0.056701740443611134,
+        0.021178496954814743,
+        -0.007677437237806214,
+        0.003027939339635816,
+        -0.0010554851332044285,
+        0.0002841019235579368,
+        -4.832580251405117e-05,
+        4.198243276201555e-06,
+    ),
+)
+
+
+def _polynomial(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Polynomial in x with coefficients in ascending order."""
+    return jnp.polyval(jnp.asarray(coefficients[::-1], x.dtype), x, unroll=len(coefficients))
+
+
+def log_viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[Array, "..."]:
+    """Natural logarithm of `viscoelastic_restitution`, accurate also where eps is close to 1.
+
+    Args, validity: as `viscoelastic_restitution`.
+    """
+    beta = jnp.asarray(beta, dtype=jnp.result_type(float, beta))
+    fit = _CLIPPED if clipped else _UNCLIPPED
+    positive = beta > 0
+    # The derivative of sqrt at 0 is infinite: its argument is replaced there, not only its result.
+    root = jnp.where(positive, jnp.sqrt(jnp.where(positive, beta, 1.0)), 0.0)
+    x = root if fit.in_sqrt_beta else beta
+    p = (fit.decay * fit.kappa - C1) + beta * _polynomial(fit.p, x)
+    q = 1 + beta * _polynomial(fit.q, x)
+    return beta * p / q - fit.decay * jnp.log1p(fit.kappa * beta)
+
+
+def viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[Array, "..."]:
+    """Coefficient of restitution of viscoelastic spheres, by a rational fit to `jaxgran.impact`.
+
+    ``eps = 1 - C1 beta + C2 beta^2 + (4/15) beta^(5/2) - ...`` (the last term only if clipped);
+    ``eps -> (3/2)^(2/3) beta^(-5/3)`` (clipped) or ``5.158 beta^(-5)`` for heavy damping.
+
+    Args:
+        beta: ``(3/2) A alpha^(2/5) v^(1/5)``, dimensionless, >= 0, any shape.
+        clipped: whether contact ends where the force vanishes (default) or where the overlap does.
+
+    Returns:
+        eps, in (0, 1], same shape. Relative error against `jaxgran.impact`: below 1e-9 for beta
+        up to 1e4 (clipped) and below 1e-7 for beta up to 40 (unclipped); below 3e-5 beyond. The
+        first two derivatives are finite down to beta = 0, where the first is -C1.
+
+    Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eqs. (4)-(6).
+
+    >>> found = jaxgran.viscoelastic_restitution(jnp.array([0.0, 0.1, 1.0]))
+    >>> [round(float(eps), 4) for eps in found]
+    [1.0, 0.8929, 0.3939]
+    """
+    NOT_NEGATIVE.check("beta", beta, "It is (3/2) A alpha^(2/5) v^(1/5).")
+    return jnp.exp(log_viscoelastic_restitution(beta, clipped=clipped))
+
+
+class ReducedViscoelastic(ReducedLaw):
+    """`Viscoelastic` in reduced units: the two numbers on which an impact depends.
+
+    Attributes:
+        beta: ``(3/2) A alpha^(2/5) v^(1/5)`` at the reference speed.
+        length: ``(v^2/alpha)^(2/5)`` at the reference speed, in diameters.
+        clipped: as for `Viscoelastic`.
+    """
+
+    beta: Float[Array, ""]
+    length: Float[Array, ""]
+    clipped: bool = eqx.field(static=True)
+
+    num_nodes: ClassVar[int] = 20
+
+    def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return viscoelastic_restitution(self.dissipation(normal_speed), clipped=self.clipped)
+
+    def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        beta = self.dissipation(normal_speed)
+        return -jnp.expm1(log_viscoelastic_restitution(beta, clipped=self.clipped))
+
+    def impact_length(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.length * normal_speed**0.8
+
+    def dissipation(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.beta * normal_speed**0.2
+
+
+class Viscoelastic(RestitutionLaw):
+    """Viscoelastic spheres, with the force ``F = rho xi^(3/2) + (3/2) A rho sqrt(xi) xi_dot``.
+
+    Args:
+        youngs_modulus: Y, Pa, > 0.
+        poisson_ratio: nu, in (-1, 0.5).
+        dissipative_constant: A, s, >= 0; 0 makes the spheres elastic.
+        clipped: whether contact ends where the force vanishes (True: spheres without adhesion
+            cannot pull) or where the overlap does (False: the convention of the paper's series).
+
+    Raises:
+        ValueError: for a value outside its range.
+
+    Valid while impacts are neither so fast that the material yields plastically nor so slow that
+    adhesion matters.
+
+    Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eqs. (1)-(2).
+
+    >>> glass = jaxgran.Viscoelastic(5e7, poisson_ratio=0.22, dissipative_constant=3e-6)
+    >>> f"{float(glass.dissipative_constant):g} s"
+    '3e-06 s'
+    """
+
+    youngs_modulus: Float[Array, ""] = eqx.field(converter=number)
+    poisson_ratio: Float[Array, ""] = eqx.field(converter=number)
+    dissipative_constant: Float[Array, ""] = eqx.field(converter=number)
+    clipped: UserTruth = eqx.field(static=True, default=True)
+
+    domains: ClassVar[dict[str, Domain]] = {
+        "youngs_modulus": POSITIVE,
+        "poisson_ratio": Domain(-1.0, 0.5),
+        "dissipative_constant": NOT_NEGATIVE,
+    }
+    advice: ClassVar[dict[str, str]] = {
+        "youngs_modulus": "Give Young's modulus in Pa (glass has about 7e10).",
+        "poisson_ratio": "Most solids lie between 0.2 and 0.45.",
+        "dissipative_constant": "Give A in seconds; A = 0 makes the spheres elastic.",
+    }
+
+    def __check_init__(self):
+        check_bool("clipped", self.clipped)
+
+    def alpha(self, *, diameter: ArrayLike, mass: ArrayLike) -> Float[Array, ""]:
+        """Elastic constant over effective mass, ``alpha = rho / m_eff`` with ``m_eff = m / 2``.
+
+        Args:
+            diameter: sigma, m, > 0.
+            mass: m, kg, > 0, of either sphere.
+
+        Returns:
+            alpha, m^(-1/2) s^(-2).
+
+        Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eq. (2).
+        """
+        rho = contact.elastic_constant(self.youngs_modulus, self.poisson_ratio, diameter)
+        return 2 * rho / mass
+
+    def reduced(
+        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
+    ) -> ReducedViscoelastic:
+        alpha = self.alpha(diameter=diameter, mass=mass)
+        beta = 1.5 * self.dissipative_constant * alpha**0.4 * speed**0.2
+        length = jnp.asarray((speed**2 / alpha) ** 0.4 / diameter)
+        return ReducedViscoelastic(beta, length, self.clipped)
+
+    def of_wall(self) -> "Viscoelastic":
+        """The law of two spheres that collide as a sphere does with a flat wall of this material.
+
+        ``alpha``, proportional to ``Y sqrt(R_eff)/m_eff``, is smaller by sqrt(2): the effective
+        radius and mass are twice those of two spheres.
+        """
+        return eqx.tree_at(lambda law: law.youngs_modulus, self, self.youngs_modulus / 2**0.5)
+
+    def on_wall(
+        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
+    ) -> ReducedViscoelastic:
+        return self.of_wall().reduced(diameter=diameter, mass=mass, speed=speed)
+
+
+class ConstantRestitution(RestitutionLaw, ReducedLaw):
+    """The same coefficient of restitution at every speed, as in Haff's law.
+
+    Args:
+        coefficient: e, in [0, 1].
+
+    Raises:
+        ValueError: for e outside [0, 1].
+
+    >>> grains = jaxgran.ConstantRestitution(0.9)
+    >>> float(gas.replace(temperature=1.0).restitution(0.1)), float(grains.coefficient)
+    (0.9075542559594306, 0.9)
+    """
+
+    coefficient: Float[Array, ""] = eqx.field(converter=number)
+
+    domains: ClassVar[dict[str, Domain]] = {"coefficient": FRACTION}
+    advice: ClassVar[dict[str, str]] = {
+        "coefficient": "1 is an elastic impact; 0 removes the normal relative velocity."
+    }
+
+    def reduced(
+        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
+    ) -> "ConstantRestitution":
+        return self
+
+    def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return jnp.broadcast_to(self.coefficient, normal_speed.shape)
+
+
+class RestitutionSeries(RestitutionLaw, ReducedLaw):
+    """A series in powers of the speed, ``eps(v) = 1 + sum_k c_k v^(gamma_k)``.
+
+    The series is not restricted to [0, 1]: check that eps is physical for the normal speeds of
+    the gas, up to about five times sqrt(2 T).
+
+    Args:
+        coefficients: c_k, (m/s)^(-gamma_k), shape (terms,).
+        exponents: gamma_k, shape (terms,).
+
+    Raises:
+        ValueError: for shapes that differ or values that are not finite.
+
+    >>> law = jaxgran.RestitutionSeries(coefficients=[-0.1], exponents=[0.2])  # 1 - .1 v^(1/5)
+    >>> law.coefficients.shape
+    (1,)
+    """
+
+    coefficients: Float[Array, "terms"] = eqx.field(converter=number)
+    exponents: Float[Array, "terms"] = eqx.field(converter=number)
+
+    domains: ClassVar[dict[str, Domain]] = {"coefficients": ANY, "exponents": ANY}
+    lists: ClassVar[tuple[str, ...]] = ("coefficients", "exponents")
+
+    def __check_init__(self):
+        shape = self.coefficients.shape
+        if shape != self.exponents.shape or self.coefficients.ndim < 1 or shape[-1] < 1:
+            raise ValueError(
+                "coefficients and exponents must be lists of the same length, 1 or more, got "
+                f"shapes {shape} and {self.exponents.shape}"
+            )
+
+    @classmethod
+    def from_viscoelastic(
+        cls, law: Viscoelastic, *, diameter: ArrayLike, mass: ArrayLike, num_terms: int = 2
+    ) -> "RestitutionSeries":
+        """The truncated series in powers of beta of given viscoelastic spheres.
+
+        Args:
+            law: the material.
+            diameter: sigma, m, > 0.
+            mass: m, kg, > 0, of either sphere.
+            num_terms: number of powers of beta, 1 to 5; the paper has 2.
+
+        Raises:
+            ValueError: for another number of terms.
+
+        Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eq. (1).
+        """
+        if not 1 <= num_terms <= len(UNCLIPPED_SERIES):
+            raise ValueError(
+                f"num_terms must be 1 to {len(UNCLIPPED_SERIES)}, got {num_terms}; "
+                "use the Viscoelastic law itself for more"
+            )
+        beta = law.reduced(diameter=diameter, mass=mass, speed=1.0).beta
+        powers = jnp.arange(1, num_terms + 1)
+        return cls(jnp.asarray(UNCLIPPED_SERIES[:num_terms]) * beta**powers, powers / 5)
+
+    def reduced(
+        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
+    ) -> "RestitutionSeries":
+        return RestitutionSeries(self.coefficients * speed**self.exponents, self.exponents)
+
+    def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return 1 - self.loss(normal_speed)
+
+    def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        terms = zip(self.coefficients, self.exponents, strict=True)
+        return jnp.asarray(-sum(c * normal_speed**gamma for c, gamma in terms))
