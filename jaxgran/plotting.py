@@ -41,14 +41,6 @@ differences), guides to the eye, a model by its name, a kind of gas. It is the p
 and K. Ito, Color Universal Design (2008), which colour-blind people tell apart; in grey, lines
 and points also differ in style."""
 
-STYLES = {
-    "kinetic theory": ("--", "D"),
-    "DSMC": ("-.", "v"),
-    "hard spheres": (":", "s"),
-    "soft spheres": ("-", "^"),
-}
-"""Line and marker of each model."""
-
 INK = COLOURS["measured"]
 
 

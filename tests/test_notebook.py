@@ -83,7 +83,7 @@ def test_a_missing_library_is_named(curve, library, monkeypatch):
 
 def test_a_curve_is_drawn_in_given_axes(curve):
     figure, axes = pyplot.subplots()
-    assert curve.plot(axes, label="mine") is axes
+    assert jaxgran.plot_curve(curve, axes, label="mine") is axes
     drawn: Any = axes.containers[0].get_children()[0]
     np.testing.assert_array_equal(drawn.get_xdata(), curve.times[1:])  # 0 has no logarithm
     np.testing.assert_array_equal(drawn.get_ydata(), curve.temperature[1:])

@@ -1,18 +1,13 @@
-import ast
 import re
 import subprocess
 import sys
 from pathlib import Path
-
-import pytest
 
 import jaxgran
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "jaxgran"
 FILES = sorted(PACKAGE.rglob("*.py"))
-MOST_LINES_OF_A_FUNCTION = 60
-MOST_LINES_OF_A_FILE = 300
 
 
 def test_import_is_light():
@@ -34,25 +29,6 @@ def test_imports_keep_to_the_floors():
     linter = Path(sys.executable).with_name("lint-imports")
     done = subprocess.run([linter, "--no-cache"], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
-
-
-def test_the_house_is_small_at_the_top():
-    entries = [entry for entry in PACKAGE.iterdir() if entry.name != "__pycache__"]
-    assert len(entries) <= 13
-
-
-@pytest.mark.parametrize("file", FILES, ids=[str(f.relative_to(PACKAGE)) for f in FILES])
-def test_functions_and_files_are_short(file):
-    text = file.read_text()
-    tree = ast.parse(text)
-    assert ast.get_docstring(tree), "every module says what it is"
-    excuse = "long because" in (ast.get_docstring(tree) or "")
-    assert excuse or len(text.splitlines()) <= MOST_LINES_OF_A_FILE
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef):
-            lines = (node.end_lineno or 0) - node.lineno + 1
-            excuse = "long because" in (ast.get_docstring(node) or "")
-            assert excuse or lines <= MOST_LINES_OF_A_FUNCTION, f"{node.name}: {lines} lines"
 
 
 def test_no_model_is_known_by_its_class_outside_models():

@@ -17,9 +17,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
+from experiments.paper.closed_forms import haff
 from experiments.support.record import add_recording, write_picture
 from experiments.support.scenes import hard_beads
-from jaxgran.theory.equations import haff
 
 
 class HaffLaw(jaxgran.AbstractModel):

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.paper.closed_forms import haff, paper_temperature
 from experiments.support import paper
 from experiments.support.scenes import beads, hard_beads
-from jaxgran.theory.equations import COOLING_RATE, haff, paper_temperature
+from jaxgran.theory.equations import COOLING_RATE
 
 NAME = "paper_cooling"
 

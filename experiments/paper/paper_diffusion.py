@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.paper.closed_forms import paper_displacement
 from experiments.support import paper
 from experiments.support.scenes import beads, hard_beads
-from jaxgran.theory.equations import COOLING_RATE, paper_averages, paper_displacement
+from jaxgran.theory.equations import COOLING_RATE, paper_averages
 
 NAME = "paper_diffusion"
 

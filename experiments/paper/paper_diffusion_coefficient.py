@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 import jaxgran
+from experiments.paper.closed_forms import RELAXATION_CORRECTION
 from experiments.paper.paper_velocity_correlation import (
     SPHERES,
     diffusion,
@@ -24,7 +25,7 @@ from experiments.paper.paper_velocity_correlation import (
 from experiments.paper.paper_velocity_correlation import Config as Correlation
 from experiments.support import paper
 from experiments.support.scenes import beads, hard_beads
-from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, RELAXATION_CORRECTION
+from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 NAME = "paper_diffusion_coefficient"
 

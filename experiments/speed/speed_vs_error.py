@@ -36,7 +36,16 @@ from experiments.support.record import (
 )
 from experiments.support.scenes import beads
 from jaxgran.data.files import header_number
-from jaxgran.plotting import COLOURS, INK, STYLES
+from jaxgran.plotting import COLOURS, INK
+
+STYLES = {
+    "kinetic theory": ("--", "D"),
+    "DSMC": ("-.", "v"),
+    "hard spheres": (":", "s"),
+    "soft spheres": ("-", "^"),
+}
+"""Line and marker of each model."""
+
 
 KEY = 1  # of the random numbers of the rows; the reference has another
 MODELS = "kinetic theory", "DSMC", "hard spheres", "soft spheres"

@@ -302,11 +302,6 @@ class CoolingCurve(eqx.Module):
         """
         return to_frame(self)
 
-    def plot(self, axes: Any = None, **style: Any) -> Any:
-        """Draw T against t; see `jaxgran.plot_curve`."""
-        # A floor above, which needs matplotlib: looked for when a picture is asked for.
-        return import_module("jaxgran.plotting").plot_curve(self, axes, **style)
-
     @property
     def _words(self) -> tuple[str, Rows]:
         """Title and rows of a short account of the curve."""

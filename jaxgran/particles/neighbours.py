@@ -310,40 +310,6 @@ def choose_engine(name: str, ahead: int = 0, traced: bool = False) -> str:
     return "sweep" if traced or ahead <= MAX_LOOKAHEAD else "scipy"
 
 
-def find_pairs(
-    position: Float[Array, "particles d"],
-    side: ArrayLike,
-    cutoff: ArrayLike,
-    *,
-    replicas: int = 1,
-    capacity: int,
-    by: str = "scipy",
-) -> Pairs:
-    """All pairs closer than a cutoff, in each of several equal periodic boxes.
-
-    The result carries no derivatives. A sweep is compiled. A tree works under `jax.jit` and
-    `jax.vmap` too, by a callback to the host. jax-md chooses the number of its cells from the
-    values, so that with it `position`, `side` and `cutoff` must not be traced.
-
-    Args:
-        position: of all particles, replica after replica, in [0, side).
-        side: of the boxes.
-        cutoff: in the same unit, > 0 and at most half a side; for a sweep less than that by at
-            least a part in 10^6.
-        replicas: number of boxes; particles of different boxes form no pairs.
-        capacity: of the list, in pairs.
-        by: "scipy", "sweep" or "jax-md"; all return the same pairs, except that pairs within
-            rounding error of the cutoff may or may not be included.
-
-    Raises:
-        ValueError: for another `by`.
-    """
-    n = len(position) // replicas
-    return with_offsets(
-        position, side, search_pairs(position, side, cutoff, replicas, (capacity, n), by)
-    )
-
-
 Found = tuple[Int[Any, "pairs"], Int[Any, "pairs"], Int[Any, ""], Int[Any, ""]]
 """i, j, count and lookahead of `Pairs`; NumPy arrays if they come from the host."""
 
@@ -356,9 +322,25 @@ def search_pairs(
     capacity: tuple[int, int],
     by: str,
 ) -> Found:
-    """`find_pairs` without the offsets, which `with_offsets` adds in compiled code.
+    """Search all pairs closer than a cutoff in each of several equal periodic boxes.
 
-    The capacities are that of the list, in pairs, and that of a sweep's look-ahead, in particles.
+    The result carries no derivatives. `with_offsets` adds the offsets in compiled code. A sweep is
+    compiled. A tree works under `jax.jit` and `jax.vmap` too, by a callback to the host. jax-md
+    chooses the number of its cells from the values, so that with it `position`, `side` and `cutoff`
+    must not be traced.
+
+    Args:
+        position: of all particles, replica after replica, in [0, side).
+        side: of the boxes.
+        cutoff: in the same unit, > 0 and at most half a side; for a sweep less than that by at
+            least a part in 10^6.
+        replicas: number of boxes; particles of different boxes form no pairs.
+        capacity: of the list, in pairs, and of a sweep's look-ahead, in particles.
+        by: "scipy", "sweep" or "jax-md"; all return the same pairs, except that pairs within
+            rounding error of the cutoff may or may not be included.
+
+    Raises:
+        ValueError: for another `by`.
     """
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
     if by not in ENGINES[1:]:
@@ -400,7 +382,7 @@ def tree_search(
 ) -> tuple[
     Int[np.ndarray, "{capacity}"], Int[np.ndarray, "{capacity}"], Int[np.ndarray | np.int32, ""]
 ]:
-    """`find_pairs` on the host, without offsets: i, j and count of `Pairs` as NumPy arrays.
+    """Search pairs on the host: i, j and count of `Pairs` as NumPy arrays.
 
     Positions that are not finite form no pairs.
     """

@@ -395,7 +395,7 @@ def min_distance(
     """The least distance between two spheres, in diameters; 1 if none is below.
 
     Args:
-        position, side, replicas, by: as in `neighbours.find_pairs`.
+        position, side, replicas, by: as in `neighbours.search_pairs`.
         capacity: numbers of overlapping pairs, and of particles that a sweep looks ahead.
     """
     found = neighbours.search_pairs(position, side, 1.0, replicas, capacity, by)

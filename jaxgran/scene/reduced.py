@@ -33,10 +33,6 @@ class ReducedRough(NamedTuple):
         """``q (1 + beta_w) / (1 + q)``, the same where a wall does not give way."""
         return self.inertia * (1 + beta) / (1 + self.inertia)
 
-    def lost_share(self, beta: Float[Array, ""]) -> Float[Array, ""]:
-        """``q/(1 + q) (1 - beta_t^2)``, the share of the energy of the slip that is lost."""
-        return self.inertia / (1 + self.inertia) * (1 - beta**2)
-
 
 class ReducedWalls(NamedTuple):
     """`Walls` in reduced units.

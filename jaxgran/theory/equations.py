@@ -35,22 +35,21 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME
 from jaxgran.scene.elements import MOST_IMPACTS, NUM_SPIN_COMPONENTS, share_of_impacts
 from jaxgran.scene.gas import Gas, unit_wavenumber
 from jaxgran.scene.geometry import contact_value_slopes, impact_average, sphere_surface
-from jaxgran.scene.laws import C1, C_CLIP, ReducedLaw, ReducedViscoelastic
+from jaxgran.scene.laws import C1, ReducedLaw, ReducedViscoelastic
 from jaxgran.scene.reduced import ReducedRough, ReducedScene, ReducedWalls, reduced_scene
 from jaxgran.theory import averages
 from jaxgran.theory.averages import TERMS, Bounds, RateTable, collision_rate, impact_moments
 
 
-def _moment(power: float) -> float:
+def speed_moment(power: float) -> float:
     """``int_0^inf g^(1 + power) exp(-g^2/2) dg``."""
     return 2 ** (power / 2) * gamma(1 + power / 2)
 
@@ -60,13 +59,6 @@ COOLING_RATE = {d: 9 / 5 / d * 2**0.2 * C1 * gamma(2.1) for d in (2, 3)}
 
 COOLING_CORRECTION = 33 / 20 * 2**0.2 * C1 * gamma(2.2) / gamma(2.1)
 """q, the second term of the cooling rate over the first at T_0 and delta = 1, b_2/b_1: 2.3018."""
-
-RELAXATION_CORRECTION = 3 / 4 * gamma(2.1) * C1 * 4**0.1
-"""c in ``tau_E/tau_v = 1 - c delta``, where tau_v is the velocity relaxation time and tau_E that of
-elastic spheres: 1.03992; Eq. (32)."""
-
-SONINE_COEFFICIENT = 3 / 20 * C1 * _moment(2.2) * 1.5 * 2**0.1
-"""s in ``a_2 = -s delta (T/T_0)^(1/10)``, to first order in delta, in 3D: 0.62395."""
 
 
 def paper_averages(
@@ -97,193 +89,15 @@ def paper_averages(
             "use the exact averages for other laws"
         )
     beta = law.beta * speed**0.2
-    cooling = C1 * beta * _moment(2.2) - 11 / 10 * C1**2 * beta**2 * _moment(2.4)
-    slowing = 2 * _moment(2.0) - C1 * _moment(2.2) * beta + 3 / 5 * C1**2 * _moment(2.4) * beta**2
+    cooling = C1 * beta * speed_moment(2.2) - 11 / 10 * C1**2 * beta**2 * speed_moment(2.4)
+    slowing = (
+        2 * speed_moment(2.0)
+        - C1 * speed_moment(2.2) * beta
+        + 3 / 5 * C1**2 * speed_moment(2.4) * beta**2
+    )
     column = jnp.stack([cooling, jnp.zeros_like(beta), slowing / dimension])
     maxwellian = jnp.asarray([1.0, 0.0, 0.0], beta.dtype)
     return sphere_surface(dimension) / sqrt(8 * pi) * jnp.outer(column, maxwellian)
-
-
-def haff(tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3) -> Float[Array, "..."]:
-    """Haff's law, ``T/T_0 = (1 + gamma_0 tau)^(-2)`` with ``gamma_0 = (1 - e^2) / (2 d)``.
-
-    Args:
-        tau: ``nu_0 t``, >= 0, any shape.
-        coefficient: e, in [0, 1].
-        dimension: d.
-
-    Returns:
-        T/T_0, same shape.
-
-    Valid for constant restitution and Maxwellian velocities (a_2 = 0).
-
-    Reference: Brilliantov & Poeschel, Eq. (44).
-    """
-    loss = (1 - jnp.asarray(coefficient) ** 2) / (2 * dimension)
-    return (1 + loss * jnp.asarray(tau)) ** -2.0
-
-
-def haff_collisions(
-    tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3
-) -> Float[Array, "..."]:
-    """Collisions per particle under Haff's law, ``N = ln(1 + gamma_0 tau) / gamma_0``.
-
-    Args, validity: as `haff`, but e in [0, 1).
-
-    Returns:
-        N, same shape as tau.
-    """
-    loss = (1 - jnp.asarray(coefficient) ** 2) / (2 * dimension)
-    return jnp.log1p(loss * jnp.asarray(tau)) / loss
-
-
-def constant_displacement(
-    collisions: ArrayLike, coefficient: ArrayLike, dimension: int = 3
-) -> Float[Array, "..."]:
-    """Mean square displacement of a gas of constant restitution.
-
-    ``<dr^2> = (2 d / k) (N - (1 - exp(-k N)) / k)`` with ``k = (1 + e)^2 / (2 d)``: at first
-    ballistic, then linear in the collisions per particle and hence logarithmic in time. It solves
-    ``dD/dt = T - D/tau_v`` with ``1/tau_v = nu (1 + e)/d``.
-
-    Args:
-        collisions: N per particle, any shape; see `haff_collisions`.
-        coefficient: e, in [0, 1].
-        dimension: d.
-
-    Returns:
-        <dr^2> in units of ``T_0 tau_c(0)^2``, same shape.
-
-    Valid for Maxwellian velocities, in the first Sonine approximation of D.
-
-    Reference: Brilliantov & Poeschel, Eqs. (45) and (46); their ``D = T tau_v``, Eq. (34), neglects
-    the cooling during tau_v and has ``k = (1 + e) / d``.
-    """
-    k = (1 + jnp.asarray(coefficient)) ** 2 / (2 * dimension)
-    n = jnp.asarray(collisions)
-    return 2 * dimension / k * (n + jnp.expm1(-k * n) / k)
-
-
-def paper_temperature(
-    tau: ArrayLike, delta: ArrayLike, *, corrected: bool = True, clipped: bool = True
-) -> Float[Array, "..."]:
-    """Temperature of viscoelastic spheres in 3D as an expansion in delta, to order delta^2.
-
-    ``T/T_0 = u^(-5/3) + 2 q delta (u^(-11/6) - u^(-8/3)) + ...`` with ``u = 1 + t/tau_0``.
-
-    Args:
-        tau: ``nu_0 t``, >= 0, any shape.
-        delta: ``A alpha^(2/5) T_0^(1/10)``, small against 1.
-        corrected: whether to include the homogeneous solutions, without which T(0) is not T_0.
-            False gives the printed form, ``u^(-5/3) + a_1 delta u^(-11/6)`` with ``a_1 = 2 q``,
-            without its term in delta^2, whose coefficient does not follow from the two-term
-            cooling equation.
-        clipped: whether to include the term in delta^(3/2) of contacts that end at zero force.
-
-    Returns:
-        T/T_0, same shape as tau.
-
-    Valid for Maxwellian velocities (a_2 = 0).
-
-    Reference: Brilliantov & Poeschel, Eq. (38), corrected.
-    """
-    u = 1 + COOLING_RATE[3] * jnp.asarray(delta) * jnp.asarray(tau)
-    q = COOLING_CORRECTION
-    if not corrected:
-        return u ** (-5 / 3) + 2 * q * delta * u ** (-11 / 6)
-    p = EXPANSION_P if clipped else 0.0
-    r = EXPANSION_R
-    second = q**2 * (
-        3.7 * u**-2.0 - 2.5 * u ** (-8 / 3) + 3.2 * u ** (-11 / 3) - 4.4 * u ** (-17 / 6)
-    ) - 2.5 * r * (u**-2.0 - u ** (-8 / 3))
-    return jnp.asarray(
-        u ** (-5 / 3)
-        + 2 * q * delta * (u ** (-11 / 6) - u ** (-8 / 3))
-        + 20 / 9 * p * delta**1.5 * (u ** (-23 / 12) - u ** (-8 / 3))
-        + delta**2 * second
-    )
-
-
-def paper_displacement(
-    tau: ArrayLike, delta: ArrayLike, *, corrected: bool = True
-) -> Float[Array, "..."]:
-    """Mean square displacement of viscoelastic spheres in 3D, to first order in delta.
-
-    ``<dr^2> = 6 D_0 tau_0 {6 (u^(1/6) - 1) + delta [a_3 ln u - (6/5) (q' (1 - u^(-5/6)) + c)]}``
-    with ``u = 1 + t/tau_0``, ``D_0 = T_0 tau_E(0) = 3/2``, ``a_3 = q' + (c + 3 s/16) + c = 4.648``
-    and ``q' = q + 0.24 s``. The three terms of a_3 are due to the correction of the temperature,
-    to the slower velocity relaxation, and to the cooling during the relaxation (memory), which also
-    gives the last c. Each includes a_2 to the same order.
-
-    Args:
-        tau: ``nu_0 t``, any shape; times long against tau_v.
-        delta: ``A alpha^(2/5) T_0^(1/10)``, small against 1.
-        corrected: False gives the integral of the paper's D from t = 0, with
-            ``a_3 = q + c = 3.342``, without memory, a_2 and the terms that keep T(0) = T_0.
-
-    Returns:
-        <dr^2> in units of ``T_0 tau_c(0)^2``, same shape as tau.
-
-    Reference: Brilliantov & Poeschel, Eqs. (40) and (42), corrected: (41) has 1/tau_E in place of
-    D_0, and (42) omits the factor 6 of u^(1/6) and the constant, without which the power law is
-    visible only for u > 2e6.
-    """
-    rate = COOLING_RATE[3] * jnp.asarray(delta)
-    u = 1 + rate * jnp.asarray(tau)
-    if corrected:
-        cooling = COOLING_CORRECTION + 0.24 * SONINE_COEFFICIENT
-        first = (cooling + 2 * RELAXATION_CORRECTION + 3 / 16 * SONINE_COEFFICIENT) * jnp.log(u)
-        first -= 6 / 5 * (cooling * (1 - u ** (-5 / 6)) + RELAXATION_CORRECTION)
-    else:
-        first = (COOLING_CORRECTION + RELAXATION_CORRECTION) * jnp.log(u)
-    return 9 / rate * (6 * (u ** (1 / 6) - 1) + delta * first)
-
-
-def _expansion_coefficient(power: float, coefficient: float) -> float:
-    """Coefficient of delta^(power - 1) in the cooling rate over that of its leading term.
-
-    The term of 1 - eps^2 is ``coefficient beta^power``, the leading one ``2 C1 beta``.
-    """
-    scale = (1.5 * 2**0.1) ** (power - 1)
-    return coefficient / (2 * C1) * scale * _moment(2 + power / 5) / _moment(2.2)
-
-
-EXPANSION_P = _expansion_coefficient(2.5, 2 * C_CLIP)
-"""p, relative coefficient of delta^(3/2) in the cooling rate: 0.56613; 0 if not clipped."""
-
-EXPANSION_R = _expansion_coefficient(3.0, 2 * 0.522882568 + 2 * C1 * 3 / 5 * C1**2)
-"""r, relative coefficient of delta^2 in the cooling rate: 4.14272."""
-
-
-def two_term_time(theta: ArrayLike, delta: ArrayLike) -> Float[Array, "..."]:
-    """Time at which T/T_0 is reached: exact solution of the two-term cooling equation in 3D.
-
-    With ``x = (T/T_0)^(1/10)``, ``k = q delta`` and ``b = 0.83193`` (`COOLING_RATE`), the equation
-    ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)`` has the solution ``tau = 6/(b delta) [
-    sum_{j<6} k^j (x^(j-6) - 1)/(6 - j) - k^6 ln x + k^6 ln((1 - k x)/(1 - k))]``.
-
-    Args:
-        theta: T/T_0, in (0, 1], any shape.
-        delta: ``A alpha^(2/5) T_0^(1/10)``, in (0, 1/q); a gas with a larger delta would heat.
-
-    Returns:
-        tau = nu_0 t, same shape.
-
-    Raises:
-        ValueError: for delta >= 1/q.
-
-    Reference: Brilliantov & Poeschel, Eq. (36), integrated by partial fractions.
-    """
-    limit = 1 / COOLING_CORRECTION
-    if np.any(np.asarray(delta) >= limit):
-        raise ValueError(
-            f"delta must lie in (0, {limit:.4f}), got {delta}; use jaxgran.KineticTheory() for "
-            "larger ones"
-        )
-    x, k = jnp.asarray(theta) ** 0.1, COOLING_CORRECTION * jnp.asarray(delta)
-    powers = sum(k**j * (x ** (j - 6) - 1) / (6 - j) for j in range(6))
-    logs = k**6 * (jnp.log1p(-k * x) - jnp.log1p(-k) - jnp.log(x))
-    return jnp.asarray(6 / (COOLING_RATE[3] * jnp.asarray(delta)) * (powers + logs))
 
 
 SHORTEST = {2: (0.181, 3.10), 3: (0.926, 2.19)}

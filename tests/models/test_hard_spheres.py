@@ -12,8 +12,8 @@ from jaxgran.models.hard_spheres import HardSpheres, reduced_hard_scene
 from jaxgran.particles import run
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.hard.dynamics import MIN_SKIN, HardDynamics
-from jaxgran.particles.neighbours import find_pairs
 from jaxgran.particles.run import _run_segments
+from tests.pairs import find_pairs
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 

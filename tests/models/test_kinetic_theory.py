@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
+from experiments.paper.closed_forms import paper_temperature
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.theory import solver
-from jaxgran.theory.equations import Density, crowding, paper_temperature, scene_at_start, softness
+from jaxgran.theory.equations import Density, crowding, scene_at_start, softness
 from jaxgran.theory.solver import WINDOW, Integrator, _solve_along, moments_at
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same

@@ -15,12 +15,12 @@ from jaxgran.particles.neighbours import (
     MAX_LOOKAHEAD,
     choose_engine,
     displacement,
-    find_pairs,
     sweep,
     tree_search,
     unsorted,
     wrap,
 )
+from tests.pairs import find_pairs
 
 # In boxes of less than three cutoffs jax-md itself warns about its integers.
 jax_md_warns = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")

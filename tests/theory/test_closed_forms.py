@@ -5,21 +5,19 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.theory import averages as kinetics
-from jaxgran.theory.equations import (
-    COOLING_CORRECTION,
-    COOLING_RATE,
+from experiments.paper.closed_forms import (
     EXPANSION_P,
     EXPANSION_R,
     SONINE_COEFFICIENT,
     constant_displacement,
     haff,
     haff_collisions,
-    paper_averages,
     paper_displacement,
     paper_temperature,
     two_term_time,
 )
+from jaxgran.theory import averages as kinetics
+from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, paper_averages
 
 
 def hard_gas(e: float, dimension: int = 3) -> jaxgran.Gas:

@@ -7,18 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.paper.closed_forms import (
+    RELAXATION_CORRECTION,
+    SONINE_COEFFICIENT,
+    paper_temperature,
+)
 from experiments.support.claims.table import SMALL, Table, cooled
 from experiments.support.scenes import beads
 from jaxgran.scene.laws import C1
 from jaxgran.theory.averages import collision_rate, impact_moments
-from jaxgran.theory.equations import (
-    COOLING_CORRECTION,
-    COOLING_RATE,
-    RELAXATION_CORRECTION,
-    SONINE_COEFFICIENT,
-    paper_averages,
-    paper_temperature,
-)
+from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, paper_averages
 
 
 def cooling(table: Table) -> None:

@@ -6,16 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.claims.table import SMALL, Table, cooled
-from experiments.support.scenes import hard_beads
-from jaxgran.theory.averages import TERMS, impact_moments
-from jaxgran.theory.equations import (
-    COOLING_CORRECTION,
-    COOLING_RATE,
+from experiments.paper.closed_forms import (
     RELAXATION_CORRECTION,
     SONINE_COEFFICIENT,
     paper_displacement,
 )
+from experiments.support.claims.table import SMALL, Table, cooled
+from experiments.support.scenes import hard_beads
+from jaxgran.theory.averages import TERMS, impact_moments
+from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 
 def equilibrium(table: Table) -> None:

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.paper.closed_forms import haff
 from experiments.support.hard_cases.rows import (
     PRECISIONS,
     Case,
@@ -18,8 +19,8 @@ from experiments.support.hard_cases.rows import (
     worst,
 )
 from experiments.support.scenes import beads
-from jaxgran.particles.neighbours import find_pairs
-from jaxgran.theory.equations import COOLING_RATE, haff
+from jaxgran.particles.neighbours import search_pairs, with_offsets
+from jaxgran.theory.equations import COOLING_RATE
 
 DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
 MAXWELLIAN = jaxgran.KineticTheory(softness=False, order=2, correlations=False, sonine=False)
@@ -129,7 +130,10 @@ def _deepest_overlap(particles) -> float:
     """The deepest overlap of two spheres of diameter 1; 0 if none overlap."""
     d = particles.position.shape[-1]
     position = particles.position.reshape(-1, d)
-    pairs = find_pairs(position, particles.box_side, 1.02, capacity=20 * len(position))
+    side, n = particles.box_side, len(position)
+    pairs = with_offsets(
+        position, side, search_pairs(position, side, 1.02, 1, (20 * n, n), "scipy")
+    )
     apart = position[pairs.i] - position[pairs.j] - pairs.offset
     distance = np.linalg.norm(np.asarray(apart), axis=-1)[: int(pairs.count)]
     return max(1 - float(np.min(distance, initial=1.0)), 0.0)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.paper.closed_forms import paper_temperature
 from experiments.support.hard_cases.rows import (
     HARD_THEORY,
     PRECISIONS,
@@ -32,7 +33,6 @@ from experiments.support.scenes import beads
 from jaxgran.data import checkpoint
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.soft.dynamics import DRIFT_TOLERANCE
-from jaxgran.theory.equations import paper_temperature
 
 DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
 FREE = "dissipative_constant"

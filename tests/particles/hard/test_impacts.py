@@ -6,7 +6,7 @@ import pytest
 
 import jaxgran
 from jaxgran.particles.hard.prediction import Rows, Slots, first_impacts
-from jaxgran.particles.neighbours import find_pairs
+from tests.pairs import find_pairs
 
 
 @pytest.mark.slow
