@@ -69,7 +69,7 @@ def test_every_quantity_of_a_curve_has_its_unit(curve):
 
 def test_several_curves_in_one_are_refused(curve):
     two = jax.tree.map(lambda x: jnp.stack([x, x]), curve)
-    for show in (two.to_xarray, two.to_pandas, two.plot):
+    for show in (two.to_xarray, two.to_pandas):
         with pytest.raises(ValueError, match="times of this curve have shape"):
             show()
 
