@@ -84,7 +84,7 @@ def test_an_archive_of_something_else_is_refused(tmp_path):
 def test_nothing_is_written_over(write):
     path = write(HEADER + ROWS)
     curve, header = jaxgran.read_curve(path)
-    with pytest.raises(ValueError, match="exists; choose another name or say overwrite=True"):
+    with pytest.raises(ValueError, match="exists; choose another name or set overwrite=True"):
         jaxgran.write_curve(path, curve, {})
     assert path.read_text() == HEADER + ROWS
     jaxgran.write_curve(path, curve, header, overwrite=True)

@@ -115,10 +115,10 @@ def test_tracks_of_hard_spheres(tmp_path):
 
 
 CASES = [
-    (lambda rows: rows[:30] + rows[31:], r"line \d+: particle 1 stands here, and is missing"),
+    (lambda rows: rows[:30] + rows[31:], r"line \d+: particle 1 has a position in this line"),
     (lambda rows: rows + [rows[-1]], r"line 66: particle 10 at t = .* given again, after line 65"),
     (lambda rows: [r for r in rows if r.startswith("4,")], r"of 1 particle\(s\); at least 3"),
-    (lambda rows: [r for r in rows if r[0] in "456"][::-1], r"earlier than that of particle"),
+    (lambda rows: [r for r in rows if r[0] in "456"][::-1], r"earlier than in the previous row"),
     (lambda rows: rows[:30], r"of 3 frames; at least 4"),
     (lambda rows: [*rows[:-1], "x" + rows[-1]], r"line 65: expected 5 finite numbers"),
     (lambda rows: [*rows[:-1], "1.5" + rows[-1][2:]], r"line 65: id is 1.5; number the particles"),

@@ -113,5 +113,5 @@ def test_drop_tests_are_read(tmp_path):
             jaxgran.read_drop_test(path)
     with pytest.raises(ValueError, match="no such file"):
         jaxgran.read_drop_test(tmp_path / "missing.csv")
-    with pytest.raises(ValueError, match="lists of one length"):
+    with pytest.raises(ValueError, match="lists of equal length"):
         jaxgran.DropTest([0.1, 0.2], [0.9], [0.01])
