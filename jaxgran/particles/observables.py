@@ -1,21 +1,15 @@
-"""Observables of particles: functions that compile and have derivatives, for `cool(save=...)`.
+"""Observables of particles, for `cool(save=...)`: jittable and differentiable functions.
 
 Positions and velocities of one box are arrays of shape (N, d), in any consistent units; boxes are
-periodic squares or cubes. Below, ``u`` is the mean velocity of the box.
+periodic squares or cubes. Below, ``u`` is the mean velocity of the box. There are moments of
+velocities and displacements, density and flow in a grid of cells, distributions of velocities and
+of distances, and Fourier modes of the density and of the flow.
 
 >>> from jaxgran import observables
 >>> position, velocity = jax.random.uniform(jax.random.key(0), (2, 1000, 3))
 >>> k, S = jax.jit(observables.structure_factor)(position, 1.0)
 >>> k.shape, S.shape
 ((4,), (4,))
-
-Moments of velocities and displacements.
-
-Density and flow in a grid of cells.
-
-Distributions of velocities and of distances, in bins.
-
-Waves of the density and of the flow.
 """
 
 import itertools
@@ -28,23 +22,53 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+__all__ = [
+    "cell_density",
+    "cell_velocity",
+    "flow_share",
+    "flow_spectrum",
+    "mean_square_displacement",
+    "number_fluctuation",
+    "pair_correlation",
+    "sonine",
+    "structure_factor",
+    "temperature",
+    "third_sonine",
+    "velocity_correlation",
+    "velocity_distribution",
+]
+
 
 def temperature(velocity: Float[Array, "... particles d"]) -> Float[Array, "..."]:
-    """Temperature ``T = <v^2>/d`` for mass 1, of velocities relative to their mean."""
+    """Return the temperature ``T = <v^2>/d`` for mass 1.
+
+    Args:
+        velocity: velocities relative to their mean.
+    """
     return jnp.mean(velocity**2, axis=(-2, -1))
 
 
 def sonine(velocity: Float[Array, "... particles d"]) -> Float[Array, "..."]:
-    """Sonine coefficient ``a_2 = d <v^4> / ((d + 2) <v^2>^2) - 1``, of velocities relative to their
-    mean; 0 for a Maxwellian gas. Its standard error is ``sqrt(8 / (d (d + 2) N))``."""
+    """Return the Sonine coefficient ``a_2 = d <v^4> / ((d + 2) <v^2>^2) - 1``.
+
+    It is 0 for a Maxwellian gas. Its standard error is ``sqrt(8 / (d (d + 2) N))``.
+
+    Args:
+        velocity: velocities relative to their mean.
+    """
     d = velocity.shape[-1]
     square = jnp.sum(velocity**2, axis=-1)
     return d / (d + 2) * jnp.mean(square**2, axis=-1) / jnp.mean(square, axis=-1) ** 2 - 1
 
 
 def third_sonine(velocity: Float[Array, "... particles d"]) -> Float[Array, "..."]:
-    """Sonine coefficient ``a_3 = 1 + 3 a_2 - d^2 <v^6> / ((d + 2)(d + 4) <v^2>^3)``, of velocities
-    relative to their mean; 0 for a Maxwellian gas."""
+    """Return the Sonine coefficient ``a_3 = 1 + 3 a_2 - d^2 <v^6> / ((d + 2)(d + 4) <v^2>^3)``.
+
+    It is 0 for a Maxwellian gas.
+
+    Args:
+        velocity: velocities relative to their mean.
+    """
     d = velocity.shape[-1]
     square = jnp.sum(velocity**2, axis=-1)
     sixth = jnp.mean(square**3, axis=-1) / jnp.mean(square, axis=-1) ** 3
@@ -54,37 +78,44 @@ def third_sonine(velocity: Float[Array, "... particles d"]) -> Float[Array, "...
 def mean_square_displacement(
     displacement: Float[Array, "... particles d"],
 ) -> Float[Array, "..."]:
-    """``<dr^2>`` of displacements since t = 0, followed across the faces of the box."""
+    """Return the mean square displacement ``<dr^2>``.
+
+    Args:
+        displacement: displacements since t = 0, continued across the faces of the periodic box.
+    """
     return jnp.mean(jnp.sum(displacement**2, axis=-1), axis=-1)
 
 
 def velocity_correlation(
     first: Float[Array, "... particles d"], velocity: Float[Array, "... particles d"]
 ) -> Float[Array, "..."]:
-    """Velocity autocorrelation ``<v(0) . v(t)> / d``, which is T at t = 0."""
+    """Return the velocity autocorrelation ``<v(0) . v(t)> / d``, which is T at t = 0."""
     return jnp.mean(first * velocity, axis=(-2, -1))
 
 
 def centred(velocity: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    """Velocities relative to their mean."""
+    """Return velocities relative to their mean."""
     return velocity - jnp.mean(velocity, axis=0, keepdims=True)
 
 
 def cell_density(
     position: Float[Array, "particles d"], side: ArrayLike, cells: int
 ) -> Float[Array, "*grid"]:
-    """Density over its mean in a grid of cells^d equal cells, shape (cells, ..., cells).
+    """Return the density over its mean in a grid of cells^d equal cells.
 
     Args:
-        position: of any periodic images.
-        side: of the periodic box.
-        cells: along each side, >= 1.
+        position: positions, in any periodic images.
+        side: side of the periodic box.
+        cells: number of cells along each side, >= 1.
+
+    Returns:
+        Array of shape (cells, ..., cells).
 
     >>> float(jnp.mean(observables.cell_density(position, 1.0, 4)))
     1.0
     """
     n, d = position.shape
-    number = jnp.bincount(_cells(position, side, cells), length=cells**d)
+    number = jnp.bincount(_cell_index(position, side, cells), length=cells**d)
     return (number * (cells**d / n)).reshape((cells,) * d)
 
 
@@ -94,36 +125,38 @@ def cell_velocity(
     side: ArrayLike,
     cells: int,
 ) -> Float[Array, "*grid d"]:
-    """The flow: mean of v - u in each cell of a grid, shape (cells, ..., cells, d); nan in empty
-    cells.
+    """Return the flow: the mean of v - u in each cell of a grid.
 
     Args:
-        position, velocity: of one box; positions of any periodic images.
-        side: of the periodic box.
-        cells: along each side, >= 1.
+        position, velocity: particles of one box; positions in any periodic images.
+        side: side of the periodic box.
+        cells: number of cells along each side, >= 1.
+
+    Returns:
+        Array of shape (cells, ..., cells, d); nan in empty cells.
 
     >>> observables.cell_velocity(position, velocity, 1.0, 4).shape
     (4, 4, 4, 3)
     """
     d = position.shape[-1]
-    place, v = _cells(position, side, cells), centred(velocity)
-    number = jnp.bincount(place, length=cells**d)
-    total = jax.ops.segment_sum(v, place, num_segments=cells**d)
+    cell, v = _cell_index(position, side, cells), centred(velocity)
+    number = jnp.bincount(cell, length=cells**d)
+    total = jax.ops.segment_sum(v, cell, num_segments=cells**d)
     return (total / number[:, None]).reshape((cells,) * d + (d,))  # 0/0 is nan
 
 
 def number_fluctuation(
     position: Float[Array, "particles d"], side: ArrayLike, cells: int
 ) -> Float[Array, ""]:
-    """Variance over mean of the number of particles in the cells of a grid.
+    """Return the variance over the mean of the number of particles in the cells of a grid.
 
-    1 for independent particles up to ``1/cells^d``, less in a fluid of hard spheres, more where
-    clusters as large as a cell are.
+    The ratio is 1 for independent particles up to ``1/cells^d``, less in a fluid of hard spheres,
+    and more where there are clusters as large as a cell.
 
     Args:
-        position: of any periodic images.
-        side: of the periodic box.
-        cells: along each side, >= 1.
+        position: positions, in any periodic images.
+        side: side of the periodic box.
+        cells: number of cells along each side, >= 1.
 
     >>> bool(abs(observables.number_fluctuation(position, 1.0, 5) - 1) < 0.5)
     True
@@ -132,32 +165,30 @@ def number_fluctuation(
     return jnp.var(cell_density(position, side, cells)) * (n / cells**d)
 
 
-def _cells(position: Float[Array, "particles d"], side: ArrayLike, cells: int) -> Array:
-    """The number of the cell of each particle."""
+def _cell_index(position: Float[Array, "particles d"], side: ArrayLike, cells: int) -> Array:
     if not (isinstance(cells, int) and cells >= 1):
         raise ValueError(f"cells must be a whole number >= 1, got {cells!r}")
-    turns = position / jnp.asarray(side)
-    place = jnp.floor((turns - jnp.floor(turns)) * cells).astype(int)
-    place = jnp.minimum(place, cells - 1)  # where rounding gave a whole turn
+    unit = position / jnp.asarray(side)
+    cell = jnp.floor((unit - jnp.floor(unit)) * cells).astype(int)
+    cell = jnp.minimum(cell, cells - 1)  # rounding may give `cells` itself
     powers = np.array([cells**k for k in reversed(range(position.shape[-1]))])
-    return jnp.sum(place * powers[None], axis=-1)
+    return jnp.sum(cell * powers[None], axis=-1)
 
 
-ROWS = 64
-"""Particles whose distances to all others are computed at once."""
+BATCH_SIZE = 64
+"""Number of particles whose distances to all others are computed at once."""
 
 
 def velocity_distribution(
     velocity: Float[Array, "particles d"], edges: ArrayLike | Sequence[float]
 ) -> Float[Array, "bins"]:
-    """The distribution f(c) of velocities ``c = (v - u) / sqrt(2 T)``, averaged over angles.
+    """Return the distribution f(c) of velocities ``c = (v - u) / sqrt(2 T)``, averaged over angles.
 
-    Normalised so that its integral over all c is 1: a Maxwellian gas has
-    ``pi^(-d/2) exp(-c^2)``.
+    Its integral over all c is 1: a Maxwellian gas has ``pi^(-d/2) exp(-c^2)``.
 
     Args:
-        velocity: of one box.
-        edges: of the bins in |c|, increasing, >= 0, shape (bins + 1,).
+        velocity: velocities of one box.
+        edges: edges of the bins in |c|, increasing, >= 0, shape (bins + 1,).
 
     >>> velocity = jax.random.normal(jax.random.key(0), (100_000, 3))
     >>> f = observables.velocity_distribution(velocity, [0.0, 0.1, 0.2])
@@ -177,21 +208,22 @@ def pair_correlation(
     edges: ArrayLike | Sequence[float],
     centres: int | None = None,
 ) -> Float[Array, "bins"]:
-    """Radial distribution function g(r): 1 for independent particles.
+    """Return the radial distribution function g(r), which is 1 for independent particles.
 
     ``g = pairs / (centres n V_shell)`` with the number density n. Its relative statistical error is
-    about 1 / sqrt(number of pairs in the bin). All distances are computed: the time is that of
-    N times `centres` of them.
+    about 1 / sqrt(number of pairs in the bin). The time is that of N times `centres` distances.
 
     Args:
-        position: of any periodic images.
-        side: of the periodic box.
-        edges: of the bins in r, increasing, >= 0, the last one <= side / 2, shape (bins + 1,).
-        centres: how many of the particles, the first, are centres of shells; all by default.
+        position: positions, in any periodic images.
+        side: side of the periodic box.
+        edges: edges of the bins in r, increasing, >= 0, the last one <= side / 2, shape
+            (bins + 1,).
+        centres: number of particles, counted from the first, that are centres of shells; all by
+            default.
 
     Raises:
-        ValueError: for edges, or a number of centres, out of range. Where the side is traced, bins
-            beyond half of it are nan.
+        ValueError: if edges or the number of centres are out of range. Where the side is traced,
+            bins beyond half of it are nan instead.
 
     >>> g = observables.pair_correlation(position, 1.0, [0.1, 0.2, 0.3])
     >>> bool(jnp.all(jnp.abs(g - 1) < 0.05))
@@ -204,9 +236,8 @@ def pair_correlation(
         raise ValueError(f"centres must be a whole number from 1 to {n}, got {centres!r}")
     if not any(isinstance(x, Tracer) for x in (side, edges)) and edges[-1] > side / 2:
         raise ValueError(
-            f"the last edge of g(r) is {float(edges[-1]):g}, at most half a box side "
-            f"({np.asarray(side) / 2:g}) is allowed; use a larger box (more particles) or smaller "
-            "distances"
+            f"the last edge of g(r) must be at most half a box side, {np.asarray(side) / 2:g}, got "
+            f"{float(edges[-1]):g}. Use smaller distances, or more particles for a larger box."
         )
 
     def around(i: Array) -> Float[Array, "bins"]:
@@ -215,57 +246,55 @@ def pair_correlation(
         distance = jnp.sqrt(jnp.sum(apart**2, axis=-1))
         return histogram(distance.at[i].set(jnp.inf), edges)
 
-    counts = jax.lax.map(around, jnp.arange(centres), batch_size=min(ROWS, centres))
+    counts = jax.lax.map(around, jnp.arange(centres), batch_size=min(BATCH_SIZE, centres))
     density = n / jnp.asarray(side) ** d
     g = jnp.sum(counts, axis=0) / (centres * density * shell_volumes(edges, d))
-    # Rounding of half a side is no reason for nan.
+    # The tolerance allows for rounding of half a side.
     return jnp.where(edges[1:] <= side * (0.5 + 1e-6), g, jnp.nan)
 
 
 def checked_edges(edges: ArrayLike | Sequence[float]) -> Array | np.ndarray:
-    """Edges of bins as an array; ValueError if they are known and not increasing from >= 0 on."""
+    """Return edges as an array; raise ValueError if they are known and invalid."""
     if isinstance(edges, Tracer):
         return edges
     array = np.asarray(edges, float)
     if array.ndim != 1 or array.size < 2 or array[0] < 0 or not np.all(np.diff(array) > 0):
-        raise ValueError(
-            f"edges of bins must be two or more increasing numbers >= 0, got {edges!r}"
-        )
+        raise ValueError(f"edges must be at least two increasing numbers >= 0, got {edges!r}")
     return array
 
 
 def histogram(
     values: Float[Array, "n"], edges: Float[Array | np.ndarray, "e"]
 ) -> Float[Array, "bins"]:
-    """How many values lie in each bin, the last edge included."""
+    """Count the values in each bin; the last bin includes its upper edge."""
     bins, edges = edges.size - 1, jnp.asarray(edges, values.dtype)
-    place = jnp.searchsorted(edges, values, side="right")
-    place = jnp.where(values == edges[-1], bins, place)
-    return jnp.bincount(place, length=bins + 2)[1:-1].astype(edges.dtype)
+    index = jnp.searchsorted(edges, values, side="right")
+    index = jnp.where(values == edges[-1], bins, index)
+    return jnp.bincount(index, length=bins + 2)[1:-1].astype(edges.dtype)
 
 
 def shell_volumes(edges: Float[Array | np.ndarray, "e"], d: int) -> Float[Array, "bins"]:
-    """Volumes of the shells between spheres of these radii."""
+    """Return the volumes of the shells between spheres of these radii."""
     return math.pi ** (d / 2) / math.gamma(d / 2 + 1) * jnp.diff(jnp.asarray(edges) ** d)
 
 
-FLOW_SHELLS = 2
-"""Lengths of wave vectors that count as flow: k = 2 pi / side, and sqrt(2) times that."""
+NUM_FLOW_SHELLS = 2
+"""Number of lengths of wave vectors that count as flow: k = 2 pi / side, and sqrt(2) times that."""
 
 
 def structure_factor(
     position: Float[Array | np.ndarray, "particles d"], side: ArrayLike, num_shells: int = 4
 ) -> tuple[Float[Array, "shells"], Float[Array, "shells"]]:
-    """Static structure factor ``S(k) = |sum exp(i k x)|^2 / N`` at the smallest wave vectors.
+    """Return the static structure factor ``S(k) = |sum exp(i k x)|^2 / N`` at small k.
 
     Args:
-        position: of any periodic images of the particles.
-        side: of the periodic box.
+        position: positions, in any periodic images.
+        side: side of the periodic box.
         num_shells: number of different lengths of the wave vector, from 2 pi / side upwards.
 
     Returns:
-        The lengths k (1/length), and S averaged over the wave vectors of each length. A homogeneous
-        gas has S below 1 at these wave vectors; clusters raise it.
+        The lengths k (1/length), and S averaged over the wave vectors of each length, both of shape
+        (num_shells,). A homogeneous gas has S below 1 at these wave vectors; clusters raise it.
 
     >>> k, S = observables.structure_factor(position, 1.0, num_shells=2)
     >>> [round(float(x), 3) for x in k]
@@ -273,7 +302,7 @@ def structure_factor(
     """
     waves, shells = _waves(position.shape[-1], num_shells)
     amplitude = _amplitudes(position, jnp.ones(len(position)), waves, side)
-    return _lengths(waves, shells, side), _by_shell(jnp.abs(amplitude) ** 2, shells)
+    return _wave_numbers(waves, shells, side), _shell_means(jnp.abs(amplitude) ** 2, shells)
 
 
 def flow_spectrum(
@@ -282,19 +311,20 @@ def flow_spectrum(
     side: ArrayLike,
     num_shells: int = 4,
 ) -> tuple[Float[Array, "shells"], Float[Array, "shells"], Float[Array, "shells"]]:
-    """How much energy the flow has at the smallest wave vectors.
+    """Return the energy spectra of the flow at the smallest wave vectors.
 
-    With ``j(k) = sum (v - u) exp(i k x) / sqrt(N)`` split along k and across it, the spectra are
-    ``|j_across|^2 / (d - 1)`` and ``|j_along|^2``, in the unit of T. Both are T where velocities
-    are independent; vortices raise the first.
+    The current ``j(k) = sum (v - u) exp(i k x) / sqrt(N)`` has a part across k and one along k.
+    The transverse spectrum is ``|j_across|^2 / (d - 1)``, the longitudinal one ``|j_along|^2``,
+    both in the unit of T. Both are T where velocities are independent; vortices raise the first.
 
     Args:
-        position, velocity: of one box; positions of any periodic images.
-        side: of the periodic box.
+        position, velocity: particles of one box; positions in any periodic images.
+        side: side of the periodic box.
         num_shells: number of different lengths of the wave vector, from 2 pi / side upwards.
 
     Returns:
-        The lengths k, the transverse and the longitudinal spectrum.
+        The lengths k (1/length), the transverse and the longitudinal spectrum, each of shape
+        (num_shells,).
 
     >>> k, across, along = observables.flow_spectrum(position, velocity, 1.0)
     >>> across.shape == along.shape == k.shape
@@ -307,22 +337,24 @@ def flow_spectrum(
     unit = waves / np.sqrt(np.sum(waves**2, axis=1, keepdims=True))
     along = jnp.abs(jnp.sum(current * unit, axis=1)) ** 2
     across = (jnp.sum(jnp.abs(current) ** 2, axis=1) - along) / (d - 1)
-    return _lengths(waves, shells, side), _by_shell(across, shells), _by_shell(along, shells)
+    k = _wave_numbers(waves, shells, side)
+    return k, _shell_means(across, shells), _shell_means(along, shells)
 
 
 def flow_share(
     position: Float[Array, "particles d"],
     velocity: Float[Array, "particles d"],
     side: ArrayLike,
-    num_shells: int = FLOW_SHELLS,
+    num_shells: int = NUM_FLOW_SHELLS,
 ) -> Float[Array, ""]:
-    """Share of the kinetic energy in the flow: in its longest waves, above equipartition.
+    """Return the share of the kinetic energy in the longest waves of the flow, above equipartition.
 
-    ``(sum |j(k)|^2 - d T M) / (d N T / 2)`` with j of `flow_spectrum`, over M wave vectors, one of
-    each pair k and -k. 0 on average where velocities are independent; its standard deviation is
-    then ``2 sqrt(M / d) / N``.
+    The share is ``(sum |j(k)|^2 - d T M) / (d N T / 2)`` with j of `flow_spectrum`, summed over M
+    wave vectors, one of each pair k and -k. Where velocities are independent its mean is 0 and its
+    standard deviation ``2 sqrt(M / d) / N``.
 
-    Args: as `flow_spectrum`.
+    Args:
+        position, velocity, side, num_shells: see `flow_spectrum`.
 
     >>> share = observables.flow_share(position, velocity, 1.0)
     >>> bool(abs(share) < 0.02)
@@ -332,14 +364,13 @@ def flow_share(
     waves, _ = _waves(d, num_shells)
     v = centred(velocity)
     current = jax.vmap(lambda x: _amplitudes(position, x, waves, side), 1, 1)(v)
-    # Where nothing moves there is no flow.
     energy = jnp.sum(v**2)
-    moving = jnp.where(energy > 0, energy, 1.0)
-    return 2 * jnp.sum(jnp.abs(current) ** 2) / moving - 2 * len(waves) / num_particles
+    divisor = jnp.where(energy > 0, energy, 1.0)  # particles at rest have no flow
+    return 2 * jnp.sum(jnp.abs(current) ** 2) / divisor - 2 * len(waves) / num_particles
 
 
 def _waves(d: int, num_shells: int) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Wave vectors in units of 2 pi / side, one of each pair k and -k, and those of each length."""
+    """Return wave vectors k in units of 2 pi / side, without -k, and their indices by length."""
     if not (isinstance(num_shells, int) and num_shells >= 1):
         raise ValueError(f"num_shells must be a whole number >= 1, got {num_shells!r}")
     reach = range(-num_shells, num_shells + 1)
@@ -357,34 +388,17 @@ def _amplitudes(
     waves: np.ndarray,
     side: ArrayLike,
 ) -> Array:
-    """``sum w exp(i k x) / sqrt(n)`` for each wave vector."""
-    turns = jnp.asarray(position) / jnp.asarray(side)
-    # A whole turn changes nothing, and a small phase is rounded less.
-    phase = 2 * jnp.pi * ((turns - jnp.floor(turns)) @ waves.T.astype(turns.dtype))
+    """Return ``sum w exp(i k x) / sqrt(n)`` for each wave vector."""
+    unit = jnp.asarray(position) / jnp.asarray(side)
+    # Whole periods do not change the result, and a small phase is rounded less.
+    phase = 2 * jnp.pi * ((unit - jnp.floor(unit)) @ waves.T.astype(unit.dtype))
     return weights @ jnp.exp(1j * phase) / math.sqrt(len(position))
 
 
-def _lengths(waves: np.ndarray, shells: list[np.ndarray], side: ArrayLike) -> Array:
+def _wave_numbers(waves: np.ndarray, shells: list[np.ndarray], side: ArrayLike) -> Array:
     square = np.array([np.sum(waves[shell[0]] ** 2) for shell in shells])
     return 2 * jnp.pi / jnp.asarray(side) * jnp.sqrt(square)
 
 
-def _by_shell(values: Float[Array, "waves"], shells: list[np.ndarray]) -> Float[Array, "shells"]:
+def _shell_means(values: Float[Array, "waves"], shells: list[np.ndarray]) -> Float[Array, "shells"]:
     return jnp.stack([jnp.mean(values[shell]) for shell in shells])
-
-
-__all__ = [
-    "cell_density",
-    "cell_velocity",
-    "flow_share",
-    "flow_spectrum",
-    "mean_square_displacement",
-    "number_fluctuation",
-    "pair_correlation",
-    "sonine",
-    "structure_factor",
-    "temperature",
-    "third_sonine",
-    "velocity_correlation",
-    "velocity_distribution",
-]

@@ -120,7 +120,7 @@ def test_pairs_of_a_clump_are_all_counted():
 def test_pair_correlation_ends_at_half_the_box():
     position = jnp.asarray(np.random.default_rng(2).random((10, 2)))
     assert pair_correlation(position, 1.0, [0.0, 0.25, 0.5]).shape == (2,)
-    with pytest.raises(ValueError, match=r"the last edge of g\(r\) is 0.51, at most half a box"):
+    with pytest.raises(ValueError, match=r"the last edge of g\(r\) must be .* 0.5, got 0.51"):
         pair_correlation(position, 1.0, [0.0, 0.25, 0.51])
 
 
@@ -309,7 +309,7 @@ def test_observables_compile_and_have_batches():
         (lambda x: pair_correlation(x, 1.0, [0.1, 0.2], centres=11), "from 1 to 10, got 11"),
         (lambda x: structure_factor(x, 1.0, 0), "num_shells must be a whole number >= 1, got 0"),
         (lambda x: cell_density(x, 1.0, 0), "cells must be a whole number >= 1, got 0"),
-        (lambda x: velocity_distribution(x, [0.1]), "two or more increasing numbers"),
+        (lambda x: velocity_distribution(x, [0.1]), "at least two increasing numbers"),
     ],
 )
 def test_bad_requests_are_refused(call, message):
