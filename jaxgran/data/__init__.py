@@ -1,4 +1,4 @@
-"""Data: cooling curves and their files, checkpoints, and the options of a run.
+"""Cooling curves and their files, particles and their files, checkpoints, and options of a run.
 
-Imports `checks` and `scene` only; every package above may import it.
+The package imports `jaxgran._utils` and `jaxgran.scene` only; every package above may import it.
 """

@@ -1,9 +1,4 @@
-"""Atomic writing of files.
-
-Numbers in the header of a curve.
-
-Tables of numbers in CSV files, with a header.
-"""
+"""Atomic writing of files, and reading of CSV files whose header lines hold values."""
 
 import errno
 import os
@@ -15,45 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-
-MAX_COUNT = 10**12
-"""The largest whole number of a header."""
-
-
-def header_number(header: dict[str, str], key: str) -> float:
-    """The value of a key in the header of a curve, as a number.
-
-    Raises:
-        ValueError: if the value is not a finite number.
-        KeyError: if there is no such key.
-    """
-    try:
-        number = float(header[key])
-    except ValueError:
-        number = float("nan")
-    if not np.isfinite(number):
-        raise ValueError(f"header line {key}: {header[key]!r} is not a finite number")
-    return number
-
-
-def header_count(header: dict[str, str], key: str) -> int | None:
-    """The value of a key in the header of a curve, such as N, as a positive whole number.
-
-    Returns:
-        The number, or None if there is no such key.
-
-    Raises:
-        ValueError: if the value is not a positive whole number.
-    """
-    if key not in header:
-        return None
-    number = header_number(header, key)
-    if not (1 <= number <= MAX_COUNT and number.is_integer()):
-        raise ValueError(
-            f"header line {key}: must be a whole number from 1 to {MAX_COUNT:g}, got "
-            f"{header[key]!r}"
-        )
-    return int(number)
 
 
 def write_atomically(path: str | Path, write: Callable[[Any], Any]) -> None:
@@ -88,12 +44,14 @@ def write_atomically(path: str | Path, write: Callable[[Any], Any]) -> None:
         if not isinstance(error, OSError):
             raise
         raise OSError(
-            error.errno, f"cannot write ({error.strerror}); any earlier file is unharmed", str(path)
+            error.errno,
+            f"could not write ({error.strerror}); an existing file was not changed",
+            str(path),
         ) from error
 
 
 def _permissions(path: Path) -> int:
-    """The permissions of a file, or those of a new one."""
+    """Return the permissions of a file, or those of a new one."""
     try:
         return stat.S_IMODE(path.stat().st_mode)
     except OSError:
@@ -103,11 +61,11 @@ def _permissions(path: Path) -> int:
 
 
 def check_writable(path: str | Path) -> None:
-    """Check that a file could be written, before a long run whose result it is to hold.
+    """Check that a file can be written, before a long run that ends with writing it.
 
     Raises:
-        OSError: naming the path, if its folder does not exist or cannot be written to, or if it is
-            a folder itself.
+        OSError: naming the path, if its folder does not exist or is not writable, or if it is a
+            folder itself.
     """
     target = Path(os.path.realpath(path))
     if target.is_dir():
@@ -121,12 +79,55 @@ def check_writable(path: str | Path) -> None:
     raise OSError(code, f"cannot write ({os.strerror(code)}); name another file", str(path))
 
 
+MAX_COUNT = 10**12
+"""Largest whole number in a header."""
+
+
+def header_number(header: dict[str, str], key: str) -> float:
+    """Return the value of a key in the header of a curve, as a number.
+
+    Raises:
+        ValueError: if the value is not a finite number.
+        KeyError: if there is no such key.
+    """
+    try:
+        number = float(header[key])
+    except ValueError:
+        number = float("nan")
+    if not np.isfinite(number):
+        raise ValueError(f"header line {key}: {header[key]!r} is not a finite number")
+    return number
+
+
+def header_count(header: dict[str, str], key: str) -> int | None:
+    """Return the value of a key in the header of a curve, such as N, as a positive whole number.
+
+    Returns:
+        The number, or None if there is no such key.
+
+    Raises:
+        ValueError: if the value is not a positive whole number.
+    """
+    if key not in header:
+        return None
+    number = header_number(header, key)
+    if not (1 <= number <= MAX_COUNT and number.is_integer()):
+        raise ValueError(
+            f"header line {key}: must be a whole number from 1 to {MAX_COUNT:g}, got "
+            f"{header[key]!r}"
+        )
+    return int(number)
+
+
 def read_text(path: Path, columns: str) -> str:
-    """The text of a CSV file; ValueError if it cannot be read, is empty or is no text.
+    """Return the text of a CSV file.
 
     Args:
         path: the file.
-        columns: that it should have, for the message.
+        columns: names of the columns that it should have, for the message.
+
+    Raises:
+        ValueError: if the file cannot be read, is empty or is no text.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte-order mark
@@ -148,7 +149,7 @@ def read_text(path: Path, columns: str) -> str:
 
 
 def number_row(path: Path, i: int, line: str, names: list[str]) -> list[float]:
-    """The numbers of line i; ValueError unless there is a finite one for each column."""
+    """Return the numbers of line i; raise ValueError unless each column has a finite one."""
     cells = line.split(",")
     try:
         values = [float(cell) for cell in cells]
@@ -163,12 +164,12 @@ def number_row(path: Path, i: int, line: str, names: list[str]) -> list[float]:
 
 
 class Table(NamedTuple):
-    """The content of a file.
+    """Content of a CSV file.
 
     Attributes:
-        header: values of its lines ``# key: value``.
-        columns: their numbers by name.
-        lines: where each row stands, counted from 1.
+        header: values of the lines ``# key: value``, by key.
+        columns: numbers of each column, by its name.
+        lines: line number of each row, counted from 1.
     """
 
     header: dict[str, str]
@@ -182,7 +183,7 @@ def read_table(path: Path, wanted: str, check_names: Callable[[int, list[str]], 
     Args:
         path: the file.
         wanted: the names of its columns, for messages.
-        check_names: is given the line of the names and the names, and raises ValueError.
+        check_names: raises ValueError for wrong names; its arguments are their line and the names.
 
     Raises:
         ValueError: saying what is wrong, in which line, and what to do.
@@ -196,7 +197,7 @@ def read_table(path: Path, wanted: str, check_names: Callable[[int, list[str]], 
         if line.startswith("#"):
             key, colon, value = line[1:].partition(":")
             if colon:
-                _add(path, i, header, key.strip(), value.strip())
+                _add_header_line(path, i, header, key.strip(), value.strip())
         elif line and not names:
             names = [name.strip() for name in line.split(",")]
             check_names(i, names)
@@ -207,7 +208,7 @@ def read_table(path: Path, wanted: str, check_names: Callable[[int, list[str]], 
     return Table(header, dict(zip(names, values.T, strict=True)), lines)
 
 
-def _add(path: Path, i: int, header: dict[str, str], key: str, value: str) -> None:
+def _add_header_line(path: Path, i: int, header: dict[str, str], key: str, value: str) -> None:
     if key in header:
         raise ValueError(
             f"{path}, line {i}: {key} is given again, as {value} after {header[key]}; remove one"

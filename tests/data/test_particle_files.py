@@ -86,7 +86,7 @@ def test_a_trajectory_goes_on_where_it_ended(tmp_path, suffix, digits):
         np.testing.assert_allclose(read.velocity, expected, atol=4 * digits, rtol=0)
     with pytest.raises(ValueError, match="5 frames, there is no frame 5"):
         jaxgran.read_particles(path, frame=5)
-    with pytest.raises(ValueError, match="has 5 frames, and the checkpoint goes on with frame 7"):
+    with pytest.raises(ValueError, match="has 5 frames, but the checkpoint continues with frame 7"):
         Trajectory(path, 1, resumed=True).write(7, 0.0, particles(), SPHERE)
 
 
@@ -125,7 +125,7 @@ def test_a_run_writes_its_trajectory(beads, tmp_path, monkeypatch):
     jaxgran.cool(gas, t, **options, **run)
     assert (tmp_path / "run.0.xyz").read_text().splitlines() == lines
     with pytest.raises(ValueError, match=r"run.0.xyz exists"):  # before it melts
-        monkeypatch.setattr(run, "_equilibrate", None)
+        monkeypatch.setattr("jaxgran.particles.run._equilibrate", None)
         jaxgran.cool(gas, t, **options, trajectory=path)
 
 
@@ -207,16 +207,20 @@ def test_files_of_lammps(tmp_path, text):
     [
         (DUMP, ("xu yu zu", "a b c"), "it has no column x y z"),
         (DUMP, ("vx vy vz omegax", "fx fy fz omegax"), "it has no column vx vy vz"),
-        (DUMP, ("2 1 0.5 1 -1 4 5 6 0 0 2\n", ""), "a frame of 2 atoms has not as many whole rows"),
+        (
+            DUMP,
+            ("2 1 0.5 1 -1 4 5 6 0 0 2\n", ""),
+            "a frame of 2 atoms has not as many complete rows",
+        ),
         (DUMP, ("BOUNDS pp", "BOUNDS xy xz yz pp"), "its box is slanted"),
         (DUMP, ("2.5 1 1 1", "nan 1 1 1"), "positions are not finite"),
         (DUMP, ("2.5 1 1 1", "x 1 1 1"), "could not convert string"),
         (DATA, ("# sphere", ""), "must name its style, atomic or sphere"),
         (DATA, ("# sphere", "# bond"), "must name its style, atomic or sphere"),
         (DATA, ("Velocities", "Bodies"), "it has no section Velocities"),
-        (DATA, ("2 4 5 6 0 0 2", "3 4 5 6 0 0 2"), "have other ids"),
+        (DATA, ("2 4 5 6 0 0 2", "3 4 5 6 0 0 2"), "have different ids"),
         (DATA, ("-1 3 xlo xhi", "3 -1 xlo xhi"), "which must be positive"),
-        ("t,T\n1,2\n", ("", ""), "neither a LAMMPS dump nor a data file"),
+        ("t,T\n1,2\n", ("", ""), "neither a LAMMPS dump nor a LAMMPS data file"),
     ],
 )
 def test_bad_files_are_refused(tmp_path, text, change, message):

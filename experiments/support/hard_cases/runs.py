@@ -377,7 +377,7 @@ def faults_on_the_way() -> list[Row]:
             check=False,
         )
         said = done.stdout.strip().splitlines()
-        right = len(said) == 2 and all("unharmed" in line and path.name in line for line in said)
+        right = len(said) == 2 and all("not changed" in line and path.name in line for line in said)
         right = right and path.read_bytes() == whole and os.listdir(folder) == [path.name]
         words = (said[0] if said else done.stderr).replace(f"{folder}/", "")
         rows.append(_right("no room on the disk", right, words))
@@ -386,7 +386,7 @@ def faults_on_the_way() -> list[Row]:
             ("checkpoint", lambda: checkpoint.save(nowhere, {"N": "3"}, like)),
             ("curve", lambda: _write_curve(nowhere)),
         ):
-            asked = r"cannot write .*run\.ckpt"
+            asked = r"could not write .*run\.ckpt"
             rows.append(refusal(f"{what}, no such folder", "float64", write, asked))
         gas = unit_gas(jaxgran.ConstantRestitution(0.9), 0.05)
         times = [float(gas.mean_free_time)]
