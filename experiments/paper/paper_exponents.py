@@ -21,7 +21,7 @@ from matplotlib.ticker import NullFormatter
 import jaxgran
 from experiments.support import paper
 from experiments.support.scenes import beads
-from jaxgran._utils.validation import POSITIVE, Domain, number
+from jaxgran._utils.validation import POSITIVE, Domain, float_array
 
 SHADES = ("#084594", "#2171b5", "#6baed6", "#bdc9e1")
 """From the smallest gamma to the largest: one colour from dark to light, which has no other use."""
@@ -48,8 +48,10 @@ SMOKE = Config(gammas=(0.0, 1.0), num_particles=1000, replicas=2, last=100.0, po
 class Ice(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
     """``eps = min(1, (v/v_1)^(-p))``: elastic below v_1, decreasing with the speed above."""
 
-    threshold: Float[Array, ""] = eqx.field(converter=number, default=0.01 * 0.34 ** (1 / 0.234))
-    exponent: Float[Array, ""] = eqx.field(converter=number, default=0.234)
+    threshold: Float[Array, ""] = eqx.field(
+        converter=float_array, default=0.01 * 0.34 ** (1 / 0.234)
+    )
+    exponent: Float[Array, ""] = eqx.field(converter=float_array, default=0.234)
 
     domains: ClassVar[dict[str, Domain]] = {"threshold": POSITIVE, "exponent": POSITIVE}
 

@@ -1,4 +1,4 @@
-"""Checks: validation of what a user gives, what is traced by JAX, and the status of compiled code.
+"""Validation of user input, traced values, the status of compiled code, and tables for display.
 
-The lowest floor: imports no other package of jaxgran, and every other package may import it.
+The lowest package: it imports no other package of jaxgran, and every other package may import it.
 """

@@ -1,4 +1,4 @@
-"""Objects in short words, for a terminal and for a notebook."""
+"""Short representations of objects, for a terminal and for a notebook."""
 
 from collections.abc import Sequence
 from html import escape
@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from jax.core import Tracer
 
-Rows = Sequence[tuple[str, str]]
-"""Names and what is said of them."""
+TableRows = Sequence[tuple[str, str]]
+"""Pairs of a name and its description."""
 
 
 def format_quantity(value: Any, unit: str = "") -> str:
-    """A number with its unit; of an array the shape, of a traced value that it is one."""
+    """Format a number with its unit; for an array give its shape, for a traced value "traced"."""
     if isinstance(value, Tracer):
         return "traced"
     array = np.asarray(value)
@@ -21,13 +21,13 @@ def format_quantity(value: Any, unit: str = "") -> str:
     return f"{float(array):.4g} {unit}".rstrip()
 
 
-def text_table(title: str, rows: Rows) -> str:
-    """A title, and a line for each row."""
+def text_table(title: str, rows: TableRows) -> str:
+    """Format a title and rows as plain text, one row a line."""
     width = max((len(name) for name, _ in rows), default=0)
-    return "\n".join([title, *(f"  {name:{width}}  {words}" for name, words in rows)])
+    return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
 
 
-def html_table(title: str, rows: Rows) -> str:
-    """The same as a table."""
-    lines = [f"<tr><th>{escape(name)}</th><td>{escape(words)}</td></tr>" for name, words in rows]
+def html_table(title: str, rows: TableRows) -> str:
+    """Format a title and rows as an HTML table."""
+    lines = [f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in rows]
     return f"<table><caption>{escape(title)}</caption>{''.join(lines)}</table>"

@@ -1,4 +1,4 @@
-"""Status of a run in compiled code, where nothing can be raised: one bit for each fault."""
+"""Status of a run: one bit for each fault, since compiled code cannot raise exceptions."""
 
 from typing import NamedTuple, SupportsInt
 
@@ -12,7 +12,7 @@ class Fault(NamedTuple):
     Attributes:
         bit: a power of two.
         meaning: what happened, as a clause.
-        advice: what the user can do if the run could not repair it by itself.
+        advice: what the user can do if the run cannot recover by itself.
     """
 
     bit: int
@@ -22,20 +22,20 @@ class Fault(NamedTuple):
 
 OK = 0
 _ALLOW_MORE_PAIRS = (
-    "inside jax.jit allow more pairs by sized_for(gas, spare=4); else lower the packing fraction: "
-    "the gas may have clustered into one dense region"
+    "inside jax.jit allow more pairs by sized_for(gas, spare=4); otherwise lower the packing "
+    "fraction, since the gas may have clustered into one dense region"
 )
 LIST_FULL = Fault(1, "the neighbour list is full", _ALLOW_MORE_PAIRS)
 CONTACTS_FULL = Fault(2, "the list of pairs that may touch is full", _ALLOW_MORE_PAIRS)
-SKIN_OUTRUN = Fault(
+SKIN_EXCEEDED = Fault(
     4,
     "a sphere moved farther than the skin of its neighbour list within one block of steps",
-    "raise steps_per_contact, or start with smaller velocities",
+    "increase steps_per_contact, or start with smaller velocities",
 )
 STEP_TOO_LARGE = Fault(
     8,
     "the total energy has grown: the time step is too large",
-    "raise steps_per_contact",
+    "increase steps_per_contact",
 )
 NOT_FINITE = Fault(
     16,
@@ -49,90 +49,90 @@ STALLED = Fault(
 )
 TOO_FAST = Fault(
     64,
-    "many pairs meet faster than the largest relative speed for which collisions are sampled",
-    "the velocity distribution has grown a tail of fast particles; check whether the law of "
-    "restitution gains energy at some speed",
+    "many pairs are faster than the largest relative speed for which collisions are sampled",
+    "the velocity distribution has a tail of fast particles; check whether the law of restitution "
+    "gains energy at some speed",
 )
-STEPS_SPENT = Fault(
+MAX_STEPS_REACHED = Fault(
     128,
     "the solver reached its largest number of steps before the last time",
     "for a nearly elastic gas over many decades of time use KineticTheory(solver=diffrax.Kvaerno5"
-    "()); else raise max_steps, or end earlier",
+    "()); otherwise increase max_steps, or end earlier",
 )
 OVERLAPPING = Fault(
     256,
-    "two spheres of the initial state overlap, or a sphere and a wall, which hard spheres must not",
-    "move them apart, or leave out start for a random initial state",
+    "two spheres of the initial state overlap, or a sphere and a wall",
+    "move them apart, or leave start out for a random initial state",
 )
-OTHER_BOX = Fault(
+BOX_MISMATCH = Fault(
     512,
-    "the start's box is not that of the gas",
+    "the box of start does not match the gas",
     "change packing_fraction, or give a start in a box of the right size",
 )
 BOX_TOO_SMALL = Fault(
     1024,
-    "the box is too short to tell a sphere from its periodic image",
+    "the box is too short to distinguish a sphere from its periodic image",
     "use more particles or a lower packing_fraction",
 )
 ENERGY_DRIFT = Fault(
     2048,
     "the energy balance of the whole run is off by more than 5 %, by small errors of many steps",
-    "raise steps_per_contact, or in single precision use float64",
+    "increase steps_per_contact, or use float64 instead of single precision",
 )
 OUT_OF_RANGE = Fault(
     4096,
     "a float of the gas lies outside its range, or the times do not increase from 0 or later",
-    "look at gas.domains, and sort the times",
+    "see gas.domains for the ranges, and sort the times",
 )
 UNSUPPORTED = Fault(
     8192,
-    "the model does not take this gas",
-    "call jaxgran.cool for it alone, which says why",
+    "the model does not support this gas",
+    "call jaxgran.cool for this gas alone to see the reason",
 )
-NO_ROOM = Fault(
+OVERLAPS_REMAIN = Fault(
     16384,
-    "spheres at random places still overlap after many pushes apart",
+    "randomly placed spheres still overlap after many steps that push them apart",
     "lower the packing fraction, or give your own start",
 )
 FAULTS = (
     LIST_FULL,
     CONTACTS_FULL,
-    SKIN_OUTRUN,
+    SKIN_EXCEEDED,
     STEP_TOO_LARGE,
     NOT_FINITE,
     STALLED,
     TOO_FAST,
-    STEPS_SPENT,
+    MAX_STEPS_REACHED,
     OVERLAPPING,
-    OTHER_BOX,
+    BOX_MISMATCH,
     BOX_TOO_SMALL,
     ENERGY_DRIFT,
     OUT_OF_RANGE,
     UNSUPPORTED,
-    NO_ROOM,
+    OVERLAPS_REMAIN,
 )
 
 
 def flag(fault: Fault, when: ArrayLike) -> Int[Array, "..."]:
-    """The bit of a fault where `when` is true, else 0; combine several statuses with `|`.
+    """Return the bit of a fault if `when` is true, otherwise 0; combine statuses with `|`.
 
     Args:
-        fault: what to report.
+        fault: the fault to report.
         when: booleans, any shape.
     """
     return jnp.where(jnp.asarray(when), fault.bit, OK).astype(jnp.int32)
 
 
 def has(status: ArrayLike, fault: Fault) -> Bool[Array, "..."]:
-    """Whether the status of each run, any shape, contains a fault."""
+    """Tell for each run whether its status contains a fault; `status` has any shape."""
     return (jnp.asarray(status) & fault.bit) != 0
 
 
 def explain(status: SupportsInt) -> str:
-    """The faults of one status in words, each with what to do about it; "ok" for 0.
+    """Describe the faults of one status, each with advice; "ok" for 0.
 
     Args:
-        status: a whole number, such as `jaxgran.CoolingCurve.status`.
+        status: an integer, such as `jaxgran.CoolingCurve.status`.
 
     >>> jaxgran.explain_status(0)
     'ok'

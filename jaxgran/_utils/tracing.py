@@ -1,4 +1,4 @@
-"""Numbers that are known, and those that are being traced by a JAX transformation."""
+"""Values that a JAX transformation traces, and operations on concrete arrays."""
 
 from typing import Any
 
@@ -10,37 +10,40 @@ from jaxtyping import Array, DTypeLike
 
 
 def any_traced(*trees: Any) -> bool:
-    """Whether some number among the leaves of these pytrees is being traced."""
+    """Tell whether any leaf of these pytrees is traced."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def concrete(value: Any, dtype: DTypeLike | None = None) -> Array:
-    """Numbers known to Python or NumPy as a JAX array.
+def concrete_array(value: Any, dtype: DTypeLike | None = None) -> Array:
+    """Convert numbers of Python or NumPy to a concrete JAX array.
 
-    Unlike `jax.numpy.asarray` it returns a concrete array also inside a rule of differentiation,
+    Unlike `jax.numpy.asarray` it returns a concrete array also inside a differentiation rule,
     within `jax.ensure_compile_time_eval`.
     """
     return jax.device_put(np.asarray(value, dtype))
 
 
 def is_known(value: Any) -> bool:
-    """Whether the value of a number is known, though a derivative in it may be taken."""
+    """Tell whether the value of a number is known, even if it carries a tangent."""
     while isinstance(value, Tracer) and hasattr(value, "primal"):
         value = value.primal
     return not isinstance(value, Tracer)
 
 
 def pad_to(values: Array, size: int) -> Array:
-    """An array with its last value repeated until there are `size`."""
-    more = size - len(values)
+    """Pad an array to `size` rows by repeating its last row."""
+    missing = size - len(values)
     if isinstance(values, Tracer):
-        return jnp.concatenate([values, jnp.broadcast_to(values[-1:], (more, *values.shape[1:]))])
-    # By NumPy: JAX would compile a program for each length.
-    return concrete(np.concatenate([values, np.repeat(np.asarray(values)[-1:], more, axis=0)]))
+        last = jnp.broadcast_to(values[-1:], (missing, *values.shape[1:]))
+        return jnp.concatenate([values, last])
+    # NumPy, because JAX would compile a program for each length.
+    return concrete_array(
+        np.concatenate([values, np.repeat(np.asarray(values)[-1:], missing, axis=0)])
+    )
 
 
 def truncate_to(values: Array, size: int) -> Array:
-    """The first `size` values of an array."""
+    """Return the first `size` rows of an array."""
     if isinstance(values, Tracer):
         return values[:size]
-    return concrete(np.asarray(values)[:size])  # as above
+    return concrete_array(np.asarray(values)[:size])  # NumPy: see `pad_to`

@@ -1,4 +1,4 @@
-"""Validation of numbers given by a user, and the map between a range and the whole real line."""
+"""Validation of user input, and the map from an interval to an unconstrained parameter."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -13,26 +13,26 @@ F = TypeVar("F", bound=Callable)
 
 if TYPE_CHECKING:
     UserNumber = ArrayLike | Sequence[float]
-    UserCount = int
+    UserInt = int
     UserFloat = float
-    UserTruth = bool
+    UserBool = bool
 
     def no_type_check(function: F) -> F:
-        """Mark a public function that checks its arguments itself, with clearer errors."""
+        """Mark a public function that checks its arguments itself and raises clearer errors."""
         return function
 else:
-    # A run-time type checker lets everything pass, so that a wrong type is reported in words.
+    # With `Any` a run-time type checker accepts all values; the functions below report wrong types.
     from typing import no_type_check  # noqa: F401
 
-    UserNumber = UserCount = UserFloat = UserTruth = Any
+    UserNumber = UserInt = UserFloat = UserBool = Any
 
 
 class Domain(NamedTuple):
-    """The interval of allowed values of a number; open, unless an end is said to be included.
+    """Interval of the allowed values of a number; each end is excluded by default.
 
     Attributes:
         low, high: the ends; may be infinite.
-        low_allowed, high_allowed: whether the end itself is an allowed value.
+        low_allowed, high_allowed: whether the end itself is allowed.
 
     >>> positive = jaxgran.Domain(low=0.0)
     >>> str(positive), bool(positive.contains(-1.0))
@@ -57,10 +57,10 @@ class Domain(NamedTuple):
         Args:
             name: name of the value in the error message.
             value: any shape.
-            advice: a sentence that tells the user what to do; ends the error message.
+            advice: a sentence that ends the error message and tells the user what to do.
 
         Raises:
-            ValueError: if the value is no number, or an element is not finite or lies outside.
+            ValueError: if the value is not a number, or an element is not finite or lies outside.
         """
         if isinstance(value, Tracer):
             return
@@ -77,7 +77,10 @@ class Domain(NamedTuple):
             raise ValueError(f"{name} must lie in {self}, got {numbers[wrong].flat[0]:g}. {advice}")
 
     def contains(self, value: ArrayLike) -> Bool[Array, "..."]:
-        """Whether each element of a value, which may be traced, is finite and in the interval."""
+        """Tell for each element of a value whether it is finite and lies in the interval.
+
+        The value may be traced.
+        """
         value = jnp.asarray(value)
         above = value >= self.low if self.low_allowed else value > self.low
         below = value <= self.high if self.high_allowed else value < self.high
@@ -86,8 +89,8 @@ class Domain(NamedTuple):
     def to_free(self, value: ArrayLike) -> Float[Array, "..."]:
         """Map the interior of the interval one-to-one onto the whole real line.
 
-        The identity if both ends are infinite, ``ln(x - low)`` if only the upper one is, else the
-        logit ``ln(x - low) - ln(high - x)``.
+        The map is the identity if both ends are infinite, ``ln(x - low)`` if only the upper end is,
+        otherwise the logit ``ln(x - low) - ln(high - x)``.
         """
         value = jnp.asarray(value)
         if np.isinf(self.low) and np.isinf(self.high):
@@ -107,13 +110,13 @@ class Domain(NamedTuple):
 
 
 POSITIVE = Domain(low=0.0)
-NOT_NEGATIVE = Domain(low=0.0, low_allowed=True)
+NON_NEGATIVE = Domain(low=0.0, low_allowed=True)
 FRACTION = Domain(low=0.0, high=1.0, low_allowed=True, high_allowed=True)
 ANY = Domain()
 
 
-def number(value: UserNumber) -> Float[Array, "..."]:
-    """Convert a number, or a list of numbers, to a JAX array of the default float type.
+def float_array(value: UserNumber) -> Float[Array, "..."]:
+    """Convert a number or a list of numbers to a JAX array of the default float type.
 
     The array is strongly typed, so that two Python floats do not cause two compilations.
 
@@ -128,61 +131,61 @@ def number(value: UserNumber) -> Float[Array, "..."]:
         raise ValueError(f"expected a number or an array of numbers, got {value!r}") from None
 
 
-def check_normal(name: str, value: Array) -> None:
-    """Raise ValueError for a number that single precision cannot hold, where that is used."""
+def check_not_subnormal(name: str, value: Array) -> None:
+    """Raise ValueError for a number in single precision that is too small to be normal."""
     if not isinstance(value, Tracer) and value.dtype != jnp.float64:
-        small = np.asarray(value)
-        if np.any((small != 0) & (np.abs(small) < np.finfo(small.dtype).tiny)):
+        numbers = np.asarray(value)
+        if np.any((numbers != 0) & (np.abs(numbers) < np.finfo(numbers.dtype).tiny)):
             raise ValueError(
-                f"{name} is too small for {small.dtype}, got {small.min():g}: "
-                'jax.config.update("jax_enable_x64", True) first'
+                f"{name} is too small for {numbers.dtype}, got {numbers.min():g}. "
+                'Call jax.config.update("jax_enable_x64", True) first.'
             )
 
 
 def _floats(value: Any) -> np.ndarray:
-    """Numbers as NumPy floats; TypeError or ValueError for texts, truth values and the like."""
+    """Convert to NumPy floats; raise TypeError or ValueError for strings, booleans and the like."""
     array = np.asarray(value)
     if array.dtype.kind not in "iuf" and not jnp.issubdtype(array.dtype, jnp.floating):
         raise TypeError
     return array.astype(float)
 
 
-def python_number(value: Any) -> Any:
-    """A whole number of NumPy as one of Python, which compares and prints the same everywhere."""
+def python_int(value: Any) -> Any:
+    """Convert a NumPy integer to a Python int, which compares and prints the same everywhere."""
     return int(value) if isinstance(value, np.integer) else value
 
 
-def whole_number(name: str, value: Any, least: int, advice: str = "") -> int:
-    """A whole number given by a user, of Python or NumPy.
+def checked_int(name: str, value: Any, minimum: int, advice: str = "") -> int:
+    """Return an integer of Python or NumPy as an int, after a check of its type and size.
 
     Args:
-        name: of the value in the error message.
-        value: what was given.
-        least: the smallest allowed.
-        advice: ends the error message.
+        name: name of the value in the error message.
+        value: the value that the user gave.
+        minimum: the smallest allowed value.
+        advice: a sentence that ends the error message.
 
     Raises:
-        ValueError: for anything else or less.
+        ValueError: if the value is not an integer, or is less than the minimum.
     """
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or value < least:
+    if not whole or value < minimum:
         raise ValueError(
-            f"{name} must be a whole number >= {least}, an int, got {value!r}. {advice}".rstrip()
+            f"{name} must be a whole number >= {minimum}, an int, got {value!r}. {advice}".rstrip()
         )
     return int(value)
 
 
-def plain_number(name: str, value: Any, domain: Domain, advice: str = "") -> float:
-    """A number given by a user that is fixed when a program is compiled.
+def checked_float(name: str, value: Any, domain: Domain, advice: str = "") -> float:
+    """Return a number that is fixed at compilation as a float, after a check of type and range.
 
     Args:
-        name: of the value in the error message.
-        value: what was given.
+        name: name of the value in the error message.
+        value: the value that the user gave.
         domain: the allowed interval.
-        advice: ends the error message.
+        advice: a sentence that ends the error message.
 
     Raises:
-        ValueError: for anything that is no single number, or outside of the interval.
+        ValueError: if the value is not a single number, or lies outside the interval.
     """
     if not isinstance(value, float | int | np.number) or isinstance(value, bool):
         raise ValueError(f"{name} must be a number in {domain}, got {value!r}. {advice}".rstrip())
@@ -191,18 +194,18 @@ def plain_number(name: str, value: Any, domain: Domain, advice: str = "") -> flo
 
 
 def check_bool(name: str, value: Any) -> None:
-    """Raise ValueError for anything but True or False."""
+    """Raise ValueError unless the value is True or False."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {value!r}")
 
 
-def array_if_listed(value: Any) -> Any:
-    """A list, tuple or NumPy array of numbers as a JAX array; anything else as it is."""
-    return number(value) if isinstance(value, list | tuple | np.ndarray) else value
+def list_to_array(value: Any) -> Any:
+    """Convert a list, tuple or NumPy array of numbers to a JAX array; return others unchanged."""
+    return float_array(value) if isinstance(value, list | tuple | np.ndarray) else value
 
 
 def checked_times(times: UserNumber) -> Float[Array, "times"]:
-    """Convert output times to a JAX array, after checking that they increase from t >= 0.
+    """Convert output times to a JAX array, after a check that they increase from t >= 0.
 
     Traced times are not checked.
 
@@ -210,7 +213,7 @@ def checked_times(times: UserNumber) -> Float[Array, "times"]:
         times: t, s, shape (times,).
 
     Raises:
-        ValueError: if there is no time, or times are not finite, negative or not increasing.
+        ValueError: if there are no times, or if they are not finite, negative or not increasing.
     """
     if not isinstance(times, Tracer):
         try:
@@ -222,19 +225,19 @@ def checked_times(times: UserNumber) -> Float[Array, "times"]:
         wrong = ~np.isfinite(numbers) | (numbers < 0)
         if np.any(wrong):
             raise ValueError(
-                f"times must be finite and not negative, got {numbers[wrong][0]:g}; "
-                "the gas starts at t = 0"
+                f"times must be finite and not negative, got {numbers[wrong][0]:g}. "
+                "The gas starts at t = 0."
             )
         if np.any(np.diff(numbers) <= 0):
             i = int(np.argmax(np.diff(numbers) <= 0)) + 1
             raise ValueError(
-                f"times must increase, got {numbers[i]:g} after {numbers[i - 1]:g}; sort them and "
-                "remove repeated ones"
+                f"times must increase, got {numbers[i]:g} after {numbers[i - 1]:g}. Sort them and "
+                "remove repeated times."
             )
     times = jnp.asarray(times, dtype=jnp.result_type(float))
     if not isinstance(times, Tracer) and np.any(np.diff(np.asarray(times)) <= 0):
         raise ValueError(
-            f"times are closer together than {times.dtype} can tell apart: give fewer of them, or "
-            'jax.config.update("jax_enable_x64", True) first'
+            f"two times are equal in {times.dtype}. Give fewer times, or call "
+            'jax.config.update("jax_enable_x64", True) first.'
         )
     return times

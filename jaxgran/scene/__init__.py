@@ -1,4 +1,4 @@
 """The scene: the gas, its law of restitution, the contact force and the geometry of spheres.
 
-Imports `checks` only; every package above may import it.
+This package imports only `jaxgran._utils`; every package above may import it.
 """

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran._utils.validation import NOT_NEGATIVE
+from jaxgran._utils.validation import NON_NEGATIVE
 
 ELASTIC_CONTACT_TIME = 3.21806546
 """Duration of an elastic Hertz impact in units of ``X/v = (alpha^2 v)^(-1/5)``."""
@@ -44,9 +44,9 @@ def elastic_constant(
 def stress(
     overlap: ArrayLike, overlap_rate: ArrayLike, relaxation_time: ArrayLike
 ) -> Float[Array, "..."]:
-    """Contact force over ``rho sqrt(xi)``, which is ``xi + (3/2) A xi_dot``.
+    """Normal force divided by ``rho sqrt(xi)``, that is ``xi + (3/2) A xi_dot``.
 
-    A contact between spheres without adhesion ends where it is 0.
+    A contact between spheres without adhesion ends when this stress is 0.
 
     Args:
         overlap: xi = sigma - r, any shape, positive in contact.
@@ -54,7 +54,7 @@ def stress(
         relaxation_time: (3/2) A.
 
     Returns:
-        The stress in the units of `overlap`, same shape.
+        Stress in the units of `overlap`, same shape.
     """
     return jnp.asarray(overlap) + relaxation_time * jnp.asarray(overlap_rate)
 
@@ -69,7 +69,7 @@ def contact_force(
 ) -> Float[Array, "..."]:
     """Normal force between two viscoelastic spheres, positive if it is repulsive.
 
-    ``F = rho sqrt(xi) (xi + (3/2) A xi_dot)`` for xi > 0, else 0. Unless ``clipped=False``,
+    ``F = rho sqrt(xi) (xi + (3/2) A xi_dot)`` for xi > 0, otherwise 0. Unless ``clipped=False``,
     negative values are replaced by 0, since spheres without adhesion cannot attract each other.
 
     Args:
@@ -77,7 +77,7 @@ def contact_force(
         overlap_rate: xi_dot, m/s, same shape, positive while the spheres approach.
         elastic_constant: rho, N / m^(3/2), see `jaxgran.elastic_constant`.
         dissipative_constant: A, s, >= 0.
-        clipped: whether contact ends where F = 0 (True) or where xi = 0 (False).
+        clipped: whether the contact ends at F = 0 (True) or at xi = 0 (False).
 
     Returns:
         F, N, same shape. Values and derivatives are finite at xi = 0, where the derivative is
@@ -92,10 +92,10 @@ def contact_force(
     xi = jnp.asarray(overlap)
     touching = xi > 0
     root = jnp.sqrt(jnp.where(touching, xi, 1.0))
-    strength = stress(xi, overlap_rate, 1.5 * jnp.asarray(dissipative_constant))
+    normal_stress = stress(xi, overlap_rate, 1.5 * jnp.asarray(dissipative_constant))
     if clipped:
-        strength = jnp.maximum(strength, 0.0)
-    return jnp.where(touching, elastic_constant * root * strength, 0.0)
+        normal_stress = jnp.maximum(normal_stress, 0.0)
+    return jnp.where(touching, elastic_constant * root * normal_stress, 0.0)
 
 
 def midpoint_rate(
@@ -109,8 +109,8 @@ def midpoint_rate(
 
     The update is ``xi_dot' = xi_dot - dt alpha sqrt(xi) (xi + (3/2) A r)`` with the mean
     ``r = (xi_dot + xi_dot')/2``: the implicit midpoint rule, of second order. Its solution is
-    ``r = (xi_dot - h xi) / (1 + (3/2) A h)`` with ``h = dt alpha sqrt(xi) / 2``. The force at this
-    rate does the work ``F r dt``, which is exactly the change of the kinetic energy.
+    ``r = (xi_dot - h xi) / (1 + (3/2) A h)`` with ``h = dt alpha sqrt(xi) / 2``. The work of the
+    force at this rate, ``F r dt``, is exactly the change of the kinetic energy.
 
     Args:
         overlap: xi, any shape; for xi <= 0 the rate is returned unchanged.
@@ -131,12 +131,12 @@ def midpoint_rate(
 
 
 class Impact(NamedTuple):
-    """One head-on impact, in units of its initial speed v and of ``X = (v^2/alpha)^(2/5)``.
+    """Result of one head-on impact, in units of its initial speed v and ``X = (v^2/alpha)^(2/5)``.
 
     Attributes:
         restitution: coefficient of restitution eps.
         duration: contact duration, in X/v.
-        largest_overlap: in X.
+        largest_overlap: largest overlap, in X.
 
     >>> jaxgran.Impact._fields
     ('restitution', 'duration', 'largest_overlap')
@@ -153,7 +153,7 @@ def _rates(state, beta):
     return w, -2 * y * y * stress(y * y, w, beta), 2 * y
 
 
-# An impact is followed until one of these three functions of its state falls to 0.
+# An impact is integrated until one of the next three functions of its state falls to 0.
 
 
 def _overlap_rate(state, beta):
@@ -165,7 +165,7 @@ def _root_of_overlap(state, beta):
 
 
 def _scaled_stress(state, beta):
-    # sqrt(xi) - sqrt(-beta w) is 0 where the stress xi + beta w is, and its root is always simple.
+    # sqrt(xi) - sqrt(-beta w) has the same root as the stress xi + beta w, and always a simple one.
     y, w, _ = state
     attraction = jnp.maximum(-beta * w, 0.0)
     positive = attraction > 0
@@ -173,7 +173,7 @@ def _scaled_stress(state, beta):
 
 
 def _integrate_to_zero(end, beta, state, smallest, rtol, max_steps):
-    """Integrate the state of an impact until `end(state, beta)` has fallen to 0."""
+    """Integrate the state of an impact until `end(state, beta)` is 0."""
     solve = partial(
         diffrax.diffeqsolve,
         solver=diffrax.Dopri8(),
@@ -183,7 +183,7 @@ def _integrate_to_zero(end, beta, state, smallest, rtol, max_steps):
         max_steps=max_steps,
     )
     controller = diffrax.PIDController(rtol=rtol, atol=rtol * smallest, dtmax=0.25 + beta)
-    past = solve(
+    overshot = solve(
         diffrax.ODETerm(lambda s, y, beta: _rates(y, beta)),
         t0=0.0,
         t1=jnp.inf,
@@ -191,11 +191,11 @@ def _integrate_to_zero(end, beta, state, smallest, rtol, max_steps):
         stepsize_controller=controller,
         event=diffrax.Event(lambda t, y, args, **_: end(y, args) <= 0),
     )
-    state = jax.tree.map(lambda leaf: leaf[-1], past.ys)
+    state = jax.tree.map(lambda leaf: leaf[-1], overshot.ys)
 
-    # The event stops the solver up to one step after the root. A second integration, backwards and
-    # with `end` as the independent variable, ends on the root to the tolerance of the solver,
-    # without interpolation (Henon, Physica D 5, 412 (1982)).
+    # The event stops the solver up to one step after the root. A second integration, backwards with
+    # `end` as the independent variable, reaches the root within the tolerance of the solver and
+    # needs no interpolation (Henon, Physica D 5, 412 (1982)).
     def rates_per_end(_, state, beta):
         rates = _rates(state, beta)
         _, slope = jax.jvp(lambda state: end(state, beta), (state,), (rates,))
@@ -218,34 +218,34 @@ def impact(
 
     With ``xi = X y^2`` and ``t = (X/v) int 2y ds`` the equation of motion
     ``xi'' = -alpha sqrt(xi) (xi + (3/2) A xi')`` becomes ``y' = w``,
-    ``w' = -2 y^2 (y^2 + beta w)`` from ``(y, w) = (0, 1)``. This is polynomial and hence without
-    the square-root singularity at first contact. Compression ends at ``w = 0``, the contact at
+    ``w' = -2 y^2 (y^2 + beta w)`` from ``(y, w) = (0, 1)``. These equations are polynomial and have
+    no square-root singularity at first contact. Compression ends at ``w = 0``, the contact ends at
     ``y^2 + beta w = 0`` (clipped) or ``y = 0``.
 
     Args:
         beta: ``(3/2) A alpha^(2/5) v^(1/5)``, dimensionless, >= 0, a scalar (use `jax.vmap` for
             more). Derivatives (forward mode only) need beta > 0.
-        clipped: whether contact ends where the force vanishes (default) or where the overlap does.
+        clipped: whether the contact ends at zero force (True, the default) or at zero overlap.
         rtol: relative tolerance of the adaptive eighth-order solver.
-        max_steps: largest number of steps of either half of the impact. The default suffices for
+        max_steps: largest number of steps of each half of the impact. The default suffices for
             beta <= 1e4 (clipped) and for beta <= 1e3 (unclipped, where the slow rebound takes
             seconds to compute).
 
     Returns:
-        `jaxgran.Impact`: restitution, duration in X/v and largest overlap in X.
+        `jaxgran.Impact` with the restitution, the duration in X/v and the largest overlap in X.
 
     Raises:
         ValueError: for a negative beta, unless it is traced.
 
-    >>> found = jaxgran.impact(0.1)
-    >>> round(float(found.restitution), 4), round(float(found.duration), 3)
+    >>> impact = jaxgran.impact(0.1)
+    >>> round(float(impact.restitution), 4), round(float(impact.duration), 3)
     (0.8929, 3.157)
     """
-    NOT_NEGATIVE.check("beta", beta, "It is 1.5 A alpha^0.4 v^0.2.")
+    NON_NEGATIVE.check("beta", beta, "It is 1.5 A alpha^0.4 v^0.2.")
     beta = jnp.asarray(beta, dtype=jnp.result_type(float))
     zero, one = jnp.zeros_like(beta), jnp.ones_like(beta)
 
-    # Order of magnitude of the rebound speed: the absolute tolerance must be small against it.
+    # Order of magnitude of the rebound speed; the absolute tolerance must be much smaller.
     smallest = (1 + jax.lax.stop_gradient(beta)) ** (-5 / 3 if clipped else -5)
     solve = partial(_integrate_to_zero, smallest=smallest, rtol=rtol, max_steps=max_steps)
     y, _, half_time = solve(_overlap_rate, beta, (zero, one, zero))

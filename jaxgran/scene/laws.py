@@ -1,8 +1,7 @@
 """Laws of restitution: the ratio of the normal speeds after and before an impact, eps(v).
 
-What a law of restitution is: the base classes of those in `restitution` and of a user's own.
-
-Coefficient of restitution of viscoelastic spheres: its series and a rational fit to it.
+First the base classes, `RestitutionLaw` in SI units and `ReducedLaw` in reduced units; then the
+coefficient of restitution of viscoelastic spheres; then the laws of the package.
 """
 
 import dataclasses
@@ -15,45 +14,46 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import (
     ANY,
     FRACTION,
-    NOT_NEGATIVE,
+    NON_NEGATIVE,
     POSITIVE,
     Domain,
-    UserTruth,
+    UserBool,
     check_bool,
-    number,
+    float_array,
 )
 from jaxgran.scene import contact
 
-REDUCED_UNITS = (
-    "a reduced law is given speeds in units of `speed`: leave `reduced` out and let "
-    "restitution(self, normal_speed) take m/s, or divide the law's speeds by `speed`"
+_UNITS_ADVICE = (
+    "a reduced law gets speeds in units of `speed`: leave `reduced` out and let "
+    "restitution(self, normal_speed) take m/s, or divide the speeds of the law by `speed`"
 )
-_CHECKED: set[type] = set()
+_CHECKED_CLASSES: set[type] = set()
 
 
 class RestitutionLaw(eqx.Module):
-    """A law of restitution of a material, in SI units.
+    """Base class of the laws of restitution of a material, in SI units.
 
-    A law of one's own is a subclass with `restitution(self, normal_speed)`, eps at normal approach
-    speeds in m/s, and a field for each of its numbers, annotated ``float``, in any units that
-    `restitution` understands. Fields become JAX arrays: they can be fitted, swept and
-    differentiated by name. `domains` may give the allowed range of a field, as
-    ``domains = {"yield_speed": jaxgran.Domain(0.0)}``; without it any finite number is allowed. No
-    field may have the name of a float of `jaxgran.Gas`. Kinetic theory needs an eps that is smooth
-    in the speed. Where eps depends on the diameter or the mass too, override `reduced` instead.
+    To write a law, make a subclass with a method `restitution(self, normal_speed)`, which returns
+    eps at normal approach speeds in m/s, and with a field for each number of the law, annotated
+    ``float``, in any units that `restitution` understands. The fields become JAX arrays: they can
+    be fitted, swept and differentiated by name. `domains` may give the allowed range of a field, as
+    in ``domains = {"yield_speed": jaxgran.Domain(0.0)}``; without it any finite number is allowed.
+    No field may have the name of a float of `jaxgran.Gas`. Kinetic theory needs an eps that is
+    smooth in the speed. If eps also depends on the diameter or the mass, override `reduced`
+    instead.
 
     >>> class Plastic(jaxgran.RestitutionLaw):
     ...     yield_speed: float  # m/s
     ...     def restitution(self, normal_speed):  # m/s
     ...         return (1 + (normal_speed / self.yield_speed) ** 2) ** -0.125
-    >>> own = dataclasses.replace(gas, law=Plastic(0.2))
-    >>> round(float(own.restitution(0.1)), 4)
+    >>> plastic = dataclasses.replace(gas, law=Plastic(0.2))
+    >>> round(float(plastic.restitution(0.1)), 4)
     0.9725
     """
 
@@ -61,10 +61,10 @@ class RestitutionLaw(eqx.Module):
     """Allowed range of every float field, by name; used for validation and for fits."""
 
     lists: ClassVar[tuple[str, ...]] = ()
-    """Names of those fields that hold more than one number."""
+    """Names of the fields that hold more than one number."""
 
     advice: ClassVar[dict[str, str]] = {}
-    """What to do about a value outside its range, by name: a sentence for the error message."""
+    """Advice on a value outside its range, by name: a sentence that ends the error message."""
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -74,25 +74,25 @@ class RestitutionLaw(eqx.Module):
         for name in numbers:
             default = vars(cls).get(name, dataclasses.MISSING)
             if not isinstance(default, dataclasses.Field):
-                setattr(cls, name, eqx.field(converter=number, default=default))
+                setattr(cls, name, eqx.field(converter=float_array, default=default))
 
     def __check_init__(self):
         kind, base = type(self), RestitutionLaw
         if kind.reduced is base.reduced and kind.restitution is base.restitution:
             raise ValueError(
-                f"{kind.__name__} has no restitution: define restitution(self, normal_speed), "
-                "which returns eps at normal approach speeds in m/s"
+                f"{kind.__name__} has no restitution: define restitution(self, "
+                "normal_speed), which returns eps at normal approach speeds in m/s."
             )
         for name, domain in self.domains.items():
             if not hasattr(self, name):
                 raise ValueError(
-                    f"domains of {kind.__name__} has {name!r}, which is no field: give domains the "
-                    "names of its float fields"
+                    f"domains of {kind.__name__} has the key {name!r}, which is not a field. Use "
+                    "the names of its float fields as keys."
                 )
             domain.check(name, getattr(self, name), self.advice.get(name, ""))
 
     def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Coefficient of restitution eps, where it depends on nothing but the speed.
+        """Coefficient of restitution eps of a law that depends on the speed alone.
 
         Args:
             normal_speed: normal approach speed, m/s, > 0, any shape.
@@ -101,35 +101,38 @@ class RestitutionLaw(eqx.Module):
             eps, same shape, or one number for all speeds.
         """
         raise NotImplementedError(
-            f"eps of {type(self).__name__} depends on the spheres: see jaxgran.Gas.restitution"
+            f"eps of {type(self).__name__} depends on the spheres. Use jaxgran.Gas.restitution."
         )
 
     def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """``1 - eps``; override it where it can be computed without cancellation for eps near 1.
+        """Loss ``1 - eps``, with the arguments of `restitution`.
 
-        Args: as `restitution`.
+        Override it if it can be computed without cancellation for eps near 1.
         """
         return 1 - self.restitution(normal_speed)
 
     def reduced(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> "ReducedLaw":
-        """The law for two equal spheres, in units of their diameter and of a reference speed.
+        """Return the law of two equal spheres, in units of their diameter and a reference speed.
 
-        By default `restitution` at the speeds in m/s, the same for all spheres.
+        By default it is `restitution` at the speeds in m/s, for spheres of any diameter and mass.
 
         Args:
             diameter: sigma, m, > 0.
             mass: m, kg, > 0, of either sphere.
             speed: reference speed, m/s, > 0.
         """
-        return LawInUnits(self, jnp.asarray(speed))
+        return ScaledLaw(self, jnp.asarray(speed))
 
     def on_wall(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> "ReducedLaw":
-        """The same for a sphere and a flat wall, where the law is that of the wall."""
+        """Return the law of a sphere and a flat wall that has this law, in the units of `reduced`.
+
+        By default it equals the law of two spheres.
+        """
         return self.reduced(diameter=diameter, mass=mass, speed=speed)
 
 
 class ReducedLaw(eqx.Module):
-    """A law of restitution for two given spheres, in units of a length and a reference speed.
+    """Base class of the laws of two given spheres, in units of their diameter and a speed.
 
     A subclass defines `restitution`.
 
@@ -141,8 +144,8 @@ class ReducedLaw(eqx.Module):
     num_nodes: ClassVar[int] = 40
     """Number of Chebyshev nodes in ln T that resolve averages over the impacts of this law.
 
-    40 suffice for laws as steep as 1 - eps ~ v over 12 decades of time (relative error 1e-7 of the
-    cooling rate); flatter laws need fewer."""
+    40 nodes suffice for laws as steep as 1 - eps ~ v over 12 decades of time (relative error of the
+    cooling rate: 1e-7); flatter laws need fewer."""
 
     @abstractmethod
     def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -156,31 +159,29 @@ class ReducedLaw(eqx.Module):
         """
 
     def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """``1 - eps``; override it where it can be computed without cancellation for eps near 1.
+        """Loss ``1 - eps``, with the arguments of `restitution`.
 
-        Args: as `restitution`.
+        Override it if it can be computed without cancellation for eps near 1.
         """
         return 1 - self.restitution(normal_speed)
 
     def impact_length(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """``X = (v^2/alpha)^(2/5)``, the length scale of the overlap, in diameters.
+        """Length scale of the overlap in diameters, ``X = (v^2/alpha)^(2/5)``.
 
-        Zero for hard spheres, the default.
-
-        Args: as `restitution`.
+        It is zero for hard spheres, which is the default. The arguments are those of `restitution`.
         """
         return jnp.zeros_like(normal_speed)
 
     def dissipation(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """``beta = (3/2) A alpha^(2/5) v^(1/5)`` of viscoelastic spheres; 0 of others."""
+        """Dissipation ``beta = (3/2) A alpha^(2/5) v^(1/5)``; 0 if spheres are not viscoelastic."""
         return jnp.zeros_like(normal_speed)
 
 
-class LawInUnits(ReducedLaw):
-    """A law that is a function of the speed alone, in units of a reference speed.
+class ScaledLaw(ReducedLaw):
+    """A law that depends on the speed alone, in units of a reference speed.
 
     Attributes:
-        law: takes speeds in m/s.
+        law: law of restitution, a function of the speed in m/s.
         speed: the reference speed, m/s.
     """
 
@@ -188,54 +189,54 @@ class LawInUnits(ReducedLaw):
     speed: Float[Array, ""]
 
     def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        found = self.law.restitution(normal_speed * self.speed)
-        return jnp.broadcast_to(found, jnp.shape(normal_speed))
+        values = self.law.restitution(normal_speed * self.speed)
+        return jnp.broadcast_to(values, jnp.shape(normal_speed))
 
     def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        found = self.law.loss(normal_speed * self.speed)
-        return jnp.broadcast_to(found, jnp.shape(normal_speed))
+        values = self.law.loss(normal_speed * self.speed)
+        return jnp.broadcast_to(values, jnp.shape(normal_speed))
 
 
 def restitution_at(
     law: RestitutionLaw, diameter: Array, mass: Array, normal_speed: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """eps of spheres at speeds in m/s."""
-    reduced = law.reduced(diameter=diameter, mass=mass, speed=number(1.0))
+    """Coefficient of restitution eps of given spheres at speeds in m/s."""
+    reduced = law.reduced(diameter=diameter, mass=mass, speed=float_array(1.0))
     return reduced.restitution(normal_speed)
 
 
-def check_units(law: RestitutionLaw) -> None:
-    """Check, once for each class of law, that `reduced` returns a law in the units it is told.
+def check_reduced_units(law: RestitutionLaw) -> None:
+    """Check, once for each class of laws, that `reduced` returns a law in the given units.
 
     Raises:
-        ValueError: if it returns no `ReducedLaw`, or one whose eps depends on the units.
+        ValueError: if it does not return a `ReducedLaw`, or if eps depends on the units.
     """
-    kind = type(law)
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(law))
-    own = kind.__module__.startswith(f"{__package__}.")  # those of this package, which are tested
-    if own or kind in _CHECKED or kind.reduced is RestitutionLaw.reduced or traced:
+    cls = type(law)
+    built_in = cls.__module__.startswith(f"{__package__}.")  # checked by tests
+    default = cls.reduced is RestitutionLaw.reduced
+    if built_in or default or cls in _CHECKED_CLASSES or any_traced(law):
         return
-    found = []
+    values = []
     with jax.ensure_compile_time_eval():
         for unit in (0.1, 1.0):
             reduced = law.reduced(diameter=1e-3, mass=1e-6, speed=jnp.asarray(unit))
             if not isinstance(reduced, ReducedLaw):
                 raise ValueError(
-                    f"{kind.__name__}.reduced must return a jaxgran.ReducedLaw, got "
-                    f"{type(reduced).__name__}; {REDUCED_UNITS}"
+                    f"{cls.__name__}.reduced must return a jaxgran.ReducedLaw, got "
+                    f"{type(reduced).__name__}; {_UNITS_ADVICE}"
                 )
-            found.append(np.asarray(reduced.restitution(jnp.array([0.03, 0.3]) / unit), float))
-    one, other = found
-    if np.all(np.isfinite(found)) and np.max(np.abs(one - other)) > 1e-3:
+            values.append(np.asarray(reduced.restitution(jnp.array([0.03, 0.3]) / unit), float))
+    fine, coarse = values
+    if np.all(np.isfinite(values)) and np.max(np.abs(fine - coarse)) > 1e-3:
         raise ValueError(
-            f"{kind.__name__}.reduced gives eps = {one[1]:.4g} at 0.3 m/s in units of 0.1 m/s and "
-            f"{other[1]:.4g} in units of 1 m/s; {REDUCED_UNITS}"
+            f"{cls.__name__}.reduced gives eps = {fine[1]:.4g} at 0.3 m/s in units of 0.1 m/s and "
+            f"{coarse[1]:.4g} in units of 1 m/s; {_UNITS_ADVICE}"
         )
-    _CHECKED.add(kind)
+    _CHECKED_CLASSES.add(cls)
 
 
 def _number_fields(cls: type) -> list[str]:
-    """Names of the fields that a class adds and that are annotated as numbers or arrays."""
+    """Names of the fields that a class itself annotates as numbers or arrays."""
     kinds = (float, jax.Array, Array, "float", "jax.Array", "Array")
     return [name for name, kind in inspect.get_annotations(cls).items() if kind in kinds]
 
@@ -247,18 +248,18 @@ C2 = 3 / 5 * C1**2
 """Second coefficient of the restitution series, 0.798266561; Brilliantov & Poeschel, Eq. (6)."""
 
 UNCLIPPED_SERIES = (-C1, C2, -0.522882568, 0.348742675, -0.233098132)
-"""Coefficients of beta, beta^2, ... if contact ends at zero overlap, the paper's convention."""
+"""Coefficients of beta, beta^2, ... if the contact ends at zero overlap, as in the paper."""
 
 C_CLIP = 4 / 15
-"""Coefficient of beta^(5/2), the lowest term that changes if contact ends at zero force."""
+"""Coefficient of beta^(5/2), the lowest term that changes if the contact ends at zero force."""
 
 
 class _RationalFit(NamedTuple):
     # eps = (1 + kappa beta)^(-decay) exp(beta P / Q). The power is the asymptotic decay for heavy
-    # damping. P = decay kappa - C1 + beta p(x) and Q = 1 + beta q(x), with x = sqrt(beta) or
-    # x = beta and coefficients in ascending order, were fitted to `contact.impact` by
+    # damping. P = decay kappa - C1 + beta p(x) and Q = 1 + beta q(x), where x is sqrt(beta) or beta
+    # and the coefficients are in ascending order, were fitted to `contact.impact` by
     # experiments/accuracy/derive_restitution.py. There is no odd power of sqrt(beta) below the
-    # beta^(5/2) of the series, so that the first two derivatives at beta = 0 are finite.
+    # beta^(5/2) of the series; hence the first two derivatives at beta = 0 are finite.
     kappa: float
     decay: float
     in_sqrt_beta: bool
@@ -330,14 +331,14 @@ def _polynomial(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Floa
 
 
 def log_viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[Array, "..."]:
-    """Natural logarithm of `viscoelastic_restitution`, accurate also where eps is close to 1.
+    """Natural logarithm of `viscoelastic_restitution`, accurate also for eps close to 1.
 
-    Args, validity: as `viscoelastic_restitution`.
+    Arguments and validity are those of `viscoelastic_restitution`.
     """
     beta = jnp.asarray(beta, dtype=jnp.result_type(float, beta))
     fit = _CLIPPED if clipped else _UNCLIPPED
     positive = beta > 0
-    # The derivative of sqrt at 0 is infinite: its argument is replaced there, not only its result.
+    # The derivative of sqrt at 0 is infinite: replace the argument there, not only the result.
     root = jnp.where(positive, jnp.sqrt(jnp.where(positive, beta, 1.0)), 0.0)
     x = root if fit.in_sqrt_beta else beta
     p = (fit.decay * fit.kappa - C1) + beta * _polynomial(fit.p, x)
@@ -353,30 +354,33 @@ def viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[
 
     Args:
         beta: ``(3/2) A alpha^(2/5) v^(1/5)``, dimensionless, >= 0, any shape.
-        clipped: whether contact ends where the force vanishes (default) or where the overlap does.
+        clipped: whether the contact ends at zero force (True, the default) or at zero overlap.
 
     Returns:
         eps, in (0, 1], same shape. Relative error against `jaxgran.impact`: below 1e-9 for beta
-        up to 1e4 (clipped) and below 1e-7 for beta up to 40 (unclipped); below 3e-5 beyond. The
-        first two derivatives are finite down to beta = 0, where the first is -C1.
+        up to 1e4 (clipped) and below 1e-7 for beta up to 40 (unclipped); below 3e-5 for larger
+        beta. The first two derivatives are finite down to beta = 0, where the first is -C1.
+
+    Raises:
+        ValueError: for a negative beta, unless it is traced.
 
     Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eqs. (4)-(6).
 
-    >>> found = jaxgran.viscoelastic_restitution(jnp.array([0.0, 0.1, 1.0]))
-    >>> [round(float(eps), 4) for eps in found]
+    >>> restitution = jaxgran.viscoelastic_restitution(jnp.array([0.0, 0.1, 1.0]))
+    >>> [round(float(eps), 4) for eps in restitution]
     [1.0, 0.8929, 0.3939]
     """
-    NOT_NEGATIVE.check("beta", beta, "It is (3/2) A alpha^(2/5) v^(1/5).")
+    NON_NEGATIVE.check("beta", beta, "It is (3/2) A alpha^(2/5) v^(1/5).")
     return jnp.exp(log_viscoelastic_restitution(beta, clipped=clipped))
 
 
 class ReducedViscoelastic(ReducedLaw):
-    """`Viscoelastic` in reduced units: the two numbers on which an impact depends.
+    """`Viscoelastic` in reduced units.
 
     Attributes:
-        beta: ``(3/2) A alpha^(2/5) v^(1/5)`` at the reference speed.
-        length: ``(v^2/alpha)^(2/5)`` at the reference speed, in diameters.
-        clipped: as for `Viscoelastic`.
+        beta: dissipation ``(3/2) A alpha^(2/5) v^(1/5)`` at the reference speed.
+        length: length ``(v^2/alpha)^(2/5)`` at the reference speed, in diameters.
+        clipped: see `Viscoelastic`.
     """
 
     beta: Float[Array, ""]
@@ -406,14 +410,14 @@ class Viscoelastic(RestitutionLaw):
         youngs_modulus: Y, Pa, > 0.
         poisson_ratio: nu, in (-1, 0.5).
         dissipative_constant: A, s, >= 0; 0 makes the spheres elastic.
-        clipped: whether contact ends where the force vanishes (True: spheres without adhesion
-            cannot pull) or where the overlap does (False: the convention of the paper's series).
+        clipped: whether the contact ends at zero force (True: spheres without adhesion cannot
+            pull) or at zero overlap (False: the convention of the paper's series).
 
     Raises:
         ValueError: for a value outside its range.
 
-    Valid while impacts are neither so fast that the material yields plastically nor so slow that
-    adhesion matters.
+    The law is valid for impacts that are slow enough to leave no plastic deformation and fast
+    enough for adhesion to be negligible.
 
     Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eqs. (1)-(2).
 
@@ -422,15 +426,15 @@ class Viscoelastic(RestitutionLaw):
     '3e-06 s'
     """
 
-    youngs_modulus: Float[Array, ""] = eqx.field(converter=number)
-    poisson_ratio: Float[Array, ""] = eqx.field(converter=number)
-    dissipative_constant: Float[Array, ""] = eqx.field(converter=number)
-    clipped: UserTruth = eqx.field(static=True, default=True)
+    youngs_modulus: Float[Array, ""] = eqx.field(converter=float_array)
+    poisson_ratio: Float[Array, ""] = eqx.field(converter=float_array)
+    dissipative_constant: Float[Array, ""] = eqx.field(converter=float_array)
+    clipped: UserBool = eqx.field(static=True, default=True)
 
     domains: ClassVar[dict[str, Domain]] = {
         "youngs_modulus": POSITIVE,
         "poisson_ratio": Domain(-1.0, 0.5),
-        "dissipative_constant": NOT_NEGATIVE,
+        "dissipative_constant": NON_NEGATIVE,
     }
     advice: ClassVar[dict[str, str]] = {
         "youngs_modulus": "Give Young's modulus in Pa (glass has about 7e10).",
@@ -465,10 +469,10 @@ class Viscoelastic(RestitutionLaw):
         return ReducedViscoelastic(beta, length, self.clipped)
 
     def of_wall(self) -> "Viscoelastic":
-        """The law of two spheres that collide as a sphere does with a flat wall of this material.
+        """Return the law of two spheres that collide as a sphere and a flat wall of this material.
 
-        ``alpha``, proportional to ``Y sqrt(R_eff)/m_eff``, is smaller by sqrt(2): the effective
-        radius and mass are twice those of two spheres.
+        The effective radius and mass of a sphere and a wall are twice those of two spheres, so that
+        ``alpha``, proportional to ``Y sqrt(R_eff)/m_eff``, is smaller by the factor sqrt(2).
         """
         return eqx.tree_at(lambda law: law.youngs_modulus, self, self.youngs_modulus / 2**0.5)
 
@@ -479,7 +483,7 @@ class Viscoelastic(RestitutionLaw):
 
 
 class ConstantRestitution(RestitutionLaw, ReducedLaw):
-    """The same coefficient of restitution at every speed, as in Haff's law.
+    """Constant coefficient of restitution, as in Haff's law.
 
     Args:
         coefficient: e, in [0, 1].
@@ -492,7 +496,7 @@ class ConstantRestitution(RestitutionLaw, ReducedLaw):
     (0.9075542559594306, 0.9)
     """
 
-    coefficient: Float[Array, ""] = eqx.field(converter=number)
+    coefficient: Float[Array, ""] = eqx.field(converter=float_array)
 
     domains: ClassVar[dict[str, Domain]] = {"coefficient": FRACTION}
     advice: ClassVar[dict[str, str]] = {
@@ -509,7 +513,7 @@ class ConstantRestitution(RestitutionLaw, ReducedLaw):
 
 
 class RestitutionSeries(RestitutionLaw, ReducedLaw):
-    """A series in powers of the speed, ``eps(v) = 1 + sum_k c_k v^(gamma_k)``.
+    """Series in powers of the speed, ``eps(v) = 1 + sum_k c_k v^(gamma_k)``, v in m/s.
 
     The series is not restricted to [0, 1]: check that eps is physical for the normal speeds of
     the gas, up to about five times sqrt(2 T).
@@ -519,15 +523,15 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
         exponents: gamma_k, shape (terms,).
 
     Raises:
-        ValueError: for shapes that differ or values that are not finite.
+        ValueError: for different shapes, or values that are not finite.
 
     >>> law = jaxgran.RestitutionSeries(coefficients=[-0.1], exponents=[0.2])  # 1 - .1 v^(1/5)
     >>> law.coefficients.shape
     (1,)
     """
 
-    coefficients: Float[Array, "terms"] = eqx.field(converter=number)
-    exponents: Float[Array, "terms"] = eqx.field(converter=number)
+    coefficients: Float[Array, "terms"] = eqx.field(converter=float_array)
+    exponents: Float[Array, "terms"] = eqx.field(converter=float_array)
 
     domains: ClassVar[dict[str, Domain]] = {"coefficients": ANY, "exponents": ANY}
     lists: ClassVar[tuple[str, ...]] = ("coefficients", "exponents")
@@ -537,14 +541,14 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
         if shape != self.exponents.shape or self.coefficients.ndim < 1 or shape[-1] < 1:
             raise ValueError(
                 "coefficients and exponents must be lists of the same length, 1 or more, got "
-                f"shapes {shape} and {self.exponents.shape}"
+                f"the shapes {shape} and {self.exponents.shape}"
             )
 
     @classmethod
     def from_viscoelastic(
         cls, law: Viscoelastic, *, diameter: ArrayLike, mass: ArrayLike, num_terms: int = 2
     ) -> "RestitutionSeries":
-        """The truncated series in powers of beta of given viscoelastic spheres.
+        """Return the truncated series in powers of beta of given viscoelastic spheres.
 
         Args:
             law: the material.
@@ -553,14 +557,14 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
             num_terms: number of powers of beta, 1 to 5; the paper has 2.
 
         Raises:
-            ValueError: for another number of terms.
+            ValueError: if num_terms is not 1 to 5.
 
         Reference: Brilliantov & Poeschel, Self-diffusion in granular gases, Eq. (1).
         """
         if not 1 <= num_terms <= len(UNCLIPPED_SERIES):
             raise ValueError(
-                f"num_terms must be 1 to {len(UNCLIPPED_SERIES)}, got {num_terms}; "
-                "use the Viscoelastic law itself for more"
+                f"num_terms must be 1 to {len(UNCLIPPED_SERIES)}, got {num_terms}. "
+                "For more accuracy use the Viscoelastic law itself."
             )
         beta = law.reduced(diameter=diameter, mass=mass, speed=1.0).beta
         powers = jnp.arange(1, num_terms + 1)

@@ -1,4 +1,4 @@
-"""A scene in reduced units: `Gas.impact_speed`, sqrt(2 T_0), and `Gas.path_length`."""
+"""A scene in reduced units: speeds in `Gas.impact_speed`, lengths in `Gas.path_length`."""
 
 from math import pi
 from typing import NamedTuple
@@ -15,7 +15,7 @@ class ReducedRough(NamedTuple):
     """`Rough` in reduced units.
 
     Attributes:
-        beta: beta_t.
+        beta: tangential restitution beta_t.
         inertia: q.
         ratio: T_rot/T at t = 0.
     """
@@ -26,11 +26,11 @@ class ReducedRough(NamedTuple):
 
     @property
     def eta(self) -> Float[Array, ""]:
-        """``q (1 + beta_t) / (2 (1 + q))``."""
+        """Coefficient eta of `Rough`, ``q (1 + beta_t) / (2 (1 + q))``."""
         return self.eta_on_wall(self.beta) / 2
 
     def eta_on_wall(self, beta: Float[Array, ""]) -> Float[Array, ""]:
-        """``q (1 + beta_w) / (1 + q)``, the same where a wall does not give way."""
+        """Coefficient eta for a wall at rest with beta_w, ``q (1 + beta_w) / (1 + q)``."""
         return self.inertia * (1 + beta) / (1 + self.inertia)
 
 
@@ -38,9 +38,9 @@ class ReducedWalls(NamedTuple):
     """`Walls` in reduced units.
 
     Attributes:
-        law: of restitution, in units of `Gas.impact_speed`.
-        frequency: impacts on the two walls across each axis per particle and unit of time, over
-            sqrt(T/T_0).
+        law: law of restitution, in units of `Gas.impact_speed`.
+        frequency: impacts on the two walls across each axis per particle and unit of time, divided
+            by sqrt(T/T_0).
         beta: beta_t of the walls; None if they are smooth.
     """
 
@@ -50,22 +50,22 @@ class ReducedWalls(NamedTuple):
 
 
 class ReducedDrag(NamedTuple):
-    """`StokesDrag` in reduced units, of velocities and of angular velocities."""
+    """`StokesDrag` in reduced units: the rates of velocities and of angular velocities."""
 
     rate: Float[Array, ""]
     rotational_rate: Float[Array, ""]
 
 
 class ReducedDrive(NamedTuple):
-    """`WhiteNoise` in reduced units: the growth of T/T_0 by it."""
+    """`WhiteNoise` in reduced units: the growth rate of T/T_0 that it causes."""
 
     strength: Float[Array, ""]
 
 
 class ReducedScene(NamedTuple):
-    """A gas in units of `Gas.impact_speed` and `Gas.path_length`; None is what it does not have.
+    """A gas in units of `Gas.impact_speed` and `Gas.path_length`; None for each missing element.
 
-    Of `DrivenStart` there are no numbers: () is that the gas has been prepared so.
+    `prepared` is () for a gas with `DrivenStart`, which has no numbers.
     """
 
     law: ReducedLaw
@@ -77,11 +77,11 @@ class ReducedScene(NamedTuple):
 
 
 def reduced_scene(gas: Gas) -> ReducedScene:
-    """The law of restitution and the elements of a scene in reduced units.
+    """Return the law of restitution and the elements of a gas in reduced units.
 
-    The density of centres at a hard wall is Z times the mean one (contact theorem), with the
-    pressure ``Z = 1 + 2^(d-1) phi g_2`` of elastic spheres over that of a dilute gas: a sphere
-    meets walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
+    The density of centres at a hard wall is Z times the mean density (contact theorem). Here
+    ``Z = 1 + 2^(d-1) phi g_2`` is the pressure of elastic spheres over that of a dilute gas. Hence
+    a sphere hits the walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
     """
     d, length, speed = gas.dimension, gas.path_length, gas.impact_speed
     surface = walls = drag = drive = None

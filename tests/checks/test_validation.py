@@ -5,20 +5,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxgran._utils.validation import ANY, FRACTION, POSITIVE, Domain, checked_times, number
+from jaxgran._utils.validation import ANY, FRACTION, POSITIVE, Domain, checked_times, float_array
 
 
 def test_numbers_are_strongly_typed():
     for value in (2, 2.0, np.float32(2), np.array(2), jnp.asarray(2)):
-        assert number(value) == 2.0
-        assert number(value).dtype == jnp.result_type(float) and not number(value).weak_type
-    assert number([1, 2.5]).shape == (2,)
+        assert float_array(value) == 2.0
+        assert (
+            float_array(value).dtype == jnp.result_type(float) and not float_array(value).weak_type
+        )
+    assert float_array([1, 2.5]).shape == (2,)
 
 
 @pytest.mark.parametrize("value", ["steel", object(), [1.0, [2.0]]])
 def test_what_is_no_number_is_refused(value):
     with pytest.raises(ValueError, match="expected a number or an array of numbers, got"):
-        number(value)
+        float_array(value)
     with pytest.raises(ValueError, match=r"speed must be a number in \(0, inf\), got .* Give m/s"):
         POSITIVE.check("speed", value, "Give m/s.")
 
@@ -60,7 +62,7 @@ def test_free_values_return(fraction):
     [
         ([1.0, -1.0], "times must be finite and not negative, got -1"),
         ([0.0, np.inf], "times must be finite and not negative, got inf"),
-        ([0.0, 2.0, 2.0], "times must increase, got 2 after 2; sort them"),
+        ([0.0, 2.0, 2.0], "times must increase, got 2 after 2. Sort them"),
         ([], r"times must be a list of numbers, got shape \(0,\)"),
         ([[1.0]], r"times must be a list of numbers, got shape \(1, 1\)"),
     ],

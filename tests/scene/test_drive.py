@@ -85,7 +85,8 @@ def test_the_derivative_in_the_strength():
 
     x = jnp.log(strength)
     forward, reverse = jax.jacfwd(log_temperature)(x), jax.jacrev(log_temperature)(x)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
+    # Rounding errors: 1.1e-12 on one processor, where XLA does not optimise.
+    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
     h = 1e-3  # errors h^2/6 of the difference and 1e-8/h of the solver, some 1e-5 at most
     difference = (log_temperature(x + h) - log_temperature(x - h)) / (2 * h)
     np.testing.assert_allclose(forward, difference, rtol=2e-5)
@@ -160,7 +161,7 @@ def test_the_steady_state_of_rough_viscoelastic_spheres_in_air(beads):
 
 def test_what_has_no_steady_state_is_refused():
     for gas in (constant(1.0), constant(0.9, rate=0.0)):
-        with pytest.raises(ValueError, match="no temperature is found"):
+        with pytest.raises(ValueError, match="losses balance the drive at no temperature"):
             jaxgran.steady_state(gas)
     with pytest.raises(ValueError, match="add drive=WhiteNoise"):
         jaxgran.steady_state(dataclasses.replace(constant(0.9), drive=None))
@@ -182,7 +183,7 @@ def test_a_gas_that_was_driven_begins_in_its_steady_state(eps):
     assert float(plain.sonine[0]) == 0.0
     assert float(curve.temperature[1]) != float(plain.temperature[1])
     spinning = {"surface": jaxgran.Rough(0.0, rotational_temperature=1e-3)}
-    with pytest.raises(ValueError, match="determines T_rot at t = 0: leave rotational_temperature"):
+    with pytest.raises(ValueError, match="determines T_rot at t = 0, but rotational_temperature"):
         dataclasses.replace(prepared(eps), **spinning)
 
 
