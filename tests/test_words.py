@@ -1,4 +1,4 @@
-"""What a notebook shows of a gas, a curve, a fit and a choice."""
+"""Text and HTML representations of a gas, a curve and a choice."""
 
 import copy
 import pickle
@@ -12,7 +12,7 @@ import jaxgran
 from tests.beads import glass_beads
 
 
-def test_a_gas_is_shown_with_units():
+def test_repr_of_a_gas_has_units():
     gas = glass_beads()
     words = repr(gas)
     assert "dissipative_constant" in words and "m^2/s^2" in words and "f64[]" not in words
@@ -20,20 +20,20 @@ def test_a_gas_is_shown_with_units():
     assert gas._repr_html_().startswith("<table><caption>Gas of Viscoelastic spheres, d = 3")
 
 
-def test_a_curve_is_shown_by_its_fields():
+def test_repr_of_a_curve_lists_its_fields():
     curve = jaxgran.CoolingCurve([0.0, 1.0, 2.0], [4.0, 2.0, 1.0], temperature_error=[1, 1, 1])
     assert "3 times, t = 0 s to 2 s" in repr(curve) and "0.25" in repr(curve)
     assert "temperature, temperature_error" in curve._repr_html_()
 
 
-def test_a_choice_is_shown_by_its_reasons():
+def test_repr_of_a_choice_lists_its_reasons():
     choice = jaxgran.choose_model(glass_beads(), [1e-3, 1.0])
     assert repr(choice).startswith("Choice: kinetic theory, T within")
     assert all(reason in repr(choice) for reason in choice.reasons)
     assert "<th>1.</th>" in choice._repr_html_()
 
 
-def test_batches_and_traced_values_are_said_to_be_such():
+def test_repr_marks_batches_and_traced_values():
     gas, shown = glass_beads(), []
     jax.jit(lambda gas: shown.append(repr(gas)) or gas.temperature)(gas)
     assert "traced" in shown[0]
@@ -41,7 +41,7 @@ def test_batches_and_traced_values_are_said_to_be_such():
     assert "values of shape (3,)" in repr(many)
 
 
-def test_floats_of_parts_are_read_as_they_are_replaced():
+def test_floats_of_parts_are_attributes_of_the_gas():
     gas = glass_beads().replace(dissipative_constant=2e-6)
     assert float(gas.dissipative_constant) == 2e-6
     with pytest.raises(AttributeError, match="Gas has no attribute 'viscosity'"):
@@ -50,11 +50,13 @@ def test_floats_of_parts_are_read_as_they_are_replaced():
         np.testing.assert_array_equal(again.dissipative_constant, gas.dissipative_constant)
 
 
-@pytest.mark.parametrize("model", ["dsmc", jaxgran.DSMC])
-def test_what_is_no_model_is_answered_with_the_list(model):
-    with pytest.raises(ValueError, match="there are KineticTheory"):
-        jaxgran.cool(glass_beads(), [1.0], model=model)
+def test_an_invalid_model_is_answered_with_a_suggestion():
+    with pytest.raises(ValueError, match="got 'dsmc'. Use KineticTheory"):
+        jaxgran.cool(glass_beads(), [1.0], model="dsmc")
+    message = r"model must be an instance, got the class DSMC; did you mean DSMC\(N\)\?"
+    with pytest.raises(ValueError, match=message):
+        jaxgran.cool(glass_beads(), [1.0], model=jaxgran.DSMC)
 
 
-def test_completion_shows_public_names_alone():
+def test_completion_shows_only_public_names():
     assert set(dir(jaxgran)) == {*jaxgran.__all__, "plot_curve", "plot_fit"}

@@ -47,7 +47,7 @@ class HaffLaw(jaxgran.AbstractModel):
         if float(gas.value("coefficient")) > 0.7:
             return ()
         remedy = "This scene needs kinetic theory, which follows a_2."
-        return (jaxgran.Omission("velocities are not Maxwellian", True, remedy),)
+        return (jaxgran.Limitation("velocities are not Maxwellian", True, remedy),)
 
 
 def main() -> int:

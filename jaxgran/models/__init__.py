@@ -1,9 +1,13 @@
-"""The models of a cooling gas.
+"""Models of a cooling gas.
 
-`base` is the interface that every model has; `kinetic_theory`, `dsmc`, `hard_spheres` and
-`soft_spheres` are the models, cheapest first; `spheres` is what the last two share; `checks` and
-`error_model` judge scenes; `selection` chooses a model. No module outside this package knows a model by
-its class, except for the default.
+- `cool`: the cooling curve of a gas by any model.
+- `base`: the interface of a model.
+- `kinetic_theory`, `dsmc`, `hard_spheres`, `soft_spheres`: the models, cheapest first; `spheres`
+  is the base of the last two.
+- `choose`: choice of a model, by the errors that `error_model` estimates.
+- `checks`: checks of arguments and scenes.
 
-May import: checks, scene, data, theory, tangents, particles. Imported by: cooling, fitting.
+No module outside this package knows a model by its class, except for the default.
+
+May import: _utils, scene, data, theory, gradients, particles. Imported by: fitting, sweep, cli.
 """

@@ -13,36 +13,27 @@ from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas
 
-ELEMENTS = {
-    "surface": "rough spheres (surface=Rough)",
-    "friction": "friction between spheres (surface=Frictional)",
-    "container": "walls (container)",
-    "drag": "drag",
-    "drive": "a drive (drive)",
-    "preparation": "a driven start (preparation)",
-}
-"""Words for the elements of a scene."""
-
-TAKE_IT = "KineticTheory(), DSMC(N) or HardSpheres(N), which take it"
-"""What to use for an element that a model does not take."""
-
 SUPPORTED_BY = {
-    "friction": "SoftSpheres(N), which takes it, or surface=Rough(...) for instantaneous impacts",
-    "container": "KineticTheory(), DSMC(N), HardSpheres(N) or SoftSpheres(N), which take it",
-    "drag": "KineticTheory(), DSMC(N), HardSpheres(N) or SoftSpheres(N), which take it",
+    "surface": "KineticTheory, DSMC or HardSpheres",
+    "friction": "SoftSpheres, or surface=Rough(...) for instantaneous impacts",
+    "container": "KineticTheory, DSMC, HardSpheres or SoftSpheres",
+    "drag": "KineticTheory, DSMC, HardSpheres or SoftSpheres",
+    "drive": "KineticTheory, DSMC or HardSpheres",
+    "preparation": "KineticTheory, DSMC or HardSpheres",
 }
-"""The same for elements that other models take."""
+"""Models that support each element of a scene (see `Gas.elements`)."""
 
 
 class Limitation(NamedTuple):
-    """Something that a model leaves out and a scene contains.
+    """An effect that a scene contains and a model leaves out.
 
     Attributes:
-        words: what, as the clause of a sentence.
-        decisive: estimates of a fit cannot be trusted; else the scene is at the edge of validity.
-        remedy: a sentence saying which model contains it.
+        words: the effect, as the clause of a sentence.
+        decisive: True if the estimates of a fit cannot be trusted; False if the scene is at the
+            edge of validity.
+        remedy: a sentence that names a model with this effect.
 
-    >>> [omission.words for omission in jaxgran.KineticTheory().omissions(gas)]
+    >>> [limitation.words for limitation in jaxgran.KineticTheory().limitations(gas)]
     []
     """
 
@@ -55,9 +46,9 @@ class AbstractModel(eqx.Module):
     """A model of a cooling gas: a description, without state and without the options of a run.
 
     A subclass defines the members below; it then works in `jaxgran.cool`, `jaxgran.fit`,
-    `jaxgran.choose_model` and `jaxgran.diagnose`, which ask the model nothing else. Numbers that a
-    person may differentiate or sweep are array fields, counts and choices are static fields. A
-    missing member is named by the TypeError that creating the model raises.
+    `jaxgran.choose_model` and `jaxgran.diagnose`, which use no other members. Numbers that a
+    user may differentiate or sweep are array fields, counts and choices are static fields. If a
+    member is missing, creating the model raises a TypeError that names it.
 
     `jaxgran.DSMC` is a short example; `tests/models/test_own_model.py` defines one in 25 lines.
 
@@ -68,38 +59,44 @@ class AbstractModel(eqx.Module):
     """
 
     stochastic: AbstractClassVar[bool]
-    """Whether curves carry random noise. A fit then makes repeated runs with fresh random numbers,
-    takes the noise from ``curve.replicas`` and needs two replicas at least."""
+    """True if curves carry random noise. A fit then makes repeated runs with fresh random numbers,
+    takes the noise from ``curve.replicas`` and needs at least two replicas."""
 
     derivative_accuracy: AbstractClassVar[float]
-    """Relative accuracy of a derivative of ln T in a parameter. Parameters whose effects differ by
-    less count as undetermined."""
+    """Relative accuracy of a derivative of ln T in a parameter. A fit treats parameters whose
+    effects differ by less as undetermined."""
 
     saves: ClassVar[bool] = False
-    """Whether curves have `CoolingCurve.saved` where a run asks for it: the model has particles."""
+    """True if the model has particles, so that a run can return `CoolingCurve.saved`."""
 
     has_positions: ClassVar[bool] = False
-    """Whether it writes a trajectory where a run asks for it."""
+    """True if the model has positions, so that a run can write a trajectory."""
 
     rotation_accuracy: ClassVar[float] = 0.07
     """Relative accuracy of T_rot/T of rough spheres."""
 
     elements: ClassVar[tuple[str, ...]] = ()
-    """What the model takes besides smooth spheres in free flight: see `Gas.elements`."""
+    """Elements that the model supports in addition to smooth spheres in free flight: see
+    `Gas.elements`."""
 
     def check_scene(self, gas: Gas) -> None:
-        """`check`, after refusing the elements of a scene that the model does not take."""
+        """Refuse the elements of a scene that the model does not support, then call `check`.
+
+        Raises:
+            ValueError: naming the unsupported element and the models that support it.
+        """
         for name in gas.elements:
             if name not in self.elements:
+                field = "surface" if name in ("surface", "friction") else name
+                given = {"surface": "surface=Rough", "friction": "surface=Frictional"}
                 raise ValueError(
-                    f"{type(self).__name__} does not take {ELEMENTS[name]}: use "
-                    f"{SUPPORTED_BY.get(name, TAKE_IT)}, or "
-                    f"leave {'surface' if name == 'friction' else name} out of the gas"
+                    f"{type(self).__name__} does not support `{given.get(name, name)}`. "
+                    f"Use {SUPPORTED_BY[name]}, or set {field}=None."
                 )
         self.check(gas)
 
     def check_save(self, save: Any) -> None:
-        """Raise ValueError for something to save that is no function, or of no particles."""
+        """Raise ValueError if `save` is not a function, or the model has no particles."""
         if save is None:
             return
         if not (callable(save) or save == "particles"):
@@ -109,24 +106,24 @@ class AbstractModel(eqx.Module):
             )
         if not self.saves:
             raise ValueError(
-                f"{type(self).__name__} has no particles of which something could be saved: leave "
-                "save out, or use DSMC(N), HardSpheres(N) or SoftSpheres(N)"
+                f"{type(self).__name__} has no particles to save. Use DSMC, HardSpheres or "
+                "SoftSpheres, or set save=None."
             )
 
     @abstractmethod
     def check(self, gas: Gas) -> None:
-        """Check that the model can take this law and scene. Traced values pass unchecked.
+        """Check that the model supports this law and scene. Traced values pass unchecked.
 
         Raises:
-            ValueError: saying what was given, what is allowed and what to do.
+            ValueError: with what was given, what is allowed and what to do.
         """
 
     @abstractmethod
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run) -> CoolingCurve:
-        """The cooling curve at the given times.
+        """Return the cooling curve at the given times.
 
-        Inside `jax.jit`, `jax.vmap` and derivatives this is a pure function. A failure is reported
-        by ``curve.status``, and values that could not be computed are nan.
+        Inside `jax.jit`, `jax.vmap` and derivatives this is a pure function. ``curve.status``
+        reports a failure, and values that could not be computed are nan.
 
         Args:
             gas: a scene that has passed `check`.
@@ -136,44 +133,49 @@ class AbstractModel(eqx.Module):
 
     @abstractmethod
     def estimated_error(self, error_model: ErrorModel) -> float:
-        """Estimated relative error of T at the worst time of a gas's course, noise included."""
+        """Estimated relative error of T at the worst time, noise included."""
 
     def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"] | float:
-        """Estimated relative error of the cooling rate along a gas's course, without noise.
+        """Estimated relative error of the cooling rate, without noise.
 
-        The error bars of a fit contain it. By default `derivative_accuracy`, or 0 for a stochastic
-        model.
+        It is given at the times of `error_model`. The error bars of a fit contain it. The default
+        is `derivative_accuracy`, or 0 for a stochastic model.
         """
         return 0.0 if self.stochastic else self.derivative_accuracy
 
     def derivative_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"] | float:
-        """Estimated relative error of the derivatives of ln T along a gas's course, beyond
-        `derivative_accuracy`: they may be too large by it. The error bars of a fit contain it.
+        """Estimated relative error by which the derivatives of ln T may be too large.
+
+        It comes in addition to `derivative_accuracy`, at the times of `error_model`, and is 0 by
+        default. The error bars of a fit contain it.
         """
         return 0.0
 
     @abstractmethod
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
-        """What the model leaves out of a scene, the most serious first; () if nothing matters.
+        """Return the effects that the model leaves out of a scene, the most serious first.
 
         Args:
             gas: the scene.
             num_particles: N of the gas, or None if it is unknown.
+
+        Returns:
+            A tuple, empty if the model leaves out nothing that matters.
         """
 
     def check_fit(self, names: tuple[str, ...]) -> None:
         """Check that the named floats of a gas can be fitted through this model (default: all).
 
         Raises:
-            ValueError: saying which cannot, and why.
+            ValueError: naming the floats that cannot be fitted, with the reason.
         """
 
     def displacement_accuracy(self, gas: Gas) -> Float[Array, ""] | None:
-        """Relative accuracy of <dr^2>; None (the default) if a fit should not use it."""
+        """Relative accuracy of <dr^2>; None (the default) if a fit should not use <dr^2>."""
         return None
 
     @property
     def name(self) -> str:
-        """The model's name in a sentence: "soft spheres" for `SoftSpheres`."""
-        parted = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(self).__name__)
-        return " ".join(word if word.isupper() else word.lower() for word in parted.split())
+        """Name of the model in a sentence: "soft spheres" for `SoftSpheres`."""
+        words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(self).__name__).split()
+        return " ".join(word if word.isupper() else word.lower() for word in words)

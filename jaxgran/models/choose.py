@@ -1,4 +1,4 @@
-"""Selection of the cheapest model whose estimated error in a scene is small enough."""
+"""Choice of the cheapest model whose estimated error in a scene is small enough."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils import status
-from jaxgran._utils.formatting import Rows, html_table, text_table
-from jaxgran._utils.validation import POSITIVE, checked_times, no_type_check, plain_number
+from jaxgran._utils.formatting import TableRows, html_table, text_table
+from jaxgran._utils.validation import POSITIVE, checked_float, checked_times, no_type_check
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import check_softness, check_volume, checked_gas, describe_walls
@@ -27,10 +27,10 @@ from jaxgran.scene.gas import Gas
 from jaxgran.theory.equations import softness_factor
 
 NUM_PARTICLES = 4000
-"""Particles of a particle model if no number is given."""
+"""Particles of a particle model if the user gives no number."""
 
 NUM_TIMES = 65
-"""Times at which the course of a gas is sampled."""
+"""Number of times at which an `ErrorModel` samples the cooling gas."""
 
 
 class Candidate(NamedTuple):
@@ -39,8 +39,8 @@ class Candidate(NamedTuple):
     Attributes:
         model: the model.
         error: its estimated relative error of T at the worst of the times, at most 1, which means
-            that nothing is known of T; None if the model cannot take the scene.
-        refusal: why it cannot take the scene; None if it can.
+            that nothing is known of T; None if the model does not support the scene.
+        refusal: the reason why the model does not support the scene; None if it does.
     """
 
     model: AbstractModel
@@ -52,8 +52,8 @@ class Choice(NamedTuple):
     """The model chosen for a scene.
 
     Attributes:
-        model: ready to be given to `jaxgran.cool` or `jaxgran.fit`.
-        reasons: why, a sentence each, the verdict first.
+        model: the model, for `jaxgran.cool` or `jaxgran.fit`.
+        reasons: the reasons, one sentence each, the verdict first.
         candidates: all models considered, cheapest first.
         error: estimated relative error of T of the chosen model.
 
@@ -73,13 +73,13 @@ class Choice(NamedTuple):
     def _repr_html_(self) -> str:
         return html_table(*self._words())
 
-    def _words(self) -> tuple[str, Rows]:
+    def _words(self) -> tuple[str, TableRows]:
         title = f"Choice: {self.model.name}, T within {100 * self.error:.2g} % by estimate"
         return title, [(f"{i}.", reason) for i, reason in enumerate(self.reasons, start=1)]
 
 
 def default_models(num_particles: int, replicas: int = 1) -> tuple[AbstractModel, ...]:
-    """The models of this package, cheapest first."""
+    """Return the models of this package, cheapest first."""
     kinds = (DSMC, HardSpheres, SoftSpheres)
     return KineticTheory(), *(kind(num_particles, replicas=replicas) for kind in kinds)
 
@@ -94,32 +94,32 @@ def choose_model(
     replicas: int = 1,
     models: Sequence[AbstractModel] | None = None,
 ) -> Choice:
-    """The cheapest model whose estimated error of T is within a tolerance.
+    """Return the cheapest model whose estimated error of T is within a tolerance.
 
-    A model whose cooling rate errs by a share e(t) errs in T by ``|d ln T/dt| int_0^t e dt'``. The
-    share adds up from Enskog's collision frequency, from contacts that last and overlap, and, in a
-    box of known size, from the flow that grows in it, whose energy kinetic theory and DSMC count as
-    heat, which cools. Particle models have noise. Each model estimates its own error
-    (`jaxgran.AbstractModel.estimated_error`).
+    A model whose cooling rate has a relative error e(t) has a relative error
+    ``|d ln T/dt| int_0^t e dt'`` of T. Contributions to e(t) are Enskog's collision frequency,
+    contacts that last and overlap, and, in a box of known size, the flow that grows in it:
+    kinetic theory and DSMC count its energy as heat, which cools. Particle models have noise. Each
+    model estimates its own error (`jaxgran.AbstractModel.estimated_error`).
 
     Args:
         gas: the scene.
-        times: t, s, as given to `jaxgran.cool`; they tell how long the gas is followed.
+        times: t, s, as given to `jaxgran.cool`; the last one is the end of the estimate.
         tolerance: relative error of T allowed, > 0.
         num_particles: N of the gas, if known: gives the box, and the number of particles of a
-            particle model (4000 if unknown). Without it the gas is taken to stay homogeneous.
-        replicas: of a particle model.
+            particle model (4000 if unknown). Without it the gas is assumed to stay homogeneous.
+        replicas: number of replicas of a particle model.
         models: the models to choose from, cheapest first; by default those of this package.
 
     Returns:
         `Choice`: the model, reasons in words, all candidates with their estimated errors. If no
-        model is accurate enough, the most accurate one; the first reason says so.
+        model is accurate enough, the most accurate one, and the first reason says so.
 
     Raises:
         ValueError: for values out of range or being traced, a gas so soft that kinetic theory is
-            meaningless, a container that is not that of so many spheres, or a scene that no model
-            can take.
-        RuntimeError: if kinetic theory, which estimates the errors, cannot follow the gas so far.
+            meaningless, a container of another volume than N spheres need, or a scene that no
+            model supports.
+        RuntimeError: if kinetic theory, which estimates the errors, cannot reach the last time.
 
     >>> choice = jaxgran.choose_model(gas, times, num_particles=200)
     >>> choice.reasons[0][:43]
@@ -135,14 +135,18 @@ def choose_model(
     candidates = tuple(_candidate(model, error_model) for model in models)
     possible = [(c.error, c) for c in candidates if c.error is not None]
     if not possible:
-        refusals = "; ".join(str(c.refusal) for c in candidates)
-        raise ValueError(f"no model can take this scene: {refusals}")
+        refusals = "; ".join(str(c.refusal).rstrip(".") for c in candidates)
+        raise ValueError(f"no model supports this scene: {refusals}.")
     good = [(error, c) for error, c in possible if error <= tolerance]
     error, best = good[0] if good else min(possible, key=lambda pair: pair[0])
     reasons = [
         _verdict(best.model, error, tolerance, enough=bool(good)),
         *_describe_scene(error_model, size, replicas),
-        *(f"{_capitalised(c.model.name)}: {c.refusal}." for c in candidates if c.refusal),
+        *(
+            f"{_capitalised(c.model.name)}: {c.refusal.rstrip('.')}."
+            for c in candidates
+            if c.refusal
+        ),
     ]
     return Choice(best.model, tuple(reasons), candidates, error)
 
@@ -151,10 +155,10 @@ def _check_arguments(gas: Any, times: Any, tolerance: Any) -> None:
     checked_gas(gas)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, times))):
         raise ValueError(
-            "a model cannot be chosen for values being traced by jax.jit, jax.grad or jax.vmap: "
-            "call choose_model outside, and give its model to cool"
+            "a model cannot be chosen for values traced by jax.jit, jax.grad or jax.vmap: "
+            "call choose_model outside, and pass its model to cool"
         )
-    plain_number("tolerance", tolerance, POSITIVE, "0.02 allows T to err by 2 %.")
+    checked_float("tolerance", tolerance, POSITIVE, "0.02 allows T to err by 2 %.")
 
 
 def _candidate(model: AbstractModel, error_model: ErrorModel) -> Candidate:
@@ -173,20 +177,20 @@ def _verdict(model: AbstractModel, error: float, tolerance: float, enough: bool)
             f"{_percent(tolerance)}."
         )
     verdict = (
-        f"{name}: the closest; no model is within {_percent(tolerance)}, and its estimated error "
-        f"of T is {share}."
+        f"{name}: the most accurate model, with an estimated error of T of {share}; no model is "
+        f"within {_percent(tolerance)}."
     )
     if model.stochastic:
-        verdict += " More particles or replicas have less noise."
+        verdict += " More particles or replicas reduce the noise."
     return verdict
 
 
 def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> ErrorModel:
-    """The course of a gas from t = 0 to an end, s, as kinetic theory predicts it without friction.
+    """Build the error model of a gas from t = 0 to `end`, s, by kinetic theory without friction.
 
     Raises:
-        ValueError: for a gas so soft that the softness correction has no meaning.
-        RuntimeError: if kinetic theory cannot follow the gas so far.
+        ValueError: for a gas so soft that the softness correction is invalid.
+        RuntimeError: if kinetic theory cannot reach the end.
     """
     grid = jnp.linspace(0, jnp.log1p(end / gas.mean_free_time), NUM_TIMES)
     known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
@@ -204,17 +208,17 @@ def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> Er
 def error_model_along(
     gas: Gas, curve: CoolingCurve, num_particles: int | None = None
 ) -> ErrorModel:
-    """The course of a gas along its cooling curve, which begins at t = 0.
+    """Build the error model of a gas from its cooling curve, which begins at t = 0.
 
-    a_2 and the collisions are taken for 0 where the curve does not have them.
+    a_2 and the collisions are set to 0 if the curve does not have them.
     """
     temperature = np.asarray(curve.temperature)
-    nothing = np.zeros_like(temperature)
+    zero = np.zeros_like(temperature)
     values = {
         "time": curve.times,
         "log_temperature": np.log(temperature / np.asarray(gas.temperature)),
-        "collisions": nothing if curve.collisions is None else curve.collisions,
-        "sonine": nothing if curve.sonine is None else curve.sonine,
+        "collisions": zero if curve.collisions is None else curve.collisions,
+        "sonine": zero if curve.sonine is None else curve.sonine,
     }
     scales = _scales(gas, curve.temperature)
     values = {name: np.asarray(value, float) for name, value in (values | scales).items()}
@@ -227,8 +231,6 @@ def error_model_along(
 
 @eqx.filter_jit
 def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Array, "times"]]:
-    """Contacts and the critical box at each temperature."""
-
     def scales(temperature):
         now = gas.replace(temperature=temperature)
         factor = softness_factor(now.reduced_law, jnp.ones_like(temperature), now.dimension)
@@ -249,19 +251,18 @@ def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[s
     )
     lowest, end = np.exp([error_model.log_temperature.min(), error_model.log_temperature[-1]])
     heated = error_model.gas.drive is not None and end > 1
+    frictional = "friction" in error_model.gas.elements
+    friction = ["These estimates leave friction out."] if frictional else []
     return [
         f"T {f'rises to {end:.2g}' if heated else f'falls to {lowest:.2g}'} T_0 in "
         f"{error_model.collisions[-1]:.3g} collisions per particle.",
-        f"Contacts last {_percent(error_model.contact_fraction.max())} of the mean free time and overlap"
-        f" by {_percent(error_model.overlap.max())} of a diameter: T errs by {_percent(hard)} with "
-        f"instantaneous impacts, {_percent(corrected)} with kinetic theory's first correction.",
+        f"Contacts last {_percent(error_model.contact_fraction.max())} of the mean free time and "
+        f"overlap by {_percent(error_model.overlap.max())} of a diameter: the error of T is "
+        f"{_percent(hard)} with instantaneous impacts, {_percent(corrected)} with kinetic theory's "
+        "first-order correction.",
         _describe_box(error_model),
         _describe_noise(error_model, size, replicas),
-        *(
-            ["These estimates leave friction out."]
-            if "friction" in error_model.gas.elements
-            else []
-        ),
+        *friction,
     ]
 
 
@@ -270,15 +271,15 @@ def _describe_box(error_model: ErrorModel) -> str:
     text = f"At a packing fraction of {float(gas.packing_fraction):.2g}"
     if error_model.num_particles is None:
         return (
-            f"{text} a gas that stays homogeneous leaves an error of {error}; without "
+            f"{text} the error of kinetic theory is {error} if the gas stays homogeneous; without "
             "num_particles the box is unknown, and clustering is not estimated."
         )
     ratio = float(gas.box_side(error_model.num_particles) / gas.critical_box)
-    later = " Clusters come after the flow (see Gas.critical_box)." if ratio > 1 else ""
+    later = " Clusters follow the flow (see Gas.critical_box)." if ratio > 1 else ""
     return (
-        f"{text} in a box of {ratio:.2g} L_c, where the flow comes to hold "
-        f"{_percent(error_model.flow_share.max())} of the energy, homogeneous models err by {error}."
-        f"{later} The box {describe_walls(gas, error_model.num_particles)}."
+        f"{text} in a box of {ratio:.2g} L_c, where the flow reaches "
+        f"{_percent(error_model.flow_share.max())} of the energy, the error of homogeneous models "
+        f"is {error}.{later} The box {describe_walls(gas, error_model.num_particles)}."
     )
 
 
@@ -287,7 +288,7 @@ def _describe_noise(error_model: ErrorModel, size: int, replicas: int) -> str:
     text = f"{size * replicas} particles have a noise of {_percent(noise)} in T"
     if flowing <= noise / 10:
         return f"{text}."
-    return f"{text}, {_percent(hypot(noise, flowing))} with the chance amplitudes of the flow."
+    return f"{text}, {_percent(hypot(noise, flowing))} with the random amplitudes of the flow."
 
 
 def _capitalised(text: str) -> str:

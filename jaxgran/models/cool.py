@@ -1,4 +1,4 @@
-"""The one verb: cool a gas."""
+"""`cool`: the cooling curve of a gas by any model."""
 
 import os
 import warnings
@@ -36,58 +36,56 @@ def cool(
     tolerance: float | None = None,
     num_particles: int | None = None,
 ) -> CoolingCurve:
-    """How the gas cools and spreads from its initial temperature at t = 0.
+    """Compute how a gas cools and spreads from its initial temperature at t = 0.
 
     The model is a description; `key`, `progress`, `checkpoint` and `throw` are options of this run.
-    Called with known numbers, a particle model is run from the host, which enlarges its arrays
-    where they are too small, shows progress and writes checkpoints. Called inside `jax.jit`,
-    `jax.vmap` or a derivative it is a pure function of arrays, which calls nothing on the host; a
-    random start then is another one of the same kind.
+    With known numbers a particle model is run from the host, which enlarges arrays that are too
+    small, shows progress and writes checkpoints. Inside `jax.jit`, `jax.vmap` or a derivative this
+    is a pure function of arrays, which calls nothing on the host; a random start is then another
+    sample of the same distribution.
 
     Args:
         gas: the scene; its floats may be traced, differentiated and batched with `jax.vmap`.
         times: t, s, increasing and >= 0, shape (times,); need not start at 0.
-        model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`. "auto" takes the
-            cheapest whose estimated error is small enough; `jaxgran.choose_model` says which, and
-            why.
-        key: of the random numbers of a particle model. Without one it is `jax.random.key(0)`: two
-            such calls return the same numbers. Where there are several CPU devices, and on one for
-            8192 spheres and more, each replica is a run of its own, with the key
-            ``fold_in(key, k)``, and the same whoever runs beside it; others stand in one array, and
-            spheres then share the lengths of their steps and the lives of their neighbour lists.
+        model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`. "auto" uses the
+            cheapest model whose estimated error is small enough; `jaxgran.choose_model` returns it
+            with the reasons.
+        key: key of the random numbers of a particle model, by default `jax.random.key(0)`: two
+            calls without a key return the same numbers. With several CPU devices, or from 8192
+            spheres on with one, each replica is a separate run with the key ``fold_in(key, k)``,
+            independent of the number of devices. Otherwise replicas share one array, and replicas
+            of spheres share their step lengths and the lifetimes of their neighbour lists.
         progress: show a progress bar on a terminal during a run of some seconds.
-        checkpoint: a file to which a particle model's run is saved each minute and when it is
-            interrupted, and from which it is resumed; the resumed run gives the same numbers bit
-            for bit. Not inside `jax.jit` and `jax.vmap`. Replicas that are runs of their own have a
-            file each, with the endings .0, .1, ...
-        save: of a model with particles: a function that JAX can compile, of the `Particles` of one
-            replica (arrays of shape (N, d), SI), which returns arrays in any tree; see
+        checkpoint: path of a file for particle models. The run is saved there each minute and when
+            it is interrupted, and is resumed from it; a resumed run gives the same numbers bit for
+            bit. Replicas that are separate runs write one file each, with the suffixes .0, .1, ...
+            Not inside `jax.jit` and `jax.vmap`.
+        save: function for models with particles, which JAX can compile. It takes the `Particles` of
+            one replica (arrays of shape (N, d), SI) and returns a pytree of arrays; see
             `jaxgran.observables`. Its mean over replicas at each time is ``curve.saved``, its
-            standard error ``curve.saved_error``, and that of each replica
-            ``curve.replicas.saved``. "particles" keeps these themselves, all of them at all times.
-            Positions of DSMC, which has none, are nan.
-        trajectory: of a model with positions: a file, .gsd (OVITO, freud, VMD, HOOMD; needs the
-            extra `trajectories`) or .xyz (extended XYZ), to which the particles are written at each
-            time, as soon as it is reached; `jaxgran.read_particles` reads it. Of several replicas
-            that is one file each, ``name.0.gsd`` and so on. Not inside `jax.jit` and `jax.vmap`.
-        throw: raise RuntimeError if the run fails. False returns the curve, nan from the failure
-            on, and its ``status`` (`jaxgran.explain_status` puts it into words); inside compiled
-            code, where nothing can be raised, that is always so.
-        tolerance: for "auto" only, relative error of T allowed; 0.02 by default.
-        num_particles: for "auto" only, N of the gas, if known.
+            standard error ``curve.saved_error``, and its values in each replica
+            ``curve.replicas.saved``. "particles" saves all particles at all times. Positions of
+            DSMC, which has none, are nan.
+        trajectory: path of a file for models with positions, .gsd (OVITO, freud, VMD, HOOMD; needs
+            the extra `trajectories`) or .xyz (extended XYZ). The particles are written to it at
+            each time, as soon as it is reached; `jaxgran.read_particles` reads it. Several replicas
+            write one file each, ``name.0.gsd`` and so on. Not inside `jax.jit` and `jax.vmap`.
+        throw: raise RuntimeError if the run fails. With False, and always inside compiled code,
+            which cannot raise, the curve is nan from the failure on, and its ``status`` gives the
+            reason (see `jaxgran.explain_status`).
+        tolerance: relative error of T allowed, for "auto" only; 0.02 by default.
+        num_particles: N of the gas, if known, for "auto" only.
 
     Returns:
         `CoolingCurve` at those times.
 
     Raises:
         ValueError: for times that are negative, unsorted, not finite or not a list, a trajectory
-            that exists already, a scene that the model cannot take, a checkpoint where none can be
-            kept, or options of "auto" with another model. Values being traced cannot be looked at:
-            where they lie outside their ranges the curve is nan, and its status says so.
+            that exists already, a scene that the model does not support, a checkpoint of a model
+            without a run, or options of "auto" with another model. Traced values cannot be
+            checked: if they are out of range the curve is nan, and its status says so.
         OSError: for a checkpoint that cannot be written.
         RuntimeError: if the run fails and `throw` is True, with what to do.
-
-    This docstring is long because it documents every option of every model's run.
 
     >>> curve = jaxgran.cool(gas, times)
     >>> [round(float(T), 5) for T in curve.temperature]
@@ -103,8 +101,8 @@ def cool(
         model = choice.model
     elif not (tolerance is None and num_particles is None):
         raise ValueError(
-            'tolerance and num_particles go with model="auto"; give them to the model instead, as '
-            "in SoftSpheres(num_particles), or leave them out"
+            'tolerance and num_particles go with model="auto". Leave them out, or give '
+            "num_particles to the model, as in SoftSpheres(num_particles)."
         )
     model = checks.checked_model(model)
     model.check_save(save)
@@ -130,8 +128,8 @@ def _check_trajectory(trajectory: Any, model: AbstractModel) -> None:
     _check_path("trajectory", trajectory)
     if not model.has_positions:
         raise ValueError(
-            f"{type(model).__name__} has no positions: leave trajectory out, or use HardSpheres(N) "
-            "or SoftSpheres(N)"
+            f"{type(model).__name__} has no positions to write. Use HardSpheres or SoftSpheres, or "
+            "set trajectory=None."
         )
 
 
@@ -139,8 +137,8 @@ def _check_checkpoint(checkpoint: Any, model: AbstractModel) -> None:
     _check_path("checkpoint", checkpoint)
     if not model.stochastic:
         raise ValueError(
-            f"{type(model).__name__} has no run to be saved: leave checkpoint out, got "
-            f"{str(checkpoint)!r}"
+            f"{type(model).__name__} has no run to be saved, got {str(checkpoint)!r}. Set "
+            "checkpoint=None."
         )
     check_writable(os.fspath(checkpoint))
 

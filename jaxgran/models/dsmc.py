@@ -1,4 +1,4 @@
-"""Direct simulation Monte Carlo: the velocities of a homogeneous gas, by random collisions."""
+"""Direct simulation Monte Carlo (DSMC) of the velocities of a homogeneous gas."""
 
 import dataclasses
 from functools import partial
@@ -15,11 +15,11 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import (
     Domain,
-    UserCount,
     UserFloat,
-    plain_number,
-    python_number,
-    whole_number,
+    UserInt,
+    checked_float,
+    checked_int,
+    python_int,
 )
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
@@ -44,7 +44,7 @@ from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory.equations import scene_at_start
 
 MAX_STEP = 0.1
-"""Most collisions per particle in one step: a particle can be drawn at most twice in it."""
+"""Largest number of collisions per particle and step: a step draws a particle at most twice."""
 
 
 class DSMC(AbstractModel):
@@ -53,24 +53,25 @@ class DSMC(AbstractModel):
     Solves the Enskog-Boltzmann equation of the homogeneous gas with any law of restitution:
     pairs collide at the rate ``sigma^(d-1) g_2 / V`` times ``g.n`` for each normal n with
     ``g.n > 0``, ``v_i -> v_i - (1 + eps)/2 (g.n) n``, ``v_j -> v_j + (1 + eps)/2 (g.n) n``.
-    Exact in the velocity distribution where kinetic theory takes two Sonine terms. Leaves out
-    correlations, clustering and the duration of contacts.
+    The velocity distribution is exact, while kinetic theory has two Sonine terms. The model leaves
+    out correlations, clustering and the duration of contacts.
 
-    A step takes a fixed share of the current mean free time. Its error is of second order: a
-    step draws disjoint random pairs, and then pairs that share a particle with those, as often as
+    A step is a fixed share of the current mean free time. Its error is of second order: a step
+    draws disjoint random pairs, and then pairs that share a particle with these, as often as
     drawing one pair after the other would. Means over N particles have errors of O(1/N).
 
-    Takes all elements of a scene but friction: rough spheres; walls, which a homogeneous gas meets
-    everywhere alike, the more often the more they take (`jaxgran.scene.elements`); drag, exactly,
-    by collisions in transformed time (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32);
-    a drive, half of whose kicks begin each step and half end it, in turns for portions of all
-    particles (`jaxgran.particles.dsmc.collisions`);
-    and a driven start, which is driven for 10 mean free times with what its collisions take.
-    Derivatives are then of T, T_rot and collisions (`jaxgran.gradients.tangents`), others are nan.
+    Supports all elements of a scene but friction: rough spheres; walls, which all particles of the
+    homogeneous gas hit with the same probability, more often the more energy the walls take
+    (`jaxgran.scene.elements`); drag, exactly, by collisions in transformed time
+    (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32); a drive, with half of the kicks
+    at the beginning of each step and half at its end, on subsets of the particles in turn
+    (`jaxgran.particles.dsmc.collisions`); and a driven start, for which a drive returns the energy
+    that collisions take during 10 mean free times. With elements the derivatives of T, T_rot and
+    collisions are known (`jaxgran.gradients.tangents`), others are nan.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
-    The derivatives are estimates. They are taken at a fixed own time (dt = dtau / sqrt(T), so that
-    the order of collisions does not depend on the speeds). The gas is assumed to remember its
+    The derivatives are estimates. They are taken at a fixed scaled time s (``ds = sqrt(T) dt``, so
+    that the order of collisions does not depend on the speeds). The gas is assumed to remember its
     temperature only; <dr^2> and the velocity correlation are assumed to change by the first Sonine
     order of diffusion. The derivative of a_2 in a float of the gas is not known, and is nan. Rates
     of change with time are those of the Maxwell-Sonine distribution. Second derivatives are
@@ -78,9 +79,10 @@ class DSMC(AbstractModel):
 
     Args:
         num_particles: N, >= 2, on one device.
-        replicas: independent gases that are simulated together; two or more give error bars.
-        step: collisions per particle in one step, in (0, 0.1]. A step has one pair at least, which
-            is 0.5/N and in a gas of some ten particles longer than asked.
+        replicas: number of independent gases that are simulated together; two or more give error
+            bars.
+        step: collisions per particle in one step, in (0, 0.1]. A step has at least one pair, which
+            is 0.5/N; in a gas of some ten particles this is longer than requested.
 
     Raises:
         ValueError: for numbers out of range.
@@ -93,8 +95,8 @@ class DSMC(AbstractModel):
     '0.005'
     """
 
-    num_particles: UserCount = eqx.field(static=True, converter=python_number)
-    replicas: UserCount = eqx.field(static=True, converter=python_number, default=1)
+    num_particles: UserInt = eqx.field(static=True, converter=python_int)
+    replicas: UserInt = eqx.field(static=True, converter=python_int, default=1)
     step: UserFloat = eqx.field(static=True, default=0.05)
 
     stochastic: ClassVar[bool] = True
@@ -103,22 +105,22 @@ class DSMC(AbstractModel):
     derivative_accuracy: ClassVar[float] = 0.01
 
     def __check_init__(self):
-        whole_number("num_particles", self.num_particles, 2)
-        whole_number("replicas", self.replicas, 1)
+        checked_int("num_particles", self.num_particles, 2)
+        checked_int("replicas", self.replicas, 1)
         allowed = Domain(0.0, MAX_STEP, high_allowed=True)
-        plain_number("step", self.step, allowed, "A particle collides at most twice in a step.")
+        checked_float("step", self.step, allowed, "A particle collides at most twice in a step.")
 
     def check(self, gas: Gas) -> None:
-        """Raise ValueError for a law of restitution that heats the gas."""
+        """Raise ValueError if the law of restitution heats the gas."""
         checks.check_cools(checks.first_cooling_rate(gas))
 
     def estimated_error(self, error_model: ErrorModel) -> float:
-        """Error of Enskog's rate, lasting and soft contacts, and the shot noise of all replicas."""
+        """Estimated relative error of T by `rate_error` and the shot noise of all replicas."""
         noise = error_model.shot_noise(self.num_particles * self.replicas)
         return hypot(error_model.error_of_temperature(self.rate_error(error_model)), noise)
 
     def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
-        """Error of Enskog's rate, and of contacts that last and are soft."""
+        """Relative error of Enskog's rate, by contacts that last and are soft, and by walls."""
         return (
             error_model.homogeneous
             + error_model.lasting_contacts
@@ -127,14 +129,14 @@ class DSMC(AbstractModel):
         )
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
-        """Contacts that last, correlated collisions and boxes in which a flow grows."""
-        lasting = checks.limitations_of_instant_impacts(gas)
-        return lasting + checks.limitations_of_homogeneity(gas, num_particles)
+        """Return limitations by contacts that last, correlated collisions, and a growing flow."""
+        contacts = checks.limitations_of_instant_impacts(gas)
+        return contacts + checks.limitations_of_homogeneity(gas, num_particles)
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
-        """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`.
+        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`.
 
-        A run fails if too many pairs meet faster than the ceiling of the collision rate.
+        A run fails if too many pairs are faster than the ceiling of the collision rate.
         """
         unreachable_times = checks.unreachable_with_drag(gas, times)
         words = _key_words(run)
@@ -145,33 +147,32 @@ class DSMC(AbstractModel):
         units = self._units(gas)
         if any_traced(gas, times, words):
             checks.refuse_files(self, run)
-            options = {"units": units, "save": snapshot.function(run.save)}
+            options = {"units": units, "save": snapshot.save_function(run.save)}
             records = differentiable_run(
                 scene, reduced, words, replicas=self.replicas, scheme=scheme, **options
             )
         elif on := replica_devices(self.replicas):
-            alone = dataclasses.replace(self, replicas=1)
+            single = dataclasses.replace(self, replicas=1)
 
-            def one(k: int, run: Run) -> dict[str, Array]:
-                return alone._driven(scene, reduced, _key_words(run), scheme, units, run)
+            def run_replica(k: int, run: Run) -> dict[str, Array]:
+                return single._run_on_host(scene, reduced, _key_words(run), scheme, units, run)
 
-            runs = run_replicas(one, self.replicas, run, on)
-            records = join_records(runs)
+            records = join_records(run_replicas(run_replica, self.replicas, run, on))
         else:
-            records = self._driven(scene, reduced, words, scheme, units, run)
+            records = self._run_on_host(scene, reduced, words, scheme, units, run)
         curve, failed = _curve(gas, times, records, unreachable_times)
         size = self.replicas, self.num_particles
         rough = gas.surface is not None
-        like = snapshot.shapes(units, size, gas.dimension, times.dtype, rough)
-        return snapshot.with_saved(curve, run.save, records, like, failed)
+        like = snapshot.particle_shapes(units, size, gas.dimension, times.dtype, rough)
+        return snapshot.attach_saved(curve, run.save, records, like, failed)
 
     def _units(self, gas: Gas) -> snapshot.Units:
-        """Of what is seen of the particles, SI."""
+        """Return the SI units of the particles that `save` sees."""
         side = gas.box_side(self.num_particles) if gas.container is None else gas.container.side
         speed = gas.impact_speed
         return snapshot.Units(gas.path_length, speed, 2 * speed / gas.diameter, side, gas.mass)
 
-    def _driven(
+    def _run_on_host(
         self,
         scene: ReducedScene,
         times: Float[Array, "times"],
@@ -180,14 +181,14 @@ class DSMC(AbstractModel):
         units: snapshot.Units,
         run: Run,
     ) -> dict[str, Array]:
-        """The records of a run by the driver on the host, with progress and checkpoints."""
+        """Run on the host, with progress and checkpoints, and return the records."""
         new = needs_compilation((scheme, self.replicas, jax.tree.structure(scene), times.dtype))
         with compiling(run.progress and new):
             start, advance, observe = host_run_parts(
                 scene, words, replicas=self.replicas, scheme=scheme, donate=run.checkpoint is None
             )
-            recorded = partial(observe, units=units, save=snapshot.function(run.save))
-            if new:  # compiled by a call that goes no step; a state that is given away is a copy
+            recorded = partial(observe, units=units, save=snapshot.save_function(run.save))
+            if new:  # compile with a call of zero steps; it may delete its state, so copy that
                 jax.block_until_ready(recorded(advance(jax.tree.map(jnp.copy, start), 0.0)))
         description = {}
         if run.checkpoint is not None:
@@ -203,12 +204,12 @@ class DSMC(AbstractModel):
             progress=run.progress,
             path=run.checkpoint,
         )
-        records["fault"][np.isnan(records["temperature"])] |= fault  # of the driver itself
+        records["fault"][np.isnan(records["temperature"])] |= fault  # a fault of the driver
         return {name: jnp.asarray(value) for name, value in records.items()}
 
 
 def _key_words(run: Run) -> UInt32[Array, "2"]:
-    """Two words of any kind of key, for the kind that is used here."""
+    """Return two random words from a key of any kind."""
     key = jax.random.key(0) if run.key is None else run.key
     return jax.random.bits(key, (2,), jnp.uint32)
 
@@ -219,8 +220,10 @@ def _curve(
     records: dict[str, Array],
     unreachable_times: Bool[Array, "times"],
 ) -> tuple[CoolingCurve, Bool[Array, "replicas times"]]:
-    """The curve in SI units, and where it is nan: a replica is from its first fault on, and all
-    are beyond some time."""
+    """Return the curve in SI units and a mask of its nan values.
+
+    A replica is nan from its first fault on, and all replicas are nan at unreachable times.
+    """
     fault = records["fault"] | status.flag(status.OUT_OF_RANGE, unreachable_times)[:, None]
     failed = jnp.cumsum(fault != status.OK, axis=0) > 0
     units = {
@@ -231,12 +234,12 @@ def _curve(
         "collisions": 1.0,
         "rotational_temperature": gas.temperature,
     }
-    if gas.container is not None:  # spheres do not go far
+    if gas.container is not None:  # walls would limit <dr^2>
         del units["displacement"]
-    each = {
+    values = {
         name: jnp.where(failed, jnp.nan, records[name]).T * unit
         for name, unit in units.items()
         if name in records
     }
     status_of_all = jnp.bitwise_or.reduce(fault, axis=None)
-    return CoolingCurve.of_replicas(times, each, status=status_of_all), failed.T
+    return CoolingCurve.of_replicas(times, values, status=status_of_all), failed.T

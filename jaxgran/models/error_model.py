@@ -1,8 +1,8 @@
-"""Shear modes of a freely cooling gas: the energy of the flow in a box longer than L_c.
+"""Estimates of the errors of the models, with constants measured by experiments.
 
-The bias of projected derivatives in a gas with a flow, estimated from the energy of the flow.
-
-The course of a cooling gas as kinetic theory predicts it, from which models estimate errors.
+`ErrorModel` holds a cooling gas as kinetic theory predicts it, and the errors that follow from it.
+`flow_share` is the energy of the flow that grows in a box longer than L_c, and `slope_bias` the
+bias of projected derivatives by it.
 """
 
 from math import sqrt
@@ -19,81 +19,34 @@ A = TypeVar("A", Array, np.ndarray)
 
 MISSING_HEAT = 1.6
 """Relative error of the cooling rate over the share of energy that is flow instead of heat: the
-rate of viscoelastic spheres goes as T^(8/5)."""
-
-FLOW_OF_SLOPE = 3.0, 0.14
-"""a, b of the relative error of a projected derivative of ln T in A, ``a c (1 + (c/b)^2)``, over
-the relative error c of the clock of a model that takes the flow that a run has for heat.
-
-Measured by differences of runs after 3, 10, 30, 100 collisions: soft spheres, phi = .3,
-beta = .2, N = 1000 (1.4 L_c), 3, 7, 16, 78 +- 1, 1, 1, 3 % too large (this: 3, 6, 19, 80 %); hard
-spheres, phi = .2, beta = .3, N = 500 (1.1 L_c), 7, 17, 18, 21 +- 2, 3, 3, 3 % (3, 9, 28, 21 %);
-hard disks, phi = .25, beta = .3, N = 300 (2 L_c), 9, 21, 77 +- 4, 6, 30 % (4, 16, 670 %), after
-which ln T does not depend on A any more, and the projected derivative says -1.7. Fitted to these
-runs; ``experiments/accuracy/derivatives_in_flows.py`` has measured the last two again since, with
-smaller errors.
-"""
-
-PREDICTED = 0.65
-"""Flow that a run has in its longest waves over that of all modes that theory predicts.
-
-Measured: .4 to .85 in these gases, more the later.
-"""
-
-
-def slope_bias(clock: A) -> A:
-    """Relative error of a projected derivative: see `FLOW_OF_SLOPE`.
-
-    Args:
-        clock: relative error of the clock of a model that takes the flow for heat.
-    """
-    factor, scale = FLOW_OF_SLOPE
-    return factor * clock * (1 + (clock / scale) ** 2)
-
-
-@jax.jit
-def slope_bias_of_run(
-    times: Float[Array, "times"], flow_share: Float[Array, "times"]
-) -> Float[Array, "times"]:
-    """The same from the share of the energy in the flow that a run had at some times.
-
-    ``c = 1.6 int_0^t share dt' / t``, by the trapezoidal rule, from no flow at t = 0. Where times
-    are far apart c is too large, as a flow grows ever faster.
-    """
-    missing = MISSING_HEAT * flow_share
-    before = jnp.concatenate([jnp.zeros(1, missing.dtype), missing[:-1]])
-    steps = jnp.diff(times, prepend=jnp.zeros(1, times.dtype))
-    # t = 0 itself has no clock yet.
-    clock = jnp.cumsum((before + missing) / 2 * steps) / jnp.where(times > 0, times, 1.0)
-    return slope_bias(jnp.where(times > 0, clock, 0.0))
-
+rate of viscoelastic spheres is proportional to T^(8/5)."""
 
 ENSKOG_ERROR = (0.005, 0.1)
 """Relative error of Enskog's cooling rate in a small box, ``a + b phi``.
 
 Measured: the rate of hard spheres, N = 500, 8 replicas, 80 mean free times, beta_T0 = .15, is off
-by 0 +- .6 %, .5 +- .6 %, 1.3 +- .8 % at phi = .02, .05, .1, that of LAMMPS by 1 % at .05; what
-fluctuations leave over at phi = .2, .3, .4 is 1.2, 2.8, 2.4 %.
+by 0 +- .6 %, .5 +- .6 %, 1.3 +- .8 % at phi = .02, .05, .1, that of LAMMPS by 1 % at .05; the
+error that fluctuations do not explain at phi = .2, .3, .4 is 1.2, 2.8, 2.4 %.
 """
 
 CORRELATED_ERROR = {2: (0.003, 0.045), 3: (0.003, 0.02)}
-"""The same of a rate with velocity correlations (`jaxgran.theory.equations`), by dimension.
+"""Relative error ``a + b phi`` of the rate with velocity correlations, by dimension.
 
-As `experiments/accuracy/measure_correlations.py --full` finds: in 3D at most .4 % is left over at
-phi = .05 and .1, .5 % at .2 and .9 % at .3, in 2D .5, .4, .8 and 1.7 %, each at eps = .8, of which
-nothing was fitted.
+Measured by `experiments/accuracy/measure_correlations.py --full`: in 3D the error is at most .4 %
+at phi = .05 and .1, .5 % at .2 and .9 % at .3, in 2D .5, .4, .8 and 1.7 %, each at eps = .8, a
+value to which nothing was fitted. `jaxgran.theory.equations` has the rate.
 """
 
 CONTACT_ERROR = 0.3
-"""Relative error of the cooling rate over the contact fraction t_c/tau_c: three spheres in contact.
+"""Relative error of the cooling rate over the contact fraction t_c/tau_c, by contacts of three.
 
-Measured: soft spheres, N = 400, 8 replicas, 5 to 40 mean free times, net of the flow: .1 to .3
-+- .1 at phi = .05, t_c/tau_c = .1 and .2; at phi = .2 .25 to .45 +- .08 for t_c/tau_c = .17, .27 to
-.38 +- .04 for .4.
+Measured: soft spheres, N = 400, 8 replicas, 5 to 40 mean free times, without the effect of the
+flow: .1 to .3 +- .1 at phi = .05, t_c/tau_c = .1 and .2; at phi = .2 .25 to .45 +- .08 for
+t_c/tau_c = .17, .27 to .38 +- .04 for .4.
 """
 
 CROWDED_ERROR = 0.15
-"""The same of a rate that is corrected for it to first order (`jaxgran.theory.equations.crowding`).
+"""`CONTACT_ERROR` of a rate with the first-order correction (`crowding_coefficient`).
 
 Measured: soft spheres, 40 replicas of 200 or 300, 15 mean free times, beta = .1: the clock is fast
 by 2.0 +- .6 % at phi = .05, t_c/tau_c = .1, slow by .3 +- .5 % at .1, .05, fast by 1.3 +- .7 % at
@@ -107,8 +60,8 @@ Measured: .3 % at c X_T/sigma = .11; 8 to 12 % at .57, falling as the gas cools.
 """
 
 THIRD_SONINE_TRUNCATION = 0.1
-"""Relative error of the cooling rate over a_2^2 of a theory that follows a_3, which errs in a_2 by
-up to 3 % (constant restitution, eps from 0 to 1)."""
+"""Relative error of the cooling rate over a_2^2 of a theory with a_3, whose a_2 has an error of up
+to 3 % (constant restitution, eps from 0 to 1)."""
 
 SONINE_TRUNCATION = 0.3
 """Relative error of the cooling rate over a_2^2, from truncating the Sonine expansion at a_2.
@@ -118,7 +71,7 @@ Measured: kinetic theory against DSMC, 200000 particles, constant restitution: T
 """
 
 WALL_ERROR = 0.04
-"""Relative error of a cooling rate that takes a gas between walls for mixed, but for the layer
+"""Relative error of a cooling rate that assumes a mixed gas between walls, apart from the layer
 before them (`jaxgran.scene.elements`).
 
 Measured: hard spheres in a cube of 25 diameters, eps_w = .8, beta = .15, N = 100, 500, 4000 (mean
@@ -135,20 +88,46 @@ ROUGHNESS_ERROR = 0.01
 correlated. Measured: T within .8 % of DSMC after 60 mean free times, beta_t = -.8 to .5."""
 
 FLOW_NOISE = 0.8
-"""Scatter of ln T over sqrt(min(1, |ln T/T_0|) / N): shot noise of the first collisions.
+"""Standard deviation of ln T over sqrt(min(1, |ln T/T_0|) / N): shot noise of first collisions.
 
 Measured: hard spheres, N = 1000 (48 replicas) and 4000 (16), phi = .1 and .2, beta = .3 to .5, up
 to 5 mean free times: .6 to 1.1, .82 in the mean.
 """
 
+FLOW_OF_SLOPE = 3.0, 0.14
+"""a, b of the relative error of a projected derivative of ln T in A, ``a c (1 + (c/b)^2)``.
+
+c is the relative error of the clock of a model that counts the flow of a run as heat.
+
+Measured by differences of runs after 3, 10, 30, 100 collisions: soft spheres, phi = .3,
+beta = .2, N = 1000 (1.4 L_c), 3, 7, 16, 78 +- 1, 1, 1, 3 % too large (this: 3, 6, 19, 80 %); hard
+spheres, phi = .2, beta = .3, N = 500 (1.1 L_c), 7, 17, 18, 21 +- 2, 3, 3, 3 % (3, 9, 28, 21 %);
+hard disks, phi = .25, beta = .3, N = 300 (2 L_c), 9, 21, 77 +- 4, 6, 30 % (4, 16, 670 %), after
+which ln T no longer depends on A, and the projected derivative is -1.7. a and b are fitted to these
+runs; ``experiments/accuracy/derivatives_in_flows.py`` measures the last two again, with smaller
+errors.
+"""
+
+MEASURED_FLOW = 0.65
+"""Ratio of the flow in the longest waves of a run to the predicted flow in all modes.
+
+Measured: .4 to .85 in the gases of `FLOW_OF_SLOPE`, increasing with time.
+"""
+
+MAX_WAVENUMBER_SQUARED = 4.0
+"""Largest (k/k_c)^2 of the modes in `flow_share`; `ENSKOG_ERROR` contains shorter waves."""
+
+MAX_ENUMERATED_BOX = 6.0
+"""Largest box, in L_c, with enumerated waves; larger boxes are scaled from it."""
+
 
 class ErrorModel(NamedTuple):
-    """The course of a cooling gas from t = 0 on, with the quantities that limit the models.
+    """Error model: a cooling gas from t = 0 on, with the quantities that limit the models.
 
     Attributes:
         gas: the scene.
-        num_particles: N of the gas, or None if it is unknown; then the box is, too.
-        time: t, s, shape (times,), increasing from 0; so are all that follow, at these times.
+        num_particles: N of the gas, or None if it is unknown; then the box is unknown, too.
+        time: t, s, shape (times,), increasing from 0; all following arrays are at these times.
         log_temperature: ln(T/T_0).
         collisions: per particle.
         sonine: a_2.
@@ -156,11 +135,11 @@ class ErrorModel(NamedTuple):
         overlap: mean largest overlap, in diameters.
         softness: c X_T/sigma, by which soft contacts slow the cooling.
         flow_share: mean share of the kinetic energy in the flow, 0 where the box is unknown.
-        flow_scatter: its standard deviation between realisations.
+        flow_scatter: standard deviation of this share between realisations.
 
-    >>> from jaxgran.models.choose import course_of
-    >>> course = course_of(gas, end=3.0)
-    >>> 0.005 < course.error_of_temperature(0.01) < 0.02
+    >>> from jaxgran.models.choose import error_model_of
+    >>> error_model = error_model_of(gas, end=3.0)
+    >>> 0.005 < error_model.error_of_temperature(0.01) < 0.02
     True
     """
 
@@ -177,11 +156,11 @@ class ErrorModel(NamedTuple):
     flow_scatter: Float[np.ndarray, "times"]
 
     def error_of_temperature(self, rate_error: Float[np.ndarray, "times"] | float) -> float:
-        """Relative error of T, at the worst time, of a model whose cooling rate errs.
+        """Relative error of T, at the worst time, by a relative error e(t) of the cooling rate.
 
-        ``|d ln T/dt| int_0^t e dt'`` for a cooling rate wrong by the share e(t): the model's clock
-        is off by the integral. Of a driven gas y = |d ln T| obeys
-        ``dy/dt = e zeta - (zeta/2 + xi_0^2/T) y`` with the cooling rate zeta by all losses.
+        It is ``|d ln T/dt| int_0^t e dt'``, since the clock of the model is wrong by the integral.
+        In a driven gas y = |d ln T| obeys ``dy/dt = e zeta - (zeta/2 + xi_0^2/T) y`` with the
+        cooling rate zeta by all losses.
         """
         t = self.time
         if t[-1] == 0:
@@ -205,44 +184,46 @@ class ErrorModel(NamedTuple):
     def clock_error(
         self, rate_error: Float[np.ndarray, "times"] | float
     ) -> Float[np.ndarray, "times"]:
-        """Relative error of the clock, ``int_0^t e dt' / t``, of a cooling rate wrong by e(t)."""
+        """Relative error of the clock, ``int_0^t e dt' / t``, by an error e(t) of the rate."""
         e = np.broadcast_to(rate_error, self.time.shape)
         return np.where(self.time > 0, self._integral(e) / np.where(self.time > 0, self.time, 1), e)
 
     def chance_of_clock(self, num_particles: int) -> Float[np.ndarray, "times"]:
-        """Variance of the clock, s^2, by the chance of single collisions of N particles.
+        """Variance of the clock, s^2, by the randomness of single collisions of N particles.
 
-        Collisions are a Poisson process of rate N nu/2. The energy lost in each goes as the square
-        of the normal speed, which is distributed exponentially: its mean square is twice the square
-        of its mean. Time, told by the loss, is then uncertain by ``int 4 dt / (N nu)``. (It is 4.4
-        where ``1 - eps^2`` grows as v^(1/5).)
+        Collisions are a Poisson process of rate N nu/2. The energy lost in each is proportional to
+        the square of the normal speed, which is distributed exponentially: its mean square is twice
+        the square of its mean. A clock that reads the loss then has the variance
+        ``int 4 dt / (N nu)`` (4.4 instead of 4 if ``1 - eps^2`` grows as v^(1/5)).
         """
         frequency = float(self.gas.collision_frequency) * np.exp(self.log_temperature / 2)
         return self._integral(4 / (num_particles * frequency))
 
     def slope_error(self) -> Float[np.ndarray, "times"]:
-        """Relative error of projected derivatives through particles in a box that has a flow: the
-        memory of T alone loses how the flow depends on the material. 0 in boxes below L_c.
+        """Relative error of projected derivatives of a particle run by a flow in its box.
+
+        The projection remembers T alone, and not how the flow depends on the material. The error
+        is 0 in boxes below L_c.
         """
         if self.num_particles is None:
             return np.zeros(self.time.shape)
         if float(self.gas.box_side(self.num_particles)) <= float(self.gas.critical_box):
             return np.zeros(self.time.shape)
-        return slope_bias(self.clock_error(PREDICTED * MISSING_HEAT * self.flow_share))
+        return slope_bias(self.clock_error(MEASURED_FLOW * MISSING_HEAT * self.flow_share))
 
     def noise_of_differences(self, step: float, noise: float) -> Float[np.ndarray, "times"]:
-        """Relative standard error of a derivative of ln T by differences of runs.
+        """Relative standard error of a derivative of ln T by differences of runs, at most 1.
 
-        ``s / (sqrt(2) h |d ln T/d ln A|)`` for a step h and a standard error s of ln T, with the
-        derivative of a gas that depends on the product of A and t, ``d ln T/d ln t``.
+        It is ``s / (sqrt(2) h |d ln T/d ln A|)`` for a step h and a standard error s of ln T, with
+        the derivative ``d ln T/d ln t`` of a gas that depends on the product of A and t.
         """
         slope = np.abs(self.time * np.gradient(self.log_temperature, self.time))
         error = noise / (np.sqrt(2) * step)
-        return error / np.maximum(slope, error)  # nothing is known where it exceeds the slope
+        return error / np.maximum(slope, error)  # 1 if the error exceeds the slope
 
     @property
     def mixing(self) -> float:
-        """Error of the cooling rate of models in which the gas between walls is mixed."""
+        """Error of the cooling rate of models that assume a mixed gas between walls."""
         return 0.0 if self.gas.container is None else WALL_ERROR
 
     def _integral(self, values: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
@@ -251,17 +232,17 @@ class ErrorModel(NamedTuple):
 
     @property
     def homogeneous(self) -> Float[np.ndarray, "times"]:
-        """Error of Enskog's cooling rate where the gas has a flow (an energy that is no heat)."""
-        return self._of_density(ENSKOG_ERROR)
+        """Error of Enskog's cooling rate by density, and by a flow (energy that is not heat)."""
+        return self._density_and_flow(ENSKOG_ERROR)
 
     @property
     def correlated(self) -> Float[np.ndarray, "times"]:
-        """The same of a rate with velocity correlations."""
-        return self._of_density(CORRELATED_ERROR[self.gas.dimension])
+        """Error of the cooling rate with velocity correlations, by density and by a flow."""
+        return self._density_and_flow(CORRELATED_ERROR[self.gas.dimension])
 
-    def _of_density(self, error: tuple[float, float]) -> Float[np.ndarray, "times"]:
-        own = error[0] + error[1] * float(self.gas.packing_fraction)
-        return own + MISSING_HEAT * self.flow_share
+    def _density_and_flow(self, error: tuple[float, float]) -> Float[np.ndarray, "times"]:
+        by_density = error[0] + error[1] * float(self.gas.packing_fraction)
+        return by_density + MISSING_HEAT * self.flow_share
 
     @property
     def lasting_contacts(self) -> Float[np.ndarray, "times"]:
@@ -270,12 +251,12 @@ class ErrorModel(NamedTuple):
 
     @property
     def crowded_contacts(self) -> Float[np.ndarray, "times"]:
-        """The same of a model that corrects for them to first order."""
+        """Error of the cooling rate with the first-order correction for contacts that last."""
         return CROWDED_ERROR * self.contact_fraction
 
     @property
     def second_order_softness(self) -> Float[np.ndarray, "times"]:
-        """Error of the cooling rate left by the first-order softness correction."""
+        """Error of the cooling rate with the first-order softness correction."""
         return SOFTNESS_SQUARED * self.softness**2
 
     def truncation(self, order: int) -> Float[np.ndarray, "times"]:
@@ -283,21 +264,40 @@ class ErrorModel(NamedTuple):
         return {2: SONINE_TRUNCATION, 3: THIRD_SONINE_TRUNCATION}[order] * self.sonine**2
 
     def shot_noise(self, num_particles: int) -> float:
-        """Standard error of ln T of so many particles in a homogeneous gas."""
+        """Standard error of ln T by shot noise of N particles in a homogeneous gas."""
         cooled = min(1.0, max(0.0, -self.log_temperature.min()))
         return FLOW_NOISE * sqrt(cooled / num_particles)
 
     def flow_noise(self, replicas: int) -> float:
-        """Standard error of ln T by the few waves of a flow that grows, over so many replicas."""
+        """Standard error of ln T over some replicas, by the few random waves of a growing flow."""
         return self.error_of_temperature(MISSING_HEAT * self.flow_scatter) / sqrt(replicas)
 
 
-MAX_WAVENUMBER_SQUARED = 4.0
-"""Largest (k/k_c)^2 of the modes that are counted; shorter waves belong to the error of Enskog's
-theory."""
+def slope_bias(clock: A) -> A:
+    """Return the relative error of a projected derivative: see `FLOW_OF_SLOPE`.
 
-MAX_ENUMERATED_BOX = 6.0
-"""Largest box, in L_c, whose waves are enumerated; larger boxes are scaled from it."""
+    Args:
+        clock: relative error of the clock of a model that counts the flow as heat.
+    """
+    factor, scale = FLOW_OF_SLOPE
+    return factor * clock * (1 + (clock / scale) ** 2)
+
+
+@jax.jit
+def slope_bias_of_run(
+    times: Float[Array, "times"], flow_share: Float[Array, "times"]
+) -> Float[Array, "times"]:
+    """Return `slope_bias` from the share of the energy in the flow of a run at some times.
+
+    ``c = 1.6 int_0^t share dt' / t``, by the trapezoidal rule, from no flow at t = 0. If times are
+    far apart c is too large, because the growth of a flow accelerates.
+    """
+    missing = MISSING_HEAT * flow_share
+    before = jnp.concatenate([jnp.zeros(1, missing.dtype), missing[:-1]])
+    steps = jnp.diff(times, prepend=jnp.zeros(1, times.dtype))
+    # The clock error is not defined at t = 0.
+    clock = jnp.cumsum((before + missing) / 2 * steps) / jnp.where(times > 0, times, 1.0)
+    return slope_bias(jnp.where(times > 0, clock, 0.0))
 
 
 def flow_share(
@@ -306,7 +306,7 @@ def flow_share(
     critical_box: Float[np.ndarray, "times"],
     num_particles: int,
 ) -> tuple[Float[np.ndarray, "times"], Float[np.ndarray, "times"]]:
-    """Fraction of the kinetic energy in shear modes above equipartition, and its scatter.
+    """Return the fraction of kinetic energy in shear modes above equipartition, and its scatter.
 
     A shear mode of wavenumber k loses energy by viscosity only, while T falls by collisions. Its
     energy in units of T, e = 1 in equilibrium, obeys ``de/ds = (1 - q) e + q`` with
@@ -329,9 +329,9 @@ def flow_share(
     q_of_longest = (critical_box / float(gas.box_side(num_particles))) ** 2
     longest = sqrt(1 / q_of_longest.min())
     if longest * sqrt(MAX_WAVENUMBER_SQUARED) < 1:
-        none = np.zeros_like(q_of_longest)
-        return none, none
-    # A larger box has more waves, but as many for each particle: they are counted in a smaller box.
+        zero = np.zeros_like(q_of_longest)
+        return zero, zero
+    # Waves per particle do not depend on the box, so a smaller box stands for a large one.
     scale = max(1.0, longest / MAX_ENUMERATED_BOX)
     d = gas.dimension
     count = _count_waves(int(sqrt(MAX_WAVENUMBER_SQUARED) * longest / scale), d)
@@ -339,7 +339,7 @@ def flow_share(
     q = np.arange(1, count.size + 1) * scale**2 * q_of_longest[:, None]
     counted = q[0] < MAX_WAVENUMBER_SQUARED
     s = -log_temperature
-    # Energy of one mode in units of T, above its value of 1 in equilibrium.
+    # Energy of one mode in units of T, minus its value of 1 in equilibrium.
     energy, flow, variance = np.zeros(count.size), [0.0], [0.0]
     for ds, q_now in zip(np.diff(s), (q[1:] + q[:-1]) / 2, strict=True):
         growth = 1 - q_now
@@ -351,11 +351,11 @@ def flow_share(
     return np.minimum(np.array(flow) / degrees, 1.0), np.minimum(np.sqrt(variance) / degrees, 1.0)
 
 
-def _count_waves(most: int, dimension: int) -> Int[np.ndarray, "squares"]:
-    """Number of wave vectors n, in units of 2 pi / box, with n^2 = 1, 2, ...
+def _count_waves(largest: int, dimension: int) -> Int[np.ndarray, "squares"]:
+    """Return the numbers of wave vectors n, in units of 2 pi / box, with n^2 = 1, 2, ...
 
-    The components of n go from -most to most.
+    The components of n go from -largest to largest.
     """
-    axes = np.meshgrid(*[np.arange(-most, most + 1)] * dimension)
+    axes = np.meshgrid(*[np.arange(-largest, largest + 1)] * dimension)
     squares = np.sum([n**2 for n in axes], axis=0)
     return np.bincount(squares.ravel())[1:]

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import any_traced
-from jaxgran._utils.validation import Domain, UserCount, UserFloat, plain_number, python_number
+from jaxgran._utils.validation import Domain, UserFloat, UserInt, checked_float, python_int
 from jaxgran.data.curve import UserParticles
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
@@ -20,7 +20,7 @@ from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Neighbourhood, capacities
 from jaxgran.particles.hard.dynamics import MIN_IMPACTS, SPEED_MARGIN, HardDynamics
 from jaxgran.particles.hard.impacts import HardScene
-from jaxgran.particles.hard.prediction import MARGIN, HardWalls
+from jaxgran.particles.hard.prediction import BOX_MARGIN, HardWalls
 from jaxgran.particles.setup import check_inside, min_distance, overlap_by_rounding
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
@@ -32,12 +32,12 @@ WINDOW_SHARE = 0.05
 """Impacts per particle in a window."""
 
 SKIN_GROWTH = 1.5
-"""How much longer windows of `LEAST_IMPACTS` grow than they should: (8/2)^0.3 after one of two."""
+"""Factor by which windows of `MIN_IMPACTS` grow too long: (8/2)^0.3 after a window of two."""
 
 CONTACT_TIMES = Domain(0.0, 0.1, low_allowed=True, high_allowed=True)
 
 ALLOWED_OVERLAP = 1e-9
-"""Overlap in diameters up to which a given start is one of hard spheres."""
+"""Overlap in diameters that is allowed in a given start."""
 
 
 class HardPace(NamedTuple):
@@ -52,7 +52,7 @@ class HardSpheres(AbstractSpheres):
     Between impacts spheres fly freely; an impact changes their velocities by
     ``+- (1 + eps(g)) g n / 2`` with the unit vector n between the centres and the normal speed g of
     approach. The impacts are those of a serial event-driven code, but many are resolved at once:
-    all that no other impact can come before.
+    all impacts that no other impact can precede.
 
     Inelastic collapse, infinitely many impacts in a finite time, is prevented by making an impact
     of a sphere elastic within ``contact_time`` of its last one (Luding & McNamara, Granular Matter
@@ -60,53 +60,53 @@ class HardSpheres(AbstractSpheres):
     ``2 contact_time``.
 
     The gas starts from random positions and Maxwellian velocities of exactly T_0 and no momentum,
-    after an elastic melt of 10 mean free times.
+    after an elastic equilibration of 10 mean free times.
 
-    Takes all elements of a scene but friction: rough spheres; containers, cubes or boxes of given
-    sides, whose walls are met exactly, in place of the periodic box; drag, exactly, as impacts in
-    transformed time (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32); a drive, whose
-    kicks come at both ends of each window of some .05 mean free times; and a driven start, which is
-    driven for 10 mean free times with what its impacts take.
+    Supports all elements of a scene but friction: rough spheres; containers, cubes or boxes of
+    given sides, with exact impacts on their walls, in place of the periodic box; drag, exactly, by
+    impacts in transformed time (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32); a
+    drive, with kicks at both ends of each window of some .05 mean free times; and a driven start,
+    for which a drive returns the energy that impacts take during 10 mean free times.
 
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer. It lives on
             one device: the guide says how large it may be.
-        replicas: independent boxes; two or more give error bars. See `key` of `jaxgran.cool` for
-            what they share.
+        replicas: number of independent boxes; two or more give error bars. `key` of `jaxgran.cool`
+            describes what replicas share.
         contact_time: in mean free times of the homogeneous gas at the current temperature, in
             [0, 0.1]; 0 is the pure hard sphere, which may collapse.
-        start: positions and velocities to begin with instead of random ones; their box must be
-            that of the gas, and no spheres may overlap. In a container positions are coordinates
-            from a corner, and centres a radius or more from each wall.
-        neighbours: who finds the pairs: "sweep" (compiled with the rest), "scipy" (on the host),
+        start: initial positions and velocities instead of random ones; their box must be that of
+            the gas, and no spheres may overlap. In a container positions are coordinates from a
+            corner, and centres must be at least a radius from each wall.
+        neighbours: the search for pairs: "sweep" (compiled with the rest), "scipy" (on the host),
             "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses: two more
-            runs for each number of the law, noise, and no bias in a gas that clusters. None for
-            projected derivatives.
+            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses. They need two
+            more runs for each number of the law and have noise, but no bias in a gas that
+            clusters. None for projected derivatives.
         plan: static sizes of arrays, see `sized_for`.
 
-    Derivatives of T, collisions, <dr^2> and the dissipated energy are taken in every float of the
-    gas and in the times, forward and reverse alike, whatever the law. They are thermally projected
-    at every impact (see `jaxgran.gradients.tangents`): the gas is taken to remember its temperature
-    only, and to continue to cool at the rate of its last 5 mean free times. Against finite
+    Derivatives of T, collisions, <dr^2> and the dissipated energy are known in every float of the
+    gas and in the times, forward and reverse, for any law. They are thermally projected at every
+    impact (see `jaxgran.gradients.tangents`): the gas is assumed to remember its temperature only,
+    and to continue to cool at the rate of its last 5 mean free times. Compared with finite
     differences d ln T/d ln A is right within 5 % in boxes shorter than L_c, but 14 % too large
-    after 10 mean free times where flows have begun to hold energy (phi = .2, beta = .3, 1.1 L_c):
-    the curve's ``derivative_bias`` estimates by how much, and `differences` avoids it.
-    The paths are followed by the first Sonine order of diffusion (see `jaxgran.gradients.tangents`),
-    the velocity correlation in time as decaying at 2/d of the collision rate. The density acts
-    through Enskog's collision frequency; that the box changes with it at fixed N, and with the box
-    the growth of flows, is left out. The derivatives of a_2 and of the final particles are not
-    known, and are nan. Second derivatives are refused. A run is followed in the frame in which each
-    replica is at rest, unless there are walls or drag. With a given start T_0 is a unit only, and
-    its derivative 0; the start takes part in a change of the diameter.
+    after 10 mean free times where flows have begun to hold energy (phi = .2, beta = .3, 1.1 L_c).
+    The curve's ``derivative_bias`` estimates this bias, and `differences` avoids it.
+    Derivatives of <dr^2> use the first Sonine order of diffusion (see
+    `jaxgran.gradients.tangents`), those of the velocity correlation in time a decay at 2/d of the
+    collision rate. The density acts through Enskog's collision frequency only: at fixed N it also
+    changes the box, and with it the growth of flows, which is left out. The derivatives of a_2 and
+    of the final particles are not known, and are nan. Second derivatives are refused. Each replica
+    is simulated in the frame in which it is at rest, unless there are walls or drag. With a given
+    start T_0 is a unit only, and its derivative is 0; the start scales with the diameter.
 
-    With elements derivatives of T, T_rot and collisions are known, in every float of the gas, and
-    those of all else are nan. The gas is then taken to remember its two energies
-    (`jaxgran.gradients.tangents`), and not where its spheres are, but that it is the denser before
-    walls the more they take (`jaxgran.scene.elements`). Beside differences (N = 500, eps_w = .8)
-    a derivative in eps_w is right within 2 %; that of T_rot in beta_t of rough walls, before which
-    spins differ from those in the middle, is up to 20 % too small.
+    With elements the derivatives of T, T_rot and collisions are known in every float of the gas,
+    and all others are nan. The gas is then assumed to remember its two energies
+    (`jaxgran.gradients.tangents`), but not the positions of its spheres, except that it is denser
+    before walls the more energy they take (`jaxgran.scene.elements`). Compared with differences
+    (N = 500, eps_w = .8) a derivative in eps_w is right within 2 %; that of T_rot in beta_t of
+    rough walls, before which spins differ from those in the middle, is up to 20 % too small.
 
     Raises:
         ValueError: for numbers out of range.
@@ -116,8 +116,8 @@ class HardSpheres(AbstractSpheres):
     (50, True)
     """
 
-    num_particles: UserCount = eqx.field(static=True, converter=python_number)
-    replicas: UserCount = eqx.field(static=True, converter=python_number, default=1)
+    num_particles: UserInt = eqx.field(static=True, converter=python_int)
+    replicas: UserInt = eqx.field(static=True, converter=python_int, default=1)
     contact_time: UserFloat = eqx.field(static=True, default=1e-5)
     start: UserParticles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
@@ -130,16 +130,20 @@ class HardSpheres(AbstractSpheres):
     def __check_init__(self):
         self.check_counts()
         advice = "In mean free times; it only keeps clusters from collapsing, so leave it small."
-        plain_number("contact_time", self.contact_time, CONTACT_TIMES, advice)
+        checked_float("contact_time", self.contact_time, CONTACT_TIMES, advice)
 
     @property
     def projected(self) -> bool:
-        """Always: impacts have no plain derivatives."""
+        """True: impacts have no plain derivatives."""
         return True
 
     def check(self, gas: Gas) -> None:
-        """Raise ValueError for a law that heats the gas, a gas too dense, a box too small or a
-        start whose spheres overlap."""
+        """Check that the model supports this law and scene.
+
+        Raises:
+            ValueError: for a law that heats the gas, a gas too dense, a box too small, or a start
+                with spheres that overlap.
+        """
         checks.check_cools(checks.first_cooling_rate(gas))
         with jax.ensure_compile_time_eval():
             self.check_box(gas)
@@ -150,61 +154,61 @@ class HardSpheres(AbstractSpheres):
                 check_inside(self.start, gas.container, radius, gas.dimension)
         if self.start is not None and self.start.angular_velocity is not None:
             raise ValueError(
-                "HardSpheres draws the angular velocities of a start: give it without them, as "
-                "start._replace(angular_velocity=None), and their rotational_temperature"
+                "HardSpheres draws the angular velocities of a start. Give the start without them, "
+                "start._replace(angular_velocity=None), and rotational_temperature of the surface."
             )
 
     def _check_overlap(self, gas: Gas) -> None:
         if self.start is None or any_traced(gas, self.start):
-            return  # looked at when it runs
+            return  # the run checks traced values
         start, side = self.start, reduced_hard_scene(gas, self.num_particles).side
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
         closest = float(min_distance(position, side, self.replicas, (8 * len(position), 0)))
         if closest < 1 - overlap_by_rounding(position, side, ALLOWED_OVERLAP):
             raise ValueError(
                 f"two spheres of the start are {closest:.9g} diameters apart, hard spheres must "
-                "not overlap; move them apart, or leave start out for a random one"
+                "not overlap. Move them apart, or leave start out for a random one."
             )
 
     def estimated_error(self, error_model: ErrorModel) -> float:
-        """Contacts that last and overlap, and noise."""
+        """Estimated relative error of T by contacts that last and overlap, and by noise."""
         contacts = error_model.error_of_temperature(self.rate_error(error_model))
         return math.hypot(contacts, *self.noise(error_model))
 
     def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
-        """Error of contacts that last and overlap."""
+        """Relative error of the cooling rate by contacts that last and overlap."""
         return error_model.lasting_contacts + error_model.softness
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
-        """Contacts that last."""
+        """Return limitations by contacts that last and overlap."""
         return checks.limitations_of_instant_impacts(gas)
 
     def scene(self, gas: Gas) -> HardScene:
-        """The gas in units of its diameter, mass and first temperature."""
+        """Return the gas in units of its diameter, mass and initial temperature."""
         return reduced_hard_scene(gas, self.num_particles, self.contact_time)
 
     def dynamics(self, scene: HardScene, plan: Plan) -> HardDynamics:
-        """How the spheres move."""
+        """Return the equations of motion of the spheres."""
         return HardDynamics(scene, plan.replicas, plan.capacity, plan.pace.share, ALLOWED_OVERLAP)
 
     def pace_fixed(self) -> dict[str, Any]:
-        """Settings that a plan repeats."""
+        """Return no settings: a plan repeats none of this model."""
         return {}
 
     def clock(self, scene: HardScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
-        """The transformed times of drag."""
+        """Return the transformed times of a gas with drag, otherwise the times."""
         return times if scene.drag is None else transformed_times(scene.decay_rates, times)
 
     def filled_side(self, scene: HardScene) -> Array:
-        """Of the container, where there is one."""
+        """Return the side of the box, or of a cube of the container's volume."""
         if scene.walls is None:
             return scene.side
         sides = scene.walls.sides
         return jnp.prod(sides) ** (1 / len(sides))
 
     def planned(self, scene: HardScene, dimension: int, spare: float | None = None) -> Plan:
-        """Static sizes: capacities as measured for phi = .001 to .4 (disks: .6), N = 125 to
-        50 000."""
+        """Return static sizes; capacities were measured for phi = .001 to .4 (disks: .6) and
+        N = 125 to 50 000."""
         d, n = dimension, self.replicas * self.num_particles
         filled = float(self.filled_side(scene))
         around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
@@ -217,16 +221,16 @@ class HardSpheres(AbstractSpheres):
         near = min(near, around.listed)
         chosen = min((0.65 + 0.35 * near) * longest, around.listed)
         expected = around.listed, near, chosen, 1.25 * longest
-        extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # in random places more are near
+        extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # random positions have more near pairs
         ahead = around.lookahead
-        if scene.walls is not None:  # a sweep goes along the first axis
+        if scene.walls is not None:  # the sweep runs along the first axis
             ahead = min(ahead * max(1.0, filled / float(scene.walls.sides[0])), self.num_particles)
         sizes = capacities(expected, ahead, spare or 1.15, extra, n)
         return Plan(self.replicas, HardPace(share), *sizes)
 
 
 def reduced_hard_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:
-    """A gas of hard spheres in units of its diameter, mass and first temperature."""
+    """Return a gas of hard spheres in units of its diameter, mass and initial temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
     side, scene = gas.box_side(num_particles) / gas.diameter, scene_at_start(gas)
     nu = gas.collision_frequency
@@ -235,7 +239,7 @@ def reduced_hard_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) 
         sides = jnp.broadcast_to(gas.container.side / gas.diameter, (gas.dimension,))
         often = scene.walls.frequency / collision_rate(0.0, gas.dimension)
         walls = HardWalls(sides, scene.walls.law, scene.walls.beta, often)
-        side = jnp.max(sides) + MARGIN
+        side = jnp.max(sides) + BOX_MARGIN
     if gas.drag is not None:
         drag = ReducedDrag(gas.drag.rate / nu, gas.drag.rotational_rate / nu)
     if gas.drive is not None:

@@ -1,4 +1,4 @@
-"""Kinetic theory: the homogeneous gas as seven ordinary differential equations."""
+"""Kinetic theory of a homogeneous gas: seven ordinary differential equations."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -26,57 +26,63 @@ TOLERANCES = validation.Domain(0.0, 0.1)
 
 
 class KineticTheory(AbstractModel):
-    """The homogeneous cooling gas, by Maxwell-Sonine kinetic theory; integrated with diffrax.
+    """Homogeneous cooling gas by Maxwell-Sonine kinetic theory, integrated with diffrax.
 
     ``dT/dt = -(2/d) mu_2 T (1 - c X_T/sigma)/(1 + k X_T/sigma) (1 - h)``,
     ``da_2/dt = (4/d) mu_2 (1 + a_2) - 4 mu_4/(d(d+2))``, ``da_3/dt = 3 da_2/dt - (6/d) mu_2 (1 +
     3 a_2 - a_3) + 8 mu_6/(d(d+2)(d+4))``, ``d<dr^2>/dt = 2 d D``, ``dN/dt = nu``, and two moments
-    of labelled velocities for D, the first ``dD/dt = T - nu_v D``; all but T from 0, with averages
-    exact in eps(v) (`jaxgran.theory.averages.averages`). c and k are those of contacts that last
-    (`jaxgran.theory.equations`), h that of correlated velocities (`jaxgran.theory.equations`).
-    Leaves out clustering: right in boxes below L_c whose contacts are short. The averages assume
-    that eps(v) is smooth: for a law with a kink, such as an eps capped at 1, use `jaxgran.DSMC`; T
-    of ice, which becomes elastic at low speed, is 3 % off after some 1e5 mean free times.
+    of labelled velocities for D, the first ``dD/dt = T - nu_v D``. All but T start from 0, and the
+    averages over impacts are exact in eps(v) (`jaxgran.theory.averages.impact_moments`). c and k
+    correct for contacts that last, h for correlated velocities (`jaxgran.theory.equations`).
+    The theory leaves out clustering: it holds in boxes below L_c with short contacts. The averages
+    assume that eps(v) is smooth: for a law with a kink, such as an eps capped at 1, use
+    `jaxgran.DSMC`; T of ice, which becomes elastic at low speed, is 3 % off after some 1e5 mean
+    free times.
 
-    Takes all elements of a scene but friction, of a gas that is everywhere alike: rough spheres,
-    with T_rot, whose spins and velocities are taken for independent; walls, with the denser layer
-    before them (`jaxgran.scene.elements`); drag; a drive by white noise; and a driven start. Of
-    a gas between walls D and <dr^2> are left out.
+    Supports all elements of a scene but friction, in a homogeneous gas: rough spheres, with T_rot,
+    where spins and velocities are assumed to be independent; walls, with the denser layer before
+    them (`jaxgran.scene.elements`); drag; a drive by white noise; and a driven start. Between walls
+    the curve has no D and <dr^2>.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
-    Second derivatives are forward over forward or over reverse, as `jax.hessian`, not
-    ``jax.jacrev(jax.jacrev(...))``.
+    Second derivatives must be forward over forward or forward over reverse, as in `jax.hessian`,
+    not ``jax.jacrev(jax.jacrev(...))``.
 
     Args:
-        sonine: follow the Sonine coefficients; otherwise the gas stays Maxwellian.
-        order: 3 follows a_2 and a_3, with D in the second Sonine order; 2 a_2, with the first.
-        softness: the first corrections for contacts of finite duration (viscoelastic spheres).
-        correlations: of velocities, at finite density; without them this is Enskog's theory.
+        sonine: solve for the Sonine coefficients; with False the gas stays Maxwellian.
+        order: 3 solves for a_2 and a_3, with D in the second Sonine order; 2 for a_2, with D in the
+            first.
+        softness: apply the first-order corrections for contacts of finite duration (viscoelastic
+            spheres).
+        correlations: correct for velocity correlations at finite density; with False this is
+            Enskog's theory.
         averages: "exact", or "paper" for its truncated b_1, b_2, tau_v (delta < 0.43; Maxwellian).
         rtol: relative tolerance of the adaptive solver; by default 1e-8 in float64, 1e-5 in
-            float32. T is wrong by about as much, <dr^2> by it in mean free paths squared.
+            float32. The relative error of T is about rtol, the error of <dr^2> about rtol in mean
+            free paths squared.
         solver: a diffrax solver. The default suits up to some 1e6 collisions per particle; for
             more (A near 0 over many decades of time) use ``diffrax.Kvaerno5()``.
-        max_steps: the most steps of one curve.
+        max_steps: the maximum number of steps of one curve.
 
     Raises:
         ValueError: for values out of range.
 
     Reference: van Noije & Ernst 1998, Brilliantov & Poeschel 2006. D of a dilute gas is within
-    .6 % of direct simulation for eps from .05 to 1; at packing fraction phi it is 0.85 phi greater.
+    .6 % of direct simulation for eps from .05 to 1; at packing fraction phi the true D is greater
+    by the share 0.85 phi.
 
     >>> jaxgran.cool(gas, times, model=jaxgran.KineticTheory()).sonine.shape
     (4,)
     """
 
-    sonine: validation.UserTruth = eqx.field(static=True, default=True)
-    order: validation.UserCount = eqx.field(static=True, default=3)
-    softness: validation.UserTruth = eqx.field(static=True, default=True)
-    correlations: validation.UserTruth = eqx.field(static=True, default=True)
+    sonine: validation.UserBool = eqx.field(static=True, default=True)
+    order: validation.UserInt = eqx.field(static=True, default=3)
+    softness: validation.UserBool = eqx.field(static=True, default=True)
+    correlations: validation.UserBool = eqx.field(static=True, default=True)
     averages: str = eqx.field(static=True, default="exact")
     rtol: validation.UserFloat | None = eqx.field(static=True, default=None)
     solver: Any = eqx.field(static=True, default=diffrax.Tsit5(scan_kind="lax"))
-    max_steps: validation.UserCount = eqx.field(static=True, default=200_000)
+    max_steps: validation.UserInt = eqx.field(static=True, default=200_000)
 
     def __check_init__(self):
         validation.check_bool("sonine", self.sonine)
@@ -84,29 +90,29 @@ class KineticTheory(AbstractModel):
         validation.check_bool("correlations", self.correlations)
         if self.order not in (2, 3) or isinstance(self.order, bool | float):
             raise ValueError(
-                f"order must be 2 or 3, got {self.order!r}; sonine=False keeps a gas Maxwellian"
+                f"order must be 2 or 3, got {self.order!r}. Use sonine=False for a Maxwellian gas."
             )
         if self.averages not in ("exact", "paper"):
             raise ValueError(f'averages must be "exact" or "paper", got {self.averages!r}')
         if self.rtol is not None:
-            validation.plain_number(
+            validation.checked_float(
                 "rtol", self.rtol, TOLERANCES, "Leave it out for 1e-8 (float32: 1e-5)."
             )
         if not isinstance(self.solver, diffrax.AbstractSolver):
             raise ValueError(
                 f"solver must be a diffrax solver such as diffrax.Kvaerno5(), got {self.solver!r}"
             )
-        validation.whole_number("max_steps", self.max_steps, 1, "Leave it out for 200000.")
+        validation.checked_int("max_steps", self.max_steps, 1, "Leave it out for 200000.")
 
     stochastic: ClassVar[bool] = False
     elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive", "preparation")
     derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs
 
     def displacement_accuracy(self, gas: Gas) -> Float[Array, ""]:
-        """Relative error of <dr^2>: Sonine order of D, and correlated collisions.
+        """Relative error of <dr^2> by the Sonine order of D and by correlated collisions.
 
-        Hard spheres diffuse faster than Enskog's theory says, by the share 0.85 phi up to phi = .2
-        (Speedy, Mol. Phys. 62 (1987) 509); the same is assumed for disks.
+        Hard spheres diffuse faster than in Enskog's theory by the share 0.85 phi up to phi = .2
+        (Speedy, Mol. Phys. 62 (1987) 509); this is assumed for disks, too.
         """
         correlation = 0.85 * jnp.minimum(gas.packing_fraction, 0.2)
         sonine = 0.005 if self.order > 2 and self.sonine else {2: 0.024, 3: 0.017}[gas.dimension]
@@ -115,11 +121,11 @@ class KineticTheory(AbstractModel):
         return jnp.hypot(sonine, correlation)
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
-        """``-d ln T/dt`` at t = 0, 1/s, of the Maxwellian gas; negative if the law heats it."""
+        """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; < 0 if the law heats it."""
         return checks.first_cooling_rate(gas, self._averages)
 
     def check(self, gas: Gas) -> None:
-        """Raise ValueError for a law that heats the gas or contacts too soft for the theory."""
+        """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""
         if any_traced(gas):
             return
         rate, factor, hottest = checks.initial_cooling(gas, self._averages)
@@ -128,11 +134,15 @@ class KineticTheory(AbstractModel):
         checks.check_cools(rate)
 
     def estimated_error(self, error_model: ErrorModel) -> float:
-        """Of its cooling rate: see `rate_error`."""
+        """Estimated relative error of T, which follows from `rate_error`."""
         return error_model.error_of_temperature(self.rate_error(error_model))
 
     def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
-        """What correlations, lasting contacts and the Sonine terms beyond a_3 leave over."""
+        """Relative error of the cooling rate.
+
+        Contributions are correlations, contacts that last, walls, roughness, and Sonine terms
+        beyond a_3.
+        """
         rate = error_model.correlated if self.correlations else error_model.homogeneous
         if self.softness:
             rate = rate + error_model.crowded_contacts + error_model.second_order_softness
@@ -144,14 +154,13 @@ class KineticTheory(AbstractModel):
         return rate + error_model.truncation(self.order) + elements
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
-        """Contacts that last, correlated collisions and boxes in which a flow grows."""
-        beyond = "beyond the first-order softness correction"
-        return checks.limitations_of_instant_impacts(
-            gas, beyond
-        ) + checks.limitations_of_homogeneity(gas, num_particles)
+        """Return limitations by contacts that last, correlated collisions, and a growing flow."""
+        consequence = "beyond the first-order softness correction"
+        contacts = checks.limitations_of_instant_impacts(gas, consequence)
+        return contacts + checks.limitations_of_homogeneity(gas, num_particles)
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
-        """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
         size = times.size
         padded = pad_to(times, padded_length(size))
         curve = self._simulate(gas, padded)
@@ -160,7 +169,7 @@ class KineticTheory(AbstractModel):
     @eqx.filter_jit
     def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
         unit_time = gas.path_length / gas.impact_speed
-        scene = scene_at_start(gas), Density.of(gas, self.softness, self.correlations)
+        scene = scene_at_start(gas), Density.from_gas(gas, self.softness, self.correlations)
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
         integrator = Integrator(self.solver, rtol, self.max_steps)
         equations = self._equations(gas.dimension)
@@ -168,28 +177,28 @@ class KineticTheory(AbstractModel):
         theta = jnp.exp(state.log_temperature)
         length = gas.path_length
         # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
-        spoilt = jnp.where(fault == status.OK, 0.0, jnp.nan).astype(theta.dtype)
-        temperature, further = gas.temperature * theta + spoilt, {}
+        nan_if_failed = jnp.where(fault == status.OK, 0.0, jnp.nan).astype(theta.dtype)
+        temperature, optional = gas.temperature * theta + nan_if_failed, {}
         if state.third_sonine is not None:
-            further["third_sonine"] = state.third_sonine + spoilt
+            optional["third_sonine"] = state.third_sonine + nan_if_failed
         if state.rotation is not None:
-            further["rotational_temperature"] = temperature * state.rotation
-        if gas.container is None:  # else spheres do not go far
+            optional["rotational_temperature"] = temperature * state.rotation
+        if gas.container is None:  # walls would limit <dr^2>
             diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
-            further["diffusion"] = diffusion + spoilt
-            further["displacement"] = state.displacement * length**2 + spoilt
+            optional["diffusion"] = diffusion + nan_if_failed
+            optional["displacement"] = state.displacement * length**2 + nan_if_failed
         return CoolingCurve(
             times=times,
             temperature=temperature,
-            sonine=state.sonine + spoilt,
-            collisions=state.collisions + spoilt,
+            sonine=state.sonine + nan_if_failed,
+            collisions=state.collisions + nan_if_failed,
             status=fault,
-            **further,
+            **optional,
         )
 
     @property
     def _averages(self) -> Callable[..., Array]:
-        """The averages over impacts, a function of law, speed and dimension."""
+        """Averages over impacts, a function of law, speed and dimension."""
         return averages.impact_moments if self.averages == "exact" else paper_averages
 
     def _equations(self, dimension: int) -> Equations:

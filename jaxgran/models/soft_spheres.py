@@ -1,7 +1,4 @@
-"""Soft spheres: every contact resolved in time, in a periodic box.
-
-A gas of soft spheres in units of its diameter, mass and first temperature.
-"""
+"""Soft spheres: every contact resolved in time, in a periodic box."""
 
 import math
 from typing import Any, ClassVar, NamedTuple
@@ -12,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxgran._utils.tracing import concrete
-from jaxgran._utils.validation import POSITIVE, UserCount, UserFloat, plain_number, python_number
+from jaxgran._utils.tracing import concrete_array
+from jaxgran._utils.validation import POSITIVE, UserFloat, UserInt, checked_float, python_int
 from jaxgran.data.curve import UserParticles
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
@@ -22,70 +19,10 @@ from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
 from jaxgran.particles.setup import check_inside
 from jaxgran.particles.soft.dynamics import SoftDynamics
-from jaxgran.particles.soft.forces import MARGIN, SoftDrag, SoftScene, SoftSurface, SoftWalls
+from jaxgran.particles.soft.forces import BOX_MARGIN, SoftDrag, SoftScene, SoftSurface, SoftWalls
 from jaxgran.scene.elements import Frictional, StokesDrag, Walls
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import Viscoelastic
-
-
-def reduced_soft_scene(gas: Gas, num_particles: int) -> SoftScene:
-    """A gas of viscoelastic spheres in units of its diameter, mass and first temperature."""
-    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    law: Any = gas.law  # `SoftSpheres.check` refuses others
-    side, walls = gas.box_side(num_particles) / gas.diameter, None
-    if gas.container is not None:
-        walls = reduced_walls(gas, gas.container)
-        side = jnp.max(walls.sides) + MARGIN
-    return SoftScene(
-        side=side,
-        alpha=gas.alpha * gas.diameter**0.5 * unit_time**2,
-        dissipative_constant=law.dissipative_constant / unit_time,
-        contact_duration=gas.contact_duration / unit_time,
-        collision_frequency=reduced_frequency(gas, unit_time),
-        clipped=law.clipped,
-        walls=walls,
-        drag=None if gas.drag is None else reduced_drag(gas, gas.drag),
-        surface=reduced_surface(gas),
-    )
-
-
-def reduced_walls(gas: Gas, container: Walls) -> SoftWalls:
-    """The walls of a gas in these units."""
-    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    law: Any = container.restitution  # `check_container` refuses others than Viscoelastic
-    alpha = law.of_wall().alpha(diameter=gas.diameter, mass=gas.mass)
-    return SoftWalls(
-        sides=jnp.broadcast_to(container.side, (gas.dimension,)) / gas.diameter,
-        alpha=alpha * gas.diameter**0.5 * unit_time**2,
-        dissipative_constant=law.dissipative_constant / unit_time,
-        clipped=law.clipped,
-        damping=container.tangential_damping,
-        friction=container.friction,
-    )
-
-
-def reduced_frequency(gas: Gas, unit_time: Float[Array, ""]) -> Float[Array, ""]:
-    """Collisions per particle and unit of time at T = 1; of no T_0 where `non_differentiable` refuses others."""
-    if gas.container is None:
-        return gas.collision_frequency * unit_time
-    still = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
-    return still.collision_frequency * gas.diameter / jnp.sqrt(still.temperature)
-
-
-def reduced_drag(gas: Gas, drag: StokesDrag) -> SoftDrag:
-    """The drag of a gas in these units."""
-    time = gas.diameter / jnp.sqrt(gas.temperature)
-    per_collision = time / reduced_frequency(gas, time)
-    return SoftDrag(drag.rate * per_collision, drag.rotational_rate * per_collision)
-
-
-def reduced_surface(gas: Gas) -> SoftSurface | None:
-    """The surface of the spheres of a gas in these units; None where they are smooth."""
-    s, T = gas.surface, gas.temperature
-    if not isinstance(s, Frictional):
-        return None
-    return SoftSurface(s.tangential_damping, s.friction, s.inertia, s.rotational_temperature / T)
-
 
 PROJECTION = 0.1
 """Mean free times between thermal projections of a derivative."""
@@ -94,17 +31,17 @@ MAX_SPEED = 4.8
 """Speed of the fastest of some thousand spheres, in sqrt(T)."""
 
 BLOCK_FLIGHT = 0.08
-"""Diameters that the fastest sphere may fly in a block."""
+"""Distance in diameters that the fastest sphere may fly in a block of steps."""
 
 BLOCK_LENGTHS = Grid(ratio=1.2, spare=1.0)
-"""Grid of the lengths of blocks, in mean contact durations: each length is compiled anew."""
+"""Grid of the lengths of blocks, in mean contact durations: each length needs a compilation."""
 
 INTEGRATION_ERROR = 0.001
-"""Relative error of T by the time steps: eps is right to 1e-4."""
+"""Relative error of T by the time steps, with which eps is right to 1e-4."""
 
 
 class SoftPace(NamedTuple):
-    """Settings of the time steps: see `SoftDynamics`."""
+    """Static settings of the time steps: see `SoftDynamics`."""
 
     steps_per_contact: int
     steps_per_block: int
@@ -119,47 +56,46 @@ class SoftSpheres(AbstractSpheres):
     of 2e-4 that comes from the square root at first contact and falls as dt^(3/2).
 
     The gas starts from random positions and Maxwellian velocities of exactly T_0 and no momentum,
-    after an elastic melt of 10 mean free times. Steps lengthen as it cools.
+    after an elastic equilibration of 10 mean free times. Steps lengthen as it cools.
 
     A gas may have walls (of a `jaxgran.Viscoelastic` law: the same force, with the mass and radius
     of one sphere), where momentum is not conserved; drag, exact in the drift; and friction, also of
-    walls (`jaxgran.Frictional`). What they take counts as dissipated. In a step the kicks of walls,
-    then of tangential forces, follow the normal ones of pairs.
+    walls (`jaxgran.Frictional`). The energy that they take counts as dissipated. In a step the
+    normal kicks of pairs come first, then those of walls, then those of tangential forces.
 
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer. It lives on
             one device: the guide says how large it may be.
         steps_per_contact: steps in the mean contact duration at the current temperature, >= 10.
-        replicas: independent boxes; two or more give error bars. See `key` of `jaxgran.cool` for
-            what they share.
-        start: positions and velocities to begin with instead of random ones; their box must be
-            that of the gas.
-        neighbours: who finds the pairs: "sweep" (compiled with the rest), "scipy" (on the host),
+        replicas: number of independent boxes; two or more give error bars. `key` of `jaxgran.cool`
+            describes what replicas share.
+        start: initial positions and velocities instead of random ones; their box must be that of
+            the gas.
+        neighbours: the search for pairs: "sweep" (compiled with the rest), "scipy" (on the host),
             "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
-        projection: mean free times between thermal projections of a derivative, > 0; from 0.02 to
-            0.5 they agree (see `jaxgran.gradients.tangents`). None for the plain derivative, which is
-            exact, and useless after 3 to 5 collisions per particle.
+        projection: mean free times between thermal projections of a derivative, > 0; derivatives
+            agree for 0.02 to 0.5 (see `jaxgran.gradients.tangents`). None for the plain
+            derivative, which is exact, and useless after 3 to 5 collisions per particle.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses: two more
-            runs for each of A and alpha, noise, and no bias in a gas that clusters. None for
-            projected derivatives.
+            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses. They need two
+            more runs for each of A and alpha and have noise, but no bias in a gas that clusters.
+            None for projected derivatives.
         plan: static sizes of arrays, see `sized_for`.
 
-    Derivatives of T, collisions, <dr^2> and the energies are taken in every float of the gas,
-    forward and reverse alike: a gas depends on (alpha, A), its collision frequency and the times
-    only. The first two are followed by tangents; the density acts through Enskog's collision
-    frequency; that the box changes with it at fixed N, and with it the growth of flows, is left
-    out. T is followed exactly but for the projection, the rest is estimated from it: the paths by
-    the first Sonine order of diffusion (see `jaxgran.gradients.tangents`), the velocity correlation in
-    time as decaying at 2/d of the collision rate. Walls, drag and friction are followed like
-    (alpha, A), and T_rot beside T (`jaxgran.gradients.tangents`); between walls the derivatives in
-    lengths and the density are refused. Not known, and nan, are the derivatives of a_2 and of the
-    final particles, with friction those of <dr^2> and the velocity correlation, and the one in a
-    rotational_temperature of 0. Second derivatives are
-    refused. In boxes above L_c derivatives are too large by some share, which the curve estimates
-    (``derivative_bias``); `differences` avoids that. A run is followed in the frame in which each
-    replica is at rest. With a given start T_0
-    is a unit only, and its derivative 0.
+    Derivatives of T, collisions, <dr^2> and the energies are known in every float of the gas,
+    forward and reverse: a gas depends on (alpha, A), its collision frequency and the times only.
+    The run computes tangents in alpha and A. The density acts through Enskog's collision frequency
+    only: at fixed N it also changes the box, and with it the growth of flows, which is left out.
+    The tangent of T is exact but for the projection, and the others are estimated from it: those of
+    <dr^2> by the first Sonine order of diffusion (see `jaxgran.gradients.tangents`), that of the
+    velocity correlation in time by a decay at 2/d of the collision rate. The run also computes
+    tangents in walls, drag and friction, and of T_rot (`jaxgran.gradients.tangents`); between walls
+    derivatives in lengths and the density are refused. Derivatives that are not known are nan:
+    those of a_2 and of the final particles, with friction those of <dr^2> and the velocity
+    correlation, and those in a rotational_temperature of 0. Second derivatives are refused. In
+    boxes above L_c derivatives are too large; the curve estimates this bias (``derivative_bias``),
+    and `differences` avoids it. Each replica is simulated in the frame in which it is at rest. With
+    a given start T_0 is a unit only, and its derivative is 0.
 
     Raises:
         ValueError: for numbers out of range.
@@ -169,9 +105,9 @@ class SoftSpheres(AbstractSpheres):
     ('soft spheres', 20)
     """
 
-    num_particles: UserCount = eqx.field(static=True, converter=python_number)
-    steps_per_contact: UserCount = eqx.field(static=True, converter=python_number, default=40)
-    replicas: UserCount = eqx.field(static=True, converter=python_number, default=1)
+    num_particles: UserInt = eqx.field(static=True, converter=python_int)
+    steps_per_contact: UserInt = eqx.field(static=True, converter=python_int, default=40)
+    replicas: UserInt = eqx.field(static=True, converter=python_int, default=1)
     start: UserParticles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
     projection: UserFloat | None = eqx.field(static=True, default=PROJECTION)
@@ -185,11 +121,11 @@ class SoftSpheres(AbstractSpheres):
         self.check_counts(steps_per_contact=10)
         if self.projection is not None:
             advice = f"It is in mean free times: {PROJECTION}, or None for the plain derivative."
-            plain_number("projection", self.projection, POSITIVE, advice)
+            checked_float("projection", self.projection, POSITIVE, advice)
 
     @property
     def projected(self) -> bool:
-        """Whether derivatives are not the plain ones."""
+        """True if derivatives are projected or by differences, False if they are plain."""
         return self.projection is not None
 
     def check(self, gas: Gas) -> None:
@@ -197,102 +133,162 @@ class SoftSpheres(AbstractSpheres):
         if not isinstance(gas.law, Viscoelastic):
             raise ValueError(
                 "SoftSpheres needs the Viscoelastic law, which has a force; this gas has "
-                f"{type(gas.law).__name__}: use a model of instantaneous impacts"
+                f"{type(gas.law).__name__}. Use KineticTheory, DSMC or HardSpheres."
             )
         with jax.ensure_compile_time_eval():
             self.check_box(gas)
             checks.check_volume(gas, self.num_particles)
             if gas.container is not None:
-                check_walls(gas.container)
+                _check_walls(gas.container)
                 check_inside(self.start, gas.container, 0.0, gas.dimension)
         if gas.surface and self.start is not None and self.start.angular_velocity is not None:
             raise ValueError(
-                "SoftSpheres draws the angular velocities of a start: give it without them, as "
-                "start._replace(angular_velocity=None), and their rotational_temperature"
+                "SoftSpheres draws the angular velocities of a start. Give the start without them, "
+                "start._replace(angular_velocity=None), and rotational_temperature of the surface."
             )
 
     def estimated_error(self, error_model: ErrorModel) -> float:
-        """Time steps and noise: every contact is resolved."""
+        """Estimated relative error of T by time steps and noise."""
         return math.hypot(INTEGRATION_ERROR, *self.noise(error_model))
 
     def rate_error(self, error_model: ErrorModel) -> float:
-        """Error of time steps."""
+        """Relative error of the cooling rate by time steps."""
         return INTEGRATION_ERROR
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
-        """Nothing that a scene contains."""
+        """Return no limitations: soft spheres resolve every contact."""
         return ()
 
     def scene(self, gas: Gas) -> SoftScene:
-        """The gas in units of its diameter, mass and first temperature."""
+        """Return the gas in units of its diameter, mass and initial temperature."""
         return reduced_soft_scene(gas, self.num_particles)
 
     def unreachable_times(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
-        """None: time is not transformed."""
+        """Return a mask without times: soft spheres do not transform time, and reach all."""
         return jnp.zeros(times.shape, bool)
 
     def filled_side(self, scene: SoftScene) -> Array:
-        """Of the container, where there is one."""
+        """Return the side of the box, or of a cube of the container's volume."""
         return scene.filled_side
 
     def non_differentiable(self, scene: SoftScene) -> Any:
-        """The room between walls, and how often spheres meet there."""
+        """Return the lengths and the collision frequency between walls, otherwise nothing."""
         walls = scene.walls
         return () if walls is None else (scene.side, walls.sides, scene.collision_frequency)
 
     def dynamics(self, scene: SoftScene, plan: Plan) -> SoftDynamics:
-        """How the spheres move."""
-        projection = concrete(self.projection or np.inf, scene.side.dtype)
+        """Return the equations of motion of the spheres."""
+        projection = concrete_array(self.projection or np.inf, scene.side.dtype)
         pace: SoftPace = plan.pace
         steps = pace.steps_per_contact, pace.steps_per_block
         return SoftDynamics(scene, plan.replicas, plan.capacity, *steps, projection)
 
     def pace_fixed(self) -> dict[str, Any]:
-        """Settings that a plan repeats."""
+        """Return the setting that a plan repeats."""
         return {"steps_per_contact": self.steps_per_contact}
 
     def planned(self, scene: SoftScene, dimension: int, spare: float | None = None) -> Plan:
-        """Static sizes: capacities as measured for phi = .01 to .4 (disks: .5), t_c/tau_c = .003
-        to .3."""
+        """Return static sizes; capacities were measured for phi = .01 to .4 (disks: .5) and
+        t_c/tau_c = .003 to .3."""
         d, n = dimension, self.replicas * self.num_particles
         filled, ahead = float(scene.filled_side), 1.0
         around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
-        if scene.walls is not None:  # a sweep goes along the first axis
+        if scene.walls is not None:  # the sweep runs along the first axis
             ahead = max(1.0, filled / float(scene.walls.sides[0]))
-        duration = Grid.of(n).up(float(scene.contact_duration))
+        duration = Grid.of(n).round_up(float(scene.contact_duration))
         steps = self._steps_per_block(float(scene.contact_duration))
         block = steps / self.steps_per_contact
         flight = MAX_SPEED * duration * block
         near = 0.75 * around.in_contact * around.contact_value * ((1 + 5 * flight) ** d - 1)
         near = near * around.listed / (near + around.listed)
-        # Contacts that exist and that begin in a block, and the pairs near them.
+        # Contacts that exist or begin in a block, and the near pairs.
         contact_fraction = duration * around.collision_frequency
         contact_fraction *= (1 + block) / 2
         touching = min(contact_fraction * (2.2 + 3 * near**2), near)
         expected = around.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
-        # In random places about as many pairs touch besides as would without correlation.
+        # At random positions the additional touching pairs are about those without correlation.
         extra = 1.3 * around.in_contact
         lookahead = min(ahead * around.lookahead, self.num_particles)
         sizes = capacities(expected, lookahead, spare or 1.2, extra, n)
         return Plan(self.replicas, SoftPace(self.steps_per_contact, steps), *sizes)
 
     def _steps_per_block(self, contact_duration: float) -> int:
-        """A block is at most a contact long, and shorter where spheres fly far in that time."""
-        shorter = BLOCK_LENGTHS.up(max(1.0, MAX_SPEED * contact_duration / BLOCK_FLIGHT))
+        """Return the steps of a block: at most a contact, fewer if spheres fly far in that time."""
+        shorter = BLOCK_LENGTHS.round_up(max(1.0, MAX_SPEED * contact_duration / BLOCK_FLIGHT))
         return max(round(self.steps_per_contact / shorter), 8)
 
 
-def check_walls(walls: Walls) -> None:
-    """Raise ValueError for walls that have no force."""
+def _check_walls(walls: Walls) -> None:
+    """Raise ValueError for walls without a force."""
     if not isinstance(walls.restitution, Viscoelastic):
         raise ValueError(
-            "SoftSpheres needs walls of the Viscoelastic law, which has a force (with A = 0 they "
-            f"are elastic); these have {type(walls.restitution).__name__}: use HardSpheres(N), "
-            "DSMC(N) or KineticTheory(), or Walls(side, restitution=jaxgran.Viscoelastic(...))"
+            "SoftSpheres needs walls of the Viscoelastic law, which has a force (elastic for "
+            f"A = 0); these have {type(walls.restitution).__name__}. Use HardSpheres, DSMC or "
+            "KineticTheory, or Walls(side, restitution=jaxgran.Viscoelastic(...))."
         )
     if walls.tangential_restitution is not None:
         raise ValueError(
-            "tangential_restitution of the walls belongs to impacts without duration: give "
-            "SoftSpheres tangential_damping and friction of the walls in its place, or use "
-            "HardSpheres(N)"
+            "tangential_restitution of the walls belongs to instantaneous impacts. Give the walls "
+            "tangential_damping and friction instead, or use HardSpheres."
         )
+
+
+def reduced_soft_scene(gas: Gas, num_particles: int) -> SoftScene:
+    """Return a gas of viscoelastic spheres in units of its diameter, mass and initial T."""
+    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
+    law: Any = gas.law  # `SoftSpheres.check` refuses others
+    side, walls = gas.box_side(num_particles) / gas.diameter, None
+    if gas.container is not None:
+        walls = _reduced_walls(gas, gas.container)
+        side = jnp.max(walls.sides) + BOX_MARGIN
+    return SoftScene(
+        side=side,
+        alpha=gas.alpha * gas.diameter**0.5 * unit_time**2,
+        dissipative_constant=law.dissipative_constant / unit_time,
+        contact_duration=gas.contact_duration / unit_time,
+        collision_frequency=_reduced_frequency(gas, unit_time),
+        clipped=law.clipped,
+        walls=walls,
+        drag=None if gas.drag is None else _reduced_drag(gas, gas.drag),
+        surface=_reduced_surface(gas),
+    )
+
+
+def _reduced_walls(gas: Gas, container: Walls) -> SoftWalls:
+    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
+    law: Any = container.restitution  # `_check_walls` refuses others than Viscoelastic
+    alpha = law.of_wall().alpha(diameter=gas.diameter, mass=gas.mass)
+    return SoftWalls(
+        sides=jnp.broadcast_to(container.side, (gas.dimension,)) / gas.diameter,
+        alpha=alpha * gas.diameter**0.5 * unit_time**2,
+        dissipative_constant=law.dissipative_constant / unit_time,
+        clipped=law.clipped,
+        damping=container.tangential_damping,
+        friction=container.friction,
+    )
+
+
+def _reduced_frequency(gas: Gas, unit_time: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the collisions per particle and unit of time at T = 1.
+
+    Between walls it has no derivative in T_0, since `SoftSpheres.non_differentiable` refuses
+    derivatives in the collision frequency.
+    """
+    if gas.container is None:
+        return gas.collision_frequency * unit_time
+    constant = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
+    return constant.collision_frequency * gas.diameter / jnp.sqrt(constant.temperature)
+
+
+def _reduced_drag(gas: Gas, drag: StokesDrag) -> SoftDrag:
+    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
+    per_collision = unit_time / _reduced_frequency(gas, unit_time)
+    return SoftDrag(drag.rate * per_collision, drag.rotational_rate * per_collision)
+
+
+def _reduced_surface(gas: Gas) -> SoftSurface | None:
+    """Return the surface of the spheres in reduced units, or None if they are smooth."""
+    s, T = gas.surface, gas.temperature
+    if not isinstance(s, Frictional):
+        return None
+    return SoftSurface(s.tangential_damping, s.friction, s.inertia, s.rotational_temperature / T)

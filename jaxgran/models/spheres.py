@@ -1,7 +1,4 @@
-"""What models of spheres in periodic boxes share: checks, array sizes, runs and curves.
-
-How the derivatives of models of spheres are taken: projected, by differences, or plainly.
-"""
+"""Base of the models of spheres in periodic boxes: checks, array sizes, derivatives and runs."""
 
 import dataclasses
 import math
@@ -18,15 +15,15 @@ from jaxtyping import Array, Bool, Float
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
-from jaxgran._utils.validation import POSITIVE, Domain, no_type_check, plain_number, whole_number
+from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int, no_type_check
 from jaxgran.data.curve import DEFAULTS, CoolingCurve, Particles, Run
 from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.error_model import ErrorModel, slope_bias_of_run
 from jaxgran.particles import neighbours, snapshot
-from jaxgran.particles import run as beside
-from jaxgran.particles.capacity import Capacity, skin_adding
+from jaxgran.particles import run as particle_run
+from jaxgran.particles.capacity import Capacity, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.run import Simulation, simulate_on_host, simulate_traced
 from jaxgran.particles.setup import (
@@ -38,29 +35,29 @@ from jaxgran.particles.setup import (
 from jaxgran.scene.gas import Gas
 
 DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
-"""Steps of differences: the lower one of alpha must leave it positive."""
+"""Allowed steps of differences: the lower value of alpha must stay positive."""
 
 
 def check_difference_step(differences: Any, projected: bool) -> None:
-    """Raise ValueError for a step of differences out of range, or beside plain derivatives."""
+    """Raise ValueError for a step of differences out of range, or with plain derivatives."""
     if differences is None:
         return
     advice = "In the logarithm of an impact's loss: 0.3, or None for projected derivatives."
-    plain_number("differences", differences, DIFFERENCE_STEPS, advice)
+    checked_float("differences", differences, DIFFERENCE_STEPS, advice)
     if not projected:
         raise ValueError(
-            f"differences = {differences} and projection = None ask for two kinds of derivative: "
-            "leave one of them out"
+            f"differences = {differences} and projection = None ask for two kinds of derivative. "
+            "Leave one of them out."
         )
 
 
 def check_gas_for_differences(differences: float | None, gas: Gas) -> None:
-    """Raise ValueError for a gas whose derivatives are not known by differences."""
+    """Raise ValueError for derivatives by differences of a gas with elements."""
     if differences is not None and gas.elements:
         raise ValueError(
-            "derivatives by differences are known for smooth spheres in free flight, and this gas "
-            f"has {', '.join(gas.elements)}: leave differences out of the model, or take "
-            "differences of runs yourself"
+            "derivatives by differences need smooth spheres in free flight, and this gas has "
+            f"{', '.join(gas.elements)}. Leave differences out of the model, or take differences "
+            "of runs yourself."
         )
 
 
@@ -71,21 +68,21 @@ def with_derivative_rule(
     projected: bool,
     non_differentiable: Callable[[Any], Any],
 ) -> Callable[[Inputs], Outputs]:
-    """A run with its rule of differentiation.
+    """Return a run as a function of its inputs, with its rule of differentiation.
 
     Args:
-        outputs: the run, of inputs, directions, and options.
+        outputs: the run, a function of inputs, directions, and options.
         run: the options.
-        differences: step of differences of whole runs; None for none.
-        projected: whether derivatives are projected; if not they are plain.
-        held: see `jaxgran.gradients.rule.differentiable`.
+        differences: step of derivatives by differences of whole runs, or None.
+        projected: True for projected derivatives or differences, False for plain derivatives.
+        non_differentiable: see `jaxgran.gradients.rule.differentiable`.
     """
     outputs = partial(outputs, run=run)
     if not projected:
         return outputs
     if differences is not None:
-        further = partial(outputs, run=Run(run.key, run.progress))  # which write no files
-        outputs = by_differences(outputs, further, differences)
+        shifted = partial(outputs, run=Run(run.key, run.progress))  # these runs write no files
+        outputs = by_differences(outputs, shifted, differences)
     return differentiable(outputs, lambda scene: scene.material, non_differentiable)
 
 
@@ -93,13 +90,13 @@ S = TypeVar("S", bound="AbstractSpheres")
 
 
 class Plan(NamedTuple):
-    """The static sizes of a compiled run.
+    """Static sizes of a compiled run.
 
     Attributes:
         replicas: number of boxes.
         pace: static settings of the steps, which differ between kinds of spheres.
-        capacity: of the run.
-        melt_capacity: of the first mean free times of its melt.
+        capacity: sizes of the arrays of the run.
+        equilibration_capacity: sizes of the arrays in the first mean free times of equilibration.
     """
 
     replicas: int
@@ -113,11 +110,11 @@ class AbstractSpheres(AbstractModel):
 
     Attributes:
         num_particles: N in each box.
-        replicas: independent boxes.
+        replicas: number of independent boxes.
         start: positions and velocities given by a user; None for random ones.
-        neighbours: who finds the pairs.
+        neighbours: the search for pairs.
         differences: step of derivatives by differences; None for projected ones.
-        plan: static sizes, where `sized_for` has settled them.
+        plan: static sizes from `sized_for`; None if they follow from the gas.
         listed_by_skin: pairs per particle that the skin adds to a neighbour list.
     """
 
@@ -137,10 +134,10 @@ class AbstractSpheres(AbstractModel):
     @property
     @abstractmethod
     def projected(self) -> bool:
-        """Whether derivatives are projected, or by differences, and not plain."""
+        """True if derivatives are projected or by differences, False if they are plain."""
 
     def derivative_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
-        """Of projected derivatives, where the gas has a flow; of differences their noise."""
+        """Relative error of projected derivatives by a flow, or of differences by their noise."""
         if self.differences is None:
             return error_model.slope_error()
         return error_model.noise_of_differences(
@@ -149,69 +146,70 @@ class AbstractSpheres(AbstractModel):
 
     @abstractmethod
     def scene(self, gas: Gas) -> Any:
-        """The gas in units of its diameter, mass and first temperature."""
+        """Return the gas in units of its diameter, mass and initial temperature."""
 
     @abstractmethod
     def planned(self, scene: Any, dimension: int, spare: float | None = None) -> Plan:
-        """Static sizes for a scene of known numbers, with a spare factor on the capacities."""
+        """Return static sizes for a scene of known numbers, with a spare factor on capacities."""
 
     @abstractmethod
     def dynamics(self, scene: Any, plan: Plan) -> AbstractDynamics:
-        """How the spheres move."""
+        """Return the equations of motion of the spheres."""
 
     @abstractmethod
     def pace_fixed(self) -> dict[str, Any]:
-        """Settings of this model that `Plan.pace` repeats, by name."""
+        """Return the settings of this model that `Plan.pace` repeats, by name."""
 
     def clock(self, scene: Any, times: Float[Array, "times"]) -> Float[Array, "times"]:
-        """The time of the run at reduced times."""
+        """Return the times of the run at reduced times."""
         return times
 
     def unreachable_times(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
-        """Which times are too late for the clock."""
+        """Return a mask of the times that the run cannot reach."""
         return checks.unreachable_with_drag(gas, times)
 
     def filled_side(self, scene: Any) -> Array:
-        """Side in diameters of a cube of the volume in which the spheres are."""
+        """Return the side, in diameters, of a cube of the volume that the spheres can fill."""
         return scene.side
 
     def non_differentiable(self, scene: Any) -> Any:
-        """Numbers of a scene in which the derivative of a run is not known."""
+        """Return the numbers of a scene in which the derivative of a run is not known."""
         return ()
 
     def check_fit(self, names: tuple[str, ...]) -> None:
-        """A given start has its own temperature and lengths, which then cannot be fitted."""
+        """Refuse plain derivatives, and the temperature and lengths of a given start."""
         if not self.projected:
             raise ValueError(
-                f"a fit needs projected derivatives: give {type(self).__name__} a projection"
+                f"a fit needs projected derivatives. Give {type(self).__name__} a projection."
             )
         fixed = [n for n in ("temperature", "diameter", "packing_fraction") if n in names]
         if self.start is not None and fixed:
             raise ValueError(
-                f"{' and '.join(fixed)} cannot be fitted from a given start, which has its own: "
-                f"leave start out of {type(self).__name__}, or free other parameters"
+                f"{' and '.join(fixed)} cannot be fitted from a given start, which fixes them. "
+                f"Leave start out of {type(self).__name__}, or free other parameters."
             )
 
     @no_type_check
     def sized_for(self: S, gas: Gas, spare: float = 2.0) -> S:
-        """This model with the sizes of its arrays settled, which `jax.jit` needs beforehand.
+        """Return this model with fixed sizes of its arrays, for `jax.jit`.
 
-        Outside of jit sizes follow from the gas, and arrays grow where they must. Inside they are
+        Outside of jit sizes follow from the gas, and arrays grow if they must. Inside they are
         fixed; a run that exceeds them ends in nan and a status.
 
         Args:
-            gas: with known numbers, like the gases to come: the densest, hottest and softest.
+            gas: a gas of known numbers that represents the later ones: the densest, hottest and
+                softest of them.
             spare: capacity over the expected need.
         """
         if not isinstance(gas, Gas):
             raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
-        plain_number("spare", spare, POSITIVE, "2 is twice the expected need.")
+        checked_float("spare", spare, POSITIVE, "2 is twice the expected need.")
         self.check_scene(gas)
         plan = self.planned(self.scene(gas), gas.dimension, spare)
         return dataclasses.replace(self, plan=plan)
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
-        """The cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
         unreachable_times = self.unreachable_times(gas, times)
         gas = with_constant_temperature(self.start, gas)
         scene = self.scene(gas)
@@ -226,31 +224,34 @@ class AbstractSpheres(AbstractModel):
         def outputs(inputs: Inputs, directions: Any = None, run: Run = run) -> Outputs:
             return self._outputs(inputs, directions, gas.dimension, run)
 
-        how = self.differences, self.projected, self.non_differentiable
-        found = with_derivative_rule(outputs, run, *how)(inputs)
-        return self._curve(gas, times, inputs.units, found, unreachable_times, run.save)
+        differentiable_outputs = with_derivative_rule(
+            outputs, run, self.differences, self.projected, self.non_differentiable
+        )
+        out = differentiable_outputs(inputs)
+        return self._curve(gas, times, inputs.units, out, unreachable_times, run.save)
 
     def _units(self, gas: Gas, side: Array) -> snapshot.Units:
-        """Of what is seen of the particles, SI."""
+        """Return the SI units of the particles that `save` sees."""
         length, velocity = gas.diameter, jnp.sqrt(gas.temperature)
         box_side = side * length if gas.container is None else gas.container.side
         return snapshot.Units(length, velocity, 2 * velocity / length, box_side, gas.mass)
 
     def _outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
-        """The run in reduced units: driven from the host if all numbers are known, else pure."""
+        """Run in reduced units: from the host if all numbers are known, otherwise compiled."""
         if not any_traced(inputs) and (
-            on := beside.replica_devices(self.replicas, self.num_particles)
+            on := particle_run.replica_devices(self.replicas, self.num_particles)
         ):
-            alone = dataclasses.replace(self, replicas=1, start=None, plan=None)
+            single = dataclasses.replace(self, replicas=1, start=None, plan=None)
 
-            def one(k: int, run: Run) -> Outputs:
-                own = beside.replica_inputs(inputs, k, self.num_particles, run)
-                return alone._outputs(own, directions, dimension, run)
+            def run_replica(k: int, run: Run) -> Outputs:
+                part = particle_run.replica_inputs(inputs, k, self.num_particles, run)
+                return single._outputs(part, directions, dimension, run)
 
-            return beside.join_outputs(beside.run_replicas(one, self.replicas, run, on))
-        plan = self._settled_plan(inputs.scene, dimension)
+            runs = particle_run.run_replicas(run_replica, self.replicas, run, on)
+            return particle_run.join_outputs(runs)
+        plan = self._known_plan(inputs.scene, dimension)
         side = self.filled_side(inputs.scene)
-        skin = skin_adding(self.listed_by_skin, self.num_particles, side, dimension)
+        skin = skin_for_pairs(self.listed_by_skin, self.num_particles, side, dimension)
         sim = Simulation(
             dynamics=self.dynamics(inputs.scene, plan),
             equilibration_capacity=plan.equilibration_capacity,
@@ -260,7 +261,7 @@ class AbstractSpheres(AbstractModel):
             dimension=dimension,
             skin=skin,
             engine=self.neighbours,
-            save=snapshot.function(run.save),
+            save=snapshot.save_function(run.save),
         )
         if not any_traced(inputs):
             model = dataclasses.replace(self, start=None, plan=None)
@@ -268,13 +269,13 @@ class AbstractSpheres(AbstractModel):
         checks.refuse_files(self, run)
         if self.neighbours == "jax-md":
             raise ValueError(
-                'inside jax.jit or jax.vmap neighbours="jax-md" cannot find the pairs, as it sizes '
+                'inside jax.jit or jax.vmap neighbours="jax-md" is not supported, since it sizes '
                 "its cells from known numbers: leave neighbours out"
             )
         return simulate_traced(sim)
 
-    def _settled_plan(self, scene: Any, dimension: int) -> Plan:
-        """The model's plan, or one made now, if all numbers that it depends on are known."""
+    def _known_plan(self, scene: Any, dimension: int) -> Plan:
+        """Return the plan of the model, or a new one if all numbers that it needs are known."""
         name = type(self).__name__
         if self.plan is not None:
             planned = {"replicas": self.plan.replicas} | self.plan.pace._asdict()
@@ -282,7 +283,7 @@ class AbstractSpheres(AbstractModel):
                 if planned[setting] != value:
                     raise ValueError(
                         f"this {name} was sized for {setting} = {planned[setting]!r}, and now has "
-                        f"{value!r}: call sized_for(gas) again"
+                        f"{value!r}. Call sized_for(gas) again."
                     )
             return self.plan
         try:
@@ -290,8 +291,8 @@ class AbstractSpheres(AbstractModel):
                 return self.planned(scene, dimension)
         except jax.errors.ConcretizationTypeError:
             raise ValueError(
-                f"inside jax.jit the sizes of arrays must be known: give {name}(...)"
-                ".sized_for(gas), made outside with a gas of known numbers"
+                "inside jax.jit the sizes of arrays must be known. Use "
+                f"{name}(...).sized_for(gas), with a gas of known numbers and outside of jax.jit."
             ) from None
 
     def _curve(
@@ -303,9 +304,9 @@ class AbstractSpheres(AbstractModel):
         unreachable_times: Bool[Array, "times"],
         save: Any,
     ) -> CoolingCurve:
-        """The curve in SI units, of records in units of diameter, mass and first temperature."""
+        """Return the curve in SI units from records in reduced units."""
         energy = gas.mass * gas.temperature
-        of_records = {
+        units_of_records = {
             "temperature": gas.temperature,
             "sonine": 1.0,
             "displacement": gas.diameter**2,
@@ -317,44 +318,47 @@ class AbstractSpheres(AbstractModel):
             "flow_share": 1.0,
             "rotational_temperature": gas.temperature,
         }
-        known = [name for name in of_records if name in out.records]
-        each = {name: out.records[name].T * of_records[name] for name in known}
-        # Where it could not be checked before.
-        other = has_other_box(self.start, gas, self.num_particles)
-        wrong = other | unreachable_times
-        each = {name: jnp.where(wrong[None], jnp.nan, values) for name, values in each.items()}
+        values = {
+            name: out.records[name].T * unit
+            for name, unit in units_of_records.items()
+            if name in out.records
+        }
+        # Traced values could not be checked before the run.
+        other_box = has_other_box(self.start, gas, self.num_particles)
+        invalid = other_box | unreachable_times
+        values = {name: jnp.where(invalid[None], jnp.nan, x) for name, x in values.items()}
         particles = snapshot.particles(units, self.replicas, out.position, out.velocity, out.spin)
         late = status.flag(status.OUT_OF_RANGE, jnp.any(unreachable_times))
         curve = CoolingCurve.of_replicas(
             times,
-            each,
+            values,
             particles=particles,
-            status=out.status | status.flag(status.OTHER_BOX, other) | late,
-            derivative_bias=self._bias(gas, times, each.get("flow_share")),
+            status=out.status | status.flag(status.BOX_MISMATCH, other_box) | late,
+            derivative_bias=self._bias(gas, times, values.get("flow_share")),
         )
-        return snapshot.with_saved(curve, save, out.records, particles, wrong[None])
+        return snapshot.attach_saved(curve, save, out.records, particles, invalid[None])
 
     def _bias(self, gas: Gas, times: Array, flow_share: Array | None) -> Array | None:
-        """Estimated bias of projected derivatives, 0 in a box below L_c, which has no flow."""
+        """Estimate the bias of projected derivatives, 0 in a box below L_c, which has no flow."""
         if flow_share is None or self.differences is not None or not self.projected:
             return None
-        longer = gas.box_side(self.num_particles) > gas.critical_box
-        return jnp.where(longer, slope_bias_of_run(times, jnp.mean(flow_share, axis=0)), 0.0)
+        has_flow = gas.box_side(self.num_particles) > gas.critical_box
+        return jnp.where(has_flow, slope_bias_of_run(times, jnp.mean(flow_share, axis=0)), 0.0)
 
-    def check_counts(self, **least: int) -> None:
-        """Raise ValueError where a whole number of the model is less than it must be."""
-        for name, lowest in ({"num_particles": 2, "replicas": 1} | least).items():
-            whole_number(name, getattr(self, name), lowest)
+    def check_counts(self, **minimum: int) -> None:
+        """Check the whole numbers of the model against their minima, and its other settings."""
+        for name, lowest in ({"num_particles": 2, "replicas": 1} | minimum).items():
+            checked_int(name, getattr(self, name), lowest)
         neighbours.choose_engine(self.neighbours)
         check_difference_step(self.differences, self.projected)
 
     def check_box(self, gas: Gas) -> None:
-        """Raise ValueError for a gas too dense, a box too small, or a start not of this gas."""
+        """Raise ValueError for a gas too dense, a box too small, or a start of another gas."""
         check_start(self.start, gas, self.replicas, self.num_particles)
         check_gas_for_differences(self.differences, gas)
         checks.check_packing(gas, self.num_particles, random=self.start is None)
 
     def noise(self, error_model: ErrorModel) -> tuple[float, float]:
-        """Standard errors of ln T by shot noise and by the chance amplitudes of a flow."""
+        """Standard errors of ln T by shot noise and by the random amplitudes of a flow."""
         total = self.num_particles * self.replicas
         return error_model.shot_noise(total), error_model.flow_noise(self.replicas)

@@ -10,7 +10,7 @@ import pytest
 import jaxgran
 from jaxgran.models.dsmc import DSMC
 from jaxgran.particles.dsmc import collisions, run
-from jaxgran.particles.dsmc.collisions import Scheme, draw
+from jaxgran.particles.dsmc.collisions import Scheme, draw_pairs
 from jaxgran.particles.dsmc.run import initial_dsmc_state
 from jaxgran.scene.reduced import ReducedScene
 from tests.beads import glass_beads
@@ -174,7 +174,7 @@ def test_every_pair_is_about_equally_likely(n):
     scheme = Scheme.of(3, n, 0.1)
 
     def drawn(key):
-        i, j, k = draw(jax.random.bits(key, (4,)), scheme)
+        i, j, k = draw_pairs(jax.random.bits(key, (4,)), scheme)
         one = jnp.stack([i, j])
         return jnp.concatenate([one, jnp.stack([i[: scheme.second], k])], axis=1)
 
@@ -315,21 +315,21 @@ def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
     times = np.array([0.3, 2.0, 4.0]) * float(gas.mean_free_time)
     file = tmp_path / "run.npz"
     whole = jaxgran.cool(gas, times, model=DSMC(1000, replicas=2))
-    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("jaxgran.particles.run.CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(run, "CHUNK", 1)
-    advancing, left = collisions.advancing, [4]
+    compiled_advance, left = collisions.compiled_advance, [4]
 
     def dies(*args, **kwargs):
         left[0] -= 1
         if left[0] < 0:
             raise MemoryError("killed")
-        return advancing(False)(*args, **kwargs)
+        return compiled_advance(False)(*args, **kwargs)
 
-    monkeypatch.setattr(collisions, "advancing", lambda donate: dies)
+    monkeypatch.setattr(collisions, "compiled_advance", lambda donate: dies)
     with pytest.raises(MemoryError):
         jaxgran.cool(gas, times, model=DSMC(1000, replicas=2), checkpoint=file)
     assert file.exists()
-    monkeypatch.setattr(collisions, "advancing", advancing)
+    monkeypatch.setattr(collisions, "compiled_advance", compiled_advance)
     resumed = jaxgran.cool(gas, times, model=DSMC(1000, replicas=2), checkpoint=file)
     for name in ("temperature", "sonine", "displacement", "collisions", "velocity_correlation"):
         np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))
@@ -513,7 +513,7 @@ def test_keeps_no_checkpoint_in_compiled_code():
         curve = jaxgran.cool(constant(eps), [1.0], model=DSMC(100), checkpoint="run.npz")
         return curve.temperature[0]
 
-    with pytest.raises(ValueError, match="DSMC writes no checkpoint: leave checkpoint out"):
+    with pytest.raises(ValueError, match="DSMC cannot write a checkpoint.*Set checkpoint=None"):
         jax.grad(f)(0.6)
 
 

@@ -1,4 +1,4 @@
-"""Walls and a drive in DSMC, which act on portions of the particles in turns."""
+"""Walls and a drive in DSMC, which act on subsets of the particles in turn."""
 
 import dataclasses
 
@@ -7,22 +7,22 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.dsmc.collisions import MIN_ROWS, num_portions, portion_of
+from jaxgran.particles.dsmc.collisions import MIN_SUBSET_SIZE, num_subsets, subset_of
 from tests.beads import glass_beads
 
 
 @pytest.mark.parametrize("n", [2, 15, 31, 257, 1000, 4096])
-def test_every_particle_belongs_to_one_portion(n):
+def test_every_particle_belongs_to_one_subset(n):
     rows = jnp.arange(float(n))[:, None]
     count, yes = np.zeros(n, int), jnp.ones((), bool)
     sizes = []
-    for k in range(num_portions(n)):
-        part = portion_of(jnp.asarray(k), n, yes)
+    for k in range(num_subsets(n)):
+        part = subset_of(jnp.asarray(k), n, yes)
         chosen = np.asarray(part.of(rows), int)[np.asarray(part.counted), 0]
         count[chosen] += 1
         sizes.append(len(chosen))
     assert np.all(count == 1)
-    assert max(sizes) - min(sizes) <= 1 and min(sizes) >= min(n, MIN_ROWS) - 1
+    assert max(sizes) - min(sizes) <= 1 and min(sizes) >= min(n, MIN_SUBSET_SIZE) - 1
 
 
 def elastic(strength, **elements) -> jaxgran.Gas:
@@ -38,7 +38,7 @@ def elastic(strength, **elements) -> jaxgran.Gas:
     return dataclasses.replace(gas, drive=drive, **elements)
 
 
-@pytest.mark.parametrize("strength", [0.01, 0.6])  # one portion in half a step, and all of them
+@pytest.mark.parametrize("strength", [0.01, 0.6])  # one subset in half a step, and all of them
 def test_kicks_heat_by_the_strength_and_leave_the_gas_at_rest(strength):
     gas = elastic(strength)
     times = jnp.array([1.0, 3.0, 10.0]) * gas.mean_free_time

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.hard.impacts import HardScene, Impact, pair_effect
+from jaxgran.particles.hard.impacts import HardScene, ImpactEvents, pair_effect
 from jaxgran.scene.reduced import ReducedDrag
 from tests.beads import glass_beads
 
@@ -38,7 +38,7 @@ def test_laws_see_the_speeds_that_drag_has_left():
     scene = HardScene(*[zero] * 5, drag=ReducedDrag(jnp.asarray(gamma / 2), zero))
     scene = scene._replace(law=law, collision_frequency=jnp.asarray(2.0))
     normal = jnp.tile(jnp.array([1.0, 0.0, 0.0]), (n, 1))
-    impact = Impact(time, normal, speed[:, None] * normal, speed, None, jnp.zeros(n, bool))
+    impact = ImpactEvents(time, normal, speed[:, None] * normal, speed, None, jnp.zeros(n, bool))
     eps = law.restitution(speed * (1 - gamma * time) / 2**0.5)
     np.testing.assert_allclose(
         pair_effect(scene, impact).lost, (1 - eps**2) * speed**2 / 8, rtol=1e-9

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.hard.impacts import HardScene, Impact, pair_effect
+from jaxgran.particles.hard.impacts import HardScene, ImpactEvents, pair_effect
 from jaxgran.scene.reduced import ReducedRough
 from tests.beads import glass_beads
 
@@ -39,7 +39,7 @@ def test_impacts_keep_angular_momentum_and_follow_the_rule(dimension, beta):
     )._replace(law=jaxgran.ConstantRestitution(eps))
     effect = pair_effect(
         scene,
-        Impact(
+        ImpactEvents(
             time=jnp.zeros(n),
             normal=-jnp.asarray(normal[:, shown]),
             relative=jnp.asarray(v[0][:, shown]),

@@ -100,7 +100,7 @@ def test_elastic_walls_cool_as_dsmc():
 @pytest.mark.parametrize("num", [100, 500, 4000])
 def test_mixed_gas_between_lossy_walls(num, record):
     # Near walls that take much the gas is colder and denser; theory's estimate of that is
-    # course.WALLS of the rate of cooling, so of ln T.
+    # error_model.WALL_ERROR of the rate of cooling, so of ln T.
     gas = contained(num, 0.8)
     gas = gas.replace(
         dissipative_constant=gas.value("dissipative_constant") * 0.15 / gas.thermal_beta

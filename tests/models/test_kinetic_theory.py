@@ -15,8 +15,13 @@ import jaxgran
 from experiments.paper.closed_forms import paper_temperature
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.theory import solver
-from jaxgran.theory.equations import Density, crowding, scene_at_start, softness
-from jaxgran.theory.solver import WINDOW, Integrator, _solve_along, moments_at
+from jaxgran.theory.equations import (
+    Density,
+    crowding_coefficient,
+    scene_at_start,
+    softness_coefficient,
+)
+from jaxgran.theory.solver import WINDOW, Integrator, _solve_with_tangents, moments_at
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
 # equations, clipped restitution, Gaussian start, no softness correction.
@@ -76,15 +81,15 @@ def test_sensitivity_table(beads, record):
 
 
 def test_tangents_of_what_moves_alone_are_followed(beads, monkeypatch):
-    followed, solve_along = [], _solve_along
+    followed, solve_along = [], _solve_with_tangents
 
     def watched(parameters, unravel, times, directions, *rest):
         followed.append(directions)
         return solve_along(parameters, unravel, times, directions, *rest)
 
-    monkeypatch.setattr(solver, "_solve_along", watched)
+    monkeypatch.setattr(solver, "_solve_with_tangents", watched)
     gas = beads()
-    scene = scene_at_start(gas), Density.of(gas)
+    scene = scene_at_start(gas), Density.from_gas(gas)
     equations = KineticTheory()._equations(gas.dimension)
     integrator = Integrator(diffrax.Tsit5(scan_kind="lax"), 1e-8, 10_000)
     times = jnp.geomspace(1.0, 100.0, WINDOW)
@@ -177,8 +182,8 @@ def test_softness_slows_cooling(beads):
     hard = 1 - jaxgran.cool(gas, times, model=hard).temperature / gas.temperature
     length = (2 * gas.temperature / gas.alpha) ** 0.4 / gas.diameter
     # c = 1.8106 by quadrature at the beta of this gas, k = .9094 (see test_softness).
-    c = float(softness(gas.thermal_beta, 3))
-    expected = (1 - c * length) / (1 + crowding(gas) * length)
+    c = float(softness_coefficient(gas.thermal_beta, 3))
+    expected = (1 - c * length) / (1 + crowding_coefficient(gas) * length)
     np.testing.assert_allclose(soft / hard, expected, rtol=1e-4)  # O(t) of the decay
 
 
@@ -212,7 +217,7 @@ def test_times_of_every_kind(beads):
     "times, message",
     [
         ([-1.0, 1.0], "times must be finite and not negative, got -1"),
-        ([1.0, 1.0], "times must increase, got 1 after 1; sort them"),
+        ([1.0, 1.0], "times must increase, got 1 after 1. Sort them"),
         ([2.0, 1.0], "times must increase"),
         ([0.0, float("nan")], "finite"),
         ([], "list of numbers"),
@@ -253,7 +258,7 @@ def test_a_law_that_heats_is_refused(beads):
 def test_a_gas_as_soft_as_air_is_refused(beads):
     gas = beads(0.1)
     gas = gas.replace(youngs_modulus=1e-9 * gas.value("youngs_modulus"))  # GPa taken for Pa
-    with pytest.raises(ValueError, match="is youngs_modulus in Pa"):
+    with pytest.raises(ValueError, match="Check that youngs_modulus is in Pa"):
         jaxgran.cool(gas, [1.0])
     assert jaxgran.cool(gas, [1.0], model=KineticTheory(softness=False)).temperature[0] > 0
 

@@ -12,7 +12,7 @@ from scipy.linalg import hadamard
 import jaxgran
 from jaxgran.models.soft_spheres import SoftSpheres, reduced_soft_scene
 from jaxgran.particles.setup import reduced_start
-from jaxgran.particles.soft.forces import SERIES_BELOW, flight_time
+from jaxgran.particles.soft.forces import SERIES_LIMIT, flight_time
 from tests.beads import glass_beads
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
@@ -142,7 +142,7 @@ def test_elastic_gas_with_drag_cools_as_drag_alone():
     assert np.all(curve.collisions[-1] > 2)
 
 
-@pytest.mark.parametrize("z", [0.0, 1e-9, 0.99 * SERIES_BELOW, 1.01 * SERIES_BELOW, 2.0])
+@pytest.mark.parametrize("z", [0.0, 1e-9, 0.99 * SERIES_LIMIT, 1.01 * SERIES_LIMIT, 2.0])
 def test_shortened_duration_and_its_derivative(z):
     value, slope = jax.value_and_grad(lambda rate: flight_time(rate, 2.0))(z / 2)
     exact = 2 * (-np.expm1(-z) / z if z else 1.0)
@@ -236,7 +236,7 @@ def test_without_friction_frictional_spheres_are_smooth():
     [
         ({"law": 0.9}, "needs walls of the Viscoelastic law.*use HardSpheres"),
         ({"law": "own", "num": 120}, "spheres of packing_fraction 0.05 need a container 0.833"),
-        ({"surface": jaxgran.Rough(0.1)}, "does not take rough spheres.*DSMC"),
+        ({"surface": jaxgran.Rough(0.1)}, "does not support `surface=Rough`.*DSMC"),
     ],
 )
 def test_what_it_cannot_take_is_refused_in_words(change, message):
@@ -249,7 +249,8 @@ def test_friction_is_refused_by_the_other_models():
     gas = soft(surface=jaxgran.Frictional(0.5, 0.3))
     for model in (jaxgran.KineticTheory(), jaxgran.DSMC(100), jaxgran.HardSpheres(100)):
         name = type(model).__name__
-        with pytest.raises(ValueError, match=f"{name} does not take friction.*SoftSpheres.*Rough"):
+        message = f"{name} does not support `surface=Frictional`.*SoftSpheres.*Rough"
+        with pytest.raises(ValueError, match=message):
             jaxgran.cool(gas, [0.1], model=model)
     with pytest.raises(ValueError, match="friction must lie in"):
         jaxgran.Frictional(0.5, -0.1)
@@ -265,7 +266,7 @@ def test_walls_that_cannot_rub_are_refused():
         jaxgran.Walls(0.1, restitution=law, tangential_damping=0.5, friction=-0.1)
     walls = jaxgran.Walls(0.1, restitution=law, **RUBBING_WALLS)
     for surface in (None, jaxgran.Rough(0.1)):
-        with pytest.raises(ValueError, match="friction of the walls needs spheres that rub"):
+        with pytest.raises(ValueError, match="friction of the walls needs frictional spheres"):
             soft(container=walls, surface=surface)
     walls = jaxgran.Walls(soft().box_side(NUM), restitution=law, tangential_restitution=0.5)
     gas = soft(container=walls, surface=jaxgran.Rough(0.1))

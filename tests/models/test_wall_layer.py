@@ -24,5 +24,5 @@ def test_walls_take_from_elastic_spheres_what_theory_says(phi, eps):
     times = jnp.array([0.5, 1.0, 2.5, 4.0]) / rate
     hard = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(N, replicas=16))
     slopes = np.diff((hard.temperature / gas.temperature) ** -0.5) / np.diff(times * rate)
-    # Four standard errors of a slope, .8 sqrt(2/(N replicas)), and course.WALLS.
+    # Four standard errors of a slope, .8 sqrt(2/(N replicas)), and error_model.WALL_ERROR.
     assert np.all(np.abs(slopes - 1) < 4 * 0.8 * (2 / (N * 16)) ** 0.5 + 0.04), slopes

@@ -33,9 +33,11 @@ def given(monkeypatch):
 
         return call
 
-    advancing = collisions.advancing
+    compiled_advance = collisions.compiled_advance
     monkeypatch.setattr(run, "compiled_segments", watched(compiled_segments, 1))
-    monkeypatch.setattr(collisions, "advancing", lambda donate: watched(advancing(donate), 0))
+    monkeypatch.setattr(
+        collisions, "compiled_advance", lambda donate: watched(compiled_advance(donate), 0)
+    )
     return states
 
 

@@ -1,4 +1,4 @@
-"""Sweeps in one process: members, stores, failures and mistakes."""
+"""Sweeps in one process: members, stores, failures and invalid input."""
 
 import dataclasses
 import json
@@ -56,7 +56,7 @@ def test_members_are_the_curves_of_cool(gases):
     curves = sweep(gases, chunk=2)
     for i in range(len(A)):
         curve = jaxgran.cool(one(gases, i), TIMES)
-        # Beside others a member's steps are rounded in another order, within the ODE's tolerance.
+        # Under jax.vmap rounding differs, within the tolerance of the ODE solver.
         np.testing.assert_allclose(curves.temperature[i], curve.temperature, rtol=1e-9)
         np.testing.assert_allclose(curves.diffusion[i], curve.diffusion, rtol=1e-9)
     assert curves.times.shape == curves.temperature.shape == (5, 3)
@@ -85,7 +85,7 @@ def test_particles_with_replicas_and_keys(gas):
     np.testing.assert_array_equal(first.temperature[0], curves.temperature[0])
 
 
-def test_one_key_gives_each_member_its_own_whatever_their_number(gas, gases):
+def test_keys_of_members_do_not_depend_on_their_number(gas, gases):
     model, key = jaxgran.DSMC(200), jax.random.key(1)
     same = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), gases)
     curves = sweep(same, model=model, key=key, chunk=2)
@@ -130,35 +130,35 @@ def test_a_sweep_is_resumed_chunk_by_chunk(gases, stored, tmp_path, monkeypatch)
 def test_members_that_fail_are_nan_and_do_not_end_the_others(gases):
     steps = jaxgran.KineticTheory(max_steps=16)  # enough for few of them
     curves = sweep(gases, (0.1, 1.0, 1e6), model=steps)
-    assert np.any(curves.status == status.STEPS_SPENT.bit)
+    assert np.any(curves.status == status.MAX_STEPS_REACHED.bit)
     dense = jax.vmap(lambda phi: one(gases, 0).replace(packing_fraction=phi))
-    with pytest.warns(UserWarning, match="members 0 to 2 .* first of them 1"):
+    with pytest.warns(UserWarning, match="members 0 to 2 .* first of them is 1"):
         curves = sweep(dense(jnp.array([0.05, 0.9, 0.1])), (0.01,))
     assert curves.status[1] != 0 and np.all(curves.status[::2] == 0)
     assert np.isnan(curves.temperature[1]).all() and np.all(curves.temperature[::2] > 0)
 
 
 @pytest.mark.slow  # a program of particles is compiled
-def test_members_that_a_model_does_not_take_are_nan(gases):
+def test_unsupported_members_are_nan(gases):
     bad = jax.vmap(lambda phi: one(gases, 0).replace(packing_fraction=phi))
     dense = bad(jnp.array([0.05, 0.6, 0.1]))
-    with pytest.warns(UserWarning, match="members 0 to 2 .* first of them 1: .*too dense"):
+    with pytest.warns(UserWarning, match="members 0 to 2 .* first of them is 1: .*too dense"):
         curves = sweep(dense, (0.01,), model=jaxgran.HardSpheres(50))
     assert list(curves.status) == [0, status.UNSUPPORTED.bit, 0]
     assert np.isnan(curves.temperature[1]).all() and np.all(curves.temperature[::2] > 0)
-    assert "does not take" in jaxgran.explain_status(curves.status[1])
+    assert "does not support" in jaxgran.explain_status(curves.status[1])
 
 
 @pytest.mark.slow  # two programs of particles are compiled
-def test_a_chunk_is_run_again_where_a_member_outgrows_its_arrays(gas, gases):
+def test_a_chunk_is_run_again_if_a_member_overflows_its_arrays(gas, gases):
     model = jaxgran.HardSpheres(100)
     long = model.sized_for(gas)
     few = {name: getattr(long.plan, name)._replace(pairs=20) for name in Plan._fields[2:]}
     short = dataclasses.replace(long, plan=long.plan._replace(**few))
-    program = Program.of(long, jnp.array([0.01]), 1, [])
+    program = Program.create(long, jnp.array([0.01]), 1, [])
     args = jax.tree.map(lambda x: x[:1], gases), jax.random.split(jax.random.key(2), 1)
-    outgrown = program._replace(models=(short,)).run(*args)
-    assert outgrown["status"] & status.LIST_FULL.bit and np.isnan(outgrown["temperature"]).all()
+    overflowed = program._replace(models=(short,)).run(*args)
+    assert overflowed["status"] & status.LIST_FULL.bit and np.isnan(overflowed["temperature"]).all()
     repeated = program._replace(models=(short, long)).run(*args)
     np.testing.assert_array_equal(repeated["temperature"], program.run(*args)["temperature"])
     assert repeated["status"] == 0
@@ -219,25 +219,25 @@ def gone(name):
     )
 
 
-HALF = r"copy.zarr: chunk 1 \(members 2 to 3\) is half written or was changed"
-NO_STORE = "copy.zarr is no store of a sweep .*: name another folder, or remove it"
+DAMAGED = r"copy.zarr: chunk 1 \(members 2 to 3\) is incomplete or was changed"
+NO_STORE = "copy.zarr is not the store of a sweep .*. Name another folder, or remove it"
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (cut("temperature/c/1/0"), HALF),
-        (gone("temperature/c/1/0"), HALF),
-        (one_bit, HALF),
-        (gone("temperature"), "no array 'temperature' .* is not whole: copy the store again"),
-        (cut("temperature/zarr.json"), "no array 'temperature' .* is not whole"),
+        (cut("temperature/c/1/0"), DAMAGED),
+        (gone("temperature/c/1/0"), DAMAGED),
+        (one_bit, DAMAGED),
+        (gone("temperature"), "is damaged: it has no array 'temperature' .*. Copy the store again"),
+        (cut("temperature/zarr.json"), "is damaged: it has no array 'temperature'"),
         (header_of("temperature", shape=[4, 3]), r"'temperature' of float64 and shape \(4, 3\)"),
         (header_of("diffusion", data_type="float32"), "an array 'diffusion' of float32"),
         (header_of("finished", shape=[2]), r"an array 'finished' of uint64 and shape \(2,\)"),
-        (cut("finished/c/1"), "a damaged array 'finished' .* is not whole"),
+        (cut("finished/c/1"), "is damaged: it has a damaged array 'finished'"),
         (gone("dissipative_constant"), "no array 'dissipative_constant'"),
         (gone("time/c/0"), "other values in 'time'"),
-        (attributes(version="0.0.9"), "written by jaxgran 0.0.9 .*: finish the sweep with that"),
+        (attributes(version="0.0.9"), "written by jaxgran 0.0.9 .*Finish the sweep with that"),
         (attributes(format=2), "in format 2, this is .* with format 1, .*or name another store"),
         (attributes(chunk="two"), NO_STORE),
         (attributes(chunk=0), NO_STORE),
@@ -246,7 +246,7 @@ NO_STORE = "copy.zarr is no store of a sweep .*: name another folder, or remove 
         (gone("zarr.json"), NO_STORE),
     ],
 )
-def test_stores_of_another_version_or_half_written_are_refused(
+def test_stores_of_another_version_and_incomplete_stores_are_refused(
     gases, stored, tmp_path, change, message
 ):
     path = copied(stored, tmp_path)
@@ -257,24 +257,24 @@ def test_stores_of_another_version_or_half_written_are_refused(
     assert files(path) == before
 
 
-def test_what_is_no_store_is_refused_and_left_alone(gases, tmp_path):
+def test_other_files_and_folders_are_refused_and_left_alone(gases, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="notes.txt is no store of a sweep .it is a file"):
+    with pytest.raises(ValueError, match="notes.txt is not the store of a sweep .it is a file"):
         sweep(gases, store=tmp_path / "notes.txt")
-    with pytest.raises(ValueError, match="is no store of a sweep .No group found"):
+    with pytest.raises(ValueError, match="is not the store of a sweep .No group found"):
         sweep(gases, store=tmp_path)
     assert files(tmp_path) == {tmp_path / "notes.txt": b"mine"}
     with pytest.raises(ValueError, match="store must be a path, got 3"):
         sweep(gases, store=3)
 
 
-def test_mistakes_are_told_before_a_store_is_made(gas, gases, tmp_path):
+def test_invalid_input_is_refused_before_a_store_is_created(gas, gases, tmp_path):
     path = tmp_path / "sweep.zarr"
     wrong = [
         ({"times": (1.0, 0.1)}, "times must increase, got 0.1 after 1"),
-        ({"model": "auto"}, "model must be a model, .* got 'auto'"),
+        ({"model": "auto"}, "model must be a jaxgran model, got 'auto'"),
         ({"chunk": "2"}, "chunk must be a whole number >= 1"),
-        ({"gases": {"dissipation": A}}, "a dict: take jax.vmap"),
+        ({"gases": {"dissipation": A}}, "a dict: use jax.vmap"),
         ({"save": lambda p: p.velocity}, "KineticTheory has no particles"),
         ({"save": "velocities", "model": jaxgran.DSMC(100)}, 'or "particles", got'),
     ]
@@ -304,16 +304,16 @@ def test_ragged_batches_and_unknown_names_are_refused(gas, gases):
         sweep([gas, gas])
     with pytest.raises(ValueError, match=r"temperature has shape \(2, 2\).*ravel"):
         sweep(gas.replace(temperature=jnp.ones((2, 2))))
-    with pytest.raises(ValueError, match="key must be a key .* or a row of keys"):
+    with pytest.raises(ValueError, match="key must be a key .* or an array of keys"):
         sweep(gases, key=3)
     with pytest.raises(ValueError, match="chunk must be"):
         sweep(gases, chunk=0)
-    with pytest.raises(ValueError, match="takes no member of this sweep; member 0: temperature"):
+    with pytest.raises(ValueError, match="supports no member of this sweep; member 0: temperature"):
         sweep(jax.vmap(lambda T: gas.replace(temperature=T))(jnp.array([-1.0, -2.0])))
 
 
 @pytest.mark.slow
-def test_lists_have_the_axis_of_members_before_their_own():
+def test_lists_have_the_axis_of_members_first():
     law = jaxgran.RestitutionSeries((-0.1, -0.1), (0.0, 0.2))
     gas = jaxgran.Gas(law, diameter=2e-3, mass=1e-5, packing_fraction=0.05, temperature=0.01)
     lists = jax.vmap(lambda c: gas.replace(coefficients=jnp.stack([-0.1, c])))
@@ -324,7 +324,7 @@ def test_lists_have_the_axis_of_members_before_their_own():
 
 
 @pytest.mark.slow
-def test_wall_sides_that_may_be_of_one_box_or_of_three(gas):
+def test_ambiguous_wall_sides_are_refused(gas):
     walls = jaxgran.Walls([0.05, 0.06, 0.07], restitution=0.9)
     box = dataclasses.replace(gas, container=walls)
     curves = sweep(jax.vmap(lambda a: box.replace(dissipative_constant=a))(A))
@@ -333,7 +333,7 @@ def test_wall_sides_that_may_be_of_one_box_or_of_three(gas):
         sweep(box.replace(temperature=jnp.ones(3) * 0.01))
 
 
-def test_warnings_are_none_for_a_good_sweep(gases, tmp_path):
+def test_a_valid_sweep_gives_no_warning(gases, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sweep(gases, store=tmp_path / "sweep.zarr")

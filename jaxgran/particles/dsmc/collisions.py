@@ -1,34 +1,18 @@
-"""One step of direct simulation Monte Carlo: random collisions of a homogeneous gas.
+"""Steps of direct simulation Monte Carlo (DSMC): random collisions in a homogeneous gas.
 
-The collision rule of DSMC: which candidate pairs collide, and what a collision does.
+A step draws candidate pairs, decides which of them collide, and changes their velocities. It also
+applies walls and a drive, and updates the tangents of the run. Spins are ``s = (sigma/2) w``, a
+velocity. With drag the velocities, spins and time are transformed: see `jaxgran.particles.state`.
 
-Walls, a drive and drag in a step of DSMC.
+Walls and a drive act on subsets of the particles. The kicks of a drive in one step are far smaller
+than the velocities. So each half of a step kicks only some of the subsets, in turn, with the
+variance of all steps until their next turn: the mean energy of a step is the same, at a lower cost.
+The energy of a kick is limited; under a strong drive each half of a step kicks all particles.
 
-Spins are ``s = (sigma/2) w``, a velocity. Where there is drag, velocities, spins and time are
-transformed: see `jaxgran.particles.state`.
-
-Tangents of DSMC with elements, by the energies that a step exchanges.
-
-See `jaxgran.gradients.tangents`. Energies here are sum v^2 of translation, and q sum s^2 of the
-spins that are kept.
-
-Which pairs of particles are drawn in a step of DSMC.
-
-A drive and walls in a step of DSMC, which act on portions of the particles.
-
-The kicks of a drive in one step are far smaller than the velocities. So each half of a step kicks
-a portion of all particles, with the variance of all steps until it has its turn again: the energy
-that a step brings is the same, and costs as much less. How much may be brought in one turn limits
-the number of portions, down to all particles in each half of a step.
-
-Walls are met by portions that are drawn anew in each step, and so are met by a sphere that moves as
-it does now: by turns, a mean free time apart, spheres that have lost speed would not come later,
-and the loss be .9 % of T too large. As many portions are drawn as the fastest spheres need, and a
-sphere of them meets a wall the more often.
-
-Tangents of a DSMC run in the parameters of the law of restitution.
-
-The state of a DSMC run.
+Subsets that hit walls are drawn at random in each step, so that spheres hit walls with their
+current velocity. With fixed turns, a mean free time apart, spheres that have lost speed would not
+come later, and the loss would be .9 % of T too large. A step draws as many subsets as the fastest
+spheres need, and a sphere in them hits a wall with a larger probability.
 """
 
 from collections.abc import Callable
@@ -53,15 +37,145 @@ from jaxgran.particles.state import (
     threefry_key,
     true_duration,
 )
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, share_of_impacts
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
 from jaxgran.scene.geometry import sphere_surface
 from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedDrag, ReducedDrive, ReducedRough, ReducedScene
 from jaxgran.theory.averages import collision_rate
 
+CEILING = 5.0
+"""Relative speed, in sqrt(2 T), up to which the collision rate is right; beyond it is constant.
+
+A Maxwellian gas misses 2e-6 of its collisions and 1e-5 of its losses by this. A run counts the
+missed collisions.
+"""
+
+
+class Scheme(NamedTuple):
+    """Static sizes of one step.
+
+    Attributes:
+        dimension: d.
+        num_particles: N.
+        first: number of disjoint random pairs, the first pairs.
+        second: number of second pairs, each of a particle of a first pair and a new particle.
+    """
+
+    dimension: int
+    num_particles: int
+    first: int
+    second: int
+
+    @classmethod
+    def of(cls, dimension: int, num_particles: int, step: float) -> "Scheme":
+        """Return the scheme with a number `step` of collisions per particle and step.
+
+        If M pairs were drawn one after the other with replacement, ``2 M (M - 1) / N`` of them
+        would on average share a particle with an earlier pair. The scheme has the same number of
+        second pairs, which makes the step second order.
+        """
+        accepted = sphere_surface(dimension) / sqrt(2 * pi) / (2 ** (dimension - 1) * CEILING)
+        pairs = max(round(step * num_particles / (2 * accepted)), 1)
+        second = round(2 * pairs * (pairs - 1) / num_particles)
+        return cls(dimension, num_particles, pairs - second, second)
+
+    @property
+    def scaled_step(self) -> float:
+        """Length ``dt sqrt(T/T_0)`` of a step in scaled time.
+
+        Each particle collides with any of the N - 1 others.
+        """
+        candidates = 2 * (self.first + self.second) / (self.num_particles - 1)
+        return candidates / (2 ** (self.dimension - 1) * CEILING)
+
+
+class DSMCTangents(NamedTuple):
+    """Tangents at a fixed scaled time s, ``ds = sqrt(T/T_0) dt``, in P parameters of the law.
+
+    The tangent of the velocities is c v / 2. That of <dr^2> follows from ``d<dr^2>/ds = 2 d M``,
+    ``dM/ds = 1/2 - kappa M``, the equation of kinetic theory for ``M = D / sqrt(T/T_0)``. Here
+    kappa is the rate of velocity relaxation less half the cooling rate, and is measured on the
+    collisions.
+
+    Attributes:
+        log_temperature: c = d ln T.
+        clock: tangent of the time.
+        mobility: tangent of M.
+        displacement: tangent of <dr^2>.
+        persistence: tangent of the logarithm of <v(0).v> / sqrt(T).
+    """
+
+    log_temperature: Float[Array, "*replicas P"]
+    clock: Float[Array, "*replicas P"]
+    mobility: Float[Array, "*replicas P"]
+    displacement: Float[Array, "*replicas P"]
+    persistence: Float[Array, "*replicas P"]
+
+
+class DSMCState(NamedTuple):
+    """State of R replicas of N particles. Units: the impact speed sqrt(2 T_0) and the path length.
+
+    Attributes:
+        time: time that all replicas have reached.
+        clock: start of the step of each replica that ends beyond `time`.
+        clock_rest: rounding error of `clock`, for a compensated sum.
+        temperature: T/T_0, updated by the losses, recomputed every `RECOUNT_INTERVAL` steps.
+        particles: the 2 d components of v and of x - v t, which only collisions change, and the
+            spins of rough spheres. With drag they are transformed: see `jaxgran.particles.state`.
+        collisions: number of pairs that collided.
+        missed: number of collisions missed because of the `CEILING`.
+        steps: number of steps.
+        mobility: M = D / sqrt(T/T_0), computed together with the tangents.
+        tangents: tangents in the parameters of the law, or of a scene with elements.
+    """
+
+    time: Float[Array, ""]
+    clock: Float[Array, "*replicas"]
+    clock_rest: Float[Array, "*replicas"]
+    temperature: Float[Array, "*replicas"]
+    particles: Float[Array, "*replicas N components"]
+    collisions: Float[Array, "*replicas"]
+    missed: Float[Array, "*replicas"]
+    steps: UInt32[Array, "*replicas"]
+    mobility: Float[Array, "*replicas"]
+    tangents: DSMCTangents | ExchangeTangents
+
+
+@cache
+def _strides(num_particles: int) -> np.ndarray:
+    """Return numbers coprime to N, so small that their product with N fits into 32 bits."""
+    top = min(num_particles, 2**32 // num_particles - 1)
+    return np.array([s for s in range(1, max(top, 2)) if gcd(s, num_particles) == 1], np.uint32)
+
+
+def draw_pairs(
+    bits: UInt[Array, "4"], scheme: Scheme
+) -> tuple[Int[Array, "first"], Int[Array, "first"], Int[Array, "second"]]:
+    """Draw the indices of both particles of the first pairs, and of new ones for second pairs.
+
+    Since particles are exchangeable, evenly spaced indices are sufficient if any two particles form
+    a pair with about the same probability: the first particles of the pairs are a + s l for random
+    a and s, their partners are a random number of places further on. Every particle is drawn with
+    the same probability, and every pair, too, if N is prime. Otherwise pairs whose distance shares
+    a large divisor with N (one in a hundred at N = 1000) are up to 1.7 times as likely, and the
+    probabilities scatter by 6 % (14 % at N = 64).
+    """
+    n, first, second = scheme.num_particles, scheme.first, scheme.second
+    strides = jnp.asarray(_strides(n))
+    stride = strides[bits[0] % len(strides)]
+    apart = first + second + bits[1] % (n - 2 * first - second + 1)
+
+    def particle(place):
+        return ((bits[2] % n + stride * place) % n).astype(jnp.int32)
+
+    place = jnp.arange(first, dtype=jnp.uint32)
+    # The new particles are in between, also at a random distance.
+    new = first + bits[3] % (apart - (first + second) + 1) + jnp.arange(second, dtype=jnp.uint32)
+    return particle(place), particle(place + apart), particle(new)
+
 
 class Outcome(NamedTuple):
-    """What the collisions of candidate pairs do: kicks, and sums over the collisions.
+    """Outcome of the collisions of candidate pairs: kicks, and sums over the collisions.
 
     Attributes:
         kick: change of the velocity of the first particle of each pair; that of the second is
@@ -69,18 +183,18 @@ class Outcome(NamedTuple):
         num: number of collisions.
         missed: number of collisions missed because of the ceiling of the collision rate.
         loss: decrease of sum v^2.
-        memory: ``sum (1 + eps)^2 (g.n)^2 / 4``, by which D/sqrt(T) decays.
-        along: tangents of -loss and of memory in the parameters of the law.
+        relaxation: ``sum (1 + eps)^2 (g.n)^2 / 4``, by which D/sqrt(T) decays.
+        along: tangents of -loss and of relaxation in the parameters of the law.
         along_speed: their tangents in the logarithm of all speeds.
-        turned: increase of q sum s^2 of rough spheres.
-        twist: change of the spins of both particles of each pair; None of smooth ones.
+        rotational_gain: increase of q sum s^2 of rough spheres.
+        spin_change: change of the spins of both particles of each pair; None for smooth spheres.
     """
 
     kick: Float[Array, "pairs d"]
     num: Float[Array, ""]
     missed: Float[Array, ""]
     loss: Float[Array, ""]
-    memory: Float[Array, ""]
+    relaxation: Float[Array, ""]
     along: Float[Array, "2 P"]
     along_speed: Float[Array, "..."]  # (2,)
     rotational_gain: Float[Array, ""] | float = 0.0
@@ -95,19 +209,19 @@ def collide(
     scene: ReducedScene,
     tangents: bool,
     spin: Float[Array, "pairs spins"] | None = None,
-    slowed: Float[Array, ""] | None = None,
+    drag_factor: Float[Array, ""] | None = None,
 ) -> Outcome:
     """Let candidate pairs collide at a rate proportional to |g|, with normals weighted by g.n.
 
     Args:
         relative: g = v_i - v_j of equal masses.
-        bits: random ones.
+        bits: random bits.
         ceiling: |g| at which a candidate collides with probability 1 in a whole step.
-        share: of the step to be done.
+        share: fraction of the step to be done.
         scene: in reduced units.
-        tangents: whether the tangents are wanted.
+        tangents: True to compute the tangents.
         spin: s_i + s_j of rough spheres.
-        slowed: physical velocities over these; None if they are the same.
+        drag_factor: ratio of physical velocities to these; None for 1.
     """
     d, dtype = relative.shape[-1], relative.dtype
     g = [relative[:, k] for k in range(d)]
@@ -118,12 +232,12 @@ def collide(
     offset = [((b >> 11).astype(dtype) + 0.5) * 2.0**-20 - 1 for b in bits[: d - 1]]
     chance = ((bits[0] & 2047) << 11 | (bits[1] & 2047)).astype(dtype) + 0.5
     sine_square = sum(b * b for b in offset)
-    met = (sine_square < 1) & (square > 0)
-    hit = met & (chance * 2.0**-22 * ceiling < speed * share)
-    cosine = jnp.sqrt(jnp.where(met, 1 - sine_square, 1.0))
+    in_disk = (sine_square < 1) & (square > 0)
+    hit = in_disk & (chance * 2.0**-22 * ceiling < speed * share)
+    cosine = jnp.sqrt(jnp.where(in_disk, 1 - sine_square, 1.0))
     sideways = _perpendicular(axis)
     normal_speed = jnp.where(hit, speed * cosine, ceiling)
-    at_impact = normal_speed if slowed is None else normal_speed * slowed
+    at_impact = normal_speed if drag_factor is None else normal_speed * drag_factor
     eps, along, along_speed = _restitution(at_impact, hit, scene.law, tangents)
     square = jnp.where(hit, normal_speed**2, 0.0)
     push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
@@ -134,9 +248,9 @@ def collide(
     outcome = Outcome(
         kick=jnp.stack([-push * n for n in normal], axis=-1),
         num=jnp.sum(hit, dtype=dtype),
-        missed=share * jnp.sum(jnp.where(met, jnp.maximum(speed / ceiling - 1, 0.0), 0.0)),
+        missed=share * jnp.sum(jnp.where(in_disk, jnp.maximum(speed / ceiling - 1, 0.0), 0.0)),
         loss=jnp.sum((1 - eps**2) / 2 * square),
-        memory=jnp.sum((1 + eps) ** 2 / 4 * square),
+        relaxation=jnp.sum((1 + eps) ** 2 / 4 * square),
         along=along,
         along_speed=along_speed,
     )
@@ -153,20 +267,20 @@ def _with_tangential(
     normal: Float[Array, "pairs d"],
     hit: Bool[Array, "pairs"],
 ) -> Outcome:
-    """The outcome with the tangential part of the impacts; see `jaxgran.Rough`."""
-    found = tangential_impulse(relative, spin, normal, hit, surface.eta, surface.inertia)
-    lost = -2 * jnp.sum(found.kick * (found.sideways + found.kick))  # of translation alone
-    rotational_gain = 2 * surface.inertia * jnp.sum(found.spin_change * (spin + found.spin_change))
+    """Return the outcome with the tangential part of the impacts; see `jaxgran.Rough`."""
+    tangential = tangential_impulse(relative, spin, normal, hit, surface.eta, surface.inertia)
+    kick, spin_change = tangential.kick, tangential.spin_change
+    loss = -2 * jnp.sum(kick * (tangential.sideways + kick))  # of translation alone
     return outcome._replace(
-        kick=outcome.kick + found.kick,
-        loss=outcome.loss + lost,
-        rotational_gain=rotational_gain,
-        spin_change=found.spin_change,
+        kick=outcome.kick + kick,
+        loss=outcome.loss + loss,
+        rotational_gain=2 * surface.inertia * jnp.sum(spin_change * (spin + spin_change)),
+        spin_change=spin_change,
     )
 
 
 def _perpendicular(axis: list[Float[Array, "pairs"]]) -> list[list[Float[Array, "pairs"]]]:
-    """Unit vectors perpendicular to unit vectors: one in a plane, two in space, as components."""
+    """Return unit vectors perpendicular to unit vectors: one in a plane, two in space."""
     if len(axis) == 2:
         return [[-axis[1], axis[0]]]
     x, y, z = axis
@@ -184,7 +298,7 @@ def _restitution(
     law: ReducedLaw,
     tangents: bool,
 ) -> tuple[Float[Array, "pairs"], Float[Array, "2 P"], Float[Array, "..."]]:
-    """eps of each pair, and `Outcome.along` and `Outcome.along_speed` of the pairs that collide."""
+    """Return eps of each pair, and `Outcome.along` and `Outcome.along_speed` of the collisions."""
     zero, along = jnp.zeros((), normal_speed.dtype), jnp.zeros((2, 0), normal_speed.dtype)
 
     def restitution(law, log_scale):
@@ -201,22 +315,22 @@ def _restitution(
 
 
 FASTEST_SPEED = 3.5
-"""Speed along an axis, in sqrt(2 T), up to which impacts on walls are as frequent as they should
-be; one of 1e6 particles is faster."""
+"""Speed along an axis, in sqrt(2 T), up to which the rate of impacts on walls is right; one of 1e6
+particles is faster."""
 
 
 class WallImpacts(NamedTuple):
-    """Some particles after impacts on walls.
+    """Velocities and spins of some particles after impacts on walls.
 
     Attributes:
-        velocity, spin: of each.
-        lost: decrease of sum v^2.
-        turned: increase of q sum s^2.
+        velocity, spin: of each particle.
+        loss: decrease of sum v^2.
+        rotational_gain: increase of q sum s^2.
     """
 
     velocity: Float[Array, "N d"]
     spin: Float[Array, "N spins"]
-    lost: Float[Array, ""]
+    loss: Float[Array, ""]
     rotational_gain: Float[Array, ""]
 
 
@@ -227,68 +341,68 @@ def hit_walls(
     velocity: Float[Array, "N d"],
     spin: Float[Array, "N spins"],
     ds: Float[Array, ""],
-    slowed: Float[Array, ""] | float,
+    drag_factor: Float[Array, ""] | float,
 ) -> WallImpacts:
-    """Particles after a step in which they meet walls, everywhere alike.
+    """Let particles hit walls in a step, independent of their places.
 
-    A sphere between two walls meets one of them ``|v| ds/(L - sigma)`` times in a step, times the
-    share that tells how dense the gas is before them (`share_of_impacts`). The steps take the axes
-    in turns, and each does d times as much.
+    A sphere between two walls hits one of them ``|v| ds/(L - sigma)`` times in a step, times the
+    ratio of the density before walls to the mean (`wall_impact_ratio`). Each step has walls across
+    one axis, in turn, with d times this number of impacts.
 
     Args:
         scene: in reduced units.
-        chance: a random number for each; it meets a wall if this is less than that many times.
-        axis: across which the walls are.
-        velocity, spin: before.
+        chance: a random number for each particle, which hits a wall if its number of impacts is
+            larger.
+        axis: the axis across which the walls are.
+        velocity, spin: before the step.
         ds: length of the step.
-        slowed: physical velocities over these.
+        drag_factor: ratio of physical velocities to these.
     """
     walls, surface = scene.walls, scene.surface
     assert walls is not None
     n, d = velocity.shape
     frequency = walls.frequency[axis]
-    each = frequency * (d * sqrt(pi)) * ds  # over the speed
+    per_speed = frequency * (d * sqrt(pi)) * ds
     across = (jnp.arange(d) == axis).astype(velocity.dtype)[None]
     normal = jnp.sum(velocity * across, axis=1)
     speed, outwards = jnp.abs(normal), jnp.sign(normal)[:, None] * across
-    eps = walls.law.restitution(jnp.where(speed > 0, speed * slowed, 1.0))
-    often = share_of_impacts(eps, frequency / collision_rate(0.0, d), d)
-    hit = (chance < often * each * speed) & (speed > 0)
+    eps = walls.law.restitution(jnp.where(speed > 0, speed * drag_factor, 1.0))
+    ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
+    hit = (chance < ratio * per_speed * speed) & (speed > 0)
     kick = -jnp.where(hit, (1 + eps) * speed, 0.0)[:, None] * outwards
     spin_change = jnp.zeros_like(spin)
     if surface is not None and walls.beta is not None:
         eta = surface.eta_on_wall(walls.beta)
-        found = tangential_impulse(velocity, spin, outwards, hit, eta, surface.inertia)
-        kick, spin_change = kick + found.kick, found.spin_change
-    # The number of impacts is not differentiable: they count for more where there are more.
-    share = frequency * often
-    share = share / jax.lax.stop_gradient(share)
+        tangential = tangential_impulse(velocity, spin, outwards, hit, eta, surface.inertia)
+        kick, spin_change = kick + tangential.kick, tangential.spin_change
+    # The number of impacts is not differentiable, so weights of value 1 carry its derivative.
+    weight = frequency * ratio
+    weight = weight / jax.lax.stop_gradient(weight)
     inertia = 0.0 if surface is None else surface.inertia
-    lost = -jnp.sum(share[:, None] * kick * (2 * velocity + kick))
-    rotational_gain = inertia * jnp.sum(share[:, None] * spin_change * (2 * spin + spin_change))
-    return WallImpacts(velocity + kick, spin + spin_change, lost, rotational_gain)
+    loss = -jnp.sum(weight[:, None] * kick * (2 * velocity + kick))
+    rotational_gain = inertia * jnp.sum(weight[:, None] * spin_change * (2 * spin + spin_change))
+    return WallImpacts(velocity + kick, spin + spin_change, loss, rotational_gain)
 
 
-def fastest_share(
+def _max_wall_impacts(
     scene: ReducedScene,
     temperature: Float[Array, "*replicas"],
-    slowed: Float[Array, "*replicas"] | float,
+    drag_factor: Float[Array, "*replicas"] | float,
     ds: Float[Array, "*replicas"],
     d: int,
 ) -> Float[Array, "*replicas"]:
-    """The probability that a sphere of the speed `REACH` meets a wall in a step, that has its turn
-    in each."""
+    """Return the number of wall impacts in a step of a sphere of the speed `FASTEST_SPEED`."""
     walls = scene.walls
     assert walls is not None
     speed = FASTEST_SPEED * jnp.sqrt(temperature)
-    eps = walls.law.restitution(speed * slowed)[..., None]
+    eps = walls.law.restitution(speed * drag_factor)[..., None]
     frequency = jnp.broadcast_to(walls.frequency, (*eps.shape[:-1], d))
-    often = share_of_impacts(eps, frequency / collision_rate(0.0, d), d)
-    return jnp.max(often * frequency, axis=-1) * (d * sqrt(pi)) * speed * ds
+    ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
+    return jnp.max(ratio * frequency, axis=-1) * (d * sqrt(pi)) * speed * ds
 
 
 def drag_decay_or_one(drag: ReducedDrag | None, time: Float[Array, "..."]) -> DragDecay:
-    """What drag has left; all where there is none."""
+    """Return the factors of `drag_decay`, or ones without drag."""
     if drag is None:
         return DragDecay(*[jnp.ones_like(time)] * 3)
     return drag_decay(drag, time)
@@ -297,38 +411,22 @@ def drag_decay_or_one(drag: ReducedDrag | None, time: Float[Array, "..."]) -> Dr
 def kick_growth(
     drive: ReducedDrive,
     drag: ReducedDrag | None,
-    began: Float[Array, "*replicas"],
+    start: Float[Array, "*replicas"],
     ds: Float[Array, "*replicas"],
     place: float,
 ) -> Float[Array, "*replicas"]:
-    """Growth of T/T_0 by half of the kicks of a step, made at its begin (place 0) or end (1)."""
+    """Return the growth of T/T_0 by half of the kicks of a step.
+
+    They come at its start (place 0) or end (1).
+    """
     if drag is None:
         return drive.strength * jnp.maximum(ds, 0.0) / 2
     return (
         drive.strength
-        * true_duration(drag, began, ds)
+        * true_duration(drag, start, ds)
         / 2
-        / drag_decay(drag, began + place * ds).velocity ** 2
+        / drag_decay(drag, start + place * ds).velocity ** 2
     )
-
-
-def limited_step(
-    scene: ReducedScene,
-    temperature: Float[Array, "*replicas"],
-    clock: Float[Array, "*replicas"],
-    ds: Float[Array, "*replicas"],
-    d: int,
-) -> Float[Array, "*replicas"]:
-    """The length of a step, so short that a sphere meets one wall at most, and that the kicks of a
-    drive are small beside the velocities."""
-    if scene.walls is not None:
-        slowed = drag_decay_or_one(scene.drag, clock).velocity
-        ds = ds / jnp.maximum(fastest_share(scene, temperature, slowed, ds, d), 1.0)
-    if scene.drive is None:
-        return ds
-    growth = scene.drive.strength / drag_decay_or_one(scene.drag, clock).velocity ** 3
-    safe = jnp.where(growth > 0, growth, 1.0)
-    return jnp.where(growth > 0, jnp.minimum(ds, MAX_KICK * temperature / safe), ds)
 
 
 def kick_all(
@@ -339,28 +437,247 @@ def kick_all(
     d: int,
     at_rest: bool,
 ) -> Float[Array, "N components"]:
-    """Particles after random kicks at a time, by which T/T_0 grows.
+    """Return particles after random kicks that let T/T_0 grow.
 
     Args:
         particles: v, x - v t and spins.
-        key: of the random numbers.
-        growth: of T/T_0.
+        key: key of the random numbers.
+        growth: growth of T/T_0.
         time: t, as in x - v t.
         d: dimension.
-        at_rest: whether the kicks leave the momentum as it is.
+        at_rest: True if the kicks conserve the momentum.
     """
     change = jnp.sqrt(growth / 2) * random_kicks(key, particles[:, :d], at_rest)
     moved = [particles[:, :d] + change, particles[:, d : 2 * d] - time * change]
     return jnp.concatenate([*moved, particles[:, 2 * d :]], axis=1)
 
 
+def _limit_step(
+    scene: ReducedScene,
+    temperature: Float[Array, "*replicas"],
+    clock: Float[Array, "*replicas"],
+    ds: Float[Array, "*replicas"],
+    d: int,
+) -> Float[Array, "*replicas"]:
+    """Limit the length of a step: spheres hit at most one wall, and kicks of a drive are small."""
+    if scene.walls is not None:
+        drag_factor = drag_decay_or_one(scene.drag, clock).velocity
+        ds = ds / jnp.maximum(_max_wall_impacts(scene, temperature, drag_factor, ds, d), 1.0)
+    if scene.drive is None:
+        return ds
+    growth = scene.drive.strength / drag_decay_or_one(scene.drag, clock).velocity ** 3
+    safe = jnp.where(growth > 0, growth, 1.0)
+    return jnp.where(growth > 0, jnp.minimum(ds, MAX_KICK * temperature / safe), ds)
+
+
+MAX_SUBSETS = 16
+"""Number of subsets of many particles."""
+
+MIN_SUBSET_SIZE = 16
+"""Minimum number of particles in a subset, whose kicks together conserve its momentum."""
+
+
+class Subset(NamedTuple):
+    """Subset of the particles: some neighbouring rows.
+
+    Attributes:
+        first: the first row.
+        counted: mask of the rows that belong to the subset.
+    """
+
+    first: Int[Array, ""]
+    counted: Bool[Array, "rows"]
+
+    def of(self, particles: Float[Array, "N components"]) -> Float[Array, "rows components"]:
+        """Return the rows of the subset."""
+        return jax.lax.dynamic_slice_in_dim(particles, self.first, len(self.counted))
+
+    def written(self, particles: Float[Array, "N components"], rows: Array) -> Array:
+        """Return all particles with new rows."""
+        return jax.lax.dynamic_update_slice_in_dim(particles, rows, self.first, 0)
+
+
+def num_subsets(num_particles: int) -> int:
+    return max(min(MAX_SUBSETS, num_particles // MIN_SUBSET_SIZE), 1)
+
+
+def subset_of(index: Int[Array, ""], num_particles: int, active: Bool[Array, ""]) -> Subset:
+    """Return a subset of the particles; each particle belongs to exactly one."""
+    n, parts = num_particles, num_subsets(num_particles)
+    begin, end = index * n // parts, (index + 1) * n // parts
+    rows = -(-n // parts)
+    first = jnp.minimum(begin, n - rows)
+    row = first + jnp.arange(rows, dtype=first.dtype)
+    return Subset(first, (row >= begin) & (row < end) & active)
+
+
+class SubsetCounts(NamedTuple):
+    """Numbers of subsets that take part in a step.
+
+    Attributes:
+        kicks: subsets that a drive kicks in half of the step; None without a drive.
+        walls: subsets that may hit walls; None without walls.
+    """
+
+    kicks: Int[Array, "*replicas"] | None
+    walls: Int[Array, "*replicas"] | None
+
+
+def subsets_per_step(
+    temperature: Float[Array, "*replicas"],
+    clock: Float[Array, "*replicas"],
+    share: Float[Array, "*replicas"],
+    scene: ReducedScene,
+    scheme: Scheme,
+) -> SubsetCounts:
+    """Return the numbers of subsets that take part in a share of a step.
+
+    A drive kicks so many subsets in half of it that T of none grows by more than the share
+    `MAX_KICK`. Particles that are kicked in turn then have temperatures that differ by up to w T,
+    by which a_2 of all particles is too large by ``w^2/12``, at most 2e-4. So many subsets may hit
+    walls that one of the fastest spheres hits at most one.
+    """
+    parts = num_subsets(scheme.num_particles)
+    ds = share * scheme.scaled_step / jnp.sqrt(temperature)
+
+    def at_least(needed: Array) -> Array:
+        return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
+
+    kicks = walls = None
+    if scene.drive is not None:
+        growth = kick_growth(scene.drive, scene.drag, clock, ds, 0.0)
+        safe = jnp.where(temperature > 0, temperature, 1.0)
+        kicks = at_least(parts * growth / (MAX_KICK * safe))
+    if scene.walls is not None:
+        drag_factor = drag_decay_or_one(scene.drag, clock).velocity
+        impacts = _max_wall_impacts(scene, temperature, drag_factor, ds, scheme.dimension)
+        walls = at_least(parts * impacts)
+    return SubsetCounts(kicks, walls)
+
+
+Sums = TypeVar("Sums")
+
+
+def hit_walls_of_subsets(
+    particles: Float[Array, "N components"],
+    key: PRNGKeyArray,
+    drawn: Int[Array, ""],
+    largest: Int[Array, ""],
+    hit: Callable[[Array, Array], tuple[Array, Sums]],
+    zero: Sums,
+) -> tuple[Float[Array, "N components"], Sums]:
+    """Let the particles of one replica hit walls in a step; return them and sums over impacts.
+
+    Args:
+        particles: the particles of the replica.
+        key: key of the step.
+        drawn: number of subsets that may hit walls.
+        largest: the largest such number of all replicas, which share the loop.
+        hit: a function of particles and of a random number for each. It returns the particles after
+            impacts of those whose expected number of impacts is larger, and the sums.
+        zero: sums of no impacts.
+    """
+    n, parts = len(particles), num_subsets(len(particles))
+    bits = jax.random.bits(jax.random.fold_in(key, MAX_SUBSETS), (), jnp.uint16)
+    first = (bits % parts).astype(jnp.int32)
+
+    def hit_subset(i: Int[Array, ""], carry: tuple[Array, Sums]) -> tuple[Array, Sums]:
+        particles, sums = carry
+        subset = subset_of((first + i) % parts, n, i < drawn)
+        bits = jax.random.bits(jax.random.fold_in(key, i), subset.counted.shape, jnp.uint16)
+        chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
+        rows, more = hit(subset.of(particles), jnp.where(subset.counted, chance, jnp.inf))
+        return subset.written(particles, rows), jax.tree.map(jnp.add, sums, more)
+
+    return jax.lax.fori_loop(0, largest, hit_subset, (particles, zero))
+
+
+def kick_subsets(
+    particles: Float[Array, "N components"],
+    key: PRNGKeyArray,
+    kicked: Int[Array, ""],
+    largest: Int[Array, ""],
+    half_steps: UInt32[Array, ""],
+    growth: Float[Array, ""],
+    time: Float[Array, ""],
+    d: int,
+    at_rest: bool,
+) -> tuple[Float[Array, "N components"], Float[Array, ""]]:
+    """Apply half of the kicks of a step to one replica; return particles and growth of T/T_0.
+
+    Args:
+        particles: v, x - v t and spins.
+        key: key of this half of the step.
+        kicked: number of subsets that are kicked.
+        largest: the largest such number of all replicas, which share the loop.
+        half_steps: number of earlier halves.
+        growth: mean growth of T/T_0.
+        time: t, as in x - v t.
+        d: dimension.
+        at_rest: True if the kicks conserve the momentum.
+    """
+    n, parts = len(particles), num_subsets(len(particles))
+    size = jnp.sqrt(growth / 2 * (parts / kicked))
+
+    def kick_subset(i: Int[Array, ""], carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        particles, gain = carry
+        index = ((kicked * half_steps.astype(jnp.int32) + i) & (2**30 - 1)) % parts
+        subset = subset_of(index, n, i < kicked)
+        rows = subset.of(particles)
+        v = rows[:, :d]
+        kick = random_kicks(jax.random.fold_in(key, i), v, at_rest, subset.counted)
+        kick = jnp.where(subset.counted[:, None], size * kick, 0.0)
+        after = [v + kick, rows[:, d : 2 * d] - time * kick, rows[:, 2 * d :]]
+        particles = subset.written(particles, jnp.concatenate(after, axis=-1))
+        return particles, gain + jnp.sum(kick * (2 * v + kick))
+
+    zero = jnp.zeros((), particles.dtype)
+    particles, gain = jax.lax.fori_loop(0, largest, kick_subset, (particles, zero))
+    return particles, 2 * gain / (n * d)
+
+
+def _update_tangents(
+    old: DSMCTangents,
+    before: Float[Array, ""],
+    dimension: int,
+    sums: Outcome,
+    dt: Float[Array, ""],
+    ds: Float[Array, ""],
+    energy: Float[Array, ""],
+) -> tuple[Float[Array, ""], DSMCTangents]:
+    """Return M and the tangents after a step.
+
+    Args:
+        old, before: the tangents and M before the step.
+        dimension: d.
+        sums: sums over its collisions.
+        dt, ds: its length in time and in scaled time.
+        energy: sum v^2 after the step.
+    """
+    c = old.log_temperature
+    # The tangent of the velocities is (c/2) v, and the law contributes at every collision.
+    gain, fading = (sums.along + sums.along_speed[:, None] * (c / 2)[None]) / energy
+    # dM/ds = 1/2 - kappa M and its tangent, by the implicit midpoint rule.
+    half = sums.relaxation / energy / 2
+    mobility = ((1 - half) * before + ds / 2) / (1 + half)
+    along = ((1 - half) * old.mobility - fading * (before + mobility) / 2) / (1 + half)
+    tangents = DSMCTangents(
+        log_temperature=c + gain,
+        clock=old.clock - c / 2 * dt,
+        mobility=along,
+        displacement=old.displacement + dimension * ds * (old.mobility + along),
+        persistence=old.persistence - fading,
+    )
+    return mobility, tangents
+
+
 class CandidatePairs(NamedTuple):
     """Candidate pairs of a step.
 
     Attributes:
-        relative: velocities.
-        spin: sums of the spins that are kept; None of smooth spheres.
-        bits: random ones.
+        relative: relative velocities.
+        spin: sums of the spins in the state; None for smooth spheres.
+        bits: random bits.
     """
 
     relative: Float[Array, "pairs d"]
@@ -369,12 +686,14 @@ class CandidatePairs(NamedTuple):
 
 
 class EnergyGains(NamedTuple):
-    """What both energies gain, and its tangents.
+    """Gains of both energies and their tangents, for `ExchangeTangents`.
+
+    The energies are sum v^2 of translation, and q sum s^2 of the spins in the state.
 
     Attributes:
-        gains: of translation and rotation.
-        along: in the parameters of the scene, in time, and in the logarithms of all velocities and
-            of all spins.
+        gains: gains of translation and rotation.
+        along: tangents in the parameters of the scene, in time, and in the logarithms of all
+            velocities and of all spins.
     """
 
     gains: Float[Array, "2"]
@@ -382,32 +701,31 @@ class EnergyGains(NamedTuple):
 
 
 class StepEvents(NamedTuple):
-    """All that happens in a step.
+    """Events of a step.
 
     Attributes:
-        pairs: candidates.
-        walls: what impacts on them bring; None without walls.
+        pairs: candidate pairs.
+        walls: gains by impacts on walls; None without walls.
         ceiling, share: as for `collide`.
-        began, ds: time at its begin, and its length.
-        particles: N.
+        start, ds: the time at the start of the step, and its length.
+        num_particles: N.
     """
 
     pairs: tuple[CandidatePairs, CandidatePairs]
     walls: EnergyGains | None
     ceiling: Float[Array, ""]
     share: Float[Array, ""]
-    began: Float[Array, ""]
+    start: Float[Array, ""]
     ds: Float[Array, ""]
-    particles: int
+    num_particles: int
 
 
 def initial_exchange_tangents(
     scene: ReducedScene, num_parameters: int, num_particles: int, dimension: int, replicas: int
 ) -> ExchangeTangents:
-    """The tangents at t = 0, where T is 1 and T_rot as the scene has it; the last is that in time.
+    """Return the tangents at t = 0, with a first axis of replicas; the last one is that in time.
 
-    Returns:
-        For each replica, along a first axis.
+    T is then 1, and T_rot that of the scene.
     """
     zero = jnp.zeros_like(scene.law.restitution(jnp.ones(())))
     energies = jnp.zeros((num_parameters + 1, 2), zero.dtype)
@@ -421,99 +739,99 @@ def initial_exchange_tangents(
     return ExchangeTangents(many, many[:, :, 0] * 0)
 
 
-def energies_of(
+def _energies(
     particles: Float[Array, "N components"], scene: ReducedScene, d: int
 ) -> Float[Array, "2"]:
-    """sum v^2, and q sum s^2 of the spins that are kept."""
+    """Return sum v^2, and q sum s^2 of the spins in the state."""
     inertia = 0.0 if scene.surface is None else scene.surface.inertia
     translation, rotation = particles[:, :d], particles[:, 2 * d :]
     return jnp.stack([jnp.sum(translation**2), inertia * jnp.sum(rotation**2)])
 
 
-def exchange_tangents_after(
+def _update_exchange_tangents(
     old: ExchangeTangents,
     scene: ReducedScene,
     before: Float[Array, "2"],
     step: StepEvents,
     collisions: Float[Array, ""],
 ) -> ExchangeTangents:
-    """The tangents after a step.
+    """Return the tangents after a step.
 
     Args:
-        old: before it.
+        old: the tangents before the step.
         scene: in reduced units.
-        before: the two energies before it.
-        step: what happens.
-        collisions: their number.
+        before: the two energies before the step.
+        step: its events.
+        collisions: the number of its collisions.
     """
-    pairs = _gained(partial(_impacts, step=step), scene, step.ds)
-    kicks = _gained(lambda scene, v, s, sooner: _kicks(scene, sooner, step), scene, step.ds)
-    # Kicks do not depend on the speeds, which make impacts more frequent.
+    impacts = _energy_gains(partial(_impact_gains, step=step), scene, step.ds)
+    kicks = _energy_gains(partial(_drive_gains, step=step), scene, step.ds)
+    # The rate of impacts depends on the speeds; kicks do not depend on them.
     kicks = kicks._replace(along=kicks.along.at[-2].add(-kicks.gains))
-    all_of = jax.tree.map(jnp.add, pairs, kicks)
+    total = jax.tree.map(jnp.add, impacts, kicks)
     if step.walls is not None:
-        all_of = jax.tree.map(jnp.add, all_of, step.walls)
-    return old.after(before, all_of.gains, all_of.along, collisions)
+        total = jax.tree.map(jnp.add, total, step.walls)
+    return old.after(before, total.gains, total.along, collisions)
 
 
-def wall_gains(
+def _wall_gains(
     hit: Callable[..., WallImpacts], scene: ReducedScene, middle: Float[Array, ""]
 ) -> EnergyGains:
-    """What impacts on walls bring, at the middle of a step: `hit` of `_bounced`."""
+    """Return the gains by impacts on walls at the middle of a step; see `hit` in `_apply_walls`."""
 
-    def by(scene, velocity, spin, sooner):
-        scene, left, faster, turning = _scaled(scene, velocity, spin, sooner, middle)
-        found = hit(scene, faster, turning, left.velocity)
-        return jnp.stack([-found.lost, found.rotational_gain / left.spin**2])
+    def gains(scene, velocity, spin, time_scale):
+        scene, decay, faster, turning = _scale_motion(scene, velocity, spin, time_scale, middle)
+        impacts = hit(scene, faster, turning, decay.velocity)
+        return jnp.stack([-impacts.loss, impacts.rotational_gain / decay.spin**2])
 
-    return _gained(by, scene, middle)
+    return _energy_gains(gains, scene, middle)
 
 
-def _gained(
-    by: Callable[..., Float[Array, "2"]], scene: ReducedScene, like: Float[Array, ""]
+def _energy_gains(
+    function: Callable[..., Float[Array, "2"]], scene: ReducedScene, like: Float[Array, ""]
 ) -> EnergyGains:
-    """Gains as a function of the scene, the logarithms of velocities and spins, and of time."""
+    """Return the gains and tangents of a function of the scene, log velocity, log spin and time."""
     zero = jnp.zeros_like(like)
-    gains, pull = jax.vjp(by, scene, zero, zero, zero)
+    gains, pull = jax.vjp(function, scene, zero, zero, zero)
 
     def row(weights):
-        in_scene, *others = pull(weights)
-        return jnp.concatenate([ravel_pytree(in_scene)[0], jnp.stack(others)])
+        in_scene, *in_motion = pull(weights)
+        return jnp.concatenate([ravel_pytree(in_scene)[0], jnp.stack(in_motion)])
 
     slopes = jax.vmap(row)(jnp.eye(2, dtype=zero.dtype)).T
     return EnergyGains(gains, jnp.concatenate([slopes[:-3], slopes[-1:], slopes[-3:-1]]))
 
 
-def _scaled(
-    scene: ReducedScene, velocity: Array, spin: Array, sooner: Array, middle: Array
+def _scale_motion(
+    scene: ReducedScene, velocity: Array, spin: Array, time_scale: Array, middle: Array
 ) -> tuple[ReducedScene, DragDecay, Array, Array]:
-    """The scene and what drag has left, if all is sooner; factors of velocities and of spins."""
-    scene = scene._replace(drag=_sooner(scene, sooner))
-    left = drag_decay_or_one(scene.drag, middle)
-    faster, turning = jnp.exp(velocity), left.spin * jnp.exp(spin)
-    if scene.surface is not None:  # at a given energy spins are smaller where the inertia is larger
+    """Return the scene and its drag decay in scaled time, and factors of velocities and spins."""
+    scene = scene._replace(drag=_scale_drag(scene, time_scale))
+    decay = drag_decay_or_one(scene.drag, middle)
+    faster, turning = jnp.exp(velocity), decay.spin * jnp.exp(spin)
+    if scene.surface is not None:  # at a given energy a larger inertia has smaller spins
         inertia = scene.surface.inertia
         turning = turning * jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
-    return scene, left, faster, turning
+    return scene, decay, faster, turning
 
 
-def _sooner(scene: ReducedScene, share: Array) -> ReducedDrag | None:
+def _scale_drag(scene: ReducedScene, share: Array) -> ReducedDrag | None:
     if scene.drag is None:
         return None
     return ReducedDrag(*(rate * (1 + share) for rate in scene.drag))
 
 
-def _impacts(
-    scene: ReducedScene, velocity: Array, spin: Array, sooner: Array, step: StepEvents
+def _impact_gains(
+    scene: ReducedScene, velocity: Array, spin: Array, time_scale: Array, step: StepEvents
 ) -> Float[Array, "2"]:
-    """What both energies gain by impacts, with velocities and spins greater by factors exp(...)."""
-    middle = step.began + step.ds / 2
-    scene, left, faster, turning = _scaled(scene, velocity, spin, sooner, middle)
-    slowed = None if scene.drag is None else left.velocity
+    """Return the gains by collisions, with velocities and spins scaled by factors exp(...)."""
+    middle = step.start + step.ds / 2
+    scene, decay, faster, turning = _scale_motion(scene, velocity, spin, time_scale, middle)
+    drag_factor = None if scene.drag is None else decay.velocity
     total = jnp.zeros(2, step.ds.dtype)
     for pairs in step.pairs:
         spins = None if pairs.spin is None else pairs.spin * turning
-        found = collide(
+        outcome = collide(
             pairs.relative * faster,
             pairs.bits,
             step.ceiling,
@@ -521,393 +839,92 @@ def _impacts(
             scene,
             False,
             spin=spins,
-            slowed=slowed,
+            drag_factor=drag_factor,
         )
-        total = total + jnp.stack([-found.loss, found.rotational_gain / left.spin**2])
+        total = total + jnp.stack([-outcome.loss, outcome.rotational_gain / decay.spin**2])
     return total
 
 
-def _kicks(scene: ReducedScene, sooner: Array, step: StepEvents) -> Float[Array, "2"]:
-    """What both energies gain by a drive."""
+def _drive_gains(
+    scene: ReducedScene, velocity: Array, spin: Array, time_scale: Array, step: StepEvents
+) -> Float[Array, "2"]:
+    """Return the gains by a drive, which do not depend on velocities and spins."""
     if scene.drive is None:
         return jnp.zeros(2, step.ds.dtype)
-    drag = _sooner(scene, sooner)
-    growth = sum(kick_growth(scene.drive, drag, step.began, step.ds, place) for place in (0.0, 1.0))
+    drag = _scale_drag(scene, time_scale)
+    growth = sum(kick_growth(scene.drive, drag, step.start, step.ds, place) for place in (0.0, 1.0))
     d = step.pairs[0].relative.shape[1]
-    return jnp.stack([step.particles * d / 2 * growth, jnp.zeros_like(step.ds)])
-
-
-CEILING = 5.0
-"""Relative speed, in sqrt(2 T), up to which the collision rate is right; beyond, it is constant.
-
-A Maxwellian gas misses 2e-6 of its collisions by this, and 1e-5 of its losses. A run counts what it
-misses.
-"""
-
-
-class Scheme(NamedTuple):
-    """Static sizes of one step.
-
-    Attributes:
-        dimension: d.
-        num_particles: N.
-        first: number of disjoint random pairs.
-        second: number of pairs that are formed next, of a particle of a first pair and a new one.
-    """
-
-    dimension: int
-    num_particles: int
-    first: int
-    second: int
-
-    @classmethod
-    def of(cls, dimension: int, num_particles: int, step: float) -> "Scheme":
-        """The scheme with so many collisions per particle and step.
-
-        Were M pairs drawn one after the other with replacement, ``2 M (M - 1) / N`` of them would
-        on average share a particle with an earlier pair. The scheme has as many of these, which
-        makes the step second order.
-        """
-        accepted = sphere_surface(dimension) / sqrt(2 * pi) / (2 ** (dimension - 1) * CEILING)
-        pairs = max(round(step * num_particles / (2 * accepted)), 1)
-        second = round(2 * pairs * (pairs - 1) / num_particles)
-        return cls(dimension, num_particles, pairs - second, second)
-
-    @property
-    def own_step(self) -> float:
-        """``dt sqrt(T/T_0)`` of a step, in which each particle meets the N - 1 others alike."""
-        candidates = 2 * (self.first + self.second) / (self.num_particles - 1)
-        return candidates / (2 ** (self.dimension - 1) * CEILING)
-
-
-@cache
-def _strides(num_particles: int) -> np.ndarray:
-    """Numbers coprime to N that are so small that their product with N fits into 32 bits."""
-    top = min(num_particles, 2**32 // num_particles - 1)
-    return np.array([s for s in range(1, max(top, 2)) if gcd(s, num_particles) == 1], np.uint32)
-
-
-def draw(
-    bits: UInt[Array, "4"], scheme: Scheme
-) -> tuple[Int[Array, "first"], Int[Array, "first"], Int[Array, "second"]]:
-    """Indices of the particles of the first pairs, and of the new particles of the second pairs.
-
-    Since particles are exchangeable, evenly spaced indices will do, as long as any two particles
-    meet with about the same probability: the first particles of the pairs are a + s l for random a
-    and s, their partners stand a random number of places further on. Every particle is drawn with
-    the same probability. Every pair is, too, if N is prime. Else pairs whose distance shares a
-    large divisor with N (one in a hundred at N = 1000) are up to 1.7 times as likely, and the
-    probabilities scatter by 6 % (14 % at N = 64).
-    """
-    n, first, second = scheme.num_particles, scheme.first, scheme.second
-    strides = jnp.asarray(_strides(n))
-    stride = strides[bits[0] % len(strides)]
-    apart = first + second + bits[1] % (n - 2 * first - second + 1)
-
-    def particle(place):
-        return ((bits[2] % n + stride * place) % n).astype(jnp.int32)
-
-    place = jnp.arange(first, dtype=jnp.uint32)
-    # The new ones stand in between, also at a random distance.
-    fresh = first + bits[3] % (apart - (first + second) + 1) + jnp.arange(second, dtype=jnp.uint32)
-    return particle(place), particle(place + apart), particle(fresh)
-
-
-Sums = TypeVar("Sums")
-
-MAX_PORTIONS = 16
-"""Portions of many particles."""
-
-MIN_ROWS = 16
-"""Particles of a portion, whose kicks together leave its momentum as it is."""
-
-
-class Portion(NamedTuple):
-    """Some neighbouring rows of the particles.
-
-    Attributes:
-        first: the first of them.
-        counted: which of them belong to the portion.
-    """
-
-    first: Int[Array, ""]
-    counted: Bool[Array, "rows"]
-
-    def of(self, particles: Float[Array, "N components"]) -> Float[Array, "rows components"]:
-        """Its rows."""
-        return jax.lax.dynamic_slice_in_dim(particles, self.first, len(self.counted))
-
-    def written(self, particles: Float[Array, "N components"], rows: Array) -> Array:
-        """All particles with new rows."""
-        return jax.lax.dynamic_update_slice_in_dim(particles, rows, self.first, 0)
-
-
-def num_portions(num_particles: int) -> int:
-    """The number of portions."""
-    return max(min(MAX_PORTIONS, num_particles // MIN_ROWS), 1)
-
-
-def portion_of(index: Int[Array, ""], num_particles: int, active: Bool[Array, ""]) -> Portion:
-    """A portion of particles, each of which belongs to one."""
-    n, parts = num_particles, num_portions(num_particles)
-    begin, end = index * n // parts, (index + 1) * n // parts
-    rows = -(-n // parts)
-    first = jnp.minimum(begin, n - rows)
-    row = first + jnp.arange(rows, dtype=first.dtype)
-    return Portion(first, (row >= begin) & (row < end) & active)
-
-
-class Portions(NamedTuple):
-    """How many portions of the particles take part in a step; None without what they take part in.
-
-    Attributes:
-        kicks: of a drive, in half of the step.
-        walls: impacts on walls.
-    """
-
-    kicks: Int[Array, "*replicas"] | None
-    walls: Int[Array, "*replicas"] | None
-
-
-def portions_of_step(
-    temperature: Float[Array, "*replicas"],
-    clock: Float[Array, "*replicas"],
-    share: Float[Array, "*replicas"],
-    scene: ReducedScene,
-    scheme: Scheme,
-) -> Portions:
-    """The portions that take part in a share of a step.
-
-    So many are kicked in half of it that T of none grows by more than `kicks.LARGEST`: particles
-    whose turns are w T apart have at one time temperatures that differ by so much, by which a_2 of
-    all is too large by ``w^2/12``, 2e-4 at most. So many may meet walls that one of the fastest
-    spheres does so at most once.
-    """
-    parts = num_portions(scheme.num_particles)
-    ds = share * scheme.own_step / jnp.sqrt(temperature)
-
-    def at_least(needed: Array) -> Array:
-        return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
-
-    kicked = walled = None
-    if scene.drive is not None:
-        growth = kick_growth(scene.drive, scene.drag, clock, ds, 0.0)
-        safe = jnp.where(temperature > 0, temperature, 1.0)
-        kicked = at_least(parts * growth / (MAX_KICK * safe))
-    if scene.walls is not None:
-        slowed = drag_decay_or_one(scene.drag, clock).velocity
-        most = fastest_share(scene, temperature, slowed, ds, scheme.dimension)
-        walled = at_least(parts * most)
-    return Portions(kicked, walled)
-
-
-def bounce_portions(
-    particles: Float[Array, "N components"],
-    key: PRNGKeyArray,
-    drawn: Int[Array, ""],
-    most: Int[Array, ""],
-    meet: Callable[[Array, Array], tuple[Array, Sums]],
-    none: Sums,
-) -> tuple[Float[Array, "N components"], Sums]:
-    """The particles of one replica after their impacts on walls in a step, and sums over these.
-
-    Args:
-        particles: of the replica.
-        key: of the step.
-        drawn: portions that may meet walls.
-        most: the largest number of these of all replicas, which share the loop.
-        meet: function of particles and of a random number for each; returns them after impacts of
-            those whose number is smaller than the impacts that they have in the step, and what is
-            summed.
-        none: sums of no impacts.
-    """
-    n, parts = len(particles), num_portions(len(particles))
-    bits = jax.random.bits(jax.random.fold_in(key, MAX_PORTIONS), (), jnp.uint16)
-    which = (bits % parts).astype(jnp.int32)
-
-    def some(i: Int[Array, ""], done: tuple[Array, Sums]) -> tuple[Array, Sums]:
-        particles, sums = done
-        own = portion_of((which + i) % parts, n, i < drawn)
-        bits = jax.random.bits(jax.random.fold_in(key, i), own.counted.shape, jnp.uint16)
-        chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
-        rows, more = meet(own.of(particles), jnp.where(own.counted, chance, jnp.inf))
-        return own.written(particles, rows), jax.tree.map(jnp.add, sums, more)
-
-    return jax.lax.fori_loop(0, most, some, (particles, none))
-
-
-def kick_portions(
-    particles: Float[Array, "N components"],
-    key: PRNGKeyArray,
-    turns: Int[Array, ""],
-    most: Int[Array, ""],
-    half_steps: UInt32[Array, ""],
-    growth: Float[Array, ""],
-    time: Float[Array, ""],
-    d: int,
-    at_rest: bool,
-) -> tuple[Float[Array, "N components"], Float[Array, ""]]:
-    """The particles of one replica after half of the kicks of a step, and how much T/T_0 has grown.
-
-    Args:
-        particles: v, x - v t and spins.
-        key: of this half of the step.
-        turns: portions that have their turn.
-        most: the largest number of turns of all replicas, which share the loop.
-        half_steps: number of halves before.
-        growth: of T/T_0, on average.
-        time: t, as in x - v t.
-        d: dimension.
-        at_rest: whether the kicks leave the momentum as it is.
-    """
-    n, parts = len(particles), num_portions(len(particles))
-    size = jnp.sqrt(growth / 2 * (parts / turns))
-
-    def turn(i: Int[Array, ""], done: tuple[Array, Array]) -> tuple[Array, Array]:
-        particles, gained = done
-        index = ((turns * half_steps.astype(jnp.int32) + i) & (2**30 - 1)) % parts
-        own = portion_of(index, n, i < turns)
-        rows = own.of(particles)
-        v = rows[:, :d]
-        kick = random_kicks(jax.random.fold_in(key, i), v, at_rest, own.counted)
-        kick = jnp.where(own.counted[:, None], size * kick, 0.0)
-        after = [v + kick, rows[:, d : 2 * d] - time * kick, rows[:, 2 * d :]]
-        particles = own.written(particles, jnp.concatenate(after, axis=-1))
-        return particles, gained + jnp.sum(kick * (2 * v + kick))
-
-    zero = jnp.zeros((), particles.dtype)
-    particles, gained = jax.lax.fori_loop(0, most, turn, (particles, zero))
-    return particles, 2 * gained / (n * d)
-
-
-class DSMCTangents(NamedTuple):
-    """Tangents at a fixed own time s, ``ds = sqrt(T/T_0) dt``, in P parameters of the law.
-
-    The tangent of the velocities is c v / 2. That of <dr^2> follows from ``d<dr^2>/ds = 2 d M``,
-    ``dM/ds = 1/2 - kappa M``, the equation of kinetic theory for ``M = D / sqrt(T/T_0)``. Here
-    kappa is the rate of velocity relaxation less half the cooling rate, and is measured on the
-    collisions.
-
-    Attributes:
-        log_temperature: c = d ln T.
-        clock: of the time.
-        mobility: of M.
-        displacement: of <dr^2>.
-        persistence: of the logarithm of <v(0).v> / sqrt(T).
-    """
-
-    log_temperature: Float[Array, "*replicas P"]
-    clock: Float[Array, "*replicas P"]
-    mobility: Float[Array, "*replicas P"]
-    displacement: Float[Array, "*replicas P"]
-    persistence: Float[Array, "*replicas P"]
-
-
-def tangents_after_step(
-    old: DSMCTangents,
-    before: Float[Array, ""],
-    dimension: int,
-    sums: Outcome,
-    dt: Float[Array, ""],
-    ds: Float[Array, ""],
-    energy: Float[Array, ""],
-) -> tuple[Float[Array, ""], DSMCTangents]:
-    """M and the tangents after a step.
-
-    Args:
-        old, before: the tangents and M before it.
-        dimension: d.
-        sums: over its collisions.
-        dt, ds: its length in time and in own time.
-        energy: sum v^2 after it.
-    """
-    c = old.log_temperature
-    # The tangent of the velocities is (c/2) v; the law adds to it at every collision.
-    gain, fading = (sums.along + sums.along_speed[:, None] * (c / 2)[None]) / energy
-    # dM/ds = 1/2 - kappa M and its tangent, by the implicit midpoint rule.
-    half = sums.memory / energy / 2
-    mobility = ((1 - half) * before + ds / 2) / (1 + half)
-    along = ((1 - half) * old.mobility - fading * (before + mobility) / 2) / (1 + half)
-    tangents = DSMCTangents(
-        log_temperature=c + gain,
-        clock=old.clock - c / 2 * dt,
-        mobility=along,
-        displacement=old.displacement + dimension * ds * (old.mobility + along),
-        persistence=old.persistence - fading,
-    )
-    return mobility, tangents
-
-
-class DSMCState(NamedTuple):
-    """R replicas of N particles. Units: the impact speed sqrt(2 T_0) and the path length.
-
-    Attributes:
-        time: which all replicas have reached.
-        clock: start of the step of each replica that ends beyond `time`.
-        clock_rest: what rounding has left out of `clock`, a compensated sum.
-        temperature: T/T_0, updated by the losses and recomputed every `collisions.RECOUNTED` steps.
-        particles: the 2 d components of v and of x - v t, which only collisions change, and the
-            spins of rough spheres. With drag they are transformed: see `jaxgran.particles.state`.
-        collisions: number of pairs that collided.
-        missed: number of collisions missed because of the `CEILING`.
-        steps: number of steps.
-        mobility: M = D / sqrt(T/T_0), followed together with the tangents.
-        tangents: in the parameters of the law, or of a scene with elements.
-    """
-
-    time: Float[Array, ""]
-    clock: Float[Array, "*replicas"]
-    clock_rest: Float[Array, "*replicas"]
-    temperature: Float[Array, "*replicas"]
-    particles: Float[Array, "*replicas N components"]
-    collisions: Float[Array, "*replicas"]
-    missed: Float[Array, "*replicas"]
-    steps: UInt32[Array, "*replicas"]
-    mobility: Float[Array, "*replicas"]
-    tangents: DSMCTangents | ExchangeTangents
+    return jnp.stack([step.num_particles * d / 2 * growth, jnp.zeros_like(step.ds)])
 
 
 RECOUNT_INTERVAL = 32
-"""Steps after which T is computed from the velocities again.
+"""Number of steps between computations of T from the velocities.
 
-In between it is updated by the losses. The rounding errors of this sum do not shrink as T falls,
-and in float32 they would dominate T once it has fallen to 1e-7 of its first value.
+In between the losses update T. The rounding errors of this sum do not shrink as T falls, and in
+float32 they would dominate T once it has fallen to 1e-7 of its initial value.
 """
+
+
+def step(
+    state: DSMCState,
+    key: UInt32[Array, "2"],
+    share: Float[Array, "replicas"],
+    scene: ReducedScene,
+    scheme: Scheme,
+    tangents: bool,
+) -> DSMCState:
+    """Do a share, 0 to 1, of the next step of each replica."""
+    replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(threefry_key(key), replicas)
+    subsets = subsets_per_step(state.temperature, state.clock, share, scene, scheme)
+    largest = jax.tree.map(jnp.max, subsets)
+    step_replica = partial(_step, largest=largest, scene=scene, scheme=scheme, tangents=tangents)
+    axes = jax.tree.map(lambda _: 0, state)._replace(time=None)
+    state = jax.vmap(step_replica, (axes, 0, 0, 0), axes)(state, keys, subsets, share)
+    due = state.steps % RECOUNT_INTERVAL == 0
+
+    def recount(temperature):
+        velocity = state.particles[..., : scheme.dimension]
+        from_velocities = 2 * jnp.mean(velocity**2, axis=(1, 2))
+        return jnp.where(due, from_velocities, temperature)
+
+    temperature = jax.lax.cond(jnp.any(due), recount, lambda x: x, state.temperature)
+    return state._replace(temperature=temperature)
 
 
 def _step(
     state: DSMCState,
     key: PRNGKeyArray,
-    some: Portions,
+    subsets: SubsetCounts,
     share: Float[Array, ""],
-    most: Portions,
+    largest: SubsetCounts,
     scene: ReducedScene,
     scheme: Scheme,
     tangents: bool,
 ) -> DSMCState:
-    """A share, 0 to 1, of one step of one replica, always with the same random numbers.
+    """Do a share, 0 to 1, of a step of one replica, with random numbers that do not depend on it.
 
     Each collision of the whole step takes place with this probability, so that the state within
     a step is as accurate as at its end.
     """
     key = jax.random.fold_in(key, state.steps)
-    dt = share * scheme.own_step / jnp.sqrt(state.temperature)
-    kicked = partial(_apply_drive, key=key, dt=dt, scene=scene, scheme=scheme)
-    kicked = partial(kicked, turns=(some.kicks, most.kicks))
-    before, state = state, kicked(state, clock=state.clock, place=0)
+    dt = share * scheme.scaled_step / jnp.sqrt(state.temperature)
+    counts = subsets.kicks, largest.kicks
+    apply_drive = partial(_apply_drive, key=key, dt=dt, counts=counts, scene=scene, scheme=scheme)
+    before, state = state, apply_drive(state, clock=state.clock, place=0)
     exchanging = tangents and isinstance(state.tangents, ExchangeTangents)
     particles, sums, pairs = _apply_collisions(
         state, key, dt, share, scene, scheme, tangents and not exchanging
     )
-    lost, met = sums.loss, None
-    if some.walls is not None and most.walls is not None:
-        bounced = partial(
-            _apply_walls, drawn=(some.walls, most.walls), scene=scene, d=scheme.dimension
+    loss, wall_gains = sums.loss, None
+    if subsets.walls is not None and largest.walls is not None:
+        counts = subsets.walls, largest.walls
+        particles, wall_loss, wall_gains = _apply_walls(
+            state, key, dt, particles, counts, scene, scheme.dimension, exchanging
         )
-        particles, to_walls, met = bounced(state, key, dt, particles, tangents=exchanging)
-        lost = lost + to_walls
+        loss = loss + wall_loss
     energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
-    temperature = state.temperature - lost / energy
+    temperature = state.temperature - loss / energy
     passed = state.clock_rest + dt
     clock = state.clock + passed
     new = state._replace(
@@ -919,18 +936,18 @@ def _step(
         missed=state.missed + sums.missed,
         steps=state.steps + (share > 0).astype(state.steps.dtype),
     )
-    new = kicked(new, clock=state.clock, place=1)
+    new = apply_drive(new, clock=state.clock, place=1)
     if not tangents:
         return new
     if isinstance(before.tangents, ExchangeTangents):
         ceiling = CEILING * jnp.sqrt(state.temperature)
-        step = StepEvents(pairs, met, ceiling, share, state.clock, dt, scheme.num_particles)
-        energies = energies_of(before.particles, scene, scheme.dimension)
-        along = exchange_tangents_after(before.tangents, scene, energies, step, sums.num)
+        step = StepEvents(pairs, wall_gains, ceiling, share, state.clock, dt, scheme.num_particles)
+        energies = _energies(before.particles, scene, scheme.dimension)
+        along = _update_exchange_tangents(before.tangents, scene, energies, step, sums.num)
         return new._replace(tangents=along)
-    ds, left = share * scheme.own_step, energy * temperature
-    mobility, along = tangents_after_step(
-        before.tangents, state.mobility, scheme.dimension, sums, dt, ds, left
+    ds, energy_after = share * scheme.scaled_step, energy * temperature
+    mobility, along = _update_tangents(
+        before.tangents, state.mobility, scheme.dimension, sums, dt, ds, energy_after
     )
     return new._replace(mobility=mobility, tangents=along)
 
@@ -939,24 +956,26 @@ def _apply_drive(
     state: DSMCState,
     key: PRNGKeyArray,
     dt: Float[Array, ""],
-    turns: tuple[Int[Array, ""] | None, Int[Array, ""] | None],
+    counts: tuple[Int[Array, ""] | None, Int[Array, ""] | None],
     scene: ReducedScene,
     scheme: Scheme,
     clock: Float[Array, ""],
     place: int,
 ) -> DSMCState:
-    """The state after half of the kicks of a step, at its begin (place 0) or end (1); `turns` are
-    portions of this replica and the most of any."""
-    own, most = turns
-    if scene.drive is None or own is None or most is None:
+    """Apply half of the kicks of a step, at its start (place 0) or end (1).
+
+    `counts` are the number of subsets of this replica and the largest of any replica.
+    """
+    kicked, largest = counts
+    if scene.drive is None or kicked is None or largest is None:
         return state
     d = scheme.dimension
     growth = kick_growth(scene.drive, scene.drag, clock, dt, float(place))
     key = jax.random.fold_in(key, 2 + place)
     halves = 2 * state.steps + place
     at_rest = scene.walls is None
-    particles, grown = kick_portions(
-        state.particles, key, own, most, halves, growth, state.clock, d, at_rest
+    particles, grown = kick_subsets(
+        state.particles, key, kicked, largest, halves, growth, state.clock, d, at_rest
     )
     return state._replace(particles=particles, temperature=state.temperature + grown)
 
@@ -970,47 +989,53 @@ def _apply_collisions(
     scheme: Scheme,
     tangents: bool,
 ) -> tuple[Float[Array, "N components"], Outcome, tuple[CandidatePairs, CandidatePairs]]:
-    """The particles after a step, sums over its collisions, and the candidates."""
+    """Return the particles after the collisions of a step, sums over them, and the candidates."""
     d, first, second = scheme.dimension, scheme.first, scheme.second
     bits = jax.random.bits(key, (2, first + second + 2), jnp.uint32)
-    i, j, k = draw(bits[:, -2:].ravel(), scheme)
+    i, j, k = draw_pairs(bits[:, -2:].ravel(), scheme)
     index = jnp.concatenate([i, j, k])
     options = {"mode": "promise_in_bounds", "unique_indices": True}
     old = state.particles.at[index].get(**options)
-    v, spin, slowed, kept = old[:, :d], old[:, 2 * d :], None, 1.0
+    v, spin, drag_factor, spin_factor = old[:, :d], old[:, 2 * d :], None, 1.0
     # Collisions happen at the middle of the step, on average: x - v t changes by -kick t.
     middle = state.clock + dt / 2
     if scene.drag is not None:
-        left = drag_decay(scene.drag, middle)
-        slowed, kept = left.velocity, left.spin
-        spin = spin * kept
+        decay = drag_decay(scene.drag, middle)
+        drag_factor, spin_factor = decay.velocity, decay.spin
+        spin = spin * spin_factor
 
-    ceiling = CEILING * jnp.sqrt(state.temperature)
     rule = partial(
-        collide, ceiling=ceiling, share=share, scene=scene, tangents=tangents, slowed=slowed
+        collide,
+        ceiling=CEILING * jnp.sqrt(state.temperature),
+        share=share,
+        scene=scene,
+        tangents=tangents,
+        drag_factor=drag_factor,
     )
     rough = scene.surface is not None
     firsts = v[:first] - v[first : 2 * first]
-    turning = spin[:first] + spin[first : 2 * first] if rough else None
-    one = rule(firsts, bits[:, :first], spin=turning)
-    twice, again = one.kick[:second], one.spin_change
-    if again is not None:
-        again = spin[:second] + again[:second] + spin[2 * first :]
-    seconds = v[:second] + twice - v[2 * first :]
-    two = rule(seconds, bits[:, first:-2], spin=again)
-    kicks = jnp.concatenate([twice + two.kick, one.kick[second:], -one.kick, -two.kick])
+    first_spins = spin[:first] + spin[first : 2 * first] if rough else None
+    one = rule(firsts, bits[:, :first], spin=first_spins)
+    kick_before, second_spins = one.kick[:second], one.spin_change
+    if second_spins is not None:
+        second_spins = spin[:second] + second_spins[:second] + spin[2 * first :]
+    seconds = v[:second] + kick_before - v[2 * first :]
+    two = rule(seconds, bits[:, first:-2], spin=second_spins)
+    kicks = jnp.concatenate([kick_before + two.kick, one.kick[second:], -one.kick, -two.kick])
     changes = [kicks, -middle * kicks]
     if one.spin_change is not None and two.spin_change is not None:
         both = one.spin_change[:second] + two.spin_change
         changes.append(
             jnp.concatenate([both, one.spin_change[second:], one.spin_change, two.spin_change])
-            / kept
+            / spin_factor
         )
     sums = jax.tree.map(jnp.add, *(x._replace(kick=0.0, spin_change=None) for x in (one, two)))
     new = old + jnp.concatenate(changes, axis=-1)
+    first_spins = None if first_spins is None else first_spins / spin_factor
+    second_spins = None if second_spins is None else second_spins / spin_factor
     pairs = (
-        CandidatePairs(firsts, None if turning is None else turning / kept, bits[:, :first]),
-        CandidatePairs(seconds, None if again is None else again / kept, bits[:, first:-2]),
+        CandidatePairs(firsts, first_spins, bits[:, :first]),
+        CandidatePairs(seconds, second_spins, bits[:, first:-2]),
     )
     return state.particles.at[index].set(new, **options), sums, pairs
 
@@ -1020,61 +1045,39 @@ def _apply_walls(
     key: PRNGKeyArray,
     dt: Float[Array, ""],
     particles: Float[Array, "N components"],
-    drawn: tuple[Int[Array, ""], Int[Array, ""]],
+    counts: tuple[Int[Array, ""], Int[Array, ""]],
     scene: ReducedScene,
     d: int,
     tangents: bool,
 ) -> tuple[Float[Array, "N components"], Float[Array, ""], EnergyGains | None]:
-    """The particles after their impacts on walls in a step, the decrease of sum v^2, and with
-    tangents what both energies gain."""
-    left = drag_decay_or_one(scene.drag, state.clock + dt / 2)
+    """Return the particles after impacts on walls in a step, the loss of sum v^2, and the gains.
+
+    `counts` are the number of subsets of this replica and the largest of any replica. Without
+    tangents the gains are None.
+    """
+    middle = state.clock + dt / 2
+    decay = drag_decay_or_one(scene.drag, middle)
     axis, one = (state.steps % d).astype(jnp.int32), jnp.ones(())
 
-    def meet(rows: Array, chance: Array) -> tuple[Array, tuple[Array, EnergyGains | None]]:
+    def hit_rows(rows: Array, chance: Array) -> tuple[Array, tuple[Array, EnergyGains | None]]:
         velocity, spin = rows[:, :d], rows[:, 2 * d :]
 
-        def hit(scene: ReducedScene, faster: Array, turning: Array, slowed: Array) -> WallImpacts:
-            return hit_walls(scene, chance, axis, velocity * faster, spin * turning, dt, slowed)
+        def hit(scene: ReducedScene, faster: Array, turning: Array, drag: Array) -> WallImpacts:
+            return hit_walls(scene, chance, axis, velocity * faster, spin * turning, dt, drag)
 
-        found = hit(scene, one, left.spin, left.velocity)
-        gained = wall_gains(hit, scene, state.clock + dt / 2) if tangents else None
-        after = [found.velocity, rows[:, d : 2 * d], found.spin / left.spin]
-        return jnp.concatenate(after, axis=-1), (found.lost, gained)
+        impacts = hit(scene, one, decay.spin, decay.velocity)
+        gains = _wall_gains(hit, scene, middle) if tangents else None
+        after = [impacts.velocity, rows[:, d : 2 * d], impacts.spin / decay.spin]
+        return jnp.concatenate(after, axis=-1), (impacts.loss, gains)
 
-    shapes = jax.eval_shape(meet, particles[:1], particles[:1, 0])[1]
-    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    bounced = bounce_portions(particles, jax.random.fold_in(key, 1), *drawn, meet, none)
-    return bounced[0], *bounced[1]
-
-
-def step(
-    state: DSMCState,
-    key: UInt32[Array, "2"],
-    share: Float[Array, "replicas"],
-    scene: ReducedScene,
-    scheme: Scheme,
-    tangents: bool,
-) -> DSMCState:
-    """A share, 0 to 1, of the next step of each replica."""
-    replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(threefry_key(key), replicas)
-    some = portions_of_step(state.temperature, state.clock, share, scene, scheme)
-    most = jax.tree.map(jnp.max, some)
-    one = partial(_step, most=most, scene=scene, scheme=scheme, tangents=tangents)
-    axes = jax.tree.map(lambda _: 0, state)._replace(time=None)
-    state = jax.vmap(one, (axes, 0, 0, 0), axes)(state, keys, some, share)
-    due = state.steps % RECOUNT_INTERVAL == 0
-
-    def recounted(temperature):
-        velocity = state.particles[..., : scheme.dimension]
-        counted = 2 * jnp.mean(velocity**2, axis=(1, 2))
-        return jnp.where(due, counted, temperature)
-
-    temperature = jax.lax.cond(jnp.any(due), recounted, lambda x: x, state.temperature)
-    return state._replace(temperature=temperature)
+    shapes = jax.eval_shape(hit_rows, particles[:1], particles[:1, 0])[1]
+    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    key = jax.random.fold_in(key, 1)
+    particles, (loss, gains) = hit_walls_of_subsets(particles, key, *counts, hit_rows, zero)
+    return particles, loss, gains
 
 
-def _advanced(
+def _advance(
     state: DSMCState,
     end: Float[Array, ""],
     scene: ReducedScene,
@@ -1084,50 +1087,50 @@ def _advanced(
     scheme: Scheme,
     tangents: bool = False,
 ) -> DSMCState:
-    """Whole steps towards a time: each replica is taken to its last step that ends before it.
+    """Advance each replica by whole steps to the last one that ends before a time.
 
     Args:
-        state: where to start.
+        state: the initial state.
         end: the time.
         scene: in reduced units.
-        key: of the random numbers, two 32-bit words.
-        max_steps: the most steps to take; `time` of the state tells how far they led.
+        key: two 32-bit words of a key of random numbers.
+        max_steps: maximum number of steps; `time` of the result is the time that they reach.
         scheme: sizes of a step.
-        tangents: whether tangents are followed.
+        tangents: True to compute tangents.
     """
 
     def length(state):
-        whole = scheme.own_step / jnp.sqrt(state.temperature)
-        return limited_step(scene, state.temperature, state.clock, whole, scheme.dimension)
+        whole = scheme.scaled_step / jnp.sqrt(state.temperature)
+        return _limit_step(scene, state.temperature, state.clock, whole, scheme.dimension)
 
     def due(state):
         return length(state) <= (end - state.clock) - state.clock_rest
 
     def unfinished(carry):
-        state, left = carry
-        return jnp.any(due(state)) & (left > 0)
+        state, steps_left = carry
+        return jnp.any(due(state)) & (steps_left > 0)
 
-    def further(carry):
-        state, left = carry
+    def step_due(carry):
+        state, steps_left = carry
         share = due(state).astype(state.clock.dtype)
         if scene.drive is not None or scene.walls is not None:
-            share = share * length(state) * jnp.sqrt(state.temperature) / scheme.own_step
-        return step(state, key, share, scene, scheme, tangents), left - 1
+            share = share * length(state) * jnp.sqrt(state.temperature) / scheme.scaled_step
+        return step(state, key, share, scene, scheme, tangents), steps_left - 1
 
-    state, _ = jax.lax.while_loop(unfinished, further, (state, max_steps))
+    state, _ = jax.lax.while_loop(unfinished, step_due, (state, max_steps))
     time = jnp.where(jnp.any(due(state)), jnp.min(state.clock), end)
     return state._replace(time=jnp.maximum(time, state.time))
 
 
-advance = jax.jit(_advanced, static_argnames=("scheme", "tangents"))
+advance = jax.jit(_advance, static_argnames=("scheme", "tangents"))
 
 
 @cache
-def advancing(donate: bool) -> Callable[..., DSMCState]:
-    """`advance` as the host driver calls it, which may write over the state given, and so delete
-    it."""
-    static, given = ("scheme", "tangents"), "state" if donate else ()
-    options = cpu_compiler_options()
+def compiled_advance(donate: bool) -> Callable[..., DSMCState]:
+    """Return `advance` for the host driver; with `donate` a call deletes its initial state."""
     return jax.jit(
-        _advanced, static_argnames=static, donate_argnames=given, compiler_options=options
+        _advance,
+        static_argnames=("scheme", "tangents"),
+        donate_argnames="state" if donate else (),
+        compiler_options=cpu_compiler_options(),
     )

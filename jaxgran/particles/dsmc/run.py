@@ -1,9 +1,7 @@
 """A DSMC run: its initial state, its records, and the run as a pure function.
 
-Units here: the impact speed sqrt(2 T_0) and the path length. Laws of restitution are reduced, times
-are in these units, and a key of random numbers is two 32-bit words.
-
-The state of a DSMC run at t = 0.
+The units are the impact speed sqrt(2 T_0) and the path length, also of times and reduced laws of
+restitution. A key of random numbers is two 32-bit words.
 """
 
 from collections.abc import Callable
@@ -34,10 +32,10 @@ from jaxgran.particles.setup import maxwellian_velocities, normalise_velocities
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import (
     DragDecay,
+    copy_buffers,
     drag_decay,
     maxwellian_spins,
     threefry_key,
-    with_own_buffers,
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.laws import ReducedLaw
@@ -45,7 +43,7 @@ from jaxgran.scene.reduced import ReducedDrag, ReducedScene
 from jaxgran.theory import averages
 
 DRIVE_TIME = 10.0
-"""Mean free times in the steady state in which a gas begins."""
+"""Mean free times during which a drive prepares the steady state of a driven start."""
 
 
 @partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
@@ -56,7 +54,7 @@ def initial_dsmc_state(
     num_parameters: int,
     scene: ReducedScene | None = None,
 ) -> DSMCState:
-    """Maxwellian velocities at t = 0, with tangents in so many parameters."""
+    """Return the state at t = 0, with Maxwellian velocities and tangents in some parameters."""
     d = scheme.dimension
     key = jax.random.fold_in(threefry_key(key), 2**32 - 1)
     v = maxwellian_velocities(key, replicas, scheme.num_particles, d).reshape(replicas, -1, d)
@@ -66,7 +64,7 @@ def initial_dsmc_state(
         key = jax.random.fold_in(key, 0)
         mean_square = (scene.surface.ratio / (2 * scene.surface.inertia)).astype(v.dtype)
         parts.append(maxwellian_spins(key, shape, mean_square))
-    each, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
+    zero, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
     tangents = DSMCTangents(*[along] * len(DSMCTangents._fields))
     if scene is not None and num_parameters and has_elements(scene):
         tangents = initial_exchange_tangents(
@@ -74,14 +72,14 @@ def initial_dsmc_state(
         )
     state = DSMCState(
         time=jnp.zeros((), v.dtype),
-        clock=each,
-        clock_rest=each,
-        temperature=each + 1,
+        clock=zero,
+        clock_rest=zero,
+        temperature=zero + 1,
         particles=jnp.concatenate(parts, axis=-1),
-        collisions=each,
-        missed=each,
+        collisions=zero,
+        missed=zero,
         steps=jnp.zeros(replicas, jnp.uint32),
-        mobility=each,
+        mobility=zero,
         tangents=tangents,
     )
     if scene is None or scene.prepared is None:
@@ -90,40 +88,40 @@ def initial_dsmc_state(
 
 
 def has_elements(scene: ReducedScene) -> bool:
-    """Whether there is more than smooth spheres in free flight that begin as a Maxwellian gas."""
+    """Return False for smooth spheres in free flight that start as a Maxwellian gas."""
     return any(element is not None for element in scene[1:])
 
 
 def steady_start(
     state: DSMCState, key: PRNGKeyArray, scene: ReducedScene, scheme: Scheme
 ) -> Float[Array, "replicas N components"]:
-    """The particles in the steady state of white noise that returns what impacts take."""
-    losing, d = ReducedScene(scene.law, scene.surface, scene.walls), scheme.dimension
-    rate = averages.collision_rate(0.0, d) * scheme.own_step
+    """Return particles in the steady state of white noise that returns the losses of impacts."""
+    undriven, d = ReducedScene(scene.law, scene.surface, scene.walls), scheme.dimension
+    rate = averages.collision_rate(0.0, d) * scheme.scaled_step
     words = jax.random.bits(jax.random.fold_in(key, 1), (2,), jnp.uint32)
     share = jnp.ones(len(state.clock), state.clock.dtype)
 
-    def further(i, now):
-        after = collisions.step(now, words, share, losing, scheme, False)
+    def step_and_heat(i, before):
+        after = collisions.step(before, words, share, undriven, scheme, False)
         growth = jnp.maximum(1 - after.temperature, 0.0)
         keys = jax.random.split(jax.random.fold_in(threefry_key(words), i), len(share))
         kick = jax.vmap(kick_all, (0, 0, 0, None, None, None))
-        hot = kick(after.particles, keys, growth, jnp.zeros(()), d, scene.walls is None)
-        velocity = normalise_velocities(hot[..., :d].reshape(-1, d), len(share)) / sqrt(2)
-        velocity = velocity.reshape(hot[..., :d].shape)
-        parts = [velocity, jnp.zeros_like(velocity), hot[..., 2 * d :]]
+        kicked = kick(after.particles, keys, growth, jnp.zeros(()), d, scene.walls is None)
+        velocity = normalise_velocities(kicked[..., :d].reshape(-1, d), len(share)) / sqrt(2)
+        velocity = velocity.reshape(kicked[..., :d].shape)
+        parts = [velocity, jnp.zeros_like(velocity), kicked[..., 2 * d :]]
         particles = jnp.concatenate(parts, axis=-1)
         return after._replace(particles=particles, temperature=share)
 
     steps = jnp.ceil(DRIVE_TIME / rate).astype(jnp.int32)
-    return jax.lax.fori_loop(0, steps, further, state).particles
+    return jax.lax.fori_loop(0, steps, step_and_heat, state).particles
 
 
 ALLOWED_MISSED = 1e-4
-"""Share of collisions missed because of the ceiling of the collision rate that fails a run."""
+"""Largest share of collisions that a run may miss because of the ceiling of the collision rate."""
 
 CHUNK = 4_000_000
-"""Candidate pairs of one call to compiled code by the host driver, which take about a second."""
+"""Candidate pairs in one call of compiled code by the host driver, which takes about a second."""
 
 
 @partial(jax.jit, static_argnames=("scheme", "tangents", "save"))
@@ -138,34 +136,34 @@ def dsmc_records(
     units: Units | None = None,
     save: Callable[[Particles], Any] | None = None,
 ) -> dict[str, Any]:
-    """The records of each replica at the time of a state, and the status of each, "fault".
+    """Return the records of each replica at the time of a state, with their status as "fault".
 
     The next step of each replica is done in part, up to this time, and then discarded.
 
     Args:
-        state: of the gas.
+        state: the state of the gas.
         first: velocities at t = 0.
-        scene, key, scheme: of the run.
+        scene, key, scheme: the scene, key and scheme of the run.
         tangents: return three dictionaries instead: "values", the "rates" of their change with
             time, and "along", their tangents in the parameters of the law at this time.
-        units, save: of the particles, and a user's function of them.
+        units, save: units of the particles, and a user's function of them.
     """
     left = (state.time - state.clock) - state.clock_rest
-    share = left * jnp.sqrt(state.temperature) / scheme.own_step
+    share = left * jnp.sqrt(state.temperature) / scheme.scaled_step
     state = collisions.step(state, key, jnp.clip(share, 0.0, 1.0), scene, scheme, tangents)
     d = scheme.dimension
 
     velocity = state.particles[..., :d]
-    if scene.walls is None:  # which stop what moves as a whole
+    if scene.walls is None:  # walls stop the gas as a whole
         velocity = _centred(velocity)
-    travelled = _centred(
+    displacement = _centred(
         state.particles[..., d : 2 * d] + state.clock[:, None, None] * state.particles[..., :d]
     )
     theta = 2 * observables.temperature(velocity)
     values = {
         "temperature": theta,
         "sonine": observables.sonine(velocity),
-        "displacement": observables.mean_square_displacement(travelled),
+        "displacement": observables.mean_square_displacement(displacement),
         "velocity_correlation": 2 * observables.velocity_correlation(first, velocity),
         "collisions": 2 / scheme.num_particles * state.collisions,
     }
@@ -177,14 +175,15 @@ def dsmc_records(
     fast = status.flag(status.TOO_FAST, state.missed > ALLOWED_MISSED * state.collisions + 1)
     values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
     if save is not None and units is not None:
-        values |= snapshot.saved(save, _to_particles(state, scene, d, units))
+        values |= snapshot.saved_records(save, _to_particles(state, scene, d, units))
     if not tangents:
         return values
     if isinstance(state.tangents, ExchangeTangents):
-        return {"values": values} | _exchanged(values, state, scene, scheme)
-    walked = 2 * jnp.mean(jnp.sum(travelled * velocity, axis=-1), axis=-1)
-    rates = _rates(values, scene.law, d) | {"displacement": walked}
-    return {"values": values, "rates": rates, "along": _along(values, rates, state.tangents)}
+        return {"values": values} | _exchange_derivatives(values, state, scene, scheme)
+    spreading = 2 * jnp.mean(jnp.sum(displacement * velocity, axis=-1), axis=-1)
+    rates = _rates(values, scene.law, d) | {"displacement": spreading}
+    along = _tangents_at_time(values, rates, state.tangents)
+    return {"values": values, "rates": rates, "along": along}
 
 
 def _centred(x: Float[Array, "replicas N d"]) -> Float[Array, "replicas N d"]:
@@ -192,18 +191,18 @@ def _centred(x: Float[Array, "replicas N d"]) -> Float[Array, "replicas N d"]:
 
 
 def _without_drag(values: dict[str, Array], left: DragDecay) -> dict[str, Array]:
-    """Records in true velocities, of those that drag would not have slowed."""
+    """Return the records that depend on velocities, in true instead of transformed velocities."""
     powers = {"temperature": left.velocity**2, "velocity_correlation": left.velocity}
-    powers["rotational_temperature"] = left.kept**2
+    powers["rotational_temperature"] = left.true_spin**2
     return {name: powers[name] * values[name] for name in powers.keys() & values.keys()}
 
 
 def _to_particles(state: DSMCState, scene: ReducedScene, d: int, units: Units) -> Particles:
-    """Particles in SI; positions, of which there are none, are nan."""
+    """Return particles in SI, with nan for positions, which do not exist."""
     velocity, spin = state.particles[..., :d], state.particles[..., 2 * d :]
     if scene.drag is not None:
         left = drag_decay(scene.drag, state.time)
-        velocity, spin = velocity * left.velocity, spin * left.kept
+        velocity, spin = velocity * left.velocity, spin * left.true_spin
     return Particles(
         position=jnp.full_like(velocity, jnp.nan),
         velocity=velocity * units.velocity,
@@ -213,13 +212,13 @@ def _to_particles(state: DSMCState, scene: ReducedScene, d: int, units: Units) -
 
 
 def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array]:
-    """Rates of change with time of all records but <dr^2>, of the Maxwell-Sonine distribution."""
+    """Return the rates of change with time of all records but <dr^2>, in a Maxwell-Sonine gas."""
     theta, a2 = values["temperature"], values["sonine"]
     speed = jnp.sqrt(theta)
 
     @jax.vmap
     def rates_of(speed, a2):
-        return averages.Rates.of(averages.impact_moments(law, speed, d), a2)
+        return averages.Rates.from_averages(averages.impact_moments(law, speed, d), a2)
 
     rates = rates_of(speed, a2)
     cooling = 2 / d * rates.cooling * speed
@@ -231,23 +230,23 @@ def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array
     }
 
 
-def _exchanged(
+def _exchange_derivatives(
     values: dict[str, Array], state: DSMCState, scene: ReducedScene, scheme: Scheme
 ) -> dict[str, dict[str, Array]]:
-    """ "rates" and "along" of a scene with elements, of T, T_rot and collisions.
+    """Return "rates" and "along" of T, T_rot and collisions of a scene with elements.
 
-    Those in time are by the last direction, in which everything is sooner by the same share.
+    The rates come from the last direction of the tangents, in which time is scaled.
     """
     n, d, time = scheme.num_particles, scheme.dimension, state.time
     assert isinstance(state.tangents, ExchangeTangents)
     energies, collided = state.tangents
 
-    def logarithms(scene: ReducedScene, sooner: Array) -> Array:
+    def logarithms(scene: ReducedScene, time_scale: Array) -> Array:
         if scene.drag is None:
             return jnp.zeros(2)
-        rates = ReducedDrag(*(rate * (1 + sooner) for rate in scene.drag))
+        rates = ReducedDrag(*(rate * (1 + time_scale) for rate in scene.drag))
         left = drag_decay(rates, time)
-        return jnp.log(jnp.stack([left.velocity, left.kept]))
+        return jnp.log(jnp.stack([left.velocity, left.true_spin]))
 
     log_left, pull = jax.vjp(logarithms, scene, jnp.zeros(()))
     along_left = jax.vmap(lambda weights: ravel_pytree(pull(weights))[0])(jnp.eye(2))
@@ -264,19 +263,19 @@ def _exchanged(
     }
 
 
-def _along(
+def _tangents_at_time(
     values: dict[str, Array], rates: dict[str, Array], tangents: DSMCTangents
 ) -> dict[str, Array]:
-    """Tangents of the records at a fixed time, from those at a fixed own time and the clock's."""
+    """Return tangents of the records at a fixed time, from those at a fixed scaled time."""
     theta, c = values["temperature"], tangents.log_temperature
     correlation = values["velocity_correlation"]
-    at_own_time = {
+    at_scaled_time = {
         "temperature": theta[:, None] * c,
         "velocity_correlation": correlation[:, None] * (c / 2 + tangents.persistence),
         "displacement": tangents.displacement,
     }
     return {
-        name: at_own_time.get(name, 0.0) - rate[:, None] * tangents.clock
+        name: at_scaled_time.get(name, 0.0) - rate[:, None] * tangents.clock
         for name, rate in rates.items()
     }
 
@@ -293,18 +292,18 @@ def run_traced(
     units: Units | None = None,
     save: Callable[[Particles], Any] | None = None,
 ) -> dict[str, Any]:
-    """The records of `observe` at all times, with a first axis of times. A pure function."""
+    """Return `dsmc_records` at all times, with a first axis of times. A pure function."""
     num_parameters = ravel_pytree(scene)[0].size if tangents else 0
     state = initial_dsmc_state(key, replicas, scheme, num_parameters, scene)
     first = state.particles[..., : scheme.dimension]
-    forever = jnp.asarray(2**31 - 1, jnp.int32)
+    max_steps = jnp.asarray(2**31 - 1, jnp.int32)
 
-    def to(state, end):
+    def advance_to(state, end):
         options = {"scheme": scheme, "tangents": tangents}
-        state = collisions.advance(state, end, scene, key, forever, **options)
+        state = collisions.advance(state, end, scene, key, max_steps, **options)
         return state, dsmc_records(state, first, scene, key, units=units, save=save, **options)
 
-    return jax.lax.scan(to, state, times)[1]
+    return jax.lax.scan(advance_to, state, times)[1]
 
 
 def differentiable_run(
@@ -317,34 +316,34 @@ def differentiable_run(
     units: Units,
     save: Callable[[Particles], Any] | None,
 ) -> dict[str, Array]:
-    """`run` with one linear rule for forward and reverse mode, from tangents beside the state."""
+    """Return the records of `run_traced` with a linear rule for forward and reverse mode.
+
+    The rule uses the tangents of the state.
+    """
     parameters, unravel = ravel_pytree(scene)
 
-    def simulated(parameters, times, key, units, tangents):
+    def simulate(parameters, times, key, units, tangents):
         options = {"replicas": replicas, "scheme": scheme, "units": units, "save": save}
         return run_traced(unravel(parameters), times, key, tangents=tangents, **options)
 
     @jax.custom_jvp
     def solve(parameters, times, key, units):
-        return simulated(parameters, times, key, units, False)
+        return simulate(parameters, times, key, units, False)
 
     @solve.defjvp
     def solve_jvp(at, along):
         scene, (parameters, times, key, units) = unravel(at[0]), first_order_only(at)
-        out = simulated(parameters, times, key, units, True)
+        out = simulate(parameters, times, key, units, True)
         values = out["values"]
         tangents = {
             name: rate * along[1][:, None] + out["along"][name] @ along[0]
             for name, rate in out["rates"].items()
         }
-        if has_elements(scene):
-            for name in set(values) - set(tangents) - {"fault"}:
-                tangents[name] = nan_tangent_like(values[name], *along[:2])
-        else:
+        if not has_elements(scene):
             in_time = out["rates"]["sonine"] * along[1][:, None]
             tangents["sonine"] = in_time + nan_tangent(in_time.shape, along[0])
-            for name in set(values) - set(tangents) - {"fault"}:
-                tangents[name] = nan_tangent_like(values[name], *along[:2])
+        for name in set(values) - set(tangents) - {"fault"}:
+            tangents[name] = nan_tangent_like(values[name], *along[:2])
         return values, tangents | {"fault": np.zeros(values["fault"].shape, jax.dtypes.float0)}
 
     return solve(parameters, times, key, units)
@@ -358,18 +357,18 @@ def host_run_parts(
     scheme: Scheme,
     donate: bool,
 ) -> tuple[DSMCState, Callable[[DSMCState, float], DSMCState], Callable[..., dict]]:
-    """The parts of `run` that the host driver needs: a state, how to advance, and to observe it.
+    """Return the parts of a run for the host: a state, and functions to advance and observe it.
 
-    With `donate` a state is deleted when it is advanced.
+    With `donate` a call to advance deletes its initial state.
     """
-    state = with_own_buffers(initial_dsmc_state(key, replicas, scheme, 0, scene))
+    state = copy_buffers(initial_dsmc_state(key, replicas, scheme, 0, scene))
     pairs = replicas * (scheme.first + scheme.second)
     max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
     first = state.particles[..., : scheme.dimension]
-    further = collisions.advancing(donate)
+    compiled = collisions.compiled_advance(donate)
 
     def advance(state: DSMCState, end: float) -> DSMCState:
         end_array = jnp.asarray(end, state.clock.dtype)
-        return further(state, end_array, scene, key, max_steps, scheme=scheme)
+        return compiled(state, end_array, scene, key, max_steps, scheme=scheme)
 
     return state, advance, partial(dsmc_records, first=first, scene=scene, key=key, scheme=scheme)
