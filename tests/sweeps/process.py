@@ -1,5 +1,9 @@
-"""One process of a sweep over several: python -m tests.sweeps.process PORT INDEX PROCESSES STORE
-MEMBERS [DIE_AT]. Prints each chunk that it has written; is killed amid chunk DIE_AT."""
+"""One process of a sweep over several processes.
+
+    python -m tests.sweeps.process PORT INDEX PROCESSES STORE MEMBERS [DIE_AT]
+
+Prints the number of each chunk that it has written; kills itself while it writes chunk DIE_AT.
+"""
 
 import os
 import signal
@@ -25,7 +29,7 @@ TIMES = (0.1, 1.0, 10.0)
 def main(port, index, processes, store, size, die_at=-1):
     jax.config.update("jax_num_cpu_devices", 2)
     jax.config.update("jax_enable_x64", True)
-    # The time after which JAX ends the others if one has died.
+    # JAX ends the other processes this long after one has died.
     seconds = 100 if die_at < 0 else 5
     address = f"127.0.0.1:{port}"
     jax.distributed.initialize(address, processes, index, heartbeat_timeout_seconds=seconds)

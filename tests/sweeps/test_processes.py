@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def run(processes, store, number, die_at=-1):
-    """Exit codes, and the chunks that each process says it has written."""
+    """Return exit codes, the chunks that each process reports as written, and the outputs."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -38,20 +38,20 @@ def expected():
 
 
 def check(store, expected):
-    # The same program on as many devices, but for the devices' number: the same numbers.
+    # The same program, on another number of devices.
     stored = jaxgran.sweep(members(10), TIMES, store=store, progress=False)
     np.testing.assert_allclose(stored.temperature, expected.temperature, rtol=1e-12)
     assert not np.any(stored.status)
 
 
-def test_a_process_is_killed_amid_a_chunk_and_the_sweep_resumed(tmp_path, expected):
+def test_a_sweep_is_resumed_after_a_process_was_killed_within_a_chunk(tmp_path, expected):
     store = tmp_path / "sweep.zarr"
     codes, chunks, outputs = run(2, store, 10, die_at=3)
     assert codes[1] == -signal.SIGKILL and codes[0] != 0
     assert "another task died" in outputs[0][1]
     assert chunks == [[0, 2, 4], [1]]
     codes, again, _ = run(1, store, 10)
-    # None is lost and none made twice; chunk 3, of which half had been written, is made again.
+    # No chunk is lost or computed twice, except chunk 3, half of which had been written.
     assert codes == [0] and again == [[3]]
     check(store, expected)
 
@@ -61,7 +61,7 @@ def test_two_processes_with_two_devices_each(tmp_path, expected):
     store = tmp_path / "sweep.zarr"
     codes, chunks, outputs = run(2, store, 10)
     assert codes == [0, 0] and chunks == [[0, 2, 4], [1, 3]]
-    for out, _ in outputs:  # all devices, those of the process, and every member
+    for out, _ in outputs:  # all devices, devices of the process, members
         assert "done 4 2 (10, 3)" in out
     check(store, expected)
 

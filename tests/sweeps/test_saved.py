@@ -1,4 +1,4 @@
-"""What a sweep saves of the particles of its members."""
+"""Values that a sweep saves from the particles of its members (option save)."""
 
 import jax
 import jax.numpy as jnp
@@ -43,9 +43,9 @@ def stored(gases, tmp_path_factory):
     return path, sweep(gases, save=save, store=path, chunk=2)
 
 
-def test_is_what_cool_saves_of_each_member(gases, stored):
+def test_saved_values_are_those_of_cool_for_each_member(gases, stored):
     curves = stored[1]
-    # Round-off of the units.
+    # Round-off of the conversion of units.
     np.testing.assert_allclose(curves.saved["T"], curves.temperature, rtol=1e-12)
     np.testing.assert_allclose(curves.replicas.saved["T"], curves.replicas.temperature, rtol=1e-12)
     np.testing.assert_allclose(curves.saved_error["T"], curves.temperature_error, rtol=1e-9)
@@ -83,7 +83,7 @@ def test_store_has_labels_for_xarray(stored):
     assert "units" not in found["saved.T"].attrs  # a user's function determines them
 
 
-def test_is_resumed_with_the_rest(gases, stored, tmp_path, monkeypatch):
+def test_a_sweep_with_saved_values_is_resumed(gases, stored, tmp_path, monkeypatch):
     path, written, write = tmp_path / "sweep.zarr", [], Store.write
 
     def killed(self, number, records):
@@ -105,17 +105,17 @@ def test_is_resumed_with_the_rest(gases, stored, tmp_path, monkeypatch):
         np.testing.assert_array_equal(a, b)
 
 
-def test_store_of_something_else_saved_is_refused(gases, stored):
+def test_a_store_with_other_saved_values_is_refused(gases, stored):
     with pytest.raises(ValueError, match="another sweep: save was .*test_saved.save .* absent"):
         sweep(gases, store=stored[0])
     with pytest.raises(ValueError, match="save was .*test_saved.save .* is .*test_saved.twice"):
         sweep(gases, save=twice, store=stored[0])
 
 
-def test_members_that_are_not_taken_are_nan_or_0(gases):
+def test_unsupported_members_are_nan_or_0(gases):
     dense = jnp.array([0.05, 0.9, 0.06])
     bad = jax.vmap(lambda gas, phi: gas.replace(packing_fraction=phi))(gases, dense)
-    with pytest.warns(UserWarning, match="the first of them 1"):
+    with pytest.warns(UserWarning, match="the first of them is 1"):
         curves = sweep(bad, save=save, chunk=2)
     assert list(curves.status) == [0, status.UNSUPPORTED.bit, 0]
     assert np.isnan(curves.saved["T"][1]).all() and np.isfinite(curves.saved["T"][::2]).all()
@@ -132,7 +132,7 @@ def test_members_that_are_not_taken_are_nan_or_0(gases):
         (lambda p: None, "must return arrays, in any tree, got None"),
     ],
 )
-def test_what_cannot_be_kept_is_refused(gases, tmp_path, function, message):
+def test_values_that_cannot_be_saved_are_refused(gases, tmp_path, function, message):
     with pytest.raises(ValueError, match=message):
         sweep(gases, save=function, store=tmp_path / "sweep.zarr")
     assert not any(tmp_path.iterdir())
@@ -152,6 +152,6 @@ def test_particles_with_positions(gases, tmp_path):
     np.testing.assert_array_equal(position, curves.saved.position)
     assert found["saved.box_side"].dims == ("member", "time")
     T = np.mean(np.square(found["saved.velocity"].values), axis=(2, 3, 4))
-    np.testing.assert_allclose(T, curves.temperature, rtol=1e-12)  # round-off of the units
+    np.testing.assert_allclose(T, curves.temperature, rtol=1e-12)  # round-off of units
     again = sweep(gases, model=model, save="particles", store=path)
     np.testing.assert_array_equal(again.saved.position, curves.saved.position)
