@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from experiments.support.record import add_recording, write_picture
 from jaxgran.plotting import COLOURS, INK
-from jaxgran.theory.equations import MEAN_OVERLAP, softness
+from jaxgran.theory.equations import MEAN_OVERLAP, softness_coefficient
 
 BETAS = np.geomspace(1e-3, 8.0, 40)
 
@@ -74,8 +74,8 @@ def main() -> None:
         print(f"c/(d - 1) at beta = {beta:g}: {exact(beta):.5f}")
     print("numerator", found[:2], "denominator", found[2:])
     print(f"largest error of this fit {np.max(np.abs(fit(found, BETAS) / c - 1)):.1e}")
-    error = np.max(np.abs(np.asarray(softness(jnp.asarray(BETAS), 2)) / c - 1))
-    print(f"largest error of jaxgran.theory.equations.softness {error:.1e}")
+    error = np.max(np.abs(np.asarray(softness_coefficient(jnp.asarray(BETAS), 2)) / c - 1))
+    print(f"largest error of jaxgran.theory.equations.softness_coefficient {error:.1e}")
     write_picture(draw(c), "derive_softness", options)
 
 
@@ -85,7 +85,9 @@ def draw(c: np.ndarray) -> Figure:
     axes = figure.subplots()
     fine = np.geomspace(BETAS[0], BETAS[-1], 300)
     colour = COLOURS["kinetic theory"]
-    axes.plot(fine, np.asarray(softness(jnp.asarray(fine), 2)), color=colour, label="the fit")
+    axes.plot(
+        fine, np.asarray(softness_coefficient(jnp.asarray(fine), 2)), color=colour, label="the fit"
+    )
     axes.plot(BETAS, c, "o", color=INK, ms=3.5, label="impacts followed, averaged")
     axes.axhline(MEAN_OVERLAP, color=COLOURS["guide"], ls="--", lw=1)
     axes.text(BETAS[-1], MEAN_OVERLAP + 0.02, r"$\beta\to 0$", color=COLOURS["guide"], ha="right")

@@ -33,7 +33,7 @@ from experiments.support.scenes import hard_beads
 from jaxgran.models.error_model import flow_share
 from jaxgran.plotting import COLOURS, INK
 from jaxgran.scene.geometry import contact_value
-from jaxgran.theory.equations import built_up, slowing
+from jaxgran.theory.equations import correlation_build_up, correlation_slowdown
 
 MARKS = np.array([0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0])
 """Collisions per particle at which T is recorded."""
@@ -158,7 +158,7 @@ def measured(point: Point, impacts: float, seed: int) -> dict:
 def strength(phi: float, eps: float, d: int) -> float:
     """h in ``1 - h (1 - eps^2)``, the rate over Enskog's by theory."""
     loss = 1 - eps**2
-    return float(slowing(jnp.asarray(phi), jnp.asarray(loss), d)) / loss
+    return float(correlation_slowdown(jnp.asarray(phi), jnp.asarray(loss), d)) / loss
 
 
 def compared(row: dict, elastic: dict) -> dict:
@@ -172,7 +172,7 @@ def compared(row: dict, elastic: dict) -> dict:
     log_t = np.append(0.0, np.log(np.asarray(theory.temperature / gas.temperature)))
     loss = 1 - point.restitution**2
     h = strength(point.packing_fraction, point.restitution, point.dimension)
-    built = np.asarray(built_up(jnp.asarray(MARKS[1:] + MARKS[:-1]) / 2))
+    built = np.asarray(correlation_build_up(jnp.asarray(MARKS[1:] + MARKS[:-1]) / 2))
 
     def flow_at(rate: np.ndarray) -> np.ndarray:
         longer = np.append(rate[0], (rate[1:] + rate[:-1]) / 2)

@@ -1,9 +1,8 @@
-"""The paper's solutions in closed form, corrected where the printed form errs.
+"""The paper's solutions in closed form, as printed and as corrected.
 
-Times are ``tau = nu_0 t``, in units of the initial mean free time; temperatures are over T_0.
-
-Reference: N. V. Brilliantov and T. Poeschel, Self-diffusion in granular gases, Phys. Rev. E 61
-(2000) 1716.
+Times are ``tau = nu_0 t``, in units of the initial mean free time ``tau_c(0) = 1/nu_0``;
+temperatures are over T_0. The paper is N. V. Brilliantov & T. Poeschel, Self-diffusion in granular
+gases, Phys. Rev. E 61, 1716 (2000); its equations are numbered as in the authors' preprint.
 """
 
 from math import gamma
@@ -16,15 +15,32 @@ from jaxgran.scene.laws import C1, C_CLIP
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, speed_moment
 
 RELAXATION_CORRECTION = 3 / 4 * gamma(2.1) * C1 * 4**0.1
-"""c in ``tau_E/tau_v = 1 - c delta``, where tau_v is the velocity relaxation time and tau_E that of
-elastic spheres: 1.03992; Eq. (32)."""
+"""c in ``tau_E/tau_v = 1 - c delta`` at T_0, with the velocity relaxation time tau_v and that of
+elastic spheres, tau_E: 1.03992; Eq. (32).
+"""
 
 SONINE_COEFFICIENT = 3 / 20 * C1 * speed_moment(2.2) * 1.5 * 2**0.1
 """s in ``a_2 = -s delta (T/T_0)^(1/10)``, to first order in delta, in 3D: 0.62395."""
 
 
+def _expansion_coefficient(power: float, coefficient: float) -> float:
+    """Coefficient of delta^(power - 1) in the cooling rate over that of its leading term.
+
+    The term of 1 - eps^2 is ``coefficient beta^power``, the leading one ``2 C1 beta``.
+    """
+    scale = (1.5 * 2**0.1) ** (power - 1)
+    return coefficient / (2 * C1) * scale * speed_moment(2 + power / 5) / speed_moment(2.2)
+
+
+EXPANSION_P = _expansion_coefficient(2.5, 2 * C_CLIP)
+"""p, relative coefficient of delta^(3/2) in the cooling rate: 0.56613; 0 without the clip."""
+
+EXPANSION_R = _expansion_coefficient(3.0, 2 * 0.522882568 + 2 * C1 * 3 / 5 * C1**2)
+"""r, relative coefficient of delta^2 in the cooling rate: 4.14272."""
+
+
 def haff(tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3) -> Float[Array, "..."]:
-    """Haff's law, ``T/T_0 = (1 + gamma_0 tau)^(-2)`` with ``gamma_0 = (1 - e^2) / (2 d)``.
+    """Return Haff's law, ``T/T_0 = (1 + gamma_0 tau)^(-2)`` with ``gamma_0 = (1 - e^2) / (2 d)``.
 
     Args:
         tau: ``nu_0 t``, >= 0, any shape.
@@ -36,7 +52,7 @@ def haff(tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3) -> Float[Ar
 
     Valid for constant restitution and Maxwellian velocities (a_2 = 0).
 
-    Reference: Brilliantov & Poeschel, Eq. (44).
+    Reference: Brilliantov & Poeschel, Eq. (44), which has d = 3.
     """
     loss = (1 - jnp.asarray(coefficient) ** 2) / (2 * dimension)
     return (1 + loss * jnp.asarray(tau)) ** -2.0
@@ -45,12 +61,17 @@ def haff(tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3) -> Float[Ar
 def haff_collisions(
     tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3
 ) -> Float[Array, "..."]:
-    """Collisions per particle under Haff's law, ``N = ln(1 + gamma_0 tau) / gamma_0``.
+    """Return the collisions per particle under Haff's law, ``N = ln(1 + gamma_0 tau) / gamma_0``.
 
-    Args, validity: as `haff`, but e in [0, 1).
+    Args:
+        tau: ``nu_0 t``, >= 0, any shape.
+        coefficient: e, in [0, 1).
+        dimension: d.
 
     Returns:
         N, same shape as tau.
+
+    Valid as `haff`.
     """
     loss = (1 - jnp.asarray(coefficient) ** 2) / (2 * dimension)
     return jnp.log1p(loss * jnp.asarray(tau)) / loss
@@ -59,7 +80,7 @@ def haff_collisions(
 def constant_displacement(
     collisions: ArrayLike, coefficient: ArrayLike, dimension: int = 3
 ) -> Float[Array, "..."]:
-    """Mean square displacement of a gas of constant restitution.
+    """Return the mean square displacement of a gas of constant restitution.
 
     ``<dr^2> = (2 d / k) (N - (1 - exp(-k N)) / k)`` with ``k = (1 + e)^2 / (2 d)``: at first
     ballistic, then linear in the collisions per particle and hence logarithmic in time. It solves
@@ -75,8 +96,8 @@ def constant_displacement(
 
     Valid for Maxwellian velocities, in the first Sonine approximation of D.
 
-    Reference: Brilliantov & Poeschel, Eqs. (45) and (46); their ``D = T tau_v``, Eq. (34), neglects
-    the cooling during tau_v and has ``k = (1 + e) / d``.
+    Reference: Brilliantov & Poeschel, Eqs. (45) and (46), which give the asymptotic growth; their
+    ``D = T tau_v``, Eq. (34), neglects the cooling during tau_v and has ``k = (1 + e) / d``.
     """
     k = (1 + jnp.asarray(coefficient)) ** 2 / (2 * dimension)
     n = jnp.asarray(collisions)
@@ -86,18 +107,18 @@ def constant_displacement(
 def paper_temperature(
     tau: ArrayLike, delta: ArrayLike, *, corrected: bool = True, clipped: bool = True
 ) -> Float[Array, "..."]:
-    """Temperature of viscoelastic spheres in 3D as an expansion in delta, to order delta^2.
+    """Return the temperature of viscoelastic spheres in 3D as an expansion to order delta^2.
 
     ``T/T_0 = u^(-5/3) + 2 q delta (u^(-11/6) - u^(-8/3)) + ...`` with ``u = 1 + t/tau_0``.
 
     Args:
         tau: ``nu_0 t``, >= 0, any shape.
         delta: ``A alpha^(2/5) T_0^(1/10)``, small against 1.
-        corrected: whether to include the homogeneous solutions, without which T(0) is not T_0.
-            False gives the printed form, ``u^(-5/3) + a_1 delta u^(-11/6)`` with ``a_1 = 2 q``,
-            without its term in delta^2, whose coefficient does not follow from the two-term
-            cooling equation.
-        clipped: whether to include the term in delta^(3/2) of contacts that end at zero force.
+        corrected: True includes the homogeneous solutions, without which T(0) is not T_0. False
+            gives the printed form, ``u^(-5/3) + a_1 delta u^(-11/6)`` with ``a_1 = 2 q``, without
+            its term in delta^2, whose coefficient does not follow from the two-term cooling
+            equation.
+        clipped: True includes the term in delta^(3/2) of contacts that end at zero force.
 
     Returns:
         T/T_0, same shape as tau.
@@ -123,16 +144,47 @@ def paper_temperature(
     )
 
 
+def two_term_time(theta: ArrayLike, delta: ArrayLike) -> Float[Array, "..."]:
+    """Return the time at which T/T_0 is reached, by the two-term cooling equation in 3D.
+
+    With ``x = (T/T_0)^(1/10)``, ``k = q delta`` and ``b = 0.83193`` (`COOLING_RATE`), the equation
+    ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)`` has the exact solution ``tau = 6/(b delta) [
+    sum_{j<6} k^j (x^(j-6) - 1)/(6 - j) - k^6 ln x + k^6 ln((1 - k x)/(1 - k))]``.
+
+    Args:
+        theta: T/T_0, in (0, 1], any shape.
+        delta: ``A alpha^(2/5) T_0^(1/10)``, in (0, 1/q); a gas with a larger delta would heat up.
+
+    Returns:
+        tau = nu_0 t, same shape.
+
+    Raises:
+        ValueError: for delta >= 1/q.
+
+    Reference: Brilliantov & Poeschel, Eq. (36), integrated by partial fractions.
+    """
+    limit = 1 / COOLING_CORRECTION
+    if np.any(np.asarray(delta) >= limit):
+        raise ValueError(
+            f"delta must lie in (0, {limit:.4f}), got {delta}. For larger values use "
+            "jaxgran.KineticTheory()"
+        )
+    x, k = jnp.asarray(theta) ** 0.1, COOLING_CORRECTION * jnp.asarray(delta)
+    powers = sum(k**j * (x ** (j - 6) - 1) / (6 - j) for j in range(6))
+    logs = k**6 * (jnp.log1p(-k * x) - jnp.log1p(-k) - jnp.log(x))
+    return jnp.asarray(6 / (COOLING_RATE[3] * jnp.asarray(delta)) * (powers + logs))
+
+
 def paper_displacement(
     tau: ArrayLike, delta: ArrayLike, *, corrected: bool = True
 ) -> Float[Array, "..."]:
-    """Mean square displacement of viscoelastic spheres in 3D, to first order in delta.
+    """Return the mean square displacement of viscoelastic spheres in 3D, to first order in delta.
 
     ``<dr^2> = 6 D_0 tau_0 {6 (u^(1/6) - 1) + delta [a_3 ln u - (6/5) (q' (1 - u^(-5/6)) + c)]}``
-    with ``u = 1 + t/tau_0``, ``D_0 = T_0 tau_E(0) = 3/2``, ``a_3 = q' + (c + 3 s/16) + c = 4.648``
-    and ``q' = q + 0.24 s``. The three terms of a_3 are due to the correction of the temperature,
-    to the slower velocity relaxation, and to the cooling during the relaxation (memory), which also
-    gives the last c. Each includes a_2 to the same order.
+    with ``u = 1 + t/tau_0``, ``D_0 = T_0 tau_E(0) = (3/2) T_0 tau_c(0)``,
+    ``a_3 = q' + (c + 3 s/16) + c = 4.648`` and ``q' = q + 0.24 s``. The three terms of a_3 are due
+    to the correction of the temperature, to the slower velocity relaxation, and to the cooling
+    during the relaxation (memory), which also gives the last c. Each includes a_2 to that order.
 
     Args:
         tau: ``nu_0 t``, any shape; times long against tau_v.
@@ -156,50 +208,3 @@ def paper_displacement(
     else:
         first = (COOLING_CORRECTION + RELAXATION_CORRECTION) * jnp.log(u)
     return 9 / rate * (6 * (u ** (1 / 6) - 1) + delta * first)
-
-
-def _expansion_coefficient(power: float, coefficient: float) -> float:
-    """Coefficient of delta^(power - 1) in the cooling rate over that of its leading term.
-
-    The term of 1 - eps^2 is ``coefficient beta^power``, the leading one ``2 C1 beta``.
-    """
-    scale = (1.5 * 2**0.1) ** (power - 1)
-    return coefficient / (2 * C1) * scale * speed_moment(2 + power / 5) / speed_moment(2.2)
-
-
-EXPANSION_P = _expansion_coefficient(2.5, 2 * C_CLIP)
-"""p, relative coefficient of delta^(3/2) in the cooling rate: 0.56613; 0 if not clipped."""
-
-EXPANSION_R = _expansion_coefficient(3.0, 2 * 0.522882568 + 2 * C1 * 3 / 5 * C1**2)
-"""r, relative coefficient of delta^2 in the cooling rate: 4.14272."""
-
-
-def two_term_time(theta: ArrayLike, delta: ArrayLike) -> Float[Array, "..."]:
-    """Time at which T/T_0 is reached: exact solution of the two-term cooling equation in 3D.
-
-    With ``x = (T/T_0)^(1/10)``, ``k = q delta`` and ``b = 0.83193`` (`COOLING_RATE`), the equation
-    ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)`` has the solution ``tau = 6/(b delta) [
-    sum_{j<6} k^j (x^(j-6) - 1)/(6 - j) - k^6 ln x + k^6 ln((1 - k x)/(1 - k))]``.
-
-    Args:
-        theta: T/T_0, in (0, 1], any shape.
-        delta: ``A alpha^(2/5) T_0^(1/10)``, in (0, 1/q); a gas with a larger delta would heat.
-
-    Returns:
-        tau = nu_0 t, same shape.
-
-    Raises:
-        ValueError: for delta >= 1/q.
-
-    Reference: Brilliantov & Poeschel, Eq. (36), integrated by partial fractions.
-    """
-    limit = 1 / COOLING_CORRECTION
-    if np.any(np.asarray(delta) >= limit):
-        raise ValueError(
-            f"delta must lie in (0, {limit:.4f}), got {delta}; use jaxgran.KineticTheory() for "
-            "larger ones"
-        )
-    x, k = jnp.asarray(theta) ** 0.1, COOLING_CORRECTION * jnp.asarray(delta)
-    powers = sum(k**j * (x ** (j - 6) - 1) / (6 - j) for j in range(6))
-    logs = k**6 * (jnp.log1p(-k * x) - jnp.log1p(-k) - jnp.log(x))
-    return jnp.asarray(6 / (COOLING_RATE[3] * jnp.asarray(delta)) * (powers + logs))

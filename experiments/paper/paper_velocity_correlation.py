@@ -69,7 +69,7 @@ def relaxation(law, theta, sonine, dimension: int):
     """nu_v and the collision rate, in reduced units, at the temperatures theta = T/T_0."""
 
     def one(theta, sonine):
-        rates = Rates.of(impact_moments(law, jnp.sqrt(theta), dimension), sonine)
+        rates = Rates.from_averages(impact_moments(law, jnp.sqrt(theta), dimension), sonine)
         return jnp.stack([rates.relaxation, collision_rate(sonine, dimension)])
 
     return (jax.vmap(one)(theta, sonine) * jnp.sqrt(theta)[:, None]).T

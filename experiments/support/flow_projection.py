@@ -117,7 +117,7 @@ def _project(
         position=jnp.where(forgotten, moved, along.position),
         velocity=jnp.where(forgotten, flow, held),
         elapsed=jnp.zeros_like(along.elapsed),
-        own_elapsed=jnp.zeros_like(along.own_elapsed),
+        thermal_elapsed=jnp.zeros_like(along.thermal_elapsed),
     )
     return projected, moved
 

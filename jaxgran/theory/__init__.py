@@ -1,5 +1,5 @@
-"""Kinetic theory: averages over impacts, closed forms, and the shear modes of a large box.
+"""Kinetic theory: averages over impacts, the equations of a homogeneous gas, and their solver.
 
-Imports `checks` and `scene` only, no particles and no models; `tangents`, `particles`, `models` and
-the packages above may import it.
+Imports `_utils`, `data` and `scene` only; `gradients`, `particles`, `models` and the packages above
+may import it.
 """

@@ -4,21 +4,17 @@ Units: `Gas.impact_speed`, sqrt(2 T_0), and `Gas.path_length`, 1 / (n g_2 sigma^
 time ("reduced time") is their ratio. In these units the averages depend on the reduced law, the
 dimension and T/T_0 only.
 
-How one impact changes the velocity moments of a gas, averaged over all but its normal speed.
-
-Two spheres meet with the normal speed g. What else their velocities are, the velocity of their
-centre along the normal and across it and their relative velocity across it, is distributed as in a
-Maxwellian gas times ``(1 + a_2 S_2 + a_3 S_3 + a_4 S_4)`` for each sphere. The averages over it are
-integrals of polynomials with Gaussian weights, here done by Gauss quadrature, which is exact for
-them. Velocities c are in units of sqrt(2 T), S_k are the Laguerre polynomials L_k^(d/2 - 1)(c^2).
+Two spheres meet with the normal speed g. The other components of their velocities (of the velocity
+of their centre along the normal and across it, and of their relative velocity across it) have the
+distribution of a Maxwellian gas times ``(1 + a_2 S_2 + a_3 S_3 + a_4 S_4)`` for each sphere. The
+averages over them are integrals of polynomials with Gaussian weights, for which Gauss quadrature is
+exact. Velocities c are in units of sqrt(2 T), S_k are the Laguerre polynomials L_k^(d/2 - 1)(c^2).
+`impact_moments` integrates over g, and `RateTable` tabulates the result for the temperatures that a
+gas reaches.
 
 References: Brilliantov & Poeschel, Europhys. Lett. 74, 424 (2006), and Santos & Montanero, Granular
 Matter 11, 157 (2009), for mu_2, mu_4, mu_6 with a_3 at constant eps; Garzo & Montanero, Phys. Rev.
 E 69, 021301 (2004), for the second Sonine approximation of D.
-
-A table of the averages over impacts for the temperatures that a gas reaches.
-
-Units as in `jaxgran.theory.averages`.
 """
 
 from collections.abc import Callable
@@ -30,17 +26,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy  # whose scipy.special is imported when it is first used
+import scipy  # imports scipy.special at its first use
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.scene.geometry import NODES, WEIGHTS, sphere_surface
 from jaxgran.scene.laws import ReducedLaw
 
-SAMPLES = 7
-"""Values of eps from which the polynomials in 1 - eps, of sixth degree, are found."""
+NUM_RESTITUTIONS = 7
+"""Number of values of eps that determine the polynomials of sixth degree in 1 - eps."""
 
 # Nodes that integrate polynomials of degree 18 in the velocities exactly.
-_ALONG, _ACROSS, _ANGLES = 10, 5, 6
+_NUM_NORMAL, _NUM_TANGENTIAL, _NUM_ANGLES = 10, 5, 6
 
 CLOSURE = {2: (0.1127, 0.2725, 4.1658, -2.8628), 3: (0.0667, 0.2452, 4.8105, -1.4002)}
 """p, q, r, s of ``a_4 = p a_2 + q a_3 + r a_2^2 + s a_2 a_3`` by dimension.
@@ -49,9 +45,9 @@ The Sonine series of an inelastic gas is asymptotic, since its velocity distribu
 exponentially: cut off behind a_3 it gives an a_2 that is 6 % (3D) and 11 % (2D) too small at
 eps = .5 and 28 % and 40 % at 0, and cut off behind a_4 one that is too large. The term in a_2^2 is
 that of a gas whose temperature varies in space or time. The numbers were chosen so that a_2 and a_3
-of the homogeneous cooling state agree with direct simulation by a code of its own (constant eps
-from 0 to .95); ``experiments/accuracy/sonine_coefficients.py`` tells how well they do for other
-gases.
+of the homogeneous cooling state agree with direct simulation by an independent code (constant eps
+from 0 to .95); ``experiments/accuracy/sonine_coefficients.py`` measures how well they agree for
+other gases.
 """
 
 
@@ -66,17 +62,17 @@ TERMS = {
     2: Terms((0, 1, 2), (0, 0, 0)),
     3: Terms((0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)),
 }
-"""1, a_2, a_2^2 of a gas followed to a_2; and 1, a_2, a_3, a_2^2, a_2 a_3, a_3^2."""
+"""Terms by order: 1, a_2, a_2^2 at order 2; 1, a_2, a_3, a_2^2, a_2 a_3, a_3^2 at order 3."""
 
 
-class _Impacts(NamedTuple):
+class _ImpactNodes(NamedTuple):
     """Velocities before impacts of one normal speed, and the weights of the average over them.
 
     Attributes:
         centre: velocity of the centre along the normal.
-        centre_across: square of the part of it across.
-        relative_across: square of the relative velocity across.
-        product: scalar product of the two last vectors.
+        centre_across: square of its tangential part.
+        relative_across: square of the tangential relative velocity.
+        product: scalar product of these two tangential vectors.
         weights: with the sum 1.
     """
 
@@ -88,35 +84,35 @@ class _Impacts(NamedTuple):
 
 
 @cache
-def _impacts(dimension: int) -> _Impacts:
-    along, weight = np.polynomial.hermite_e.hermegauss(_ALONG)
-    square, weight_of_square = scipy.special.roots_genlaguerre(_ACROSS, (dimension - 3) / 2)
+def _impact_nodes(dimension: int) -> _ImpactNodes:
+    along, weight = np.polynomial.hermite_e.hermegauss(_NUM_NORMAL)
+    square, weight_of_square = scipy.special.roots_genlaguerre(_NUM_TANGENTIAL, (dimension - 3) / 2)
     if dimension == 2:
         cosine = np.array([-1.0, 1.0])
     else:
-        cosine = np.cos((np.arange(_ANGLES) + 0.5) * pi / _ANGLES)
+        cosine = np.cos((np.arange(_NUM_ANGLES) + 0.5) * pi / _NUM_ANGLES)
     n, u, w, c = np.meshgrid(along / 2, square / 2, 2 * square, cosine, indexing="ij")
     weights = np.einsum("a,b,c->abc", weight, weight_of_square, weight_of_square)
     weights = np.repeat(weights[..., None], cosine.size, axis=-1)
     values = (n, u, w, np.sqrt(u * w) * c, weights / weights.sum())
-    return _Impacts(*(x.ravel() for x in values))
+    return _ImpactNodes(*(x.ravel() for x in values))
 
 
-def _squares(at: _Impacts, g: float) -> tuple[np.ndarray, np.ndarray]:
+def _squared_velocities(at: _ImpactNodes, g: float) -> tuple[np.ndarray, np.ndarray]:
     """Squares of the two velocities, whose relative normal velocity is g."""
     mean = at.centre**2 + at.centre_across + at.relative_across / 4 + g**2 / 4
     half = at.centre * g + at.product
     return mean + half, mean - half
 
 
-def _distribution(square: np.ndarray, dimension: int, highest: int) -> np.ndarray:
+def _sonine_polynomials(square: np.ndarray, dimension: int, highest: int) -> np.ndarray:
     """1, S_2, ... up to S_highest at the squares of velocities."""
     orders = [0, *range(2, highest + 1)]
     return np.stack([scipy.special.eval_genlaguerre(k, dimension / 2 - 1, square) for k in orders])
 
 
-def _of_terms(bilinear: np.ndarray, dimension: int, order: int) -> np.ndarray:
-    """Coefficients of `TERMS` out of those of the products a_i a_j, with a_4 by its closure."""
+def _term_coefficients(bilinear: np.ndarray, dimension: int, order: int) -> np.ndarray:
+    """Coefficients of `TERMS` from those of the products a_i a_j, with a_4 by its closure."""
     pairs = bilinear + np.swapaxes(bilinear, -1, -2)
     one, square = pairs[..., 0, :], bilinear[..., 1, 1]
     if order == 2:
@@ -137,7 +133,7 @@ def _of_terms(bilinear: np.ndarray, dimension: int, order: int) -> np.ndarray:
 def collision_changes(
     dimension: int, order: int, speeds: tuple[float, ...]
 ) -> Float[np.ndarray, "..."]:
-    """Mean changes of velocity moments by impacts, as polynomials in 1 - eps and the Sonine terms.
+    """Return the mean changes of velocity moments by impacts, as polynomial coefficients.
 
     Args:
         dimension: d.
@@ -145,83 +141,140 @@ def collision_changes(
         speeds: normal speeds g in units of sqrt(2 T).
 
     Returns:
-        Shape (rows, terms, 7 powers of 1 - eps, speeds). The first `order` rows are losses, minus
-        the change of ``c_1^(2p) + c_2^(2p)`` for p = 1 to order. The others are the relaxation of
-        the velocity of a labelled sphere, minus the change of ``(4/d) c.c' S_j(c'^2)`` with the
-        weight ``S_k(c^2)``, S_j = L_j^(d/2), for (j, k) from (0, 0) to (order - 2, order - 2), row
-        by row. Columns as in `TERMS`.
+        Coefficients in 1 - eps and the Sonine terms, shape (rows, terms, 7 powers of 1 - eps,
+        speeds). The first `order` rows are losses, minus the change of ``c_1^(2p) + c_2^(2p)`` for
+        p = 1 to order. The others are the relaxation of the velocity of a labelled sphere, minus
+        the change of ``(4/d) c.c' S_j(c'^2)`` with the weight ``S_k(c^2)``, S_j = L_j^(d/2), for
+        (j, k) from (0, 0) to (order - 2, order - 2), row by row. Columns as in `TERMS`.
     """
-    at, epsilons = _impacts(dimension), 1 - np.linspace(0, 2, SAMPLES)
+    at, epsilons = _impact_nodes(dimension), 1 - np.linspace(0, 2, NUM_RESTITUTIONS)
     highest = 2 if order == 2 else 4
     sampled = np.stack(
         [
-            np.stack([_changes(at, g, e, dimension, order, highest) for e in epsilons], axis=-1)
+            np.stack([_changes_at(at, g, e, dimension, order, highest) for e in epsilons], axis=-1)
             for g in speeds
         ],
         axis=-1,
     )
+    bilinear = np.moveaxis(sampled, (1, 2), (-2, -1))
+    terms = np.moveaxis(_term_coefficients(bilinear, dimension, order), -1, 1)
     inverse = np.linalg.inv(np.vander(1 - epsilons, increasing=True))
-    powers = np.einsum("ps,rtsn->rtpn", inverse, _of_terms_first(sampled, dimension, order))
-    powers[0, :, 0] = 0.0  # elastic impacts keep the energy, and a Maxwellian gas as it is
+    powers = np.einsum("ps,rtsn->rtpn", inverse, terms)
+    powers[0, :, 0] = 0.0  # elastic impacts conserve the energy and a Maxwellian distribution
     powers[:order, 0, 0] = 0.0
     return powers
 
 
-def _of_terms_first(sampled: np.ndarray, dimension: int, order: int) -> np.ndarray:
-    bilinear = np.moveaxis(sampled, (1, 2), (-2, -1))
-    return np.moveaxis(_of_terms(bilinear, dimension, order), -1, 1)
-
-
-def _changes(
-    at: _Impacts, g: float, eps: float, dimension: int, order: int, highest: int
+def _changes_at(
+    at: _ImpactNodes, g: float, eps: float, dimension: int, order: int, highest: int
 ) -> Float[np.ndarray, "rows i j"]:
-    """The rows of `changes` at one g and eps, by the pairs of Sonine polynomials of the spheres."""
-    one, other = _squares(at, g)
-    after, other_after = _squares(at, -eps * g)
-    first = _distribution(one, dimension, highest) * at.weights
-    second = _distribution(other, dimension, highest)
-    losses = [one**p + other**p - after**p - other_after**p for p in range(1, order + 1)]
-    # The scalar product of a velocity before and after.
-    kept = one - (1 + eps) / 2 * g * (at.centre + g / 2)
-    of_label = [
+    """Rows of `collision_changes` at one g and eps, by pairs of the two Sonine polynomials."""
+    square_1, square_2 = _squared_velocities(at, g)
+    after_1, after_2 = _squared_velocities(at, -eps * g)
+    weighted_1 = _sonine_polynomials(square_1, dimension, highest) * at.weights
+    polynomials_2 = _sonine_polynomials(square_2, dimension, highest)
+    losses = [square_1**p + square_2**p - after_1**p - after_2**p for p in range(1, order + 1)]
+    product = square_1 - (1 + eps) / 2 * g * (at.centre + g / 2)  # before times after
+    label_polynomials = [
         lambda x, j=j: scipy.special.eval_genlaguerre(j, dimension / 2, x) for j in range(order - 1)
     ]
     relaxation = [
-        4 / dimension * (one * s_j(one) - kept * s_j(after)) * s_k(one)
-        for s_j in of_label
-        for s_k in of_label
+        4 / dimension * (square_1 * s_j(square_1) - product * s_j(after_1)) * s_k(square_1)
+        for s_j in label_polynomials
+        for s_k in label_polynomials
     ]
     rows = np.stack(losses + relaxation)
-    return np.einsum("rn,in,jn->rij", rows, first, second, optimize=True)
+    return np.einsum("rn,in,jn->rij", rows, weighted_1, polynomials_2, optimize=True)
+
+
+@cache
+def averaging_matrix(dimension: int, order: int) -> np.ndarray:
+    """Return the matrix from the powers 0 to 6 of 1 - eps at the nodes to `impact_moments`."""
+    changes = collision_changes(dimension, order, tuple(NODES))
+    return sphere_surface(dimension) / sqrt(8 * pi) * changes * WEIGHTS
+
+
+def impact_moments(
+    law: ReducedLaw, speed: Float[Array, ""], dimension: int, order: int = 2
+) -> Float[Array, "rows terms"]:
+    """Return averages over the impacts of a Maxwell-Sonine gas, exact in eps(v).
+
+    ``mu_2p = (S_d / 2 sqrt(2 pi)) int_0^inf g exp(-g^2/2) L_p(g, eps(g)) dg`` with the loss L_p of
+    ``c_1^(2p) + c_2^(2p)`` in an impact, and likewise the relaxation of a labelled sphere's
+    velocity, by Gauss quadrature with 32 nodes in sqrt(g): relative error below 1e-9 for the laws
+    of this package.
+
+    Args:
+        law: law of restitution in units of `Gas.impact_speed`.
+        speed: sqrt(T/T_0).
+        dimension: d.
+        order: of the Sonine expansion: 2 has a_2, 3 also a_3.
+
+    Returns:
+        Coefficients of polynomials in a_2 (and a_3), with the columns of `TERMS`. Order 2: mu_2,
+        mu_4 and nu_v, shape (3, 3), see `Rates`. Order 3: mu_2, mu_4, mu_6 and nu_00, nu_01,
+        nu_10, nu_11, shape (7, 6), see `jaxgran.theory.equations`.
+
+    Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution; see the
+    references of this module.
+    """
+    loss = law.loss(jnp.asarray(NODES, speed.dtype) * speed)
+    powers = jnp.stack([loss**0 * 1.0, loss, *(loss**k for k in range(2, 7))])
+    return jnp.tensordot(jnp.asarray(averaging_matrix(dimension, order), speed.dtype), powers, 2)
+
+
+class Rates(NamedTuple):
+    """Rates of a gas at one temperature, per unit of reduced time and divided by sqrt(T/T_0).
+
+    Attributes:
+        cooling: mu_2, in ``d ln T/dt = -(2/d) mu_2``.
+        fourth_moment: mu_4, in ``d a_2/dt = (4/d) mu_2 (1 + a_2) - 4 mu_4 / (d (d + 2))``.
+        relaxation: nu_v, relaxation rate of the velocity autocorrelation function.
+    """
+
+    cooling: Float[Array, ""]
+    fourth_moment: Float[Array, ""]
+    relaxation: Float[Array, ""]
+
+    @classmethod
+    def from_averages(cls, averages: Float[Array, "3 3"], sonine: Float[Array, ""]) -> "Rates":
+        """Return the rates at a given a_2.
+
+        Args:
+            averages: coefficients of the polynomials in a_2, from `impact_moments` at order 2.
+            sonine: a_2.
+        """
+        return cls(*(averages[:, 0] + sonine * (averages[:, 1] + sonine * averages[:, 2])))
+
+
+def collision_rate(
+    sonine: ArrayLike, dimension: int, third_sonine: ArrayLike = 0.0
+) -> Float[Array, "..."]:
+    """Return the collisions per particle and unit of reduced time, over sqrt(T/T_0).
+
+    ``S_d / sqrt(2 pi) (1 - a_2/16 - a_3/64)``.
+
+    Args:
+        sonine: a_2, any shape.
+        dimension: d.
+        third_sonine: a_3, the same shape.
+    """
+    factor = 1 - jnp.asarray(sonine) / 16 - jnp.asarray(third_sonine) / 64
+    return sphere_surface(dimension) / sqrt(2 * pi) * factor
 
 
 _SCAN_POINTS = 16
-"""Temperatures at which the cooling rate is computed to find the ends of a `RateTable`."""
+"""Temperatures at which the cooling rate is computed to determine the range of a `RateTable`."""
 
 
-@cache
-def _chebyshev(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Chebyshev nodes in [-1, 1], and the matrix from values at them to coefficients."""
-    angles = (np.arange(num_nodes) + 0.5) * pi / num_nodes
-    matrix = 2 / num_nodes * np.cos(np.outer(np.arange(num_nodes), angles))
-    matrix[0] /= 2
-    return np.cos(angles), matrix
-
-
-@cache
-def _derivative(num_nodes: int) -> np.ndarray:
-    """Matrix from the coefficients of a Chebyshev series to those of its derivative."""
-    return np.pad(np.polynomial.chebyshev.chebder(np.eye(num_nodes)), ((0, 1), (0, 0)))
-
-
-class Bounds(NamedTuple):
-    """Bounds of what the elements of a scene do to T, from which a `RateTable` takes its range.
+class ElementBounds(NamedTuple):
+    """Bounds of the effects of a scene's elements on T, for the range of a `RateTable`.
 
     Attributes:
         by_speed: an upper bound of a part of ``-d ln T/dt`` over sqrt(T/T_0).
-        constant: of a part that does not depend on T.
+        constant: an upper bound of the part that does not depend on T.
         heating: d(T/T_0)/dt by a drive; None where nothing heats.
-        rotation: T/T_0 that a gas could gain from the spins; None of smooth spheres.
+        rotation: T/T_0 that a gas could gain from the spins; None for smooth spheres.
     """
 
     by_speed: ArrayLike = 0.0
@@ -230,12 +283,12 @@ class Bounds(NamedTuple):
     rotation: ArrayLike | None = None
 
 
-NO_ELEMENTS = Bounds()
-"""Of smooth spheres without walls, drag and drive."""
+NO_ELEMENTS = ElementBounds()
+"""Bounds of smooth spheres without walls, drag and drive."""
 
 
 class RateTable(eqx.Module):
-    """The function `averages` of one gas as a Chebyshev series in ln T.
+    """Averages over the impacts of one gas (`impact_moments`) as a Chebyshev series in ln T.
 
     The averages are smooth in ln T, so that a few quadratures in advance replace one in every
     stage of the ODE solver.
@@ -244,7 +297,7 @@ class RateTable(eqx.Module):
         coefficients: of the Chebyshev polynomials, shape (nodes, rows, terms), or (nodes, ...,
             rows, terms) for several such functions over the same range.
         lowest: lower end of the series in ln(T/T_0). The series must not be evaluated outside.
-        highest: the upper end of a gas that is heated; None is 0.
+        highest: upper end of a gas that is heated; None means 0.
     """
 
     coefficients: Float[Array, "nodes ... rows terms"]
@@ -252,22 +305,22 @@ class RateTable(eqx.Module):
     highest: Float[Array, ""] | None = None
 
     @classmethod
-    def of(
+    def from_function(
         cls,
         averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
         duration: Float[Array, ""],
         dimension: int,
         num_nodes: int,
-        bounds: Bounds = NO_ELEMENTS,
+        bounds: ElementBounds = NO_ELEMENTS,
     ) -> "RateTable":
-        """The series for all temperatures that a gas reaches in a given time.
+        """Return the series for all temperatures that a gas reaches in a given time.
 
         Args:
             averages: the function to be tabulated, of sqrt(T/T_0).
             duration: reduced time.
             dimension: d.
             num_nodes: number of terms; see `ReducedLaw.num_nodes`.
-            bounds: of what the elements of the scene do to T.
+            bounds: of the effects of the elements of the scene on T.
         """
         lowest = _lowest_log_temperature(averages, duration, dimension, bounds)
         nodes, to_coefficients = (jnp.asarray(x, lowest.dtype) for x in _chebyshev(num_nodes))
@@ -282,7 +335,7 @@ class RateTable(eqx.Module):
         return cls(jnp.tensordot(to_coefficients, values, 1), lowest, highest)
 
     def __call__(self, log_theta: Float[Array, ""]) -> Float[Array, "... rows terms"]:
-        """The averages at ln(T/T_0), as the function `averages` returns them.
+        """Return the averages at ln(T/T_0), as the tabulated function returns them.
 
         Args:
             log_theta: ln(T/T_0), from `lowest` to `highest`.
@@ -291,7 +344,7 @@ class RateTable(eqx.Module):
             x = 2 * (1 - log_theta / self.lowest) - 1
         else:
             x = 2 * (log_theta - self.lowest) / (self.highest - self.lowest) - 1
-        if self.coefficients.ndim > 3:  # of many functions a product with a matrix is faster
+        if self.coefficients.ndim > 3:  # a matrix product is faster for many functions
             polynomials = [jnp.ones_like(x), x]
             for _ in range(2, len(self.coefficients)):
                 polynomials.append(2 * x * polynomials[-1] - polynomials[-2])
@@ -303,7 +356,7 @@ class RateTable(eqx.Module):
         return self.coefficients[0] + x * last - before
 
     def with_slopes(self, along: Float[Array, "directions nodes rows terms"]) -> "RateTable":
-        """This function of one gas, its slope and its derivatives as one function of ln(T/T_0).
+        """Return the function, its slope and its derivatives as one function of ln(T/T_0).
 
         Args:
             along: coefficients of the derivatives of the function in some directions.
@@ -312,26 +365,41 @@ class RateTable(eqx.Module):
             A table of shape (2 + directions, rows, terms) at each temperature: the function, its
             derivative in ln(T/T_0), and those given.
         """
-        derivative = jnp.asarray(_derivative(len(self.coefficients)), self.lowest.dtype)
+        derivative = jnp.asarray(_derivative_matrix(len(self.coefficients)), self.lowest.dtype)
         width = -self.lowest if self.highest is None else self.highest - self.lowest
         slope = jnp.tensordot(derivative, self.coefficients, 1) * 2 / width
         both = jnp.stack([self.coefficients, slope], axis=1)
-        further = jnp.moveaxis(along, 0, 1)
-        return RateTable(jnp.concatenate([both, further], 1), self.lowest, self.highest)
+        derivatives = jnp.moveaxis(along, 0, 1)
+        return RateTable(jnp.concatenate([both, derivatives], 1), self.lowest, self.highest)
+
+
+@cache
+def _chebyshev(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Chebyshev nodes in [-1, 1], and the matrix from values at them to coefficients."""
+    angles = (np.arange(num_nodes) + 0.5) * pi / num_nodes
+    matrix = 2 / num_nodes * np.cos(np.outer(np.arange(num_nodes), angles))
+    matrix[0] /= 2
+    return np.cos(angles), matrix
+
+
+@cache
+def _derivative_matrix(num_nodes: int) -> np.ndarray:
+    """Matrix from the coefficients of a Chebyshev series to those of its derivative."""
+    return np.pad(np.polynomial.chebyshev.chebder(np.eye(num_nodes)), ((0, 1), (0, 0)))
 
 
 def _lowest_log_temperature(
     averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
     duration: Float[Array, ""],
     dimension: int,
-    bounds: Bounds,
+    bounds: ElementBounds,
 ) -> Float[Array, ""]:
-    """A lower bound of ln(T/T_0) after a reduced time, negative and not far below the true value.
+    """Lower bound of ln(T/T_0) after a reduced time, negative and not far below the true value.
 
     The first bound is Haff's law for e = 0 with 10 % added to the rate. A law with small losses at
     low speed cools much less; a series over the whole range would lose digits. Therefore the time
-    to cool is bounded from below by integrating the law's own rate, with 10 % added, over
-    `_SCAN_POINTS` temperatures, and the range is cut off one point below what is reached.
+    to cool is bounded from below by integrating the law's rate, with 10 % added, over
+    `_SCAN_POINTS` temperatures, and the range is cut off one point below the temperature reached.
     """
     duration, bounds = jax.lax.stop_gradient((duration, bounds))
     by_speed, constant = bounds.by_speed, bounds.constant
@@ -358,12 +426,12 @@ def _highest_log_temperature(
     heating: ArrayLike,
     rotation: ArrayLike | None,
 ) -> Float[Array, ""]:
-    """An upper bound of ln(T/T_0) of a driven gas within a reduced time, positive.
+    """Upper bound of ln(T/T_0) of a driven gas within a reduced time, positive.
 
-    The first bound has no losses, ``T_0 + xi_0^2 t`` and all the heat of rotation. Smooth spheres
-    are not heated beyond the temperature at which their impacts, with half of the losses to spare
-    for a_2 and soft contacts, take what the drive gives; the range is cut off one of `_SCAN_POINTS`
-    temperatures above it.
+    The first bound has no losses, ``T_0 + xi_0^2 t`` and the whole energy of rotation. Smooth
+    spheres do not heat up beyond the temperature at which their impacts take the power of the
+    drive, with half of the losses to spare for a_2 and soft contacts; the range is cut off one of
+    `_SCAN_POINTS` temperatures above it.
     """
     duration, heating, rotation = jax.lax.stop_gradient((duration, heating, rotation))
     bound = jnp.log1p(heating * duration + (0.0 if rotation is None else rotation))
@@ -375,80 +443,3 @@ def _highest_log_temperature(
         stop = jnp.min(jnp.where(balanced, scan, bound))
         bound = jnp.minimum(bound, stop + scan[1])
     return jnp.maximum(bound, 1e-3)
-
-
-class Rates(NamedTuple):
-    """Rates of a gas at one temperature, per unit of reduced time and divided by sqrt(T/T_0).
-
-    Attributes:
-        cooling: mu_2, in ``d ln T/dt = -(2/d) mu_2``.
-        fourth_moment: mu_4, in ``d a_2/dt = (4/d) mu_2 (1 + a_2) - 4 mu_4 / (d (d + 2))``.
-        relaxation: nu_v, relaxation rate of the velocity autocorrelation function.
-    """
-
-    cooling: Float[Array, ""]
-    fourth_moment: Float[Array, ""]
-    relaxation: Float[Array, ""]
-
-    @classmethod
-    def of(cls, averages: Float[Array, "3 3"], sonine: Float[Array, ""]) -> "Rates":
-        """The rates at a given a_2.
-
-        Args:
-            averages: coefficients of the polynomials in a_2, as the function `averages` returns
-                them.
-            sonine: a_2.
-        """
-        return cls(*(averages[:, 0] + sonine * (averages[:, 1] + sonine * averages[:, 2])))
-
-
-def collision_rate(
-    sonine: ArrayLike, dimension: int, third_sonine: ArrayLike = 0.0
-) -> Float[Array, "..."]:
-    """Collisions per particle and per unit of reduced time, divided by sqrt(T/T_0).
-
-    ``S_d / sqrt(2 pi) (1 - a_2/16 - a_3/64)``.
-
-    Args:
-        sonine: a_2, any shape.
-        dimension: d.
-        third_sonine: a_3, the same shape.
-    """
-    factor = 1 - jnp.asarray(sonine) / 16 - jnp.asarray(third_sonine) / 64
-    return sphere_surface(dimension) / sqrt(2 * pi) * factor
-
-
-@cache
-def averaging_matrix(dimension: int, order: int) -> np.ndarray:
-    """Matrix from the powers 0 to 6 of 1 - eps at the nodes to `averages`."""
-    changes = collision_changes(dimension, order, tuple(NODES))
-    return sphere_surface(dimension) / sqrt(8 * pi) * changes * WEIGHTS
-
-
-def impact_moments(
-    law: ReducedLaw, speed: Float[Array, ""], dimension: int, order: int = 2
-) -> Float[Array, "rows terms"]:
-    """Averages over the impacts of a Maxwell-Sonine gas, exact in eps(v).
-
-    ``mu_2p = (S_d / 2 sqrt(2 pi)) int_0^inf g exp(-g^2/2) L_p(g, eps(g)) dg`` with the loss L_p of
-    ``c_1^(2p) + c_2^(2p)`` in an impact, and likewise the relaxation of a labelled sphere's
-    velocity, by Gauss quadrature with 32 nodes in sqrt(g): relative error below 1e-9 for the laws
-    of this package.
-
-    Args:
-        law: law of restitution in units of `Gas.impact_speed`.
-        speed: sqrt(T/T_0).
-        dimension: d.
-        order: of the Sonine expansion: 2 follows a_2, 3 also a_3.
-
-    Returns:
-        Coefficients of polynomials in a_2 (and a_3), whose columns `collision_integrals.TERMS`
-        lists. Order 2: mu_2, mu_4 and nu_v, shape (3, 3), see `Rates`. Order 3: mu_2, mu_4, mu_6
-        and nu_00, nu_01, nu_10, nu_11, shape (7, 6), see `jaxgran.theory.equations`.
-
-    Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution; see
-    `jaxgran.theory.averages`.
-    """
-    loss = law.loss(jnp.asarray(NODES, speed.dtype) * speed)
-    powers = jnp.stack([loss**0 * 1.0, loss, *(loss**k for k in range(2, 7))])
-    return jnp.tensordot(jnp.asarray(averaging_matrix(dimension, order), speed.dtype), powers, 2)

@@ -1,13 +1,13 @@
-"""The moments of a homogeneous gas at given times, and their derivatives.
+"""Integration of the equations of a homogeneous gas: its moments at given times, and derivatives.
 
-One linear rule serves forward and reverse mode: the tangents of those parameters of the scene that
-move are integrated beside the state, in the same steps, so that they are the derivatives of the
-discrete solution. A scene has few parameters in reduced units, of which mostly one moves.
+`integrate_at` solves ordinary differential equations with output at given times. Steps and their
+sizes are those of diffrax; the loop around them is written here because it takes half as long to
+compile as `diffrax.diffeqsolve` with its events, adjoints and rounding of times.
 
-Integration of ordinary differential equations with output at given times.
-
-The steps and their sizes are those of diffrax; the loop around them is written here, because it is
-half as much to compile as `diffrax.diffeqsolve` with its events, adjoints and rounding of times.
+`moments_at` has one linear rule for forward and reverse mode: the tangents of those parameters of
+the scene that change are integrated together with the state, in the same steps, so that they are
+the derivatives of the discrete solution. A scene has few parameters in reduced units, and mostly
+one of them changes.
 """
 
 from collections.abc import Callable
@@ -24,18 +24,58 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils import status
-from jaxgran.theory.equations import Equations, Moments, Scene
+from jaxgran.theory.equations import Equations, Moments, SceneAndDensity
 
 FIRST_STEP = 0.01
-"""The first step, before the error of a step is known; it is shortened where it is too long."""
+"""First step, before the error of a step is known; it is shortened where it is too long."""
 
 WINDOW = 16
-"""Output times that are interpolated together. Their number must be a multiple of it."""
+"""Number of output times that are interpolated together; their total must be a multiple of it."""
+
+
+def padded_length(size: int) -> int:
+    """Return the smallest length of a geometric grid, `WINDOW` times a power of 2, >= `size`.
+
+    Output times are padded to it, so that few lengths are compiled.
+    """
+    return WINDOW * 2 ** max(0, (size - 1) // WINDOW).bit_length()
+
+
+def integrate_at(
+    vector_field: Callable[[Any, Array], Array],
+    start: Array,
+    times: Float[Array, "times"],
+    *,
+    solver: diffrax.AbstractSolver,
+    controller: diffrax.AbstractAdaptiveStepSizeController,
+    max_steps: int,
+) -> tuple[Float[Array, "times ..."], Bool[Array, ""]]:
+    """Return the solution of ``dy/dt = vector_field(t, y)`` from t = 0 at given times.
+
+    It is interpolated between the steps, to the order of an explicit solver.
+
+    Args:
+        vector_field: a function of a time and a state.
+        start: y(0), any shape.
+        times: not decreasing, >= 0; their number is a multiple of `WINDOW`.
+        solver: an explicit one with ``scan_kind="lax"`` compiles fastest. Other methods than
+            explicit Runge-Kutta are run by `diffrax.diffeqsolve`.
+        controller: of the step sizes.
+        max_steps: largest number of steps, including rejected ones.
+
+    Returns:
+        The states at those times, and whether the last time was reached within that number of
+        steps; nan where the solver failed otherwise.
+    """
+    term = diffrax.ODETerm(lambda t, y, args: vector_field(t, y))
+    if isinstance(solver, diffrax.AbstractERK):
+        return _integrate_with_loop(term, start, times, solver, controller, max_steps)
+    return _integrate_with_diffrax(term, start, times, solver, controller, max_steps)
 
 
 class _Progress(NamedTuple):
-    # Of the loop over steps: the next step, the state before it, what solver and controller
-    # remember, the values at output times, how many of these are known, and the steps made.
+    # The next step, the state before it, the states of solver and controller, the values at output
+    # times, how many of these are known, and the number of steps made.
     t: Float[Array, ""]
     end: Float[Array, ""]
     y: Array
@@ -46,47 +86,7 @@ class _Progress(NamedTuple):
     steps: Int[Array, ""]
 
 
-def padded_length(size: int) -> int:
-    """The least length of a geometric grid, `WINDOW` times a power of 2, that is not below `size`.
-
-    Output times are padded to it, so that few lengths are compiled.
-    """
-    return WINDOW * 2 ** max(0, (size - 1) // WINDOW).bit_length()
-
-
-def integrate_at(
-    velocity: Callable[[Any, Array], Array],
-    start: Array,
-    times: Float[Array, "times"],
-    *,
-    solver: diffrax.AbstractSolver,
-    controller: diffrax.AbstractAdaptiveStepSizeController,
-    max_steps: int,
-) -> tuple[Float[Array, "times ..."], Bool[Array, ""]]:
-    """Solution of ``dy/dt = velocity(t, y)`` from t = 0 at given times.
-
-    It is interpolated between the steps, to the order of an explicit solver.
-
-    Args:
-        velocity: of a time and a state.
-        start: y(0), any shape.
-        times: not decreasing, >= 0; a multiple of `WINDOW`.
-        solver: an explicit one with ``scan_kind="lax"`` compiles fastest. What is no explicit
-            Runge-Kutta method is left to `diffrax.diffeqsolve`.
-        controller: of the step sizes.
-        max_steps: the most steps, refused ones included.
-
-    Returns:
-        The states at those times, and whether the last time was reached within that number of
-        steps; nan where the solver failed otherwise.
-    """
-    term = diffrax.ODETerm(lambda t, y, args: velocity(t, y))
-    if isinstance(solver, diffrax.AbstractERK):
-        return _by_steps(term, start, times, solver, controller, max_steps)
-    return _by_diffrax(term, start, times, solver, controller, max_steps)
-
-
-def _by_steps(
+def _integrate_with_loop(
     term: diffrax.ODETerm,
     start: Array,
     times: Array,
@@ -94,18 +94,17 @@ def _by_steps(
     controller: diffrax.AbstractAdaptiveStepSizeController,
     max_steps: int,
 ) -> tuple[Array, Array]:
-    """The same by a loop over the steps of an explicit solver."""
     last = times[-1]
     order: Any = solver.error_order(term)
     zero, first = jnp.zeros((), times.dtype), jnp.asarray(FIRST_STEP, times.dtype)
     end, control = controller.init(term, zero, last, start, first, None, solver.func, order)
     end = jnp.minimum(jnp.asarray(end), last)
-    begun = solver.init(term, zero, end, start, None)
-    # As arrays, whose types do not change from step to step.
-    begun, control = jax.tree.map(jnp.asarray, (begun, control))
+    solver_state = solver.init(term, zero, end, start, None)
+    # As arrays, so that their types do not change from step to step.
+    solver_state, control = jax.tree.map(jnp.asarray, (solver_state, control))
     values = jnp.broadcast_to(start, (times.size, *start.shape))
     none = jnp.zeros((), int)
-    progress = _Progress(zero, end, start, begun, control, values, none, none)
+    progress = _Progress(zero, end, start, solver_state, control, values, none, none)
 
     def unfinished(at: _Progress) -> Array:
         return (at.t < last) & (at.steps < max_steps)
@@ -114,30 +113,30 @@ def _by_steps(
         y, error, dense, solver_state, _ = solver.step(
             term, at.t, at.end, at.y, None, at.solver, False
         )
-        error = jnp.where(jnp.isnan(error), jnp.inf, error)  # such a step is made shorter
-        kept, t, end, _, control, _ = controller.adapt_step_size(
+        # An infinite error makes the controller repeat the step with a shorter one.
+        error = jnp.where(jnp.isnan(error), jnp.inf, error)
+        accepted, t, end, _, control, _ = controller.adapt_step_size(
             at.t, at.end, at.y, y, None, error, order, at.control
         )
         piece = solver.interpolation_cls(t0=at.t, t1=at.end, **dense)
-        reached = jnp.where(kept, at.end, -1.0)
-        values, known = _interpolated(piece.evaluate, times, reached, at.values, at.known)
+        reached = jnp.where(accepted, at.end, -1.0)
+        values, known = _fill_values(piece.evaluate, times, reached, at.values, at.known)
         y, solver_state = jax.tree.map(
-            lambda new, old: jnp.where(kept, new, old), (y, solver_state), (at.y, at.solver)
+            lambda new, old: jnp.where(accepted, new, old), (y, solver_state), (at.y, at.solver)
         )
-        near = jnp.where(end > last - 1e-3 * (end - t), last, end)  # no sliver of a last step
+        # Avoid a very short last step.
+        end = jnp.where(end > last - 1e-3 * (end - t), last, end)
         control = jax.tree.map(jnp.asarray, control)
-        return _Progress(
-            jnp.asarray(t), near, y, solver_state, control, values, known, at.steps + 1
-        )
+        return _Progress(jnp.asarray(t), end, y, solver_state, control, values, known, at.steps + 1)
 
     done = jax.lax.while_loop(unfinished, step, progress)
     return done.values, done.t >= last
 
 
-def _interpolated(
+def _fill_values(
     evaluate: Callable[[Array], Array], times: Array, reached: Array, values: Array, known: Array
 ) -> tuple[Array, Int[Array, ""]]:
-    """The values with those up to a reached time filled in, and how many are known then."""
+    """Values with those up to a reached time filled in, and the number of known ones."""
 
     def next_time(known):
         return times[jnp.minimum(known, times.size - 1)]
@@ -159,7 +158,7 @@ def _interpolated(
     return jax.lax.while_loop(some_left, fill, (values, known))
 
 
-def _by_diffrax(
+def _integrate_with_diffrax(
     term: diffrax.ODETerm,
     start: Array,
     times: Array,
@@ -167,9 +166,8 @@ def _by_diffrax(
     controller: diffrax.AbstractAdaptiveStepSizeController,
     max_steps: int,
 ) -> tuple[Array, Array]:
-    """The same by `diffrax.diffeqsolve`."""
     if isinstance(solver, diffrax.AbstractImplicitSolver):
-        # Their dense output is only of third order: step onto every requested time instead.
+        # Their dense output is only of third order: step to every requested time instead.
         controller = diffrax.ClipStepSizeController(controller, step_ts=times)
     solution = diffrax.diffeqsolve(
         term,
@@ -191,12 +189,12 @@ def _by_diffrax(
 
 
 class Integrator(NamedTuple):
-    """How equations are integrated.
+    """Settings of the integration of equations.
 
     Attributes:
         solver: of diffrax.
         rtol: relative tolerance.
-        max_steps: the most steps of one curve.
+        max_steps: largest number of steps of one curve.
     """
 
     solver: diffrax.AbstractSolver
@@ -205,18 +203,21 @@ class Integrator(NamedTuple):
 
 
 def moments_at(
-    scene: Scene, times: Float[Array, "times"], equations: Equations, integrator: Integrator
+    scene: SceneAndDensity,
+    times: Float[Array, "times"],
+    equations: Equations,
+    integrator: Integrator,
 ) -> tuple[Moments, Int[Array, ""]]:
-    """The moments of a gas at some reduced times, and a status.
+    """Return the moments of a gas at some reduced times, and a status.
 
     Args:
-        scene: whose floats can be differentiated.
-        times: not decreasing, >= 0; their number is that of `jaxgran.theory.solver.integrate_at`.
+        scene: its floats can be differentiated.
+        times: not decreasing, >= 0; their number is a multiple of `WINDOW`.
         equations: of the moments.
         integrator: of the equations.
 
     Returns:
-        The moments, each of shape (times,), nan unless the status, which follows them, is ok.
+        The moments, each of shape (times,), nan unless the status is ok; and the status.
     """
     leaves, structure = jax.tree.flatten(scene)
     leaves = [jnp.asarray(x, times.dtype) for x in leaves]
@@ -224,28 +225,30 @@ def moments_at(
 
     @jax.custom_jvp
     def solve(leaves, times):
-        return _solve(_raveled(leaves, times.dtype), unravel, times, equations, integrator)
+        return _solve(_ravel(leaves, times.dtype), unravel, times, equations, integrator)
 
     @partial(solve.defjvp, symbolic_zeros=True)
-    def solve_jvp(at, along):
-        leaves, times = at
-        parameters = _raveled(leaves, times.dtype)
-        moving = [np.full(x.size, not _is_zero(x)) for x in along[0]]
-        each = np.eye(parameters.size)[np.concatenate([np.zeros(0, bool), *moving])]
-        directions = jnp.asarray(each, times.dtype)
-        solution = _solve_along(parameters, unravel, times, directions, equations, integrator)
-        state, velocity, jacobian, fault = solution
-        by = _raveled([x for x in along[0] if not _is_zero(x)], times.dtype)
-        moved = jax.tree.map(lambda j: by @ j, jacobian)
-        if not _is_zero(along[1]):
-            moved = jax.tree.map(lambda m, v: m + v * along[1], moved, velocity)
-        no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of a whole number
-        return (state, fault), (moved, no_tangent)
+    def solve_jvp(primals, tangents):
+        (leaves, times), (along, times_along) = primals, tangents
+        parameters = _ravel(leaves, times.dtype)
+        changing = [np.full(x.size, not _is_zero(x)) for x in along]
+        units = np.eye(parameters.size)[np.concatenate([np.zeros(0, bool), *changing])]
+        directions = jnp.asarray(units, times.dtype)
+        solution = _solve_with_tangents(
+            parameters, unravel, times, directions, equations, integrator
+        )
+        state, rate, jacobian, fault = solution
+        amounts = _ravel([x for x in along if not _is_zero(x)], times.dtype)
+        changes = jax.tree.map(lambda j: amounts @ j, jacobian)
+        if not _is_zero(times_along):
+            changes = jax.tree.map(lambda m, v: m + v * times_along, changes, rate)
+        no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of an integer
+        return (state, fault), (changes, no_tangent)
 
     return solve(leaves, times)
 
 
-def _raveled(leaves: list[Array], dtype: Any) -> Float[Array, "parameters"]:
+def _ravel(leaves: list[Array], dtype: Any) -> Float[Array, "parameters"]:
     return jnp.concatenate([jnp.zeros(0, dtype), *map(jnp.ravel, leaves)])
 
 
@@ -255,34 +258,34 @@ def _is_zero(tangent: Any) -> bool:
 
 def _solve(
     parameters: Array,
-    unravel: Callable[[Array], Scene],
+    unravel: Callable[[Array], SceneAndDensity],
     times: Array,
     equations: Equations,
     integrator: Integrator,
 ) -> tuple[Moments, Int[Array, ""]]:
-    """The states, nan unless the status, which follows them, is ok."""
+    """The moments, nan unless the status is ok, and the status."""
     scene = unravel(parameters)
     table = equations.table(scene, times[-1])
 
-    def velocity(row):
-        return equations.velocity(row, table(row[0]), scene)
+    def derivative(row):
+        return equations.derivative(row, table(row[0]), scene)
 
-    start = equations.start(scene, times)
-    rows, fault = _integrate(jax.vmap(velocity), start[None], parameters, times, integrator)
-    return Moments.of(rows[:, 0].T, equations.order), fault
+    start = equations.initial(scene, times)
+    rows, fault = _integrate_rows(jax.vmap(derivative), start[None], parameters, times, integrator)
+    return Moments.from_array(rows[:, 0].T, equations.order), fault
 
 
-def _solve_along(
+def _solve_with_tangents(
     parameters: Array,
-    unravel: Callable[[Array], Scene],
+    unravel: Callable[[Array], SceneAndDensity],
     times: Array,
     directions: Float[Array, "directions parameters"],
     equations: Equations,
     integrator: Integrator,
 ) -> tuple[Moments, Moments, Moments, Int[Array, ""]]:
-    """States, their time derivatives and their derivatives along directions of the parameters.
+    """The moments, their time derivatives, their derivatives along directions, and a status.
 
-    Last, a status; unless it is ok all of them are nan.
+    The directions are those of the parameters. All are nan unless the status is ok.
     """
     order = equations.order
     table, table_along = jax.linearize(
@@ -290,13 +293,13 @@ def _solve_along(
     )
     table = table.with_slopes(jax.vmap(lambda x: table_along(x).coefficients)(directions))
 
-    def velocity(state, rates, parameters):
-        return equations.velocity(state, rates, unravel(parameters))
+    def derivative(state, rates, parameters):
+        return equations.derivative(state, rates, unravel(parameters))
 
-    def rows_velocity(rows):
+    def rows_derivative(rows):
         # Row 0 is the state; the others, its tangents, obey the linearised equation.
         rates, slope, *_ = at = table(rows[0, 0])
-        rate, linear = jax.linearize(velocity, rows[0], rates, parameters)
+        rate, linear = jax.linearize(derivative, rows[0], rates, parameters)
 
         def along(tangent, rates_along, direction):
             return linear(tangent, rates_along + slope * tangent[0], direction)
@@ -304,31 +307,31 @@ def _solve_along(
         return jnp.concatenate([rate[None], jax.vmap(along)(rows[1:], at[2:], directions)])
 
     start, start_along = jax.linearize(
-        lambda parameters: equations.start(unravel(parameters), times), parameters
+        lambda parameters: equations.initial(unravel(parameters), times), parameters
     )
     first = jnp.concatenate([start[None], jax.vmap(start_along)(directions)])
-    rows, fault = _integrate(rows_velocity, first, parameters, times, integrator)
+    rows, fault = _integrate_rows(rows_derivative, first, parameters, times, integrator)
     states, jacobian = rows[:, 0], jnp.moveaxis(rows[:, 1:], 2, 0)
-    velocities = jax.vmap(lambda x: velocity(x, table(x[0])[0], parameters))(states)
+    state_rates = jax.vmap(lambda x: derivative(x, table(x[0])[0], parameters))(states)
     jacobian = jnp.swapaxes(jacobian, 1, 2)
-    state, rate, slope = (Moments.of(x, order) for x in (states.T, velocities.T, jacobian))
+    state, rate, slope = (Moments.from_array(x, order) for x in (states.T, state_rates.T, jacobian))
     return state, rate, slope, fault
 
 
-def _integrate(
-    velocity: Callable, first: Array, parameters: Array, times: Array, integrator: Integrator
+def _integrate_rows(
+    derivative: Callable, first: Array, parameters: Array, times: Array, integrator: Integrator
 ) -> tuple[Array, Int[Array, ""]]:
     """The rows at the given reduced times, shape (times, rows, states), and a status."""
     known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
-    # A gas of nan keeps its state, so that its solver does not try ever shorter steps.
+    # With nan parameters the state stays constant, so that the solver does not shorten its steps.
     times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=times.dtype))
-    # Steps follow the state alone: its tangents are then those of the discrete solution.
+    # The state alone controls the steps: its tangents are then those of the discrete solution.
     controller = diffrax.PIDController(
         rtol=integrator.rtol, atol=integrator.rtol, norm=lambda rows: optx.rms_norm(rows[0][:5])
     )
-    rows, ended = integrate_at(
+    rows, completed = integrate_at(
         # s = ln(1 + t): a power law of time takes the same number of steps each decade.
-        lambda s, rows: jnp.where(known, velocity(rows) * jnp.exp(s), 0.0),
+        lambda s, rows: jnp.where(known, derivative(rows) * jnp.exp(s), 0.0),
         jnp.where(known, first, 0.0),
         jnp.log1p(times),
         solver=integrator.solver,
@@ -336,6 +339,6 @@ def _integrate(
         max_steps=integrator.max_steps,
     )
     finite = known & jnp.all(jnp.isfinite(rows))
-    fault = status.flag(status.STEPS_SPENT, ~ended)
-    fault |= status.flag(status.NOT_FINITE, ended & ~finite)
+    fault = status.flag(status.MAX_STEPS_REACHED, ~completed)
+    fault |= status.flag(status.NOT_FINITE, completed & ~finite)
     return jnp.where(fault == status.OK, rows, jnp.nan), fault

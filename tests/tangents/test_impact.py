@@ -49,7 +49,7 @@ def test_gains_are_slopes_of_the_loss(law):
 
     parts = zip(jnp.split(jnp.eye(flat.size), ends, axis=1), leaves, strict=True)
     directions = structure.unflatten([p.reshape(-1, *leaf.shape) for p, leaf in parts])
-    along = ImpactTangents.at_start(directions, 1, g.dtype)
+    along = ImpactTangents.initial(directions, 1, g.dtype)
     h = 1e-5
     steps = h * jnp.eye(flat.size)
     pairs = [(eps(flat + e), eps(flat - e)) for e in steps] + [(eps(flat, h), eps(flat, -h))]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.gradients.tangents import initial_tangents, projected
+from jaxgran.gradients.tangents import initial_tangents, thermal_projection
 from jaxgran.models.soft_spheres import SoftSpheres, reduced_soft_scene
 from tests.models.test_soft_spheres import soft_beads
 
@@ -81,7 +81,7 @@ def test_one_impact_has_the_slope_of_its_law(beads, beta, angle):
     for interval in (1e-9, 1e-4, 1e3):
         state, scene = followed(gas, position, velocity, len(gaps), end, interval)
         assert bool(jnp.all(state.tangents.free))
-        c = projected(state.tangents, state.velocity).log_temperature
+        c = thermal_projection(state.tangents, state.velocity).log_temperature
         got = float(jnp.mean(c) * scene.dissipative_constant)
         speed = 2.0 * float(jnp.sqrt(gas.temperature))
         # The onset's sqrt(xi) in steps of t_c/40 leaves 1e-3 of a slope on average over its phase.

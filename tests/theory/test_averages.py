@@ -16,7 +16,9 @@ def test_averages_of_constant_restitution():
     for d in (2, 3):
         e = 0.7
         law = jaxgran.ConstantRestitution(e)
-        rates = kinetics.Rates.of(kinetics.impact_moments(law, jnp.ones(()), d), jnp.zeros(()))
+        rates = kinetics.Rates.from_averages(
+            kinetics.impact_moments(law, jnp.ones(()), d), jnp.zeros(())
+        )
         share = {2: 2 * np.pi, 3: 4 * np.pi}[d] / np.sqrt(2 * np.pi)
         np.testing.assert_allclose(rates.cooling, share * (1 - e**2) / 2, rtol=1e-12)
         np.testing.assert_allclose(rates.relaxation, share * (1 + e) / d, rtol=1e-12)
@@ -30,7 +32,9 @@ def test_averages_agree_with_sampled_impacts():
     g = np.sqrt(-2 * np.log(np.random.default_rng(0).random(1_000_000)))
     loss = 1 - np.asarray(law.restitution(jnp.asarray(g))) ** 2
     sampled = 4 * np.pi / (2 * np.sqrt(2 * np.pi)) * np.mean(loss * g**2 / 2)
-    rates = kinetics.Rates.of(kinetics.impact_moments(law, jnp.ones(()), 3), jnp.zeros(()))
+    rates = kinetics.Rates.from_averages(
+        kinetics.impact_moments(law, jnp.ones(()), 3), jnp.zeros(())
+    )
     # 1e6 samples with a relative scatter of 1.2.
     np.testing.assert_allclose(rates.cooling, sampled, rtol=4e-3)
 
@@ -71,7 +75,7 @@ def test_rate_table_is_exact_over_decades(beads):
             def direct(speed, law=law):
                 return kinetics.impact_moments(law, speed, 3)
 
-            table = RateTable.of(direct, jnp.asarray(duration), 3, law.num_nodes)
+            table = RateTable.from_function(direct, jnp.asarray(duration), 3, law.num_nodes)
             x = jnp.linspace(table.lowest, 0.0, 300)
             error = jax.vmap(table)(x)[:, 0, 0] / jax.vmap(direct)(jnp.exp(x / 2))[:, 0, 0] - 1
             assert jnp.max(jnp.abs(error)) < tolerance
@@ -99,7 +103,9 @@ def test_no_gas_leaves_its_rate_table(beads):
         gas = gas.replace(dissipative_constant=gas.value("dissipative_constant") * beta)
         law, duration = gas.reduced_law, tau / gas.collision_frequency
         duration = duration * gas.impact_speed / gas.path_length
-        table = RateTable.of(lambda v: kinetics.impact_moments(law, v, 3), duration, 3, 20)
+        table = RateTable.from_function(
+            lambda v: kinetics.impact_moments(law, v, 3), duration, 3, 20
+        )
         times = tau[None] * gas.mean_free_time
         curve = jaxgran.cool(
             gas, times, model=jaxgran.KineticTheory(softness=False, correlations=False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.theory.averages import SAMPLES, collision_changes
+from jaxgran.theory.averages import NUM_RESTITUTIONS, collision_changes
 
 # a_2, a_3, D n sigma^(d-1)/sqrt(2 T) of the homogeneous cooling state: direct simulation by a code
 # of its own in C, 1e5 particles over 25 relaxations of D. Errors: a_2 1e-4 (1.7e-4 for small eps),
@@ -104,7 +104,7 @@ def test_changes_agree_with_sampled_impacts(dimension, eps):
         for k in (False, True):
             lost = square[0] * (s1[0] if j else 1) - kept * (s1[2] if j else 1)
             sampled.append(dot * lost * (s1[0] if k else 1))
-    powers = (1 - eps) ** np.arange(SAMPLES)
+    powers = (1 - eps) ** np.arange(NUM_RESTITUTIONS)
     exact = np.einsum("rpn,p->r", collision_changes(dimension, 3, (g,))[:, 0], powers)
     for value, samples in zip(exact, sampled, strict=True):
         error = np.std(samples) / n**0.5

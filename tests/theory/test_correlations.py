@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 
 import jaxgran
-from jaxgran.theory.equations import SHORTEST, built_up, slowing
+from jaxgran.theory.equations import MAX_WAVENUMBER, correlation_build_up, correlation_slowdown
 
 
 def disks_or_spheres(eps, phi, dimension):
@@ -27,7 +27,7 @@ def disks_or_spheres(eps, phi, dimension):
 def test_slowing_is_the_integral_over_the_modes(dimension, phi, eps):
     gas = disks_or_spheres(eps, phi, dimension)
     k_c = 2 * pi / float(gas.critical_box)
-    a, b = SHORTEST[dimension]
+    a, b = MAX_WAVENUMBER[dimension]
     shell = {2: 2 * pi, 3: 4 * pi}[dimension]
     # d - 1 shear modes a wave; d N kinetic degrees of freedom; the rate goes as T^(3/2) of heat.
     # The leading term up to K, what a mode holds beyond it over all waves.
@@ -40,14 +40,14 @@ def test_slowing_is_the_integral_over_the_modes(dimension, phi, eps):
     energy = leading + beyond
     n = float(gas.number_density)
     expected = 1.5 * (dimension - 1) / (dimension * n) * energy / (2 * pi) ** dimension
-    found = slowing(jnp.asarray(phi), jnp.asarray(1 - eps**2), dimension)
+    found = correlation_slowdown(jnp.asarray(phi), jnp.asarray(1 - eps**2), dimension)
     np.testing.assert_allclose(found, expected, rtol=1e-6)  # of the quadrature
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_slowing_of_elastic_and_of_strongly_dissipating_spheres(dimension):
     def of(inelasticity):
-        return slowing(jnp.asarray(0.3), inelasticity, dimension)
+        return correlation_slowdown(jnp.asarray(0.3), inelasticity, dimension)
 
     value, slope = jax.value_and_grad(of)(jnp.zeros(()))
     assert value == 0 and jnp.isfinite(slope) and slope > 0
@@ -58,7 +58,9 @@ def test_slowing_of_elastic_and_of_strongly_dissipating_spheres(dimension):
 
 
 def test_correlations_build_up_from_none():
-    np.testing.assert_allclose(built_up(jnp.array([0.0, 4.0, 400.0])), [0.0, 1 - 1 / np.e, 1.0])
+    np.testing.assert_allclose(
+        correlation_build_up(jnp.array([0.0, 4.0, 400.0])), [0.0, 1 - 1 / np.e, 1.0]
+    )
 
 
 @pytest.mark.slow
