@@ -1,4 +1,8 @@
-"""The interface of one kind of spheres: how they move from neighbour list to neighbour list."""
+"""Dynamics of soft or hard spheres: the interface, and the loops over neighbour lists.
+
+A segment of a run is what can be computed with one neighbour list. It consists of blocks of time
+steps (soft spheres) or windows of impacts (hard spheres).
+"""
 
 import dataclasses
 from abc import abstractmethod
@@ -15,25 +19,25 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from jaxgran._utils import status
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.neighbours import Found, Pairs
+from jaxgran.particles.neighbours import ListedPairs, Pairs
 from jaxgran.particles.state import State, initial_state
 
-MAX_IDLE = 1000
-"""Blocks, or neighbour lists, in a row that may advance the time by nothing."""
+MAX_STALLED = 1000
+"""Largest number of blocks or segments in a row that do not advance the time."""
 
 MIN_FLIGHT = 1e-15
-"""Flight of the fastest sphere, in diameters, below which a block advances the time by nothing."""
+"""Flight of the fastest sphere, in diameters, below which the time counts as not advanced."""
 
 
 class Progress(NamedTuple):
-    """A state on its way within one neighbour list.
+    """Progress of a run within one segment.
 
     Attributes:
-        state: after the last block (window) that succeeded.
+        state: state after the last block (window) that succeeded.
         stale: whether a new neighbour list is needed.
-        status: of the last block.
-        needed: the most rows needed of each array of `Capacity`.
-        own: what only one kind of spheres has.
+        status: status of the last block.
+        needed: largest number of rows needed in each array of `Capacity`.
+        internal: further fields of soft or of hard spheres.
     """
 
     state: State
@@ -44,10 +48,10 @@ class Progress(NamedTuple):
 
 
 class AbstractDynamics(eqx.Module):
-    """How one kind of spheres moves. All lengths of arrays are static; the scene is data.
+    """Dynamics of one kind of spheres. The lengths of arrays are static, and the scene is data.
 
     Attributes:
-        scene: numbers of the gas, in units of its diameter, mass and first temperature.
+        scene: numbers of the gas, in units of its diameter, mass and initial temperature.
         replicas: number of boxes.
         capacity: lengths of the arrays.
     """
@@ -58,152 +62,159 @@ class AbstractDynamics(eqx.Module):
 
     @abstractmethod
     def initial_internal(self, num_rows: int, dtype: Any) -> Any:
-        """`State.internal` at t = 0."""
+        """Return `State.internal` at t = 0."""
 
     @abstractmethod
     def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, Array]:
-        """The state ready for a new neighbour list, the positions to list, and until when."""
+        """Return the state for a new neighbour list, the positions to list, and its last time."""
 
     @abstractmethod
     def advance(
         self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
     ) -> Progress:
-        """Follow the spheres to an end, or until the neighbour list is stale or a block fails."""
+        """Move the spheres to an end, or until the neighbour list is stale or a block fails."""
 
     @abstractmethod
-    def recover(self, now: Progress, began: State) -> tuple[State, Int[Array, ""]]:
-        """The state with settings that avoid a failure, and the status of what cannot be mended."""
+    def recover(self, now: Progress, before: State) -> tuple[State, Int[Array, ""]]:
+        """Change settings of the state to avoid a failure, if possible.
+
+        Args:
+            now: progress at the end of a segment.
+            before: state at its beginning.
+
+        Returns:
+            The state, and the status with the faults that cannot be avoided.
+        """
 
     @abstractmethod
     def observe(self, state: State) -> dict[str, Array]:
-        """The records of a state; with tangents, those of `jaxgran.gradients.rule`, too."""
+        """Return the records of a state, and with tangents those for `jaxgran.gradients.rule`."""
 
     @abstractmethod
     def elastic(self) -> "AbstractDynamics":
-        """The same spheres without dissipation."""
+        """Return the dynamics without dissipation."""
 
     @abstractmethod
     def with_tangents(self, state: State, directions: Any) -> State:
-        """A state that does not depend on the material, with its tangents along directions."""
+        """Add tangents along directions in the material to a state independent of the material."""
 
     @property
-    def room(self) -> Float[Array, "d"] | None:
-        """Lengths of the box, from 1/2 on, in which centres are placed; None for the whole box."""
+    def region(self) -> Float[Array, "d"] | None:
+        """Sides of the region, which begins at 1/2, of the centres; None for the whole box."""
         return None
 
     @property
-    def inertial(self) -> bool:
-        """Whether a run may be followed in any frame that moves at a constant velocity."""
+    def galilean_invariant(self) -> bool:
+        """Whether the dynamics is the same in every frame that moves at a constant velocity."""
         return True
 
     @property
-    def preparing(self) -> "AbstractDynamics | None":
-        """The same spheres in the steady state in which they begin; None if they just melt."""
+    def preparation_dynamics(self) -> "AbstractDynamics | None":
+        """Dynamics towards the initial steady state; None if a run begins in equilibrium."""
         return None
 
-    def with_kicks(self, state: State, key: PRNGKeyArray) -> State:
-        """The state after the melt with what `preparing` needs: random numbers for kicks, spins."""
+    def start_preparation(self, state: State, key: PRNGKeyArray) -> State:
+        """Add the spins and the key of kicks that `preparation_dynamics` needs."""
         return state
 
-    def sample_spins(self, state: State, key: PRNGKeyArray, melted: State) -> State:
-        """The state at t = 0 with what else is random: spins, but for those of a preparation.
+    def sample_spins(self, state: State, key: PRNGKeyArray, equilibrated: State) -> State:
+        """Draw the random fields of a state at t = 0: the spins, unless a preparation gave them.
 
         Args:
-            state: so far.
-            key: of the run.
-            melted: the state after the melt and the preparation.
+            state: state at t = 0 without them.
+            key: key of the run.
+            equilibrated: state after equilibration and preparation.
         """
         return state
 
     def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
-        """True velocities, from those of a state's kind, and spins, where spheres have some."""
+        """Return true velocities and spins, None without spins, from stored velocities."""
         return velocity, None
 
     def check_start(self, state: State) -> Int[Array, ""]:
-        """The status of positions given by a user."""
+        """Return the status of positions given by a user."""
         return jnp.zeros((), jnp.int32)
 
     def begin(self, position: Array, velocity: Array, skin: ArrayLike) -> State:
-        """The state at t = 0 of given positions and velocities."""
+        """Return the state at t = 0 with given positions and velocities."""
         internal = self.initial_internal(len(position), position.dtype)
         return initial_state(position, velocity, self.scene.side, skin, self.replicas, internal)
 
     def with_capacity(self, capacity: Capacity) -> "AbstractDynamics":
-        """The same spheres in arrays of other lengths."""
+        """Return the same dynamics with other lengths of arrays."""
         return dataclasses.replace(self, capacity=capacity)
 
     def run_segment(self, state: State, end: ArrayLike, engine: str) -> Progress:
-        """A new neighbour list, blocks until it is stale, and what can be mended of a failure.
+        """Build a neighbour list, run blocks until it is stale, and recover from a failure.
 
-        The state is the last good one. A status that is not ok cannot be mended here: an array is
-        too short, a number is not finite, or a step cannot become shorter.
+        The state is the last good one. If the status is not ok, `recover` was not possible: an
+        array is too short, a number is not finite, or a step cannot become shorter.
 
         Args:
-            state: where to start.
+            state: state at the beginning.
             end: time at which to stop.
-            engine: who finds the pairs, see `neighbours.search`.
+            engine: one of `neighbours.ENGINES`, but not "auto".
         """
-        began, listed, until = self.prepare(state, end)
-        cutoff, room = 1 + began.skin, self.capacity[:2]
-        found = neighbours.search_pairs(
-            listed, self.scene.side, cutoff, self.replicas, room, engine
+        before, listed, until = self.prepare(state, end)
+        cutoff, sizes = 1 + before.skin, self.capacity[:2]
+        result = neighbours.search_pairs(
+            listed, self.scene.side, cutoff, self.replicas, sizes, engine
         )
-        return _until_stale(self, began, listed, found, until)
+        return _run_until_stale(self, before, listed, result, until)
 
 
 @jax.jit
-def _until_stale(
-    dynamics: AbstractDynamics, began: State, listed: Array, found: Found, until: ArrayLike
+def _run_until_stale(
+    dynamics: AbstractDynamics, before: State, listed: Array, result: ListedPairs, until: ArrayLike
 ) -> Progress:
-    pairs = neighbours.with_offsets(listed, dynamics.scene.side, found)
-    now = dynamics.advance(began, listed, pairs, until)
-    state, fault = dynamics.recover(now, began)
+    pairs = neighbours.with_offsets(listed, dynamics.scene.side, result)
+    now = dynamics.advance(before, listed, pairs, until)
+    state, fault = dynamics.recover(now, before)
     return now._replace(state=state, status=fault)
 
 
-def first_progress(state: State, pairs: Pairs, capacity: Capacity, internal: Any) -> Progress:
-    """Before the first block within a neighbour list."""
+def initial_progress(state: State, pairs: Pairs, capacity: Capacity, internal: Any) -> Progress:
+    """Return the progress before the first block of a segment."""
     zero = jnp.zeros((), jnp.int32)
     needed = jnp.stack([pairs.count, pairs.lookahead, zero, zero, zero])
     return Progress(state, jnp.zeros((), bool), capacity.exceeded_by(needed), needed, internal)
 
 
-def kept_if(good: Array, new: State, old: State) -> State:
-    """The new state if a block succeeded, else the old one."""
+def accept_if(good: Array, new: State, old: State) -> State:
+    """Return the new state if a block succeeded, and the old one otherwise."""
     return jax.tree.map(lambda new, old: jnp.where(good, new, old), new, old)
 
 
 def repeat_until(
     end: ArrayLike, block: Callable[[Progress], Progress], first: Progress
 ) -> Progress:
-    """Blocks until the end is reached, the neighbour list is stale or a block fails.
+    """Run blocks until the end is reached, the neighbour list is stale or a block fails.
 
-    Blocks that do not advance the time fail in the end, too.
+    A run of `MAX_STALLED` blocks that do not advance the time is a failure, too.
     """
-
-    shortest = _shortest(first.state)
+    min_duration = _min_duration(first.state)
 
     def unfinished(carry):
         now, _ = carry
         return (now.state.time < end) & ~now.stale & (now.status == status.OK)
 
-    def further(carry):
-        old, idle = carry
+    def run_block(carry):
+        old, num_stalled = carry
         new = block(old)
-        idle = jnp.where(_passed(old.state, new.state) > shortest, 0, idle + 1)
-        stalled = status.flag(status.STALLED, idle >= MAX_IDLE)
-        return new._replace(status=new.status | stalled), idle
+        advanced = _elapsed(old.state, new.state) > min_duration
+        num_stalled = jnp.where(advanced, 0, num_stalled + 1)
+        stalled = status.flag(status.STALLED, num_stalled >= MAX_STALLED)
+        return new._replace(status=new.status | stalled), num_stalled
 
-    return jax.lax.while_loop(unfinished, further, (first, jnp.zeros((), jnp.int32)))[0]
+    return jax.lax.while_loop(unfinished, run_block, (first, jnp.zeros((), jnp.int32)))[0]
 
 
-def _passed(old: State, new: State) -> Float[Array, ""]:
-    """The time from one state to another."""
+def _elapsed(old: State, new: State) -> Float[Array, ""]:
     return (new.time - old.time) + (new.time_rest - old.time_rest)
 
 
-def _shortest(state: State) -> Float[Array, ""]:
-    """The time in which the fastest sphere of a state flies `SHORTEST_FLIGHT`; 0 at rest."""
+def _min_duration(state: State) -> Float[Array, ""]:
+    """Return the time in which the fastest sphere flies `MIN_FLIGHT`; 0 for spheres at rest."""
     speed = jnp.sqrt(jnp.max(jnp.sum(state.velocity * state.velocity, -1)))
     return jnp.where(speed > 0, MIN_FLIGHT / jnp.where(speed > 0, speed, 1.0), 0.0)
 
@@ -213,31 +224,42 @@ def run_segments(
     state: State,
     end: ArrayLike,
     engine: str,
-    least: int,
-    most: int | None = None,
+    min_segments: int,
+    max_segments: int | None = None,
     fault: ArrayLike = status.OK,
 ) -> tuple[State, Array, Array]:
-    """Stretches until an end, at least and at most so many, or until one fails.
+    """Run segments until an end, or until one fails.
+
+    Args:
+        dynamics: of the spheres.
+        state: state at the beginning.
+        end: time at which to stop.
+        engine: see `AbstractDynamics.run_segment`.
+        min_segments: least number of segments, even if the end is reached.
+        max_segments: largest number of segments; None for no limit.
+        fault: status before; no segment is run unless it is ok.
 
     Returns:
-        The state after the last good stretch, the status of the last, and the most rows needed.
+        The state after the last good segment, the status of the last segment, and the largest
+        number of rows needed in each array.
     """
 
     def unfinished(carry):
-        made, _, state, fault, _ = carry
-        going = (made < least) | (state.time < end)
-        if most is not None:
-            going &= made < most
-        return going & (fault == status.OK)
+        num_segments, _, state, fault, _ = carry
+        due = (num_segments < min_segments) | (state.time < end)
+        if max_segments is not None:
+            due &= num_segments < max_segments
+        return due & (fault == status.OK)
 
-    def further(carry):
-        made, idle, state, _, needed = carry
-        now = dynamics.run_segment(state, end, engine)
-        idle = jnp.where(_passed(state, now.state) > _shortest(state), 0, idle + 1)
-        fault = now.status | status.flag(status.STALLED, idle >= MAX_IDLE)
-        kept = jax.tree.map(partial(jnp.where, now.status == status.OK), now.state, state)
-        return made + 1, idle, kept, fault, jnp.maximum(needed, now.needed)
+    def run_one(carry):
+        num_segments, num_stalled, old, _, needed = carry
+        now = dynamics.run_segment(old, end, engine)
+        advanced = _elapsed(old, now.state) > _min_duration(old)
+        num_stalled = jnp.where(advanced, 0, num_stalled + 1)
+        fault = now.status | status.flag(status.STALLED, num_stalled >= MAX_STALLED)
+        state = jax.tree.map(partial(jnp.where, now.status == status.OK), now.state, old)
+        return num_segments + 1, num_stalled, state, fault, jnp.maximum(needed, now.needed)
 
     zero, needed = jnp.zeros((), jnp.int32), jnp.zeros(len(dynamics.capacity), jnp.int32)
-    begin = zero, zero, state, jnp.asarray(fault, jnp.int32), needed
-    return jax.lax.while_loop(unfinished, further, begin)[2:]
+    carry = zero, zero, state, jnp.asarray(fault, jnp.int32), needed
+    return jax.lax.while_loop(unfinished, run_one, carry)[2:]

@@ -1,14 +1,9 @@
-"""The periodic box and the neighbour list; the only file that imports jax_md.
+"""Periodic boxes and neighbour lists, built by sweep and prune, by SciPy's k-d tree or by jax-md.
 
-Importing jax_md takes seconds. It is imported when a box is first used, so that a user of kinetic
-theory alone does not wait for it.
+Compiled code cannot make an array whose length depends on the number of pairs. Arrays have a fixed
+capacity instead, and the number of pairs is counted, so that the caller notices an overflow.
 
-Fixed-size compaction: indices of the True entries of a mask, or of the set bits of words.
-
-Compiled code cannot make an array of as many rows as there happen to be True entries. It makes one
-of a fixed size instead, and counts the entries, so that the caller can tell whether all fitted.
-
-Neighbour search by sweep and prune along x, compiled with the rest of a run.
+Only this module imports jax_md, and only when a box is used: the import takes seconds.
 """
 
 from functools import lru_cache, partial
@@ -22,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float, Int, UInt32
 
 
 def rows_where(mask: Bool[Array, "all"], size: int) -> tuple[Int[Array, "{size}"], Int[Array, ""]]:
-    """Indices of the True entries of a mask, in increasing order, and their number.
+    """Return the indices of the True entries of a mask, in increasing order, and their number.
 
     The True entries are counted in words of 32 bits, and each is found in its word by bisection: on
     a CPU this is two to six times as fast as a cumulative sum over the mask.
@@ -32,8 +27,8 @@ def rows_where(mask: Bool[Array, "all"], size: int) -> tuple[Int[Array, "{size}"
         size: length of the array of indices.
 
     Returns:
-        The indices, with ``mask.size`` in the rows that are left over, and the number of True
-        entries. If that exceeds `size`, only the first `size` of them are returned.
+        The indices, with ``mask.size`` in unused rows, and the number of True entries. If that
+        exceeds `size`, only the first `size` of them are returned.
     """
     num_words = -(-mask.size // 32)
     bits = jnp.pad(mask, (0, 32 * num_words - mask.size)).reshape(num_words, 32)
@@ -45,7 +40,7 @@ def rows_where(mask: Bool[Array, "all"], size: int) -> tuple[Int[Array, "{size}"
 def bits_where(
     words: UInt32[Array, "words"], size: int
 ) -> tuple[Int[Array, "{size}"], Int[Array, "{size}"], Int[Array, ""]]:
-    """Positions of the set bits of an array of words, in increasing order, and their number.
+    """Return the positions of the set bits of an array of words, in increasing order.
 
     Args:
         words: the bits; bit 0 is the lowest of a word.
@@ -58,8 +53,8 @@ def bits_where(
     counts = jax.lax.population_count(words).astype(jnp.int32)
     ends = jnp.cumsum(counts, dtype=jnp.int32)
     starts, row = ends - counts, jnp.arange(size, dtype=jnp.int32)
-    begun = jnp.zeros(size, jnp.int32).at[starts].add(1, mode="drop")
-    word = jnp.cumsum(begun, dtype=jnp.int32) - 1  # the last word that begins at or before a row
+    num_starts = jnp.zeros(size, jnp.int32).at[starts].add(1, mode="drop")
+    word = jnp.cumsum(num_starts, dtype=jnp.int32) - 1  # the last one that starts up to this row
     rest, rank, bit = words[word], row - starts[word], jnp.zeros(size, jnp.int32)
     for half in (16, 8, 4, 2, 1):
         low = jax.lax.population_count(rest & jnp.uint32(2**half - 1)).astype(jnp.int32)
@@ -71,11 +66,11 @@ def bits_where(
 
 
 _WORD = 32
-_X, _YZ = 2.0**30, 2.0**32  # grid steps per box side, along x and along the other axes
+_X_STEPS, _YZ_STEPS = 2.0**30, 2.0**32  # grid steps per box side, along x and the other axes
 
 
-def unsorted(num_particles: int) -> float:
-    """Share of the box side within which a sweep leaves particles in arbitrary order."""
+def unsorted_share(num_particles: int) -> float:
+    """Return the share of the box side within which a sweep does not sort particles."""
     return 2.0 ** (_index_bits(num_particles) - 31)
 
 
@@ -93,28 +88,28 @@ def sweep(
     capacity: int,
     ahead: int,
 ) -> tuple[Int[Array, "{capacity}"], Int[Array, "{capacity}"], Int[Array, ""], Int[Array, ""]]:
-    """All pairs closer than a cutoff, in each of several equal periodic boxes.
+    """Find all pairs closer than a cutoff, in each of several equal periodic boxes.
 
-    Sweep and prune: the particles of each box are sorted by x, and every particle is compared with
-    those that follow it, up to the cutoff along x: ``N cutoff / side`` particles in a homogeneous
-    gas. Coordinates are rounded to a grid of whole numbers, whose differences are periodic by
-    integer overflow (along x by a second copy of the box). One bit per comparison tells whether the
-    pair is within the cutoff. The work grows as ``N^(2 - 1/d)``. For boxes of up to some ten
-    thousand particles this is faster than a cell list, and it needs no call to the host.
+    The method is sweep and prune: the particles of each box are sorted by x, and every particle is
+    compared with the following ones, up to the cutoff along x: ``N cutoff / side`` particles in a
+    homogeneous gas. Coordinates are rounded to a grid of whole numbers, whose differences are
+    periodic by integer overflow (along x by a second copy of the box). One bit per comparison says
+    whether the pair is within the cutoff. The work grows as ``N^(2 - 1/d)``. For boxes of up to
+    some ten thousand particles this is faster than a cell list, and it needs no call to the host.
 
     Args:
-        position: of all particles, replica after replica, in [0, side).
-        side: of the boxes.
-        cutoff: in the same unit, > 0 and less than half a side by at least a part in 10^6.
+        position: positions of all particles, replica after replica, in [0, side).
+        side: side of the boxes.
+        cutoff: distance in the same unit, > 0 and less than half a side by at least a part in 10^6.
         replicas: number of boxes.
         capacity: largest number of pairs that can be returned.
-        ahead: how many of the following particles each particle can be compared with.
+        ahead: largest number of following particles with which a particle can be compared.
 
     Returns:
-        i and j with i < j; the number of pairs found, of which the first `capacity` are returned;
-        and the look-ahead that was needed. If that exceeds `ahead`, pairs beyond `ahead` are
-        missing. Pairs slightly beyond the cutoff may be included, by at most a part in 10^6 of the
-        cutoff and 10^-8 of the side (in float32: 10^-6).
+        i and j with i < j; the number of pairs, of which the first `capacity` are returned; and the
+        look-ahead that was needed. If that exceeds `ahead`, pairs beyond `ahead` are missing. Pairs
+        slightly beyond the cutoff may be included, by at most a part in 10^6 of the cutoff and
+        10^-8 of the side (in float32: 10^-6).
 
     Raises:
         ValueError: if the number of particles times the look-ahead is too large for 32-bit indices.
@@ -124,7 +119,7 @@ def sweep(
     if num_words * replicas * n >= 2**31:
         raise ValueError(
             f"a sweep over {replicas * n} particles cannot look {ahead} particles ahead: its "
-            f"indices have 32 bits, which allow {(2**31 - 1) // (replicas * n) * _WORD} ahead; use "
+            f"indices have 32 bits, which allow {(2**31 - 1) // (replicas * n) * _WORD} ahead. Use "
             "neighbours='scipy' or 'jax-md'"
         )
     unit = position.reshape(replicas, n, position.shape[-1]) / side
@@ -132,20 +127,21 @@ def sweep(
     finite = jnp.all(jnp.isfinite(position))
     order, unit = _sorted_along_x(unit)
     grid = _Grid.of(unit)
-    words, num_looked = _near_bits(grid, _reach(side, cutoff, n, position.dtype), finite, num_words)
+    reach = _Reach.of(side, cutoff, n, position.dtype)
+    words, num_compared = _near_bits(grid, reach, finite, num_words)
     word, bit, count = bits_where(words.ravel(), capacity)
-    i, j = _decoded(word, bit, order)
-    real = jnp.arange(capacity) < count
-    i, j = (jnp.where(real, k, 0) for k in (i, j))
-    return jnp.minimum(i, j), jnp.maximum(i, j), count, jnp.minimum(num_looked, n - 1)
+    i, j = _decode_pairs(word, bit, order)
+    in_use = jnp.arange(capacity) < count
+    i, j = (jnp.where(in_use, k, 0) for k in (i, j))
+    return jnp.minimum(i, j), jnp.maximum(i, j), count, jnp.minimum(num_compared, n - 1)
 
 
 def _sorted_along_x(
     unit: Float[Array, "replicas n d"],
 ) -> tuple[Int[Array, "replicas n"], Float[Array, "replicas n d"]]:
-    """The order of the particles of each box along x, and their positions in that order."""
+    """Return the order of the particles of each box along x, and their positions in that order."""
     n = unit.shape[1]
-    # One integer holds the coarse coordinate and the index: sorting it takes a tenth of the time of
+    # Sorting one integer of the coarse coordinate and the index takes a tenth of the time of
     # sorting two arrays.
     index_bits = _index_bits(n)
     coarse = (unit[..., 0] * 2.0 ** (31 - index_bits)).astype(jnp.int32) << index_bits
@@ -154,50 +150,53 @@ def _sorted_along_x(
 
 
 class _Grid(NamedTuple):
-    """Coordinates as whole numbers of grid steps, of particles sorted along x."""
+    """Coordinates of the particles, sorted along x, as whole numbers of grid steps."""
 
     here: tuple[Int[Array, "replicas n"], ...]  # one array per axis
-    ahead: tuple[Int[Array, "replicas more"], ...]  # and the particles that follow, periodically
+    ahead: tuple[Int[Array, "replicas more"], ...]  # continued periodically behind the last one
 
     @classmethod
     def of(cls, unit: Float[Array, "replicas n d"]) -> "_Grid":
-        x = (unit[..., 0] * _X).astype(jnp.int32)
-        others = [((unit[..., k] - 0.5) * _YZ).astype(jnp.int32) for k in range(1, unit.shape[-1])]
-        # The last particle is followed by the first of the next image of the box, then by nobody.
+        x = (unit[..., 0] * _X_STEPS).astype(jnp.int32)
+        others = [
+            ((unit[..., k] - 0.5) * _YZ_STEPS).astype(jnp.int32) for k in range(1, unit.shape[-1])
+        ]
+        # The next image of the box follows the last particle, and then padding at a large distance.
         end = jnp.full((len(unit), 2 * _WORD), jnp.iinfo(jnp.int32).max)
-        x_ahead = jnp.concatenate([x, x + int(_X), end], axis=1)
+        x_ahead = jnp.concatenate([x, x + int(_X_STEPS), end], axis=1)
         others_ahead = [jnp.concatenate([y, y, end], axis=1) for y in others]
         return cls((x, *others), (x_ahead, *others_ahead))
 
     def following(self, axis: int, first: ArrayLike, count: int) -> Int[Array, "replicas {count}"]:
-        """Coordinates of `count` sorted particles, from index `first` on."""
+        """Return the coordinates of `count` sorted particles, from index `first` on."""
         return jax.lax.dynamic_slice_in_dim(self.ahead[axis], first, count, axis=1)
 
 
 class _Reach(NamedTuple):
-    """The cutoff in grid steps, enlarged by the rounding errors."""
+    """Cutoff in grid steps, enlarged by the rounding errors."""
 
     square: Float[Array, ""]  # of the distance, in steps of y and z
     farthest: Int[Array, ""]  # along x, in steps of x
 
-
-def _reach(side: ArrayLike, cutoff: ArrayLike, n: int, dtype: DTypeLike) -> _Reach:
-    reach = cutoff / side * _YZ + 8 + 4 * _YZ * jnp.finfo(dtype).eps  # for rounding
-    square = jnp.minimum(reach * reach * (1 + 1e-6), (_YZ / 2) ** 2).astype(jnp.float32)
-    return _Reach(square, (reach * (_X / _YZ)).astype(jnp.int32) + 2 ** max(_index_bits(n) - 1, 1))
+    @classmethod
+    def of(cls, side: ArrayLike, cutoff: ArrayLike, n: int, dtype: DTypeLike) -> "_Reach":
+        reach = cutoff / side * _YZ_STEPS + 8 + 4 * _YZ_STEPS * jnp.finfo(dtype).eps  # rounding
+        square = jnp.minimum(reach * reach * (1 + 1e-6), (_YZ_STEPS / 2) ** 2).astype(jnp.float32)
+        along_x = (reach * (_X_STEPS / _YZ_STEPS)).astype(jnp.int32)
+        return cls(square, along_x + 2 ** max(_index_bits(n) - 1, 1))
 
 
 def _near_bits(
     grid: _Grid, reach: _Reach, finite: Bool[Array, ""], num_words: int
 ) -> tuple[UInt32[Array, "{num_words} replicas n"], Int[Array, ""]]:
-    """For each particle one bit per following particle: whether it is within the cutoff.
+    """Compare each particle with the following ones, and set a bit for each within the cutoff.
 
     Returns:
-        The words of 32 bits, and how many following particles had to be compared.
+        The bits in words of 32, and the number of following particles that had to be compared.
     """
     replicas, n = grid.here[0].shape
 
-    def look(carry):
+    def compare_block(carry):
         block, words = carry
         window = [
             grid.following(axis, _WORD * block + 1, n + _WORD - 1) for axis in range(len(grid.here))
@@ -208,7 +207,7 @@ def _near_bits(
                 (there[:, bit : bit + n] - here).astype(jnp.float32)
                 for there, here in zip(window, grid.here, strict=True)
             ]
-            apart[0] *= _YZ / _X
+            apart[0] *= _YZ_STEPS / _X_STEPS
             near = sum(a * a for a in apart) < reach.square
             word |= near.astype(jnp.uint32) << bit
         return block + 1, words.at[block].set(word, mode="drop")
@@ -219,14 +218,14 @@ def _near_bits(
         return finite & (_WORD * block + 1 < n) & (nearest <= reach.farthest)
 
     words = jnp.zeros((num_words, replicas, n), jnp.uint32)
-    blocks, words = jax.lax.while_loop(unfinished, look, (jnp.int32(0), words))
+    blocks, words = jax.lax.while_loop(unfinished, compare_block, (jnp.int32(0), words))
     return words, _WORD * blocks
 
 
-def _decoded(
+def _decode_pairs(
     word: Int[Array, "pairs"], bit: Int[Array, "pairs"], order: Int[Array, "replicas n"]
 ) -> tuple[Int[Array, "pairs"], Int[Array, "pairs"]]:
-    """The two particles of the pairs that set bits stand for."""
+    """Return the two particles of the pair of each set bit."""
     replicas, n = order.shape
     here = word % (replicas * n)
     first = n * (here // n)
@@ -237,11 +236,11 @@ def _decoded(
 
 
 ENGINES = ("auto", "sweep", "scipy", "jax-md")
-"""Builders of neighbour lists: `sweep` in compiled code, SciPy's k-d tree on the host, jax-md on
-the device; "auto" for the fastest of them."""
+"""Methods of building neighbour lists: `sweep` in compiled code, SciPy's k-d tree on the host, or
+jax-md on the device; "auto" is the fastest of them."""
 
 MAX_LOOKAHEAD = 1500
-"""Largest look-ahead of a sweep, in particles; beyond it a tree is faster."""
+"""Largest look-ahead, in particles, up to which a sweep is faster than a tree."""
 
 
 class Pairs(NamedTuple):
@@ -249,12 +248,12 @@ class Pairs(NamedTuple):
 
     Attributes:
         i, j: indices into the particles of all replicas; rows beyond `count` are (0, 0).
-        offset: a multiple of the box side in each direction, such that ``x_i - x_j - offset`` is
-            the shortest displacement of the pair. It remains valid while particles move without
-            being wrapped.
-        count: number of pairs found. If it exceeds the capacity of the list, pairs are missing.
+        offset: multiple of the box side in each direction, such that ``x_i - x_j - offset`` is the
+            shortest displacement of the pair. It remains valid while particles move without being
+            wrapped.
+        count: number of pairs. If it exceeds the capacity of the list, pairs are missing.
         lookahead: look-ahead, in particles, that a sweep needed. If it exceeds the capacity of the
-            sweep, pairs are missing. 0 for the other builders.
+            sweep, pairs are missing. 0 for the other engines.
     """
 
     i: Int[Array, "pairs"]
@@ -267,7 +266,7 @@ class Pairs(NamedTuple):
 def displacement(
     side: ArrayLike, a: Float[Array, "... d"], b: Float[Array, "... d"]
 ) -> Float[Array, "... d"]:
-    """Shortest displacement ``a - b`` in a periodic cube (square) of the given side, by jax-md."""
+    """Return the shortest displacement ``a - b`` in a periodic cube (square), by jax-md."""
     from jax_md import space
 
     shortest, _ = space.periodic(jnp.asarray(side, jnp.result_type(float)))
@@ -275,7 +274,7 @@ def displacement(
 
 
 def wrap(side: ArrayLike, position: Float[Array, "... d"]) -> Float[Array, "... d"]:
-    """Positions moved by multiples of the side into [0, side), by jax-md."""
+    """Move positions by multiples of the side into [0, side), by jax-md."""
     from jax_md import space
 
     _, shift = space.periodic(jnp.asarray(side))
@@ -284,11 +283,11 @@ def wrap(side: ArrayLike, position: Float[Array, "... d"]) -> Float[Array, "... 
 
 
 def choose_engine(name: str, ahead: int = 0, traced: bool = False) -> str:
-    """The builder of neighbour lists to use: `name`, or for "auto" the fastest, as measured.
+    """Return the engine that builds neighbour lists: `name`, or for "auto" the fastest one.
 
-    The fastest is jax-md on a GPU, outside of compiled code. On a CPU it is a sweep up to a
-    look-ahead of `MOST_AHEAD`, and a tree beyond. In compiled code it is a sweep, which calls
-    nothing on the host.
+    As measured, the fastest engine is jax-md on a GPU, outside of compiled code. On a CPU it is a
+    sweep up to a look-ahead of `MAX_LOOKAHEAD`, and a tree beyond. In compiled code it is a sweep,
+    which does not call the host.
 
     Args:
         name: one of `ENGINES`.
@@ -300,8 +299,7 @@ def choose_engine(name: str, ahead: int = 0, traced: bool = False) -> str:
     """
     if name not in ENGINES:
         raise ValueError(
-            f"neighbours must be one of {', '.join(ENGINES)}, got {name!r}; leave it out for the "
-            "fastest"
+            f'neighbours must be one of {", ".join(ENGINES)}, got {name!r}. The default is "auto"'
         )
     if name != "auto":
         return name
@@ -310,8 +308,8 @@ def choose_engine(name: str, ahead: int = 0, traced: bool = False) -> str:
     return "sweep" if traced or ahead <= MAX_LOOKAHEAD else "scipy"
 
 
-Found = tuple[Int[Any, "pairs"], Int[Any, "pairs"], Int[Any, ""], Int[Any, ""]]
-"""i, j, count and lookahead of `Pairs`; NumPy arrays if they come from the host."""
+ListedPairs = tuple[Int[Any, "pairs"], Int[Any, "pairs"], Int[Any, ""], Int[Any, ""]]
+"""Fields i, j, count and lookahead of `Pairs`: NumPy arrays if a tree on the host found them."""
 
 
 def search_pairs(
@@ -320,44 +318,46 @@ def search_pairs(
     cutoff: ArrayLike,
     replicas: int,
     capacity: tuple[int, int],
-    by: str,
-) -> Found:
-    """Search all pairs closer than a cutoff in each of several equal periodic boxes.
+    engine: str,
+) -> ListedPairs:
+    """Find all pairs closer than a cutoff in each of several equal periodic boxes.
 
-    The result carries no derivatives. `with_offsets` adds the offsets in compiled code. A sweep is
+    The result has no derivatives. `with_offsets` adds the offsets in compiled code. A sweep is
     compiled. A tree works under `jax.jit` and `jax.vmap` too, by a callback to the host. jax-md
-    chooses the number of its cells from the values, so that with it `position`, `side` and `cutoff`
-    must not be traced.
+    chooses the number of its cells from the values: `position`, `side` and `cutoff` must not be
+    traced.
 
     Args:
-        position: of all particles, replica after replica, in [0, side).
-        side: of the boxes.
-        cutoff: in the same unit, > 0 and at most half a side; for a sweep less than that by at
-            least a part in 10^6.
+        position: positions of all particles, replica after replica, in [0, side).
+        side: side of the boxes.
+        cutoff: distance in the same unit, > 0 and at most half a side; for a sweep less than that
+            by at least a part in 10^6.
         replicas: number of boxes; particles of different boxes form no pairs.
-        capacity: of the list, in pairs, and of a sweep's look-ahead, in particles.
-        by: "scipy", "sweep" or "jax-md"; all return the same pairs, except that pairs within
-            rounding error of the cutoff may or may not be included.
+        capacity: capacity of the list, in pairs, and of a sweep's look-ahead, in particles.
+        engine: "scipy", "sweep" or "jax-md". All return the same pairs, but may differ in pairs
+            within rounding error of the cutoff.
 
     Raises:
-        ValueError: for another `by`.
+        ValueError: for any other engine.
     """
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
-    if by not in ENGINES[1:]:
-        raise ValueError(f"by must be one of {', '.join(ENGINES[1:])}, got {by!r}; take 'sweep'")
-    most, ahead = capacity
-    if by == "sweep":
-        return sweep(position, side, cutoff, replicas=replicas, capacity=most, ahead=ahead)
-    build = {"scipy": _tree_pairs, "jax-md": _jax_md_pairs}[by]
-    i, j, count = build(position, side, cutoff, replicas, most)
+    if engine not in ENGINES[1:]:
+        raise ValueError(f"engine must be one of {', '.join(ENGINES[1:])}, got {engine!r}")
+    max_pairs, ahead = capacity
+    if engine == "sweep":
+        return sweep(position, side, cutoff, replicas=replicas, capacity=max_pairs, ahead=ahead)
+    build = {"scipy": _tree_pairs, "jax-md": _jax_md_pairs}[engine]
+    i, j, count = build(position, side, cutoff, replicas, max_pairs)
     return i, j, count, np.int32(0)
 
 
 @jax.jit
-def with_offsets(position: Float[Array, "particles d"], side: ArrayLike, found: Found) -> Pairs:
-    """The pairs found for these positions, with their offsets."""
+def with_offsets(
+    position: Float[Array, "particles d"], side: ArrayLike, listed: ListedPairs
+) -> Pairs:
+    """Add the offsets to the pairs that were found for these positions."""
     position, side = jax.lax.stop_gradient((position, jnp.asarray(side)))
-    i, j, count, lookahead = found
+    i, j, count, lookahead = listed
     offset = side * jnp.round((position[i] - position[j]) / side)
     return Pairs(i, j, offset, count, lookahead)
 
@@ -382,23 +382,23 @@ def tree_search(
 ) -> tuple[
     Int[np.ndarray, "{capacity}"], Int[np.ndarray, "{capacity}"], Int[np.ndarray | np.int32, ""]
 ]:
-    """Search pairs on the host: i, j and count of `Pairs` as NumPy arrays.
+    """Find pairs on the host; return i, j and count of `Pairs` as NumPy arrays.
 
-    Positions that are not finite form no pairs.
+    If any position is not finite, no pairs are returned.
     """
-    from scipy.spatial import KDTree  # takes a tenth of a second: for a user of particles alone
+    from scipy.spatial import KDTree  # the import takes a tenth of a second
 
     pairs, count = np.zeros((2, capacity), np.int32), 0
     if np.all(np.isfinite(position)):
         boxes = position.reshape(replicas, -1, position.shape[-1]).astype(np.float64)
         boxes = np.where(boxes >= side, 0.0, boxes)  # by rounding
         for first, points in zip(range(0, len(position), boxes.shape[1]), boxes, strict=True):
-            # Trees that are not balanced find as much and are made in half of the time.
+            # Unbalanced trees give the same pairs and are built in half of the time.
             tree = KDTree(points, boxsize=side, balanced_tree=False, compact_nodes=False)
-            found = tree.query_pairs(cutoff, output_type="ndarray")
-            end = min(count + len(found), capacity)
-            pairs[:, count:end] = found[: end - count].T + first
-            count += len(found)
+            in_box = tree.query_pairs(cutoff, output_type="ndarray")
+            end = min(count + len(in_box), capacity)
+            pairs[:, count:end] = in_box[: end - count].T + first
+            count += len(in_box)
             if count > capacity:
                 break
     return pairs[0], pairs[1], np.int32(count)
@@ -406,17 +406,17 @@ def tree_search(
 
 def _jax_md_pairs(position, side, cutoff, replicas: int, capacity: int):
     boxes = position.reshape(replicas, -1, position.shape[-1])
-    multiplier, most = 1.5, 100.0
+    multiplier, max_multiplier = 1.5, 100.0
     with jax.numpy_rank_promotion("allow"):  # jax-md needs it
         while True:
             allocated, update = _jax_md_list(boxes.shape, float(side), float(cutoff), multiplier)
             lists = update(boxes, allocated(boxes[0]))
             if not bool(jnp.any(lists.did_buffer_overflow)):
                 break
-            if multiplier > most:
+            if multiplier > max_multiplier:
                 raise RuntimeError(
                     f"jax-md's neighbour list overflows even at {multiplier:.3g} times the "
-                    f"capacity of a homogeneous gas (at most {most:g} are tried); use "
+                    f"capacity of a homogeneous gas, and the limit is {max_multiplier:g}. Use "
                     "neighbours='scipy'"
                 )
             multiplier *= 1.5
@@ -425,7 +425,7 @@ def _jax_md_pairs(position, side, cutoff, replicas: int, capacity: int):
 
 @lru_cache(maxsize=8)
 def _jax_md_list(shape: tuple[int, ...], side: float, cutoff: float, multiplier: float):
-    # jax-md's functions are closures, which would be compiled again at every call if not cached.
+    # jax-md returns closures, which would be compiled again at every call without this cache.
     from jax_md import partition, space
 
     shortest, _ = space.periodic(jnp.asarray(side))
@@ -436,29 +436,24 @@ def _jax_md_list(shape: tuple[int, ...], side: float, cutoff: float, multiplier:
         capacity_multiplier=multiplier,
         format=partition.NeighborListFormat.OrderedSparse,
     )
-    allocated = _once(functions.allocate)
-    return allocated, jax.jit(jax.vmap(functions.update, in_axes=(0, None)))
-
-
-def _once(allocate):
-    """`allocate`, called at the first positions only; later ones update that list."""
-    kept = []
+    lists = []
 
     def allocated(position):
-        if not kept:
-            kept.append(allocate(position, extra_capacity=1))  # the first list may be empty
-        return kept[0]
+        """Allocate a list at the first call; later positions update it."""
+        if not lists:
+            lists.append(functions.allocate(position, extra_capacity=1))  # it may be empty
+        return lists[0]
 
-    return allocated
+    return allocated, jax.jit(jax.vmap(functions.update, in_axes=(0, None)))
 
 
 @partial(jax.jit, static_argnums=(1, 2))
 def _flatten(index: Int[Array, "replicas 2 most"], num_particles: int, capacity: int):
-    """i, j and count of `Pairs` from one of jax-md's lists per replica."""
+    """Return i, j and count of `Pairs` from jax-md's lists, one for each replica."""
     first = num_particles * jnp.arange(len(index), dtype=jnp.int32)[:, None]
-    there = jnp.ravel(index[:, 0] < num_particles)
-    (rows,) = jnp.nonzero(there, size=capacity, fill_value=0)
-    count = jnp.sum(there, dtype=jnp.int32)
-    real = jnp.arange(capacity) < count
-    i, j = (jnp.where(real, jnp.ravel(index[:, k] + first)[rows], 0) for k in (0, 1))
+    is_pair = jnp.ravel(index[:, 0] < num_particles)
+    (rows,) = jnp.nonzero(is_pair, size=capacity, fill_value=0)
+    count = jnp.sum(is_pair, dtype=jnp.int32)
+    in_use = jnp.arange(capacity) < count
+    i, j = (jnp.where(in_use, jnp.ravel(index[:, k] + first)[rows], 0) for k in (0, 1))
     return i.astype(jnp.int32), j.astype(jnp.int32), count

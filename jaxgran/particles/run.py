@@ -1,36 +1,25 @@
-"""The host driver of particle runs: progress, checkpoints, interruption, arrays that grow.
+"""Particle runs of soft or hard spheres: inside JAX transformations, or from the host.
 
-For runs whose numbers are all known; the same run as a pure function is in `pure`.
+A gas starts from random positions and Maxwellian velocities. It is equilibrated by elastic motion,
+and at t = 0 it has no momentum and the temperature T_0. Or it starts from particles of the user.
 
-How many cores of a CPU a compiled program of a run takes.
+`simulate_traced` is a pure function of arrays for `jax.jit`, `jax.vmap` and derivatives. Its
+capacities are fixed; a run that exceeds them ends in nan and a status. `simulate_on_host` needs
+known numbers. It shows progress, writes checkpoints and trajectories, can be interrupted, and
+enlarges arrays that are too short.
 
-Waiting for compiled code in a way that the user can interrupt.
+Replicas run separately where the process has several CPU devices
+(`jax.config.update("jax_num_cpu_devices", 2)`), because XLA works through sorts, sums and scatters
+on one core: `run_replicas`. Each has a key, a step, a neighbour list and arrays of its own, and its
+numbers are independent of the number of devices.
 
-Compiled programs of the host driver, which are kept.
-
-A run of spheres in boxes: what its two layers, `pure` and `driver`, have in common.
-
-A gas starts from random positions and Maxwellian velocities, melts elastically, and then cools from
-exactly T_0 without momentum; or it starts from what a user gives.
-
-Runs of spheres as a pure function of arrays: for `jax.jit`, `jax.vmap` and derivatives.
-
-Capacities are fixed beforehand; a run that exceeds them ends in nan and a status. There is no I/O.
-
-Replicas as runs of their own, side by side on the CPU devices of a process, or in turn on one.
-
-XLA works through sorts, sums and scatters on one core. Where a process has several CPU devices
-(`jax.config.update("jax_num_cpu_devices", 2)`), each replica of a run from the host is a run with
-one replica and a key of its own, on one of them: it has its own step, neighbour list and arrays,
-and its numbers are the same whoever runs beside it.
-
-On one device small replicas of spheres stand in one array, which saves the overhead of many short
-operations. Then they share what is one number of a state: the length of blocks or windows, which
-the hottest (fastest) spheres of all decide, refined steps, the skin, and with it when a neighbour
-list is made. Each is as accurate as alone, but not the same bit for bit, and so, after some
-collisions, another sample of the same gas. Replicas of `MANY` spheres and more run one after the
-other on one CPU device, too, where one array saves nothing any more. Replicas of DSMC share nothing
-but the array: each has its own steps and random numbers.
+On one device small replicas of spheres share one array, which saves the overhead of many short
+operations. They share every quantity that the state holds once: the length of blocks or windows,
+which the fastest spheres of all replicas decide, refined steps, and the skin, and thereby the times
+of new neighbour lists. Each replica is as accurate as alone, but not the same bit for bit, and so,
+after some collisions, another sample of the same gas. Replicas of `MIN_SPHERES_PER_RUN` spheres and
+more run one after the other even on one CPU device: one array does not save time any more. Replicas
+of DSMC share nothing but the array: each has its own steps and random numbers.
 """
 
 import queue
@@ -52,7 +41,7 @@ from jaxtyping import Array, ArrayLike, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced, concrete
+from jaxgran._utils.tracing import any_traced, concrete_array
 from jaxgran.data import checkpoint
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import Particles, Run
@@ -60,197 +49,63 @@ from jaxgran.data.particles import Sphere, Trajectory, file_of_replica
 from jaxgran.gradients.rule import Inputs, Outputs
 from jaxgran.particles import neighbours, snapshot
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.dynamics import MAX_IDLE, AbstractDynamics, run_segments
+from jaxgran.particles.dynamics import MAX_STALLED, AbstractDynamics, run_segments
 from jaxgran.particles.setup import (
     host_positions,
     maxwellian_velocities,
     normalise_velocities,
     relaxed_positions,
 )
-from jaxgran.particles.state import State, centred, empty_records, fill_nan_from, with_own_buffers
-
-
-def cpu_compiler_options() -> dict[str, str | bool] | None:
-    """Options of the compiler for a program that the host driver calls.
-
-    Where a process has several CPU devices, runs go on side by side, one on each. XLA would divide
-    the operations of every one among threads of all cores, which then wait for each other: two
-    replicas of DSMC take 15 to 20 % longer so. A program of each device takes one core instead. For
-    one device there are no options: a single run takes as long with them as without, within 6 %.
-    """
-    if jax.default_backend() != "cpu" or jax.local_device_count() == 1:
-        return None
-    return {"xla_cpu_multi_thread_eigen": False}
-
-
-Waited = TypeVar("Waited")
-
-_THREAD = threading.local()
-
-
-@contextmanager
-def stopped_by(stop: threading.Event) -> Iterator[None]:
-    """In this thread, which an interruption from the keyboard does not reach, an event stands for
-    it: `waited_for` raises KeyboardInterrupt once it is set."""
-    _THREAD.stop = stop
-    try:
-        yield
-    finally:
-        _THREAD.stop = None
-
-
-def block_until_ready(arrays: Waited) -> Waited:
-    """The same arrays, once they are computed; an interruption ends the waiting at once.
-
-    Looking again and again whether they are ready would take 3 to 8 % of a run's time.
-
-    Raises:
-        KeyboardInterrupt: in a thread within `stopped_by`, too, once its event is set.
-    """
-    arrays = in_thread(lambda: jax.block_until_ready(arrays))
-    if (stop := getattr(_THREAD, "stop", None)) is not None and stop.is_set():
-        raise KeyboardInterrupt
-    return arrays
-
-
-def in_thread(function: Callable[[], Waited]) -> Waited:
-    """The result of a function that is called in a thread of its own.
-
-    An interruption from the keyboard ends the waiting at once; the thread, which Python cannot end,
-    then goes on in the background. No JAX transformation and no JAX configuration of the calling
-    thread is under way in that thread.
-    """
-    results: queue.SimpleQueue[tuple[bool, object]] = queue.SimpleQueue()
-
-    def call() -> None:
-        try:
-            results.put((True, function()))
-        except BaseException as error:
-            results.put((False, error))
-
-    threading.Thread(target=call, daemon=True).start()
-    succeeded, result = results.get()
-    if not succeeded:
-        assert isinstance(result, BaseException)
-        raise result
-    return result  # type: ignore[return-value]
-
-
-def outside_transformations(function: Callable[[], Waited]) -> Waited:
-    """Call a function in a thread of its own, where no JAX transformation is under way."""
-    x64, device = jax.config.read("jax_enable_x64"), chosen_device()
-
-    def call() -> Waited:
-        with jax.enable_x64(x64), jax.default_device(device):
-            return function()
-
-    return in_thread(call)
-
-
-def chosen_device() -> Any:
-    """The device that `jax.default_device` has set in this thread, or None."""
-    return jax.config.jax_default_device  # type: ignore[attr-defined]
-
-
-SEGMENTS_PER_CALL = 8
-"""Neighbour lists used in one call of compiled code; progress is shown between calls."""
-
-COMPILING = "compiling ..."
-
-
-@contextmanager
-def compiling(progress: bool) -> Iterator[None]:
-    """Say "compiling ..." on a terminal as long as the block lasts; the progress bar follows."""
-    shown = progress and sys.stderr.isatty()
-    if shown:
-        print(f"\r{COMPILING}", end="", file=sys.stderr, flush=True)
-    try:
-        yield
-    finally:
-        if shown:
-            print(f"\r{' ' * len(COMPILING)}\r", end="", file=sys.stderr, flush=True)
-
-
-_COMPILED: set[Hashable] = set()
-
-
-def needs_compilation(program: Hashable) -> bool:
-    """Whether this process is told of a program for the first time, and so has it to compile."""
-    new = program not in _COMPILED
-    _COMPILED.add(program)
-    return new
-
-
-MAX_PROGRAMS = 32
-"""Compiled programs that are kept; beyond that the one unused for longest is released."""
-
-_PROGRAMS: OrderedDict[Any, jax.stages.Compiled] = OrderedDict()
-"""Programs of `stretches` by what they were compiled for. Unlike those that `jax.jit` keeps they
-are bounded in number, and shared by plain runs and those inside a rule of differentiation."""
-
-
-def compiled_segments(
-    dynamics: AbstractDynamics,
-    state: State,
-    end: np.ndarray,
-    engine: str,
-    progress: bool = False,
-    donate: bool = False,
-) -> tuple[State, Array, Array]:
-    """`STRETCHES` stretches, compiled for the types and the static fields of these arguments.
-
-    With `donate` the new state is written over the given one, which must be `owned` and is deleted.
-    """
-    kept, rest = jax.tree.flatten((dynamics, end))
-    moving, of_state = jax.tree.flatten(state)
-
-    def some(moving: list[Array], kept: list[Array]) -> tuple[State, Array, Array]:
-        dynamics, end = rest.unflatten(kept)
-        state = of_state.unflatten(moving)
-        return run_segments(dynamics, state, end, engine, least=1, most=SEGMENTS_PER_CALL)
-
-    leaves = moving, kept
-    if any_traced(leaves):  # constants within a transformation of something else
-        return jax.jit(some)(*leaves)
-    types = tuple((x.shape, x.dtype, getattr(x, "sharding", None)) for x in (*moving, *kept))
-    key = engine, SEGMENTS_PER_CALL, rest, of_state, types, donate
-    if (program := _PROGRAMS.pop(key, None)) is None:  # in one step: there are threads
-        jitted = jax.jit(some, donate_argnums=0 if donate else ())
-        with compiling(progress):
-            options = cpu_compiler_options()
-            program = outside_transformations(lambda: jitted.lower(*leaves).compile(options))
-    _PROGRAMS[key] = program
-    if len(_PROGRAMS) > MAX_PROGRAMS:
-        _PROGRAMS.popitem(last=False)
-    return program(*leaves)
-
+from jaxgran.particles.state import State, centred, copy_buffers, empty_records, fill_nan_from
 
 EQUILIBRATION_COLLISIONS = 10.0
-"""Mean free times of elastic motion before t = 0."""
+"""Duration of the equilibration, in mean free times."""
 
-DRIVE_TIME = 10.0
-"""Further mean free times in a steady state, where a gas begins in one."""
+PREPARATION_COLLISIONS = 10.0
+"""Duration of the preparation of a steady state after it, in mean free times."""
 
-SETTLING_TIME = 2.0
-"""Mean free times of melting after which the capacity of the run suffices."""
+SETTLING_COLLISIONS = 2.0
+"""Mean free times of equilibration after which the capacity of the run is sufficient."""
 
 MIN_BOX = 2.1
-"""Box side in diameters below which a sphere could touch another one and its image at once."""
+"""Least side of a box in diameters; in a smaller one a sphere could touch another one and its image
+at once."""
+
+CHECKPOINT_SECONDS = 60.0
+"""Time between checkpoints; one more is written when a run is interrupted."""
+
+MAX_ROWS_PER_PARTICLE = 100
+"""Rows per particle beyond which an array is not enlarged."""
+
+SEGMENTS_PER_CALL = 8
+"""Largest number of segments in one call of compiled code; progress is shown between calls."""
+
+MAX_PROGRAMS = 32
+"""Largest number of compiled programs in memory; the one unused for longest is released first."""
+
+MIN_SPHERES_PER_RUN = 8192
+"""Least number of spheres in a replica with which replicas run one after the other. On one core
+four replicas of 1000, 2000 and 4096 take then 1.4, 1.1 and 0.9 (hard), 1.4, 1.3 and 1.1 (soft)
+times as long as in one array."""
+
+Devices = tuple[Any, ...]
+
+T = TypeVar("T")
 
 
 class Simulation(NamedTuple):
     """A run of spheres in boxes.
 
     Attributes:
-        dynamics: how they move; with the capacity of the run.
-        melt_capacity: of the first mean free times of the melt.
+        dynamics: dynamics of the spheres, with the capacity of the run.
+        equilibration_capacity: capacity in the first mean free times of the equilibration.
         inputs: times, start and key, in reduced units.
-        directions: in the material, along which tangents are followed; None for no tangents.
-        num_particles: in each box.
-        dimension: d.
-        skin: of the first neighbour list.
-        engine: who finds the pairs, see `neighbours.engine`.
-        save: a user's function of the particles of a replica; None for none.
+        directions: directions of the tangents in the material; None for no tangents.
+        num_particles: number of particles in each box.
+        dimension: dimension d.
+        skin: skin of the first neighbour list.
+        engine: method of finding the pairs, see `neighbours.ENGINES`.
+        save: function of the user of the particles of a replica, or None.
     """
 
     dynamics: AbstractDynamics
@@ -270,57 +125,59 @@ class Simulation(NamedTuple):
 
     @property
     def equilibration_time(self) -> Array:
-        """Duration of the melt."""
+        """Duration of the equilibration."""
         return EQUILIBRATION_COLLISIONS / self.dynamics.scene.collision_frequency
 
     @property
-    def prepared_time(self) -> Array:
-        """Time at the end of the preparation, which begins at that of the melt."""
-        return (EQUILIBRATION_COLLISIONS + DRIVE_TIME) / self.dynamics.scene.collision_frequency
+    def preparation_end(self) -> Array:
+        """End of the preparation, counted from the beginning of the equilibration."""
+        total = EQUILIBRATION_COLLISIONS + PREPARATION_COLLISIONS
+        return total / self.dynamics.scene.collision_frequency
 
     @property
     def key(self) -> PRNGKeyArray:
-        """Of the random numbers."""
+        """Key of the random numbers."""
         return jax.random.key(0) if self.inputs.key is None else self.inputs.key
 
     @property
     def drift(self) -> Array:
-        """Velocity of the centre of mass of each particle's replica, in which the run is at rest.
+        """Velocity of the frame of the run: that of the centre of mass of each given replica.
 
-        Shape (n, d), or 0 for a random start, and where walls or drag are at rest.
+        Its shape is (n, d). It is the number 0 for a random start, and where walls or drag are at
+        rest.
         """
-        if self.inputs.start is None or not self.dynamics.inertial:
+        if self.inputs.start is None or not self.dynamics.galilean_invariant:
             return jnp.zeros(())
         velocity = self.inputs.start[1]
         return velocity - centred(velocity, self.dynamics.replicas).reshape(velocity.shape)
 
     def outputs(self, state: State, records: dict[str, Array], fault: ArrayLike) -> Outputs:
-        """The results of a run, in the frame in which the start was given."""
+        """Return the results of a run, in the frame in which the start was given."""
         position, velocity, spin = self.to_lab_frame(state, self.inputs.times[-1])
         fault = jnp.asarray(fault, jnp.int32)
         return Outputs(position, velocity, records, fault, spin)
 
     def to_lab_frame(self, state: State, time: Array) -> tuple[Array, Array, Array | None]:
-        """Positions in the box, velocities and spins, in the frame in which the start was given."""
+        """Return wrapped positions, velocities and spins in the frame of the given start."""
         drift = self.drift
         velocity, spin = self.dynamics.to_lab_frame(state, state.velocity + drift)
         inside = neighbours.wrap(self.dynamics.scene.side, state.position + drift * time)
         return inside, velocity, spin
 
     def observe(self, state: State) -> dict[str, Array]:
-        """The records of a state, and what a user's function makes of it."""
+        """Return the records of a state, with those of the user's function."""
         records = self.dynamics.observe(state)
         if self.save is None:
             return records
-        return records | snapshot.saved(self.save, self.particles(state))
+        return records | snapshot.saved_records(self.save, self.particles(state))
 
     def particles(self, state: State) -> Particles:
-        """The particles of a state in SI."""
-        to_lab_frame = self.to_lab_frame(state, state.time)
-        return snapshot.particles(self.inputs.units, self.dynamics.replicas, *to_lab_frame)
+        """Return the particles of a state in SI."""
+        arrays = self.to_lab_frame(state, state.time)
+        return snapshot.particles(self.inputs.units, self.dynamics.replicas, *arrays)
 
     def writer(self, run: Run) -> Callable[[int, State], None]:
-        """Writes the particles at a time, by its number, to the trajectory, if there is one."""
+        """Return a function that writes the particles at time number k to the trajectory."""
         if run.trajectory is None:
             return lambda k, state: None
         resumed = run.checkpoint is not None and Path(run.checkpoint).exists()
@@ -336,202 +193,101 @@ class Simulation(NamedTuple):
         return write
 
     def first_state(self) -> State:
-        """The state at the beginning of the melt, or of the run of a given start."""
+        """Return the state at the beginning: of the equilibration, or of a run of a given start."""
         if self.inputs.start is not None:
-            position, velocity = self.inputs.start
-            return self.dynamics.begin(position, velocity - self.drift, self.skin)
-        places, _ = jax.random.split(self.key)
-        return self._at_random(host_positions(places, *self._box))
-
-    def compiled_first_state(self, fault: Array) -> tuple[State, Array]:
-        """The same without a call to the host, and the status, from that before."""
-        if self.inputs.start is not None:
-            return self.first_state(), fault
-        places, _ = jax.random.split(self.key)
-        side, *size, room = self._box
-        lists = self.equilibration_capacity.pairs, self.equilibration_capacity.lookahead
-        sizes = size[0], size[1], size[2]
-        found, fault = relaxed_positions(places, side, sizes, self.skin, lists, room, fault)
-        return self._at_random(found), fault
-
-    @property
-    def _box(self) -> tuple[Array, int, int, int, Array | None]:
-        """Side, replicas, particles in each, dimension and room."""
+            return self._given_state(self.inputs.start)
         dynamics = self.dynamics
+        position_key, velocity_key = jax.random.split(self.key)
         size = dynamics.replicas, self.num_particles, self.dimension
-        return dynamics.scene.side, *size, dynamics.room
+        position = host_positions(position_key, dynamics.scene.side, *size, dynamics.region)
+        return self._random_state(position, velocity_key)
 
-    def _at_random(self, position: Array) -> State:
-        """The state of random velocities at given positions."""
-        _, speeds = jax.random.split(self.key)
-        position = position if self.dynamics.room is None else position + 0.5
-        velocity = maxwellian_velocities(
-            speeds, self.dynamics.replicas, self.num_particles, self.dimension
+    def first_state_traced(self, fault: Array) -> tuple[State, Array]:
+        """Return the first state without a call to the host, and the status, from that before."""
+        if self.inputs.start is not None:
+            return self._given_state(self.inputs.start), fault
+        dynamics = self.dynamics
+        position_key, velocity_key = jax.random.split(self.key)
+        position, fault = relaxed_positions(
+            position_key,
+            dynamics.scene.side,
+            (dynamics.replicas, self.num_particles, self.dimension),
+            self.skin,
+            (self.equilibration_capacity.pairs, self.equilibration_capacity.lookahead),
+            dynamics.region,
+            fault,
         )
-        return self.dynamics.begin(position, velocity, self.skin)
+        return self._random_state(position, velocity_key), fault
 
-    def cooling_state(self, melted: State) -> State:
-        """The state at t = 0, from that at the end of the melt; with tangents if they are wanted.
+    def _given_state(self, start: tuple[Array, Array]) -> State:
+        position, velocity = start
+        return self.dynamics.begin(position, velocity - self.drift, self.skin)
 
-        The energy in contacts is counted by the first call of `AbstractDynamics.advance`.
+    def _random_state(self, position: Array, velocity_key: PRNGKeyArray) -> State:
+        dynamics = self.dynamics
+        position = position if dynamics.region is None else position + 0.5
+        size = dynamics.replicas, self.num_particles, self.dimension
+        velocity = maxwellian_velocities(velocity_key, *size)
+        return dynamics.begin(position, velocity, self.skin)
+
+    def cooling_state(self, equilibrated: State) -> State:
+        """Return the state at t = 0 after equilibration, with tangents if there are directions.
+
+        The first call of `AbstractDynamics.advance` counts the energy in contacts.
         """
-        velocity = melted.velocity
+        velocity = equilibrated.velocity
         if self.needs_equilibration:
             velocity = normalise_velocities(velocity, self.dynamics.replicas)
-        state = self.dynamics.begin(melted.position, velocity, melted.skin)
-        state = self.dynamics.sample_spins(state, self.key, melted)
+        state = self.dynamics.begin(equilibrated.position, velocity, equilibrated.skin)
+        state = self.dynamics.sample_spins(state, self.key, equilibrated)
         if self.directions is None:
             return state
         return self.dynamics.with_tangents(state, self.directions)
 
 
-CHECKPOINT_SECONDS = 60.0
-"""A checkpoint is written this often, and when the run is interrupted."""
+def simulate_traced(sim: Simulation) -> Outputs:
+    """Equilibrate and cool inside JAX transformations, with records at the times of the inputs."""
+    dynamics, inputs = sim.dynamics, sim.inputs
+    engine = neighbours.choose_engine(sim.engine, dynamics.capacity.lookahead, traced=True)
+    side = dynamics.scene.side
+    # In a smaller box a new neighbour list is stale at once, and the loop would not end.
+    fault = status.flag(status.BOX_TOO_SMALL, side < MIN_BOX)
+    state, fault = sim.first_state_traced(fault)
+    if sim.needs_equilibration:
+        elastic = dynamics.elastic().with_capacity(sim.equilibration_capacity)
+        state, fault, _ = run_segments(
+            elastic, state, sim.equilibration_time, engine, 0, None, fault
+        )
+        if (preparation := dynamics.preparation_dynamics) is not None:
+            state, until = preparation.start_preparation(state, sim.key), sim.preparation_end
+            state, fault, _ = run_segments(preparation, state, until, engine, 0, None, fault)
+    else:
+        fault |= dynamics.check_start(state)
+    # One segment until t = 0 counts the energy in contacts.
+    state = sim.cooling_state(state)
+    state, fault, _ = run_segments(dynamics, state, jnp.zeros_like(state.time), engine, 1, 1, fault)
 
-MAX_PAIRS_EACH = 100
-"""Rows per particle beyond which an array does not grow any more."""
+    def record_at(carry, end):
+        state, fault, _ = run_segments(dynamics, carry[0], end, engine, 0, None, carry[1])
+        records, failed = sim.observe(state), fault != status.OK
+        return (state, fault), jax.tree.map(partial(_nan_if, failed), records)
 
-
-class RunFailure(Exception):
-    """A run that cannot go on, with its status, and its last good state where that is not the one
-    from before the call."""
-
-    def __init__(self, fault: int, state: Any = None):
-        super().__init__(status.explain(fault))
-        self.fault, self.state = fault, state
-
-
-@runtime_checkable
-class _Timed(Protocol):
-    @property
-    def time(self) -> Any: ...
-
-
-S = TypeVar("S", bound=_Timed)
-
-
-def run_through_times(
-    state: S,
-    times: np.ndarray,
-    advance: Callable[[S, float], S],
-    observe: Callable[[S], dict[str, jax.Array]],
-    *,
-    write: Callable[[int, S], None] = lambda k, state: None,
-    shown: Callable[[S], dict[str, jax.Array]] | None = None,
-    scene: dict[str, str] | None = None,
-    progress: bool = True,
-    label: str | None = None,
-    path: str | Path | None = None,
-    fault: int = status.OK,
-) -> tuple[S, dict[str, np.ndarray], int]:
-    """Take a state through all times and observe it at each.
-
-    Args:
-        state: a pytree with a field `time`; where the run starts.
-        times: increasing, not before the state's own.
-        advance: takes a state towards a time, at most to it; raises `Failure` if it cannot.
-        observe: what to record, a dictionary of arrays.
-        write: called with the number of a time and the state there.
-        shown: of its results "temperature" is shown in the bar; `observe` by default.
-        scene: description of everything that fixes the result.
-        progress, label: show a bar with T/T_0 and the time left, after some seconds, on a terminal.
-        path: of the checkpoint, from which the run is resumed if it exists; None for none.
-        fault: the status before; unless it is ok nothing is done.
-
-    Returns:
-        The last state; the records with a first axis of times, nan from a failure on; the status.
-    """
-    done, state, records = _resumed(path, scene, state, empty_records(observe(state), len(times)))
-    saved, idle = time.monotonic(), 0
-
-    def save():
-        if path is not None:
-            checkpoint.save(path, scene or {}, (done, state, records))
-
-    with _progress_bar(float(times[-1]), float(state.time), progress, label) as bar:
-        try:
-            _raise_if(fault)
-            while done < len(times):
-                while (now := float(state.time)) < times[done]:
-                    state = advance(state, float(times[done]))
-                    idle = _idle(idle, now, state)
-                    _show(bar, state, shown or observe)
-                    if time.monotonic() - saved > CHECKPOINT_SECONDS:
-                        save()
-                        saved = time.monotonic()
-                _record(records, done, observe(state))
-                write(done, state)
-                done += 1
-            save()
-        except KeyboardInterrupt:
-            save()
-            raise
-        except RunFailure as failure:
-            fault, state = failure.fault, failure.state or state
-            fill_nan_from(records, done)
-    return state, records, fault
+    (state, fault), records = jax.lax.scan(record_at, (state, fault), inputs.times)
+    return sim.outputs(state, records, fault)
 
 
-def _raise_if(fault: int) -> None:
-    if fault != status.OK:
-        raise RunFailure(fault)
-
-
-def _record(records: dict[str, np.ndarray], done: int, observed: dict[str, jax.Array]) -> None:
-    for name, value in observed.items():
-        records[name][done] = value
-
-
-def _idle(idle: int, before: float, state: _Timed) -> int:
-    """How often in a row the time has not advanced; Failure if too often."""
-    idle = idle + 1 if float(state.time) <= before else 0
-    if idle >= MAX_IDLE:
-        raise RunFailure(status.STALLED.bit)
-    return idle
-
-
-def _resumed(
-    path: str | Path | None, scene: dict[str, str] | None, state: S, records: dict[str, np.ndarray]
-) -> tuple[int, S, dict[str, np.ndarray]]:
-    """The number of times done, the state and the records: of a checkpoint, if there is one."""
-    if path is None or not Path(path).exists():
-        return 0, state, records
-    done, loaded, records = checkpoint.load(path, scene or {}, (0, state, records))
-    # As JAX arrays of the same types: the compiled functions must not see a difference.
-    state = jax.tree.map(lambda new, old: concrete(new, old.dtype), loaded, state)
-    return int(done), state, records
-
-
-def _progress_bar(total: float, initial: float, progress: bool, label: str | None) -> tqdm:
-    return tqdm(
-        total=total,
-        initial=initial,
-        disable=None if progress else True,
-        delay=3,
-        desc=label,
-        bar_format="{l_bar}{bar}| {elapsed} elapsed, {remaining} left{postfix}",
-    )
-
-
-def _show(bar: tqdm, state: Any, observe: Callable[[Any], dict[str, jax.Array]]) -> None:
-    bar.update(float(state.time) - bar.n)
-    if not bar.disable:
-        ratio = float(np.mean(observe(state)["temperature"]))
-        bar.set_postfix_str(f"T/T_0 = {ratio:.3g}", refresh=False)
-
-
-_GROWN: dict[Capacity, Capacity] = {}
-"""What capacities came to be enlarged to: the next run begins with the larger ones, and neither
-fails on the way to them nor compiles again. Results do not depend on it."""
+def _nan_if(failed: Array, x: Array) -> Array:
+    """Return nan after a failure; integers and booleans have no nan and stay as they are."""
+    return jnp.where(failed, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x
 
 
 def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
-    """Melt and cool, enlarging arrays where they are too short.
+    """Equilibrate and cool from the host, and enlarge arrays where they are too short.
 
     Args:
         sim: the run, with known numbers.
         run: its options.
-        settings: what else fixes the result, by name, for the checkpoint's description.
+        settings: further settings that determine the result, by name, for the checkpoint.
     """
     if sim.directions is None:
         return _simulate_on_host(sim, run, settings)
@@ -541,16 +297,16 @@ def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Out
 
 
 def _simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
-    write = sim.writer(run)  # a file that cannot be is told before the melt
+    write = sim.writer(run)  # raises an error before the equilibration if there cannot be a file
     dynamics, fault, state = sim.dynamics, status.OK, sim.first_state()
     engine = neighbours.choose_engine(sim.engine, dynamics.capacity.lookahead)
-    # An interruption saves the state from before the call under way, which then is not donated.
+    # An interruption saves the state before the current call, which then must not be donated.
     donate = run.checkpoint is None
     if sim.needs_equilibration and not (
         run.checkpoint is not None and Path(run.checkpoint).exists()
     ):
         state, fault = _equilibrate(sim, state, engine, run.progress)
-    state = with_own_buffers(sim.cooling_state(state))
+    state = copy_buffers(sim.cooling_state(state))
 
     def advance(state: State, end: float) -> State:
         return _advance_growing(
@@ -582,30 +338,40 @@ def _simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Ou
 
 
 def _equilibrate(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[State, int]:
-    """The state after elastic motion, and what prepares it else, and the status."""
+    """Return the state after equilibration and preparation, and the status."""
     elastic = sim.dynamics.elastic()
-    settled = SETTLING_TIME / float(elastic.scene.collision_frequency)
+    settled = SETTLING_COLLISIONS / float(elastic.scene.collision_frequency)
 
     def advance(state: State, end: float) -> State:
         crowded = float(state.time) < settled
         capacity = sim.equilibration_capacity if crowded else elastic.capacity
         return _advance_growing(state, end, elastic, capacity, engine, progress)
 
-    state, end = with_own_buffers(state), np.asarray([sim.equilibration_time])
+    state, end = copy_buffers(state), np.asarray([sim.equilibration_time])
     state, _, fault = run_through_times(
-        state, end, advance, elastic.observe, progress=progress, label="melt"
+        state, end, advance, elastic.observe, progress=progress, label="equilibrating"
     )
-    steady = sim.dynamics.preparing
+    steady = sim.dynamics.preparation_dynamics
     if steady is None or fault != status.OK:
         return state, fault
-    kept = {"capacity": steady.capacity, "engine": engine, "progress": progress}
-    prepare = partial(_advance_growing, dynamics=steady, **kept)
-    state = with_own_buffers(steady.with_kicks(state, sim.key))
-    end = np.asarray([sim.prepared_time])
+    prepare = partial(
+        _advance_growing,
+        dynamics=steady,
+        capacity=steady.capacity,
+        engine=engine,
+        progress=progress,
+    )
+    state = copy_buffers(steady.start_preparation(state, sim.key))
+    end = np.asarray([sim.preparation_end])
     state, _, fault = run_through_times(
-        state, end, prepare, steady.observe, progress=progress, label="melt"
+        state, end, prepare, steady.observe, progress=progress, label="preparing"
     )
     return state, fault
+
+
+_GROWN: dict[Capacity, Capacity] = {}
+"""Enlarged capacities by the original ones. Later runs begin with the enlarged ones, and neither
+fail on the way to them nor compile again. Results do not depend on it."""
 
 
 def _advance_growing(
@@ -617,24 +383,24 @@ def _advance_growing(
     progress: bool,
     donate: bool = True,
 ) -> State:
-    """Some stretches towards an end, in arrays that grow from a given capacity.
+    """Run some segments towards an end; enlarge arrays, from a given capacity, where necessary.
 
-    With `donate` the state given may be deleted: after a failure the last good one takes its place.
+    With `donate` the given state may be deleted. A failure then holds the last good state.
 
     Raises:
-        Failure: if something else goes wrong.
+        RunFailure: for any other failure.
     """
     while True:
-        room = _GROWN.get(capacity, capacity)
-        roomy = dynamics if dynamics.capacity == room else dynamics.with_capacity(room)
-        state, fault, needed = _run_segments(roomy, state, end, engine, progress, donate)
+        enlarged = _GROWN.get(capacity, capacity)
+        sized = dynamics if dynamics.capacity == enlarged else dynamics.with_capacity(enlarged)
+        state, fault, needed = _run_segments(sized, state, end, engine, progress, donate)
         if fault == status.OK:
             return state
         full = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
-        if not full or max(needed) > MAX_PAIRS_EACH * len(state.position):
+        if not full or max(needed) > MAX_ROWS_PER_PARTICLE * len(state.position):
             raise RunFailure(fault, state)
-        # That stretch is made again as a whole: a list made on the way has another order.
-        _GROWN[capacity] = room.grown(needed)
+        # The whole segment is repeated, because a list made within it has another order.
+        _GROWN[capacity] = enlarged.grown(needed)
 
 
 def _run_segments(
@@ -645,9 +411,9 @@ def _run_segments(
     progress: bool,
     donate: bool,
 ) -> tuple[State, int, list[int]]:
-    """Several stretches in one compiled call, or one if the host finds the pairs.
+    """Run several segments in one compiled call, or one segment if the host finds the pairs.
 
-    That one begins again from the state given if it fails, which then is never donated.
+    After a failure of the latter the given state is returned, which therefore is never donated.
     """
     if engine == "sweep":
         until = np.asarray(end, state.time.dtype)
@@ -660,100 +426,327 @@ def _run_segments(
     return (now.state if fault == status.OK else state), fault, np.asarray(now.needed).tolist()
 
 
-def simulate_traced(sim: Simulation) -> Outputs:
-    """Melt and cool; the records at the times of the inputs."""
-    dynamics, inputs = sim.dynamics, sim.inputs
-    engine = neighbours.choose_engine(sim.engine, dynamics.capacity.lookahead, traced=True)
-    side = dynamics.scene.side
-    # In a smaller box a new neighbour list is at once stale, and stretches would not end.
-    fault = status.flag(status.BOX_TOO_SMALL, side < MIN_BOX)
-    state, fault = sim.compiled_first_state(fault)
-    if sim.needs_equilibration:
-        melting = dynamics.elastic().with_capacity(sim.equilibration_capacity)
-        state, fault, _ = run_segments(
-            melting, state, sim.equilibration_time, engine, 0, None, fault
+class RunFailure(Exception):
+    """Failure of a run, with its status and the last good state.
+
+    The state is None if it is the one before the call.
+    """
+
+    def __init__(self, fault: int, state: Any = None):
+        super().__init__(status.explain(fault))
+        self.fault, self.state = fault, state
+
+
+@runtime_checkable
+class _Timed(Protocol):
+    @property
+    def time(self) -> Any: ...
+
+
+S = TypeVar("S", bound=_Timed)
+
+
+def run_through_times(
+    state: S,
+    times: np.ndarray,
+    advance: Callable[[S, float], S],
+    observe: Callable[[S], dict[str, jax.Array]],
+    *,
+    write: Callable[[int, S], None] = lambda k, state: None,
+    shown: Callable[[S], dict[str, jax.Array]] | None = None,
+    scene: dict[str, str] | None = None,
+    progress: bool = True,
+    label: str | None = None,
+    path: str | Path | None = None,
+    fault: int = status.OK,
+) -> tuple[S, dict[str, np.ndarray], int]:
+    """Advance a state through all times and record it at each.
+
+    Args:
+        state: pytree with a field `time`, at the beginning of the run.
+        times: increasing times, not before that of the state.
+        advance: function that advances a state towards a time, but not beyond it. It raises
+            `RunFailure` if it cannot.
+        observe: function that returns the records, a dictionary of arrays.
+        write: function of the number of a time and the state there.
+        shown: function whose result "temperature" the progress bar shows; `observe` by default.
+        scene: description of everything that determines the result.
+        progress: whether to show a bar with T/T_0 and the time left, after some seconds, on a
+            terminal.
+        label: label of the bar.
+        path: checkpoint, from which the run is resumed if it exists; None for none.
+        fault: status before; unless it is ok the state is not advanced.
+
+    Returns:
+        The last state; the records, whose first axis is that of the times, with nan from a failure
+        on; and the status.
+    """
+    first = empty_records(observe(state), len(times))
+    num_done, state, records = _resumed(path, scene, state, first)
+    last_save, num_stalled = time.monotonic(), 0
+
+    def save():
+        if path is not None:
+            checkpoint.save(path, scene or {}, (num_done, state, records))
+
+    with _progress_bar(float(times[-1]), float(state.time), progress, label) as bar:
+        try:
+            if fault != status.OK:
+                raise RunFailure(fault)
+            while num_done < len(times):
+                while (now := float(state.time)) < times[num_done]:
+                    state = advance(state, float(times[num_done]))
+                    num_stalled = num_stalled + 1 if float(state.time) <= now else 0
+                    if num_stalled >= MAX_STALLED:
+                        raise RunFailure(status.STALLED.bit)
+                    _update_bar(bar, state, shown or observe)
+                    if time.monotonic() - last_save > CHECKPOINT_SECONDS:
+                        save()
+                        last_save = time.monotonic()
+                for name, value in observe(state).items():
+                    records[name][num_done] = value
+                write(num_done, state)
+                num_done += 1
+            save()
+        except KeyboardInterrupt:
+            save()
+            raise
+        except RunFailure as failure:
+            fault, state = failure.fault, failure.state or state
+            fill_nan_from(records, num_done)
+    return state, records, fault
+
+
+def _resumed(
+    path: str | Path | None, scene: dict[str, str] | None, state: S, records: dict[str, np.ndarray]
+) -> tuple[int, S, dict[str, np.ndarray]]:
+    """Return the number of finished times, the state and the records of a checkpoint, if any."""
+    if path is None or not Path(path).exists():
+        return 0, state, records
+    num_done, loaded, records = checkpoint.load(path, scene or {}, (0, state, records))
+    # JAX arrays of the same types do not make compiled functions compile again.
+    state = jax.tree.map(lambda new, old: concrete_array(new, old.dtype), loaded, state)
+    return int(num_done), state, records
+
+
+def _progress_bar(total: float, initial: float, progress: bool, label: str | None) -> tqdm:
+    return tqdm(
+        total=total,
+        initial=initial,
+        disable=None if progress else True,
+        delay=3,
+        desc=label,
+        bar_format="{l_bar}{bar}| {elapsed} elapsed, {remaining} left{postfix}",
+    )
+
+
+def _update_bar(bar: tqdm, state: Any, observe: Callable[[Any], dict[str, jax.Array]]) -> None:
+    bar.update(float(state.time) - bar.n)
+    if not bar.disable:
+        ratio = float(np.mean(observe(state)["temperature"]))
+        bar.set_postfix_str(f"T/T_0 = {ratio:.3g}", refresh=False)
+
+
+_PROGRAMS: OrderedDict[Any, jax.stages.Compiled] = OrderedDict()
+"""Programs of `compiled_segments`, by the arguments for which they were compiled. Unlike the cache
+of `jax.jit` it is bounded, and shared by plain runs and those inside a rule of differentiation."""
+
+
+def compiled_segments(
+    dynamics: AbstractDynamics,
+    state: State,
+    end: np.ndarray,
+    engine: str,
+    progress: bool = False,
+    donate: bool = False,
+) -> tuple[State, Array, Array]:
+    """Run up to `SEGMENTS_PER_CALL` segments, compiled for types and static fields of the input.
+
+    With `donate` the new state overwrites the given one, which is deleted. The given one must come
+    from `copy_buffers` or from an earlier call.
+    """
+    fixed, fixed_tree = jax.tree.flatten((dynamics, end))
+    donated, state_tree = jax.tree.flatten(state)
+
+    def segments(donated: list[Array], fixed: list[Array]) -> tuple[State, Array, Array]:
+        dynamics, end = fixed_tree.unflatten(fixed)
+        state = state_tree.unflatten(donated)
+        return run_segments(
+            dynamics, state, end, engine, min_segments=1, max_segments=SEGMENTS_PER_CALL
         )
-        if (preparing := dynamics.preparing) is not None:
-            state, until = preparing.with_kicks(state, sim.key), sim.prepared_time
-            state, fault, _ = run_segments(preparing, state, until, engine, 0, None, fault)
-    else:
-        fault |= dynamics.check_start(state)
-    # One stretch to t = 0 counts the energy in contacts.
-    state = sim.cooling_state(state)
-    state, fault, _ = run_segments(dynamics, state, jnp.zeros_like(state.time), engine, 1, 1, fault)
 
-    def to(carry, end):
-        state, fault, _ = run_segments(dynamics, carry[0], end, engine, 0, None, carry[1])
-        records, bad = sim.observe(state), fault != status.OK
-        return (state, fault), jax.tree.map(partial(_nan_if, bad), records)
-
-    (state, fault), records = jax.lax.scan(to, (state, fault), inputs.times)
-    return sim.outputs(state, records, fault)
-
-
-def _nan_if(bad: Array, x: Array) -> Array:
-    """Nan where a run has failed; numbers that have no nan stay as they are."""
-    return jnp.where(bad, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x
+    leaves = donated, fixed
+    if any_traced(leaves):  # constants within a transformation of something else
+        return jax.jit(segments)(*leaves)
+    types = tuple((x.shape, x.dtype, getattr(x, "sharding", None)) for x in (*donated, *fixed))
+    key = engine, SEGMENTS_PER_CALL, fixed_tree, state_tree, types, donate
+    if (program := _PROGRAMS.pop(key, None)) is None:  # one operation, safe between threads
+        jitted = jax.jit(segments, donate_argnums=0 if donate else ())
+        with compiling(progress):
+            options = cpu_compiler_options()
+            program = outside_transformations(lambda: jitted.lower(*leaves).compile(options))
+    _PROGRAMS[key] = program
+    if len(_PROGRAMS) > MAX_PROGRAMS:
+        _PROGRAMS.popitem(last=False)
+    return program(*leaves)
 
 
-Result = TypeVar("Result")
+def cpu_compiler_options() -> dict[str, str | bool] | None:
+    """Return compiler options for a program that the host calls, or None.
 
-Devices = tuple[Any, ...]
+    With several CPU devices runs go on side by side, one on each. XLA would divide the operations
+    of each run among threads of all cores, which then wait for each other: two replicas of DSMC
+    would take 15 to 20 % longer. The program of each device takes one core instead. For one device
+    there are no options: they change the time of a single run by less than 6 %.
+    """
+    if jax.default_backend() != "cpu" or jax.local_device_count() == 1:
+        return None
+    return {"xla_cpu_multi_thread_eigen": False}
 
-MIN_SPHERES_PER_RUN = 8192
-"""Spheres of a replica from which on replicas run in turn. Four of 1000, 2000 and 4096 take 1.4,
-1.1 and .9 (hard), 1.4, 1.3 and 1.1 (soft) times as long so as in one array, on one core."""
+
+_COMPILED: set[Hashable] = set()
+
+
+def needs_compilation(program: Hashable) -> bool:
+    """Return whether this is the first call for a program in this process."""
+    new = program not in _COMPILED
+    _COMPILED.add(program)
+    return new
+
+
+@contextmanager
+def compiling(progress: bool) -> Iterator[None]:
+    """Show "compiling ..." on a terminal during the block; the progress bar follows."""
+    shown, text = progress and sys.stderr.isatty(), "compiling ..."
+    if shown:
+        print(f"\r{text}", end="", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        if shown:
+            print(f"\r{' ' * len(text)}\r", end="", file=sys.stderr, flush=True)
+
+
+_THREAD = threading.local()
+
+
+@contextmanager
+def interrupted_by(stop: threading.Event) -> Iterator[None]:
+    """Let `block_until_ready` raise KeyboardInterrupt in this thread once an event is set.
+
+    An interruption from the keyboard reaches only the main thread.
+    """
+    _THREAD.stop = stop
+    try:
+        yield
+    finally:
+        _THREAD.stop = None
+
+
+def block_until_ready(arrays: T) -> T:
+    """Return arrays once they are computed; an interruption ends the waiting at once.
+
+    Polling whether they are ready would take 3 to 8 % of a run's time.
+
+    Raises:
+        KeyboardInterrupt: also in a thread within `interrupted_by`, once its event is set.
+    """
+    arrays = in_thread(lambda: jax.block_until_ready(arrays))
+    if (stop := getattr(_THREAD, "stop", None)) is not None and stop.is_set():
+        raise KeyboardInterrupt
+    return arrays
+
+
+def in_thread(function: Callable[[], T]) -> T:
+    """Return the result of a function that is called in a new thread.
+
+    An interruption from the keyboard ends the waiting at once; the thread, which Python cannot end,
+    then goes on in the background. JAX transformations and JAX configuration of the calling thread
+    do not apply in the new one.
+    """
+    results: queue.SimpleQueue[tuple[bool, object]] = queue.SimpleQueue()
+
+    def call() -> None:
+        try:
+            results.put((True, function()))
+        except BaseException as error:
+            results.put((False, error))
+
+    threading.Thread(target=call, daemon=True).start()
+    succeeded, result = results.get()
+    if not succeeded:
+        assert isinstance(result, BaseException)
+        raise result
+    return result  # type: ignore[return-value]
+
+
+def outside_transformations(function: Callable[[], T]) -> T:
+    """Call a function in a new thread, outside of any JAX transformation."""
+    x64, device = jax.config.read("jax_enable_x64"), chosen_device()
+
+    def call() -> T:
+        with jax.enable_x64(x64), jax.default_device(device):
+            return function()
+
+    return in_thread(call)
+
+
+def chosen_device() -> Any:
+    """Return the device that `jax.default_device` has set in this thread, or None."""
+    return jax.config.jax_default_device  # type: ignore[attr-defined]
 
 
 def replica_devices(replicas: int, spheres: int = 0) -> Devices:
-    """The CPU devices for several replicas; () where they stand in one array.
+    """Return the CPU devices for separate runs of replicas; () where they share one array.
 
-    That is so for less than `MANY` spheres (0 for DSMC) with one device, on an accelerator, and
-    where the user has chosen a device by `jax.default_device`.
+    They share one array if there is one device and each has less than `MIN_SPHERES_PER_RUN` spheres
+    (0 for DSMC), on an accelerator, and if the user has chosen a device by `jax.default_device`.
     """
     if replicas == 1 or jax.default_backend() != "cpu" or chosen_device() is not None:
         return ()
-    found = tuple(jax.local_devices()[:replicas])
-    return found if len(found) > 1 or spheres >= MIN_SPHERES_PER_RUN else ()
+    devices = tuple(jax.local_devices()[:replicas])
+    return devices if len(devices) > 1 or spheres >= MIN_SPHERES_PER_RUN else ()
 
 
 def run_replicas(
-    one: Callable[[int, Run], Result], replicas: int, run: Run, on: Devices
-) -> list[Result]:
-    """The results of all replicas, replica k on device k modulo their number.
+    run_one: Callable[[int, Run], T], replicas: int, run: Run, devices: Devices
+) -> list[T]:
+    """Run all replicas separately, replica k on device k modulo their number.
 
-    An interruption from the keyboard ends all of them, each of which then saves its checkpoint, and
-    so does an error of one.
+    An interruption from the keyboard, or an error of one replica, ends all of them; after an
+    interruption each saves its checkpoint.
 
     Args:
-        one: a run of replica k alone, called in a thread where no JAX transformation is under way.
-        replicas: their number.
-        run: the options; replica k has the key ``fold_in(key, k)`` and files of its own.
-        on: devices.
+        run_one: function that runs replica k alone. It is called in a thread outside of any JAX
+            transformation.
+        replicas: number of replicas.
+        run: options; replica k has the key ``fold_in(key, k)`` and its own files.
+        devices: CPU devices.
 
     Raises:
-        ValueError: for the checkpoint of replicas that stood in one array.
+        ValueError: for the checkpoint of replicas in one array.
     """
     if run.checkpoint is not None and Path(run.checkpoint).exists():
         raise ValueError(
-            f"{run.checkpoint} was written by replicas in one array, as on one CPU device: resume "
-            f"it so, or name another file; on {len(on)} CPU device(s) each replica here has its own"
+            f"{run.checkpoint} was written by replicas in one array, but on {len(devices)} CPU "
+            "device(s) each replica here has its own checkpoint. Resume it on one CPU device, or "
+            "name another file"
         )
     x64, stop = jax.config.read("jax_enable_x64"), threading.Event()
 
-    def some(first: int) -> list[Result]:
-        with jax.enable_x64(x64), jax.default_device(on[first]), stopped_by(stop):
+    def run_on_device(first: int) -> list[T]:
+        with jax.enable_x64(x64), jax.default_device(devices[first]), interrupted_by(stop):
             try:
                 return [
-                    one(k, _replica_options(run, k, len(on)))
-                    for k in range(first, replicas, len(on))
+                    run_one(k, _replica_options(run, k, len(devices)))
+                    for k in range(first, replicas, len(devices))
                 ]
             except BaseException:
                 stop.set()
                 raise
 
-    with ThreadPoolExecutor(len(on)) as pool:
-        futures = [pool.submit(some, first) for first in range(len(on))]
+    with ThreadPoolExecutor(len(devices)) as pool:
+        futures = [pool.submit(run_on_device, first) for first in range(len(devices))]
         try:
             wait(futures)
         except BaseException:
@@ -761,50 +754,54 @@ def run_replicas(
             raise
     errors = [error for future in futures if (error := future.exception()) is not None]
     for error in sorted(errors, key=lambda error: isinstance(error, KeyboardInterrupt)):
-        raise error  # what a replica met, rather than that others were stopped then
+        raise error  # the error of a replica rather than the interruption of the others
     results = [future.result() for future in futures]
-    return [results[k % len(on)][k // len(on)] for k in range(replicas)]
+    return [results[k % len(devices)][k // len(devices)] for k in range(replicas)]
 
 
-def replica_inputs(inputs: Inputs, k: int, num_particles: int, run: Run) -> Inputs:
-    """The inputs of replica k alone, with the key of its run."""
-    rows = slice(k * num_particles, (k + 1) * num_particles)
-    return inputs._replace(start=jax.tree.map(lambda x: x[rows], inputs.start), key=run.key)
-
-
-def join_outputs(runs: list[Outputs]) -> Outputs:
-    """The results of runs with one replica each as those of one run."""
-
-    position, velocity, spin = (
-        jax.tree.map(partial(_along, 0), *(getattr(out, name) for out in runs))
-        for name in ("position", "velocity", "spin")
-    )
-    records = join_records([out.records for out in runs])
-    fault = np.bitwise_or.reduce([np.asarray(out.status) for out in runs])
-    return Outputs(position, velocity, records, concrete(fault), spin)
-
-
-def join_records(runs: list[dict[str, Array]]) -> dict[str, Array]:
-    """The records of runs with one replica each, of shape (times, replicas, ...), as those of one
-    run; derivatives along directions have replicas last."""
-    return {
-        name: _along(-1 if name.endswith(".along") else 1, *(records[name] for records in runs))
-        for name in runs[0]
-    }
-
-
-def _along(axis: int, *parts: Array) -> Array:
-    return concrete(np.concatenate([np.asarray(part) for part in parts], axis))
-
-
-def _replica_options(run: Run, k: int, together: int) -> Run:
-    """The options of a replica; the first of those that run together shows the progress."""
+def _replica_options(run: Run, k: int, num_devices: int) -> Run:
+    """Return the options of replica k; the first of those side by side shows its progress."""
     key = jax.random.key(0) if run.key is None else run.key
     checkpoint = None if run.checkpoint is None else Path(f"{run.checkpoint}.{k}")
     trajectory = None if run.trajectory is None else file_of_replica(run.trajectory, k)
     return run._replace(
         key=jax.random.fold_in(key, k),
-        progress=run.progress and k % together == 0,
+        progress=run.progress and k % num_devices == 0,
         checkpoint=checkpoint,
         trajectory=trajectory,
     )
+
+
+def replica_inputs(inputs: Inputs, k: int, num_particles: int, run: Run) -> Inputs:
+    """Return the inputs of replica k alone, with the key of its run."""
+    rows = slice(k * num_particles, (k + 1) * num_particles)
+    return inputs._replace(start=jax.tree.map(lambda x: x[rows], inputs.start), key=run.key)
+
+
+def join_outputs(runs: list[Outputs]) -> Outputs:
+    """Join the results of runs with one replica each to those of one run."""
+    position, velocity, spin = (
+        jax.tree.map(partial(_concatenate, 0), *(getattr(out, name) for out in runs))
+        for name in ("position", "velocity", "spin")
+    )
+    records = join_records([out.records for out in runs])
+    fault = np.bitwise_or.reduce([np.asarray(out.status) for out in runs])
+    return Outputs(position, velocity, records, concrete_array(fault), spin)
+
+
+def join_records(runs: list[dict[str, Array]]) -> dict[str, Array]:
+    """Join the records of runs with one replica each to those of one run.
+
+    Records have the shape (times, replicas, ...); in derivatives along directions replicas are the
+    last axis.
+    """
+    return {
+        name: _concatenate(
+            -1 if name.endswith(".along") else 1, *(records[name] for records in runs)
+        )
+        for name in runs[0]
+    }
+
+
+def _concatenate(axis: int, *parts: Array) -> Array:
+    return concrete_array(np.concatenate([np.asarray(part) for part in parts], axis))

@@ -1,8 +1,7 @@
-"""Positions and velocities given by a user for a run of spheres to begin with.
+"""Initial conditions of particle runs.
 
-Initial conditions of particle runs: positions without overlap and Maxwellian velocities.
-
-Positions without overlap from random points, compiled: what `initial` does on the host.
+A random start has Maxwellian velocities and positions without overlap, which are computed on the
+host or in compiled code. A start given by a user is checked and reduced to the units of the run.
 """
 
 from typing import NamedTuple
@@ -14,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced, concrete
+from jaxgran._utils.tracing import any_traced, concrete_array
 from jaxgran.data.curve import Particles, UserParticles
 from jaxgran.particles import neighbours
 from jaxgran.particles.neighbours import Pairs, tree_search
@@ -22,29 +21,33 @@ from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
 
 PACKING_LIMIT = {2: 0.65, 3: 0.48}
-"""Largest packing fraction of a random start, which is a fluid; hard disks and spheres freeze at
-slightly larger ones."""
+"""Largest packing fraction of a random start, which is a fluid, by dimension; hard disks and
+spheres freeze at slightly larger ones."""
 
 GAP = 1e-3
-"""Smallest distance between the surfaces to which a pair is pushed apart."""
+"""Smallest distance, in diameters, between the surfaces to which a pair is pushed apart."""
 
 MAX_PUSHES = 20_000
-"""Pushes of all pairs after which to give up."""
+"""Largest number of pushes of all overlapping pairs."""
+
+COINCIDENT = 1e-9
+"""Distance, in diameters, that is assumed between points at the same place."""
+
+SAME_BOX = 1e-6
+"""Relative difference up to which the box of a start counts as that of the gas."""
 
 
 def maxwellian_velocities(
     key: PRNGKeyArray, replicas: int, num_particles: int, dimension: int
 ) -> Float[Array, "particles d"]:
-    """Maxwellian velocities of unit temperature, replica after replica.
-
-    Each replica has zero momentum and exactly ``<v^2>/d = 1``.
+    """Draw Maxwellian velocities with zero momentum and exactly ``<v^2>/d = 1`` in each replica.
 
     Raises:
-        ValueError: for fewer than two particles, which could only be at rest at zero momentum.
+        ValueError: for fewer than two particles.
     """
     if num_particles < 2:
         raise ValueError(
-            f"num_particles must be at least 2, got {num_particles}; a single particle without "
+            f"num_particles must be at least 2, got {num_particles}. A single particle without "
             "momentum is at rest"
         )
     v = jax.random.normal(key, (replicas, num_particles, dimension), jnp.result_type(float))
@@ -54,7 +57,7 @@ def maxwellian_velocities(
 def normalise_velocities(
     velocity: Float[Array, "particles d"], replicas: int
 ) -> Float[Array, "particles d"]:
-    """Velocities shifted and scaled to zero momentum and unit temperature in every replica."""
+    """Shift and scale velocities to zero momentum and unit temperature in every replica."""
     v = velocity.reshape(replicas, -1, velocity.shape[-1])
     v = v - jnp.mean(v, axis=1, keepdims=True)
     v = v / jnp.sqrt(jnp.mean(v**2, axis=(1, 2), keepdims=True))
@@ -67,104 +70,101 @@ def host_positions(
     replicas: int,
     num_particles: int,
     dimension: int,
-    room: Float[Array, "d"] | None = None,
+    region: Float[Array, "d"] | None = None,
 ) -> Float[Array, "particles d"]:
-    """Random positions of unit spheres without overlap in periodic boxes, computed on the host.
-
-    `jaxgran.particles.setup` does the same in compiled code, with other random gaps.
+    """Place unit spheres at random positions without overlap in periodic boxes, on the host.
 
     The spheres are first placed at uniform random points. Then all overlapping pairs are pushed
     apart, both spheres by the same distance, and again until no overlap is left. For a dilute gas
-    the result is close to equilibrium; a dense gas should be melted afterwards.
+    the result is close to equilibrium; a dense gas should be equilibrated afterwards.
+    `relaxed_positions` does the same in compiled code, with other random gaps.
 
     Args:
-        key: of the random numbers, which determines the result.
-        side: of the boxes in diameters.
+        key: key of the random numbers, which determines the result.
+        side: side of the boxes in diameters.
         replicas: number of boxes, filled independently.
-        num_particles: in each.
+        num_particles: number of spheres in each box.
         dimension: 2 or 3.
-        room: lengths from 0 on along each axis within which positions must be, each at least a
-            diameter less than the side; None is the whole box.
+        region: sides of the region, which begins at 0, of the positions, each at least a diameter
+            less than the side of the box; None for the whole box.
 
     Returns:
-        Positions in [0, side), or in [0, room], replica after replica.
+        Positions in [0, side), or in [0, region], replica after replica.
 
     Raises:
-        RuntimeError: if overlaps are left after many pushes, which means that the packing is too
-            dense.
+        RuntimeError: if overlaps are left after many pushes because the packing is too dense.
     """
     uniform = uniform_points(key, replicas * num_particles, dimension)
-    within = () if room is None else (room,)
-    return concrete(_OverlapRemoval(replicas)(uniform, side, *within))
+    return concrete_array(_OverlapRemoval(replicas)(uniform, side, region))
 
 
 def uniform_points(key: PRNGKeyArray, number: int, dimension: int) -> Float[Array, "particles d"]:
-    """Uniform random points in [0, 1)."""
+    """Draw uniform random points in [0, 1)."""
     return jax.random.uniform(key, (number, dimension), jnp.result_type(float))
 
 
 class _OverlapRemoval(NamedTuple):
-    """Positions without overlap from random points in [0, 1), on the host.
+    """Removal of overlaps of spheres at random points in [0, 1), on the host.
 
     Attributes:
         replicas: number of boxes.
-        gap, max_pushes: as `GAP` and `MOST_PUSHES`.
+        gap, max_pushes: see `GAP` and `MAX_PUSHES`.
     """
 
     replicas: int
     gap: float = GAP
     max_pushes: int = MAX_PUSHES
 
-    def __call__(self, uniform, side, room=None):
+    def __call__(self, uniform, side, region=None):
         uniform, side = np.asarray(uniform), float(side)
-        room = None if room is None else np.asarray(room, float)
+        region = None if region is None else np.asarray(region, float)
         boxes = uniform.reshape(self.replicas, -1, uniform.shape[-1]).astype(float)
-        boxes = boxes * (side if room is None else room)
-        x = np.concatenate([self._box(x, side, room) for x in boxes]).astype(uniform.dtype)
+        boxes = boxes * (side if region is None else region)
+        x = np.concatenate([self._relax(x, side, region) for x in boxes]).astype(uniform.dtype)
         return np.where(x >= uniform.dtype.type(side), uniform.dtype.type(0), x)
 
-    def _box(
-        self, x: Float[np.ndarray, "n d"], side: float, room: Float[np.ndarray, "d"] | None
+    def _relax(
+        self, x: Float[np.ndarray, "n d"], side: float, region: Float[np.ndarray, "d"] | None
     ) -> Float[np.ndarray, "n d"]:
         cutoff, built, random = min(1.4, side / 2), None, np.random.default_rng(len(x))
-        volume = side ** x.shape[1] if room is None else float(np.prod(room + 1))
-        at_random = float(largest_gap(len(x), x.shape[1], volume))
+        volume = side ** x.shape[1] if region is None else float(np.prod(region + 1))
+        max_extra_gap = float(largest_extra_gap(len(x), x.shape[1], volume))
         i = j = np.empty(0, int)
         for _ in range(self.max_pushes):
             moved = np.inf if built is None else np.sqrt(np.max(np.sum((x - built) ** 2, axis=1)))
             if 2 * moved > cutoff - 1 - 2 * self.gap:
-                # x stays unwrapped, or it could not be told how far particles have moved since.
+                # x stays unwrapped, so that the distance moved since then can be computed.
                 i, j = _close_pairs(_wrap_all(x, side), side, cutoff)
                 built = x.copy()
-            apart = x[i] - x[j]
-            apart -= side * np.round(apart / side)
-            distance = np.sqrt(np.sum(apart**2, axis=1))
+            separation = x[i] - x[j]
+            separation -= side * np.round(separation / side)
+            distance = np.sqrt(np.sum(separation**2, axis=1))
             close = distance < 1 + self.gap / 2
             if not close.any():
                 return _wrap_all(x, side)
-            apart, distance = apart[close], distance[close]
-            # Coincident points part along the first axis.
-            apart[distance == 0, 0] = distance[distance == 0] = 1e-9
-            target = 1 + self.gap + at_random * random.random(len(distance))
-            push = (0.5 * (target - distance) / distance)[:, None] * apart
+            separation, distance = separation[close], distance[close]
+            # Coincident points are separated along the first axis.
+            separation[distance == 0, 0] = distance[distance == 0] = COINCIDENT
+            target = 1 + self.gap + max_extra_gap * random.random(len(distance))
+            push = (0.5 * (target - distance) / distance)[:, None] * separation
             for axis in range(x.shape[1]):
                 x[:, axis] += np.bincount(i[close], push[:, axis], len(x))
                 x[:, axis] -= np.bincount(j[close], push[:, axis], len(x))
-            if room is not None:
-                x = np.clip(x, 0.0, room)
+            if region is not None:
+                x = np.clip(x, 0.0, region)
         raise RuntimeError(
-            f"{len(x)} spheres at this packing still overlap after {self.max_pushes} pushes; lower "
+            f"{len(x)} spheres at this packing still overlap after {self.max_pushes} pushes. Lower "
             "the packing fraction"
         )
 
 
-def largest_gap(n: int, d: int, volume: ArrayLike) -> Float[Array, ""]:
-    """Largest gap that is added at random between pushed pairs.
+def largest_extra_gap(n: int, d: int, volume: ArrayLike) -> Float[Array, ""]:
+    """Return the largest random gap that is added to `GAP`.
 
-    With equal gaps all these pairs would touch again at the same moment.
+    With equal gaps all pairs that were pushed would touch again at the same moment.
     """
-    filled = n / jnp.asarray(volume) * {2: np.pi / 4, 3: np.pi / 6}[d]
-    return 0.1 * jnp.maximum(0.0, 1 - 1.5 * filled / PACKING_LIMIT[d])
+    packing_fraction = n / jnp.asarray(volume) * {2: np.pi / 4, 3: np.pi / 6}[d]
+    return 0.1 * jnp.maximum(0.0, 1 - 1.5 * packing_fraction / PACKING_LIMIT[d])
 
 
 def _wrap_all(x: Float[np.ndarray, "n d"], side: float) -> Float[np.ndarray, "n d"]:
@@ -175,7 +175,6 @@ def _wrap_all(x: Float[np.ndarray, "n d"], side: float) -> Float[np.ndarray, "n 
 def _close_pairs(
     inside: Float[np.ndarray, "n d"], side: float, cutoff: float
 ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-    """The pairs closer than a cutoff."""
     capacity = 16 * len(inside)
     while True:
         i, j, count = tree_search(inside, side, cutoff, 1, capacity)
@@ -184,71 +183,73 @@ def _close_pairs(
         capacity = int(1.5 * count)
 
 
-COINCIDENT = 1e-9
-"""Distance from which points at the same place part."""
-
-
 class _Relaxation(NamedTuple):
-    """Spheres that are pushed apart: positions, pushes made, whether some overlapped before the
-    last of them, and the status."""
+    """State of spheres that are pushed apart.
+
+    Attributes:
+        position: positions of all spheres.
+        num_pushes: number of pushes so far.
+        overlap: whether any spheres overlapped before the last push.
+        fault: status.
+    """
 
     position: Float[Array, "n d"]
-    pushes: Int[Array, ""]
+    num_pushes: Int[Array, ""]
     overlap: Bool[Array, ""]
     fault: Int[Array, ""]
 
 
-class _Boxes(NamedTuple):
-    """What does not change: see the arguments of `positions`; and the largest random gap."""
+class _RelaxationSetup(NamedTuple):
+    """Constants of a relaxation: arguments of `relaxed_positions`, and the largest extra gap."""
 
     key: PRNGKeyArray
     side: ArrayLike
     replicas: int
     skin: ArrayLike
     capacity: tuple[int, int]
-    room: Float[Array, "1 d"] | None
-    at_random: Float[Array, ""]
+    region: Float[Array, "1 d"] | None
+    max_extra_gap: Float[Array, ""]
 
-    def until_stale(self, now: _Relaxation) -> _Relaxation:
-        """A new neighbour list, and pushes until it is stale or none is needed."""
+    def push_until_stale(self, now: _Relaxation) -> _Relaxation:
+        """Build a neighbour list, and push until it is stale or no overlap is left."""
         built, cutoff = neighbours.wrap(self.side, now.position), 1 + jnp.asarray(self.skin)
-        found = neighbours.search_pairs(
+        listed = neighbours.search_pairs(
             built, self.side, cutoff, self.replicas, self.capacity, "sweep"
         )
-        pairs = neighbours.with_offsets(built, self.side, found)
+        pairs = neighbours.with_offsets(built, self.side, listed)
         full = (pairs.count > self.capacity[0]) | (pairs.lookahead > self.capacity[1])
 
-        def goes_on(carry: tuple[_Relaxation, Array]) -> Array:
+        def unfinished(carry: tuple[_Relaxation, Array]) -> Array:
             now, stale = carry
-            return now.overlap & ~stale & (now.pushes < MAX_PUSHES)
+            return now.overlap & ~stale & (now.num_pushes < MAX_PUSHES)
 
         def push(carry: tuple[_Relaxation, Array]) -> tuple[_Relaxation, Array]:
             now, _ = carry
-            x, overlap = self.pushed(now.position, pairs, now.pushes)
+            x, overlap = self._push(now.position, pairs, now.num_pushes)
             moved = jnp.sqrt(jnp.max(jnp.sum((x - built) ** 2, axis=1)))
-            now = now._replace(position=x, pushes=now.pushes + 1, overlap=overlap)
+            now = now._replace(position=x, num_pushes=now.num_pushes + 1, overlap=overlap)
             return now, 2 * moved > self.skin - 2 * GAP
 
-        now, _ = jax.lax.while_loop(goes_on, push, (now._replace(position=built), full))
-        late = now.overlap & (now.pushes >= MAX_PUSHES)
-        fault = status.flag(status.LIST_FULL, full) | status.flag(status.NO_ROOM, late)
+        now, _ = jax.lax.while_loop(unfinished, push, (now._replace(position=built), full))
+        failed = now.overlap & (now.num_pushes >= MAX_PUSHES)
+        fault = status.flag(status.LIST_FULL, full) | status.flag(status.OVERLAPS_REMAIN, failed)
         return now._replace(fault=now.fault | fault)
 
-    def pushed(self, x: Array, pairs: Pairs, k: Array) -> tuple[Array, Array]:
-        """The positions after push k of all overlapping pairs, and whether there are any."""
-        apart = x[pairs.i] - x[pairs.j] - pairs.offset
-        square = jnp.sum(apart * apart, axis=1)
+    def _push(self, x: Array, pairs: Pairs, k: Array) -> tuple[Array, Array]:
+        """Return the positions after push k of all overlapping pairs, and whether there are any."""
+        separation = x[pairs.i] - x[pairs.j] - pairs.offset
+        square = jnp.sum(separation * separation, axis=1)
         distance = jnp.sqrt(jnp.where(square > 0, square, COINCIDENT**2))
-        # Coincident points part along the first axis.
-        first_axis = jnp.zeros_like(apart).at[:, 0].set(COINCIDENT)
-        apart = jnp.where((square > 0)[:, None], apart, first_axis)
-        real = jnp.arange(self.capacity[0]) < pairs.count
-        close = real & (distance < 1 + GAP / 2)
-        more = jax.random.uniform(jax.random.fold_in(self.key, k), distance.shape, x.dtype)
-        target = 1 + GAP + self.at_random * more
-        push = jnp.where(close, 0.5 * (target - distance) / distance, 0.0)[:, None] * apart
+        # Coincident points are separated along the first axis.
+        first_axis = jnp.zeros_like(separation).at[:, 0].set(COINCIDENT)
+        separation = jnp.where((square > 0)[:, None], separation, first_axis)
+        in_use = jnp.arange(self.capacity[0]) < pairs.count
+        close = in_use & (distance < 1 + GAP / 2)
+        random = jax.random.uniform(jax.random.fold_in(self.key, k), distance.shape, x.dtype)
+        target = 1 + GAP + self.max_extra_gap * random
+        push = jnp.where(close, 0.5 * (target - distance) / distance, 0.0)[:, None] * separation
         x = x.at[pairs.i].add(push).at[pairs.j].add(-push)
-        return x if self.room is None else jnp.clip(x, 0.0, self.room), jnp.any(close)
+        return x if self.region is None else jnp.clip(x, 0.0, self.region), jnp.any(close)
 
 
 def relaxed_positions(
@@ -257,52 +258,49 @@ def relaxed_positions(
     size: tuple[int, int, int],
     skin: ArrayLike,
     capacity: tuple[int, int],
-    room: Float[Array, "d"] | None = None,
+    region: Float[Array, "d"] | None = None,
     fault: ArrayLike = status.OK,
 ) -> tuple[Float[Array, "particles d"], Int[Array, ""]]:
-    """As `jaxgran.particles.setup.host_positions`, with random gaps of its own.
+    """Place unit spheres as `host_positions` does, in compiled code.
 
     Args:
-        key: of the random numbers.
-        side: of the boxes in diameters.
+        key: key of the random numbers.
+        side: side of the boxes in diameters.
         size: replicas, particles in each, dimension.
-        skin: of the neighbour list.
-        capacity: of the list, in pairs, and of its look-ahead, in particles.
-        room: as there.
-        fault: the status before; unless it is ok nothing is pushed.
+        skin: skin of the neighbour list.
+        capacity: capacity of the list, in pairs, and of its look-ahead, in particles.
+        region: see `host_positions`.
+        fault: status before; unless it is ok no sphere is pushed.
 
     Returns:
-        Positions, replica after replica, and the status: the list is full, or there is no room.
+        Positions, replica after replica, and the status: `LIST_FULL` or `OVERLAPS_REMAIN` after a
+        failure.
     """
     replicas, num_particles, dimension = size
-    volume = jnp.asarray(side) ** dimension if room is None else jnp.prod(room + 1)
-    within = None if room is None else room[None]
-    at_random = largest_gap(num_particles, dimension, volume)
-    boxes = _Boxes(key, side, replicas, skin, capacity, within, at_random)
+    volume = jnp.asarray(side) ** dimension if region is None else jnp.prod(region + 1)
+    row = None if region is None else region[None]
+    extra_gap = largest_extra_gap(num_particles, dimension, volume)
+    setup = _RelaxationSetup(key, side, replicas, skin, capacity, row, extra_gap)
     points = uniform_points(key, replicas * num_particles, dimension)
-    points = points * (jnp.asarray(side) if within is None else within)
+    points = points * (jnp.asarray(side) if row is None else row)
     zero = jnp.zeros((), jnp.int32)
     first = _Relaxation(points, zero, jnp.ones((), bool), jnp.asarray(fault, jnp.int32))
 
     def unfinished(now: _Relaxation) -> Array:
         return now.overlap & (now.fault == status.OK)
 
-    last = jax.lax.while_loop(unfinished, boxes.until_stale, first)
+    last = jax.lax.while_loop(unfinished, setup.push_until_stale, first)
     return neighbours.wrap(side, last.position), last.fault
 
 
-SAME_BOX = 1e-6
-"""Relative difference up to which the box of a start counts as that of the gas."""
-
-
 def check_start(start: UserParticles | None, gas: Gas, replicas: int, num_particles: int) -> None:
-    """Raise ValueError for a start of another shape, or, if its numbers are known, another box."""
+    """Raise ValueError if a start has another shape or, with known numbers, another box."""
     if start is None:
         return
     if not isinstance(start, Particles):
         raise ValueError(
-            "start must be a jaxgran.Particles(position, velocity, box_side), such as "
-            f"curve.particles, got {type(start).__name__}"
+            f"start must be a jaxgran.Particles, got {type(start).__name__}. Take curve.particles "
+            "of another run, or Particles(position, velocity, box_side)"
         )
     shape = (replicas, num_particles, gas.dimension)
     for name, values in zip(start._fields[:2], start[:2], strict=True):
@@ -311,43 +309,45 @@ def check_start(start: UserParticles | None, gas: Gas, replicas: int, num_partic
     other = has_other_box(start, gas, num_particles)
     if not isinstance(other, Tracer) and bool(other):
         side = box_side(gas, num_particles)
-        given, own = (
+        given, expected = (
             np.array2string(np.asarray(s / gas.diameter), precision=7)
             for s in (start.box_side, side)
         )
         raise ValueError(
-            f"start.box_side is {given} diameters, that of the gas {own}: change packing_fraction "
-            "or the start"
+            f"start.box_side is {given} diameters, that of the gas {expected}. Change "
+            "packing_fraction or the start"
         )
 
 
-def check_inside(start: Particles | None, walls: Walls, least: ArrayLike, dimension: int) -> None:
-    """Raise ValueError for a start with a sphere that does not stand between the walls.
+def check_inside(
+    start: Particles | None, walls: Walls, min_wall_distance: ArrayLike, dimension: int
+) -> None:
+    """Raise ValueError if a sphere of a start is not between the walls.
 
     Args:
-        start: as given by the user.
-        walls: at 0 and at each side.
-        least: distance of centres from them, m.
-        dimension: d.
+        start: particles given by the user.
+        walls: walls at 0 and at each side.
+        min_wall_distance: smallest allowed distance of a centre from a wall, m.
+        dimension: dimension d.
     """
-    if start is None or any_traced(start.position, walls.side, least):
+    if start is None or any_traced(start.position, walls.side, min_wall_distance):
         return
-    least = float(np.asarray(least))
-    sides, place = np.broadcast_to(walls.side, (dimension,)), np.asarray(start.position)
-    outside = np.any((place < least) | (place > sides - least), axis=-1)
+    least = float(np.asarray(min_wall_distance))
+    sides, position = np.broadcast_to(walls.side, (dimension,)), np.asarray(start.position)
+    outside = np.any((position < least) | (position > sides - least), axis=-1)
     if np.any(outside):
         replica, i = np.argwhere(outside)[0]
         where = "outside of the walls"
-        if np.all((place[replica, i] >= 0) & (place[replica, i] <= sides)):
+        if np.all((position[replica, i] >= 0) & (position[replica, i] <= sides)):
             where = f"less than its radius, {least:.6g} m, from a wall"
         raise ValueError(
-            f"sphere {i} of replica {replica} of the start is at {place[replica, i]} m, {where}: "
-            f"they are at 0 and {sides} m; move it inside"
+            f"sphere {i} of replica {replica} of the start is at {position[replica, i]} m, "
+            f"{where}. The walls are at 0 and {sides} m: move it inside"
         )
 
 
 def has_other_box(start: Particles | None, gas: Gas, num_particles: int) -> Bool[Array, ""]:
-    """Whether there is a start and its box is not that of the gas."""
+    """Return whether the start has another box than the gas; False without a start."""
     if start is None:
         return jnp.array(False)
     ratio = jax.lax.stop_gradient(start.box_side / box_side(gas, num_particles))
@@ -355,12 +355,12 @@ def has_other_box(start: Particles | None, gas: Gas, num_particles: int) -> Bool
 
 
 def box_side(gas: Gas, num_particles: int) -> Float[Array, "..."]:
-    """Side of the periodic box of a gas, or of its container, which may have d sides."""
+    """Return the side of the periodic box of a gas, or the sides of its container, m."""
     return gas.box_side(num_particles) if gas.container is None else gas.container.side
 
 
 def with_constant_temperature(start: Particles | None, gas: Gas) -> Gas:
-    """The gas as derivatives see it: with a start, T_0 is a unit of speed and nothing else."""
+    """Return the gas for derivatives: with a start, T_0 is a constant unit of speed."""
     if start is None:
         return gas
     return gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
@@ -369,13 +369,13 @@ def with_constant_temperature(start: Particles | None, gas: Gas) -> Gas:
 def reduced_start(
     start: Particles | None, gas: Gas, *, differentiable: bool = False
 ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]] | None:
-    """Positions and velocities in units of the gas, replica after replica; None without a start.
+    """Return positions and velocities of a start in units of the gas; None without a start.
 
     Args:
-        start: as given by the user.
-        gas: the scene.
-        differentiable: whether derivatives see the diameter as the unit of length; else the start
-            is the same, in diameters, for a gas of any diameter.
+        start: particles given by the user.
+        gas: the gas.
+        differentiable: whether the unit of length, the diameter, is differentiated. Otherwise
+            derivatives keep the start, in diameters, constant.
     """
     if start is None:
         return None
@@ -390,24 +390,24 @@ def min_distance(
     side: ArrayLike,
     replicas: int,
     capacity: tuple[int, int],
-    by: str = "scipy",
+    engine: str = "scipy",
 ) -> Float[Array, ""]:
-    """The least distance between two spheres, in diameters; 1 if none is below.
+    """Return the least distance between two spheres in diameters, and 1 without overlap.
 
     Args:
-        position, side, replicas, by: as in `neighbours.search_pairs`.
-        capacity: numbers of overlapping pairs, and of particles that a sweep looks ahead.
+        position, side, replicas, engine: see `neighbours.search_pairs`.
+        capacity: capacity in overlapping pairs, and in particles that a sweep looks ahead.
     """
-    found = neighbours.search_pairs(position, side, 1.0, replicas, capacity, by)
-    pairs = neighbours.with_offsets(position, side, found)
-    apart = position[pairs.i] - position[pairs.j] - pairs.offset
-    real = jnp.arange(capacity[0]) < pairs.count
-    square = jnp.where(real, jnp.sum(apart * apart, -1), 1.0)
+    listed = neighbours.search_pairs(position, side, 1.0, replicas, capacity, engine)
+    pairs = neighbours.with_offsets(position, side, listed)
+    separation = position[pairs.i] - position[pairs.j] - pairs.offset
+    in_use = jnp.arange(capacity[0]) < pairs.count
+    square = jnp.where(in_use, jnp.sum(separation * separation, -1), 1.0)
     return jnp.sqrt(jnp.min(square, initial=1.0))
 
 
 def overlap_by_rounding(
     position: Float[Array, "n d"], side: ArrayLike, least: float
 ) -> Float[Array, ""]:
-    """Overlap that rounding of positions can give two spheres in contact; at least `least`."""
+    """Return the overlap of spheres in contact by rounding of positions, but at least `least`."""
     return jnp.maximum(least, 10 * side * jnp.finfo(position.dtype).eps)

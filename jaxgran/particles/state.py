@@ -1,18 +1,14 @@
-"""The state of spheres in periodic boxes, soft or hard, and what is recorded of it.
+"""State of soft or hard spheres, its records, and its drag, random kicks and spins.
 
-Units here: diameter, mass and first temperature are 1. All particles of all boxes stand in one
-array, replica after replica (n = replicas * N rows).
+Units: the diameter, the mass and the initial temperature are 1. One array holds the particles of
+all replicas, replica after replica (n = replicas * N rows). Spins are ``s = (sigma/2) w`` with the
+angular velocity w: the surface of a sphere moves at the speed s.
 
-Drag on spheres, exactly: collisions in transformed time.
-
-Between collisions ``dv/dt = -gamma v``, and so ``v = u exp(-gamma t)`` with a velocity u that only
-collisions change. In the time ``s = (1 - exp(-gamma t))/gamma`` positions obey ``dx = u ds``: the
-sequence of collisions is that of a gas without drag. Its laws see the true velocities,
-``v = u (1 - gamma s)``, and spins that have decayed at a rate of their own.
-
-Random kicks by which white noise drives spheres.
-
-Spins of rough spheres, ``s = (sigma/2) w``, which are velocities of their surfaces.
+Drag is integrated exactly, in transformed time. Between collisions ``dv/dt = -gamma v``, and so
+``v = u exp(-gamma t)`` with a velocity u that only collisions change. In the time
+``s = (1 - exp(-gamma t))/gamma`` positions obey ``dx = u ds``: the sequence of collisions is that
+of a gas without drag. The laws of collision take the true velocities, ``v = u (1 - gamma s)``, and
+the true spins, which decay at another rate. A run stores u, and spins without their decay.
 """
 
 from functools import partial
@@ -28,167 +24,6 @@ from jaxgran.particles import neighbours, observables
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.reduced import ReducedDrag
 
-
-class DragDecay(NamedTuple):
-    """What drag has left at a time.
-
-    Attributes:
-        velocity: v over u, ``exp(-gamma t)``.
-        spin: spins in the units of u over those that are kept.
-        kept: spins over those that are kept.
-    """
-
-    velocity: Float[Array, "..."]
-    spin: Float[Array, "..."]
-    kept: Float[Array, "..."]
-
-
-def drag_decay(drag: ReducedDrag, time: Float[Array, "..."]) -> DragDecay:
-    """What drag has left at a transformed time, ``s = (1 - exp(-gamma t))/gamma``."""
-    velocity = 1 - drag.rate * time
-    kept = jnp.exp(-drag.rotational_rate * true_time(drag, time))
-    return DragDecay(velocity, kept / velocity, kept)
-
-
-def true_time(drag: ReducedDrag, time: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The time at a transformed time."""
-    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
-    return jnp.where(drag.rate > 0, -jnp.log1p(-drag.rate * time) / safe, time)
-
-
-def true_duration(
-    drag: ReducedDrag, began: Float[Array, "..."], duration: Float[Array, "..."]
-) -> Float[Array, "..."]:
-    """The time that a transformed duration lasts, >= 0."""
-    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
-    share = drag.rate * duration / (1 - drag.rate * began)
-    return jnp.maximum(jnp.where(drag.rate > 0, -jnp.log1p(-share) / safe, duration), 0.0)
-
-
-def transformed_times(drag: ReducedDrag, times: Float[Array, "times"]) -> Float[Array, "times"]:
-    """The transformed times of times."""
-    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
-    return jnp.where(drag.rate > 0, -jnp.expm1(-drag.rate * times) / safe, times)
-
-
-MAX_KICK = 0.05
-"""Largest growth of T by the kicks of one step, over T."""
-
-
-def threefry_key(words: Array) -> PRNGKeyArray:
-    """Two 32-bit words as a key of threefry, whose numbers do not change under `jax.vmap`."""
-    return jax.random.wrap_key_data(words, impl="threefry2x32")
-
-
-def random_kicks(
-    key: PRNGKeyArray,
-    velocity: Float[Array, "N d"],
-    at_rest: bool,
-    counted: Bool[Array, "N"] | None = None,
-) -> Float[Array, "N d"]:
-    """Random kicks of variance 1 for each component, of the shape of velocities.
-
-    Each is the number of ones in 16 random bits, whose fourth moment is 4 % below that of a
-    Gaussian number. Sums over the many small kicks of a mean free time are Gaussian.
-
-    Args:
-        key: of the random numbers.
-        velocity: of the particles of one replica.
-        at_rest: whether the kicks together leave the momentum as it is; they are then enlarged by
-            ``sqrt(N/(N - 1))``, so that their mean square is 1 again.
-        counted: which particles are kicked; all by default. Those that are not have any value.
-    """
-    bits = jax.random.bits(key, velocity.shape, jnp.uint16)
-    found = 0.5 * (jax.lax.population_count(bits).astype(velocity.dtype) - 8)
-    if not at_rest:
-        return found
-    if counted is None:
-        n = len(velocity)
-        return (n / (n - 1)) ** 0.5 * (found - jnp.mean(found, axis=0, keepdims=True))
-    n = jnp.maximum(jnp.sum(counted), 2).astype(velocity.dtype)
-    mean = jnp.sum(jnp.where(counted[:, None], found, 0.0), axis=0, keepdims=True) / n
-    return jnp.sqrt(n / (n - 1)) * (found - mean)
-
-
-def maxwellian_spins(
-    key: PRNGKeyArray, shape: tuple[int, int, int], mean_square: Float[Array, ""]
-) -> Float[Array, "replicas N spins"]:
-    """Maxwellian spins of a given mean square of each component in each replica."""
-    spins = jax.random.normal(key, shape, mean_square.dtype)
-    size = jnp.sqrt(mean_square / jnp.mean(spins**2, axis=(1, 2), keepdims=True))
-    return size * spins
-
-
-def initial_spins(
-    key: PRNGKeyArray, velocity: Float[Array, "n d"], replicas: int, mean_square: Float[Array, ""]
-) -> Float[Array, "n spins"]:
-    """Spins at t = 0 of all spheres of a run with this key, see `at_start`."""
-    n, d = velocity.shape
-    key = jax.random.fold_in(key, 2)  # 0 and 1 are of positions and velocities
-    shape = replicas, n // replicas, NUM_SPIN_COMPONENTS[d]
-    return maxwellian_spins(key, shape, mean_square.astype(velocity.dtype)).reshape(
-        n, NUM_SPIN_COMPONENTS[d]
-    )
-
-
-def surface_direction(
-    spin: Float[Array, "pairs spins"], normal: Float[Array, "pairs d"]
-) -> Float[Array, "pairs d"]:
-    """``s x n``, the velocity of a surface in the direction of n."""
-    if normal.shape[-1] == 2:
-        return spin * jnp.stack([-normal[:, 1], normal[:, 0]], axis=-1)
-    return jnp.cross(spin, normal)
-
-
-def torque(
-    normal: Float[Array, "pairs d"], force: Float[Array, "pairs d"]
-) -> Float[Array, "pairs spins"]:
-    """``n x f``; the one component of two vectors in a plane."""
-    if normal.shape[-1] == 2:
-        return (normal[:, 0] * force[:, 1] - normal[:, 1] * force[:, 0])[:, None]
-    return jnp.cross(normal, force)
-
-
-class TangentialImpulse(NamedTuple):
-    """The tangential part of impacts.
-
-    Attributes:
-        sideways: tangential part of the relative velocity of the centres.
-        slip: that of the surfaces at contact; 0 where there is no friction.
-        kick: change of velocity of the first partner.
-        twist: change of spin, of both partners alike.
-    """
-
-    sideways: Float[Array, "pairs d"]
-    slip: Float[Array, "pairs d"]
-    kick: Float[Array, "pairs d"]
-    spin_change: Float[Array, "pairs spins"]
-
-
-def tangential_impulse(
-    relative: Float[Array, "pairs d"],
-    spin: Float[Array, "pairs spins"],
-    normal: Float[Array, "pairs d"],
-    where: Bool[Array, "pairs"],
-    eta: Float[Array, ""],
-    inertia: Float[Array, ""],
-) -> TangentialImpulse:
-    """The tangential part of impacts, ``-eta`` times the slip: see `jaxgran.Rough`.
-
-    Args:
-        relative: velocity of the first partner less that of the second.
-        spin: sum of their spins; a wall has none.
-        normal: from the first to the second.
-        where: there is friction.
-        eta: share of the slip that becomes the kick.
-        inertia: q.
-    """
-    sideways = relative - jnp.sum(relative * normal, axis=-1, keepdims=True) * normal
-    slip = jnp.where(where[:, None], sideways + surface_direction(spin, normal), 0.0)
-    kick = -eta * slip
-    return TangentialImpulse(sideways, slip, kick, torque(normal, kick) / inertia)
-
-
 S = TypeVar("S")
 
 
@@ -196,19 +31,19 @@ class State(NamedTuple):
     """Particles of all replicas at one time.
 
     Attributes:
-        time: t.
-        time_rest: what rounding has left out of `time`, which thus is the sum of even the shortest
-            steps in single precision.
-        position: not wrapped into the box since the last neighbour list was built.
-        velocity: in the laboratory frame.
-        image: box sides that wrapping has subtracted from the position.
-        origin: position at t = 0.
-        first_velocity: velocity at t = 0.
+        time: time t.
+        time_rest: rounding error of `time`, to be added to it. With it even the shortest steps in
+            single precision are summed correctly.
+        position: positions, which are wrapped into the box when a neighbour list is built.
+        velocity: velocities, in the laboratory frame.
+        image: number of box sides that wrapping has subtracted from each position.
+        origin: positions at t = 0.
+        first_velocity: velocities at t = 0.
         dissipated: energy lost since t = 0.
-        collisions: begun since t = 0, each pair counted once.
-        skin: of the neighbour list.
-        own: what only one kind of spheres has.
-        tangents: derivatives of the state, if they are followed.
+        collisions: number of collisions that began since t = 0; each pair counts once.
+        skin: skin of the neighbour list.
+        internal: further fields of soft or of hard spheres.
+        tangents: derivatives of the state; None without them.
     """
 
     time: Float[Array, ""]
@@ -233,7 +68,7 @@ def initial_state(
     replicas: int,
     internal: Any,
 ) -> State:
-    """The state at t = 0."""
+    """Return the state at t = 0."""
     dtype, inside = position.dtype, neighbours.wrap(side, position)
     return State(
         time=jnp.zeros((), dtype),
@@ -250,18 +85,18 @@ def initial_state(
     )
 
 
-def with_own_buffers(state: S) -> S:
-    """The same state in buffers of its own, none of them twice, which may be donated."""
+def copy_buffers(state: S) -> S:
+    """Copy every array of a state to a new buffer, which may then be donated."""
     return jax.tree.map(jnp.copy, state)
 
 
 def time_left(state: State, end: ArrayLike) -> Array:
-    """The time from a state to an end."""
+    """Return the time from a state to an end."""
     return (jnp.asarray(end) - state.time) - state.time_rest
 
 
 def advance_time(state: State, duration: ArrayLike, end: ArrayLike, at_end: ArrayLike) -> State:
-    """The state with its time after a duration, or at the end; a compensated sum."""
+    """Advance the time of a state by a duration, or to the end, by a compensated sum."""
     step = state.time_rest + duration
     time = state.time + step
     return state._replace(
@@ -272,45 +107,45 @@ def advance_time(state: State, duration: ArrayLike, end: ArrayLike, at_end: Arra
 
 @jax.jit
 def wrap_positions(state: State, side: ArrayLike) -> State:
-    """The same state with every position inside the box; a new neighbour list must follow."""
+    """Wrap every position into the box; the neighbour list must then be built anew."""
     inside = neighbours.wrap(side, state.position)
     image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
     return state._replace(position=inside, image=image)
 
 
 def centred(values: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas N d"]:
-    """Values less their mean over each replica: in the frame in which its momentum is zero."""
-    each = values.reshape(replicas, -1, values.shape[-1])
-    return each - jnp.mean(each, axis=1, keepdims=True)
+    """Return values minus their mean over each replica."""
+    by_replica = values.reshape(replicas, -1, values.shape[-1])
+    return by_replica - jnp.mean(by_replica, axis=1, keepdims=True)
 
 
 def temperature(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas"]:
-    """T of each replica."""
+    """Return T of each replica."""
     return observables.temperature(centred(velocity, replicas))
 
 
 def kinetic_energy(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas"]:
-    """Kinetic energy of each replica in the laboratory frame."""
+    """Return the kinetic energy of each replica in the laboratory frame."""
     return 0.5 * jnp.sum(velocity.reshape(replicas, -1) ** 2, axis=-1)
 
 
 def fastest(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas"]:
-    """Speed of the fastest sphere of each replica."""
+    """Return the speed of the fastest sphere of each replica."""
     return jnp.sqrt(jnp.max(jnp.sum(velocity * velocity, -1).reshape(replicas, -1), axis=-1))
 
 
 def common_records(
     state: State, side: ArrayLike, replicas: int
 ) -> tuple[dict[str, Array], Float[Array, "replicas N d"], Float[Array, "replicas N d"]]:
-    """What is recorded of every kind of spheres, and displacements and velocities, centred."""
+    """Return the records that soft and hard spheres share, centred displacements and velocities."""
     velocity = centred(state.velocity, replicas)
-    travelled = centred(state.position - state.origin + side * state.image, replicas)
+    displacement = centred(state.position - state.origin + side * state.image, replicas)
     num_particles = velocity.shape[1]
     position = state.position.reshape(velocity.shape)
     values = {
         "temperature": observables.temperature(velocity),
         "sonine": observables.sonine(velocity),
-        "displacement": observables.mean_square_displacement(travelled),
+        "displacement": observables.mean_square_displacement(displacement),
         "velocity_correlation": observables.velocity_correlation(
             centred(state.first_velocity, replicas), velocity
         ),
@@ -318,55 +153,217 @@ def common_records(
         "collisions": 2 / num_particles * state.collisions,
         "flow_share": jax.vmap(partial(observables.flow_share, side=side))(position, velocity),
     }
-    return values, travelled, velocity
+    return values, displacement, velocity
 
 
 def derivatives_of_records(
     values: dict[str, Array],
-    travelled: Float[Array, "replicas N d"],
+    displacement: Float[Array, "replicas N d"],
     velocity: Float[Array, "replicas N d"],
     log_temperature: Float[Array, "p replicas"],
     paths: PathTangents,
-    cooling: Float[Array, "replicas"],
-    meeting: Float[Array, "replicas"],
+    cooling_rate: Float[Array, "replicas"],
+    collision_rate: Float[Array, "replicas"],
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Derivatives of the records of `records`, as `jaxgran.gradients.rule.with_tangents` takes them.
+    """Return derivatives of `common_records` for `jaxgran.gradients.rule.with_tangents`.
 
-    In time ``<v(0).v>`` decays at 2/d of the collision rate.
+    As a function of time ``<v(0).v>`` decays at 2/d of the collision rate.
 
     Args:
-        values, travelled, velocity: what `records` returns.
+        values, displacement, velocity: results of `common_records`.
         log_temperature: derivatives of ln T along p directions.
         paths: tangents of the paths.
-        cooling: ``-d ln T/dt``.
-        meeting: collisions per particle and time.
+        cooling_rate: ``-d ln T/dt``.
+        collision_rate: collisions per particle and time.
 
     Returns:
-        The derivatives along the directions at a fixed place, and those in time.
+        The derivatives along the directions at a fixed place, and those with respect to time.
     """
     c, d = log_temperature, velocity.shape[-1]
     T, C = values["temperature"], values["velocity_correlation"]
-    kept = {
+    along = {
         "temperature": c * T[None],
         "displacement": paths.log_displacement * values["displacement"][None],
         "velocity_correlation": (0.5 * c + paths.correlation_along) * C[None],
     }
     rates = {
-        "temperature": -cooling * T,
-        "displacement": 2 * jnp.mean(jnp.sum(travelled * velocity, -1), axis=1),
-        "velocity_correlation": -2 / d * meeting * C,
-        "collisions": meeting,
+        "temperature": -cooling_rate * T,
+        "displacement": 2 * jnp.mean(jnp.sum(displacement * velocity, -1), axis=1),
+        "velocity_correlation": -2 / d * collision_rate * C,
+        "collisions": collision_rate,
     }
-    return kept, rates
+    return along, rates
 
 
 def empty_records(observed: dict[str, jax.Array], num_times: int) -> dict[str, np.ndarray]:
-    """Records at so many times, of the shapes and types of those at one time."""
-    each = {name: np.asarray(value) for name, value in observed.items()}
-    return {name: np.zeros((num_times, *v.shape), v.dtype) for name, v in each.items()}
+    """Return zeros for records at several times, with the types of those at one time."""
+    arrays = {name: np.asarray(value) for name, value in observed.items()}
+    return {name: np.zeros((num_times, *v.shape), v.dtype) for name, v in arrays.items()}
 
 
-def fill_nan_from(records: dict[str, np.ndarray], done: int) -> None:
-    """Nan from the time of a failure on; 0 where there is no nan."""
+def fill_nan_from(records: dict[str, np.ndarray], first: int) -> None:
+    """Set records to nan from one time on, and integers to 0."""
     for values in records.values():
-        values[done:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
+        values[first:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
+
+
+class DragDecay(NamedTuple):
+    """Decay by drag until one time.
+
+    Attributes:
+        velocity: true over stored velocities, v over u: ``exp(-gamma t)``.
+        spin: true over stored spins, divided by `velocity`: spins in the unit of u.
+        true_spin: true over stored spins.
+    """
+
+    velocity: Float[Array, "..."]
+    spin: Float[Array, "..."]
+    true_spin: Float[Array, "..."]
+
+
+def drag_decay(drag: ReducedDrag, time: Float[Array, "..."]) -> DragDecay:
+    """Return the decay until a transformed time, ``s = (1 - exp(-gamma t))/gamma``."""
+    velocity = 1 - drag.rate * time
+    spin = jnp.exp(-drag.rotational_rate * true_time(drag, time))
+    return DragDecay(velocity, spin / velocity, spin)
+
+
+def true_time(drag: ReducedDrag, time: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the true time at a transformed time."""
+    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
+    return jnp.where(drag.rate > 0, -jnp.log1p(-drag.rate * time) / safe, time)
+
+
+def true_duration(
+    drag: ReducedDrag, start: Float[Array, "..."], duration: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Return the true duration, >= 0, of a transformed one that begins at a transformed time."""
+    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
+    share = drag.rate * duration / (1 - drag.rate * start)
+    return jnp.maximum(jnp.where(drag.rate > 0, -jnp.log1p(-share) / safe, duration), 0.0)
+
+
+def transformed_times(drag: ReducedDrag, times: Float[Array, "times"]) -> Float[Array, "times"]:
+    """Return the transformed times of true times."""
+    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
+    return jnp.where(drag.rate > 0, -jnp.expm1(-drag.rate * times) / safe, times)
+
+
+MAX_KICK = 0.05
+"""Largest relative growth of T by the kicks of one step."""
+
+
+def threefry_key(words: Array) -> PRNGKeyArray:
+    """Return a threefry key from two 32-bit words; its numbers are the same under `jax.vmap`."""
+    return jax.random.wrap_key_data(words, impl="threefry2x32")
+
+
+def random_kicks(
+    key: PRNGKeyArray,
+    velocity: Float[Array, "N d"],
+    zero_momentum: bool,
+    kicked: Bool[Array, "N"] | None = None,
+) -> Float[Array, "N d"]:
+    """Draw kicks with components of mean 0 and variance 1, in the shape of velocities.
+
+    Each component is the number of ones in 16 random bits, centred and scaled. Its fourth moment is
+    4 % below that of a Gaussian number. Sums over the many small kicks of a mean free time are
+    Gaussian.
+
+    Args:
+        key: key of the random numbers.
+        velocity: velocities of the particles of one replica.
+        zero_momentum: whether the sum of the kicks is 0. Kicks are then enlarged by
+            ``sqrt(N/(N - 1))``, so that their mean square is 1 again.
+        kicked: mask of the particles that are kicked; None for all. The values of the others are
+            arbitrary.
+    """
+    bits = jax.random.bits(key, velocity.shape, jnp.uint16)
+    kicks = 0.5 * (jax.lax.population_count(bits).astype(velocity.dtype) - 8)
+    if not zero_momentum:
+        return kicks
+    if kicked is None:
+        n = len(velocity)
+        return (n / (n - 1)) ** 0.5 * (kicks - jnp.mean(kicks, axis=0, keepdims=True))
+    n = jnp.maximum(jnp.sum(kicked), 2).astype(velocity.dtype)
+    mean = jnp.sum(jnp.where(kicked[:, None], kicks, 0.0), axis=0, keepdims=True) / n
+    return jnp.sqrt(n / (n - 1)) * (kicks - mean)
+
+
+def maxwellian_spins(
+    key: PRNGKeyArray, shape: tuple[int, int, int], mean_square: Float[Array, ""]
+) -> Float[Array, "replicas N spins"]:
+    """Draw Maxwellian spins with a given mean square of each component in each replica."""
+    spins = jax.random.normal(key, shape, mean_square.dtype)
+    size = jnp.sqrt(mean_square / jnp.mean(spins**2, axis=(1, 2), keepdims=True))
+    return size * spins
+
+
+def initial_spins(
+    key: PRNGKeyArray, velocity: Float[Array, "n d"], replicas: int, mean_square: Float[Array, ""]
+) -> Float[Array, "n spins"]:
+    """Draw the spins of all spheres at t = 0, see `maxwellian_spins`."""
+    n, d = velocity.shape
+    key = jax.random.fold_in(key, 2)  # 0 and 1 are used for positions and velocities
+    shape = replicas, n // replicas, NUM_SPIN_COMPONENTS[d]
+    return maxwellian_spins(key, shape, mean_square.astype(velocity.dtype)).reshape(
+        n, NUM_SPIN_COMPONENTS[d]
+    )
+
+
+def surface_direction(
+    spin: Float[Array, "pairs spins"], normal: Float[Array, "pairs d"]
+) -> Float[Array, "pairs d"]:
+    """Return ``s x n``, the velocity of the surface at the point in direction n."""
+    if normal.shape[-1] == 2:
+        return spin * jnp.stack([-normal[:, 1], normal[:, 0]], axis=-1)
+    return jnp.cross(spin, normal)
+
+
+def torque(
+    normal: Float[Array, "pairs d"], force: Float[Array, "pairs d"]
+) -> Float[Array, "pairs spins"]:
+    """Return ``n x f``, which has one component in two dimensions."""
+    if normal.shape[-1] == 2:
+        return (normal[:, 0] * force[:, 1] - normal[:, 1] * force[:, 0])[:, None]
+    return jnp.cross(normal, force)
+
+
+class TangentialImpulse(NamedTuple):
+    """Tangential part of impacts.
+
+    Attributes:
+        sideways: tangential part of the relative velocity of the centres.
+        slip: tangential relative velocity of the surfaces at contact; 0 without friction.
+        kick: velocity change of the first partner.
+        spin_change: spin change, the same for both partners.
+    """
+
+    sideways: Float[Array, "pairs d"]
+    slip: Float[Array, "pairs d"]
+    kick: Float[Array, "pairs d"]
+    spin_change: Float[Array, "pairs spins"]
+
+
+def tangential_impulse(
+    relative: Float[Array, "pairs d"],
+    spin: Float[Array, "pairs spins"],
+    normal: Float[Array, "pairs d"],
+    where: Bool[Array, "pairs"],
+    eta: Float[Array, ""],
+    inertia: Float[Array, ""],
+) -> TangentialImpulse:
+    """Return the tangential part of impacts, ``-eta`` times the slip: see `jaxgran.Rough`.
+
+    Args:
+        relative: velocity of the first partner minus that of the second.
+        spin: sum of the spins of both partners; a wall has none.
+        normal: unit vector from the first to the second.
+        where: mask of the impacts with friction.
+        eta: share of the slip that becomes the kick.
+        inertia: q = 4 I/(m sigma^2).
+    """
+    sideways = relative - jnp.sum(relative * normal, axis=-1, keepdims=True) * normal
+    slip = jnp.where(where[:, None], sideways + surface_direction(spin, normal), 0.0)
+    kick = -eta * slip
+    return TangentialImpulse(sideways, slip, kick, torque(normal, kick) / inertia)

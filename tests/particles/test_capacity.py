@@ -17,11 +17,11 @@ def test_the_grid_is_geometric(num_particles):
     grid = Grid.of(num_particles)
     ratio = grid.ratio
     values = np.geomspace(1e-3, 1e3, 2000)
-    rounded = np.array([grid.up(x) for x in values])
+    rounded = np.array([grid.round_up(x) for x in values])
     assert np.all(rounded >= values) and np.all(rounded <= ratio * values * (1 + 1e-9))
     steps = np.log(np.unique(rounded.round(12))) / np.log(ratio)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
-    np.testing.assert_allclose([grid.up(x) for x in rounded], rounded, rtol=1e-9)
+    np.testing.assert_allclose([grid.round_up(x) for x in rounded], rounded, rtol=1e-9)
 
 
 def test_a_capacity_grows_where_it_must():

@@ -84,7 +84,7 @@ def test_a_start_of_the_user_is_not_donated(name, beads, given):
 
 def test_a_run_that_fails_returns_its_last_good_state(beads, monkeypatch):
     gas = beads(packing_fraction=0.1)
-    monkeypatch.setattr(run, "MAX_PAIRS_EACH", 0)  # no array may grow
+    monkeypatch.setattr(run, "MAX_ROWS_PER_PARTICLE", 0)  # no array may grow
     tiny = MODELS["HardSpheres"].sized_for(gas).plan
     assert tiny is not None
     plan = tiny._replace(capacity=Capacity(*(4,) * len(Capacity._fields)))
