@@ -1,6 +1,6 @@
-"""jaxgran: differentiable granular gases in JAX.
+"""Differentiable granular gases in JAX.
 
-Examples in the docstrings begin with these lines:
+The examples in the docstrings use these definitions:
 
 >>> import dataclasses, jax, jax.numpy as jnp, jaxgran
 >>> jax.config.update("jax_enable_x64", True)
@@ -10,7 +10,7 @@ Examples in the docstrings begin with these lines:
 >>> cooled = jaxgran.cool(gas, times)
 >>> error = 0.01 * cooled.temperature
 >>> curve = jaxgran.CoolingCurve(times, cooled.temperature, temperature_error=error)
->>> result = jaxgran.fit(gas, curve)  # of A
+>>> result = jaxgran.fit(gas, curve)  # estimates A
 """
 
 from importlib import import_module
@@ -61,11 +61,11 @@ __all__ = [
     "Choice",
     "ConstantRestitution",
     "CoolingCurve",
-    "ErrorModel",
     "Diagnosis",
     "Domain",
     "DrivenStart",
     "DropTest",
+    "ErrorModel",
     "Fit",
     "Frictional",
     "Gas",
@@ -110,15 +110,15 @@ __all__ = [
 ]
 
 
-_PICTURES = ("plot_curve", "plot_fit")
-"""Names of `jaxgran.plotting`, whose matplotlib is imported when the first of them is used."""
+_PLOT_FUNCTIONS = ("plot_curve", "plot_fit")
+"""Functions of `jaxgran.plotting`, which is imported with matplotlib when one is first used."""
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PICTURES:
+    if name in _PLOT_FUNCTIONS:
         return getattr(import_module("jaxgran.plotting"), name)
     raise AttributeError(f"module 'jaxgran' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return [*__all__, *_PICTURES]
+    return [*__all__, *_PLOT_FUNCTIONS]

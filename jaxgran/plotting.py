@@ -1,7 +1,6 @@
-"""Pictures of curves and fits; needs matplotlib (the extras `notebook` and `experiments`).
+"""Plots of curves and fits; needs matplotlib (the extras `notebook` and `experiments`).
 
-May import `data` and `fitting`. `jaxgran.plot_curve` and `jaxgran.plot_fit` are these, imported
-when they are first used.
+`jaxgran.plot_curve` and `jaxgran.plot_fit` import this module when they are first used.
 """
 
 import textwrap
@@ -23,7 +22,7 @@ except ModuleNotFoundError as error:  # pragma: no cover
     ) from error
 
 MAX_DRAWN = 1000
-"""Points that are drawn of a longer curve, evenly spaced in the logarithm of time."""
+"""Largest number of points drawn; of a longer curve, points evenly spaced in log time are drawn."""
 
 COLOURS = {
     "measured": "#222222",
@@ -36,68 +35,72 @@ COLOURS = {
     "constant restitution": "#cc79a7",
     "viscoelastic": "#009e73",
 }
-"""What a colour means in every picture: what was measured (in an experiment, in LAMMPS, by finite
-differences), guides to the eye, a model by its name, a kind of gas. It is the palette of M. Okabe
-and K. Ito, Color Universal Design (2008), which colour-blind people tell apart; in grey, lines
-and points also differ in style."""
+"""Colours of all pictures by meaning: measurements (in an experiment, in LAMMPS, by finite
+differences), guides to the eye, models by their names, kinds of gases. The palette is that of M.
+Okabe and K. Ito, Color Universal Design (2008), which colour-blind people can distinguish; lines
+and points also differ in style, for pictures in grey."""
 
 INK = COLOURS["measured"]
 
 
 def colour_of(model: str) -> str:
-    """The colour of a model by its name; one that is not the package's is drawn in grey."""
+    """Return the colour of a model by its name; grey for models of users."""
     return COLOURS.get(model, "#5f5f5f")
 
 
-TEMPERATURE = r"temperature $T=\langle v^2\rangle/d$ (m$^2$/s$^2$)"
+TEMPERATURE_LABEL = r"temperature $T=\langle v^2\rangle/d$ (m$^2$/s$^2$)"
 
 
 def plot_curve(curve: CoolingCurve, axes: Axes | None = None, **style: Any) -> Axes:
-    """Draw T against t on logarithmic axes, with error bars where T has errors.
+    """Plot T against t on logarithmic axes, with error bars if T has errors.
 
     Args:
-        curve: measured or computed, one.
-        axes: of matplotlib, to draw in; by default the current ones of pyplot.
-        style: of matplotlib's lines, such as label="hard spheres", color="C1", fmt="o".
+        curve: one curve, measured or computed.
+        axes: matplotlib axes; by default the current axes of pyplot.
+        style: options of matplotlib's `errorbar`, such as label="hard spheres", color="C1",
+            fmt="o".
 
     Returns:
         The axes.
 
     Raises:
-        ValueError: for several curves in one, as `jax.vmap` returns them.
+        ValueError: for a batch of curves, as `jax.vmap` returns it.
     """
     if np.ndim(curve.times) != 1:
         raise ValueError(
-            f"the times of this curve have shape {np.shape(curve.times)}: draw one at a time, as "
-            "jax.tree.map(lambda x: x[0], curves)"
+            f"the times of this curve have shape {np.shape(curve.times)}. Plot one curve at a "
+            "time, such as jax.tree.map(lambda x: x[0], curves)."
         )
-    axes = _current() if axes is None else axes
-    shown = _shown(curve.times)
+    axes = _current_axes() if axes is None else axes
+    shown = _drawn_indices(curve.times)
     t, T = (np.asarray(x)[shown] for x in (curve.times, curve.temperature))
     error = None if curve.temperature_error is None else np.asarray(curve.temperature_error)[shown]
     look: dict[str, Any] = {"lw": 1.8, "elinewidth": 1.0} | style
     axes.errorbar(t, T, error, **look)
-    axes.set(xscale="log", yscale="log", xlabel="time t (s)", ylabel=TEMPERATURE)
+    axes.set(xscale="log", yscale="log", xlabel="time t (s)", ylabel=TEMPERATURE_LABEL)
     return axes
 
 
-def _current() -> Axes:
-    """The current axes of pyplot, which shows them in a notebook."""
+def _current_axes() -> Axes:
+    """Return the current axes of pyplot, which a notebook displays."""
     from matplotlib import pyplot
 
     return pyplot.gca()
 
 
 def plot_fit(result: Fit, curve: CoolingCurve, axes: Any = None) -> np.ndarray:
-    """Draw the measured T with error bars, the fitted one, power laws as guides, and the residuals.
+    """Plot the measured T with error bars, the fitted T, power laws as guides, and the residuals.
 
     Args:
         result: of `jaxgran.fit`.
         curve: the measured curve.
-        axes: two of matplotlib, for T and for the residuals; by default those of a new figure.
+        axes: two matplotlib axes, for T and for the residuals; by default those of a new figure.
 
     Returns:
         Both axes, shape (2,).
+
+    Raises:
+        ValueError: if `axes` are not two.
     """
     if axes is None:
         from matplotlib import pyplot
@@ -107,15 +110,15 @@ def plot_fit(result: Fit, curve: CoolingCurve, axes: Any = None) -> np.ndarray:
     axes = np.asarray(axes)
     if axes.shape != (2,):
         raise ValueError(
-            f"axes must be two, for T and for the residuals, got shape {axes.shape}: make them by "
-            "matplotlib.pyplot.subplots(2, sharex=True)"
+            f"axes must be two, for T and for the residuals, got shape {axes.shape}. Make them by "
+            "matplotlib.pyplot.subplots(2, sharex=True)."
         )
     top, bottom = axes
     fitted = result.model.name
     measured, error = curve.temperature, curve.temperature_error
-    _draw(top, curve.times, measured, error, result.curve.temperature, fitted)
+    _draw_fit(top, curve.times, measured, error, result.curve.temperature, fitted)
     _draw_residuals(bottom, curve.times, result.residuals, fitted)
-    top.set_ylabel(TEMPERATURE)
+    top.set_ylabel(TEMPERATURE_LABEL)
     T = np.asarray(curve.temperature)
     top.set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
     _draw_power_laws(top, result.curve)
@@ -124,7 +127,7 @@ def plot_fit(result: Fit, curve: CoolingCurve, axes: Any = None) -> np.ndarray:
 
 
 def save_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> None:
-    """Write the picture of a fit: that of `plot_fit`, and T_rot and <dr^2> where they were fitted.
+    """Write the picture of a fit: `plot_fit`, with panels for T_rot and <dr^2> if they were fitted.
 
     Args:
         result: of `jaxgran.fit`.
@@ -132,7 +135,7 @@ def save_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
         title: above the picture.
         path: of the file; its suffix is the format, PNG without one.
     """
-    further = [
+    panels = [
         (
             curve.rotational_temperature,
             curve.rotational_temperature_error,
@@ -150,20 +153,20 @@ def save_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
             "upper left",
         ),
     ]
-    further = [panel for panel in further if panel[3] is not None]
-    figure = Figure(figsize=(max(8.0, 4.0 + 4.0 * len(further)), 6.4), layout="constrained")
+    panels = [panel for panel in panels if panel[3] is not None]
+    figure = Figure(figsize=(max(8.0, 4.0 + 4.0 * len(panels)), 6.4), layout="constrained")
     axes = figure.subplots(
         2,
-        1 + len(further),
+        1 + len(panels),
         sharex=True,
         squeeze=False,
         gridspec_kw={"height_ratios": [3, 1]},
     )
     plot_fit(result, curve, axes[:, 0])
     fitted = result.model.name
-    for (top, bottom), panel in zip(axes[:, 1:].T, further, strict=True):
+    for (top, bottom), panel in zip(axes[:, 1:].T, panels, strict=True):
         measured, error, computed, residuals, label, corner = panel
-        _draw(top, curve.times, measured, error, computed, fitted)
+        _draw_fit(top, curve.times, measured, error, computed, fitted)
         _draw_residuals(bottom, curve.times, residuals, fitted)
         top.set_ylabel(label)
         top.legend(frameon=False, loc=corner)
@@ -171,10 +174,10 @@ def save_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
 
 
 def save_curves(curves: dict[str, tuple[CoolingCurve, CoolingCurve | None]], title: str, path):
-    """Write a picture of one curve or several: measured points, where there are, and computed ones.
+    """Write a picture of one or several curves: measured points and computed lines.
 
     Args:
-        curves: by label; a computed curve, or a measured one, and None or the one computed for it.
+        curves: by label; a measured curve and the one fitted to it, or a computed curve and None.
         title: above the picture.
         path: of the file; its suffix is the format, PNG without one.
     """
@@ -202,9 +205,9 @@ def _save(figure: Figure, title: str, path: str | Path) -> None:
     write_atomically(path, lambda f: figure.savefig(f, dpi=150, format=picture_format))
 
 
-def _draw(axis, times, measured, error, computed, fitted: str) -> None:
-    """Measured values with error bars, and the fitted curve, at t > 0."""
-    shown = _shown(times)
+def _draw_fit(axis, times, measured, error, computed, fitted: str) -> None:
+    """Draw measured values with error bars, and the fitted curve, at t > 0."""
+    shown = _drawn_indices(times)
     t, measured, computed = (np.asarray(x)[shown] for x in (times, measured, computed))
     error = None if error is None else np.asarray(error)[shown]
     label = "measured" if len(times) <= MAX_DRAWN else f"measured: {t.size} of {len(times)}"
@@ -213,8 +216,8 @@ def _draw(axis, times, measured, error, computed, fitted: str) -> None:
     axis.set(xscale="log", yscale="log")
 
 
-def _shown(times) -> np.ndarray:
-    """Indices of the times that are drawn: those after 0, or `MOST_DRAWN` of them."""
+def _drawn_indices(times) -> np.ndarray:
+    """Return the indices of the times after 0, at most `MAX_DRAWN` of them."""
     times = np.asarray(times)
     (shown,) = np.nonzero(times > 0)
     if shown.size <= MAX_DRAWN:
@@ -224,7 +227,7 @@ def _shown(times) -> np.ndarray:
 
 
 def _draw_residuals(axis, times, residuals, fitted: str) -> None:
-    shown = _shown(times)
+    shown = _drawn_indices(times)
     axis.axhspan(-1, 1, color=COLOURS["guide"], alpha=0.2, lw=0)
     axis.axhline(0, color=colour_of(fitted), lw=1.4)
     axis.plot(np.asarray(times)[shown], np.asarray(residuals)[shown], "o", ms=3.5, color=INK)
@@ -232,10 +235,10 @@ def _draw_residuals(axis, times, residuals, fitted: str) -> None:
 
 
 def _draw_power_laws(axis, curve: CoolingCurve) -> None:
-    """Guides to the eye, labelled in the panel: the late laws of viscoelastic spheres and Haff's.
+    """Draw labelled guides to the eye: the late law of viscoelastic spheres and Haff's law.
 
-    They end in the last point and begin at .8 of the largest T; a curve that has not fallen so far
-    that they differ from it has none.
+    They begin at 0.8 of the largest T and end in the last point. They are left out if the curve has
+    not fallen far enough to differ from them.
     """
     t, T = (np.asarray(x, float) for x in (curve.times, curve.temperature))
     top = 0.8 * float(T.max())

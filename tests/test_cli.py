@@ -1,4 +1,4 @@
-"""The command line, in this process."""
+"""The command line, run in this process."""
 
 import json
 import os
@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.cli.common import MODELS, SWITCH, models_by_name, use_compilation_cache
-from jaxgran.cli.main import FREE, main
+from jaxgran.cli.common import MODELS, NO_CACHE_VARIABLE, models_by_name, use_compilation_cache
+from jaxgran.cli.main import FreeParameter, main
 from jaxgran.models.choose import default_models
 
 PNG = b"\x89PNG\r\n\x1a\n"
-"""The first bytes of a picture."""
+"""The first bytes of a PNG file."""
 
 SCENE = "eta = 0.05\ndiameter = 2e-3\ndensity = 2500\nY = 5e7\nnu = 0.22\nT0 = 0.01\nA = 3e-6\n"
 
@@ -41,10 +41,10 @@ def test_cool_writes_the_curve_of_the_package(scene, capsys):
     assert "written  cooling.csv\n         cooling.png" in capsys.readouterr().out
     assert (scene / "cooling.png").read_bytes()[:8] == PNG
     assert main(["cool", "scene.toml", "--until", "10"]) == 2
-    assert "exists; name another --out" in capsys.readouterr().err
+    assert "exists. Name another --out" in capsys.readouterr().err
 
 
-def test_choose_says_why(scene, capsys):
+def test_choose_prints_reasons(scene, capsys):
     assert main(["choose", "scene.toml", "--until", "10"]) == 0
     assert "Kinetic theory: the cheapest model" in capsys.readouterr().out
 
@@ -60,7 +60,7 @@ def test_choose_says_why(scene, capsys):
         (["fit", "scene.toml", "--replicas", "many"], "many"),
         (["cool"], "SCENE"),
         (["cool", "nowhere.toml", "--until", "1"], "no such file"),
-        (["cool", "scene.toml"], "give the last one, in s, as --until"),
+        (["cool", "scene.toml"], "Give the last one, in s, as --until"),
         (["cool", "scene.toml", "--until", "-1"], "--until must lie above"),
         (["cool", "scene.toml", "--until", "1", "--out", "nowhere/a.csv"], "cannot write"),
         (["cool", "scene.toml", "--until", "1", "--out", "folder", "--overwrite"], "cannot write"),
@@ -72,14 +72,14 @@ def test_choose_says_why(scene, capsys):
 )
 def test_bad_input_is_answered_with_one_line(scene, capsys, arguments, words):
     assert main(arguments) == 2
-    said, told = capsys.readouterr()
-    assert told.startswith("error: ") and words in told and len(told.splitlines()) == 1
-    assert not said and not (scene / "results").exists()
+    out, err = capsys.readouterr()
+    assert err.startswith("error: ") and words in err and len(err.splitlines()) == 1
+    assert not out and not (scene / "results").exists()
 
 
 @pytest.fixture
 def measured(scene):
-    """Two curves (errors of 2 %) and a drop test of one material, and a drop test of another."""
+    """Two curves (errors of 2 %) and a drop test of one material; a drop test of another one."""
     rng, names = np.random.default_rng(1), {}
     for name, phi in {"thin": 0.02, "dense": 0.08}.items():
         text = SCENE.replace("A = 3e-6\n", "").replace("0.05", str(phi))
@@ -100,15 +100,15 @@ def measured(scene):
 
 
 def _answer(capsys):
-    said = capsys.readouterr().out
-    return said, json.loads(said.splitlines()[-1])
+    out = capsys.readouterr().out
+    return out, json.loads(out.splitlines()[-1])
 
 
 def test_several_measurements_are_fitted_jointly(measured, capsys):
     assert main(["fit", "thin.csv", "dense.csv", "--drop-test", "drops.csv", "--out", "a"]) == 0
-    said, answer = _answer(capsys)
+    out, answer = _answer(capsys)
     assert abs(answer["A"] / 3e-6 - 1) < 3 * answer["A_std_err"] / 3e-6 < 0.1
-    assert answer["agree"] and "do not contradict" in said
+    assert answer["agree"] and "do not contradict" in out
     record = json.loads((measured / "a" / "thin-kinetic-theory.json").read_text())
     assert set(record["weight"]) == {"thin", "dense", "drops"}
     assert sum(part["dissipative_constant"] for part in record["weight"].values()) == (
@@ -118,18 +118,18 @@ def test_several_measurements_are_fitted_jointly(measured, capsys):
     assert (measured / "a" / "thin-kinetic-theory.png").read_bytes()[:8] == PNG
 
 
-def test_a_contradicting_drop_test_is_named(measured, capsys):
-    # As many measurements as above, so that the program is compiled.
+def test_a_contradicting_drop_test_is_reported(measured, capsys):
+    # As many measurements as above, so that the program is compiled already.
     assert main(["fit", "thin.csv", "dense.csv", "--drop-test", "others.csv", "--out", "b"]) == 0
-    said, answer = _answer(capsys)
-    assert not answer["agree"] and answer["p_value"] < 1e-4 and "contradict each other" in said
+    out, answer = _answer(capsys)
+    assert not answer["agree"] and answer["p_value"] < 1e-4 and "contradict each other" in out
 
 
 @pytest.mark.slow
 def test_the_budget_is_explained(measured, capsys):
     assert main(["fit", "thin.csv", "--free", "A", "--explain", "--out", "c"]) == 0
-    said, _ = _answer(capsys)
-    assert "error of A, in per cent" in said and "the model's clock in this scene" in said
+    out, _ = _answer(capsys)
+    assert "error of A, in per cent" in out and "the model's clock in this scene" in out
 
 
 @pytest.mark.parametrize(
@@ -141,48 +141,48 @@ def test_the_budget_is_explained(measured, capsys):
         (["thin.csv", "--drop-test", "dense.csv"], "name them v,eps,eps_err"),
     ],
 )
-def test_measurements_that_do_not_go_together_are_refused(measured, capsys, arguments, words):
+def test_incompatible_measurements_are_refused(measured, capsys, arguments, words):
     assert main(["fit", *arguments]) == 2
-    said, told = capsys.readouterr()
-    assert told.startswith("error: ") and words in told and len(told.splitlines()) == 1
+    out, err = capsys.readouterr()
+    assert err.startswith("error: ") and words in err and len(err.splitlines()) == 1
 
 
 @pytest.mark.parametrize("command", [[], ["fit"], ["cool"], ["choose"]])
-def test_help_is_there(capsys, command):
+def test_every_command_has_help(capsys, command):
     assert main([*command, "--help"]) == 0
     assert "Usage: jaxgran" in capsys.readouterr().out
 
 
-def test_every_model_has_its_name():
+def test_model_names_are_complete():
     assert (*models_by_name(default_models(2)), "auto") == MODELS
 
 
-def test_every_parameter_of_a_fit_has_its_name():
+def test_names_of_free_parameters_are_complete():
     from jaxgran.cli.fit import PARAMETERS
 
-    assert set(PARAMETERS) == set(FREE.__args__)
+    assert set(PARAMETERS) == set(FreeParameter.__args__)
 
 
-def test_a_folder_without_permission_is_named(measured, capsys, monkeypatch):
+def test_a_folder_without_permission_is_reported(measured, capsys, monkeypatch):
     monkeypatch.setattr("os.access", lambda *args: False)  # the tests may run as root
     for command in (["fit", "thin.csv"], ["cool", "scene.toml", "--until", "1"]):
         assert main(command) == 2
-        said, told = capsys.readouterr()
-        assert len(told.splitlines()) == 1 and "writ" in told and not said
+        out, err = capsys.readouterr()
+        assert len(err.splitlines()) == 1 and "writ" in err and not out
 
 
 @pytest.mark.parametrize("variable, value", [("NO_COLOR", "1"), ("TERM", "dumb")])
-def test_a_terminal_without_colours_gets_none(capsys, monkeypatch, variable, value):
+def test_a_terminal_without_colours_gets_no_escape_codes(capsys, monkeypatch, variable, value):
     monkeypatch.setenv(variable, value)
     assert main(["fit", "--help"]) == 0 and main(["melt"]) == 2
-    said, told = capsys.readouterr()
-    assert "\x1b" not in said + told
+    out, err = capsys.readouterr()
+    assert "\x1b" not in out + err
 
 
 @pytest.fixture
 def no_cache_yet(monkeypatch):
-    """JAX's settings as in a new process, and as before after the test."""
-    monkeypatch.delenv(SWITCH, raising=False)
+    """Set JAX up as in a new process, and restore its settings after the test."""
+    monkeypatch.delenv(NO_CACHE_VARIABLE, raising=False)
     monkeypatch.setenv("XLA_FLAGS", "")
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", None)
@@ -190,20 +190,20 @@ def no_cache_yet(monkeypatch):
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def test_compilation_cache_is_used_where_it_can_be(tmp_path, monkeypatch, no_cache_yet):
+def test_the_compilation_cache_is_used_if_possible(tmp_path, monkeypatch, no_cache_yet):
     (tmp_path / "file").write_text("")
     assert not use_compilation_cache(tmp_path / "file" / "programs")
     assert jax.config.values["jax_compilation_cache_dir"] is None
-    monkeypatch.setenv(SWITCH, "1")
+    monkeypatch.setenv(NO_CACHE_VARIABLE, "1")
     assert not use_compilation_cache(tmp_path / "programs")
-    monkeypatch.setenv(SWITCH, "0")
+    monkeypatch.setenv(NO_CACHE_VARIABLE, "0")
     assert use_compilation_cache(tmp_path / "programs")
     assert (tmp_path / "programs").stat().st_mode & 0o777 == 0o700
     assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path / "programs")
     assert not use_compilation_cache(tmp_path / "others")  # one is set already
 
 
-def test_programs_that_others_can_write_are_not_run(tmp_path, no_cache_yet):
+def test_a_cache_folder_that_others_can_write_is_not_used(tmp_path, no_cache_yet):
     (tmp_path / "shared").mkdir()
     (tmp_path / "shared").chmod(0o777)
     assert not use_compilation_cache(tmp_path / "shared")
@@ -211,8 +211,8 @@ def test_programs_that_others_can_write_are_not_run(tmp_path, no_cache_yet):
 
 
 @pytest.mark.slow
-def test_the_second_time_a_command_compiles_nothing(scene):
-    """In processes of their own, without a display; 30 s."""
+def test_the_second_run_of_a_command_compiles_nothing(scene):
+    """Run the command in separate processes, without a display; 30 s."""
     environment = {"XDG_CACHE_HOME": str(scene), "PATH": os.environ["PATH"], "HOME": str(scene)}
     environment |= {"PYTHONPATH": os.pathsep.join(sys.path)}
     cache = scene / "jaxgran" / "compiled"

@@ -1,4 +1,4 @@
-"""Curves and fits as tables and pictures in a notebook."""
+"""Curves as tables and pictures in a notebook."""
 
 import dataclasses
 import sys
@@ -16,7 +16,7 @@ from jaxgran.data.curve import QUANTITY_UNITS
 
 @pytest.fixture(scope="module")
 def curve():
-    """Of two replicas of three particles, at four times, with numbers that tell them apart."""
+    """A curve of two replicas of three particles at four times, with numbers that all differ."""
     times = jnp.array([0.0, 1.0, 2.0, 5.0])
     each = jnp.array([[4.0, 3.0, 2.0, 1.0], [4.0, 2.0, 1.5, 0.5]])
     place = jnp.arange(18.0).reshape(2, 3, 3)
@@ -39,7 +39,7 @@ def test_a_dataset_has_names_dimensions_and_units(curve):
     assert data.attrs["status"] == 0 and "sonine" not in data
 
 
-def test_a_dataset_has_what_was_saved(curve):
+def test_a_dataset_has_saved_values(curve):
     each = jnp.arange(16.0).reshape(2, 4, 2)  # replicas, times, and an axis of the user's
     data = curve.with_saved({"S": [each, each[..., 0]]}).to_xarray()
     assert data["saved.S.0"].dims == ("time", "saved.S.0.axis0")
@@ -61,13 +61,13 @@ def test_a_frame_has_a_row_for_each_time(curve):
     assert set(table.columns) == {"temperature", "temperature_error", "collisions"}
 
 
-def test_every_quantity_of_a_curve_has_its_unit(curve):
+def test_every_quantity_of_a_curve_has_a_unit(curve):
     no_number = ("replicas", "particles", "status", "saved", "saved_error")
     numbers = {name for name in vars(curve) if name not in no_number}
     assert numbers == set(QUANTITY_UNITS)
 
 
-def test_several_curves_in_one_are_refused(curve):
+def test_a_batch_of_curves_is_refused(curve):
     two = jax.tree.map(lambda x: jnp.stack([x, x]), curve)
     for show in (two.to_xarray, two.to_pandas):
         with pytest.raises(ValueError, match="times of this curve have shape"):
@@ -75,7 +75,7 @@ def test_several_curves_in_one_are_refused(curve):
 
 
 @pytest.mark.parametrize("library", ["xarray", "pandas"])
-def test_a_missing_library_is_named(curve, library, monkeypatch):
+def test_a_missing_library_is_reported(curve, library, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ModuleNotFoundError, match=f"needs {library}: pip install"):
         getattr(curve, f"to_{library}")()
@@ -93,7 +93,7 @@ def test_a_curve_is_drawn_in_given_axes(curve):
     pyplot.close("all")
 
 
-def test_what_is_drawn_is_imported_when_it_is_used():
+def test_plot_functions_are_imported_on_first_use():
     assert {"plot_curve", "plot_fit"} <= set(dir(jaxgran))
     with pytest.raises(AttributeError, match="no attribute 'plot_nothing'"):
         _ = jaxgran.plot_nothing

@@ -1,9 +1,4 @@
-"""The compilation cache of the commands, in the user's cache folder.
-
-Models by the names that they have as arguments.
-
-Files that the commands write, and header values given as arguments.
-"""
+"""Parts shared by the commands: models by name, header values, output files, compilation cache."""
 
 import os
 import platform
@@ -21,30 +16,32 @@ from jaxgran.data.curve_file import ELEMENT_KEYS, GAS_KEYS, PRIOR_KEYS
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import default_models
 
+ModelName = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres"]
+"""Models of `jaxgran cool`. The names are literals because making the models would start XLA before
+a command has set its options (`use_compilation_cache`)."""
+
+ModelOrAuto = Literal[ModelName, "auto"]
+"""Models of `jaxgran fit`, which can also choose one."""
+
+MODELS: tuple[str, ...] = get_args(ModelOrAuto)
+
 
 def models_by_name(models) -> dict[str, AbstractModel]:
-    """Models by their names as arguments: "soft-spheres"."""
+    """Return models by their names on the command line, such as "soft-spheres"."""
     return {model.name.lower().replace(" ", "-"): model for model in models}
 
 
-Model = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres", "auto"]
-"""Arguments of --model. Written down, for making the models would start XLA, whose settings a
-command has still to choose (`jaxgran.cli.common`)."""
-
-MODELS: tuple[str, ...] = get_args(Model)
-
-
 def choose_or_make_model(options: Any, gas, curve, free, num_particles: int | None):
-    """The model, and why it was chosen if it was."""
+    """Return the model, and the reasons for it if it was chosen automatically."""
     size = num_particles if options.particles is None else options.particles
     replicas = options.replicas
     if options.model != "auto":
         model = models_by_name(default_models(2 if size is None else size, replicas))[options.model]
         if model.stochastic and size is None:
-            raise ValueError(f"{options.curve} does not say N: give --particles")
+            raise ValueError(f"{options.curve} does not give N. Add --particles.")
         return model, ()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the diagnosis of the final fit says it
+        warnings.simplefilter("ignore", UserWarning)  # the diagnosis of the final fit repeats them
         first = jaxgran.fit(gas, curve, free=free)
     choice = jaxgran.choose_model(
         first.gas,
@@ -55,37 +52,13 @@ def choose_or_make_model(options: Any, gas, curve, free, num_particles: int | No
     )
     if options.particles is None:
         return choice.model, choice.reasons
-    # Chosen for the box of the file's N, followed with as many particles as asked.
+    # The choice is for the box of the file's N; the run has the number of particles given.
     (name,) = models_by_name([choice.model])
     return models_by_name(default_models(options.particles, replicas))[name], choice.reasons
 
 
-def environment() -> dict:
-    """Versions and device."""
-    return {
-        "versions": {name: version(name) for name in ("jaxgran", "jax", "diffrax", "optimistix")},
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-    }
-
-
-def alternative_as_json(rival) -> dict[str, Any]:
-    """A rival as JSON has it."""
-    fields = rival._asdict().items()
-    return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in fields}
-
-
-def finite_or_null(value: Any) -> Any:
-    """The same lists and dictionaries with None, which is null in JSON, for nan and inf."""
-    if isinstance(value, dict):
-        return {key: finite_or_null(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite_or_null(part) for part in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def settings(pairs: list[str]) -> dict[str, str]:
-    """Header values out of KEY=VALUE."""
+def parse_settings(pairs: list[str]) -> dict[str, str]:
+    """Return header values from KEY=VALUE arguments."""
     known = (*GAS_KEYS, "t0", *PRIOR_KEYS, *ELEMENT_KEYS, "N", "A", "dimension", "replicas")
     values = {}
     for pair in pairs:
@@ -96,8 +69,12 @@ def settings(pairs: list[str]) -> dict[str, str]:
     return values
 
 
-def outputs(options: Any) -> tuple[Path, Path]:
-    """Where to write; a new folder unless one is named, and nothing is written over unasked."""
+def output_files(options: Any) -> tuple[Path, Path]:
+    """Return the paths of the picture and the JSON file, by default in a new folder.
+
+    Raises:
+        ValueError: if the folder cannot be written to, or if a file exists and may not be replaced.
+    """
     stem = f"{options.curve.stem}-{options.model}"
     folder = options.out
     if folder is None:
@@ -106,33 +83,57 @@ def outputs(options: Any) -> tuple[Path, Path]:
             folder, i = Path("results") / f"{stem}-{i}", i + 1
     existing = next(part for part in (folder, *folder.absolute().parents) if part.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):
-        raise ValueError(f"{existing} is no folder to write to; name another --out")
+        raise ValueError(f"{existing} is not a writable folder. Name another one with --out.")
     files = folder / f"{stem}.png", folder / f"{stem}.json"
     for file in files:
         if file.exists() and not options.overwrite:
-            raise ValueError(f"{file} exists; name another --out or say --overwrite")
+            raise ValueError(f"{file} exists. Name another --out, or add --overwrite.")
     return files
 
 
-SWITCH = "JAXGRAN_NO_CACHE"
-"""An environment variable: set to anything but 0, it disables the compilation cache."""
+def environment() -> dict:
+    """Return versions and device."""
+    return {
+        "versions": {name: version(name) for name in ("jaxgran", "jax", "diffrax", "optimistix")},
+        "python": platform.python_version(),
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+def alternative_as_json(alternative) -> dict[str, Any]:
+    """Return the fields of an alternative, with lists for arrays."""
+    fields = alternative._asdict().items()
+    return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in fields}
+
+
+def finite_or_null(value: Any) -> Any:
+    """Replace nan and inf in lists and dictionaries by None, which is null in JSON."""
+    if isinstance(value, dict):
+        return {key: finite_or_null(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite_or_null(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+NO_CACHE_VARIABLE = "JAXGRAN_NO_CACHE"
+"""An environment variable: any value but 0 disables the compilation cache."""
 
 
 def use_compilation_cache(folder: Path | None = None) -> bool:
-    """Let JAX keep the programs that this process compiles, and load those it kept before.
+    """Let JAX store the programs that this process compiles, and load those stored before.
 
-    The cache is not used if `SWITCH` disables it, if JAX has a cache folder already
-    (JAX_COMPILATION_CACHE_DIR), or if the folder is not the user's alone: its files are programs
-    that JAX runs.
+    The cache is not used if `NO_CACHE_VARIABLE` disables it, if JAX already has a cache folder
+    (JAX_COMPILATION_CACHE_DIR), or if others can access the folder: its files are programs that JAX
+    runs.
 
     Args:
-        folder: created with access for the user alone; by default that of this command in the
+        folder: created with access for the user alone; by default a folder of this command in the
             user's cache folder.
 
     Returns:
         Whether the cache is used.
     """
-    disabled = os.environ.get(SWITCH, "0") != "0"
+    disabled = os.environ.get(NO_CACHE_VARIABLE, "0") != "0"
     if disabled or jax.config.values["jax_compilation_cache_dir"] is not None:
         return False
     folder = user_cache_path("jaxgran") / "compiled" if folder is None else folder
@@ -148,10 +149,10 @@ def use_compilation_cache(folder: Path | None = None) -> bool:
 def _is_private(folder: Path) -> bool:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.stat()
+        stat = folder.stat()
     except OSError:
         return False
-    if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & 0o077):
+    if hasattr(os, "getuid") and (stat.st_uid != os.getuid() or stat.st_mode & 0o077):
         return False
     return os.access(folder, os.W_OK | os.X_OK)
 
