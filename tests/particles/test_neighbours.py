@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 import jaxgran
-from jaxgran.particles.capacity import within_reach
+from jaxgran.particles.capacity import expected_lookahead
 from jaxgran.particles.neighbours import (
     MAX_LOOKAHEAD,
     choose_engine,
     displacement,
     sweep,
     tree_search,
-    unsorted,
+    unsorted_share,
     wrap,
 )
 from tests.pairs import find_pairs
@@ -375,8 +375,8 @@ def test_very_many_disks_are_in_reach(beads):
     rng = np.random.default_rng(9)
     position = jnp.asarray(side * rng.random((n, 2)))
     for skin in (0.2, 1.0):
-        reach = within_reach(n, side, skin)
+        reach = expected_lookahead(n, side, skin)
         *_, ahead = sweep(position, side, 1 + skin, replicas=1, capacity=9, ahead=int(reach))
         # From two widths of what is unsorted to three, and the scatter of counts.
-        least = reach - n * unsorted(n)
+        least = reach - n * unsorted_share(n)
         assert least - 5 * least**0.5 < ahead < reach + 5 * reach**0.5

@@ -58,16 +58,16 @@ def test_dilute_spheres_stay_where_they_are_put():
 
 
 def test_spheres_stay_within_their_room():
-    side, room = 8.0, jnp.array([3.0, 4.0, 5.5])
-    x, fault = relaxed_positions(jax.random.key(0), side, (1, 50, 3), 0.4, (1000, 60), room)
-    assert fault == status.OK and np.all((x >= 0) & (x <= room[None]))
+    side, region = 8.0, jnp.array([3.0, 4.0, 5.5])
+    x, fault = relaxed_positions(jax.random.key(0), side, (1, 50, 3), 0.4, (1000, 60), region)
+    assert fault == status.OK and np.all((x >= 0) & (x <= region[None]))
     assert closest(np.asarray(x), side, periodic=False) >= 1 + GAP / 2
 
 
 def test_where_there_is_no_room_or_the_list_is_full_the_status_says_so(monkeypatch):
     monkeypatch.setattr("jaxgran.particles.setup.MAX_PUSHES", 50)
     _, fault = relaxed_positions(jax.random.key(0), side_of(0.8, 3), (1, N, 3), 0.3, (2000, 60))
-    assert fault == status.NO_ROOM.bit
+    assert fault == status.OVERLAPS_REMAIN.bit
     _, fault = relaxed_positions(jax.random.key(0), side_of(0.4, 3), (1, N, 3), 0.3, (20, 60))
     assert fault == status.LIST_FULL.bit
     x, fault = relaxed_positions(jax.random.key(0), 1.0, (1, N, 3), 0.3, (20, 60), None, 1024)
