@@ -1,4 +1,4 @@
-"""Errors that follow from the fitted gas: of its model's clock there, and of few particles."""
+"""Errors of a fit that depend on the fitted gas: of clock, few particles, derivatives, priors."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -20,32 +20,34 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
 
 MIN_REPORTED_BIAS = 0.05
-"""Relative error of the derivatives of a fit from which on a diagnosis speaks of it."""
+"""Smallest relative error of the derivatives of a fit that a diagnosis reports."""
 
 
 def with_scene_errors(result: Fit, num_particles: int | None, replicas: int) -> Fit:
-    """A fit with the errors of its model's clock in this scene, and of few particles.
+    """Return a fit with the errors of its model's clock in this scene, and of few particles.
 
     Args:
-        result: of one curve, of known numbers.
+        result: a fit of one curve, not traced.
         num_particles: N of each measured run, if known.
-        replicas: measured runs over which the curve is a mean.
+        replicas: number of measured runs over which the curve is a mean.
     """
     error_model = _error_model(result, num_particles)
-    own = error_model.clock_error(result.model.rate_error(error_model))[-result.curve.times.size :]
-    clock_error = np.asarray(own, result.clock_error.dtype)
-    fitted = bool(result.priors.names) and not result.model.stochastic
-    # What a clock that was fitted along, within its error at a first guess, does not hold yet.
-    extrapolation = np.maximum(clock_error**2 - fitted * np.asarray(result.clock_error) ** 2, 0.0)
-    moved = np.asarray(result.clock_gain) @ np.sqrt(extrapolation)
+    clock_error = error_model.clock_error(result.model.rate_error(error_model))[
+        -result.curve.times.size :
+    ]
+    clock_error = np.asarray(clock_error, result.clock_error.dtype)
+    is_clock_free = bool(result.priors.names) and not result.model.stochastic
+    # The error of a free clock is that at the first guess: only what exceeds it is added.
+    excess = np.maximum(clock_error**2 - is_clock_free * np.asarray(result.clock_error) ** 2, 0.0)
+    shift = np.asarray(result.clock_gain) @ np.sqrt(excess)
     covariances = {name: np.asarray(part) for name, part in result.covariances.items()}
-    model = covariances["model"] if fitted else 0.0
-    covariances["model"] = model + np.outer(moved, moved)
+    model = covariances["model"] if is_clock_free else 0.0
+    covariances["model"] = model + np.outer(shift, shift)
     if result.model.stochastic:
-        covariances["slope"] = np.asarray(_by_slope(result))
+        covariances["slope"] = np.asarray(_derivative_bias_covariance(result))
     if num_particles is not None:
-        chance = _by_chance(result, error_model, num_particles * replicas)
-        covariances["few particles"] = _beyond(chance, covariances["measurement"])
+        noise = _collision_noise_covariance(result, error_model, num_particles * replicas)
+        covariances["few particles"] = _excess_covariance(noise, covariances["measurement"])
     parts = {name: jnp.asarray(part) for name, part in covariances.items()}
     return dataclasses.replace(result, clock_error=jnp.asarray(clock_error), covariances=parts)
 
@@ -56,9 +58,9 @@ def clock_accuracy(
     """Relative accuracy of a model's clock in the scene of a curve, at each of its times.
 
     Args:
-        guess: the gas, about.
-        curve: at whose times.
-        model: a deterministic one.
+        guess: a guess of the gas.
+        curve: the curve with the times.
+        model: a deterministic model.
         num_particles: N of each measured run, if known.
     """
     times = np.asarray(curve.times)
@@ -68,56 +70,59 @@ def clock_accuracy(
 
 
 def _error_model(result: Fit, num_particles: int | None) -> ErrorModel:
-    """The course of the fitted gas, when it began and at the measured times after it."""
-    curve, times = result.curve, _since_start(result)
+    """Return the error model of the fitted gas, at its start and at the measured times."""
+    curve, times = result.curve, _times_since_start(result)
     before = np.zeros(int(times[0] > 0), times.dtype)
 
-    def whole(values: ArrayLike, first: Any = 0.0) -> Array:
+    def with_start(values: ArrayLike, first: Any = 0.0) -> Array:
         return jnp.asarray(np.concatenate([before + np.asarray(first), np.asarray(values)]))
 
-    along = CoolingCurve(
-        times=whole(times),
-        temperature=whole(curve.temperature, result.gas.temperature),
-        sonine=None if curve.sonine is None else whole(curve.sonine),
-        collisions=None if curve.collisions is None else whole(curve.collisions),
+    curve_from_start = CoolingCurve(
+        times=with_start(times),
+        temperature=with_start(curve.temperature, result.gas.temperature),
+        sonine=None if curve.sonine is None else with_start(curve.sonine),
+        collisions=None if curve.collisions is None else with_start(curve.collisions),
     )
-    return error_model_along(result.gas, along, num_particles)
+    return error_model_along(result.gas, curve_from_start, num_particles)
 
 
-def _since_start(result: Fit) -> Float[np.ndarray, "times"]:
-    """The measured times after the start of the cooling; 0 before."""
+def _times_since_start(result: Fit) -> Float[np.ndarray, "times"]:
+    """Return the measured times minus t0, or 0 if they are earlier."""
     times = np.asarray(result.curve.times)
     return np.maximum(times - np.asarray(result.start_time, times.dtype), 0.0)
 
 
-def _by_chance(
+def _collision_noise_covariance(
     result: Fit, error_model: ErrorModel, num_particles: int
 ) -> Float[np.ndarray, "p p"]:
-    """Covariance of the estimates by the chance of single collisions of N particles.
+    """Covariance of the estimates due to the randomness of single collisions of N particles.
 
-    The delays of the clock at two times have in common what was gathered until the earlier one.
+    The delay of the clock accumulates: the covariance of its delays at two times is the variance at
+    the earlier one.
     """
-    times = _since_start(result)
-    gathered = error_model.chance_of_clock(num_particles)[-times.size :]
-    common = np.minimum(gathered[:, None], gathered[None, :])
+    times = _times_since_start(result)
+    variance = error_model.chance_of_clock(num_particles)[-times.size :]
+    common = np.minimum(variance[:, None], variance[None, :])
     gain = np.asarray(result.clock_gain) / np.where(times > 0, times, 1.0)[None]
     return gain @ common @ gain.T
 
 
-def _by_slope(result: Fit) -> Float[Array, "p p"]:
-    """Covariance of the estimates by derivatives that are too large in a gas with a flow.
+def _derivative_bias_covariance(result: Fit) -> Float[Array, "p p"]:
+    """Covariance of the estimates due to a relative bias b of the derivatives.
 
-    They are so by the share b: errors are larger by 1 + b than their derivatives say, and b of the
-    last extrapolation is missing.
+    The true errors are larger by the factor 1 + b, and the last extrapolation is too short by its
+    fraction b.
     """
-    b = abs(bias_of_slope(result))
-    found = result.covariances["measurement"] + result.covariances["simulation"]
-    return ((1 + b) ** 2 - 1) * found + b**2 * jnp.outer(result.extrapolation, result.extrapolation)
+    b = abs(mean_derivative_bias(result))
+    noise = result.covariances["measurement"] + result.covariances["simulation"]
+    return ((1 + b) ** 2 - 1) * noise + b**2 * jnp.outer(result.extrapolation, result.extrapolation)
 
 
-def bias_of_slope(result: Fit) -> float:
-    """By which share the derivatives of a fit through particles are too large, in the mean over the
-    points by their weight: as the flow of the last run tells, or else as the model estimates it."""
+def mean_derivative_bias(result: Fit) -> float:
+    """Relative bias of the derivatives of a fit of particles, as a weighted mean over the points.
+
+    It is that of the curve of the last run or, if this has none, an estimate by the model.
+    """
     bias = result.curve.derivative_bias
     if bias is None:
         error_model = _error_model(result, getattr(result.model, "num_particles", None))
@@ -128,31 +133,32 @@ def bias_of_slope(result: Fit) -> float:
     return float(np.sum(weights * np.asarray(bias)[-times:]) / whole)
 
 
-def describe_slope_bias(result: Fit) -> Iterator[str]:
-    """A clause about derivatives through particles that are wrong by more than `WORTH_SAYING`."""
-    b = bias_of_slope(result) if result.model.stochastic else 0.0
+def describe_derivative_bias(result: Fit) -> Iterator[str]:
+    """Yield a clause about derivatives whose bias or noise exceeds `MIN_REPORTED_BIAS`."""
+    b = mean_derivative_bias(result) if result.model.stochastic else 0.0
     if abs(b) < MIN_REPORTED_BIAS:
         return
     if getattr(result.model, "differences", None) is not None:
         yield (
-            f"its derivatives, differences of runs, have a noise of {100 * b:.2g} % by estimate, "
-            "which the error bar contains: more replicas have less"
+            f"the derivatives are differences of runs, with an estimated noise of {100 * b:.2g} %, "
+            "which the standard error includes: more replicas reduce it"
         )
         return
     share = result.curve.flow_share
-    held = "" if share is None else f", which holds up to {100 * float(jnp.max(share)):.2g} % of "
-    held += "the energy" if held else ""
+    flow = "a flow"
+    if share is not None:
+        flow += f" with up to {100 * float(jnp.max(share)):.2g} % of the energy"
     yield (
-        f"its projected derivatives are too large by {100 * b:.2g} % by estimate, because of the "
-        f"flow{held}: the error bar contains it; {type(result.model).__name__}(..., "
-        "differences=0.3) has derivatives without this bias"
+        f"the projected derivatives are too large by an estimated {100 * b:.2g} %, because of "
+        f"{flow}; the standard error includes this bias, and {type(result.model).__name__}(..., "
+        "differences=0.3) avoids it"
     )
 
 
-def _beyond(
+def _excess_covariance(
     whole: Float[np.ndarray, "p p"], measured: Float[np.ndarray, "p p"]
 ) -> Float[np.ndarray, "p p"]:
-    """What a covariance adds to that of measured errors, which may hold it already."""
+    """Return the part of a covariance that exceeds that of the measured errors."""
     share = 1 - np.diag(measured) / np.maximum(np.diag(whole), np.finfo(whole.dtype).tiny)
     factor = np.sqrt(np.clip(share, 0.0, 1.0))
     return np.asarray(whole * np.outer(factor, factor), measured.dtype)
@@ -161,34 +167,34 @@ def _beyond(
 def parameter_effects(
     gas: Gas, priors: Priors, computed: CoolingCurve, rotation: bool
 ) -> tuple[Float[Array, "points"], dict[str, Float[Array, "points size"]]]:
-    """How ln T, and ln T_rot if a fit uses it, change with the clock and with each prior.
+    """Return the changes of ln T, and of ln T_rot if it is used, with the clock and each prior.
 
-    By kinetic theory; of T_rot of spheres with friction, which it does not know, the change with
-    the clock is that along the computed curve.
+    Kinetic theory gives the changes. It does not support friction: for spheres with friction, the
+    change of T_rot with the clock is the slope of the computed curve.
 
     Args:
-        gas: which was fitted.
-        priors: of the fit.
-        computed: its curve.
-        rotation: whether the fit uses T_rot.
+        gas: the fitted gas.
+        priors: the priors of the fit.
+        computed: the computed curve of the fit.
+        rotation: True if the fit uses T_rot.
 
     Returns:
         ``d ln T/d ln t``, and for each prior the changes by one standard error of its numbers.
     """
     model, varied, times = KineticTheory(), priors.extra_parameters(()), computed.times
-    parameters, known = Parameters(gas, varied), "friction" not in gas.elements
+    parameters, is_supported = Parameters(gas, varied), "friction" not in gas.elements
 
     def logarithms(flat: Array, clock: Array) -> Array:
-        since = (times - parameters.start(flat)) * clock
-        found = model.simulate(parameters.gas(flat), since, Run())
-        return log_temperatures(found, rotation and known)
+        elapsed = (times - parameters.start(flat)) * clock
+        curve = model.simulate(parameters.gas(flat), elapsed, Run())
+        return log_temperatures(curve, rotation and is_supported)
 
     flat, clock = parameters.flat(gas), jnp.ones_like(times)
     slope = jax.jvp(lambda x: logarithms(flat, x), (clock,), (clock,))[1]
-    if rotation and not known:
-        own = np.log(np.asarray(computed.rotational_temperature))
-        along = np.gradient(own, np.asarray(times)) * np.asarray(times)
-        slope = jnp.concatenate([slope, jnp.asarray(along, slope.dtype)])
+    if rotation and not is_supported:
+        log_T_rot = np.log(np.asarray(computed.rotational_temperature))
+        rotation_slope = np.gradient(log_T_rot, np.asarray(times)) * np.asarray(times)
+        slope = jnp.concatenate([slope, jnp.asarray(rotation_slope, slope.dtype)])
     if not varied:
         return slope, {}
     by_parameter = jax.jacfwd(logarithms)(flat, clock)

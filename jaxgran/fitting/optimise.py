@@ -1,7 +1,4 @@
-"""Fits through a deterministic model, whose residuals have no noise of their own.
-
-Minimisers of a sum of squared residuals that have no noise.
-"""
+"""Least squares for residuals without noise, and fits of deterministic models by it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -21,58 +18,35 @@ from jaxgran.fitting.residuals import (
     correlation_factor,
     neighbour_correlation,
 )
-from jaxgran.fitting.result import Fit, Minima, misfit, search_starts
+from jaxgran.fitting.result import Fit, Minima, goodness_of_fit, search_starts
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
 CONVERGED_STEP = 0.01
-"""Length of a Gauss-Newton step, in standard errors, below which it is the last one."""
+"""Length of a Gauss-Newton step, in standard errors, below which a search has converged."""
+
 
 TOLERANCE = 1e-7
-"""Relative and absolute tolerance of the minimisers, of the parameters and of the objective."""
+"""Relative and absolute tolerance of the minimisers, for the parameters and the objective."""
+
 
 Residuals = Callable[[Float[Array, "p"]], Float[Array, "residuals"]]
+
+
 Minimum = tuple[Float[Array, "p"], Int[Array, ""], Bool[Array, ""]]
-"""Where a search ended, after how many iterations, and whether it converged."""
+"""Parameters at the end of a search, the number of iterations, and True if it converged."""
+
+
 Search = Callable[[Residuals, Float[Array, "p"], int], Minimum]
 
 
-def is_converged(residuals: Float[Array, "n"], jacobian: Float[Array, "n p"]) -> Bool[Array, ""]:
-    """Whether the next Gauss-Newton step is shorter than `AT_REST` standard errors.
-
-    The components of the step along the right singular vectors of the Jacobian, in standard errors
-    for residuals of unit variance, are those of the residuals along the left singular vectors. The
-    variance is taken from the residuals. Singular values so small that only round-off is left do
-    not count.
-    """
-    left, singular, _ = jnp.linalg.svd(jacobian, full_matrices=False)
-    known = singular > jnp.finfo(singular.dtype).eps ** 0.5 * singular[0]
-    step = jnp.max(jnp.where(known, jnp.abs(residuals @ left), 0.0))
-    return step < CONVERGED_STEP * jnp.sqrt(jnp.mean(residuals**2))
-
-
-class _TrustRegion(optx.ClassicalTrustRegion):
-    """Stops once the Gauss-Newton step is below AT_REST standard errors.
-
-    That step is accepted and the next one has length 0, which ends the search. Steps so short
-    change chi^2 by no more than its round-off: the classical rule would reject half of them, and
-    the search would not reach its tolerance.
-    """
-
-    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
-        step_size, accept, *rest = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
-        assert isinstance(f_info, optx.FunctionInfo.ResidualJac)
-        ended = is_converged(f_info.residual, f_info.jac.as_matrix())
-        return jnp.where(ended, 0.0, step_size), accept | ended, *rest
-
-
 def least_squares(residuals: Residuals, first: Float[Array, "p"], max_steps: int) -> Minimum:
-    """Minimum of the sum of squares by Levenberg-Marquardt, with forward-mode Jacobians.
+    """Minimise the sum of squares by Levenberg-Marquardt, with forward-mode Jacobians.
 
     Args:
         residuals: function of the parameters.
         first: the initial guess.
-        max_steps: the most iterations.
+        max_steps: maximum number of iterations.
     """
     solver = optx.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
     solution = optx.least_squares(
@@ -86,15 +60,15 @@ def least_squares(residuals: Residuals, first: Float[Array, "p"], max_steps: int
 
 
 def quasi_newton(residuals: Residuals, first: Float[Array, "p"], max_steps: int) -> Minimum:
-    """The same minimum by L-BFGS, with reverse-mode gradients.
+    """Minimise the sum of squares by L-BFGS, with reverse-mode gradients.
 
-    The first step goes along the gradient, as far as the residuals linearised at the initial guess
-    say (the Cauchy step), but no further than 1: a factor e of a positive parameter. The objective
-    is scaled for that, as L-BFGS begins with a Hessian of 1.
+    The first step goes along the gradient to the minimum for residuals linearised at the initial
+    guess (the Cauchy step), but no further than 1: a factor e of a positive parameter. The
+    objective is scaled accordingly, because L-BFGS starts with a Hessian of 1.
 
     Args:
         residuals, first: as for `least_squares`.
-        max_steps: the most evaluations, those of line searches included.
+        max_steps: maximum number of evaluations, including those of line searches.
     """
 
     def half_chi2(flat):
@@ -116,8 +90,45 @@ def quasi_newton(residuals: Residuals, first: Float[Array, "p"], max_steps: int)
     return _minimum(solution)
 
 
+SEARCHES = {"levenberg-marquardt": least_squares, "lbfgs": quasi_newton}
+"""Minimisers by the name of their method."""
+
+
+def is_converged(residuals: Float[Array, "n"], jacobian: Float[Array, "n p"]) -> Bool[Array, ""]:
+    """Return True if the next Gauss-Newton step is shorter than `CONVERGED_STEP` standard errors.
+
+    The components of the step along the right singular vectors of the Jacobian, in standard errors
+    for residuals of unit variance, are those of the residuals along the left singular vectors. The
+    variance is estimated from the residuals. Singular values at the level of round-off are ignored.
+    """
+    left, singular, _ = jnp.linalg.svd(jacobian, full_matrices=False)
+    known = singular > jnp.finfo(singular.dtype).eps ** 0.5 * singular[0]
+    step = jnp.max(jnp.where(known, jnp.abs(residuals @ left), 0.0))
+    return step < CONVERGED_STEP * jnp.sqrt(jnp.mean(residuals**2))
+
+
+class _TrustRegion(optx.ClassicalTrustRegion):
+    """Trust region that stops once the Gauss-Newton step is below `CONVERGED_STEP`.
+
+    That step is accepted and the next one has length 0, which ends the search. Such short steps
+    change chi^2 by less than its round-off: the classical rule would reject half of them, and the
+    search would not reach its tolerance.
+    """
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        step_size, accept, *rest = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
+        assert isinstance(f_info, optx.FunctionInfo.ResidualJac)
+        ended = is_converged(f_info.residual, f_info.jac.as_matrix())
+        return jnp.where(ended, 0.0, step_size), accept | ended, *rest
+
+
+def _minimum(solution: optx.Solution) -> Minimum:
+    converged = solution.result == optx.RESULTS.successful
+    return jnp.asarray(solution.value), solution.stats["num_steps"], converged
+
+
 class SearchEnds(NamedTuple):
-    """Where searches ended, and chi^2 there; infinite where it is not known."""
+    """Parameters at the end of several searches, and chi^2 there; infinite if it is nan."""
 
     flats: Float[Array, "starts p"]
     chi2: Float[Array, "starts"]
@@ -126,35 +137,26 @@ class SearchEnds(NamedTuple):
 def best_of_starts(
     residuals: Residuals, search: Search, starts: Float[Array, "starts p"], max_steps: int
 ) -> tuple[Minimum, SearchEnds]:
-    """The deepest of the minima that a search finds from several starts, with the steps of all.
+    """Search from several starts; return the deepest minimum, with the steps of all searches.
 
     Args:
         residuals: function of the parameters.
         search: `least_squares` or `quasi_newton`.
         starts: initial guesses.
-        max_steps: the most iterations from each.
+        max_steps: maximum number of iterations from each start.
     """
 
-    def one(start: Array) -> tuple[Minimum, Array]:
-        found = search(residuals, start, max_steps)
-        chi2 = jnp.sum(residuals(found[0]) ** 2)
-        return found, jnp.where(jnp.isnan(chi2), jnp.inf, chi2)
+    def search_from(start: Array) -> tuple[Minimum, Array]:
+        minimum = search(residuals, start, max_steps)
+        chi2 = jnp.sum(residuals(minimum[0]) ** 2)
+        return minimum, jnp.where(jnp.isnan(chi2), jnp.inf, chi2)
 
     if len(starts) == 1:
-        found, chi2 = one(starts[0])
-        return found, SearchEnds(found[0][None], chi2[None])
-    (flats, steps, converged), chi2 = jax.lax.map(one, starts)
+        minimum, chi2 = search_from(starts[0])
+        return minimum, SearchEnds(minimum[0][None], chi2[None])
+    (flats, steps, converged), chi2 = jax.lax.map(search_from, starts)
     best = jnp.argmin(chi2)
     return (flats[best], jnp.sum(steps), converged[best]), SearchEnds(flats, chi2)
-
-
-def _minimum(solution: optx.Solution) -> Minimum:
-    converged = solution.result == optx.RESULTS.successful
-    return jnp.asarray(solution.value), solution.stats["num_steps"], converged
-
-
-SEARCHES = {"levenberg-marquardt": least_squares, "lbfgs": quasi_newton}
-"""Minimisers by the name of the method."""
 
 
 @eqx.filter_jit
@@ -169,69 +171,72 @@ def fit_deterministic(
     method: str = "levenberg-marquardt",
     max_steps: int = 100,
     priors: Priors = NO_PRIORS,
-    of_errors: dict[str, Float[Array, ""]] | None = None,
+    error_degrees: dict[str, Float[Array, ""]] | None = None,
     clock_accuracy: Float[Array, "times"] | None = None,
 ) -> Fit:
-    """Fit through a deterministic model, from the best of some guesses.
+    """Fit a deterministic model, starting at the best of some guesses.
 
-    Args, returns: as `jaxgran.fit`; of_errors are the degrees of freedom of the errors, see
-    `jaxgran.fitting.residuals.smooth_errors`; clock_accuracy is the relative accuracy of the
-    model's clock at each time, which is fitted along where there are priors.
+    Arguments and result are those of `jaxgran.fit`. `error_degrees` are the degrees of freedom of
+    the errors, see `jaxgran.fitting.residuals.smooth_errors`. `clock_accuracy` is the relative
+    accuracy of the model's clock at each time; the clock is a free parameter if there are priors.
     """
-    known = num_particles, replicas, priors, clock_accuracy
-    comparison = Comparison.of(gas, curve, model, names, *known)
-    first = comparison.best(guesses)
+    comparison = Comparison.of(
+        gas, curve, model, names, num_particles, replicas, priors, clock_accuracy
+    )
+    first = comparison.best_guess(guesses)
     search = SEARCHES[method]
-    several = first[None]
+    starts = first[None]
     if "rotation" in comparison.weights:
-        here = comparison.of_gas(first)
-        several = search_starts(comparison.parameters, here, first[here.size :])
-    found = best_of_starts(comparison.residuals, search, several, max_steps)
-    flat, iterations, converged = found[0]
+        of_gas = comparison.gas_parameters(first)
+        starts = search_starts(comparison.parameters, of_gas, first[of_gas.size :])
+    minimum, ends = best_of_starts(comparison.residuals, search, starts, max_steps)
+    flat, iterations, converged = minimum
     if curve.temperature_error is None:
-        comparison = comparison.scaled(flat)
-        if priors.names:  # which now have their right weight beside the curve
+        comparison = comparison.with_scatter_as_error(flat)
+        if priors.names:  # search again with the correct weight of the priors
             flat, more, converged = search(comparison.residuals, flat, max_steps)
-            comparison, iterations = comparison.scaled(flat), iterations + more
-    result = _fit_at(comparison, names, of_errors or {}, first, flat, iterations, converged)
-    if len(several) == 1:
+            comparison, iterations = comparison.with_scatter_as_error(flat), iterations + more
+    result = _deterministic_result(
+        comparison, names, error_degrees or {}, first, flat, iterations, converged
+    )
+    if len(starts) == 1:
         return result
-    estimates = jax.vmap(comparison.estimates)(found[1].flats)
-    return dataclasses.replace(result, minima=Minima(estimates, found[1].chi2))
+    estimates = jax.vmap(comparison.estimates)(ends.flats)
+    return dataclasses.replace(result, minima=Minima(estimates, ends.chi2))
 
 
-def _fit_at(
+def _deterministic_result(
     comparison: Comparison,
     names: tuple[str, ...],
-    of_errors: dict[str, Float[Array, ""]],
+    error_degrees: dict[str, Float[Array, ""]],
     first: Float[Array, "q"],
     flat: Float[Array, "q"],
     iterations: Int[Array, ""],
     converged: Bool[Array, ""],
 ) -> Fit:
-    """The fit whose search began at one and ended at another point."""
+    """Return the fit of a search that started at `first` and ended at `flat`."""
     derivatives = jax.jacfwd(comparison.evaluate, argnums=(0, 1), has_aux=True)
     (jacobian, clock_slope), (residuals, computed) = derivatives(flat, jnp.ones(()))
     parts = comparison.split(residuals)
     gain = _gain(comparison, flat, jacobian)
     gains = comparison.split(gain)
     used = jnp.sum(jnp.concatenate([*comparison.weights.values()]) > 0)
-    own = residuals.size - comparison.num_measured
-    degrees_of_freedom = used + own - flat.size
+    num_priors = residuals.size - comparison.num_measured
+    degrees_of_freedom = used + num_priors - flat.size
     num_used = {name: jnp.sum(weights > 0) for name, weights in comparison.weights.items()}
     degrees = num_used["measurement"] - comparison.num_free
-    tested = [(parts["measurement"], degrees, of_errors.get("measurement"))]
+    tested = [(parts["measurement"], degrees, error_degrees.get("measurement"))]
     for name in comparison.accuracies:
-        own_part = jnp.concatenate([parts[name], parts[f"model of {QUANTITIES[name]}"]])
-        tested.append((own_part, num_used[name], of_errors.get(name)))
-    known = comparison.curve.temperature_error is not None
-    chance = misfit(tested, degrees_of_freedom, errors_known=known)
+        with_prior = jnp.concatenate([parts[name], parts[f"model of {QUANTITIES[name]}"]])
+        tested.append((with_prior, num_used[name], error_degrees.get(name)))
+    errors_known = comparison.curve.temperature_error is not None
+    goodness = goodness_of_fit(tested, degrees_of_freedom, errors_known=errors_known)
     clock_gain = _clock_gain(comparison.split(clock_slope), gains)
     shape = comparison.curve.times.shape
     clock_error = jnp.broadcast_to(jnp.asarray(comparison.clock_accuracy, flat.dtype), shape)
-    moved = clock_gain @ clock_error
-    covariances = {"model": jnp.outer(moved, moved)}
-    covariances |= _covariances(comparison, gains, parts["measurement"], chance.inflation)
+    shift = clock_gain @ clock_error
+    covariances = {"model": jnp.outer(shift, shift)}
+    covariances |= _covariances(comparison, gains, parts["measurement"], goodness.inflation)
     return Fit(
         names=names,
         model=comparison.model,
@@ -243,8 +248,10 @@ def _fit_at(
         sensitivity=jacobian[: comparison.num_measured, : comparison.num_free],
         extrapolation=jnp.zeros(comparison.num_free, flat.dtype),
         start=comparison.estimates(first),
-        gas=comparison.parameters.gas(comparison.of_gas(flat)),
-        start_time=jnp.asarray(comparison.parameters.start(comparison.of_gas(flat)), flat.dtype),
+        gas=comparison.parameters.gas(comparison.gas_parameters(flat)),
+        start_time=jnp.asarray(
+            comparison.parameters.start(comparison.gas_parameters(flat)), flat.dtype
+        ),
         priors=comparison.priors,
         curve=dataclasses.replace(computed, times=comparison.curve.times),
         weights=comparison.weights["measurement"],
@@ -252,36 +259,36 @@ def _fit_at(
         displacement_residuals=parts.get("displacement"),
         rotation_residuals=parts.get("rotation"),
         scatter=comparison.scatter,
-        chi2=chance.chi2,
+        chi2=goodness.chi2,
         degrees_of_freedom=degrees_of_freedom,
-        reduced_chi2=chance.reduced,
-        p_value=chance.p_value,
+        reduced_chi2=goodness.reduced,
+        p_value=goodness.p_value,
         iterations=iterations,
-        converged=converged & jnp.isfinite(chance.chi2),
+        converged=converged & jnp.isfinite(goodness.chi2),
     )
 
 
 def _gain(
     comparison: Comparison, flat: Float[Array, "q"], jacobian: Float[Array, "residuals q"]
 ) -> Float[Array, "p residuals"]:
-    """Change of each estimate, SI, for a change of the residuals at fixed parameters by 1."""
-    left, singular, rotation = jnp.linalg.svd(jacobian, full_matrices=False)
-    spread = rotation.T / jnp.maximum(singular, jnp.finfo(flat.dtype).tiny ** 0.5)[None]
+    """Derivative of each estimate, SI, in the residuals at fixed parameters."""
+    left, singular, right = jnp.linalg.svd(jacobian, full_matrices=False)
+    spread = right.T / jnp.maximum(singular, jnp.finfo(flat.dtype).tiny ** 0.5)[None]
     return -jax.jacfwd(comparison.estimates)(flat) @ spread @ left.T
 
 
 def _clock_gain(
     slope: dict[str, Float[Array, "part"]], gains: dict[str, Float[Array, "p part"]]
 ) -> Float[Array, "p times"]:
-    """Change of each estimate, SI, over a relative change of the model's clock at each time.
+    """Derivative of each estimate, SI, in a relative change of the model's clock at each time.
 
     Args:
         slope: derivatives of the residuals in a factor of all times.
-        gains: changes of the estimates over those of the residuals.
+        gains: derivatives of the estimates in the residuals.
     """
     measured = [name for name in ("measurement", "rotation", "displacement") if name in slope]
-    moved = [gains[name] * slope[name][None] for name in measured]
-    return sum(moved[1:], moved[0])
+    shifts = [gains[name] * slope[name][None] for name in measured]
+    return sum(shifts[1:], shifts[0])
 
 
 def _covariances(
@@ -290,7 +297,7 @@ def _covariances(
     residuals: Float[Array, "times"],
     inflation: Float[Array, ""],
 ) -> dict[str, Float[Array, "p p"]]:
-    """The parts of the covariance, but for that of a clock that is not fitted."""
+    """Return the parts of the covariance, without that of a clock that is not a free parameter."""
     covariances = {name: part @ part.T for name, part in gains.items()}
     correlation = neighbour_correlation(residuals, comparison.weights["measurement"] > 0)
     measured = correlation_factor(correlation) ** 2 * covariances["measurement"]

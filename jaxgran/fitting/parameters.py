@@ -1,9 +1,4 @@
-"""The free parameters of a fit as one array in a scale without bounds.
-
-Initial guesses of parameters from the measured curve.
-
-What is known of a gas besides its cooling curve.
-"""
+"""Parameters of a fit: their unconstrained scale, initial guesses from the data, and priors."""
 
 from typing import Any
 
@@ -22,17 +17,22 @@ from jaxgran.scene.laws import ConstantRestitution, Viscoelastic
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 START_TIME = "t0"
-"""The one free parameter that is no float of a gas: the time, on the clock of the measurement, at
-which the gas had its temperature T_0 and began to cool."""
+"""Name of the time, on the clock of the measurement, at which the gas had its temperature T_0 and
+began to cool: the only free parameter that is not a float of a gas."""
+
+
+DENSITY = "density"
+"""Name of a prior that is not of a float of a gas: the mass over the volume of a sphere."""
+
 
 ANY_TIME = Domain()
 
 
 def domain_of(gas: Gas, name: str) -> Domain:
-    """The allowed values of a parameter.
+    """Return the allowed values of a parameter.
 
     Raises:
-        ValueError: for a name that is none, with those that are.
+        ValueError: for an unknown name; the message lists the known ones.
     """
     if name == START_TIME:
         return ANY_TIME
@@ -41,15 +41,15 @@ def domain_of(gas: Gas, name: str) -> Domain:
 
 
 def size_of(gas: Gas, name: str) -> int:
-    """How many numbers a parameter is."""
+    """Return the number of elements of a parameter."""
     return 1 if name == START_TIME else gas.value(name).size
 
 
 class Parameters:
-    """Map between a gas and the array of its free parameters in their unbounded scale.
+    """Map between a gas and the array of its free parameters in their unconstrained scale.
 
-    The scale of a positive parameter is its logarithm (see `jaxgran._utils.validation.Domain`),
-    that of `START` is linear, in units of a time.
+    The scale of a positive parameter is its logarithm (see `jaxgran._utils.validation.Domain`);
+    that of `START_TIME` is linear, in units of `time_scale`.
     """
 
     def __init__(self, gas: Gas, names: tuple[str, ...], time_scale: ArrayLike = 1.0):
@@ -59,15 +59,15 @@ class Parameters:
 
     def _to_free(self, gas: Gas, start: ArrayLike) -> list[Array]:
         pairs = zip(self.names, self._domains, strict=True)
-        late = jnp.asarray(start / self._time_scale, gas.temperature.dtype)
-        return [late if n == START_TIME else domain.to_free(gas.value(n)) for n, domain in pairs]
+        t0 = jnp.asarray(start / self._time_scale, gas.temperature.dtype)
+        return [t0 if n == START_TIME else domain.to_free(gas.value(n)) for n, domain in pairs]
 
     def flat(self, gas: Gas, start: ArrayLike = 0.0) -> Float[Array, "p"]:
-        """The free parameters of a gas that began at some time, in the unbounded scale."""
+        """Return the free parameters, unconstrained, of a gas that began to cool at `start`."""
         return ravel_pytree(self._to_free(gas, start))[0]
 
     def values(self, flat: Float[Array, "p"]) -> dict[str, Array]:
-        """Their SI values by name."""
+        """Return SI values by name."""
         pairs = zip(self.names, self._domains, self._unravel(flat), strict=True)
         return {
             name: free * self._time_scale if name == START_TIME else domain.from_free(free)
@@ -75,27 +75,27 @@ class Parameters:
         }
 
     def gas(self, flat: Float[Array, "p"]) -> Gas:
-        """The gas with these values."""
+        """Return the gas with these values."""
         values = self.values(flat)
         values.pop(START_TIME, None)
         return self._gas.replace(**values)
 
     def start(self, flat: Float[Array, "p"]) -> Array | float:
-        """The time at which the gas began to cool, s; 0 if it is not free."""
+        """Return the time at which the gas began to cool, s; 0 if it is not free."""
         return self.values(flat).get(START_TIME, 0.0)
 
     def estimates(self, flat: Float[Array, "p"]) -> Float[Array, "p"]:
-        """SI values in one array."""
+        """Return SI values in one array."""
         return jnp.concatenate([jnp.ravel(value) for value in self.values(flat).values()])
 
 
 def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
-    """The gas with A (or e) and T_0, where they are free, guessed from the measured curve.
+    """Return the gas with its free parameters guessed from the measured curve.
 
     ``T^(-3/5)`` (``T^(-1/2)`` for constant restitution) of a cooling gas is a straight line in
-    time, whose value at t = 0 gives T_0 and whose slope over that value is 1/tau_0, proportional to
-    A (to 1 - e^2). The line is fitted by linear least squares. Other parameters keep the values of
-    the gas.
+    time. Its value at t = 0 gives T_0; its slope over that value is 1/tau_0, proportional to A (to
+    1 - e^2). The line is fitted by linear least squares. Floats of elements are guessed where they
+    are at an end of their range; all others keep the values of the gas.
 
     Args:
         gas: the scene.
@@ -108,7 +108,7 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
 
 @eqx.filter_jit
 def _guess(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
-    """The same, of unchecked values."""
+    """Compiled part of `guess_from_data`."""
     power, line = _power_and_line(gas, curve)
     scale = curve.temperature[0]
     origin = (gas.temperature / scale) ** -power
@@ -132,34 +132,37 @@ def _guess(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
         correction = 0.5 * COOLING_CORRECTION * delta
         delta = delta / (1 - jnp.minimum(correction, 0.7))
         gas = gas.replace(dissipative_constant=delta / (gas.alpha**0.4 * gas.temperature**0.1))
-    return _elements_from_data(gas, curve, free)
+    return _guess_elements(gas, curve, free)
 
 
 def guess_start_time(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Array | float:
-    """The time, s, at which that line gives the T_0 of a gas, where t0 is free and T_0 is known."""
+    """Return the time, s, at which the line of `guess_from_data` gives the T_0 of a gas.
+
+    It is 0 if t0 is not free, or if T_0 is free too.
+    """
     if START_TIME not in free or "temperature" in free:
         return 0.0
     power, line = _power_and_line(gas, curve)
     intercept, slope = _intercept_and_slope(curve, line)
-    late = ((gas.temperature / curve.temperature[0]) ** -power - intercept) / slope
+    t0 = ((gas.temperature / curve.temperature[0]) ** -power - intercept) / slope
     duration = curve.times[-1]
-    return jnp.clip(jnp.where(slope > 0, late, 0.0), -duration, 0.5 * duration)
+    return jnp.clip(jnp.where(slope > 0, t0, 0.0), -duration, 0.5 * duration)
 
 
 def halving_time(curve: CoolingCurve) -> Float[Array, ""]:
-    """The time until T has fallen to a half of its first value, or the last time before it has."""
+    """Return the first time at which T is below half of its first value, or the last time."""
     halved = (curve.temperature < 0.5 * curve.temperature[0]).at[-1].set(True)
     return curve.times[jnp.argmax(halved)]
 
 
 def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, Float[Array, "times"]]:
-    """The power of T that is a straight line in time, and it, over its first value."""
+    """Return the negative power of T that is a straight line in time, and that line, 1 at first."""
     power = 1 / 2 if isinstance(gas.law, ConstantRestitution) else 3 / 5
     return power, (curve.temperature / curve.temperature[0]) ** -power
 
 
 def _intercept_and_slope(curve: CoolingCurve, line: Float[Array, "times"]) -> tuple[Array, Array]:
-    """Of a straight line, by least squares with equal relative errors."""
+    """Fit a straight line by least squares with equal relative errors."""
     weight = 1 / line
     design = jnp.stack([weight, weight * curve.times], axis=1)
     size = jnp.linalg.norm(design, axis=0)
@@ -167,18 +170,19 @@ def _intercept_and_slope(curve: CoolingCurve, line: Float[Array, "times"]) -> tu
     return jnp.maximum(intercept, 0.1 * line.min()), slope
 
 
-def _elements_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
-    """The gas with those free floats of its elements guessed that are at an end of their range.
+def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
+    """Guess free floats of the elements that are at an end of their range.
 
-    A fit in an unbounded scale cannot begin there. beta_t is taken for 0, T_rot at t = 0 for the
-    first measured one, or a tenth of T_0, and a rate of drag for a tenth of the mean cooling rate.
+    A fit in an unconstrained scale cannot start there. The guess of beta_t is 0, that of T_rot at
+    t = 0 the first measured one or a tenth of T_0, and that of a drag rate a tenth of the mean
+    cooling rate.
     """
     measured = curve.rotational_temperature
-    first = 0.1 * gas.temperature if measured is None else jnp.maximum(measured[0], measured[1])
+    T_rot = 0.1 * gas.temperature if measured is None else jnp.maximum(measured[0], measured[1])
     mean_rate = jnp.log(curve.temperature[0] / curve.temperature[-1]) / curve.times[-1]
     guesses = {
         "tangential_restitution": jnp.zeros(()),
-        "rotational_temperature": jnp.maximum(first, 1e-6 * gas.temperature),
+        "rotational_temperature": jnp.maximum(T_rot, 1e-6 * gas.temperature),
         "wall_coefficient": jnp.full((), 0.8),
         "wall_tangential_restitution": jnp.zeros(()),
         "drag_rate": 0.1 * jnp.maximum(mean_rate, 1e-9 / curve.times[-1]),
@@ -190,20 +194,16 @@ def _elements_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) ->
     return gas
 
 
-DENSITY = "density"
-"""The one name that is not a float of a gas: the mass over the volume of a sphere."""
-
-
 class Priors(eqx.Module):
     """Known values of floats of a gas, each with a standard error.
 
-    Each is Gaussian in the float's unbounded scale (the logarithm of a positive one).
+    Each prior is Gaussian in the unconstrained scale (the logarithm of a positive float).
 
     Attributes:
-        names: of the floats, or "density", which then lets the mass vary, or "t0", the time at
+        names: names of the floats, or "density", which lets the mass vary, or "t0", the time at
             which the gas began to cool.
-        given: their values, SI.
-        errors: and standard errors, SI.
+        given: known values, SI.
+        errors: standard errors, SI.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -212,7 +212,7 @@ class Priors(eqx.Module):
 
     @classmethod
     def of(cls, gas: Gas, priors: Any) -> "Priors":
-        """The priors that a user gave.
+        """Check and convert the priors that a user gave.
 
         Raises:
             ValueError: for an unknown name, a value outside its range or an error that is not
@@ -231,21 +231,24 @@ class Priors(eqx.Module):
         values, errors = zip(*pairs, strict=True) if pairs else ((), ())
         return cls(tuple(priors), tuple(values), tuple(errors))
 
-    def with_one(self, name: str, value: ArrayLike, error: ArrayLike) -> "Priors":
-        """These and one more."""
-        more = (jnp.asarray(value),), (jnp.asarray(error),)
-        return Priors((*self.names, name), self.given + more[0], self.errors + more[1])
+    def add(self, name: str, value: ArrayLike, error: ArrayLike) -> "Priors":
+        """Return these priors and one more."""
+        return Priors(
+            (*self.names, name),
+            (*self.given, jnp.asarray(value)),
+            (*self.errors, jnp.asarray(error)),
+        )
 
     def extra_parameters(self, free: tuple[str, ...]) -> tuple[str, ...]:
-        """Floats that vary because of a prior, besides those that are free anyway."""
+        """Return the floats that vary because of a prior and are not free parameters."""
         varied = ("mass" if name == DENSITY else name for name in self.names)
         return tuple(dict.fromkeys(name for name in varied if name not in free))
 
     def residuals(self, gas: Gas, start: Array | float = 0.0) -> Float[Array, "priors"]:
-        """(value - given one) / standard error of each, in the unbounded scale.
+        """Return (value - known value) / standard error of each prior, in the unconstrained scale.
 
         Args:
-            gas: with its values.
+            gas: the gas with the values.
             start: the time at which it began to cool, s.
         """
         parts = []
@@ -282,9 +285,11 @@ def _check_prior(gas: Gas, name: str, pair: object) -> None:
         return
     value, error = pair
     _prior_domain(gas, name).check(f"priors: {name}", value, "Give the known value, in SI units.")
-    POSITIVE.check(f"priors: standard error of {name}", error, "Leave out what is known exactly.")
+    POSITIVE.check(
+        f"priors: standard error of {name}", error, "Leave out values that are known exactly."
+    )
     if not np.all(np.isfinite(np.asarray(_prior_domain(gas, name).to_free(value)))):
         raise ValueError(
-            f"priors: {name} = {value} lies on the end of its range {_prior_domain(gas, name)}, "
-            "where no error has a meaning; give a value inside"
+            f"priors: {name} = {value} lies on the end of its range {_prior_domain(gas, name)}: "
+            "give a value inside the range"
         )

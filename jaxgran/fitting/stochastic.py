@@ -1,9 +1,8 @@
-"""Fits through a stochastic model, whose noise becomes part of the errors.
+"""Fits of stochastic models by a Gauss-Newton search through simulations.
 
-Gauss-Newton search through simulations, whose residuals have noise of their own.
-
-Every step is made from one simulation with fresh random numbers and its derivatives. The answer is
-the mean of the Gauss-Newton estimates of all simulations near it.
+Each step uses one simulation with new random numbers, and its derivatives. The estimate is the mean
+of the Gauss-Newton estimates of all simulations near it; the noise of the simulations is part of
+its error.
 """
 
 import dataclasses
@@ -27,40 +26,44 @@ from jaxgran.fitting.residuals import (
     neighbour_correlation,
     uses_rotation,
 )
-from jaxgran.fitting.result import Fit, misfit
+from jaxgran.fitting.result import Fit, goodness_of_fit
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
 
 MAX_STEP = 0.7
-"""Longest Gauss-Newton step of a parameter in its unbounded scale: a factor of two."""
+"""Longest Gauss-Newton step of a parameter in the unconstrained scale: a factor of two."""
 
-NEARBY = 0.1
-"""Distance in every parameter's unbounded scale within which simulations are averaged."""
 
-MIN_NOISE_SHARE = 0.5
-"""Share of the standard error below which the noise needs no further simulations."""
+AVERAGING_DISTANCE = 0.1
+"""Distance of each parameter, in the unconstrained scale, within which simulations are averaged."""
+
+
+MAX_NOISE_SHARE = 0.5
+"""Share of the standard error up to which the noise needs no further simulations."""
+
 
 NOISE_WINDOW = 9
-"""Neighbouring times over which the variance between replicas is averaged."""
+"""Number of neighbouring times over which the variance between replicas is averaged."""
 
 
-class Simulated(NamedTuple):
-    """Result of a search through simulations, of p parameters in their unbounded scale.
+class SearchResult(NamedTuple):
+    """Result of a search through simulations, of p parameters in their unconstrained scale.
 
-    Points are those of `log_temperatures`.
+    The points are those of `log_temperatures`.
 
     Attributes:
         flat: the estimate.
         computed: the curve of the last simulation.
-        weights: of the residuals; 0 where not used.
-        residuals: weighted, at `flat` extrapolated linearly from the simulations; 0 where not used.
+        weights: weights of the residuals; 0 where a point is not used.
+        residuals: weighted residuals at `flat`, extrapolated linearly from the simulations; 0 where
+            a point is not used.
         sensitivity: derivative of the weighted residuals.
-        beyond: `flat` less the mean of the simulations' parameters.
-        gain: derivative of `flat` in each measured value; 0 where not used.
-        noise_covariance: covariance of `flat` by the noise of the simulations.
-        num_simulations: how many were made.
-        converged: whether the last step was below `NEAR`.
+        extrapolation: `flat` minus the mean of the parameters of the simulations.
+        gain: derivative of `flat` in each measured value; 0 where a point is not used.
+        noise_covariance: covariance of `flat` due to the noise of the simulations.
+        num_simulations: the number of simulations.
+        converged: True if the last step was below `AVERAGING_DISTANCE`.
     """
 
     flat: Float[np.ndarray, "p"]
@@ -75,183 +78,6 @@ class Simulated(NamedTuple):
     converged: bool
 
 
-class _Simulation(NamedTuple):
-    """One simulation at some parameters, at the points that are used."""
-
-    flat: Float[np.ndarray, "p"]
-    values: Float[np.ndarray, "used"]
-    slope: Float[np.ndarray, "used p"]  # derivative of the values
-    deviation: Float[np.ndarray, "replicas used"]  # of each replica's values from their mean
-    variance: Float[np.ndarray, "used"]  # of the mean over replicas
-
-
-class _Average(NamedTuple):
-    """The estimate that simulations near each other give together."""
-
-    flat: Float[np.ndarray, "p"]
-    sigma: Float[np.ndarray, "used"]  # standard error of each residual; 1 if errors are unknown
-    gain: Float[np.ndarray, "p used"]  # derivative of `flat` in the measured values
-    errors: Float[np.ndarray, "p p"]  # covariance of `flat` by the errors of the measurement
-    noises: Float[np.ndarray, "p p"]  # and by the noise of the simulations
-
-    @property
-    def covariance(self) -> Float[np.ndarray, "p p"]:
-        return self.errors + self.noises
-
-
-def search_by_simulation(
-    simulate: Callable[[Array, int], CoolingCurve],
-    first: Float[np.ndarray, "p"],
-    measured: Float[np.ndarray, "points"],
-    error: Float[np.ndarray, "points"],
-    used: Bool[np.ndarray, "points"],
-    *,
-    rotation: bool = False,
-    resolution: float,
-    max_simulations: int,
-    progress: bool,
-) -> Simulated:
-    """Gauss-Newton steps, each on one simulation and its derivatives.
-
-    Every simulation has its own random numbers. Those within `NEAR` of the last give independent
-    Gauss-Newton estimates, whose mean is the answer. Residuals are weighted by the measured error
-    and the noise of the mean of these simulations, or equally if no error is known. The noise of
-    the answer is estimated from the changes that single replicas would make to it. The search ends
-    when a step is below `NEAR` and the noise is below `QUIET` of the standard error.
-
-    For wrong derivatives see `jaxgran.fit`.
-
-    Args:
-        simulate: makes a cooling curve, with replicas, of the parameters and a number that differs
-            between simulations.
-        first: the initial guess.
-        measured, error: values of `log_temperatures` and their standard errors, which are 0
-            everywhere if they are not known.
-        used: the points that have a weight.
-        rotation: whether T_rot is used beside T.
-        resolution: singular values of the sensitivity below this share of the largest are ignored:
-            the parameters do not move in those directions.
-        max_simulations: the most simulations.
-        progress: show a bar.
-    """
-    flat, measured, error = np.asarray(first, float), measured[used], error[used]
-    known, simulations = bool(error.any()), []
-    hidden = None if progress else True  # None hides the bar where there is no terminal
-    with tqdm(total=max_simulations, disable=hidden, desc="fit", unit="simulation") as bar:
-        while True:
-            simulation, curve = _simulated(simulate, flat, len(simulations), used, rotation)
-            simulations.append(simulation)
-            near = [s for s in simulations if np.abs(s.flat - flat).max() < NEARBY]
-            average = _average(near, measured, error if known else None, resolution)
-            step = average.flat - flat
-            step *= min(1.0, MAX_STEP / max(np.abs(step).max(), 1e-300))
-            settled = bool(np.abs(step).max() < NEARBY)
-            flat = flat + step
-            variance = np.diag(average.covariance)
-            quiet = np.all(np.diag(average.noises) <= MIN_NOISE_SHARE**2 * variance)
-            in_errors = np.abs(step / np.sqrt(variance)).max()
-            bar.update()
-            bar.set_postfix_str(f"last step {in_errors:.2g} standard errors")
-            ended = settled and len(near) > 1 and (quiet or not known)
-            if ended or len(simulations) == max_simulations:
-                break
-    weighted = _residuals_at(flat, near, measured, average.sigma, used)
-    extrapolation = flat - np.mean([s.flat for s in near], axis=0)
-    parts = *weighted, extrapolation, _spread(average.gain, used), average.noises
-    return Simulated(flat, curve, *parts, len(simulations), settled)
-
-
-def _spread(values: Float[np.ndarray, "p used"], used: Bool[np.ndarray, "points"]) -> np.ndarray:
-    """Values at all points, 0 where not used."""
-    spread = np.zeros((len(values), len(used)))
-    spread[:, used] = values
-    return spread
-
-
-def _simulated(
-    simulate: Callable[[Array, int], CoolingCurve],
-    flat: Float[np.ndarray, "p"],
-    number: int,
-    used: Bool[np.ndarray, "points"],
-    rotation: bool,
-) -> tuple[_Simulation, CoolingCurve]:
-    """One simulation with its derivatives, and its curve."""
-
-    def values_of(flat):
-        curve = simulate(flat, number)
-        value = log_temperatures(curve, rotation)
-        return value, (value, curve)
-
-    slope, (value, curve) = jax.jacfwd(values_of, has_aux=True)(jnp.asarray(flat))
-    replicas: Any = curve.replicas  # checked by the caller
-    each = np.asarray(log_temperatures(replicas, rotation))
-    parts = np.split(each, 1 + rotation, axis=1), np.split(used, 1 + rotation)
-    kept = [part[:, some] for part, some in zip(*parts, strict=True)]
-    kept = [part - part.mean(axis=0) for part in kept]
-    variance = np.concatenate([_variance(part) for part in kept])
-    value, slope = np.asarray(value)[used], np.asarray(slope)[used]
-    return _Simulation(flat, value, slope, np.concatenate(kept, axis=1), variance), curve
-
-
-def _average(
-    near: list[_Simulation],
-    measured: Float[np.ndarray, "used"],
-    error: Float[np.ndarray, "used"] | None,
-    resolution: float,
-) -> _Average:
-    """The mean of the Gauss-Newton estimates of some simulations, the last of which is the newest.
-
-    Args:
-        near: the simulations.
-        measured, error: the values and their standard errors, None if these are not known.
-        resolution: see `by_simulation`.
-    """
-    noise = np.sqrt(np.mean([s.variance for s in near], axis=0) / len(near))
-    sigma = np.ones_like(measured) if error is None else np.hypot(error, noise)
-    ends, scatter = [], []
-    for simulation in near:
-        sensitivity = simulation.slope / sigma[:, None]
-        inverse = np.linalg.pinv(sensitivity, rcond=resolution)
-        ends.append(simulation.flat + inverse @ ((measured - simulation.values) / sigma))
-        replicas = len(simulation.deviation)
-        moved = (simulation.deviation / sigma) @ inverse.T / (replicas * (replicas - 1)) ** 0.5
-        scatter.append(moved.T @ moved)
-    # The errors of the measurement are the same in all of them: those of the newest stand for all.
-    newest = near[-1].slope / sigma[:, None]
-    gain = np.linalg.pinv(newest, rcond=resolution) / sigma
-    share = gain * (np.ones_like(sigma) if error is None else error)
-    noises = np.mean(scatter, axis=0) / len(near)
-    return _Average(np.mean(ends, axis=0), sigma, gain, share @ share.T, noises)
-
-
-def _variance(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:
-    """Variance of the mean over replicas, averaged over neighbouring times."""
-    replicas, num_times = deviation.shape
-    variance = np.sum(deviation**2, axis=0) / (replicas * (replicas - 1))
-    window = np.ones(min(NOISE_WINDOW, num_times))
-    parts = np.convolve(np.ones(num_times), window, "same")
-    return np.convolve(variance, window, "same") / parts
-
-
-def _residuals_at(
-    flat: Float[np.ndarray, "p"],
-    near: list[_Simulation],
-    measured: Float[np.ndarray, "used"],
-    sigma: Float[np.ndarray, "used"],
-    used: Bool[np.ndarray, "points"],
-) -> tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"], Float[np.ndarray, "points p"]]:
-    """Weights, weighted residuals, extrapolated from each simulation and averaged, and their
-    derivative."""
-    each = [measured - s.values - s.slope @ (flat - s.flat) for s in near]
-    slope = np.mean([s.slope for s in near], axis=0)
-    weights, residuals = np.zeros(len(used)), np.zeros(len(used))
-    sensitivity = np.zeros((len(used), len(flat)))
-    weights[used] = 1 / sigma
-    residuals[used] = np.mean(each, axis=0) / sigma
-    sensitivity[used] = slope / sigma[:, None]
-    return weights, residuals, sensitivity
-
-
 def fit_stochastic(
     gas: Gas,
     curve: CoolingCurve,
@@ -262,16 +88,17 @@ def fit_stochastic(
     progress: bool = True,
     max_simulations: int = 8,
     priors: Priors = NO_PRIORS,
-    of_errors: dict[str, Float[Array, ""]] | None = None,
+    error_degrees: dict[str, Float[Array, ""]] | None = None,
 ) -> Fit:
-    """Fit through a stochastic model, from a guess, by default the result of kinetic theory.
+    """Fit a stochastic model, starting at a guess, by default the result of kinetic theory.
 
-    Args, returns, raises: as `jaxgran.fit`; of_errors as `fit_deterministic`.
+    Arguments, result and errors are those of `jaxgran.fit`; `error_degrees` are those of
+    `fit_deterministic`.
     """
     if any_traced(gas, curve, guess, model, key):
         raise ValueError(
-            "a fit through a stochastic model cannot run inside jax.jit or jax.vmap: fit one curve "
-            "at a time, outside"
+            "a fit of a stochastic model cannot run inside jax.jit or jax.vmap: fit one curve at a "
+            "time, outside of them"
         )
     guess = _guess_of_kinetic_theory(gas, curve, names) if guess is None else guess
     parameters = Parameters(gas, names)
@@ -279,8 +106,8 @@ def fit_stochastic(
     if not np.all(np.isfinite(first)):
         at = ", ".join(f"{name} = {guess.value(name)}" for name in names)
         raise ValueError(
-            f"a fit cannot start at {at}: positive parameters are fitted in their logarithm; give "
-            "a start inside their ranges, or leave it out"
+            f"a fit cannot start at {at}: positive parameters are fitted in their logarithm. Give "
+            "start inside their ranges, or leave it out"
         )
     model.check_scene(parameters.gas(first))
     key = jax.random.key(0) if key is None else key
@@ -293,8 +120,8 @@ def fit_stochastic(
 
     rotation = uses_rotation(gas, curve)
     errors_known = curve.temperature_error is not None
-    error, used = _errors_of(curve, rotation)
-    found = search_by_simulation(
+    error, used = _relative_errors(curve, rotation)
+    search = search_by_simulation(
         simulate,
         np.asarray(first),
         np.asarray(log_temperatures(curve, rotation)),
@@ -305,14 +132,22 @@ def fit_stochastic(
         max_simulations=max_simulations,
         progress=progress,
     )
-    of = model, parameters, names, first, found, priors
-    return _fit_of(*of, error if errors_known else None, of_errors or {})
+    return _stochastic_result(
+        model,
+        parameters,
+        names,
+        first,
+        search,
+        priors,
+        error if errors_known else None,
+        error_degrees or {},
+    )
 
 
-def _errors_of(
+def _relative_errors(
     curve: CoolingCurve, rotation: bool
 ) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:
-    """Relative errors of T, and of T_rot if it is used, and the points that have a weight."""
+    """Return relative errors of T, and of T_rot if it is used, and which points have a weight."""
     pairs: list[tuple[Any, Any]] = [(curve.temperature, curve.temperature_error)]
     if rotation:
         pairs.append((curve.rotational_temperature, curve.rotational_temperature_error))
@@ -328,60 +163,63 @@ def _check_replicas(model: AbstractModel, computed: CoolingCurve) -> None:
     replicas = computed.replicas
     if replicas is None or len(replicas.temperature) < 2:
         raise ValueError(
-            f"a fit through {type(model).__name__} needs curves with two replicas at least, whose "
-            "scatter gives the noise: CoolingCurve.of_replicas makes them"
+            f"a fit of {type(model).__name__} needs curves with at least two replicas, whose "
+            "scatter gives the noise: simulate must return CoolingCurve.of_replicas(...)"
         )
 
 
 def _guess_of_kinetic_theory(gas: Gas, curve: CoolingCurve, names: tuple[str, ...]) -> Gas:
-    """The result of kinetic theory's fit of those parameters that it can determine."""
-    found_by_theory = {"dissipative_constant", "coefficient", "temperature"}
+    """Fit kinetic theory for those parameters that it can determine."""
+    determined = {"dissipative_constant", "coefficient", "temperature"}
     if uses_rotation(gas, curve):
-        found_by_theory |= {"tangential_restitution", "rotational_temperature"}
-    known = tuple(name for name in names if name in found_by_theory)
-    if not known:
+        determined |= {"tangential_restitution", "rotational_temperature"}
+    free = tuple(name for name in names if name in determined)
+    if not free:
         return gas
-    plain = gas
-    if "friction" in gas.elements:  # which theory does not know
-        plain = dataclasses.replace(gas, surface=None)
+    smooth = gas
+    if "friction" in gas.elements:  # not supported by kinetic theory
+        smooth = dataclasses.replace(gas, surface=None)
         curve = dataclasses.replace(curve, rotational_temperature=None)
         curve = dataclasses.replace(curve, rotational_temperature_error=None)
-    guesses = [guess_from_data(plain, curve, known)]
-    found = fit_deterministic(plain, curve, KineticTheory(), known, guesses).gas
-    return gas.replace(**{name: found.value(name) for name in known})
+    guesses = [guess_from_data(smooth, curve, free)]
+    fitted = fit_deterministic(smooth, curve, KineticTheory(), free, guesses).gas
+    return gas.replace(**{name: fitted.value(name) for name in free})
 
 
-def _fit_of(
+def _stochastic_result(
     model: AbstractModel,
     parameters: Parameters,
     names: tuple[str, ...],
     first: Float[Array, "p"],
-    found: Simulated,
+    search: SearchResult,
     priors: Priors,
     error: Float[np.ndarray, "points"] | None,
-    of_errors: dict[str, Float[Array, ""]],
+    error_degrees: dict[str, Float[Array, ""]],
 ) -> Fit:
-    """The fit in SI units of what a search found."""
-    flat, num_times = jnp.asarray(found.flat), found.computed.times.size
-    own = found.residuals, found.sensitivity, found.weights
-    residuals, sensitivity, weights = map(jnp.asarray, own)
+    """Return the fit, in SI units, from the result of a search."""
+    flat, num_times = jnp.asarray(search.flat), search.computed.times.size
+    residuals, sensitivity, weights = map(
+        jnp.asarray, (search.residuals, search.sensitivity, search.weights)
+    )
     degrees_of_freedom, scatter = jnp.sum(residuals != 0) - flat.size, None
     if error is None:
         scatter = jnp.sqrt(jnp.sum(residuals**2) / degrees_of_freedom)
         residuals, sensitivity, weights = (x / scatter for x in (residuals, sensitivity, weights))
-    of_T, of_rotation = residuals[:num_times], residuals[num_times:]
-    used = of_T != 0
-    tested = [(of_T, jnp.sum(used) - flat.size, of_errors.get("measurement"))]
-    if of_rotation.size:
-        tested.append((of_rotation, jnp.sum(of_rotation != 0), of_errors.get("rotation")))
-    chance = misfit(tested, degrees_of_freedom, errors_known=error is not None)
+    residuals, rotation_residuals = residuals[:num_times], residuals[num_times:]
+    used = residuals != 0
+    tested = [(residuals, jnp.sum(used) - flat.size, error_degrees.get("measurement"))]
+    rotation = rotation_residuals.size > 0
+    if rotation:
+        num_used = jnp.sum(rotation_residuals != 0)
+        tested.append((rotation_residuals, num_used, error_degrees.get("rotation")))
+    goodness = goodness_of_fit(tested, degrees_of_freedom, errors_known=error is not None)
     scale = jax.jacfwd(parameters.estimates)(flat)
-    gain = scale @ jnp.asarray(found.gain)
-    gas, rotation = parameters.gas(flat), of_rotation.size > 0
-    slope, changes = parameter_effects(gas, priors, found.computed, rotation)
+    gain = scale @ jnp.asarray(search.gain)
+    gas = parameters.gas(flat)
+    slope, changes = parameter_effects(gas, priors, search.computed, rotation)
     shares = gain * (scatter if error is None else jnp.asarray(error)[None])
-    measured = chance.inflation * _of_errors(shares, of_T, used)
-    covariances = {"measurement": measured, "simulation": scale @ found.noise_covariance @ scale.T}
+    measured = goodness.inflation * _measurement_covariance(shares, residuals, used)
+    covariances = {"measurement": measured, "simulation": scale @ search.noise_covariance @ scale.T}
     covariances |= {name: gain @ x @ x.T @ gain.T for name, x in changes.items()}
     delays = -gain * slope[None]
     return Fit(
@@ -393,30 +231,215 @@ def _fit_of(
         gain=gain[:, :num_times],
         clock_gain=sum(jnp.split(delays, slope.size // num_times, axis=1), start=jnp.zeros(())),
         sensitivity=sensitivity,
-        extrapolation=scale @ jnp.asarray(found.extrapolation),
+        extrapolation=scale @ jnp.asarray(search.extrapolation),
         start=parameters.estimates(first),
         gas=gas,
         start_time=jnp.zeros(()),
         priors=priors,
-        curve=found.computed,
+        curve=search.computed,
         weights=weights[:num_times],
-        residuals=of_T,
+        residuals=residuals,
         displacement_residuals=None,
-        rotation_residuals=of_rotation if of_rotation.size else None,
+        rotation_residuals=rotation_residuals if rotation else None,
         scatter=scatter,
-        chi2=chance.chi2,
+        chi2=goodness.chi2,
         degrees_of_freedom=degrees_of_freedom,
-        reduced_chi2=chance.reduced,
-        p_value=chance.p_value,
-        iterations=jnp.asarray(found.num_simulations),
-        converged=jnp.asarray(found.converged),
+        reduced_chi2=goodness.reduced,
+        p_value=goodness.p_value,
+        iterations=jnp.asarray(search.num_simulations),
+        converged=jnp.asarray(search.converged),
     )
 
 
-def _of_errors(
+def _measurement_covariance(
     shares: Float[Array, "p points"], residuals: Float[Array, "times"], used: Bool[Array, "times"]
 ) -> Float[Array, "p p"]:
-    """Covariance by errors of T, with that of neighbouring ones, and of T_rot, if it was used."""
+    """Covariance by the errors of T, which may be correlated, and by those of T_rot if used."""
     factor = correlation_factor(neighbour_correlation(residuals, used)) ** 2
     by_T, by_rotation = shares[:, : residuals.size], shares[:, residuals.size :]
     return factor * by_T @ by_T.T + by_rotation @ by_rotation.T
+
+
+class _Simulation(NamedTuple):
+    """One simulation at some parameters, at the used points."""
+
+    flat: Float[np.ndarray, "p"]
+    values: Float[np.ndarray, "used"]
+    slope: Float[np.ndarray, "used p"]  # derivative of the values
+    deviation: Float[np.ndarray, "replicas used"]  # values of each replica minus their mean
+    variance: Float[np.ndarray, "used"]  # variance of the mean over replicas
+
+
+class _Average(NamedTuple):
+    """Estimate from the mean of simulations near each other."""
+
+    flat: Float[np.ndarray, "p"]
+    sigma: Float[np.ndarray, "used"]  # standard error of each residual; 1 if errors are unknown
+    gain: Float[np.ndarray, "p used"]  # derivative of `flat` in the measured values
+    error_covariance: Float[np.ndarray, "p p"]  # of `flat`, by the errors of the measurement
+    noise_covariance: Float[np.ndarray, "p p"]  # of `flat`, by the noise of the simulations
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "p p"]:
+        return self.error_covariance + self.noise_covariance
+
+
+def search_by_simulation(
+    simulate: Callable[[Array, int], CoolingCurve],
+    first: Float[np.ndarray, "p"],
+    measured: Float[np.ndarray, "points"],
+    error: Float[np.ndarray, "points"],
+    used: Bool[np.ndarray, "points"],
+    *,
+    rotation: bool = False,
+    resolution: float,
+    max_simulations: int,
+    progress: bool,
+) -> SearchResult:
+    """Search by Gauss-Newton steps, each on one simulation and its derivatives.
+
+    Each simulation has different random numbers. The simulations within `AVERAGING_DISTANCE` of the
+    last one give independent Gauss-Newton estimates; their mean is the result. Residuals are
+    weighted by the measured error and the noise of the mean of these simulations, or equally if no
+    error is known. The noise of the result is estimated from the changes that single replicas
+    would make to it. The search ends when a step is below `AVERAGING_DISTANCE` and the noise is
+    below `MAX_NOISE_SHARE` of the standard error.
+
+    `jaxgran.fit` describes the effect of biased derivatives.
+
+    Args:
+        simulate: function of the parameters and of a number that differs between simulations;
+            returns a cooling curve with replicas.
+        first: the initial guess.
+        measured, error: values of `log_temperatures` and their standard errors, which are all 0 if
+            they are not known.
+        used: True for points that have a weight.
+        rotation: True if T_rot is used too.
+        resolution: ratio to the largest singular value of the sensitivity below which singular
+            values are ignored: the parameters do not change in those directions.
+        max_simulations: maximum number of simulations.
+        progress: show a progress bar.
+    """
+    flat, measured, error = np.asarray(first, float), measured[used], error[used]
+    known, simulations = bool(error.any()), []
+    hidden = None if progress else True  # None hides the bar where there is no terminal
+    with tqdm(total=max_simulations, disable=hidden, desc="fit", unit="simulation") as bar:
+        while True:
+            simulation, curve = _run_simulation(simulate, flat, len(simulations), used, rotation)
+            simulations.append(simulation)
+            near = [s for s in simulations if np.abs(s.flat - flat).max() < AVERAGING_DISTANCE]
+            average = _average(near, measured, error if known else None, resolution)
+            step = average.flat - flat
+            step *= min(1.0, MAX_STEP / max(np.abs(step).max(), 1e-300))
+            converged = bool(np.abs(step).max() < AVERAGING_DISTANCE)
+            flat = flat + step
+            variance = np.diag(average.covariance)
+            low_noise = np.all(np.diag(average.noise_covariance) <= MAX_NOISE_SHARE**2 * variance)
+            in_errors = np.abs(step / np.sqrt(variance)).max()
+            bar.update()
+            bar.set_postfix_str(f"last step {in_errors:.2g} standard errors")
+            ended = converged and len(near) > 1 and (low_noise or not known)
+            if ended or len(simulations) == max_simulations:
+                break
+    weights, residuals, sensitivity = _residuals_at(flat, near, measured, average.sigma, used)
+    gain = np.zeros((len(flat), len(used)))
+    gain[:, used] = average.gain
+    return SearchResult(
+        flat=flat,
+        computed=curve,
+        weights=weights,
+        residuals=residuals,
+        sensitivity=sensitivity,
+        extrapolation=flat - np.mean([s.flat for s in near], axis=0),
+        gain=gain,
+        noise_covariance=average.noise_covariance,
+        num_simulations=len(simulations),
+        converged=converged,
+    )
+
+
+def _run_simulation(
+    simulate: Callable[[Array, int], CoolingCurve],
+    flat: Float[np.ndarray, "p"],
+    number: int,
+    used: Bool[np.ndarray, "points"],
+    rotation: bool,
+) -> tuple[_Simulation, CoolingCurve]:
+    """Run one simulation with its derivatives; return it and its curve."""
+
+    def values_of(flat):
+        curve = simulate(flat, number)
+        value = log_temperatures(curve, rotation)
+        return value, (value, curve)
+
+    slope, (value, curve) = jax.jacfwd(values_of, has_aux=True)(jnp.asarray(flat))
+    replicas: Any = curve.replicas  # checked by the caller
+    replica_values = np.asarray(log_temperatures(replicas, rotation))
+    # T and T_rot are split, because the variance is averaged over neighbouring times.
+    parts = np.split(replica_values, 1 + rotation, axis=1), np.split(used, 1 + rotation)
+    used_values = [part[:, used_part] for part, used_part in zip(*parts, strict=True)]
+    deviations = [part - part.mean(axis=0) for part in used_values]
+    variance = np.concatenate([_variance_of_mean(part) for part in deviations])
+    value, slope = np.asarray(value)[used], np.asarray(slope)[used]
+    return _Simulation(flat, value, slope, np.concatenate(deviations, axis=1), variance), curve
+
+
+def _average(
+    near: list[_Simulation],
+    measured: Float[np.ndarray, "used"],
+    error: Float[np.ndarray, "used"] | None,
+    resolution: float,
+) -> _Average:
+    """Return the mean of the Gauss-Newton estimates of some simulations.
+
+    Args:
+        near: the simulations, the newest one last.
+        measured, error: the values and their standard errors, None if these are not known.
+        resolution: see `search_by_simulation`.
+    """
+    noise = np.sqrt(np.mean([s.variance for s in near], axis=0) / len(near))
+    sigma = np.ones_like(measured) if error is None else np.hypot(error, noise)
+    estimates, noise_covariances = [], []
+    for simulation in near:
+        sensitivity = simulation.slope / sigma[:, None]
+        inverse = np.linalg.pinv(sensitivity, rcond=resolution)
+        estimates.append(simulation.flat + inverse @ ((measured - simulation.values) / sigma))
+        replicas = len(simulation.deviation)
+        shift = (simulation.deviation / sigma) @ inverse.T / (replicas * (replicas - 1)) ** 0.5
+        noise_covariances.append(shift.T @ shift)
+    # The errors of the measurement are common to all estimates: the newest simulation gives them.
+    newest = near[-1].slope / sigma[:, None]
+    gain = np.linalg.pinv(newest, rcond=resolution) / sigma
+    share = gain * (np.ones_like(sigma) if error is None else error)
+    noise_covariance = np.mean(noise_covariances, axis=0) / len(near)
+    return _Average(np.mean(estimates, axis=0), sigma, gain, share @ share.T, noise_covariance)
+
+
+def _variance_of_mean(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:
+    """Variance of the mean over replicas, averaged over neighbouring times."""
+    replicas, num_times = deviation.shape
+    variance = np.sum(deviation**2, axis=0) / (replicas * (replicas - 1))
+    window = np.ones(min(NOISE_WINDOW, num_times))
+    num_averaged = np.convolve(np.ones(num_times), window, "same")
+    return np.convolve(variance, window, "same") / num_averaged
+
+
+def _residuals_at(
+    flat: Float[np.ndarray, "p"],
+    near: list[_Simulation],
+    measured: Float[np.ndarray, "used"],
+    sigma: Float[np.ndarray, "used"],
+    used: Bool[np.ndarray, "points"],
+) -> tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"], Float[np.ndarray, "points p"]]:
+    """Return weights, weighted residuals and their derivative at the estimate.
+
+    The residuals are extrapolated from each simulation and averaged.
+    """
+    differences = [measured - s.values - s.slope @ (flat - s.flat) for s in near]
+    slope = np.mean([s.slope for s in near], axis=0)
+    weights, residuals = np.zeros(len(used)), np.zeros(len(used))
+    sensitivity = np.zeros((len(used), len(flat)))
+    weights[used] = 1 / sigma
+    residuals[used] = np.mean(differences, axis=0) / sigma
+    sensitivity[used] = slope / sigma[:, None]
+    return weights, residuals, sensitivity

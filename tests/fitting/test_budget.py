@@ -9,7 +9,11 @@ import pytest
 
 import jaxgran
 from experiments.support.scenes import beads as beads_of
-from jaxgran.fitting.error_budget import bias_of_slope, describe_slope_bias, with_scene_errors
+from jaxgran.fitting.error_budget import (
+    describe_derivative_bias,
+    mean_derivative_bias,
+    with_scene_errors,
+)
 from jaxgran.models.choose import error_model_of
 from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
@@ -141,7 +145,7 @@ def test_a_prior_counts_in_a_curve_without_errors():
         ({"phi": (0.05, 0.01)}, "priors: no float 'phi' in this gas; it has .*, and density"),
         ({"packing_fraction": 0.05}, r"priors: packing_fraction needs \(value, standard error\)"),
         ({"packing_fraction": (0.05, -0.01)}, "standard error of packing_fraction must lie in"),
-        ({"packing_fraction": (0.05, 0.0)}, "Leave out what is known exactly"),
+        ({"packing_fraction": (0.05, 0.0)}, "Leave out values that are known exactly"),
         ({"packing_fraction": (1.5, 0.1)}, "priors: packing_fraction must lie in"),
         ({"dissipative_constant": (0.0, 1e-7)}, "lies on the end of its range"),
     ],
@@ -228,24 +232,26 @@ def test_a_diagnosis_tells_the_bias_of_the_derivatives():
     weights = result.sensitivity[:, 0] ** 2
     expected = float(jnp.sum(weights * bias) / jnp.sum(weights))
     assert 0.1 < expected < 0.3
-    assert bias_of_slope(fitted) == pytest.approx(expected, rel=1e-12)
+    assert mean_derivative_bias(fitted) == pytest.approx(expected, rel=1e-12)
     whole = with_scene_errors(fitted, 500, 1)
     assert relative(whole, "slope") == pytest.approx(
         relative(fitted, "measurement") * np.sqrt((1 + expected) ** 2 - 1), rel=1e-9
     )
-    (words,) = describe_slope_bias(fitted)
+    (words,) = describe_derivative_bias(fitted)
     assert f"{100 * expected:.2g} %" in words and "25 % of the energy" in words
     assert "HardSpheres(..., differences=0.3)" in words
     assert words in jaxgran.diagnose(fitted, curve).reasons
     unbiased = dataclasses.replace(fitted, curve=dataclasses.replace(ran, derivative_bias=0 * bias))
-    assert not list(describe_slope_bias(unbiased)) and not list(describe_slope_bias(result))
+    assert not list(describe_derivative_bias(unbiased)) and not list(
+        describe_derivative_bias(result)
+    )
     # Without the energy of a flow, by the course of the gas: of differences their noise.
     unknown = dataclasses.replace(ran, derivative_bias=None)
     noisy = dataclasses.replace(
         fitted, curve=unknown, model=jaxgran.HardSpheres(50, replicas=2, differences=0.1)
     )
-    (words,) = describe_slope_bias(noisy)
-    assert "differences of runs, have a noise of" in words
+    (words,) = describe_derivative_bias(noisy)
+    assert "differences of runs, with an estimated noise of" in words
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""What a fit means, in words."""
+"""Diagnosis of a fit in words."""
 
 import dataclasses
 import re
@@ -22,7 +22,7 @@ def test_a_search_that_was_cut_short_is_said_to_be():
     assert not bool(result.converged)
     diagnosis = jaxgran.diagnose(result, curve)
     assert not diagnosis.explains and "did not converge" in diagnosis.verdict
-    assert any("more max_steps" in reason for reason in diagnosis.reasons)
+    assert any("increase max_steps" in reason for reason in diagnosis.reasons)
 
 
 @pytest.mark.slow
@@ -41,29 +41,29 @@ def test_dense_measured_curve_is_not_explained():
         assert word in text
 
 
-def test_a_good_scene_omits_nothing():
+def test_a_valid_scene_has_no_limitations():
     gas = glass_beads(0.09)
     for model in default_models(4000):
         assert model.limitations(gas, 4000) == ()
 
 
-def test_every_model_says_what_it_omits():
+def test_every_model_has_limitations_in_a_dense_scene():
     gas, _, a, n, _ = measured("dense")
     gas = gas.replace(dissipative_constant=a)
     theory, dsmc, hard, soft = (model.limitations(gas, n) for model in default_models(n))
-    assert [omission.decisive for omission in theory] == [True, True, False]
+    assert [limitation.decisive for limitation in theory] == [True, True, False]
     assert "softness correction" in theory[1].words and "above L_c" in theory[2].words
     assert dsmc[2] == theory[2] and "instantaneous impacts leave out" in dsmc[1].words
     assert hard == dsmc[:2] and soft == ()
 
 
 class Stub(jaxgran.KineticTheory):
-    """Kinetic theory that says to omit what it is told."""
+    """Kinetic theory with given limitations."""
 
-    told: tuple[Limitation, ...] = ()
+    given: tuple[Limitation, ...] = ()
 
     def limitations(self, gas, num_particles=None):
-        return self.told
+        return self.given
 
 
 EDGE = Limitation("the gas is dense", False, "Take positions.")
@@ -73,13 +73,13 @@ NOT_EXPLAINED = "Stub does not explain this curve: do not trust its estimates."
 
 
 @pytest.mark.parametrize(
-    "omissions, p_value, explains, verdict",
+    "limitations, p_value, explains, verdict",
     [
         (
             (),
             GOOD,
             True,
-            # The clock is known to .5 %: no rival changes A by more than its error.
+            # The clock is known to .5 %: no alternative changes A by more than its error.
             r"Stub is compatible with this curve\.",
         ),
         (
@@ -101,10 +101,12 @@ NOT_EXPLAINED = "Stub does not explain this curve: do not trust its estimates."
 )
 def test_verdicts(result, limitations, p_value, explains, verdict):
     fitted, curve = result
-    fitted = dataclasses.replace(fitted, model=Stub(told=limitations), p_value=jnp.asarray(p_value))
+    fitted = dataclasses.replace(
+        fitted, model=Stub(given=limitations), p_value=jnp.asarray(p_value)
+    )
     diagnosis = jaxgran.diagnose(fitted, curve)
     assert diagnosis.explains == explains and re.fullmatch(verdict, diagnosis.verdict)
-    assert {omission.words for omission in limitations} <= set(diagnosis.reasons)
+    assert {limitation.words for limitation in limitations} <= set(diagnosis.reasons)
 
 
 @pytest.fixture(scope="module")

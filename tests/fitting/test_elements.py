@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.residuals import clock_of_few
+from jaxgran.fitting.residuals import finite_size_cooling_factor
 from tests.beads import glass_beads
 
 THEORY = jaxgran.KineticTheory()
@@ -69,7 +69,7 @@ def test_roughness_and_A_are_found_together(model):
     assert "model of T_rot" in result.error_budget
     said = " ".join(jaxgran.diagnose(result, curve).reasons)
     assert "rough spheres of constant beta_t, far from walls" in said
-    assert "not looked for beside tangential_restitution" in said
+    assert "loss terms were not tested: tangential_restitution" in said
 
 
 def test_of_two_minima_in_beta_t_the_deeper_one_is_found_and_said_where_as_deep():
@@ -85,12 +85,12 @@ def test_of_two_minima_in_beta_t_the_deeper_one_is_found_and_said_where_as_deep(
     assert np.ptp(result.minima.chi2) > 9.0
     gas = gas.replace(tangential_restitution=-0.42)
     curve = measured(gas, error=0.05)
-    with pytest.warns(UserWarning, match="chi.2 has another minimum as good, at dissipative"):
+    with pytest.warns(UserWarning, match="chi.2 has another, equally good minimum at dissipative"):
         result = jaxgran.fit(other, curve, free=names)
     assert float(result.degenerate_solutions()[0, 0] / result.estimate[0]) < 0.7
     found = jaxgran.diagnose(result, curve)
     assert not found.explains and "Other parameters fit this curve as well" in found.verdict
-    assert any("has another minimum as good" in reason for reason in found.reasons)
+    assert any("has another, equally good minimum" in reason for reason in found.reasons)
 
 
 def test_a_T_rot_that_theory_misses_as_a_whole_is_no_misfit():
@@ -142,14 +142,14 @@ def test_A_is_right_where_the_scene_is_known(elements):
 
 
 @pytest.mark.slow
-def test_rivals_know_the_elements_of_the_scene():
+def test_alternatives_know_the_elements_of_the_scene():
     gas = dataclasses.replace(glass_beads(), container=jaxgran.Walls(0.05, restitution=0.8))
     curve = measured(gas)
     result = jaxgran.fit(gas, curve, free=("dissipative_constant", "temperature"))
     diagnosis = jaxgran.diagnose(result, curve)
-    assert not any(rival.preferred for rival in diagnosis.alternatives)
-    names = [rival.name for rival in diagnosis.alternatives]
-    assert "a further loss at constant eps, as of rough grains" in names
+    assert not any(x.preferred for x in diagnosis.alternatives)
+    names = [alternative.name for alternative in diagnosis.alternatives]
+    assert "an additional loss at constant eps, as by rough grains" in names
     low, high = diagnosis.ranges["dissipative_constant"]
     assert low < float(gas.value("dissipative_constant")) < high
 
@@ -164,6 +164,13 @@ def test_a_measured_T_rot_of_smooth_spheres_is_said_to_be_unused(beads):
 def test_between_walls_few_particles_have_all_their_energy_in_T():
     # Without walls N particles of no momentum are hotter by N/(N - 1), and cool faster.
     count = jnp.asarray(50.0)
-    assert float(clock_of_few(glass_beads(), count)) == pytest.approx(1 + 0.6 / 50, rel=2e-3)
+    assert float(finite_size_cooling_factor(glass_beads(), count)) == pytest.approx(
+        1 + 0.6 / 50, rel=2e-3
+    )
     walls = jaxgran.Walls(0.05, restitution=0.9)
-    assert float(clock_of_few(dataclasses.replace(glass_beads(), container=walls), count)) == 1.0
+    assert (
+        float(
+            finite_size_cooling_factor(dataclasses.replace(glass_beads(), container=walls), count)
+        )
+        == 1.0
+    )

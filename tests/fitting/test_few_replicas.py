@@ -7,7 +7,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting.residuals import runs_test, smooth_errors
-from jaxgran.fitting.result import misfit
+from jaxgran.fitting.result import goodness_of_fit
 from tests.beads import glass_beads
 from tests.fitting.curves import synthetic
 
@@ -60,7 +60,7 @@ def p_values(smoothed):
             curve, degrees = smooth_errors(curve, R)
         residuals = (curve.temperature - 1) / curve.temperature_error
         tested = [(residuals, jnp.asarray(N), degrees.get("measurement"))]
-        found.append(float(misfit(tested, jnp.asarray(N), errors_known=True).p_value))
+        found.append(float(goodness_of_fit(tested, jnp.asarray(N), errors_known=True).p_value))
     return np.array(found)
 
 
@@ -116,4 +116,4 @@ def test_runs_are_told():
     diagnosis = jaxgran.diagnose(jaxgran.fit(gas, waved), waved)
     assert diagnosis.explains and diagnosis.verdict.endswith("come in runs of one sign.")
     assert diagnosis.runs_p_value < 1e-3
-    assert any("residuals change their sign seldom" in reason for reason in diagnosis.reasons)
+    assert any("residuals rarely change sign" in reason for reason in diagnosis.reasons)

@@ -282,11 +282,11 @@ def test_a_rotation_that_is_not_used_is_said():
     T = jnp.geomspace(0.01, 0.001, 8)
     bare = jaxgran.CoolingCurve(jnp.arange(1.0, 9.0), T, rotational_temperature=0.1 * T)
     assert "no surface" in str(unused_rotation(gas, bare))
-    assert "for want of T_err and T_rot_err" in str(unused_rotation(rough, bare))
+    assert "its weights need T_err and T_rot_err" in str(unused_rotation(rough, bare))
     known = dataclasses.replace(
         bare, temperature_error=0.1 * T, rotational_temperature_error=0.1 * T
     )
     assert unused_rotation(rough, known) is None
     # Said before a long search.
-    with pytest.warns(UserWarning, match="for want of T_err"), pytest.raises(ValueError):
+    with pytest.warns(UserWarning, match="its weights need T_err"), pytest.raises(ValueError):
         jaxgran.fit(rough, bare, method="none")

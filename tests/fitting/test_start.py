@@ -79,7 +79,7 @@ def test_a_gas_begun_before_the_file_is_found(measured):
 
 
 def fitted_together(gas, curve, name):
-    with pytest.warns(UserWarning, match="temperature and t0: .*a gas forgets how hot it began"):
+    with pytest.warns(UserWarning, match="temperature and t0: .*a cooling gas forgets its initial"):
         both = jaxgran.fit(gas, curve, free=(name, "temperature", "t0"))
     assert both.undetermined() == ("temperature", "t0") and bool(both.converged)
     assert repr(both).count("not determined") == 2

@@ -1,4 +1,4 @@
-"""What else could have made a curve, and what A then is."""
+"""Alternative explanations of a curve, and the range of A over them."""
 
 import dataclasses
 
@@ -30,10 +30,10 @@ def curve_of(rates_of, floor=0.0, *, errors=True, seed=0):
 
 
 CASES = [
-    # what the curve contains, noise floor, true A over 3e-6, words, whether it must be noticed
+    # content of the curve, noise floor, true A over 3e-6, words, True if it must be noticed
     ("nothing", closed_curves.nothing, 0.0, 1.0, "", False),
     ("rough", closed_curves.rough(-0.5), 0.0, 1.0, "constant eps", False),
-    ("very rough", closed_curves.rough(0.0), 0.0, 1.0, "rough grains, at rest", False),
+    ("very rough", closed_curves.rough(0.0), 0.0, 1.0, "rough grains without", False),
     ("walls", closed_curves.walls(0.8), 0.0, 1.0, "constant eps", False),
     # No A at all: any small one must be left possible.
     ("constant", closed_curves.constant(0.8), 0.0, 0.05, "constant eps", True),
@@ -59,22 +59,25 @@ def test_the_range_contains_the_truth(rates_of, floor, true, words, noticed, err
     said = " ".join([diagnosis.verdict, *diagnosis.reasons])
     assert words in said and "equal, smooth spheres, far from walls, in vacuum" in said
     if noticed:
-        assert not diagnosis.explains and f"asks for {diagnosis.alternatives[0].name}" in said
+        assert (
+            not diagnosis.explains
+            and f"prefer a model with {diagnosis.alternatives[0].name}" in said
+        )
     if words == "":
         # 0.46 here, 0.41 without errors: what a constant loss leaves open at 3 % noise.
         assert diagnosis.explains and high - low < 0.8
 
 
-def test_a_loss_that_is_not_told_apart_makes_a_an_upper_bound():
+def test_a_loss_that_is_not_distinguishable_makes_a_an_upper_bound():
     gas, curve = curve_of(closed_curves.walls(0.8))
     result = jaxgran.fit(gas, curve, free=FREE)
-    found = {rival.name: rival for rival in compare_alternatives(result, curve)}
-    loss = next(rival for name, rival in found.items() if "constant eps" in name)
+    alternatives = compare_alternatives(result, curve)
+    loss = next(x for x in alternatives if "constant eps" in x.name)
     assert not loss.distinguishable and loss.error_reduction_needed > 2
     # The fit alone is wrong by many of its standard errors.
     a, error = result.value("dissipative_constant")
     assert (a - closed_curves.TRUE_A) / error > 10
-    low, high = ranges_over_alternatives(result, tuple(found.values()))["dissipative_constant"]
+    low, high = ranges_over_alternatives(result, alternatives)["dissipative_constant"]
     assert low[0] <= loss.low[0] < 0.7 * a < a < high[0]
 
 
@@ -108,7 +111,7 @@ def test_many_points_of_displacement_do_not_hide_a_misfit_of_temperature():
 
 
 @pytest.mark.slow
-def test_a_gas_that_does_not_cool_has_no_rivals():
+def test_a_gas_that_does_not_cool_has_no_alternatives():
     gas = glass_beads(0.0)
     times = np.geomspace(1.0, 10.0, 8)
     curve = jaxgran.CoolingCurve(
@@ -130,7 +133,7 @@ def test_noise_of_simulations_widens_the_range():
         ranges_over_alternatives(fit, compare_alternatives(fit, curve))["dissipative_constant"]
         for fit in (result, noisy)
     )
-    # Beside it the fit's own error, 2 %, is small; low itself is of another amplitude.
+    # The error of the fit without this noise, 2 %, is small; low is at another amplitude.
     np.testing.assert_allclose(higher - result.estimate[0], 1.96 * noise[0], rtol=0.1)
     assert lower < low - noise[0] and higher > high + noise[0]
 
@@ -149,5 +152,5 @@ def test_both_precisions_in_one_process():
             found[x64] = ranges_over_alternatives(result, compare_alternatives(result, curve))[
                 "dissipative_constant"
             ]
-    # Float32 moves a profile's search by a part of its grid in the amplitude.
+    # Float32 moves the limits by a part of the grid in the amplitude.
     np.testing.assert_allclose(found[False], found[True], rtol=0.02)
