@@ -34,51 +34,39 @@ from jaxgran.theory.equations import element_rates, scene_at_start
 PREFERRED_CHI2 = 6.63
 """Decrease of chi^2 above which the data prefer an alternative (1 % by chance)."""
 
-
 ALLOWED_CHI2 = 3.84
 """Increase of chi^2 over its minimum up to which an amplitude is allowed (5 % by chance)."""
 
-
 DISTINGUISHABLE_SHARE = 0.1
 """Relative change of an estimate below which an allowed alternative is negligible."""
-
 
 SHARES = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97, 0.995)
 """Amplitudes of an added loss, as shares of the initial cooling rate, and of a noise floor, as
 shares of the last temperature."""
 
-
 DRAG_SHARES = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
 """Amplitudes of drag, as shares of the initial cooling rate; its share grows as the gas cools."""
-
 
 ROUGHNESS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 1.9)
 """Values of 1 + beta_t of rough spheres."""
 
-
 DELAYS = (0.003, 0.01, 0.03, 0.1, 0.3, -0.001, -0.003, -0.01, -0.03, -0.1, -0.3)
 """Errors of the start of the clock, over the initial cooling time."""
-
 
 EXTRA_DECADES = (0.5, 1.0, 2.0, 3.0)
 """Numbers of further decades of T that are tried to distinguish alternatives."""
 
-
 MAX_STEPS = 30
 """Maximum number of iterations of each search."""
-
 
 NUM_NODES = 192
 """Number of temperatures in the table of T(t)."""
 
-
 NUM_RATE_NODES = 20
 """Number of temperatures at which the cooling rate is computed; ln rate is a polynomial of ln T."""
 
-
 NUM_RELAXATION_STEPS = 3
 """Number of Newton steps for the value to which a_2 relaxes."""
-
 
 Kind = tuple[str, str, tuple[float, ...]]
 """Name of an alternative, its field of `AddedTerms`, and its amplitudes."""

@@ -36,16 +36,13 @@ from jaxgran.scene.gas import Gas
 MAX_SCATTER = 0.3
 """Relative scatter of T about a model above which it does not explain a curve without errors."""
 
-
 SYSTEMATIC_CORRELATION = 3.0
 """Correlation of neighbouring residuals, in standard errors for independent ones, above which a
 model does not explain a curve without errors."""
 
-
 MIN_RUNS_P_VALUE = 0.00135
 """p-value of the runs of one sign, that of 3 standard errors, below which a model does not explain
 a curve without errors."""
-
 
 NEGLIGIBLE_SHARE = 0.01
 """Share of an estimate below which the low end of a range counts as 0."""

@@ -44,7 +44,6 @@ from jaxgran.scene.gas import Gas
 MAX_JOINT_STEPS = 100
 """Maximum number of iterations of a joint fit."""
 
-
 START_TIME_PRIOR = 1.0
 """Standard error of the prior of t0 where T_0 is free too, over the time in which T halves."""
 

@@ -25,17 +25,14 @@ from jaxgran.scene.gas import Gas
 CONVERGED_STEP = 0.01
 """Length of a Gauss-Newton step, in standard errors, below which a search has converged."""
 
-
 TOLERANCE = 1e-7
 """Relative and absolute tolerance of the minimisers, for the parameters and the objective."""
-
 
 Residuals = Callable[[Float[Array, "p"]], Float[Array, "residuals"]]
 
 
 Minimum = tuple[Float[Array, "p"], Int[Array, ""], Bool[Array, ""]]
 """Parameters at the end of a search, the number of iterations, and True if it converged."""
-
 
 Search = Callable[[Residuals, Float[Array, "p"], int], Minimum]
 

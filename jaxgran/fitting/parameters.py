@@ -20,10 +20,8 @@ START_TIME = "t0"
 """Name of the time, on the clock of the measurement, at which the gas had its temperature T_0 and
 began to cool: the only free parameter that is not a float of a gas."""
 
-
 DENSITY = "density"
 """Name of a prior that is not of a float of a gas: the mass over the volume of a sphere."""
-
 
 ANY_TIME = Domain()
 

@@ -28,7 +28,6 @@ from jaxgran.scene.gas import Gas
 MAGNITUDES = 1e-30, 1e30
 """Smallest and largest allowed values of a measurement, SI."""
 
-
 MIN_ERROR = 1e-12
 """Smallest allowed relative error of a measurement."""
 
@@ -394,10 +393,8 @@ def _log_ratio(
 MIN_RESIDUALS = 4
 """Minimum number of residuals for an estimate of their correlation."""
 
-
 OUTLIER_DISTANCE = 3.0
 """Distance from the median, in standard deviations, beyond which a residual is clipped."""
-
 
 MAX_CORRELATION = 0.95
 """Largest magnitude of an estimated correlation."""
@@ -479,10 +476,8 @@ REPLICA_QUANTITIES = {
 }
 """Fields of a curve that have errors, by the names of `Comparison.weights`."""
 
-
 MIN_POINTS_PER_COEFFICIENT = 6
 """Minimum number of points for each coefficient of the polynomial of `smooth_errors`."""
-
 
 NUM_SMOOTHING_STEPS = 60
 """Iterations of the fit of that polynomial; a step is at most 1 in the logarithm of a variance."""

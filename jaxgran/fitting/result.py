@@ -19,10 +19,8 @@ from jaxgran.scene.gas import FLOAT_UNITS, Gas
 DEGENERATE_CHI2 = 9.0
 """Difference of chi^2 up to which two minima are equally good: three standard errors."""
 
-
 MULTIMODAL_PARAMETER, MULTIMODAL_STARTS = "tangential_restitution", (-0.6, 0.0, 0.6)
 """Parameter in which chi^2 has several minima if T_rot is measured, and its start values."""
-
 
 SIGNIFICANCE = 0.01
 """Level of significance of the chi^2 test: a model with a smaller p-value is rejected."""

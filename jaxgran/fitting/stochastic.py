@@ -34,14 +34,11 @@ from jaxgran.scene.gas import Gas
 MAX_STEP = 0.7
 """Longest Gauss-Newton step of a parameter in the unconstrained scale: a factor of two."""
 
-
 AVERAGING_DISTANCE = 0.1
 """Distance of each parameter, in the unconstrained scale, within which simulations are averaged."""
 
-
 MAX_NOISE_SHARE = 0.5
 """Share of the standard error up to which the noise needs no further simulations."""
-
 
 NOISE_WINDOW = 9
 """Number of neighbouring times over which the variance between replicas is averaged."""
