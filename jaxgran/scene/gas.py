@@ -66,7 +66,6 @@ FLOAT_UNITS = {
 }
 """Unit of each float of a gas that has one."""
 
-
 S = TypeVar("S", bound="NamedFloats")
 
 
@@ -114,7 +113,9 @@ class NamedFloats(eqx.Module):
         return reduce(getattr, fields[name].path, self)
 
     def replace(self: S, **values: UserNumber) -> S:
-        """Return a copy with new values of some floats: ``gas.replace(temperature=0.02)``.
+        """Return a copy with new values of some floats.
+
+        For example ``gas.replace(dissipative_constant=1e-6)``.
 
         Args:
             values: new values, by name of the float.
@@ -149,7 +150,7 @@ class NamedFloats(eqx.Module):
 if TYPE_CHECKING:
     UserLaw = RestitutionLaw
 else:
-    # A run-time type checker lets everything pass, so that a wrong type is reported in words.
+    # With `Any` a run-time type checker accepts all values; the converter reports wrong types.
     UserLaw = Any
 
 
