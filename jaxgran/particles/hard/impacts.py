@@ -1,20 +1,13 @@
-"""Execution of the impacts of hard spheres within one window of time.
+"""Hard spheres in reduced units, the effect of their impacts, and the impacts of a window of time.
 
 Units here: the diameter, the mass and the first temperature are 1. Times and positions count as in
 `jaxgran.particles.hard.prediction`: an impact changes both the velocity of a path and its position
-extrapolated back to the start of the window.
+extrapolated back to the start of the window. With drag, velocities, spins and time are transformed:
+see `jaxgran.particles.state`. Spins here are then the transformed ones, which drag does not change.
 
-A gas of hard spheres in reduced units.
-
-What impacts of hard spheres do, to each other and to walls.
-
-Units here: the diameter, the mass and the first temperature are 1. Where there is drag, velocities,
-spins and time are transformed: see `jaxgran.particles.state`.
-
-Tangents of hard spheres with elements: rough ones, between walls, with drag, driven.
-
-See `jaxgran.gradients.tangents`. What is followed at each impact is the energy that it exchanges, as
-a function of the numbers of the material and of the scale of all velocities and spins.
+For tangents see `jaxgran.gradients.tangents`. The tangents of a scene with elements follow the
+energy that each impact exchanges, as a function of the numbers of the material and of the scale of
+all velocities and spins.
 """
 
 from collections.abc import Callable
@@ -29,20 +22,20 @@ from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
 from jaxgran.particles.hard.prediction import (
     FirstImpacts,
     HardWalls,
-    Rows,
-    Selection,
-    Slots,
+    ImpactCandidates,
+    PairRows,
+    Paths,
     first_impacts,
 )
 from jaxgran.particles.state import DragDecay, TangentialImpulse, drag_decay, tangential_impulse
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, share_of_impacts
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
 from jaxgran.scene.gas import mean_loss
 from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedDrag, ReducedDrive, ReducedRough
 
 
-class Material(NamedTuple):
-    """The numbers of a scene with elements that derivatives are followed in.
+class HardMaterial(NamedTuple):
+    """Numbers of a scene with elements in which derivatives are taken.
 
     Attributes:
         law, surface, drag, drive: as in `HardScene`.
@@ -65,15 +58,16 @@ class HardScene(NamedTuple):
         side: of the periodic box.
         law: of restitution, for speeds in units of sqrt(2).
         collision_frequency: at T = 1.
-        contact_time: in mean free times; the impact of a sphere within this time of its last one
-            is elastic.
-        elastic: whether all impacts are, and smooth.
-        surface: of rough spheres; else None.
+        contact_time: in mean free times; the impact of a sphere within this time of its last one is
+            elastic.
+        elastic: whether all impacts are elastic and smooth.
+        surface: of rough spheres; None of smooth ones.
         walls: of a container; None where the box is periodic.
         drag: rates over the collision frequency; None in a vacuum. Time and velocities are then
             transformed, see `jaxgran.particles.state`.
         drive: growth of T over the collision frequency by white noise; None where there is none.
-        prepared: () where the gas begins in the steady state of such a drive; else None.
+        prepared: () where the gas begins in the steady state of such a drive; None where it does
+            not.
     """
 
     side: Float[Array, ""]
@@ -89,30 +83,30 @@ class HardScene(NamedTuple):
 
     @property
     def has_elements(self) -> bool:
-        """Whether there is more than smooth spheres in free flight."""
+        """True unless the scene has only smooth spheres in free flight."""
         return any(x is not None for x in (self.surface, self.walls, self.drag, self.drive))
 
     @property
-    def material(self) -> ReducedLaw | Material:
-        """The numbers that derivatives are followed in: those of the law, and of elements.
+    def material(self) -> ReducedLaw | HardMaterial:
+        """The numbers of the law and of the elements, in which derivatives are taken.
 
-        All are per collision, so that a denser gas does the same sooner.
+        All are per collision, so that in a denser gas the same happens sooner.
         """
         if not self.has_elements:
             return self.law
-        found = Material(self.law, self.surface, self.drag, self.drive, None, None, None)
+        material = HardMaterial(self.law, self.surface, self.drag, self.drive, None, None, None)
         if self.walls is None:
-            return found
+            return material
         _, law, beta, frequency = self.walls
-        return found._replace(wall_law=law, wall_beta=beta, wall_frequency=frequency)
+        return material._replace(wall_law=law, wall_beta=beta, wall_frequency=frequency)
 
     def log_loss(self, material: ReducedLaw) -> Float[Array, ""]:
-        """ln of ``I/(1 - I)`` with the share I of the normal energy that impacts take."""
+        """Return ln of ``I/(1 - I)``, I the share of normal energy that impacts dissipate."""
         lost = mean_loss(material, self.side)
         return jnp.log(lost) - jnp.log1p(-lost)
 
     def with_material(self, material: Any) -> "HardScene":
-        """The same scene with other numbers of its material."""
+        """Return this scene with other numbers of its material."""
         if not self.has_elements:
             return self._replace(law=material)
         walls = self.walls
@@ -128,21 +122,21 @@ class HardScene(NamedTuple):
             drive=material.drive,
         )
 
-    def by_impacts(self, elastic: bool) -> "HardScene":
-        """The scene of a melt, without drag and drive; with elastic and smooth impacts or not."""
+    def for_equilibration(self, elastic: bool) -> "HardScene":
+        """Return the scene without drag and drive; with elastic and smooth impacts or not."""
         drag = None if self.drag is None else ReducedDrag(*(0 * x for x in self.drag))
         drive = None if self.drive is None else ReducedDrive(0 * self.drive.strength)
         return self._replace(elastic=self.elastic | elastic, drag=drag, drive=drive)
 
     @property
     def decay_rates(self) -> ReducedDrag:
-        """The drag in the units of the scene's time."""
+        """Rates of drag in the units of the scene's time."""
         assert self.drag is not None
         rate, nu = self.drag, self.collision_frequency
         return ReducedDrag(rate.rate * nu, rate.rotational_rate * nu)
 
 
-class Impact(NamedTuple):
+class ImpactEvents(NamedTuple):
     """Spheres at impact, on others or on walls; rows without an impact have no meaning.
 
     Attributes:
@@ -150,8 +144,9 @@ class Impact(NamedTuple):
         normal: from the first sphere out into the second, or into the wall.
         relative: velocity of the first less that of the second, or of the sphere.
         speed: its normal part.
-        spin: sum of the spins that are kept, or the sphere's; None of smooth spheres.
-        elastic: the impact is elastic and smooth.
+        spin: sum of the (transformed) spins of both spheres, or that of the sphere; None of smooth
+            spheres.
+        elastic: whether the impact is elastic and smooth.
     """
 
     time: Float[Array, "rows"]
@@ -161,8 +156,8 @@ class Impact(NamedTuple):
     spin: Float[Array, "rows spins"] | None
     elastic: Bool[Array, "rows"]
 
-    def faster(self, velocity: Float[Array, ""], spin: Float[Array, ""]) -> "Impact":
-        """The same with all velocities and all spins greater by factors exp(...)."""
+    def scaled(self, velocity: Float[Array, ""], spin: Float[Array, ""]) -> "ImpactEvents":
+        """Return the impacts with all velocities and all spins multiplied by exp(...)."""
         factor = jnp.exp(velocity)
         return self._replace(
             relative=self.relative * factor,
@@ -171,14 +166,17 @@ class Impact(NamedTuple):
         )
 
 
-class Effect(NamedTuple):
-    """What impacts do to the first sphere; the second gets the opposite kick and the same twist.
+class ImpactEffect(NamedTuple):
+    """Effect of impacts on the first sphere.
+
+    The second sphere gets the opposite kick and the same change of spin.
 
     Attributes:
         kick: change of velocity.
         lost: translational energy lost, by each sphere half of what both lose.
-        twist: change of the spin that is kept; None of smooth spheres.
-        turned: gain of the energy of the spins that are kept, likewise; None of smooth spheres.
+        spin_change: change of the (transformed) spin; None of smooth spheres.
+        rotational_gain: gain of the energy of these spins, half of it for each sphere; None of
+            smooth spheres.
     """
 
     kick: Float[Array, "rows d"]
@@ -187,82 +185,90 @@ class Effect(NamedTuple):
     rotational_gain: Float[Array, "rows"] | None = None
 
 
-def pair_effect(scene: HardScene, impact: Impact) -> Effect:
-    """The effect of impacts of two spheres, see `jaxgran.Rough`."""
-    left = None if scene.drag is None else drag_decay(scene.decay_rates, impact.time)
-    eps = _restitution(scene, impact, left)
+def pair_effect(scene: HardScene, impact: ImpactEvents) -> ImpactEffect:
+    """Return the effect of impacts of two spheres, see `jaxgran.Rough`."""
+    decay = None if scene.drag is None else drag_decay(scene.decay_rates, impact.time)
+    eps = _restitution(scene, impact, decay)
     kick = (-0.5 * (1 + eps) * impact.speed)[:, None] * impact.normal
-    effect = Effect(kick, 0.125 * (1 - eps * eps) * impact.speed**2)
+    effect = ImpactEffect(kick, 0.125 * (1 - eps * eps) * impact.speed**2)
     if scene.surface is None or impact.spin is None:
         return effect
-    return _with_tangential(
-        effect, impact, left, scene.surface.eta, scene.surface.inertia, shares=2
+    return _add_tangential_impulse(
+        effect, impact, decay, scene.surface.eta, scene.surface.inertia, num_spheres=2
     )
 
 
-def wall_effect(scene: HardScene, impact: Impact, axis: Int[Array, "rows"]) -> Effect:
-    """The effect of impacts on the walls across an axis, whose law is that of `HardWalls`."""
+def wall_effect(scene: HardScene, impact: ImpactEvents, axis: Int[Array, "rows"]) -> ImpactEffect:
+    """Return the effect of impacts on the walls across an axis, whose law is that of
+    `HardWalls`."""
     walls, surface = scene.walls, scene.surface
     assert walls is not None
-    left = None if scene.drag is None else drag_decay(scene.decay_rates, impact.time)
-    eps = _restitution(scene._replace(law=walls.law), impact, left)
+    decay = None if scene.drag is None else drag_decay(scene.decay_rates, impact.time)
+    eps = _restitution(scene._replace(law=walls.law), impact, decay)
     kick = -((1 + eps) * impact.speed)[:, None] * impact.normal
-    effect = Effect(kick, 0.5 * (1 - eps**2) * impact.speed**2)
+    effect = ImpactEffect(kick, 0.5 * (1 - eps**2) * impact.speed**2)
     if surface is None or impact.spin is None:
         return effect
     if walls.beta is None:
-        nothing = jnp.zeros_like(impact.spin)
-        return effect._replace(spin_change=nothing, rotational_gain=nothing[:, 0])
-    return _with_tangential(
-        effect, impact, left, surface.eta_on_wall(walls.beta), surface.inertia, shares=1
+        no_change = jnp.zeros_like(impact.spin)
+        return effect._replace(spin_change=no_change, rotational_gain=no_change[:, 0])
+    return _add_tangential_impulse(
+        effect, impact, decay, surface.eta_on_wall(walls.beta), surface.inertia, num_spheres=1
     )
 
 
-def wall_effect_along(scene: HardScene, impact: Impact, axis: Int[Array, "rows"]) -> Effect:
-    """The effect of impacts on walls to a derivative: of more where walls are nearer or take more.
+def wall_effect_for_tangents(
+    scene: HardScene, impact: ImpactEvents, axis: Int[Array, "rows"]
+) -> ImpactEffect:
+    """Return the effect of impacts on walls with its dependence on their frequency, for tangents.
 
-    A derivative sees neither where walls are nor where spheres are; it knows how often a gas meets
-    them, see `share_of_impacts`.
+    The frequency is larger where walls are closer together or dissipate more. A tangent knows
+    neither the positions of walls nor those of spheres, but only how often a gas meets the walls,
+    see `wall_impact_ratio`. The value is that of `wall_effect`.
     """
     assert scene.walls is not None
     effect = wall_effect(scene, impact, axis)
-    often = scene.walls.frequency[axis]
+    frequency = scene.walls.frequency[axis]
     eps = -jnp.sum(effect.kick * impact.normal, -1) / impact.speed - 1
-    often = often * share_of_impacts(eps, often, impact.normal.shape[1])
-    share = often / jax.lax.stop_gradient(often)
+    frequency = frequency * wall_impact_ratio(eps, frequency, impact.normal.shape[1])
+    share = frequency / jax.lax.stop_gradient(frequency)
     rotational_gain = None if effect.rotational_gain is None else effect.rotational_gain * share
     return effect._replace(lost=effect.lost * share, rotational_gain=rotational_gain)
 
 
-def _restitution(scene: HardScene, impact: Impact, left: DragDecay | None) -> Float[Array, "rows"]:
+def _restitution(
+    scene: HardScene, impact: ImpactEvents, decay: DragDecay | None
+) -> Float[Array, "rows"]:
     speed = impact.speed * 0.5**0.5  # the law's unit of speed is sqrt(2)
-    eps = scene.law.restitution(speed if left is None else speed * left.velocity)
+    eps = scene.law.restitution(speed if decay is None else speed * decay.velocity)
     return jnp.where(impact.elastic, 1.0, eps)
 
 
-def _with_tangential(
-    effect: Effect,
-    impact: Impact,
-    left: DragDecay | None,
+def _add_tangential_impulse(
+    effect: ImpactEffect,
+    impact: ImpactEvents,
+    decay: DragDecay | None,
     eta: Float[Array, ""],
     inertia: Float[Array, ""],
-    shares: int,
-) -> Effect:
-    """The effect with the tangential part of impacts, of which each sphere bears a share."""
+    num_spheres: int,
+) -> ImpactEffect:
+    """Add the tangential part of impacts on `num_spheres` spheres, of which each bears a share."""
     assert impact.spin is not None
-    kept = 1.0 if left is None else left.spin[:, None]
-    found: TangentialImpulse = tangential_impulse(
-        impact.relative, impact.spin * kept, impact.normal, ~impact.elastic, eta, inertia
+    spin_factor = 1.0 if decay is None else decay.spin[:, None]
+    impulse: TangentialImpulse = tangential_impulse(
+        impact.relative, impact.spin * spin_factor, impact.normal, ~impact.elastic, eta, inertia
     )
-    if shares == 2:
-        lost = -0.5 * jnp.sum(found.kick * (found.sideways + found.kick), -1)
+    if num_spheres == 2:
+        lost = -0.5 * jnp.sum(impulse.kick * (impulse.sideways + impulse.kick), -1)
     else:
-        lost = -jnp.sum(found.kick * (found.sideways + 0.5 * found.kick), -1)
-    spin_change = found.spin_change / kept
+        lost = -jnp.sum(impulse.kick * (impulse.sideways + 0.5 * impulse.kick), -1)
+    spin_change = impulse.spin_change / spin_factor
     rotational_gain = (
-        inertia / 2 * jnp.sum(spin_change * (impact.spin * 2 / shares + spin_change), -1)
+        inertia / 2 * jnp.sum(spin_change * (impact.spin * 2 / num_spheres + spin_change), -1)
     )
-    return Effect(effect.kick + found.kick, effect.lost + lost, spin_change, rotational_gain)
+    return ImpactEffect(
+        effect.kick + impulse.kick, effect.lost + lost, spin_change, rotational_gain
+    )
 
 
 class HardTangents(NamedTuple):
@@ -271,7 +277,7 @@ class HardTangents(NamedTuple):
     Attributes:
         directions: in the material, stacked along a first axis of each leaf; the last one is that
             of time, in which everything is more frequent.
-        exchange: tangents of the energies of translation and of the spins that are kept.
+        exchange: tangents of the energies of translation and of the (transformed) spins.
     """
 
     directions: Any
@@ -281,32 +287,33 @@ class HardTangents(NamedTuple):
     def at_start(
         cls, scene: HardScene, directions: Any, replicas: int, num_particles: int, dimension: int
     ) -> "HardTangents":
-        """The tangents at t = 0, where T is 1 and T_rot as the material has it."""
-        directions = jax.tree.map(_with_time_direction, directions)
-        if scene.drag is not None:  # drag is sooner over, too
+        """Return the tangents at t = 0, where T is 1 and T_rot is that of the material."""
+        directions = jax.tree.map(_append_time_direction, directions)
+        if scene.drag is not None:  # drag acts sooner, too
             rates = jax.tree.map(lambda x, rate: x.at[-1].set(rate), directions.drag, scene.drag)
             directions = directions._replace(drag=rates)
         p = len(jax.tree.leaves(directions)[0])
         energies = jnp.zeros((p, 2, replicas), scene.collision_frequency.dtype)
         if scene.surface is not None:
-            each = num_particles * NUM_SPIN_COMPONENTS[dimension] / 2
-            energies = energies.at[:, 1].add(each * directions.surface.ratio[:, None])
+            rotational_energy = num_particles * NUM_SPIN_COMPONENTS[dimension] / 2
+            energies = energies.at[:, 1].add(rotational_energy * directions.surface.ratio[:, None])
         return cls(directions, ExchangeTangents(energies, jnp.zeros((p, replicas), energies.dtype)))
 
     def gains(
         self,
         scene: HardScene,
-        impact: Impact,
+        impact: ImpactEvents,
         happens: Bool[Array, "rows"],
-        effect_of: Callable[[HardScene, Impact], Effect],
+        effect_of: Callable[[HardScene, ImpactEvents], ImpactEffect],
     ) -> Float[Array, "changes 2 rows"]:
-        """Tangents of what both energies gain in impacts, see `ExchangeTangents.after`."""
+        """Return the tangents of the gains of both energies in impacts, see
+        `ExchangeTangents.after`."""
 
-        def energies(material: Material, velocity: Array, spin: Array) -> Array:
+        def energies(material: HardMaterial, velocity: Array, spin: Array) -> Array:
             if scene.surface is not None and material.surface is not None:
                 # At a given energy spins are smaller where the inertia is larger.
                 spin = spin - 0.5 * jnp.log(material.surface.inertia / scene.surface.inertia)
-            effect = effect_of(scene.with_material(material), impact.faster(velocity, spin))
+            effect = effect_of(scene.with_material(material), impact.scaled(velocity, spin))
             rotational_gain = (
                 jnp.zeros_like(effect.lost)
                 if effect.rotational_gain is None
@@ -317,19 +324,19 @@ class HardTangents(NamedTuple):
         zero, one = (jnp.full((), x, impact.speed.dtype) for x in (0.0, 1.0))
         material: Any = scene.material
         _, linear = jax.linearize(energies, material, zero, zero)
-        nothing = jax.tree.map(jnp.zeros_like, material)
-        along = jax.vmap(lambda direction: linear(direction, zero, zero))(self.directions)
-        scales = jnp.stack([linear(nothing, one, zero), linear(nothing, zero, one)])
-        return jnp.concatenate([along, scales])
+        no_direction = jax.tree.map(jnp.zeros_like, material)
+        by_direction = jax.vmap(lambda direction: linear(direction, zero, zero))(self.directions)
+        by_scale = jnp.stack([linear(no_direction, one, zero), linear(no_direction, zero, one)])
+        return jnp.concatenate([by_direction, by_scale])
 
     @property
     def num_changes(self) -> int:
-        """Rows of `gains`."""
+        """Number of rows of `gains`."""
         return len(self.exchange.energies) + 2
 
 
-def _with_time_direction(leaf: Array) -> Array:
-    """Directions with a last one, along which the number does not change."""
+def _append_time_direction(leaf: Array) -> Array:
+    """Append a direction along which the number does not change."""
     return jnp.concatenate([leaf, jnp.zeros((1, *leaf.shape[1:]), leaf.dtype)])
 
 
@@ -338,48 +345,48 @@ MAX_ROUNDS = 100_000
 
 
 class ImpactWork(NamedTuple):
-    """The particles after the impacts of a window, and sums over these impacts.
+    """Particles after the impacts of a window, and sums over these impacts.
 
     Attributes:
-        slots: the particles.
+        paths: of the particles.
         dissipated: translational energy lost, half of it counted for each of two spheres.
-        turned: gain of the energy of the spins that are kept; None of smooth spheres.
-        impacts: number of impacts of each particle.
-        bounces: number of impacts on walls of each particle; None without walls.
+        rotational_gain: gain of the energy of the (transformed) spins; None of smooth spheres.
+        impacts: number of impacts of each particle on others.
+        wall_impacts: number of impacts on walls of each particle; None without walls.
         regularised: number of impacts that were elastic because they followed too soon.
-        moved: largest squared distance of each particle, at its impacts, from the place for which
-            the neighbour list was built.
-        fastest: largest squared speed of each particle.
+        max_distance2: largest squared distance of each particle, at its impacts, from the place for
+            which the neighbour list was built.
+        max_speed2: largest squared speed of each particle.
         pending: whether the last round executed an impact.
         num_rounds: number of rounds.
-        gains: of energy in impacts of pairs along directions in the material, see
-            `ImpactTangents` and `HardTangents`; without tangents, no rows.
-        wall_gains: in impacts on walls.
+        gains: tangents of the energy gained in impacts of pairs, along directions in the material,
+            see `ImpactTangents` and `HardTangents`; without tangents, no rows.
+        wall_gains: the corresponding tangents of impacts on walls.
     """
 
-    slots: Slots
+    paths: Paths
     dissipated: Float[Array, "slots"]
     rotational_gain: Float[Array, "slots"] | None
     impacts: Int[Array, "slots"]
-    bounces: Int[Array, "slots"] | None
+    wall_impacts: Int[Array, "slots"] | None
     regularised: Int[Array, "slots"]
-    moved: Float[Array, "slots"]
-    fastest: Float[Array, "slots"]
+    max_distance2: Float[Array, "slots"]
+    max_speed2: Float[Array, "slots"]
     pending: Bool[Array, ""]
     num_rounds: Int[Array, ""]
     gains: Float[Array, "changes *energies rows"]
     wall_gains: Float[Array, "wallchanges 2 slots"]
 
 
-def resolve(
-    slots: Slots,
+def execute_impacts(
+    paths: Paths,
     listed: Float[Array, "slots d"],
-    chosen: Selection,
+    candidates: ImpactCandidates,
     scene: HardScene,
-    began: Float[Array, ""],
+    start_time: Float[Array, ""],
     duration: ArrayLike,
-    shortest: Float[Array, "replicas"],
-    along: ImpactTangents | HardTangents | None,
+    contact_duration: Float[Array, "replicas"],
+    tangents: ImpactTangents | HardTangents | None,
 ) -> ImpactWork:
     """Execute all impacts of a window, in rounds of independent impacts.
 
@@ -387,210 +394,228 @@ def resolve(
     changed. The earliest impact of all is always one of them.
 
     Args:
-        slots: the members of the selection.
+        paths: of the members of the selection.
         listed: the places for which the neighbour list was built.
-        chosen: the selection.
+        candidates: the selection.
         scene: the gas.
-        began: time at which the window begins.
+        start_time: time at which the window begins.
         duration: of the window.
-        shortest: time after a sphere's last impact within which its next one is elastic.
-        along: the tangents, if they are followed, for the gains of energy along their directions.
+        contact_duration: time after a sphere's last impact within which its next one is elastic.
+        tangents: for the gains of energy along their directions; None in a run without tangents.
     """
-    shortest = shortest[jnp.minimum(chosen.replica, len(shortest) - 1)]
+    contact_duration = contact_duration[jnp.minimum(candidates.replica, len(contact_duration) - 1)]
 
     def one_round(work: ImpactWork) -> ImpactWork:
-        impacts, safe, row = _executable(work.slots, chosen.rows, duration, scene.walls)
-        s, soon, met = _impact_events(
-            impacts, safe, work.slots, chosen.rows, shortest, scene, began
+        impacts, executable, row = _select_executable(
+            work.paths, candidates.rows, duration, scene.walls
         )
-        effect = pair_effect(scene, met)
-        new = _with_pair_impacts(work, effect, s, soon, safe, row, chosen.rows, listed)
-        new = new._replace(gains=work.gains + _gains(along, scene, met, safe, soon))
-        if impacts.bounces is None or scene.walls is None:
+        s, too_soon, events = _impact_events(
+            impacts, executable, work.paths, candidates.rows, contact_duration, scene, start_time
+        )
+        effect = pair_effect(scene, events)
+        new = _apply_pair_impacts(
+            work, effect, s, too_soon, executable, row, candidates.rows, listed
+        )
+        new = new._replace(
+            gains=work.gains + _pair_gains(tangents, scene, events, executable, too_soon)
+        )
+        if impacts.wall_impacts is None or scene.walls is None:
             return new
-        alone = row == len(chosen.rows.a)
-        return _with_wall_impacts(work, new, impacts, alone, listed, shortest, scene, began, along)
+        unpaired = row == len(candidates.rows.a)
+        return _apply_wall_impacts(
+            work, new, impacts, unpaired, listed, contact_duration, scene, start_time, tangents
+        )
 
     def unfinished(work: ImpactWork):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
-    first = _initial_work(slots, scene, along, len(chosen.rows.a))
+    first = _initial_work(paths, scene, tangents, len(candidates.rows.a))
     return jax.lax.while_loop(unfinished, one_round, first)
 
 
 def _initial_work(
-    slots: Slots, scene: HardScene, along: ImpactTangents | HardTangents | None, num_rows: int
+    paths: Paths, scene: HardScene, tangents: ImpactTangents | HardTangents | None, num_rows: int
 ) -> ImpactWork:
-    """Before the first round."""
-    num_slots = len(slots.v)
-    count, zeros = jnp.zeros(num_slots, jnp.int32), jnp.zeros(num_slots, slots.x.dtype)
-    size, on_walls = (0, num_rows), (0, 2, num_slots)
-    if isinstance(along, ImpactTangents):
-        size = len(along.log_temperature) + 1, num_rows
-    elif along is not None:
-        size = along.num_changes, 2, num_rows
-        on_walls = (0 if scene.walls is None else along.num_changes), 2, num_slots
+    num_slots = len(paths.v)
+    zero_counts, zeros = jnp.zeros(num_slots, jnp.int32), jnp.zeros(num_slots, paths.x.dtype)
+    shape, wall_shape = (0, num_rows), (0, 2, num_slots)
+    if isinstance(tangents, ImpactTangents):
+        shape = len(tangents.log_temperature) + 1, num_rows
+    elif tangents is not None:
+        shape = tangents.num_changes, 2, num_rows
+        wall_shape = (0 if scene.walls is None else tangents.num_changes), 2, num_slots
     return ImpactWork(
-        slots=slots,
+        paths=paths,
         dissipated=zeros,
-        rotational_gain=None if slots.spin is None else zeros,
-        impacts=count,
-        bounces=None if scene.walls is None else count,
-        regularised=count,
-        moved=zeros,
-        fastest=zeros,
+        rotational_gain=None if paths.spin is None else zeros,
+        impacts=zero_counts,
+        wall_impacts=None if scene.walls is None else zero_counts,
+        regularised=zero_counts,
+        max_distance2=zeros,
+        max_speed2=zeros,
         pending=jnp.array(True),
         num_rounds=jnp.int32(0),
-        gains=jnp.zeros(size, zeros.dtype),
-        wall_gains=jnp.zeros(on_walls, zeros.dtype),
+        gains=jnp.zeros(shape, zeros.dtype),
+        wall_gains=jnp.zeros(wall_shape, zeros.dtype),
     )
 
 
-def _gains(
-    along: ImpactTangents | HardTangents | None,
-    scene: HardScene,
-    met: Impact,
-    safe: Bool[Array, "rows"],
-    soon: Bool[Array, "rows"],
-) -> Float[Array, "changes *energies rows"]:
-    """The gains of energy along directions in the material, in the impacts marked as safe."""
-    if along is None:
-        return jnp.zeros((0, len(safe)), met.speed.dtype)
-    if isinstance(along, HardTangents):
-        # By each of two spheres half of it is lost.
-        return 2 * along.gains(scene, met, safe, pair_effect)
-    # The law's unit of speed is sqrt(2).
-    gained = 2 * along.gains(scene.law, met.speed * 0.5**0.5)
-    return jnp.where((safe & ~soon & ~scene.elastic)[None], gained, 0.0)
-
-
-def _executable(
-    slots: Slots, rows: Rows, duration: ArrayLike, walls: HardWalls | None
+def _select_executable(
+    paths: Paths, rows: PairRows, duration: ArrayLike, walls: HardWalls | None
 ) -> tuple[FirstImpacts, Bool[Array, "rows"], Int[Array, "slots"]]:
-    """The next impacts, which of them can be executed now, and the row of each particle's own.
+    """Return the next impacts, which are executable now, and the row of each particle's impact.
 
-    A particle without one has a row beyond the last.
+    A particle without an executable impact has a row beyond the last.
     """
     a, b = rows.a, rows.b
     index = jnp.arange(len(a), dtype=jnp.int32)
-    impacts = first_impacts(slots, rows, duration, walls)
-    safe = jnp.isfinite(impacts.times)
+    impacts = first_impacts(paths, rows, duration, walls)
+    executable = jnp.isfinite(impacts.times)
     for k in (a, b):
-        safe &= (impacts.times == impacts.first[k]) & (impacts.times == impacts.final[k])
-    # Of several impacts at the very same time a sphere takes the one in the first row.
-    rank = jnp.where(safe, index, len(a))
-    row = jnp.full(len(slots.v), len(a), jnp.int32).at[a].min(rank).at[b].min(rank)
-    return impacts, safe & (row[a] == index) & (row[b] == index), row
+        executable &= (impacts.times == impacts.first[k]) & (impacts.times == impacts.final[k])
+    # Of several impacts at exactly the same time, a sphere takes the one in the first row.
+    rank = jnp.where(executable, index, len(a))
+    row = jnp.full(len(paths.v), len(a), jnp.int32).at[a].min(rank).at[b].min(rank)
+    return impacts, executable & (row[a] == index) & (row[b] == index), row
 
 
 def _impact_events(
     impacts: FirstImpacts,
-    safe: Bool[Array, "rows"],
-    slots: Slots,
-    rows: Rows,
-    shortest: Float[Array, "slots"],
+    executable: Bool[Array, "rows"],
+    paths: Paths,
+    rows: PairRows,
+    contact_duration: Float[Array, "slots"],
     scene: HardScene,
-    began: Float[Array, ""],
-) -> tuple[Float[Array, "rows"], Bool[Array, "rows"], Impact]:
-    """The impacts of pairs marked as safe: their times, whether they come too soon, and they."""
-    s = jnp.where(safe, impacts.times, 0.0)
+    start_time: Float[Array, ""],
+) -> tuple[Float[Array, "rows"], Bool[Array, "rows"], ImpactEvents]:
+    """Return the times of executable impacts of pairs, whether they come too soon, and the
+    events."""
+    s = jnp.where(executable, impacts.times, 0.0)
     r = impacts.r + impacts.w * s[:, None]
-    normal = r / jnp.where(safe, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
-    speed = jnp.where(safe, -jnp.sum(impacts.w * normal, -1), 1.0)
-    soon = s - jnp.maximum(slots.last[rows.a], slots.last[rows.b]) < shortest[rows.a]
-    spin = None if slots.spin is None else slots.spin[rows.a] + slots.spin[rows.b]
-    elastic = soon | scene.elastic | ~safe
-    return s, soon, Impact(began + s, -normal, impacts.w, speed, spin, elastic)
+    normal = r / jnp.where(executable, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
+    speed = jnp.where(executable, -jnp.sum(impacts.w * normal, -1), 1.0)
+    too_soon = s - jnp.maximum(paths.last[rows.a], paths.last[rows.b]) < contact_duration[rows.a]
+    spin = None if paths.spin is None else paths.spin[rows.a] + paths.spin[rows.b]
+    elastic = too_soon | scene.elastic | ~executable
+    return s, too_soon, ImpactEvents(start_time + s, -normal, impacts.w, speed, spin, elastic)
 
 
-def _with_pair_impacts(
+def _apply_pair_impacts(
     work: ImpactWork,
-    effect: Effect,
+    effect: ImpactEffect,
     time: Float[Array, "rows"],
-    soon: Bool[Array, "rows"],
-    safe: Bool[Array, "rows"],
+    too_soon: Bool[Array, "rows"],
+    executable: Bool[Array, "rows"],
     row: Int[Array, "slots"],
-    rows: Rows,
+    rows: PairRows,
     listed: Float[Array, "slots d"],
 ) -> ImpactWork:
-    """The particles after the impacts marked as safe, and the sums with these impacts."""
-    slots, internal = work.slots, jnp.arange(len(row), dtype=jnp.int32)
+    """Return the particles after the executable impacts of pairs, and the sums with these
+    impacts."""
+    paths, slot_indices = work.paths, jnp.arange(len(row), dtype=jnp.int32)
     row = jnp.minimum(row, len(rows.a) - 1)
-    hit = safe[row] & ((rows.a[row] == internal) | (rows.b[row] == internal))
+    hit = executable[row] & ((rows.a[row] == slot_indices) | (rows.b[row] == slot_indices))
     s = jnp.where(hit, time[row], 0.0)
-    sign = jnp.where(hit, jnp.where(rows.a[row] == internal, 1.0, -1.0), 0.0)
+    sign = jnp.where(hit, jnp.where(rows.a[row] == slot_indices, 1.0, -1.0), 0.0)
     kick = sign[:, None] * effect.kick[row]
-    place = slots.x + slots.v * s[:, None]
-    v = slots.v + kick
-    spin, rotational_gain = slots.spin, work.rotational_gain
+    position = paths.x + paths.v * s[:, None]
+    v = paths.v + kick
+    spin, rotational_gain = paths.spin, work.rotational_gain
     if spin is not None and rotational_gain is not None and effect.spin_change is not None:
         assert effect.rotational_gain is not None
         spin = spin + jnp.where(hit[:, None], effect.spin_change[row], 0.0)
         rotational_gain = rotational_gain + jnp.where(hit, effect.rotational_gain[row], 0.0)
-    away = jnp.where(hit, jnp.sum((place - listed) ** 2, -1), 0.0)
+    distance2 = jnp.where(hit, jnp.sum((position - listed) ** 2, -1), 0.0)
     return work._replace(
-        slots=Slots(slots.x - kick * s[:, None], v, jnp.where(hit, s, slots.last), spin),
+        paths=Paths(paths.x - kick * s[:, None], v, jnp.where(hit, s, paths.last), spin),
         dissipated=work.dissipated + jnp.where(hit, effect.lost[row], 0.0),
         rotational_gain=rotational_gain,
         impacts=work.impacts + hit,
-        regularised=work.regularised + (hit & soon[row]),
-        moved=jnp.maximum(work.moved, away),
-        fastest=jnp.maximum(work.fastest, jnp.sum(v * v, -1)),
-        pending=jnp.any(safe),
+        regularised=work.regularised + (hit & too_soon[row]),
+        max_distance2=jnp.maximum(work.max_distance2, distance2),
+        max_speed2=jnp.maximum(work.max_speed2, jnp.sum(v * v, -1)),
+        pending=jnp.any(executable),
         num_rounds=work.num_rounds + 1,
     )
 
 
-def _with_wall_impacts(
+def _apply_wall_impacts(
     old: ImpactWork,
     new: ImpactWork,
     impacts: FirstImpacts,
-    alone: Bool[Array, "slots"],
+    unpaired: Bool[Array, "slots"],
     listed: Float[Array, "slots d"],
-    shortest: Float[Array, "slots"],
+    contact_duration: Float[Array, "slots"],
     scene: HardScene,
-    began: Float[Array, ""],
-    along: ImpactTangents | HardTangents | None,
+    start_time: Float[Array, ""],
+    tangents: ImpactTangents | HardTangents | None,
 ) -> ImpactWork:
-    """The particles after a round, with those impacts on walls that nothing can come before.
+    """Return the particles after a round, with the impacts on walls that no other impact can
+    precede.
 
     Args:
         old, new: before the round, and after its impacts of pairs.
         impacts: the next ones, before the round.
-        alone: who takes part in no impact of a pair.
-        listed, shortest, scene, began, along: as for `resolve`.
+        unpaired: particles without an impact of a pair in this round.
+        listed, contact_duration, scene, start_time, tangents: as for `execute_impacts`.
     """
-    assert impacts.bounces is not None and scene.walls is not None and new.bounces is not None
-    slots, (times, axis) = old.slots, impacts.bounces
-    hit = alone & jnp.isfinite(times) & (times == impacts.first) & (times == impacts.final)
+    assert (
+        impacts.wall_impacts is not None
+        and scene.walls is not None
+        and new.wall_impacts is not None
+    )
+    paths, (times, axis) = old.paths, impacts.wall_impacts
+    hit = unpaired & jnp.isfinite(times) & (times == impacts.first) & (times == impacts.final)
     s = jnp.where(hit, times, 0.0)
-    soon = s - slots.last < shortest
-    across = axis[:, None] == jnp.arange(slots.v.shape[1])[None]
-    outwards = jnp.where(across, jnp.sign(slots.v), 0.0)
-    speed = jnp.where(hit, jnp.sum(slots.v * outwards, axis=1), 1.0)
-    met = Impact(began + s, outwards, slots.v, speed, slots.spin, soon | scene.elastic | ~hit)
-    effect = wall_effect(scene, met, axis)
+    too_soon = s - paths.last < contact_duration
+    is_axis = axis[:, None] == jnp.arange(paths.v.shape[1])[None]
+    outwards = jnp.where(is_axis, jnp.sign(paths.v), 0.0)
+    speed = jnp.where(hit, jnp.sum(paths.v * outwards, axis=1), 1.0)
+    events = ImpactEvents(
+        start_time + s, outwards, paths.v, speed, paths.spin, too_soon | scene.elastic | ~hit
+    )
+    effect = wall_effect(scene, events, axis)
     kick = jnp.where(hit[:, None], effect.kick, 0.0)
-    place = slots.x + slots.v * s[:, None]
-    v = jnp.where(hit[:, None], slots.v + kick, new.slots.v)
-    x = jnp.where(hit[:, None], place - v * s[:, None], new.slots.x)
-    spin, rotational_gain = new.slots.spin, new.rotational_gain
+    position = paths.x + paths.v * s[:, None]
+    v = jnp.where(hit[:, None], paths.v + kick, new.paths.v)
+    x = jnp.where(hit[:, None], position - v * s[:, None], new.paths.x)
+    spin, rotational_gain = new.paths.spin, new.rotational_gain
     if spin is not None and rotational_gain is not None and effect.spin_change is not None:
         assert effect.rotational_gain is not None
         spin = spin + jnp.where(hit[:, None], effect.spin_change, 0.0)
         rotational_gain = rotational_gain + jnp.where(hit, effect.rotational_gain, 0.0)
     gains = new.wall_gains
-    if isinstance(along, HardTangents):
-        gains = gains + along.gains(scene, met, hit, partial(wall_effect_along, axis=axis))
-    away = jnp.where(hit, jnp.sum((place - listed) ** 2, -1), 0.0)
+    if isinstance(tangents, HardTangents):
+        gains = gains + tangents.gains(
+            scene, events, hit, partial(wall_effect_for_tangents, axis=axis)
+        )
+    distance2 = jnp.where(hit, jnp.sum((position - listed) ** 2, -1), 0.0)
     return new._replace(
-        slots=Slots(x, v, jnp.where(hit, s, new.slots.last), spin),
+        paths=Paths(x, v, jnp.where(hit, s, new.paths.last), spin),
         dissipated=new.dissipated + jnp.where(hit, effect.lost, 0.0),
         rotational_gain=rotational_gain,
-        bounces=new.bounces + hit,
-        regularised=new.regularised + 2 * (hit & soon),  # an impact of two spheres counts twice
-        moved=jnp.maximum(new.moved, away),
-        fastest=jnp.maximum(new.fastest, jnp.sum(v * v, -1)),
+        wall_impacts=new.wall_impacts + hit,
+        regularised=new.regularised + 2 * (hit & too_soon),  # an impact of two spheres counts twice
+        max_distance2=jnp.maximum(new.max_distance2, distance2),
+        max_speed2=jnp.maximum(new.max_speed2, jnp.sum(v * v, -1)),
         pending=new.pending | jnp.any(hit),
         wall_gains=gains,
     )
+
+
+def _pair_gains(
+    tangents: ImpactTangents | HardTangents | None,
+    scene: HardScene,
+    events: ImpactEvents,
+    executable: Bool[Array, "rows"],
+    too_soon: Bool[Array, "rows"],
+) -> Float[Array, "changes *energies rows"]:
+    """Return the tangents of the energy gained in executable impacts of pairs."""
+    if tangents is None:
+        return jnp.zeros((0, len(executable)), events.speed.dtype)
+    if isinstance(tangents, HardTangents):
+        # Each of two spheres loses half of it.
+        return 2 * tangents.gains(scene, events, executable, pair_effect)
+    # The law's unit of speed is sqrt(2).
+    gains = 2 * tangents.gains(scene.law, events.speed * 0.5**0.5)
+    return jnp.where((executable & ~too_soon & ~scene.elastic)[None], gains, 0.0)

@@ -1,18 +1,11 @@
-"""Prediction of the next impacts of hard spheres on their current paths.
+"""Prediction of the next impacts of hard spheres, on each other and on walls.
 
-Units here: the diameter is 1. The time s counts from the start of a window, and a path is given by
-its velocity and its position extrapolated back to s = 0, as in x(s) = x + v s.
+Units here: the diameter is 1. The time s counts from the start of a window. A path is given by its
+velocity and its position extrapolated back to s = 0, as in x(s) = x + v s.
 
-Impacts of hard spheres on the flat walls of a box.
-
-Units here: the diameter, the mass and the first temperature are 1. Positions are coordinates from a
-corner of the container, so that centres are between 1/2 and each side less 1/2. The periodic box,
-a cube, is longer than the longest side by a diameter: no sphere meets another one through its
-boundary.
-
-Hard spheres that may touch within one window of time.
-
-Units here: the diameter is 1.
+In a container positions are coordinates from a corner, so that centres lie between 1/2 and each
+side less 1/2. The periodic box, a cube, is longer than the longest side by a diameter: no sphere
+meets another one through its boundary.
 """
 
 from typing import NamedTuple
@@ -25,12 +18,12 @@ from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.neighbours import Pairs, rows_where
 from jaxgran.scene.laws import ReducedLaw
 
-MARGIN = 1.0
+BOX_MARGIN = 1.0
 """Diameters by which the periodic box is longer than the container."""
 
 
 class HardWalls(NamedTuple):
-    """The walls of a container.
+    """Walls of a container.
 
     Attributes:
         sides: of the container.
@@ -46,63 +39,7 @@ class HardWalls(NamedTuple):
     frequency: Float[Array, "d"]
 
 
-class Bounces(NamedTuple):
-    """The next impacts of particles on walls: their times, inf if there is none, and axes."""
-
-    times: Float[Array, "slots"]
-    axis: Int[Array, "slots"]
-
-
-def next_bounces(
-    walls: HardWalls,
-    x: Float[Array, "slots d"],
-    v: Float[Array, "slots d"],
-    last: Float[Array, "slots"],
-    end: ArrayLike,
-) -> Bounces:
-    """The next impacts on walls of particles on paths x + v s since their last impacts."""
-    to = jnp.where(v > 0, walls.sides[None] - 0.5, 0.5)
-    moving = v != 0
-    each = jnp.where(moving, (to - x) / jnp.where(moving, v, 1.0), jnp.inf)
-    axis = jnp.argmin(each, axis=1)
-    # Rounding may have left a sphere beyond a wall: it bounces at once.
-    times = jnp.maximum(jnp.min(each, axis=1), jnp.maximum(last, 0.0))
-    return Bounces(jnp.where(times < end, times, jnp.inf), axis)
-
-
-class Motion(NamedTuple):
-    """Relative motion ``r + w s`` of pairs, as the scalar products that their distance needs."""
-
-    rr: Float[Array, "rows"]
-    rw: Float[Array, "rows"]
-    ww: Float[Array, "rows"]
-
-    @classmethod
-    def of(cls, r: Float[Array, "rows d"], w: Float[Array, "rows d"]) -> "Motion":
-        return cls(jnp.sum(r * r, -1), jnp.sum(r * w, -1), jnp.sum(w * w, -1))
-
-    def gap(self, s: ArrayLike) -> Float[Array, "rows"]:
-        """Distance between the surfaces at s."""
-        return jnp.sqrt(jnp.maximum(self.rr + (2 * self.rw + self.ww * s) * s, 0.0)) - 1
-
-    def impact_time(self, since: ArrayLike) -> Float[Array, "rows"]:
-        """The first s >= `since` at which the spheres touch while they approach, or inf.
-
-        ``s - since = c / (sqrt(b^2 - w^2 c) - b)`` with ``b = r w`` and ``c = r^2 - 1`` at `since`,
-        the form of the root without cancellation. Approaching spheres that rounding has left closer
-        than a diameter touch at once. Grazing impacts to a depth of less than 1e-16 are left out.
-        """
-        b = self.rw + self.ww * since
-        c = self.rr + (2 * self.rw + self.ww * since) * since - 1
-        graze = jnp.finfo(b.dtype).eps ** 0.5
-        square = b * b - self.ww * c
-        touch = (b < -graze * jnp.sqrt(self.ww)) & ((c <= 0) | (square > 0))
-        root = jnp.sqrt(jnp.where(touch & (c > 0), square, 1.0))
-        ahead = jnp.maximum(c, 0.0) / jnp.where(touch, root - b, 1.0)
-        return jnp.where(touch, since + ahead, jnp.inf)
-
-
-class Rows(NamedTuple):
+class PairRows(NamedTuple):
     """Pairs of particles that may touch.
 
     Attributes:
@@ -119,15 +56,15 @@ class Rows(NamedTuple):
     real: Bool[Array, "rows"]
 
 
-class Slots(NamedTuple):
-    """Particles on their current paths.
+class Paths(NamedTuple):
+    """Current paths of particles.
 
     Attributes:
         x: position, extrapolated back to the start of the window.
         v: velocity.
         last: time of the last impact, from which on the path is valid; negative if the impact was
             before the window.
-        spin: of rough spheres; else None.
+        spin: of rough spheres; None of smooth ones.
     """
 
     x: Float[Array, "slots d"]
@@ -136,69 +73,129 @@ class Slots(NamedTuple):
     spin: Float[Array, "slots spins"] | None = None
 
 
+class RelativeMotion(NamedTuple):
+    """Relative motion ``r + w s`` of pairs, as the scalar products that their distance needs."""
+
+    rr: Float[Array, "rows"]
+    rw: Float[Array, "rows"]
+    ww: Float[Array, "rows"]
+
+    @classmethod
+    def from_vectors(cls, r: Float[Array, "rows d"], w: Float[Array, "rows d"]) -> "RelativeMotion":
+        return cls(jnp.sum(r * r, -1), jnp.sum(r * w, -1), jnp.sum(w * w, -1))
+
+    def gap(self, s: ArrayLike) -> Float[Array, "rows"]:
+        """Return the distance between the surfaces at s."""
+        return jnp.sqrt(jnp.maximum(self.rr + (2 * self.rw + self.ww * s) * s, 0.0)) - 1
+
+    def impact_time(self, since: ArrayLike) -> Float[Array, "rows"]:
+        """Return the first s >= `since` at which the spheres touch while they approach, or inf.
+
+        ``s - since = c / (sqrt(b^2 - w^2 c) - b)`` with ``b = r w`` and ``c = r^2 - 1`` at `since`,
+        the form of the root without cancellation. Approaching spheres that rounding has left closer
+        than a diameter touch at once. Grazing impacts to a depth of less than 1e-16 are left out.
+        """
+        b = self.rw + self.ww * since
+        c = self.rr + (2 * self.rw + self.ww * since) * since - 1
+        graze = jnp.finfo(b.dtype).eps ** 0.5
+        square = b * b - self.ww * c
+        touch = (b < -graze * jnp.sqrt(self.ww)) & ((c <= 0) | (square > 0))
+        root = jnp.sqrt(jnp.where(touch & (c > 0), square, 1.0))
+        ahead = jnp.maximum(c, 0.0) / jnp.where(touch, root - b, 1.0)
+        return jnp.where(touch, since + ahead, jnp.inf)
+
+
+class WallImpactTimes(NamedTuple):
+    """Next impacts of particles on walls: their times, inf if there is none, and their axes."""
+
+    times: Float[Array, "slots"]
+    axis: Int[Array, "slots"]
+
+
+def next_wall_impacts(
+    walls: HardWalls,
+    x: Float[Array, "slots d"],
+    v: Float[Array, "slots d"],
+    last: Float[Array, "slots"],
+    end: ArrayLike,
+) -> WallImpactTimes:
+    """Return the next impacts on walls of particles on paths x + v s since their last impacts."""
+    target = jnp.where(v > 0, walls.sides[None] - 0.5, 0.5)
+    moving = v != 0
+    times_by_axis = jnp.where(moving, (target - x) / jnp.where(moving, v, 1.0), jnp.inf)
+    axis = jnp.argmin(times_by_axis, axis=1)
+    # A sphere that rounding has left beyond a wall hits it at once.
+    times = jnp.maximum(jnp.min(times_by_axis, axis=1), jnp.maximum(last, 0.0))
+    return WallImpactTimes(jnp.where(times < end, times, jnp.inf), axis)
+
+
 class FirstImpacts(NamedTuple):
-    """The next impacts of particles on their current paths.
+    """Next impacts of particles on their current paths.
 
     Attributes:
-        r, w: relative position, extrapolated back to the start of the window, and relative
-            velocity of each pair.
-        motion: the same as scalar products.
+        r, w: relative position, extrapolated back to the start of the window, and relative velocity
+            of each pair.
+        motion: the same vectors as scalar products.
         times: of each pair's impact; inf if there is none before the end.
-        bounces: of each particle on a wall; None without walls.
+        wall_impacts: of each particle; None without walls.
         first: the earliest impact time of each particle on its current path.
         final: a lower bound on the time until which each particle's path is final.
     """
 
     r: Float[Array, "rows d"]
     w: Float[Array, "rows d"]
-    motion: Motion
+    motion: RelativeMotion
     times: Float[Array, "rows"]
-    bounces: Bounces | None
+    wall_impacts: WallImpactTimes | None
     first: Float[Array, "slots"]
     final: Float[Array, "slots"]
 
 
 def first_impacts(
-    slots: Slots, rows: Rows, end: ArrayLike, walls: HardWalls | None = None
+    paths: Paths, rows: PairRows, end: ArrayLike, walls: HardWalls | None = None
 ) -> FirstImpacts:
-    """The next impact of each pair and of each particle before `end`."""
+    """Return the next impact of each pair and of each particle before `end`."""
     a, b = rows.a, rows.b
-    r, w = slots.x[a] - slots.x[b] - rows.offset, slots.v[a] - slots.v[b]
-    motion = Motion.of(r, w)
-    last = slots.last[a], slots.last[b]
+    r, w = paths.x[a] - paths.x[b] - rows.offset, paths.v[a] - paths.v[b]
+    motion = RelativeMotion.from_vectors(r, w)
+    last = paths.last[a], paths.last[b]
     times = motion.impact_time(jnp.maximum(jnp.maximum(*last), 0.0))
     times = jnp.where(rows.real & (times < end), times, jnp.inf)
-    first = jnp.full(len(slots.x), jnp.inf, times.dtype).at[a].min(times).at[b].min(times)
-    bounces = None
+    first = jnp.full(len(paths.x), jnp.inf, times.dtype).at[a].min(times).at[b].min(times)
+    wall_impacts = None
     if walls is not None:
-        bounces = next_bounces(walls, slots.x, slots.v, slots.last, end)
-        first = jnp.minimum(first, bounces.times)
-    final = _final(slots, rows, motion, first, end)
-    return FirstImpacts(r, w, motion, times, bounces, first, final)
+        wall_impacts = next_wall_impacts(walls, paths.x, paths.v, paths.last, end)
+        first = jnp.minimum(first, wall_impacts.times)
+    final = _final_times(paths, rows, motion, first, end)
+    return FirstImpacts(r, w, motion, times, wall_impacts, first, final)
 
 
-def _final(
-    slots: Slots, rows: Rows, motion: Motion, first: Float[Array, "slots"], end: ArrayLike
+def _final_times(
+    paths: Paths,
+    rows: PairRows,
+    motion: RelativeMotion,
+    first: Float[Array, "slots"],
+    end: ArrayLike,
 ) -> Float[Array, "slots"]:
-    """A lower bound on the time until which each particle's path is final, for times before `end`.
+    """Return a lower bound on the time until which each path is final, for times before `end`.
 
-    The path of a particle changes at its first impact, or when it is hit by a particle whose own
-    path has changed earlier. Such a particle moves no faster than the bound on all speeds, which
-    gives the earliest time at which it can arrive. These times depend on each other from pair to
-    pair; starting from `first` they are lowered until they are consistent.
+    The path of a particle changes at its first impact, or when it is hit by a particle whose path
+    has changed earlier. Such a particle moves no faster than the bound on all speeds, which gives
+    the earliest time at which it can arrive. These times depend on each other from pair to pair;
+    starting from `first` they are lowered until they are consistent.
     """
     a, b = rows.a, rows.b
-    last = slots.last[a], slots.last[b]
-    speed = jnp.sqrt(jnp.sum(slots.v**2, -1))
+    last = paths.last[a], paths.last[b]
+    speed = jnp.sqrt(jnp.sum(paths.v**2, -1))
     closing = rows.bound + speed[a], rows.bound + speed[b]
 
     def arrival(disturbed, last, closing):
-        there = rows.real & (disturbed < end)
-        disturbed = jnp.where(there, disturbed, 0.0)
+        arrives = rows.real & (disturbed < end)
+        disturbed = jnp.where(arrives, disturbed, 0.0)
         # The path of the particle that may be hit is known from its last impact on only.
-        seen = jnp.maximum(disturbed, last)
-        left = motion.gap(seen) - 2 * rows.bound * (seen - disturbed)
-        return jnp.where(there, seen + jnp.maximum(left, 0.0) / closing, jnp.inf)
+        since = jnp.maximum(disturbed, last)
+        gap_left = motion.gap(since) - 2 * rows.bound * (since - disturbed)
+        return jnp.where(arrives, since + jnp.maximum(gap_left, 0.0) / closing, jnp.inf)
 
     def lower(carry):
         final, _ = carry
@@ -209,8 +206,8 @@ def _final(
     return jax.lax.while_loop(lambda carry: carry[1], lower, (first, jnp.array(True)))[0]
 
 
-class Selection(NamedTuple):
-    """The pairs that may touch in a window, and the particles that belong to them, its members.
+class ImpactCandidates(NamedTuple):
+    """Pairs that may touch in a window, and the particles that belong to them, its members.
 
     Attributes:
         members: the particle in each slot, in increasing order; n where a slot is empty.
@@ -221,12 +218,12 @@ class Selection(NamedTuple):
     """
 
     members: Int[Array, "members"]
-    rows: Rows
+    rows: PairRows
     replica: Int[Array, "members"]
     needed: Int[Array, "kinds"]
 
 
-def select_reachable(
+def select_impact_candidates(
     x: Float[Array, "n d"],
     v: Float[Array, "n d"],
     pairs: Pairs,
@@ -234,8 +231,8 @@ def select_reachable(
     bound: Float[Array, "replicas"],
     capacity: Capacity,
     walls: HardWalls | None = None,
-) -> Selection:
-    """The pairs that touch in free flight, and all that may touch once paths have changed.
+) -> ImpactCandidates:
+    """Select the pairs that touch in free flight, and all that may touch once paths have changed.
 
     Args:
         x, v: positions and velocities of all particles of all replicas.
@@ -243,48 +240,51 @@ def select_reachable(
         duration: of the window.
         bound: an upper bound on the speeds in each replica during the window.
         capacity: sizes of the arrays.
-        walls: of a container; who meets them is a member, too.
+        walls: of a container; particles that reach them are members, too.
     """
     n, size = len(x), len(x) // len(bound)
-    rows, num_near = _reachable_pairs(x, pairs, duration, bound, capacity.near)
-    free = first_impacts(Slots(x, v, jnp.zeros(n, x.dtype)), rows, duration, walls)
+    rows, num_near = _select_reachable_pairs(x, pairs, duration, bound, capacity.near)
+    free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, walls)
     i, j = rows.a, rows.b
     disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
     closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
-    chosen = rows.real & (jnp.isfinite(free.times) | closer)
+    selected = rows.real & (jnp.isfinite(free.times) | closer)
 
-    picked, num_chosen = rows_where(chosen, capacity.contacts)
+    picked, num_chosen = rows_where(selected, capacity.contacts)
     real = jnp.arange(capacity.contacts) < num_chosen
     picked = jnp.where(real, picked, 0)
     i, j = i[picked], j[picked]
     ends = jnp.where(real[None], jnp.stack([i, j]), n)
-    present = jnp.zeros(n, bool).at[ends].set(True, mode="drop")
-    if free.bounces is not None:
-        present |= jnp.isfinite(free.bounces.times)
-    members, num_members = rows_where(present, capacity.members)
-    own = jnp.arange(capacity.members, dtype=jnp.int32)
-    slot = jnp.zeros(n, jnp.int32).at[members].set(own, mode="drop")
+    is_member = jnp.zeros(n, bool).at[ends].set(True, mode="drop")
+    if free.wall_impacts is not None:
+        is_member |= jnp.isfinite(free.wall_impacts.times)
+    members, num_members = rows_where(is_member, capacity.members)
+    slot_indices = jnp.arange(capacity.members, dtype=jnp.int32)
+    slot = jnp.zeros(n, jnp.int32).at[members].set(slot_indices, mode="drop")
     a, b = (jnp.where(real, slot[k], 0) for k in (i, j))
-    rows = Rows(a, b, rows.offset[picked], rows.bound[picked], real)
+    rows = PairRows(a, b, rows.offset[picked], rows.bound[picked], real)
     needed = jnp.stack([pairs.count, pairs.lookahead, num_near, num_chosen, num_members])
-    return Selection(members, rows, members // size, needed)
+    return ImpactCandidates(members, rows, members // size, needed)
 
 
-def _reachable_pairs(
+def _select_reachable_pairs(
     x: Float[Array, "n d"],
     pairs: Pairs,
     duration: ArrayLike,
     bound: Float[Array, "replicas"],
     capacity: int,
-) -> tuple[Rows, Int[Array, ""]]:
-    """The listed pairs that can touch at the largest speeds, a small part of the list, and their
-    number; as slots the indices of the particles."""
+) -> tuple[PairRows, Int[Array, ""]]:
+    """Select the listed pairs that can touch at the largest speeds, a small part of the list.
+
+    Returns:
+        The pairs, whose slots are the indices of the particles, and their number.
+    """
     size = len(x) // len(bound)
-    apart = x[pairs.i] - x[pairs.j] - pairs.offset
-    gap = jnp.sqrt(jnp.sum(apart * apart, -1)) - 1
+    displacement = x[pairs.i] - x[pairs.j] - pairs.offset
+    gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
     gap = jnp.where(jnp.arange(gap.size) < pairs.count, gap, jnp.inf)
     near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, capacity)
     real = jnp.arange(capacity) < num_near
     near = jnp.where(real, near, 0)
     i, j = pairs.i[near], pairs.j[near]
-    return Rows(i, j, pairs.offset[near], bound[i // size], real), num_near
+    return PairRows(i, j, pairs.offset[near], bound[i // size], real), num_near

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.hard.prediction import Rows, Slots, first_impacts
+from jaxgran.particles.hard.prediction import PairRows, Paths, first_impacts
 from tests.pairs import find_pairs
 
 
@@ -25,8 +25,8 @@ def test_disturbances_go_from_sphere_to_sphere_as_far_as_they_can():
     x, v = start.position.reshape(n, 3), start.velocity.reshape(n, 3)
     pairs = find_pairs(x, start.box_side, 2.0, capacity=10 * n)
     real, bound, end = jnp.arange(10 * n) < pairs.count, 5.0, 0.04
-    rows = Rows(pairs.i, pairs.j, pairs.offset, jnp.full(10 * n, bound), real)
-    *_, final = first_impacts(Slots(x, v, jnp.zeros(n)), rows, end)
+    rows = PairRows(pairs.i, pairs.j, pairs.offset, jnp.full(10 * n, bound), real)
+    *_, final = first_impacts(Paths(x, v, jnp.zeros(n)), rows, end)
 
     i, j, offset = (np.asarray(values)[: int(pairs.count)] for values in pairs[:3])
     r, w = np.asarray(x)[i] - np.asarray(x)[j] - offset, np.asarray(v)[i] - np.asarray(v)[j]
