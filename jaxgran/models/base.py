@@ -50,7 +50,7 @@ class AbstractModel(eqx.Module):
     user may differentiate or sweep are array fields, counts and choices are static fields. If a
     member is missing, creating the model raises a TypeError that names it.
 
-    `jaxgran.DSMC` is a short example; `tests/models/test_own_model.py` defines one in 25 lines.
+    `jaxgran.DSMC` is a short example; `experiments/fit/own_model.py` defines one in 25 lines.
 
     >>> jaxgran.KineticTheory().name, jaxgran.DSMC(1000).stochastic
     ('kinetic theory', True)

@@ -283,5 +283,5 @@ def test_bad_requests_are_refused(beads):
     with pytest.raises(ValueError, match="call choose_model outside"):
         jax.jit(lambda g: jaxgran.cool(g, [1.0], model="auto").temperature)(gas)
     curve = jaxgran.cool(gas, over(gas, 10))
-    with pytest.raises(ValueError, match="replicas=3"):
+    with pytest.raises(ValueError, match="model must be a jaxgran model, got .auto"):
         jaxgran.fit(gas, curve, model="auto")

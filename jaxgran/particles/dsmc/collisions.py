@@ -805,7 +805,7 @@ def _energy_gains(
 def _scale_motion(
     scene: ReducedScene, velocity: Array, spin: Array, time_scale: Array, middle: Array
 ) -> tuple[ReducedScene, DragDecay, Array, Array]:
-    """Return the scene and its drag decay in scaled time, and factors of velocities and spins."""
+    """Return the scene with scaled drag rates, its drag decay, and factors of velocity and spin."""
     scene = scene._replace(drag=_scale_drag(scene, time_scale))
     decay = drag_decay_or_one(scene.drag, middle)
     faster, turning = jnp.exp(velocity), decay.spin * jnp.exp(spin)
@@ -902,7 +902,7 @@ def _step(
     scheme: Scheme,
     tangents: bool,
 ) -> DSMCState:
-    """Do a share, 0 to 1, of a step of one replica, with random numbers that do not depend on it.
+    """Do a share, 0 to 1, of a step of one replica; random numbers do not depend on the share.
 
     Each collision of the whole step takes place with this probability, so that the state within
     a step is as accurate as at its end.
