@@ -754,7 +754,7 @@ def _balance_log_temperature(scene: ReducedScene, like: Array, d: int) -> Float[
 
 
 def max_thermal_speed(gas: Gas) -> Float[Array, ""]:
-    """Return sqrt(T/T_0) of the steady state of a driven gas that heats up, or else 1.
+    """Return sqrt(T/T_0) of the steady state of a driven gas that heats up, and otherwise 1.
 
     It is 1 if the gas cools, and if no loss balances the drive.
     """

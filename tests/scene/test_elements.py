@@ -219,7 +219,7 @@ def test_bad_elements_are_refused(make, message):
         make()
 
 
-RUBBING = {"friction": "0.3", "tangential_damping": "0.5", "T_rot_0": "2e-3"}
+FRICTION = {"friction": "0.3", "tangential_damping": "0.5", "T_rot_0": "2e-3"}
 
 
 def test_elements_are_read_from_a_header():
@@ -250,14 +250,14 @@ def test_elements_are_read_from_a_header():
         ({"T_rot_0": "1"}, "gives T_rot_0 without beta_t"),
         ({"container_side": "0.05"}, "gives container_side without wall_restitution"),
         ({"friction": "0.5"}, "gives friction without tangential_damping"),
-        (RUBBING | {"beta_t": "0"}, "both beta_t.*SoftSpheres"),
-        (RUBBING | {"friction": "-1"}, r"friction must lie in \[0, inf\)"),
+        (FRICTION | {"beta_t": "0"}, "both beta_t.*SoftSpheres"),
+        (FRICTION | {"friction": "-1"}, r"friction must lie in \[0, inf\)"),
     ):
         with pytest.raises(ValueError, match=message):
             jaxgran.read_gas(header | wrong)
     with pytest.warns(UserWarning, match="ignoring unknown header keys: mu.*are eta.*friction"):
         jaxgran.read_gas(header | {"mu": "0.5", "A comment of some words": "x"})
-    gas = jaxgran.read_gas(header | RUBBING)
+    gas = jaxgran.read_gas(header | FRICTION)
     assert gas.elements == ("friction",)
     found = [float(gas.value(name)) for name in ("tangential_damping", "friction", "inertia")]
     assert found == [0.5, 0.3, 0.4] and float(gas.value("rotational_temperature")) == 2e-3
