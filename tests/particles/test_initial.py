@@ -66,7 +66,7 @@ def test_coincident_points_are_parted():
 @pytest.mark.parametrize("dimension, packing", [(3, 0.8), (2, 0.95)])
 def test_too_dense_is_refused(dimension, packing):
     uniform = np.random.default_rng(0).random((60, dimension))
-    with pytest.raises(RuntimeError, match="60 spheres .* after 50 pushes; lower the packing"):
+    with pytest.raises(RuntimeError, match="60 spheres .* after 50 pushes. Lower the packing"):
         _OverlapRemoval(1, max_pushes=50)(uniform, box_side(packing, 60, dimension))
 
 
