@@ -31,7 +31,7 @@ def names():
     return run(jaxgran.__doc__, {}, "jaxgran")
 
 
-# Each compiles a fit of several curves, all rivals, or a run of spheres, for its example alone.
+# Each compiles a fit of several curves, all alternatives, or a run of spheres.
 LONG = ("Diagnosis", "JointFit", "diagnose", "fit_jointly", "impact", "read_particles")
 NAMES = [
     pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in jaxgran.__all__

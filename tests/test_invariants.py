@@ -66,7 +66,7 @@ def check_start(kind, **changed):
 @few
 @given(length=scales, duration=scales, mass=scales)
 def test_units(model, length, duration, mass):
-    """Spheres begin at a given state: in ten collisions of a melt rounding grows to 1e-8."""
+    """Spheres begin at a given state: ten collisions before it would let rounding grow to 1e-8."""
     value = GAS.value
     gas = GAS.replace(
         diameter=value("diameter") * length,

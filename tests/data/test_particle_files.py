@@ -124,7 +124,7 @@ def test_a_run_writes_its_trajectory(beads, tmp_path, monkeypatch):
     # It has ended: its checkpoint goes on with nothing, and its files stay.
     jaxgran.cool(gas, t, **options, **run)
     assert (tmp_path / "run.0.xyz").read_text().splitlines() == lines
-    with pytest.raises(ValueError, match=r"run.0.xyz exists"):  # before it melts
+    with pytest.raises(ValueError, match=r"run.0.xyz exists"):  # before the equilibration
         monkeypatch.setattr("jaxgran.particles.run._equilibrate", None)
         jaxgran.cool(gas, t, **options, trajectory=path)
 

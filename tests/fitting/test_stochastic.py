@@ -108,7 +108,7 @@ def test_T_rot_is_fitted_beside_T(beads, surface, model, free):
     for name in names:
         estimate, error = result.value(name)
         assert abs(float(estimate) - float(gas.value(name))) < 3 * float(error)
-    # Both are known to some per cent; from T alone they are not told apart.
+    # Both are known to some per cent; from T alone they are not distinguishable.
     assert float(result.standard_error[0] / result.estimate[0]) < 0.1
     assert float(result.standard_error[1]) < 0.06
     with_priors = {"priors": {"packing_fraction": (0.05, 0.002)}, "model": model}

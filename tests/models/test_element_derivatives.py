@@ -17,10 +17,12 @@ def scene(*names) -> jaxgran.Gas:
     gas = glass_beads(packing_fraction=0.02)
     rate = 0.02 / float(gas.mean_free_time)
     spinning = "surface" in names
-    rub = 0.2 if spinning else None
+    wall_beta = 0.2 if spinning else None
     elements = {
         "surface": jaxgran.Rough(0.0, rotational_temperature=4e-3),
-        "container": jaxgran.Walls(gas.box_side(N), restitution=0.8, tangential_restitution=rub),
+        "container": jaxgran.Walls(
+            gas.box_side(N), restitution=0.8, tangential_restitution=wall_beta
+        ),
         "drag": jaxgran.StokesDrag(rate, rotational_rate=rate if spinning else 0.0),
         "drive": jaxgran.WhiteNoise(rate * gas.temperature),
     }

@@ -288,8 +288,8 @@ def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     plan = model.sized_for(gas).plan
     tiny = plan._replace(capacity=Capacity(*(rows // 5 for rows in plan.capacity)))
     small = jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
-    # In another order sums are rounded differently, and that grows in the melt's ten impacts;
-    # rows are only added at the end, so the order is the same.
+    # In another order sums are rounded differently, and that grows in the ten impacts of the
+    # equilibration; rows are only added at the end, so the order is the same.
     np.testing.assert_array_equal(small.temperature, reference.temperature)
     np.testing.assert_array_equal(small.particles.position, reference.particles.position)
     monkeypatch.setattr(Capacity, "grown", lambda *args: pytest.fail("arrays had to grow again"))
@@ -534,7 +534,7 @@ def test_a_skin_full_of_spheres_is_shortened(monkeypatch):
         skins.append(float(state.skin))
         return run_segment(self, state, *others)
 
-    monkeypatch.setattr(HardDynamics, "stretch", watched)
+    monkeypatch.setattr(HardDynamics, "run_segment", watched)
     end = 2.0
     curve = jaxgran.cool(gas, [end], model=HardSpheres(size, start=start, neighbours="scipy"))
     assert skins[-1] < skins[0] and min(skins) >= MIN_SKIN

@@ -20,8 +20,8 @@ def contained(num_particles, walls=1.0, gas=None, diameter=2e-3, **elements) -> 
     gas = glass_beads() if gas is None else gas
     phi = num_particles * np.pi / 6 * diameter**3 / SIDE**3
     gas = gas.replace(diameter=diameter, packing_fraction=phi)
-    rub = elements.pop("rub", None)
-    walls = jaxgran.Walls(SIDE, restitution=walls, tangential_restitution=rub)
+    wall_beta = elements.pop("wall_beta", None)
+    walls = jaxgran.Walls(SIDE, restitution=walls, tangential_restitution=wall_beta)
     return dataclasses.replace(gas, container=walls, **elements)
 
 
@@ -34,7 +34,7 @@ def run(gas, num_particles, replicas, taus):
     "elements",
     [
         pytest.param({}, marks=pytest.mark.slow),
-        {"surface": jaxgran.Rough(0.2, rotational_temperature=3e-3), "rub": 0.3},
+        {"surface": jaxgran.Rough(0.2, rotational_temperature=3e-3), "wall_beta": 0.3},
     ],
     ids=["smooth", "rough"],
 )

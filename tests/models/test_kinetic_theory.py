@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
-from experiments.paper.closed_forms import paper_temperature
+from experiments.support.closed_forms import paper_temperature
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.theory import solver
 from jaxgran.theory.equations import (

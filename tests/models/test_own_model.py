@@ -11,7 +11,7 @@ import pytest
 
 import jaxgran
 from experiments.fit.own_model import HaffLaw
-from experiments.paper.closed_forms import haff
+from experiments.support.closed_forms import haff
 
 MEMBERS = sorted(
     jaxgran.AbstractModel.__abstractmethods__ | jaxgran.AbstractModel.__abstractclassvars__

@@ -298,7 +298,7 @@ def test_jit_and_vmap_give_the_same_numbers(beads):
     assert np.all(fault == 0)
     one = jax.jit(temperature)
     for i in range(2):
-        # Round-off grows by e^3 a collision, and the melt alone has ten.
+        # Round-off grows by e^3 a collision, and the equilibration alone has ten.
         np.testing.assert_allclose(swept[i], one(constants[i])[0], rtol=1e-5)
 
 
@@ -359,8 +359,8 @@ def test_whoever_finds_the_pairs_the_run_is_the_same(beads):
         jaxgran.cool(gas, times, model=SoftSpheres(200, replicas=2, neighbours=by))
         for by in ("scipy", "sweep", "jax-md")
     )
-    # The order of pairs differs, and round-off with it; the melt has ten collisions, so only
-    # what does not depend on the start is compared.
+    # The order of pairs differs, and round-off with it; the equilibration has ten collisions, so
+    # only what does not depend on the start is compared.
     for b in others:
         np.testing.assert_allclose(a.temperature, b.temperature, rtol=0.1)
     start = a.particles

@@ -55,7 +55,7 @@ RUBBING_WALLS = {"tangential_damping": 0.8, "friction": 0.4}
 
 
 def with_all(num=NUM) -> jaxgran.Gas:
-    """Rubbing spheres, that walls of three sides rub too, in a gas that drags."""
+    """Frictional spheres between frictional walls of three sides, with drag."""
     gas = soft(num=num, **SCENES["all"])
     sides = float(gas.box_side(num)) * np.array([1.25, 1.0, 0.8])
     walls = jaxgran.Walls(sides, restitution=gas.law, **RUBBING_WALLS)
@@ -303,7 +303,7 @@ def log_temperatures(gas, model, times, names):
     return logs, jnp.log(jnp.stack([gas.value(name) for name in names]))
 
 
-RUBBED = [
+FRICTION_FLOATS = [
     "dissipative_constant",
     "tangential_damping",
     "friction",
@@ -332,7 +332,7 @@ def test_derivatives_with_friction_of_a_short_run_are_differences():
     h, gas = 1e-6, with_all()
     times = np.array([0.1, 0.2]) * float(gas.mean_free_time)  # before chaos
     model = SoftSpheres(NUM, projection=100.0, steps_per_contact=30)
-    logs, at = both_temperatures(gas, model, times, RUBBED)
+    logs, at = both_temperatures(gas, model, times, FRICTION_FLOATS)
     found = np.asarray(jax.jacfwd(logs)(at))
     np.testing.assert_allclose(jax.jacrev(logs)(at), found, rtol=1e-10, atol=1e-15)
     # Along four directions in all floats, of mixed signs; float by float in a slow test.
@@ -348,7 +348,7 @@ def test_derivatives_with_friction_of_a_short_run_are_differences():
 
 @pytest.mark.slow
 def test_tangents_of_spins_are_exact_between_projections():
-    num, floats = 30, RUBBED[:-2] + ["drag_rotational_rate"]
+    num, floats = 30, FRICTION_FLOATS[:-2] + ["drag_rotational_rate"]
     gas = with_all(num)
     end = 0.4 * float(gas.mean_free_time)
     first = jaxgran.cool(gas, [0.0], model=SoftSpheres(num)).particles
@@ -397,7 +397,7 @@ def test_derivatives_with_friction_are_those_of_differences(dimension):
     gas = with_all(num) if dimension == 3 else in_a_plane()
     times = np.array([1.0, 5.0, 20.0]) * float(gas.mean_free_time)
     model = SoftSpheres(num, replicas=replicas, steps_per_contact=20)
-    names = [name for name in RUBBED if name in gas.domains]
+    names = [name for name in FRICTION_FLOATS if name in gas.domains]
     logs, at = both_temperatures(gas, model, times, names)
     found = np.moveaxis(np.asarray(jax.jacfwd(logs)(at)), -1, 0)
     for i, name in enumerate(names):
@@ -410,7 +410,7 @@ def test_derivatives_with_friction_are_those_of_differences(dimension):
 
 
 def in_a_plane() -> jaxgran.Gas:
-    """Disks that rub."""
+    """Frictional disks."""
     gas = glass_beads(0.15, dimension=2, packing_fraction=0.1)
     stiffer = (float(gas.contact_fraction) / 0.05) ** 2.5
     gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from experiments.paper.closed_forms import (
+from experiments.support.closed_forms import (
     EXPANSION_P,
     EXPANSION_R,
     SONINE_COEFFICIENT,
