@@ -140,5 +140,5 @@ def test_the_steady_state_of_hard_spheres_is_that_of_theory(eps):
 @pytest.mark.parametrize("model", [jaxgran.HardSpheres(50), jaxgran.DSMC(50)])
 def test_drag_that_leaves_nothing_is_refused(model):
     gas = of_constant(0.9, drag=jaxgran.StokesDrag(2.0))
-    with pytest.raises(ValueError, match=r"drag.*end before t = 9\.0.*KineticTheory"):
+    with pytest.raises(ValueError, match=r"drag.*End before t = 9\.0.*KineticTheory"):
         jaxgran.cool(gas, [1.0, 10.0], model=model)

@@ -51,14 +51,14 @@ SCENES = {
         "surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=3e-3),
     },
 }
-RUBBING_WALLS = {"tangential_damping": 0.8, "friction": 0.4}
+FRICTIONAL_WALLS = {"tangential_damping": 0.8, "friction": 0.4}
 
 
 def with_all(num=NUM) -> jaxgran.Gas:
     """Frictional spheres between frictional walls of three sides, with drag."""
     gas = soft(num=num, **SCENES["all"])
     sides = float(gas.box_side(num)) * np.array([1.25, 1.0, 0.8])
-    walls = jaxgran.Walls(sides, restitution=gas.law, **RUBBING_WALLS)
+    walls = jaxgran.Walls(sides, restitution=gas.law, **FRICTIONAL_WALLS)
     return dataclasses.replace(gas, container=walls)
 
 
@@ -234,7 +234,7 @@ def test_without_friction_frictional_spheres_are_smooth():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"law": 0.9}, "needs walls of the Viscoelastic law.*use HardSpheres"),
+        ({"law": 0.9}, "needs walls of the Viscoelastic law.*Use HardSpheres"),
         ({"law": "own", "num": 120}, "spheres of packing_fraction 0.05 need a container 0.833"),
         ({"surface": jaxgran.Rough(0.1)}, "does not support `surface=Rough`.*DSMC"),
     ],
@@ -258,19 +258,19 @@ def test_friction_is_refused_by_the_other_models():
         jaxgran.Frictional(-0.5, 0.1)
 
 
-def test_walls_that_cannot_rub_are_refused():
+def test_walls_with_friction_need_a_tangential_damping():
     law = glass_beads().law
-    with pytest.raises(ValueError, match="have friction and no tangential_damping.*give tang"):
+    with pytest.raises(ValueError, match="have friction but no tangential_damping.*Give both"):
         jaxgran.Walls(0.1, restitution=law, friction=0.1)
     with pytest.raises(ValueError, match="friction of the walls must lie in"):
         jaxgran.Walls(0.1, restitution=law, tangential_damping=0.5, friction=-0.1)
-    walls = jaxgran.Walls(0.1, restitution=law, **RUBBING_WALLS)
+    walls = jaxgran.Walls(0.1, restitution=law, **FRICTIONAL_WALLS)
     for surface in (None, jaxgran.Rough(0.1)):
         with pytest.raises(ValueError, match="friction of the walls needs frictional spheres"):
             soft(container=walls, surface=surface)
     walls = jaxgran.Walls(soft().box_side(NUM), restitution=law, tangential_restitution=0.5)
     gas = soft(container=walls, surface=jaxgran.Rough(0.1))
-    with pytest.raises(ValueError, match="SoftSpheres tangential_damping and friction of the wal"):
+    with pytest.raises(ValueError, match="belongs to instantaneous impacts.*tangential_damping"):
         SoftSpheres(NUM).check(gas)
 
 
