@@ -1,13 +1,13 @@
-"""Write every figure of the documents: the tables of how wrong and how slow, the gallery, README.
+"""Write the generated documents: tables of accuracy and performance, the gallery, README.
 
     python experiments/documents.py [--pictures]
 
-The figures come from `experiments/figures/*.json`, which the scripts write when they are run with
---record, and from nothing else. accuracy.md, speed.md, speed_vs_error.md, hard_cases.md,
-wrong_physics.md, interval_coverage.md and paper_claims.md are written whole; README.md and
-experiments/README.md between their marks `<!-- NAME -->` and `<!-- end of NAME -->`. A test
-compares all of them with what this would write. With --pictures the pictures that
-show nothing but figures (`support/dot_plots.py`) are drawn, too.
+All figures come from `experiments/figures/*.json`, which the scripts write when they are run with
+--record. accuracy.md, speed.md, speed_vs_error.md, hard_cases.md, wrong_physics.md,
+interval_coverage.md and paper_claims.md are generated whole; README.md and experiments/README.md
+only between the marks `<!-- NAME -->` and `<!-- end of NAME -->`. A test compares the documents
+with the output of this script. With --pictures the pictures that show only recorded figures
+(`support/dot_plots.py`) are drawn, too.
 """
 
 import argparse
@@ -33,15 +33,15 @@ MODELS = {
     "hard spheres": ("`HardSpheres(N)`", (2000, 3000), 1.0, "s"),
     "soft spheres": ("`SoftSpheres(N)`", (2000, 3000), 1.0, "s"),
 }
-"""Names, N, units of time and their words, of the models in the table of README.md."""
+"""Code, N, factor and unit of the run time for each model in the table of README.md."""
 USES = {
     "kinetic theory": (
         "dilute gases in boxes below L_c; fits",
         "correlations, clusters, lasting contacts",
     ),
-    "DSMC": ("any law, many decades of time", "positions: the same"),
+    "DSMC": ("any law, many decades of time", "positions, so the same effects"),
     "hard spheres": ("clusters, short contacts", "lasting contacts"),
-    "soft spheres": ("dense and soft gases", "β_t of impacts (it has friction)"),
+    "soft spheres": ("dense and soft gases", "impacts with β_t (friction instead)"),
 }
 
 
@@ -50,7 +50,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--pictures", action="store_true", help="draw the pictures of figures, too")
+    parser.add_argument(
+        "--pictures", action="store_true", help="draw pictures from the figures, too"
+    )
     if parser.parse_args().pictures:
         for name, plot in PLOTS.items():
             drawn(plot(figures(name))).savefig(PICTURES / f"{name}.png", dpi=110)
@@ -59,37 +61,41 @@ def main() -> None:
 
 
 def documents() -> dict[Path, str]:
-    """What each document should contain, by its path."""
+    """Return the text of each generated document, by its path."""
     scenes = figures("speed_vs_error")["scenes"]
     memories = figures("flow_memory")
     whole = {
         "accuracy": "\n".join(
             [
-                table("How wrong", accuracy.ROWS, accuracy.NOTE),
+                table("Accuracy", accuracy.ROWS, accuracy.NOTE),
                 accuracy.MEMORIES,
                 flow_memory.table(memories),
                 "",
-                f"`python experiments/accuracy/flow_memory.py`. Made: {made([memories])}.",
+                f"`python experiments/accuracy/flow_memory.py`. Date: {made([memories])}.",
                 "",
                 accuracy.MEMORIES_MEAN,
             ]
         ),
-        "speed": table("How slow", speed.ROWS, speed.NOTE),
+        "speed": table("Performance", speed.ROWS, speed.NOTE),
         "speed_vs_error": "\n\n".join(
             [
                 "# Speed against error",
                 f"{BY}`/speed_vs_error.json`.",
                 *(
-                    f"{speed_vs_error.table(name, scene)}\n\nMade: {scene['date']}."
+                    f"{speed_vs_error.table(name, scene)}\n\nDate: {scene['date']}."
                     for name, scene in scenes.items()
                 ),
             ]
         )
         + "\n",
-        "hard_cases": hard_cases.table(figures("hard_cases")["cases"]),
-        "wrong_physics": wrong_physics.table(figures("wrong_physics")),
+        "hard_cases": "# Hard cases\n\n" + hard_cases.table(figures("hard_cases")["cases"]),
+        "wrong_physics": (
+            "# Fits with incomplete physics\n\n" + wrong_physics.table(figures("wrong_physics"))
+        ),
         "interval_coverage": "\n".join(
             [
+                "# Coverage of 95 % intervals",
+                "",
                 interval_coverage.table(figures("interval_coverage")),
                 interval_coverage.IN_CLUSTERS,
                 "",
@@ -110,13 +116,13 @@ def documents() -> dict[Path, str]:
 
 
 def claims() -> str:
-    """The table of the paper's claims."""
+    """Return the table of the paper's claims."""
     rows = [claims_table.Row(**row) for row in figures("paper_claims")["rows"]]
     return paper_claims.HEAD + claims_table.Table(FIGURES, rows).markdown()
 
 
 def filled(text: str, blocks: dict[str, str]) -> str:
-    """The text with each block between its marks."""
+    """Return the text with each block inserted between its marks."""
     for name, block in blocks.items():
         begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
         if begin not in text or end not in text:
@@ -127,14 +133,14 @@ def filled(text: str, blocks: dict[str, str]) -> str:
 
 
 def table(title: str, rows: Iterable[Row], note: str) -> str:
-    """A document with one table; the last column says when, and on what if not on two cores."""
+    """Return a document with one table, whose last column is the date of each run."""
     lines = [
         f"# {title}",
         "",
         f"{BY}. Version 0.1.0 on a two-core CPU in float64,",
-        "unless the last column says otherwise; it has the day on which the command was run.",
+        "unless the last column says otherwise. The last column is the date of the run.",
         "",
-        "| what | against | measured | command | made |",
+        "| measurement | reference | result | command | date |",
         "|---|---|---|---|---|",
     ]
     for row in rows:
@@ -145,7 +151,7 @@ def table(title: str, rows: Iterable[Row], note: str) -> str:
 
 
 def made(found: list[dict]) -> str:
-    """The dates of some figures, and what is not usual of what made them."""
+    """Return the dates of some figures, with version, machine and precision if unusual."""
     usual = {"version": "0.1.0", "machine": "two-core CPU", "precision": "float64"}
     words = {
         ", ".join([f["made_by"]["date"], *(f["made_by"][k] for k in usual if differs(f, k, usual))])
@@ -159,9 +165,9 @@ def differs(found: dict, key: str, usual: dict) -> bool:
 
 
 def model_table(scenes: dict) -> str:
-    """README's table: which model when, how wrong, how fast."""
+    """Return the table of the models in README.md: use, limits, error of T and run time."""
     lines = [
-        "| model | for | leaves out | error of T | time, N = 2000 to 3000 |",
+        "| model | use for | leaves out | error of T | run time, N = 2000 to 3000 |",
         "|---|---|---|---|---|",
     ]
     for name, (code, sizes, unit, words) in MODELS.items():
@@ -171,16 +177,17 @@ def model_table(scenes: dict) -> str:
         seconds = between((unit * row["run_s"] for some in rows.values() for row in some), "{:.2g}")
         if max(everywhere) > 10:
             dense = between(errors["dense"] + errors["clustering"], "{:.0f}")
-            error = f"{between(errors['dilute'])} % where dilute, {dense} % where dense"
+            error = f"{between(errors['dilute'])} % dilute, {dense} % dense"
         else:
             error = f"{between(everywhere, '{:.0f}')} %"
         use, omitted = USES[name]
         lines.append(f"| {code} | {use} | {omitted} | {error} | {seconds} {words} |")
-    return "\n".join([*lines, '| `"auto"` | the cheapest within a tolerance | | 2 % asked | |'])
+    auto = '| `"auto"` | the fastest model within a tolerance | | 2 % by default | |'
+    return "\n".join([*lines, auto])
 
 
 def usual_rows(rows: list[dict], name: str, sizes) -> list[dict]:
-    """Rows of a model of these sizes, with nothing else unusual."""
+    """Return the rows of a model with these sizes and otherwise default settings."""
     mine = [row for row in of(rows, model=name) if speed_vs_error.is_usual(row)]
     if name == "kinetic theory":
         return mine
@@ -188,12 +195,12 @@ def usual_rows(rows: list[dict], name: str, sizes) -> list[dict]:
 
 
 def printed(name: str) -> str:
-    """Lines that a fit printed."""
+    """Return the printed lines of a fit as a code block."""
     return "\n".join(["```", *figures(name)["printed"], "```"])
 
 
 def gallery_text() -> str:
-    """A table of scripts for each group of questions."""
+    """Return one table of scripts for each group of questions."""
     lines = []
     for group, entries in gallery.ENTRIES.items():
         lines += ["", f"## {group}", "", "| | question | finding | time |", "|---|---|---|---|"]

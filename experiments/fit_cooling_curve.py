@@ -6,12 +6,12 @@
 CURVE.csv holds header lines `# key: value` (N, eta, diameter, density, Y, nu, T0; SI units), a line
 of column names and rows: t,T and, where measured, T_err, msd, msd_err, T_rot, T_rot_err. Spheres
 are smooth, far from walls and in vacuum unless header lines say otherwise: beta_t, reduced_inertia,
-T_rot_0 of rough ones; container_side, wall_restitution, wall_beta_t; gamma of drag. Lines eta_err,
-diameter_err, density_err, Y_err, nu_err, T0_err are standard errors of the values beside them,
-which then enter the error of the answer. A header line A is not used in the fit; the estimate is
-compared with it. --model auto takes the cheapest model whose estimated
-error, for the gas that kinetic theory fits, is within the tolerance, and says why. Prints a table
-and one line of JSON, and writes a picture and a JSON file.
+T_rot_0 of rough spheres; container_side, wall_restitution, wall_beta_t; gamma of drag. Lines
+eta_err, diameter_err, density_err, Y_err, nu_err, T0_err are standard errors of these values, which
+then enter the error of the estimate. A header line A is not used in the fit; the estimate is
+compared with it. --model auto selects the cheapest model whose estimated error, for the gas that
+kinetic theory fits, is within the tolerance, and gives the reason. Prints a table and one line of
+JSON, and writes a picture and a JSON file.
 """
 
 import sys
@@ -26,7 +26,7 @@ DEFAULT_CURVE = Path(__file__).parent / "data" / "lammps_cooling_dilute.csv"
 
 
 def main() -> int:
-    """`jaxgran fit` with the arguments of this script, and a curve where none is given."""
+    """Run `jaxgran fit` with the arguments of this script and a default curve."""
     return command(["fit", *sys.argv[1:]], started=started, default_curve=DEFAULT_CURVE)
 
 

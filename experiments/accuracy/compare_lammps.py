@@ -2,8 +2,8 @@
 
     python experiments/accuracy/compare_lammps.py [--replicas 4] [--smoke] [--out DIR]
 
-Simulates the gases of both LAMMPS curves. Prints at some times the relative difference of T between
-soft spheres and LAMMPS with its standard error, from the replicas of both, and the difference
+Simulates the gases of both LAMMPS curves. Prints the relative difference of T between soft spheres
+and LAMMPS at some times, with its standard error from the replicas of both, and the difference
 between kinetic theory and LAMMPS. Writes a picture and a JSON file.
 """
 
@@ -40,7 +40,7 @@ def main() -> None:
     curves = {}
     for column, name in zip(axes.T, SCENES, strict=True):
         curves[name] = compare(name, options, column)
-    figure.suptitle("Temperature of two gases with nothing fitted: the A of LAMMPS is given")
+    figure.suptitle("Temperature of two gases, without fitted parameters")
     write_picture(figure, "compare_lammps", options)
     write_results(
         "compare_lammps",

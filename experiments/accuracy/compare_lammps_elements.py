@@ -2,12 +2,12 @@
 
     python experiments/accuracy/compare_lammps_elements.py [--particles 500] [--store] [--out DIR]
 
-The same start is followed in LAMMPS (`pair_style granular` with viscous tangential forces and
-Coulomb's limit, `fix wall/gran` for walls, which rub too) and in jaxgran, for one mean free time.
-Prints the differences of the velocities at several times, and of T and T_rot. LAMMPS has sigma/2 in
-place of the distance to the contact in the slip, so that spheres with friction differ by their
-overlap: a stiffer gas agrees better. LAMMPS is the extra `lammps`. ``--store`` writes a short
-trajectory of 64 spheres for the tests. Writes a picture and a JSON file.
+LAMMPS (`pair_style granular` with viscous tangential forces and Coulomb's limit, `fix wall/gran`
+for walls, which have friction too) and jaxgran simulate the same initial state for one mean free
+time. Prints the differences of the velocities at several times, and of T and T_rot. LAMMPS computes
+the slip with sigma/2 instead of the distance to the contact. The difference is of the order of the
+overlap, so a stiffer gas with friction agrees better. LAMMPS is the extra `lammps`. ``--store``
+writes a short trajectory of 64 spheres for the tests. Writes a picture and a JSON file.
 """
 
 import argparse
@@ -70,13 +70,13 @@ def main() -> None:
 
 
 def scene(name: str, num: int) -> jaxgran.Gas:
-    duration, rubs, contained = SCENES[name]
+    duration, frictional, contained = SCENES[name]
     gas = beads(packing_fraction=0.15, beta=0.3, contact_fraction=duration)
     elements: dict[str, Any] = {}
-    if rubs:
+    if frictional:
         elements["surface"] = jaxgran.Frictional(**FRICTION)
     if contained:
-        friction_material = OF_WALLS if rubs else {}
+        friction_material = OF_WALLS if frictional else {}
         walls = jaxgran.Walls(gas.box_side(num), restitution=gas.law, **friction_material)
         elements["container"] = walls
     return dataclasses.replace(gas, **elements)
@@ -117,7 +117,7 @@ def compare(name: str, num: int) -> dict:
 
 
 def drawn(gas: jaxgran.Gas, num: int) -> jaxgran.Particles:
-    """A start of a gas, without rotation."""
+    """Return an initial state of a gas, without rotation."""
     walls = gas.container and jaxgran.Walls(gas.container.side, restitution=gas.law)
     smooth = dataclasses.replace(gas, surface=None, container=walls)
     start = jaxgran.cool(smooth, [0.0], model=jaxgran.SoftSpheres(num)).particles
@@ -126,19 +126,19 @@ def drawn(gas: jaxgran.Gas, num: int) -> jaxgran.Particles:
 
 
 def relative(T, velocity: np.ndarray, factor: float) -> float:
-    """Relative difference of a temperature from that of velocities."""
+    """Return the relative difference of a temperature from that of given velocities."""
     return T / (factor * np.mean(velocity**2)) - 1
 
 
 def followed(gas: jaxgran.Gas, start: jaxgran.Particles, times, num: int) -> tuple[Any, Any]:
-    """Particles at the last time, and the curve."""
+    """Return the particles at the last time, and the curve."""
     model = jaxgran.SoftSpheres(num, steps_per_contact=STEPS, start=start)
     curve = jaxgran.cool(gas, times, model=model, progress=False)
     return curve.particles, curve
 
 
 def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[str, np.ndarray]:
-    """Positions, velocities and angular velocities in LAMMPS at the given times."""
+    """Return positions, velocities and angular velocities in LAMMPS at the given times."""
     lmp = new_lammps()
     side, sigma = float(start.box_side), float(gas.diameter)
     walls = gas.container
@@ -187,7 +187,7 @@ def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[s
 
 
 def contact(gas: jaxgran.Gas, law, walls: bool) -> str:
-    """The contact law in LAMMPS, between spheres or with a flat wall of a material."""
+    """Return the LAMMPS contact law between spheres or with a flat wall."""
     sigma, mass = float(gas.diameter), float(gas.mass)
     m_eff, radius = (mass, sigma / 2) if walls else (mass / 2, sigma / 4)
     own = law.of_wall() if walls else law
@@ -195,9 +195,9 @@ def contact(gas: jaxgran.Gas, law, walls: bool) -> str:
     stiffness = rho / radius**0.5
     damping = 1.5 * float(law.dissipative_constant) * rho / (m_eff * radius**0.5)
     values = OF_WALLS if walls else FRICTION
-    rub = "0 0" if gas.surface is None else " ".join(str(value) for value in values.values())
+    tangential = "0 0" if gas.surface is None else " ".join(str(value) for value in values.values())
     return (
-        f"hertz {stiffness!r} {damping!r} tangential linear_nohistory {rub} "
+        f"hertz {stiffness!r} {damping!r} tangential linear_nohistory {tangential} "
         "damping viscoelastic limit_damping"
     )
 
@@ -218,7 +218,7 @@ def picture(rows: dict[str, dict], options: argparse.Namespace) -> None:
 
 
 def store(file: Path) -> None:
-    """A trajectory of 64 spheres with friction between walls, for the tests."""
+    """Write a trajectory of 64 spheres with friction between walls, for the tests."""
     gas = scene("walls and friction", 64)
     start = drawn(gas, 64)
     assert isinstance(gas.law, jaxgran.Viscoelastic)

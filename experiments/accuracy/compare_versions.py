@@ -1,12 +1,12 @@
-"""Does this version give the same numbers as another one?
+"""Does this version give the same numbers as another version?
 
     python experiments/accuracy/compare_versions.py CHECKOUT [--record] [--out FILE]
 
 CHECKOUT is the folder of the other version (``git worktree add --detach FOLDER COMMIT``). Both
 versions simulate the same ten scenes with all four models, with elements, derivatives and saved
 observables, fit two curves, one by kinetic theory with its diagnosis and one by DSMC, and fit two
-curves jointly, each version in a process of its own. Every array that they return is compared.
-Prints one row for each case: the number of arrays, "identical" where all bits agree, else the
+curves jointly. Each version runs in a separate process. Every returned array is compared. Prints
+one row for each case: the number of arrays, and "identical" if all bits agree, otherwise the
 largest difference relative to the largest value of that array. The exit code is 1 if a case is not
 identical.
 """
@@ -22,7 +22,7 @@ import numpy as np
 
 from experiments.support.record import DATA, EXPERIMENTS, add_recording, write_results
 
-# Written out, as modules of other versions have other names.
+# The scenes are written out because modules of other versions have other names.
 CASES = """
 import sys
 from dataclasses import replace
@@ -144,7 +144,7 @@ def main() -> int:
 
 
 def relative_difference(one: np.ndarray, other: np.ndarray) -> float:
-    """Largest difference over the largest value; 0 if all bits agree."""
+    """Return the largest difference over the largest value; 0 if all bits agree."""
     if one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes():
         return 0.0
     if one.shape != other.shape or one.dtype.kind not in "fiu":
@@ -153,7 +153,7 @@ def relative_difference(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def arrays_of(folder: Path) -> dict[str, np.ndarray]:
-    """All arrays that the version in a folder returns, by case and number."""
+    """Return all arrays of the version in a folder, by case and number."""
     environment = os.environ | {"PYTHONPATH": str(folder.resolve())}
     with tempfile.TemporaryDirectory() as results:
         file = Path(results) / "arrays.npz"

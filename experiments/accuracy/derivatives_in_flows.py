@@ -1,17 +1,17 @@
-"""How wrong are derivatives in a gas with a flow, does the curve say so, and do differences help?
+"""Are derivatives accurate in a gas with a flow, is their bias estimated, and do differences help?
 
     python experiments/accuracy/derivatives_in_flows.py [--scenes hard disks] [--smoke] [--record]
         [--out DIR]
 
 d ln T / d ln A of gases in boxes longer than L_c, after 3, 10, 30 and 100 collisions per particle:
 
-- reference: central differences of runs, by hand, over many sets of replicas with keys of their
-  own; the step's truncation is corrected by kinetic theory;
-- projected derivatives, and what the curve says of their bias (`CoolingCurve.derivative_bias`);
+- reference: central differences of runs over many sets of replicas with separate keys; kinetic
+  theory corrects the truncation error of the step;
+- projected derivatives, and the estimate of their bias (`CoolingCurve.derivative_bias`);
 - derivatives by differences of one set (``differences=0.3``), with another key.
 
-Standard errors are over replicas. Relative biases mean little where ln T hardly depends on A any
-more. Printed besides: what derivatives cost, forward and reverse, over a run without them.
+Standard errors are over replicas. Relative biases mean little at times when ln T hardly depends on
+A. Also prints the run time of derivatives, forward and reverse, over that of a run without them.
 """
 
 import argparse
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def times_of(gas: jaxgran.Gas, model: jaxgran.HardSpheres, last: float) -> np.ndarray:
-    """Times up to that at which a particle has collided so often, by a run."""
+    """Return times until a particle has made the last number of collisions, measured by a run."""
     times = float(gas.mean_free_time) * np.geomspace(0.3, 60 * last, POINTS)
     counts = jaxgran.cool(gas, times, model=model, progress=False).collisions
     assert counts is not None
@@ -64,7 +64,7 @@ def times_of(gas: jaxgran.Gas, model: jaxgran.HardSpheres, last: float) -> np.nd
 
 
 def examine(name: str, smoke: bool) -> dict:
-    """All results of a scene."""
+    """Compute all results of a scene."""
     phi, beta, dimension, size, replicas, sets = SCENES[name]
     gas = beads(phi, beta, 0.01, dimension)
     collisions = COLLISIONS[:2] if smoke else COLLISIONS
@@ -122,18 +122,18 @@ def examine(name: str, smoke: bool) -> dict:
 
 
 def over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard error over the first axis."""
+    """Return mean and standard error over the first axis."""
     return values.mean(0), values.std(0, ddof=1) / len(values) ** 0.5
 
 
 def bias(columns: dict, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """By which share a derivative is larger than the reference, and its standard error."""
+    """Return the relative difference of a derivative from the reference, and its standard error."""
     (mean, error), (true, spread) = columns[name], columns["reference"]
     return mean / true - 1, np.hypot(error, spread * mean / true) / np.abs(true)
 
 
 def costs(f, model: jaxgran.HardSpheres) -> dict[str, float]:
-    """Seconds of derivatives over those of a run, the second of two calls each."""
+    """Return the run time of derivatives over that of a run, from the second of two calls each."""
 
     def took(call):
         call()
@@ -153,23 +153,23 @@ def costs(f, model: jaxgran.HardSpheres) -> dict[str, float]:
 
 
 def print_scene(name: str, found: dict) -> None:
-    """The table of a scene."""
+    """Print the table of a scene."""
     sizes = f"N = {found['num_particles']} ({found['box_over_critical']:.2f} L_c)"
     print(f"\n{name}: phi, beta = {SCENES[name][:2]}, {sizes}, {found['replicas']} replicas")
-    titles = ("reference", "projected", "differences=0.3", "projected over", "the curve says")
+    titles = ("reference", "projected", "differences=0.3", "projected over", "estimated bias")
     print(f"{'collisions':>11}" + "".join(f"{title:>20}" for title in titles))
     for i, n in enumerate(found["collisions"]):
         print(f"{n:11.1f}", end="")
         for mean, error in found["d_ln_T_d_ln_A"].values():
             print(f"{mean[i]:+12.4f} ± {error[i]:5.4f}", end="")
-        (b, e), told = (x[i] for x in found["bias"]), found["derivative_bias"][i]
-        print(f"{100 * b:+11.1f} ± {100 * e:4.1f} %{100 * told:+18.1f} %")
+        (b, e), estimated = (x[i] for x in found["bias"]), found["derivative_bias"][i]
+        print(f"{100 * b:+11.1f} ± {100 * e:4.1f} %{100 * estimated:+18.1f} %")
     words = ", ".join(f"{kind} {x:.2f}" for kind, x in found["costs"].items() if kind != "run_s")
     print(f"cost in runs of {found['costs']['run_s']:.1f} s: {words}")
 
 
 def draw(results: dict) -> Figure:
-    """The derivatives of each gas by three ways, and the band of the bias that the curve tells."""
+    """Draw the derivatives of each gas by three methods, and the band of the estimated bias."""
     figure = Figure(figsize=(5 * len(results), 4), layout="constrained")
     looks = {
         "reference": ("o", INK, "differences of many runs"),
@@ -187,7 +187,7 @@ def draw(results: dict) -> Figure:
             axes.errorbar(n * 1.08 ** (shift - 1), mean, error, **look)
         slope = np.array(found["d_ln_T_d_ln_A"]["projected"][0])
         freed = slope / (1 + np.array(found["derivative_bias"]))
-        label = "projected, less the bias that its curve tells"
+        label = "projected, minus its estimated bias"
         axes.plot(n, freed, "--", color=COLOURS["soft spheres"], lw=1.2, label=label, zorder=0)
         axes.set(xscale="log", xlabel="collisions per particle", ylabel="d ln T / d ln A")
         title = f"{WORDS[name]} in a box of {found['box_over_critical']:.1f} $L_c$"

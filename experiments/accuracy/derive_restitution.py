@@ -24,7 +24,7 @@ ROUNDS = 300
 
 
 def samples(clipped: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Values of beta, and eps of an impact at each."""
+    """Return values of beta, and eps of an impact at each."""
     top = 3e4 if clipped else 40.0
     s = (1 - np.cos((np.arange(160) + 0.5) * np.pi / 160)) / 2
     beta = np.concatenate([s / (1 - s), np.geomspace(1, top, 50)])
@@ -40,7 +40,7 @@ def fit_rational(
     powers_p: list[int],
     powers_q: list[int],
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """The largest error, and the coefficients of P and Q without the constant ones, slope and 1."""
+    """Return the largest error, and the coefficients of P and Q without the constant ones."""
     z = np.sqrt(beta)[:, None]
     basis_p, basis_q = z ** np.array(powers_p), z ** np.array(powers_q)
     denominator, lawson = np.ones_like(beta), np.ones_like(beta)
@@ -90,7 +90,7 @@ def main() -> None:
 
 
 def draw() -> Figure:
-    """eps by the equation of motion, and the relative error of the package's fit."""
+    """Draw eps by the equation of motion, and the relative error of the package's fit."""
     figure = Figure(figsize=(7.5, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     for clipped, words, style in ((True, "force clipped at 0", "-"), (False, "unclipped", "--")):

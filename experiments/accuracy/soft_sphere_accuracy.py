@@ -1,4 +1,4 @@
-"""How large are the errors of soft spheres, and of which order in the time step?
+"""How large are the errors of soft spheres, and what is their order in the time step?
 
     python experiments/accuracy/soft_sphere_accuracy.py [--smoke] [--out DIR]
 
@@ -36,7 +36,7 @@ IMPACT_STEPS = (25, 50, 100, 200)  # each twice the one before
 GAS_STEPS = (20, 40, 80)
 BETA = 0.1  # of the head-on impact
 ANGLES = {"head-on": 0.0, "at 45°": np.pi / 4}  # between relative velocity and line of centres
-PHASES = 499  # odd: they span several steps of the finer runs, and must not repeat there
+PHASES = 499  # odd, so that phases do not repeat in the finer runs
 LEDGER = {"num_particles": 200, "beta": 0.3, "collision_times": 20, "replicas": 4}
 ELASTIC = {"num_particles": 200, "beta": 0.0, "collision_times": 100, "replicas": 4}
 CONTACT_FRACTION = 0.05  # of the mean free time, in both gases
@@ -123,8 +123,8 @@ def follow_lammps(steps_per_contact, finest: int) -> dict:
 
 
 def impacts(steps_per_contact, phases: int) -> dict:
-    """Errors of eps over all phases of a time step at first touch: one replica per phase."""
-    # So stiff that spheres do not turn about each other during a contact.
+    """Measure errors of eps over the phases of a time step at first touch, one replica each."""
+    # The spheres are so stiff that they do not rotate about each other during a contact.
     gas = beads(0.02, 0.0, 1e-8)
     side, sigma, contact = (float(x) for x in (gas.box_side(2), gas.diameter, gas.contact_duration))
     speed = float(jnp.sqrt(12 * gas.temperature))  # relative speed of a pair with temperature T
@@ -178,15 +178,17 @@ def balance(
     collision_times: float,
     replicas: int,
 ) -> dict:
-    """Relative error of the sum of kinetic, elastic and dissipated energy, which is constant."""
+    """Measure the error of the sum of kinetic, elastic and dissipated energy, a constant."""
     gas = beads(PACKING, 0.0, CONTACT_FRACTION)
     gas = gas.replace(dissipative_constant=beta / (1.5 * 2**0.1 * gas.alpha**0.4 * 0.01**0.1))
     times = np.linspace(0, collision_times, 41) * float(gas.mean_free_time)
-    melted = jaxgran.cool(gas, [0.0], model=jaxgran.SoftSpheres(num_particles, replicas=replicas))
-    rows, curve = [], melted
+    equilibrated = jaxgran.cool(
+        gas, [0.0], model=jaxgran.SoftSpheres(num_particles, replicas=replicas)
+    )
+    rows, curve = [], equilibrated
     for steps in steps_per_contact:
         model = jaxgran.SoftSpheres(
-            num_particles, replicas=replicas, steps_per_contact=steps, start=melted.particles
+            num_particles, replicas=replicas, steps_per_contact=steps, start=equilibrated.particles
         )
         curve = jaxgran.cool(gas, times, model=model)
         each = curve.replicas
@@ -236,7 +238,7 @@ def draw(results: dict) -> Figure:
         (ledger, "ledger", "Energy balance of a cooling gas"),
         (elastic, "elastic", "Energy of an elastic gas"),
     ):
-        axes.set(title=title, ylabel="error, of the first energy")
+        axes.set(title=title, ylabel="error over the initial energy")
         line(axes, results[key], "worst", "o-", SOFT, "worst of all times")
         line(axes, results[key], "end", "s--", INK, "rms at the end")
     for axes in (trajectory, impact, ledger, elastic):

@@ -1,11 +1,11 @@
-"""Are a_2, a_3, D and T of kinetic theory those of direct simulation?
+"""Do a_2, a_3, D and T of kinetic theory agree with direct simulation?
 
     python experiments/accuracy/sonine_coefficients.py [--record] [--smoke] [--out DIR]
 
-By a direct simulation in NumPy that shares no code with jaxgran (`experiments.support.boltzmann`):
-the homogeneous cooling state at constant eps, and the course of a viscoelastic gas from a
-Maxwellian start, in two and three dimensions. Prints what is simulated with its standard error, and
-what kinetic theory differs by.
+A direct simulation in NumPy (`experiments.support.boltzmann`) shares no code with jaxgran. It
+computes the homogeneous cooling state at constant eps, and the evolution of a viscoelastic gas from
+a Maxwellian start, in two and three dimensions. Prints the simulated values with their standard
+errors, and their differences from kinetic theory.
 """
 
 import argparse
@@ -28,17 +28,17 @@ RELAXING = 20.0
 """Collisions per sphere before the cooling state is recorded."""
 
 EFOLDS = 6.0
-"""Relaxation times of D in one window: of D exp(-6) are missing then, and are added."""
+"""Relaxation times of D in one window; the missing fraction exp(-6) of D is added."""
 
 WINDOWS = 6
 LEAST = {3: 90.0, 2: 360.0}
-"""Collisions per sphere in all windows together, at least, by dimension: D scatters more in 2D."""
+"""Least collisions per sphere in all windows, by dimension: D scatters more in 2D."""
 
 SEEDS = {3: 8, 2: 32}
-"""Runs of a course."""
+"""Number of runs of a viscoelastic gas."""
 
 MARKS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
-"""Collisions per sphere at which a course is recorded."""
+"""Collisions per sphere at which a viscoelastic gas is recorded."""
 
 BETA = 0.15
 MODEL = jaxgran.KineticTheory(softness=False, correlations=False)
@@ -46,7 +46,7 @@ NAMES = {"sonine": "a_2", "third_sonine": "a_3", "diffusion": "D"}
 
 
 def cooling_state(d: int, eps: float, blocks: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """a_2, a_3 and D n sigma^(d-1)/sqrt(2 T) with their errors, from the scatter of windows."""
+    """Measure a_2, a_3 and D n sigma^(d-1)/sqrt(2 T), with errors from the scatter of windows."""
     gas = Boltzmann(eps, d, blocks, seed)
     gas.run(RELAXING)
     # Per collision D relaxes at this rate in the first Sonine approximation.
@@ -64,7 +64,7 @@ def cooling_state(d: int, eps: float, blocks: int, seed: int) -> tuple[np.ndarra
 
 
 def theory_of_state(d: int, eps: float) -> np.ndarray:
-    """The same by kinetic theory."""
+    """Return a_2, a_3 and the reduced D of the cooling state by kinetic theory."""
     gas = hard_beads(0.01, eps, d)
     loss = max((1 - eps**2) / (2 * d), 1e-9)
     times = jnp.expm1(80 * loss) / loss * jnp.array([0.5, 1.0]) * gas.mean_free_time
@@ -72,17 +72,17 @@ def theory_of_state(d: int, eps: float) -> np.ndarray:
 
 
 def in_units(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> np.ndarray:
-    """T/T_0, a_2, a_3 and D n sigma^(d-1)/sqrt(2 T), shape (4, times)."""
+    """Return T/T_0, a_2, a_3 and D n sigma^(d-1)/sqrt(2 T), shape (4, times)."""
     assert curve.sonine is not None and curve.third_sonine is not None
     assert curve.diffusion is not None
     theta = curve.temperature / gas.temperature
-    # Without the contact value, by which the path length is shorter.
+    # The contact value, which shortens the path length, is divided out.
     reduced = curve.diffusion / gas.path_length / jnp.sqrt(2 * curve.temperature)
     return np.stack([theta, curve.sonine, curve.third_sonine, reduced])
 
 
 def law_of(gas: jaxgran.Gas) -> Callable[[np.ndarray], np.ndarray]:
-    """eps of a normal speed in units of sqrt(T_0), from a table over its fourth root."""
+    """Return eps of a normal speed in units of sqrt(T_0), from a table over its fourth root."""
     per_unit = 40_000
     g = (np.arange(2 * per_unit) / per_unit) ** 4
     table = np.asarray(1 - gas.reduced_law.loss(jnp.asarray(g / 2**0.5)), np.float32)
@@ -94,7 +94,7 @@ def law_of(gas: jaxgran.Gas) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def error_model(d: int, blocks: int, seeds: int) -> dict:
-    """A viscoelastic gas from a Maxwellian start, and theory at the same times."""
+    """Simulate a viscoelastic gas from a Maxwellian start, and compute theory at the same times."""
     gas = beads(0.01, BETA, dimension=d)
     runs = []
     for seed in range(seeds):
@@ -104,7 +104,7 @@ def error_model(d: int, blocks: int, seeds: int) -> dict:
             rows.append([own.time, *own.moments])
         runs.append(rows)
     found = np.array(runs)
-    # A time is random where N is given: theory is computed at each run's own times.
+    # At a given N the time is random: theory is computed at the times of each run.
     unit = float(gas.path_length / gas.impact_speed) * 2**0.5
     off = np.stack(
         [r[:, 1:].T - in_units(gas, jaxgran.cool(gas, r[:, 0] * unit, model=MODEL)) for r in found]
@@ -122,7 +122,7 @@ def error_model(d: int, blocks: int, seeds: int) -> dict:
 
 
 def draw(states: list[dict], courses: list[dict]) -> Figure:
-    """What theory differs by, in per cent, for constant eps; and T of the courses."""
+    """Draw differences of theory in per cent, for constant eps and for T of viscoelastic gases."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     panels = figure.subplots(1, 3)
     shades = {3: COLOURS["kinetic theory"], 2: COLOURS["soft spheres"]}

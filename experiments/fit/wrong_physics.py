@@ -1,18 +1,18 @@
-"""What does a fit of A say where the curve contains physics that it does not know?
+"""What is the result of a fit of A if the curve contains physics that the model leaves out?
 
     python experiments/fit/wrong_physics.py [--draws 20] [--rows walls] [--record] [--out FILE]
 
 Makes cooling curves of 2 mm beads (phi = .05, A = 3e-6 s; 30 points, 3 % noise) that contain rough
-grains, walls, drag, a noise floor or a constant eps besides or instead, fits A and T_0 with kinetic
-theory of smooth viscoelastic spheres, and prints for each: A found over A true, how often the
-verdict still says "compatible", and how often the range of A over all rivals contains the true A.
-A curve of constant eps has no A: there the range must reach down to 1 % of the A found. Where the
-scene can be told of the roughness, the walls or the drag, it is fitted again so, and the last two
-columns are A and how often its 95 % interval contains the true one.
+grains, walls, drag, a noise floor or a constant eps, fits A and T_0 with kinetic theory of smooth
+viscoelastic spheres, and prints for each: fitted over true A, how often the verdict still says
+"compatible", and how often the range of A over all alternatives contains the true A. A curve of
+constant eps has no A: there the range must reach down to 1 % of the fitted A. If the scene can
+contain the roughness, the walls or the drag, the curve is fitted again with them; the last two
+columns are that A and how often its 95 % interval contains the true one.
 
-The curves are those of hard spheres, 16 boxes of 50 mm with 1492 each, until T has fallen to 2 %
-(walls: between walls); the noise is added to their mean. Hard spheres do not touch for long, so
-that kinetic theory is told to leave the softness of contacts out.
+The curves are simulated with hard spheres, in 16 boxes of 50 mm with 1492 spheres each, until T
+has fallen to 2 % (walls: between walls); the noise is added to their mean. Contacts of hard spheres
+have no duration, so kinetic theory is used with `softness=False`.
 """
 
 import argparse
@@ -33,10 +33,11 @@ BOX, NUM_PARTICLES, REPLICAS = 0.05, 1492, 16  # m; phi = .05
 LAST = 0.02
 THEORY = jaxgran.KineticTheory(softness=False)
 HEAD = (
-    "| the curve contains | A found / 3e-6 s | compatible | range of A / 3e-6 s | truth in it "
-    "| A / 3e-6 s where the scene is told | intervals that hold it |\n|---|---|---|---|---|---|---|"
+    "| added to the curve | fitted A / 3e-6 s | compatible | range of A / 3e-6 s "
+    "| contains the true A | fitted A / 3e-6 s, complete scene "
+    "| 95 % intervals that contain the true A |\n|---|---|---|---|---|---|---|"
 )
-NOTE = "In rows of constant eps there is no A: the range must reach down to 1 % of the A found."
+NOTE = "In rows of constant eps there is no A: the range must reach down to 1 % of the fitted A."
 
 
 def beads() -> jaxgran.Gas:
@@ -51,7 +52,7 @@ def beads() -> jaxgran.Gas:
 
 
 def measured(gas: jaxgran.Gas) -> tuple[jax.Array, jax.Array]:
-    """Times until T has fallen to its last share, and T of hard spheres then."""
+    """Return times until T has fallen to its last share, and T of hard spheres at these times."""
     error_model = jnp.geomspace(1e-2, 1e4, 400) * gas.mean_free_time
     T = jaxgran.cool(gas, error_model, model=THEORY).temperature / gas.temperature
     end = float(jnp.interp(-np.log(LAST), -jnp.log(T), error_model))
@@ -61,7 +62,7 @@ def measured(gas: jaxgran.Gas) -> tuple[jax.Array, jax.Array]:
 
 
 def drag(gas: jaxgran.Gas) -> jaxgran.StokesDrag:
-    """Linear drag that takes 3 % of what the first collisions take."""
+    """Return linear drag whose initial losses are 3 % of those of collisions."""
     return jaxgran.StokesDrag(0.03 * float(first_cooling_rate(gas)) / 2)
 
 
@@ -74,7 +75,7 @@ def constant(eps: float) -> dict:
 
 
 SCENES = [
-    # what the curve contains; what is other than in the gas of the fit; the noise floor over T_0
+    # name of the row; difference from the gas of the fit; noise floor over T_0
     ("nothing else", {}, 0.0),
     ("rough grains, beta_t = -.8", {"surface": jaxgran.Rough(-0.8)}, 0.0),
     ("rough grains, beta_t = -.5", {"surface": jaxgran.Rough(-0.5)}, 0.0),
@@ -114,34 +115,34 @@ def main() -> None:
 
 
 def with_recorded(rows: list[dict]) -> list[dict]:
-    """These rows, and the recorded ones of other curves, in the order of the table."""
+    """Return these rows and the recorded rows of other curves, in the order of the table."""
     known = {row["name"]: row for row in [*figures("wrong_physics")["rows"], *rows]}
     return [known[name] for name, *_ in SCENES if name in known]
 
 
 def table(results: dict) -> str:
-    """The table of all rows."""
+    """Return the table of all rows."""
     return "\n".join([HEAD, *map(line, results["rows"]), "", NOTE]) + "\n"
 
 
 def line(row: dict) -> str:
-    """A row of the table."""
+    """Format a row of the table."""
     low, high = row["range"]
     draws = row["draws"]
-    told = "| "
+    complete = "| "
     if row["told"] is not None:
-        told = f"{row['told']:.2f} | {row['told_held']} of {draws}"
+        complete = f"{row['told']:.2f} | {row['told_held']} of {draws}"
     return (
         f"| {row['name']} | {row['A']:.2f} | {row['compatible']} of {draws} | "
-        f"{low:.2f} to {high:.2f} | {row['inside']} of {draws} | {told} |"
+        f"{low:.2f} to {high:.2f} | {row['inside']} of {draws} | {complete} |"
     )
 
 
 def row(name: str, other: dict, floor: float, draws: int) -> dict:
-    """One row of the table; for a curve without A, A is compared with 3e-6 s."""
+    """Compute a row of the table; for a curve without A, A is compared with 3e-6 s."""
     gas = beads()
     scene = dataclasses.replace(gas, **other)
-    told, true = bool(scene.elements), 0.0 if "law" in other else TRUE_A
+    has_elements, true = bool(scene.elements), 0.0 if "law" in other else TRUE_A
     times, T = measured(scene)
     exact = T + floor * float(gas.temperature)
     found, compatible, ranges, inside = [], 0, [], 0
@@ -158,7 +159,7 @@ def row(name: str, other: dict, floor: float, draws: int) -> dict:
         ranges.append((low / TRUE_A, high / TRUE_A))
         compatible += diagnosis.explains
         inside += low <= max(true, 0.01 * float(result.estimate[0])) <= high
-        if told:
+        if has_elements:
             result = jaxgran.fit(scene, curve, model=THEORY, free=free)
             A, error = (float(x) for x in result.value("dissipative_constant"))
             found_so.append(A / TRUE_A)

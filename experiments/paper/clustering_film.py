@@ -6,8 +6,9 @@
 
 Simulates hard disks of constant restitution, writes their trajectory (GSD, which OVITO, freud and
 VMD read, too) and draws its density: a film, and a picture of four frames. At each frame the run
-also keeps the structure factor and the flow's spectrum (``cool(save=...)``), drawn beside them: the
-flow comes first, the clusters later. With --trajectory only the film of another trajectory is made.
+also saves the structure factor and the spectrum of the flow (``cool(save=...)``), which the picture
+shows too: the flow grows first, the clusters later. With --trajectory only the film of another
+trajectory is made.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from jaxgran import observables
 
 PACKING_FRACTION = 0.245
 COLLISIONS = 100.0
-"""Per particle, until the end."""
+"""Collisions per particle until the end."""
 
 
 def main() -> None:
@@ -38,7 +39,7 @@ def main() -> None:
     parser.add_argument("--restitution", type=float, default=0.85)
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--smoke", action="store_true", help="few disks, few frames")
-    parser.add_argument("--trajectory", type=Path, help="film this one; simulate nothing")
+    parser.add_argument("--trajectory", type=Path, help="trajectory to film, without a simulation")
     parser.add_argument("--out", type=Path, default=Path("results") / "clustering_film")
     add_recording(parser)
     options = parser.parse_args()
@@ -50,7 +51,7 @@ def main() -> None:
         film(options.trajectory, options.out)
         return
     path = options.out / "run.gsd"
-    path.unlink(missing_ok=True)  # of an earlier film here
+    path.unlink(missing_ok=True)  # the trajectory of an earlier film in this folder
     results = simulate(options, path)
     write_results("clustering_film", options, options.out / "clustering_film.json", **results)
     draw(path, results, options)
@@ -58,7 +59,7 @@ def main() -> None:
 
 
 def simulate(options: argparse.Namespace, path: Path) -> dict:
-    """Write the trajectory; the spectra at its frames, and the seconds of the run."""
+    """Write the trajectory; return the spectra at its frames and the seconds of the run."""
     gas = hard_beads(PACKING_FRACTION, options.restitution, dimension=2)
     # Haff's law: collisions per particle N, T/T_0 = exp(-2 N/N_0), 1 + t/t_0 = exp(N/N_0).
     N_0 = 2 * gas.dimension / (1 - options.restitution**2)
@@ -94,7 +95,7 @@ def simulate(options: argparse.Namespace, path: Path) -> dict:
 
 
 def density(path: Path, frame: int) -> np.ndarray:
-    """Density over its mean, in cells of some 9 disks."""
+    """Return the density over its mean, in cells of some 9 disks."""
     particles = jaxgran.read_particles(path, frame=frame)
     cells = max(4, int((particles.position.shape[1] / 9) ** 0.5))
     return np.asarray(observables.cell_density(particles.position[0], particles.box_side, cells))
@@ -116,7 +117,7 @@ def show(axes, values: np.ndarray):
 
 
 def draw(path: Path, results: dict, options: argparse.Namespace) -> None:
-    """Four frames above, the growth of flow and clusters below."""
+    """Draw four frames and, below, the growth of flow and clusters."""
     figure = Figure(figsize=(9, 6.2), layout="constrained")
     above, below = np.asarray(figure.subfigures(2, height_ratios=(1, 1.15)), dtype=object)
     panels = above.subplots(1, 4)
@@ -124,7 +125,7 @@ def draw(path: Path, results: dict, options: argparse.Namespace) -> None:
     for axes, share in zip(panels, (0.0, 0.2, 0.5, 1.0), strict=True):
         k = np.argmin(np.abs(found - share * found[-1]))
         image = show(axes, density(path, int(k)))
-        axes.set_title(f"{results['collisions'][k]:.0f} collisions a disk", fontsize=10)
+        axes.set_title(f"{results['collisions'][k]:.0f} collisions per disk", fontsize=10)
     above.colorbar(image, ax=panels, label="density over its mean", shrink=0.8)
     growth, spectrum = below.subplots(1, 2)
     x = results["collisions"]
@@ -136,7 +137,7 @@ def draw(path: Path, results: dict, options: argparse.Namespace) -> None:
         values = np.asarray(results[name])
         growth.plot(x, values[:, :3].mean(axis=1), style, color="black", label=label)
         spectrum.plot(results["k"][0], values[-1], style, color="black", marker=".")
-    growth.set(xlabel="collisions a disk", ylabel="mean of the three longest waves", yscale="log")
+    growth.set(xlabel="collisions per disk", ylabel="mean of the three longest waves", yscale="log")
     growth.legend(frameon=False)
     spectrum.set(xlabel="wavenumber, diameter k", ylabel="at the last frame", yscale="log")
     spectrum.axvline(2 * np.pi / results["critical_box"], color="0.6", linewidth=1)
@@ -146,7 +147,7 @@ def draw(path: Path, results: dict, options: argparse.Namespace) -> None:
 
 
 def film(path: Path, folder: Path) -> None:
-    """An animated picture of the density, ``film.gif``."""
+    """Write an animated picture of the density, ``film.gif``."""
     count = number_of_frames(path)
     figure = Figure(figsize=(4, 4), layout="constrained")
     axes = figure.subplots()

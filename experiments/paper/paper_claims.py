@@ -1,10 +1,10 @@
-"""A table of every numbered claim of the paper, compared with what is found here.
+"""Which claims of the paper are confirmed? A table of every numbered claim with measurements.
 
     python experiments/paper/paper_claims.py [--results results] [--out DIR]
 
-Constants and formulas are computed here, in seconds. Results that need particles are read from the
-JSON files of the other paper_*.py scripts in the results folder: run these first, rows without
-their file are left out. A verdict is replaced by "DOES NOT HOLD" if the numbers contradict it.
+Constants and formulas are computed here, in seconds. Results of particle simulations are read from
+the JSON files of the other paper_*.py scripts in the results folder. Run these scripts first: a row
+without its file is left out. A verdict is replaced by "DOES NOT HOLD" if the numbers contradict it.
 """
 
 import argparse
@@ -27,15 +27,15 @@ from jaxgran.scene.laws import C1, C2
 
 HEAD = """# The paper's claims
 
-Brilliantov & Pöschel, *Self-diffusion in granular gases*; equations as LaTeX numbers the preprint.
-Made by `paper_claims.py` from the figures of the `paper_*.py`. Definitions and formalism are left
-out (15–21, 23, 25, 26, 28–30, 35, 37). θ = T/T₀, u = 1 + t/τ₀, 𝒯 = T₀/T.
+Brilliantov & Pöschel, *Self-diffusion in granular gases*; equation numbers are those of the
+preprint. Written by `paper_claims.py` from the results of the scripts `paper_*.py`. Definitions and
+formal steps are not listed (15–21, 23, 25, 26, 28–30, 35, 37). θ = T/T₀, u = 1 + t/τ₀, 𝒯 = T₀/T.
 
 """
 
 
 def restitution(table: Table) -> None:
-    """The series of eps, its coefficients and the impact of Hertzian spheres."""
+    """Add the series of eps, its coefficients and the impact of Hertzian spheres."""
     shot = table.found("paper_restitution")
     if shot:
         reach = shot["two_terms_good_to_one_per_cent"]
@@ -72,7 +72,7 @@ def restitution(table: Table) -> None:
 
 
 def remarks(table: Table) -> None:
-    """Other laws of restitution, and a measured curve."""
+    """Add other laws of restitution, and a measured curve."""
     run = table.found("paper_exponents")
     if run:
         seen = [run[k] for k in run if k.startswith("γ")]
@@ -141,7 +141,7 @@ def main() -> None:
 
 
 def _place(row: Row) -> float:
-    """Position of a row in the table, by its first equation; "text" comes last."""
+    """Return the position of a row, by its first equation; "text" comes last."""
     first = row.equation.split(",")[0].split("–")[0]
     return float(first) if first.isdigit() else 99.0 if first else 35.5
 

@@ -5,8 +5,8 @@
 The last argument of Brilliantov & Poeschel's self-diffusion paper: clustering begins in two gases
 of disks after different numbers of collisions per particle, N_c = 70 and 23, but at nearly the same
 temperature, T_c/T_0 = .0031 and .0027, so that temperature would be the better clock. Both gases
-are simulated from several seeds, and so are viscoelastic gases with the same initial cooling rates.
-Writes two pictures and a JSON file.
+and viscoelastic gases with the same initial cooling rates are simulated with several seeds. Writes
+two pictures and a JSON file.
 
 A gas departs from Haff's law when its T, that of all kinetic energy, first exceeds by a given
 factor the T of kinetic theory (Enskog, Sonine a_2) at the same number of collisions per particle,
@@ -99,7 +99,7 @@ def main() -> None:
 
 
 def simulate(config: Config) -> dict:
-    """Every run, by scene, law and seed, compared with kinetic theory."""
+    """Return every run, by scene, law and seed, compared with kinetic theory."""
     runs = {}
     for i, scene in enumerate(config.scenes):
         constant = hard_beads(scene.packing_fraction, scene.restitution, dimension=2)
@@ -129,7 +129,7 @@ def simulate(config: Config) -> dict:
 
 
 def analyse(config: Config, runs: dict) -> dict:
-    """Means and standard errors over the seeds, and ratios between the scenes and the laws."""
+    """Return means and errors over the seeds, and ratios between the scenes and the laws."""
     scenes = {}
     for scene in config.scenes:
         found = {}
@@ -177,7 +177,7 @@ def analyse(config: Config, runs: dict) -> dict:
 
 
 def found_in_all(values: Iterable[float]) -> list[float] | None:
-    """Mean and standard error, or None if not every seed departed."""
+    """Return mean and standard error, or None if not every seed departed."""
     found = mean_error(values)
     return found if np.isfinite(found[0]) else None
 
@@ -187,7 +187,7 @@ def mean_curve(runs: list[dict], grid: np.ndarray, name: str) -> list[float]:
 
 
 def ratios(one: dict, other: dict) -> dict[str, list[float] | None]:
-    """Ratio of two departures in each clock, with its standard error; None if one is missing."""
+    """Return the ratio of two departures in each clock, with its error; None if one is missing."""
 
     def ratio(x, y):
         if x is None or y is None:
@@ -223,9 +223,9 @@ def report(config: Config, figures: dict) -> None:
 
 
 def draw_curves(config: Config, runs: dict, figures: dict) -> Figure:
-    """T over N, and its ratio to that of kinetic theory over N and over T_0/T.
+    """Draw T over N, and its ratio to that of kinetic theory over N and over T_0/T.
 
-    A law has a colour, a density a line style; each of the thin lines is a seed.
+    Colours show laws, line styles densities; each thin line is a seed.
     """
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     axes = figure.subplots(1, 3)
@@ -260,9 +260,9 @@ def draw_curves(config: Config, runs: dict, figures: dict) -> Figure:
         axis.axhline(FACTORS[-1], color=COLOURS_OF["guide"], lw=0.8, zorder=0)
         axis.set_yticks([1, 2, 5, 10, 20], ["1", "2", "5", "10", "20"])
         axis.set_yticks([], minor=True)
-    axes[1].set_title("... from different numbers of collisions on", fontsize=10, loc="left")
+    axes[1].set_title("... after different numbers of collisions", fontsize=10, loc="left")
     axes[2].set(xscale="log", xlabel="$T_0/T$")
-    axes[2].set_title("... but from nearly the same temperature on", fontsize=10, loc="left")
+    axes[2].set_title("... but below nearly the same temperature", fontsize=10, loc="left")
     for axis in axes[:2]:
         axis.set_xlabel("collisions per particle N")
     for axis in axes:
@@ -273,7 +273,7 @@ def draw_curves(config: Config, runs: dict, figures: dict) -> Figure:
 
 
 def draw_fields(config: Config, runs: dict) -> Figure:
-    """The density of the first scene at some times, smoothed over 1.5 mean distances of disks."""
+    """Draw the density of the first scene, smoothed over 1.5 mean distances of disks."""
     scene, seed = config.scenes[0], config.seeds[0]
     figure = Figure(figsize=(2.6 * len(config.fields) + 0.8, 5.6), layout="constrained")
     axes = figure.subplots(2, len(config.fields))

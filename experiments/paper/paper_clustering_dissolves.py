@@ -73,7 +73,7 @@ def gases(config: Config) -> dict[str, jaxgran.Gas]:
 
 
 def simulate(config: Config) -> dict[str, list[dict]]:
-    """The runs of each law, one per seed."""
+    """Return the runs of each law, one per seed."""
     runs = {law: [] for law in LAWS}
     for (law, gas), until in zip(gases(config).items(), config.until, strict=True):
         for seed in config.seeds:
@@ -90,14 +90,14 @@ def simulate(config: Config) -> dict[str, list[dict]]:
 
 
 def critical_boxes(config: Config, run: dict) -> np.ndarray:
-    """L_c in box sides, at each temperature of a run of viscoelastic disks."""
+    """Return L_c in box sides, at each temperature of a run of viscoelastic disks."""
     gas = gases(config)["viscoelastic"]
     lengths = jax.vmap(lambda t: gas.replace(temperature=t).critical_box)(run["temperature"])
     return np.asarray(lengths / gas.box_side(config.num_particles))
 
 
 def analyse(config: Config, runs: dict[str, list[dict]]) -> dict:
-    """Means and standard errors over the seeds, at common numbers of collisions; prints some."""
+    """Return and print means and errors over the seeds, at common numbers of collisions."""
     elastic = mean_error(run["unevenness"][0] for each in runs.values() for run in each)
     figures = {"elastic_unevenness": elastic, "cells_of": PER_CELL}
     print(f"unevenness of the elastic fluid {elastic[0]:.3f} +- {elastic[1]:.3f}")
@@ -137,7 +137,7 @@ def analyse(config: Config, runs: dict[str, list[dict]]) -> dict:
 
 
 def smooth(grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Averages of y over points within 10 % of each grid point, else by interpolation."""
+    """Average y over points within 10 % of each grid point; interpolate if there are none."""
     near = [np.abs(np.log(np.maximum(x, 1e-9) / at)) < 0.1 for at in grid]
     return np.array(
         [y[i].mean() if i.any() else np.interp(at, x, y) for i, at in zip(near, grid, strict=True)]
@@ -145,7 +145,7 @@ def smooth(grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def draw(config: Config, runs: dict[str, list[dict]], figures: dict) -> Figure:
-    """Unevenness and flow over the collisions, and the viscoelastic disks at some times."""
+    """Draw density fluctuations and flow over the collisions, and disks at some times."""
     columns = len(config.fields)
     figure = Figure(figsize=(11, 7.2), layout="constrained")
     grid = figure.add_gridspec(2, 2 * columns, height_ratios=[1.15, 1])
@@ -154,7 +154,7 @@ def draw(config: Config, runs: dict[str, list[dict]], figures: dict) -> Figure:
     panels = zip(
         top,
         ("unevenness", "flow"),
-        ("unevenness of density / elastic", "share of the energy that flows"),
+        ("density fluctuations / elastic", "share of the energy in the flow"),
         strict=True,
     )
     for axis, name, label in panels:
@@ -166,7 +166,7 @@ def draw(config: Config, runs: dict[str, list[dict]], figures: dict) -> Figure:
             axis.fill_between(x, y - error, y + error, color=colour, alpha=0.25, lw=0)
         if None not in figures["critical_box_passes_at"]:
             at = np.mean(figures["critical_box_passes_at"])
-            axis.axvline(at, color="0.5", ls="--", lw=1, label="$L_c$ passes the box")
+            axis.axvline(at, color="0.5", ls="--", lw=1, label="$L_c$ exceeds the box")
         axis.set(xscale="log", xlabel="collisions per particle N", ylabel=label)
         axis.spines[["top", "right"]].set_visible(False)
     top[0].axhline(1, color="0.7", lw=0.8)

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.paper.closed_forms import haff, paper_temperature
 from experiments.support import paper
+from experiments.support.closed_forms import haff, paper_temperature
 from experiments.support.scenes import beads, hard_beads
 from jaxgran.theory.equations import COOLING_RATE
 
@@ -54,7 +54,7 @@ def main() -> None:
 
     figure = paper.figure(
         "Viscoelastic spheres cool as t$^{-5/3}$, spheres of constant ε as t$^{-2}$:"
-        " both of the paper's laws hold, late",
+        " both of the paper's laws hold at late times",
         columns=3,
     )
     left, middle, right = figure.axes
@@ -117,7 +117,7 @@ def main() -> None:
     right.axhline(0, color="0.7", lw=0.8)
     paper.caption(
         right,
-        "Closed forms, off from kinetic theory",
+        "Closed forms: difference from kinetic theory",
         xlabel="time t / τ$_c$(0)",
         ylabel="T$_{formula}$ / T − 1",
         xscale="log",
@@ -139,7 +139,7 @@ def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
 
 
 def formulas(axes, tau: np.ndarray, theta: np.ndarray, delta: float) -> dict:
-    """Relative errors of the paper's closed forms of T(t), drawn, and at some times."""
+    """Draw relative errors of the closed forms of T(t), and return them at some times."""
     u = 1 + COOLING_RATE[3] * delta * tau
     t = jnp.asarray(tau)
     forms = {

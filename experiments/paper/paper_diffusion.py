@@ -1,11 +1,11 @@
-"""How does <dr^2> grow with time, collisions and 1/T, and when do the paper's laws of it hold?
+"""How does <dr^2> grow with time, collisions and 1/T, and when do the paper's laws hold?
 
     python experiments/paper/paper_diffusion.py [--smoke] [--out DIR]
 
-<dr^2> of two gases with the same initial cooling rate, of viscoelastic and of constant restitution,
-by DSMC, kinetic theory and the closed forms (paper, Eqs. (42), (45), (46), (47)); its local
-exponent; and the range of times in which the paper expects its laws to hold, Eq. (43), compared
-with the range in which they do.
+Compares <dr^2> of two gases with the same initial cooling rate, one viscoelastic and one of
+constant restitution, by DSMC, kinetic theory and the closed forms (paper, Eqs. (42), (45), (46),
+(47)); computes its local exponent; and compares the range of times in which the paper expects its
+laws to hold, Eq. (43), with the range in which they do.
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.paper.closed_forms import paper_displacement
 from experiments.support import paper
+from experiments.support.closed_forms import paper_displacement
 from experiments.support.scenes import beads, hard_beads
 from jaxgran.theory.equations import COOLING_RATE, paper_averages
 
@@ -49,8 +49,8 @@ def main() -> None:
     colors = {"viscoelastic": paper.VISCOELASTIC, "constant": paper.CONSTANT}
     labels = {"viscoelastic": f"viscoelastic, δ = {delta:.3f}", "constant": f"constant ε = {e:.3f}"}
     figure = paper.figure(
-        "Viscoelastic grains spread further: ⟨Δr²⟩ ~ t$^{1/6}$ against log t, but the exponent"
-        " 1/6 is far away",
+        "Viscoelastic grains spread further: ⟨Δr²⟩ ~ t$^{1/6}$ instead of log t, but the exponent"
+        " 1/6 is reached very late",
         columns=2,
         rows=2,
     )
@@ -120,7 +120,7 @@ def main() -> None:
 
 
 def columns(curve: jaxgran.CoolingCurve, temperature: float, unit: float) -> list[np.ndarray]:
-    """<dr^2> in T_0 tau_c(0)^2, collisions, T/T_0."""
+    """Return <dr^2> in T_0 tau_c(0)^2, collisions, T/T_0."""
     assert curve.displacement is not None and curve.collisions is not None
     parts = (curve.displacement / unit, curve.collisions, curve.temperature / temperature)
     return [np.asarray(part) for part in parts]
@@ -132,7 +132,7 @@ def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
 
 
 def formulas(axes, tau: np.ndarray, spread: np.ndarray, delta: float) -> dict:
-    """Relative errors of the closed forms of <dr^2>(t), drawn, and at some times."""
+    """Draw relative errors of the closed forms of <dr^2>(t), and return them at some times."""
     rate = COOLING_RATE[3] * delta
     u, t = 1 + rate * tau, jnp.asarray(tau)
     of = {
@@ -150,7 +150,7 @@ def formulas(axes, tau: np.ndarray, spread: np.ndarray, delta: float) -> dict:
 
 
 def cooling_window(delta: float, tau: np.ndarray) -> dict:
-    """Times at which the paper's conditions are met for a given delta, and what holds there."""
+    """Return the paper's range of times for a given delta, and the accuracy of its laws there."""
     gas = beads(0.05, 1.5 * 2**0.1 * delta)
     curve = jaxgran.cool(
         gas,
@@ -190,18 +190,18 @@ def dress(panels) -> None:
     for axes in (in_time, exponent, in_collisions):
         axes.plot([], [], "o", ms=3.5, color=paper.GUIDE, label="DSMC")
     spread, time = "⟨Δr²⟩ / (T$_0$ τ$_c$(0)²)", "time t / τ$_c$(0)"
-    title = "In time: a straight line is log t"
+    title = "Over time: a straight line is log t"
     paper.caption(in_time, title, xlabel=time, ylabel=spread, xscale="log", ylim=(0, 9000))
     exponent.axhline(1 / 6, color=paper.GUIDE, ls=":", lw=1.2)
     exponent.annotate("the paper's 1/6", (2e-1, 1 / 6), color=paper.GUIDE, va="bottom", fontsize=8)
     title = "Local exponent; a logarithm has 0"
     labels = {"xlabel": time, "ylabel": "d ln⟨Δr²⟩ / d ln t"}
     paper.caption(exponent, title, xscale="log", yscale="log", ylim=(0.015, 2.2), **labels)
-    title = "In collisions: both linear, and nearly the same line"
+    title = "Over collisions: both linear, nearly the same line"
     labels = {"xlabel": "collisions per particle  N", "ylabel": spread}
     paper.caption(in_collisions, title, xlim=(0, 600), ylim=(0, 7500), **labels)
     forms.axhline(0, color="0.7", lw=0.8)
-    title = "Closed forms of the viscoelastic ⟨Δr²⟩, off from theory"
+    title = "Closed forms of the viscoelastic ⟨Δr²⟩: difference from theory"
     paper.caption(forms, title, xlabel=time, ylabel="formula / theory − 1", xscale="log")
 
 

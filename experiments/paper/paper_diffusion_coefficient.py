@@ -2,10 +2,10 @@
 
     python experiments/paper/paper_diffusion_coefficient.py [--smoke] [--out DIR]
 
-D(t) of a cooling gas is computed in three ways: from the integral of the velocity autocorrelation
-from t' on, Eq. (9); from the slope of <dr^2>, Eq. (14); and by theory, Eqs. (34) and (40) as
-printed and with memory, dD/dt = T - D/tau_v. The simulations are DSMC, and hard and soft spheres at
-one time t'.
+D(t) of a cooling gas is computed by three methods: from the integral of the velocity
+autocorrelation from t' on, Eq. (9); from the slope of <dr^2>, Eq. (14); and by theory, Eqs. (34)
+and (40) as printed and with memory, dD/dt = T - D/tau_v. The simulations are DSMC, and hard and
+soft spheres at one time t'.
 """
 
 from dataclasses import dataclass, field, replace
@@ -14,7 +14,6 @@ import jax
 import numpy as np
 
 import jaxgran
-from experiments.paper.closed_forms import RELAXATION_CORRECTION
 from experiments.paper.paper_velocity_correlation import (
     SPHERES,
     diffusion,
@@ -24,6 +23,7 @@ from experiments.paper.paper_velocity_correlation import (
 )
 from experiments.paper.paper_velocity_correlation import Config as Correlation
 from experiments.support import paper
+from experiments.support.closed_forms import RELAXATION_CORRECTION
 from experiments.support.scenes import beads, hard_beads
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
@@ -59,7 +59,7 @@ def main() -> None:
         "viscoelastic": (viscoelastic, paper.VISCOELASTIC),
     }
     figure = paper.figure(
-        "Three routes give one D, and it is not T τ$_v$: the gas cools while it remembers",
+        "Three methods give the same D, and it is not T τ$_v$: the gas cools during τ$_v$",
         columns=3,
     )
     fall, ratio, kinds = figure.axes
@@ -86,7 +86,7 @@ def main() -> None:
         ratio.plot([], [], style, mfc="none", color=paper.GUIDE, label=label)
     paper.caption(
         ratio,
-        "Over T τ$_E$, as the gas cools (to the right)",
+        "D over T τ$_E$; the gas cools to the right",
         xlabel="T(t′) / T$_0$",
         ylabel="D / (T τ$_E$)",
         xscale="log",
@@ -112,7 +112,7 @@ def main() -> None:
 
 
 def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio) -> dict:
-    """D of one gas by all methods, in units of T tau_E; drawn and returned."""
+    """Draw and return D of one gas by all methods, in units of T tau_E."""
     start, tau_c = float(gas.temperature), float(gas.mean_free_time)
     unit = 9 * start * tau_c**2  # of <dr^2> per collision at D = T tau_E
     # D of elastic spheres is constant after a few collisions, and their collision rate is constant.
@@ -166,7 +166,7 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: Config, fall, ratio)
 
 
 def by_models(axes, gases: dict, found: dict) -> None:
-    """D/(T tau_E) soon after the start by each model of particles, a line for each way to it."""
+    """Draw D/(T tau_E) soon after the start by each particle model and method."""
     lines = [("DSMC", "dsmc")] + [(name.replace("_", " "), name) for name in SPHERES]
     ways = (("slope", "⟨Δr²⟩", "o"), ("integral", "∫⟨v·v⟩", "D"))
     labels = [f"{words}, {way}" for words, _ in lines for _, way, _ in ways]
@@ -177,7 +177,7 @@ def by_models(axes, gases: dict, found: dict) -> None:
                 if kind == "dsmc":
                     at = -1 if way == "slope" and name != "viscoelastic" else 0
                     if way == "slope" and name == "viscoelastic":
-                        continue  # its D/(T tau_E) falls: no value of it is that of a start
+                        continue  # its D/(T tau_E) decreases: no single value is initial
                     value, error = row[f"by_{way}"][at], row[f"by_{way}_error"][at]
                 elif kind in row:
                     value, error = row[kind][way], row[kind][f"{way}_error"]
@@ -195,7 +195,7 @@ def by_models(axes, gases: dict, found: dict) -> None:
                 )
     axes.set_yticks(range(len(labels)), labels)
     axes.invert_yaxis()
-    title = "By every model, from T(t′) ≥ 0.4 T$_0$ on"
+    title = "All models, T(t′) ≥ 0.4 T$_0$"
     paper.caption(axes, title, xlabel="D / (T τ$_E$)", xlim=(0.95, 1.62))
 
 

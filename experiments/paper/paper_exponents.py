@@ -5,7 +5,7 @@
 The paper's closing remark considers eps = 1 - c v^gamma with exponents other than 1/5. Then
 dT/dt ~ -T^((3 + gamma)/2), T ~ t^(-2/(1 + gamma)) and <dr^2> ~ t^(gamma/(1 + gamma)). Ice as
 measured by Bridges, Hatzes & Lin (Nature 309, 333, 1984), eps = min(1, 0.34 v^-0.234) with v in
-cm/s, is not such a power law: the exponent of its T(t) changes with time. By theory and DSMC.
+cm/s, is not such a power law: the exponent of its T(t) changes with time. Uses theory and DSMC.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from experiments.support.scenes import beads
 from jaxgran._utils.validation import POSITIVE, Domain, float_array
 
 SHADES = ("#084594", "#2171b5", "#6baed6", "#bdc9e1")
-"""From the smallest gamma to the largest: one colour from dark to light, which has no other use."""
+"""Colours from the smallest gamma to the largest, from dark to light."""
 NAME = "paper_exponents"
 
 
@@ -63,11 +63,11 @@ class Ice(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
 
 
 def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """T/T_0 of a Maxwellian gas with any law, and gamma = d ln <1 - eps^2> / d ln sqrt(T).
+    """Return T/T_0 of a Maxwellian gas of any law, and gamma = d ln <1 - eps^2> / d ln sqrt(T).
 
     ``d ln T/d tau = -<1 - eps^2> sqrt(T/T_0)/3`` with the mean weighted by ``g^3 exp(-g^2/2)``,
-    computed as a sum over a fine grid, since `jaxgran.KineticTheory` requires a smooth law, which
-    that of ice is not.
+    computed as a sum over a fine grid, since `jaxgran.KineticTheory` requires a smooth law, unlike
+    that of ice.
     """
     theta = np.geomspace(1.0, 1e-7, 1500)
     g = (np.arange(4000) + 0.5) / 400
@@ -82,7 +82,7 @@ def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def gas_of(gamma: float, config: Config) -> jaxgran.Gas:
-    """Beads with 1 - eps = loss (v/sqrt(2 T_0))^gamma."""
+    """Return beads with 1 - eps = loss (v/sqrt(2 T_0))^gamma."""
     scene = beads(config.packing_fraction, 0.1)
     coefficient = -config.loss / float(scene.impact_speed) ** gamma
     return eqx.tree_at(
@@ -95,7 +95,7 @@ def main() -> None:
     config = SMOKE if options.smoke else Config()
     clock = paper.Clock()
     figure = paper.figure(
-        "1 − ε ~ v$^γ$ cools as t$^{−2/(1+γ)}$; ice has no exponent of its own and ends elastic",
+        "1 − ε ~ v$^γ$ cools as t$^{−2/(1+γ)}$; ice has no fixed exponent and becomes elastic",
         columns=3,
     )
     cooling, exponents, ice = figure.axes

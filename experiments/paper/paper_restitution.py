@@ -1,4 +1,4 @@
-"""Is the paper's series of eps, Eqs. (1), (5) and (6), right, and up to which beta is it accurate?
+"""Is the paper's series of eps, Eqs. (1), (5) and (6), correct, and up to which beta?
 
     python experiments/paper/paper_restitution.py [--smoke] [--out DIR]
 
@@ -25,7 +25,7 @@ RAMIREZ = (0.48358, 0.28528)
 
 @dataclass(frozen=True)
 class Config:
-    rtol: float = 1e-13  # of an impact's solver
+    rtol: float = 1e-13  # tolerance of the solver of an impact
     num_impacts: int = 60  # values of beta in the picture
     lowest: float = 1e-3
     highest: float = 2.0
@@ -46,7 +46,7 @@ def series(betas: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
 
 
 def recovered(config: Config) -> dict[str, list[float]]:
-    """Coefficients of beta^(1/2), beta, ... (clipped) or beta, beta^2, ..., fitted to impacts."""
+    """Fit coefficients of beta^(1/2), beta, ... (clipped) or beta, beta^2, ... to impacts."""
     # A least-squares fit on Chebyshev nodes, twice as many as coefficients.
     nodes = (
         1 - np.cos((np.arange(2 * config.fit_degree) + 0.5) / config.fit_degree * np.pi / 2)
@@ -74,12 +74,18 @@ def main() -> None:
     two = series(betas, (-C1, C2))
 
     figure = paper.figure(
-        "The paper's two terms of ε hold to 1 % up to β = 0.25, whichever way contact ends",
+        "The paper's two terms of ε hold to 1 % up to β = 0.25, for both ends of contact",
         columns=2,
     )
     left, right = figure.axes
     left.plot(betas, clipped, color=paper.INK, label="equation of motion, ends at F = 0")
-    left.plot(betas, unclipped, "--", color=paper.ELASTIC, label="same, ends at ξ = 0 (paper)")
+    left.plot(
+        betas,
+        unclipped,
+        "--",
+        color=paper.ELASTIC,
+        label="equation of motion, ends at ξ = 0 (paper)",
+    )
     left.plot(betas, two, color=paper.VISCOELASTIC, label="paper, Eq. (1): two terms")
     five = series(betas, UNCLIPPED_SERIES)
     left.plot(betas, five, ":", color=paper.INK, label="five terms")
@@ -112,7 +118,7 @@ def main() -> None:
         right.plot(betas[seen], error[seen], style, color=color, label=label)
     paper.caption(
         right,
-        "How far from the equation of motion",
+        "Difference from the equation of motion",
         xlabel="dissipation  β",
         ylabel="error of ε",
         xscale="log",

@@ -2,13 +2,13 @@
 
     python experiments/paper/paper_velocity_correlation.py [--smoke] [--out DIR]
 
-The velocity autocorrelation <v(t').v(t)> of elastic spheres and of spheres of constant and of
+Measures the velocity autocorrelation <v(t').v(t)> of elastic spheres and of spheres of constant and
 viscoelastic restitution, by DSMC and by hard and soft spheres: its decay, and its relaxation time
-tau_v compared with the elastic Enskog time tau_E (paper, Eqs. (24), (31), (32)).
+tau_v, compared with the elastic Enskog time tau_E (paper, Eqs. (24), (31), (32)).
 
 DSMC starts from Maxwellian velocities at T(t'). Hard and soft spheres first cool until t' and
 continue from the state reached there; elastic spheres, whose state does not change, start at once.
-Soft spheres take the viscoelastic law only.
+Soft spheres support the viscoelastic law only.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ from jaxgran.theory.equations import paper_averages
 NAME = "paper_velocity_correlation"
 SPHERES = {"hard_spheres": jaxgran.HardSpheres, "soft_spheres": jaxgran.SoftSpheres}
 MARKERS = {"dsmc": ("o", 3), "hard_spheres": ("s", 1), "soft_spheres": ("^", 1)}
-"""Marker of each model in the picture, and which points are drawn: every third, every one."""
+"""Marker of each model in the picture, and step between drawn points."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,13 @@ SMOKE = replace(
 
 
 def enskog_time(gas: jaxgran.Gas) -> float:
-    """tau_E = (3/2) tau_c, of the gas at its initial temperature."""
+    """Return tau_E = (3/2) tau_c of the gas at its initial temperature."""
     return 1.5 * float(gas.mean_free_time)
 
 
 @partial(jax.jit, static_argnames="dimension")
 def relaxation(law, theta, sonine, dimension: int):
-    """nu_v and the collision rate, in reduced units, at the temperatures theta = T/T_0."""
+    """Return nu_v and the collision rate, in reduced units, at temperatures theta = T/T_0."""
 
     def one(theta, sonine):
         rates = Rates.from_averages(impact_moments(law, jnp.sqrt(theta), dimension), sonine)
@@ -76,9 +76,9 @@ def relaxation(law, theta, sonine, dimension: int):
 
 
 def theory(gas: jaxgran.Gas, lags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """<v(0).v(t)>/(d T_0) = exp(-int nu_v dt) and the collisions per particle.
+    """Return <v(0).v(t)>/(d T_0) = exp(-int nu_v dt) and the collisions per particle.
 
-    The lags, in tau_E, must be so dense that the trapezoidal rule suffices.
+    The lags, in tau_E, must be dense enough for the trapezoidal rule.
     """
     times = lags * enskog_time(gas)
     curve = jaxgran.cool(
@@ -92,7 +92,7 @@ def theory(gas: jaxgran.Gas, lags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stochastic(gas: jaxgran.Gas, config: Config) -> dict:
-    """The autocorrelation by DSMC from a Maxwellian start, its relaxation time and its integral."""
+    """Compute the autocorrelation by DSMC from a Maxwellian start, its tau_v and its integral."""
     lags = np.linspace(0, config.longest, config.lags)
     model = jaxgran.DSMC(config.num_particles, config.replicas)
     key = jax.random.key(config.seed)
@@ -101,7 +101,7 @@ def stochastic(gas: jaxgran.Gas, config: Config) -> dict:
 
 
 def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray, temperature: float) -> dict:
-    """Means and standard errors over the replicas, as lists and numbers for JSON."""
+    """Return means and standard errors over the replicas, as lists and numbers for JSON."""
     each = paper.replicas_of(curve, "velocity_correlation")
     each = each / each[:, :1]
     collisions = paper.replicas_of(curve, "collisions").mean(axis=0)
@@ -123,7 +123,7 @@ def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray, temperature: float) -
 
 
 def in_boxes(gas: jaxgran.Gas, config: Config, ages: bool) -> dict[str, dict]:
-    """The same by every model of spheres that can take the gas; empty if `config.boxes` is 0."""
+    """Compute it by every sphere model that supports the gas; empty if `config.boxes` is 0."""
     kinds = SPHERES if isinstance(gas.law, jaxgran.Viscoelastic) else ["hard_spheres"]
     return {
         kind: spheres(SPHERES[kind](config.num_spheres, replicas=config.boxes), gas, config, ages)
@@ -133,7 +133,7 @@ def in_boxes(gas: jaxgran.Gas, config: Config, ages: bool) -> dict[str, dict]:
 
 
 def spheres(model, gas: jaxgran.Gas, config: Config, ages: bool) -> dict:
-    """The same in boxes of spheres, from t' on, and D from the slope of <dr^2> there."""
+    """Compute it in boxes of spheres, from t' on, and D from the slope of <dr^2> there."""
     age, key = config.age * float(gas.mean_free_time), jax.random.key(config.seed)
     grown = jaxgran.cool(gas, [age / 2, age] if ages else [age / 100], model=model, key=key)
     temperature = float(grown.temperature[-1])
@@ -152,7 +152,7 @@ def spheres(model, gas: jaxgran.Gas, config: Config, ages: bool) -> dict:
 def diffusion(
     curve: jaxgran.CoolingCurve, gas: jaxgran.Gas, which: slice
 ) -> tuple[np.ndarray, np.ndarray]:
-    """D/(T tau_E) between times: d<dr^2>/(6 T tau_E dt), where T tau_E dt ~ sqrt(T) dt ~ dN."""
+    """Return d<dr^2>/(6 T tau_E dt) between times, where T tau_E dt ~ sqrt(T) dt ~ dN."""
     spread = paper.replicas_of(curve, "displacement")[:, which]
     collisions = paper.replicas_of(curve, "collisions")[:, which]
     unit = 9 * float(gas.temperature * gas.mean_free_time**2)
@@ -172,7 +172,7 @@ def main() -> None:
         "viscoelastic": (viscoelastic, paper.VISCOELASTIC, f"viscoelastic, β = {config.beta}"),
     }
     figure = paper.figure(
-        "Dissipation stretches the paths: velocities decay nearly exponentially in collisions,"
+        "Dissipation lengthens the paths: velocities decay nearly exponentially in collisions,"
         " more slowly in time",
         columns=3,
     )
@@ -198,9 +198,9 @@ def main() -> None:
         found[name] = row
     shared = {"yscale": "log", "ylim": (2e-3, 1.2), "ylabel": "⟨v(t′)·v(t)⟩ / ⟨v(t′)²⟩"}
     kinds = "● DSMC, □ hard, △ soft spheres, — theory"
-    title = f"In time: slower than exp(−(t−t′)/τ$_v$(t′)), dashed\n{kinds}"
+    title = f"Over time: slower than exp(−(t−t′)/τ$_v$(t′)), dashed\n{kinds}"
     paper.caption(decay, title, xlabel="(t − t′) / τ$_E$(t′)", xlim=(0, 9), **shared)
-    title = f"In collisions: nearly exponential\n{kinds}"
+    title = f"Over collisions: nearly exponential\n{kinds}"
     paper.caption(counted, title, xlabel="collisions per particle since t′", xlim=(0, 9), **shared)
     found["relaxation"] = relaxation_times(times, config)
     for name in gases:
@@ -216,13 +216,13 @@ def main() -> None:
 
 
 def exact_relaxation(gas: jaxgran.Gas) -> jax.Array:
-    """tau_v/tau_E of the Maxwellian gas at its initial temperature, for any law."""
+    """Return tau_v/tau_E of the Maxwellian gas at its initial temperature, for any law."""
     nu, rate = relaxation(gas.reduced_law, jnp.ones(1), jnp.zeros(1), gas.dimension)
     return (2 / 3 * rate / nu)[0]
 
 
 def printed_relaxation(gas: jaxgran.Gas) -> jax.Array:
-    """tau_v/tau_E by Eq. (31), or by the two terms of Eq. (32)."""
+    """Return tau_v/tau_E by Eq. (31), or by the two terms of Eq. (32)."""
     if isinstance(gas.law, jaxgran.ConstantRestitution):
         return 2 / (1 + gas.law.coefficient)
     one = jnp.ones(())
@@ -231,7 +231,7 @@ def printed_relaxation(gas: jaxgran.Gas) -> jax.Array:
 
 
 def relaxation_times(axes, config: Config) -> dict:
-    """tau_v/tau_E for several strengths of dissipation, drawn over 1 - eps at the thermal speed."""
+    """Draw tau_v/tau_E for several strengths of dissipation over 1 - eps at the thermal speed."""
     short = replace(config, longest=2.0, lags=11)
     phi, found = config.packing_fraction, {}
     laws = {
@@ -259,7 +259,7 @@ def relaxation_times(axes, config: Config) -> dict:
     two = [float(printed_relaxation(gas)) for gas in line]
     axes.plot(x, exact, color=paper.VISCOELASTIC, label="exact average of ε(v)")
     axes.plot(x, two, "--", color=paper.VISCOELASTIC, lw=1, label="Eq. (32), two terms")
-    labels = {"xlabel": "1 − ε at the thermal speed", "ylabel": "τ$_v$ / τ$_E$ at once"}
+    labels = {"xlabel": "1 − ε at the thermal speed", "ylabel": "initial τ$_v$ / τ$_E$"}
     paper.caption(axes, "The relaxation time, from the initial slope", **labels)
     return found
 

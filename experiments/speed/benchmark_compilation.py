@@ -1,15 +1,15 @@
-"""How long does the first run of each particle model, or a fit, compile?
+"""How long does the first run of each particle model, or a fit, take?
 
     python experiments/speed/benchmark_compilation.py [--smoke]
 
 Each row is a new process without a cache of compiled programs: the seconds of the first call of
 `jaxgran.cool` and of the same call again, the seconds that XLA compiles, and the number of
-programs, among them those of single operations on arrays. "HardSpheres from a start" goes on from
-the particles of a run of the same process; its first call is that of the second run.
+programs, including those of single operations on arrays. "HardSpheres from a start" continues from
+the particles of a run in the same process; its first call is that of the second run.
 
-"jaxgran fit" is the main job, `python experiments/fit_cooling_curve.py`, as a user waits for it,
-from the start of Python to its end, with the picture: for the first time, with an empty cache
-folder of the command, and the median of three later times, each a process of its own.
+"jaxgran fit" is the main job, `python experiments/fit_cooling_curve.py`, from the start of Python
+to its end, with the picture: the first time with an empty cache folder, and the median of three
+later times, each in a separate process.
 """
 
 import argparse
@@ -37,7 +37,7 @@ ROWS = ("SoftSpheres", "HardSpheres", "HardSpheres from a start", "DSMC")
 
 
 def first_run(name: str, num: int) -> dict[str, float]:
-    """Seconds and programs of the first run of a model in this process, of one mean free time."""
+    """Measure seconds and programs of the first run of a model, of one mean free time."""
     jax.config.update("jax_enable_x64", True)
     gas = beads(0.05, 0.15)
     times = jnp.array([0.5, 1.0]) * gas.mean_free_time
@@ -63,7 +63,7 @@ def first_run(name: str, num: int) -> dict[str, float]:
 
 
 def in_new_process(name: str, num: int) -> dict[str, float]:
-    """The same in a process of its own, without a cache."""
+    """Measure the first run of a model in a separate process, without a cache."""
     done = subprocess.run(
         [sys.executable, __file__, "--row", name, "--num", str(num)],
         check=True,
@@ -75,7 +75,7 @@ def in_new_process(name: str, num: int) -> dict[str, float]:
 
 
 def main_job() -> dict[str, float]:
-    """Seconds of the fit of the measured curve: the first time, and the median of later ones."""
+    """Measure the seconds of a fit: the first time, and the median of later times."""
     took = []
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, str(JOB), "--out", folder, "--overwrite"]
@@ -88,7 +88,7 @@ def main_job() -> dict[str, float]:
 
 
 def _bare() -> dict[str, str]:
-    """The environment without settings of JAX and of its caches."""
+    """Return the environment without settings of JAX and of its caches."""
     bare = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", "XLA"))}
     return bare | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 

@@ -3,16 +3,16 @@
     python experiments/speed/benchmark_derivatives.py [--fractions .01 .1] [--repeats 5] [--smoke]
         [--out FILE]
 
-ln T at the end of a run of soft spheres, which starts from melted particles, and of a DSMC run, is
-computed in four ways: without a derivative, with its derivative in A in forward mode, with the same
-in reverse mode, and with its Jacobian in A and Y. The four ways take turns in one process. The
-table shows the median run times without compilation; the compilation time of a way leaves out what
-the ways above it have already compiled. Where other processes use the same cores, the ratio of CPU
-seconds is the reliable one.
+ln T at the end of a run is computed in four ways: without a derivative, with its derivative in A in
+forward mode, with the same derivative in reverse mode, and with its Jacobian in A and Y. The runs
+are soft spheres, which start from equilibrated particles, and DSMC. The four ways run alternately
+in one process. The table shows the median run times without compilation; the compilation time of a
+way excludes programs that the ways above it have already compiled. If other processes use the same
+cores, only the ratio of CPU seconds is reliable.
 
-The second table shows by how much reverse mode through soft spheres raises the peak memory of a
-process that has already compiled it, for runs of increasing length, and how much memory it would
-take to store the state after every block (Linux only).
+The second table shows the increase of the peak memory by reverse mode through soft spheres, in a
+process that has already compiled it, for runs of increasing length, and the memory that storing the
+state after every block would need (Linux only).
 """
 
 import argparse
@@ -69,7 +69,7 @@ def main() -> None:
     rows = []
     for fraction in fractions:
         gas = beads(PACKING, BETA, fraction)
-        model = melted(gas, soft)
+        model = equilibrated(gas, soft)
         title = f"SoftSpheres, N={soft}, t_c/tau_c={fraction:g}"
         rows.append(measure(title, gas, model, repeats, compiled=False))
     gas = beads(PACKING, BETA, fractions[0])
@@ -83,8 +83,8 @@ def soft_spheres(start: Particles | None, size: int) -> jaxgran.SoftSpheres:
     return jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT, start=start)
 
 
-def melted(gas: jaxgran.Gas, size: int) -> jaxgran.SoftSpheres:
-    """A model that starts from the final particles of an elastic run."""
+def equilibrated(gas: jaxgran.Gas, size: int) -> jaxgran.SoftSpheres:
+    """Return a model that starts from the final particles of an elastic run."""
     elastic = gas.replace(dissipative_constant=0.0)
     end = [0.5 * float(gas.mean_free_time)]
     curve = jaxgran.cool(elastic, end, model=soft_spheres(None, size), progress=False)
@@ -92,7 +92,7 @@ def melted(gas: jaxgran.Gas, size: int) -> jaxgran.SoftSpheres:
 
 
 def log_temperature(gas: jaxgran.Gas, model, t: float):
-    """ln T at the time t, as a function of A and Y."""
+    """Return ln T at the time t, as a function of A and Y."""
     times = jnp.asarray([t])
 
     def function(constant, modulus):
@@ -104,7 +104,7 @@ def log_temperature(gas: jaxgran.Gas, model, t: float):
 
 
 def measure(title: str, gas: jaxgran.Gas, model, repeats: int, compiled: bool) -> dict:
-    """Run times of each way; with `compiled` the whole run is one program, as of DSMC here.
+    """Measure run times of each way; with `compiled` the whole run is one program (DSMC).
 
     Soft spheres are run by the host driver, which calls compiled functions.
     """
@@ -151,19 +151,19 @@ def measure(title: str, gas: jaxgran.Gas, model, repeats: int, compiled: bool) -
 
 
 def timed(way, at) -> tuple[float, float]:
-    """Wall seconds of a call, and CPU seconds of all its threads."""
+    """Return wall seconds of a call, and CPU seconds of all its threads."""
     begin, cpu = time.perf_counter(), time.process_time()
     jax.block_until_ready(way(*at))
     return time.perf_counter() - begin, time.process_time() - cpu
 
 
 def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict | None:
-    """Peak memory of reverse mode by number of blocks; here a block lasts one contact duration."""
+    """Measure the peak memory of reverse mode by number of blocks of one contact duration."""
     if not STATUS.exists():
         print("no /proc here: peak memory is not measured")
         return None
     gas = beads(PACKING, BETA, fraction)
-    start = melted(gas, size).start
+    start = equilibrated(gas, size).start
     assert start is not None
     state = 2 * np.asarray(start.position).nbytes / 2**20  # positions and velocities, MiB
     print(f"\nreverse mode, SoftSpheres, N={size}, t_c/tau_c={fraction:g}")
@@ -205,7 +205,7 @@ def memory_worker(file: Path, blocks: float) -> None:
 
 
 def memory(name: str) -> float:
-    """Memory of this process, MiB; not from getrusage, whose peak a child takes from its parent."""
+    """Return the memory of this process, MiB; a child inherits the peak of getrusage."""
     (line,) = (x for x in STATUS.read_text().splitlines() if x.startswith(f"{name}:"))
     return int(line.split()[1]) / 2**10
 

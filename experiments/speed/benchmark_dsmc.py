@@ -1,12 +1,12 @@
-"""How many collisions per second does DSMC make, and what does a derivative cost?
+"""How fast is DSMC, and what does a derivative cost?
 
     python experiments/speed/benchmark_dsmc.py [--sizes 10000 100000 1000000] [--smoke] [--out FILE]
 
 A homogeneous gas of viscoelastic spheres cools for some collisions per particle. Times are medians
-of repeated runs; compilation is timed separately. The derivative is that of the whole curve in A,
-by forward mode; it and the plain run it is compared with are each compiled as one program. For
-comparison the speed of DynamO, an event-driven code with positions, is quoted from an earlier
-measurement; DynamO is not run here.
+of repeated runs; compilation is timed separately. The derivative of the whole curve in A is
+computed by forward mode; it and the plain run are each compiled as one program. For comparison the
+speed of DynamO, an event-driven code with positions, is quoted from an earlier measurement; DynamO
+is not run here.
 """
 
 import argparse
@@ -72,7 +72,7 @@ def main() -> None:
 def measure(size: int, dimension: int, collisions: float, repeats: int) -> dict:
     gas = beads(0.1, BETA, dimension=dimension)
     model = jaxgran.DSMC(size)
-    # Kinetic theory tells at which time each particle has collided so often.
+    # Kinetic theory gives the time at which each particle has made these collisions.
     each = max(2 * collisions / size, 2.0)
     trial = np.geomspace(0.1, 1e6, 400) * float(gas.mean_free_time)
     theory = jaxgran.cool(gas, trial)

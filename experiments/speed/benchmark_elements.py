@@ -1,13 +1,13 @@
-"""What do rough spheres, walls, drag and a drive cost, over the smooth gas without them?
+"""What do rough spheres, walls, drag and a drive cost, compared with a smooth gas?
 
     python experiments/speed/benchmark_elements.py [--soft] [--repeats 7] [--smoke] [--out FILE]
 
 Beads (phi = .05, beta_T0 = .15) cool for some mean free times, with each element that a model
-takes. Prints seconds of a first run, the median of repeats in which all scenes take turns, and the
-ratio of the time for each collision to that of the smooth gas (of kinetic theory, of each run), as
-gases with other losses make other numbers of collisions. A box between walls is small, and its
-particles meet walls beside each other: "each contact" is the ratio of times for each collision with
-a particle or a wall, the latter counted by the flux of a mixed gas.
+supports. Prints seconds of a first run, the median of repeats in which all scenes run alternately,
+and the ratio of the time per collision to that of the smooth gas, since gases with other losses
+make other numbers of collisions (for kinetic theory, the ratio of the time per run). In a small box
+between walls, particles also collide with walls: "each contact" is the ratio of times per collision
+with a particle or a wall. Wall collisions are counted by the flux of a homogeneous gas.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads
 
 NUM_HARD, NUM_DSMC, NUM_SOFT = 4096, 100_000, 2000
-RUBBING = {"surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=4e-3)}
+FRICTION = {"surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=4e-3)}
 ELEMENTS = {
     "smooth": {},
     "rough": {"surface": jaxgran.Rough(0.0, rotational_temperature=4e-3)},
@@ -32,8 +32,8 @@ ELEMENTS = {
     "rough, walls": {"surface": jaxgran.Rough(0.0, rotational_temperature=4e-3), "container": None},
     "drag": {"drag": jaxgran.StokesDrag(0.5)},
     "drive": {"drive": None},  # of .02 T_0 in a mean free time
-    "friction": RUBBING,
-    "friction, walls": RUBBING | {"container": None},
+    "friction": FRICTION,
+    "friction, walls": FRICTION | {"container": None},
 }
 
 
@@ -87,7 +87,7 @@ def main() -> None:
 
 
 def measured(model, until: float, repeats: int) -> list[dict]:
-    """A row for each scene that the model takes; the scenes take turns."""
+    """Measure a row for each scene that the model supports; the scenes run alternately."""
     soft = isinstance(model, jaxgran.SoftSpheres)
     gases = {name: scene(elements, soft) for name, elements in ELEMENTS.items()}
     gases = {name: gas for name, gas in gases.items() if set(gas.elements) <= set(model.elements)}
@@ -118,8 +118,11 @@ def measured(model, until: float, repeats: int) -> list[dict]:
 
 
 def wall_hits(gas: jaxgran.Gas, model) -> float:
-    """Collisions with walls for each collision of a pair, ``2 tau_c sum_i 2/(L - sigma) sqrt(T/(2
-    pi))`` over the axes i; 0 for kinetic theory, whose cost has nothing to do with them."""
+    """Return wall collisions per collision of a pair.
+
+    ``2 tau_c sum_i 2/(L - sigma) sqrt(T/(2 pi))`` over the axes i; 0 for kinetic theory, whose cost
+    does not depend on them.
+    """
     if gas.container is None or not model.stochastic:
         return 0.0
     room = np.asarray(gas.container.side) - float(gas.diameter)

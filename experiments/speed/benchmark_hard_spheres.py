@@ -1,17 +1,17 @@
-"""How many collisions per second do hard spheres resolve, compared with LAMMPS in the same run?
+"""How fast are hard spheres, compared with LAMMPS in the same run?
 
     python experiments/speed/benchmark_hard_spheres.py [--sizes 1000 4096] [--smoke] [--out FILE]
     python experiments/speed/benchmark_hard_spheres.py --until 100
 
 A gas cools for some mean free times in a periodic box: viscoelastic beads in three dimensions,
-disks of constant restitution in two. The beads are also run in LAMMPS from the same melted
+disks of constant restitution in two. The beads are also run in LAMMPS from the same equilibrated
 particles; their contacts last .01 mean free times and take 30 steps there. Compilation and the
 set-up before the first step are timed separately and are left out of the rates of both codes.
-Times are medians of repeats in which the two codes take turns, since the speed of a machine varies.
-Small gases are run several times in each repeat, as a single run is too short to be timed.
+Times are medians of repeats in which the two codes run alternately, since the speed of a machine
+varies. Small gases are run several times in each repeat, as a single run is too short to be timed.
 
-With `--until`, 50 000 disks (or the last of `--sizes`) are instead followed into the clustering
-state, until each has made so many collisions.
+With `--until`, 50 000 disks (or the last of `--sizes`) are instead simulated until each has made
+this number of collisions and the gas clusters.
 """
 
 import argparse
@@ -36,7 +36,7 @@ RESTITUTION = 0.9  # in two
 SIZES = (1000, 4096, 16384, 50000)
 COLLISION_TIMES = 4.0
 REPEATS = 7
-TIMED = 10_000  # one timing covers so many runs that they have at least this many particles
+TIMED = 10_000  # one timing covers several runs with at least this many particles in total
 
 
 def main() -> None:

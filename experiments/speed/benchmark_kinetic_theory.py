@@ -7,7 +7,7 @@
    relative to a solution with a tighter tolerance.
 2. One derivative, in forward and in reverse mode, compared with one solution without it.
 3. The first calls in a new process, which compile; the time of `import jaxgran`, and of a whole fit
-   by `fit_cooling_curve.py` in a new process, for the first time and again.
+   by `fit_cooling_curve.py` in a new process, the first time and the second time.
 
 Run times are medians of repeats, without compilation, which is given separately.
 """
@@ -39,7 +39,7 @@ RTOL = 1e-7  # gives the accuracy that LSODA reaches with SCIPY_RTOL
 SCIPY_RTOL = 1e-9
 REPEATS = 5
 SAME_EQUATIONS = {"order": 2, "softness": False, "correlations": False}
-"""Options with which kinetic theory has the equations that are written here for SciPy."""
+"""Options for which kinetic theory solves the equations that are written here for SciPy."""
 
 
 def scene() -> jaxgran.Gas:
@@ -53,7 +53,7 @@ def scene() -> jaxgran.Gas:
 
 
 def median_seconds(run: Callable, repeats: int) -> tuple[float, float]:
-    """Seconds of compilation (the first call less a later one), and the median of later calls."""
+    """Return seconds of compilation (first call less a later one) and the median of later calls."""
     begin = time.perf_counter()
     jax.block_until_ready(run())
     first = time.perf_counter() - begin
@@ -66,7 +66,7 @@ def median_seconds(run: Callable, repeats: int) -> tuple[float, float]:
 
 
 def scipy_curve(gas: jaxgran.Gas, a: float, times: np.ndarray) -> np.ndarray:
-    """T of one gas by NumPy and SciPy, with the averages computed by quadrature at every step."""
+    """Solve T of one gas by NumPy and SciPy, with averages by quadrature at every step."""
     law = gas.replace(dissipative_constant=a).reduced_law
     beta = float(law.beta)  # pyright: ignore
     g, weights = NODES, averaging_matrix(3, 2).reshape(9, -1)
@@ -104,7 +104,7 @@ def scipy_curve(gas: jaxgran.Gas, a: float, times: np.ndarray) -> np.ndarray:
 
 
 def numpy_restitution(beta: np.ndarray) -> np.ndarray:
-    """The rational fit of the clipped restitution law, in NumPy."""
+    """Return eps by the rational fit of the clipped restitution law, in NumPy."""
     from jaxgran.scene.laws import _CLIPPED as fit
     from jaxgran.scene.laws import C1
 
@@ -198,11 +198,11 @@ for name, run in {
     seconds[f"first_{name}_s"] = time.perf_counter() - begin
 print(json.dumps(seconds))
 """
-"""The first calls of a new process, one after the other; each compiles what it needs."""
+"""Script of a new process that times first calls, each of which compiles."""
 
 
 def cold_starts() -> dict[str, float]:
-    """Seconds of new processes; nothing compiled is kept from before."""
+    """Measure seconds of new processes, without earlier compiled programs."""
     bare = {k: v for k, v in os.environ.items() if not k.startswith("JAX")}
     root = Path(__file__).parents[2]
     bare["PYTHONPATH"] = os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
@@ -227,7 +227,7 @@ def cold_starts() -> dict[str, float]:
     script = str(root / "experiments" / "fit_cooling_curve.py")
     with tempfile.TemporaryDirectory() as folder:
         kept = {"XDG_CACHE_HOME": folder}
-        for name in ("main_job_s", "main_job_again_s"):  # the second time with kept programs
+        for name in ("main_job_s", "main_job_again_s"):  # the second time with cached programs
             row[name] = seconds(script, "--out", folder, "--overwrite", **kept)
     empty = float(np.median([seconds("-c", "pass") for _ in range(3)]))
     light = float(np.median([seconds("-c", "import jaxgran") for _ in range(3)]))

@@ -1,16 +1,17 @@
-"""What does a gas of a million particles cost, until it has clusters, and on one core or two?
+"""What does a gas of a million particles cost until it clusters, on one and on two cores?
 
     python experiments/speed/benchmark_million.py [--models hard-spheres soft-spheres dsmc]
         [--size 1000000] [--cases "two cores" clusters] [--smoke] [--out FILE] [--record]
 
 Disks of phi = .05, of constant restitution .6 (hard), or viscoelastic with the same first cooling
-rate and contacts of .01 mean free times (soft), cool in one periodic box. Every case is a process
-of its own, which tells its peak memory. Four cases are short runs, without compilation and set-up,
-from a disturbed lattice: the whole gas on one core and on all, half of it on one core, and two
-replicas of half of it on two CPU devices. In "clusters" the gas is melted, by hard disks, and then
-followed until the number of disks in cells of 20 varies twice as much as in an elastic fluid, which
-takes 7 to 10 collisions per disk. DSMC has no clusters. With --record models that are not run keep
-their rows, which tell their date, and the load of the machine before they began.
+rate and contacts of .01 mean free times (soft), cool in one periodic box. Every case runs in a
+separate process and reports its peak memory. Four cases are short runs, without compilation and
+set-up, from a disturbed lattice: the whole gas on one core and on all cores, half of the gas on one
+core, and two replicas of half the gas on two CPU devices. In "clusters" the gas is equilibrated as
+hard disks and then simulated until the number of disks in cells of 20 varies twice as much as in an
+elastic fluid, which takes 7 to 10 collisions per disk. DSMC has no clusters. With --record, models
+that are not run keep their rows. Each row contains its date and the load of the machine before the
+run.
 """
 
 import argparse
@@ -44,14 +45,14 @@ SHORT = {"hard-spheres": 0.5, "soft-spheres": 0.5, "dsmc": 10.0}
 SCALING = ("one core", "two cores", "half on one core", "two devices")
 CLUSTERS = "clusters"
 UNTIL = {"hard-spheres": 10.0, "soft-spheres": 13.0}
-"""Collisions per disk of a gas that is followed to its clusters, if it stayed homogeneous."""
+"""Collisions per disk, in a homogeneous gas, of the run in which clusters form."""
 
 FLUID = 0.798
 """Variance over mean of the number of disks in the cells of the elastic fluid
 (`experiments/paper/paper_clustering.py`)."""
 
 DEVICES_GB = (16, 80, 141)
-"""Memory of devices for which a number of particles is told."""
+"""Memory of devices for which the largest number of particles is estimated."""
 
 
 def main() -> None:
@@ -89,7 +90,7 @@ def main() -> None:
 
 
 def merged(rows: list[dict]) -> list[dict]:
-    """With what was recorded of other models and other cases."""
+    """Return the rows, completed by recorded rows of other models and cases."""
     known = figures(NAME)["rows"] if (FIGURES / f"{NAME}.json").exists() else []
     each = {row["model"]: row for row in known}
     for row in rows:
@@ -99,15 +100,15 @@ def merged(rows: list[dict]) -> list[dict]:
 
 
 def words(found: dict) -> str:
-    text = f"{1e6 * found['s_per_collision']:.3g} us a collision, {found['peak_GiB']:.2f} GiB"
+    text = f"{1e6 * found['s_per_collision']:.3g} us per collision, {found['peak_GiB']:.2f} GiB"
     if "clusters_at" in found:
         text += f", clusters after {found['clusters_at']:.1f} collisions, "
-        text += f"melt {found['melt_s']:.0f} s, run {found['run_s']:.0f} s"
+        text += f"equilibration {found['melt_s']:.0f} s, run {found['run_s']:.0f} s"
     return text
 
 
 def derived(row: dict) -> dict:
-    """Ratios of rates, and memory of a particle."""
+    """Return ratios of rates, and memory per particle."""
     known = {case: row[case] for case in SCALING if case in row}
     rate = {case: 1 / found["s_per_collision"] for case, found in known.items()}
     found = {}
@@ -126,7 +127,7 @@ def derived(row: dict) -> dict:
 
 
 def peak_memory() -> float:
-    """Of this process so far, GiB."""
+    """Return the peak memory of this process so far, GiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
@@ -155,7 +156,7 @@ def gas_of(name: str) -> jaxgran.Gas:
 
 
 def times_of(gas: jaxgran.Gas, collisions: np.ndarray) -> np.ndarray:
-    """When a homogeneous gas has made so many collisions per particle, by kinetic theory."""
+    """Return the times of given collisions per particle, by kinetic theory."""
     trial = np.concatenate([[0.0], np.geomspace(1e-3, 1e4, 400)]) * float(gas.mean_free_time)
     theory = jaxgran.cool(gas, trial)
     assert theory.collisions is not None
@@ -163,7 +164,7 @@ def times_of(gas: jaxgran.Gas, collisions: np.ndarray) -> np.ndarray:
 
 
 def disturbed_lattice(gas: jaxgran.Gas, size: int, replicas: int) -> jaxgran.Particles:
-    """Disks in a square lattice, each anywhere in its square, with Maxwellian velocities."""
+    """Return disks at random places in the cells of a square lattice, with random velocities."""
     rng, side = np.random.default_rng(0), float(gas.box_side(size))
     per_side = int(np.ceil(size**0.5))
     spacing = side / per_side
@@ -177,7 +178,7 @@ def disturbed_lattice(gas: jaxgran.Gas, size: int, replicas: int) -> jaxgran.Par
 
 
 def short(gas: jaxgran.Gas, name: str, size: int, replicas: int) -> dict:
-    """A short run; seconds for each collision of any replica, without compilation and set-up."""
+    """Return seconds per collision of a short run, without compilation and set-up."""
     more = {}
     if name != "dsmc":
         more["start"] = disturbed_lattice(gas, size, replicas)
@@ -205,7 +206,7 @@ def short(gas: jaxgran.Gas, name: str, size: int, replicas: int) -> dict:
 
 
 def to_clusters(gas: jaxgran.Gas, name: str, size: int) -> dict:
-    """A melted gas followed to its clusters, compilation included."""
+    """Run an equilibrated gas until it clusters, compilation included."""
     cells = max(2, round((size / PER_CELL) ** 0.5))
 
     def unevenness(particles: jaxgran.Particles) -> jax.Array:
@@ -213,18 +214,18 @@ def to_clusters(gas: jaxgran.Gas, name: str, size: int) -> dict:
         return jaxgran.observables.number_fluctuation(*where, cells)
 
     begin = time.perf_counter()
-    melt = jaxgran.HardSpheres(size)
-    start = jaxgran.cool(gas, [0.0], model=melt, progress=False).particles
+    equilibration = jaxgran.HardSpheres(size)
+    start = jaxgran.cool(gas, [0.0], model=equilibration, progress=False).particles
     assert start is not None
-    melted = time.perf_counter()
+    equilibrated = time.perf_counter()
     model = MODELS[name](size, start=start)
     times = times_of(gas, np.linspace(0.0, UNTIL[name], 14))
     curve = jaxgran.cool(gas, times, model=model, save=unevenness, progress=False)
     assert curve.collisions is not None
     collisions, uneven = np.asarray(curve.collisions), np.asarray(curve.saved)
-    run_s = time.perf_counter() - melted
+    run_s = time.perf_counter() - equilibrated
     return {
-        "melt_s": melted - begin,
+        "melt_s": equilibrated - begin,
         "run_s": run_s,
         "s_per_collision": run_s / (float(collisions[-1]) * size / 2),
         "clusters_at": crossing(collisions, uneven, 2 * FLUID),

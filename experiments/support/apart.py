@@ -1,4 +1,4 @@
-"""Measurements that need a process of their own: cores, devices and the peak of its memory."""
+"""Measurements that need a separate process: cores, devices and peak memory."""
 
 import json
 import os
@@ -9,11 +9,11 @@ from experiments.support.record import EXPERIMENTS
 
 
 def alone(script: str, *arguments: str) -> dict:
-    """What a script prints in its last line, as JSON, in a process of its own.
+    """Run a script in a separate process and return its last printed line, which is JSON.
 
     Args:
-        script: its file.
-        arguments: of its command line.
+        script: file of the script.
+        arguments: its command-line arguments.
     """
     environment = dict(os.environ)
     folders = [str(EXPERIMENTS.parent), environment.get("PYTHONPATH", "")]

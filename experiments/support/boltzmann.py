@@ -1,8 +1,8 @@
-"""The homogeneous Boltzmann equation by random collisions, in NumPy, apart from jaxgran's DSMC.
+"""The homogeneous Boltzmann equation by random collisions, in NumPy, without jaxgran's code.
 
-Blocks of spheres are drawn at random and two of them meet, sphere by sphere: a pair collides with
-the probability |g|/g_max of its normal speed g along a random unit vector. Only some thousandth of
-the gas takes part in one such event, so that time is continuous to that order.
+An event pairs two random blocks of spheres, sphere by sphere. A pair collides along a random unit
+vector with probability |g|/g_max, where g is its normal speed. Only some thousandth of the gas
+takes part in one event, so that time is continuous to that order.
 """
 
 from collections.abc import Callable
@@ -16,14 +16,14 @@ FASTEST = 6.5
 """g_max in units of sqrt(T): 4e-6 of pairs of a Maxwellian gas are faster."""
 
 POOL = 1 << 18
-"""Unit vectors and random numbers that are drawn at once, and read from random places."""
+"""Number of unit vectors and random numbers drawn at once; reads start at random places."""
 
 RENEWED = 512
-"""Events after which they are drawn anew."""
+"""Number of events after which these numbers are replaced."""
 
 
 class Moments(NamedTuple):
-    """Of the gas at one time: T over its first value, a_2, a_3, D n sigma^(d-1)/sqrt(2 T)."""
+    """Moments at one time: T over its initial value, a_2, a_3, D n sigma^(d-1)/sqrt(2 T)."""
 
     temperature: float
     sonine: float
@@ -48,13 +48,13 @@ class Boltzmann:
         self.velocity = self.rng.standard_normal((blocks, d, BLOCK), dtype=np.float32)
         self.scale, self.collisions, self.time, self.events = 1.0, 0.0, 0.0, 0
         self._rescale(first=True)
-        self.since = 0.0  # scaled time for which spheres move at their present velocities
+        self.since = 0.0  # scaled time during which spheres move at their current velocities
         self.moved = np.zeros_like(self.velocity)
         surface = 2 * pi ** (d / 2) / gamma(d / 2)
         self.step = 4 * BLOCK / (self.n * FASTEST * surface)
 
     def run(self, collisions: float) -> None:
-        """Go on for so many collisions per sphere."""
+        """Continue for the given number of collisions per sphere."""
         end = self.collisions + collisions
         while self.collisions < end:
             hits = 0
@@ -69,12 +69,12 @@ class Boltzmann:
             self._rescale()
 
     def forget(self) -> None:
-        """Count displacements from now on."""
+        """Reset the displacements."""
         self.moved[:] = 0
 
     @property
     def moments(self) -> Moments:
-        """At the end of a run."""
+        """Return the moments at the end of a run."""
         d, square = self.d, np.sum(self.velocity.astype(float) ** 2, axis=1)
         mean = np.mean(square)
         square *= d / mean

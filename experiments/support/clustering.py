@@ -15,7 +15,7 @@ from jaxgran.plotting import COLOURS as COLOURS_OF
 
 LAWS = ("constant", "viscoelastic")
 COLOURS = (COLOURS_OF["constant restitution"], COLOURS_OF["viscoelastic"])
-"""Of the laws."""
+"""Colours of the laws."""
 
 PER_CELL = 20
 """Mean number of disks in the cells over which density and flow are measured.
@@ -23,7 +23,7 @@ PER_CELL = 20
 Such a cell is smaller than a cluster."""
 
 SPARE = 4.0
-"""Capacity for pairs over what a homogeneous gas needs: clusters have more."""
+"""Capacity for pairs over that of a homogeneous gas, since clusters have more pairs."""
 
 FACTORS = (1.05, 1.1, 1.2, 2.0)
 """Ratios of T to that of kinetic theory at which a gas counts as departed from it."""
@@ -36,7 +36,7 @@ SLOPE_OVER = 6
 
 
 def viscoelastic_like(gas: jaxgran.Gas) -> jaxgran.Gas:
-    """Viscoelastic disks with the same initial cooling rate, -d ln T/dt of a Maxwellian gas."""
+    """Return viscoelastic disks with the same initial cooling rate of a Maxwellian gas."""
     theory = jaxgran.KineticTheory()
 
     def alike(beta: float) -> jaxgran.Gas:
@@ -49,7 +49,7 @@ def viscoelastic_like(gas: jaxgran.Gas) -> jaxgran.Gas:
 
 
 def dissipation(gas: jaxgran.Gas) -> float:
-    """gamma_0: half of the initial decrease of ln T per collision per particle."""
+    """Return gamma_0, half of the initial decrease of ln T per collision per particle."""
     return float(jaxgran.KineticTheory().cooling_rate(gas) / gas.collision_frequency) / 2
 
 
@@ -61,14 +61,14 @@ def follow(
     keep: Collection[float] = (),
     progress: Callable[[float], None] = lambda collisions: None,
 ) -> dict:
-    """Cool hard disks until each has made `until` collisions, in runs of about one collision.
+    """Cool hard disks until each has made `until` collisions, in a sequence of short runs.
 
     Each run starts from the final particles of the one before and lasts about one collision per
     particle, or 3 % of those made so far. Its duration follows from the temperature reached.
 
     Args:
         gas: the disks.
-        seed: of the random numbers of the initial state, a melted elastic gas.
+        seed: random seed of the initial state, an equilibrated elastic gas.
         num_particles: number of disks.
         until: collisions per particle.
         keep: collisions per particle at which positions are stored.
@@ -120,7 +120,7 @@ def follow(
 
 
 def clusters(particles: jaxgran.Particles) -> tuple[float, float]:
-    """Unevenness of the density, and the share of the kinetic energy that is flow.
+    """Return the unevenness of the density, and the share of the kinetic energy in the flow.
 
     Both are measured on square cells with `PER_CELL` disks on average. The unevenness is the
     variance of the number of disks in a cell over its mean: 1 for independent points, less for a
@@ -139,7 +139,7 @@ def clusters(particles: jaxgran.Particles) -> tuple[float, float]:
 
 
 def homogeneous(gas: jaxgran.Gas, run: dict) -> tuple[np.ndarray, np.ndarray]:
-    """ln T of kinetic theory at the collisions per particle of a run, and at its times."""
+    """Return ln T of kinetic theory at the collisions per particle of a run, and at its times."""
     tau = np.concatenate([[0.0], np.geomspace(1e-2, 1e13, 800)])
     theory = jaxgran.cool(gas, jnp.asarray(tau) * gas.mean_free_time)
     assert theory.collisions is not None
@@ -149,7 +149,7 @@ def homogeneous(gas: jaxgran.Gas, run: dict) -> tuple[np.ndarray, np.ndarray]:
 
 
 def crossing(x: np.ndarray, y: np.ndarray, level: float) -> float:
-    """The first x at which y reaches a level, by linear interpolation; nan if it never does."""
+    """Return the first x at which y reaches a level, by linear interpolation; nan if never."""
     above = np.flatnonzero(y >= level)
     if not above.size or above[0] == 0:
         return float("nan")
@@ -158,14 +158,14 @@ def crossing(x: np.ndarray, y: np.ndarray, level: float) -> float:
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """dy/dx at each point, from a straight line fitted through it and its neighbours."""
+    """Return dy/dx at each point, from a line fitted to it and its neighbours."""
     half = SLOPE_OVER // 2
     ends = [(max(i - half, 0), min(i + half, len(x) - 1) + 1) for i in range(len(x))]
     return np.array([np.polyfit(x[a:b], y[a:b], 1)[0] for a, b in ends])
 
 
 def departures(run: dict, elastic: float) -> dict[str, dict[str, float]]:
-    """Collisions, T/T_0 and nu_0 t where a run departs from kinetic theory, by each definition."""
+    """Return N, T/T_0 and nu_0 t of the departure from kinetic theory, by each definition."""
     x = run["collisions"]
     at = {f"T over theory's of N by {c:g}": crossing(x, run["excess"], np.log(c)) for c in FACTORS}
     for c in FACTORS:
@@ -186,6 +186,6 @@ def departures(run: dict, elastic: float) -> dict[str, dict[str, float]]:
 
 
 def mean_error(values: Iterable[float]) -> list[float]:
-    """Mean and standard error; nan if one value is."""
+    """Return mean and standard error; nan if one value is nan."""
     every = np.asarray(list(values))
     return [float(every.mean()), float(every.std(ddof=1) / len(every) ** 0.5)]

@@ -1,4 +1,4 @@
-"""Pictures of recorded figures: a dot for each row, with its range, beside what it is held against.
+"""Pictures of recorded figures: a dot for each row, with its range, and a reference line.
 
 ``python experiments/documents.py --pictures`` draws them all; the entries of the gallery show them.
 """
@@ -16,11 +16,11 @@ class Dot(NamedTuple):
     """A row of a picture.
 
     Attributes:
-        label: left of it.
-        value: where the dot is.
+        label: text to the left.
+        value: position of the dot.
         low, high: ends of its bar; None for no bar.
-        model: whose colour it has; "" for that of what was measured.
-        hollow: a second kind of dot, told in the legend of the picture.
+        model: model whose colour is used; "" for the colour of measurements.
+        hollow: whether it is of the second kind in the legend.
     """
 
     label: str
@@ -36,10 +36,10 @@ class DotPlot(NamedTuple):
 
     Attributes:
         dots: from top to bottom; dots with the same label share a line.
-        axis: words under the axis.
-        reference: a vertical line, and its words; None for none.
-        logarithmic: whether the axis is.
-        kinds: words for full and hollow dots; "" where there is one kind only.
+        axis: label of the axis.
+        reference: position and label of a vertical line; None for no line.
+        logarithmic: whether the axis is logarithmic.
+        kinds: legend of full and hollow dots; "" if there is one kind only.
     """
 
     dots: list[Dot]
@@ -54,7 +54,7 @@ NAMES = {"dsmc": "DSMC", "DSMC": "DSMC"} | {
     for words in ("hard spheres", "soft spheres")
     for spelled in (words.replace(" ", "-"), "".join(w.capitalize() for w in words.split()))
 }
-"""Models as a person would write them."""
+"""Names of models in the pictures."""
 
 
 def _named(model: str) -> str:
@@ -62,7 +62,7 @@ def _named(model: str) -> str:
 
 
 def drawn(plot: DotPlot) -> Figure:
-    """The picture."""
+    """Draw the picture."""
     labels = list(dict.fromkeys(dot.label for dot in plot.dots))
     figure = Figure(figsize=(7.0, 1.1 + 0.27 * len(labels)), layout="constrained")
     axes = figure.subplots()
@@ -101,10 +101,10 @@ def wrong_physics(found: dict) -> DotPlot:
             dots.append(Dot(row["name"], row["told"], hollow=True))
     return DotPlot(
         dots,
-        "A of the fit over the true A (bar: range over rivals)",
+        "A of the fit over the true A (bar: range over alternatives)",
         (1.0, ""),
         logarithmic=True,
-        kinds=("smooth spheres in a periodic box", "told of what the grains are"),
+        kinds=("smooth spheres in a periodic box", "the complete scene"),
     )
 
 
@@ -116,7 +116,7 @@ def interval_coverage(found: dict) -> DotPlot:
         label = f"{_named(row['model'])}, N = {row['num_particles']}, φ = {row['phi']:g}"
         low, high = (100 * (p + k * error) for k in (-1, 1))
         dots.append(Dot(label, 100 * p, low, high, _named(row["model"])))
-    return DotPlot(dots, "runs whose 95 % interval holds A, %", (95.0, "95 %"))
+    return DotPlot(dots, "runs whose 95 % interval contains A, %", (95.0, "95 %"))
 
 
 def fit_head_to_head(found: dict) -> DotPlot:
@@ -162,21 +162,21 @@ def benchmark_kinetic_theory(found: dict) -> DotPlot:
         Dot(f"{count} curves, vmap", sweep["vmap_run_s"]),
         Dot(f"{count} curves, SciPy LSODA", sweep["scipy_s"], hollow=True),
         Dot("first curve in a new process, with compilation", cold["first_cool_s"]),
-        Dot("a whole fit in a new process, for the first time", cold["main_job_s"]),
-        Dot("a whole fit in a new process, again", cold["main_job_again_s"]),
+        Dot("a whole fit in a new process, first time", cold["main_job_s"]),
+        Dot("a whole fit in a new process, second time", cold["main_job_again_s"]),
     ]
     dots = [dot._replace(model="kinetic theory") for dot in dots]
     return DotPlot(dots, "seconds", logarithmic=True, kinds=("jaxgran", "SciPy"))
 
 
 def ratios(rows: Iterable[tuple[str, float, str]], axis: str, words: str) -> DotPlot:
-    """Ratios held against 1."""
+    """Return a picture of ratios, with a reference line at 1."""
     return DotPlot([Dot(label, x, model=_named(m)) for label, x, m in rows], axis, (1.0, words))
 
 
 def benchmark_replicas(found: dict) -> DotPlot:
     rows = [(_named(row["model"]), row["ratio"], row["model"]) for row in found["rows"]]
-    return ratios(rows, "collisions a second on two CPU devices, over one core", "one core")
+    return ratios(rows, "collisions per second on two CPU devices, over one core", "one core")
 
 
 def benchmark_million(found: dict) -> DotPlot:
@@ -191,7 +191,9 @@ def benchmark_million(found: dict) -> DotPlot:
         for case in cases
         if case in row
     ]
-    return DotPlot(dots, "microseconds a collision, 10⁶ disks (or half of them)", logarithmic=True)
+    return DotPlot(
+        dots, "microseconds per collision, 10⁶ disks (or half of them)", logarithmic=True
+    )
 
 
 def benchmark_compilation(found: dict) -> DotPlot:
@@ -203,7 +205,7 @@ def benchmark_compilation(found: dict) -> DotPlot:
             Dot(label, row["first_s"], model=model),
             Dot(label, row["again_s"], model=model, hollow=True),
         ]
-    command, label = found["main_job"], "jaxgran fit, in a new process each"
+    command, label = found["main_job"], "jaxgran fit, each in a new process"
     dots.append(Dot(label, command["first_s"], model="kinetic theory"))
     dots.append(Dot(label, command["again_s"], model="kinetic theory", hollow=True))
     kinds = "first run", "again"
@@ -215,12 +217,12 @@ def benchmark_dsmc(found: dict) -> DotPlot:
         Dot(f"N = {row['num_particles']}", row["collisions_per_s"], model="DSMC")
         for row in found["rows"]
     ]
-    return DotPlot(dots, "collisions a second", logarithmic=True)
+    return DotPlot(dots, "collisions per second", logarithmic=True)
 
 
 def against_lammps(rows: Iterable[tuple[str, float]], model: str) -> DotPlot:
     dots = [Dot(label, ratio, model=model) for label, ratio in rows]
-    axis = "collisions a second, over those of LAMMPS on one core"
+    axis = "collisions per second, over those of LAMMPS on one core"
     return DotPlot(dots, axis, (1.0, "LAMMPS"), logarithmic=True)
 
 
@@ -265,7 +267,7 @@ def benchmark_elements(found: dict) -> DotPlot:
         dots.append(dot)
         if row["ratio_of_contacts"] != row["ratio"]:
             dots.append(dot._replace(value=row["ratio_of_contacts"], hollow=True))
-    kinds = "a collision of particles", "a contact, walls' counted"
+    kinds = "per collision of particles", "per contact, walls included"
     return DotPlot(dots, "time over that of the smooth gas", (1.0, "smooth"), kinds=kinds)
 
 
@@ -280,7 +282,7 @@ def benchmark_versions(found: dict) -> DotPlot:
         x, error = row["ratio"], row["error"]
         model = "kinetic theory" if theory else _named(what)
         dots.append(Dot(label, x, x - error, x + error, model))
-    return DotPlot(dots, "time now over time before", (1.0, "as before"))
+    return DotPlot(dots, "time now over time before", (1.0, "no change"))
 
 
 def paper_claims(found: dict) -> DotPlot:
@@ -290,7 +292,7 @@ def paper_claims(found: dict) -> DotPlot:
             label = words if row["equation"] == "text" else f"Eq. {row['equation']}: {words}"
             ends = (None, None) if error is None else (ratio - error, ratio + error)
             dots.append(Dot(label, ratio, *ends, hollow=row["verdict"] == "corrected"))
-    axis = "number found here over the paper's"
+    axis = "measured value over the paper's value"
     kinds = "agrees within its accuracy", "the paper's is corrected"
     return DotPlot(dots, axis, (1.0, "as printed"), kinds=kinds)
 
@@ -312,4 +314,4 @@ PLOTS: dict[str, Callable[[dict], DotPlot]] = {
     "benchmark_versions": benchmark_versions,
     "paper_claims": paper_claims,
 }
-"""Pictures by the name of the figures, and of the picture."""
+"""Functions by the name of the figures, which is also that of the picture."""

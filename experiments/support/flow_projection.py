@@ -1,6 +1,6 @@
-"""Runs of soft spheres whose tangents are projected onto waves of the flow too.
+"""Soft spheres whose tangents are also projected onto waves of the flow.
 
-`projecting` puts another projection in the place of the package's for as long as its block lasts.
+`projecting` is a context manager that replaces the projection of the package.
 """
 
 from collections.abc import Iterator
@@ -26,11 +26,11 @@ from jaxgran.particles.state import State
 
 
 class Carried(NamedTuple):
-    """Stands in the field `interval` of the tangents.
+    """Value of the field `interval` of the tangents.
 
     Attributes:
-        interval: between projections, in mean free times.
-        displacement: that is kept, like the tangents of the positions.
+        interval: interval between projections, in mean free times.
+        displacement: displacement that is kept, in the form of the tangents of the positions.
     """
 
     interval: Array
@@ -39,9 +39,9 @@ class Carried(NamedTuple):
 
 @contextmanager
 def projecting(memory: Memory) -> Iterator[None]:
-    """Runs in the block project their tangents onto a memory.
+    """Project the tangents of runs in the block onto a memory.
 
-    Compiled programs do not know of it: one memory in a process.
+    Compiled programs do not depend on the memory: use one memory per process.
     """
 
     def at_start(*arguments: Any) -> ThermalTangents:
@@ -60,7 +60,7 @@ def projecting(memory: Memory) -> Iterator[None]:
 
 
 def _projected(new: State, more: tuple[Any, ...], memory: Memory) -> ThermalTangents:
-    """The tangents after a block, projected onto a memory if it is time to."""
+    """Return the tangents after a block, projected onto a memory if a projection is due."""
     along, scene = new.tangents, more[-1]
     own: Any = along.interval
     never = along._replace(interval=jnp.full((), jnp.inf))
@@ -87,7 +87,7 @@ def _project(
     position: Array,
     velocity: Array,
 ) -> tuple[ThermalTangents, Array]:
-    """The tangents after a projection, and the displacements that they keep."""
+    """Return the tangents after a projection, and the displacements that they keep."""
     replicas = along.log_temperature.shape[1]
 
     def boxes(x: Array) -> Array:  # with the boxes first
@@ -133,7 +133,7 @@ def _in_box(
     displacement: Array,
     weight: Array,
 ) -> tuple[Array, Array, Array]:
-    """In one box: the gain of c, and what is kept of velocities and positions."""
+    """Return, for one box, the gain of c, and the kept parts of velocities and positions."""
     temperature = jnp.mean(velocity**2)
     relaxation = kinetic_relaxation(len(velocity), side) / jnp.sqrt(temperature)
     kept, more = columns(memory, position, velocity, side, relaxation)
@@ -148,7 +148,7 @@ def _in_box(
 
 
 def kinetic_relaxation(num_particles: int, side: Array) -> Array:
-    """``eta_K / (rho T)`` of elastic hard spheres at T = 1, by Enskog's theory in 3D.
+    """Return ``eta_K / (rho T)`` of elastic hard spheres at T = 1, by Enskog's theory in 3D.
 
     ``eta_K = eta_0 (1 + 8 phi chi/5) / chi`` with ``eta_0 = 5 sqrt(m T/pi) / (16 sigma^2)``.
     """

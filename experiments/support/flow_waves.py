@@ -1,17 +1,19 @@
-"""Waves of the flow of a gas, and the tangents that a projection keeps of them.
+"""Waves of the flow of a gas, and the tangents that a projection keeps.
 
-A `Memory` says what is kept. Its columns are changes of the velocities, shape (N, d) in each box:
+A `Memory` lists the kept quantities. Its columns are changes of the velocities, shape (N, d) in
+each box:
 
 - v itself, which is the temperature;
-- each wave by itself, ``cos(k x) e`` and ``sin(k x) e``, with e across k or in all directions, and
-  where the stress is kept, the same waves of ``M v`` with symmetric M (temperature and stress);
-- one column for all waves of a band of lengths of k: the flow ``u_b(x) = sum_k a_k exp(i k x)``
-  that they make together, with a_k measured from the velocities. Twice its amount is the change of
-  the logarithm of the energy of the band. With it ``S_b C``, the stress that its strain ``S_b``
-  makes with the velocities C relative to the flow.
+- one column per wave, ``cos(k x) e`` and ``sin(k x) e``, with e perpendicular to k or in all
+  directions; if the stress is kept, also these waves of ``M v`` with symmetric M (temperature and
+  stress);
+- one column for all waves of a band of lengths of k: their total flow
+  ``u_b(x) = sum_k a_k exp(i k x)``, with a_k measured from the velocities. Twice its amount is the
+  change of the logarithm of the energy of the band. With stress also ``S_b C``, the stress of its
+  strain ``S_b`` with the velocities C relative to the flow.
 
-A rest of the tangents is fitted by them (least squares) and replaced by the fit. This conserves
-``sum dv . u_b``, the change of the energy of each band, and ``sum dv . v``, that of all.
+The rest of the tangents is replaced by its least-squares fit with these columns. This conserves
+``sum dv . u_b``, the change of the energy of each band, and ``sum dv . v``, that of the whole gas.
 """
 
 import itertools
@@ -22,29 +24,29 @@ import numpy as np
 from jaxtyping import Array, Float
 
 RIDGE = 1e-9
-"""Of the least squares, for columns that depend on each other: S_b of few waves."""
+"""Regularisation of the least squares, for dependent columns: S_b of few waves."""
 
 Bands = tuple[tuple[int, ...], ...]
-"""Of squared lengths n^2 of wave vectors ``2 pi n / side``."""
+"""Bands of squared lengths n^2 of wave vectors ``2 pi n / side``."""
 
 
 class Memory(NamedTuple):
-    """What a projection keeps.
+    """Quantities that a projection keeps.
 
     Attributes:
-        waves: n^2 of waves that are kept each by itself.
-        transverse: whether these have velocities across k only.
+        waves: n^2 of waves with one coefficient each.
+        transverse: whether their velocities are perpendicular to k only.
         tensors: whether waves of temperature and stress are kept with them.
-        flow: bands of transverse waves, of which the energy is kept.
-        stress: bands of which the stress is kept too.
-        compression: bands of longitudinal waves, of which the energy is kept.
+        flow: bands of transverse waves whose energy is kept.
+        stress: bands whose stress is kept too.
+        compression: bands of longitudinal waves whose energy is kept.
         heat: bands of waves of the temperature.
         density: bands of waves of the density, kept as displacements.
-        displacement: of `waves`: "forgotten", "fitted" or "carried" by the flow that is kept.
-        viscous: whether waves have their stress with them, of Enskog's kinetic viscosity.
-        touching: whether spheres in contact are projected like all others, which conserves the
-            momentum of each wave.
-        interval: between projections, in mean free times.
+        displacement: displacements of `waves`: "forgotten", "fitted" or "carried" by the flow.
+        viscous: whether waves include their stress, by Enskog's kinetic viscosity.
+        touching: whether spheres in contact are projected too, which conserves the momentum of each
+            wave.
+        interval: interval between projections, in mean free times.
     """
 
     waves: tuple[int, ...] = ()
@@ -62,7 +64,7 @@ class Memory(NamedTuple):
 
 
 class Waves:
-    """The waves of some n^2 in one box, and what they hold."""
+    """The waves of some n^2 in one box, and their amplitudes."""
 
     def __init__(self, position: Array, side: Array, squares: tuple[int, ...]):
         size, d = position.shape
@@ -77,23 +79,23 @@ class Waves:
         self.cos, self.sin = wave.real, wave.imag
 
     def amplitudes(self, values: Array) -> tuple[Array, Array]:
-        """Of cos and sin, of values of each particle."""
+        """Return the amplitudes of cos and sin of values of each particle."""
         scale = 2 / self.cos.shape[1]
         return scale * self.cos @ values, scale * self.sin @ values
 
     def split(self, velocity: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Amplitudes of the flow across k, and along it."""
+        """Return the amplitudes of the flow perpendicular and parallel to k."""
         both = self.amplitudes(velocity)
         along = tuple(jnp.sum(a * self.k, -1, keepdims=True) * self.k / self.square for a in both)
         across = tuple(a - b for a, b in zip(both, along, strict=True))
         return (across[0], across[1]), (along[0], along[1])
 
     def field(self, amplitudes: tuple[Array, Array]) -> Array:
-        """What the waves make together at each particle."""
+        """Return the sum of the waves at each particle."""
         return self.cos.T @ amplitudes[0] + self.sin.T @ amplitudes[1]
 
     def gradient(self, amplitudes: tuple[Array, Array]) -> Array:
-        """The derivative of `field` in the place, a last axis."""
+        """Return the derivative of `field` in the position, on the last axis."""
         a, b = (x[..., None] * self._k_for(x) for x in amplitudes)
         return jnp.tensordot(self.cos.T, b, 1) - jnp.tensordot(self.sin.T, a, 1)
 
@@ -101,12 +103,12 @@ class Waves:
         return self.k if x.ndim == 1 else self.k[:, None, :]
 
     def each(self) -> Float[Array, "waves N"]:
-        """Each cos and each sin."""
+        """Return each cos and each sin."""
         return jnp.concatenate([self.cos, self.sin])
 
 
 def vectors(d: int, squares: tuple[int, ...]) -> np.ndarray:
-    """Wave vectors n of these squared lengths, one of each pair n and -n."""
+    """Return wave vectors n of these squared lengths, one of each pair n and -n."""
     reach = int(max(squares) ** 0.5)
     half = [n for n in itertools.product(range(-reach, reach + 1), repeat=d) if n > (0,) * d]
     return np.array([n for n in half if sum(i * i for i in n) in squares])
@@ -115,13 +117,13 @@ def vectors(d: int, squares: tuple[int, ...]) -> np.ndarray:
 def columns(
     memory: Memory, position: Array, velocity: Array, side: Array, relaxation: Array
 ) -> tuple[Float[Array, "columns N d"], Float[Array, "more N d"] | None]:
-    """Changes of the velocities that are kept, v first, and of the positions; in one box.
+    """Return the kept changes of the velocities, v first, and of the positions, in one box.
 
     Args:
-        memory: what is kept.
-        position, velocity: of the particles, in the frame in which the box is at rest.
-        side: of the box.
-        relaxation: time by which a strain's stress follows it, ``eta_K / (rho T)``.
+        memory: the kept quantities.
+        position, velocity: state of the particles, in the rest frame of the box.
+        side: side of the box.
+        relaxation: relaxation time of the stress, ``eta_K / (rho T)``.
     """
     waves = {b: Waves(position, side, b) for b in sorted(_bands(memory))}
     flows = {b: waves[b].split(velocity) for b in waves}
@@ -155,13 +157,13 @@ def _bands(memory: Memory) -> set[tuple[int, ...]]:
 
 
 def _strained(waves: Waves, amplitudes: tuple[Array, Array], thermal: Array) -> Array:
-    """``S C``, with the symmetric part S of the gradient of a flow."""
+    """Return ``S C``, with the symmetric part S of the gradient of a flow."""
     gradient = waves.gradient(amplitudes)
     return jnp.einsum("nij,nj->ni", 0.5 * (gradient + jnp.swapaxes(gradient, 1, 2)), thermal)
 
 
 def _each_wave(memory: Memory, waves: Waves, velocity: Array) -> Float[Array, "columns N d"]:
-    """Waves of the velocity, and of temperature and stress, each by itself."""
+    """Return waves of the velocity, and of temperature and stress, one column each."""
     size, d = velocity.shape
     phase = waves.each()
     if memory.transverse:
@@ -185,14 +187,14 @@ def _each_wave(memory: Memory, waves: Waves, velocity: Array) -> Float[Array, "c
 
 
 def _across(n: np.ndarray) -> np.ndarray:
-    """Unit vectors across a wave vector."""
+    """Return unit vectors perpendicular to a wave vector."""
     return np.linalg.svd(n[None].astype(float))[2][1:]
 
 
 def fit(
     kept: Float[Array, "columns N d"], rest: Float[Array, "p N d"], weight: Float[Array, "N"]
 ) -> Float[Array, "p columns"]:
-    """Amounts of the columns in a rest, by least squares over particles of weight 1."""
+    """Fit the columns to a rest, by least squares over particles of weight 1."""
     scale = jnp.sqrt(jnp.mean(kept**2, axis=(1, 2)))
     scaled = kept / scale[:, None, None]
     weighed = scaled * weight[:, None]

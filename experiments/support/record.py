@@ -1,8 +1,8 @@
 """Timing of experiments, files of their results, and the figures that the documents quote.
 
-A script run with ``--record`` writes what it found to ``experiments/figures/NAME.json``, beside
-the version, the date, the machine and the precision that made it. The documents are made from
-these files (``python experiments/documents.py``) and from nothing else.
+A script run with ``--record`` writes its results to ``experiments/figures/NAME.json``, with the
+version, the date, the machine and the precision of the run. The documents are generated from these
+files only (``python experiments/documents.py``).
 """
 
 import argparse
@@ -31,7 +31,7 @@ BEGAN = time.perf_counter()
 
 
 def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
-    """Seconds of compilation (the first call less a later one), and the median of later calls."""
+    """Return seconds of compilation (first call less a later one) and the median of later calls."""
     took = []
     for _ in range(repeats + 1):
         begin = time.perf_counter()
@@ -44,7 +44,7 @@ def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
 def add_recording(parser: argparse.ArgumentParser) -> None:
     """Give a script the option --record."""
     parser.add_argument(
-        "--record", action="store_true", help="write the figures that the documents quote"
+        "--record", action="store_true", help="write the figures and pictures of the documents"
     )
 
 
@@ -52,13 +52,13 @@ def write_results(name: str, options: argparse.Namespace, path: Path | None, **r
     """Write results to `path`, if there is one, and with --record to ``figures/NAME.json``.
 
     Raises:
-        SystemExit: for --record with --smoke, whose figures no document may quote.
+        SystemExit: for --record with --smoke, since smoke runs are too small for the documents.
     """
     if path is not None:
         save(path, **results)
     if options.record:
         if getattr(options, "smoke", False):
-            raise SystemExit("a smoke run is too small for the documents: leave out --record")
+            raise SystemExit("A smoke run is too small for the documents. Leave out --record.")
         save(FIGURES / f"{name}.json", **results)
         print(f"recorded in experiments/figures/{name}.json: run python experiments/documents.py")
 
@@ -71,15 +71,14 @@ def write_picture(figure: Any, name: str, options: argparse.Namespace, dpi: int 
 
 
 def figures(name: str) -> dict[str, Any]:
-    """What the script of this name recorded last."""
+    """Return the last recorded results of the script of this name."""
     return json.loads((FIGURES / f"{name}.json").read_text(encoding="utf-8"))
 
 
 def save(path: Path, **results) -> None:
-    """Write results as JSON, with what made them: versions, date, machine, precision, seconds.
+    """Write results as JSON, with versions, date, machine, precision and seconds of the run.
 
-    The file is replaced as a whole; if that fails, an older file is unchanged and an OSError names
-    the path.
+    If writing fails, an older file is unchanged and an OSError names the path.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"made_by": made_by()} | results, indent=1) + "\n"
@@ -87,7 +86,7 @@ def save(path: Path, **results) -> None:
 
 
 def made_by() -> dict[str, Any]:
-    """Version, date, machine and precision in words, seconds since the script began, packages."""
+    """Return version, date, machine, precision, seconds since the script began, and packages."""
     device = jax.devices()[0]
     cores = os.cpu_count() or 1
     of_cores = f"{COUNTS.get(cores, cores)}-core CPU"

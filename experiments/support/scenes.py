@@ -1,4 +1,4 @@
-"""Gases that several experiments share."""
+"""Gases of several experiments."""
 
 import jaxgran
 
@@ -9,7 +9,7 @@ def beads(
     contact_fraction: float | None = None,
     dimension: int = 3,
 ) -> jaxgran.Gas:
-    """Viscoelastic beads of 2 mm with T = 0.01 m^2/s^2.
+    """Return viscoelastic beads of 2 mm with T = 0.01 m^2/s^2.
 
     Args:
         packing_fraction: phi.
@@ -32,7 +32,7 @@ def beads(
 
 
 def hard_beads(packing_fraction: float, restitution: float, dimension: int = 3) -> jaxgran.Gas:
-    """Beads as those of `beads`, with a constant coefficient of restitution."""
+    """Return the beads of `beads`, with a constant coefficient of restitution."""
     return jaxgran.Gas(
         jaxgran.ConstantRestitution(restitution),
         diameter=2e-3,

@@ -1,1 +1,1 @@
-"""The claims that `paper/paper_claims.py` sets beside measurements, by subject."""
+"""The claims that `paper/paper_claims.py` compares with measurements, by subject."""

@@ -21,7 +21,7 @@ def clustering(table: Table) -> None:
 
 
 def onset(table: Table, run: dict, haff: list) -> None:
-    """When the gas leaves Haff's law, and which clock tells it."""
+    """Add the departure from Haff's law, and the comparison of clocks."""
     scenes = [scene["constant"] for scene in run["scenes"].values()]
     cooler = [scene["T_at_the_papers_N"] for scene in scenes]
     found = {name: [scene["departures"][name] for scene in scenes] for name in (BY_NUMBER, BY_TIME)}
@@ -99,7 +99,7 @@ def onset(table: Table, run: dict, haff: list) -> None:
 
 
 def dissolution(table: Table, gas: dict) -> None:
-    """Whether clusters dissolve as the coefficient of restitution approaches 1."""
+    """Add the dissolution of clusters as the coefficient of restitution approaches 1."""
     uneven, flow, N = (np.asarray(gas[key]) for key in ("unevenness", "flow", "collisions"))
     peak = int(np.argmax(uneven))
     table.add(
@@ -116,7 +116,7 @@ def dissolution(table: Table, gas: dict) -> None:
 
 
 def _of(mean_and_error: list[float]) -> str:
-    """ "mean ± error", the error with two significant digits or rounded to units."""
+    """Write "mean ± error", the error with two significant digits or rounded to units."""
     mean, error = mean_and_error
     digits = max(0, 1 - int(np.floor(np.log10(error))))
     return f"{mean:.{digits}f} ± {error:.{digits}f}"

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.paper.closed_forms import (
+from experiments.support.claims.table import SMALL, Table, cooled
+from experiments.support.closed_forms import (
     RELAXATION_CORRECTION,
     SONINE_COEFFICIENT,
     paper_temperature,
 )
-from experiments.support.claims.table import SMALL, Table, cooled
 from experiments.support.scenes import beads
 from jaxgran.scene.laws import C1
 from jaxgran.theory.averages import collision_rate, impact_moments
@@ -20,7 +20,7 @@ from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, paper_ave
 
 
 def cooling(table: Table) -> None:
-    """The power law of T, the collision frequency, and the times at which they hold."""
+    """Add the power law of T, the collision frequency, and the times at which they hold."""
     run = table.found("paper_cooling")
     gas, early = cooled(SMALL, [1.0001, 10.0])
     if run:
@@ -87,7 +87,7 @@ def cooling(table: Table) -> None:
 
 
 def series(table: Table, gas: jaxgran.Gas) -> None:
-    """The coefficients of Eqs. (32) and (36)."""
+    """Add the coefficients of Eqs. (32) and (36)."""
     q, s = COOLING_CORRECTION, SONINE_COEFFICIENT
     rates = jnp.asarray([impact_moments(gas.reduced_law, jnp.ones(()), 3)[i, 0] for i in (0, 2)])
     paper_rates = jnp.asarray(
@@ -120,7 +120,7 @@ def series(table: Table, gas: jaxgran.Gas) -> None:
 
 
 def sonine(table: Table, early: jaxgran.CoolingCurve) -> None:
-    """The Sonine coefficient a_2, which the paper takes as zero."""
+    """Add the Sonine coefficient a_2, which the paper takes as zero."""
     s = SONINE_COEFFICIENT
     assert early.sonine is not None
     a_2 = float(early.sonine[1]) / SMALL / 10 ** (-1 / 6)
@@ -136,7 +136,7 @@ def sonine(table: Table, early: jaxgran.CoolingCurve) -> None:
 
 
 def formulas(table: Table) -> None:
-    """The paper's closed forms of T(t)."""
+    """Add the paper's closed forms of T(t)."""
     q, s = COOLING_CORRECTION, SONINE_COEFFICIENT
     first = float(paper_temperature(0.0, 0.093, corrected=False))
     run = table.found("paper_cooling")
@@ -184,7 +184,7 @@ def formulas(table: Table) -> None:
 
 
 def _two_terms_off(delta: float) -> float:
-    """Relative error of the relaxation rate by the two terms of Eq. (32)."""
+    """Return the relative error of the relaxation rate by the two terms of Eq. (32)."""
     law = beads(0.05, 1.5 * 2**0.1 * delta).reduced_law
     one = jnp.ones(())
     return float(abs(paper_averages(law, one, 3)[2, 0] / impact_moments(law, one, 3)[2, 0] - 1))

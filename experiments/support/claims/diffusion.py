@@ -6,19 +6,19 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.paper.closed_forms import (
+from experiments.support.claims.table import SMALL, Table, cooled
+from experiments.support.closed_forms import (
     RELAXATION_CORRECTION,
     SONINE_COEFFICIENT,
     paper_displacement,
 )
-from experiments.support.claims.table import SMALL, Table, cooled
 from experiments.support.scenes import hard_beads
 from jaxgran.theory.averages import TERMS, impact_moments
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 
 def equilibrium(table: Table) -> None:
-    """D of elastic spheres."""
+    """Add D of elastic spheres."""
     routes = table.found("paper_diffusion_coefficient")
     if routes:
         row = routes["elastic"]
@@ -37,7 +37,7 @@ def equilibrium(table: Table) -> None:
 
 
 def memory(table: Table) -> None:
-    """The velocity autocorrelation of a cooling gas, and D from it."""
+    """Add the velocity autocorrelation of a cooling gas, and D from it."""
     run = table.found("paper_velocity_correlation")
     if run:
         row, e = run["constant"]["dsmc"], run["restitution"]
@@ -108,7 +108,7 @@ def memory(table: Table) -> None:
 
 
 def _relaxation_of_cooling_state(eps: float) -> float:
-    """1/tau_v of the homogeneous cooling state over that of a Maxwellian gas of its T, less 1."""
+    """Return 1/tau_v of the cooling state over that of a Maxwellian gas at this T, less 1."""
     gas, model = hard_beads(0.01, eps), jaxgran.KineticTheory(correlations=False)
     curve = jaxgran.cool(gas, jnp.array([1e3, 1e4]) * gas.mean_free_time, model=model)
     a2, a3 = np.asarray(curve.sonine)[-1], np.asarray(curve.third_sonine)[-1]
@@ -118,7 +118,7 @@ def _relaxation_of_cooling_state(eps: float) -> float:
 
 
 def diffusion(table: Table) -> None:
-    """The laws of D(t) and <dr^2>(t)."""
+    """Add the laws of D(t) and <dr^2>(t)."""
     gas, curve = cooled(SMALL, [1e4, 1e6])
     u, d_0 = np.array([1e4, 1e6]), 1.5 * float(gas.temperature * gas.mean_free_time)
     a_3 = (np.asarray(curve.diffusion) / d_0 - u ** (-5 / 6)) * u / SMALL

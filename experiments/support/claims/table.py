@@ -1,4 +1,4 @@
-"""The table of claims: its rows, the results of other scripts that it reads, and a test gas."""
+"""The table of claims: its rows, the results of other scripts, and a test gas."""
 
 import json
 from dataclasses import dataclass, field
@@ -20,14 +20,14 @@ class Row:
 
     Attributes:
         equation: its number in the paper, or "text".
-        claim: what the paper says.
-        ours: what is found here.
-        checked: the method by which it was checked.
+        claim: the paper's statement.
+        ours: the result of jaxgran.
+        checked: the method of the check.
         verdict: "agree" or "corrected".
         holds: whether the numbers support the verdict.
         why: a reason or a limit.
-        ratios: of numbers, what is found here over what the paper prints: words, ratio, and its
-            standard error, or None if it has none.
+        ratios: measured values over the paper's values: label, ratio, and its standard error or
+            None.
     """
 
     equation: str
@@ -48,7 +48,7 @@ class Table:
     rows: list[Row] = field(default_factory=list)
 
     def add(self, equation, claim, ours, checked, verdict, holds=True, why="", ratios=()) -> None:
-        """Add a row; ratios are given as (words, found, printed) or with the error of the found."""
+        """Add a row; ratios are (label, measured, printed), and optionally the measured error."""
         found = []
         for words, here, printed, *error in ratios:
             spread = abs(float(error[0] / printed)) if error else None
@@ -56,17 +56,17 @@ class Table:
         self.rows.append(Row(equation, claim, ours, checked, verdict, bool(holds), why, found))
 
     def found(self, name: str) -> dict | None:
-        """The entry "found" of the results of a script, or None if there are none."""
+        """Return the entry "found" of the results of a script, or None if there are none."""
         whole = self.whole(name)
         return whole["found"] if whole else None
 
     def whole(self, name: str) -> dict | None:
-        """All results of a script, or None if there are none."""
+        """Return all results of a script, or None if there are none."""
         path = self.results / f"{name}.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     def markdown(self) -> str:
-        lines = ["| Eq. | the paper | here | checked by | verdict | why |", "|" + "---|" * 6]
+        lines = ["| Eq. | the paper | jaxgran | method | verdict | remark |", "|" + "---|" * 6]
         for r in self.rows:
             verdict = r.verdict if r.holds else "DOES NOT HOLD"
             cells = (r.equation, r.claim, r.ours, r.checked, verdict, r.why)
@@ -76,7 +76,7 @@ class Table:
 
 
 def cooled(delta: float, u, **options) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
-    """Dilute viscoelastic beads of a given delta, cooled to the times u = 1 + t/tau_0."""
+    """Return dilute viscoelastic beads of a given delta, cooled to times u = 1 + t/tau_0."""
     gas = beads(0.05, 1.5 * 2**0.1 * delta)
     tau = (jnp.asarray(u) - 1) / (COOLING_RATE[3] * delta)
     model = jaxgran.KineticTheory(

@@ -1,1 +1,1 @@
-"""The hard cases of `accuracy/hard_cases.py`, by what goes to its limit."""
+"""The hard cases of `accuracy/hard_cases.py`: impacts, gases and runs."""

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.paper.closed_forms import haff
+from experiments.support.closed_forms import haff
 from experiments.support.hard_cases.rows import (
     PRECISIONS,
     Case,
@@ -31,7 +31,7 @@ def _taus(gas, *taus):
 
 
 def _run(model, gas, times, free=None):
-    """T/T_0 of a particle model at some times, and d ln T in a float of the gas if it is named."""
+    """Return T/T_0 of a particle model at some times, and d ln T in a named float of the gas."""
     first = float(gas.temperature)
     if free is None:
         return np.asarray(jaxgran.cool(gas, times, model=model).temperature) / first, None
@@ -42,7 +42,7 @@ def _run(model, gas, times, free=None):
 
 
 def elastic_limit() -> list[Row]:
-    """A = 0, and A so small that ln T is linear in it."""
+    """Test A = 0, and A so small that ln T is linear in it."""
     rows, free = [], "dissipative_constant"
     for name in PRECISIONS:
         with precision(name):
@@ -94,7 +94,7 @@ def elastic_limit() -> list[Row]:
 
 
 def plastic_and_elastic() -> list[Row]:
-    """Constant restitution 0 and 1."""
+    """Test constant restitution 0 and 1."""
     rows, free = [], "coefficient"
     for name in PRECISIONS:
         with precision(name):
@@ -127,7 +127,7 @@ def plastic_and_elastic() -> list[Row]:
 
 
 def _deepest_overlap(particles) -> float:
-    """The deepest overlap of two spheres of diameter 1; 0 if none overlap."""
+    """Return the deepest overlap of two spheres of diameter 1; 0 if none overlap."""
     d = particles.position.shape[-1]
     position = particles.position.reshape(-1, d)
     side, n = particles.box_side, len(position)
@@ -140,7 +140,7 @@ def _deepest_overlap(particles) -> float:
 
 
 def collapse() -> list[Row]:
-    """Three spheres in a row and a dense cluster, which would collide infinitely often."""
+    """Test three spheres in a row and a dense cluster, which would collide infinitely often."""
     rows = []
     for name in PRECISIONS:
         with precision(name):
@@ -164,7 +164,7 @@ def collapse() -> list[Row]:
 
 
 def thin_and_dense() -> list[Row]:
-    """Packing fractions from 1e-4 to .45 in 3D, to .6 in 2D."""
+    """Test packing fractions from 1e-4 to .45 in 3D, to .6 in 2D."""
     rows, free = [], "coefficient"
     for d, packings in ((3, (1e-4, 0.45)), (2, (1e-4, 0.6))):
         for name in PRECISIONS:
@@ -204,7 +204,7 @@ def thin_and_dense() -> list[Row]:
 
 
 def two_particles() -> list[Row]:
-    """N = 2 in every particle model."""
+    """Test N = 2 in every particle model."""
     rows = []
     for name in PRECISIONS:
         with precision(name):
@@ -220,7 +220,7 @@ def two_particles() -> list[Row]:
 
 
 def million_particles() -> list[Row]:
-    """N = 1e6: DSMC for 5 mean free times; hard, soft spheres for .2, from a perturbed lattice."""
+    """Test N = 1e6: DSMC for 5 mean free times; spheres for .2, from a perturbed lattice."""
     gas, rows, n = beads(0.05, 0.15, 0.02), [], 1_000_000
     times = _taus(gas, 5.0)
     value, _ = _run(DSMC(n), gas, times)
@@ -251,7 +251,7 @@ def million_particles() -> list[Row]:
 
 
 def deep_cold() -> list[Row]:
-    """T/T_0 down to 1e-12 by theory, 1e-6 by DSMC and hard spheres, 1e-4 by soft spheres."""
+    """Test T/T_0 down to 1e-12 (theory), 1e-6 (DSMC, hard spheres) and 1e-4 (soft spheres)."""
     rows, free, e = [], "coefficient", 0.5
     gamma = (1 - e * e) / 6
     for name in PRECISIONS:
@@ -262,7 +262,7 @@ def deep_cold() -> list[Row]:
             tau = np.asarray(times / gas.mean_free_time, float)
             exact = np.log(np.asarray(haff(tau, e)))
             assert exact[-1] < np.log(1e-12)
-            # Of ln T = -28, by a solver with an rtol of 1e-9 and 1e-5.
+            # Relative to ln T = -28, by a solver with an rtol of 1e-9 and 1e-5.
             allowed = 1e-7 if name == "float64" else 3e-3
             error = float(np.max(np.abs(value - exact)))
             along = worst(slope, 4 * e / 6 * tau / (1 + gamma * tau))
@@ -271,7 +271,7 @@ def deep_cold() -> list[Row]:
             expected = float(haff(2e3 / gamma, e))
             # With a_2 = .048 the gas cools 1 % more slowly than Haff's law, and late T goes as the
             # inverse square of the rate. 4000 particles of DSMC and 50 spheres in one small box
-            # scatter besides.
+            # also scatter.
             value, slope = _run(DSMC(4000), gas, end, free)
             assert slope is not None and value[0] < 1e-6
             # The derivative is a small difference of terms that are ten times larger: 2 % of T are
@@ -305,7 +305,7 @@ def deep_cold() -> list[Row]:
 
 
 def along_of(e, tau):
-    """d ln T / d e by Haff's law in 3D."""
+    """Return d ln T / d e by Haff's law in 3D."""
     return 4 * e / 6 * tau / (1 + (1 - e * e) / 6 * tau)
 
 
@@ -318,7 +318,7 @@ MATERIALS = {  # Y in Pa, nu, density in kg/m^3
 
 
 def si_units() -> list[Row]:
-    """Steel, glass, ice, gel, 10 um to 10 cm, um/s to 10 m/s: the same curve in reduced units."""
+    """Test steel, glass, ice and gel, 10 um to 10 cm, um/s to 10 m/s, in reduced units."""
     rows, free = [], "dissipative_constant"
     scenes = [
         (material, diameter, speed)
@@ -353,7 +353,7 @@ def si_units() -> list[Row]:
 
 
 def _of_material(material, diameter, speed, contact=None):
-    """A gas of beta = .15; `contact` is t_c/tau_c, to which Y is adapted."""
+    """Return a gas of beta = .15; `contact` is t_c/tau_c, to which Y is adapted."""
     youngs, poisson, density = MATERIALS[material]
     gas = jaxgran.Gas(
         jaxgran.Viscoelastic(youngs, poisson, 1e-6),
@@ -369,8 +369,10 @@ def _of_material(material, diameter, speed, contact=None):
 
 
 def _same_in_units(kind, name) -> tuple[float, float]:
-    """Relative difference of T after a mean free time of two gases that are the same in reduced
-    units, and the largest one allowed."""
+    """Compare T after a mean free time of two gases with equal reduced units.
+
+    Returns the relative difference and the largest one allowed.
+    """
     ends = []
     for material, diameter, speed in (("soft gel", 1e-5, 1e-6), ("steel", 0.1, 10.0)):
         gas = _of_material(material, diameter, speed, 0.02)

@@ -33,7 +33,7 @@ HARD, SOFT = jaxgran.HardSpheres, jaxgran.SoftSpheres
 
 
 def wide_range_of_beta() -> list[Row]:
-    """One impact by its equation of motion and by the fitted law, over eleven decades of beta."""
+    """Test an impact by its equation of motion and by the fitted law, over 11 decades of beta."""
     rows = []
     betas = np.array([1e-8, 1e-6, 1e-4, 1e-2, 0.3, 1.0, 10.0, 100.0, 1e3])
     for clipped, some in ((True, betas), (False, betas[:7])):
@@ -74,18 +74,18 @@ def wide_range_of_beta() -> list[Row]:
 
 
 def creeping_rebound() -> list[Row]:
-    """The unclipped impact at beta = 1e3, whose rebound is very slow."""
+    """Test the unclipped impact at beta = 1e3, whose rebound is very slow."""
     eps = float(contact.impact(1e3, clipped=False).restitution)
     # The asymptote's next term is of order beta^(-5/2).
     return [Row("equation of motion", "float64", worst(eps, 5.15838170427e-15), 1e-4)]
 
 
 def _pair(gas, speed, offset=0.0, gap=1.0, origin=None):
-    """Two spheres that approach along x at a relative speed, with an impact parameter along y.
+    """Return two spheres that approach along x, with an impact parameter along y.
 
     Args:
         gas: the scene, with a box for two spheres.
-        speed: relative.
+        speed: relative speed.
         offset: impact parameter in diameters.
         gap: distance that the pair approaches before contact, in diameters.
         origin: centre of mass; by default the centre of the box.
@@ -106,7 +106,7 @@ def _pair_temperature(speed, dimension=3):
 
 
 def _hard_impact(gas, free, speed, offset=0.0, **place):
-    """Ratio of T after to before one impact of hard spheres, and its projected derivative."""
+    """Return T after over T before one impact of hard spheres, and its projected derivative."""
     start = _pair(gas, speed, offset, **place)
     times = [2.0 * float(gas.diameter) / speed]  # before they meet the next images
     model = HARD(2, start=start)
@@ -117,7 +117,7 @@ def _hard_impact(gas, free, speed, offset=0.0, **place):
 
 
 def _soft_impact(gas, free, speed, offset=0.0, steps=40):
-    """The same for soft spheres, with the plain derivative, which is exact for one impact."""
+    """Return the ratio for soft spheres, with the plain derivative, exact for one impact."""
     duration = float(gas.contact_duration) * (speed / float(gas.impact_speed)) ** -0.2
     gap = 2.37 * speed * duration / steps / float(gas.diameter)
     start = _pair(gas, speed, offset, gap=gap)
@@ -132,12 +132,12 @@ def _soft_impact(gas, free, speed, offset=0.0, steps=40):
 
 @cache
 def _stiff_pair_gas(beta: float = 0.1):
-    """Spheres so stiff that they do not turn about each other during a contact."""
+    """Return spheres so stiff that they do not rotate about each other during a contact."""
     return beads(0.02, beta, 1e-6)
 
 
 def _exact(gas, speed, free):
-    """eps^2 of an impact, and the derivative of ln eps^2 in a float of the gas."""
+    """Return eps^2 of an impact, and the derivative of ln eps^2 in a float of the gas."""
 
     def log_square(x):
         return 2 * jnp.log(gas.replace(**{free: x}).restitution(speed))
@@ -147,7 +147,7 @@ def _exact(gas, speed, free):
 
 
 def speeds_over_eighteen_decades() -> list[Row]:
-    """One impact from 1e-12 to 1e6 of the thermal speed."""
+    """Test one impact from 1e-12 to 1e6 of the thermal speed."""
     rows, free = [], "dissipative_constant"
     factors = {"float64": np.geomspace(1e-12, 1e6, 4), "float32": np.array([1e-6, 1.0, 1e6])}
     for name in PRECISIONS:
@@ -180,7 +180,7 @@ def speeds_over_eighteen_decades() -> list[Row]:
 
 
 def onset_and_end() -> list[Row]:
-    """The force and its derivative at first touch and at the end of contact."""
+    """Test the force and its derivative at first touch and at the end of contact."""
     rows = []
     for name in PRECISIONS:
         with precision(name):
@@ -208,8 +208,7 @@ def onset_and_end() -> list[Row]:
 
 
 def _phases(steps: int, count: int = 32):
-    """Errors of eps and of its derivative in ln A, of impacts that begin at different phases of a
-    time step."""
+    """Return errors of eps and of its derivative in ln A over the phases of a time step."""
     gas = _stiff_pair_gas()
     sigma, speed = float(gas.diameter), 2 * float(jnp.sqrt(gas.temperature))
     side = box(gas, 2)
@@ -246,7 +245,7 @@ def _phases(steps: int, count: int = 32):
 
 
 def angles() -> list[Row]:
-    """Head-on, oblique and grazing impacts."""
+    """Test head-on, oblique and grazing impacts."""
     rows, e = [], 0.7
     offsets = {"float64": (0.0, 0.6, 0.999, 1 - 1e-9), "float32": (0.0, 0.6, 0.999)}
     for name in PRECISIONS:
@@ -277,7 +276,7 @@ def angles() -> list[Row]:
 
 
 def touching_coincident_corner() -> list[Row]:
-    """A pair that touches, coincides, or collides across a corner of the box."""
+    """Test a pair that touches, coincides, or collides across a corner of the box."""
     rows, e = [], 0.7
     for name in PRECISIONS:
         with precision(name):
@@ -320,7 +319,7 @@ def touching_coincident_corner() -> list[Row]:
 
 
 def _coincident_in_jit() -> Row:
-    """A batch of starts, in one of which the spheres coincide: compiled code cannot raise."""
+    """Test a batch with one coincident start, for which compiled code cannot raise."""
     gas = unit_gas(jaxgran.ConstantRestitution(0.7), 2 * np.pi / 6 / 10.0**3)
     sized = HARD(2).sized_for(gas)
 
@@ -349,7 +348,7 @@ def _coincident_soft():
 
 
 def smallest_box() -> list[Row]:
-    """Two spheres that collide with each other and each other's images in the smallest box."""
+    """Test two spheres that collide with each other and their images in the smallest box."""
     rows = []
     phi = float(2 * np.pi / 6 / (MIN_BOX * (1 + 1e-6)) ** 3)
     for name in PRECISIONS:
@@ -376,7 +375,7 @@ def smallest_box() -> list[Row]:
 
 
 def three_and_four_at_once() -> list[Row]:
-    """Three and four spheres in contact at once, compared with a general ODE solver."""
+    """Test three and four spheres in contact, compared with a general ODE solver."""
     gas = beads(0.02, 0.2, 0.05)
     rows = []
     for count in (3, 4):
@@ -403,7 +402,7 @@ def three_and_four_at_once() -> list[Row]:
 
 
 def _contacts(gas, position, velocity, end):
-    """Velocities of spheres without a box after a time, by SciPy."""
+    """Return velocities of spheres without a box after a time, by SciPy."""
     law, m, sigma = gas.law, float(gas.mass), float(gas.diameter)
     rho = float(contact.elastic_constant(law.youngs_modulus, law.poisson_ratio, sigma))
     a = float(law.dissipative_constant)
@@ -424,7 +423,7 @@ def _contacts(gas, position, velocity, end):
 
 
 def order_that_flips() -> list[Row]:
-    """Three spheres in a row whose impacts are simultaneous up to round-off, in either order."""
+    """Test three spheres in a row whose impacts are simultaneous up to round-off."""
     rows, e = [], 0.6
     for name in PRECISIONS:
         shifts = (1e-13, -1e-13, 0.0) if name == "float64" else (3e-6, -3e-6, 0.0)
@@ -461,7 +460,7 @@ def order_that_flips() -> list[Row]:
 
 
 def _row_of_three(e):
-    """T after all impacts of a row of three, resolved one after another."""
+    """Return T after all impacts of a row of three, resolved one after another."""
     v = np.array([1.0, 0.0, -1.0])
     pair = 0
     while v[0] > v[1] or v[1] > v[2]:

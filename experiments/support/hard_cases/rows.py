@@ -1,4 +1,4 @@
-"""What the hard cases share: rows of the table, precisions, and values with derivatives."""
+"""Common parts of the hard cases: rows of the table, precisions, values with derivatives."""
 
 import re
 import warnings
@@ -22,11 +22,11 @@ class Row(NamedTuple):
     """The result of one model in one case, in one precision.
 
     Attributes:
-        model: its name, and which part of the case if there are several.
+        model: name of the model, and the part of the case if there are several.
         precision: float64 or float32.
-        error: of the value; relative unless the case says otherwise.
+        error: error of the value, relative unless the case defines it otherwise.
         allowed: the largest error; the case gives the reason.
-        slope_error, slope_allowed: the same for a derivative; None where there is none.
+        slope_error, slope_allowed: these two for a derivative; None if there is none.
         status: "ok", or the error or status that the case expects.
     """
 
@@ -40,7 +40,7 @@ class Row(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether all errors are allowed; nan never is."""
+        """Return whether all errors are allowed; nan is never allowed."""
         slope = self.slope_error is None or self.slope_error <= (self.slope_allowed or 0.0)
         return bool(self.error <= self.allowed and slope)
 
@@ -49,10 +49,10 @@ class Case(NamedTuple):
     """One hard case.
 
     Attributes:
-        name: of the case.
-        elsewhere: how other simulations fail in it.
-        here: what jaxgran does, and up to which limit.
-        run: computes the rows.
+        name: name of the case.
+        elsewhere: failures of other simulations.
+        here: behaviour of jaxgran, and its limits.
+        run: function that computes the rows.
         heavy: whether it takes a minute or more.
     """
 
@@ -65,25 +65,25 @@ class Case(NamedTuple):
 
 @contextmanager
 def precision(name: str) -> Iterator[None]:
-    """Context in which new numbers have this precision."""
+    """Return a context in which new numbers have this precision."""
     with jax.enable_x64(name == "float64"):
         yield
 
 
 def worst(found, exact) -> float:
-    """Largest relative difference; nan if any number is not finite."""
+    """Return the largest relative difference; nan if any number is not finite."""
     found, exact = np.asarray(found, np.float64), np.asarray(exact, np.float64)
     size = np.where(exact == 0, 1.0, np.abs(exact))
     return float(np.max(np.abs(found - exact) / size))
 
 
 def finite(*values) -> float:
-    """0 if all numbers are finite, else nan: for derivatives that are only estimates."""
+    """Return 0 if all numbers are finite, otherwise nan: for estimated derivatives."""
     return 0.0 if all(np.all(np.isfinite(value)) for value in values) else np.nan
 
 
 def refusal(model: str, name: str, call: Callable, asked: str) -> Row:
-    """A row that passes if the call raises an error whose message matches the regex `asked`."""
+    """Return a row that passes if the error message of the call matches the regex `asked`."""
     try:
         with precision(name), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -96,7 +96,7 @@ def refusal(model: str, name: str, call: Callable, asked: str) -> Row:
 
 
 def flagged(model: str, name: str, values, codes, bad: int, asked: str) -> Row:
-    """A row of a batch whose member `bad` must be nan with a status, the others finite and ok."""
+    """Return a row of a batch: member `bad` must be nan with a status, the others finite."""
     values, codes = np.asarray(values), np.asarray(codes)
     words = jaxgran.explain_status(int(codes[bad]))
     others = np.delete(np.arange(len(codes)), bad)
@@ -107,7 +107,7 @@ def flagged(model: str, name: str, values, codes, bad: int, asked: str) -> Row:
 
 @eqx.filter_jit
 def theory(gas: jaxgran.Gas, times, free: str, model=HARD_THEORY) -> tuple:
-    """ln(T/T_0) by kinetic theory, and its derivative in a float of the gas."""
+    """Return ln(T/T_0) by kinetic theory, and its derivative in a float of the gas."""
 
     def log_ratio(value):
         changed = gas.replace(**{free: value})
@@ -117,7 +117,7 @@ def theory(gas: jaxgran.Gas, times, free: str, model=HARD_THEORY) -> tuple:
 
 
 def slope_of(run: Callable, at) -> tuple:
-    """T of a particle model's curve, as a function of one number, and its derivative."""
+    """Return T of a particle model as a function of one number, and its derivative."""
     at = jnp.asarray(at, jnp.result_type(float))
 
     def temperature(x):
@@ -129,7 +129,7 @@ def slope_of(run: Callable, at) -> tuple:
 
 
 def unit_gas(law, packing_fraction: float, dimension: int = 3) -> jaxgran.Gas:
-    """A gas of diameter, mass and temperature 1."""
+    """Return a gas of diameter, mass and temperature 1."""
     return jaxgran.Gas(
         law,
         diameter=1.0,
@@ -141,12 +141,12 @@ def unit_gas(law, packing_fraction: float, dimension: int = 3) -> jaxgran.Gas:
 
 
 def spheres(position, velocity, side) -> jaxgran.Particles:
-    """Given particles as a start with one replica."""
+    """Return given particles as a start with one replica."""
     arrays = (np.asarray(x, float)[None] for x in (position, velocity))
     place, speed = map(jnp.asarray, arrays)
     return jaxgran.Particles(place, speed, jnp.asarray(float(side)))
 
 
 def box(gas: jaxgran.Gas, num_particles: int) -> float:
-    """Side of the box, m."""
+    """Return the side of the box, m."""
     return float(gas.box_side(num_particles))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.paper.closed_forms import paper_temperature
+from experiments.support.closed_forms import paper_temperature
 from experiments.support.hard_cases.rows import (
     HARD_THEORY,
     PRECISIONS,
@@ -38,11 +38,11 @@ DSMC, HARD, SOFT = jaxgran.DSMC, jaxgran.HardSpheres, jaxgran.SoftSpheres
 FREE = "dissipative_constant"
 
 ENSKOG = {"softness": False, "order": 2, "correlations": False}
-"""Options with which kinetic theory is that of the reference solutions."""
+"""Options for which kinetic theory solves the equations of the references."""
 
 
 def times_of_every_kind() -> list[Row]:
-    """A single time, 1e5 times, times that do not start at 0, and twelve decades."""
+    """Test a single time, 1e5 times, times that do not start at 0, and twelve decades."""
     rows = []
     for name in PRECISIONS:
         with precision(name):
@@ -81,7 +81,7 @@ def times_of_every_kind() -> list[Row]:
 
 
 def many_times() -> list[Row]:
-    """1e5 output times of a particle model, compared with one."""
+    """Test 1e5 output times of a particle model, compared with one."""
     gas = beads(0.05, 0.15, 0.02)
     tau, rows = float(gas.mean_free_time), []
     for kind, allowed in ((DSMC, 1e-6), (HARD, 1e-6), (SOFT, 3e-2)):  # see `times_of_every_kind`
@@ -97,7 +97,7 @@ def _scaled(times, gas, tau):
 
 
 def steps_and_lists() -> list[Row]:
-    """A time step five times too large, and capacities ten times too small."""
+    """Test a time step five times too large, and capacities ten times too small."""
     rows = []
     asked = "step must lie in"
     call = lambda: DSMC(50, step=0.5)  # noqa: E731
@@ -140,12 +140,12 @@ def steps_and_lists() -> list[Row]:
         1.5 * gas.mass * curve.temperature + curve.elastic_energy + curve.dissipated_energy
     )
     error = worst(held[1], held[0])
-    rows.append(Row("SoftSpheres, step mended", "float64", error, DRIFT_TOLERANCE))
+    rows.append(Row("SoftSpheres, step halved", "float64", error, DRIFT_TOLERANCE))
     return rows
 
 
 def solver_ends() -> list[Row]:
-    """Solver tolerances from 1e-3 to 1e-12, and nearly elastic gases, whose equations are stiff."""
+    """Test solver tolerances from 1e-3 to 1e-12, and nearly elastic gases (stiff equations)."""
     rows = []
     gas = beads(0.05, 0.15)
     times = jnp.geomspace(0.01, 1e5, 3) * gas.mean_free_time
@@ -197,7 +197,7 @@ def _measured(gas, seed=0, error=0.01, points=40):
 
 
 def _fitted(gas, curve, free=(FREE,), **options):
-    """A fit, and its warnings as one string."""
+    """Return a fit, and its warnings as one string."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         result = jaxgran.fit(gas, curve, model=HARD_THEORY, free=free, **options)
@@ -205,8 +205,10 @@ def _fitted(gas, curve, free=(FREE,), **options):
 
 
 def fits() -> list[Row]:
-    """Undetermined parameters, outliers, wrong error bars, a curve that no model explains, and
-    guesses wrong by a factor 100."""
+    """Test undetermined parameters, outliers, wrong error bars, an unexplained curve, far guesses.
+
+    Far guesses are wrong by a factor 100; no model explains the unexplained curve.
+    """
     rows = []
     for name in PRECISIONS:
         with precision(name):
@@ -242,7 +244,7 @@ def fits() -> list[Row]:
             )
             result, _ = _fitted(gas, boast)
             widened = float(result.error_budget["measurement"][0]) / sigma
-            # The fit takes them from the scatter instead, which 40 points give to 11 %.
+            # The fit estimates them from the scatter instead, which 40 points determine to 11 %.
             noticed = not jaxgran.diagnose(result, boast).explains
             rows.append(
                 Row("error bars 5 times too small", name, worst(widened, 1.0), 0.3)
@@ -255,13 +257,15 @@ def fits() -> list[Row]:
 
 
 def _diagnosed(case, name, gas, curve, temperature, truth, words) -> Row:
-    """A row that passes if the diagnosis of a wrong curve contains `words`, and the estimate is
-    within three of its standard errors of the truth, if there is one."""
-    spoilt = jaxgran.CoolingCurve(
+    """Return a row that passes if the diagnosis of a wrong curve contains `words`.
+
+    The estimate must also be within three standard errors of the truth, if there is one.
+    """
+    corrupted = jaxgran.CoolingCurve(
         times=curve.times, temperature=temperature, temperature_error=curve.temperature_error
     )
-    result, _ = _fitted(gas, spoilt)
-    diagnosis = jaxgran.diagnose(result, spoilt)
+    result, _ = _fitted(gas, corrupted)
+    diagnosis = jaxgran.diagnose(result, corrupted)
     said = not diagnosis.explains and words in " ".join(diagnosis.reasons)
     off = 0.0
     if truth is not None:
@@ -270,7 +274,7 @@ def _diagnosed(case, name, gas, curve, temperature, truth, words) -> Row:
 
 
 def one_of_a_batch_fails() -> list[Row]:
-    """`jax.vmap` over a batch of which one member fails: it has a status, the others are right."""
+    """Test a batch of `jax.vmap` with one failing member, which must not affect the others."""
     rows = []
     for name in PRECISIONS:
         with precision(name):
@@ -300,7 +304,7 @@ def one_of_a_batch_fails() -> list[Row]:
             rows.append(flagged("KineticTheory, nan", name, values, codes, 1, "outside its range"))
     gas = beads(0.05, 0.15, 0.05)
     times = jnp.asarray([0.5 * float(gas.mean_free_time)])
-    # The others differ from single runs by round-off, which grows in the ten impacts of the melt.
+    # The others differ from single runs by round-off, which grows in the equilibration.
     for sized, allowed in (
         (DSMC(50), 1e-9),
         (HARD(50).sized_for(gas), 1e-3),
@@ -350,8 +354,10 @@ for write in (
 
 
 def faults_on_the_way() -> list[Row]:
-    """A process killed while writing, a full disk, a missing folder, and a checkpoint of another
-    run or of another version."""
+    """Test a killed process, a full disk, a missing folder, and checkpoints that do not belong.
+
+    These are checkpoints of another run and of another version.
+    """
     rows, like = [], np.zeros(200_000, int)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.ckpt"
@@ -443,7 +449,7 @@ RUNS = [
         solver_ends,
     ),
     Case(
-        "fits: open, spoilt, unexplained, far",
+        "fits: open, corrupted, unexplained, far",
         "a wrong value with a small error bar",
         "a warning or the diagnosis says so, or the error bars are widened",
         fits,

@@ -1,4 +1,4 @@
-"""Rows of accuracy.md: how wrong."""
+"""Rows of accuracy.md: errors of values, derivatives and fits."""
 
 from collections.abc import Callable
 
@@ -8,33 +8,35 @@ from experiments.support.scenes import beads
 from experiments.support.tables.words import Row, each, minus, percent, power
 
 NOTE = """\
-Kinetic theory leaves out clustering and three-body contacts. Its self-diffusion is that of
-uncorrelated collisions: 0.85 φ low for dense spheres in boxes of some hundred, more in larger ones.
-Errors of T of every model against its run time: [speed_vs_error.md](speed_vs_error.md).
+Kinetic theory leaves out clustering and three-body contacts. It computes self-diffusion for
+uncorrelated collisions. The relative error is −0.85 φ for dense spheres in boxes of some hundred
+spheres, and larger in larger boxes. [speed_vs_error.md](speed_vs_error.md) compares the error of T
+of every model with its run time.
 """
 
 MEMORIES = """\
-## Which memory of its flow makes the derivative of a clustering gas right?
+## Derivatives of a clustering gas: projections that also keep the flow
 
-d ln T/d ln A of soft spheres, φ = .3, β = .2, t_c/τ_c = .05, in boxes of 1000 (1.4 L_c). The
-tangents are projected every .1 mean free time, or as said, onto T and what the first column names;
-a number there is the largest n² of the waves, k = 2π n / box side. "Waves" are kept each by itself;
-"energy" is one number for all transverse waves of a band of n² (1; 2; 3 and 4; 5 and 6; 8 and 9),
-which scales the flow that the gas has in them; "stress" is the stress that this flow makes.
+d ln T/d ln A of soft spheres, φ = .3, β = .2, t_c/τ_c = .05, in boxes of 1000 spheres (1.4 L_c).
+The tangents are projected onto T and the quantities in the first column, every .1 mean free time
+unless the row gives another interval. The number in a row is the largest n² of the waves,
+k = 2π n / box side. "Waves" means one coefficient per wave; "energy" means one coefficient for all
+transverse waves of a band of n² (1; 2; 3 and 4; 5 and 6; 8 and 9), which scales the flow of the gas
+in that band; "stress" is the stress caused by this flow.
 """
 
 MEMORIES_MEAN = """\
-Two bands of a kept flow take the bias at 30 collisions away, whether they are kept wave by wave or
-as one amplitude each. At 100 none is right to 10 %: what is kept makes the derivative too small, or
-of the wrong sign, and stress, heat and density mend only part of that. To project spheres in
-contact too, which conserves momentum, makes it too small from the start. Displacements that are
-fitted or carried are lost to chaos. So projections of the package keep T alone, and `differences=`
-is what a clustering gas needs.
+Keeping two bands of the flow removes the bias at 30 collisions, both with one coefficient per wave
+and with one per band. At 100 collisions no projection is accurate within 10 %: the derivative is
+too small or has the wrong sign, and stress, heat and density correct only part of this error.
+Projecting spheres in contact as well, which conserves momentum, makes the derivative too small from
+the start. Fitted and carried displacements are dominated by chaos. The projections of the package
+therefore keep T only; for a clustering gas use `differences=`.
 """
 
 
 def off_true(i: int = 0) -> Callable[[dict], str]:
-    """How far an estimate is from the true value, with its standard error."""
+    """Return the text of the relative error of an estimate, with its standard error."""
 
     def words(found: dict) -> str:
         row = found["parameters"][i]
@@ -55,17 +57,17 @@ def projected(found: dict) -> str:
 
 
 def in_flow(scene: str) -> Callable[[dict], str]:
-    """Errors of derivatives where they are no larger than the derivative itself."""
+    """Return the text of the errors of derivatives, at times where the error is below 50 %."""
 
     def words(found: dict) -> str:
         one = found["scenes"][scene]
         known = [i for i, error in enumerate(one["bias"][1]) if error < 0.5]
-        told = " / ".join(percent(one["derivative_bias"][i]) for i in known)
+        estimated = " / ".join(percent(one["derivative_bias"][i]) for i in known)
         parts = [
             " / ".join(f"{percent(one[key][0][i])} ± {100 * one[key][1][i]:.1f}" for i in known)
             for key in ("bias", "bias_of_differences")
         ]
-        return f"projected {parts[0]} %, told {told} %; by differences {parts[1]} %"
+        return f"projected {parts[0]} %, estimated bias {estimated} %; by differences {parts[1]} %"
 
     return words
 
@@ -82,7 +84,8 @@ def plain(found: dict) -> str:
 def trajectory(found: dict) -> str:
     rows = found["trajectory"]["rows"]
     steps = each((row["steps"] for row in rows), "{}")
-    return f"{each((power(row['lammps']) for row in rows), '{}')} of the rms at {steps} steps"
+    shares = each((power(row["lammps"]) for row in rows), "{}")
+    return f"{shares} of the rms velocity at {steps} steps"
 
 
 def impact(found: dict) -> str:
@@ -114,20 +117,23 @@ def lammps_elements(found: dict) -> str:
 
 def drops(found: dict) -> str:
     low, high = min(found["A_over_true"]), max(found["A_over_true"])
-    return f"{low:.2f} to {high:.2f} times; intervals hold it in {found['held']} of {found['runs']}"
+    return (
+        f"fitted over true A {low:.2f} to {high:.2f}; intervals contain the true A in "
+        f"{found['held']} of {found['runs']} runs"
+    )
 
 
 def posterior(found: dict) -> str:
     row = found["dissipative_constant"]
     return (
-        f"mean {percent(row['mean'] / row['fit'] - 1)} %, error bar "
-        f"{percent(row['std'] / row['fit_std'] - 1, 0)} % off the fit's; "
-        f"{found['samples_per_second']:.0f} samples a second"
+        f"mean differs from the fit's by {percent(row['mean'] / row['fit'] - 1)} %, "
+        f"its error bar by {percent(row['std'] / row['fit_std'] - 1, 0)} %; "
+        f"{found['samples_per_second']:.0f} samples per second"
     )
 
 
 def largest(*names: str) -> Callable[[dict], str]:
-    """The largest errors of all rows of a test; names of several are written before them."""
+    """Return the text of the largest error of each named quantity over all rows of a test."""
 
     def words(found: dict) -> str:
         errors = {name: max(row[name] for row in found["rows"]) for name in names or ("error",)}
@@ -138,7 +144,7 @@ def largest(*names: str) -> Callable[[dict], str]:
 
 
 def off_in(row: dict, digits: int = 1) -> str:
-    """How far the numbers of a row are off, in per cent: -0.1 ± 0.2 / +0.3 ± 0.2."""
+    """Write the relative errors of a row in per cent: -0.1 ± 0.2 / +0.3 ± 0.2."""
     misses = zip(np.atleast_1d(row["off"]), np.atleast_1d(row["error"]), strict=True)
     pairs = (f"{percent(off, digits)} ± {100 * error:.{digits}f}" for off, error in misses)
     return " / ".join(pairs)
@@ -155,10 +161,10 @@ def intervals(found: dict) -> str:
 
 def hard_derivatives(found: dict) -> str:
     *below, above = found["rows"]
-    told = " / ".join(f"{100 * share:.0f}" for share in above["told"])
+    estimated = " / ".join(f"{100 * share:.0f}" for share in above["told"])
     return (
         f"{'; '.join(off_in(row) for row in below)} %; {off_in(above)} % in the box above L_c, "
-        f"where flows hold energy and the curve tells a bias of {told} %"
+        f"where a flow contains part of the energy; estimated bias {estimated} %"
     )
 
 
@@ -206,7 +212,7 @@ BOX = float(CLUSTERING.box_side(1000) / CLUSTERING.critical_box)
 """Side of the box of `gradient_health.py`'s clustering gas, in L_c."""
 
 OTHERS = ("phi003", "phi003_large", "phi010", "phi025")
-"""Curves of `make_lammps_curves.py`."""
+"""Names of the curves of `make_lammps_curves.py`."""
 
 ROWS = (
     Row(
@@ -259,15 +265,15 @@ ROWS = (
         f"{FIT} --cases dilute",
     ),
     Row(
-        "A of LAMMPS curves of other gases, which theory was never adjusted to: φ = .03 with "
-        "N = 1000 and with N = 4000, φ = .1, φ = .25",
+        "A of other LAMMPS curves, to which the theory was never adjusted: φ = .03 with N = 1000 "
+        "and with N = 4000, φ = .1, φ = .25",
         "true A",
         " ".join(f"lammps_curves_{name}" for name in OTHERS),
         lambda *found: "; ".join(off_true()(one) for one in found),
         f"{FIT} --cases {' '.join(OTHERS)}",
     ),
     Row(
-        "A of the dense LAMMPS curve, which the diagnosis refuses; with T₀ free",
+        "A of the dense LAMMPS curve, which the diagnosis rejects; with T₀ free",
         "true A",
         "lammps_curves_dense lammps_curves_dense_T0",
         lambda one, two: f"{off_true()(one)}; {off_true()(two)}",
@@ -302,7 +308,7 @@ ROWS = (
         "python experiments/fit/sample_posterior.py",
     ),
     Row(
-        "A of a drop tower's twin, 300 rough spheres between walls, told so",
+        "A of a simulated drop-tower experiment, 300 rough spheres between walls",
         "true A",
         "drop_tower",
         drops,
@@ -323,8 +329,8 @@ ROWS = (
         f"{HEALTH} dense",
     ),
     Row(
-        f"{SLOPE}, clustering (φ = .3, β = .2, box {BOX:.2g} L_c), {AT}: biased once there are "
-        "clusters",
+        f"{SLOPE}, clustering (φ = .3, β = .2, box {BOX:.2g} L_c), {AT}; biased after "
+        "clusters form",
         "finite differences",
         "gradient_health_clustering",
         projected,
@@ -341,7 +347,7 @@ ROWS = (
     *(
         Row(
             f"d ln T/d ln A through hard {kind} in a box of {box} L_c, at 3 / 10 / 30 / 100 "
-            "collisions, projected and by differences of 32 replicas",
+            "collisions, projected, and by differences of 32 replicas",
             "finite differences of more runs",
             "derivatives_in_flows",
             in_flow(scene),
@@ -378,21 +384,21 @@ ROWS = (
         SOFT,
     ),
     Row(
-        "energy ledger at 20 / 40 / 80 steps",
-        "closed, of the first energy",
+        "error of the energy balance over the initial energy, 20 / 40 / 80 steps per contact",
+        "0",
         "soft_sphere_accuracy",
         worst("ledger"),
         SOFT,
     ),
     Row(
-        "elastic energy over 100 τ_c at 20 / 40 / 80 steps",
-        "constant",
+        "change of the energy of an elastic gas in 100 τ_c, 20 / 40 / 80 steps per contact",
+        "0",
         "soft_sphere_accuracy",
         worst("elastic"),
         SOFT,
     ),
     Row(
-        "T(t) of the LAMMPS gases, nothing fitted",
+        "T(t) of the LAMMPS gases, without fitted parameters",
         "LAMMPS, 3 replicas",
         "compare_lammps",
         lammps,
@@ -400,29 +406,29 @@ ROWS = (
     ),
     Row(
         "velocities with friction, with walls, after one mean free time, from the same start, rms",
-        "LAMMPS (granular, wall/gran), over √T₀",
+        "LAMMPS (granular, wall/gran); difference over √T₀",
         "compare_lammps_elements",
         lammps_elements,
         "python experiments/accuracy/compare_lammps_elements.py",
     ),
     Row(
-        "D of 4096 elastic hard spheres, φ = .1 / .2 / .3, with the box's own term (Yeh & Hummer)",
+        "D of 4096 elastic hard spheres, φ = .1 / .2 / .3, corrected for box size (Yeh & Hummer)",
         "Erpenbeck & Wood 1991, infinite box",
         "tests/diffusion_published",
         offs,
         f"{FOUND} tests/models/test_hard_spheres.py",
     ),
     Row(
-        "D of 500 elastic hard spheres, φ = .1 / .2 / .3, as it is",
+        "D of 500 elastic hard spheres, φ = .1 / .2 / .3, without that correction",
         "Speedy 1987",
         "tests/diffusion_500",
         offs,
         f"{FOUND} tests/models/test_hard_spheres.py",
     ),
     Row(
-        "24 hard cases: limits of every law, density, size, unit, tolerance, fit and fault on the "
-        "way",
-        "right answers, or a clear error or status",
+        "24 hard cases: limits of laws, densities, sizes, units, tolerances and fits, and faults "
+        "during a run",
+        "correct results, or a clear error or status",
         "hard_cases",
         lambda f: "[table](hard_cases.md)",
         "python experiments/accuracy/hard_cases.py --heavy",
@@ -442,7 +448,7 @@ ROWS = (
         f"{FOUND} tests/models/test_dsmc.py",
     ),
     Row(
-        "memory of the first velocity after 1 τ_c (ε = .6), DSMC steps of .1 / .05",
+        "ln of the velocity autocorrelation after 1 τ_c (ε = .6), DSMC steps of .1 / .05",
         "steps of .0125",
         "tests/dsmc_order",
         dsmc_order,
@@ -451,7 +457,7 @@ ROWS = (
     Row(
         "ln T of hard spheres between walls (2 mm beads, 50 mm cube, ε_w = .8, β = .15), N = 100 / "
         "500 / 4000, at T/T₀ = .5, and at .006 / .04 / .1",
-        "DSMC, which takes the gas for mixed",
+        "DSMC, which assumes a homogeneous gas",
         "tests/walls",
         walls,
         f"{FOUND} tests/models/test_hard_spheres_walls.py",

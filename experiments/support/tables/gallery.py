@@ -1,4 +1,4 @@
-"""Entries of the gallery in README.md: one question, one finding, one picture, one time."""
+"""Entries of the gallery in README.md: question, finding, picture and run time of each script."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,22 +8,22 @@ from experiments.support.tables.accuracy import off_true
 from experiments.support.tables.words import between, minus, of, percent, power
 
 KINETIC = ("KineticTheory", "forward", "reverse")
-"""Rows of kinetic theory in `benchmark_versions.py`."""
+"""Beginnings of the names of kinetic-theory rows in `benchmark_versions.py`."""
 
 MOST_WORDS = 15
-"""Of a finding."""
+"""Largest number of words of a finding."""
 
 
 class Entry(NamedTuple):
     """A script of the gallery.
 
     Attributes:
-        script: its path in experiments/.
-        question: that it answers.
-        source: the file in figures/, without its end; "" for none.
-        finding: in 15 words or less, out of the contents of that file.
-        picture: in pictures/, or "".
-        time: on two cores.
+        script: path in experiments/.
+        question: the question that the script answers.
+        source: name of the file in figures/ without extension; "" for none.
+        finding: returns the answer, at most 15 words, from the contents of that file.
+        picture: name in pictures/, or "".
+        time: run time on two cores.
         table: a document with the details, or "".
     """
 
@@ -37,21 +37,21 @@ class Entry(NamedTuple):
 
 
 def dilute(f: dict) -> str:
-    return f"Of the dilute curve A comes out {off_true()(f)} from the true one."
+    return f"Dilute curve: the fitted A differs from the true by {off_true()(f)}."
 
 
 def wrong(f: dict) -> str:
-    off = [row["A"] for row in f["rows"] if not row["name"].startswith("nothing")]
-    return f"A is off by factors of {between(off)}; its range over rivals holds it."
+    ratios = [row["A"] for row in f["rows"] if not row["name"].startswith("nothing")]
+    return f"A is {between(ratios)} times the true; the alternatives' range usually contains it."
 
 
 def drop(f: dict) -> str:
-    return f"Told of walls and roughness, its interval holds A in {f['held']} of {f['runs']} runs."
+    return f"With walls and roughness, the interval contains A in {f['held']} of {f['runs']} runs."
 
 
 def devices(f: dict) -> str:
     ratios = between((row["ratio"] for row in f["rows"]), "{:.2f}")
-    return f"Two replicas are {ratios} times as fast as on one core."
+    return f"Two replicas run {ratios} times as fast as on one core."
 
 
 def million(f: dict) -> str:
@@ -80,12 +80,13 @@ def heads(f: dict) -> str:
         next(row["simulations"] for row in rows if row["search"].startswith(name))
         for name in ("jaxgran", "Nelder")
     )
-    return f"A and T₀ take {ours} runs of DSMC with derivatives, {simplex} by Nelder–Mead."
+    return f"A and T₀ take {ours} DSMC runs with derivatives, {simplex} with Nelder–Mead."
 
 
 def health(f: dict) -> str:
     bias, _ = f["projected_over_differences"]
-    return f"To {max(abs(100 * x) for x in bias):.0f} % until 100 collisions; not in clusters."
+    largest = max(abs(100 * x) for x in bias)
+    return f"Within {largest:.0f} % up to 100 collisions, but not in clusters."
 
 
 def in_flows(f: dict) -> str:
@@ -93,30 +94,30 @@ def in_flows(f: dict) -> str:
     bias = [100 * x for x in found["bias"][0]]
     left = max(abs(100 * x) for x in found["bias_of_differences"][0])
     too_large = between(bias, "{:.0f}")
-    return f"Projected ones are {too_large} % too large, differences within {left:.0f} %."
+    return f"Projected ones are {too_large} % too large, differences are within {left:.0f} %."
 
 
 def memories(f: dict) -> str:
     rows = f["memories"]
     right = [name for name, row in rows.items() if within_bounds(row)]
     if right:
-        return f"{right[0][0].upper()}{right[0][1:]}, within 10 % until 100 collisions."
-    return f"None of {len(rows)} is shown to be right within 10 % at 100 collisions."
+        return f"{right[0][0].upper()}{right[0][1:]}, within 10 % up to 100 collisions."
+    return f"None of {len(rows)} is shown to be accurate within 10 % at 100 collisions."
 
 
 def lammps(f: dict) -> str:
     found = f["curves"]["dense"]["largest_temperature_difference"]
-    return f"Within {100 * found:.1f} % in the dense gas, with nothing fitted."
+    return f"T agrees within {100 * found:.1f} % in the dense gas."
 
 
 def lammps_elements(f: dict) -> str:
     most = max(row["rms_velocity"][-1] for row in f["scenes"].values())
-    return f"Velocities differ by at most {most:.0e} of √T₀ after a mean free time."
+    return f"Velocities differ by at most {most:.0e} √T₀ after one mean free time."
 
 
 def soft(f: dict) -> str:
     order = f["impact"]["head-on"]["order"]["bias"]
-    return f"ε of an impact errs with the step to the power {order:.1f}."
+    return f"The error of ε in an impact has order {order:.1f}."
 
 
 def theory(f: dict) -> str:
@@ -125,17 +126,17 @@ def theory(f: dict) -> str:
 
 def particles(f: dict) -> str:
     ratios = [row["lammps"]["1"]["ratio"] for row in f["rows"]]
-    return f"{between(ratios, '{:.1f}')} times LAMMPS on one core."
+    return f"{between(ratios, '{:.1f}')} times as fast as LAMMPS on one core."
 
 
 def hard(f: dict) -> str:
     ratios = [row["lammps"]["ratio"] for row in f["rows"] if row["lammps"]]
-    return f"{between(ratios, '{:.0f}')} times LAMMPS at short contacts."
+    return f"{between(ratios, '{:.0f}')} times as fast as LAMMPS, for short contacts."
 
 
 def dsmc(f: dict) -> str:
     rates = [row["collisions_per_s"] / 1e6 for row in f["rows"]]
-    return f"{between(rates, '{:.1f}')} million collisions a second."
+    return f"{between(rates, '{:.1f}')} million collisions per second."
 
 
 def versions(f: dict) -> str:
@@ -145,12 +146,12 @@ def versions(f: dict) -> str:
 
 def elements(f: dict) -> str:
     most = max(f["rows"], key=lambda row: row["ratio"])
-    return f"At most {most['ratio']:.1f} times ({most['scene']}, {most['model']})."
+    return f"At most {most['ratio']:.1f} times a smooth gas ({most['scene']}, {most['model']})."
 
 
 def slopes(f: dict) -> str:
     ratios = [row["ways"]["reverse, A"]["ratio"] for row in f["rows"]]
-    return f"Reverse mode takes {between(ratios, '{:.1f}')} runs, in constant memory."
+    return f"Reverse mode takes {between(ratios, '{:.1f}')} times a run, in constant memory."
 
 
 def front(f: dict) -> str:
@@ -165,12 +166,13 @@ def constant(f: dict) -> dict:
 
 def clustering(f: dict) -> str:
     n, error = constant(f)["T over theory's of N by 2"]["N"]
-    return f"T doubles after {n:.1f} ± {error:.1f} collisions; viscoelastic gases need more."
+    return f"T is twice Haff's after {n:.1f} ± {error:.1f} collisions, later in viscoelastic gases."
 
 
 def dissolves(f: dict) -> str:
     uneven = f["viscoelastic"]["unevenness"]
-    return f"Yes: unevenness peaks at {max(uneven):.0f}, ends at {uneven[-1]:.1f} times elastic."
+    peak, last = max(uneven), uneven[-1]
+    return f"Yes: density fluctuations peak at {peak:.0f} and end at {last:.1f} times elastic."
 
 
 def film(f: dict) -> str:
@@ -182,14 +184,14 @@ def film(f: dict) -> str:
         )
         for name in ("across", "S")
     )
-    return f"The flow is 30 times itself after {flow:.0f} collisions, S(k) after {density:.0f}."
+    return f"The flow grows 30-fold in {flow:.0f} collisions, S(k) in {density:.0f}."
 
 
 def compilation(f: dict) -> str:
     rows = f["rows"]
     soft, hard, dsmc = (rows[name]["first_s"] for name in ("SoftSpheres", "HardSpheres", "DSMC"))
     first, again = f["main_job"]["first_s"], f["main_job"]["again_s"]
-    runs = f"Soft, hard spheres, DSMC {soft:.0f}, {hard:.0f}, {dsmc:.0f} s"
+    runs = f"Soft spheres {soft:.0f}, hard spheres {hard:.0f}, DSMC {dsmc:.0f} s"
     return f"{runs}; fit {first:.0f} s, again {again:.1f} s."
 
 
@@ -203,13 +205,13 @@ def velocities(f: dict) -> str:
     row = f["found"]["viscoelastic"]
     return (
         "Nearly exponentially in collisions, not in time; τ_v/τ_E is "
-        f"{row['dsmc']['relaxation']:.3f}, printed {row['paper_relaxation']:.3f}."
+        f"{row['dsmc']['relaxation']:.3f}, in the paper {row['paper_relaxation']:.3f}."
     )
 
 
 def coefficient(f: dict) -> str:
     row = f["found"]["constant"]
-    return f"No: it is {row['by_slope'][-1]:.2f} T τ_E, printed {row['paper'][-1]:.2f}."
+    return f"No: D is {row['by_slope'][-1]:.2f} T τ_E, in the paper {row['paper'][-1]:.2f} T τ_E."
 
 
 def spread(f: dict) -> str:
@@ -219,12 +221,12 @@ def spread(f: dict) -> str:
 
 def exponents(f: dict) -> str:
     last = minus(f"{f['found']['ice']['exponent']:.2f}")
-    return f"As t^(−2/(1+γ)); of ice the exponent is {last} at last."
+    return f"T falls as t^(−2/(1+γ)); for ice the last exponent is {last}."
 
 
 def restitution(f: dict) -> str:
     limit = f["found"]["two_terms_good_to_one_per_cent"]["F = 0"]
-    return f"Two terms hold to 1 % up to β = {limit:.2f}."
+    return f"Two terms of the series are accurate within 1 % up to β = {limit:.2f}."
 
 
 def claims(f: dict) -> str:
@@ -234,8 +236,14 @@ def claims(f: dict) -> str:
 
 def derived(f: dict) -> str:
     return (
-        f"A fit to the equation of motion, right within {power(f['largest']['clipped']['error'])}."
+        f"A fit to the equation of motion, accurate within "
+        f"{power(f['largest']['clipped']['error'])}."
     )
+
+
+def same_numbers(f: dict) -> str:
+    same = [row["difference"] == 0 for row in f["rows"]]
+    return f"Identical to version 0.1.0, bit for bit, in {sum(same)} of {len(same)} cases."
 
 
 def states(f: dict) -> str:
@@ -247,14 +255,14 @@ def states(f: dict) -> str:
         )
         for k, least in ((0, 0.01), (1, 0.003), (2, 0.0))
     }
-    return f"Within {off[0]:.1f}, {off[1]:.0f} and {off[2]:.1f} %, for ε from 0 to 1."
+    return f"a₂, a₃, D agree within {off[0]:.1f}, {off[1]:.0f}, {off[2]:.1f} %, for ε from 0 to 1."
 
 
 def correlations(f: dict) -> str:
     rows = [row for row in f["rows"] if "h" in row]
     rates = [100 * (1 - row["rate"]) for row in rows]
     off = max(abs(100 * (row["theory"] - row["rate"])) for row in rows)
-    return f"By {min(rates):.1f} to {max(rates):.0f} %; theory is at most {off:.1f} % off."
+    return f"By {min(rates):.1f} to {max(rates):.0f} %; the error of theory is at most {off:.1f} %."
 
 
 ENTRIES = {
@@ -269,7 +277,7 @@ ENTRIES = {
         ),
         Entry(
             "fit/wrong_physics.py",
-            "What does a fit say of physics that it does not know?",
+            "What is the result of a fit whose model leaves out some physics?",
             "wrong_physics",
             wrong,
             "wrong_physics.png",
@@ -286,7 +294,7 @@ ENTRIES = {
         ),
         Entry(
             "fit/interval_coverage.py",
-            "How often does a 95 % interval of A hold the truth?",
+            "How often does a 95 % interval contain the true A?",
             "interval_coverage",
             coverage,
             "interval_coverage.png",
@@ -295,7 +303,7 @@ ENTRIES = {
         ),
         Entry(
             "fit/coverage_in_clusters.py",
-            "And where the gas clusters?",
+            "How often does it contain the true A in a clustering gas?",
             "coverage_in_clusters",
             in_clusters,
             "coverage_in_clusters.png",
@@ -304,7 +312,7 @@ ENTRIES = {
         ),
         Entry(
             "fit/sample_posterior.py",
-            "Is the error bar of a fit that of the posterior?",
+            "Does the error bar of a fit agree with the posterior?",
             "sample_posterior",
             posterior,
             "sample_posterior.png",
@@ -321,7 +329,7 @@ ENTRIES = {
         ),
         Entry(
             "fit/own_model.py",
-            "How do I add a model of my own?",
+            "How do I add my own model?",
             "",
             lambda f: "A class with six members works in cool, choose_model, fit and diagnose.",
             "own_model.png",
@@ -347,7 +355,7 @@ ENTRIES = {
         ),
         Entry(
             "accuracy/gradient_health.py",
-            "Is the derivative of a chaotic gas right, and until when?",
+            "Is the derivative of a chaotic gas accurate, and for how long?",
             "gradient_health_dilute",
             health,
             "gradient_health.png",
@@ -356,7 +364,7 @@ ENTRIES = {
         ),
         Entry(
             "accuracy/derivatives_in_flows.py",
-            "Are derivatives right where a gas has a flow, or does the curve say?",
+            "Are derivatives accurate in a gas with a flow, and is their bias estimated?",
             "derivatives_in_flows",
             in_flows,
             "derivatives_in_flows.png",
@@ -365,7 +373,7 @@ ENTRIES = {
         ),
         Entry(
             "accuracy/flow_memory.py",
-            "Which memory of its flow would make projected ones right?",
+            "Are projected derivatives accurate if the projection also keeps the flow?",
             "flow_memory",
             memories,
             "flow_memory.png",
@@ -374,7 +382,7 @@ ENTRIES = {
         ),
         Entry(
             "accuracy/soft_sphere_accuracy.py",
-            "How large are the errors of soft spheres, and of which order?",
+            "How large are the errors of soft spheres, and what is their order in the step?",
             "soft_sphere_accuracy",
             soft,
             "soft_sphere_accuracy.png",
@@ -382,9 +390,9 @@ ENTRIES = {
         ),
         Entry(
             "accuracy/hard_cases.py",
-            "In which limits do simulations fail, and does jaxgran?",
+            "How does jaxgran behave in limits in which simulations often fail?",
             "hard_cases",
-            lambda f: "24 limits: right answers within tolerances, or clear errors.",
+            lambda f: "24 limits: correct results within tolerances, or clear errors.",
             "hard_cases.png",
             "9 to 18 min",
             "hard_cases.md",
@@ -399,15 +407,15 @@ ENTRIES = {
         ),
         Entry(
             "accuracy/derive_softness.py",
-            "How much slower do two soft spheres cool, c(β)?",
+            "How much do soft contacts slow the cooling, c(β)?",
             "",
-            lambda f: "0.969 (d − 1) as β → 0, and less the more they dissipate.",
+            lambda f: "c = 0.969 (d − 1) as β → 0, and less for larger β.",
             "derive_softness.png",
             "10 s",
         ),
         Entry(
             "accuracy/sonine_coefficients.py",
-            "Are a₂, a₃, D and T of kinetic theory those of direct simulation?",
+            "Do a₂, a₃, D and T of kinetic theory agree with direct simulation?",
             "sonine_coefficients",
             states,
             "sonine_coefficients.png",
@@ -422,10 +430,18 @@ ENTRIES = {
             "7 min; the whole grid 25 min",
         ),
         Entry(
-            "accuracy/make_lammps_curves.py",
-            "How does one make more cooling curves in LAMMPS?",
+            "accuracy/compare_versions.py",
+            "Does this version give the same numbers as another version?",
+            "compare_versions",
+            same_numbers,
             "",
-            lambda f: "Three are in data/; no constant of the theory was fitted to them.",
+            "8 min",
+        ),
+        Entry(
+            "accuracy/make_lammps_curves.py",
+            "How can I make more cooling curves with LAMMPS?",
+            "",
+            lambda f: "Four are in data/; no constant of the theory was fitted to them.",
             "make_lammps_curves.png",
             "4 min each",
         ),
@@ -460,7 +476,7 @@ ENTRIES = {
         ),
         Entry(
             "speed/benchmark_million.py",
-            "What does a gas of a million cost, until it clusters?",
+            "What does a gas of a million particles cost, until it clusters?",
             "benchmark_million",
             million,
             "benchmark_million.png",
@@ -469,7 +485,7 @@ ENTRIES = {
         ),
         Entry(
             "speed/benchmark_compilation.py",
-            "How long does the first run of each particle model, or a fit, compile?",
+            "How long does the first run of each particle model, or a fit, take?",
             "benchmark_compilation",
             compilation,
             "benchmark_compilation.png",
@@ -513,7 +529,7 @@ ENTRIES = {
         ),
         Entry(
             "speed/benchmark_versions.py",
-            "Does a gas without elements cost what it did before scenes had any?",
+            "Did support for walls, roughness and drag slow down gases without them?",
             "benchmark_versions",
             versions,
             "benchmark_versions.png",
@@ -533,7 +549,7 @@ ENTRIES = {
     "The paper": (
         Entry(
             "paper/paper_claims.py",
-            "Which claims of the paper hold, equation by equation?",
+            "Which claims of the paper are confirmed, equation by equation?",
             "paper_claims",
             claims,
             "paper_claims.png",
@@ -550,7 +566,7 @@ ENTRIES = {
         ),
         Entry(
             "paper/paper_cooling.py",
-            "How do spheres of viscoelastic and of constant ε cool?",
+            "How do gases of viscoelastic and of constant ε cool?",
             "paper_cooling",
             cooling,
             "paper_cooling.png",
@@ -582,7 +598,7 @@ ENTRIES = {
         ),
         Entry(
             "paper/paper_exponents.py",
-            "And if 1 − ε is a power v^γ, or ε as measured on ice?",
+            "How does T fall if 1 − ε is a power v^γ, or for ε of ice?",
             "paper_exponents",
             exponents,
             "paper_exponents.png",

@@ -7,17 +7,17 @@ from experiments.support.tables.words import Row, each
 COMMAND = "python experiments/speed/benchmark_million.py"
 KINDS = {"hard-spheres": "HardSpheres", "soft-spheres": "SoftSpheres", "dsmc": "DSMC"}
 BUSY = 0.5
-"""Load of a machine from which on a timing is one beside other work."""
+"""Load of the machine above which a timing is marked as disturbed by other jobs."""
 
 
 def of_each(words: Callable[[dict], str], *needed: str) -> Callable[[dict], str]:
-    """Words of each model of `benchmark_million` for which the needed figures are known."""
+    """Return the text of each model of `benchmark_million` that has the needed figures."""
 
     def measured(found: dict) -> str:
         rows = [row for row in found["rows"] if all(key in row for key in needed)]
-        said = [f"{KINDS[row['model']]} {words(row)}" for row in rows]
-        beside = any(row["load"] > BUSY for row in rows)
-        return "; ".join(said) + (" (timed beside other work)" if beside else "")
+        parts = [f"{KINDS[row['model']]} {words(row)}" for row in rows]
+        disturbed = any(row["load"] > BUSY for row in rows)
+        return "; ".join(parts) + (" (timed while other jobs ran)" if disturbed else "")
 
     return measured
 
@@ -25,15 +25,15 @@ def of_each(words: Callable[[dict], str], *needed: str) -> Callable[[dict], str]
 def of_a_collision(row: dict) -> str:
     case = row["two cores"]
     peak = case["peak_GiB"]
-    return f"{1e6 * case['s_per_collision']:.3g} µs a collision, {peak:.1f} GiB at the peak"
+    return f"{1e6 * case['s_per_collision']:.3g} µs per collision, peak memory {peak:.1f} GiB"
 
 
 def into_clusters(row: dict) -> str:
     case = row["clusters"]
     minutes = case["run_s"] / 60 * case["clusters_at"] / case["collisions"][-1]
     return (
-        f"{case['clusters_at']:.1f} collisions each, {minutes:.1f} min after a melt of "
-        f"{case['melt_s'] / 60:.1f} min, {case['peak_GiB']:.1f} GiB"
+        f"{case['clusters_at']:.1f} collisions per disk, {minutes:.1f} min after an equilibration "
+        f"of {case['melt_s'] / 60:.1f} min, {case['peak_GiB']:.1f} GiB"
     )
 
 
@@ -51,29 +51,29 @@ ROWS = (
         COMMAND,
     ),
     Row(
-        "the same from a fluid to clusters: numbers in cells vary twice as much as in a fluid",
+        "this gas until it clusters: numbers in cells vary twice as much as in a fluid",
         "",
         "benchmark_million",
         of_each(into_clusters, "clusters"),
         COMMAND,
     ),
     Row(
-        "the same, strong scaling: two cores",
+        "this gas, strong scaling: two cores",
         "one core",
         "benchmark_million",
         of_each(lambda row: f"{row['strong']:.2f}×", "strong"),
         COMMAND,
     ),
     Row(
-        "the same, weak scaling: collisions a second of N on two cores; of two replicas of N/2 on "
-        "two CPU devices",
+        "this gas, weak scaling, collisions per second: N on two cores; two replicas of N/2 on two "
+        "CPU devices",
         "N/2 on one core",
         "benchmark_million",
         of_each(lambda row: f"{row['weak']:.2f}×; {row['replicas']:.2f}×", "weak", "replicas"),
         COMMAND,
     ),
     Row(
-        "memory of one disk with all arrays of a run, and on paper the largest N of one device",
+        "memory per disk with all arrays of a run, and the estimated largest N on one device",
         "16 / 80 / 141 GB",
         "benchmark_million",
         of_each(on_paper, "largest"),

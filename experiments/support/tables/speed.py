@@ -1,4 +1,4 @@
-"""Rows of speed.md: how slow."""
+"""Rows of speed.md: run times, memory and compilation."""
 
 from collections.abc import Callable
 
@@ -8,21 +8,22 @@ from experiments.support.tables.words import Row, between, each, of, thousands
 NOTE = """\
 ## Speed against error
 
-[speed_vs_error.md](speed_vs_error.md) has the largest error of T over a whole curve, and the run
-time without compilation, of every model as its knob is turned
-([picture](pictures/speed_vs_error.png)). The dilute and the dense gas are LAMMPS' own curves,
-nothing fitted; the clustering gas (φ = .2, β = .5, t_c/τ_c = .02, to 60 τ_c) is held against
-12 × 12 000 soft spheres of 80 steps a contact. Models have four replicas of N particles. The
-largest of 30 to 60 noisy points is itself two of its standard errors where nothing is wrong; boxes
-of fewer particles are smaller boxes. The noise that `choose_model` estimates is that of shots and
-of the few waves of a growing flow, as runs of three gases in two boxes each scatter
+[speed_vs_error.md](speed_vs_error.md) gives the largest error of T over a whole curve and the run
+time without compilation, for every model and several values of its settings
+([picture](pictures/speed_vs_error.png)). The reference of the dilute and the dense gas is the
+LAMMPS curve, without fitted parameters; the reference of the clustering gas (φ = .2, β = .5,
+t_c/τ_c = .02, to 60 τ_c) is 12 × 12 000 soft spheres with 80 steps per contact. Models have four
+replicas of N particles. The largest error of 30 to 60 noisy points is about two standard errors
+even for an exact model; fewer particles mean a smaller box. The noise that `choose_model` estimates
+is shot noise and the noise of the few waves of a growing flow; it agrees with the scatter of runs
+of three gases in two boxes each
 (`pytest -m "slow or not slow" tests/models/test_selection.py -k noise`).
 
-For a dilute gas in a box below L_c take kinetic theory: no model beats it by more than a
-fraction of its own noise and 1 %. Where contacts last or overlap, or the box is longer than L_c,
-take soft spheres with 10 to 20 steps a contact and spend the time on particles rather than on
-steps. Hard spheres of the same N take a seventh to two fifths of that time, and are good where
-contacts are short. float32 costs no accuracy that shows here.
+For a dilute gas in a box below L_c use kinetic theory: no model is better by more than a fraction
+of its own noise and 1 %. If contacts last long or overlap, or the box is longer than L_c, use soft
+spheres with 10 to 20 steps per contact, and spend run time on particles rather than on steps. Hard
+spheres of the same N take a seventh to two fifths of that time, and are accurate if contacts are
+short. float32 has no visible loss of accuracy here.
 """
 
 SOFT = "python experiments/speed/benchmark_particles.py"
@@ -161,10 +162,12 @@ ROWS = (
         SOFT,
     ),
     Row(
-        "soft spheres, 8 gases of N = 1000 that differ in A, vmap",
+        "soft spheres, 8 gases of N = 1000 with different A, vmap",
         "one after another",
         "benchmark_particles",
-        lambda f: f"{f['sweep']['ratio']:.2f} of the time (the melt, 10 of 12 τ_c, is shared)",
+        lambda f: (
+            f"{f['sweep']['ratio']:.2f} of the time (the equilibration, 10 of 12 τ_c, is common)"
+        ),
         SOFT,
     ),
     Row(
@@ -182,7 +185,7 @@ ROWS = (
         HARD,
     ),
     Row(
-        "50 000 hard disks, φ = .2, ε = .9, into clusters, 100 collisions each",
+        "50 000 hard disks, φ = .2, ε = .9, 100 collisions per disk, until they cluster",
         "",
         "benchmark_hard_spheres_until",
         lambda f: f"{f['run_s']:.0f} s with compilation",
@@ -219,7 +222,7 @@ ROWS = (
     ),
     Row(
         "peak memory that reverse mode adds, 1 / 10 / 100 / 1000 blocks",
-        "a state kept a block: .2 / 2 / 19 / 188 MiB",
+        "one stored state per block: .2 / 2 / 19 / 188 MiB",
         "benchmark_derivatives",
         memory,
         SLOPES,
@@ -232,43 +235,43 @@ ROWS = (
         "python experiments/speed/benchmark_dsmc.py",
     ),
     Row(
-        "two replicas of N = 4096 on two CPU devices, collisions a second",
-        "the same on one core",
+        "two replicas of N = 4096 on two CPU devices, collisions per second",
+        "both on one core",
         "benchmark_replicas",
         replicas,
         "python experiments/speed/benchmark_replicas.py",
     ),
     Row(
         "rough spheres, walls: hard spheres, N = 4096",
-        "smooth, for each collision (for each contact, walls' counted)",
+        "smooth gas, time per collision (time per contact, walls included)",
         "benchmark_elements",
         elements("hard spheres"),
         "python experiments/speed/benchmark_elements.py",
     ),
     Row(
         "walls, drag, friction: soft spheres, N = 2000",
-        "smooth, for each collision (for each contact, walls' counted)",
+        "smooth gas, time per collision (time per contact, walls included)",
         "benchmark_elements_soft",
         elements("soft spheres"),
         "python experiments/speed/benchmark_elements.py --soft",
     ),
     Row(
         "a smooth periodic gas: DSMC N = 10⁵, hard spheres N = 4096, soft spheres N = 2000",
-        "the same before scenes had elements, in turns",
+        "the version before scenes had elements, run alternately",
         "benchmark_versions",
         versions,
         "python experiments/speed/benchmark_versions.py CHECKOUT",
     ),
     Row(
         "rough spheres, walls, drag: DSMC, N = 10⁵",
-        "smooth, for each collision (for each contact, walls' counted)",
+        "smooth gas, time per collision (time per contact, walls included)",
         "benchmark_elements",
         elements("DSMC"),
         "python experiments/speed/benchmark_elements.py",
     ),
     Row(
         "rough spheres, walls, drag: kinetic theory",
-        "smooth, for each run",
+        "smooth gas, time per run",
         "benchmark_elements",
         elements("kinetic theory"),
         "python experiments/speed/benchmark_elements.py",
@@ -288,7 +291,7 @@ ROWS = (
         HEADS,
     ),
     Row(
-        "`import jaxgran`; the whole fit of the README, cold",
+        "`import jaxgran`; the whole fit of the README, without cached programs",
         "",
         "benchmark_kinetic_theory",
         cold,
