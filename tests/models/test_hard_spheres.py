@@ -468,7 +468,7 @@ def test_refuses_what_it_cannot_do():
     more = dataclasses.replace(HardSpheres(100).sized_for(gas), replicas=3)
     with pytest.raises(ValueError, match="sized for replicas = 1, and now has 3"):
         jaxgran.cool(gas, [1.0], model=more)
-    with pytest.raises(ValueError, match="use more particles"):
+    with pytest.raises(ValueError, match="Use more particles"):
         jaxgran.cool(gas.replace(packing_fraction=0.3), [1.0], model=HardSpheres(4))
     with pytest.raises(ValueError, match="too dense for a fluid"):
         jaxgran.cool(gas.replace(packing_fraction=0.6), [1.0], model=HardSpheres(500))

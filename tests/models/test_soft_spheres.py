@@ -408,7 +408,7 @@ def test_refuses_what_it_cannot_do(beads):
     ):
         with pytest.raises(ValueError, match=message):
             SoftSpheres(**settings)
-    with pytest.raises(ValueError, match="use more particles"):
+    with pytest.raises(ValueError, match="Use more particles"):
         jaxgran.cool(gas.replace(packing_fraction=0.3), [1.0], model=SoftSpheres(4))
     with pytest.raises(ValueError, match="too dense for a fluid"):
         jaxgran.cool(gas.replace(packing_fraction=0.6), [1.0], model=SoftSpheres(500))
