@@ -52,7 +52,7 @@ def test_figures_say_what_made_them(path):
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.script)
 def test_entries_of_the_gallery_are_short(entry):
     finding = entry.finding(figures(entry.source) if entry.source else {})
-    assert len(finding.split()) <= gallery.MOST_WORDS and finding.endswith(".")
+    assert len(finding.split()) <= gallery.MAX_WORDS and finding.endswith(".")
     assert entry.question.endswith("?") and re.search(r"\d+ (s|min)", entry.time)
     assert (EXPERIMENTS / entry.script).exists()
     assert not entry.picture or (EXPERIMENTS / "pictures" / entry.picture).exists()

@@ -10,7 +10,7 @@ from experiments.support.tables.words import between, minus, of, percent, power
 KINETIC = ("KineticTheory", "forward", "reverse")
 """Beginnings of the names of kinetic-theory rows in `benchmark_versions.py`."""
 
-MOST_WORDS = 15
+MAX_WORDS = 15
 """Largest number of words of a finding."""
 
 
