@@ -9,19 +9,20 @@ import pytest
 PROGRAMS = "JAXGRAN_TEST_PROGRAMS"
 """An environment variable: the folder of programs compiled in this run of the tests."""
 
-QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+FAST_BUILD = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 """Flags of XLA. On a CPU its emitters of fusions take more than half of the time of a compilation:
 without them it compiles a fit in 1.9 s in place of 5.1 s (jaxlib 0.10.1)."""
 
-MOST_MAPS = 12_000
-"""Memory maps of a process from which on it forgets what it has compiled, after a file. Linux gives
-65530, of which thousands of compiled functions take tens each."""
+MAX_MAPS_AFTER_A_FILE = 12_000
+"""Memory maps above which a process clears its caches after a file of tests. Linux allows 65530;
+each of thousands of compiled functions takes tens."""
 
-FAR_TOO_MANY = 40_000
-"""The same after each test: XLA crashes, without a word, where it gets no further map."""
+MAX_MAPS = 40_000
+"""Memory maps above which a process clears its caches after each slow test: XLA crashes without a
+message if it gets no further map."""
 
-FOUND: dict[str, list[dict]] = {}
-"""What tests found in this session, by the name of the file that would keep it."""
+RESULTS: dict[str, list[dict]] = {}
+"""Results of tests in this session, by the name of the file to record them in."""
 
 
 def pytest_addoption(parser):
@@ -38,7 +39,7 @@ def record():
     """Keep numbers that a document quotes: called at the end of a test, when all has held."""
 
     def keep(name, **numbers):
-        FOUND.setdefault(name, []).append(numbers)
+        RESULTS.setdefault(name, []).append(numbers)
 
     return keep
 
@@ -47,12 +48,12 @@ def pytest_sessionfinish(session, exitstatus):
     if session.config.option.record and exitstatus == 0:
         from experiments.support.record import FIGURES, save
 
-        for name, rows in FOUND.items():
+        for name, rows in RESULTS.items():
             save(FIGURES / "tests" / f"{name}.json", rows=rows)
 
 
 def pytest_configure(config):
-    """What one file or worker has compiled serves the others, in this run of the tests alone."""
+    """Share compiled programs between the workers of this run of the tests."""
     worker = hasattr(config, "workerinput")
     if config.option.record and (worker or getattr(config.option, "dist", "no") != "no"):
         raise pytest.UsageError("--record needs all tests in one process: add -n 0")
@@ -62,7 +63,7 @@ def pytest_configure(config):
         config.add_cleanup(partial(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True))
         if config.option.markexpr == "not slow":
             # Tests mostly compile. The slow ones run what users run, with all optimisation.
-            os.environ["XLA_FLAGS"] = f"{QUICKLY} {os.environ.get('XLA_FLAGS', '')}".strip()
+            os.environ["XLA_FLAGS"] = f"{FAST_BUILD} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 
 @pytest.hookimpl(trylast=True)  # after what measures the coverage of lines has begun
@@ -99,14 +100,14 @@ def beads():
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled_code():
     yield
-    _forget_beyond(MOST_MAPS, where_unknown=True)
+    _forget_beyond(MAX_MAPS_AFTER_A_FILE, where_unknown=True)
 
 
 @pytest.fixture(autouse=True)
 def forget_within_a_file(request):
     yield
     if request.node.get_closest_marker("slow"):
-        _forget_beyond(FAR_TOO_MANY)
+        _forget_beyond(MAX_MAPS)
 
 
 def _forget_beyond(most: int, where_unknown: bool = False):

@@ -27,7 +27,7 @@ def run(text, names, title):
 
 @pytest.fixture(scope="module")
 def names():
-    """What the first lines, in the docstring of the package, define."""
+    """Return the names that the first lines of the package docstring define."""
     return run(jaxgran.__doc__, {}, "jaxgran")
 
 

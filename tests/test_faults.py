@@ -1,4 +1,4 @@
-"""What can go wrong, where, and what happens: nothing wrong comes out without a word."""
+"""Faults: every wrong result is reported."""
 
 import dataclasses
 import os

@@ -1,4 +1,4 @@
-"""What must not change the curve of a gas, nor its derivative: units, frame, place and names."""
+"""A curve and its derivative do not depend on units, frame, place and names."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""What `cool(save=...)` makes of the particles on the way."""
+"""Functions of the particles during a run: `cool(save=...)`."""
 
 import dataclasses
 from functools import partial

@@ -105,7 +105,7 @@ class AbstractDynamics(eqx.Module):
 
     @property
     def galilean_invariant(self) -> bool:
-        """Whether the dynamics is the same in every frame that moves at a constant velocity."""
+        """True if the dynamics is invariant under a constant velocity of the frame."""
         return True
 
     @property

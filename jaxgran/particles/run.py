@@ -120,7 +120,7 @@ class Simulation(NamedTuple):
 
     @property
     def needs_equilibration(self) -> bool:
-        """Whether the start is random."""
+        """True if the start is random."""
         return self.inputs.start is None
 
     @property

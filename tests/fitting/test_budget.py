@@ -79,7 +79,7 @@ def test_inputs_are_propagated(names, part, slope):
 
 @pytest.mark.slow
 def test_a_prior_and_a_curve_share_what_they_know():
-    """Of T_0 both tell something: the estimate is the mean by inverse variances."""
+    """Both measurements contain T_0: the estimate is the mean by inverse variances."""
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(1), relative_error=0.05)
     alone = jaxgran.fit(gas, curve, free=BOTH)

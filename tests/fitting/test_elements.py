@@ -38,7 +38,7 @@ FREE = ("dissipative_constant", "tangential_restitution", "rotational_temperatur
 
 
 def unknown(gas) -> jaxgran.Gas:
-    """The same gas before its A, beta_t and first T_rot are known."""
+    """Return the gas before its A, beta_t and initial T_rot are known."""
     gas = gas.replace(dissipative_constant=0.0, rotational_temperature=0.0)
     return gas.replace(tangential_restitution=-1.0)
 

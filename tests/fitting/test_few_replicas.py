@@ -51,7 +51,7 @@ def test_a_set_value_stays_without_weight_and_one_run_has_no_scatter():
 
 
 def p_values(smoothed):
-    """Of 400 curves that are what they are compared with."""
+    """400 curves of the model that they are compared with."""
     found = []
     for seed in range(400):
         curve = averaged(seed)

@@ -30,7 +30,7 @@ def measured():
 
 
 def test_t0_takes_up_a_late_clock(measured):
-    """The same curve on two clocks: the same A, and t0 by the difference."""
+    """A curve on two clocks has one A, and the values of t0 differ by the offset."""
     gas, curve = measured
     late = 10.0 * float(curve.times[0])
     early, later = (

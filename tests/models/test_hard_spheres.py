@@ -19,7 +19,7 @@ DATA = Path(__file__).parents[2] / "experiments" / "data"
 
 
 def hard_gas(law=1.0, packing_fraction=0.1, dimension=3, **values) -> jaxgran.Gas:
-    """Of diameter, mass and temperature 1, so that SI and reduced units are the same."""
+    """A gas of diameter, mass and temperature 1: SI and reduced units are the same."""
     if not isinstance(law, jaxgran.RestitutionLaw):
         law = jaxgran.ConstantRestitution(law)
     values = {"diameter": 1.0, "mass": 1.0, "temperature": 1.0, **values}

@@ -12,7 +12,7 @@ from tests.fitting.curves import measured
 
 
 def stiff(gas, contact_fraction, beta=0.15):
-    """The same gas with contacts of another duration."""
+    """Return the gas with contacts of another duration."""
     stiffer = (float(gas.contact_fraction) / contact_fraction) ** 2.5
     gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
     return gas.replace(
