@@ -397,7 +397,7 @@ def test_jit_flags_the_start_of_another_gas():
     own, other = (jax.jit(cooled)(phi) for phi in (0.1, 0.05))
     assert own.status == 0 and np.isfinite(own.temperature[0])
     assert np.isnan(other.temperature[0])
-    assert "start's box is not that of the gas" in jaxgran.explain_status(other.status)
+    assert "the box of start does not match the gas" in jaxgran.explain_status(other.status)
     folded = dataclasses.replace(model, num_particles=50, plan=None)
     with pytest.raises(ValueError, match=r"has shape \(1, 100, 3\), not \(1, 50, 3\)"):
         jax.jit(partial(cooled, model=folded))(0.1)

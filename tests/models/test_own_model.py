@@ -138,7 +138,7 @@ def test_diagnosis_asks_the_model():
     assert not diagnosis.explains and "velocities are not Maxwellian" in diagnosis.reasons
     assert diagnosis.verdict == (
         "Haff law cannot be trusted in this scene, though the curve fits. "
-        "This scene needs kinetic theory, which follows a_2."
+        "This scene needs kinetic theory, which includes a_2."
     )
 
 
