@@ -113,7 +113,7 @@ def test_T_rot_is_fitted_beside_T(beads, surface, model, free):
     assert float(result.standard_error[1]) < 0.06
     with_priors = {"priors": {"packing_fraction": (0.05, 0.002)}, "model": model}
     if free == "tangential_damping":
-        with pytest.raises(ValueError, match="kinetic theory's derivatives, which does not know"):
+        with pytest.raises(ValueError, match="support friction. Leave priors out"):
             jaxgran.fit(guess, curve, free=names, **with_priors)
 
 
