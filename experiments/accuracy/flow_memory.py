@@ -33,7 +33,6 @@ from experiments.support.flow_projection import projecting
 from experiments.support.flow_waves import Memory
 from experiments.support.record import add_recording, figures, write_picture, write_results
 from experiments.support.scenes import beads
-from experiments.support.tables.words import minus
 from jaxgran.plotting import COLOURS, INK
 
 COLLISIONS = (10.0, 30.0, 60.0, 100.0)
@@ -170,26 +169,6 @@ def line(name: str, row: dict) -> str:
     columns = zip(*row["d_ln_T_d_ln_A"], strict=True)
     words = "".join(f"{m:+9.3f} ± {e:5.3f}" for m, e in columns)
     return f"{name:>42}{words}   ({row['num_boxes']} boxes)"
-
-
-def table(results: dict) -> str:
-    """Return the table of all measured memories, for the documents."""
-    head = [f"{n:.0f} collisions" for n in COLLISIONS]
-    lines = [
-        f"| kept in addition to T | {' | '.join(head)} | over differences, % | boxes |",
-        "|---|" + "---|" * (len(head) + 2),
-    ]
-    reference = {n: f"{m:.3f} ± {e:.3f}" for n, m, e in results["reference"]}
-    cells = (reference.get(n, "") for n in COLLISIONS)
-    lines.append(f"| *differences of many runs* | {' | '.join(cells)} | | |")
-    for name, row in results["memories"].items():
-        columns = zip(*row["d_ln_T_d_ln_A"], strict=True)
-        cells = [f"{m:+.3f} ± {e:.3f}" for m, e in columns]
-        cells += [""] * (len(COLLISIONS) - len(cells))
-        off = " / ".join(f"{100 * b:+.0f} ± {100 * e:.0f}" for b, e in over_reference(row).values())
-        cells = ["nothing" if name == "T" else name, *cells, off, str(row["num_boxes"])]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*lines[:2], *map(minus, lines[2:])])
 
 
 def draw(rows: dict) -> Figure:
