@@ -1,9 +1,21 @@
-"""Files of particles: particles are read from GSD, extended XYZ and LAMMPS files, and trajectories
-are written frame by frame during a run, as GSD or extended XYZ.
+"""Files of particles: frames are read from GSD, extended XYZ and LAMMPS files, and trajectories are
+written frame by frame during a run, as GSD or extended XYZ.
+
+GSD files are read and written by `gsd`. Text files are read here: ASE 3.29, which reads them too,
+changes the last digit of a tenth of the numbers of a dump and of half of those of a data file,
+leaves out angular velocities, units and times, accepts chemical elements alone as species, and
+writes XYZ with 8 decimals.
 """
 
+import gzip
 import re
+import shlex
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,47 +29,104 @@ from jaxgran.data.files import check_writable
 GSD = ".gsd"
 XYZ = ".xyz"
 
-SIDE_TOLERANCE = 1e-12
+TOLERANCE = 1e-12
 """Largest relative difference of the sides of a box that is read as a cube."""
 
-DATA_COLUMNS = {"atomic": 5, "sphere": 7}
-"""Columns up to z by atom style of LAMMPS data files: id, type, (diameter, density,) x, y, z."""
+FLOAT32_TOLERANCE = 1e-6
+"""Largest relative difference of equal sizes and masses, which GSD files store as float32."""
+
+UNITS = {
+    "si": (1.0, 1.0, 1.0),
+    "cgs": (1e-2, 1.0, 1e-3),
+    "micro": (1e-6, 1e-6, 1e-15),
+    "nano": (1e-9, 1e-9, 1e-21),
+    "metal": (1e-10, 1e-12, 1.66053906660e-27),
+    "real": (1e-10, 1e-15, 1.66053906660e-27),
+}
+"""Units of length (m), time (s) and mass (kg), by their names in LAMMPS."""
+
+DATA_COLUMNS = {
+    "atomic": ("id", "type", "x", "y", "z"),
+    "sphere": ("id", "type", "diameter", "density", "x", "y", "z"),
+}
+"""Columns of the section Atoms of a LAMMPS data file, by its atom style."""
+
+POSITIONS = (("xu", "yu", "zu"), ("x", "y", "z"), ("xs", "ys", "zs"), ("xsu", "ysu", "zsu"))
+"""Columns of positions, the first of which that a file has is read; those with s are scaled."""
+VELOCITY = ("vx", "vy", "vz")
+SPIN = ("omegax", "omegay", "omegaz")
+
+XYZ_VECTORS = {
+    "pos": ("x", "y", "z"),
+    "velo": VELOCITY,
+    "vel": VELOCITY,
+    "velocities": VELOCITY,
+    "angular_velocity": SPIN,
+}
+"""Names of the columns of properties of an extended XYZ file."""
+
+EQUAL = ("type", "element", "species", "Z", "diameter", "radius", "mass", "masses", "density")
+"""Columns that must be equal for all particles: gases of jaxgran consist of equal spheres."""
+
+DUMP_ITEMS = ("UNITS", "TIMESTEP", "TIME", "NUMBER OF ATOMS", "BOX BOUNDS", "ATOMS")
+
+SLANTED = "its box is slanted; only rectangular boxes are supported"
 
 
-class _Frame(NamedTuple):
-    """Content of one frame: the box, given by its low corner and sides, and rows of coordinates."""
+class Frame(NamedTuple):
+    """Content of one frame of a file, in SI.
+
+    Attributes:
+        position: m, shape (N, 3).
+        velocity: m/s, shape (N, 3), or None if the frame has none.
+        low: low corner of the box, m.
+        sides: of the box, m.
+        spin: angular velocity, 1/s, or None.
+        equal: columns that must be equal for all particles, by name.
+        periodic: whether the box is periodic in x, y, z.
+        time: s, or None if the file gives no time.
+        step: number of the time step, or None.
+        dimension: 2 or 3, or None if the file does not give it.
+    """
 
     position: np.ndarray
-    velocity: np.ndarray
+    velocity: np.ndarray | None
     low: np.ndarray
     sides: np.ndarray
     spin: np.ndarray | None
-    dimension: int = 3
+    equal: dict[str, np.ndarray]
+    periodic: tuple[bool, ...] = (True, True, True)
+    time: float | None = None
+    step: int | None = None
+    dimension: int | None = None
 
 
 def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None = None) -> Particles:
     """Read the particles of one frame, as a start for `HardSpheres` or `SoftSpheres`.
 
-    Supported formats are GSD (``.gsd``, needs the extra `trajectories`), extended XYZ (``.xyz``,
-    with ``velo`` or ``vel``), LAMMPS dumps (text; columns id, x y z or xu yu zu or xs ys zs, vx vy
-    vz and optionally omegax omegay omegaz) and LAMMPS data files as its command ``write_data``
-    writes them (atom styles sphere and atomic, with velocities). Numbers are read as SI, LAMMPS's
-    ``units si``. Particles are sorted by id and wrapped into the box, whose low corner becomes 0.
+    Supported formats are GSD (``.gsd``, needs the extra `trajectories`), extended XYZ (``velo``,
+    ``vel`` or ``velocities``), LAMMPS dumps (text; columns x y z or xu yu zu or xs ys zs, vx vy vz
+    and optionally id and omegax omegay omegaz) and LAMMPS data files as its command ``write_data``
+    writes them (atom styles sphere and atomic, with velocities). Text files may be compressed
+    (``.gz``). Units that a file names are converted to SI, other numbers are read as SI. Particles
+    are sorted by id, if the file has ids. The low corner of the box becomes 0, and particles are
+    wrapped into a periodic box.
 
     Args:
         path: the file.
         frame: index of the frame, counted from 0, or from the end for negative ones; -1 is the
             last.
-        dimension: 2 or 3; by default the dimension that the file gives, and 3 for LAMMPS files,
-            which give none.
+        dimension: 2 or 3; by default the dimension that the file gives, and 3 for files that give
+            none. A LAMMPS dump of disks does not give it.
 
     Returns:
         `Particles` of one replica. ``box_side`` is one number for a cube or square, otherwise one
         for each side.
 
     Raises:
-        ValueError: naming the file and what is wrong: no such file or frame, a box that is not
-            rectangular, missing velocities or columns, values that are no finite numbers.
+        ValueError: naming the file and what is wrong: no such file or frame, an incomplete frame, a
+            box that is not rectangular or periodic in some directions only, missing velocities,
+            unequal particles, units without a size in m, values that are no finite numbers.
         ModuleNotFoundError: for a .gsd file without `gsd`.
 
     >>> particles = jaxgran.cool(
@@ -70,169 +139,338 @@ def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None =
     path = Path(path)
     if dimension not in (None, 2, 3):
         raise ValueError(f"dimension must be 2 or 3, or None, got {dimension!r}")
+    with name_in_errors(path):
+        frames = open_frames(path)
+        if not -len(frames) <= frame < len(frames):
+            raise ValueError(f"it has {len(frames)} frames, there is no frame {frame}")
+        return _to_particles(*checked_frame(frames[frame](), dimension))
+
+
+@contextmanager
+def name_in_errors(path: Path) -> Iterator[None]:
+    """Name the file in errors of its content."""
     try:
-        if path.suffix == GSD:
-            content = _read_gsd(path, frame)
-        else:
-            text = path.read_text(encoding="utf-8")
-            read = _read_xyz if path.suffix == XYZ else _read_lammps
-            content = read(text, frame)
-        return _to_particles(content, content.dimension if dimension is None else dimension)
+        yield
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; check the path") from None
-    except (ValueError, OSError, RuntimeError, IndexError, KeyError) as error:
-        words = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path}: {words}") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: it is no text file; GSD files end in .gsd") from None
+    except (ValueError, OSError, RuntimeError, EOFError, zlib.error) as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
-def _to_particles(content: _Frame, d: int) -> Particles:
-    """Return one replica of d dimensions, with positions in [0, side)."""
-    position, velocity = content.position[:, :d], content.velocity[:, :d]
-    sides, spin = content.sides[:d], content.spin
-    for name, values in (("positions", position), ("velocities", velocity), ("sides", sides)):
-        if not np.all(np.isfinite(values)):
-            raise ValueError(f"some of its {name} are not finite numbers")
-    if not np.all(sides > 0):
-        raise ValueError(f"its box has the sides {sides}, which must be positive")
-    inside = np.mod(position - content.low[:d], sides)
-    inside = np.where(inside < sides, inside, 0.0)  # rounding may give a side
-    is_cube = np.ptp(sides) <= SIDE_TOLERANCE * sides[0]
-    if spin is not None and d == 2:
-        spin = spin[:, -1:]
+def open_frames(path: Path) -> list[Callable[[], Frame]]:
+    """Return a function for each frame of a file, which reads it."""
+    if path.suffix == GSD:
+        if not path.exists():
+            raise FileNotFoundError
+        with _import_gsd().open(str(path), "r") as file:
+            return [partial(_read_gsd, path, k) for k in range(len(file))]
+    content = path.read_bytes()
+    text = (gzip.decompress(content) if path.suffix == ".gz" else content).decode()
+    if text.lstrip().startswith("ITEM:"):
+        return _open_dump(text)
+    if text.split(maxsplit=1)[:1] and text.split(maxsplit=1)[0].isdigit():
+        return _open_xyz(text)
+    return [partial(_read_data, text)]
+
+
+def checked_frame(frame: Frame, dimension: int | None) -> tuple[Frame, int]:
+    """Return a frame of equal particles, positions relative to the low corner, and its dimension.
+
+    Raises:
+        ValueError: for values, boxes and particles that `read_particles` does not support.
+    """
+    if frame.velocity is None:
+        raise ValueError(
+            "it has no velocities in this frame: write the columns vx vy vz (LAMMPS), velo (XYZ; "
+            "not momenta), or particles/velocity into every frame (GSD; HOOMD needs "
+            "dynamic=['property', 'momentum'] for it)"
+        )
+    d = dimension or frame.dimension or 3
+    low, sides, periodic = frame.low[:d], frame.sides[:d], all(frame.periodic[:d])
+    position, velocity = frame.position[:, :d] - low, frame.velocity[:, :d]
+    different = [name for name, values in frame.equal.items() if not _all_equal(values)]
+    for wrong, message in (
+        (
+            different,
+            f"its particles differ in {', '.join(different)}, but gases of jaxgran consist of "
+            "equal spheres; give a file of one kind of particles",
+        ),
+        (
+            not all(np.all(np.isfinite(x)) for x in (position, velocity, sides)),
+            "some of its positions, velocities or sides are not finite numbers",
+        ),
+        (not np.all(sides > 0), f"its box has the sides {sides}, which must be positive"),
+        (
+            any(frame.periodic[:d]) and not periodic,
+            "its box is periodic in some directions only; boxes of jaxgran are periodic, or have "
+            "walls, on all sides",
+        ),
+        (
+            not periodic and np.any((position < 0) | (position > sides)),
+            "some particles are outside of its box, which is not periodic",
+        ),
+        (
+            dimension is None and frame.dimension is None and _is_flat(position, velocity),
+            "all its particles move in one plane: give dimension=2 for disks, or 3",
+        ),
+    ):
+        if wrong:
+            raise ValueError(message)
+    if periodic:
+        position = np.mod(position, sides)
+        position = np.where(position < sides, position, 0.0)  # rounding may give a side
+    spin = frame.spin if frame.spin is None or d == 3 else frame.spin[:, -1:]
+    return frame._replace(position=position, velocity=velocity, sides=sides, spin=spin), d
+
+
+def _is_flat(position: np.ndarray, velocity: np.ndarray) -> bool:
+    still = not np.any(velocity[:, 2]) and np.any(velocity)
+    return bool(still and np.ptp(position[:, 2]) == 0)
+
+
+def _all_equal(values: np.ndarray) -> bool:
+    if values.dtype.kind not in "fiu":
+        return len(set(values)) <= 1
+    return bool(np.ptp(values) <= FLOAT32_TOLERANCE * np.max(np.abs(values)))
+
+
+def _to_particles(frame: Frame, d: int) -> Particles:
+    is_cube = np.ptp(frame.sides) <= TOLERANCE * frame.sides[0]
     return Particles(
-        position=jnp.asarray(inside[None]),
-        velocity=jnp.asarray(velocity[None]),
-        box_side=jnp.asarray(sides[0] if is_cube else sides),
-        angular_velocity=None if spin is None else jnp.asarray(spin[None]),
+        position=jnp.asarray(frame.position[None]),
+        velocity=jnp.asarray(frame.velocity)[None],
+        box_side=jnp.asarray(frame.sides[0] if is_cube else frame.sides),
+        angular_velocity=None if frame.spin is None else jnp.asarray(frame.spin[None]),
     )
 
 
-def _frame_index(frames: int, frame: int) -> int:
-    if not -frames <= frame < frames:
-        raise ValueError(f"it has {frames} frames, there is no frame {frame}")
-    return frame % frames
-
-
-def _read_gsd(path: Path, frame: int) -> _Frame:
-    if not path.exists():
-        raise FileNotFoundError
+def _read_gsd(path: Path, k: int) -> Frame:
     with _import_gsd().open(str(path), "r") as file:
-        snapshot = file[_frame_index(len(file), frame)]
-    d, box = int(snapshot.configuration.dimensions), np.asarray(snapshot.configuration.box, float)
-    if np.any(box[3:] != 0):
-        raise ValueError("its box is slanted; only rectangular boxes are supported")
-    sides = box[:3]
-    spin = snapshot.log.get("particles/angular_velocity")
-    spin = None if spin is None else np.reshape(spin, (int(snapshot.particles.N), -1))
-    position = np.asarray(snapshot.particles.position, float)
-    velocity = np.asarray(snapshot.particles.velocity, float)
-    return _Frame(position, velocity, -sides / 2, sides, spin, d)
+        snapshot = file[k]
+        # gsd returns the velocities of the first frame for a frame without, and 0 for the first. It
+        # does not write those that equal the ones of the first frame: files of jaxgran have all.
+        known = file.file.application.startswith("jaxgran") or file.file.chunk_exists(
+            k, "particles/velocity"
+        )
+    particles = snapshot.particles
+    sides, tilts = np.split(np.asarray(snapshot.configuration.box, float), 2)
+    if np.any(tilts != 0):
+        raise ValueError(SLANTED)
+    spin, time = (snapshot.log.get(name) for name in ("particles/angular_velocity", "time"))
+    return Frame(
+        position=np.asarray(particles.position, float),
+        velocity=np.asarray(particles.velocity, float) if known else None,
+        low=-sides / 2,
+        sides=sides,
+        spin=None if spin is None else np.reshape(spin, (int(particles.N), -1)),
+        equal={
+            "type": particles.typeid,
+            "diameter": particles.diameter,
+            "mass": particles.mass,
+        },
+        time=None if time is None else float(time[0]),
+        step=int(snapshot.configuration.step),
+        dimension=int(snapshot.configuration.dimensions),
+    )
 
 
-def _read_xyz(text: str, frame: int) -> _Frame:
-    lines, starts, at = text.split("\n")[:-1], [], 0  # drops an incomplete last line
-    while at < len(lines) and lines[at].strip():
-        starts.append(at)
-        at += int(lines[at]) + 2
-    if at > len(lines):
-        starts.pop()
-    at = starts[_frame_index(len(starts), frame)]
-    count, head = int(lines[at]), lines[at + 1]
-    match = re.search(r'Lattice="([^"]*)"', head)
-    if match is None:
-        raise KeyError("Lattice")
-    lattice = np.array(match[1].split(), float).reshape(3, 3)
-    if np.any(lattice != np.diag(np.diag(lattice))):
-        raise ValueError("its box is slanted; only rectangular boxes are supported")
-    columns = _xyz_columns(head)
-    rows = [line.split() for line in lines[at + 2 : at + 2 + count]]
-
-    def values(name: str) -> np.ndarray:
-        return np.array([row[columns[name]] for row in rows], float)
-
-    velocity = next((name for name in ("velo", "vel", "velocities") if name in columns), "velo")
-    spin = values("angular_velocity") if "angular_velocity" in columns else None
-    d = int((re.search(r"\bdimension=(\d)", head) or [0, 3])[1])
-    return _Frame(values("pos"), values(velocity), np.zeros(3), np.diag(lattice), spin, d)
+def _readers(
+    read: Callable[[Any], Frame], parts: list[Any], text: str
+) -> list[Callable[[], Frame]]:
+    """Return readers of the parts of a text, whose last line must be complete."""
+    frames: list[Callable[[], Frame]] = [partial(read, part) for part in parts]
+    if not text.endswith("\n"):
+        frames[-1:] = [_refuse_cut]
+    return frames
 
 
-def _xyz_columns(head: str) -> dict[str, slice]:
-    """Return the slice of each property in the columns of an extended XYZ file."""
-    match = re.search(r"Properties=(\S+)", head)
-    if match is None:
-        raise KeyError("Properties")
-    parts, columns, at = match[1].split(":"), {}, 0
-    for name, number in zip(parts[::3], parts[2::3], strict=True):
-        columns[name] = slice(at, at + int(number))
-        at += int(number)
-    return columns
+def _refuse_cut() -> Frame:
+    raise ValueError(
+        "it ends within a line, so that its last number may be cut off: end the last line if the "
+        "file is complete, or read a frame before the last one"
+    )
 
 
-def _read_lammps(text: str, frame: int) -> _Frame:
-    return _read_dump(text, frame) if text.startswith("ITEM:") else _read_data(text)
+def _open_dump(text: str) -> list[Callable[[], Frame]]:
+    frames, items = [], {}
+    for section in re.split(r"^ITEM: ", text, flags=re.MULTILINE)[1:]:
+        head, _, body = section.partition("\n")
+        name = next((name for name in DUMP_ITEMS if head.startswith(name)), head)
+        items[name] = head.removeprefix(name).split(), body
+        if name == "ATOMS":
+            frames.append(items)
+            items = {"UNITS": items["UNITS"]} if "UNITS" in items else {}
+    if items.keys() - {"UNITS"}:
+        frames.append(items)
+    return _readers(_read_dump, frames, text)
 
 
-def _read_dump(text: str, frame: int) -> _Frame:
-    frames = re.split(r"^ITEM: TIMESTEP\n", text, flags=re.MULTILINE)[1:]
-    text = frames[_frame_index(len(frames), frame)]
-    bounds = re.search(r"ITEM: BOX BOUNDS(.*)\n((?:.*\n){3})", text)
-    atoms = re.search(r"ITEM: ATOMS (.*)\n", text)
-    count = re.search(r"ITEM: NUMBER OF ATOMS\n(\d+)", text)
-    if bounds is None or atoms is None or count is None:
+def _read_dump(items: dict[str, tuple[list[str], str]]) -> Frame:
+    if not {"BOX BOUNDS", "ATOMS", "NUMBER OF ATOMS"} <= items.keys():
         raise ValueError("the frame of the LAMMPS dump is incomplete")
-    if "xy" in bounds[1] or "abc" in bounds[1]:
-        raise ValueError("its box is slanted; only rectangular boxes are supported")
-    low, high = np.array([line.split()[:2] for line in bounds[2].splitlines()], float).T
-    names = atoms[1].split()
-    table = np.array([line.split() for line in text[atoms.end() :].splitlines()], dtype=object)
-    if table.shape != (int(count[1]), len(names)):
-        raise ValueError(f"a frame of {count[1]} atoms has not as many complete rows")
-    order = np.argsort(table[:, names.index("id")].astype(int)) if "id" in names else slice(None)
+    flags, bounds = items["BOX BOUNDS"]
+    if not all(re.fullmatch("[pfsm]{2}", flag) for flag in flags):
+        raise ValueError(SLANTED)
+    if any(set(flag) & set("sm") for flag in flags):
+        raise ValueError("its box is fitted to the particles (boundary s or m): use p or f")
+    low, high = np.array([line.split()[:2] for line in bounds.splitlines()[:3]], float).T
+    names, body = items["ATOMS"]
+    rows = [line.split() for line in body.splitlines() if line.strip()]
+    count = int(items["NUMBER OF ATOMS"][1])
+    step, time = (
+        items[name][1].strip() if name in items else None for name in ("TIMESTEP", "TIME")
+    )
+    return _frame_of_columns(
+        _table(rows, names, count),
+        low,
+        high - low,
+        units=items["UNITS"][1].strip() if "UNITS" in items else "si",
+        periodic=tuple("p" in flag for flag in flags) or (True,) * 3,
+        time=None if time is None else float(time),
+        step=None if step is None else int(step),
+    )
 
-    def values(*wanted: str) -> np.ndarray:
-        missing = [name for name in wanted if name not in names]
-        if missing:
-            raise KeyError(f"column {' '.join(missing)}")
-        return table[order][:, [names.index(name) for name in wanted]].astype(float)
 
-    if "xs" in names:
-        position = low + values("xs", "ys", "zs") * (high - low)
-    else:
-        position = values("xu", "yu", "zu") if "xu" in names else values("x", "y", "z")
-    spin = values("omegax", "omegay", "omegaz") if "omegax" in names else None
-    return _Frame(position, values("vx", "vy", "vz"), low, high - low, spin)
+def _open_xyz(text: str) -> list[Callable[[], Frame]]:
+    lines, frames, at = text.splitlines(), [], 0
+    while at < len(lines):
+        if not lines[at].strip():
+            at += 1
+            continue
+        if not lines[at].strip().isdigit():
+            raise ValueError(f"line {at + 1} must be a number of particles, got {lines[at]!r}")
+        end = at + 2 + int(lines[at])
+        frames.append(lines[at:end])
+        at = end
+    return _readers(_read_xyz, frames, text)
 
 
-def _read_data(text: str) -> _Frame:
+def _read_xyz(lines: list[str]) -> Frame:
+    head = lines[1] if len(lines) > 1 else ""
+    info = dict(part.split("=", 1) for part in shlex.split(head) if "=" in part)
+    info = {key.lower(): value for key, value in info.items()}
+    missing = [name for name in ("Lattice", "Properties") if name.lower() not in info]
+    if missing:
+        raise ValueError(f"it has no {missing[0]} in the second line of a frame")
+    unknown = [key for key in info if "unit" in key and key != "units"]
+    if unknown:
+        raise ValueError(f"it gives {unknown[0]}: write units={', units='.join(UNITS)} or SI")
+    lattice = np.array(info["lattice"].split(), float).reshape(3, 3)
+    if np.any(lattice != np.diag(np.diag(lattice))):
+        raise ValueError(SLANTED)
+    parts = info["properties"].split(":")
+    names: list[str] = []
+    for name, number in zip(parts[::3], map(int, parts[2::3]), strict=True):
+        several = XYZ_VECTORS.get(name, [f"{name}_{k}" for k in range(number)])
+        # In a plane the only component of the angular velocity is that of z.
+        names += [name] if number == 1 and name not in XYZ_VECTORS else several[-number:]
+    table = _table([line.split() for line in lines[2:]], names, int(lines[0]))
+    return _frame_of_columns(
+        table,
+        np.array(info.get("origin", "0 0 0").split(), float),
+        np.diag(lattice),
+        units=info.get("units", "si"),
+        periodic=tuple(x in "T1" for x in re.findall("[TF01]", info.get("pbc", "TTT"))),
+        time=float(info["time"]) if "time" in info else None,
+        dimension=int(info["dimension"]) if "dimension" in info else None,
+    )
+
+
+def _read_data(text: str) -> Frame:
     bounds = [re.search(rf"^\s*(\S+)\s+(\S+)\s+{x}lo {x}hi", text, re.MULTILINE) for x in "xyz"]
     if not all(bounds):
         raise ValueError(
-            "neither a LAMMPS dump nor a LAMMPS data file. Give one of these, or .gsd or .xyz"
+            "no file of particles: give a LAMMPS dump or data file, extended XYZ, or GSD (.gsd)"
         )
-    if re.search(r"^.*xy xz yz", text, re.MULTILINE):
-        raise ValueError("its box is slanted; only rectangular boxes are supported")
+    if re.search(r"^.*(xy xz yz|avec)", text, re.MULTILINE):
+        raise ValueError(SLANTED)
     low, high = np.array([[b[1], b[2]] for b in bounds if b], float).T
     style = re.search(r"^Atoms\s*#\s*(\w+)", text, re.MULTILINE)
     if style is None or style[1] not in DATA_COLUMNS:
         raise ValueError(f"its section Atoms must name its style, {' or '.join(DATA_COLUMNS)}")
-    atoms, velocities = _section(text, "Atoms"), _section(text, "Velocities")
-    if set(atoms) != set(velocities):
+    count = re.search(r"^\s*(\d+)\s+atoms\s*$", text, re.MULTILINE)
+    atoms = _section(text, "Atoms", DATA_COLUMNS[style[1]], count)
+    velocities = _section(text, "Velocities", ("id", *VELOCITY, *SPIN), count)
+    if np.any(atoms["id"] != velocities["id"]):
         raise ValueError("its sections Atoms and Velocities have different ids")
-    ids = sorted(atoms)
-    end = DATA_COLUMNS[style[1]] - 1
-    position = np.array([atoms[i][end - 3 : end] for i in ids])
-    velocity = np.array([velocities[i] for i in ids])
-    spin = velocity[:, 3:6] if velocity.shape[1] > 3 else None
-    return _Frame(position, velocity[:, :3], low, high - low, spin)
+    units = re.search(r"^.*units = (\w+)", text)
+    return _frame_of_columns(atoms | velocities, low, high - low, units[1] if units else "si")
 
 
-def _section(text: str, name: str) -> dict[int, list[float]]:
-    """Return the rows of numbers of a section of a LAMMPS data file, by id."""
+def _section(
+    text: str, name: str, columns: tuple[str, ...], count: re.Match[str] | None
+) -> dict[str, np.ndarray]:
+    """Return the columns of a section of a LAMMPS data file, sorted by id."""
     match = re.search(rf"^{name}\b.*\n\s*\n((?:[ \t]*[-+\d].*(?:\n|$))+)", text, re.MULTILINE)
     if match is None:
-        raise KeyError(f"section {name}")
-    rows = [line.split("#")[0].split() for line in match[1].splitlines()]
-    return {int(row[0]): [float(x) for x in row[1:]] for row in rows}
+        raise ValueError(f"it has no section {name}")
+    rows = [line.split("#")[0].split()[: len(columns)] for line in match[1].splitlines()]
+    rows.sort(key=lambda row: int(row[0]))
+    return _table(rows, columns[: len(rows[0])], int(count[1]) if count else len(rows))
+
+
+def _table(rows: list[list[str]], names: Sequence[str], count: int) -> dict[str, np.ndarray]:
+    """Return the columns of the rows of a frame, by name, as text."""
+    if len(rows) != count or any(len(row) != len(names) for row in rows):
+        raise ValueError(
+            f"a frame of {count} atoms has not as many complete rows of {len(names)} columns"
+        )
+    columns = np.array(rows, object).reshape(count, len(names)).T
+    return dict(zip(names, columns, strict=True))
+
+
+def _frame_of_columns(
+    table: dict[str, np.ndarray],
+    low: np.ndarray,
+    sides: np.ndarray,
+    units: str = "si",
+    **others: Any,
+) -> Frame:
+    """Return a frame in SI of columns, sorted by id."""
+    if units.lower() not in UNITS:
+        raise ValueError(
+            f"its units are {units!r}, without a size in m: convert it to SI. Known units are "
+            f"{', '.join(UNITS)}"
+        )
+    length, second, kilogram = UNITS[units.lower()]
+    if "id" in table:
+        ids = table["id"].astype(int)
+        if len(set(ids)) < len(ids):
+            raise ValueError("it has an id twice; remove one of its particles")
+        table = {name: column[np.argsort(ids)] for name, column in table.items()}
+
+    def vector(names: tuple[str, ...]) -> np.ndarray | None:
+        known = [table[name].astype(float) for name in names if name in table]
+        return np.stack(known, axis=1) if len(known) == len(names) else None
+
+    position = next((x for names in POSITIONS if (x := vector(names)) is not None), None)
+    if position is None:
+        raise ValueError(f"it has no columns {' or '.join(map(' '.join, POSITIONS))}")
+    if not table.keys() & {"x", "xu"}:
+        position = low + position * sides
+    velocity = vector(VELOCITY)
+    spin = vector(SPIN) if SPIN[0] in table else vector(SPIN[-1:])
+    factors = {"diameter": length, "radius": length, "mass": kilogram, "masses": kilogram}
+    factors |= {"density": kilogram / length**3}
+    equal = {name: table[name] for name in EQUAL if name in table}
+    equal |= {
+        name: factor * equal[name].astype(float)
+        for name, factor in factors.items()
+        if name in equal
+    }
+    time = others.pop("time", None)
+    return Frame(
+        position=length * position,
+        velocity=None if velocity is None else length / second * velocity,
+        low=length * low,
+        sides=length * sides,
+        spin=None if spin is None else spin / second,
+        equal=equal,
+        time=None if time is None else second * time,
+        **others,
+    )
 
 
 class Sphere(NamedTuple):
@@ -333,8 +571,16 @@ def _append_gsd(path: Path, k: int, time: float, replica: Particles, sphere: Sph
     if replica.angular_velocity is not None:
         spins = np.asarray(replica.angular_velocity, np.float32)
         frame.log["particles/angular_velocity"] = spins
-    with hoomd.open(str(path), "r+" if path.exists() else "x") as file:
-        file.append(frame)
+    # The application says that each frame has its own velocities: see `_read_gsd`.
+    file = import_module("gsd.fl").open(
+        name=str(path),
+        mode="r+" if path.exists() else "x",
+        application=f"jaxgran {version('jaxgran')}",
+        schema="hoomd",
+        schema_version=[1, 4],
+    )
+    with hoomd.HOOMDTrajectory(file) as frames:
+        frames.append(frame)
 
 
 def _count_frames_gsd(path: Path) -> int:

@@ -59,6 +59,16 @@ def test_gsd_is_read_by_gsd(tmp_path):
     assert found.log["time"] == [0.25]
 
 
+def test_velocities_that_do_not_change_are_those_of_each_frame(tmp_path):
+    """gsd writes no velocities that equal those of the first frame, nor such as are 0."""
+    path, frame = tmp_path / "run.gsd", particles()
+    still = frame._replace(velocity=0 * frame.velocity)
+    trajectory = Trajectory(path, 1, resumed=False)
+    for k, state in enumerate([still, frame, still]):
+        trajectory.write(k, 0.1 * k, state, SPHERE)
+    assert not np.any(jaxgran.read_particles(path).velocity)
+
+
 @SUFFIXES
 def test_each_replica_has_its_file(tmp_path, suffix, digits):
     frame = particles(replicas=2)
@@ -97,7 +107,10 @@ def test_half_a_frame_is_cut_off(tmp_path):
         trajectory.write(k, 0.1 * k, particles(seed=k), SPHERE)
     whole = path.read_bytes()
     path.write_bytes(whole[:-30])
-    np.testing.assert_array_equal(jaxgran.read_particles(path).velocity, particles().velocity)
+    with pytest.raises(ValueError, match="it ends within a line"):
+        jaxgran.read_particles(path)
+    read = jaxgran.read_particles(path, frame=-2)
+    np.testing.assert_array_equal(read.velocity, particles().velocity)
     resumed = Trajectory(path, 1, resumed=True)
     resumed.write(1, 0.1, particles(seed=1), SPHERE)
     assert path.read_bytes() == whole
@@ -205,22 +218,22 @@ def test_files_of_lammps(tmp_path, text):
 @pytest.mark.parametrize(
     "text, change, message",
     [
-        (DUMP, ("xu yu zu", "a b c"), "it has no column x y z"),
-        (DUMP, ("vx vy vz omegax", "fx fy fz omegax"), "it has no column vx vy vz"),
+        (DUMP, ("xu yu zu", "a b c"), "it has no columns xu yu zu or x y z or"),
+        (DUMP, ("vx vy vz omegax", "fx fy fz omegax"), "it has no velocities in this frame"),
         (
             DUMP,
             ("2 1 0.5 1 -1 4 5 6 0 0 2\n", ""),
             "a frame of 2 atoms has not as many complete rows",
         ),
         (DUMP, ("BOUNDS pp", "BOUNDS xy xz yz pp"), "its box is slanted"),
-        (DUMP, ("2.5 1 1 1", "nan 1 1 1"), "positions are not finite"),
+        (DUMP, ("2.5 1 1 1", "nan 1 1 1"), "positions, velocities or sides are not finite"),
         (DUMP, ("2.5 1 1 1", "x 1 1 1"), "could not convert string"),
         (DATA, ("# sphere", ""), "must name its style, atomic or sphere"),
         (DATA, ("# sphere", "# bond"), "must name its style, atomic or sphere"),
         (DATA, ("Velocities", "Bodies"), "it has no section Velocities"),
         (DATA, ("2 4 5 6 0 0 2", "3 4 5 6 0 0 2"), "have different ids"),
         (DATA, ("-1 3 xlo xhi", "3 -1 xlo xhi"), "which must be positive"),
-        ("t,T\n1,2\n", ("", ""), "neither a LAMMPS dump nor a LAMMPS data file"),
+        ("t,T\n1,2\n", ("", ""), "no file of particles: give a LAMMPS dump"),
     ],
 )
 def test_bad_files_are_refused(tmp_path, text, change, message):
