@@ -1,0 +1,646 @@
+"""T(t) of particles that are followed: from tracks, positions in frames, and from trajectories."""
+
+import warnings
+from collections.abc import Iterator, Mapping
+from math import pi
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import least_squares
+from scipy.spatial import KDTree
+from scipy.stats import chi2
+
+from jaxgran.data.curve import MIN_POINTS, CoolingCurve
+from jaxgran.data.files import header_count, header_number
+from jaxgran.data.particles import Frame, checked_frame, name_in_errors, open_frames
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.geometry import sphere_mass
+from jaxgran.scene.laws import ConstantRestitution
+
+COORDINATES = ("x", "y", "z")
+IDENTITIES = ("id", "particle")
+CLOCKS = ("t", "frame")
+"""Columns of tracks, the first of which that a file has is read; the second names are trackpy's."""
+
+TRACK_KEYS = ("box_side", "frame_rate", "timestep", "localisation_error")
+"""Header keys of tracks and trajectories."""
+
+TRAJECTORIES = (".gsd", ".xyz", ".extxyz", ".dump", ".lammpstrj")
+"""Suffixes of files that give the velocities of all particles."""
+
+MIN_TRACKS = 3
+"""Particles needed for a scatter after the drift is removed and one particle is left out."""
+
+MAX_CORRECTION = 0.3
+"""Largest share of T that impacts may take, or localisation may add, without a warning."""
+
+NUM_ITERATIONS = 50
+"""Iterations for T from the displacements, each of which reduces the error by 2 or more."""
+
+CHANCE = 1e-3
+"""Probability that one or more of the displacements of Maxwellian particles is left out."""
+
+MIN_GAIN = 9.0
+"""Least improvement of chi^2 by which two identities count as swapped.
+
+With 0, 1 and 5 % of 300 identities swapped, T is then right within 2 % for particles that move up
+to .3 of their mean distance between frames, in two and three dimensions.
+"""
+
+MAX_STEP = 0.3
+"""Largest step, over the mean distance, at which identities are exchanged for a comparison."""
+
+MAX_SWAPPED = 1e-3
+"""Largest share of identities that count as swapped without a warning."""
+
+MAX_TAIL = 10.0
+"""Largest number of too long displacements, over that of Maxwellian speeds, without a warning."""
+
+MIN_SIGMAS = 5.0
+"""Least significance of what the displacements show, the errors of which are correlated."""
+
+ENSKOG_ERROR = 0.2
+"""Relative standard error of Enskog's rate for a granular gas."""
+
+MAX_SONINE = 0.05
+"""Largest relative difference of T by the median and by the mean that the tails of f(v) explain."""
+
+
+HEADER_TOLERANCE = 0.01
+"""Largest relative difference of a number of a header from that of a trajectory."""
+
+GSD_DEFAULT = 1.0
+"""Diameter, in m, of GSD files that give none."""
+
+
+class Step(NamedTuple):
+    """Displacements between two neighbouring frames.
+
+    Attributes:
+        time: the middle of the two times, s.
+        duration: s.
+        ids: of the particles in both frames, increasing.
+        displacement: m, shape (n, d), without those of wrong identities.
+        too_long: number of displacements left out as longer than the distribution allows.
+        folded: number of these that are usual but for the difference of the extreme positions.
+        swapped: number of further displacements left out, of exchanged identities.
+        spread: difference of the extreme positions, m, shape (d,).
+    """
+
+    time: float
+    duration: float
+    ids: Int[np.ndarray, "n"]
+    displacement: Float[np.ndarray, "n d"]
+    too_long: int = 0
+    folded: int = 0
+    swapped: int = 0
+    spread: Float[np.ndarray, "d"] = np.zeros(1)
+
+
+def is_trajectory(path: Path) -> bool:
+    """Return whether a file contains velocities of particles, by its name."""
+    return Path(str(path).removesuffix(".gz")).suffix in TRAJECTORIES
+
+
+def track_columns(i: int, names: list[str]) -> list[str]:
+    """Return the columns of tracks that are read; further ones are ignored.
+
+    Raises:
+        ValueError: for a missing column, in line i.
+    """
+    chosen = [next((name for name in kind if name in names), None) for kind in (IDENTITIES, CLOCKS)]
+    coordinates = [name for name in COORDINATES if name in names]
+    if None in chosen or coordinates[:2] != ["x", "y"]:
+        raise ValueError(
+            f"line {i}: the columns are {', '.join(names)}; tracks of particles have id,t,x,y and, "
+            "where measured, z (or particle and frame, as trackpy names them)"
+        )
+    return [*map(str, chosen), *coordinates]
+
+
+def curve_of_tracks(
+    path: Path,
+    columns: Mapping[str, np.ndarray],
+    header: Mapping[str, str],
+    lines: list[int],
+    elements: dict[str, Any],
+) -> tuple[CoolingCurve, dict[str, str]]:
+    """Return T(t) of particles whose positions are known in frames.
+
+    Velocities are differences over neighbouring frames, ``u = (x(t_2) - x(t_1))/(t_2 - t_1)``, of
+    the particles in both frames, and belong to the middle of the two times, to second order in the
+    share by which T falls meanwhile. The drift, the mean velocity of all tracked particles between
+    the two frames, is removed: ``T = sum (u - <u>)^2 / (d (n - 1))`` for n particles and d
+    coordinates. In a gas of N particles (header key N) without walls, whose true momentum is 0, T
+    is multiplied by ``(N - 1)/N``. Two coordinates of a three-dimensional gas represent all three.
+
+    Displacements of wrong identities are left out: those that fewer than `CHANCE` gases with
+    Maxwellian velocities would show, and those of two particles whose displacements are more
+    probable, by `MIN_GAIN` in chi^2, with their identities exchanged. T by the median of the speeds
+    is compared with T by their mean square.
+
+    Two biases of u^2 are removed if the header gives the necessary values. The standard error of
+    one coordinate of a position, ``localisation_error``, adds ``2 error^2/(t_2 - t_1)^2`` to T; the
+    jackknife error, which it widens, is not corrected. Impacts between frames bend the paths: with
+    the velocity autocorrelation ``exp(-nu_v t)`` T is too small by the factor
+    ``2 (exp(-x) - 1 + x)/x^2 = 1 - x/3 + ...``, ``x = nu_v (t_2 - t_1)``; nu_v is Enskog's value
+    for elastic spheres, ``(2/d)`` of their collision frequency, from eta, diameter and T.
+
+    T_err is the jackknife error over particles, which leaves out one at a time. It is the error of
+    T of the gas from which these particles are a sample. Errors of neighbouring times are
+    correlated, as the particles are the same.
+
+    Args:
+        path: of the file, for messages.
+        columns: those of `track_columns`, in SI; rows in any order. Positions continue when a
+            particle leaves a periodic box, unless the header gives ``box_side``.
+        header: in SI; with ``frame_rate``, frames per second, for frames without times.
+        lines: line number of each row.
+        elements: those of the gas that the header describes, as arguments of `jaxgran.Gas`.
+
+    Returns:
+        The curve, and the header, whose entry T_from says how T was computed.
+
+    Raises:
+        ValueError: for fewer than 3 particles or 4 frames, a particle twice in a frame, and
+            positions that are wrapped into a box.
+    """
+    header = dict(header)
+    steps = list(_steps(path, columns, header, lines))
+    _check_wrapped(path, steps, header)
+    usable = [step for step in steps if len(step.ids) >= MIN_TRACKS]
+    if len(usable) < MIN_POINTS:
+        number = len(np.unique(columns[_first(IDENTITIES, columns)]))
+        raise ValueError(
+            f"{path}, line {lines[-1] if lines else 1}: the file ends after tracks of {number} "
+            f"particle(s) in {len(steps) + 1} frames; at least {MIN_TRACKS} particles in "
+            f"{MIN_POINTS + 1} frames are needed to remove the drift and estimate errors"
+        )
+    n, d = max(len(step.ids) for step in usable), usable[0].displacement.shape[1]
+    factor, notes = _momentum_correction(path, n, d, header)
+    T, error = np.array(
+        [_temperature_and_error(step.displacement / step.duration) for step in usable]
+    ).T
+    notes += _compare_with_median(path, T, usable)
+    notes += _count_left_out(path, steps)
+    T, error = factor * T, factor * error
+    duration = np.array([step.duration for step in usable])
+    rate, words = _fit_memory(path, usable, T, header, _enskog_rate(header, elements))
+    notes += words
+    T, words = _correct_localisation(path, T, duration, header)
+    notes += words
+    T_true, words = _correct_impacts(path, T, duration, rate)
+    notes += words
+    curve = CoolingCurve(
+        times=jnp.asarray([step.time for step in usable]),
+        temperature=jnp.asarray(T_true),
+        temperature_error=jnp.asarray(error * T_true / T),
+    )
+    header["T_from"] = f"T = <(u - <u>)^2>/d, u over neighbouring frames; {'; '.join(notes)}"
+    curve.check(f"{path}: T between frames {{0}} and the next".format)
+    return curve, {
+        key: value for key, value in header.items() if key not in ("box_side", "frame_rate")
+    }
+
+
+def _first(names: tuple[str, ...], columns: Mapping[str, Any]) -> str:
+    return next(name for name in names if name in columns)
+
+
+def _steps(
+    path: Path, columns: Mapping[str, np.ndarray], header: dict[str, str], lines: list[int]
+) -> Iterator[Step]:
+    ids, clock = columns[_first(IDENTITIES, columns)], _first(CLOCKS, columns)
+    position = np.stack([columns[name] for name in COORDINATES if name in columns], axis=1)
+    if np.any(fractions := ids != np.round(ids)):
+        i = int(np.argmax(fractions))
+        raise ValueError(f"{path}, line {lines[i]}: id is {ids[i]:g}; number the particles")
+    t = columns[clock]
+    if clock == "frame":
+        if "frame_rate" not in header:
+            raise ValueError(
+                f"{path}: the tracks have frames without times; add '# frame_rate: ...', in frames "
+                "per second, to the header (1 for T in m^2 per frame^2)"
+            )
+        t = t / header_number(header, "frame_rate")
+    order = np.lexsort((ids, t))
+    repeated = (np.diff(t[order]) == 0) & (np.diff(ids[order]) == 0)
+    if np.any(repeated):
+        i, j = sorted(order[int(np.argmax(repeated)) :][:2])
+        raise ValueError(
+            f"{path}, line {lines[j]}: particle {ids[j]:g} at t = {t[j]:g} s is given again, after "
+            f"line {lines[i]}; remove one"
+        )
+    side = header_number(header, "box_side") if "box_side" in header else None
+    frames = np.split(order, np.flatnonzero(np.diff(t[order])) + 1)
+    for before, after in zip(frames, frames[1:], strict=False):
+        shared, i, j = np.intersect1d(
+            ids[before], ids[after], assume_unique=True, return_indices=True
+        )
+        start, end = position[before[i]], position[after[j]]
+        if side is not None:
+            end = end - side * np.round((end - start) / side)
+        times = float(t[before[0]]), float(t[after[0]])
+        lost, new = np.delete(position[before], i, axis=0), np.delete(position[after], j, axis=0)
+        yield _step(times, shared.astype(int), start, end, lost, new)
+
+
+def _step(
+    times: tuple[float, float],
+    ids: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+    lost: np.ndarray,
+    new: np.ndarray,
+) -> Step:
+    """Return the displacements of particles without those of wrong identities.
+
+    Args:
+        times: of the two frames, s.
+        ids: of the particles in both frames.
+        start: their positions in the first frame, m.
+        end: their positions in the second frame, m.
+        lost: positions of particles that are in the first frame only, m.
+        new: positions of particles that are in the second frame only, m.
+    """
+    n, d = start.shape
+    step = Step((times[0] + times[1]) / 2, times[1] - times[0], ids, end - start)
+    drift = np.median(step.displacement, axis=0) if n else 0.0
+    start = start + drift
+    scale = np.median(np.sum((end - start) ** 2, axis=1)) / chi2.median(d) if n else 0.0
+    if n < MIN_TRACKS or scale == 0:
+        return step
+
+    def chi_squared(moved: np.ndarray) -> np.ndarray:
+        return np.sum(moved**2, axis=1) / scale
+
+    moved = end - start
+    own, limit = chi_squared(moved), chi2.isf(CHANCE / n, d)
+    too_long = own > limit
+    spread = np.ptp(np.concatenate([start, end]), axis=0)
+    folded = too_long & (chi_squared(moved - spread * np.round(moved / spread)) < chi2.isf(0.05, d))
+    wrong = too_long.copy()
+    if scale**0.5 < MAX_STEP * (np.prod(spread) / n) ** (1 / d):
+        reach = np.sqrt(scale * np.minimum(own, limit))
+        near = KDTree(end).query_ball_point(start, reach)
+        pairs = [(i, j) for i, ends in enumerate(near) for j in ends if i != j]
+        i, j = np.array(pairs, int).reshape(-1, 2).T
+        exchanged = chi_squared(end[j] - start[i]), chi_squared(end[i] - start[j])
+        swapped = (own[i] + own[j] - sum(exchanged) > MIN_GAIN) & (np.maximum(*exchanged) < limit)
+        wrong[i[swapped]] = wrong[j[swapped]] = True
+        for others, here in ((lost + drift, end), (new, start)):
+            if len(others):
+                other = KDTree(others).query(here)[0] ** 2 / scale
+                wrong |= own - other > MIN_GAIN
+    return step._replace(
+        ids=ids[~wrong],
+        displacement=step.displacement[~wrong],
+        too_long=int(np.sum(too_long)),
+        folded=int(np.sum(folded)),
+        swapped=int(np.sum(wrong & ~too_long)),
+        spread=spread,
+    )
+
+
+def _check_wrapped(path: Path, steps: list[Step], header: dict[str, str]) -> None:
+    too_long, folded = (sum(x) for x in zip(*((s.too_long, s.folded) for s in steps), strict=True))
+    if "box_side" not in header and 2 * folded > max(too_long, 4):
+        side = max(np.max(step.spread) for step in steps)
+        raise ValueError(
+            f"{path}: {folded} displacements are as long as the box: are the positions wrapped? "
+            f"Give its side, {side:.3g} m or slightly more, in the header as '# box_side: ...', or "
+            "unwrap them"
+        )
+
+
+def _count_left_out(path: Path, steps: list[Step]) -> list[str]:
+    too_long, swapped = (
+        sum(x) for x in zip(*((s.too_long, s.swapped) for s in steps), strict=True)
+    )
+    total = too_long + swapped + sum(len(step.ids) for step in steps)
+    if not too_long + swapped:
+        return []
+    words = f"{too_long + swapped} of {total} displacements left out as those of wrong identities"
+    if too_long > 1 + MAX_TAIL * CHANCE * len(steps) or swapped > MAX_SWAPPED * total:
+        warnings.warn(
+            f"{path}: {words}: {too_long} are longer than the distribution of speeds allows, and "
+            f"{swapped} shorter if two particles exchange their identities; check the tracks",
+            stacklevel=4,
+        )
+    return [words]
+
+
+def _compare_with_median(path: Path, T: np.ndarray, steps: list[Step]) -> list[str]:
+    """Return a note on T by the median of the speeds; warn if it differs by more than chance."""
+    d = steps[0].displacement.shape[1]
+    medians = []
+    for step in steps:
+        u = (step.displacement - step.displacement.mean(axis=0)) / step.duration
+        medians.append(np.median(np.sum(u**2, axis=1)) / chi2.median(d))
+    share = float(np.mean(np.log(T / np.maximum(medians, np.finfo(float).tiny))))
+    number = float(np.mean([len(step.ids) for step in steps]))
+    # Variances of a median and of a mean of squares of Maxwellian speeds; the latter is the least.
+    of_median = 1 / (2 * chi2.median(d) * chi2.pdf(chi2.median(d), d))
+    chance = float(np.sqrt((of_median**2 - 2 / d) / number))
+    if abs(share) > 3 * chance + MAX_SONINE:
+        warnings.warn(
+            f"{path}: T by the mean square of the speeds is {100 * np.expm1(share):+.2g} % from T "
+            "by their median: identities may be wrong, or the gas may consist of unequal parts",
+            stacklevel=4,
+        )
+    return [f"{100 * np.expm1(share):+.2g} % from T by the median of the speeds"]
+
+
+def _temperature_and_error(velocity: Float[np.ndarray, "n d"]) -> tuple[float, float]:
+    """Return the variance of a velocity component, drift removed, and its jackknife error."""
+    n, d = velocity.shape
+    square = np.sum((velocity - velocity.mean(axis=0)) ** 2, axis=1)
+    # Without particle i the others have the mean -u_i/(n - 1), in the frame of all.
+    left = (square.sum() - square * n / (n - 1)) / (d * (n - 2))
+    return float(square.sum() / (d * (n - 1))), float(np.sqrt((n - 1) * np.var(left)))
+
+
+def _momentum_correction(
+    path: Path, n: int, d: int, header: dict[str, str]
+) -> tuple[float, list[str]]:
+    """Return (N - 1)/N, or 1 if N is unknown or walls change the momentum; and notes on both."""
+    dimension = header_count(header, "dimension") or 3
+    if d > dimension:
+        raise ValueError(
+            f"{path}: a gas of dimension {dimension} has no tracks with {d} coordinates; correct "
+            "the header or leave out z"
+        )
+    projected = ["two of three coordinates, for isotropic velocities"] if d < dimension else []
+    N = header_count(header, "N")
+    if N is None:
+        return 1.0, [f"drift of {n} particles removed", *projected]
+    if n > N:
+        raise ValueError(
+            f"{path}: the header gives N = {N}, but {n} particles are tracked; correct N"
+        )
+    free = "container_side" not in header
+    return (N - 1) / N if free else 1.0, [f"drift of {n} of {N} particles removed", *projected]
+
+
+def _correct_localisation(
+    path: Path, T: Float[np.ndarray, "times"], duration: np.ndarray, header: dict[str, str]
+) -> tuple[Float[np.ndarray, "times"], list[str]]:
+    """Return T without the scatter of measured positions, and a note."""
+    if "localisation_error" not in header:
+        return T, ["errors of positions not known (localisation_error)"]
+    error = header_number(header, "localisation_error")
+    if error < 0:
+        raise ValueError(f"{path}: header line localisation_error: must be >= 0, got {error:g}")
+    added = 2 * (error / duration) ** 2
+    if np.any(added >= T):
+        k = int(np.argmax(added >= T))
+        raise ValueError(
+            f"{path}: between frames {k} and {k + 1} particles move no further than "
+            f"localisation_error = {error:g} m; leave out this and later frames, or use frames "
+            "further apart"
+        )
+    share = float(np.max(added / T))
+    _warn_of_correction(path, "localisation_error adds", share, "to", "leave out the last frames")
+    return T - added, [f"localisation_error removed, at most {100 * share:.2g} % of T"]
+
+
+def _enskog_rate(header: dict[str, str], elements: dict[str, Any]) -> float | None:
+    """Return nu_v/sqrt(T) of elastic spheres, 1/m, or None if eta or diameter is not known."""
+    if not {"eta", "diameter"} <= header.keys():
+        return None
+    gas = Gas(
+        ConstantRestitution(1.0),
+        diameter=header_number(header, "diameter"),
+        mass=1.0,
+        packing_fraction=header_number(header, "eta"),
+        temperature=1.0,
+        dimension=header_count(header, "dimension") or 3,
+        **elements,
+    )
+    return 2 / gas.dimension * float(gas.collision_frequency)
+
+
+def _fit_memory(
+    path: Path, steps: list[Step], T: np.ndarray, header: dict[str, str], enskog: float | None
+) -> tuple[float, list[str]]:
+    """Return nu_v/sqrt(T), 1/m, from the correlations of displacements, and notes.
+
+    With the velocity autocorrelation ``exp(-nu_v t)`` and an error e of the positions
+
+        <dx_k^2> = T f_k + 2 e^2,    <dx_k dx_l> = T h_k h_l exp(-nu_v gap) - e^2 (if they touch),
+
+    where f and h are integrals over the intervals and gap is the time between these. Enskog's rate
+    is known with the error `ENSKOG_ERROR`. An e that the header lacks and that is significant is
+    added to the header.
+    """
+    time, duration = (
+        np.array([getattr(step, name) for step in steps]) for name in Step._fields[:2]
+    )
+    D = T * duration**2
+    i, j, correlation, weight = _correlations(steps)
+    gap = np.maximum(time[j] - time[i] - (duration[j] + duration[i]) / 2, 0.0)
+    touch = gap < 1e-6 * duration[i]
+    unit = float(np.median(D))
+    given = (
+        header_number(header, "localisation_error") ** 2 / unit
+        if "localisation_error" in header
+        else None
+    )
+    prior = None if enskog is None else enskog * unit**0.5
+
+    def residuals(parameters: np.ndarray) -> np.ndarray:
+        rate, square = (
+            parameters[0] / unit**0.5,
+            unit * (given or 0.0 if len(parameters) == 1 else parameters[1]),
+        )
+        moved = np.maximum(D - 2 * square, 1e-3 * D)
+        x = rate * np.sqrt(moved)
+        for _ in range(NUM_ITERATIONS):
+            x = rate * np.sqrt(moved / _displacement_factor(x))
+        h = np.sqrt(moved / _displacement_factor(x)) * _mean_memory(x)
+        model = h[i] * h[j] * np.exp(-gap * np.sqrt(x[i] / duration[i] * x[j] / duration[j]))
+        misfit = weight * (correlation - (model - square * touch) / np.sqrt(D[i] * D[j]))
+        return (
+            misfit
+            if prior is None
+            else np.append(misfit, (parameters[0] / prior - 1) / ENSKOG_ERROR)
+        )
+
+    def fit(start: list[float]) -> tuple[np.ndarray, np.ndarray]:
+        bounds = np.zeros(len(start)), np.array([20.0, 0.49])[: len(start)]
+        found = least_squares(residuals, start, bounds=bounds)
+        return found.x, np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
+
+    notes: list[str] = []
+    start = [prior or 0.1]
+    found, error = fit(start)
+    if given is None:
+        both, errors = fit([*start, 0.05])
+        if both[1] > MIN_SIGMAS * errors[1]:
+            found, error = both, errors
+            e = float(np.sqrt(both[1] * unit))
+            header["localisation_error"] = repr(e)
+            notes = [f"localisation_error not given, and estimated as {e:.2g} m"]
+            warnings.warn(f"{path}: {notes[0]}; measure it and add it to the header", stacklevel=4)
+    if prior is None and found[0] < MIN_SIGMAS * error[0]:
+        return 0.0, notes
+    if prior is not None and abs(found[0] - prior) > MIN_SIGMAS * np.hypot(
+        error[0], ENSKOG_ERROR * prior
+    ):
+        warnings.warn(
+            f"{path}: velocities change {found[0] / prior:.2g} times as fast as impacts at this "
+            "eta and diameter change them: check these and the tracks",
+            stacklevel=4,
+        )
+    return found[0] / unit**0.5, notes
+
+
+def _correlations(steps: list[Step]) -> tuple[np.ndarray, ...]:
+    """Return correlations of the displacements of two steps, their indices and 1/error."""
+    rows = []
+    for lag in (1, 2):
+        for k, (one, two) in enumerate(zip(steps, steps[lag:], strict=False)):
+            _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
+            a, b = (x - x.mean(axis=0) for x in (one.displacement[i], two.displacement[j]))
+            if len(i) >= MIN_TRACKS:
+                correlation = np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))
+                rows.append((k, k + lag, correlation, np.sqrt(a.size)))
+    first, second, correlation, weight = np.array(rows).reshape(-1, 4).T
+    return first.astype(int), second.astype(int), correlation, weight
+
+
+def _mean_memory(x: np.ndarray) -> np.ndarray:
+    """Return ``(1 - exp(-x))/x``."""
+    safe = np.where(x < 1e-6, 1.0, x)
+    return np.where(x < 1e-6, 1.0, -np.expm1(-safe) / safe)
+
+
+def _correct_impacts(
+    path: Path, T: Float[np.ndarray, "times"], duration: np.ndarray, rate: float
+) -> tuple[Float[np.ndarray, "times"], list[str]]:
+    """Return T corrected for impacts between frames, and a note."""
+    if rate == 0:
+        return T, ["impacts between frames not corrected (the velocities show none)"]
+    true = T
+    for _ in range(NUM_ITERATIONS):
+        true = T / _displacement_factor(rate * duration * np.sqrt(true))
+    share = float(np.max(1 - T / true))
+    _warn_of_correction(
+        path, "impacts between frames take", share, "from", "use frames closer together"
+    )
+    return true, [f"impacts between frames corrected, at most {100 * share:.2g} % of T"]
+
+
+def _displacement_factor(x: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
+    """Return ``2 (exp(-x) - 1 + x)/x^2``, T from displacements over x relaxation times, over T."""
+    small = x < 1e-3
+    safe = np.where(small, 1.0, x)
+    return np.where(small, 1 - x / 3, 2 * (np.expm1(-safe) + safe) / safe**2)
+
+
+def _warn_of_correction(path: Path, cause: str, share: float, direction: str, advice: str) -> None:
+    if share > MAX_CORRECTION:
+        warnings.warn(
+            f"{path}: {cause} up to {100 * share:.2g} % {direction} T, too much for an accurate "
+            f"correction: {advice}",
+            stacklevel=5,
+        )
+
+
+def curve_of_trajectory(
+    path: Path, header: Mapping[str, str]
+) -> tuple[CoolingCurve, dict[str, str]]:
+    """Return T(t) of the frames of a file of particles.
+
+    ``T = sum (v - <v>)^2 / (d N)`` in periodic boxes, and ``<v^2>/d`` between walls, which are at
+    rest. With angular velocities w and a diameter ``T_rot = q sigma^2 <w^2>/(4 d_rot)``, where q is
+    the header key reduced_inertia, by default 0.4. The standard errors are those of N independent
+    particles.
+
+    Args:
+        path: of a GSD, extended XYZ or LAMMPS file: see `jaxgran.read_particles`.
+        header: in SI; with timestep, s, for files that count time steps, and reduced_inertia and
+            diameter for T_rot, unless the file gives the diameter.
+
+    Returns:
+        The curve, and the header with N, the dimension of disks and, as far as the file gives them,
+        diameter, density and eta.
+
+    Raises:
+        ValueError: for a file or frame that `jaxgran.read_particles` refuses, and for frames
+            without times.
+    """
+    header = dict(header)
+    values: dict[str, list[float]] = {}
+    with name_in_errors(path):
+        for k, read in enumerate(open_frames(path)):
+            try:
+                frame, d = checked_frame(read(), header_count(header, "dimension"))
+                _add_to_header(header, frame, d)
+                quantities = _quantities(frame, header)
+            except ValueError as error:
+                raise ValueError(f"frame {k}: {error}") from None
+            for name, value in quantities.items():
+                values.setdefault(name, []).append(value)
+        quantities: dict[str, Any] = {name: jnp.asarray(x) for name, x in values.items()}
+        curve = CoolingCurve(**quantities)
+        curve.check("frame {}".format)
+    if curve.times[0] == 0:
+        header.setdefault("T0", repr(float(curve.temperature[0])))
+    header["T_from"] = "T = <v^2>/d of the particles of each frame, in the frame at rest"
+    header.pop("timestep", None)
+    return curve, header
+
+
+def _add_to_header(header: dict[str, str], frame: Frame, d: int) -> None:
+    """Add what a frame says of the gas; raise ValueError if the header contradicts it."""
+    N, equal = len(frame.position), frame.equal
+    told: dict[str, float] = {"N": N, "dimension": d}
+    if "diameter" in equal or "radius" in equal:
+        sigma = float(equal["diameter"][0] if "diameter" in equal else 2 * equal["radius"][0])
+        if sigma != GSD_DEFAULT:
+            told["diameter"] = sigma
+            if "density" in equal:
+                told["density"] = float(equal["density"][0])
+            elif "mass" in equal:
+                told["density"] = float(equal["mass"][0] / sphere_mass(sigma, 1.0))
+            if all(frame.periodic):
+                volume = float(np.prod(frame.sides))
+                told["eta"] = N * (pi / 6 if d == 3 else pi / 4) * sigma**d / volume
+    for key, value in told.items():
+        tolerance = 0.0 if key in ("N", "dimension") else HEADER_TOLERANCE
+        if abs(header_number(header, key) - value if key in header else 0.0) > tolerance * value:
+            raise ValueError(f"{key} is {value:g}, but {header[key]} in the header or before")
+        header.setdefault(key, repr(value))
+
+
+def _quantities(frame: Frame, header: dict[str, str]) -> dict[str, float]:
+    """Return the quantities of a curve at the time of a frame, by the names of its fields."""
+    if frame.time is None and "timestep" not in header:
+        raise ValueError(
+            "it has no time: let the file contain times (dump_modify ... time yes, or Time=...), "
+            "or give header={'timestep': ...}, in s"
+        )
+    time = frame.time
+    if time is None:
+        if frame.step is None:
+            raise ValueError("it has neither a time nor a step: write Time=... in its second line")
+        time = frame.step * header_number(header, "timestep")
+    assert frame.velocity is not None
+    n, d = frame.velocity.shape
+    velocity = frame.velocity - frame.velocity.mean(axis=0) * all(frame.periodic[:d])
+    values = {"times": time}
+    energies = {"temperature": np.mean(velocity**2, axis=1)}
+    if frame.spin is not None and "diameter" in header:
+        inertia = header_number({"reduced_inertia": "0.4"} | header, "reduced_inertia")
+        square = inertia * header_number(header, "diameter") ** 2 / 4
+        energies["rotational_temperature"] = square * np.mean(frame.spin**2, axis=1)
+    for name, each in energies.items():
+        values |= {
+            name: float(np.mean(each)),
+            f"{name}_error": float(np.std(each, ddof=1) / n**0.5),
+        }
+    return values
