@@ -20,7 +20,7 @@ from typing import Any
 import jinja2
 
 from experiments.support.dot_plots import PLOTS, drawn
-from experiments.support.record import EXPERIMENTS, FIGURES, PICTURES
+from experiments.support.record import EXPERIMENTS, FIGURES, PICTURES, figures
 
 ROOT = EXPERIMENTS.parent
 TEMPLATES = EXPERIMENTS / "templates"
@@ -41,11 +41,10 @@ def main() -> None:
     parser.add_argument(
         "--pictures", action="store_true", help="draw pictures from the figures, too"
     )
-    found = recorded()
     if parser.parse_args().pictures:
         for name, plot in PLOTS.items():
-            drawn(plot(found[name])).savefig(PICTURES / f"{name}.png", dpi=110)
-    for path, text in documents(found).items():
+            drawn(plot(figures(name))).savefig(PICTURES / f"{Path(name).name}.png", dpi=110)
+    for path, text in documents(recorded()).items():
         path.write_text(text, encoding="utf-8")
 
 

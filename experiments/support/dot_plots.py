@@ -3,7 +3,7 @@
 ``python experiments/documents.py --pictures`` draws them all; the entries of the gallery show them.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -49,16 +49,27 @@ class DotPlot(NamedTuple):
     kinds: tuple[str, str] = ("", "")
 
 
-NAMES = {"dsmc": "DSMC", "DSMC": "DSMC"} | {
-    spelled: words
-    for words in ("hard spheres", "soft spheres")
-    for spelled in (words.replace(" ", "-"), "".join(w.capitalize() for w in words.split()))
+NAMES = {"hard-spheres": "hard spheres", "HardSpheres": "hard spheres"} | {
+    "soft-spheres": "soft spheres",
+    "SoftSpheres": "soft spheres",
+    "Soft spheres": "soft spheres",
+    "dsmc": "DSMC",
+    "KineticTheory": "kinetic theory",
 }
-"""Names of models in the pictures."""
+"""Names of models in the pictures, by those in the figures."""
 
 
-def _named(model: str) -> str:
+def named(model: str) -> str:
     return NAMES.get(model, model)
+
+
+def dots_of(rows: list[dict], label: str, value: str, model: str = "") -> list[Dot]:
+    """Return a dot for each row: label and model are formats of the fields of the row."""
+    words = [{key: named(x) if isinstance(x, str) else x for key, x in row.items()} for row in rows]
+    return [
+        Dot(label.format(**word), row[value], model=named(model.format(**row)))
+        for row, word in zip(rows, words, strict=True)
+    ]
 
 
 def drawn(plot: DotPlot) -> Figure:
@@ -99,55 +110,43 @@ def wrong_physics(found: dict) -> DotPlot:
         dots.append(Dot(row["name"], row["A"], *row["range"]))
         if row["told"] is not None:
             dots.append(Dot(row["name"], row["told"], hollow=True))
-    return DotPlot(
-        dots,
-        "A of the fit over the true A (bar: range over alternatives)",
-        (1.0, ""),
-        logarithmic=True,
-        kinds=("smooth spheres in a periodic box", "the complete scene"),
-    )
+    axis = "A of the fit over the true A (bar: range over alternatives)"
+    kinds = "smooth spheres in a periodic box", "the complete scene"
+    return DotPlot(dots, axis, (1.0, ""), logarithmic=True, kinds=kinds)
 
 
 def interval_coverage(found: dict) -> DotPlot:
     dots = []
-    for row in found["rows"]:
-        p, n = row["coverage"], row["runs"]
-        error = (p * (1 - p) / n) ** 0.5
-        label = f"{_named(row['model'])}, N = {row['num_particles']}, φ = {row['phi']:g}"
-        low, high = (100 * (p + k * error) for k in (-1, 1))
-        dots.append(Dot(label, 100 * p, low, high, _named(row["model"])))
+    plain = dots_of(
+        found["rows"], "{model}, N = {num_particles}, φ = {phi:g}", "coverage", "{model}"
+    )
+    for row, dot in zip(found["rows"], plain, strict=True):
+        p = dot.value
+        error = (p * (1 - p) / row["runs"]) ** 0.5
+        dots.append(dot._replace(value=100 * p, low=100 * (p - error), high=100 * (p + error)))
     return DotPlot(dots, "runs whose 95 % interval contains A, %", (95.0, "95 %"))
 
 
 def fit_head_to_head(found: dict) -> DotPlot:
-    scenes = {"stochastic": "DSMC", "soft-spheres": "soft spheres"}
-    dots = [
-        Dot(
-            f"{scenes[row['scene']]}, {'A' if len(row['free']) == 1 else 'A and T₀'}: "
-            f"{row['search']}",
-            row["simulations"],
-            model=scenes[row["scene"]],
-            hollow=not row["search"].startswith("jaxgran"),
-        )
+    rows = [
+        row | {"scene": row["scene"].replace("stochastic", "dsmc"), "free": free}
         for row in found["rows"]
         if row["simulations"]
+        for free in ["A" if len(row["free"]) == 1 else "A and T₀"]
+    ]
+    dots = [
+        dot._replace(hollow="jaxgran" not in dot.label)
+        for dot in dots_of(rows, "{scene}, {free}: {search}", "simulations", "{scene}")
     ]
     axis = "simulations until A is known to 2 %"
     return DotPlot(dots, axis, logarithmic=True, kinds=("with derivatives", "without"))
 
 
 def hard_cases(found: dict) -> DotPlot:
-    dots = []
-    for case in found["cases"]:
-        shares = [
-            max(row[error] / row[allowed], 1e-6)
-            for row in case["rows"]
-            for error, allowed in (("error", "allowed"), ("slope_error", "slope_allowed"))
-            if row[error] is not None and row[allowed]
-        ]
-        if shares:
-            name = case["case"] if len(case["case"]) < 56 else case["case"][:53] + "..."
-            dots.append(Dot(name, float(np.median(shares)), min(shares), max(shares)))
+    shares: dict[str, list[float]] = {}
+    for row in found["rows"]:
+        shares.setdefault(row["case"], []).append(max(row["error"] / row["allowed"], 1e-8))
+    dots = [Dot(name, float(np.median(x)), min(x), max(x)) for name, x in shares.items()]
     axis = "error over the error allowed: median and range of the rows"
     return DotPlot(dots, axis, (1.0, "allowed"), logarithmic=True)
 
@@ -155,95 +154,75 @@ def hard_cases(found: dict) -> DotPlot:
 def benchmark_kinetic_theory(found: dict) -> DotPlot:
     sweep, slope, cold = found["sweep"], found["derivative"], found["cold"]
     count = sweep["num_curves"]
+    seconds = {
+        "one curve": slope["solve_ms"] / 1e3,
+        "its derivative, forward": slope["forward_ms"] / 1e3,
+        "its derivative, reverse": slope["reverse_ms"] / 1e3,
+        f"{count} curves, vmap": sweep["vmap_run_s"],
+        f"{count} curves, SciPy LSODA": sweep["scipy_s"],
+        "first curve in a new process, with compilation": cold["first_cool_s"],
+        "a whole fit in a new process, first time": cold["main_job_s"],
+        "a whole fit in a new process, second time": cold["main_job_again_s"],
+    }
     dots = [
-        Dot("one curve", slope["solve_ms"] / 1e3),
-        Dot("its derivative, forward", slope["forward_ms"] / 1e3),
-        Dot("its derivative, reverse", slope["reverse_ms"] / 1e3),
-        Dot(f"{count} curves, vmap", sweep["vmap_run_s"]),
-        Dot(f"{count} curves, SciPy LSODA", sweep["scipy_s"], hollow=True),
-        Dot("first curve in a new process, with compilation", cold["first_cool_s"]),
-        Dot("a whole fit in a new process, first time", cold["main_job_s"]),
-        Dot("a whole fit in a new process, second time", cold["main_job_again_s"]),
+        Dot(name, x, model="kinetic theory", hollow="SciPy" in name) for name, x in seconds.items()
     ]
-    dots = [dot._replace(model="kinetic theory") for dot in dots]
     return DotPlot(dots, "seconds", logarithmic=True, kinds=("jaxgran", "SciPy"))
 
 
-def ratios(rows: Iterable[tuple[str, float, str]], axis: str, words: str) -> DotPlot:
-    """Return a picture of ratios, with a reference line at 1."""
-    return DotPlot([Dot(label, x, model=_named(m)) for label, x, m in rows], axis, (1.0, words))
-
-
 def benchmark_replicas(found: dict) -> DotPlot:
-    rows = [(_named(row["model"]), row["ratio"], row["model"]) for row in found["rows"]]
-    return ratios(rows, "collisions per second on two CPU devices, over one core", "one core")
+    axis = "collisions per second on two CPU devices, over one core"
+    return DotPlot(dots_of(found["rows"], "{model}", "ratio", "{model}"), axis, (1.0, "one core"))
 
 
 def benchmark_million(found: dict) -> DotPlot:
     cases = ("one core", "two cores", "half on one core", "two devices")
-    dots = [
-        Dot(
-            f"{_named(row['model'])}, {case}",
-            1e6 * row[case]["s_per_collision"],
-            model=_named(row["model"]),
-        )
+    rows = [
+        {"model": row["model"], "case": case, "x": 1e6 * row[case]["s_per_collision"]}
         for row in found["rows"]
         for case in cases
         if case in row
     ]
-    return DotPlot(
-        dots, "microseconds per collision, 10⁶ disks (or half of them)", logarithmic=True
-    )
+    axis = "microseconds per collision, 10⁶ disks (or half of them)"
+    return DotPlot(dots_of(rows, "{model}, {case}", "x", "{model}"), axis, logarithmic=True)
 
 
 def benchmark_compilation(found: dict) -> DotPlot:
     dots = []
     for name, row in found["rows"].items():
-        model = _named(name.split()[0])
-        label = name.replace(name.split()[0], model, 1)
-        dots += [
-            Dot(label, row["first_s"], model=model),
-            Dot(label, row["again_s"], model=model, hollow=True),
-        ]
-    command, label = found["main_job"], "jaxgran fit, each in a new process"
-    dots.append(Dot(label, command["first_s"], model="kinetic theory"))
-    dots.append(Dot(label, command["again_s"], model="kinetic theory", hollow=True))
-    kinds = "first run", "again"
-    return DotPlot(dots, "seconds", logarithmic=True, kinds=kinds)
+        model, *more = name.split(" ", 1)
+        dot = Dot(" ".join([named(model), *more]), row["first_s"], model=named(model))
+        dots += [dot, dot._replace(value=row["again_s"], hollow=True)]
+    command = found["main_job"]
+    dot = Dot("jaxgran fit, each in a new process", command["first_s"], model="kinetic theory")
+    dots += [dot, dot._replace(value=command["again_s"], hollow=True)]
+    return DotPlot(dots, "seconds", logarithmic=True, kinds=("first run", "again"))
 
 
 def benchmark_dsmc(found: dict) -> DotPlot:
-    dots = [
-        Dot(f"N = {row['num_particles']}", row["collisions_per_s"], model="DSMC")
-        for row in found["rows"]
-    ]
+    dots = dots_of(found["rows"], "N = {num_particles}", "collisions_per_s", "DSMC")
     return DotPlot(dots, "collisions per second", logarithmic=True)
 
 
-def against_lammps(rows: Iterable[tuple[str, float]], model: str) -> DotPlot:
-    dots = [Dot(label, ratio, model=model) for label, ratio in rows]
+def over_lammps(rows: list[dict], label: str, model: str, *keys: str) -> DotPlot:
+    dots = []
+    for row in rows:
+        found = row["lammps"]
+        for key in keys:
+            found = found[key]
+        dots += dots_of([row | {"ratio": found}], label, "ratio", model)
     axis = "collisions per second, over those of LAMMPS on one core"
     return DotPlot(dots, axis, (1.0, "LAMMPS"), logarithmic=True)
 
 
 def benchmark_hard_spheres(found: dict) -> DotPlot:
-    rows = [
-        (f"N = {row['num_particles']}", row["lammps"]["ratio"])
-        for row in found["rows"]
-        if row["lammps"]
-    ]
-    return against_lammps(rows, "hard spheres")
+    rows = [row for row in found["rows"] if row["lammps"]]
+    return over_lammps(rows, "N = {num_particles}", "hard spheres", "ratio")
 
 
 def benchmark_particles(found: dict) -> DotPlot:
-    rows = [
-        (
-            f"N = {row['num_particles']}, t_c/τ_c = {row['contact_fraction']:g}",
-            row["lammps"]["1"]["ratio"],
-        )
-        for row in found["rows"]
-    ]
-    return against_lammps(rows, "soft spheres")
+    label = "N = {num_particles}, t_c/τ_c = {contact_fraction:g}"
+    return over_lammps(found["rows"], label, "soft spheres", "1", "ratio")
 
 
 def benchmark_derivatives(found: dict) -> DotPlot:
@@ -251,22 +230,21 @@ def benchmark_derivatives(found: dict) -> DotPlot:
     for row in found["rows"]:
         model, *scene = row["title"].split(", ")
         rows += [
-            (", ".join([_named(model), *scene, way]), cost["ratio"], model)
+            {"model": model, "way": ", ".join([*scene, way]), "ratio": cost["ratio"]}
             for way, cost in row["ways"].items()
             if way != "plain"
         ]
-    return ratios(rows, "time over that of the plain run", "plain run")
+    dots = dots_of(rows, "{model}, {way}", "ratio", "{model}")
+    return DotPlot(dots, "time over that of the plain run", (1.0, "plain run"))
 
 
 def benchmark_elements(found: dict) -> DotPlot:
     dots = []
     for row in found["rows"]:
-        if row["scene"] == "smooth":
-            continue
-        dot = Dot(f"{row['model']}, {row['scene']}", row["ratio"], model=row["model"])
-        dots.append(dot)
-        if row["ratio_of_contacts"] != row["ratio"]:
-            dots.append(dot._replace(value=row["ratio_of_contacts"], hollow=True))
+        if row["scene"] != "smooth":
+            (dot,) = dots_of([row], "{model}, {scene}", "ratio", "{model}")
+            walls = dot._replace(value=row["ratio_of_contacts"], hollow=True)
+            dots += [dot, walls] if walls.value != dot.value else [dot]
     kinds = "per collision of particles", "per contact, walls included"
     return DotPlot(dots, "time over that of the smooth gas", (1.0, "smooth"), kinds=kinds)
 
@@ -275,12 +253,10 @@ def benchmark_versions(found: dict) -> DotPlot:
     dots = []
     for row in found["rows"]:
         what, *first = row["model"].split(", ")
-        theory = what not in NAMES
-        slope = theory and what != "KineticTheory"
-        words = f"kinetic theory, {what} derivative" if slope else _named(what)
-        label = ", ".join(["kinetic theory" if what == "KineticTheory" else words, *first])
+        is_slope = what in ("forward", "reverse")
+        model = "kinetic theory" if is_slope else named(what)
+        label = ", ".join([f"{model}, {what} derivative" if is_slope else model, *first])
         x, error = row["ratio"], row["error"]
-        model = "kinetic theory" if theory else _named(what)
         dots.append(Dot(label, x, x - error, x + error, model))
     return DotPlot(dots, "time now over time before", (1.0, "no change"))
 
@@ -292,26 +268,27 @@ def paper_claims(found: dict) -> DotPlot:
             label = words if row["equation"] == "text" else f"Eq. {row['equation']}: {words}"
             ends = (None, None) if error is None else (ratio - error, ratio + error)
             dots.append(Dot(label, ratio, *ends, hollow=row["verdict"] == "corrected"))
-    axis = "measured value over the paper's value"
     kinds = "agrees within its accuracy", "the paper's is corrected"
-    return DotPlot(dots, axis, (1.0, "as printed"), kinds=kinds)
+    return DotPlot(dots, "measured value over the paper's value", (1.0, "as printed"), kinds=kinds)
 
 
 PLOTS: dict[str, Callable[[dict], DotPlot]] = {
-    "hard_cases": hard_cases,
-    "wrong_physics": wrong_physics,
-    "interval_coverage": interval_coverage,
-    "fit_head_to_head": fit_head_to_head,
-    "benchmark_kinetic_theory": benchmark_kinetic_theory,
-    "benchmark_replicas": benchmark_replicas,
-    "benchmark_million": benchmark_million,
-    "benchmark_compilation": benchmark_compilation,
-    "benchmark_dsmc": benchmark_dsmc,
-    "benchmark_hard_spheres": benchmark_hard_spheres,
-    "benchmark_particles": benchmark_particles,
-    "benchmark_derivatives": benchmark_derivatives,
-    "benchmark_elements": benchmark_elements,
-    "benchmark_versions": benchmark_versions,
-    "paper_claims": paper_claims,
-}
-"""Functions by the name of the figures, which is also that of the picture."""
+    plot.__name__: plot
+    for plot in (
+        wrong_physics,
+        interval_coverage,
+        fit_head_to_head,
+        benchmark_kinetic_theory,
+        benchmark_replicas,
+        benchmark_million,
+        benchmark_compilation,
+        benchmark_dsmc,
+        benchmark_hard_spheres,
+        benchmark_particles,
+        benchmark_derivatives,
+        benchmark_elements,
+        benchmark_versions,
+        paper_claims,
+    )
+} | {"tests/hard_cases": hard_cases}
+"""Functions by the name of the file of the figures; its last part is the name of the picture."""

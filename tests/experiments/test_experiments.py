@@ -330,13 +330,3 @@ def test_fits_head_to_head_run(tmp_path):
         assert len(row["guesses"]) == row["all_simulations"] > 0
         if row["search"] == "jaxgran.fit":  # 1000 spheres leave A open by some per cent
             assert abs(row["last_error"][0]) < 0.15
-
-
-@pytest.mark.slow
-def test_hard_cases_run(tmp_path):
-    done = run("accuracy/hard_cases.py", "--smoke", "--out", "here", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    (case,) = json.loads((tmp_path / "here" / "hard_cases.json").read_text())["cases"]
-    assert {row["precision"] for row in case["rows"]} == {"float64", "float32"}
-    table = (tmp_path / "here" / "hard_cases.md").read_text().splitlines()
-    assert len(table) == 2 + len(case["rows"])

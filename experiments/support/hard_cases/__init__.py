@@ -1,1 +1,0 @@
-"""The hard cases of `accuracy/hard_cases.py`: impacts, gases and runs."""
