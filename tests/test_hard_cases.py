@@ -141,8 +141,8 @@ def four_bodies():
     # Just apart, and approaching the centre at different speeds: all pairs come into contact.
     velocity = -corner / sigma * np.array([[1.0], [1.3], [0.8], [1.1]]) * speed
     place, end = 1.0001 * corner + side / 2, 3 * float(gas.contact_duration)
-    law, a = gas.law, float(gas.value(FREE))
-    rho = jaxgran.scene.contact.elastic_constant(law.youngs_modulus, law.poisson_ratio, sigma)
+    youngs, poisson, a = (gas.value(x) for x in ("youngs_modulus", "poisson_ratio", FREE))
+    rho = jaxgran.scene.contact.elastic_constant(youngs, poisson, sigma)
 
     def rates(_, state):
         x, v = state.reshape(2, 4, 3)
@@ -150,7 +150,7 @@ def four_bodies():
         distance = np.sqrt(np.sum(r * r, -1)) + np.eye(4)
         normal = r / distance[..., None]
         xi = np.maximum(sigma - distance, 0.0) * (1 - np.eye(4))
-        rate = 1.5 * a * np.sum(w * normal, -1)
+        rate = 1.5 * float(a) * np.sum(w * normal, -1)
         force = float(rho) * np.sqrt(xi) * np.maximum(xi - rate, 0.0)
         return np.concatenate([v, np.sum(force[..., None] * normal, 1) / float(gas.mass)]).ravel()
 
