@@ -65,6 +65,9 @@ MIN_SIGMAS = 5.0
 ENSKOG_ERROR = 0.2
 """Relative standard error of Enskog's rate for a granular gas."""
 
+MAX_RATE_ERROR = 0.6
+"""Largest relative difference from Enskog's rate without a warning."""
+
 MAX_SONINE = 0.05
 """Largest relative difference of T by the median and by the mean that the tails of f(v) explain."""
 
@@ -101,8 +104,14 @@ class Step(NamedTuple):
 
 
 def is_trajectory(path: Path) -> bool:
-    """Return whether a file contains velocities of particles, by its name."""
-    return Path(str(path).removesuffix(".gz")).suffix in TRAJECTORIES
+    """Return whether a file contains velocities of particles, by its name or its first word."""
+    if Path(str(path).removesuffix(".gz")).suffix in TRAJECTORIES:
+        return True
+    try:
+        with path.open("rb") as file:
+            return file.read(5) == b"ITEM:"
+    except OSError:
+        return False
 
 
 def track_columns(i: int, names: list[str]) -> list[str]:
@@ -436,48 +445,40 @@ def _fit_memory(
     is known with the error `ENSKOG_ERROR`. An e that the header lacks and that is significant is
     added to the header.
     """
-    time, duration = (
-        np.array([getattr(step, name) for step in steps]) for name in Step._fields[:2]
-    )
-    D = T * duration**2
     i, j, correlation, weight = _correlations(steps)
+    if not (np.all(T > 0) and len(correlation)):
+        return enskog or 0.0, []
+    time = np.array([step.time for step in steps])
+    duration = np.array([step.duration for step in steps])
+    D = T * duration**2
+    unit = float(np.median(D))
     gap = np.maximum(time[j] - time[i] - (duration[j] + duration[i]) / 2, 0.0)
     touch = gap < 1e-6 * duration[i]
-    unit = float(np.median(D))
-    given = (
-        header_number(header, "localisation_error") ** 2 / unit
-        if "localisation_error" in header
-        else None
-    )
+    given = "localisation_error" in header
+    e_squared = header_number(header, "localisation_error") ** 2 / unit if given else 0.0
     prior = None if enskog is None else enskog * unit**0.5
 
     def residuals(parameters: np.ndarray) -> np.ndarray:
-        rate, square = (
-            parameters[0] / unit**0.5,
-            unit * (given or 0.0 if len(parameters) == 1 else parameters[1]),
-        )
-        moved = np.maximum(D - 2 * square, 1e-3 * D)
+        rate, square = [*parameters, e_squared][:2]
+        moved = np.maximum(D / unit - 2 * square, 1e-3)
         x = rate * np.sqrt(moved)
         for _ in range(NUM_ITERATIONS):
             x = rate * np.sqrt(moved / _displacement_factor(x))
         h = np.sqrt(moved / _displacement_factor(x)) * _mean_memory(x)
-        model = h[i] * h[j] * np.exp(-gap * np.sqrt(x[i] / duration[i] * x[j] / duration[j]))
-        misfit = weight * (correlation - (model - square * touch) / np.sqrt(D[i] * D[j]))
-        return (
-            misfit
-            if prior is None
-            else np.append(misfit, (parameters[0] / prior - 1) / ENSKOG_ERROR)
-        )
+        decay = np.exp(-gap * np.sqrt(x[i] / duration[i] * x[j] / duration[j]))
+        model = unit * (h[i] * h[j] * decay - square * touch) / np.sqrt(D[i] * D[j])
+        known = [] if prior is None else [(rate / prior - 1) / ENSKOG_ERROR]
+        return np.concatenate([weight * (correlation - model), known])
 
     def fit(start: list[float]) -> tuple[np.ndarray, np.ndarray]:
-        bounds = np.zeros(len(start)), np.array([20.0, 0.49])[: len(start)]
+        bounds = [0.0] * len(start), [max(20.0, 2 * start[0]), 0.49][: len(start)]
         found = least_squares(residuals, start, bounds=bounds)
         return found.x, np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
 
     notes: list[str] = []
     start = [prior or 0.1]
     found, error = fit(start)
-    if given is None:
+    if not given:
         both, errors = fit([*start, 0.05])
         if both[1] > MIN_SIGMAS * errors[1]:
             found, error = both, errors
@@ -487,9 +488,7 @@ def _fit_memory(
             warnings.warn(f"{path}: {notes[0]}; measure it and add it to the header", stacklevel=4)
     if prior is None and found[0] < MIN_SIGMAS * error[0]:
         return 0.0, notes
-    if prior is not None and abs(found[0] - prior) > MIN_SIGMAS * np.hypot(
-        error[0], ENSKOG_ERROR * prior
-    ):
+    if prior is not None and abs(found[0] / prior - 1) > MAX_RATE_ERROR:
         warnings.warn(
             f"{path}: velocities change {found[0] / prior:.2g} times as fast as impacts at this "
             "eta and diameter change them: check these and the tracks",
@@ -562,8 +561,9 @@ def curve_of_trajectory(
 
     Args:
         path: of a GSD, extended XYZ or LAMMPS file: see `jaxgran.read_particles`.
-        header: in SI; with timestep, s, for files that count time steps, and reduced_inertia and
-            diameter for T_rot, unless the file gives the diameter.
+        header: in SI; with timestep, s, for files that count time steps, or frame_rate, 1/s, for
+            files without times, and reduced_inertia and diameter for T_rot, unless the file gives
+            the diameter.
 
     Returns:
         The curve, and the header with N, the dimension of disks and, as far as the file gives them,
@@ -580,19 +580,18 @@ def curve_of_trajectory(
             try:
                 frame, d = checked_frame(read(), header_count(header, "dimension"))
                 _add_to_header(header, frame, d)
-                quantities = _quantities(frame, header)
+                quantities = {"times": _time(k, frame, header), **_quantities(frame, header)}
             except ValueError as error:
                 raise ValueError(f"frame {k}: {error}") from None
             for name, value in quantities.items():
                 values.setdefault(name, []).append(value)
-        quantities: dict[str, Any] = {name: jnp.asarray(x) for name, x in values.items()}
-        curve = CoolingCurve(**quantities)
+        fields: dict[str, Any] = {name: jnp.asarray(x) for name, x in values.items()}
+        curve = CoolingCurve(**fields)
         curve.check("frame {}".format)
     if curve.times[0] == 0:
-        header.setdefault("T0", repr(float(curve.temperature[0])))
+        header.setdefault("T0", repr(values["temperature"][0]))
     header["T_from"] = "T = <v^2>/d of the particles of each frame, in the frame at rest"
-    header.pop("timestep", None)
-    return curve, header
+    return curve, {key: x for key, x in header.items() if key not in ("timestep", "frame_rate")}
 
 
 def _add_to_header(header: dict[str, str], frame: Frame, d: int) -> None:
@@ -617,22 +616,26 @@ def _add_to_header(header: dict[str, str], frame: Frame, d: int) -> None:
         header.setdefault(key, repr(value))
 
 
+def _time(k: int, frame: Frame, header: dict[str, str]) -> float:
+    """Return the time of frame k, s."""
+    if frame.time is not None:
+        return frame.time
+    if frame.step is not None and "timestep" in header:
+        return frame.step * header_number(header, "timestep")
+    if "frame_rate" in header:
+        return k / header_number(header, "frame_rate")
+    raise ValueError(
+        "it has no time: write times into the file (LAMMPS: dump_modify ... time yes; XYZ: "
+        "Time=...), or give header={'timestep': ...}, in s, or {'frame_rate': ...}, in 1/s"
+    )
+
+
 def _quantities(frame: Frame, header: dict[str, str]) -> dict[str, float]:
-    """Return the quantities of a curve at the time of a frame, by the names of its fields."""
-    if frame.time is None and "timestep" not in header:
-        raise ValueError(
-            "it has no time: let the file contain times (dump_modify ... time yes, or Time=...), "
-            "or give header={'timestep': ...}, in s"
-        )
-    time = frame.time
-    if time is None:
-        if frame.step is None:
-            raise ValueError("it has neither a time nor a step: write Time=... in its second line")
-        time = frame.step * header_number(header, "timestep")
+    """Return T and T_rot of a frame, and their errors, by the names of the fields of a curve."""
     assert frame.velocity is not None
     n, d = frame.velocity.shape
     velocity = frame.velocity - frame.velocity.mean(axis=0) * all(frame.periodic[:d])
-    values = {"times": time}
+    values: dict[str, float] = {}
     energies = {"temperature": np.mean(velocity**2, axis=1)}
     if frame.spin is not None and "diameter" in header:
         inertia = header_number({"reduced_inertia": "0.4"} | header, "reduced_inertia")
