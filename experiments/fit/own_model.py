@@ -7,9 +7,6 @@ Prints T of a gas with a constant coefficient of restitution by both models, the
 fit.
 """
 
-import argparse
-import sys
-from pathlib import Path
 from typing import ClassVar
 
 import jax
@@ -19,7 +16,7 @@ from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.closed_forms import haff
-from experiments.support.record import add_recording, write_picture
+from experiments.support.record import script_parser, write_picture
 from experiments.support.scenes import hard_beads
 
 
@@ -51,22 +48,15 @@ class HaffLaw(jaxgran.AbstractModel):
         return (jaxgran.Limitation("velocities are not Maxwellian", True, remedy),)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results") / "own_model")
-    add_recording(parser)
+def main() -> None:
+    parser = script_parser(__doc__, "own_model", smoke=False)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     gas = hard_beads(packing_fraction=0.02, restitution=0.9)
     times = jnp.geomspace(1, 300, 9) * gas.mean_free_time
     theory = jaxgran.cool(gas, times)
     own = jaxgran.cool(gas, times, model=HaffLaw())
-    print(f"{'t (s)':>8}{'T/T_0, Haff':>14}{'kinetic theory':>16}{'difference':>12}")
-    for t, a, b in zip(times, own.temperature, theory.temperature, strict=True):
-        a, b = float(a / gas.temperature), float(b / gas.temperature)
-        print(f"{float(t):8.3g}{a:14.5g}{b:16.5g}{100 * (a / b - 1):+10.2f} %")
+    print("T of Haff's law over that of kinetic theory:", own.temperature / theory.temperature)
 
     models = (HaffLaw(), jaxgran.KineticTheory())
     choice = jaxgran.choose_model(gas, times, 0.05, models=models)
@@ -80,20 +70,17 @@ def main() -> int:
     )
     free = ("coefficient", "temperature")
     result = jaxgran.fit(gas.replace(coefficient=0.5), curve, model=HaffLaw(), free=free)
-    print("\nfit to a curve by kinetic theory with noise of 1 %:")
+    print("\nfit to a curve by kinetic theory with noise of 1 %, restitution .9, T_0 .01 m^2/s^2:")
     for i, name in enumerate(free):
         estimate, error = result.value(name)
-        print(
-            f"{name:12} {float(estimate):.5g} +- {float(error):.1g}, of the model's clock "
-            f"{float(result.error_budget['model'][i]):.1g}; true {float(gas.value(name)):.5g}"
-        )
+        clock = result.error_budget["model"][i]
+        print(f"{name}: {estimate:.5g} +- {error:.1g}, of the model's clock {clock:.1g}")
     print(jaxgran.diagnose(result, curve).verdict)
     figure = Figure(figsize=(6.0, 5.5), layout="constrained")
     axes = figure.subplots(2, sharex=True, height_ratios=[3, 1])
     jaxgran.plot_fit(result, curve, axes)
     write_picture(figure, "own_model", options)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -8,11 +8,8 @@ the error of kinetic theory's clock. Prints both results and the effective sampl
 writes a corner plot.
 """
 
-import argparse
 import json
-import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import blackjax
@@ -21,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 from corner import corner
-from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import DATA, add_recording, write_picture, write_results
+from experiments.support.record import DATA, script_parser, write_picture, write_results
 from jaxgran.plotting import COLOURS
 
 FREE = ("dissipative_constant", "temperature")
@@ -38,9 +35,12 @@ less time than at 1e-9."""
 LABELS = ("A (1e-6 s)", "phi", "T_0 (1e-2 m²/s²)")
 
 
-def main() -> int:
+def main() -> None:
+    parser = script_parser(__doc__, "sample_posterior", smoke=False)
+    parser.add_argument("--samples", type=int, default=1000, help="of a chain (default: 1000)")
+    parser.add_argument("--chains", type=int, default=4, help="parallel chains (default: 4)")
+    options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    options = parse()
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     gas = jaxgran.read_gas(header)
     priors = {
@@ -51,30 +51,17 @@ def main() -> int:
         times=curve.times, temperature=curve.temperature, temperature_error=curve.temperature_error
     )
     result = jaxgran.fit(gas, curve, free=FREE, priors=priors)
-    found, seconds, evaluations = sample(log_posterior(gas, curve, priors, result), options)
-    A, phi, T_0 = (np.asarray(found[..., i]) for i in range(3))
-    report(result, A, phi, T_0, seconds, evaluations, options)
-    shown = np.stack([A.ravel() * 1e6, phi.ravel(), T_0.ravel() * 100], axis=1)
-    picture(result, shown, options)
-    return 0
-
-
-def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--samples", type=int, default=1000, help="samples per chain (default: 1000)"
-    )
-    parser.add_argument("--chains", type=int, default=4, help="parallel chains (default: 4)")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("results") / "sample_posterior",
-        help="folder of the picture",
-    )
-    add_recording(parser)
-    return parser.parse_args()
+    samples, facts = sample(*log_posterior(gas, curve, priors, result), options)
+    A, phi, T_0 = samples.reshape(-1, 3).T
+    for name, values in (("dissipative_constant", A), ("temperature", T_0)):
+        estimate, error = (float(x) for x in result.value(name))
+        facts[name] = {"mean": float(values.mean()), "std": float(values.std())}
+        facts[name] |= {"fit": estimate, "fit_std": error}
+    print(f"correlation of A and phi: {np.corrcoef(A, phi)[0, 1]:.3f}")
+    print(json.dumps(facts))
+    write_results("sample_posterior", options, None, **facts)
+    picture = draw(result, np.stack([A * 1e6, phi, T_0 * 100], axis=1))
+    write_picture(picture, "sample_posterior", options, dpi=100)
 
 
 def log_posterior(gas, curve, priors, result):
@@ -106,9 +93,8 @@ def log_posterior(gas, curve, priors, result):
     return log_density, values
 
 
-def sample(posterior, options):
-    """Return samples (chains, samples, 3) of SI values, run seconds, and effective samples."""
-    log_density, values = posterior
+def sample(log_density, values, options) -> tuple[np.ndarray, dict]:
+    """Return samples (chains, samples, 3) of SI values, and seconds and diagnostics of the run."""
     warm_key, key = jax.random.split(jax.random.key(0))
     adapt: Any = blackjax.window_adaptation(
         blackjax.nuts, log_density, is_mass_matrix_diagonal=False
@@ -130,45 +116,17 @@ def sample(posterior, options):
     begin = time.perf_counter()
     theta, steps, divergent = jax.block_until_ready(chains(jax.random.split(keys[0], len(keys))))
     seconds = time.perf_counter() - begin
-    return (
-        values(theta),
-        seconds,
-        {
-            "steps": float(jnp.mean(steps)),
-            "divergent": int(jnp.sum(divergent)),
-            "effective": float(jnp.min(effective_sample_size(theta))),
-            "r_hat": float(jnp.max(potential_scale_reduction(theta))),
-        },
-    )
+    return np.asarray(values(theta)), {
+        "samples_per_second": options.samples * options.chains / seconds,
+        "seconds": seconds,
+        "steps": float(jnp.mean(steps)),
+        "divergent": int(jnp.sum(divergent)),
+        "effective": float(jnp.min(effective_sample_size(theta))),
+        "r_hat": float(jnp.max(potential_scale_reduction(theta))),
+    }
 
 
-def report(result, A, phi, T_0, seconds, facts, options) -> None:
-    """Print both results and the speed."""
-    print(f"{'':24}{'posterior (NUTS)':>24}{'fit, with its budget':>24}")
-    summary = {}
-    for name, samples in (("dissipative_constant", A), ("temperature", T_0)):
-        estimate, error = (float(x) for x in result.value(name))
-        mean, spread = float(samples.mean()), float(samples.std())
-        both = (f"{x:.5g} +- {e:.2g}" for x, e in ((mean, spread), (estimate, error)))
-        print(f"{name:24}" + "".join(f"{text:>24}" for text in both))
-        summary[name] = {"mean": mean, "std": spread, "fit": estimate, "fit_std": error}
-    parts = ", ".join(
-        f"{part} {100 * float(x[0] / result.estimate[0]):.2g} %"
-        for part, x in result.error_budget.items()
-    )
-    print(f"error of A by the fit: {parts}")
-    print(f"correlation of A and phi: {np.corrcoef(A.ravel(), phi.ravel())[0, 1]:.3f}")
-    summary |= {"samples_per_second": A.size / seconds, "seconds": seconds, **facts}
-    print(
-        f"{A.size} samples in {seconds:.1f} s: {A.size / seconds:.0f} a second, "
-        f"{facts['effective'] / seconds:.0f} effective; {facts['steps']:.1f} steps each, "
-        f"{facts['divergent']} divergent, R-hat {facts['r_hat']:.3f}"
-    )
-    print(json.dumps(summary))
-    write_results("sample_posterior", options, None, **summary)
-
-
-def picture(result, samples, options: argparse.Namespace) -> None:
+def draw(result: jaxgran.Fit, samples: np.ndarray) -> Figure:
     """Draw a corner plot, with the Gaussian of the fit over the histograms of A and T_0."""
     figure = corner(samples, labels=LABELS, color="0.3", quantiles=(0.025, 0.975))
     axes = np.array(figure.axes).reshape(3, 3)
@@ -177,14 +135,11 @@ def picture(result, samples, options: argparse.Namespace) -> None:
         left, right = axes[i, i].get_xlim()
         x = np.linspace(left, right, 200)
         normal = np.exp(-0.5 * ((x - estimate) / error) ** 2)
-        axes[i, i].plot(
-            x, normal * axes[i, i].get_ylim()[1] * 0.95, color=COLOURS["kinetic theory"], lw=2
-        )
+        top = axes[i, i].get_ylim()[1] * 0.95
+        axes[i, i].plot(x, normal * top, color=COLOURS["kinetic theory"], lw=2)
     axes[0, 2].text(0.0, 0.8, "grey: NUTS\nblue: fit, with its budget", fontsize=12)
-    write_picture(figure, "sample_posterior", options, dpi=100)
-    plt.close(figure)
-    print(f"written  {options.out / 'sample_posterior.png'}")
+    return figure
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

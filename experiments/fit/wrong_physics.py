@@ -7,8 +7,8 @@ grains, walls, drag, a noise floor or a constant eps, fits A and T_0 with kineti
 viscoelastic spheres, and prints for each: fitted over true A, how often the verdict still says
 "compatible", and how often the range of A over all alternatives contains the true A. A curve of
 constant eps has no A: there the range must reach down to 1 % of the fitted A. If the scene can
-contain the roughness, the walls or the drag, the curve is fitted again with them; the last two
-columns are that A and how often its 95 % interval contains the true one.
+contain the roughness, the walls or the drag, the curve is fitted again with them; `told` is that A
+and `told_held` how often its 95 % interval contains the true one.
 
 The curves are simulated with hard spheres, in 16 boxes of 50 mm with 1492 spheres each, until T
 has fallen to 2 % (walls: between walls); the noise is added to their mean. Contacts of hard spheres
@@ -32,12 +32,6 @@ NUM_POINTS, NOISE = 30, 0.03
 BOX, NUM_PARTICLES, REPLICAS = 0.05, 1492, 16  # m; phi = .05
 LAST = 0.02
 THEORY = jaxgran.KineticTheory(softness=False)
-HEAD = (
-    "| added to the curve | fitted A / 3e-6 s | compatible | range of A / 3e-6 s "
-    "| contains the true A | fitted A / 3e-6 s, complete scene "
-    "| 95 % intervals that contain the true A |\n|---|---|---|---|---|---|---|"
-)
-NOTE = "In rows of constant eps there is no A: the range must reach down to 1 % of the fitted A."
 
 
 def beads() -> jaxgran.Gas:
@@ -66,25 +60,17 @@ def drag(gas: jaxgran.Gas) -> jaxgran.StokesDrag:
     return jaxgran.StokesDrag(0.03 * float(first_cooling_rate(gas)) / 2)
 
 
-def walls(eps: float) -> dict:
-    return {"container": jaxgran.Walls(BOX, restitution=eps)}
-
-
-def constant(eps: float) -> dict:
-    return {"law": jaxgran.ConstantRestitution(eps)}
-
-
 SCENES = [
     # name of the row; difference from the gas of the fit; noise floor over T_0
     ("nothing else", {}, 0.0),
     ("rough grains, beta_t = -.8", {"surface": jaxgran.Rough(-0.8)}, 0.0),
     ("rough grains, beta_t = -.5", {"surface": jaxgran.Rough(-0.5)}, 0.0),
     ("rough grains, beta_t = 0", {"surface": jaxgran.Rough(0.0)}, 0.0),
-    ("walls of a 50 mm box, eps_w = .9", walls(0.9), 0.0),
-    ("walls of a 50 mm box, eps_w = .8", walls(0.8), 0.0),
-    ("constant eps = .9", constant(0.9), 0.0),
-    ("constant eps = .8", constant(0.8), 0.0),
-    ("constant eps = .65", constant(0.65), 0.0),
+    ("walls of a 50 mm box, eps_w = .9", {"container": jaxgran.Walls(BOX, restitution=0.9)}, 0.0),
+    ("walls of a 50 mm box, eps_w = .8", {"container": jaxgran.Walls(BOX, restitution=0.8)}, 0.0),
+    ("constant eps = .9", {"law": jaxgran.ConstantRestitution(0.9)}, 0.0),
+    ("constant eps = .8", {"law": jaxgran.ConstantRestitution(0.8)}, 0.0),
+    ("constant eps = .65", {"law": jaxgran.ConstantRestitution(0.65)}, 0.0),
     ("drag, 3 % of the first losses", {"drag": drag(beads())}, 0.0),
     ("a noise floor of 1 % of T_0", {}, 0.01),
 ]
@@ -96,46 +82,17 @@ def main() -> None:
     )
     parser.add_argument("--draws", type=int, default=20, help="of the noise (default: 20)")
     parser.add_argument("--rows", default="", help="only those whose name contains this")
-    parser.add_argument("--out", type=Path, help="a file for the table")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
     add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    print(HEAD)
-    rows = []
+    rows = {row["name"]: row for row in figures("wrong_physics")["rows"]} if options.rows else {}
     for name, other, floor in SCENES:
-        if options.rows not in name:
-            continue
-        rows.append(row(name, other, floor, options.draws))
-        print(line(rows[-1]), flush=True)
-    write_results(
-        "wrong_physics", options, None, rows=with_recorded(rows) if options.rows else rows
-    )
-    if options.out is not None:
-        options.out.write_text(table({"rows": rows}), encoding="utf-8")
-
-
-def with_recorded(rows: list[dict]) -> list[dict]:
-    """Return these rows and the recorded rows of other curves, in the order of the table."""
-    known = {row["name"]: row for row in [*figures("wrong_physics")["rows"], *rows]}
-    return [known[name] for name, *_ in SCENES if name in known]
-
-
-def table(results: dict) -> str:
-    """Return the table of all rows."""
-    return "\n".join([HEAD, *map(line, results["rows"]), "", NOTE]) + "\n"
-
-
-def line(row: dict) -> str:
-    """Format a row of the table."""
-    low, high = row["range"]
-    draws = row["draws"]
-    complete = "| "
-    if row["told"] is not None:
-        complete = f"{row['told']:.2f} | {row['told_held']} of {draws}"
-    return (
-        f"| {row['name']} | {row['A']:.2f} | {row['compatible']} of {draws} | "
-        f"{low:.2f} to {high:.2f} | {row['inside']} of {draws} | {complete} |"
-    )
+        if options.rows in name:
+            rows[name] = row(name, other, floor, options.draws)
+            print(rows[name], flush=True)
+    ordered = [rows[name] for name, *_ in SCENES if name in rows]
+    write_results("wrong_physics", options, options.out, rows=ordered)
 
 
 def row(name: str, other: dict, floor: float, draws: int) -> dict:

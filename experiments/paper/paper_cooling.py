@@ -1,163 +1,325 @@
-"""How does a granular gas cool, with viscoelastic and with constant restitution?
+"""How does a granular gas cool, and is the paper's eps(v) right?
 
-    python experiments/paper/paper_cooling.py [--smoke] [--out DIR]
+    python experiments/paper/paper_cooling.py [--only paper_restitution paper_cooling
+        paper_exponents] [--smoke] [--record] [--out DIR]
 
-Two gases with the same initial cooling rate over seven decades of time: DSMC, kinetic theory, and
-the paper's closed forms, Eqs. (10), (38) and (44), as printed and as corrected.
+paper_restitution: the series of eps, Eqs. (1), (5), (6). Integrates the equation of motion of
+single impacts for both conditions at which contact can end (xi = 0 and F = 0), fits the
+coefficients of the series to them, and measures the errors of the truncated series.
+
+paper_cooling: two gases with the same initial cooling rate, viscoelastic and of constant
+restitution, over seven decades of time: DSMC, kinetic theory, and the paper's closed forms, Eqs.
+(10), (38) and (44), as printed and as corrected.
+
+paper_exponents: the paper's closing remark considers eps = 1 - c v^gamma with exponents other than
+1/5. Then dT/dt ~ -T^((3 + gamma)/2), T ~ t^(-2/(1 + gamma)) and <dr^2> ~ t^(gamma/(1 + gamma)). Ice
+as measured by Bridges, Hatzes & Lin (Nature 309, 333, 1984), eps = min(1, 0.34 v^-0.234) with v in
+cm/s, is not such a power law: the exponent of its T(t) changes with time.
 """
 
-from dataclasses import dataclass
+from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
+from matplotlib.ticker import NullFormatter
 
 import jaxgran
 from experiments.support import paper
 from experiments.support.closed_forms import haff, paper_temperature
 from experiments.support.scenes import beads, hard_beads
+from jaxgran._utils.validation import POSITIVE, Domain, float_array
+from jaxgran.scene.contact import impact
+from jaxgran.scene.laws import C1, C2, C_CLIP, UNCLIPPED_SERIES, viscoelastic_restitution
 from jaxgran.theory.equations import COOLING_RATE
 
-NAME = "paper_cooling"
+RAMIREZ = (0.48358, 0.28528)
+"""Third and fourth coefficients of Ramirez et al., PRE 60, 4465 (1999), as often quoted."""
+
+PACKING = 0.05
+TIME, RATE = "time t / τ$_c$(0)", "d ln T / d ln t"
+SHADES = ("#084594", "#2171b5", "#6baed6", "#bdc9e1")
+"""Colours from the smallest gamma to the largest, from dark to light."""
 
 
-@dataclass(frozen=True)
-class Config:
-    packing_fraction: float = 0.05
-    beta: float = 0.15  # of an impact at the thermal speed, sqrt(2 T_0)
-    num_particles: int = 20_000
-    replicas: int = 8
-    seed: int = 0
-    last: float = 1e6  # mean free times simulated
-    last_theory: float = 1e10
-    points: int = 22
-
-
-SMOKE = Config(num_particles=1000, replicas=2, last=1e3, points=9)
-
-
-def main() -> None:
-    options = paper.options(__doc__, NAME)
-    config = SMOKE if options.smoke else Config()
-    clock = paper.Clock()
-    viscoelastic = beads(config.packing_fraction, config.beta)
-    e = paper.alike(viscoelastic)
-    gases = {"viscoelastic": viscoelastic, "constant": hard_beads(config.packing_fraction, e)}
-    colors = {"viscoelastic": paper.VISCOELASTIC, "constant": paper.CONSTANT}
-    slopes = {"viscoelastic": -5 / 3, "constant": -2.0}
-    labels = {"viscoelastic": f"viscoelastic, δ = {float(viscoelastic.delta):.3f}"}
-    labels["constant"] = f"constant ε = {e:.3f}"
-    tau = np.geomspace(0.1, config.last_theory, 133)
-    measured = np.geomspace(0.1, config.last, config.points)
-    model = jaxgran.DSMC(config.num_particles, config.replicas)
-    key = jax.random.key(config.seed)
-
-    figure = paper.figure(
-        "Viscoelastic spheres cool as t$^{-5/3}$, spheres of constant ε as t$^{-2}$:"
-        " both of the paper's laws hold at late times",
-        columns=3,
+def restitution(smoke: bool) -> tuple:
+    config = {"rtol": 1e-13, "num_impacts": 60, "lowest": 1e-3, "highest": 2.0, "fit_top": 0.3}
+    config["fit_degree"] = 16
+    config |= {"num_impacts": 16, "fit_degree": 12} if smoke else {}
+    betas = np.geomspace(config["lowest"], config["highest"], config["num_impacts"])
+    clipped, unclipped = (restitutions(betas, end, config["rtol"]) for end in (True, False))
+    coefficients = recovered(config)
+    two, five = series(betas, (-C1, C2)), series(betas, UNCLIPPED_SERIES)
+    errors = {
+        "two_terms_unclipped": two - unclipped,
+        "two_terms_clipped": two - clipped,
+        "ramirez_four_terms": series(betas, (-C1, C2, -RAMIREZ[0], RAMIREZ[1])) - unclipped,
+        "four_terms": series(betas, UNCLIPPED_SERIES[:4]) - unclipped,
+        "fast_law": np.asarray(viscoelastic_restitution(jnp.asarray(betas))) - clipped,
+    }
+    errors = {name: np.abs(error) for name, error in errors.items()}
+    title = "The paper's two terms of ε hold to 1 % up to β = 0.25, for both ends of contact"
+    figure = paper.figure(title, columns=2)
+    left, right = figure.axes
+    for eps, style, color, label in (
+        (clipped, "-", paper.INK, "equation of motion, ends at F = 0"),
+        (unclipped, "--", paper.ELASTIC, "equation of motion, ends at ξ = 0 (paper)"),
+        (two, "-", paper.VISCOELASTIC, "paper, Eq. (1): two terms"),
+        (five, ":", paper.INK, "five terms"),
+    ):
+        left.plot(betas, eps, style, color=color, label=label)
+    labels = {"xlabel": "dissipation  β = (3/2) A α$^{2/5}$ v$^{1/5}$", "xscale": "log"}
+    paper.caption(left, "One impact", ylabel="restitution  ε", ylim=(-0.02, 1.02), **labels)
+    looks = (
+        ("two terms, from ε that ends at ξ = 0", paper.VISCOELASTIC, "-"),
+        ("two terms, from ε that ends at F = 0", paper.VISCOELASTIC, ":"),
+        ("four terms of Ramírez et al. 1999", paper.ELASTIC, "-"),
+        ("four terms, corrected", paper.GUIDE, "-."),
+        ("the package's fast law, from F = 0", paper.INK, "-"),
     )
-    left, middle, right = figure.axes
-    found = {}
-    for name, gas in gases.items():
-        theory = jaxgran.cool(
-            gas,
-            tau * gas.mean_free_time,
-            model=jaxgran.KineticTheory(softness=False, correlations=False),
+    for error, (label, color, style) in zip(errors.values(), looks, strict=True):
+        seen = error > 1e-13
+        right.plot(betas[seen], error[seen], style, color=color, label=label)
+    labels |= {"ylabel": "error of ε", "yscale": "log", "ylim": (1e-13, 30)}
+    paper.caption(right, "Difference from the equation of motion", **labels)
+    relative = {"F = 0": np.abs(two / clipped - 1), "xi = 0": np.abs(two / unclipped - 1)}
+    found = {
+        "recovered": coefficients,
+        "closed_forms": [C1, C2, C_CLIP],
+        "orders": {
+            name: float(np.mean(paper.slope(betas[:10], errors[name][:10])[1]))
+            for name in ("two_terms_unclipped", "two_terms_clipped", "ramirez_four_terms")
+        },
+        "two_terms_good_to_one_per_cent": {
+            name: float(np.exp(paper.interpolate(0.01, miss, np.log(betas))))
+            for name, miss in relative.items()
+        },
+        "fast_law_error": float(errors["fast_law"].max()),
+        "beta": paper.listed(betas),
+        "restitution_clipped": paper.listed(clipped),
+        "restitution_unclipped": paper.listed(unclipped),
+    }
+    return figure, config, found
+
+
+def restitutions(betas: np.ndarray, clipped: bool, rtol: float) -> np.ndarray:
+    solve = jax.jit(lambda b: impact(b, clipped=clipped, rtol=rtol).restitution)
+    return np.array([float(solve(b)) for b in betas])
+
+
+def series(betas: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    return 1 + betas[:, None] ** np.arange(1, len(coefficients) + 1) @ np.array(coefficients)
+
+
+def recovered(config: dict) -> dict[str, list[float]]:
+    """Fit coefficients of beta^(1/2), beta, ... (clipped) or beta, beta^2, ... to impacts."""
+    # A least-squares fit on Chebyshev nodes, twice as many as coefficients.
+    degree, top = config["fit_degree"], config["fit_top"]
+    nodes = (1 - np.cos((np.arange(2 * degree) + 0.5) / degree * np.pi / 2)) / 2
+    powers, found = np.arange(1, degree + 1), {}
+    for clipped in (True, False):
+        x = nodes * (top**0.5 if clipped else top)
+        lost = restitutions(x**2 if clipped else x, clipped, config["rtol"]) - 1
+        fitted = np.linalg.lstsq((x / x.max())[:, None] ** powers, lost, rcond=None)[0]
+        found["clipped" if clipped else "unclipped"] = paper.listed(
+            (fitted / x.max() ** powers)[:6]
         )
-        theta = np.asarray(theory.temperature / gas.temperature)
-        dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model, key=key)
-        each = paper.replicas_of(dsmc, "temperature") / float(gas.temperature)
-        mean, error = paper.mean_and_error(each)
-        at, exponents = paper.slope(measured, each)
-        exponent, exponent_error = paper.mean_and_error(exponents)
-        left.plot(tau, theta, color=colors[name], label=f"{labels[name]}: theory")
-        left.errorbar(measured, mean, error, fmt="o", ms=3.5, color=colors[name], label="DSMC")
-        where, local = paper.slope(tau, theta)
-        middle.plot(where, local, color=colors[name], label=f"{name}: theory")
-        middle.errorbar(at, exponent, exponent_error, fmt="o", ms=3.5, color=colors[name])
-        middle.axhline(slopes[name], color=colors[name], ls=":", lw=1)
-        of_theory = np.interp(np.log(measured), np.log(tau), np.log(theta))
+    return found
+
+
+def cooling(smoke: bool) -> tuple:
+    config = {"num_particles": 20_000, "replicas": 8, "last": 1e6, "points": 22}
+    config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9} if smoke else {}
+    config |= {"packing_fraction": PACKING, "beta": 0.15, "seed": 0, "last_theory": 1e10}
+    viscoelastic = beads(PACKING, config["beta"])
+    e, delta = paper.alike(viscoelastic), float(viscoelastic.delta)
+    gases = {
+        "viscoelastic": (
+            viscoelastic,
+            paper.VISCOELASTIC,
+            -5 / 3,
+            f"viscoelastic, δ = {delta:.3f}",
+        ),
+        "constant": (hard_beads(PACKING, e), paper.CONSTANT, -2.0, f"constant ε = {e:.3f}"),
+    }
+    tau = np.geomspace(0.1, config["last_theory"], 133)
+    title = (
+        "Viscoelastic spheres cool as t$^{-5/3}$, spheres of constant ε as t$^{-2}$:"
+        " both of the paper's laws hold at late times"
+    )
+    figure = paper.figure(title, columns=3)
+    left, middle, right = figure.axes
+    found: dict[str, Any] = {"restitution": e}
+    for name, (gas, color, power, label) in gases.items():
+        theory = jaxgran.KineticTheory(softness=False, correlations=False)
+        _, dsmc, T = compared(gas, tau, config, theory)
+        T.draw(left, middle, color, f"{label}: theory", f"{name}: theory")
+        middle.axhline(power, color=color, ls=":", lw=1)
         found[name] = {
-            "largest_difference_of_theory": float(np.abs(np.exp(of_theory) / mean - 1).max()),
-            "largest_standard_error": float((error / mean).max()),
-            "exponent": {f"{t:.3g}": x for t, x in zip(at, exponent, strict=True)},
-            "exponent_error": paper.listed(exponent_error),
-            "exponent_of_theory": {f"{10.0**k:g}": _at(10.0**k, where, local) for k in range(10)},
+            "largest_difference_of_theory": float(np.abs(1 / (1 + T.miss) - 1).max()),
+            "largest_standard_error": float((T.error / T.mean).max()),
+            "exponent": {f"{t:.3g}": x for t, x in zip(T.middle, T.exponent, strict=True)},
+            "exponent_error": paper.listed(T.exponent_error),
+            "exponent_of_theory": paper.at_powers(0, 10, T.where, T.local),
             "collisions": float(np.asarray(dsmc.collisions)[-1]),
-            "tau": paper.listed(measured),
-            "temperature": paper.listed(mean),
-            "temperature_error": paper.listed(error),
+            "tau": paper.listed(T.at),
+            "temperature": paper.listed(T.mean),
+            "temperature_error": paper.listed(T.error),
         }
         if name == "viscoelastic":
-            late = np.abs(local - slopes[name]) < 0.01 * abs(slopes[name])
-            found["exponent_within_1_per_cent_from"] = paper.from_here(late, where)
-            found["closed_forms"] = formulas(right, tau, theta, float(gas.delta))
+            late = np.abs(T.local - power) < 0.01 * abs(power)
+            found["exponent_within_1_per_cent_from"] = paper.from_here(late, T.where)
+            u, t = 1 + COOLING_RATE[3] * delta * tau, jnp.asarray(tau)
+            printed = paper_temperature(t, delta, corrected=False)
+            forms = {
+                "Eq. (10): u$^{-5/3}$": (u ** (-5 / 3), ":"),
+                "Eq. (38) as printed, to order δ": (printed, "--"),
+                "Eq. (38) corrected, to order δ$^2$": (paper_temperature(t, delta), "-"),
+            }
+            found["closed_forms"] = paper.draw_forms(right, T, forms, (-1, 11))
         else:
-            expected = np.asarray(haff(tau, e))
-            right.plot(tau, expected / theta - 1, color=colors[name], label="Haff, Eq. (44)")
-            found["haff"] = paper.listed(expected[::12] / theta[::12] - 1)
-    paper.caption(
-        left,
-        "Temperature",
-        xlabel="time t / τ$_c$(0)",
-        ylabel="T / T$_0$",
-        xscale="log",
-        yscale="log",
-        ylim=(1e-16, 3),
+            expected = np.asarray(haff(tau, e)) / T.theory - 1
+            right.plot(tau, expected, color=color, label="Haff, Eq. (44)")
+            found["haff"] = paper.listed(expected[::12])
+    logs = {"xlabel": TIME, "xscale": "log"}
+    title = "Temperature: — theory, ● DSMC"
+    paper.caption(left, title, ylabel="T / T$_0$", yscale="log", ylim=(1e-16, 3), **logs)
+    title = "Local exponent; dotted: the paper's −5/3 and −2"
+    paper.caption(middle, title, ylabel=RATE, ylim=(-2.1, 0.05), **logs)
+    title = "Closed forms: difference from kinetic theory"
+    paper.caption(right, title, ylabel="T$_{formula}$ / T − 1", ylim=(-0.42, 0.62), **logs)
+    return figure, config, found
+
+
+def compared(gas: jaxgran.Gas, tau: np.ndarray, config: dict, theory: jaxgran.AbstractModel):
+    """Return the curves of theory and DSMC, and T/T_0 of both."""
+    of = jaxgran.cool(gas, tau * gas.mean_free_time, model=theory)
+    at = np.geomspace(0.1, config["last"], config["points"])
+    model = jaxgran.DSMC(config["num_particles"], config["replicas"])
+    key = jax.random.key(config["seed"])
+    dsmc = jaxgran.cool(gas, at * gas.mean_free_time, model=model, key=key)
+    T_0 = float(gas.temperature)
+    each = paper.replicas_of(dsmc, "temperature") / T_0
+    return of, dsmc, paper.Compared(tau, np.asarray(of.temperature) / T_0, at, each)
+
+
+class Ice(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
+    """``eps = min(1, (v/v_1)^(-p))``: elastic below v_1, decreasing with the speed above."""
+
+    threshold: Float[Array, ""] = eqx.field(
+        converter=float_array, default=0.01 * 0.34 ** (1 / 0.234)
     )
-    paper.caption(
-        middle,
-        "Local exponent; dotted: the paper's −5/3 and −2",
-        xlabel="time t / τ$_c$(0)",
-        ylabel="d ln T / d ln t",
-        xscale="log",
-        ylim=(-2.1, 0.05),
+    exponent: Float[Array, ""] = eqx.field(converter=float_array, default=0.234)
+
+    domains: ClassVar[dict[str, Domain]] = {"threshold": POSITIVE, "exponent": POSITIVE}
+
+    def reduced(self, *, diameter, mass, speed) -> "Ice":
+        return Ice(self.threshold / speed, self.exponent)
+
+    def restitution(self, normal_speed):
+        return jnp.minimum(1.0, (normal_speed / self.threshold) ** -self.exponent)
+
+
+def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return T/T_0 of a Maxwellian gas of any law, and gamma = d ln <1 - eps^2> / d ln sqrt(T).
+
+    ``d ln T/d tau = -<1 - eps^2> sqrt(T/T_0)/3`` with the mean weighted by ``g^3 exp(-g^2/2)``,
+    computed as a sum over a fine grid, since `jaxgran.KineticTheory` requires a smooth law, unlike
+    that of ice.
+    """
+    theta = np.geomspace(1.0, 1e-7, 1500)
+    g = (np.arange(4000) + 0.5) / 400
+    weight = g**3 * np.exp(-(g**2) / 2)
+    eps = np.asarray(gas.reduced_law.restitution(jnp.asarray(g * np.sqrt(theta)[:, None])))
+    lost = np.maximum((1 - eps**2) @ weight / weight.sum(), 1e-300)
+    pace = 3 / (lost * np.sqrt(theta))
+    passed = np.cumsum((pace[1:] + pace[:-1]) / 2 * -np.diff(np.log(theta)))
+    at = np.exp(np.interp(tau, np.concatenate([[0.0], passed]), np.log(theta)))
+    gamma = 2 * np.gradient(np.log(lost), np.log(theta))
+    return at, np.interp(-np.log(at), -np.log(theta), gamma)
+
+
+def exponents(smoke: bool) -> tuple:
+    config = {"gammas": (0.0, 0.2, 0.5, 1.0), "num_particles": 5000, "last": 1e5, "points": 19}
+    config |= {"loss": 0.15, "ice_speed": 0.01, "packing_fraction": PACKING, "replicas": 8}
+    if smoke:
+        config |= {"gammas": (0.0, 1.0), "num_particles": 1000, "replicas": 2}
+        config |= {"last": 100.0, "points": 7}
+    config |= {"seed": 3, "last_theory": 1e8}
+    title = "1 − ε ~ v$^γ$ cools as t$^{−2/(1+γ)}$; ice has no fixed exponent and becomes elastic"
+    figure = paper.figure(title, columns=3)
+    left, middle, right = figure.axes
+    tau = np.geomspace(0.1, config["last_theory"], 181)
+    scene, gases = beads(PACKING, 0.1), {}
+    for gamma, color in zip(config["gammas"], SHADES, strict=False):
+        coefficient = -config["loss"] / float(scene.impact_speed) ** gamma
+        law = jaxgran.RestitutionSeries([coefficient], [gamma])
+        gases[f"γ = {gamma:g}"] = eqx.tree_at(lambda gas: gas.law, scene, law), color, gamma
+    frozen = jaxgran.Gas(
+        Ice(),
+        diameter=0.02,
+        mass=jaxgran.sphere_mass(0.02, 900.0),
+        packing_fraction=PACKING,
+        temperature=config["ice_speed"] ** 2 / 2,
     )
-    right.axhline(0, color="0.7", lw=0.8)
-    paper.caption(
-        right,
-        "Closed forms: difference from kinetic theory",
-        xlabel="time t / τ$_c$(0)",
-        ylabel="T$_{formula}$ / T − 1",
-        xscale="log",
-        ylim=(-0.42, 0.62),
-    )
-    for name in gases:
-        row = found[name]
-        print(
-            f"{name}: theory within {100 * row['largest_difference_of_theory']:.2f} % of DSMC "
-            f"(its error up to {100 * row['largest_standard_error']:.2f} %), last exponent "
-            f"{list(row['exponent'].values())[-1]:.3f} +- {row['exponent_error'][-1]:.3f}"
-        )
-    paper.write(figure, options, NAME, config, clock, restitution=e, **found)
+    found: dict[str, Any] = {}
+    for name, (gas, color, gamma) in {**gases, "ice": (frozen, paper.INK, None)}.items():
+        of, _, T = compared(gas, tau, config, jaxgran.KineticTheory())
+        if gamma is None:
+            theta, steepness = maxwellian(gas, tau)
+            off = np.abs(T.theory / theta - 1) >= 0.03
+            found["ice_by_kinetic_theory_fails_from"] = float(tau[off][0]) if off.any() else None
+            T = paper.Compared(tau, theta, T.at, T.each)
+            draw_ice(right, T, steepness, 100 * config["ice_speed"])
+        label = name if gamma is None else f"{name}: −2/(1 + γ) = {-2 / (1 + gamma):.3g}"
+        T.draw(left, None if gamma is None else middle, color, name, label)
+        if gamma is not None:
+            middle.axhline(-2 / (1 + gamma), color=color, ls=":", lw=1)
+        ends = np.log(np.interp(T.at[-2:], tau, T.theory))
+        found[name] = {
+            "paper_exponent": None if gamma is None else -2 / (1 + gamma),
+            "paper_displacement_exponent": None if gamma is None else gamma / (1 + gamma),
+            "exponent": float(T.exponent[-1]),
+            "exponent_error": float(T.exponent_error[-1]),
+            "exponent_of_theory": float(np.diff(ends)[0] / np.diff(np.log(T.at[-2:]))[0]),
+            "last_exponent_of_theory": float(T.local[-1]),
+            "last_displacement_exponent": float(
+                paper.slope(tau, np.asarray(of.displacement))[1][-1]
+            ),
+            "dsmc_from_theory": paper.listed(T.miss),
+            "standard_error": paper.listed(T.error / T.mean),
+            "tau": paper.listed(T.at),
+            "temperature": paper.listed(T.mean),
+            "last_temperature": float(T.theory[-1]),
+        }
+    elastic = 100 * float(Ice().threshold)
+    found["ice"]["threshold_cm_per_s"] = elastic
+    logs = {"xlabel": TIME, "xscale": "log"}
+    title = "Temperature: — theory, ● DSMC"
+    paper.caption(left, title, ylabel="T / T$_0$", yscale="log", **logs)
+    paper.caption(middle, "Local exponents; dotted: −2/(1 + γ)", ylabel=RATE, **logs)
+    title = f"Ice: elastic below {elastic:.3f} cm/s; time runs to the left"
+    labels = {"xlabel": "thermal speed (2T)$^{1/2}$, cm/s", "ylabel": RATE}
+    paper.caption(right, title, xscale="log", ylim=(-2.1, 0.05), **labels)
+    right.xaxis.set_minor_formatter(NullFormatter())
+    return figure, config, found
 
 
-def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
-    """Interpolate linearly in ln x."""
-    return float(np.interp(np.log(x), np.log(where), values))
+def draw_ice(axes, T: paper.Compared, steepness: np.ndarray, speed: float) -> None:
+    """Draw the local exponents of ice over its thermal speed, past the initial transient."""
+    aged, old = T.middle > 100, T.tau[1:] > 100
+    at = speed * np.sqrt(T.theory[1:][old])
+    axes.plot(at, T.local[old], color=paper.INK, label="theory, Maxwellian")
+    seen = speed * np.sqrt(np.sqrt(T.mean[1:] * T.mean[:-1]))[aged]
+    dots = {"fmt": "o", "ms": 3.5, "color": paper.INK, "label": "DSMC"}
+    axes.errorbar(seen, T.exponent[aged], T.exponent_error[aged], **dots)
+    label = "−2/(1 + γ), γ = d ln⟨1 − ε²⟩ / d ln T$^{1/2}$"
+    axes.plot(at, -2 / (1 + steepness[1:][old]), ":", color=paper.GUIDE, label=label)
 
 
-def formulas(axes, tau: np.ndarray, theta: np.ndarray, delta: float) -> dict:
-    """Draw relative errors of the closed forms of T(t), and return them at some times."""
-    u = 1 + COOLING_RATE[3] * delta * tau
-    t = jnp.asarray(tau)
-    forms = {
-        "Eq. (10): u$^{-5/3}$": (u ** (-5 / 3), ":"),
-        "Eq. (38) as printed, to order δ": (
-            paper_temperature(t, delta, corrected=False),
-            "--",
-        ),
-        "Eq. (38) corrected, to order δ$^2$": (paper_temperature(t, delta), "-"),
-    }
-    rows = {}
-    for label, (values, style) in forms.items():
-        miss = np.asarray(values) / theta - 1
-        axes.plot(tau, miss, style, color=paper.VISCOELASTIC, label=label)
-        key = label.split(":")[0].replace("$^2$", "^2")
-        rows[key] = {f"{10.0**k:g}": _at(10.0**k, tau, miss) for k in range(-1, 11)}
-    return rows
-
+PARTS = {"paper_restitution": restitution, "paper_cooling": cooling, "paper_exponents": exponents}
 
 if __name__ == "__main__":
-    main()
+    paper.run_parts(__doc__, PARTS)

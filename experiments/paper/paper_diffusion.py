@@ -1,209 +1,480 @@
-"""How does <dr^2> grow with time, collisions and 1/T, and when do the paper's laws hold?
+"""How far do the particles of a cooling gas move, and how long do they keep their velocities?
 
-    python experiments/paper/paper_diffusion.py [--smoke] [--out DIR]
+    python experiments/paper/paper_diffusion.py [--only paper_velocity_correlation
+        paper_diffusion_coefficient paper_diffusion] [--smoke] [--record] [--out DIR]
 
-Compares <dr^2> of two gases with the same initial cooling rate, one viscoelastic and one of
-constant restitution, by DSMC, kinetic theory and the closed forms (paper, Eqs. (42), (45), (46),
-(47)); computes its local exponent; and compares the range of times in which the paper expects its
-laws to hold, Eq. (43), with the range in which they do.
+paper_velocity_correlation: the autocorrelation <v(t').v(t)> of elastic spheres and of spheres of
+constant and viscoelastic restitution, its decay, and its relaxation time tau_v compared with the
+elastic Enskog time tau_E, Eqs. (24), (31), (32). DSMC starts from Maxwellian velocities at T(t').
+Hard and soft spheres first cool until t' and continue from the state reached there; elastic
+spheres, whose state does not change, start at once. Soft spheres support the viscoelastic law only.
+
+paper_diffusion_coefficient: is D = T tau_v? D(t) by three methods: from the integral of the
+autocorrelation from t' on, Eq. (9); from the slope of <dr^2>, Eq. (14); and by theory, Eqs. (34)
+and (40) as printed and with memory, dD/dt = T - D/tau_v.
+
+paper_diffusion: <dr^2> of two gases with the same initial cooling rate over time and over
+collisions, by DSMC, kinetic theory and the closed forms, Eqs. (42), (45), (46), (47); its local
+exponent; and the range of times in which the paper expects its laws to hold, Eq. (43), compared
+with the range in which they do.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import simpson
 
 import jaxgran
 from experiments.support import paper
-from experiments.support.closed_forms import paper_displacement
+from experiments.support.closed_forms import RELAXATION_CORRECTION, paper_displacement
 from experiments.support.scenes import beads, hard_beads
-from jaxgran.theory.equations import COOLING_RATE, paper_averages
+from jaxgran.theory.averages import Rates, collision_rate, impact_moments
+from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, paper_averages
 
-NAME = "paper_diffusion"
+PACKING = 0.05
+THEORY = jaxgran.KineticTheory(softness=False, correlations=False)
+SPHERES = {"hard_spheres": jaxgran.HardSpheres, "soft_spheres": jaxgran.SoftSpheres}
+MARKERS = {"dsmc": ("o", 3), "hard_spheres": ("s", 1), "soft_spheres": ("^", 1)}
+"""Marker of each model in the picture, and step between drawn points."""
+
+CORRELATION = {
+    "packing_fraction": PACKING,
+    "beta": 0.3,
+    "num_particles": 50_000,
+    "replicas": 8,
+    "seed": 0,
+    "lags": 61,
+    "longest": 12.0,  # in tau_E(t')
+    "restitutions": (1.0, 0.8, 0.6, 0.4, 0.2),
+    "betas": (0.05, 0.15, 0.3, 0.6, 1.0),
+    "num_spheres": 2000,  # in a box
+    "boxes": 4,
+    "age": 6.0,  # t' of hard and soft spheres, in tau_c(0)
+    "sphere_lags": 25,
+}
+FEW = {"num_particles": 2000, "replicas": 4, "restitutions": (1.0, 0.6), "betas": (0.3,)}
+FEW |= {"boxes": 0}
 
 
-@dataclass(frozen=True)
-class Config:
-    packing_fraction: float = 0.05
-    beta: float = 0.15  # of an impact at the thermal speed
-    num_particles: int = 20_000
-    replicas: int = 8
-    seed: int = 2
-    last: float = 1e6  # mean free times simulated
-    points: int = 22
-    last_theory: float = 1e14
-    deltas: tuple[float, ...] = (0.1, 0.03, 0.01)  # for which the range of times is tabulated
+def gases_of(beta: float) -> tuple[dict, float]:
+    """Return gases with their colour and label, and the constant restitution."""
+    viscoelastic = beads(PACKING, beta)
+    e = paper.alike(viscoelastic)
+    return {
+        "elastic": (hard_beads(PACKING, 1.0), paper.ELASTIC, "elastic"),
+        "constant": (hard_beads(PACKING, e), paper.CONSTANT, f"constant ε = {e:.3f}"),
+        "viscoelastic": (viscoelastic, paper.VISCOELASTIC, f"viscoelastic, β = {beta}"),
+    }, e
 
 
-SMOKE = Config(num_particles=1000, replicas=2, last=1e3, points=9, last_theory=1e10, deltas=(0.1,))
+def enskog_time(gas: jaxgran.Gas) -> float:
+    """Return tau_E = (3/2) tau_c of the gas at its initial temperature."""
+    return 1.5 * float(gas.mean_free_time)
 
 
-def main() -> None:
-    options = paper.options(__doc__, NAME)
-    config = SMOKE if options.smoke else Config()
-    clock = paper.Clock()
-    viscoelastic = beads(config.packing_fraction, config.beta)
-    e, delta = paper.alike(viscoelastic), float(viscoelastic.delta)
-    gases = {"viscoelastic": viscoelastic, "constant": hard_beads(config.packing_fraction, e)}
-    colors = {"viscoelastic": paper.VISCOELASTIC, "constant": paper.CONSTANT}
-    labels = {"viscoelastic": f"viscoelastic, δ = {delta:.3f}", "constant": f"constant ε = {e:.3f}"}
-    figure = paper.figure(
-        "Viscoelastic grains spread further: ⟨Δr²⟩ ~ t$^{1/6}$ instead of log t, but the exponent"
-        " 1/6 is reached very late",
-        columns=2,
-        rows=2,
-    )
-    in_time, exponent, in_collisions, forms = figure.axes
-    tau = np.geomspace(0.1, config.last_theory, 400)
-    measured = np.geomspace(0.1, config.last, config.points)
-    key = jax.random.key(config.seed)
-    model = jaxgran.DSMC(config.num_particles, config.replicas)
+@partial(jax.jit, static_argnames="dimension")
+def relaxation(law, theta, sonine, dimension: int):
+    """Return nu_v and the collision rate, in reduced units, at temperatures theta = T/T_0."""
+
+    def one(theta, sonine):
+        rates = Rates.from_averages(impact_moments(law, jnp.sqrt(theta), dimension), sonine)
+        return jnp.stack([rates.relaxation, collision_rate(sonine, dimension)])
+
+    return (jax.vmap(one)(theta, sonine) * jnp.sqrt(theta)[:, None]).T
+
+
+def decay_of_theory(gas: jaxgran.Gas, lags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return <v(0).v(t)>/(d T_0) = exp(-int nu_v dt) and the collisions per particle.
+
+    The lags, in tau_E, must be dense enough for the trapezoidal rule.
+    """
+    times = lags * enskog_time(gas)
+    curve = jaxgran.cool(gas, times, model=THEORY)
+    theta = curve.temperature / gas.temperature
+    nu = relaxation(gas.reduced_law, theta, curve.sonine, gas.dimension)[0]
+    nu = np.asarray(nu * gas.impact_speed / gas.path_length)
+    passed = np.concatenate([[0.0], np.cumsum((nu[1:] + nu[:-1]) / 2 * np.diff(times))])
+    return np.exp(-passed), np.asarray(curve.collisions)
+
+
+def stochastic(gas: jaxgran.Gas, config: dict) -> dict:
+    """Compute the autocorrelation by DSMC from a Maxwellian start, its tau_v and its integral."""
+    lags = np.linspace(0, config["longest"], config["lags"])
+    model = jaxgran.DSMC(config["num_particles"], config["replicas"])
+    key = jax.random.key(config["seed"])
+    return summary(jaxgran.cool(gas, lags * enskog_time(gas), model=model, key=key), lags)
+
+
+def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray) -> dict:
+    """Return means and standard errors over the replicas, as lists and numbers for JSON."""
+    each = paper.replicas_of(curve, "velocity_correlation")
+    each = each / each[:, :1]
+    collisions = paper.replicas_of(curve, "collisions").mean(axis=0)
+    early = (collisions > 0) & (collisions < 2.5)
+    # Early -ln C = r N + s N^2: the relaxation time is 1/r collisions, and tau_E is 3/2 collisions.
+    basis = np.stack([collisions[early], collisions[early] ** 2], axis=1)
+    fits = np.linalg.lstsq(basis, -np.log(each[:, early]).T, rcond=None)[0][0]
+    correlation, error = paper.mean_and_error(each)
+    row = {"lags": lags, "collisions": collisions, "correlation": correlation, "error": error}
+    found: dict[str, Any] = {name: paper.listed(values) for name, values in row.items()}
+    integrals = np.asarray(simpson(each, x=lags, axis=1))
+    for name, values in (("relaxation", 2 / 3 / fits), ("integral", integrals)):
+        found[name], found[f"{name}_error"] = map(float, paper.mean_and_error(values))
+    return found
+
+
+def in_boxes(gas: jaxgran.Gas, config: dict, ages: bool) -> dict[str, dict]:
+    """Compute it by every sphere model that supports the gas, from t' on; none without boxes."""
     found = {}
-    for name, gas in gases.items():
-        unit = float(gas.temperature * gas.mean_free_time**2)
-        theory = jaxgran.KineticTheory(softness=False, correlations=False)
-        of = jaxgran.cool(gas, tau * gas.mean_free_time, model=theory)
-        dsmc = jaxgran.cool(gas, measured * gas.mean_free_time, model=model, key=key)
-        spread, collisions, theta = columns(of, float(gas.temperature), unit)
-        each = paper.replicas_of(dsmc, "displacement") / unit
-        mean, error = paper.mean_and_error(each)
-        shown = {"fmt": "o", "ms": 3.5, "color": colors[name]}
-        _, dsmc_collisions, dsmc_theta = columns(dsmc, float(gas.temperature), unit)
-        far = tau <= 1e10
-        for axes, x, at in (
-            (in_time, tau, measured),
-            (in_collisions, collisions, dsmc_collisions),
-        ):
-            axes.plot(x[far], spread[far], color=colors[name], label=f"{labels[name]}: theory")
-            axes.errorbar(at, mean, error, **shown)
-        where, local = paper.slope(tau, spread)
-        at, exponents = paper.slope(measured, each)
-        local_mean, local_error = paper.mean_and_error(exponents)
-        exponent.plot(where, local, color=colors[name], label=f"{name}: theory")
-        exponent.errorbar(at, local_mean, local_error, **shown)
-        steps = np.diff(spread) / np.diff(collisions)
-        late = collisions[1:] > 20
-        miss = mean / np.exp(np.interp(np.log(measured), np.log(tau), np.log(spread))) - 1
+    for kind in SPHERES if isinstance(gas.law, jaxgran.Viscoelastic) else ["hard_spheres"]:
+        if not config["boxes"]:
+            continue
+        model = SPHERES[kind](config["num_spheres"], replicas=config["boxes"])
+        age, key = config["age"] * float(gas.mean_free_time), jax.random.key(config["seed"])
+        grown = jaxgran.cool(gas, [age / 2, age] if ages else [age / 100], model=model, key=key)
+        aged = gas.replace(temperature=float(grown.temperature[-1]))
+        lags = np.linspace(0, config["longest"], config["sphere_lags"])
+        later = replace(model, start=grown.particles)
+        curve = jaxgran.cool(aged, lags * enskog_time(aged), model=later)
+        # From 4 tau_E on the velocities at t' no longer matter, whatever the age.
+        i = int(np.searchsorted(lags, 4.0))
+        (slope,), (error,) = diffusion_of(curve, aged, slice(i, None, len(lags) - 1 - i))
+        cooled = float(aged.temperature / gas.temperature)
+        row = {"slope": float(slope), "slope_error": float(error), "temperature": cooled}
+        found[kind] = summary(curve, lags) | row
+    return found
+
+
+def diffusion_of(
+    curve: jaxgran.CoolingCurve, gas: jaxgran.Gas, which: slice
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return d<dr^2>/(6 T tau_E dt) between times, where T tau_E dt ~ sqrt(T) dt ~ dN."""
+    spread = paper.replicas_of(curve, "displacement")[:, which]
+    collisions = paper.replicas_of(curve, "collisions")[:, which]
+    unit = 9 * float(gas.temperature * gas.mean_free_time**2)
+    return paper.mean_and_error(np.diff(spread) / np.diff(collisions) / unit)
+
+
+def exact_relaxation(gas: jaxgran.Gas) -> float:
+    """Return tau_v/tau_E of the Maxwellian gas at its initial temperature, for any law."""
+    nu, rate = relaxation(gas.reduced_law, jnp.ones(1), jnp.zeros(1), gas.dimension)
+    return float((2 / 3 * rate / nu)[0])
+
+
+def printed_relaxation(gas: jaxgran.Gas) -> float:
+    """Return tau_v/tau_E by Eq. (31), or by the two terms of Eq. (32)."""
+    if isinstance(gas.law, jaxgran.ConstantRestitution):
+        return float(2 / (1 + gas.law.coefficient))
+    nu = paper_averages(gas.reduced_law, jnp.ones(()), gas.dimension)[2, 0]
+    return float(2 / 3 * collision_rate(0.0, gas.dimension) / nu)
+
+
+def velocity_correlation(smoke: bool) -> tuple:
+    config = CORRELATION | (FEW if smoke else {})
+    gases, e = gases_of(config["beta"])
+    title = (
+        "Dissipation lengthens the paths: velocities decay nearly exponentially in collisions,"
+        " more slowly in time"
+    )
+    figure = paper.figure(title, columns=3)
+    decay, counted, times = figure.axes
+    found: dict[str, Any] = {"restitution": e}
+    lags = np.linspace(0, config["longest"], 601)
+    for name, (gas, color, label) in gases.items():
+        expected, collisions = decay_of_theory(gas, lags)
+        row: dict[str, Any] = {"dsmc": stochastic(gas, config)}
+        row["paper_relaxation"] = printed_relaxation(gas)
+        row["exact_relaxation"] = exact_relaxation(gas)
+        row |= in_boxes(gas, config, ages=name != "elastic")
+        decay.plot(lags, expected, color=color, label=f"{label}: theory")
+        decay.plot(lags, np.exp(-lags / row["paper_relaxation"]), "--", color=color, lw=0.9)
+        counted.plot(collisions, expected, color=color, label=f"{label}: theory")
+        for kind in [kind for kind in MARKERS if kind in row]:
+            marker, every = MARKERS[kind]
+            of = {k: np.array(v)[::every] for k, v in row[kind].items() if isinstance(v, list)}
+            seen = of["correlation"] > 4 * of["error"]
+            style = {"fmt": marker, "ms": 3.5, "color": color}
+            style |= {"mfc": "none"} if kind in SPHERES else {}
+            for axes, x in ((decay, of["lags"]), (counted, of["collisions"])):
+                axes.errorbar(x[seen], of["correlation"][seen], of["error"][seen], **style)
+        found[name] = row
+    shared = {"yscale": "log", "ylim": (2e-3, 1.2), "ylabel": "⟨v(t′)·v(t)⟩ / ⟨v(t′)²⟩"}
+    kinds = "● DSMC, □ hard, △ soft spheres, — theory"
+    title = f"Over time: slower than exp(−(t−t′)/τ$_v$(t′)), dashed\n{kinds}"
+    paper.caption(decay, title, xlabel="(t − t′) / τ$_E$(t′)", xlim=(0, 9), **shared)
+    title = f"Over collisions: nearly exponential\n{kinds}"
+    paper.caption(counted, title, xlabel="collisions per particle since t′", xlim=(0, 9), **shared)
+    found["relaxation"] = relaxation_times(times, config)
+    return figure, config, found
+
+
+def lost_at_thermal_speed(gas: jaxgran.Gas) -> float:
+    return 1 - float(gas.reduced_law.restitution(jnp.ones(())))
+
+
+def relaxation_times(axes, config: dict) -> dict:
+    """Draw tau_v/tau_E for several strengths of dissipation over 1 - eps at the thermal speed."""
+    short, found = config | {"longest": 2.0, "lags": 11}, {}
+    laws = {
+        "constant": ([hard_beads(PACKING, e) for e in config["restitutions"]], paper.CONSTANT),
+        "viscoelastic": ([beads(PACKING, b) for b in config["betas"]], paper.VISCOELASTIC),
+    }
+    for name, (gases, color) in laws.items():
+        rows = [stochastic(gas, short) for gas in gases]
         found[name] = {
-            "tau": paper.listed(measured),
-            "displacement": paper.listed(mean),
-            "displacement_error": paper.listed(error),
-            "collisions": paper.listed(dsmc_collisions),
-            "temperature": paper.listed(dsmc_theta),
-            "dsmc_from_theory": paper.listed(miss),
-            "exponent": paper.listed(local_mean),
-            "exponent_error": paper.listed(local_error),
-            "exponent_of_theory": {f"{10.0**k:g}": _at(10.0**k, where, local) for k in range(14)},
-            "per_collision_in_1_5_ell2": paper.listed(steps[late][:: max(late.sum() // 6, 1)] / 9),
-            "linear_in_collisions_within": float(np.ptp(steps[late]) / steps[late].mean()),
+            "lost": [lost_at_thermal_speed(gas) for gas in gases],
+            "measured": [row["relaxation"] for row in rows],
+            "error": [row["relaxation_error"] for row in rows],
+            "exact": [exact_relaxation(gas) for gas in gases],
+            "paper": [printed_relaxation(gas) for gas in gases],
+        }
+        columns = (found[name][key] for key in ("lost", "measured", "error"))
+        axes.errorbar(*columns, fmt="o", ms=4, color=color, label=f"{name}: DSMC")
+    x = np.linspace(0, 0.85, 60)
+    axes.plot(x, 2 / (2 - x), color=paper.CONSTANT, label="Eq. (31): 2 / (1 + ε)")
+    line = [beads(PACKING, b) for b in np.linspace(1e-3, 1.15, 40)]
+    x = [lost_at_thermal_speed(gas) for gas in line]
+    color = paper.VISCOELASTIC
+    axes.plot(x, [*map(exact_relaxation, line)], color=color, label="exact average of ε(v)")
+    axes.plot(
+        x, [*map(printed_relaxation, line)], "--", color=color, lw=1, label="Eq. (32), two terms"
+    )
+    labels = {"xlabel": "1 − ε at the thermal speed", "ylabel": "initial τ$_v$ / τ$_E$"}
+    paper.caption(axes, "The relaxation time, from the initial slope", **labels)
+    return found
+
+
+def diffusion_coefficient(smoke: bool) -> tuple:
+    # The temperatures of the viscoelastic gas at t', over T_0; the last time in mean free times.
+    config: dict[str, Any] = {"waits": (1.0, 0.1, 0.01, 0.001), "last": 3000.0, "points": 14}
+    config |= {"waits": (1.0,), "last": 30.0, "points": 6} if smoke else {}
+    config["correlation"] = CORRELATION | (FEW if smoke else {"seed": 1})
+    gases, e = gases_of(CORRELATION["beta"])
+    title = "Three methods give the same D, and it is not T τ$_v$: the gas cools during τ$_v$"
+    figure = paper.figure(title, columns=3)
+    fall, ratio, kinds = figure.axes
+    found: dict[str, Any] = {"restitution": e}
+    for name, (gas, color, _) in gases.items():
+        found[name] = routes(name, gas, color, config, fall, ratio)
+    delta = float(gases["viscoelastic"][0].delta)
+    tau = np.geomspace(0.3, config["last"], 200)
+    u = 1 + COOLING_RATE[3] * delta * tau
+    printed = u ** (-5 / 6) + (COOLING_CORRECTION + RELAXATION_CORRECTION) * delta / u
+    fall.plot(tau, printed, "--", lw=1, color=paper.VISCOELASTIC, label="Eq. (40), to order δ")
+    title = f"viscoelastic (β = {CORRELATION['beta']}) and constant ε = {e:.3f}"
+    labels = {"xlabel": "time t / τ$_c$(0)", "ylabel": "D / D$_0$,  D$_0$ = T$_0$ τ$_E$(0)"}
+    paper.caption(fall, title, xscale="log", yscale="log", **labels)
+    ratio.plot([], [], color=paper.GUIDE, label="theory with memory")
+    ratio.plot([], [], "--", lw=1, color=paper.GUIDE, label="Eq. (34): D = T τ$_v$")
+    for style, label in (("o", "DSMC, slope of ⟨Δr²⟩"), ("D", "DSMC, ∫⟨v(t′)·v(t)⟩dt")):
+        ratio.plot([], [], style, mfc="none", color=paper.GUIDE, label=label)
+    title = "D over T τ$_E$; the gas cools to the right"
+    labels = {"xlabel": "T(t′) / T$_0$", "ylabel": "D / (T τ$_E$)"}
+    paper.caption(ratio, title, xscale="log", xlim=(2, 1e-5), ylim=(0.96, 1.62), **labels)
+    by_models(kinds, gases, found)
+    return figure, config, found
+
+
+def routes(name: str, gas: jaxgran.Gas, color: str, config: dict, fall, ratio) -> dict:
+    """Draw and return D of one gas by all methods, in units of T tau_E."""
+    start, tau_c = float(gas.temperature), float(gas.mean_free_time)
+    # D of elastic spheres is constant after a few collisions, and their collision rate is constant.
+    last = config["last"] if name != "elastic" else min(config["last"], 30.0)
+    tau, fine = np.geomspace(0.5, last, config["points"]), np.geomspace(0.02, last, 400)
+    of = jaxgran.cool(gas, fine * tau_c, model=THEORY)
+    size = config["correlation"]
+    model = jaxgran.DSMC(size["num_particles"], size["replicas"])
+    key = jax.random.key(size["seed"] + 1)
+    curve = jaxgran.cool(gas, tau * tau_c, model=model, key=key)
+    slopes, errors = diffusion_of(curve, gas, slice(None))
+    cooled = np.asarray(curve.temperature) / start
+    middle = np.sqrt(cooled[1:] * cooled[:-1])
+
+    def expected(quantity: str) -> np.ndarray:
+        values = np.log(np.asarray(getattr(of, quantity)))
+        return np.diff(np.exp(paper.interpolate(tau, fine, values)))
+
+    def printed(shares) -> list[float]:
+        return [printed_relaxation(gas.replace(temperature=start * x)) for x in shares]
+
+    waits = config["waits"] if name == "viscoelastic" else (1.0,)
+    runs = [stochastic(gas.replace(temperature=start * wait), size) for wait in waits]
+    unit = 9 * start * tau_c**2  # of <dr^2> per collision at D = T tau_E
+    row = {
+        "temperature": paper.listed(middle),
+        "by_slope": paper.listed(slopes),
+        "by_slope_error": paper.listed(errors),
+        "by_slope_theory": paper.listed(expected("displacement") / expected("collisions") / unit),
+        "waits": list(waits),
+        "by_integral": [run["integral"] for run in runs],
+        "by_integral_error": [run["integral_error"] for run in runs],
+        "paper": printed(waits),
+        **in_boxes(gas, size, ages=name != "elastic"),
+    }
+    if name != "elastic":  # elastic spheres stay at T_0
+        theta = np.asarray(of.temperature) / start
+        D = np.asarray(of.diffusion) / (1.5 * start * tau_c)
+        fall.plot(fine, D, color=color, label=name)
+        mean = slopes * np.diff(np.asarray(curve.collisions)) / np.diff(tau)
+        at = np.sqrt(tau[1:] * tau[:-1])
+        fall.errorbar(at[4:], mean[4:], (errors / slopes * mean)[4:], fmt="o", ms=4, color=color)
+        ratio.plot(theta, D / np.sqrt(theta), color=color, label=name)
+        ratio.plot(theta[::8], printed(theta[::8]), "--", color=color, lw=1)
+        ratio.errorbar(middle, slopes, errors, fmt="o", ms=4, color=color)
+        hollow = {"ms": 6, "mfc": "none", "color": color}
+        ratio.errorbar(waits, row["by_integral"], row["by_integral_error"], fmt="D", **hollow)
+    return row
+
+
+def by_models(axes, gases: dict, found: dict) -> None:
+    """Draw D/(T tau_E) soon after the start by each particle model and method."""
+    labels = []
+    for kind in ("dsmc", *SPHERES):
+        for way, words, marker in (("slope", "⟨Δr²⟩", "o"), ("integral", "∫⟨v·v⟩", "D")):
+            model = "DSMC" if kind == "dsmc" else kind.replace("_", " ")
+            labels.append(f"{model}, {words}")
+            for shift, (name, (_, color, _)) in enumerate(gases.items()):
+                row, at = found[name], -1 if way == "slope" else 0
+                if kind == "dsmc" and (way, name) == ("slope", "viscoelastic"):
+                    continue  # its D/(T tau_E) decreases: no single value is initial
+                if kind == "dsmc":
+                    value, error = row[f"by_{way}"][at], row[f"by_{way}_error"][at]
+                elif kind in row:
+                    value, error = row[kind][way], row[kind][f"{way}_error"]
+                else:
+                    continue
+                style = {"fmt": marker, "ms": 4.5, "mfc": color if marker == "o" else "none"}
+                style |= {"color": color, "label": name if len(labels) == 2 else None}
+                axes.errorbar(value, len(labels) - 1 + 0.14 * (shift - 1), xerr=error, **style)
+    axes.set_yticks(range(len(labels)), labels)
+    axes.invert_yaxis()
+    title = "All models, T(t′) ≥ 0.4 T$_0$"
+    paper.caption(axes, title, xlabel="D / (T τ$_E$)", xlim=(0.95, 1.62))
+
+
+def diffusion(smoke: bool) -> tuple:
+    config: dict[str, Any] = {"num_particles": 20_000, "last": 1e6, "points": 22, "replicas": 8}
+    config |= {"last_theory": 1e14, "deltas": (0.1, 0.03, 0.01)}  # deltas of the ranges of times
+    if smoke:
+        config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9}
+        config |= {"last_theory": 1e10, "deltas": (0.1,)}
+    config |= {"packing_fraction": PACKING, "beta": 0.15, "seed": 2}
+    gases, e = gases_of(config["beta"])
+    delta = float(gases["viscoelastic"][0].delta)
+    title = (
+        "Viscoelastic grains spread further: ⟨Δr²⟩ ~ t$^{1/6}$ instead of log t, but the exponent"
+        " 1/6 is reached very late"
+    )
+    figure = paper.figure(title, columns=2, rows=2)
+    in_time, exponent, in_collisions, forms = figure.axes
+    tau = np.geomspace(0.1, config["last_theory"], 400)
+    at = np.geomspace(0.1, config["last"], config["points"])
+    model = jaxgran.DSMC(config["num_particles"], config["replicas"])
+    found: dict[str, Any] = {"restitution": e, "delta": delta}
+    for name in ("viscoelastic", "constant"):
+        gas, color, label = gases[name]
+        theory = reduced(gas, jaxgran.cool(gas, tau * gas.mean_free_time, model=THEORY))
+        key = jax.random.key(config["seed"])
+        curve = jaxgran.cool(gas, at * gas.mean_free_time, model=model, key=key)
+        dsmc = reduced(gas, curve)
+        each = paper.replicas_of(curve, "displacement") / dsmc.unit
+        spread = paper.Compared(tau, theory.spread, at, each)
+        label = f"viscoelastic, δ = {delta:.3f}" if name == "viscoelastic" else label
+        spread.draw(in_time, exponent, color, f"{label}: theory", f"{name}: theory")
+        shown = {"fmt": "o", "ms": 3.5, "color": color}
+        in_collisions.plot(theory.collisions, theory.spread, color=color, label=f"{label}: theory")
+        in_collisions.errorbar(dsmc.collisions, spread.mean, spread.error, **shown)
+        steps = np.diff(theory.spread) / np.diff(theory.collisions)
+        steps = steps[theory.collisions[1:] > 20]
+        found[name] = {
+            "tau": paper.listed(at),
+            "displacement": paper.listed(spread.mean),
+            "displacement_error": paper.listed(spread.error),
+            "collisions": paper.listed(dsmc.collisions),
+            "temperature": paper.listed(dsmc.theta),
+            "dsmc_from_theory": paper.listed(spread.miss),
+            "exponent": paper.listed(spread.exponent),
+            "exponent_error": paper.listed(spread.exponent_error),
+            "exponent_of_theory": paper.at_powers(0, 14, spread.where, spread.local),
+            "per_collision_in_1_5_ell2": paper.listed(steps[:: max(steps.size // 6, 1)] / 9),
+            "linear_in_collisions_within": float(np.ptp(steps) / steps.mean()),
         }
         if name == "viscoelastic":
-            near = np.abs(local - 1 / 6) < 1 / 60
-            found["exponent_within_10_per_cent_from"] = paper.from_here(near, where)
-            found["closed_forms"] = formulas(forms, tau, spread, delta)
+            near = np.abs(spread.local - 1 / 6) < 1 / 60
+            found["exponent_within_10_per_cent_from"] = paper.from_here(near, spread.where)
+            rate, t = COOLING_RATE[3] * delta, jnp.asarray(tau)
+            of = {
+                "leading: u$^{1/6}$ − 1": (54 / rate * ((1 + rate * tau) ** (1 / 6) - 1), ":"),
+                "Eq. (40) integrated": (paper_displacement(t, delta, corrected=False), "--"),
+                "corrected, to order δ": (paper_displacement(t, delta), "-"),
+            }
+            found["closed_forms"] = paper.draw_forms(forms, spread, of, (1, 15))
     # At small delta the solver's steps cover few collisions; longer times would take minutes.
-    short = tau[tau < 1e12]
-    found["windows"] = [cooling_window(x, short) for x in config.deltas]
-    dress(figure.axes)
-    for name in gases:
-        row = found[name]
-        print(
-            f"{name}: DSMC from theory {100 * np.array(row['dsmc_from_theory'][1:]).min():+.2f} to "
-            f"{100 * np.array(row['dsmc_from_theory'][1:]).max():+.2f} %; last exponent "
-            f"{row['exponent'][-1]:.4f} +- {row['exponent_error'][-1]:.4f}; <dr^2> per collision "
-            f"constant within {100 * row['linear_in_collisions_within']:.1f} % beyond 20 collisions"
-        )
-    for row in found["windows"]:
-        print(row)
-    paper.write(figure, options, NAME, config, clock, restitution=e, delta=delta, **found)
+    found["windows"] = [cooling_window(x, tau[tau < 1e12]) for x in config["deltas"]]
+    for axes in (in_time, exponent, in_collisions):
+        axes.plot([], [], "o", ms=3.5, color=paper.GUIDE, label="DSMC")
+    length, logs = "⟨Δr²⟩ / (T$_0$ τ$_c$(0)²)", {"xlabel": "time t / τ$_c$(0)", "xscale": "log"}
+    title = "Over time: a straight line is log t"
+    paper.caption(in_time, title, ylabel=length, xlim=(0.05, 2e10), ylim=(0, 9000), **logs)
+    exponent.axhline(1 / 6, color=paper.GUIDE, ls=":", lw=1.2)
+    exponent.annotate("the paper's 1/6", (2e-1, 1 / 6), color=paper.GUIDE, va="bottom", fontsize=8)
+    labels = {"ylabel": "d ln⟨Δr²⟩ / d ln t", "yscale": "log", "ylim": (0.015, 2.2)}
+    paper.caption(exponent, "Local exponent; a logarithm has 0", **labels, **logs)
+    labels = {"xlabel": "collisions per particle  N", "ylabel": length}
+    title = "Over collisions: both linear, nearly the same line"
+    paper.caption(in_collisions, title, xlim=(0, 600), ylim=(0, 7500), **labels)
+    forms.axhline(0, color="0.7", lw=0.8)
+    title = "Closed forms of the viscoelastic ⟨Δr²⟩: difference from theory"
+    labels = {"ylabel": "formula / theory − 1", "xlim": (3, None)}
+    paper.caption(forms, title, **labels, **logs)
+    return figure, config, found
 
 
-def columns(curve: jaxgran.CoolingCurve, temperature: float, unit: float) -> list[np.ndarray]:
-    """Return <dr^2> in T_0 tau_c(0)^2, collisions, T/T_0."""
-    assert curve.displacement is not None and curve.collisions is not None
-    parts = (curve.displacement / unit, curve.collisions, curve.temperature / temperature)
-    return [np.asarray(part) for part in parts]
-
-
-def _at(x: float, where: np.ndarray, values: np.ndarray) -> float:
-    """Interpolate linearly in ln x."""
-    return float(np.interp(np.log(x), np.log(where), values))
-
-
-def formulas(axes, tau: np.ndarray, spread: np.ndarray, delta: float) -> dict:
-    """Draw relative errors of the closed forms of <dr^2>(t), and return them at some times."""
-    rate = COOLING_RATE[3] * delta
-    u, t = 1 + rate * tau, jnp.asarray(tau)
-    of = {
-        "leading: u$^{1/6}$ − 1": (54 / rate * (u ** (1 / 6) - 1), ":"),
-        "Eq. (40) integrated": (paper_displacement(t, delta, corrected=False), "--"),
-        "corrected, to order δ": (paper_displacement(t, delta), "-"),
-    }
-    rows = {}
-    shown = tau > 3
-    for label, (values, style) in of.items():
-        miss = np.asarray(values) / spread - 1
-        axes.plot(tau[shown], miss[shown], style, color=paper.VISCOELASTIC, label=label)
-        rows[label.split(":")[0]] = {f"{10.0**k:g}": _at(10.0**k, tau, miss) for k in range(1, 15)}
-    return rows
+def reduced(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> SimpleNamespace:
+    """Return <dr^2> in units of T_0 tau_c(0)^2, the unit, collisions, and T/T_0."""
+    unit = float(gas.temperature * gas.mean_free_time**2)
+    assert curve.displacement is not None
+    spread, theta = curve.displacement / unit, curve.temperature / gas.temperature
+    spread, collisions, theta = map(np.asarray, (spread, curve.collisions, theta))
+    return SimpleNamespace(unit=unit, spread=spread, collisions=collisions, theta=theta)
 
 
 def cooling_window(delta: float, tau: np.ndarray) -> dict:
     """Return the paper's range of times for a given delta, and the accuracy of its laws there."""
-    gas = beads(0.05, 1.5 * 2**0.1 * delta)
-    curve = jaxgran.cool(
-        gas,
-        tau * gas.mean_free_time,
-        model=jaxgran.KineticTheory(softness=False, correlations=False),
-    )
-    unit = float(gas.temperature * gas.mean_free_time**2)
-    spread, collisions, theta = columns(curve, float(gas.temperature), unit)
-    middle, local = paper.slope(tau, spread)
+    gas = beads(PACKING, 1.5 * 2**0.1 * delta)
+    curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=THEORY)
+    of = reduced(gas, curve)
+    middle, local = paper.slope(tau, of.spread)
     # tau_c |dT/dt| / T is the share of T lost in a collision, -d ln T/dN.
-    lost = -np.diff(np.log(theta)) / np.diff(collisions)
-    relaxed = np.asarray(curve.diffusion) / (1.5 * unit / float(gas.mean_free_time))
+    lost = -np.diff(np.log(of.theta)) / np.diff(of.collisions)
+    relaxed = np.asarray(curve.diffusion) / (1.5 * of.unit / float(gas.mean_free_time))
     averages = jax.vmap(lambda x: paper_averages(gas.reduced_law, x, 3)[2, 0])
-    slowing = np.asarray(averages(jnp.sqrt(jnp.asarray(theta))))
-    t_tau_v = np.sqrt(theta) * float(np.sqrt(32 * np.pi) / 3) / slowing
-    first, last = 1 / delta, delta ** (-11 / 5)
+    slowing = np.asarray(averages(jnp.sqrt(jnp.asarray(of.theta))))
+    off = np.abs(np.sqrt(of.theta) * float(np.sqrt(32 * np.pi) / 3) / slowing / relaxed - 1)
+    last = delta ** (-11 / 5)
     return {
         "delta": delta,
-        "paper_from": first,
+        "paper_from": 1 / delta,
         "paper_to": last,
-        "exponent_at_paper_to": _at(last, middle, local),
+        "exponent_at_paper_to": float(paper.interpolate(last, middle, local)),
         "lost_per_collision_at_start": float(lost[0]),
-        "lost_per_collision_at_paper_to": _at(last, middle, lost),
+        "lost_per_collision_at_paper_to": float(paper.interpolate(last, middle, lost)),
         "exponent_within_10_per_cent_from": paper.from_here(np.abs(6 * local - 1) < 0.1, middle),
-        "t_tau_v_within_5_per_cent_from": paper.from_here(
-            np.abs(t_tau_v / relaxed - 1) < 0.05, tau
-        ),
-        "t_tau_v_within_1_per_cent_from": paper.from_here(
-            np.abs(t_tau_v / relaxed - 1) < 0.01, tau
-        ),
+        "t_tau_v_within_5_per_cent_from": paper.from_here(off < 0.05, tau),
+        "t_tau_v_within_1_per_cent_from": paper.from_here(off < 0.01, tau),
     }
 
 
-def dress(panels) -> None:
-    """Give the panels their titles and labels."""
-    in_time, exponent, in_collisions, forms = panels
-    for axes in (in_time, exponent, in_collisions):
-        axes.plot([], [], "o", ms=3.5, color=paper.GUIDE, label="DSMC")
-    spread, time = "⟨Δr²⟩ / (T$_0$ τ$_c$(0)²)", "time t / τ$_c$(0)"
-    title = "Over time: a straight line is log t"
-    paper.caption(in_time, title, xlabel=time, ylabel=spread, xscale="log", ylim=(0, 9000))
-    exponent.axhline(1 / 6, color=paper.GUIDE, ls=":", lw=1.2)
-    exponent.annotate("the paper's 1/6", (2e-1, 1 / 6), color=paper.GUIDE, va="bottom", fontsize=8)
-    title = "Local exponent; a logarithm has 0"
-    labels = {"xlabel": time, "ylabel": "d ln⟨Δr²⟩ / d ln t"}
-    paper.caption(exponent, title, xscale="log", yscale="log", ylim=(0.015, 2.2), **labels)
-    title = "Over collisions: both linear, nearly the same line"
-    labels = {"xlabel": "collisions per particle  N", "ylabel": spread}
-    paper.caption(in_collisions, title, xlim=(0, 600), ylim=(0, 7500), **labels)
-    forms.axhline(0, color="0.7", lw=0.8)
-    title = "Closed forms of the viscoelastic ⟨Δr²⟩: difference from theory"
-    paper.caption(forms, title, xlabel=time, ylabel="formula / theory − 1", xscale="log")
-
+PARTS = {
+    "paper_velocity_correlation": velocity_correlation,
+    "paper_diffusion_coefficient": diffusion_coefficient,
+    "paper_diffusion": diffusion,
+}
 
 if __name__ == "__main__":
-    main()
+    paper.run_parts(__doc__, PARTS)

@@ -7,8 +7,9 @@ Each task runs in a new process without a cache of compiled programs. Prints the
 step, those of XLA's compiler, the number of programs compiled, and the ratio of the seconds to the
 reference: the first call of `jax.jit(jax.jacfwd(...))` of ln T of kinetic theory in A and T_0 in
 the same round. With CHECKOUT, the folder of another version (``git worktree add --detach FOLDER
-COMMIT``), both versions run in turn, and the last column is the ratio of seconds, now over before.
-Seconds and ratios are medians over the rounds.
+COMMIT``), both versions run in turn, and the last columns are the ratio of seconds, now over
+before, and its standard error. Seconds and ratios are medians over the rounds. With --record, a
+comparison of the speed of two versions is written to figures/benchmark_versions.json.
 
 The tasks:
     reference: the import, the Jacobian and the curve, their run times, and the numbers of
@@ -18,6 +19,7 @@ The tasks:
     command: `jaxgran fit` as a process, with an empty cache, again, and without a cache.
     SoftSpheres, HardSpheres, DSMC: runs of one mean free time; the last one of the first two
         continues from the particles of the one before.
+    speed: medians of repeated runs of larger gases and of kinetic theory, compiled before.
 """
 
 import argparse
@@ -39,7 +41,10 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 CURVE = ROOT / "experiments" / "data" / "lammps_cooling_dilute.csv"
 MODELS = "SoftSpheres", "HardSpheres", "DSMC"
-TASKS = "reference", "fit", "lengths", "command", *MODELS
+TASKS = "reference", "fit", "lengths", "command", *MODELS, "speed"
+SPEED = {"DSMC": 100_000, "HardSpheres": 4096, "SoftSpheres": 2000}
+"""Numbers of particles of the task speed."""
+
 REFERENCE = "first Jacobian"
 LENGTHS = range(40, 60)
 BOTH = "dissipative_constant", "temperature"
@@ -155,6 +160,32 @@ def first_run(steps: Steps, name: str, num: int) -> None:
         steps.run(f"{name} from a start again", lambda: run(start=particles))
 
 
+def speed(steps: Steps, num: int) -> None:
+    import jaxgran
+
+    gas = measured()[0].replace(dissipative_constant=3e-6)
+    times = np.linspace(0, 10.0, 6)[1:] * float(gas.mean_free_time)
+    for name, size in SPEED.items():
+        model = getattr(jaxgran, name)(min(size, num))
+
+        def run(model=model):
+            return jaxgran.cool(gas, times, model=model, progress=False).temperature
+
+        jax.block_until_ready(run())
+        steps.run(f"speed of {name}", run, repeats=7)
+    late = np.geomspace(0.1, 1e5, 50) * float(gas.mean_free_time)
+
+    def cool(constant):
+        return jaxgran.cool(gas.replace(dissipative_constant=constant), late).temperature
+
+    ways = {"KineticTheory": cool, "forward": lambda a: jax.jvp(cool, (a,), (1.0,))[1]}
+    ways["reverse"] = jax.grad(lambda a: np.log(late) @ cool(a))
+    for name, way in ways.items():
+        compiled = jax.jit(way)
+        jax.block_until_ready(compiled(3e-6))
+        steps.run(f"speed of {name}", lambda call=compiled: call(3e-6), repeats=100)
+
+
 def run_task(name: str, num: int) -> None:
     """Run a task in this process, and print its steps as JSON."""
     begin = time.perf_counter()
@@ -168,6 +199,8 @@ def run_task(name: str, num: int) -> None:
         steps.found["import"] = {"s": imported}
     if name in MODELS:
         first_run(steps, name, num)
+    elif name == "speed":
+        speed(steps, 200 * num)
     else:
         {"reference": reference, "fit": fit, "lengths": lengths}[name](steps)
     print(json.dumps({"package": jaxgran.__file__, "steps": steps.found}))
@@ -247,7 +280,7 @@ def main() -> None:
 
     tasks = [x for x in TASKS if x == "reference" or x in (options.only or TASKS)]
     tasks, num = (["reference", "DSMC"], 100) if options.smoke else (tasks, options.num)
-    if options.record and len(tasks) < len(TASKS):
+    if options.record and not options.checkout and len(tasks) < len(TASKS):
         parser.error("--record needs all tasks: leave out --only and --smoke")
     folders = [ROOT, *([options.checkout] if options.checkout else [])]
     rounds: dict[Path, list] = {folder: [] for folder in folders}
@@ -255,17 +288,27 @@ def main() -> None:
         for folder in folders[:: 1 - 2 * (k % 2)]:
             rounds[folder].append(measure(folder, tasks, num))
     now, *other = (median_over(rounds[folder]) for folder in folders)
+    compared = {}
     for name, row in now.items():
-        text = f"{name:28}" + "".join(f"{key} {x:<9.3g}" for key, x in row.items())
+        text = f"{name:34}" + "".join(f"{key} {x:<9.3g}" for key, x in row.items())
         if other and name in other[0]:
             key = next(iter(row))
-            before = other[0][name][key]
-            text += f"  before {before:<8.3g} now / before {row[key] / before:.3g}"
+            pairs = zip(*(rounds[folder] for folder in folders), strict=True)
+            each = [one[name][key] / before[name][key] for one, before in pairs]
+            spread = statistics.stdev(each) if len(each) > 1 else float("nan")
+            ratio, error = statistics.median(each), spread / len(each) ** 0.5
+            compared[name] = {"ratio": ratio, "error": error}
+            text += f"  before {other[0][name][key]:<8.3g} now / before {ratio:.3g} +- {error:.2g}"
         print(text)
-    results = {"num_particles": num, "rounds": options.rounds, **tables(now)}
-    results |= {"before": tables(other[0])} if other else {}
     jax.config.update("jax_enable_x64", True)  # as in the tasks
-    write_results("benchmark_compilation", options, options.out, **results)
+    results = {"num_particles": num, "rounds": options.rounds, **tables(now)}
+    if not other:
+        write_results("benchmark_compilation", options, options.out, **results)
+        return
+    speeds = {name: x for name, x in compared.items() if name.startswith("speed of ")}
+    rows = [{"model": name.removeprefix("speed of "), **x} for name, x in speeds.items()]
+    results |= {"rows": rows, "compared": compared, "before": tables(other[0])}
+    write_results("benchmark_versions", options, options.out, **results)
 
 
 def tables(steps: dict[str, dict[str, float]]) -> dict[str, dict]:

@@ -1,24 +1,20 @@
 """What does a derivative through a particle simulation cost, in time and in memory?
 
-    python experiments/speed/benchmark_derivatives.py [--fractions .01 .1] [--repeats 5] [--smoke]
-        [--out FILE]
+    python experiments/speed/benchmark_derivatives.py [--smoke] [--record] [--out FILE]
 
 ln T at the end of a run is computed in four ways: without a derivative, with its derivative in A in
 forward mode, with the same derivative in reverse mode, and with its Jacobian in A and Y. The runs
 are soft spheres, which start from equilibrated particles, and DSMC. The four ways run alternately
-in one process. The table shows the median run times without compilation; the compilation time of a
-way excludes programs that the ways above it have already compiled. If other processes use the same
-cores, only the ratio of CPU seconds is reliable.
+in one process. Prints the median run times without compilation; the compilation time of a
+way excludes programs that the ways above it have already compiled.
 
-The second table shows the increase of the peak memory by reverse mode through soft spheres, in a
-process that has already compiled it, for runs of increasing length, and the memory that storing the
-state after every block would need (Linux only).
+Then measures the increase of the peak memory by reverse mode through soft spheres, in a
+process that has already compiled it, for runs of increasing length, beside the memory that
+storing the state after every block would need (Linux only).
 """
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -28,52 +24,39 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.support.apart import alone
 from experiments.support.record import add_recording, write_results
 from experiments.support.scenes import beads
 from jaxgran.data.curve import Particles
 
-PACKING = 0.1
-BETA = 0.15
-STEPS_PER_CONTACT = 30
-CONTACT_FRACTIONS = (0.01, 0.1)
-SOFT_SIZE, STOCHASTIC_SIZE = 4096, 100_000
+PACKING, BETA, STEPS_PER_CONTACT = 0.1, 0.15, 30
 FREE_TIMES = 3.0  # length of a run, in mean free times at T_0
-BLOCKS = (1, 10, 100, 1000)
-REPEATS = 5
 STATUS = Path("/proc/self/status")
-LIMITS = {"forward, A": 3.0, "reverse, A": 5.0}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--fractions", nargs="+", type=float, default=CONTACT_FRACTIONS)
-    parser.add_argument("--repeats", type=int, default=REPEATS)
     parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    add_recording(parser)
     parser.add_argument("--memory-worker", nargs=2, help=argparse.SUPPRESS)
+    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if options.memory_worker:
         memory_worker(Path(options.memory_worker[0]), float(options.memory_worker[1]))
         return
-    fractions, repeats, blocks = options.fractions, options.repeats, BLOCKS
-    soft, stochastic = SOFT_SIZE, STOCHASTIC_SIZE
+    fractions, repeats, blocks = (0.01, 0.1), 5, (1, 10, 100, 1000)
+    soft, stochastic = 4096, 100_000
     if options.smoke:
         fractions, repeats, blocks, soft, stochastic = (0.1,), 1, (4,), 100, 1000
-    print(f"{jax.devices()[0].device_kind}, float64; a run is {FREE_TIMES:g} mean free times")
-    head = f"{'':42}{'compile s':>10}{'run s':>8}{'CPU s':>8}"
-    print(f"{head}{'ratio':>12}{'of CPU':>8}{'limit':>9}")
     rows = []
     for fraction in fractions:
         gas = beads(PACKING, BETA, fraction)
-        model = equilibrated(gas, soft)
         title = f"SoftSpheres, N={soft}, t_c/tau_c={fraction:g}"
-        rows.append(measure(title, gas, model, repeats, compiled=False))
-    gas = beads(PACKING, BETA, fractions[0])
-    model = jaxgran.DSMC(stochastic)
+        rows.append(measure(title, gas, equilibrated(gas, soft), repeats, compiled=False))
+    gas, model = beads(PACKING, BETA, fractions[0]), jaxgran.DSMC(stochastic)
     rows.append(measure(f"DSMC, N={stochastic}", gas, model, repeats, compiled=True))
     memory = measure_memory(fractions[0], soft, blocks)
     write_results("benchmark_derivatives", options, options.out, rows=rows, memory=memory)
@@ -120,41 +103,21 @@ def measure(title: str, gas: jaxgran.Gas, model, repeats: int, compiled: bool) -
     if compiled:
         ways = {name: jax.jit(way) for name, way in ways.items()}
     jax.clear_caches()
-    first, seconds = {}, {name: [] for name in ways}
-    for name, way in ways.items():
-        first[name], _ = timed(way, at)
-    for _ in range(repeats):
+    took = {name: [] for name in ways}
+    for _ in range(1 + repeats):
         for name, way in ways.items():
-            seconds[name].append(timed(way, at))
-    median = {name: np.median(took, axis=0) for name, took in seconds.items()}
-    print(title)
+            begin = time.perf_counter()
+            jax.block_until_ready(way(*at))
+            took[name].append(time.perf_counter() - begin)
+    median = {name: float(np.median(each[1:])) for name, each in took.items()}
     row = {"title": title, "ways": {}}
-    for name, (run, cpu) in median.items():
-        ratios = median[name] / median["plain"]
-        row["ways"][name] = {
-            "compile_s": float(first[name] - run),
-            "run_s": float(run),
-            "cpu_s": float(cpu),
-            "ratio": float(ratios[0]),
-            "cpu_ratio": float(ratios[1]),
-            "all_s": seconds[name],
-        }
-        print(
-            f"    {name:38}{first[name] - run:10.1f}{run:8.2f}{cpu:8.2f}{ratios[0]:12.2f}"
-            f"{ratios[1]:8.2f}" + (f"{LIMITS[name]:9g}" if name in LIMITS else ""),
-            flush=True,
-        )
-    _, forward = ways["forward, A"](*at)
-    _, reverse = ways["reverse, A"](*at)
-    row["reverse_over_forward"] = float(reverse / forward)
-    return row
-
-
-def timed(way, at) -> tuple[float, float]:
-    """Return wall seconds of a call, and CPU seconds of all its threads."""
-    begin, cpu = time.perf_counter(), time.process_time()
-    jax.block_until_ready(way(*at))
-    return time.perf_counter() - begin, time.process_time() - cpu
+    for name, run_s in median.items():
+        ratio = run_s / median["plain"]
+        row["ways"][name] = {"compile_s": took[name][0] - run_s, "run_s": run_s, "ratio": ratio}
+        print(title, name, row["ways"][name], flush=True)
+        row["ways"][name]["all_s"] = took[name][1:]
+    forward, reverse = (ways[name](*at)[1] for name in ("forward, A", "reverse, A"))
+    return row | {"reverse_over_forward": float(reverse / forward)}
 
 
 def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict | None:
@@ -162,27 +125,18 @@ def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict 
     if not STATUS.exists():
         print("no /proc here: peak memory is not measured")
         return None
-    gas = beads(PACKING, BETA, fraction)
-    start = equilibrated(gas, size).start
+    start = equilibrated(beads(PACKING, BETA, fraction), size).start
     assert start is not None
-    state = 2 * np.asarray(start.position).nbytes / 2**20  # positions and velocities, MiB
-    print(f"\nreverse mode, SoftSpheres, N={size}, t_c/tau_c={fraction:g}")
-    print(f"{'blocks':>8}{'before, MiB':>13}{'peak':>8}{'growth':>8}{'stored states':>17}")
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "start.npz"
         known = {name: x for name, x in start._asdict().items() if x is not None}
         np.savez(file, fraction=fraction, **known)
         for count in blocks:
-            command = [sys.executable, __file__, "--memory-worker", str(file), str(count)]
-            out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-            row = {"blocks": count, **json.loads(out.splitlines()[-1])}
-            before, peak = row["before_MiB"], row["peak_MiB"]
-            print(
-                f"{count:8d}{before:13.0f}{peak:8.0f}{peak - before:+8.0f}{count * state:17.1f}",
-                flush=True,
-            )
-            rows.append(row)
+            row = alone(__file__, "--memory-worker", str(file), str(count))
+            rows.append({"blocks": count, **row})
+            print(rows[-1], flush=True)
+    state = 2 * np.asarray(start.position).nbytes / 2**20  # positions and velocities
     return {"num_particles": size, "state_MiB": state, "rows": rows}
 
 

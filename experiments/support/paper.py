@@ -1,10 +1,8 @@
 """Common parts of the scripts of the paper: options, timing, local slopes, result files."""
 
-import argparse
 import time
-from collections.abc import Iterable
-from dataclasses import asdict
-from pathlib import Path
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -13,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.record import script_parser, write_picture, write_results
 from jaxgran.plotting import COLOURS
 
 INK, GUIDE, ELASTIC = (COLOURS[name] for name in ("measured", "guide", "elastic"))
@@ -39,32 +37,88 @@ class Clock:
         return {"compile_s": self.compile_s, "run_s": whole - self.compile_s}
 
 
-def options(doc: str | None, name: str) -> argparse.Namespace:
-    """Parse --smoke and --out, which all these scripts take, and switch float64 on."""
-    parser = argparse.ArgumentParser(
-        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
-    parser.add_argument("--out", type=Path, default=Path("results") / name)
-    add_recording(parser)
+def run_parts(doc: str | None, parts: dict[str, Callable]) -> None:
+    """Run the parts of a script that --only names, by default all, and write what they find.
+
+    A part takes whether the run is a small one, and returns its picture, its settings and what it
+    found, which are written to NAME.png and NAME.json.
+    """
+    parser = script_parser(doc, "paper")
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))
+    options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    return parser.parse_args()
+    for name in options.only:
+        clock = Clock()
+        figure, config, found = parts[name](options.smoke)
+        write_picture(figure, name, options, DPI)
+        results = {"config": config, "found": found, **clock.times}
+        write_results(name, options, options.out / f"{name}.json", **results)
+        print(f"{options.out / name}.png and .json, {sum(clock.times.values()):.0f} s")
 
 
-def write(
-    figure: Figure,
-    options: argparse.Namespace,
-    name: str,
-    config: Any,
-    clock: Clock,
-    **found: Any,
-) -> None:
-    """Write the picture and its data as JSON, and print the paths."""
-    folder = options.out
-    write_picture(figure, name, options, DPI)
-    results = {"config": asdict(config), "found": found, **clock.times}
-    write_results(name, options, folder / f"{name}.json", **results)
-    print(f"{folder / name}.png and .json, {sum(clock.times.values()):.0f} s")
+@dataclass
+class Compared:
+    """A quantity of a gas over time: theory at many times, and DSMC at some.
+
+    Attributes:
+        tau, theory: times in mean free times, and kinetic theory there.
+        where, local: midpoints of these times, and d ln theory / d ln t there.
+        at, each: times of DSMC, and its values in each replica.
+        mean, error: their mean and standard error.
+        middle, exponent, exponent_error: midpoints of these times, local exponents and errors.
+    """
+
+    tau: np.ndarray
+    theory: np.ndarray
+    at: np.ndarray
+    each: np.ndarray
+
+    def __post_init__(self) -> None:
+        self.mean, self.error = mean_and_error(self.each)
+        self.where, self.local = slope(self.tau, self.theory)
+        self.middle, exponents = slope(self.at, self.each)
+        self.exponent, self.exponent_error = mean_and_error(exponents)
+
+    @property
+    def miss(self) -> np.ndarray:
+        """Return DSMC over theory, minus 1."""
+        return self.mean / np.exp(interpolate(self.at, self.tau, np.log(self.theory))) - 1
+
+    def draw(
+        self, values: Axes, exponents: Axes | None, color: str, label: str, of_exponents: str
+    ) -> None:
+        """Draw theory as a line and DSMC as points, and their local exponents."""
+        style = {"fmt": "o", "ms": 3.5, "color": color}
+        values.plot(self.tau, self.theory, color=color, label=label)
+        values.errorbar(self.at, self.mean, self.error, **style)
+        if exponents is not None:
+            exponents.plot(self.where, self.local, color=color, label=of_exponents)
+            exponents.errorbar(self.middle, self.exponent, self.exponent_error, **style)
+
+
+def draw_forms(axes: Axes, of: Compared, forms: dict[str, tuple], powers: tuple[int, int]) -> dict:
+    """Draw relative errors of closed forms, and return them at powers of ten, by the short label.
+
+    Args:
+        forms: values at the times of the theory, and line styles, by label.
+        powers: the first power of ten, and the one after the last.
+    """
+    rows = {}
+    for label, (values, style) in forms.items():
+        miss = np.asarray(values) / of.theory - 1
+        axes.plot(of.tau, miss, style, color=VISCOELASTIC, label=label)
+        rows[label.split(":")[0].replace("$^2$", "^2")] = at_powers(*powers, of.tau, miss)
+    return rows
+
+
+def interpolate(x: Any, where: np.ndarray, values: np.ndarray) -> Any:
+    """Interpolate linearly in ln x."""
+    return np.interp(np.log(x), np.log(where), values)
+
+
+def at_powers(first: int, last: int, where: np.ndarray, values: np.ndarray) -> dict[str, float]:
+    """Return the values at powers of ten, from the first to before the last."""
+    return {f"{10.0**k:g}": float(interpolate(10.0**k, where, values)) for k in range(first, last)}
 
 
 def figure(title: str, columns: int, rows: int = 1) -> Figure:

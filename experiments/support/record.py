@@ -48,6 +48,18 @@ def add_recording(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def script_parser(doc: str | None, name: str, smoke: bool = True) -> argparse.ArgumentParser:
+    """Return a parser with --smoke, --record and --out, a folder, by default ``results/NAME``."""
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    if smoke:
+        parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
+    parser.add_argument("--out", type=Path, default=Path("results") / name)
+    add_recording(parser)
+    return parser
+
+
 def write_results(name: str, options: argparse.Namespace, path: Path | None, **results) -> None:
     """Write results to `path`, if there is one, and with --record to ``figures/NAME.json``.
 

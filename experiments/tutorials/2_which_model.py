@@ -5,8 +5,8 @@
 #
 # | model | what it solves | what it leaves out |
 # |---|---|---|
-# | `KineticTheory` | moments of the Enskog equation | correlations of velocities, clusters |
-# | `DSMC` | random collisions in a homogeneous gas | the same |
+# | `KineticTheory` | moments of the Enskog equation | clusters; lasting contacts but in part |
+# | `DSMC` | random collisions in a homogeneous gas | clusters, lasting contacts |
 # | `HardSpheres` | impacts without duration, particle by particle | lasting contacts |
 # | `SoftSpheres` | contacts resolved in time steps | nothing of these |
 #
@@ -76,7 +76,8 @@ axes.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# Kinetic theory and DSMC cool too fast: they know that contacts last, but not that in a dense gas
-# the velocities of neighbours become correlated. Hard spheres have these correlations, yet their
-# impacts are over at once. Only soft spheres agree with LAMMPS to the noise of so few particles,
-# and need a thousand times the time of kinetic theory.
+# Kinetic theory, DSMC and hard spheres cool too fast at late times. Impacts of DSMC and of hard
+# spheres are over at once, whereas here they last a sixth of a free flight; and DSMC does not know
+# that in a dense gas the velocities of neighbours become alike, which kinetic theory includes in
+# part. Only soft spheres agree with LAMMPS to the noise of so few particles, in a hundred times the
+# time of kinetic theory.

@@ -9,6 +9,10 @@ from jaxgran.scene.laws import C1, C2
 from tests.experiments.test_experiments import run
 
 
+def run_part(script, part, folder):
+    return run(f"paper/{script}.py", "--only", part, "--smoke", "--out", "here", cwd=folder)
+
+
 def test_claims_keep_what_is_found_over_what_is_printed(tmp_path):
     table = Table(tmp_path)
     ratios = [("exponent", -1.5, -2.0, 0.1), ("constant", 3.0, 2.0)]
@@ -18,7 +22,7 @@ def test_claims_keep_what_is_found_over_what_is_printed(tmp_path):
 
 @pytest.mark.slow
 def test_clustering_leaves_haffs_law(tmp_path):
-    done = run("paper/paper_clustering.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run_part("paper_clustering", "paper_clustering", tmp_path)
     assert done.returncode == 0, done.stderr
     for name in ("paper_clustering.png", "paper_clustering_fields.png"):
         assert (tmp_path / "here" / name).stat().st_size > 20_000
@@ -33,7 +37,7 @@ def test_clustering_leaves_haffs_law(tmp_path):
 
 @pytest.mark.slow
 def test_clusters_dissolve(tmp_path):
-    done = run("paper/paper_clustering_dissolves.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run_part("paper_clustering", "paper_clustering_dissolves", tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / "paper_clustering_dissolves.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / "paper_clustering_dissolves.json").read_text())
@@ -86,18 +90,18 @@ def exponents_follow_gamma(found):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name, holds",
+    "script, name, holds",
     [
-        ("paper_restitution", series_is_that_of_impacts),
-        ("paper_cooling", cools_as_theory),
-        ("paper_velocity_correlation", dissipation_lengthens_the_memory),
-        ("paper_diffusion_coefficient", diffusion_is_not_that_of_the_paper),
-        ("paper_diffusion", spreads_as_theory),
-        ("paper_exponents", exponents_follow_gamma),
+        ("paper_cooling", "paper_restitution", series_is_that_of_impacts),
+        ("paper_cooling", "paper_cooling", cools_as_theory),
+        ("paper_diffusion", "paper_velocity_correlation", dissipation_lengthens_the_memory),
+        ("paper_diffusion", "paper_diffusion_coefficient", diffusion_is_not_that_of_the_paper),
+        ("paper_diffusion", "paper_diffusion", spreads_as_theory),
+        ("paper_cooling", "paper_exponents", exponents_follow_gamma),
     ],
 )
-def test_paper_is_reproduced(name, holds, tmp_path):
-    done = run(f"paper/{name}.py", "--smoke", "--out", "here", cwd=tmp_path)
+def test_paper_is_reproduced(script, name, holds, tmp_path):
+    done = run_part(script, name, tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "here" / f"{name}.png").stat().st_size > 20_000
     record = json.loads((tmp_path / "here" / f"{name}.json").read_text())
@@ -117,10 +121,10 @@ def test_claims_that_need_no_particles_hold(tmp_path):
 
 @pytest.mark.slow
 def test_a_film_is_made_of_a_trajectory(tmp_path):
-    done = run("paper/clustering_film.py", "--smoke", "--out", "here", cwd=tmp_path)
+    done = run_part("paper_clustering", "clustering_film", tmp_path)
     assert done.returncode == 0, done.stderr
     for name in ("film.gif", "clustering_film.png", "run.gsd"):
         assert (tmp_path / "here" / name).stat().st_size > 5_000
     again = ("--trajectory", "here/run.gsd", "--out", "there")
-    done = run("paper/clustering_film.py", *again, cwd=tmp_path)
+    done = run("paper/paper_clustering.py", *again, cwd=tmp_path)
     assert "film.gif, 4 frames" in done.stdout, done.stderr
