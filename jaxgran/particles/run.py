@@ -30,6 +30,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
@@ -627,20 +628,9 @@ def compiling(progress: bool) -> Iterator[None]:
             print(f"\r{' ' * len(text)}\r", end="", file=sys.stderr, flush=True)
 
 
-_THREAD = threading.local()
-
-
-@contextmanager
-def interrupted_by(stop: threading.Event) -> Iterator[None]:
-    """Let `block_until_ready` raise KeyboardInterrupt in this thread once an event is set.
-
-    An interruption from the keyboard reaches only the main thread.
-    """
-    _THREAD.stop = stop
-    try:
-        yield
-    finally:
-        _THREAD.stop = None
+_STOP: ContextVar[threading.Event | None] = ContextVar("stop", default=None)
+"""Event that ends the runs of all replicas: a key pressed by the user reaches only the main
+thread."""
 
 
 def block_until_ready(arrays: T) -> T:
@@ -649,10 +639,11 @@ def block_until_ready(arrays: T) -> T:
     Polling whether they are ready would take 3 to 8 % of a run's time.
 
     Raises:
-        KeyboardInterrupt: also in a thread within `interrupted_by`, once its event is set.
+        KeyboardInterrupt: also in a thread of `run_replicas`, once another replica has failed or
+            was interrupted.
     """
     arrays = in_thread(lambda: jax.block_until_ready(arrays))
-    if (stop := getattr(_THREAD, "stop", None)) is not None and stop.is_set():
+    if (stop := _STOP.get()) is not None and stop.is_set():
         raise KeyboardInterrupt
     return arrays
 
@@ -733,43 +724,35 @@ def run_replicas(
             "name another file"
         )
     x64, stop = jax.config.read("jax_enable_x64"), threading.Event()
+    key = jax.random.key(0) if run.key is None else run.key
+    results: dict[int, T] = {}
+    errors: list[BaseException] = []
 
-    def run_on_device(first: int) -> list[T]:
-        with jax.enable_x64(x64), jax.default_device(devices[first]), interrupted_by(stop):
-            try:
-                return [
-                    run_one(k, _replica_options(run, k, len(devices)))
-                    for k in range(first, replicas, len(devices))
-                ]
-            except BaseException:
-                stop.set()
-                raise
+    def run_on_device(first: int) -> None:
+        _STOP.set(stop)
+        try:
+            with jax.enable_x64(x64), jax.default_device(devices[first]):
+                for k in range(first, replicas, len(devices)):
+                    options = run._replace(
+                        key=jax.random.fold_in(key, k),
+                        progress=run.progress and first == 0,
+                        checkpoint=run.checkpoint and Path(f"{run.checkpoint}.{k}"),
+                        trajectory=run.trajectory and file_of_replica(run.trajectory, k),
+                    )
+                    results[k] = run_one(k, options)
+        except BaseException as error:
+            errors.append(error)
+            stop.set()
 
     with ThreadPoolExecutor(len(devices)) as pool:
-        futures = [pool.submit(run_on_device, first) for first in range(len(devices))]
         try:
-            wait(futures)
+            wait([pool.submit(run_on_device, first) for first in range(len(devices))])
         except BaseException:
             stop.set()
             raise
-    errors = [error for future in futures if (error := future.exception()) is not None]
-    for error in sorted(errors, key=lambda error: isinstance(error, KeyboardInterrupt)):
-        raise error  # the error of a replica rather than the interruption of the others
-    results = [future.result() for future in futures]
-    return [results[k % len(devices)][k // len(devices)] for k in range(replicas)]
-
-
-def _replica_options(run: Run, k: int, num_devices: int) -> Run:
-    """Return the options of replica k; the first of those side by side shows its progress."""
-    key = jax.random.key(0) if run.key is None else run.key
-    checkpoint = None if run.checkpoint is None else Path(f"{run.checkpoint}.{k}")
-    trajectory = None if run.trajectory is None else file_of_replica(run.trajectory, k)
-    return run._replace(
-        key=jax.random.fold_in(key, k),
-        progress=run.progress and k % num_devices == 0,
-        checkpoint=checkpoint,
-        trajectory=trajectory,
-    )
+    if errors:
+        raise errors[0]  # the others are interruptions that it caused
+    return [results[k] for k in range(replicas)]
 
 
 def replica_inputs(inputs: Inputs, k: int, num_particles: int, run: Run) -> Inputs:
@@ -780,12 +763,11 @@ def replica_inputs(inputs: Inputs, k: int, num_particles: int, run: Run) -> Inpu
 
 def join_outputs(runs: list[Outputs]) -> Outputs:
     """Join the results of runs with one replica each to those of one run."""
-    position, velocity, spin = (
-        jax.tree.map(partial(_concatenate, 0), *(getattr(out, name) for out in runs))
-        for name in ("position", "velocity", "spin")
+    position, velocity, spin = jax.tree.map(
+        _concatenate, *((out.position, out.velocity, out.spin) for out in runs)
     )
-    records = join_records([out.records for out in runs])
     fault = np.bitwise_or.reduce([np.asarray(out.status) for out in runs])
+    records = join_records([out.records for out in runs])
     return Outputs(position, velocity, records, concrete_array(fault), spin)
 
 
@@ -795,13 +777,12 @@ def join_records(runs: list[dict[str, Array]]) -> dict[str, Array]:
     Records have the shape (times, replicas, ...); in derivatives along directions replicas are the
     last axis.
     """
+    axes = {name: -1 if name.endswith(".along") else 1 for name in runs[0]}
     return {
-        name: _concatenate(
-            -1 if name.endswith(".along") else 1, *(records[name] for records in runs)
-        )
-        for name in runs[0]
+        name: _concatenate(*(records[name] for records in runs), axis=axis)
+        for name, axis in axes.items()
     }
 
 
-def _concatenate(axis: int, *parts: Array) -> Array:
+def _concatenate(*parts: Array, axis: int = 0) -> Array:
     return concrete_array(np.concatenate([np.asarray(part) for part in parts], axis))
