@@ -13,6 +13,7 @@ the output of this script. With --pictures the pictures that show only recorded 
 
 import argparse
 import json
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -67,7 +68,9 @@ def documents(found: dict[str, Any]) -> dict[Path, str]:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {f.__name__: f for f in (each, errors, made, of, pick, power, span)}
+    environment.filters |= {
+        f.__name__: f for f in (each, errors, made, measured, of, pick, power, span)
+    }
     written: dict[Path, str] = {}
     for template in sorted(TEMPLATES.glob("*.md")):
         name, text = template.stem, environment.get_template(template.name).render(found)
@@ -119,6 +122,12 @@ def errors(both: tuple[Any, Any], digits: int = 1) -> str:
     return " / ".join(
         minus(f"{100 * off:+.{digits}f} ± {100 * error:.{digits}f}") for off, error in pairs
     )
+
+
+def measured(both: tuple[float, float]) -> str:
+    """Format a value and its standard error, this one with two digits: 3.080 ± 0.075."""
+    digits = max(0, 1 - math.floor(math.log10(both[1])))
+    return each(both, f".{digits}f", sep=" ± ")
 
 
 def pick(rows: Iterable[Any], *keys: Any) -> list:

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.support.claims.table import Table
+from experiments.paper.paper_claims import check
 from jaxgran.scene.laws import C1, C2
 from tests.experiments.test_experiments import run
 
@@ -13,11 +13,10 @@ def run_part(script, part, folder):
     return run(f"paper/{script}.py", "--only", part, "--smoke", "--out", "here", cwd=folder)
 
 
-def test_claims_keep_what_is_found_over_what_is_printed(tmp_path):
-    table = Table(tmp_path)
-    ratios = [("exponent", -1.5, -2.0, 0.1), ("constant", 3.0, 2.0)]
-    table.add("1", "claim", "ours", "checked", "agree", ratios=ratios)
-    assert table.rows[0].ratios == [("exponent", 0.75, 0.05), ("constant", 1.5, None)]
+def test_claims_keep_what_is_found_over_what_is_printed():
+    row = check("1", "agree", 0.9, 1.0, 0.2, ("exponent", -1.5, -2.0, 0.1), ("constant", 3.0, 2.0))
+    assert row["ratios"] == [("exponent", 0.75, 0.05), ("constant", 1.5, None)]
+    assert row["holds"] and not check("1", "agree", 0.7, 1.0, 0.2)["holds"]
 
 
 @pytest.mark.slow
@@ -114,7 +113,7 @@ def test_claims_that_need_no_particles_hold(tmp_path):
     done = run("paper/paper_claims.py", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "here" / "paper_claims.json").read_text())["rows"]
-    verdicts = {row["equation"]: row["verdict"] for row in rows}
+    verdicts = {row["name"]: row["verdict"] for row in rows}
     assert verdicts["39"] == "agree" and verdicts["41"] == "corrected"
     assert all(row["holds"] for row in rows)
 
