@@ -9,14 +9,13 @@ between kinetic theory and LAMMPS. Writes a picture and a JSON file.
 
 import argparse
 import time
-from pathlib import Path
 
 import jax
 import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import DATA, add_recording, write_picture, write_results
+from experiments.support.record import DATA, script_parser, write_picture, write_results
 from jaxgran.data.files import header_number
 from jaxgran.plotting import COLOURS, INK
 
@@ -25,16 +24,10 @@ STEPS_PER_CONTACT = 40
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = script_parser(__doc__, "compare_lammps")
     parser.add_argument("--replicas", type=int, default=4)
-    parser.add_argument("--smoke", action="store_true", help="few particles, early times only")
-    parser.add_argument("--out", type=Path, default=Path("results") / "compare_lammps")
-    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    options.out.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(10, 6.4), layout="constrained")
     axes = figure.subplots(2, 2, sharex="col", height_ratios=[2, 1])
     curves = {}

@@ -20,8 +20,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.lammps_library import new_lammps
-from experiments.support.record import DATA, add_recording, write_picture, write_results
+from experiments.support.lammps_library import granular_box, hertzian
+from experiments.support.record import DATA, script_parser, write_picture, write_results
 from experiments.support.scenes import beads
 
 FRICTION = {"tangential_damping": 0.6, "friction": 0.3}
@@ -40,19 +40,14 @@ SCENES = {  # contact duration in mean free times, friction, walls
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = script_parser(__doc__, "compare_lammps_elements", smoke=False)
     parser.add_argument("--particles", type=int, default=500)
     parser.add_argument("--store", action="store_true", help="write the data of the tests")
-    parser.add_argument("--out", type=Path, default=Path("results") / "compare_lammps_elements")
-    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if options.store:
         store(DATA / "lammps_elements_n64.npz")
         return
-    options.out.mkdir(parents=True, exist_ok=True)
     rows = {name: compare(name, options.particles) for name in SCENES}
     picture(rows, options)
     write_results(
@@ -139,36 +134,11 @@ def followed(gas: jaxgran.Gas, start: jaxgran.Particles, times, num: int) -> tup
 
 def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[str, np.ndarray]:
     """Return positions, velocities and angular velocities in LAMMPS at the given times."""
-    lmp = new_lammps()
-    side, sigma = float(start.box_side), float(gas.diameter)
-    walls = gas.container
-    lmp.commands_list(
-        [
-            "units si",
-            "atom_style sphere",
-            "boundary p p p" if walls is None else "boundary f f f",
-            "newton off",
-            f"region box block 0 {side} 0 {side} 0 {side}",
-            "create_box 1 box",
-        ]
-    )
-    x, v = (np.asarray(a[0], float) for a in (start.position, start.velocity))
-    n = len(x)
-    lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, x.ravel().tolist(), v.ravel().tolist())
-    lmp.commands_list(
-        [
-            f"set group all diameter {sigma!r}",
-            f"set group all density {float(gas.density)!r}",
-            "pair_style granular",
-            f"pair_coeff * * {contact(gas, gas.law, walls=False)}",
-            f"neighbor {0.3 * sigma!r} bin",
-            "neigh_modify every 1 delay 0 check yes",
-            "comm_modify vel yes",
-            "fix move all nve/sphere",
-        ]
-    )
+    walls, n, side = gas.container, start.position.shape[1], float(start.box_side)
+    law = hertzian(gas, gas.law, tangential(gas, FRICTION))
+    lmp = granular_box(gas, start.position[0], start.velocity[0], side, law, 0.3, "nve/sphere")
     if walls is not None:
-        law = contact(gas, walls.restitution, walls=True)
+        law = hertzian(gas, walls.restitution, tangential(gas, OF_WALLS), wall=True)
         for axis in "xyz":
             lmp.command(f"fix {axis} all wall/gran granular {law} {axis}plane 0 {side!r}")
     found: dict[str, list] = {"position": [], "velocity": [], "omega": []}
@@ -186,20 +156,8 @@ def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[s
     return {name: np.array(rows) for name, rows in found.items()}
 
 
-def contact(gas: jaxgran.Gas, law, walls: bool) -> str:
-    """Return the LAMMPS contact law between spheres or with a flat wall."""
-    sigma, mass = float(gas.diameter), float(gas.mass)
-    m_eff, radius = (mass, sigma / 2) if walls else (mass / 2, sigma / 4)
-    own = law.of_wall() if walls else law
-    rho = float(own.alpha(diameter=gas.diameter, mass=gas.mass)) * m_eff
-    stiffness = rho / radius**0.5
-    damping = 1.5 * float(law.dissipative_constant) * rho / (m_eff * radius**0.5)
-    values = OF_WALLS if walls else FRICTION
-    tangential = "0 0" if gas.surface is None else " ".join(str(value) for value in values.values())
-    return (
-        f"hertz {stiffness!r} {damping!r} tangential linear_nohistory {tangential} "
-        "damping viscoelastic limit_damping"
-    )
+def tangential(gas: jaxgran.Gas, values: dict[str, float]) -> str:
+    return "0 0" if gas.surface is None else " ".join(str(value) for value in values.values())
 
 
 def picture(rows: dict[str, dict], options: argparse.Namespace) -> None:

@@ -14,11 +14,9 @@ Standard errors are over replicas. Relative biases mean little at times when ln 
 A. Also prints the run time of derivatives, forward and reverse, over that of a run without them.
 """
 
-import argparse
 import time
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +24,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.record import script_parser, write_picture, write_results
 from experiments.support.scenes import beads
 from jaxgran.plotting import COLOURS, INK
 
@@ -39,13 +37,8 @@ POINTS = 40  # times from which the flow is known
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = script_parser(__doc__, "derivatives_in_flows")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
-    parser.add_argument("--smoke", action="store_true", help="few particles, early times only")
-    parser.add_argument("--out", type=Path, default=Path("results") / "derivatives_in_flows")
-    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     results = {name: examine(name, options.smoke) for name in options.scenes}

@@ -8,14 +8,11 @@ largest error (Lawson's reweighting of a linearised least-squares fit). Prints t
 ``jaxgran/scene/restitution_table.py`` contains, and draws eps and the error of the package's law.
 """
 
-import argparse
-from pathlib import Path
-
 import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.record import script_parser, write_picture, write_results
 from jaxgran.plotting import COLOURS
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, viscoelastic_restitution
@@ -63,12 +60,7 @@ def fit_rational(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results") / "derive_restitution")
-    add_recording(parser)
-    options = parser.parse_args()
+    options = script_parser(__doc__, "derive_restitution", smoke=False).parse_args()
     jax.config.update("jax_enable_x64", True)
     # beta P and Q have the same degree, so that their ratio tends to a constant.
     shapes = {

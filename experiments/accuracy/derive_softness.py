@@ -8,8 +8,6 @@ c/(d - 1) at some beta, the coefficients of `jaxgran.theory.equations` and the l
 error of the fit, and draws both.
 """
 
-import argparse
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,7 +17,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from experiments.support.record import add_recording, write_picture
+from experiments.support.record import script_parser, write_picture
 from jaxgran.plotting import COLOURS, INK
 from jaxgran.theory.equations import MEAN_OVERLAP, softness_coefficient
 
@@ -47,12 +45,7 @@ def impact(beta: float) -> tuple[float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results") / "derive_softness")
-    add_recording(parser)
-    options = parser.parse_args()
+    options = script_parser(__doc__, "derive_softness", smoke=False).parse_args()
     nodes = np.concatenate([[1e-4], np.geomspace(1e-3, 12, 70)])
     loss, slope = np.array([impact(beta) for beta in nodes]).T
     loss, slope = (CubicSpline(np.sqrt(nodes), x / nodes) for x in (loss, slope))

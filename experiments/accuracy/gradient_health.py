@@ -1,7 +1,7 @@
 """Is the derivative of the cooling curve of a chaotic gas accurate, and for how long?
 
     python experiments/accuracy/gradient_health.py [--scenes dilute dense clustering]
-        [--late-differences] [--smoke] [--out DIR]
+        [--smoke] [--record] [--out DIR]
 
 d ln T / d ln A of three gases after 1, 3, 10, 30 and 100 collisions per particle, by
 
@@ -13,24 +13,19 @@ d ln T / d ln A of three gases after 1, 3, 10, 30 and 100 collisions per particl
 
 and the dependence of the projected derivative on the interval between projections. Standard errors
 are over replicas. `derivatives_in_flows.py` examines two more gases with a flow, disks and hard
-spheres; `flow_memory.py` measures projections that keep more quantities. Prints tables, draws a
-picture and writes a JSON file. Both keep the scenes of an older JSON file that are not computed.
-With --late-differences only the finite differences at the late times are computed again.
+spheres. Prints tables, draws a
+picture with the recorded scenes that are not computed, and writes a JSON file of each scene.
 """
 
-import argparse
-import json
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 import jaxgran
-from experiments.support.record import add_recording, figures, save, write_picture, write_results
+from experiments.support.record import figures, script_parser, write_picture, write_results
 from experiments.support.scenes import beads
 from jaxgran.plotting import COLOURS, INK
 
@@ -52,37 +47,17 @@ STEPS_PER_CONTACT = 25
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = script_parser(__doc__, "gradient_health")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
-    parser.add_argument("--late-differences", action="store_true", help="compute only these again")
-    parser.add_argument("--smoke", action="store_true", help="few particles, early times only")
-    parser.add_argument("--out", type=Path, default=Path("results") / "gradient_health")
-    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    file, results = options.out / "gradient_health.json", {}
-    if file.exists():  # keep scenes that are not selected
-        results = json.loads(file.read_text())["scenes"]
-    if options.late_differences and (missing := set(options.scenes) - set(results)):
-        parser.error(
-            f"--late-differences needs earlier results, and {file} has none of "
-            f"{', '.join(sorted(missing))}: run these scenes without it first"
-        )
-    options.out.mkdir(parents=True, exist_ok=True)
+    results = {name: figures(f"gradient_health_{name}") for name in SCENES}
     settings = {"step_of_ln_A": STEP, "steps_per_contact": STEPS_PER_CONTACT}
-    for name in tqdm(options.scenes, disable=options.smoke):
-        before = results.get(name) if options.late_differences else None
-        results[name] = examine(name, options.smoke, before)
-        save(file, scenes=results, **settings, key="0; differences of set k of late replicas: k")
-    shown = {name: results[name] for name in SCENES if name in results}
-    if options.record:  # with what was recorded of the other scenes
-        shown = {name: shown.get(name) or figures(f"gradient_health_{name}") for name in SCENES}
-    write_picture(draw(shown), "gradient_health", options)
     for name in options.scenes:
-        write_results(f"gradient_health_{name}", options, None, **results[name], **settings)
-    print(f"written to {options.out}")
+        results[name] = examine(name, options.smoke)
+        file = f"gradient_health_{name}"
+        write_results(file, options, options.out / f"{file}.json", **results[name], **settings)
+    write_picture(draw(results), "gradient_health", options)
 
 
 def times_of(gas: jaxgran.Gas, collisions, size: int) -> np.ndarray:
@@ -104,8 +79,8 @@ def times_of(gas: jaxgran.Gas, collisions, size: int) -> np.ndarray:
     return times(model, np.geomspace(0.1 * tau_c, found[-1], 60))
 
 
-def examine(name: str, smoke: bool, before: dict | None) -> dict:
-    """Compute all results of a scene, or only the late differences if earlier results are given."""
+def examine(name: str, smoke: bool) -> dict:
+    """Compute all results of a scene."""
     begin, gas = time.perf_counter(), beads(*SCENES[name][:3])
     collisions = COLLISIONS[:2] if smoke else COLLISIONS
     (size, many), few, most = SCENES[name][3:], FEW_REPLICAS, EARLY_REPLICAS
@@ -152,51 +127,34 @@ def examine(name: str, smoke: bool, before: dict | None) -> dict:
 
     sets = 1 if smoke else SETS[name]
     late = np.concatenate([differences(spheres(many), times, seed) for seed in range(sets)])
-    if before is None:
-        early = spheres(most), times[:EARLY]
-        slopes, counts, seconds = forward(spheres(many))
-        columns = {
-            "kinetic theory": (exact, 0 * exact),
-            "differences": joined(differences(*early), late),
-            "projected": joined(forward(*early)[0], slopes),
-        }
-        # A plain derivative is computed under tracing, where arrays cannot be enlarged.
-        plain = spheres(few, projection=None).sized_for(gas)
-        columns["plain"] = over_replicas(forward(plain, times[:PLAIN_HORIZON])[0])
-        by_interval = {}
-        for interval in INTERVALS[:2] if smoke else INTERVALS:
-            slopes = forward(spheres(few, projection=interval))[0]
-            by_interval[interval] = over_replicas(slopes)
-        # Reverse mode: the gradient of the mean ln T at the last time, compared with forward mode.
-        model = spheres(few, projection=INTERVALS[1])
-        last = jax.grad(lambda x: jnp.mean(log_temperatures(x, model)[0][:, -1]))(0.0)
-        disagreement = abs(float(last) - by_interval[INTERVALS[1]][0][-1])
-    else:
-        counts, seconds = np.asarray(before["collisions"]), before["tangent_seconds"]
-        columns = arrays(before["d_ln_T_d_ln_A"])
-        for kept, new in zip(columns["differences"], over_replicas(late), strict=True):
-            kept[EARLY:] = new[EARLY:]
-        by_interval = {float(k): v for k, v in arrays(before["by_interval"]).items()}
-        disagreement = before["reverse_minus_forward"]
+    early = spheres(most), times[:EARLY]
+    slopes, counts, seconds = forward(spheres(many))
+    columns = {
+        "kinetic theory": (exact, 0 * exact),
+        "differences": joined(differences(*early), late),
+        "projected": joined(forward(*early)[0], slopes),
+    }
+    # A plain derivative is computed under tracing, where arrays cannot be enlarged.
+    plain = spheres(few, projection=None).sized_for(gas)
+    columns["plain"] = over_replicas(forward(plain, times[:PLAIN_HORIZON])[0])
+    by_interval = {}
+    for interval in INTERVALS[:2] if smoke else INTERVALS:
+        slopes = forward(spheres(few, projection=interval))[0]
+        by_interval[interval] = over_replicas(slopes)
+    # Reverse mode: the gradient of the mean ln T at the last time, compared with forward mode.
+    model = spheres(few, projection=INTERVALS[1])
+    last = jax.grad(lambda x: jnp.mean(log_temperatures(x, model)[0][:, -1]))(0.0)
+    disagreement = abs(float(last) - by_interval[INTERVALS[1]][0][-1])
 
-    print(f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name][:3]}, N = {size}, ", end="")
-    print(f"{many} replicas ({most} at the first {EARLY} times, {len(late)} for late differences)")
-    print(f"box {float(gas.box_side(size) / gas.diameter):.3g} diameters, ", end="")
-    print(f"L_c {float(gas.critical_box / gas.diameter):.3g}")
-    print(f"{'collisions':>11}" + "".join(f"{column:>24}" for column in columns))
-    for i in range(len(times)):
-        print(f"{counts[i]:11.1f}", end="")
-        print("".join(f"{m[i]:+14.4g} ± {e[i]:7.2g}" for m, e in columns.values() if i < len(m)))
     bias = columns["projected"][0] / columns["differences"][0] - 1
     spread = np.hypot(columns["projected"][1], columns["differences"][1])
     spread /= np.abs(columns["differences"][0])
-    print("projected over differences: ", end="")
-    print(", ".join(f"{100 * b:+.1f} ± {100 * e:.1f} %" for b, e in zip(bias, spread, strict=True)))
+    print(f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name][:3]}, N = {size}, {many} replicas")
+    print_errors("collisions", {"": (counts, 0 * counts)})
+    print_errors("d ln T/d ln A", columns)
+    print_errors("over differences, %", {"projected": (100 * bias, 100 * spread)})
+    print_errors("by interval, mean free times", by_interval)
     print(f"reverse minus forward, last point: {disagreement:.1e}; one tangent run {seconds:.0f} s")
-    print("interval between projections, in mean free times:")
-    for interval, (mean, error) in by_interval.items():
-        print(f"{interval:11.2g}", end="")
-        print("".join(f"{m:+14.4g} ± {e:7.2g}" for m, e in zip(mean, error, strict=True)))
     return {
         "collisions": counts.tolist(),
         "d_ln_T_d_ln_A": {n: [m.tolist(), e.tolist()] for n, (m, e) in columns.items()},
@@ -212,9 +170,10 @@ def examine(name: str, smoke: bool, before: dict | None) -> dict:
     }
 
 
-def arrays(columns: dict) -> dict[str, tuple[np.ndarray, ...]]:
-    """Return means and standard errors from a JSON file."""
-    return {name: tuple(map(np.asarray, values)) for name, values in columns.items()}
+def print_errors(title: str, rows: dict) -> None:
+    for name, (mean, error) in rows.items():
+        cells = (f"{m:+12.4g} ± {e:7.2g}" for m, e in zip(mean, error, strict=True))
+        print(f"{title + ' ' + str(name):>45}{''.join(cells)}")
 
 
 def over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.lammps_library import new_lammps
+from experiments.support.lammps_library import granular_box, hertzian
 from experiments.support.record import DATA, PICTURES
 from jaxgran.data.files import header_number
 from jaxgran.plotting import COLOURS, INK
@@ -117,30 +117,12 @@ def run(
     steps: np.ndarray,
 ) -> list[float]:
     """Return T of one replica at the start and after the given numbers of steps."""
-    lmp = new_lammps()
-    n, mass, sigma = len(start[0]), float(gas.mass), float(gas.diameter)
+    n, mass = len(start[0]), float(gas.mass)
+    elastic = gas.replace(dissipative_constant=0.0)
+    skin = 0.15 if n * float(gas.packing_fraction) > 60 else 0.3
+    lmp = granular_box(gas, *start, side, hertzian(elastic, elastic.law), skin, "nve")
     lmp.commands_list(
         [
-            "units si",
-            "atom_style sphere",
-            "boundary p p p",
-            "newton off",
-            f"region box block 0 {side} 0 {side} 0 {side}",
-            "create_box 1 box",
-        ]
-    )
-    position, velocity = (x.ravel().tolist() for x in start)
-    lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, position, velocity)
-    lmp.commands_list(
-        [
-            f"set group all diameter {sigma}",
-            f"set group all density {float(gas.density)}",
-            "pair_style granular",
-            coefficients(gas.replace(dissipative_constant=0.0)),
-            f"neighbor {0.15 * sigma if n * float(gas.packing_fraction) > 60 else 0.3 * sigma} bin",
-            "neigh_modify every 1 delay 0 check yes",
-            "comm_modify vel yes",
-            "fix move all nve",
             f"timestep {dt}",
             "thermo_style custom step ke",
             "thermo 1000000000",
@@ -158,7 +140,7 @@ def run(
     for axis in "xyz":
         lmp.command(f"variable v{axis} atom v{axis}*{factor}")
     lmp.command("velocity all set v_vx v_vy v_vz")
-    lmp.command(coefficients(gas))
+    lmp.command(f"pair_coeff * * {hertzian(gas, gas.law)}")
     lmp.command("run 0")
     found = [temperature()]
     for more in np.diff(steps, prepend=0):
@@ -186,17 +168,6 @@ def draw() -> Figure:
     axes.legend(frameon=False, fontsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
-
-
-def coefficients(gas: jaxgran.Gas) -> str:
-    """Return the LAMMPS line for ``F = rho xi^(3/2) + (3/2) A rho sqrt(xi) xi_dot``."""
-    rho, reduced_mass = float(gas.alpha * gas.mass / 2), float(gas.mass / 2)
-    root = (float(gas.diameter) / 4) ** 0.5
-    eta = 1.5 * float(gas.value("dissipative_constant")) * rho / (reduced_mass * root)
-    return (
-        f"pair_coeff * * hertz {rho / root} {eta} tangential linear_nohistory 0 0 "
-        "damping viscoelastic limit_damping"
-    )
 
 
 def write(

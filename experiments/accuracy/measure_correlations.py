@@ -18,9 +18,7 @@ of the same length in L_c as those of eps = .7, and errors of some .15 %. (A box
 lacks waves that the theory of a large box counts.)
 """
 
-import argparse
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -29,7 +27,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.record import script_parser, write_picture, write_results
 from experiments.support.scenes import hard_beads
 from jaxgran.models.error_model import flow_share
 from jaxgran.plotting import COLOURS, INK
@@ -223,18 +221,20 @@ def build_up(rows: list[dict]) -> tuple[float, float]:
 
 
 def said(row: dict) -> str:
-    name = (
-        f"{row['dimension']}D phi {row['packing_fraction']:<4g} eps {row['restitution']:<4g} "
-        f"N {row['num_particles']:<5d}"
+    names = (
+        "box",
+        "rate",
+        "error",
+        "theory",
+        "sigma",
+        "flow",
+        "h",
+        "h_error",
+        "h_theory",
+        "virial",
     )
-    rate = f"{row['rate']:.4f} +- {row['error']:.4f}"
-    if "virial" in row:
-        return f"{name} collision rate {rate}, virial series {1 + row['virial']:.4f}"
-    return (
-        f"{name} box {row['box']:.2f} L_c: rate {rate}, theory {row['theory']:.4f} "
-        f"({row['sigma']:+.1f} sigma; flow {row['flow']:.4f}); h {row['h']:.3f} +- "
-        f"{row['h_error']:.3f}, theory {row['h_theory']:.3f}"
-    )
+    scene = ", ".join(f"{name} {row[name]:g}" for name in Point._fields)
+    return f"{scene}: " + ", ".join(f"{name} {row[name]:.4f}" for name in names if name in row)
 
 
 def draw(rows: list[dict]) -> Figure:
@@ -261,13 +261,8 @@ def draw(rows: list[dict]) -> Figure:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = script_parser(__doc__, "measure_correlations")
     parser.add_argument("--full", action="store_true", help="the whole grid, errors below .15 %%")
-    parser.add_argument("--smoke", action="store_true", help="one gas, few impacts")
-    parser.add_argument("--out", type=Path, default=Path("results") / "measure_correlations")
-    add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     impacts = 2e4 if options.smoke else 1.6e6 if options.full else 7e5
@@ -293,7 +288,6 @@ def main() -> None:
     n_0, error = build_up(cooled)
     print(f"mean square of the differences {chi:.1f} sigma^2; largest {said(apart)}")
     print(f"correlations arise in N_0 = {n_0:.1f} +- {error:.1f} collisions per particle")
-    options.out.mkdir(parents=True, exist_ok=True)
     write_picture(draw(rows), "measure_correlations", options)
     path = options.out / "measure_correlations.json"
     results = {"rows": rows, "marks": MARKS.tolist(), "build_up": [n_0, error], "chi_squared": chi}

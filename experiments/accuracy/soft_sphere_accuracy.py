@@ -9,10 +9,8 @@ Each table gives the order of the error: the slope of its logarithm over that of
 Writes a picture and a JSON file.
 """
 
-import argparse
 import dataclasses
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +21,7 @@ from matplotlib.ticker import NullFormatter
 
 import jaxgran
 from experiments.support.record import DATA as DATA_FOLDER
-from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.record import script_parser, write_picture, write_results
 from experiments.support.scenes import beads
 from jaxgran.particles.capacity import Capacity
 from jaxgran.plotting import COLOURS, INK
@@ -44,15 +42,8 @@ PACKING = 0.2
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--smoke", action="store_true", help="few steps, early times only")
-    parser.add_argument("--out", type=Path, default=Path("results") / "soft_sphere_accuracy")
-    add_recording(parser)
-    options = parser.parse_args()
+    options = script_parser(__doc__, "soft_sphere_accuracy").parse_args()
     jax.config.update("jax_enable_x64", True)
-    options.out.mkdir(parents=True, exist_ok=True)
     num, finest, phases, ledger, elastic = None, FINEST, PHASES, LEDGER, ELASTIC
     if options.smoke:
         small = {"num_particles": 64, "collision_times": 2, "replicas": 2}
@@ -243,7 +234,6 @@ def draw(results: dict) -> Figure:
         line(axes, results[key], "end", "s--", INK, "rms at the end")
     for axes in (trajectory, impact, ledger, elastic):
         axes.set(xscale="log", yscale="log", xlabel="steps per contact")
-        guides(axes)
         ticks = axes.lines[0].get_xdata()
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
         axes.set_xticks([], minor=True)
@@ -260,25 +250,6 @@ def line(axes: Axes, result: dict, name: str, style: str, colour: str, label: st
     error = [abs(row[name]) for row in result["rows"]]
     label = f"{label} (order {result['order'][name]:.1f})"
     axes.plot(steps, error, style, color=colour, ms=5, lw=1.4, label=label)
-
-
-def guides(axes: Axes) -> None:
-    """Draw lines of order 2 and 3/2, which begin above the first point."""
-    steps = np.asarray(axes.lines[0].get_xdata(), float)
-    top = 1.6 * max(np.max(np.asarray(one.get_ydata(), float)) for one in axes.lines)
-    for order, style, name in ((1.5, ":", "3/2"), (2.0, "-", "2")):
-        axes.plot(
-            steps, top * (steps / steps[0]) ** -order, style, color=COLOURS["guide"], lw=1, zorder=0
-        )
-        axes.annotate(
-            f"order {name}",
-            (steps[-1], top * (steps[-1] / steps[0]) ** -order),
-            color=INK,
-            fontsize=8,
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-        )
 
 
 if __name__ == "__main__":

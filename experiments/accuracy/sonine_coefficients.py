@@ -8,9 +8,7 @@ a Maxwellian start, in two and three dimensions. Prints the simulated values wit
 errors, and their differences from kinetic theory.
 """
 
-import argparse
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +17,7 @@ from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.boltzmann import BLOCK, Boltzmann
-from experiments.support.record import add_recording, write_picture, write_results
+from experiments.support.record import script_parser, write_picture, write_results
 from experiments.support.scenes import beads, hard_beads
 from jaxgran.plotting import COLOURS, INK
 
@@ -42,7 +40,7 @@ MARKS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
 
 BETA = 0.15
 MODEL = jaxgran.KineticTheory(softness=False, correlations=False)
-NAMES = {"sonine": "a_2", "third_sonine": "a_3", "diffusion": "D"}
+NAMES = ("T/T_0", "a_2", "a_3", "D")
 
 
 def cooling_state(d: int, eps: float, blocks: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -126,39 +124,24 @@ def draw(states: list[dict], courses: list[dict]) -> Figure:
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     panels = figure.subplots(1, 3)
     shades = {3: COLOURS["kinetic theory"], 2: COLOURS["soft spheres"]}
-    for axes, k, title in zip(
-        panels, (0, 2), ("a₂ at constant ε", "D at constant ε"), strict=False
-    ):
-        for d in (3, 2):
-            own = [s for s in states if s["dimension"] == d and not (k == 0 and s["eps"] == 1)]
-            own = [s for s in own if k or abs(s["simulated"][0]) > 0.01]
-            scale = [100 / abs(s["simulated"][k]) for s in own]
-            y = [s["off"][k] * f for s, f in zip(own, scale, strict=True)]
-            e = [s["error"][k] * f for s, f in zip(own, scale, strict=True)]
-            x = [s["eps"] for s in own]
-            axes.errorbar(
-                x, y, e, fmt="o-" if d == 3 else "s--", ms=4, color=shades[d], label=f"{d}D"
-            )
+    titles = ("a₂ at constant ε", "D at constant ε", f"T of a viscoelastic gas, β = {BETA:g}")
+    for axes, k, title in zip(panels, (0, 2, None), titles, strict=True):
+        for d, style in ((3, "o-"), (2, "s--")):
+            if k is None:
+                (own,) = (c for c in courses if c["dimension"] == d)
+                x = own["collisions"]
+                value, off, error = (np.array(own[n][0]) for n in ("simulated", "off", "error"))
+            else:
+                some = [s for s in states if s["dimension"] == d]
+                some = [s for s in some if k or (abs(s["simulated"][0]) > 0.01 and s["eps"] < 1)]
+                x = [s["eps"] for s in some]
+                value, off, error = (
+                    np.array([s[n][k] for s in some]) for n in ("simulated", "off", "error")
+                )
+            scale, look = 100 / np.abs(value), {"fmt": style, "ms": 4, "color": shades[d]}
+            axes.errorbar(x, off * scale, error * scale, label=f"{d}D", **look)
         axes.set(xlabel="ε", title=title, ylabel="theory − simulation (%)")
-    for c in courses:
-        d = c["dimension"]
-        f = 100 / np.array(c["simulated"][0])
-        y, e = np.array(c["off"][0]) * f, np.array(c["error"][0]) * f
-        panels[2].errorbar(
-            c["collisions"],
-            y,
-            e,
-            fmt="o-" if d == 3 else "s--",
-            ms=4,
-            color=shades[d],
-            label=f"{d}D",
-        )
-    panels[2].set(
-        xlabel="collisions per particle",
-        xscale="log",
-        title=f"T of a viscoelastic gas, β = {BETA:g}",
-        ylabel="theory − simulation (%)",
-    )
+    panels[2].set(xlabel="collisions per particle", xscale="log")
     for axes in panels:
         axes.axhline(0, color=INK, lw=0.8)
         axes.legend(frameon=False, loc="upper left" if axes is panels[2] else "upper right")
@@ -166,28 +149,15 @@ def draw(states: list[dict], courses: list[dict]) -> Figure:
     return figure
 
 
-def say_course(c: dict) -> None:
-    print(f"d = {c['dimension']}, viscoelastic, beta = {BETA:g}, {c['spheres']:.2g} spheres:")
-    for i, n in enumerate(c["collisions"]):
-        v, o, e = (np.array(c[name])[:, i] for name in ("simulated", "off", "error"))
-        print(
-            f"  {n:4.0f} collisions: T {100 * o[0] / v[0]:+.3f} +- {100 * e[0] / v[0]:.3f} %; "
-            + "; ".join(
-                f"{name} {v[k]:.5f} +- {e[k]:.5f}, theory {o[k]:+.5f}"
-                for k, name in enumerate(NAMES.values(), 1)
-            ),
-            flush=True,
-        )
+def say(title: str, value: np.ndarray, off: np.ndarray, error: np.ndarray) -> None:
+    """Print simulated values, and how far theory is from them."""
+    rows = zip(NAMES, value, error, off, strict=True)
+    words = (f"{name} {v:.5f} +- {e:.5f}, theory {o:+.5f}" for name, v, e, o in rows)
+    print(f"{title}: {'; '.join(words)}", flush=True)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--smoke", action="store_true", help="few spheres, two values of eps")
-    parser.add_argument("--out", type=Path, default=Path("results") / "sonine_coefficients")
-    add_recording(parser)
-    options = parser.parse_args()
+    options = script_parser(__doc__, "sonine_coefficients").parse_args()
     jax.config.update("jax_enable_x64", True)
     blocks, epsilons = (32, (0.5, 1.0)) if options.smoke else (256, EPSILONS)
     states = []
@@ -199,18 +169,12 @@ def main() -> None:
                 {"dimension": d, "eps": eps, "simulated": value.tolist(), "off": off.tolist()}
                 | {"error": error.tolist()}
             )
-            print(
-                f"d = {d}, eps = {eps:g}: "
-                + "; ".join(
-                    f"{name} = {v:.5f} +- {e:.5f}, theory {o:+.5f} ({100 * o / abs(v):+.2f} %)"
-                    for name, v, e, o in zip(NAMES.values(), value, error, off, strict=True)
-                ),
-                flush=True,
-            )
-    courses = []
-    for d in (3, 2):
-        courses.append(error_model(d, blocks, 2 if options.smoke else SEEDS[d]))
-        say_course(courses[-1])
+            say(f"d = {d}, eps = {eps:g}", *(np.append(1.0, x) for x in (value, off, error)))
+    courses = [error_model(d, blocks, 2 if options.smoke else SEEDS[d]) for d in (3, 2)]
+    for course in courses:
+        columns = (np.array(course[name]).T for name in ("simulated", "off", "error"))
+        for n, *row in zip(course["collisions"], *columns, strict=True):
+            say(f"d = {course['dimension']}, beta = {BETA:g}, {n:g} collisions", *row)
     write_picture(draw(states, courses), "sonine_coefficients", options)
     path = options.out / "sonine_coefficients.json"
     write_results("sonine_coefficients", options, path, states=states, courses=courses)

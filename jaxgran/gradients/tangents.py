@@ -19,8 +19,8 @@ mean free times. This is less noisy than projecting at fixed times, since no tim
 or counted twice where a fixed end time moves through the steps.
 
 In a box longer than L_c a gas also remembers its flow, and these derivatives are too large.
-``experiments/accuracy/flow_memory.py`` measures projections that keep more of the tangents there:
-none of them is right at 100 collisions per particle, so the package has none. Use differences of
+``experiments/accuracy.md`` has figures of projections that keep more of the tangents there: none of
+them is right at 100 collisions per particle, so the package has none. Use differences of
 runs (`jaxgran.gradients.rule.by_differences`) in such boxes.
 """
 
