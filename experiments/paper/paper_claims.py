@@ -254,83 +254,64 @@ def claims(found: dict, n: dict[str, Any]) -> list[dict[str, Any]]:
     delayed = min(one["N"][0] - 3 * one["N"][1] for one in n["later"])
     third, lost = found["restitution"]["recovered"]["clipped"][4], spread["windows"][0]
     theory = n["relaxation_of_theory"]
-    T_error, T_even_error = visco["exponent_error"][-1], even["exponent_error"][-1]
-    as_printed, decayed = n["correlation_printed"], n["correlation_exponential"]
-    return [
-        check("1", AGREE, third, 4 / 15, 2e-3),
-        check("2–4", AGREE, n["hertz"], 3.21806546, 1e-7),
-        check("5", AGREE, C1, 1.15344, 1e-5, ("C₁", C1, 1.15344)),
-        check("6", AGREE, C2, 0.79826, 1e-5, ("C₂", C2, 0.79826)),
-        check("7–9", AGREE, elastic["by_slope"][-1], elastic["by_integral"][0], 3 * error),
-        check(
-            *("10", AGREE, last, -5 / 3, 0.05),
-            ("exponent of T(t), viscoelastic", last, -5 / 3, T_error),
-        ),
-        check("10, 42", AGREE, max(n["lammps_T"] / 0.02, n["lammps_displacement"] / 0.08), 0, 1),
-        check(
-            *("11", AGREE, n["rate_power"], 0.6, 1e-3),
-            ("exponent of 1/τ₀ in T₀", n["rate_power"], 0.6),
-        ),
-        check("12, 27", AGREE, n["frequency"], 1, 0.02, ("1/τ_c at η = 0.05", n["frequency"], 1)),
-        check("13, 43", CORRECTED, lost["lost_per_collision_at_paper_to"], 0, 0.1),
-        check("14", AGREE, n["slopes_off"], 0, 0.03),
-        check(
-            *("22, 24", CORRECTED, decay / decayed, 1, 0.05),
-            (f"⟨v(0)·v(4τ_E)⟩, ε = {eps:.2f}", decay, as_printed, decay_error),
-        ),
-        check(
-            *("31", AGREE, tau_v / tau_v_paper, 1, 0.02),
-            (f"τ_v, ε = {n['lowest_eps']:.1f}", tau_v, tau_v_paper, tau_v_error),
-        ),
-        check(
-            *("32", AGREE, theory / n["relaxation_first"], 1, 1e-3),
-            ("first coefficient of 1/τ_v", theory, n["relaxation_first"]),
-        ),
-        check(
-            *("33, 34", CORRECTED, D / D_theory, 1, 0.01),
-            (f"D/(T τ_E), ε = {eps:.2f}", D, constant["paper"][-1], D_error),
-        ),
-        check("36", CORRECTED, n["cooling_off"], 0, 1e-5),
-        check(
-            *("38", CORRECTED, n["temperature_off"], 0, 0.01),
-            ("T(0), δ = 0.093", 1.0, n["first_temperature"]),
-            ("a₁", n["a1"], n["a1_paper"]),
-        ),
-        check("39", AGREE, RATE, 0.831928, 1e-5, ("τ_c(0)/(δτ₀)", RATE, 0.831928)),
-        check(
-            *("40", CORRECTED, n["a3_of_theory"] / n["a3"], 1, 0.01),
-            ("a₃", n["a3"], n["a3_paper"]),
-        ),
-        check("41", CORRECTED, n["D0"], 1, 1e-9),
-        check(
-            *("42", CORRECTED, n["displacement_off"], 0, 1e-4),
-            ("exponent of ⟨Δr²⟩(t)", far, 1 / 6, far_error),
-        ),
-        check(
-            *("44", AGREE, last_even, -2, 0.01),
-            ("exponent of T(t), constant ε", last_even, -2.0, T_even_error),
-        ),
-        check("45", AGREE, n["logarithm_off"], 0, 0.03),
-        check("46", AGREE, max(bend[0] / 0.01, bend[1] / 0.3), 0, 1),
-        check("47", AGREE, n["leading"][-1], 1, 0.1),
-        check("—", CORRECTED, n["a2_of_theory"] / -n["a2"], 1, 0.02),
-        check(
-            *("text, clocks of the gas", AGREE, n["power_of_N"], -10, 3),
-            ("exponent of T(N)", n["power_of_N"], -10.0),
-        ),
-        check("text, γ", AGREE, max(abs(x - y) for _, x, y in powers), 0, 0.03, *powers),
-        check(
-            *("text, N_c", AGREE, max(abs(N[0] / q[0] - 1) for N, _, _, q in onset), 0, 0.05),
-            *((f"N_c, ε = {q[1]:g}", N[0], q[0], N[1]) for N, _, _, q in onset),
-        ),
-        check(
-            *("text, T_c", AGREE, max(map(abs, shifts)), 0, 1 if no_haff else 0),
-            *((f"T/T₀ at N_c, ε = {q[1]:g}", T[0], q[2], T[1]) for _, T, _, q in onset),
-        ),
-        check("text, clock", AGREE, universal, True, 0.5),
-        check("text, retarded", AGREE, delayed > 1, True, 0.5),
-        check("text, dissolution", AGREE, uneven[-1] / max(uneven), 0, 0.3),
-    ]
+    compared = {
+        "5": [("C₁", C1, 1.15344)],
+        "6": [("C₂", C2, 0.79826)],
+        "10": [("exponent of T(t), viscoelastic", last, -5 / 3, visco["exponent_error"][-1])],
+        "11": [("exponent of 1/τ₀ in T₀", n["rate_power"], 0.6)],
+        "12, 27": [("1/τ_c at η = 0.05", n["frequency"], 1)],
+        "22, 24": [
+            (f"⟨v(0)·v(4τ_E)⟩, ε = {eps:.2f}", decay, n["correlation_printed"], decay_error)
+        ],
+        "31": [(f"τ_v, ε = {n['lowest_eps']:.1f}", tau_v, tau_v_paper, tau_v_error)],
+        "32": [("first coefficient of 1/τ_v", theory, n["relaxation_first"])],
+        "33, 34": [(f"D/(T τ_E), ε = {eps:.2f}", D, constant["paper"][-1], D_error)],
+        "38": [("T(0), δ = 0.093", 1, n["first_temperature"]), ("a₁", n["a1"], n["a1_paper"])],
+        "39": [("τ_c(0)/(δτ₀)", RATE, 0.831928)],
+        "40": [("a₃", n["a3"], n["a3_paper"])],
+        "42": [("exponent of ⟨Δr²⟩(t)", far, 1 / 6, far_error)],
+        "44": [("exponent of T(t), constant ε", last_even, -2, even["exponent_error"][-1])],
+        "text, clocks of the gas": [("exponent of T(N)", n["power_of_N"], -10)],
+        "text, γ": powers,
+        "text, N_c": [(f"N_c, ε = {q[1]:g}", N[0], q[0], N[1]) for N, _, _, q in onset],
+        "text, T_c": [(f"T/T₀ at N_c, ε = {q[1]:g}", T[0], q[2], T[1]) for _, T, _, q in onset],
+    }
+    checks = {
+        "1": (AGREE, third, 4 / 15, 2e-3),
+        "2–4": (AGREE, n["hertz"], 3.21806546, 1e-7),
+        "5": (AGREE, C1, 1.15344, 1e-5),
+        "6": (AGREE, C2, 0.79826, 1e-5),
+        "7–9": (AGREE, elastic["by_slope"][-1], elastic["by_integral"][0], 3 * error),
+        "10": (AGREE, last, -5 / 3, 0.05),
+        "10, 42": (AGREE, max(n["lammps_T"] / 0.02, n["lammps_displacement"] / 0.08), 0, 1),
+        "11": (AGREE, n["rate_power"], 0.6, 1e-3),
+        "12, 27": (AGREE, n["frequency"], 1, 0.02),
+        "13, 43": (CORRECTED, lost["lost_per_collision_at_paper_to"], 0, 0.1),
+        "14": (AGREE, n["slopes_off"], 0, 0.03),
+        "22, 24": (CORRECTED, decay / n["correlation_exponential"], 1, 0.05),
+        "31": (AGREE, tau_v / tau_v_paper, 1, 0.02),
+        "32": (AGREE, theory / n["relaxation_first"], 1, 1e-3),
+        "33, 34": (CORRECTED, D / D_theory, 1, 0.01),
+        "36": (CORRECTED, n["cooling_off"], 0, 1e-5),
+        "38": (CORRECTED, n["temperature_off"], 0, 0.01),
+        "39": (AGREE, RATE, 0.831928, 1e-5),
+        "40": (CORRECTED, n["a3_of_theory"] / n["a3"], 1, 0.01),
+        "41": (CORRECTED, n["D0"], 1, 1e-9),
+        "42": (CORRECTED, n["displacement_off"], 0, 1e-4),
+        "44": (AGREE, last_even, -2, 0.01),
+        "45": (AGREE, n["logarithm_off"], 0, 0.03),
+        "46": (AGREE, max(bend[0] / 0.01, bend[1] / 0.3), 0, 1),
+        "47": (AGREE, n["leading"][-1], 1, 0.1),
+        "—": (CORRECTED, n["a2_of_theory"] / -n["a2"], 1, 0.02),
+        "text, clocks of the gas": (AGREE, n["power_of_N"], -10, 3),
+        "text, γ": (AGREE, max(abs(x - y) for _, x, y in powers), 0, 0.03),
+        "text, N_c": (AGREE, max(abs(N[0] / q[0] - 1) for N, _, _, q in onset), 0, 0.05),
+        "text, T_c": (AGREE, max(map(abs, shifts)), 0, 1 if no_haff else 0),
+        "text, clock": (AGREE, universal, True, 0.5),
+        "text, retarded": (AGREE, delayed > 1, True, 0.5),
+        "text, dissolution": (AGREE, uneven[-1] / max(uneven), 0, 0.3),
+    }
+    return [check(name, *row, *compared.get(name, [])) for name, row in checks.items()]
 
 
 if __name__ == "__main__":
