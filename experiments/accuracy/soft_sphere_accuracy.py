@@ -105,12 +105,8 @@ def follow_lammps(steps_per_contact, finest: int) -> dict:
         for steps, v in velocities.items()
     ]
     floor = rms(own, lammps)
-    print(
-        f"velocities of 64 spheres after {float(duration[0] / data['tau_c']):.2g} tau_c, rms "
-        f"difference over rms velocity; {floor:.1e} from LAMMPS to {finest} steps"
-    )
-    columns = {"lammps": "to LAMMPS", "own": f"to {finest} steps"}
-    return {"finest": finest, "finest_to_lammps": floor, **table(rows, columns)}
+    title = f"rms difference of velocities; {floor:.1e} from LAMMPS to {finest} steps"
+    return {"finest": finest, "finest_to_lammps": floor, **table(title, rows)}
 
 
 def impacts(steps_per_contact, phases: int) -> dict:
@@ -150,13 +146,8 @@ def impacts(steps_per_contact, phases: int) -> dict:
             miss = -after @ normal / normal_speeds[k] - float(exact.restitution[k])
             row = {"steps": steps, "bias": float(np.mean(miss)), "scatter": float(np.std(miss))}
             rows.append(row | {"largest": float(np.abs(miss).max())})
-        print(
-            f"eps of one impact {name}, beta = {float(betas[k]):.3g}, against the ODE's "
-            f"{float(exact.restitution[k]):.6f}; it lasts {durations[k]:.2f} mean contacts"
-        )
-        columns = {"bias": "mean", "scatter": "scatter", "largest": "largest"}
         scene = {"beta": float(betas[k]), "mean_contacts": float(durations[k])}
-        results[name] = {**scene, **table(rows, columns)}
+        results[name] = {**scene, **table(f"error of eps, {name}, {scene}", rows)}
     return results
 
 
@@ -192,25 +183,23 @@ def balance(
         rows.append({"steps": steps, "worst": float(np.abs(miss).max()), "end": end})
     assert curve.collisions is not None
     ratio = float(curve.temperature[-1] / gas.temperature)
-    print(
-        f"{title}, N = {num_particles}, {replicas} replicas, {collision_times} tau_c, "
-        f"{float(curve.collisions[-1]):.0f} collisions per particle, T/T_0 = {ratio:.3f} at the end"
-    )
-    columns = {"worst": "worst of all times", "end": "rms at the end"}
-    return {"temperature_ratio": ratio, **table(rows, columns)}
+    collisions = float(curve.collisions[-1])
+    title += f", {collisions:.0f} collisions per particle, T/T_0 = {ratio:.3f} at the end"
+    return {"temperature_ratio": ratio, **table(title, rows)}
 
 
-def table(rows: list[dict], columns: dict[str, str]) -> dict:
+def table(title: str, rows: list[dict]) -> dict:
     """Print the rows, and under each column the order of the error in the time step."""
-    print(f"{'steps':>8}" + "".join(f"{head:>22}" for head in columns.values()))
-    for row in rows:
-        print(f"{row['steps']:8d}" + "".join(f"{row[name]:22.2e}" for name in columns))
+    names = [name for name in rows[0] if name != "steps"]
     steps = np.log([row["steps"] for row in rows])
     order = {
         name: -float(np.polyfit(steps, np.log([abs(row[name]) for row in rows]), 1)[0])
-        for name in columns
+        for name in names
     }
-    print(f"{'order':>8}" + "".join(f"{value:22.2f}" for value in order.values()), end="\n\n")
+    print(f"\n{title}\n{'steps':>8}" + "".join(f"{name:>12}" for name in names))
+    for row in rows:
+        print(f"{row['steps']:8d}" + "".join(f"{row[name]:12.2e}" for name in names))
+    print(f"{'order':>8}" + "".join(f"{order[name]:12.2f}" for name in names))
     return {"rows": rows, "order": order}
 
 

@@ -7,9 +7,7 @@ Computes constants and formulas in seconds, and reads what the other scripts pap
 contradict it. The table, `templates/paper_claims.md`, quotes these numbers and those figures.
 """
 
-import argparse
 from math import gamma, pi
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,7 +21,7 @@ from experiments.support.closed_forms import (
     paper_displacement,
     paper_temperature,
 )
-from experiments.support.record import DATA, add_recording, figures, write_results
+from experiments.support.record import DATA, figures, script_parser, write_results
 from experiments.support.scenes import beads, hard_beads
 from jaxgran.data.files import header_number
 from jaxgran.scene.contact import impact
@@ -43,12 +41,7 @@ AGREE, CORRECTED = "agree", "corrected"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results") / "paper_claims")
-    add_recording(parser)
-    options = parser.parse_args()
+    options = script_parser(__doc__, "paper_claims", smoke=False).parse_args()
     jax.config.update("jax_enable_x64", True)
     found = {
         name: found.get("found", found)
