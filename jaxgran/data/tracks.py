@@ -34,6 +34,9 @@ TRAJECTORIES = (".gsd", ".xyz", ".extxyz", ".dump", ".lammpstrj")
 MIN_TRACKS = 3
 """Particles needed for a scatter after the drift is removed and one particle is left out."""
 
+MIN_JUDGED = 10
+"""Particles needed to tell wrong identities from the distribution of the others."""
+
 MAX_CORRECTION = 0.3
 """Largest share of T that impacts may take, or localisation may add, without a warning."""
 
@@ -280,7 +283,7 @@ def _step(
     drift = np.median(step.displacement, axis=0) if n else 0.0
     start = start + drift
     scale = np.median(np.sum((end - start) ** 2, axis=1)) / chi2.median(d) if n else 0.0
-    if n < MIN_TRACKS or scale == 0:
+    if n < MIN_JUDGED or scale == 0:
         return step
 
     def chi_squared(moved: np.ndarray) -> np.ndarray:
