@@ -181,19 +181,17 @@ def lammps_worker(file: Path) -> None:
 
 def lammps_scene(lmp, task: dict, skin: float) -> None:
     side, sigma, n = task["side"], task["diameter"], len(task["position"])
-    lmp.commands_string(
-        f"""units si
+    box = f"""units si
         atom_style sphere
         boundary p p p
         newton off
         region box block 0 {side} 0 {side} 0 {side}
         create_box 1 box"""
-    )
+    lmp.commands_list([line.strip() for line in box.splitlines()])
     place, velocity = (task[name].ravel().tolist() for name in ("position", "velocity"))
     lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, place, velocity)
     law = "tangential linear_nohistory 0 0 damping viscoelastic limit_damping"
-    lmp.commands_string(
-        f"""set group all diameter {sigma}
+    grains = f"""set group all diameter {sigma}
         set group all density {task["density"]}
         pair_style granular
         pair_coeff * * hertz {task["kn"]} {task["eta"]} {law}
@@ -205,7 +203,7 @@ def lammps_scene(lmp, task: dict, skin: float) -> None:
         thermo_style custom step ke
         thermo 1000000000
         thermo_modify norm no"""
-    )
+    lmp.commands_list([line.strip() for line in grains.splitlines()])
 
 
 def hard_spheres(options: argparse.Namespace) -> dict:
