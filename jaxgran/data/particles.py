@@ -372,7 +372,7 @@ def _read_xyz(lines: list[str]) -> Frame:
         np.array(info.get("origin", "0 0 0").split(), float),
         np.diag(lattice),
         units=info.get("units", "si"),
-        periodic=tuple(x in "T1" for x in re.findall("[TF01]", info.get("pbc", "TTT"))),
+        periodic=tuple(x in "Tt1" for x in re.findall("[TtFf01]", info.get("pbc", "TTT"))),
         time=float(info["time"]) if "time" in info else None,
         dimension=int(info["dimension"]) if "dimension" in info else None,
     )
