@@ -151,7 +151,7 @@ def draw(states: list[dict], courses: list[dict]) -> Figure:
 
 def say(title: str, value: np.ndarray, off: np.ndarray, error: np.ndarray) -> None:
     """Print simulated values, and how far theory is from them."""
-    rows = zip(NAMES, value, error, off, strict=True)
+    rows = zip(NAMES[-len(value) :], value, error, off, strict=True)
     words = (f"{name} {v:.5f} +- {e:.5f}, theory {o:+.5f}" for name, v, e, o in rows)
     print(f"{title}: {'; '.join(words)}", flush=True)
 
@@ -169,7 +169,7 @@ def main() -> None:
                 {"dimension": d, "eps": eps, "simulated": value.tolist(), "off": off.tolist()}
                 | {"error": error.tolist()}
             )
-            say(f"d = {d}, eps = {eps:g}", *(np.append(1.0, x) for x in (value, off, error)))
+            say(f"d = {d}, eps = {eps:g}", value, off, error)
     courses = [error_model(d, blocks, 2 if options.smoke else SEEDS[d]) for d in (3, 2)]
     for course in courses:
         columns = (np.array(course[name]).T for name in ("simulated", "off", "error"))
