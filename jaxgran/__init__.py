@@ -21,6 +21,7 @@ from jaxgran._utils.validation import Domain
 from jaxgran.data.curve import CoolingCurve, Particles, Run
 from jaxgran.data.curve_file import (
     DropTest,
+    read_absent,
     read_curve,
     read_drop_test,
     read_gas,
@@ -97,6 +98,7 @@ __all__ = [
     "impact",
     "log_likelihood",
     "observables",
+    "read_absent",
     "read_curve",
     "read_drop_test",
     "read_gas",

@@ -12,7 +12,7 @@ import pytest
 
 import jaxgran
 from jaxgran.cli.common import MODELS, NO_CACHE_VARIABLE, models_by_name, use_compilation_cache
-from jaxgran.cli.main import FreeParameter, main
+from jaxgran.cli.main import main
 from jaxgran.models.choose import default_models
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -26,7 +26,7 @@ def scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "folder").mkdir()
-    (tmp_path / "units.toml").write_text(SCENE + 'time_unit = "ms"\n')
+    (tmp_path / "units.toml").write_text(SCENE + 'length_unit = "s"\n')
     (tmp_path / "bad.toml").write_text("eta : 0.05\n")
     (tmp_path / "no_A.toml").write_text(SCENE.replace("A = 3e-6", ""))
     return tmp_path
@@ -42,6 +42,13 @@ def test_cool_writes_the_curve_of_the_package(scene, capsys):
     assert (scene / "cooling.png").read_bytes()[:8] == PNG
     assert main(["cool", "scene.toml", "--until", "10"]) == 2
     assert "exists. Name another --out" in capsys.readouterr().err
+
+
+def test_the_curve_of_a_run_of_particles_tells_their_number(scene, capsys):
+    options = ["--model", "dsmc", "--particles", "5e1", "--replicas", "2", "--until", "0.1"]
+    assert main(["cool", "scene.toml", *options]) == 0
+    _, header = jaxgran.read_curve(scene / "cooling.csv")
+    assert header["N"] == "50" and header["replicas"] == "2"
 
 
 def test_choose_prints_reasons(scene, capsys):
@@ -65,7 +72,11 @@ def test_choose_prints_reasons(scene, capsys):
         (["cool", "scene.toml", "--until", "1", "--out", "nowhere/a.csv"], "cannot write"),
         (["cool", "scene.toml", "--until", "1", "--out", "folder", "--overwrite"], "cannot write"),
         (["cool", "scene.toml", "--until", "1", "--out", "a.png"], "is the name of the picture"),
-        (["cool", "units.toml", "--until", "1"], "a TOML scene is in SI"),
+        (["cool", "units.toml", "--until", "1"], "length_unit: 's' is not known as a unit of m"),
+        (["fit", "nowhere.csv", "--particles", "1.5"], "must be a whole number, got 1.5"),
+        (["fit", "nowhere.csv", "--key", "2.5"], "must be a whole number, got 2.5"),
+        (["fit", "nowhere.csv", "--tolerance", "nan"], "--tolerance must lie in (0, inf), got nan"),
+        (["choose", "scene.toml", "--until", "1", "--tolerance", "-1"], "--tolerance must lie"),
         (["cool", "bad.toml", "--until", "1"], "not TOML"),
         (["choose", "no_A.toml", "--until", "1"], "does not give A"),
     ],
@@ -139,12 +150,29 @@ def test_the_budget_is_explained(measured, capsys):
         (["thin.csv", "dense.csv", "--model", "dsmc"], "fitted with kinetic-theory"),
         (["thin.csv", "dense.csv", "--free", "T0", "--set", "A=3e-6"], "share none of these"),
         (["thin.csv", "--drop-test", "dense.csv"], "name them v,eps,eps_err"),
+        (
+            ["thin.csv", "--free", "A", "beta_t"],
+            "Add `# beta_t: guess` to the file, or --set beta_t",
+        ),
+        (["thin.csv", "--set", "beta_t=guess"], "asks for a fit of beta_t: add --free A beta_t"),
+        (["thin.csv", "--set", "T0=2 kg"], "--set: header line T0: 'kg' is not known"),
     ],
 )
 def test_incompatible_measurements_are_refused(measured, capsys, arguments, words):
     assert main(["fit", *arguments]) == 2
     out, err = capsys.readouterr()
     assert err.startswith("error: ") and words in err and len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("fault, code", [(KeyboardInterrupt, 130), (BrokenPipeError, 0)])
+def test_interrupts_and_closed_pipes_end_quietly(scene, monkeypatch, capfd, fault, code):
+    def stop(*args, **options):
+        raise fault
+
+    monkeypatch.setattr("jaxgran.read_gas", stop)
+    monkeypatch.setattr("os.dup2", lambda *files: None)  # the output goes on after the test
+    assert main(["choose", "scene.toml", "--until", "1"]) == code
+    assert capfd.readouterr().err == ("interrupted\n" if code else "")
 
 
 @pytest.mark.parametrize("command", [[], ["fit"], ["cool"], ["choose"]])
@@ -155,12 +183,6 @@ def test_every_command_has_help(capsys, command):
 
 def test_model_names_are_complete():
     assert (*models_by_name(default_models(2)), "auto") == MODELS
-
-
-def test_names_of_free_parameters_are_complete():
-    from jaxgran.cli.fit import PARAMETERS
-
-    assert set(PARAMETERS) == set(FreeParameter.__args__)
 
 
 def test_a_folder_without_permission_is_reported(measured, capsys, monkeypatch):

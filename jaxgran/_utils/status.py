@@ -1,9 +1,12 @@
 """Status of a run: one bit for each fault, since compiled code cannot raise exceptions."""
 
-from typing import NamedTuple, SupportsInt
+from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Int
+
+from jaxgran._utils.validation import no_type_check
 
 
 class Fault(NamedTuple):
@@ -128,14 +131,30 @@ def has(status: ArrayLike, fault: Fault) -> Bool[Array, "..."]:
     return (jnp.asarray(status) & fault.bit) != 0
 
 
-def explain(status: SupportsInt) -> str:
-    """Describe the faults of one status, each with advice; "ok" for 0.
+@no_type_check
+def explain(status: ArrayLike | None) -> str:
+    """Describe the faults of a status, each with advice; "ok" for 0 and for None.
 
     Args:
-        status: an integer, such as `jaxgran.CoolingCurve.status`.
+        status: of one curve or, as `jax.vmap` returns it, of several: `CoolingCurve.status`.
+
+    Raises:
+        ValueError: for a number that is no status.
 
     >>> jaxgran.explain_status(0)
     'ok'
     """
-    faults = [fault for fault in FAULTS if int(status) & fault.bit]
-    return "; ".join(f"{f.meaning}: {f.advice}" for f in faults) or "ok"
+    bits = np.asarray(OK if status is None else status)
+    if bits.dtype.kind not in "iu" or np.any(bits < 0) or np.any(bits >= 2 * FAULTS[-1].bit):
+        raise ValueError(
+            "status must be that of a curve, whole numbers from 0 to "
+            f"{2 * FAULTS[-1].bit - 1}, got {status!r:.60}"
+        )
+    counts = [(fault, np.count_nonzero(bits & fault.bit)) for fault in FAULTS]
+    of_all = "" if bits.ndim == 0 else f" of {bits.size} curves"
+    words = [
+        (f"{count}{of_all}: " if of_all else "") + f"{fault.meaning}: {fault.advice}"
+        for fault, count in counts
+        if count
+    ]
+    return "; ".join(words) or "ok"

@@ -115,10 +115,14 @@ FRACTION = Domain(low=0.0, high=1.0, low_allowed=True, high_allowed=True)
 ANY = Domain()
 
 
-def float_array(value: UserNumber) -> Float[Array, "..."]:
+def float_array(value: UserNumber, name: str = "") -> Float[Array, "..."]:
     """Convert a number or a list of numbers to a JAX array of the default float type.
 
     The array is strongly typed, so that two Python floats do not cause two compilations.
+
+    Args:
+        value: any shape.
+        name: of the value, for messages.
 
     Raises:
         ValueError: if the value cannot be converted.
@@ -128,7 +132,17 @@ def float_array(value: UserNumber) -> Float[Array, "..."]:
             return jnp.asarray(value, dtype=jnp.result_type(float))
         return jnp.asarray(_floats(value), dtype=jnp.result_type(float))
     except (TypeError, ValueError):
-        raise ValueError(f"expected a number or an array of numbers, got {value!r}") from None
+        what = f"{name} must be" if name else "expected"
+        raise ValueError(f"{what} a number or an array of numbers, got {value!r:.60}") from None
+
+
+def number_named(name: str) -> Callable[[UserNumber], Array]:
+    """Return a converter of `equinox.field` to a float array; `name` is that in messages."""
+
+    def convert(value: UserNumber) -> Array:
+        return float_array(value, name)
+
+    return convert
 
 
 def check_not_subnormal(name: str, value: Array) -> None:
@@ -201,6 +215,8 @@ def check_bool(name: str, value: Any) -> None:
 
 def list_to_array(value: Any) -> Any:
     """Convert a list, tuple or NumPy array of numbers to a JAX array; return others unchanged."""
+    if np.ma.is_masked(value):
+        raise ValueError("some values are masked. Leave these points out of all quantities.")
     return float_array(value) if isinstance(value, list | tuple | np.ndarray) else value
 
 

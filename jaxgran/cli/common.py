@@ -3,6 +3,7 @@
 import os
 import platform
 import warnings
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -12,9 +13,12 @@ import numpy as np
 from platformdirs import user_cache_path
 
 import jaxgran
-from jaxgran.data.curve_file import ELEMENT_KEYS, GAS_KEYS, PRIOR_KEYS
+from jaxgran._utils.validation import POSITIVE
+from jaxgran.data.curve_file import GUESS, GUESSES, OPTIONAL_KEYS, PRIOR_KEYS
+from jaxgran.data.tables import header_in_si
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import default_models
+from jaxgran.scene.parameters import BY_SYMBOL
 
 ModelName = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres"]
 """Models of `jaxgran cool`. The names are literals because making the models would start XLA before
@@ -59,14 +63,47 @@ def choose_or_make_model(options: Any, gas, curve, free, num_particles: int | No
 
 def parse_settings(pairs: list[str]) -> dict[str, str]:
     """Return header values from KEY=VALUE arguments."""
-    known = (*GAS_KEYS, "t0", *PRIOR_KEYS, *ELEMENT_KEYS, "N", "A", "dimension", "replicas")
+    known = (*BY_SYMBOL, *PRIOR_KEYS, *OPTIONAL_KEYS)
     values = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not equals or key not in known:
             raise ValueError(f"--set {pair}: give KEY=VALUE with KEY one of {', '.join(known)}")
         values[key] = value
-    return values
+    try:
+        return header_in_si(values)
+    except ValueError as error:
+        raise ValueError(f"--set: {error}") from None
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Raise ValueError unless a tolerance of --tolerance is positive."""
+    POSITIVE.check("--tolerance", tolerance, "0.02 allows an error of T of 2 %.")
+
+
+def gas_of(header: dict[str, str], free: Sequence[str]) -> jaxgran.Gas:
+    """Return the gas of a header, with an element to start from for each free parameter.
+
+    Raises:
+        ValueError: for a free parameter that the header does not describe, or a guess that is not
+            fitted.
+    """
+    header = dict(header)
+    if "beta_t" in free and {"reduced_inertia", "T_rot_0"} & header.keys():
+        header.setdefault("beta_t", GUESS)
+    if guessed := [key for key in GUESSES if header.get(key) == GUESS and key not in free]:
+        raise ValueError(
+            f"the file asks for a fit of {guessed[0]}: add --free A {guessed[0]}, or give its value"
+        )
+    gas = jaxgran.read_gas(header)
+    for key in free:
+        if BY_SYMBOL[key].name not in (*gas.domains, "t0"):
+            start = f"`# {key}: {GUESS if key in GUESSES else 'VALUE'}` to the file"
+            raise ValueError(
+                f"--free {key}: the file gives no {key}. Add {start}, or --set "
+                f"{key}={f'{GUESSES[key]:g}' if key in GUESSES else 'VALUE'}"
+            )
+    return gas
 
 
 def output_files(options: Any) -> tuple[Path, Path]:

@@ -22,48 +22,17 @@ from jaxgran.cli.common import (
     choose_or_make_model,
     environment,
     finite_or_null,
+    gas_of,
     models_by_name,
     output_files,
     parse_settings,
 )
-from jaxgran.data.curve_file import DropTest
+from jaxgran.data.curve_file import GUESS, DropTest
 from jaxgran.data.files import header_count, header_number, write_atomically
 from jaxgran.fitting.fit import JointFit, free_by_default
 from jaxgran.fitting.residuals import smooth_errors, unused_rotation
 from jaxgran.models.choose import default_models
-
-PARAMETERS = {
-    "A": ("dissipative_constant", "s"),
-    "T0": ("temperature", "m^2/s^2"),
-    "t0": ("t0", "s"),
-    "Y": ("youngs_modulus", "Pa"),
-    "nu": ("poisson_ratio", ""),
-    "eta": ("packing_fraction", ""),
-    "diameter": ("diameter", "m"),
-    "beta_t": ("tangential_restitution", ""),
-    "reduced_inertia": ("inertia", ""),
-    "T_rot_0": ("rotational_temperature", "m^2/s^2"),
-    "container_side": ("wall_side", "m"),
-    "wall_restitution": ("wall_coefficient", ""),
-    "wall_beta_t": ("wall_tangential_restitution", ""),
-    "tangential_damping": ("tangential_damping", ""),
-    "friction": ("friction", ""),
-    "gamma": ("drag_rate", "1/s"),
-    "drive_strength": ("drive_strength", "m^2/s^3"),
-}
-"""Name in `jaxgran.Gas` and unit of each argument of --free."""
-
-SCENE_PARAMETERS = {
-    "temperature",
-    "packing_fraction",
-    "diameter",
-    "rotational_temperature",
-    "wall_side",
-    "drag_rate",
-    "drive_strength",
-    "t0",
-}
-"""Parameters that each curve has separately; the others belong to the material and are shared."""
+from jaxgran.scene.parameters import BY_SYMBOL, PARAMETERS, SCENE
 
 MAX_KEY = 2**63
 """Upper bound of the seeds of `jax.random.key`."""
@@ -100,13 +69,13 @@ def run_fit(options: FitOptions, started: float) -> None:
         warnings.simplefilter("always", UserWarning)
         curve, header = jaxgran.read_curve(options.curve)
         header |= parse_settings(options.set)
-        gas, priors = jaxgran.read_gas(header), jaxgran.read_priors(header)
+        gas, priors = gas_of(header, options.free), jaxgran.read_priors(header)
     options.free = options.free or free_keys(free_by_default(gas, curve))
     gas = with_given_constant(gas, header, options.free)
     n = header_count(header, "N")
     replicas = header_count(header, "replicas") or 1
     picture, record = output_files(options)
-    free = tuple(PARAMETERS[key][0] for key in options.free)
+    free = tuple(BY_SYMBOL[key].name for key in options.free)
     model, reasons = choose_or_make_model(options, gas, curve, free, n)
     (model_name,) = models_by_name([model])
     imported = time.perf_counter() - started
@@ -114,14 +83,6 @@ def run_fit(options: FitOptions, started: float) -> None:
     result, first_seconds, fit_seconds = timed_fit(options, gas, curve, model, arguments)
     diagnosis = jaxgran.diagnose(result, curve, n)
     rows = parameter_rows(options, result, diagnosis, header)
-    print_scene(options, gas, curve, header, result)
-    print_warnings(input_warnings, unused_rotation(gas, curve))
-    print_impacts(result.gas, float(curve.temperature[-1]), n)
-    print_model(model_name, result, reasons)
-    print_rows(rows)
-    print_budget(rows, options.explain)
-    print_alternatives(rows[0]["parameter"], diagnosis)
-    print_verdict(diagnosis)
     picture.parent.mkdir(parents=True, exist_ok=True)
     plotting.save_fit(result, curve, picture_title(options, rows, diagnosis), picture)
     summary = {
@@ -151,13 +112,21 @@ def run_fit(options: FitOptions, started: float) -> None:
     summary = finite_or_null(summary)
     text = json.dumps(finite_or_null(summary | details), indent=2, allow_nan=False) + "\n"
     write_atomically(record, lambda f: f.write(text.encode()))
+    print_scene(options, gas, curve, header, result)
+    print_warnings(input_warnings, unused_rotation(gas, curve))
+    print_impacts(result.gas, float(curve.temperature[-1]), n)
+    print_model(model_name, result, reasons)
+    print_rows(rows)
+    print_budget(rows, options.explain)
+    print_alternatives(rows[0]["parameter"], diagnosis)
+    print_verdict(diagnosis)
     print(f"\nwritten  {picture}\n         {record}\n")
     print(json.dumps(summary, allow_nan=False))
 
 
 def free_keys(floats: tuple[str, ...]) -> list[str]:
     """Return the arguments of --free for floats of a gas."""
-    return [key for key, (name, _) in PARAMETERS.items() if name in floats]
+    return [PARAMETERS[name].symbol for name in floats]
 
 
 def with_given_constant(gas, header, free: list[str]):
@@ -198,7 +167,7 @@ def parameter_rows(options: FitOptions, result, diagnosis, header) -> list[dict]
     """Return estimate and errors of each free parameter; nan if the curve does not determine it."""
     rows, undetermined = [], result.undetermined()
     for key in options.free:
-        name, unit = PARAMETERS[key]
+        name, unit = BY_SYMBOL[key].name, BY_SYMBOL[key].unit
         estimate, error = (float(x) for x in result.value(name))
         limits = range_over_alternatives(diagnosis, name)
         if name in undetermined:
@@ -212,7 +181,7 @@ def parameter_rows(options: FitOptions, result, diagnosis, header) -> list[dict]
                 "std_err": error,
                 "error_budget": {part: float(x[i]) for part, x in result.error_budget.items()},
                 **dict(zip(("low", "high"), limits, strict=True)),
-                "header": header_number(header, key) if key in header else None,
+                "header": None if header.get(key, GUESS) == GUESS else header_number(header, key),
             }
         )
     return rows
@@ -293,7 +262,7 @@ def print_rows(rows: list[dict]) -> None:
     """Print the table of estimates."""
     print(f"\n{'':10}{'estimate':>13} {'+-':>10} {'95 % incl. alternatives':>24}  in file")
     for row in rows:
-        print(f"{row['parameter']:4}{row['unit']:6}", end="")
+        print(f"{row['parameter']:3} {row['unit']:5} ", end="")
         if np.isnan(row["estimate"]):
             print(f"{'not determined':>13}")
             continue
@@ -386,9 +355,9 @@ def run_joint_fit(
         )
     picture, record = output_files(options)
     free = options.free or ["A", "T0"]
-    names = [PARAMETERS[key][0] for key in free]
-    shared = tuple(name for name in names if name not in SCENE_PARAMETERS)
-    separate = tuple(name for name in names if name in SCENE_PARAMETERS)
+    parameters = [BY_SYMBOL[key] for key in free]
+    shared = tuple(p.name for p in parameters if p.belongs_to != SCENE)
+    separate = tuple(p.name for p in parameters if p.belongs_to == SCENE)
     if not shared:
         raise ValueError(f"--free {' '.join(free)}: the curves share none of these. Add A.")
     files = [path.resolve() for path in (*curves, *drops)]
@@ -398,7 +367,7 @@ def run_joint_fit(
     for path in curves:
         curve, header = jaxgran.read_curve(path)
         header |= parse_settings(options.set)
-        gas = with_given_constant(jaxgran.read_gas(header), header, free)
+        gas = with_given_constant(gas_of(header, free), header, free)
         first_gas = gas if first_gas is None else first_gas
         curve, _ = smooth_errors(curve, header_count(header, "replicas") or 1)
         measurements[_label(path, measurements)] = gas, curve
@@ -407,10 +376,9 @@ def run_joint_fit(
         measurements[_label(path, measurements)] = first_gas, test
     model = models_by_name(default_models(2))[JOINT_MODEL]
     result = jaxgran.fit_jointly(measurements, shared=shared, separate=separate, model=model)
-    print_joint_fit(result, measurements, {PARAMETERS[key][0]: key for key in free})
     summary = {
-        **{key: result.estimate.get(PARAMETERS[key][0]) for key in free},
-        **{f"{key}_std_err": result.standard_error.get(PARAMETERS[key][0]) for key in free},
+        **{key: result.estimate.get(BY_SYMBOL[key].name) for key in free},
+        **{f"{key}_std_err": result.standard_error.get(BY_SYMBOL[key].name) for key in free},
     }
     summary = {key: float(x) for key, x in summary.items() if x is not None}
     summary |= {
@@ -434,6 +402,7 @@ def run_joint_fit(
     agreement = "do not contradict" if result.agree else "contradict"
     title = f"{', '.join(measurements)}: the measurements {agreement} each other"
     plotting.save_curves(_fitted_curves(result, measurements, model), title, picture)
+    print_joint_fit(result, measurements, {BY_SYMBOL[key].name: key for key in free})
     print(f"\nwritten  {picture}\n         {record}\n")
     print(json.dumps(summary, allow_nan=False))
 
@@ -466,7 +435,7 @@ def print_joint_fit(result: JointFit, measurements: dict, keys: dict[str, str]) 
     for name, estimate in result.estimate.items():
         key = keys[name]
         error = float(result.standard_error[name])
-        print(f"{key:4}{PARAMETERS[key][1]:6}{float(estimate):13.5g} {error:10.2g}")
+        print(f"{key:3} {PARAMETERS[name].unit:5} {float(estimate):13.5g} {error:10.2g}")
     width = max(map(len, measurements))
     shared = list(result.estimate)
     print(
@@ -478,7 +447,7 @@ def print_joint_fit(result: JointFit, measurements: dict, keys: dict[str, str]) 
         print(f"{label:{width}}  {points:6d}  {result.chi2[label]:7.1f}", end="")
         print(f"  {result.decrease[label]:8.1f}  {weights}")
         for name, (value, error) in result.separate.get(label, {}).items():
-            unit = PARAMETERS[keys[name]][1]
+            unit = PARAMETERS[name].unit
             print(f"{'':{width}}  {keys[name]} = {value:.5g} +- {error:.2g} {unit}")
     agreement = "do not contradict" if result.agree else "contradict"
     print(f"\nThe measurements {agreement} each other (p = {result.p_value:.2g}).")

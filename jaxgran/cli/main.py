@@ -1,43 +1,53 @@
 """The command line: `jaxgran fit`, `jaxgran cool` and `jaxgran choose`."""
 
+import os
 import sys
 import time
 import tomllib
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import jax
 import jax.numpy as jnp
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Parameter, Token
 
 import jaxgran
-from jaxgran.cli.common import ModelName, ModelOrAuto, models_by_name, use_compilation_cache
-from jaxgran.data.files import check_writable, header_count, header_number, read_text
+from jaxgran.cli.common import (
+    ModelName,
+    ModelOrAuto,
+    check_tolerance,
+    models_by_name,
+    use_compilation_cache,
+)
+from jaxgran.data.files import check_writable, header_count, header_number
+from jaxgran.data.tables import header_in_si, read_text
 from jaxgran.models.choose import NUM_PARTICLES, default_models
+from jaxgran.scene.parameters import BY_SYMBOL
 
 Several = Parameter(consume_multiple=True)
 
-FreeParameter = Literal[
-    "A",
-    "T0",
-    "t0",
-    "Y",
-    "nu",
-    "eta",
-    "diameter",
-    "beta_t",
-    "reduced_inertia",
-    "T_rot_0",
-    "container_side",
-    "wall_restitution",
-    "wall_beta_t",
-    "tangential_damping",
-    "friction",
-    "gamma",
-    "drive_strength",
-]
+
+def _whole_number(_: object, tokens: Sequence[Token]) -> int:
+    """Return the whole number of an option, which may be written as 1e4."""
+    text = tokens[0].value
+    try:
+        number = float(text)
+        if number.is_integer():
+            return int(text) if text.lstrip("+-").isdigit() else int(number)
+    except ValueError:
+        pass
+    raise ValueError(f"must be a whole number, got {text}")
+
+
+WholeNumber = Annotated[int, Parameter(converter=_whole_number)]
+
+if TYPE_CHECKING:
+    FreeParameter = str
+else:
+    FreeParameter = Literal[tuple(symbol for symbol in BY_SYMBOL if symbol != "density")]
 """Arguments of --free."""
 
 NUM_POINTS = 50
@@ -50,7 +60,7 @@ def main(
     started: float | None = None,
     default_curve: Path | None = None,
 ) -> int:
-    """Run a command. Invalid input gives one line on stderr and the exit code 2.
+    """Run a command. Invalid input gives one line on stderr and the exit code 2, Ctrl-C 130.
 
     Args:
         arguments: of the command line, by default those of this process.
@@ -62,13 +72,18 @@ def main(
     """
     app = _app(time.perf_counter() if started is None else started, default_curve)
     jax.config.update("jax_enable_x64", True)
+    words = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        app(
-            sys.argv[1:] if arguments is None else list(arguments),
-            exit_on_error=False,
-            print_error=False,
-            result_action="return_value",
-        )
+        with warnings.catch_warnings():
+            warnings.showwarning = _print_warning
+            app(words, exit_on_error=False, print_error=False, result_action="return_value")
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of the output has ended, as `head` does; files are written
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except CycloptsError as error:
         reason = " ".join(str(error).split())
         print(f"error: {reason} See jaxgran --help.", file=sys.stderr)
@@ -77,6 +92,10 @@ def main(
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"check: {message}", file=sys.stderr)
 
 
 FIT_HELP = """\
@@ -112,6 +131,7 @@ def _app(started: float, default_curve: Path | None) -> App:
         name="jaxgran",
         help="Cooling granular gases: fit a measured curve, compute one, choose a model.",
         default_parameter=Parameter(negative=()),
+        suppress_keyboard_interrupt=False,
     )
 
     def fit(
@@ -120,9 +140,9 @@ def _app(started: float, default_curve: Path | None) -> App:
         onto_plate: bool = False,
         model: ModelOrAuto = "kinetic-theory",
         tolerance: float = 0.02,
-        particles: int | None = None,
-        replicas: int = 3,
-        key: int = 0,
+        particles: WholeNumber | None = None,
+        replicas: WholeNumber = 3,
+        key: WholeNumber = 0,
         free: Annotated[list[FreeParameter] | None, Several] = None,
         set: Annotated[list[str] | None, Several] = None,  # noqa: A002
         out: Path | None = None,
@@ -130,6 +150,7 @@ def _app(started: float, default_curve: Path | None) -> App:
         explain: bool = False,
         no_cache: bool = False,
     ) -> None:
+        check_tolerance(tolerance)
         if not no_cache:
             use_compilation_cache()
         from jaxgran.cli.fit import FitOptions, run_fit, run_joint_fit
@@ -170,9 +191,9 @@ def cool(
     *,
     until: float | None = None,
     model: ModelName = "kinetic-theory",
-    particles: int | None = None,
-    replicas: int = 1,
-    key: int = 0,
+    particles: WholeNumber | None = None,
+    replicas: WholeNumber = 1,
+    key: WholeNumber = 0,
     out: Path = Path("cooling.csv"),
     overwrite: bool = False,
     no_cache: bool = False,
@@ -207,11 +228,14 @@ def cool(
     size = next(n for n in (particles, given.size, NUM_PARTICLES) if n is not None)
     chosen = models_by_name(default_models(size, replicas))[model]
     curve = jaxgran.cool(given.gas, given.times, model=chosen, key=jax.random.key(key))
-    jaxgran.write_curve(out, curve, given.header, overwrite=overwrite)
+    header = given.header
+    if chosen.stochastic:  # a later fit takes its error budget from them
+        header = header | {"N": str(size), "replicas": str(replicas)}
+    jaxgran.write_curve(out, curve, header, overwrite=overwrite)
     ratio = float(curve.temperature[-1] / curve.temperature[0])
-    print(f"{model}: T falls to {ratio:.3g} of its first value in {given.times[-1]:.3g} s")
     title = f"{scene.stem}: {chosen.name}, T falls to {ratio:.3g} of its first value"
     plotting.save_curves({chosen.name: (curve, None)}, title, picture)
+    print(f"{model}: T falls to {ratio:.3g} of its first value in {given.times[-1]:.3g} s")
     print(f"written  {out}\n         {picture}")
 
 
@@ -232,6 +256,7 @@ def choose(
         tolerance: Allowed relative error of T.
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
+    check_tolerance(tolerance)
     if not no_cache:
         use_compilation_cache()
     given = _read_scene(scene, until)
@@ -268,9 +293,8 @@ def _read_toml(path: Path) -> dict[str, str]:
     """Return the keys of a TOML file as those of a header."""
     try:
         values = tomllib.loads(read_text(path, "eta, diameter, ..."))
+        return header_in_si({key: str(value) for key, value in values.items()})
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path}: not TOML ({error}). Write lines such as eta = 0.05.") from None
-    units = [key for key in ("length_unit", "time_unit") if key in values]
-    if units:
-        raise ValueError(f"{path}: a TOML scene is in SI. Convert it and remove {units[0]}.")
-    return {key: str(value) for key, value in values.items()}
+    except ValueError as error:
+        raise ValueError(f"{path}, {error}".removeprefix(f"{path}, {path}")) from None

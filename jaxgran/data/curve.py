@@ -1,8 +1,8 @@
 """Cooling curves, measured or simulated: the type, its quantities, and its tables.
 
-`CoolingCurve` holds quantities at given times, `Particles` the particles, and `Run` the options of
-the run that computes a curve. The tables below name each quantity, its unit and its column in
-files. Curves become tables of xarray and pandas, which are imported on demand.
+`QUANTITIES` names each quantity, its unit and its column in files. `CoolingCurve` holds quantities
+at given times, `Particles` the particles, and `Run` the options of the run that computes a curve.
+`to_arrays` names all arrays of a curve, as npz files, sweeps and xarray hold them.
 """
 
 import dataclasses
@@ -21,6 +21,60 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxgran._utils.formatting import TableRows, format_quantity, html_table, text_table
 from jaxgran._utils.validation import list_to_array
+
+
+class Quantity(NamedTuple):
+    """A quantity of a cooling curve.
+
+    Attributes:
+        field: of `CoolingCurve`.
+        column: in a CSV file; its standard error has the column and field with _err and _error.
+        unit: SI; "1" for a number without one.
+        label: what it is, in words.
+        measured: whether experiments measure it, so that a fit may use it.
+    """
+
+    field: str
+    column: str
+    unit: str
+    label: str
+    measured: bool = False
+
+    @property
+    def error(self) -> "Quantity":
+        """The standard error of this quantity."""
+        label = f"standard error of {self.label}"
+        return Quantity(f"{self.field}_error", f"{self.column}_err", self.unit, label, True)
+
+
+WITH_ERRORS = (
+    Quantity("temperature", "T", "m^2/s^2", "temperature <v^2>/d", True),
+    Quantity("displacement", "msd", "m^2", "mean square displacement", True),
+    Quantity("rotational_temperature", "T_rot", "m^2/s^2", "T_rot = I <w^2>/(d_rot m)", True),
+)
+"""Quantities that have standard errors."""
+
+QUANTITIES = {
+    quantity.field: quantity
+    for quantity in (
+        Quantity("times", "t", "s", "time", True),
+        *(part for measured in WITH_ERRORS for part in (measured, measured.error)),
+        Quantity("sonine", "a2", "1", "second Sonine coefficient"),
+        Quantity("third_sonine", "a3", "1", "third Sonine coefficient"),
+        Quantity("collisions", "collisions", "1", "collisions per particle since t = 0"),
+        Quantity("diffusion", "D", "m^2/s", "self-diffusion coefficient"),
+        Quantity("velocity_correlation", "velocity_correlation", "m^2/s^2", "<v(0) . v(t)>/d"),
+        Quantity("elastic_energy", "elastic_energy", "J", "energy of contacts per particle"),
+        Quantity("dissipated_energy", "dissipated_energy", "J", "dissipated energy per particle"),
+        Quantity("regularised", "regularised", "1", "impacts per particle made elastic"),
+        Quantity("flow_share", "flow_share", "1", "share of kinetic energy in the longest waves"),
+        Quantity("derivative_bias", "derivative_bias", "1", "bias of projected d ln T"),
+    )
+}
+"""Quantities by field, in the order of the columns of a file."""
+
+MIN_POINTS = 3
+"""Smallest number of times of a measured curve."""
 
 
 class Particles(NamedTuple):
@@ -133,14 +187,38 @@ class CoolingCurve(eqx.Module):
         the dimensions replica and time; positions and velocities have replica, particle and axis.
         The arrays of ``save=`` are named by their place in the tree, as ``saved.S.0``, with the
         standard error in ``saved_error.S.0`` and the values of each replica in
-        ``saved_of_replicas.S.0``.
+        ``saved_of_replicas.S.0``. `from_xarray` is the inverse.
 
         Raises:
             ValueError: for several curves in one, as `jax.vmap` returns them, or if a key of a
-                saved dictionary contains "." or "/".
+                saved dictionary contains "." or "/" or is a number.
             ModuleNotFoundError: without xarray.
         """
-        return _to_dataset(self)
+        xarray = import_extra("xarray")
+        self._check_single()
+        arrays = {name: np.asarray(x) for name, x in to_arrays(self).items()}
+        attributes = {STATUS: int(arrays.pop(STATUS))} if STATUS in arrays else {}
+        are_particles = isinstance(self.saved, Particles)
+        labelled = {
+            name: (dims, arrays[name], attrs)
+            for name in arrays
+            for dims, attrs in [label_of(name, arrays[name].ndim, are_particles)]
+        }
+        return xarray.Dataset(labelled, coords={TIME: labelled.pop("times")}, attrs=attributes)
+
+    @classmethod
+    def from_xarray(cls, dataset: Any) -> "CoolingCurve":
+        """Return the curve of a dataset that `to_xarray` made; saved lists come back as tuples.
+
+        >>> again = jaxgran.CoolingCurve.from_xarray(curve.to_xarray())
+        >>> bool(jnp.all(again.temperature == curve.temperature))
+        True
+        """
+        arrays = {str(name): jnp.asarray(x.values) for name, x in dataset.variables.items()}
+        arrays["times"] = arrays.pop(TIME)
+        if STATUS in dataset.attrs:
+            arrays[STATUS] = jnp.asarray(dataset.attrs[STATUS])
+        return from_arrays(arrays)
 
     def to_pandas(self) -> Any:
         """Return the curve as a `pandas.DataFrame`, one row per time; needs the extra `notebook`.
@@ -148,8 +226,17 @@ class CoolingCurve(eqx.Module):
         Raises: as `to_xarray`.
         """
         pandas = import_extra("pandas")
-        columns = _known_quantities(self)
-        return pandas.DataFrame(columns, index=pandas.Index(np.asarray(self.times), name="times"))
+        self._check_single()
+        known = {name: getattr(self, name) for name in QUANTITIES}
+        columns = {name: np.asarray(x) for name, x in known.items() if x is not None}
+        return pandas.DataFrame(columns).set_index("times")
+
+    def _check_single(self) -> None:
+        if np.ndim(self.times) != 1:
+            raise ValueError(
+                f"the times of this curve have shape {np.shape(self.times)}: take one curve, as in "
+                "jax.tree.map(lambda x: x[0], curves)"
+            )
 
     @property
     def _words(self) -> tuple[str, TableRows]:
@@ -179,7 +266,7 @@ class CoolingCurve(eqx.Module):
         means: dict[str, Any] = {name: jnp.mean(value, axis=0) for name, value in values.items()}
         num_replicas = len(values["temperature"])
         if num_replicas > 1:
-            for name in {"temperature", "displacement", "rotational_temperature"} & set(values):
+            for name in {quantity.field for quantity in WITH_ERRORS} & set(values):
                 # At t = 0 all replicas agree, and the derivative of a root at 0 is not finite.
                 deviation = jnp.std(jax.lax.stop_gradient(values[name]), axis=0, ddof=1)
                 means[f"{name}_error"] = deviation / num_replicas**0.5
@@ -223,17 +310,17 @@ class CoolingCurve(eqx.Module):
                 f"a curve needs at least {MIN_POINTS} points, got {times.size}; "
                 "measure the cooling at more times"
             )
-        for column, field in COLUMNS.items():
-            values = getattr(self, field)
-            if values is not None and not isinstance(values, Tracer):
-                _check_column(column, np.asarray(values), times, place)
-        for column, field in COMPUTED_COLUMNS.items():
-            values = getattr(self, field)
-            if values is not None and np.shape(values) != times.shape:
+        for quantity in QUANTITIES.values():
+            values = getattr(self, quantity.field)
+            if values is None or isinstance(values, Tracer):
+                continue
+            if np.shape(values) != times.shape:
                 raise ValueError(
-                    f"{column} has shape {np.shape(values)}, but there are {times.size} times; "
-                    "give one value for each time"
+                    f"{quantity.column} has shape {np.shape(values)}, but there are {times.size} "
+                    "times; give one value for each time"
                 )
+            if quantity.measured:
+                _check_column(quantity.column, np.asarray(values), times, place)
         not_later = np.flatnonzero(np.diff(times) <= 0)
         if not_later.size:
             i = int(not_later[0]) + 1
@@ -249,11 +336,6 @@ def _check_column(
     times: Float[np.ndarray, "times"],
     place: Callable[[int], str],
 ) -> None:
-    if values.shape != times.shape:
-        raise ValueError(
-            f"{column} has shape {values.shape}, but there are {times.size} times; "
-            "give one value for each time"
-        )
     zero_allowed = np.zeros(times.shape, bool)
     if column != "T":
         zero_allowed[0] = column == "t" or times[0] == 0
@@ -293,55 +375,6 @@ class Run(NamedTuple):
 DEFAULTS = Run()
 """A silent run with the default random numbers, which saves nothing."""
 
-QUANTITY_UNITS = {
-    "times": "s",
-    "temperature": "m^2/s^2",
-    "temperature_error": "m^2/s^2",
-    "displacement": "m^2",
-    "displacement_error": "m^2",
-    "sonine": "1",
-    "third_sonine": "1",
-    "collisions": "1",
-    "diffusion": "m^2/s",
-    "rotational_temperature": "m^2/s^2",
-    "rotational_temperature_error": "m^2/s^2",
-    "velocity_correlation": "m^2/s^2",
-    "elastic_energy": "J",
-    "dissipated_energy": "J",
-    "regularised": "1",
-    "flow_share": "1",
-    "derivative_bias": "1",
-}
-"""Unit of each quantity of a curve, by the name of its field."""
-
-COLUMNS = {
-    "t": "times",
-    "T": "temperature",
-    "T_err": "temperature_error",
-    "msd": "displacement",
-    "msd_err": "displacement_error",
-    "T_rot": "rotational_temperature",
-    "T_rot_err": "rotational_temperature_error",
-}
-"""Columns of measured quantities in a file, and their fields of `CoolingCurve`."""
-
-COMPUTED_COLUMNS = {
-    "a2": "sonine",
-    "a3": "third_sonine",
-    "collisions": "collisions",
-    "D": "diffusion",
-    "velocity_correlation": "velocity_correlation",
-    "elastic_energy": "elastic_energy",
-    "dissipated_energy": "dissipated_energy",
-    "regularised": "regularised",
-    "flow_share": "flow_share",
-    "derivative_bias": "derivative_bias",
-}
-"""Columns of further quantities, in SI, which a fit does not use, and their fields."""
-
-MIN_POINTS = 3
-"""Smallest number of times of a measured curve."""
-
 
 def import_extra(name: str, extra: str = "notebook") -> Any:
     """Import a module that an extra of jaxgran installs.
@@ -359,150 +392,188 @@ def import_extra(name: str, extra: str = "notebook") -> Any:
         ) from None
 
 
-def _known_quantities(curve: CoolingCurve) -> dict[str, np.ndarray]:
-    """Return the known quantities of a single curve by name, without the times.
-
-    Raises:
-        ValueError: for several curves in one, as `jax.vmap` returns them.
-    """
-    if np.ndim(curve.times) != 1:
-        raise ValueError(
-            f"the times of this curve have shape {np.shape(curve.times)}: take one curve, as in "
-            "jax.tree.map(lambda x: x[0], curves)"
-        )
-    known = {name: getattr(curve, name, None) for name in QUANTITY_UNITS if name != "times"}
-    return {name: np.asarray(values) for name, values in known.items() if values is not None}
-
-
-def _to_dataset(curve: CoolingCurve) -> Any:
-    xarray = import_extra("xarray")
-
-    def variable(name: str, *dims: str, values: np.ndarray) -> tuple:
-        return dims, values, {"units": QUANTITY_UNITS[name], "long_name": name.replace("_", " ")}
-
-    variables = {
-        name: variable(name, "time", values=x) for name, x in _known_quantities(curve).items()
-    }
-    if curve.replicas is not None:
-        for name in variables.keys() & QUANTITY_UNITS.keys():
-            values = getattr(curve.replicas, name)
-            if values is not None:
-                variables[f"{name}{OF_REPLICAS}"] = variable(
-                    name, "replica", "time", values=np.asarray(values)
-                )
-    if curve.particles is not None:
-        for name, unit in (("position", "m"), ("velocity", "m/s")):
-            values = np.asarray(getattr(curve.particles, name))
-            variables[name] = (("replica", "particle", "axis"), values, {"units": unit})
-    variables |= _saved_variables(curve)
-    time = variable("times", "time", values=np.asarray(curve.times))
-    attributes = {} if curve.status is None else {"status": int(curve.status)}
-    return xarray.Dataset(variables, coords={"time": time}, attrs=attributes)
-
-
-def _saved_variables(curve: CoolingCurve) -> dict[str, tuple]:
-    """Return dimensions, values and attributes of each array that ``save=`` returned."""
-    are_particles, variables = isinstance(curve.saved, Particles), {}
-    for name, array in saved_arrays(curve).items():
-        unit = saved_unit(name, are_particles)
-        attributes = {} if unit is None else {"units": unit}
-        dims = saved_dimensions(name, np.ndim(array), are_particles)
-        variables[name] = dims, np.asarray(array), attributes
-    return variables
-
-
-TIME, REPLICA = "time", "replica"
-SAVED = "saved"
+TIME, REPLICA, STATUS, SAVED = "time", "replica", "status", "saved"
 OF_REPLICAS = "_of_replicas"
 """Ending of the names of arrays that have an axis of replicas."""
 
-_MEAN, _ERROR, _EACH = SAVED, f"{SAVED}_error", f"{SAVED}{OF_REPLICAS}"
+_SAVED_FIELDS = (SAVED, f"{SAVED}_error", f"{SAVED}{OF_REPLICAS}")
 
-_PARTICLE_DIMENSIONS = {
-    "position": (REPLICA, "particle", "axis"),
-    "velocity": (REPLICA, "particle", "axis"),
-    "angular_velocity": (REPLICA, "particle", "rotation_axis"),
-    "box_side": ("axis",),
+_PARTICLES = {
+    "position": ("m", REPLICA, "particle", "axis"),
+    "velocity": ("m/s", REPLICA, "particle", "axis"),
+    "box_side": ("m", "axis"),
+    "angular_velocity": ("1/s", REPLICA, "particle", "rotation_axis"),
 }
-"""Dimensions after the time of saved `Particles`."""
+"""Unit and dimensions of the arrays of `Particles`."""
 
-_PARTICLE_UNITS = {"position": "m", "velocity": "m/s", "angular_velocity": "1/s", "box_side": "m"}
+
+def to_arrays(curve: CoolingCurve) -> dict[str, Any]:
+    """Return the arrays of a curve by name: `from_arrays` is the inverse.
+
+    A quantity has the name of its field, and that of the replicas ends in _of_replicas. The final
+    particles have the names of their fields. A saved array is named by its place in the tree:
+    ``saved.S.0`` the mean, ``saved_error.S.0`` its standard error, ``saved_of_replicas.S.0`` the
+    values of each replica.
+
+    Raises:
+        ValueError: for a key of a saved dictionary that would make a name ambiguous.
+    """
+    each = curve.replicas
+    arrays = {name: getattr(curve, name) for name in (*QUANTITIES, STATUS)}
+    if each is not None:
+        of_each = {f"{name}{OF_REPLICAS}": getattr(each, name) for name in QUANTITIES}
+        del of_each[f"times{OF_REPLICAS}"]
+        arrays |= of_each
+    if curve.particles is not None:
+        arrays |= curve.particles._asdict()
+    for field, tree in _saved_trees(curve).items():
+        arrays |= {_name_at(field, path): x for path, x in jax.tree.flatten_with_path(tree)[0]}
+    return {name: array for name, array in arrays.items() if array is not None}
+
+
+def _saved_trees(curve: CoolingCurve) -> dict[str, Any]:
+    """Return the saved trees of a curve by the first part of the names of their arrays."""
+    each = None if curve.replicas is None else curve.replicas.saved
+    trees = zip(_SAVED_FIELDS, (curve.saved, curve.saved_error, each), strict=True)
+    return {field: tree for field, tree in trees if tree is not None}
+
+
+def _name_at(field: str, path: tuple[Any, ...]) -> str:
+    """Return the name of a saved array at a place, after a check that it is unique."""
+    keys = [jax.tree_util.keystr((key,), simple=True) for key in path]
+    for entry, key in zip(path, keys, strict=True):
+        is_index = isinstance(entry, jax.tree_util.SequenceKey)
+        if "." in key or "/" in key or (key.isdigit() and not is_index):
+            raise ValueError(
+                f"save returns a dictionary with the key {key!r}: keys name arrays of a file or of "
+                'an xarray.Dataset. Use words without "." and "/"'
+            )
+    return ".".join([field, *keys])
+
+
+def from_arrays(arrays: dict[str, Any], like: CoolingCurve | None = None) -> CoolingCurve:
+    """Return the curve with arrays that are named as by `to_arrays`.
+
+    Args:
+        arrays: by name.
+        like: a curve whose saved trees have the same structure; by default saved arrays come back
+            in dictionaries, tuples and `Particles`.
+
+    Raises:
+        ValueError: for a name that is not of an array of a curve.
+    """
+    groups: dict[str, dict[str, Any]] = {}
+    for name, array in arrays.items():
+        group, _, place = name.partition(".")
+        groups.setdefault(group, {})[place] = array
+    quantities = {name: groups.pop(name)[""] for name in (*QUANTITIES, STATUS) if name in groups}
+    names = {f"{name}{OF_REPLICAS}": name for name in QUANTITIES}
+    each = {names[key]: groups.pop(key)[""] for key in names.keys() & groups.keys()}
+    last = {name: groups.pop(name)[""] for name in _PARTICLES if name in groups}
+    saved = {name: _nest(groups.pop(name)) for name in _SAVED_FIELDS if name in groups}
+    if groups:
+        raise ValueError(f"{next(iter(groups))} is not the name of an array of a curve")
+    for field, tree in ({} if like is None else _saved_trees(like)).items():
+        paths, structure = jax.tree.flatten_with_path(tree)
+        leaves = [arrays[_name_at(field, path)] for path, _ in paths]
+        saved[field] = jax.tree.unflatten(structure, leaves)
+    saved_of_each = saved.pop(_SAVED_FIELDS[-1], None)
+    times = quantities["times"]
+    replicas = CoolingCurve(times=times, **each, saved=saved_of_each) if each else None
+    particles = Particles(**last) if last else None
+    return CoolingCurve(**quantities, **saved, replicas=replicas, particles=particles)
+
+
+def _nest(arrays: dict[str, Any]) -> Any:
+    """Return an array, or a dictionary, a tuple or `Particles` of them, by their places."""
+    if "" in arrays:
+        return arrays[""]
+    children: dict[str, dict[str, Any]] = {}
+    for name, array in arrays.items():
+        first, _, rest = name.partition(".")
+        children.setdefault(first, {})[rest] = array
+    nested = {name: _nest(inner) for name, inner in children.items()}
+    if all(name.isdigit() for name in nested):
+        return tuple(nested[str(k)] for k in range(len(nested)))
+    is_particles = set(Particles._fields) - {"angular_velocity"} == nested.keys() - {
+        "angular_velocity"
+    }
+    return Particles(**nested) if is_particles else nested
+
+
+def label_of(
+    name: str, ndim: int, are_particles: bool = False
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the dimensions and the attributes (units, long_name) of an array of a curve.
+
+    Args:
+        name: from `to_arrays`.
+        ndim: number of its axes.
+        are_particles: whether `Particles` are saved.
+    """
+    group, _, place = name.partition(".")
+    first = (REPLICA, TIME) if group.endswith(OF_REPLICAS) else (TIME,)
+    if group in _PARTICLES or (group == SAVED and are_particles):
+        unit, *dims = _PARTICLES[place or group]
+        dims = [*(first if place else ()), *dims]
+        return tuple(dims[:ndim]), {"units": unit, "long_name": (place or group).replace("_", " ")}
+    if group in _SAVED_FIELDS:  # of a function of the user, who knows its unit
+        base = f"{SAVED}.{place}" if place else SAVED
+        axes = (f"{base}.axis{k}" for k in range(ndim - len(first)))
+        return (*first, *axes), {"long_name": name.replace("_", " ")}
+    quantity = QUANTITIES[group.removesuffix(OF_REPLICAS)]
+    return first, {"units": quantity.unit, "long_name": quantity.label}
+
+
+def records_in_si(
+    records: dict[str, Array], *, length: Array, temperature: Array, mass: Array
+) -> dict[str, Array]:
+    """Return the quantities among the records of a run, shape (times, replicas), in SI.
+
+    Args:
+        records: in units of a length, a temperature and a mass, by field; others are left out.
+        length: m.
+        temperature: m^2/s^2.
+        mass: kg.
+
+    Returns:
+        Quantities by field, shape (replicas, times).
+    """
+    scales = {
+        "1": 1.0,
+        "m^2": length**2,
+        "m^2/s^2": temperature,
+        "J": mass * temperature,
+    }
+    return {
+        name: records[name].T * scales[QUANTITIES[name].unit]
+        for name in QUANTITIES
+        if name in records
+    }
+
+
+# Until `jaxgran.sweep` uses the functions above.
+QUANTITY_UNITS = {quantity.field: quantity.unit for quantity in QUANTITIES.values()}
+COLUMNS = {q.column: q.field for q in QUANTITIES.values() if q.measured}
 
 
 def is_saved(name: str) -> bool:
-    """Return whether an array of this name comes from `saved_arrays`."""
-    return name.partition(".")[0] in (_MEAN, _ERROR, _EACH)
+    return name.partition(".")[0] in _SAVED_FIELDS
 
 
 def saved_arrays(curve: CoolingCurve) -> dict[str, Any]:
-    """Return the saved arrays of a curve, named by their places in the tree.
-
-    A mean is named as ``saved.S.0``, its standard error ``saved_error.S.0``, and the values of each
-    replica ``saved_of_replicas.S.0``.
-    """
-    return {
-        _saved_name(part, path): leaf
-        for part, tree in _saved_trees(curve).items()
-        for path, leaf in jax.tree.flatten_with_path(tree)[0]
-    }
+    return {name: x for name, x in to_arrays(curve).items() if is_saved(name)}
 
 
 def with_saved_arrays(
     curve: CoolingCurve, like: CoolingCurve, arrays: dict[str, Any]
 ) -> CoolingCurve:
-    """Return a curve with these saved arrays, in trees of the structure that `like` has."""
-    trees = {}
-    for part, tree in _saved_trees(like).items():
-        paths, structure = jax.tree.flatten_with_path(tree)
-        trees[part] = jax.tree.unflatten(
-            structure, [arrays[_saved_name(part, path)] for path, _ in paths]
-        )
-    if _EACH in trees:
-        assert curve.replicas is not None
-        replicas = dataclasses.replace(curve.replicas, saved=trees.pop(_EACH))
-        curve = dataclasses.replace(curve, replicas=replicas)
-    return dataclasses.replace(curve, **trees)
+    return from_arrays(to_arrays(curve) | arrays, like)
 
 
 def saved_dimensions(name: str, ndim: int, are_particles: bool) -> tuple[str, ...]:
-    """Return the labels of the axes of a saved array.
-
-    Args:
-        name: name of the array, from `saved_arrays`.
-        ndim: number of its axes.
-        are_particles: whether `Particles` are saved.
-    """
-    part, _, place = name.partition(".")
-    if are_particles:
-        return (TIME, *_PARTICLE_DIMENSIONS[place][: ndim - 1])
-    first = (REPLICA, TIME) if part == _EACH else (TIME,)
-    base = f"{SAVED}.{place}" if place else SAVED
-    return *first, *(f"{base}.axis{k}" for k in range(ndim - len(first)))
+    return label_of(name, ndim, are_particles)[0]
 
 
 def saved_unit(name: str, are_particles: bool) -> str | None:
-    """Return the unit of a saved array, or None where a user's function determines it."""
-    return _PARTICLE_UNITS[name.partition(".")[2]] if are_particles else None
-
-
-def _saved_trees(curve: CoolingCurve) -> dict[str, Any]:
-    """Return the saved trees of a curve by the first part of their names."""
-    each = None if curve.replicas is None else curve.replicas.saved
-    trees = {_MEAN: curve.saved, _ERROR: curve.saved_error, _EACH: each}
-    return {part: tree for part, tree in trees.items() if tree is not None}
-
-
-def _saved_name(part: str, path: tuple[Any, ...]) -> str:
-    """Return the name of an array at a place in a tree.
-
-    Raises:
-        ValueError: for a key of a dictionary that would make the name ambiguous.
-    """
-    keys = [jax.tree_util.keystr((key,), simple=True) for key in path]
-    for key in keys:
-        if "." in key or "/" in key:
-            raise ValueError(
-                f"save returns a dictionary with the key {key!r}: keys name arrays of a store "
-                'or of an xarray.Dataset. Leave "." and "/" out'
-            )
-    return ".".join([part, *keys])
+    return label_of(name, 1, are_particles)[1].get("units")

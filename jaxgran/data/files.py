@@ -1,4 +1,4 @@
-"""Atomic writing of files, and reading of CSV files whose header lines hold values."""
+"""Atomic writing of files, and numbers of the header of a curve."""
 
 import errno
 import os
@@ -6,10 +6,9 @@ import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 
 def write_atomically(path: str | Path, write: Callable[[Any], Any]) -> None:
@@ -117,100 +116,3 @@ def header_count(header: dict[str, str], key: str) -> int | None:
             f"{header[key]!r}"
         )
     return int(number)
-
-
-def read_text(path: Path, columns: str) -> str:
-    """Return the text of a CSV file.
-
-    Args:
-        path: the file.
-        columns: names of the columns that it should have, for the message.
-
-    Raises:
-        ValueError: if the file cannot be read, is empty or is no text.
-    """
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte-order mark
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path") from None
-    except (UnicodeDecodeError, IsADirectoryError):
-        raise ValueError(
-            f"{path}: not a text file; give a CSV file with the columns {columns}"
-        ) from None
-    except OSError as error:
-        raise ValueError(
-            f"{path}: cannot be read ({error.strerror}); check its permissions"
-        ) from None
-    if "\x00" in text:
-        raise ValueError(f"{path}: a binary file; give a CSV file with the columns {columns}")
-    if not text.strip():
-        raise ValueError(f"{path}: the file is empty; it needs the columns {columns}")
-    return text
-
-
-def number_row(path: Path, i: int, line: str, names: list[str]) -> list[float]:
-    """Return the numbers of line i; raise ValueError unless each column has a finite one."""
-    cells = line.split(",")
-    try:
-        values = [float(cell) for cell in cells]
-    except ValueError:
-        values = []
-    if len(values) != len(names) or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"{path}, line {i}: expected {len(names)} finite numbers ({','.join(names)}), "
-            f"got {line!r}; correct or remove this row"
-        )
-    return values
-
-
-class Table(NamedTuple):
-    """Content of a CSV file.
-
-    Attributes:
-        header: values of the lines ``# key: value``, by key.
-        columns: numbers of each column, by its name.
-        lines: line number of each row, counted from 1.
-    """
-
-    header: dict[str, str]
-    columns: dict[str, Float[np.ndarray, "rows"]]
-    lines: list[int]
-
-
-def read_table(path: Path, wanted: str, check_names: Callable[[int, list[str]], None]) -> Table:
-    """Read header lines ``# key: value``, a line of names, and rows of finite numbers.
-
-    Args:
-        path: the file.
-        wanted: the names of its columns, for messages.
-        check_names: raises ValueError for wrong names; its arguments are their line and the names.
-
-    Raises:
-        ValueError: saying what is wrong, in which line, and what to do.
-    """
-    header: dict[str, str] = {}
-    names: list[str] = []
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    for i, line in enumerate(read_text(path, wanted).splitlines(), start=1):
-        line = line.strip()
-        if line.startswith("#"):
-            key, colon, value = line[1:].partition(":")
-            if colon:
-                _add_header_line(path, i, header, key.strip(), value.strip())
-        elif line and not names:
-            names = [name.strip() for name in line.split(",")]
-            check_names(i, names)
-        elif line:
-            rows.append(number_row(path, i, line, names))
-            lines.append(i)
-    values = np.array(rows, dtype=float).reshape(len(rows), len(names))
-    return Table(header, dict(zip(names, values.T, strict=True)), lines)
-
-
-def _add_header_line(path: Path, i: int, header: dict[str, str], key: str, value: str) -> None:
-    if key in header:
-        raise ValueError(
-            f"{path}, line {i}: {key} is given again, as {value} after {header[key]}; remove one"
-        )
-    header[key] = value

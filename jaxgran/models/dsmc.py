@@ -22,7 +22,7 @@ from jaxgran._utils.validation import (
     python_int,
 )
 from jaxgran.data.checkpoint import describe_run
-from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
+from jaxgran.data.curve import DEFAULTS, QUANTITIES, CoolingCurve, Run, records_in_si
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
@@ -226,20 +226,14 @@ def _curve(
     """
     fault = records["fault"] | status.flag(status.OUT_OF_RANGE, unreachable_times)[:, None]
     failed = jnp.cumsum(fault != status.OK, axis=0) > 0
-    units = {
-        "temperature": gas.temperature,
-        "sonine": 1.0,
-        "displacement": gas.path_length**2,
-        "velocity_correlation": gas.temperature,
-        "collisions": 1.0,
-        "rotational_temperature": gas.temperature,
-    }
+    records = {name: x for name, x in records.items() if name in QUANTITIES}
     if gas.container is not None:  # walls would limit <dr^2>
-        del units["displacement"]
-    values = {
-        name: jnp.where(failed, jnp.nan, records[name]).T * unit
-        for name, unit in units.items()
-        if name in records
-    }
+        records.pop("displacement", None)
+    values = records_in_si(
+        {name: jnp.where(failed, jnp.nan, x) for name, x in records.items()},
+        length=gas.path_length,
+        temperature=gas.temperature,
+        mass=gas.mass,
+    )
     status_of_all = jnp.bitwise_or.reduce(fault, axis=None)
     return CoolingCurve.of_replicas(times, values, status=status_of_all), failed.T

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int, no_type_check
-from jaxgran.data.curve import DEFAULTS, CoolingCurve, Particles, Run
+from jaxgran.data.curve import DEFAULTS, CoolingCurve, Particles, Run, records_in_si
 from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
@@ -305,24 +305,9 @@ class AbstractSpheres(AbstractModel):
         save: Any,
     ) -> CoolingCurve:
         """Return the curve in SI units from records in reduced units."""
-        energy = gas.mass * gas.temperature
-        units_of_records = {
-            "temperature": gas.temperature,
-            "sonine": 1.0,
-            "displacement": gas.diameter**2,
-            "velocity_correlation": gas.temperature,
-            "elastic_energy": energy,
-            "dissipated_energy": energy,
-            "collisions": 1.0,
-            "regularised": 1.0,
-            "flow_share": 1.0,
-            "rotational_temperature": gas.temperature,
-        }
-        values = {
-            name: out.records[name].T * unit
-            for name, unit in units_of_records.items()
-            if name in out.records
-        }
+        values = records_in_si(
+            out.records, length=gas.diameter, temperature=gas.temperature, mass=gas.mass
+        )
         # Traced values could not be checked before the run.
         other_box = has_other_box(self.start, gas, self.num_particles)
         invalid = other_box | unreachable_times

@@ -4,6 +4,7 @@ Each element is an optional field of `Gas`. The compiled program of a gas withou
 not contain it. `wall_impact_ratio` describes the gas near a wall that dissipates energy.
 """
 
+from collections.abc import Callable
 from math import pi, sqrt
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -13,11 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import is_known
-from jaxgran._utils.validation import FRACTION, NON_NEGATIVE, POSITIVE, Domain, float_array
+from jaxgran._utils.validation import FRACTION, Domain, number_named
 from jaxgran.scene.laws import ConstantRestitution, RestitutionLaw
-
-TANGENTIAL_RANGE = Domain(-1.0, 1.0, low_allowed=True, high_allowed=True)
-"""Range of tangential restitution: -1 for a smooth surface, 1 for a perfectly rough one."""
+from jaxgran.scene.parameters import check_fields, domains_of
 
 NUM_SPIN_COMPONENTS = {2: 1, 3: 3}
 """Number of components of the angular velocity, d_rot, by dimension."""
@@ -70,24 +69,18 @@ class Rough(eqx.Module):
     0.5
     """
 
-    tangential_restitution: Float[Array, ""] = eqx.field(converter=float_array)
-    inertia: Float[Array, ""] = eqx.field(converter=float_array, default=0.4)
-    rotational_temperature: Float[Array, ""] = eqx.field(converter=float_array, default=0.0)
+    tangential_restitution: Float[Array, ""] = eqx.field(
+        converter=number_named("tangential_restitution")
+    )
+    inertia: Float[Array, ""] = eqx.field(converter=number_named("inertia"), default=0.4)
+    rotational_temperature: Float[Array, ""] = eqx.field(
+        converter=number_named("rotational_temperature"), default=0.0
+    )
 
-    domains: ClassVar[dict[str, Domain]] = {
-        "tangential_restitution": TANGENTIAL_RANGE,
-        "inertia": Domain(0.0, 1.0, high_allowed=True),
-        "rotational_temperature": NON_NEGATIVE,
-    }
+    domains: ClassVar[dict[str, Domain]] = domains_of("Rough")
 
     def __check_init__(self):
-        advice = {
-            "tangential_restitution": "-1 is a smooth surface, 1 a perfectly rough one.",
-            "inertia": "It is 4 I/(m sigma^2): 0.4 for solid spheres.",
-            "rotational_temperature": "Give I <w^2>/(d_rot m) at t = 0 in m^2/s^2.",
-        }
-        for name, domain in self.domains.items():
-            domain.check(name, getattr(self, name), advice[name])
+        check_fields(self, "Rough")
 
 
 class Frictional(eqx.Module):
@@ -129,27 +122,17 @@ class Frictional(eqx.Module):
     0.3
     """
 
-    tangential_damping: Float[Array, ""] = eqx.field(converter=float_array)
-    friction: Float[Array, ""] = eqx.field(converter=float_array)
-    inertia: Float[Array, ""] = eqx.field(converter=float_array, default=0.4)
-    rotational_temperature: Float[Array, ""] = eqx.field(converter=float_array, default=0.0)
+    tangential_damping: Float[Array, ""] = eqx.field(converter=number_named("tangential_damping"))
+    friction: Float[Array, ""] = eqx.field(converter=number_named("friction"))
+    inertia: Float[Array, ""] = eqx.field(converter=number_named("inertia"), default=0.4)
+    rotational_temperature: Float[Array, ""] = eqx.field(
+        converter=number_named("rotational_temperature"), default=0.0
+    )
 
-    domains: ClassVar[dict[str, Domain]] = {
-        "tangential_damping": NON_NEGATIVE,
-        "friction": NON_NEGATIVE,
-        "inertia": Domain(0.0, 1.0, high_allowed=True),
-        "rotational_temperature": NON_NEGATIVE,
-    }
+    domains: ClassVar[dict[str, Domain]] = domains_of("Frictional")
 
     def __check_init__(self):
-        advice = {
-            "tangential_damping": "It is relative to the normal damping: 0 to 1 is usual.",
-            "friction": "It is Coulomb's coefficient: glass has 0.1 to 0.5.",
-            "inertia": "It is 4 I/(m sigma^2): 0.4 for solid spheres.",
-            "rotational_temperature": "Give I <w^2>/(d_rot m) at t = 0 in m^2/s^2.",
-        }
-        for name, domain in self.domains.items():
-            domain.check(name, getattr(self, name), advice[name])
+        check_fields(self, "Frictional")
 
 
 def _wall_law(law: UserWallLaw) -> RestitutionLaw:
@@ -159,8 +142,11 @@ def _wall_law(law: UserWallLaw) -> RestitutionLaw:
     return ConstantRestitution(law)
 
 
-def _number_or_none(value: Any) -> Array | None:
-    return None if value is None else float_array(value)
+def _number_or_none(name: str) -> Callable[[Any], Array | None]:
+    def convert(value: Any) -> Array | None:
+        return None if value is None else number_named(name)(value)
+
+    return convert
 
 
 class Walls(eqx.Module):
@@ -188,22 +174,20 @@ class Walls(eqx.Module):
     (0.05, 0.9)
     """
 
-    side: Float[Array, "..."] = eqx.field(converter=float_array)
+    side: Float[Array, "..."] = eqx.field(converter=number_named("side of the walls"))
     restitution: RestitutionLaw = eqx.field(converter=_wall_law, kw_only=True)
     tangential_restitution: Float[Array, ""] | None = eqx.field(
-        converter=_number_or_none, default=None, kw_only=True
+        converter=_number_or_none("tangential_restitution of the walls"), default=None, kw_only=True
     )
     tangential_damping: Float[Array, ""] | None = eqx.field(
-        converter=_number_or_none, default=None, kw_only=True
+        converter=_number_or_none("tangential_damping of the walls"), default=None, kw_only=True
     )
     friction: Float[Array, ""] | None = eqx.field(
-        converter=_number_or_none, default=None, kw_only=True
+        converter=_number_or_none("friction of the walls"), default=None, kw_only=True
     )
 
     def __check_init__(self):
-        for name, domain in self.domains.items():
-            advice = "Give it in metres." if name == "side" else ""
-            domain.check(f"{name} of the walls", getattr(self, name), advice)
+        check_fields(self, "Walls", " of the walls")
         if (self.tangential_damping is None) != (self.friction is None):
             given, missing = "tangential_damping", "friction"
             if self.tangential_damping is None:
@@ -215,13 +199,7 @@ class Walls(eqx.Module):
     @property
     def domains(self) -> dict[str, Domain]:
         """Allowed range of each float of the walls, without those of their law."""
-        optional = {
-            "tangential_restitution": TANGENTIAL_RANGE,
-            "tangential_damping": NON_NEGATIVE,
-            "friction": NON_NEGATIVE,
-        }
-        given = {name: d for name, d in optional.items() if getattr(self, name) is not None}
-        return {"side": POSITIVE} | given
+        return {k: d for k, d in domains_of("Walls").items() if getattr(self, k) is not None}
 
     def more_collisions(self, diameter: Array, dimension: int) -> Float[Array, ""]:
         """Ratio of the collision frequency to that without walls at the same mean density.
@@ -259,14 +237,15 @@ class StokesDrag(eqx.Module):
     0.1
     """
 
-    rate: Float[Array, ""] = eqx.field(converter=float_array)
-    rotational_rate: Float[Array, ""] = eqx.field(converter=float_array, default=0.0)
+    rate: Float[Array, ""] = eqx.field(converter=number_named("rate of the drag"))
+    rotational_rate: Float[Array, ""] = eqx.field(
+        converter=number_named("rotational_rate of the drag"), default=0.0
+    )
 
-    domains: ClassVar[dict[str, Domain]] = {"rate": NON_NEGATIVE, "rotational_rate": NON_NEGATIVE}
+    domains: ClassVar[dict[str, Domain]] = domains_of("StokesDrag")
 
     def __check_init__(self):
-        for name, domain in self.domains.items():
-            domain.check(f"{name} of the drag", getattr(self, name), "Give it in 1/s.")
+        check_fields(self, "StokesDrag", " of the drag")
 
 
 class WhiteNoise(eqx.Module):
@@ -295,13 +274,12 @@ class WhiteNoise(eqx.Module):
     0.001
     """
 
-    strength: Float[Array, ""] = eqx.field(converter=float_array)
+    strength: Float[Array, ""] = eqx.field(converter=number_named("strength of the drive"))
 
-    domains: ClassVar[dict[str, Domain]] = {"strength": NON_NEGATIVE}
+    domains: ClassVar[dict[str, Domain]] = domains_of("WhiteNoise")
 
     def __check_init__(self):
-        advice = "Give the growth of T = <v^2>/d in time, m^2/s^3."
-        NON_NEGATIVE.check("strength of the drive", self.strength, advice)
+        check_fields(self, "WhiteNoise", " of the drive")
 
 
 class DrivenStart(eqx.Module):

@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from functools import reduce
 from math import gamma, pi
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -25,6 +25,7 @@ from jaxgran._utils.validation import (
     check_not_subnormal,
     checked_int,
     float_array,
+    number_named,
 )
 from jaxgran.scene import elements
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
@@ -51,20 +52,7 @@ from jaxgran.scene.laws import (
     check_reduced_units,
     restitution_at,
 )
-
-FLOAT_UNITS = {
-    "diameter": "m",
-    "mass": "kg",
-    "temperature": "m^2/s^2",
-    "youngs_modulus": "Pa",
-    "dissipative_constant": "s",
-    "rotational_temperature": "m^2/s^2",
-    "wall_side": "m",
-    "drag_rate": "1/s",
-    "drag_rotational_rate": "1/s",
-    "drive_strength": "m^2/s^3",
-}
-"""Unit of each float of a gas that has one."""
+from jaxgran.scene.parameters import ADVICE, FLOAT_UNITS, PREFIXES, domains_of, fields_of
 
 S = TypeVar("S", bound="NamedFloats")
 
@@ -197,10 +185,12 @@ class Gas(NamedFloats):
     """
 
     law: RestitutionLaw = eqx.field(converter=_checked_law)
-    diameter: Float[Array, ""] = eqx.field(converter=float_array, kw_only=True)
-    mass: Float[Array, ""] = eqx.field(converter=float_array, kw_only=True)
-    packing_fraction: Float[Array, ""] = eqx.field(converter=float_array, kw_only=True)
-    temperature: Float[Array, ""] = eqx.field(converter=float_array, kw_only=True)
+    diameter: Float[Array, ""] = eqx.field(converter=number_named("diameter"), kw_only=True)
+    mass: Float[Array, ""] = eqx.field(converter=number_named("mass"), kw_only=True)
+    packing_fraction: Float[Array, ""] = eqx.field(
+        converter=number_named("packing_fraction"), kw_only=True
+    )
+    temperature: Float[Array, ""] = eqx.field(converter=number_named("temperature"), kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
     surface: Rough | Frictional | None = optional_element(Rough, Frictional)
     container: Walls | None = optional_element(Walls)
@@ -208,38 +198,25 @@ class Gas(NamedFloats):
     drive: WhiteNoise | None = optional_element(WhiteNoise)
     preparation: DrivenStart | None = optional_element(DrivenStart)
 
-    _domains: ClassVar[dict[str, Domain]] = {
-        "diameter": POSITIVE,
-        "mass": POSITIVE,
-        "temperature": POSITIVE,
-    }
-    _advice: ClassVar[dict[str, str]] = {
-        "diameter": "Give it in metres.",
-        "mass": "Give it in kilograms; sphere_mass(diameter, density) computes it.",
-        "temperature": "Give <v^2>/d in m^2/s^2.",
-        "packing_fraction": "It is the fraction of the volume (of the area if dimension = 2) that "
-        "the spheres occupy; the upper end is close packing.",
-    }
-
     def __check_init__(self):
         if self.dimension not in CLOSE_PACKING or isinstance(self.dimension, bool | float):
             raise ValueError(f"dimension must be 2 or 3, got {self.dimension!r}")
-        shared = [name for name in self.law.domains if name in self._advice]
+        own = fields_of("Gas")
+        shared = [name for name in self.law.domains if name in own]
         if shared:
             raise ValueError(
                 f"the law {type(self.law).__name__} has a field {shared[0]!r}, which is also the "
                 "name of a float of the gas: rename it"
             )
-        for name, domain in self.domains.items():
-            if name in self._advice:
-                value = getattr(self, name)
-                domain.check(name, value, self._advice[name])
-                check_not_subnormal(name, value)
+        for name in own:
+            value = getattr(self, name)
+            self.domains[name].check(name, value, ADVICE[name])
+            check_not_subnormal(name, value)
         elements.check_elements(self)
 
     @property
     def _float_fields(self) -> dict[str, FloatField]:
-        gas_domains = {**self._domains, "packing_fraction": _PACKING_DOMAINS[self.dimension]}
+        gas_domains = domains_of("Gas") | {"packing_fraction": _PACKING_DOMAINS[self.dimension]}
         law_domains = self.law.domains
         fields = {name: FloatField(("law", name), domain) for name, domain in law_domains.items()}
         fields |= {name: FloatField((name,), domain) for name, domain in gas_domains.items()}
@@ -253,12 +230,12 @@ class Gas(NamedFloats):
         if self.surface is not None:
             yield "", ("surface",), self.surface
         if self.container is not None:
-            yield "wall_", ("container",), self.container
-            yield "wall_", ("container", "restitution"), self.container.restitution
+            yield PREFIXES["Walls"], ("container",), self.container
+            yield PREFIXES["Walls"], ("container", "restitution"), self.container.restitution
         if self.drag is not None:
-            yield "drag_", ("drag",), self.drag
+            yield PREFIXES["StokesDrag"], ("drag",), self.drag
         if self.drive is not None:
-            yield "drive_", ("drive",), self.drive
+            yield PREFIXES["WhiteNoise"], ("drive",), self.drive
 
     @property
     def elements(self) -> tuple[str, ...]:

@@ -19,15 +19,15 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import (
     ANY,
-    FRACTION,
     NON_NEGATIVE,
-    POSITIVE,
     Domain,
     UserBool,
     check_bool,
     float_array,
+    number_named,
 )
 from jaxgran.scene import contact
+from jaxgran.scene.parameters import ADVICE, domains_of
 
 _UNITS_ADVICE = (
     "a reduced law gets speeds in units of `speed`: leave `reduced` out and let "
@@ -74,7 +74,7 @@ class RestitutionLaw(eqx.Module):
         for name in numbers:
             default = vars(cls).get(name, dataclasses.MISSING)
             if not isinstance(default, dataclasses.Field):
-                setattr(cls, name, eqx.field(converter=float_array, default=default))
+                setattr(cls, name, eqx.field(converter=number_named(name), default=default))
 
     def __check_init__(self):
         kind, base = type(self), RestitutionLaw
@@ -426,21 +426,15 @@ class Viscoelastic(RestitutionLaw):
     '3e-06 s'
     """
 
-    youngs_modulus: Float[Array, ""] = eqx.field(converter=float_array)
-    poisson_ratio: Float[Array, ""] = eqx.field(converter=float_array)
-    dissipative_constant: Float[Array, ""] = eqx.field(converter=float_array)
+    youngs_modulus: Float[Array, ""] = eqx.field(converter=number_named("youngs_modulus"))
+    poisson_ratio: Float[Array, ""] = eqx.field(converter=number_named("poisson_ratio"))
+    dissipative_constant: Float[Array, ""] = eqx.field(
+        converter=number_named("dissipative_constant")
+    )
     clipped: UserBool = eqx.field(static=True, default=True)
 
-    domains: ClassVar[dict[str, Domain]] = {
-        "youngs_modulus": POSITIVE,
-        "poisson_ratio": Domain(-1.0, 0.5),
-        "dissipative_constant": NON_NEGATIVE,
-    }
-    advice: ClassVar[dict[str, str]] = {
-        "youngs_modulus": "Give Young's modulus in Pa (glass has about 7e10).",
-        "poisson_ratio": "Most solids lie between 0.2 and 0.45.",
-        "dissipative_constant": "Give A in seconds; A = 0 makes the spheres elastic.",
-    }
+    domains: ClassVar[dict[str, Domain]] = domains_of("Viscoelastic")
+    advice: ClassVar[dict[str, str]] = ADVICE
 
     def __check_init__(self):
         check_bool("clipped", self.clipped)
@@ -496,12 +490,10 @@ class ConstantRestitution(RestitutionLaw, ReducedLaw):
     (0.9075542559594306, 0.9)
     """
 
-    coefficient: Float[Array, ""] = eqx.field(converter=float_array)
+    coefficient: Float[Array, ""] = eqx.field(converter=number_named("coefficient"))
 
-    domains: ClassVar[dict[str, Domain]] = {"coefficient": FRACTION}
-    advice: ClassVar[dict[str, str]] = {
-        "coefficient": "1 is an elastic impact; 0 removes the normal relative velocity."
-    }
+    domains: ClassVar[dict[str, Domain]] = domains_of("ConstantRestitution")
+    advice: ClassVar[dict[str, str]] = ADVICE
 
     def reduced(
         self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
@@ -530,8 +522,8 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
     (1,)
     """
 
-    coefficients: Float[Array, "terms"] = eqx.field(converter=float_array)
-    exponents: Float[Array, "terms"] = eqx.field(converter=float_array)
+    coefficients: Float[Array, "terms"] = eqx.field(converter=number_named("coefficients"))
+    exponents: Float[Array, "terms"] = eqx.field(converter=number_named("exponents"))
 
     domains: ClassVar[dict[str, Domain]] = {"coefficients": ANY, "exponents": ANY}
     lists: ClassVar[tuple[str, ...]] = ("coefficients", "exponents")

@@ -75,7 +75,9 @@ def test_everything_of_a_particle_run_is_kept(tmp_path):
 
 def test_an_archive_of_something_else_is_refused(tmp_path):
     np.savez(tmp_path / "other.npz", a=np.ones(3))
-    with pytest.raises(ValueError, match="not a file that jaxgran.write_curve wrote"):
+    with pytest.raises(
+        ValueError, match="not a file that this version of jaxgran.write_curve wrote"
+    ):
         jaxgran.read_curve(tmp_path / "other.npz")
     with pytest.raises(ValueError, match="no such file"):
         jaxgran.read_curve(tmp_path / "none.npz")
@@ -96,10 +98,10 @@ def test_nothing_is_written_over(write):
     [
         ("", "the file is empty; it needs the columns"),
         ("  \n\n", "the file is empty"),
-        (b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe", "not a text file; give a CSV"),
-        (b"t,T\n1,2\x00", "binary file"),
+        (b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe", "not a text file but a binary one; give a CSV"),
+        (b"t,T\n1,2\x00", "a binary one"),
         ("t,T_err\n1,2\n", "missing: T; name them t,T"),
-        ("time,T\n1,2\n", "missing: t; not known: time"),
+        ("when,T\n1,2\n", "missing: t; not known: when"),
         ("t,T,T\n1,2,3\n", "each once"),
         ("t,T,err\n1,2,3\n", "not known: err"),
         (
@@ -118,7 +120,8 @@ def test_nothing_is_written_over(write):
         ("t,T,T_err\n1,1,0\n2,.5,.1\n3,.3,.1\n", "line 2: T_err is 0"),
         ("t,T,msd\n0,1,0\n1,.5,-1\n2,.3,.1\n", "line 3: msd is -1"),
         ("t,T\n0,1\n1,.5\n", "2 rows of numbers, at least 3 are needed"),
-        (HEADER, "0 rows of numbers"),
+        (HEADER, "line 7: the file ends without columns; it needs t,T"),
+        (HEADER + "t,T\n", "0 rows of numbers"),
     ],
 )
 def test_bad_files_are_refused(text, message, write):

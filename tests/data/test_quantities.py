@@ -77,15 +77,16 @@ def test_units_of_the_header(read, tmp_path):
     np.testing.assert_array_equal(copy.times, curve.times)
     assert again == header
     # Centimetres and seconds: T is in cm^2/s^2.
-    curve, header = read(HEADER + "# length_unit: cm\n", "t,T", TIMES, T * 1e4)
+    head = HEADER.replace("diameter: 2", "diameter: 0.2").replace("T0: 0.01", "T0: 100")
+    curve, header = read(head + "# length_unit: cm\n", "t,T", TIMES, T * 1e4)
     np.testing.assert_allclose(curve.temperature, T, rtol=1e-12)
-    assert float(header["T0"]) == pytest.approx(1e-6)
+    assert float(header["T0"]) == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize(
     "header, names, message",
     [
-        ("# length_unit: inch\n", "t,T", "length_unit: 'inch' is not known; use m, cm, mm, um"),
+        ("# length_unit: s\n", "t,T", "length_unit: 's' is not known as a unit of m; write a unit"),
         ("", "t,energy", "column energy needs the mass of a particle: add diameter and density"),
         ("", "t,speed", "missing: T; not known: speed; .* there may be mean_speed, vx2, v2_xy"),
         ("", "t,vx2_err", "missing: T; not known: vx2_err"),
@@ -98,7 +99,7 @@ def test_what_is_not_said_is_asked_for(read, header, names, message):
 
 def test_values_of_no_granular_gas_are_warned_of(read):
     _, header = read(HEADER, "t,T", TIMES, T)  # 2 m, for 2 mm
-    with pytest.warns(UserWarning, match="diameter is 2, outside 1e-07 to 0.1 m: check its unit"):
+    with pytest.warns(UserWarning, match="diameter is 2 m, and usual is .*: is it in mm"):
         jaxgran.read_gas(header)
 
 

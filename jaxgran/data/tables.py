@@ -1,0 +1,369 @@
+"""CSV tables as people write them: encodings, separators, decimal commas, units, header lines.
+
+A table has header lines ``# key: value``, a line with the names of the columns, and rows of
+numbers. Units in names, as ``T (mm^2/s^2)``, in header values, as ``diameter: 2 mm``, and in the
+header keys length_unit, time_unit and speed_unit are converted to SI by pint.
+"""
+
+import codecs
+import csv
+import gzip
+import math
+import re
+import zlib
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxgran.data.curve import QUANTITIES
+from jaxgran.scene.parameters import BY_SYMBOL
+
+UNIT_KEYS = {"length_unit": "m", "time_unit": "s", "speed_unit": "m/s"}
+"""Header keys of units, and the units that they replace. speed_unit is also that of T, squared."""
+
+UNITS = {
+    **{quantity.column: quantity.unit for quantity in QUANTITIES.values()},
+    **{symbol: parameter.unit or "1" for symbol, parameter in BY_SYMBOL.items()},
+    **dict.fromkeys(("x", "y", "z", "localisation_error", "box_side"), "m"),
+    **dict.fromkeys(("mean_speed", "v"), "m/s"),
+    **dict.fromkeys(("vx2", "v2_xy"), "m^2/s^2"),
+    "energy": "J",
+    "frame_rate": "1/s",
+    "timestep": "s",
+    "eps": "1",
+}
+"""Unit of each column and header key; that of a standard error, x_err, is that of x."""
+
+ALIASES = {"time": "t"} | {quantity.field: quantity.column for quantity in QUANTITIES.values()}
+"""Further names of columns, in any case."""
+
+SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "bars", " ": "blanks"}
+
+_MARKS = (
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+    (codecs.BOM_UTF8, "utf-8-sig"),
+)
+_BINARY = re.compile(r"[\x00-\x08\x0e-\x1f]")
+_NAME = re.compile(r"(?P<name>\w+)\s*(?:[(\[](?P<bracket>.*)[)\]]|/\s*(?P<slash>.+))?")
+_NAMES_BETWEEN_BLANKS = re.compile(r"[^\s(\[]+(?:\s*[(\[][^)\]]*[)\]])?")
+_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eEdD][+-]?\d+)?")
+
+
+class Table(NamedTuple):
+    """Content of a CSV file, in SI.
+
+    Attributes:
+        header: values of the lines ``# key: value``, by key, without units.
+        columns: numbers of each column, by its name.
+        lines: line number of each row, counted from 1.
+    """
+
+    header: dict[str, str]
+    columns: dict[str, Float[np.ndarray, "rows"]]
+    lines: list[int]
+
+
+def checked_path(path: Any, columns: str) -> Path:
+    """Return the path of a CSV file; raise ValueError if it is no name of a file."""
+    if not isinstance(path, str | Path):
+        raise ValueError(
+            f"path must be the name of a file, got {path!r:.60}; give a CSV file with the columns "
+            f"{columns}"
+        )
+    return Path(path)
+
+
+def read_text(path: Path, columns: str) -> str:
+    """Return the text of a CSV file in UTF-8, UTF-16, UTF-32 or Latin-1, also compressed (.gz).
+
+    Args:
+        path: the file.
+        columns: names of the columns that it should have, for the message.
+
+    Raises:
+        ValueError: if the file cannot be read, is empty or is no text.
+    """
+    wanted = f"give a CSV file with the columns {columns}"
+    try:
+        content = path.read_bytes()
+        content = gzip.decompress(content) if path.suffix == ".gz" else content
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; check the path") from None
+    except IsADirectoryError:
+        raise ValueError(f"{path}: not a text file but a folder; {wanted}") from None
+    except (EOFError, gzip.BadGzipFile, zlib.error):
+        raise ValueError(f"{path}: an incomplete or damaged .gz file; pack it again") from None
+    except OSError as error:
+        raise ValueError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions"
+        ) from None
+    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8")
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    if _BINARY.search(text):
+        raise ValueError(f"{path}: not a text file but a binary one; {wanted}, saved as UTF-8")
+    if not text.strip():
+        raise ValueError(f"{path}: the file is empty; it needs the columns {columns}")
+    return text
+
+
+def read_table(
+    path: Path, wanted: str, columns_to_read: Callable[[int, list[str]], Iterable[str]]
+) -> Table:
+    """Read header lines, a line of names, and rows of finite numbers.
+
+    Args:
+        path: the file.
+        wanted: the names of its columns, for messages.
+        columns_to_read: from the number of the line of names and the names without units, the
+            columns whose numbers are read; raises ValueError, without the path, for wrong names.
+
+    Raises:
+        ValueError: saying what is wrong, in which line, and what to do.
+    """
+    text = read_text(path, wanted).replace("\r\n", "\n").replace("\r", "\n")
+    try:
+        return _parse(text, wanted, columns_to_read)
+    except ValueError as error:
+        raise ValueError(f"{path}, {error}") from None
+
+
+def _parse(
+    text: str, wanted: str, columns_to_read: Callable[[int, list[str]], Iterable[str]]
+) -> Table:
+    header: dict[str, str] = {}
+    names: list[str] = []
+    cells: dict[int, list[str]] = {}
+    separator, first = "", 0
+    for i, line in enumerate(text.split("\n"), start=1):
+        bare = line.strip(' "\t,;|')
+        if bare.startswith("#"):
+            _add_header_line(header, i, bare.strip("# "))
+        elif bare and not names:
+            separator = next((mark for mark in SEPARATORS if mark in line), " ")
+            first, names = i, _names(i, line, separator, wanted)
+        elif bare:
+            cells[i] = _split(line, separator, len(names))
+    if not names:
+        raise ValueError(f"line {i}: the file ends without columns; it needs {wanted}")
+    units = _pop_units(header)
+    told = [_name_and_unit(name) for name in names]
+    bare_names = [name for name, _ in told]
+    chosen = list(columns_to_read(first, [name for name in bare_names if name]))
+    at = [bare_names.index(name) for name in chosen]
+    factors = [_factor_of(name, dict(told), units, "column") for name in bare_names]
+    comma = _decimal_comma(cells, at, separator)
+    rows = [_numbers(i, row, names, at, separator, comma) for i, row in cells.items()]
+    values = np.array(rows, dtype=float).reshape(len(rows), len(at)) * [factors[k] for k in at]
+    header = _convert_header(header, units, comma)
+    return Table(header, dict(zip(chosen, values.T, strict=True)), list(cells))
+
+
+def _split(line: str, separator: str, length: int) -> list[str]:
+    """Return the cells of a line, without empty ones beyond a length, as spreadsheets add them."""
+    if separator == " ":
+        cells = line.split()
+    else:
+        (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+    cells = [cell.strip(' \t"') for cell in cells]
+    while len(cells) > length and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _names(i: int, line: str, separator: str, wanted: str) -> list[str]:
+    """Return the names of the columns, with their units, from line i."""
+    blanks = separator == " "
+    names = _NAMES_BETWEEN_BLANKS.findall(line) if blanks else _split(line, separator, 0)
+    if all(_NUMBER.fullmatch(name) for name in names if name):
+        raise ValueError(
+            f"line {i}: numbers without names of the columns; add a line above them, without #, "
+            f"such as {wanted}"
+        )
+    return names
+
+
+def _decimal_comma(cells: dict[int, list[str]], at: list[int], separator: str) -> bool:
+    """Return whether the numbers of some columns have decimal commas."""
+    read = [(i, row[k]) for i, row in cells.items() for k in at if k < len(row)]
+    comma = next(((i, cell) for i, cell in read if "," in cell), None)
+    point = next(((i, cell) for i, cell in read if "." in cell), None)
+    if comma is not None and (point is not None or separator == ","):
+        other = f", and {point[1]!r} in line {point[0]} a point" if point else ""
+        raise ValueError(
+            f"line {comma[0]}: {comma[1]!r} has a comma{other}, between {SEPARATORS[separator]}: "
+            "is it a decimal comma or a separator of thousands? Write decimal points alone, or "
+            "decimal commas alone between semicolons"
+        )
+    return comma is not None
+
+
+def _plain_number(text: str, comma: bool) -> str:
+    """Return a number with a decimal point and the exponent e; other text unchanged."""
+    if not _NUMBER.fullmatch(text) or ("," in text and not comma):
+        return text
+    return re.sub("[dD]", "e", text.replace(",", "."))
+
+
+def _numbers(
+    i: int, row: list[str], names: list[str], at: list[int], separator: str, comma: bool
+) -> list[float]:
+    """Return the numbers of some cells of line i, which must be finite."""
+    values = [math.nan]
+    if len(row) == len(names):
+        plain = [_plain_number(row[k], comma) for k in at]
+        values = [float(x) if _NUMBER.fullmatch(x) else math.nan for x in plain]
+    if not np.all(np.isfinite(values)):
+        advice = "correct or remove this row"
+        if len(row) > len(names) and separator == ",":
+            advice += "; if numbers have decimal commas, separate the columns by semicolons"
+        raise ValueError(
+            f"line {i}: expected {len(names)} finite numbers ({','.join(names)}) between "
+            f"{SEPARATORS[separator]}, got {separator.join(row)!r}; {advice}"
+        )
+    return values
+
+
+def _add_header_line(header: dict[str, str], i: int, line: str) -> None:
+    """Add ``key: value``, or ``key = value`` where the key is one word; skip other comments."""
+    match = re.match("([^:=]*)([:=])(.*)", line)
+    if match is None:
+        return
+    key, mark, value = (part.strip() for part in match.groups())
+    name = _NAME.fullmatch(key)
+    if name is None and (mark == "=" or key in header):
+        return
+    if name is not None and _base_unit(name["name"]) is not None:
+        key, unit = name["name"], name["bracket"] or name["slash"]
+        value = f"{value} {unit}" if unit else value
+    if key in header:
+        raise ValueError(
+            f"line {i}: {key} is given again, as {value} after {header[key]}; remove one"
+        )
+    header[key] = value
+
+
+def _base_unit(name: str) -> str | None:
+    """Return the SI unit of a column or header key, also of a standard error; None if unknown."""
+    return UNITS.get(name.removesuffix("_err"))
+
+
+def _pop_units(header: dict[str, str]) -> dict[str, str]:
+    """Remove the header keys of units; return the unit of numbers without one, by its SI unit."""
+    length, time, speed = (header.pop(key, unit) for key, unit in UNIT_KEYS.items())
+    for (key, base), unit in zip(UNIT_KEYS.items(), (length, time, speed), strict=True):
+        _factor(f"header line {key}", unit, base)
+    if speed == UNIT_KEYS["speed_unit"]:
+        speed = f"{length}/{time}"
+    return {
+        "m": length,
+        "m^2": f"{length}^2",
+        "s": time,
+        "1/s": f"1/{time}",
+        "m/s": speed,
+        "m^2/s^2": f"({speed})^2",
+        "m^2/s": f"{length}^2/{time}",
+        "m^2/s^3": f"({speed})^2/{time}",
+    }
+
+
+def header_in_si(header: dict[str, str]) -> dict[str, str]:
+    """Return a header whose numbers are in SI, without units; other text is unchanged.
+
+    Args:
+        header: values with or without a unit behind them, as "2 mm", and possibly the keys
+            length_unit, time_unit and speed_unit.
+
+    Raises:
+        ValueError: for a unit that is not known, or not one of the key.
+
+    >>> from jaxgran.data.tables import header_in_si
+    >>> header_in_si({"diameter": "2 mm", "eta": "0.05"})
+    {'diameter': '0.002', 'eta': '0.05'}
+    """
+    header = dict(header)
+    return _convert_header(header, _pop_units(header), comma=False)
+
+
+def _convert_header(header: dict[str, str], units: dict[str, str], comma: bool) -> dict[str, str]:
+    parts = {key: text.partition(" ") for key, text in header.items()}
+    told = {key: unit.strip() for key, (_, _, unit) in parts.items()}
+    converted = dict(header)
+    for key, (number, _, unit) in parts.items():
+        number, is_known = _plain_number(number, comma), _base_unit(key) is not None
+        if _NUMBER.fullmatch(number) and "," not in number and (is_known or not unit):
+            factor = _factor_of(key, told, units, "header line") if is_known else 1.0
+            converted[key] = number if factor == 1 else repr(factor * float(number))
+    return converted
+
+
+def _name_and_unit(name: str) -> tuple[str, str]:
+    """Return the name of a column, or its usual name, and the unit that stands behind it."""
+    match = _NAME.fullmatch(name)
+    if match is None:
+        return name, ""
+    bare = match["name"]
+    stem = bare.lower().removesuffix("_err").removesuffix("_error")
+    if stem in ALIASES:
+        bare = ALIASES[stem] + ("_err" if "_err" in bare.lower() else "")
+    return bare, match["bracket"] or match["slash"] or ""
+
+
+def _factor_of(name: str, told: dict[str, str], units: dict[str, str], kind: str) -> float:
+    """Return the value in SI of the unit of a name.
+
+    Args:
+        name: of a column or a header key; a standard error without a unit has that of its value.
+        told: the units that stand behind names.
+        units: the units of other numbers, by SI unit.
+        kind: of the name, for messages.
+    """
+    base = _base_unit(name)
+    if base is None:
+        return 1.0
+    unit = told[name] or told.get(name.removesuffix("_err")) or units.get(base, base)
+    return _factor(f"{kind} {name}", unit, base)
+
+
+def _factor(place: str, unit: str, base: str) -> float:
+    """Return the value of a unit in terms of an SI unit; `place` begins the message of an error."""
+    if unit in (base, base.replace("m^2/s^2", "(m/s)^2")):
+        return 1.0
+    advice = f"write a unit such as {base}, or leave it out"
+    if base == "m^2/s^2":
+        advice = "T is <v^2>/d, in m^2/s^2: convert it, or leave the unit out"
+    try:
+        return unit_in(unit, base)
+    except Exception:  # pint raises errors of many types for text that is no unit
+        raise ValueError(f"{place}: {unit!r} is not known as a unit of {base}; {advice}") from None
+
+
+def unit_in(unit: str, base: str) -> float:
+    """Return the value of a unit in terms of another one.
+
+    >>> from jaxgran.data.tables import unit_in
+    >>> unit_in("g/cm^3", "kg/m^3")
+    1000.0
+    """
+    parsed = _units().parse_units(re.sub(r"([A-Za-z])(\d)", r"\1^\2", unit))
+    if "pixel" in str(parsed):  # which pint takes for 1/96 inch
+        raise ValueError("a pixel is no length")
+    factor = _units().Quantity(1.0, parsed).to("" if base == "1" else base).magnitude
+    return float(f"{factor:.15g}")  # without the rounding errors of several factors
+
+
+@cache
+def _units() -> Any:
+    """Return pint's table of units, which takes half a second to load."""
+    import pint
+
+    return pint.UnitRegistry()
