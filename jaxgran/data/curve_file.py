@@ -427,7 +427,7 @@ def _check_container_volume(header: dict[str, str], gas: Gas) -> None:
 
 def _warn_of_unknown_keys(header: dict[str, str]) -> None:
     """Warn of unknown header keys. Comments that are no single word are not keys."""
-    keys = (*BY_SYMBOL, *OPTIONAL_KEYS, *UNIT_KEYS)
+    keys = dict.fromkeys((*REQUIRED, *BY_SYMBOL, *OPTIONAL_KEYS, *UNIT_KEYS))
     known = {*keys, *PRIOR_KEYS, *PROVENANCE_KEYS, *UNSUPPORTED_KEYS}
     unknown = [key for key in header if key.isidentifier() and key not in known]
     if unknown:
