@@ -4,12 +4,14 @@ import os
 import platform
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import jax
 import numpy as np
+from cyclopts import Parameter, Token
 from platformdirs import user_cache_path
 
 import jaxgran
@@ -28,6 +30,70 @@ ModelOrAuto = Literal[ModelName, "auto"]
 """Models of `jaxgran fit`, which can also choose one."""
 
 MODELS: tuple[str, ...] = get_args(ModelOrAuto)
+
+Several = Parameter(consume_multiple=True)
+
+
+def _whole_number(_: object, tokens: Sequence[Token]) -> int:
+    """Return the whole number of an option, which may be written as 1e4."""
+    text = tokens[0].value
+    try:
+        number = float(text)
+        if number.is_integer():
+            return int(text) if text.lstrip("+-").isdigit() else int(number)
+    except ValueError:
+        pass
+    raise ValueError(f"must be a whole number, got {text}")
+
+
+WholeNumber = Annotated[int, Parameter(converter=_whole_number)]
+
+if TYPE_CHECKING:
+    FreeParameter = str
+else:
+    FreeParameter = Literal[tuple(symbol for symbol in BY_SYMBOL if symbol != "density")]
+"""Arguments of --free."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class FitOptions:
+    """Options of `jaxgran fit`.
+
+    Attributes:
+        curve: The first curve.
+        drop_test: One or more CSV files with columns v,eps,eps_err: single impacts of the spheres
+            of the first curve, fitted jointly with it.
+        onto_plate: The impacts of the drop tests are on a thick plate of the same material.
+        model: Model to use; auto takes the cheapest one whose estimated error is within the
+            tolerance.
+        tolerance: Allowed relative error of T for the model auto.
+        particles: Number of particles per replica (particle models only; default: N from the
+            file).
+        replicas: Number of replicas (particle models only).
+        key: Seed of the random initial state (particle models only).
+        free: Parameters to fit; by default A, and T0 if T has no errors.
+        set: Header values KEY=VALUE that replace those of the file.
+        out: Output folder; by default a new one in results.
+        overwrite: Replace existing files in the output folder.
+        explain: Print the error budget as a table that explains each part.
+        no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
+    """
+
+    curve: Annotated[Path, Parameter(parse=False)] = Path()
+    drop_test: Annotated[tuple[Path, ...], Several] = ()
+    onto_plate: bool = False
+    model: ModelOrAuto = "kinetic-theory"
+    tolerance: float = 0.02
+    particles: WholeNumber | None = None
+    replicas: WholeNumber = 3
+    key: WholeNumber = 0
+    free: Annotated[tuple[FreeParameter, ...], Several] = ()
+    set: Annotated[tuple[str, ...], Several] = ()
+    out: Path | None = None
+    overwrite: bool = False
+    explain: bool = False
+    no_cache: bool = False
 
 
 def models_by_name(models) -> dict[str, AbstractModel]:
@@ -61,7 +127,7 @@ def choose_or_make_model(options: Any, gas, curve, free, num_particles: int | No
     return models_by_name(default_models(options.particles, replicas))[name], choice.reasons
 
 
-def parse_settings(pairs: list[str]) -> dict[str, str]:
+def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
     """Return header values from KEY=VALUE arguments."""
     known = (*BY_SYMBOL, *PRIOR_KEYS, *OPTIONAL_KEYS)
     values = {}

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import time
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import jaxgran
 from jaxgran import plotting
 from jaxgran.cli.common import (
     MODELS,
+    FitOptions,
     alternative_as_json,
     choose_or_make_model,
     environment,
@@ -41,23 +42,6 @@ JOINT_MODEL = MODELS[0]
 """The only model of joint fits: kinetic theory."""
 
 
-@dataclass
-class FitOptions:
-    """Options of `jaxgran fit`."""
-
-    curve: Path
-    model: str
-    tolerance: float
-    particles: int | None
-    replicas: int
-    key: int
-    free: list[str]
-    set: list[str]
-    out: Path | None
-    overwrite: bool
-    explain: bool = False
-
-
 def run_fit(options: FitOptions, started: float) -> None:
     """Fit one curve, print the result and write it.
 
@@ -70,7 +54,8 @@ def run_fit(options: FitOptions, started: float) -> None:
         curve, header = jaxgran.read_curve(options.curve)
         header |= parse_settings(options.set)
         gas, priors = gas_of(header, options.free), jaxgran.read_priors(header)
-    options.free = options.free or free_keys(free_by_default(gas, curve))
+    free_symbols = options.free or free_keys(free_by_default(gas, curve))
+    options = dataclasses.replace(options, free=tuple(free_symbols))
     gas = with_given_constant(gas, header, options.free)
     n = header_count(header, "N")
     replicas = header_count(header, "replicas") or 1
@@ -129,7 +114,7 @@ def free_keys(floats: tuple[str, ...]) -> list[str]:
     return [PARAMETERS[name].symbol for name in floats]
 
 
-def with_given_constant(gas, header, free: list[str]):
+def with_given_constant(gas, header, free: Sequence[str]):
     """Return the gas with the header's A, if A is not free."""
     if "A" in header:
         given = gas.replace(dissipative_constant=header_number(header, "A"))
@@ -336,15 +321,11 @@ def print_verdict(diagnosis) -> None:
         print(f"  - {reason}")
 
 
-def run_joint_fit(
-    curves: list[Path], drops: list[Path], onto_plate: bool, options: FitOptions, started: float
-) -> None:
+def run_joint_fit(curves: list[Path], options: FitOptions, started: float) -> None:
     """Fit curves and drop tests of one material jointly, print the result and write it.
 
     Args:
         curves: files of cooling curves.
-        drops: files of drop tests.
-        onto_plate: whether the impacts of the drop tests are on a thick plate.
         options: of the command.
         started: start of the job on the clock `time.perf_counter`.
     """
@@ -354,13 +335,13 @@ def run_joint_fit(
             "curves one by one with other models."
         )
     picture, record = output_files(options)
-    free = options.free or ["A", "T0"]
+    free = options.free or ("A", "T0")
     parameters = [BY_SYMBOL[key] for key in free]
     shared = tuple(p.name for p in parameters if p.belongs_to != SCENE)
     separate = tuple(p.name for p in parameters if p.belongs_to == SCENE)
     if not shared:
         raise ValueError(f"--free {' '.join(free)}: the curves share none of these. Add A.")
-    files = [path.resolve() for path in (*curves, *drops)]
+    files = [path.resolve() for path in (*curves, *options.drop_test)]
     if repeated := [str(path) for path in files if files.count(path) > 1]:
         raise ValueError(f"{repeated[0]} is given twice. Give each measurement once.")
     measurements, first_gas = {}, None
@@ -371,8 +352,8 @@ def run_joint_fit(
         first_gas = gas if first_gas is None else first_gas
         curve, _ = smooth_errors(curve, header_count(header, "replicas") or 1)
         measurements[_label(path, measurements)] = gas, curve
-    for path in drops:  # of spheres like those of the first curve
-        test = jaxgran.read_drop_test(path, onto_plate=onto_plate)
+    for path in options.drop_test:  # of spheres like those of the first curve
+        test = jaxgran.read_drop_test(path, onto_plate=options.onto_plate)
         measurements[_label(path, measurements)] = first_gas, test
     model = models_by_name(default_models(2))[JOINT_MODEL]
     result = jaxgran.fit_jointly(measurements, shared=shared, separate=separate, model=model)

@@ -1,5 +1,6 @@
 """The command line: `jaxgran fit`, `jaxgran cool` and `jaxgran choose`."""
 
+import dataclasses
 import os
 import sys
 import time
@@ -8,16 +9,16 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Literal
 
 import jax
 import jax.numpy as jnp
-from cyclopts import App, CycloptsError, Parameter, Token
+from cyclopts import App, CycloptsError, Parameter
 
 import jaxgran
 from jaxgran.cli.common import (
+    FitOptions,
     ModelName,
-    ModelOrAuto,
+    WholeNumber,
     check_tolerance,
     models_by_name,
     use_compilation_cache,
@@ -25,30 +26,6 @@ from jaxgran.cli.common import (
 from jaxgran.data.files import check_writable, header_count, header_number
 from jaxgran.data.tables import header_in_si, read_text
 from jaxgran.models.choose import NUM_PARTICLES, default_models
-from jaxgran.scene.parameters import BY_SYMBOL
-
-Several = Parameter(consume_multiple=True)
-
-
-def _whole_number(_: object, tokens: Sequence[Token]) -> int:
-    """Return the whole number of an option, which may be written as 1e4."""
-    text = tokens[0].value
-    try:
-        number = float(text)
-        if number.is_integer():
-            return int(text) if text.lstrip("+-").isdigit() else int(number)
-    except ValueError:
-        pass
-    raise ValueError(f"must be a whole number, got {text}")
-
-
-WholeNumber = Annotated[int, Parameter(converter=_whole_number)]
-
-if TYPE_CHECKING:
-    FreeParameter = str
-else:
-    FreeParameter = Literal[tuple(symbol for symbol in BY_SYMBOL if symbol != "density")]
-"""Arguments of --free."""
 
 NUM_POINTS = 50
 """Number of times of a curve that is computed for --until."""
@@ -98,34 +75,6 @@ def _print_warning(message, category, filename, lineno, file=None, line=None) ->
     print(f"check: {message}", file=sys.stderr)
 
 
-FIT_HELP = """\
-Estimate the dissipative constant A from one measured cooling curve or several.
-
-Prints a table and a line of JSON; writes a picture and a JSON file.
-
-Args:
-    curves: CSV file: header lines `# key: value` (eta, diameter, density, Y, nu, T0; SI),
-        a line of column names, and rows t,T[,T_err]. Several files are fitted jointly:
-        they share the parameters of the material (A, Y, ...).
-    drop_test: One or more CSV files with columns v,eps,eps_err: single impacts of the
-        spheres of the first curve, fitted jointly with it.
-    onto_plate: The impacts of the drop tests are on a thick plate of the same material.
-    model: Model to use; auto takes the cheapest one whose estimated error is within the
-        tolerance.
-    tolerance: Allowed relative error of T for the model auto.
-    particles: Number of particles per replica (particle models only; default: N from the
-        file).
-    replicas: Number of replicas (particle models only).
-    key: Seed of the random initial state (particle models only).
-    free: Parameters to fit; by default A, and T0 if T has no errors.
-    set: Header values KEY=VALUE that replace those of the file.
-    out: Output folder; by default a new one in results.
-    overwrite: Replace existing files in the output folder.
-    explain: Print the error budget as a table that explains each part.
-    no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
-"""
-
-
 def _app(started: float, default_curve: Path | None) -> App:
     app = App(
         name="jaxgran",
@@ -134,51 +83,31 @@ def _app(started: float, default_curve: Path | None) -> App:
         suppress_keyboard_interrupt=False,
     )
 
-    def fit(
-        *curves: Path,
-        drop_test: Annotated[list[Path] | None, Several] = None,
-        onto_plate: bool = False,
-        model: ModelOrAuto = "kinetic-theory",
-        tolerance: float = 0.02,
-        particles: WholeNumber | None = None,
-        replicas: WholeNumber = 3,
-        key: WholeNumber = 0,
-        free: Annotated[list[FreeParameter] | None, Several] = None,
-        set: Annotated[list[str] | None, Several] = None,  # noqa: A002
-        out: Path | None = None,
-        overwrite: bool = False,
-        explain: bool = False,
-        no_cache: bool = False,
-    ) -> None:
-        check_tolerance(tolerance)
-        if not no_cache:
-            use_compilation_cache()
-        from jaxgran.cli.fit import FitOptions, run_fit, run_joint_fit
+    def fit(*curves: Path, options: FitOptions | None = None) -> None:
+        """Estimate the dissipative constant A from one measured cooling curve or several.
 
-        if not curves and default_curve is not None:
-            curves = (default_curve,)
+        Prints a table and a line of JSON; writes a picture and a JSON file.
+
+        Args:
+            curves: CSV file: header lines `# key: value` (eta, diameter, density, Y, nu, T0; in SI
+                or with units), a line of column names, and rows t,T[,T_err]. Several files are
+                fitted jointly: they share the parameters of the material (A, Y, ...).
+        """
+        options = FitOptions() if options is None else options
+        check_tolerance(options.tolerance)
+        if not options.no_cache:
+            use_compilation_cache()
+        from jaxgran.cli.fit import run_fit, run_joint_fit
+
+        curves = curves or (() if default_curve is None else (default_curve,))
         if not curves:
             raise ValueError("no curve is given. Name a file: jaxgran fit CURVE.csv.")
-        options = FitOptions(
-            curve=curves[0],
-            model=model,
-            tolerance=tolerance,
-            particles=particles,
-            replicas=replicas,
-            key=key,
-            free=[*map(str, free or [])],
-            set=list(set or []),
-            out=out,
-            overwrite=overwrite,
-            explain=explain,
-        )
-        drops = list(drop_test or [])
-        if len(curves) + len(drops) > 1:
-            run_joint_fit(list(curves), drops, onto_plate, options, started)
+        options = dataclasses.replace(options, curve=curves[0])
+        if len(curves) + len(options.drop_test) > 1:
+            run_joint_fit(list(curves), options, started)
         else:
             run_fit(options, started)
 
-    fit.__doc__ = FIT_HELP
     app.command(fit)
     app.command(cool)
     app.command(choose)
