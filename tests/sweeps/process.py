@@ -2,7 +2,7 @@
 
     python -m tests.sweeps.process PORT INDEX PROCESSES STORE MEMBERS [DIE_AT]
 
-Prints the number of each chunk that it has written; kills itself while it writes chunk DIE_AT.
+Prints the number of each chunk that it has computed; kills itself before chunk DIE_AT is written.
 """
 
 import os
@@ -10,6 +10,9 @@ import signal
 import sys
 
 import jax
+
+TIMES = (0.1, 1.0, 10.0)
+CHUNK = 2
 
 
 def members(number):
@@ -23,10 +26,7 @@ def members(number):
     return jax.vmap(lambda a: gas.replace(dissipative_constant=a))(values)
 
 
-TIMES = (0.1, 1.0, 10.0)
-
-
-def main(port, index, processes, store, size, die_at=-1):
+def main(port, index, processes, store, number, die_at=-1):
     jax.config.update("jax_num_cpu_devices", 2)
     jax.config.update("jax_enable_x64", True)
     # JAX ends the other processes this long after one has died.
@@ -34,19 +34,20 @@ def main(port, index, processes, store, size, die_at=-1):
     address = f"127.0.0.1:{port}"
     jax.distributed.initialize(address, processes, index, heartbeat_timeout_seconds=seconds)
     import jaxgran
-    from jaxgran.sweep import Store
 
-    write = Store.write
+    gases, module = members(number), sys.modules["jaxgran.sweep"]
+    values, run_chunk = gases.value("dissipative_constant").tolist(), module._run_chunk
 
-    def reported(self, number, records):
-        if number == die_at:
-            self.group["temperature"][self.rows(number)] = records["temperature"]
+    def reported(models, members, *rest):
+        chunk = values.index(members[0].value("dissipative_constant")[0]) // CHUNK
+        arrays = run_chunk(models, members, *rest)
+        if chunk == die_at:
             os.kill(os.getpid(), signal.SIGKILL)
-        write(self, number, records)
-        print("chunk", number, flush=True)
+        print("chunk", chunk, flush=True)
+        return arrays
 
-    Store.write = reported
-    curve = jaxgran.sweep(members(size), TIMES, store=store, chunk=2, progress=False)
+    setattr(module, "_run_chunk", reported)  # noqa: B010
+    curve = jaxgran.sweep(gases, TIMES, store=store, chunk=CHUNK, progress=False)
     print("done", jax.device_count(), jax.local_device_count(), curve.temperature.shape, flush=True)
 
 

@@ -1,8 +1,7 @@
-"""Sweeps in one process: members, stores, failures and invalid input."""
+"""Sweeps in one process: members, stores, saved values, failures and invalid input."""
 
 import dataclasses
-import json
-import shutil
+import sys
 import warnings
 
 import jax
@@ -11,329 +10,290 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran import observables
 from jaxgran._utils import status
 from jaxgran.models.spheres import Plan
-from jaxgran.sweep import Program, Store
 
 TIMES = (0.1, 1.0, 10.0)
 A = jnp.geomspace(1e-6, 1e-5, 5)
+LAW = jaxgran.Viscoelastic(5e7, 0.22, 1e-6)
+GAS = jaxgran.Gas(LAW, diameter=2e-3, mass=1e-5, packing_fraction=0.05, temperature=0.01)
+GASES = jax.vmap(lambda a: GAS.replace(dissipative_constant=a))(A)
+DSMC = jaxgran.DSMC(50, replicas=2)
 
 
-@pytest.fixture(scope="module")
-def gas():
-    law = jaxgran.Viscoelastic(5e7, 0.22, 1e-6)
-    return jaxgran.Gas(law, diameter=2e-3, mass=1e-5, packing_fraction=0.05, temperature=0.01)
-
-
-@pytest.fixture(scope="module")
-def gases(gas):
-    return jax.vmap(lambda a: gas.replace(dissipative_constant=a))(A)
-
-
-def sweep(gases, times=TIMES, **options):
+def sweep(gases=GASES, times=TIMES, **options):
     return jaxgran.sweep(gases, times, progress=False, **options)
 
 
-def one(gases, i):
-    return jax.tree.map(lambda x: x[i], gases)
+def dense(*packing):
+    return jax.vmap(lambda phi: GAS.replace(packing_fraction=phi))(jnp.array(packing))
+
+
+def forward(particles):
+    v = particles.velocity
+    assert v.shape == (50, 3)
+    edges = jnp.linspace(0.0, 3.0, 8)
+    f = observables.velocity_distribution(v, edges)
+    return {"T": observables.temperature(v), "num": jnp.sum(v[:, 0] > 0), "f": [edges[1:], f]}
+
+
+def twice(particles):
+    return 2 * observables.temperature(particles.velocity)
+
+
+def equal(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 @pytest.fixture(scope="module")
-def stored(gases, tmp_path_factory):
+def store(tmp_path_factory):
     path = tmp_path_factory.mktemp("sweep") / "sweep.zarr"
-    return path, sweep(gases, store=path, chunk=2)
+    return path, sweep(store=path, chunk=2)
 
 
-def copied(stored, tmp_path):
-    return shutil.copytree(stored[0], tmp_path / "copy.zarr")
+@pytest.fixture(scope="module")
+def store_of_saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("saved") / "sweep.zarr"
+    return path, sweep(times=(0.05, 0.1), model=DSMC, save=forward, store=path, chunk=2)
 
 
 def files(path):
     return {p: p.read_bytes() for p in path.rglob("*") if p.is_file()}
 
 
-def test_members_are_the_curves_of_cool(gases):
-    curves = sweep(gases, chunk=2)
-    for i in range(len(A)):
-        curve = jaxgran.cool(one(gases, i), TIMES)
+def test_members_are_the_curves_of_cool():
+    curves = sweep(chunk=2)
+    for i, a in enumerate(A):
+        curve = jaxgran.cool(GAS.replace(dissipative_constant=a), TIMES)
         # Under jax.vmap rounding differs, within the tolerance of the ODE solver.
         np.testing.assert_allclose(curves.temperature[i], curve.temperature, rtol=1e-9)
         np.testing.assert_allclose(curves.diffusion[i], curve.diffusion, rtol=1e-9)
     assert curves.times.shape == curves.temperature.shape == (5, 3)
     assert not np.any(curves.status)
+    two = sweep(GAS.replace(temperature=jnp.array([0.01, 0.02])))  # one float with an axis
+    alone = jaxgran.cool(GAS.replace(temperature=0.02), TIMES)
+    np.testing.assert_allclose(two.temperature[1], alone.temperature, rtol=1e-9)
 
 
-def test_only_some_floats_have_an_axis(gas, gases):
-    some = gas.replace(temperature=jnp.array([0.01, 0.02]))
-    curves = sweep(some)
-    curve = jaxgran.cool(gas.replace(temperature=0.02), TIMES)
-    np.testing.assert_allclose(curves.temperature[1], curve.temperature, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_particles_with_replicas_and_keys(gas):
-    model, keys = jaxgran.DSMC(200, replicas=2), jax.random.split(jax.random.key(3), 3)
-    curves = sweep(gas, model=model, key=keys, chunk=2)
-    assert curves.replicas.temperature.shape == (3, 2, 3)
-    for i, key in enumerate(keys):
-        curve = jaxgran.cool(gas, TIMES, model=model, key=key, progress=False)
-        # The same random numbers: chaos has not made the rounding visible after few collisions.
-        np.testing.assert_allclose(
-            curves.replicas.temperature[i, :, 0], curve.replicas.temperature[:, 0], rtol=1e-6
-        )
-    first = sweep(gas, model=model, key=keys[:1])
-    np.testing.assert_array_equal(first.temperature[0], curves.temperature[0])
-
-
-def test_keys_of_members_do_not_depend_on_their_number(gas, gases):
-    model, key = jaxgran.DSMC(200), jax.random.key(1)
-    same = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), gases)
-    curves = sweep(same, model=model, key=key, chunk=2)
+def test_keys_of_members_do_not_depend_on_their_number():
+    same, key = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), GASES), jax.random.key(1)
+    curves = sweep(same, model=DSMC, key=key, chunk=2)
     assert len(np.unique(curves.temperature[:, -1])) == len(A)
-    fewer = sweep(jax.tree.map(lambda x: x[:2], same), model=model, key=key, chunk=1)
+    fewer = sweep(jax.tree.map(lambda x: x[:2], same), model=DSMC, key=key, chunk=1)
     # Programs for other numbers of members may add in another order; other keys differ by per cent.
     np.testing.assert_allclose(fewer.temperature, curves.temperature[:2], rtol=1e-13)
+    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(2))
+    given = sweep(GAS, model=DSMC, key=keys, chunk=1)
+    np.testing.assert_allclose(given.temperature, fewer.temperature, rtol=1e-13)
 
 
-def test_store_has_labels_and_units_for_xarray(stored, gases):
+def test_saved_values_are_those_of_cool_for_each_member(store_of_saved):
+    curves = store_of_saved[1]
+    # Round-off of the conversion of units.
+    np.testing.assert_allclose(curves.saved["T"], curves.temperature, rtol=1e-12)
+    np.testing.assert_allclose(curves.saved_error["T"], curves.temperature_error, rtol=1e-9)
+    assert curves.replicas.saved["f"][1].shape == (5, 2, 2, 7)
+    assert jnp.issubdtype(curves.replicas.saved["num"].dtype, jnp.integer)
+    gas, key = jax.tree.map(lambda x: x[2], GASES), jax.random.fold_in(jax.random.key(0), 2)
+    curve = jaxgran.cool(gas, (0.05, 0.1), model=DSMC, save=forward, key=key, progress=False)
+    # The same random numbers: chaos has not made the rounding visible after few collisions.
+    member = jax.tree.map(lambda x: x[2], curves)
+    for part in ("saved", "saved_error", "replicas"):
+        one, other = getattr(member, part), getattr(curve, part)
+        assert jax.tree.structure(one) == jax.tree.structure(other)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), one, other)
+
+
+def test_a_store_has_labels_and_units_for_xarray(store, store_of_saved):
     xarray = pytest.importorskip("xarray")
-    path, curves = stored
-    found = xarray.open_zarr(path)
-    np.testing.assert_array_equal(found.temperature, curves.temperature)
+    found = xarray.open_zarr(store[0])
+    np.testing.assert_array_equal(found.temperature, store[1].temperature)
     np.testing.assert_array_equal(found.dissipative_constant, A)
+    np.testing.assert_array_equal(found.time, TIMES)
     assert found.temperature.dims == ("member", "time")
     assert found.dissipative_constant.dims == ("member",)
     assert float(found.initial_temperature) == 0.01 and found.diameter.units == "m"
     assert found.dissipative_constant.units == "s" and found.temperature.units == "m^2/s^2"
-    np.testing.assert_array_equal(found.time, TIMES)
+    assert found.status.dims == ("member",) and not np.any(found.status)
+    path, curves = store_of_saved
+    found = xarray.open_zarr(path)
+    assert found["saved.f.1"].dims == ("member", "time", "saved.f.1.axis0")
+    assert found["saved_of_replicas.num"].dims == ("member", "replica", "time")
+    np.testing.assert_array_equal(found["saved_error.f.1"], curves.saved_error["f"][1])
+    np.testing.assert_array_equal(found["saved_of_replicas.num"], curves.replicas.saved["num"])
+    assert "units" not in found["saved.T"].attrs  # a user's function determines them
 
 
-def test_a_sweep_is_resumed_chunk_by_chunk(gases, stored, tmp_path, monkeypatch):
-    path, written, write = tmp_path / "sweep.zarr", [], Store.write
-
-    def killed(self, number, records):
-        if len(written) == 1:
-            raise KeyboardInterrupt
-        written.append(number)
-        write(self, number, records)
-
-    monkeypatch.setattr(Store, "write", killed)
-    with pytest.raises(KeyboardInterrupt):
-        sweep(gases, store=path, chunk=2)
-    rest = []
-    monkeypatch.setattr(Store, "write", lambda s, n, r: (rest.append(n), write(s, n, r)))
-    curves = sweep(gases, store=path)
-    assert written == [0] and rest == [1, 2]
-    np.testing.assert_array_equal(curves.temperature, stored[1].temperature)
+def test_only_unfinished_chunks_are_computed(store_of_saved, tmp_path):
+    zarr = pytest.importorskip("zarr")
+    options = {"times": (0.05, 0.1), "model": DSMC, "save": forward, "store": tmp_path / "s.zarr"}
+    assert sweep(chunk=2, **options).temperature.shape == (5, 2)
+    # As after a kill within the second chunk: its status is written last.
+    group = zarr.open_group(options["store"], mode="r+")
+    group["saved.T"][:], group["temperature"][:], group["status"][2:4] = -5.0, -5.0, -1
+    curves, whole = sweep(**options), store_of_saved[1]
+    np.testing.assert_array_equal(curves.temperature[2:4], whole.temperature[2:4])
+    np.testing.assert_array_equal(curves.saved["T"][2:4], whole.saved["T"][2:4])
+    np.testing.assert_array_equal(curves.temperature[jnp.array([0, 1, 4])], -5.0)
 
 
-def test_members_that_fail_are_nan_and_do_not_end_the_others(gases):
-    steps = jaxgran.KineticTheory(max_steps=16)  # enough for few of them
-    curves = sweep(gases, (0.1, 1.0, 1e6), model=steps)
-    assert np.any(curves.status == status.MAX_STEPS_REACHED.bit)
-    dense = jax.vmap(lambda phi: one(gases, 0).replace(packing_fraction=phi))
-    with pytest.warns(UserWarning, match="members 0 to 2 .* first of them is 1"):
-        curves = sweep(dense(jnp.array([0.05, 0.9, 0.1])), (0.01,))
-    assert curves.status[1] != 0 and np.all(curves.status[::2] == 0)
-    assert np.isnan(curves.temperature[1]).all() and np.all(curves.temperature[::2] > 0)
-
-
-@pytest.mark.slow  # a program of particles is compiled
-def test_unsupported_members_are_nan(gases):
-    bad = jax.vmap(lambda phi: one(gases, 0).replace(packing_fraction=phi))
-    dense = bad(jnp.array([0.05, 0.6, 0.1]))
-    with pytest.warns(UserWarning, match="members 0 to 2 .* first of them is 1: .*too dense"):
-        curves = sweep(dense, (0.01,), model=jaxgran.HardSpheres(50))
-    assert list(curves.status) == [0, status.UNSUPPORTED.bit, 0]
-    assert np.isnan(curves.temperature[1]).all() and np.all(curves.temperature[::2] > 0)
-    assert "does not support" in jaxgran.explain_status(curves.status[1])
-
-
-@pytest.mark.slow  # two programs of particles are compiled
-def test_a_chunk_is_run_again_if_a_member_overflows_its_arrays(gas, gases):
-    model = jaxgran.HardSpheres(100)
-    long = model.sized_for(gas)
-    few = {name: getattr(long.plan, name)._replace(pairs=20) for name in Plan._fields[2:]}
-    short = dataclasses.replace(long, plan=long.plan._replace(**few))
-    program = Program.create(long, jnp.array([0.01]), 1, [])
-    args = jax.tree.map(lambda x: x[:1], gases), jax.random.split(jax.random.key(2), 1)
-    overflowed = program._replace(models=(short,)).run(*args)
-    assert overflowed["status"] & status.LIST_FULL.bit and np.isnan(overflowed["temperature"]).all()
-    repeated = program._replace(models=(short, long)).run(*args)
-    np.testing.assert_array_equal(repeated["temperature"], program.run(*args)["temperature"])
-    assert repeated["status"] == 0
+def test_a_finished_store_is_read(store, store_of_saved):
+    equal(sweep(store=store[0]), store[1])
+    path, curves = store_of_saved
+    equal(sweep(times=(0.05, 0.1), model=DSMC, save=forward, store=path), curves)
 
 
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        (lambda g: {"times": (0.1, 1.0, 11.0)}, "another sweep: times was"),
-        (lambda g: {"model": jaxgran.KineticTheory(softness=False)}, "another sweep: model"),
-        (lambda g: {"key": jax.random.key(7)}, "another sweep: keys"),
-        (lambda g: {"gases": jax.tree.map(lambda x: x[:4], g)}, "another sweep: gases"),
-        (lambda g: {"chunk": 3}, "another sweep: chunk was 2 and is 3"),
+        ({"times": (0.1, 1.0, 11.0)}, "another sweep, with another times. Name another store"),
+        ({"model": jaxgran.KineticTheory(softness=False)}, "with another model"),
+        ({"key": jax.random.key(7)}, "with another key"),
+        ({"gases": jax.tree.map(lambda x: x[:4], GASES)}, "with another gases, key"),
+        ({"chunk": 3}, "with another chunk"),
     ],
 )
-def test_store_of_another_sweep_is_refused(gases, stored, tmp_path, changed, message):
-    path = copied(stored, tmp_path)
-    before = files(path)
+def test_a_store_of_another_sweep_is_refused(store, changed, message):
+    before = files(store[0])
     with pytest.raises(ValueError, match=message):
-        sweep(**({"gases": gases, "store": path} | changed(gases)))
-    assert files(path) == before
+        sweep(**({"store": store[0]} | changed))
+    assert files(store[0]) == before
 
 
-def attributes(**changed):
-    def change(path):
-        header = json.loads((path / "zarr.json").read_text())
-        header["attributes"] |= changed
-        (path / "zarr.json").write_text(json.dumps(header))
-
-    return change
+def test_a_store_of_other_saved_values_is_refused(store_of_saved):
+    with pytest.raises(ValueError, match="with another save"):
+        sweep(times=(0.05, 0.1), model=DSMC, save=twice, store=store_of_saved[0])
 
 
-def header_of(name, **changed):
-    def change(path):
-        path = path / name / "zarr.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | changed))
-
-    return change
+def test_a_store_of_another_version_is_refused(store, monkeypatch):
+    monkeypatch.setattr(sys.modules["jaxgran.sweep"], "version", lambda _: "0.0.9")
+    with pytest.raises(ValueError, match="with another version of jaxgran"):
+        sweep(store=store[0])
 
 
-def cut(name):
-    def change(path):
-        (path / name).write_bytes((path / name).read_bytes()[:-9])
-
-    return change
-
-
-def one_bit(path):
-    values = path / "temperature" / "c" / "1" / "0"
-    held = bytearray(values.read_bytes())
-    held[-9] ^= 1
-    values.write_bytes(held)
+def test_other_files_and_folders_are_refused_and_left_alone(tmp_path):
+    pytest.importorskip("zarr")
+    (tmp_path / "notes.txt").write_text("mine")
+    for path in (tmp_path / "notes.txt", tmp_path):
+        with pytest.raises(ValueError, match="is not the store of a sweep .*Name another folder"):
+            sweep(store=path)
+    assert files(tmp_path) == {tmp_path / "notes.txt": b"mine"}
 
 
-def gone(name):
-    return lambda path: (
-        shutil.rmtree(path / name) if (path / name).is_dir() else ((path / name).unlink())
-    )
+def test_members_that_fail_are_nan_and_do_not_end_the_others():
+    curves = sweep(times=(0.1, 1.0, 1e6), model=jaxgran.KineticTheory(max_steps=16))
+    assert np.any(curves.status == status.MAX_STEPS_REACHED.bit)
+    with pytest.warns(UserWarning, match="members 0 to 2 .* first of them is 1") as warned:
+        curves = sweep(dense(0.05, 0.9, 0.1), (0.01,), model=DSMC, save=lambda p: p.velocity[0] > 0)
+    assert list(curves.status) == [0, status.UNSUPPORTED.bit, 0]
+    assert np.isnan(curves.temperature[1]).all() and np.all(curves.temperature[::2] > 0)
+    assert not np.any(curves.replicas.saved[1]) and np.any(curves.replicas.saved[::2])
+    assert warned[0].filename == __file__  # the line of the caller
+    assert "does not support" in jaxgran.explain_status(curves.status[1])
 
 
-DAMAGED = r"copy.zarr: chunk 1 \(members 2 to 3\) is incomplete or was changed"
-NO_STORE = "copy.zarr is not the store of a sweep .*. Name another folder, or remove it"
+@pytest.mark.slow  # programs of particles are compiled
+def test_a_chunk_is_run_again_if_a_member_overflows_its_arrays(monkeypatch):
+    module = sys.modules["jaxgran.sweep"]
+    sized_for_all = module._sized_for_all
+
+    def short_below_1(model, gases, spare):
+        model = sized_for_all(model, gases, 2.0)
+        few = {name: getattr(model.plan, name)._replace(pairs=20) for name in Plan._fields[2:]}
+        short = dataclasses.replace(model, plan=model.plan._replace(**few))
+        return short if spare < 1 else model
+
+    def curves(*factors):
+        monkeypatch.setattr(module, "SPARE_FACTORS", factors)
+        pair = jax.tree.map(lambda x: x[:2], GASES)
+        return sweep(pair, (0.01,), model=jaxgran.HardSpheres(100))
+
+    monkeypatch.setattr(module, "_sized_for_all", short_below_1)
+    short, whole = curves(0.5), curves(2.0)
+    assert np.all(short.status & status.LIST_FULL.bit) and np.isnan(short.temperature).all()
+    assert not np.any(whole.status)
+    np.testing.assert_array_equal(curves(0.5, 2.0).temperature, whole.temperature)
+
+
+@pytest.mark.slow  # a program of particles is compiled
+def test_particles_with_positions(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    options = {"model": jaxgran.HardSpheres(50, replicas=2), "save": "particles"}
+    options |= {"gases": dense(0.05, 0.04), "times": (0.05, 0.1), "store": tmp_path / "sweep.zarr"}
+    curves = sweep(**options)
+    assert curves.saved.position.shape == (2, 2, 2, 50, 3)
+    found = xarray.open_zarr(options["store"])
+    position = found["saved.position"]
+    assert position.dims == ("member", "time", "replica", "particle", "axis")
+    assert position.units == "m" and found["saved.velocity"].units == "m/s"
+    assert found["saved.box_side"].dims == ("member", "time")
+    T = np.mean(np.square(found["saved.velocity"].values), axis=(2, 3, 4))
+    np.testing.assert_allclose(T, curves.temperature, rtol=1e-12)  # round-off of units
+    equal(sweep(**options), curves)
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("options", "message"),
     [
-        (cut("temperature/c/1/0"), DAMAGED),
-        (gone("temperature/c/1/0"), DAMAGED),
-        (one_bit, DAMAGED),
-        (gone("temperature"), "is damaged: it has no array 'temperature' .*. Copy the store again"),
-        (cut("temperature/zarr.json"), "is damaged: it has no array 'temperature'"),
-        (header_of("temperature", shape=[4, 3]), r"'temperature' of float64 and shape \(4, 3\)"),
-        (header_of("diffusion", data_type="float32"), "an array 'diffusion' of float32"),
-        (header_of("finished", shape=[2]), r"an array 'finished' of uint64 and shape \(2,\)"),
-        (cut("finished/c/1"), "is damaged: it has a damaged array 'finished'"),
-        (gone("dissipative_constant"), "no array 'dissipative_constant'"),
-        (gone("time/c/0"), "other values in 'time'"),
-        (attributes(version="0.0.9"), "written by jaxgran 0.0.9 .*Finish the sweep with that"),
-        (attributes(format=2), "in format 2, this is .* with format 1, .*or name another store"),
-        (attributes(chunk="two"), NO_STORE),
-        (attributes(chunk=0), NO_STORE),
-        (attributes(description=[1]), NO_STORE),
-        (cut("zarr.json"), NO_STORE),
-        (gone("zarr.json"), NO_STORE),
-    ],
-)
-def test_stores_of_another_version_and_incomplete_stores_are_refused(
-    gases, stored, tmp_path, change, message
-):
-    path = copied(stored, tmp_path)
-    change(path)
-    before = files(path)
-    with pytest.raises(ValueError, match=message):
-        sweep(gases, store=path)
-    assert files(path) == before
-
-
-def test_other_files_and_folders_are_refused_and_left_alone(gases, tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="notes.txt is not the store of a sweep .it is a file"):
-        sweep(gases, store=tmp_path / "notes.txt")
-    with pytest.raises(ValueError, match="is not the store of a sweep .No group found"):
-        sweep(gases, store=tmp_path)
-    assert files(tmp_path) == {tmp_path / "notes.txt": b"mine"}
-    with pytest.raises(ValueError, match="store must be a path, got 3"):
-        sweep(gases, store=3)
-
-
-def test_invalid_input_is_refused_before_a_store_is_created(gas, gases, tmp_path):
-    path = tmp_path / "sweep.zarr"
-    wrong = [
         ({"times": (1.0, 0.1)}, "times must increase, got 0.1 after 1"),
         ({"model": "auto"}, "model must be a jaxgran model, got 'auto'"),
         ({"chunk": "2"}, "chunk must be a whole number >= 1"),
-        ({"gases": {"dissipation": A}}, "a dict: use jax.vmap"),
-        ({"save": lambda p: p.velocity}, "KineticTheory has no particles"),
-        ({"save": "velocities", "model": jaxgran.DSMC(100)}, 'or "particles", got'),
-    ]
-    for options, message in wrong:
-        with pytest.raises(ValueError, match=message):
-            sweep(**({"gases": gases, "store": path} | options))
-    with pytest.raises(TypeError, match="parameters"):
-        sweep(gases, parameters={"dissipation": A})
+        ({"chunk": 0}, "chunk must be"),
+        ({"store": 3}, "store must be a path, got 3"),
+        ({"key": 3}, "key must be a key .* or an array of keys"),
+        ({"gases": {"dissipation": A}}, "got a dict. Build it by jax.vmap"),
+        ({"gases": [GAS, GAS]}, "got a list. Build it by jax.vmap"),
+        ({"gases": GAS}, "no float of gases has a leading axis"),
+        ({"gases": jax.tree.map(lambda x: x[:0], GASES)}, "one length, at least 1, got .* 0"),
+        (
+            {"gases": GAS.replace(temperature=jnp.ones(3), diameter=jnp.ones(2))},
+            "one length, at least 1, got .*diameter 2.* temperature 3",
+        ),
+        (
+            {"key": jax.random.split(jax.random.key(0))},
+            "one length.*key 2, .*dissipative_constant 5",
+        ),
+        ({"gases": GAS.replace(temperature=jnp.ones((2, 2)))}, r"has shape \(2, 2\).*ravel"),
+        (
+            {"gases": jax.vmap(lambda T: GAS.replace(temperature=T))(-jnp.ones(2))},
+            "supports no member of this sweep; member 0: temperature",
+        ),
+        ({"save": twice}, "KineticTheory has no particles"),
+        ({"save": "velocities", "model": DSMC}, 'or "particles", got'),
+        ({"save": lambda p: {"a.b": p.velocity}, "model": DSMC}, "the key 'a.b': keys name arrays"),
+        ({"save": lambda p: None, "model": DSMC}, "must return arrays, in any tree, got None"),
+        ({"save": lambda p: "words", "model": DSMC}, "must return numbers, got 'words'"),
+    ],
+)
+def test_invalid_input_is_refused_before_a_store_is_created(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        sweep(**({"store": tmp_path / "sweep.zarr"} | options))
     assert not any(tmp_path.iterdir())
-
-
-def test_ragged_batches_and_unknown_names_are_refused(gas, gases):
-    ragged = gas.replace(temperature=jnp.ones(3), diameter=jnp.ones(2))
-    with pytest.raises(
-        ValueError, match="one length, at least 1, got .*diameter 2.* temperature 3"
-    ):
-        sweep(ragged)
-    with pytest.raises(ValueError, match="one length.*key 2, .*dissipative_constant 5"):
-        sweep(gases, key=jax.random.split(jax.random.key(0)))
-    with pytest.raises(ValueError, match="one length, at least 1, got .* 0"):
-        sweep(jax.tree.map(lambda x: x[:0], gases))
-    with pytest.raises(ValueError, match="no float 'dissipation' in this gas; it has youngs"):
-        jax.vmap(lambda a: gas.replace(dissipation=a))(A)
-    with pytest.raises(ValueError, match="no float of gases has a leading axis"):
-        sweep(gas)
-    with pytest.raises(ValueError, match="a list: stack the floats"):
-        sweep([gas, gas])
-    with pytest.raises(ValueError, match=r"temperature has shape \(2, 2\).*ravel"):
-        sweep(gas.replace(temperature=jnp.ones((2, 2))))
-    with pytest.raises(ValueError, match="key must be a key .* or an array of keys"):
-        sweep(gases, key=3)
-    with pytest.raises(ValueError, match="chunk must be"):
-        sweep(gases, chunk=0)
-    with pytest.raises(ValueError, match="supports no member of this sweep; member 0: temperature"):
-        sweep(jax.vmap(lambda T: gas.replace(temperature=T))(jnp.array([-1.0, -2.0])))
 
 
 @pytest.mark.slow
 def test_lists_have_the_axis_of_members_first():
     law = jaxgran.RestitutionSeries((-0.1, -0.1), (0.0, 0.2))
-    gas = jaxgran.Gas(law, diameter=2e-3, mass=1e-5, packing_fraction=0.05, temperature=0.01)
+    gas = dataclasses.replace(GAS, law=law)
     lists = jax.vmap(lambda c: gas.replace(coefficients=jnp.stack([-0.1, c])))
-    lists = lists(jnp.array([-0.1, -0.2, -0.3]))
-    curves = sweep(lists)
+    curves = sweep(lists(jnp.array([-0.1, -0.2, -0.3])))
     alone = jaxgran.cool(gas.replace(coefficients=[-0.1, -0.3]), TIMES)
     np.testing.assert_allclose(curves.temperature[2], alone.temperature, rtol=1e-9)
 
 
 @pytest.mark.slow
-def test_ambiguous_wall_sides_are_refused(gas):
+def test_ambiguous_wall_sides_are_refused():
     walls = jaxgran.Walls([0.05, 0.06, 0.07], restitution=0.9)
-    box = dataclasses.replace(gas, container=walls)
+    box = dataclasses.replace(GAS, container=walls)
     curves = sweep(jax.vmap(lambda a: box.replace(dissipative_constant=a))(A))
     assert curves.temperature.shape == (5, 3)
     with pytest.raises(ValueError, match="sides of one box or those of 3 cubes"):
         sweep(box.replace(temperature=jnp.ones(3) * 0.01))
 
 
-def test_a_valid_sweep_gives_no_warning(gases, tmp_path):
+def test_a_valid_sweep_gives_no_warning(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        sweep(gases, store=tmp_path / "sweep.zarr")
+        sweep(store=tmp_path / "sweep.zarr")
