@@ -1,6 +1,8 @@
 """Files of other programs, as they were reported: read right, or refused in words."""
 
 import gzip
+import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,10 @@ import jaxgran
 
 gsd_hoomd = pytest.importorskip("gsd.hoomd")
 
-N, SIDE = 30, 0.03
+N, SIDE, FRAMES = 30, 0.03, 4
 RNG = np.random.default_rng(0)
-POSITION = SIDE * RNG.random((2, N, 3))
-VELOCITY = RNG.normal(size=(2, N, 3)) * [[[0.1]], [[0.07]]]
+POSITION = SIDE * RNG.random((FRAMES, N, 3))
+VELOCITY = RNG.normal(size=(FRAMES, N, 3)) * 0.1 / np.arange(1, FRAMES + 1)[:, None, None]
 
 
 def rows(*columns, frame=-1):
@@ -32,35 +34,36 @@ BOUNDS = f"0 {SIDE}\n" * 3
 def dump(
     *, bounds=BOUNDS, flags="pp pp pp", names="id type x y z vx vy vz", columns=(IDS, ONES), head=""
 ):
-    """A LAMMPS dump of both frames."""
+    """A LAMMPS dump of all frames; {k} in its head is the index of a frame."""
     return "".join(
-        f"{head}ITEM: TIMESTEP\n{1000 * k}\nITEM: NUMBER OF ATOMS\n{N}\n"
+        f"{head.format(k=k)}ITEM: TIMESTEP\n{1000 * k}\nITEM: NUMBER OF ATOMS\n{N}\n"
         f"ITEM: BOX BOUNDS {flags}\n{bounds}ITEM: ATOMS {names}\n"
         + "\n".join(rows(*columns, frame=k))
         + "\n"
-        for k in range(2)
+        for k in range(FRAMES)
     )
 
 
 def xyz(*, head="", properties="species:S:1:pos:R:3:velo:R:3", between="", species=("Gl",) * N):
-    """An extended XYZ file of both frames."""
+    """An extended XYZ file of all frames; {k} in its head is the index of a frame."""
     lattice = f'Lattice="{SIDE} 0 0 0 {SIDE} 0 0 0 {SIDE}"'
     return between.join(
-        f"{N}\n{lattice} Properties={properties} {head}\n"
+        f"{N}\n{lattice} Properties={properties} {head.format(k=k)}\n"
         + "\n".join(rows(species, frame=k))
         + "\n"
-        for k in range(2)
+        for k in range(FRAMES)
     )
 
 
-def gsd(*, velocities=(0, 1), types=0, diameter=1.0):
+def gsd(*, velocities=range(FRAMES), types=0, diameter=1.0):
     """Write a GSD file whose frames have velocities in some frames only."""
 
     def write(path):
         with gsd_hoomd.open(str(path), "x") as file:
-            for k in range(2):
+            for k in range(FRAMES):
                 frame = gsd_hoomd.Frame()
                 frame.configuration.box = [SIDE] * 3 + [0] * 3
+                frame.configuration.step = 1000 * k
                 frame.particles.N = N
                 frame.particles.types = ["A", "B"]
                 frame.particles.typeid = np.arange(N) * types % 2
@@ -108,6 +111,7 @@ PARTICLES = {
     "equal sizes in float32": ("a.gsd", gsd(diameter=0.1), None),
     # 9: extended XYZ of others
     "walls": ("a.xyz", xyz(head='pbc="F F F"'), None),
+    "walls in words": ("a.xyz", xyz(head='pbc="false false True"'), "in some directions only"),
     "walls elsewhere": ("a.xyz", xyz(head='pbc="F F F" Origin="1 0 0"'), "are outside of its box"),
     "walls on two sides": ("a.xyz", xyz(head='pbc="T T F"'), "periodic in some directions only"),
     "ASE's momenta": (
@@ -178,3 +182,161 @@ def test_disks_in_space_are_asked_about(tmp_path):
     with pytest.raises(ValueError, match="move in one plane: give dimension=2"):
         jaxgran.read_particles(path)
     assert jaxgran.read_particles(path, dimension=2).velocity.shape == (1, N, 2)
+
+
+def tracks(*, wrong=0.0, gaps=0.0, noise=0.0, wrapped=False, swaps=(), n=400, frames=15, step=0.15):
+    """Positions of particles in free flight whose speeds fall, their T, and the side of the box.
+
+    Args:
+        wrong: share of the identities that are exchanged with a neighbour before each frame.
+        gaps: share of the positions that are missing.
+        noise: standard error of a position, in units of the displacement.
+        wrapped: whether positions are wrapped into the box.
+        swaps: frames before which two particles anywhere exchange their identities.
+        n: number of particles.
+        frames: number of frames.
+        step: thermal displacement between the first two frames, over the mean distance.
+    """
+    rng = np.random.default_rng(1)
+    side = 0.003 * (n * np.pi / 6 / 0.04) ** (1 / 3)
+    velocity = rng.normal(size=(n, 3))
+    velocity -= velocity.mean(axis=0)
+    dt = step * side / n ** (1 / 3) / 0.1
+    clock = np.cumsum(0.1 / (1 + 0.05 * np.arange(-0.5, frames)))[:frames] * dt
+    position = side * rng.random((n, 3)) + velocity * clock[:, None, None]
+    T = np.mean(velocity**2) * (np.diff(clock) / dt) ** 2
+    position += noise * step * side / n ** (1 / 3) * rng.normal(size=position.shape)
+    ids, lines = np.arange(n), []
+    for k, frame in enumerate(position):
+        distance = np.linalg.norm(frame[:, None] - frame, axis=2) + 10 * side * np.eye(n)
+        for i in rng.choice(n, round(wrong * n / 2), replace=False) if k else ():
+            j = np.argmin(distance[i])
+            ids[i], ids[j] = ids[j], ids[i]
+        if k in swaps:
+            ids[[0, n // 2]] = ids[[n // 2, 0]]
+        frame = frame % side if wrapped else frame
+        there = np.flatnonzero(rng.random(n) >= gaps)
+        lines += [
+            ",".join(map(repr, [int(ids[i]), float(k * dt), *frame[i].tolist()])) for i in there
+        ]
+    return lines, T, side
+
+
+OUT = "displacements left out as those of wrong identities"
+RATE = "velocities change .* times as fast as impacts"
+FREE = {"N": 400}
+GAS = FREE | {"eta": 0.04, "diameter": 0.003}
+TRACKS = {
+    "clean": ({}, FREE, []),
+    "clean, of a gas whose impacts the tracks do not show": ({}, GAS, [RATE]),
+    "gaps, tracks that begin and end": ({"gaps": 0.2}, FREE, []),
+    "1 % wrong links": ({"wrong": 0.01}, FREE, [OUT]),
+    "5 % wrong links": ({"wrong": 0.05}, FREE, [OUT]),
+    "5 % wrong links and gaps": ({"wrong": 0.05, "gaps": 0.1}, FREE, [OUT]),
+    "two swapped identities": ({"swaps": (7,)}, FREE, [OUT]),
+    "wrapped, side given": ({"wrapped": True}, FREE | {"box_side": None}, []),
+    "unknown error of positions": ({"noise": 0.2}, FREE, ["localisation_error not given"]),
+    "known error of positions": ({"noise": 0.2}, FREE | {"localisation_error": 0.2}, []),
+}
+
+
+@pytest.mark.parametrize("faults, header, words", TRACKS.values(), ids=TRACKS)
+def test_tracks(tmp_path, faults, header, words):
+    lines, T, side = tracks(**faults)
+    header = dict(header)
+    if "box_side" in header:
+        header["box_side"] = side
+    if "localisation_error" in header:
+        header["localisation_error"] *= 0.15 * side / 400 ** (1 / 3)
+    head = [f"# {key}: {value}" for key, value in header.items()]
+    path = write(tmp_path / "t.csv.gz", "\n".join([*head, "id,t,x,y,z", *lines]) + "\n")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        curve, found = jaxgran.read_curve(path)
+    assert len(told) == len(words)
+    for word, warning in zip(words, told, strict=True):
+        assert re.search(word, str(warning.message))
+    assert (OUT in found["T_from"]) >= (OUT in words)
+    # Of the same particles: of chance is left that of the third which gaps take, 2.5 %, thrice.
+    np.testing.assert_allclose(curve.temperature, T, rtol=0.08)
+    assert np.mean(np.asarray(curve.temperature) / T) == pytest.approx(1.0, abs=0.03)
+
+
+def test_few_particles_are_all_kept(tmp_path):
+    """The scatter of five displacements says too little on the longest of them."""
+    times = 0.01 * np.arange(30)
+    position = RNG.normal(size=(5, 3)) * times[:, None, None]
+    lines = [
+        ",".join(map(repr, [i, float(t), *x]))
+        for t, frame in zip(times, position.tolist(), strict=True)
+        for i, x in enumerate(frame)
+    ]
+    path = write(tmp_path / "t.csv", "\n".join(["id,t,x,y,z", *lines]) + "\n")
+    assert OUT not in jaxgran.read_curve(path)[1]["T_from"]
+
+
+def test_wrapped_tracks_are_refused(tmp_path):
+    lines, _, side = tracks(wrapped=True, swaps=(7,))
+    path = write(tmp_path / "t.csv", "\n".join(["id,t,x,y,z", *lines]) + "\n")
+    with pytest.raises(ValueError, match="as long as the box.*'# box_side: ...'") as error:
+        jaxgran.read_curve(path)
+    suggested = float(re.search(r"side, ([\d.]+) m", str(error.value))[1])
+    assert suggested == pytest.approx(side, rel=0.02)
+
+
+STEP = {"timestep": "1e-3"}
+TRAJECTORIES = {
+    "times in a dump": ("a.dump", dump(head="ITEM: TIME\n{k}\n"), {}, None),
+    "steps in a dump": ("a.lammpstrj.gz", dump(), STEP, None),
+    "a dump of any name": ("dump.cooling", dump(), STEP, None),
+    "steps without their length": ("a.dump", dump(), {}, r"frame 0: it has no time.*timestep"),
+    "times in XYZ": ("a.extxyz", xyz(head="Time={k}"), {}, None),
+    "XYZ without times": ("a.xyz", xyz(), {"frame_rate": "1"}, None),
+    "GSD": ("a.gsd", gsd(), STEP, None),
+    "GSD without velocities": (
+        "a.gsd",
+        gsd(velocities=(0, 1, 3)),
+        STEP,
+        "frame 2: .*no velocities",
+    ),
+    "another N": ("a.dump", dump(), STEP | {"N": "31"}, "N is 30, but 31 in the header"),
+    "another diameter": (
+        "a.gsd",
+        gsd(diameter=0.002),
+        STEP | {"diameter": "0.003"},
+        "diameter is 0.002, but 0.003",
+    ),
+}
+
+
+@pytest.mark.parametrize("name, content, header, words", TRAJECTORIES.values(), ids=TRAJECTORIES)
+def test_trajectories(tmp_path, name, content, header, words):
+    path = write(tmp_path / name, content)
+    if words is not None:
+        with pytest.raises(ValueError, match=f"{name}: .*{words}"):
+            jaxgran.read_curve(path, header=header)
+        return
+    curve, found = jaxgran.read_curve(path, header=header)
+    still = VELOCITY - VELOCITY.mean(axis=1, keepdims=True)
+    T = np.mean(still**2, axis=(1, 2))
+    np.testing.assert_allclose(curve.temperature, T, rtol=1e-6)
+    np.testing.assert_allclose(curve.times, range(FRAMES))
+    # Of 90 Gaussian numbers, sqrt(2/90) of T, known within 18 %: three of it.
+    np.testing.assert_allclose(curve.temperature_error, (2 / (3 * N)) ** 0.5 * T, rtol=0.54)
+    assert found["N"] == str(N) and not found.keys() & header.keys()
+    assert float(found["T0"]) == pytest.approx(T[0], rel=1e-6)
+
+
+def test_spins_and_sizes_of_a_trajectory(tmp_path):
+    spin = RNG.normal(size=(N, 3))
+    columns = [IDS, [1e-3] * N, [2e-6] * N, *spin.T.tolist()]
+    text = dump(names="id radius mass omegax omegay omegaz x y z vx vy vz", columns=columns)
+    path = write(tmp_path / "a.dump", text)
+    curve, header = jaxgran.read_curve(path, header=STEP)
+    # T_rot = I <w^2>/(3 m) with I = 2/5 m r^2.
+    expected = 0.4 * 1e-6 * np.mean(spin**2)
+    np.testing.assert_allclose(curve.rotational_temperature, expected, rtol=1e-12)
+    numbers = {key: float(header[key]) for key in ("diameter", "density", "eta")}
+    volume = np.pi / 6 * 0.002**3
+    expected = {"diameter": 0.002, "density": 2e-6 / volume, "eta": N * volume / SIDE**3}
+    assert numbers == pytest.approx(expected)
