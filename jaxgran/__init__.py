@@ -30,7 +30,7 @@ from jaxgran.data.curve_file import (
 )
 from jaxgran.data.particles import read_particles
 from jaxgran.fitting.diagnosis import Diagnosis, diagnose, log_likelihood
-from jaxgran.fitting.fit import JointFit, fit, fit_jointly
+from jaxgran.fitting.fit import fit
 from jaxgran.fitting.result import Fit
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.choose import Choice, choose_model
@@ -72,7 +72,6 @@ __all__ = [
     "Gas",
     "HardSpheres",
     "Impact",
-    "JointFit",
     "KineticTheory",
     "Limitation",
     "Particles",
@@ -94,7 +93,6 @@ __all__ = [
     "elastic_constant",
     "explain_status",
     "fit",
-    "fit_jointly",
     "impact",
     "log_likelihood",
     "observables",

@@ -9,7 +9,7 @@ import pytest
 PROGRAMS = "JAXGRAN_TEST_PROGRAMS"
 """An environment variable: the folder of programs compiled in this run of the tests."""
 
-FAST_BUILD = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+FAST_BUILD = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
 """Flags of XLA. On a CPU its emitters of fusions take more than half of the time of a compilation:
 without them it compiles a fit in 1.9 s in place of 5.1 s (jaxlib 0.10.1)."""
 

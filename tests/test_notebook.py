@@ -11,7 +11,7 @@ import pytest
 from matplotlib import pyplot
 
 import jaxgran
-from jaxgran.data.curve import QUANTITY_UNITS
+from jaxgran.data.curve import QUANTITIES
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_a_frame_has_a_row_for_each_time(curve):
 def test_every_quantity_of_a_curve_has_a_unit(curve):
     no_number = ("replicas", "particles", "status", "saved", "saved_error")
     numbers = {name for name in vars(curve) if name not in no_number}
-    assert numbers == set(QUANTITY_UNITS)
+    assert numbers == set(QUANTITIES)
 
 
 def test_a_batch_of_curves_is_refused(curve):

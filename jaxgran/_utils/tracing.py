@@ -30,7 +30,7 @@ def is_known(value: Any) -> bool:
     return not isinstance(value, Tracer)
 
 
-def pad_to(values: Array, size: int) -> Array:
+def pad_to(values: Any, size: int) -> Array:
     """Pad an array to `size` rows by repeating its last row."""
     missing = size - len(values)
     if isinstance(values, Tracer):
@@ -47,3 +47,36 @@ def truncate_to(values: Array, size: int) -> Array:
     if isinstance(values, Tracer):
         return values[:size]
     return concrete_array(np.asarray(values)[:size])  # NumPy: see `pad_to`
+
+
+def array_module(*trees: Any) -> Any:
+    """Return `jax.numpy` if any leaf of these pytrees is traced, and otherwise NumPy.
+
+    Code written with it works under transformations, and on the host compiles nothing.
+    """
+    return jnp if any_traced(*trees) else np
+
+
+def as_jax_arrays(tree: Any) -> Any:
+    """Return a pytree in which arrays and numbers of NumPy have become arrays of JAX."""
+    numpy = np.ndarray, np.generic
+    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, numpy) else x, tree)
+
+
+def grid_size(size: int) -> int:
+    """Return the smallest of 32, 64, 128, ... that is >= `size`.
+
+    Arrays are padded to it, so that few lengths are compiled.
+    """
+    return max(32, 1 << (size - 1).bit_length())
+
+
+def fast_compilation(backend: str) -> dict[str, Any] | None:
+    """Return compiler options for programs that run for milliseconds, or None.
+
+    On a CPU a linearised curve compiles in 2.6 s instead of 7.4 s, and then takes 7 ms instead of
+    4 ms (jaxlib 0.10.1).
+    """
+    if backend != "cpu":
+        return None
+    return {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}

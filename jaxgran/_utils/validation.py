@@ -86,27 +86,37 @@ class Domain(NamedTuple):
         below = value <= self.high if self.high_allowed else value < self.high
         return above & below & jnp.isfinite(value)
 
-    def to_free(self, value: ArrayLike) -> Float[Array, "..."]:
+    def to_free(self, value: Any) -> Any:
         """Map the interior of the interval one-to-one onto the whole real line.
 
         The map is the identity if both ends are infinite, ``ln(x - low)`` if only the upper end is,
-        otherwise the logit ``ln(x - low) - ln(high - x)``.
+        otherwise the logit ``ln(x - low) - ln(high - x)``. Values may be arrays of JAX or of NumPy.
         """
-        value = jnp.asarray(value)
+        xp = jnp if isinstance(value, jax.Array) else np
         if np.isinf(self.low) and np.isinf(self.high):
             return value
-        if np.isinf(self.high):
-            return jnp.log(value - self.low)
-        return jnp.log(value - self.low) - jnp.log(self.high - value)
+        with np.errstate(divide="ignore"):
+            if np.isinf(self.high):
+                return xp.log(value - self.low)
+            return xp.log(value - self.low) - xp.log(self.high - value)
 
-    def from_free(self, free: ArrayLike) -> Float[Array, "..."]:
+    def from_free(self, free: Any) -> Any:
         """Inverse of `to_free`."""
-        free = jnp.asarray(free)
+        xp = jnp if isinstance(free, jax.Array) else np
         if np.isinf(self.low) and np.isinf(self.high):
             return free
+        with np.errstate(over="ignore"):
+            if np.isinf(self.high):
+                return self.low + xp.exp(free)
+        return self.low + (self.high - self.low) * (1 + xp.tanh(free / 2)) / 2
+
+    def slope(self, value: Any) -> Any:
+        """Derivative of a value in its unconstrained parameter."""
+        if np.isinf(self.low) and np.isinf(self.high):
+            return value * 0 + 1.0
         if np.isinf(self.high):
-            return self.low + jnp.exp(free)
-        return self.low + (self.high - self.low) * jax.nn.sigmoid(free)
+            return value - self.low
+        return (value - self.low) * (self.high - value) / (self.high - self.low)
 
 
 POSITIVE = Domain(low=0.0)

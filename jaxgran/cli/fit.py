@@ -28,10 +28,11 @@ from jaxgran.cli.common import (
     output_files,
     parse_settings,
 )
-from jaxgran.data.curve_file import GUESS, DropTest
+from jaxgran.data.curve_file import GUESS
 from jaxgran.data.files import header_count, header_number, write_atomically
-from jaxgran.fitting.fit import JointFit, free_by_default
-from jaxgran.fitting.residuals import smooth_errors, unused_rotation
+from jaxgran.fitting.fit import free_by_default
+from jaxgran.fitting.residuals import unused_rotation
+from jaxgran.fitting.result import SIGNIFICANCE
 from jaxgran.models.choose import default_models
 from jaxgran.scene.parameters import BY_SYMBOL, PARAMETERS, SCENE
 
@@ -308,10 +309,7 @@ def _distinguishable(alternative) -> str:
         return "preferred by the data"
     if alternative.distinguishable:
         return "yes"
-    needs = f"needs {alternative.error_reduction_needed:.2g}x smaller errors"
-    if np.isfinite(alternative.decades):
-        needs += f" or a {10**alternative.decades:.0f}x longer decay"
-    return f"no ({needs})"
+    return f"no (needs {alternative.error_reduction_needed:.2g}x smaller errors)"
 
 
 def print_verdict(diagnosis) -> None:
@@ -344,48 +342,86 @@ def run_joint_fit(curves: list[Path], options: FitOptions, started: float) -> No
     files = [path.resolve() for path in (*curves, *options.drop_test)]
     if repeated := [str(path) for path in files if files.count(path) > 1]:
         raise ValueError(f"{repeated[0]} is given twice. Give each measurement once.")
-    measurements, first_gas = {}, None
+    data, gases, numbers, runs = {}, {}, {}, {}
     for path in curves:
         curve, header = jaxgran.read_curve(path)
         header |= parse_settings(options.set)
-        gas = with_given_constant(gas_of(header, free), header, free)
-        first_gas = gas if first_gas is None else first_gas
-        curve, _ = smooth_errors(curve, header_count(header, "replicas") or 1)
-        measurements[_label(path, measurements)] = gas, curve
+        label = _label(path, data)
+        gases[label] = with_given_constant(gas_of(header, free), header, free)
+        numbers[label], runs[label] = header_count(header, "N"), header_count(header, "replicas")
+        data[label] = curve
     for path in options.drop_test:  # of spheres like those of the first curve
-        test = jaxgran.read_drop_test(path, onto_plate=options.onto_plate)
-        measurements[_label(path, measurements)] = first_gas, test
-    model = models_by_name(default_models(2))[JOINT_MODEL]
-    result = jaxgran.fit_jointly(measurements, shared=shared, separate=separate, model=model)
+        label = _label(path, data)
+        data[label] = jaxgran.read_drop_test(path, onto_plate=options.onto_plate)
+        gases[label] = next(iter(gases.values()))
+    result = jaxgran.fit(
+        gases,
+        data,
+        free=shared,
+        separate=separate,
+        model=models_by_name(default_models(2))[JOINT_MODEL],
+        num_particles=numbers,
+        replicas={label: n or 1 for label, n in runs.items()},
+    )
+    diagnosis = jaxgran.diagnose(result)
+    rows = joint_rows(result, diagnosis)
+    print_joint_fit(result, rows)
+    print_alternatives(rows[0]["parameter"], diagnosis)
+    print_verdict(diagnosis)
+    agree = float(result.p_value) > SIGNIFICANCE
     summary = {
-        **{key: result.estimate.get(BY_SYMBOL[key].name) for key in free},
-        **{f"{key}_std_err": result.standard_error.get(BY_SYMBOL[key].name) for key in free},
-    }
-    summary = {key: float(x) for key, x in summary.items() if x is not None}
-    summary |= {
+        **{row["parameter"]: row["estimate"] for row in rows},
+        **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},
+        **{f"{row['parameter']}_low": row["low"] for row in rows},
+        **{f"{row['parameter']}_high": row["high"] for row in rows},
         "model": options.model,
-        "agree": bool(result.agree),
+        "agree": agree,
         "p_value": float(result.p_value),
         "converged": bool(result.converged),
+        "explains": diagnosis.explains,
         "seconds": round(time.perf_counter() - started, 2),
     }
     summary = finite_or_null(summary)
     details = {
-        "weight": result.weight,
-        "chi2": result.chi2,
-        "decrease": result.decrease,
-        "separate": result.separate,
+        "weight": {label: x.tolist() for label, x in result.weights().items()},
+        "chi2": {label: _chi2(c) for label, c in result.comparisons.items()},
+        "parameters": rows,
+        "diagnosis": {"verdict": diagnosis.verdict, "reasons": diagnosis.reasons},
+        "alternatives": [alternative_as_json(x) for x in diagnosis.alternatives],
         **environment(),
     }
     text = json.dumps(finite_or_null(summary | details), indent=2, allow_nan=False) + "\n"
     record.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(record, lambda f: f.write(text.encode()))
-    agreement = "do not contradict" if result.agree else "contradict"
-    title = f"{', '.join(measurements)}: the measurements {agreement} each other"
-    plotting.save_curves(_fitted_curves(result, measurements, model), title, picture)
-    print_joint_fit(result, measurements, {BY_SYMBOL[key].name: key for key in free})
+    fitted = result.curve if isinstance(result.curve, dict) else {}
+    plotted = {label: (data[label], curve) for label, curve in fitted.items()}
+    plotting.save_curves(plotted, diagnosis.verdict, picture)
     print(f"\nwritten  {picture}\n         {record}\n")
     print(json.dumps(summary, allow_nan=False))
+
+
+def _chi2(comparison) -> float:
+    return sum(float(np.sum(np.asarray(x) ** 2)) for x in comparison.residuals.values())
+
+
+def joint_rows(result, diagnosis) -> list[dict]:
+    """Return estimate, error and range of each parameter of several measurements."""
+    rows = []
+    for name in result.names:
+        label, _, short = name.rpartition(": ")
+        key, unit = PARAMETERS[short].symbol, PARAMETERS[short].unit
+        low, high = range_over_alternatives(diagnosis, name)
+        rows.append(
+            {
+                "parameter": f"{label}: {key}" if label else key,
+                "unit": unit,
+                "estimate": float(result.value(name)[0]),
+                "std_err": float(result.value(name)[1]),
+                "low": low,
+                "high": high,
+            }
+        )
+    return rows
 
 
 def _label(path: Path, taken: dict) -> str:
@@ -393,42 +429,20 @@ def _label(path: Path, taken: dict) -> str:
     return path.stem if path.stem not in taken else str(path)
 
 
-def _fitted_curves(result: JointFit, measurements: dict, model) -> dict:
-    """Return each measured curve and the fitted one, by label."""
-    curves = {}
-    for label, (gas, measured) in measurements.items():
-        if isinstance(measured, DropTest):
-            continue
-        separate = {name: value for name, (value, _) in result.separate.get(label, {}).items()}
-        values = result.estimate | separate
-        start = float(values.pop("t0", 0.0))
-        fitted = gas.replace(**{name: x for name, x in values.items() if name in gas.domains})
-        times = np.asarray(measured.times)
-        times = times[times >= start]
-        computed = jaxgran.cool(fitted, times - start, model=model)
-        curves[label] = measured, dataclasses.replace(computed, times=times)
-    return curves
-
-
-def print_joint_fit(result: JointFit, measurements: dict, keys: dict[str, str]) -> None:
-    """Print shared values, the weight of each measurement, and whether the measurements agree."""
-    print(f"{'':10}{'estimate':>13} {'+-':>10}")
-    for name, estimate in result.estimate.items():
-        key = keys[name]
-        error = float(result.standard_error[name])
-        print(f"{key:3} {PARAMETERS[name].unit:5} {float(estimate):13.5g} {error:10.2g}")
-    width = max(map(len, measurements))
-    shared = list(result.estimate)
-    print(
-        f"\n{'':{width}}  points    chi^2  decrease  weight in {', '.join(keys[x] for x in shared)}"
-    )
-    for label, (_, data) in measurements.items():
-        points = np.size(data.restitution if isinstance(data, DropTest) else data.times)
-        weights = ", ".join(f"{result.weight[label][name]:.2f}" for name in shared)
-        print(f"{label:{width}}  {points:6d}  {result.chi2[label]:7.1f}", end="")
-        print(f"  {result.decrease[label]:8.1f}  {weights}")
-        for name, (value, error) in result.separate.get(label, {}).items():
-            unit = PARAMETERS[name].unit
-            print(f"{'':{width}}  {keys[name]} = {value:.5g} +- {error:.2g} {unit}")
-    agreement = "do not contradict" if result.agree else "contradict"
-    print(f"\nThe measurements {agreement} each other (p = {result.p_value:.2g}).")
+def print_joint_fit(result, rows: list[dict]) -> None:
+    """Print the estimates, and the misfit and the weight of each measurement."""
+    width = max(10, *(len(f"{row['parameter']} {row['unit']}") + 1 for row in rows))
+    print(f"{'':{width}}{'estimate':>13} {'+-':>10} {'95 % incl. alternatives':>24}")
+    for row in rows:
+        limits = f"{row['low']:.3g} .. {row['high']:.3g}"
+        limits = "not computed" if np.isnan(row["low"]) else limits
+        print(f"{row['parameter'] + ' ' + row['unit']:{width}}{row['estimate']:13.5g} ", end="")
+        print(f"{row['std_err']:10.2g} {limits:>24}")
+    width = max(map(len, result.comparisons))
+    print(f"\n{'':{width}}  points    chi^2  weight in {rows[0]['parameter']}")
+    for label, weight in result.weights().items():
+        comparison = result.comparisons[label]
+        points = sum(int(np.sum(np.asarray(x) != 0)) for x in comparison.residuals.values())
+        print(f"{label:{width}}  {points:6d}  {_chi2(comparison):7.1f}  {weight[0]:.2f}")
+    agreement = "do not contradict" if float(result.p_value) > SIGNIFICANCE else "contradict"
+    print(f"\nThe measurements {agreement} each other (p = {float(result.p_value):.2g}).")

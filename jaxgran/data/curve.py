@@ -550,30 +550,3 @@ def records_in_si(
         for name in QUANTITIES
         if name in records
     }
-
-
-# Until `jaxgran.sweep` uses the functions above.
-QUANTITY_UNITS = {quantity.field: quantity.unit for quantity in QUANTITIES.values()}
-COLUMNS = {q.column: q.field for q in QUANTITIES.values() if q.measured}
-
-
-def is_saved(name: str) -> bool:
-    return name.partition(".")[0] in _SAVED_FIELDS
-
-
-def saved_arrays(curve: CoolingCurve) -> dict[str, Any]:
-    return {name: x for name, x in to_arrays(curve).items() if is_saved(name)}
-
-
-def with_saved_arrays(
-    curve: CoolingCurve, like: CoolingCurve, arrays: dict[str, Any]
-) -> CoolingCurve:
-    return from_arrays(to_arrays(curve) | arrays, like)
-
-
-def saved_dimensions(name: str, ndim: int, are_particles: bool) -> tuple[str, ...]:
-    return label_of(name, ndim, are_particles)[0]
-
-
-def saved_unit(name: str, are_particles: bool) -> str | None:
-    return label_of(name, 1, are_particles)[1].get("units")

@@ -1,6 +1,6 @@
 """Fits of the parameters of a gas to measured cooling curves.
 
-- `fit`: the public functions `fit` and `fit_jointly`, the checks of their arguments and warnings.
+- `fit`: the public function `fit`, the checks of their arguments and warnings.
 - `parameters`: the free parameters in an unconstrained scale, initial guesses, priors.
 - `residuals`: weighted residuals of a curve, their statistics, errors from few replicas.
 - `optimise`: minimisers, and fits of deterministic models.

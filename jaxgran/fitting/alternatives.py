@@ -1,35 +1,26 @@
 """Alternative explanations of a measured curve, and the range of the parameters over them.
 
-Each alternative adds a loss of energy, or an error of the measurement, to the fitted model. Its
-amplitude is varied from 0 until it explains almost the whole curve, and the free parameters are
-fitted again for each amplitude. chi^2 as a function of the amplitude shows whether the data prefer
-the alternative, or exclude it; otherwise the parameters are only as certain as the amplitude.
-
-T(t) is computed by quadrature, with a cooling rate that is a function of T alone. This is much
-cheaper than the differential equations of `jaxgran.KineticTheory`, but its a_2 always has the value
-to which it relaxes, whereas the equations follow it from 0.
+Each alternative adds one element to the scene, or one error to the measurement, of kinetic theory:
+walls, drag, roughness, a noise floor, a wrong start of the clock. Its amplitude is varied from 0
+until it explains almost the whole curve or the data exclude it, and the free parameters are fitted
+again for each amplitude. chi^2 as a function of the amplitude shows whether the data prefer the
+alternative, or exclude it; otherwise the parameters are only as certain as the amplitude.
 """
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Float
 
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.optimise import least_squares
-from jaxgran.fitting.parameters import START_TIME, Parameters, Priors, domain_of, size_of
-from jaxgran.fitting.residuals import chi2_scale
+from jaxgran.fitting.error_budget import curve_and_gas
+from jaxgran.fitting.optimise import Problem, search
+from jaxgran.fitting.parameters import START_TIME, domain_of
+from jaxgran.fitting.residuals import FLOOR, DropTestRows, Measurement, chi2_scale
 from jaxgran.fitting.result import Fit
-from jaxgran.scene.elements import Rough
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.laws import ConstantRestitution
-from jaxgran.scene.reduced import reduced_scene
-from jaxgran.theory import averages
-from jaxgran.theory.equations import element_rates, scene_at_start
+from jaxgran.models.kinetic_theory import KineticTheory
 
 PREFERRED_CHI2 = 6.63
 """Decrease of chi^2 above which the data prefer an alternative (1 % by chance)."""
@@ -37,47 +28,84 @@ PREFERRED_CHI2 = 6.63
 ALLOWED_CHI2 = 3.84
 """Increase of chi^2 over its minimum up to which an amplitude is allowed (5 % by chance)."""
 
+EXCLUDED_CHI2 = 4 * ALLOWED_CHI2
+"""Increase of chi^2 beyond which larger amplitudes are not tried."""
+
 DISTINGUISHABLE_SHARE = 0.1
 """Relative change of an estimate below which an allowed alternative is negligible."""
 
-SHARES = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97, 0.995)
-"""Amplitudes of an added loss, as shares of the initial cooling rate, and of a noise floor, as
-shares of the last temperature."""
+SHARES = (0.05, 0.15, 0.35, 0.6, 0.85, 0.97)
+"""Amplitudes of walls, as shares of the initial cooling rate, and of a noise floor, as shares of
+the last temperature."""
 
-DRAG_SHARES = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
+DRAG_SHARES = (0.001, 0.005, 0.02, 0.06, 0.2, 0.5, 0.9)
 """Amplitudes of drag, as shares of the initial cooling rate; its share grows as the gas cools."""
 
-ROUGHNESS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 1.9)
+ROUGHNESS = (0.02, 0.08, 0.25, 0.6, 1.0, 1.4, 1.75, 1.9)
 """Values of 1 + beta_t of rough spheres."""
 
-DELAYS = (0.003, 0.01, 0.03, 0.1, 0.3, -0.001, -0.003, -0.01, -0.03, -0.1, -0.3)
-"""Errors of the start of the clock, over the initial cooling time."""
+DELAYS = (0.003, 0.02, 0.1, 0.3)
+"""Errors of the start of the clock, over the initial cooling time, of both signs."""
 
-EXTRA_DECADES = (0.5, 1.0, 2.0, 3.0)
-"""Numbers of further decades of T that are tried to distinguish alternatives."""
+NUM_REFINED = 2
+"""Number of amplitudes tried between the last allowed one and the first excluded one."""
+
+WALL_RESTITUTION = 0.5
+"""Restitution of the walls of an alternative; the side of the box is its amplitude."""
+
+MIN_WALL_SIDE = 4.0
+"""Smallest side of that box, in diameters."""
 
 MAX_STEPS = 30
-"""Maximum number of iterations of each search."""
+"""Maximum number of steps of each search."""
 
-NUM_NODES = 192
-"""Number of temperatures in the table of T(t)."""
+THEORY_TOLERANCE = 1e3
+"""Factor of the tolerance of kinetic theory."""
 
-NUM_RATE_NODES = 20
-"""Number of temperatures at which the cooling rate is computed; ln rate is a polynomial of ln T."""
+SEARCH_TOLERANCE = 1e-4
+"""Relative tolerance of each search."""
 
-NUM_RELAXATION_STEPS = 3
-"""Number of Newton steps for the value to which a_2 relaxes."""
+SUPPORTED = {"surface", "container", "drag"}
+"""Elements of a scene that alternatives add."""
 
-Kind = tuple[str, str, tuple[float, ...]]
-"""Name of an alternative, its field of `AddedTerms`, and its amplitudes."""
+ABSENT = {"walls": "wall_side", "roughness": "tangential_restitution", "drag": "drag_rate"}
+"""Names of elements that a user may declare to be absent, and the parameter of each."""
+
+
+class Kind(NamedTuple):
+    """Kind of alternative.
+
+    Attributes:
+        name: in words.
+        parameter: the float, `START_TIME` or `FLOOR` that is its amplitude.
+        amplitudes: values that are tried, in one or two increasing sequences from 0.
+        values: values of parameters at an amplitude, given the label of the measurement.
+    """
+
+    name: str
+    parameter: str
+    amplitudes: tuple[tuple[float, ...], ...]
+    values: Callable[[float, str], dict[str, float]]
+
+
+class Trial(NamedTuple):
+    """Fit of the free parameters with one amplitude of an alternative."""
+
+    amplitude: float
+    chi2: float
+    estimate: Float[np.ndarray, "p"]
+    error: Float[np.ndarray, "p"]
+    residuals: dict[str, Float[np.ndarray, "_"]]
+    flat: Float[np.ndarray, "q"]
 
 
 class Alternative(NamedTuple):
     """Alternative to a fitted law.
 
     Attributes:
-        name: description of the added term.
-        amplitude: the best amplitude, see `AddedTerms`.
+        name: description of the added element or error.
+        amplitude: the best amplitude: the share of the initial cooling rate (walls, drag) or of
+            the last T (floor), 1 + beta_t, or the delay of the clock over the cooling time.
         allowed: the smallest and the largest amplitude that the data allow.
         improvement: decrease of chi^2 from the fitted law to the best amplitude, over the scale of
             chi^2 (1 for independent errors of the given size).
@@ -88,9 +116,6 @@ class Alternative(NamedTuple):
             changes the first parameter by less than 10 % beyond the error of the fitted law.
         error_reduction_needed: factor by which the errors must decrease to distinguish it; 1 if it
             is distinguishable.
-        decades: number of further decades of T that must be measured, with the same errors and as
-            many points per decade, to distinguish it; 0 if it is distinguishable, inf if more than
-            the largest of `EXTRA_DECADES` are needed, nan if this was not computed.
     """
 
     name: str
@@ -103,78 +128,40 @@ class Alternative(NamedTuple):
     preferred: bool
     distinguishable: bool
     error_reduction_needed: float
-    decades: float
 
 
-class AddedTerms(NamedTuple):
-    """Terms added to a fitted law; each field is a number, or an array with one for each trial.
-
-    Attributes:
-        constant: share of the initial cooling rate due to a loss of a constant share of the energy
-            in each impact, ``T^(1/2)``: constant restitution, walls, friction.
-        drag: share of the initial cooling rate due to linear drag, independent of T.
-        floor: noise in T, over the last measured temperature.
-        rough: 1 + beta_t of rough spheres that do not rotate at t = 0.
-        delay: time after t = 0 at which the clock was started, over the initial cooling time.
-    """
-
-    constant: Float[Array, "*trials"]
-    drag: Float[Array, "*trials"]
-    floor: Float[Array, "*trials"]
-    rough: Float[Array, "*trials"]
-    delay: Float[Array, "*trials"]
-
-
-class AlternativeFits(NamedTuple):
-    """Results of the fits of all trials."""
-
-    chi2: Float[Array, "trials"]
-    estimate: Float[Array, "trials p"]
-    error: Float[Array, "trials p"]
-    residuals: Float[Array, "trials times"]
-
-
-def compare_alternatives(result: Fit, curve: CoolingCurve) -> tuple[Alternative, ...]:
-    """Compare a fitted law with its alternatives, using T alone.
-
-    T(t) is computed by quadrature; the difference of the fitted model from that is added to all
-    trials.
+def compare_alternatives(result: Fit, absent: tuple[str, ...] = ()) -> tuple[Alternative, ...]:
+    """Compare a fitted law with its alternatives, using T and, if it was fitted, T_rot.
 
     Args:
-        result: a fit of one curve by `jaxgran.fit`.
-        curve: the measured curve.
+        result: a fit by `jaxgran.fit`.
+        absent: elements that are known to be absent, see `ABSENT`.
 
     Returns:
         The alternatives, those that fit best first; () if the fitted gas does not cool or is
-        driven, so that T(t) has no quadrature, or if parameters of its elements were free, whose
-        losses are degenerate with the alternatives.
+        driven.
     """
-    if free_element_parameters(result) or result.gas.drive is not None:
+    gases = [curve_and_gas(result, label)[1] for label in result.comparisons]
+    if any(gas.drive is not None for gas in gases):
         return ()
-    kinds = _kinds(result)
-    residuals = np.asarray(result.residuals)
-    weights = np.where(residuals != 0, np.asarray(result.weights), 0.0)
-    measured = np.log(curve.temperature)
-    fitted = measured - residuals / np.where(weights > 0, weights, 1.0)
-    ratios, T_rot = np.zeros_like(measured), result.curve.rotational_temperature
-    if T_rot is not None:
-        ratios = np.asarray(T_rot) / np.asarray(result.curve.temperature)
-    columns = _padded(np.asarray(curve.times), measured, weights, fitted)
-    rows = columns[0].size - ratios.size
-    columns[3] = np.pad(fitted, (0, rows), "edge")
-    columns.append(np.pad(ratios, (0, rows), "edge"))
-    fits = _fit_kinds(result, kinds, columns)
-    if not np.isfinite(fits.chi2[0]):
+    problem, starts = _problem(result)
+    kinds = _kinds(result, problem, absent)
+    base = _trial(problem, 0.0, _first(problem, result, starts))
+    if base is None:
         return ()
-    best = fits.residuals[int(np.nanargmin(fits.chi2))]
-    scale = float(chi2_scale(jnp.asarray(best), len(result.names)))
+    scale = _scale(base, len(result.names))
+    trials = {kind: _profile(problem, kind, base, scale) for kind in kinds}
+    best = min((t for some in trials.values() for t in some), key=lambda t: t.chi2, default=base)
+    scale = _scale(best, len(result.names))
     # Errors that the trials, which have no noise, do not include.
     parts = [result.error_budget.get(part, 0.0) for part in ("simulation", "few particles")]
-    noise = np.hypot(*map(np.asarray, parts)) / scale**0.5
-    fits = fits._replace(error=np.hypot(fits.error, noise))
-    positive = _is_positive(result)
-    alternatives = summarise_alternatives(kinds, fits, scale, positive)
-    alternatives = _with_decades(result, kinds, columns, scale, alternatives)
+    noise = np.hypot(*map(np.asarray, parts))
+    positive = np.array(
+        [domain_of(gases[0], n.rpartition(": ")[2]).low >= 0 for n in result._element_names]
+    )
+    alternatives = [
+        _alternative(kind.name, some, base, scale, noise, positive) for kind, some in trials.items()
+    ]
     return tuple(sorted(alternatives, key=lambda alternative: -alternative.improvement))
 
 
@@ -193,410 +180,257 @@ def ranges_over_alternatives(
     as_good = [a for a in alternatives if a.improvement >= best - ALLOWED_CHI2]
     low = np.min([a.low for a in as_good], axis=0)
     high = np.max([a.high for a in as_good], axis=0)
-    sizes = [size_of(result.gas, name) for name in result.names]
-    parts = (np.split(x, np.cumsum(sizes)[:-1]) for x in (low, high))
-    return dict(zip(result.names, zip(*parts, strict=True), strict=True))
+    names = np.array(result._element_names)
+    return {name: (low[names == name], high[names == name]) for name in result.names}
 
 
-def free_element_parameters(result: Fit) -> tuple[str, ...]:
-    """Return the free parameters that are floats of the elements of the scene."""
-    plain = dataclasses.replace(result.gas, surface=None, container=None, drag=None, drive=None)
-    return tuple(name for name in result.names if name not in (*plain.domains, START_TIME))
-
-
-def _kinds(result: Fit) -> list[Kind]:
-    """Return the kinds of alternatives to a fit."""
-    kinds: list[Kind] = [
-        ("linear drag, as in air", "drag", DRAG_SHARES),
-        ("a noise floor in T", "floor", SHARES),
-    ]
-    elements = result.gas.elements
-    if not isinstance(result.gas.law, ConstantRestitution):
-        name = "an additional loss at constant eps"
-        causes = {"container": "walls", "surface": "rough grains"}
-        possible = [cause for element, cause in causes.items() if element not in elements]
-        name += f", as by {' or '.join(possible)}" if possible else ""
-        kinds.insert(0, (name, "constant", SHARES))
-    if "surface" not in elements:
-        kinds.append(("rough grains without initial rotation", "rough", ROUGHNESS))
-    is_start_known = START_TIME not in (*result.names, *result.priors.names)
-    if "temperature" not in result.names and is_start_known:
-        kinds.append(("an error of the start time or of T_0", "delay", DELAYS))
-    return kinds
-
-
-def _trials(kinds: list[Kind]) -> AddedTerms:
-    """Return no added terms, then each amplitude of each kind."""
-    rows = [np.zeros(len(AddedTerms._fields))]
-    for _, field, amplitudes in kinds:
-        terms = np.zeros((len(amplitudes), len(AddedTerms._fields)))
-        terms[:, AddedTerms._fields.index(field)] = amplitudes
-        rows += list(terms)
-    return AddedTerms(*map(jnp.asarray, np.array(rows).T))
-
-
-def _padded(times: np.ndarray, *columns: np.ndarray) -> list[np.ndarray]:
-    """Pad columns to a power of two, so that curves of many lengths share a compiled program."""
-    rows = max(32, 2 ** (times.size - 1).bit_length()) - times.size
-    return [np.pad(times, (0, rows), "edge"), *(np.pad(column, (0, rows)) for column in columns)]
-
-
-def _is_positive(result: Fit) -> np.ndarray:
-    """Return True for the free numbers that cannot be negative."""
-    names = [name for name in result.names for _ in range(size_of(result.gas, name))]
-    return np.array([domain_of(result.gas, name).low >= 0 for name in names])
-
-
-def _fit_kinds(result: Fit, kinds: list[Kind], columns: list[np.ndarray]) -> AlternativeFits:
-    """Fit all alternatives, with all amplitudes, to columns t, ln T, weights, ln T and T_rot/T."""
-    fits = fit_alternatives(
-        result.gas,
-        result.start_time,
-        result.names,
-        *map(jnp.asarray, columns),
-        trials=_trials(kinds),
-        accuracy=jnp.asarray(np.max(result.clock_error)),
-        priors=result.priors,
+def _problem(result: Fit) -> tuple[Problem, dict[str, float]]:
+    """Return the problem of a fit with a free clock and kinetic theory, and t0 by label."""
+    # A model that supports all alternatives is that of the trials, too.
+    is_theory = not result.model.stochastic and set(result.model.elements) >= SUPPORTED
+    model: Any = result.model if is_theory else KineticTheory()
+    data = result.data if isinstance(result.data, dict) else {"": result.data}
+    measurements, starts = [], {}
+    for label, comparison in result.comparisons.items():
+        curve, gas = curve_and_gas(result, label)
+        measured = data[label] if label in data else next(iter(data.values()))
+        starts[label] = float(comparison.start_time)
+        if not isinstance(measured, CoolingCurve):
+            measurements.append(DropTestRows(label, gas, measured))
+            continue
+        if "friction" in gas.elements:  # which kinetic theory does not support
+            gas = dataclasses.replace(gas, surface=None)
+        m = Measurement.of(
+            label,
+            gas,
+            measured,
+            model,
+            comparison.num_particles if is_theory else None,
+            1,
+            use_displacement=False,
+        )
+        weights = {
+            name: np.asarray(comparison.weights[name])
+            for name in m.weights
+            if name in comparison.weights
+        }
+        weights.setdefault("temperature", np.asarray(comparison.weights["temperature"]))
+        # Weights of 0 stand for points that the model cannot compute, too.
+        accuracy = np.full(weights["temperature"].shape, np.max(comparison.clock_error))
+        m = dataclasses.replace(
+            m, weights=weights, clock_accuracy=accuracy, position=_mean_position(m)
+        )
+        m = dataclasses.replace(
+            m, accuracies={k: x for k, x in m.accuracies.items() if k in weights}
+        )
+        if not is_theory:
+            m = dataclasses.replace(m, offset=_offset(m, model, comparison, starts[label]))
+        measurements.append(m)
+    free = tuple(name for name in result.names if ": " not in name)
+    separate = dict.fromkeys(name.rpartition(": ")[2] for name in result.names if ": " in name)
+    problem = Problem.of(
+        tuple(measurements), model, free, tuple(separate), result.priors, clock_is_free=True
     )
-    return jax.tree.map(np.asarray, fits)
+    return dataclasses.replace(problem, tolerance=THEORY_TOLERANCE), starts
 
 
-def _with_decades(
-    result: Fit,
-    kinds: list[Kind],
-    columns: list[np.ndarray],
-    scale: float,
-    alternatives: list[Alternative],
-) -> list[Alternative]:
-    """Add the number of further decades of T that would distinguish the alternatives.
+def _mean_position(m: Measurement) -> np.ndarray:
+    """Return half of the mean of `Measurement.position` since t = 0.
 
-    The fitted law is extrapolated by ``T = T_0 (1 + t/tau)^(-p)``, with tau from the last measured
-    point, through the further decades of T, with the same errors and number of points per decade;
-    the alternatives are then fitted to that.
+    An error of the cooling rate with a trend in ln T delays the clock by its mean. The rates at the
+    first and the last T differ in their errors by about as much as each of them is uncertain.
     """
-    decades = [0.0 if alternative.distinguishable else np.nan for alternative in alternatives]
-    # If measured and modelled ln T are equal, `fit_alternatives` needs them only for their range.
-    power = 2.0 if isinstance(result.gas.law, ConstantRestitution) else 5 / 3
-    T_0 = float(np.log(result.gas.temperature))
-    used = columns[2] > 0
-    start, last = float(result.start_time), float(columns[0][used][-1])
-    cooled = T_0 - float(columns[3][used][-1])
-    all_distinguishable = all(alternative.distinguishable for alternative in alternatives)
-    if not all_distinguishable and cooled > 0 and not result.gas.elements:
-        tau = (last - start) / np.expm1(cooled / power)
-        weight, number = np.sqrt(np.mean(columns[2][used] ** 2)), int(used.sum())
-        for further in EXTRA_DECADES:
-            depth = np.linspace(0.0, cooled + further * np.log(10.0), columns[0].size)
-            times = np.maximum(start + tau * np.expm1(depth / power), 0.0)
-            density = number * depth[-1] / cooled / depth.size
-            weights = np.full(depth.size, weight * density**0.5)
-            rows = [times, T_0 - depth, weights, T_0 - depth, np.zeros(depth.size)]
-            fits = _fit_kinds(result, kinds, rows)
-            longer = summarise_alternatives(kinds, fits, scale, _is_positive(result))
-            for i, alternative in enumerate(longer):
-                if np.isnan(decades[i]) and alternative.distinguishable:
-                    decades[i] = further
-            if not np.any(np.isnan(decades)):
+    times = np.concatenate([[0.0], np.asarray(m.curve.times)])
+    position = np.concatenate([[-1.0], np.asarray(m.position)])
+    whole = np.cumsum(np.diff(times) * (position[1:] + position[:-1]) / 2)
+    known = times[1:] > 0
+    return np.where(known, whole / np.where(known, times[1:], 1.0), position[1:]) / 2
+
+
+def _offset(m: Measurement, model: KineticTheory, comparison: Any, start: float) -> np.ndarray:
+    """Return ln T of the fitted model, at its estimate, minus that of kinetic theory."""
+    values = {START_TIME: np.asarray(start)} if start else {}
+    rows, _ = m.evaluate(model, values)
+    weights = np.asarray(comparison.weights["temperature"])
+    used = weights > 0
+    difference = rows[0].values - np.asarray(comparison.residuals["temperature"])
+    return np.where(used, difference / np.where(used, weights, 1.0), 0.0)
+
+
+def _first(problem: Problem, result: Fit, starts: dict[str, float]) -> np.ndarray:
+    """Return the unknowns of the fit."""
+    gases = {m.label: m.gas for m in problem.measurements}
+    flat, begin = np.asarray(problem.flat(gases)), 0
+    for u in problem.unknowns:
+        if u.name == START_TIME:
+            label = problem.measurements[0].label if u.label is None else u.label
+            flat[begin] = starts[label] / float(np.asarray(u.unit))
+        begin += u.size
+    return flat
+
+
+def _kinds(result: Fit, problem: Problem, absent: tuple[str, ...]) -> list[Kind]:
+    """Return the kinds of alternatives to a fit."""
+    scenes = [m.scene for m in problem.curves]
+    rates = {m.label: _initial_rate(m, result) for m in problem.curves}
+    lowest = {
+        m.label: float(np.min(np.asarray(m.curve.temperature)[m.weights["temperature"] > 0]))
+        for m in problem.curves
+    }
+
+    def walls(share: float, label: str) -> dict[str, float]:
+        gas = next(m.scene for m in problem.curves if m.label == label)
+        flux = 2 * np.sqrt(float(gas.temperature) / (2 * np.pi))
+        side = 2 * (1 - WALL_RESTITUTION**2) * flux / max(share * rates[label], 1e-300)
+        side = side + float(gas.diameter)
+        side = max(side, MIN_WALL_SIDE * float(gas.diameter))
+        return {"wall_side": side, "wall_coefficient": WALL_RESTITUTION}
+
+    def drag(share: float, label: str) -> dict[str, float]:
+        return {"drag_rate": share * rates[label] / 2}
+
+    def delay(share: float, label: str) -> dict[str, float]:
+        return {START_TIME: -share / rates[label]}
+
+    possible = [
+        Kind("walls that dissipate energy", "wall_side", (SHARES,), walls),
+        Kind("linear drag, as in air", "drag_rate", (DRAG_SHARES,), drag),
+        Kind("a noise floor in T", FLOOR, (SHARES,), lambda x, label: {FLOOR: x * lowest[label]}),
+        Kind(
+            "rough grains without initial rotation",
+            "tangential_restitution",
+            (ROUGHNESS,),
+            lambda x, label: {"tangential_restitution": x - 1},
+        ),
+    ]
+    known = {name.rpartition(": ")[2] for name in result.names}
+    known |= {name for some in result.priors.values() for name in some.names}
+    if not known & {START_TIME, "temperature"}:
+        both = DELAYS, tuple(-x for x in DELAYS)
+        possible.append(Kind("an error of the start time or of T_0", START_TIME, both, delay))
+    known |= {ABSENT[name] for name in absent}
+    known |= {name for gas in scenes for name in gas.domains}
+    return [kind for kind in possible if kind.parameter not in known and scenes]
+
+
+def _initial_rate(m: Measurement, result: Fit) -> float:
+    """Return the cooling rate at the start of a fitted curve, from the time in which T halves."""
+    curve, gas = curve_and_gas(result, m.label)
+    assert curve is not None
+    T_0 = float(gas.temperature)
+    times = np.asarray(curve.times) - float(result.comparisons[m.label].start_time)
+    log_T = np.log(np.asarray(curve.temperature) / T_0)
+    fallen = np.flatnonzero((log_T < -np.log(2)) & (times > 0))
+    at = fallen[0] if fallen.size else -1
+    cooled = np.expm1(-0.6 * min(log_T[at], -1e-6))  # 1 + t/tau = T^(-3/5)
+    return float(5 / 3 * cooled / max(times[at], 1e-300))
+
+
+def _trial(problem: Problem, amplitude: float, first: np.ndarray) -> Trial | None:
+    """Fit the unknowns of a problem; None if it cannot be computed."""
+    flat, _, _ = search(problem, first, MAX_STEPS, tolerance=SEARCH_TOLERANCE)
+    rows, residuals, jacobian, _ = problem.evaluate(flat)
+    chi2 = float(np.sum(residuals**2))
+    if not np.isfinite(chi2):
+        return None
+    p = problem.num_free
+    inverse = np.linalg.pinv(jacobian)
+    error = np.linalg.norm(inverse, axis=1)[:p] * np.abs(problem.slopes(flat)[:p])
+    by_label = {row.label or "": row.values for row in rows if row.kind == "temperature"}
+    return Trial(amplitude, chi2, problem.estimates(flat), error, by_label, flat)
+
+
+def _scale(trial: Trial, num_parameters: int) -> float:
+    scales = [float(chi2_scale(x, num_parameters)) for x in trial.residuals.values()]
+    return max(scales, default=1.0)
+
+
+def _profile(problem: Problem, kind: Kind, base: Trial, scale: float) -> list[Trial]:
+    """Return fits with increasing amplitudes, from 0, of an alternative."""
+
+    def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
+        fixed = {m.label: kind.values(amplitude, m.label) for m in problem.curves}
+        return _trial(dataclasses.replace(problem, fixed=fixed), amplitude, first)
+
+    trials, lowest = [base], base.chi2
+    for sequence in kind.amplitudes:
+        before, previous = base, None
+        for amplitude in sequence:
+            first = before.flat
+            if previous is not None:
+                slope = (before.flat - previous.flat) / (before.amplitude - previous.amplitude)
+                step = np.clip(slope * (amplitude - before.amplitude), -1.0, 1.0)
+                first = before.flat + step
+            trial = fit_with(amplitude, first)
+            if trial is None:
                 break
-        decades = [np.inf if np.isnan(x) else x for x in decades]
-    pairs = zip(alternatives, decades, strict=True)
-    return [alternative._replace(decades=x) for alternative, x in pairs]
+            trials.append(trial)
+            lowest = min(lowest, trial.chi2)
+            if trial.chi2 > lowest + ALLOWED_CHI2 * scale:
+                trials += _refined(fit_with, before, trial, lowest + ALLOWED_CHI2 * scale)
+            previous, before = before, trial
+            if trial.chi2 > lowest + EXCLUDED_CHI2 * scale:
+                break
+    return sorted(trials, key=lambda trial: trial.amplitude)
 
 
-def summarise_alternatives(
-    kinds: list[Kind], fits: AlternativeFits, scale: float, positive: Bool[np.ndarray, "p"]
-) -> list[Alternative]:
-    """Return the alternatives, from the fits of all trials, in the order of their kinds."""
-    alternatives, begin = [], 1
-    for name, _, amplitudes in kinds:
-        rows = np.array([0, *range(begin, begin + len(amplitudes))])
-        order = np.argsort([0.0, *amplitudes])
-        in_order = np.array([0.0, *amplitudes])[order]
-        alternatives.append(_alternative(name, in_order, fits, rows[order], scale, positive))
-        begin += len(amplitudes)
-    return alternatives
+def _refined(
+    fit_with: Callable[[float, np.ndarray], Trial | None], low: Trial, high: Trial, target: float
+) -> list[Trial]:
+    """Return fits near the amplitude at which chi^2, about a parabola, exceeds a target."""
+    trials = []
+    for _ in range(NUM_REFINED):
+        if not low.chi2 <= target < high.chi2:
+            break
+        share = np.sqrt((target - low.chi2) / (high.chi2 - low.chi2))
+        share = float(np.clip(share, 0.05, 0.95))
+        amplitude = low.amplitude + share * (high.amplitude - low.amplitude)
+        trial = fit_with(amplitude, low.flat + share * (high.flat - low.flat))
+        if trial is None:
+            break
+        trials.append(trial)
+        low, high = (trial, high) if trial.chi2 <= target else (low, trial)
+    return trials
 
 
 def _alternative(
     name: str,
-    amplitudes: Float[np.ndarray, "rows"],
-    fits: AlternativeFits,
-    rows: np.ndarray,
+    trials: list[Trial],
+    base: Trial,
     scale: float,
-    positive: Bool[np.ndarray, "p"],
+    noise: Any,
+    positive: np.ndarray,
 ) -> Alternative:
-    """Return an alternative, from the rows of the fits with its amplitudes in increasing order.
+    """Return an alternative from its trials in the order of their amplitudes.
 
     chi^2 and the estimates are interpolated between the amplitudes.
     """
-    all_chi2 = np.where(np.isfinite(fits.chi2), fits.chi2, np.inf)
-    chi2 = np.where(np.isfinite(all_chi2[rows]), all_chi2[rows], 1e30)
-    margin = 1.96 * scale**0.5 * fits.error
-    fine = np.linspace(0, len(rows) - 1, 40 * (len(rows) - 1) + 1)
+    chi2 = np.array([trial.chi2 for trial in trials])
+    estimate = np.array([trial.estimate for trial in trials])
+    margin = 1.96 * np.hypot(scale**0.5 * np.array([trial.error for trial in trials]), noise)
+    fine = np.linspace(0, len(trials) - 1, 40 * (len(trials) - 1) + 1)
 
-    def interpolate(values):
-        return np.interp(fine, np.arange(len(rows)), values)
+    def interpolate(values: np.ndarray) -> np.ndarray:
+        return np.interp(fine, np.arange(len(trials)), values)
 
     allowed = interpolate(chi2) <= chi2.min() + ALLOWED_CHI2 * scale
-    estimate, margins = fits.estimate[rows], margin[rows]
     columns = range(estimate.shape[1])
-    low = [interpolate(estimate[:, k] - margins[:, k])[allowed].min() for k in columns]
-    high = [interpolate(estimate[:, k] + margins[:, k])[allowed].max() for k in columns]
-    fitted, fitted_margin = fits.estimate[0, 0], margin[0, 0]
+    low = np.array([interpolate(estimate[:, k] - margin[:, k])[allowed].min() for k in columns])
+    high = np.array([interpolate(estimate[:, k] + margin[:, k])[allowed].max() for k in columns])
+    i = next(i for i, trial in enumerate(trials) if trial is base)
+    fitted, fitted_margin = estimate[i, 0], margin[i, 0]
     wider = max(fitted - fitted_margin - low[0], high[0] - fitted - fitted_margin) / abs(fitted)
-    improvement = float((all_chi2[0] - chi2.min()) / scale)
-    allowed_amplitudes = interpolate(amplitudes)[allowed]
+    improvement = float((base.chi2 - chi2.min()) / scale)
+    amplitudes = interpolate(np.array([trial.amplitude for trial in trials]))[allowed]
     return Alternative(
         name=name,
-        amplitude=float(amplitudes[np.argmin(chi2)]),
-        allowed=(float(allowed_amplitudes.min()), float(allowed_amplitudes.max())),
+        amplitude=float(trials[int(np.argmin(chi2))].amplitude),
+        allowed=(float(amplitudes.min()), float(amplitudes.max())),
         improvement=improvement,
-        estimate=np.array(estimate[np.argmin(chi2)]),
+        estimate=estimate[int(np.argmin(chi2))],
         low=np.where(positive, np.maximum(low, 0.0), low),
-        high=np.array(high),
+        high=high,
         preferred=improvement > PREFERRED_CHI2,
         distinguishable=bool(wider < DISTINGUISHABLE_SHARE),
         error_reduction_needed=float(max(wider / DISTINGUISHABLE_SHARE, 1.0)),
-        decades=float("nan"),
     )
-
-
-@eqx.filter_jit
-def fit_alternatives(
-    gas: Gas,
-    start_time: Float[Array, ""],
-    names: tuple[str, ...],
-    times: Float[Array, "times"],
-    measured: Float[Array, "times"],
-    weights: Float[Array, "times"],
-    modelled: Float[Array, "times"],
-    ratios: Float[Array, "times"],
-    trials: AddedTerms,
-    accuracy: Float[Array, ""],
-    priors: Priors,
-) -> AlternativeFits:
-    """Fit the free parameters with each set of added terms.
-
-    Args:
-        gas, start_time, names: the fitted gas and t0, and the names of the free parameters.
-        times, measured, weights: t, ln T and inverse relative errors, which are 0 where a point is
-            not used.
-        modelled, ratios: ln T and T_rot/T of the fitted model; T_rot is 0 for smooth spheres.
-        trials: the added terms.
-        accuracy: relative error of the model's cooling rate, of its mean and of its trend in ln T.
-        priors: the priors of the fit.
-    """
-    varied, used = (*names, *priors.extra_parameters(names)), weights > 0
-    parameters = Parameters(gas, varied, times[-1])
-    lowest = jnp.min(jnp.where(used, measured, jnp.inf))
-    depth = jnp.max(jnp.where(used, measured, -jnp.inf)) - lowest + 2.0
-
-    def log_T_of(terms: AddedTerms, flat: Array, mean: ArrayLike, trend: ArrayLike) -> Array:
-        changed = parameters.gas(flat)
-        log_theta, rate = relaxed_cooling_rate(changed, depth)
-        if changed.elements:
-            ratio = jnp.interp(-log_theta - jnp.log(changed.temperature), -modelled, ratios)
-            rate = rate + cooling_by_elements(changed, log_theta, ratio)
-        rate_error = accuracy.astype(rate.dtype) * (mean + trend * (2 * log_theta / depth + 1))
-        rate = rate * jnp.exp(rate_error)
-        elapsed = times - parameters.start(flat) + terms.delay / rate[0]
-        total_rate = rate + _added_rate(changed, terms, log_theta, rate)
-        cooled = _log_temperature(log_theta, total_rate, elapsed)
-        floor = jnp.log(jnp.maximum(terms.floor, jnp.finfo(rate.dtype).tiny))
-        return jnp.logaddexp(jnp.log(changed.temperature) + cooled, floor + lowest)
-
-    # The difference of the fitted model and the table is added to all trials.
-    nothing = AddedTerms(*(jnp.zeros(()) for _ in AddedTerms._fields))
-    offset = modelled - log_T_of(nothing, parameters.flat(gas, start_time), 0.0, 0.0)
-
-    def fit_one(terms: AddedTerms) -> AlternativeFits:
-        def residuals(unknowns: Array) -> Array:
-            flat, errors = unknowns[:-2], unknowns[-2:]
-            differences = measured - offset - log_T_of(terms, flat, *errors)
-            of_priors = priors.residuals(parameters.gas(flat), parameters.start(flat))
-            return jnp.concatenate([weights * jnp.where(used, differences, 0.0), of_priors, errors])
-
-        first = parameters.flat(_guess(gas, names, terms), start_time)
-        unknowns = least_squares(residuals, jnp.pad(first, (0, 2)), MAX_STEPS)[0]
-        value, estimates = residuals(unknowns), parameters.estimates(unknowns[:-2])
-        error = _errors(parameters, unknowns[:-2], jax.jacfwd(residuals)(unknowns))
-        free = slice(sum(size_of(gas, name) for name in names))
-        return AlternativeFits(jnp.sum(value**2), estimates[free], error[free], value[: times.size])
-
-    return jax.lax.map(fit_one, trials)  # a batch of searches takes twice as long to compile
-
-
-def _added_rate(
-    gas: Gas, terms: AddedTerms, log_theta: Float[Array, "table"], rate: Float[Array, "table"]
-) -> Float[Array, "table"]:
-    added = terms.constant * jnp.exp(log_theta / 2) + terms.drag
-    added = added / (1 - terms.constant - terms.drag) * rate[0]
-    if gas.surface is None:
-        added = added + cooling_by_roughness(_with_roughness(gas, terms), log_theta, rate + added)
-    return added
-
-
-def _with_roughness(gas: Gas, terms: AddedTerms) -> Gas:
-    return dataclasses.replace(gas, surface=Rough(terms.rough - 1))
-
-
-def _log_temperature(
-    log_theta: Float[Array, "table"], rate: Float[Array, "table"], times: Float[Array, "times"]
-) -> Float[Array, "times"]:
-    """Return ln(T/T_0) from a table of cooling rates, with the first rate before t = 0."""
-    cooled = log_temperature_by_quadrature(log_theta, rate, jnp.maximum(times, 0.0))
-    return cooled - rate[0] * jnp.minimum(times, 0.0)
-
-
-def _errors(
-    parameters: Parameters, flat: Float[Array, "q"], jacobian: Float[Array, "residuals unknowns"]
-) -> Float[Array, "q"]:
-    """Standard errors, SI, of the parameters, which are the first of all unknowns."""
-    slope = jnp.pad(jax.jacfwd(parameters.estimates)(flat), ((0, 0), (0, 2)))
-    covariance = slope @ jnp.linalg.pinv(jacobian.T @ jacobian) @ slope.T
-    return jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
-
-
-def _guess(gas: Gas, names: tuple[str, ...], terms: AddedTerms) -> Gas:
-    """Reduce A so that the initial cooling rate with the added terms is about the fitted one."""
-    if "dissipative_constant" not in names:
-        return gas
-    share = 1 - terms.constant - terms.drag
-    if gas.surface is None:
-        loss = 1 - gas.reduced_law.restitution(jnp.ones_like(gas.temperature)) ** 2
-        surface = reduced_scene(_with_roughness(gas, terms)).surface
-        assert surface is not None
-        share = share / (1 + 4 * surface.eta * (1 - surface.eta) / loss)
-    return gas.replace(dissipative_constant=gas.value("dissipative_constant") * share)
-
-
-def _interpolation(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return Chebyshev nodes in [0, 1], and the matrix that interpolates to evenly spaced nodes."""
-    nodes = 0.5 - 0.5 * np.cos((np.arange(NUM_RATE_NODES) + 0.5) * np.pi / NUM_RATE_NODES)
-    series = np.polynomial.chebyshev.chebvander
-    even = np.linspace(-1.0, 1.0, num_nodes)
-    return nodes, series(even, NUM_RATE_NODES - 1) @ np.linalg.inv(
-        series(2 * nodes - 1, NUM_RATE_NODES - 1)
-    )
-
-
-_RATE_NODES, _INTERPOLATION = _interpolation(NUM_NODES)
-
-
-def relaxed_cooling_rate(
-    gas: Gas, depth: Float[Array, ""]
-) -> tuple[Float[Array, "nodes"], Float[Array, "nodes"]]:
-    """``-d ln T/dt``, 1/s, of a gas of hard spheres whose a_2 has relaxed.
-
-    Args:
-        gas: the scene.
-        depth: ln(T/T_0) ranges from 0 to ``-depth``.
-
-    Returns:
-        ln(T/T_0) at `NUM_NODES` evenly spaced nodes, and the rate there.
-    """
-    d, law = gas.dimension, gas.reduced_law
-
-    def rate(log_theta):
-        speed = jnp.exp(log_theta / 2)
-        coefficients = averages.impact_moments(law, speed, d)
-
-        def drift(a2):
-            rates = averages.Rates.from_averages(coefficients, a2)
-            return 4 / d * rates.cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment
-
-        a2 = jnp.zeros_like(speed)
-        for _ in range(NUM_RELAXATION_STEPS):
-            value, slope = jax.jvp(drift, (a2,), (jnp.ones_like(a2),))
-            a2 = a2 - value / slope
-        cooling = 2 / d * averages.Rates.from_averages(coefficients, a2).cooling * speed
-        return cooling
-
-    # NumPy casts the constants to the precision of the program.
-    rate_nodes, interpolation = (
-        jnp.asarray(x.astype(depth.dtype)) for x in (_RATE_NODES, _INTERPOLATION)
-    )
-    at_nodes = jax.vmap(rate)(-depth * rate_nodes)
-    even = jnp.exp(interpolation @ jnp.log(at_nodes))
-    return -depth * jnp.linspace(0.0, 1.0, NUM_NODES), even * gas.impact_speed / gas.path_length
-
-
-def cooling_by_elements(
-    gas: Gas, log_theta: Float[Array, "nodes"], ratio: Float[Array, "nodes"]
-) -> Float[Array, "nodes"]:
-    """Contribution of roughness, walls and drag to ``-d ln T/dt``, 1/s.
-
-    Args:
-        gas: the scene.
-        log_theta: ln(T/T_0).
-        ratio: T_rot/T at these temperatures; ignored for smooth spheres.
-    """
-    scene = scene_at_start(gas)
-    nothing = jnp.zeros((), log_theta.dtype)
-
-    def cooling(log_theta, ratio):
-        speed = jnp.exp(log_theta / 2)
-        return element_rates(scene, speed, ratio, nothing, gas.dimension).cooling
-
-    return jax.vmap(cooling)(log_theta, ratio) * gas.impact_speed / gas.path_length
-
-
-def cooling_by_roughness(
-    gas: Gas, log_theta: Float[Array, "nodes"], rate: Float[Array, "nodes"]
-) -> Float[Array, "nodes"]:
-    """Contribution of roughness to ``-d ln T/dt``, 1/s, with T_rot integrated along the cooling.
-
-    Integrates ``d(T_rot/T)/ds = (dT_rot/dt)/(T L) + T_rot/T`` over ``s = -ln(T/T_0)``, from the
-    initial T_rot of the gas, where L is the total cooling rate; the steps from node to node are
-    implicit in T_rot/T.
-
-    Args:
-        gas: a gas of rough spheres.
-        log_theta: ln(T/T_0) at evenly spaced nodes, decreasing from 0.
-        rate: ``-d ln T/dt`` at the nodes due to everything but roughness, 1/s.
-    """
-    scene = reduced_scene(gas)._replace(walls=None, drag=None, drive=None)
-    nothing, unit = jnp.zeros((), log_theta.dtype), gas.impact_speed / gas.path_length
-
-    def rates_at(log_theta, ratio):
-        at = element_rates(scene, jnp.exp(log_theta / 2), ratio, nothing, gas.dimension)
-        return jnp.stack([at.cooling, at.rotation]) * unit
-
-    def advance(ratio, node):
-        other, (cooling, rotation), (cooling_of_1, rotation_of_1) = node
-        loss = cooling + ratio * (cooling_of_1 - cooling)
-        total = other + loss
-        decay = -(rotation_of_1 - rotation) / total - 1
-        next_ratio = (ratio + step * rotation / total) / (1 + step * decay)
-        return next_ratio, loss
-
-    step = log_theta[0] - log_theta[1]
-    # Both changes are linear in T_rot/T.
-    ends = [jax.vmap(rates_at, (0, None))(log_theta, nothing + ratio) for ratio in (0.0, 1.0)]
-    first = gas.value("rotational_temperature") / gas.temperature
-    return jax.lax.scan(advance, first, (rate, *ends))[1]
-
-
-def log_temperature_by_quadrature(
-    log_theta: Float[Array, "nodes"], rate: Float[Array, "nodes"], times: Float[Array, "times"]
-) -> Float[Array, "times"]:
-    """ln(T/T_0) at given times of a gas with a given cooling rate.
-
-    Integrates ``t = int dy / rate(y)`` over y = -ln(T/T_0); between two nodes the rate is a power
-    of T.
-
-    Args:
-        log_theta: ln(T/T_0) at the nodes, decreasing from 0.
-        rate: ``-d ln T/dt`` at the nodes, > 0.
-        times: t, >= 0. After the last node ln T is constant.
-    """
-    time = 1 / rate
-    growth = jnp.log(time[1:] / time[:-1])
-    small = jnp.abs(growth) < 1e-4
-    mean = jnp.where(
-        small, 0.5 * (time[1:] + time[:-1]), jnp.diff(time) / jnp.where(small, 1.0, growth)
-    )
-    elapsed = jnp.cumsum(-jnp.diff(log_theta) * mean)
-    # Interpolate in ln(1 + t/t_0), where the curve is almost straight.
-    nodes = jnp.concatenate([jnp.zeros(1), jnp.log1p(elapsed * rate[0])])
-    return jnp.interp(jnp.log1p(times * rate[0]), nodes, log_theta)

@@ -1,9 +1,9 @@
 """Diagnosis of a fit in words, and the likelihood of a measured curve."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -11,23 +11,20 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran._utils.validation import POSITIVE, no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.alternatives import (
-    EXTRA_DECADES,
+    ABSENT,
     PREFERRED_CHI2,
     Alternative,
     compare_alternatives,
-    free_element_parameters,
     ranges_over_alternatives,
 )
-from jaxgran.fitting.error_budget import describe_derivative_bias
+from jaxgran.fitting.error_budget import curve_and_gas, describe_derivative_bias
 from jaxgran.fitting.residuals import (
-    Comparison,
+    Measurement,
     check_curve,
     check_deterministic,
     neighbour_correlation,
-    runs_test,
-    smooth_errors,
 )
-from jaxgran.fitting.result import SIGNIFICANCE, Fit, describe_minima
+from jaxgran.fitting.result import SIGNIFICANCE, Comparison, Fit, describe_minima
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.checks import describe_walls
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -39,10 +36,6 @@ MAX_SCATTER = 0.3
 SYSTEMATIC_CORRELATION = 3.0
 """Correlation of neighbouring residuals, in standard errors for independent ones, above which a
 model does not explain a curve without errors."""
-
-MIN_RUNS_P_VALUE = 0.00135
-"""p-value of the runs of one sign, that of 3 standard errors, below which a model does not explain
-a curve without errors."""
 
 NEGLIGIBLE_SHARE = 0.01
 """Share of an estimate below which the low end of a range counts as 0."""
@@ -57,9 +50,8 @@ class Diagnosis(NamedTuple):
             chi^2 is as good.
         verdict: one sentence, and what to do if the model does not explain the curve.
         reasons: reasons for the verdict, one sentence each.
-        correlation: correlation of neighbouring residuals; 0 for independent errors.
-        runs_p_value: probability of so few changes of sign between neighbouring residuals, by the
-            runs test of Wald & Wolfowitz.
+        correlation: correlation of neighbouring residuals of T, the largest of all measurements; 0
+            for independent errors.
         alternatives: other explanations of the curve, those that fit best first.
         ranges: 95 % range of each free parameter, SI, over all alternatives that fit as well as the
             best one. It is much wider than the error of a parameter that depends on the
@@ -73,58 +65,77 @@ class Diagnosis(NamedTuple):
     verdict: str
     reasons: tuple[str, ...]
     correlation: float
-    runs_p_value: float
     alternatives: tuple[Alternative, ...]
     ranges: dict[str, tuple[Float[np.ndarray, "size"], Float[np.ndarray, "size"]]]
 
 
 @no_type_check
-def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None) -> Diagnosis:
-    """Decide whether the model of a fit explains the measured curve, and give the reasons.
+def diagnose(
+    result: Fit,
+    data: CoolingCurve | dict | None = None,
+    num_particles: int | None = None,
+    *,
+    absent: tuple[str, ...] = (),
+) -> Diagnosis:
+    """Decide whether the model of a fit explains the measurements, and give the reasons.
 
     Args:
-        result: a fit of one curve by `jaxgran.fit` (not batched).
-        curve: the measured curve.
-        num_particles: N of the measured gas, if known.
+        result: the result of `jaxgran.fit` (not batched).
+        data: not needed: the result holds the measurement.
+        num_particles: N of the measured gas, by default that given to `jaxgran.fit`.
+        absent: elements that are known to be absent, of "walls", "roughness" and "drag": these
+            explanations are left out.
 
     Raises:
-        ValueError: if `result` is not a `Fit` or `curve` not a `CoolingCurve`.
+        ValueError: if `result` is not a `Fit`, or for an unknown name in `absent`.
 
-    >>> jaxgran.diagnose(result, curve).explains
+    >>> jaxgran.diagnose(result).explains
     True
     """
-    if not isinstance(result, Fit) or not isinstance(curve, CoolingCurve):
+    if not isinstance(result, Fit) or not isinstance(data, CoolingCurve | dict | None):
         raise ValueError(
             "diagnose needs the result of jaxgran.fit and the fitted curve, got "
-            f"{type(result).__name__} and {type(curve).__name__}"
+            f"{type(result).__name__} and {type(data).__name__}"
         )
-    residuals = np.asarray(result.residuals)
-    used = residuals != 0
-    residuals, times = residuals[used], np.asarray(curve.times)[used]
-    correlation = float(neighbour_correlation(jnp.asarray(residuals)))
+    if isinstance(absent, str) or not set(absent) <= set(ABSENT):
+        raise ValueError(f"absent must be a tuple of {', '.join(ABSENT)}, got {absent!r}")
     p_value, converged = float(result.p_value), bool(result.converged)
-    misfit = p_value < SIGNIFICANCE
-    runs = runs_test(residuals)
-    if result.scatter is not None:
-        misfit = _is_misfit(result, residuals, correlation, runs[2], num_particles)
-    limitations = result.model.limitations(result.gas, num_particles)
+    misfit, notes, limitations, correlations = p_value < SIGNIFICANCE, [], [], []
+    for label, comparison in result.comparisons.items():
+        curve, gas = curve_and_gas(result, label)
+        if curve is None:
+            continue
+        N = comparison.num_particles if num_particles is None else num_particles
+        residuals = np.asarray(comparison.residuals["temperature"])
+        times, used = np.asarray(curve.times), residuals != 0
+        correlation = float(neighbour_correlation(residuals[used]))
+        correlations.append(correlation)
+        if comparison.scatter is not None:
+            misfit = misfit or _is_misfit(comparison, gas, residuals[used], correlation, N)
+        for limitation in result.model.limitations(gas, N):
+            if limitation.words not in {known.words for known in limitations}:
+                limitations.append(limitation)
+        prefix = f"{label}: " if label else ""
+        if N is not None and gas.container is None:
+            notes.append(f"{prefix}the box of {N} spheres {describe_walls(gas, N)}")
+        described = _describe_residuals(residuals[used], times[used], correlation, p_value)
+        notes += [prefix + note for note in described]
+    limitations = tuple(sorted(limitations, key=lambda limitation: not limitation.decisive))
     alternatives, ranges = (), {}
     if converged and np.isfinite(result.chi2):
-        alternatives = compare_alternatives(result, curve)
+        alternatives = compare_alternatives(result, tuple(absent))
     if alternatives:
         ranges = ranges_over_alternatives(result, alternatives)
     reasons = [
         _describe_chi2(result),
-        *_describe_alternatives(result, alternatives, num_particles),
-        *_describe_residuals(residuals, times, correlation, p_value),
-        *_describe_runs(runs),
+        *_describe_measurements(result),
+        *_describe_alternatives(result, alternatives, absent),
+        *notes,
         *(limitation.words for limitation in limitations),
         *_describe_search(result),
         *describe_derivative_bias(result),
     ]
     verdict = _verdict(result, misfit, limitations, alternatives, ranges)
-    if runs[2] < SIGNIFICANCE and converged and not misfit:
-        verdict += " The residuals come in runs of one sign."
     explains = (
         converged
         and not misfit
@@ -132,14 +143,15 @@ def diagnose(result: Fit, curve: CoolingCurve, num_particles: int | None = None)
         and not any(alternative.preferred for alternative in alternatives)
         and not len(result.degenerate_solutions())
     )
-    return Diagnosis(explains, verdict, tuple(reasons), correlation, runs[2], alternatives, ranges)
+    largest = max(correlations, default=0.0)
+    return Diagnosis(explains, verdict, tuple(reasons), largest, alternatives, ranges)
 
 
 def _is_misfit(
-    result: Fit,
+    comparison: Comparison,
+    gas: Gas,
     residuals: Float[np.ndarray, "used"],
     correlation: float,
-    runs_p_value: float,
     num_particles: int | None,
 ) -> bool:
     """Return True if the misfit of a curve without errors is too large or systematic.
@@ -147,11 +159,24 @@ def _is_misfit(
     Without errors chi^2 is no measure of the misfit. Fluctuations of few particles are correlated
     in time too, but N gives their size.
     """
-    scatter = float(np.asarray(result.scatter))
-    expected = np.sqrt(2 / (result.gas.dimension * num_particles)) if num_particles else 0.0
-    is_correlated = correlation > SYSTEMATIC_CORRELATION / np.sqrt(residuals.size)
-    is_systematic = is_correlated or runs_p_value < MIN_RUNS_P_VALUE
+    scatter = float(np.asarray(comparison.scatter))
+    expected = np.sqrt(2 / (gas.dimension * num_particles)) if num_particles else 0.0
+    is_systematic = correlation > SYSTEMATIC_CORRELATION / np.sqrt(residuals.size)
     return scatter > MAX_SCATTER or bool(is_systematic and scatter > 2 * expected)
+
+
+def _describe_measurements(result: Fit) -> Iterator[str]:
+    """Yield the misfit and the weight of each of several measurements."""
+    if len(result.comparisons) < 2:
+        return
+    weights = result.weights()
+    for label, comparison in result.comparisons.items():
+        chi2 = sum(float(np.sum(np.asarray(x) ** 2)) for x in comparison.residuals.values())
+        number = sum(int(np.sum(np.asarray(x) != 0)) for x in comparison.residuals.values())
+        yield (
+            f"{label}: chi^2 is {chi2:.3g} for {number} points; its weight in {result.names[0]} is "
+            f"{weights[label][0]:.2f}"
+        )
 
 
 def _verdict(
@@ -203,8 +228,9 @@ def _verdict(
 
 def _describe_chi2(result: Fit) -> str:
     reduced, p_value = float(result.reduced_chi2), float(result.p_value)
-    if result.scatter is not None:
-        scatter = 100 * float(np.asarray(result.scatter))
+    scatter = next(iter(result.comparisons.values())).scatter
+    if scatter is not None:
+        scatter = 100 * float(np.asarray(scatter))
         return (
             f"the curve has no errors; the scatter of the residuals, {scatter:.2g} % of T, is used "
             "as the error"
@@ -217,19 +243,13 @@ def _describe_chi2(result: Fit) -> str:
 
 
 def _describe_alternatives(
-    result: Fit, alternatives: tuple[Alternative, ...], num_particles: int | None
+    result: Fit, alternatives: tuple[Alternative, ...], absent: tuple[str, ...]
 ) -> Iterator[str]:
     """Yield clauses about preferred or possible alternatives, with the first parameter there."""
     yield _describe_assumptions(result)
-    if num_particles is not None and result.gas.container is None:
-        yield f"the box of {num_particles} spheres {describe_walls(result.gas, num_particles)}"
-    free = free_element_parameters(result)
-    if free:
-        verb = "is" if len(free) == 1 else "are"
-        yield (
-            f"additional loss terms were not tested: {', '.join(free)} {verb} degenerate with them"
-        )
-    elif result.gas.drive is not None:
+    if absent:
+        yield f"known to be absent: {', '.join(absent)}"
+    if any(curve_and_gas(result, k)[1].drive is not None for k in result.comparisons):
         yield "additional loss terms were not tested: the gas is driven"
     name = result.names[0]
     for alternative in alternatives:
@@ -245,7 +265,6 @@ def _describe_alternatives(
                 f"{alternative.name} cannot be excluded: {name} is then {value}; to exclude it, "
                 "the errors of the curve and of the model must be "
                 f"{alternative.error_reduction_needed:.2g} times smaller"
-                f"{_describe_longer_decay(alternative)}"
             )
 
 
@@ -256,16 +275,8 @@ def _describe_range(low: float, high: float, estimate: Any) -> str:
     return f"between {low:.3g} and {high:.3g}"
 
 
-def _describe_longer_decay(alternative: Alternative) -> str:
-    if np.isnan(alternative.decades):
-        return ""
-    if np.isinf(alternative.decades):
-        return f" ({EXTRA_DECADES[-1]:g} more decades of T are not enough)"
-    return f", or T must be measured down by a further factor of {10**alternative.decades:.2g}"
-
-
 def _describe_assumptions(result: Fit) -> str:
-    elements = result.gas.elements
+    elements = {e for k in result.comparisons for e in curve_and_gas(result, k)[1].elements}
     spheres = ", rough spheres of constant beta_t" if "surface" in elements else ", smooth spheres"
     spheres = " spheres of constant friction" if "friction" in elements else spheres
     where = [] if "container" in elements else ["far from walls"]
@@ -309,15 +320,6 @@ def _describe_residuals(
     if not np.isnan(p_value) and 0 < far.sum() <= max(2, residuals.size // 20):
         at = ", ".join(f"t = {t:.3g} s" for t in times[far])
         yield f"far outliers at {at}: check their error bars"
-
-
-def _describe_runs(runs: tuple[int, float, float]) -> Iterator[str]:
-    number, expected, chance = runs
-    if chance < SIGNIFICANCE:
-        yield (
-            f"residuals rarely change sign: {number} runs of one sign instead of {expected:.3g} "
-            f"for independent ones (probability by chance: {100 * chance:.2g} %)"
-        )
 
 
 def _describe_search(result: Fit) -> Iterator[str]:
@@ -380,16 +382,19 @@ def log_likelihood(
     """
     model = KineticTheory() if model is None else model
     _check_likelihood(gas, curve, model, clock)
-    curve, _ = smooth_errors(curve, replicas)
-    N = None if num_particles is None else jnp.asarray(float(num_particles))
-    comparison = Comparison.of(gas, curve, model, (), N, float(replicas))
-    flat = jnp.zeros(comparison.num_nuisance, gas.temperature.dtype)
-    times_factor = jnp.broadcast_to(jnp.asarray(clock), curve.times.shape)
-    residuals = comparison.evaluate(flat, times_factor)[0]
+    m = Measurement.of("", gas, curve, model, num_particles, replicas, use_displacement=True)
+    m = replace(m, faster=m.faster * jnp.asarray(clock))
+    rows, _ = m.evaluate(model, dict.fromkeys(m.nuisances, jnp.zeros(())), linear=False)
+    residuals = jnp.concatenate([jnp.asarray(row.values) for row in rows])
     chi2 = jnp.sum(residuals**2)
-    if flat.size:
+    if m.nuisances:
         # The residuals are linear in the factors of T_rot and <dr^2>: subtract the best fit.
-        slope = jax.jacfwd(lambda x: comparison.evaluate(x, times_factor)[0])(flat)
+        nothing = [jnp.zeros((row.values.shape[0], 1)) for row in rows]
+        columns = [
+            [row.slopes.get(name, zero) for row, zero in zip(rows, nothing, strict=True)]
+            for name in m.nuisances
+        ]
+        slope = jnp.concatenate([jnp.concatenate(column) for column in columns], axis=1)
         projection = slope.T @ residuals
         chi2 = chi2 - projection @ jnp.linalg.solve(slope.T @ slope, projection)
     if curve.temperature_error is None:

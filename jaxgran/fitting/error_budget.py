@@ -4,74 +4,94 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.data.curve import CoolingCurve, Run
-from jaxgran.fitting.parameters import Parameters, Priors
-from jaxgran.fitting.residuals import log_temperatures
-from jaxgran.fitting.result import Fit
+from jaxgran._utils.tracing import as_jax_arrays
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.parameters import Priors, with_floats
+from jaxgran.fitting.residuals import MODEL_ERROR, Measurement
+from jaxgran.fitting.result import Comparison, Fit
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import error_model_along
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.linearise import curve_of_program, linearise, with_all_elements
 from jaxgran.scene.gas import Gas
 
 MIN_REPORTED_BIAS = 0.05
 """Smallest relative error of the derivatives of a fit that a diagnosis reports."""
 
 
-def with_scene_errors(result: Fit, num_particles: int | None, replicas: int) -> Fit:
-    """Return a fit with the errors of its model's clock in this scene, and of few particles.
-
-    Args:
-        result: a fit of one curve, not traced.
-        num_particles: N of each measured run, if known.
-        replicas: number of measured runs over which the curve is a mean.
-    """
-    error_model = _error_model(result, num_particles)
-    clock_error = error_model.clock_error(result.model.rate_error(error_model))[
-        -result.curve.times.size :
-    ]
-    clock_error = np.asarray(clock_error, result.clock_error.dtype)
-    is_clock_free = bool(result.priors.names) and not result.model.stochastic
-    # The error of a free clock is that at the first guess: only what exceeds it is added.
-    excess = np.maximum(clock_error**2 - is_clock_free * np.asarray(result.clock_error) ** 2, 0.0)
-    shift = np.asarray(result.clock_gain) @ np.sqrt(excess)
+def with_scene_errors(result: Fit) -> Fit:
+    """Return a fit with the errors of its model's clock in each scene, and of few particles."""
     covariances = {name: np.asarray(part) for name, part in result.covariances.items()}
-    model = covariances["model"] if is_clock_free else 0.0
-    covariances["model"] = model + np.outer(shift, shift)
+    is_clock_free = not result.model.stochastic and bool(
+        result.priors or len(result.comparisons) > 1
+    )
+    clock = covariances[MODEL_ERROR] if is_clock_free else np.zeros_like(covariances[MODEL_ERROR])
+    chance, comparisons = None, {}
+    for label, comparison in result.comparisons.items():
+        comparisons[label] = comparison
+        curve, gas = curve_and_gas(result, label)
+        if curve is None:
+            continue
+        error_model = _error_model(curve, gas, comparison)
+        error = error_model.clock_error(result.model.rate_error(error_model))[-curve.times.size :]
+        clock_error = np.asarray(error, np.asarray(comparison.clock_error).dtype)
+        # The error of a free clock is that at the first guess: only what exceeds it is added.
+        before = is_clock_free * np.asarray(comparison.clock_error) ** 2
+        shift = np.asarray(comparison.clock_gain) @ np.sqrt(
+            np.maximum(clock_error**2 - before, 0.0)
+        )
+        clock = clock + np.outer(shift, shift)
+        comparisons[label] = comparison._replace(clock_error=clock_error)
+        if comparison.num_particles is not None:
+            total = comparison.num_particles * comparison.replicas
+            noise = _collision_noise_covariance(comparison, error_model, total)
+            chance = noise if chance is None else chance + noise
+    covariances[MODEL_ERROR] = clock
     if result.model.stochastic:
         covariances["slope"] = np.asarray(_derivative_bias_covariance(result))
-    if num_particles is not None:
-        noise = _collision_noise_covariance(result, error_model, num_particles * replicas)
-        covariances["few particles"] = _excess_covariance(noise, covariances["measurement"])
-    parts = {name: jnp.asarray(part) for name, part in covariances.items()}
-    return dataclasses.replace(result, clock_error=jnp.asarray(clock_error), covariances=parts)
+    if chance is not None:
+        covariances["few particles"] = _excess_covariance(chance, covariances["measurement"])
+    comparisons, covariances = as_jax_arrays((comparisons, covariances))
+    return dataclasses.replace(result, comparisons=comparisons, covariances=covariances)
+
+
+def curve_and_gas(result: Fit, label: str) -> tuple[CoolingCurve | None, Gas]:
+    """Return the fitted curve and gas of one measurement; the curve of a drop test is None."""
+    curves, gases = result.curve, result.gas
+    if isinstance(gases, dict):
+        assert isinstance(curves, dict)
+        return curves.get(label), gases[label]
+    assert not isinstance(curves, dict)
+    return curves, gases
 
 
 def clock_accuracy(
-    guess: Gas, curve: CoolingCurve, model: AbstractModel, num_particles: int | None = None
-) -> Float[Array, "times"]:
+    guess: Gas, measurement: Measurement, model: AbstractModel, num_particles: int | None = None
+) -> Float[np.ndarray, "times"]:
     """Relative accuracy of a model's clock in the scene of a curve, at each of its times.
 
     Args:
-        guess: a guess of the gas.
-        curve: the curve with the times.
+        guess: a guess of the gas, with all elements that the model supports.
+        measurement: the curve with the times.
         model: a deterministic model.
         num_particles: N of each measured run, if known.
     """
-    times = np.asarray(curve.times)
-    times = jnp.asarray(np.concatenate([np.zeros(int(times[0] > 0), times.dtype), times]))
-    error_model = error_model_along(guess, model.simulate(guess, times, Run()), num_particles)
-    return jnp.asarray(error_model.clock_error(model.rate_error(error_model))[-curve.times.size :])
+    times = np.asarray(measurement.curve.times)
+    size, times = times.size, np.concatenate([np.zeros(int(times[0] > 0), times.dtype), times])
+    names = [name for name in measurement.scene.domains if name in guess.domains]
+    gas = with_floats(measurement.scene, {name: guess.value(name) for name in names})
+    error_model = error_model_along(gas, curve_of_program(model, gas, times), num_particles)
+    return error_model.clock_error(model.rate_error(error_model))[-size:]
 
 
-def _error_model(result: Fit, num_particles: int | None) -> ErrorModel:
+def _error_model(curve: CoolingCurve, gas: Gas, comparison: Comparison) -> ErrorModel:
     """Return the error model of the fitted gas, at its start and at the measured times."""
-    curve, times = result.curve, _times_since_start(result)
+    times = _times_since_start(curve, comparison)
     before = np.zeros(int(times[0] > 0), times.dtype)
 
     def with_start(values: ArrayLike, first: Any = 0.0) -> Array:
@@ -79,31 +99,32 @@ def _error_model(result: Fit, num_particles: int | None) -> ErrorModel:
 
     curve_from_start = CoolingCurve(
         times=with_start(times),
-        temperature=with_start(curve.temperature, result.gas.temperature),
+        temperature=with_start(curve.temperature, gas.temperature),
         sonine=None if curve.sonine is None else with_start(curve.sonine),
         collisions=None if curve.collisions is None else with_start(curve.collisions),
     )
-    return error_model_along(result.gas, curve_from_start, num_particles)
+    return error_model_along(gas, curve_from_start, comparison.num_particles)
 
 
-def _times_since_start(result: Fit) -> Float[np.ndarray, "times"]:
+def _times_since_start(curve: CoolingCurve, comparison: Comparison) -> np.ndarray:
     """Return the measured times minus t0, or 0 if they are earlier."""
-    times = np.asarray(result.curve.times)
-    return np.maximum(times - np.asarray(result.start_time, times.dtype), 0.0)
+    times = np.asarray(curve.times)
+    return np.maximum(times - np.asarray(comparison.start_time, times.dtype), 0.0)
 
 
 def _collision_noise_covariance(
-    result: Fit, error_model: ErrorModel, num_particles: int
+    comparison: Comparison, error_model: ErrorModel, num_particles: int
 ) -> Float[np.ndarray, "p p"]:
     """Covariance of the estimates due to the randomness of single collisions of N particles.
 
     The delay of the clock accumulates: the covariance of its delays at two times is the variance at
     the earlier one.
     """
-    times = _times_since_start(result)
+    clock_gain = np.asarray(comparison.clock_gain)
+    times = error_model.time[-clock_gain.shape[1] :]
     variance = error_model.chance_of_clock(num_particles)[-times.size :]
     common = np.minimum(variance[:, None], variance[None, :])
-    gain = np.asarray(result.clock_gain) / np.where(times > 0, times, 1.0)[None]
+    gain = clock_gain / np.where(times > 0, times, 1.0)[None]
     return gain @ common @ gain.T
 
 
@@ -125,10 +146,13 @@ def mean_derivative_bias(result: Fit) -> float:
     """
     bias = result.curve.derivative_bias
     if bias is None:
-        error_model = _error_model(result, getattr(result.model, "num_particles", None))
+        comparison = result.comparison._replace(
+            num_particles=getattr(result.model, "num_particles", None)
+        )
+        error_model = _error_model(result.curve, result.gas, comparison)
         bias = np.broadcast_to(result.model.derivative_error(error_model), error_model.time.shape)
     times = result.curve.times.size
-    weights = np.sum(np.asarray(result.sensitivity)[:times] ** 2, axis=1)
+    weights = np.sum(np.asarray(result.comparison.sensitivity)[:times] ** 2, axis=1)
     whole = max(np.sum(weights), np.finfo(float).tiny)
     return float(np.sum(weights * np.asarray(bias)[-times:]) / whole)
 
@@ -166,7 +190,7 @@ def _excess_covariance(
 
 def parameter_effects(
     gas: Gas, priors: Priors, computed: CoolingCurve, rotation: bool
-) -> tuple[Float[Array, "points"], dict[str, Float[Array, "points size"]]]:
+) -> tuple[Float[np.ndarray, "points"], dict[str, Float[np.ndarray, "points size"]]]:
     """Return the changes of ln T, and of ln T_rot if it is used, with the clock and each prior.
 
     Kinetic theory gives the changes. It does not support friction: for spheres with friction, the
@@ -181,26 +205,33 @@ def parameter_effects(
     Returns:
         ``d ln T/d ln t``, and for each prior the changes by one standard error of its numbers.
     """
-    model, varied, times = KineticTheory(), priors.extra_parameters(()), computed.times
-    parameters, is_supported = Parameters(gas, varied), "friction" not in gas.elements
+    model, varied, times = KineticTheory(), priors.extra_parameters(()), np.asarray(computed.times)
+    smooth = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
+    linear = linearise(model, with_all_elements(smooth, model), times)
+    names = ["temperature"]
+    if rotation and "friction" not in gas.elements:
+        names.append("rotational_temperature")
 
-    def logarithms(flat: Array, clock: Array) -> Array:
-        elapsed = (times - parameters.start(flat)) * clock
-        curve = model.simulate(parameters.gas(flat), elapsed, Run())
-        return log_temperatures(curve, rotation and is_supported)
+    def of_logarithms(part: dict[str, Any]) -> np.ndarray:
+        return np.concatenate([(part[n].T / linear.values[n]).T for n in names])
 
-    flat, clock = parameters.flat(gas), jnp.ones_like(times)
-    slope = jax.jvp(lambda x: logarithms(flat, x), (clock,), (clock,))[1]
-    if rotation and not is_supported:
+    slope = of_logarithms(linear.by_time) * np.tile(times, len(names))
+    if rotation and len(names) < 2:
         log_T_rot = np.log(np.asarray(computed.rotational_temperature))
-        rotation_slope = np.gradient(log_T_rot, np.asarray(times)) * np.asarray(times)
-        slope = jnp.concatenate([slope, jnp.asarray(rotation_slope, slope.dtype)])
+        slope = np.concatenate([slope, np.gradient(log_T_rot, times) * times])
     if not varied:
         return slope, {}
-    by_parameter = jax.jacfwd(logarithms)(flat, clock)
-    by_residual = jax.jacfwd(lambda x: priors.residuals(parameters.gas(x), parameters.start(x)))(
-        flat
+    values = {name: np.asarray(gas.value(name)) for name in varied}
+    by_parameter = np.concatenate([of_logarithms(linear.by_float[n]) for n in varied], axis=1)
+    rows = priors.residuals(gas, values)
+    by_residual = np.concatenate(
+        [
+            np.concatenate(
+                [row[1].get(n, np.zeros((row[0].size, values[n].size))) for n in varied], axis=1
+            )
+            for row in rows.values()
+        ]
     )
-    changes = by_parameter @ jnp.linalg.pinv(by_residual)
+    changes = by_parameter @ np.linalg.pinv(by_residual)
     ends = np.cumsum([given.size for given in priors.given])[:-1]
-    return slope, dict(zip(priors.names, jnp.split(changes, ends, axis=1), strict=True))
+    return slope, dict(zip(priors.names, np.split(changes, ends, axis=1), strict=True))

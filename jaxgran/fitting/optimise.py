@@ -1,107 +1,322 @@
-"""Least squares for residuals without noise, and fits of deterministic models by it."""
+"""Least squares over one or many measurements, and fits of deterministic models by it.
 
-import dataclasses
-from collections.abc import Callable
-from typing import NamedTuple
+`Problem` holds the measurements and the unknowns, and returns residuals with their derivatives.
+`search` minimises their squares: on the host by scipy around the compiled program of
+`jaxgran.models.linearise`; under a transformation, or with a solver that the user gives, by
+optimistix.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+import scipy
+from jaxtyping import Array
 
-from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.parameters import NO_PRIORS, Priors
-from jaxgran.fitting.residuals import (
-    QUANTITIES,
-    Comparison,
-    correlation_factor,
-    neighbour_correlation,
+from jaxgran._utils.tracing import any_traced, array_module
+from jaxgran._utils.validation import Domain
+from jaxgran.fitting.parameters import (
+    START_TIME,
+    Numbers,
+    Priors,
+    Unknown,
+    domain_of,
+    guess_start_time,
+    halving_time,
 )
-from jaxgran.fitting.result import Fit, Minima, goodness_of_fit, search_starts
+from jaxgran.fitting.residuals import (
+    CLOCK,
+    CLOCK_TREND,
+    DropTestRows,
+    Measurement,
+    Rows,
+)
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
 CONVERGED_STEP = 0.01
 """Length of a Gauss-Newton step, in standard errors, below which a search has converged."""
 
-TOLERANCE = 1e-7
-"""Relative and absolute tolerance of the minimisers, for the parameters and the objective."""
+TOLERANCE = 1e-8
+"""Relative tolerance of a search, for the parameters and the sum of squares."""
 
-Residuals = Callable[[Float[Array, "p"]], Float[Array, "residuals"]]
+MAX_DISTANCE = 25.0
+"""Largest change of an unconstrained parameter in a search: a factor 7e10 of a positive one."""
 
-
-Minimum = tuple[Float[Array, "p"], Int[Array, ""], Bool[Array, ""]]
+Minimum = tuple[Numbers, Numbers, Numbers]
 """Parameters at the end of a search, the number of iterations, and True if it converged."""
 
-Search = Callable[[Residuals, Float[Array, "p"], int], Minimum]
 
+@dataclass(frozen=True)
+class Problem:
+    """Measurements, a deterministic model, and the unknowns that are varied.
 
-def least_squares(residuals: Residuals, first: Float[Array, "p"], max_steps: int) -> Minimum:
-    """Minimise the sum of squares by Levenberg-Marquardt, with forward-mode Jacobians.
-
-    Args:
-        residuals: function of the parameters.
-        first: the initial guess.
-        max_steps: maximum number of iterations.
-    """
-    solver = optx.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
-    solution = optx.least_squares(
-        lambda flat, _: residuals(flat),
-        eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion()),
-        first,
-        max_steps=max_steps,
-        throw=False,
-    )
-    return _minimum(solution)
-
-
-def quasi_newton(residuals: Residuals, first: Float[Array, "p"], max_steps: int) -> Minimum:
-    """Minimise the sum of squares by L-BFGS, with reverse-mode gradients.
-
-    The first step goes along the gradient to the minimum for residuals linearised at the initial
-    guess (the Cauchy step), but no further than 1: a factor e of a positive parameter. The
-    objective is scaled accordingly, because L-BFGS starts with a Hessian of 1.
-
-    Args:
-        residuals, first: as for `least_squares`.
-        max_steps: maximum number of evaluations, including those of line searches.
+    Attributes:
+        measurements: curves and drop tests.
+        model: computes the curves.
+        unknowns: the free parameters, then those that vary because of a prior, then nuisance
+            parameters.
+        num_free: number of elements of the free parameters.
+        priors: of shared parameters (None) and of those of one measurement, by its label.
+        fixed: SI values of further parameters, by label and name.
+        tolerance: factor of the model's tolerance.
     """
 
-    def half_chi2(flat):
-        return 0.5 * jnp.sum(residuals(flat) ** 2)
+    measurements: tuple[Measurement | DropTestRows, ...]
+    model: AbstractModel
+    unknowns: tuple[Unknown, ...]
+    num_free: int
+    priors: dict[str | None, Priors]
+    fixed: dict[str, dict[str, Numbers]]
+    tolerance: float = 1.0
+    _last: dict[bytes, Any] = field(init=False, default_factory=dict, compare=False)
 
-    gradient = jax.grad(half_chi2)(first)
-    steepness = jnp.linalg.norm(gradient)
-    steepness = jnp.where(steepness > 0, steepness, 1.0)
-    _, slope = jax.jvp(residuals, (first,), (gradient / steepness,))
-    scale = jnp.maximum(jnp.sum(slope**2), steepness)
-    solution = optx.minimise(
-        lambda flat, scale: half_chi2(flat) / scale,
-        optx.LBFGS(rtol=TOLERANCE, atol=TOLERANCE),
-        first,
-        scale,
-        max_steps=max_steps,
-        throw=False,
-    )
-    return _minimum(solution)
+    @classmethod
+    def of(
+        cls,
+        measurements: tuple[Measurement | DropTestRows, ...],
+        model: AbstractModel,
+        free: tuple[str, ...],
+        separate: tuple[str, ...],
+        priors: dict[str | None, Priors],
+        *,
+        clock_is_free: bool,
+    ) -> "Problem":
+        """Return the problem of `jaxgran.fit`.
+
+        Args:
+            measurements, model, priors: see the class.
+            free: names of shared free parameters.
+            separate: names of free parameters that each curve has separately.
+            clock_is_free: whether the error of the model's clock is a nuisance parameter.
+        """
+        curves = [m for m in measurements if isinstance(m, Measurement)]
+        gas = measurements[0].gas
+
+        def unknown(name: str, label: str | None, gas: Gas) -> Unknown:
+            domain = domain_of(gas, name)
+            if name != START_TIME:
+                return Unknown(name, label, jnp.shape(gas.value(name)), domain)
+            unit = halving_time(next(m.curve for m in curves if label in (None, m.label)))
+            return Unknown(name, label, (), domain, unit)
+
+        unknowns = [unknown(name, None, gas) for name in free]
+        unknowns += [unknown(name, m.label, m.gas) for name in separate for m in curves]
+        num_free = sum(u.size for u in unknowns)
+        by_label = {None: gas} | {m.label: m.gas for m in measurements}
+        for label, some in priors.items():
+            known = tuple(u.name for u in unknowns if u.label in (None, label))
+            extra = some.extra_parameters(known)
+            unknowns += [unknown(name, label, by_label[label]) for name in extra]
+        for m in curves:
+            names = ((CLOCK, CLOCK_TREND) if clock_is_free else ()) + m.nuisances
+            unknowns += [Unknown(name, m.label, (), Domain()) for name in names]
+        return cls(measurements, model, tuple(unknowns), num_free, priors, {})
+
+    @property
+    def curves(self) -> tuple[Measurement, ...]:
+        """The measured curves."""
+        return tuple(m for m in self.measurements if isinstance(m, Measurement))
+
+    def flat(self, guesses: dict[str, Gas]) -> Numbers:
+        """Return the unknowns of gases, by label, in their unconstrained scale, in one array."""
+        xp = array_module(self.measurements, guesses)
+        by_label = {m.label: m for m in self.measurements}
+        parts = []
+        for u in self.unknowns:
+            label = self.measurements[0].label if u.label is None else u.label
+            gas = guesses[label]
+            if u.name == START_TIME:
+                names = tuple(v.name for v in self.unknowns if v.label in (None, label))
+                measurement: Any = by_label[label]
+                start = guess_start_time(gas, measurement.curve, names)
+                parts.append(xp.ravel(xp.asarray(start) / u.unit))
+            elif u.name in gas.domains:
+                parts.append(xp.ravel(u.domain.to_free(xp.asarray(gas.value(u.name)))))
+            else:
+                parts.append(xp.zeros(1, xp.asarray(gas.temperature).dtype))
+        return xp.concatenate([xp.zeros(0, xp.asarray(gas.temperature).dtype), *parts])
+
+    def parts(self, flat: Numbers) -> list[tuple[Unknown, Numbers]]:
+        """Return each unknown with its SI value."""
+        pairs, begin = [], 0
+        for u in self.unknowns:
+            free = flat[begin : begin + u.size].reshape(u.shape)
+            begin += u.size
+            infinite = np.isinf(u.domain.low) and np.isinf(u.domain.high)
+            pairs.append((u, free * u.unit if infinite else u.domain.from_free(free)))
+        return pairs
+
+    def estimates(self, flat: Numbers) -> Numbers:
+        """Return SI values of the free parameters in one array."""
+        xp = array_module(flat)
+        values = [xp.ravel(value) for _, value in self.parts(flat)]
+        return xp.concatenate([flat[:0], *values])[: self.num_free]
+
+    def slopes(self, flat: Numbers) -> Numbers:
+        """Return the derivative of each SI value in its unconstrained parameter."""
+        xp = array_module(flat)
+        slopes = [xp.ravel(u.domain.slope(value)) * u.unit for u, value in self.parts(flat)]
+        return xp.concatenate([flat[:0], *slopes])
+
+    def values(self, flat: Numbers) -> dict[str, dict[str, Numbers]]:
+        """Return SI values of all parameters that are varied, by label and name."""
+        values = {m.label: dict(self.fixed.get(m.label, {})) for m in self.measurements}
+        for u, value in self.parts(flat):
+            for label in values if u.label is None else (u.label,):
+                values[label][u.name] = value
+        return values
+
+    def evaluate(
+        self, flat: Numbers
+    ) -> tuple[list[Rows], Numbers, Numbers, dict[str, dict[str, Numbers]]]:
+        """Return the residuals by kind, all in one array, their Jacobian, and the curves.
+
+        The curves are dictionaries of their fields, by label.
+        """
+        if not isinstance(flat, np.ndarray):
+            return self._evaluate(flat)
+        if (key := flat.tobytes()) not in self._last:
+            self._last.clear()
+            self._last[key] = self._evaluate(flat)
+        return self._last[key]
+
+    def _evaluate(self, flat: Numbers) -> tuple[list[Rows], Numbers, Numbers, dict]:
+        values, rows, computed = self.values(flat), [], {}
+        for m in self.measurements:
+            more, curve = m.evaluate(self.model, values[m.label], tolerance=self.tolerance)
+            rows += more
+            if curve is not None:
+                computed[m.label] = curve
+        for label, priors in self.priors.items():
+            at = self.measurements[0].label if label is None else label
+            gas = next(m.gas for m in self.measurements if m.label == at)
+            parts = priors.residuals(gas, values[at])
+            rows += [Rows(name, label, *row) for name, row in parts.items()]
+        xp = array_module(flat, rows)
+        jacobian = self._jacobian(xp, flat, rows)
+        return rows, xp.concatenate([row.values for row in rows]), jacobian, computed
+
+    def _jacobian(self, xp: Any, flat: Numbers, rows: list[Rows]) -> Numbers:
+        slopes, columns, begin = self.slopes(flat), [], 0
+        for u in self.unknowns:
+            factor = slopes[begin : begin + u.size]
+            begin += u.size
+            blocks = []
+            for row in rows:
+                applies = row.label is None or u.label is None or row.label == u.label
+                if applies and u.name in row.slopes:
+                    blocks.append(row.slopes[u.name] * factor[None])
+                else:
+                    blocks.append(xp.zeros((row.values.shape[0], u.size), flat.dtype))
+            columns.append(xp.concatenate(blocks))
+        whole = sum(row.values.shape[0] for row in rows)
+        return xp.concatenate([xp.zeros((whole, 0), flat.dtype), *columns], axis=1)
+
+    def with_scatter_as_error(self, flat: Numbers) -> "Problem":
+        """Return the problem with the scatter of ln T as the error of curves without errors."""
+        rows, *_ = self.evaluate(flat)
+        measurements = tuple(
+            m.with_scatter_as_error([r for r in rows if r.label == m.label], self.num_free)
+            if isinstance(m, Measurement) and m.curve.temperature_error is None
+            else m
+            for m in self.measurements
+        )
+        return replace(self, measurements=measurements)
 
 
-SEARCHES = {"levenberg-marquardt": least_squares, "lbfgs": quasi_newton}
-"""Minimisers by the name of their method."""
-
-
-def is_converged(residuals: Float[Array, "n"], jacobian: Float[Array, "n p"]) -> Bool[Array, ""]:
+def is_converged(residuals: Numbers, jacobian: Numbers) -> Numbers:
     """Return True if the next Gauss-Newton step is shorter than `CONVERGED_STEP` standard errors.
 
     The components of the step along the right singular vectors of the Jacobian, in standard errors
     for residuals of unit variance, are those of the residuals along the left singular vectors. The
     variance is estimated from the residuals. Singular values at the level of round-off are ignored.
     """
-    left, singular, _ = jnp.linalg.svd(jacobian, full_matrices=False)
-    known = singular > jnp.finfo(singular.dtype).eps ** 0.5 * singular[0]
-    step = jnp.max(jnp.where(known, jnp.abs(residuals @ left), 0.0))
-    return step < CONVERGED_STEP * jnp.sqrt(jnp.mean(residuals**2))
+    xp = array_module(residuals, jacobian)
+    left, singular, _ = xp.linalg.svd(jacobian, full_matrices=False)
+    known = singular > xp.finfo(singular.dtype).eps ** 0.5 * singular[0]
+    step = xp.max(xp.where(known, xp.abs(residuals @ left), 0.0))
+    return step < CONVERGED_STEP * xp.sqrt(xp.mean(residuals**2))
+
+
+def search(
+    problem: Problem,
+    first: Numbers,
+    max_steps: int,
+    solver: Any = None,
+    tolerance: float = TOLERANCE,
+) -> Minimum:
+    """Minimise the sum of squares from a first guess.
+
+    Args:
+        problem: of a fit.
+        first: the first guess, in the unconstrained scale.
+        max_steps: maximum number of steps.
+        solver: of optimistix; None for Levenberg-Marquardt.
+        tolerance: relative tolerance of the parameters and of the sum of squares.
+    """
+    if solver is None and not any_traced(problem.measurements, problem.priors, first):
+        return _search_on_host(problem, np.asarray(first), max_steps, tolerance)
+    return _search_compiled(problem, jnp.asarray(first), max_steps, solver)
+
+
+def _search_on_host(
+    problem: Problem, first: np.ndarray, max_steps: int, tolerance: float
+) -> Minimum:
+    def at(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if np.any(np.abs(flat - first) > MAX_DISTANCE):
+            return np.full(size, np.inf), np.zeros((size, first.size))
+        _, residuals, jacobian, _ = problem.evaluate(flat.astype(first.dtype))
+        return residuals.astype(float), jacobian.astype(float)
+
+    size = problem.evaluate(first)[1].size
+    if not all(np.all(np.isfinite(x)) for x in at(first.astype(float))):
+        return first, np.asarray(0), np.asarray(False)
+    tolerance = max(tolerance, float(np.finfo(first.dtype).eps))
+    solution = scipy.optimize.least_squares(
+        lambda x: at(x)[0],
+        first.astype(float),
+        jac=lambda x: at(x)[1],  # type: ignore
+        x_scale="jac",
+        ftol=tolerance,
+        xtol=tolerance,
+        gtol=tolerance**1.5,
+        max_nfev=max_steps,
+    )
+    residuals, jacobian = at(solution.x)
+    converged = solution.status > 0 or bool(is_converged(residuals, jacobian))
+    return solution.x.astype(first.dtype), np.asarray(solution.njev), np.asarray(converged)
+
+
+def _search_compiled(problem: Problem, first: Array, max_steps: int, solver: Any) -> Minimum:
+    @jax.custom_jvp
+    def residuals(flat: Array) -> Array:
+        return problem.evaluate(flat)[1]
+
+    @residuals.defjvp
+    def residuals_jvp(primals, tangents):
+        _, value, jacobian, _ = problem.evaluate(primals[0])
+        return value, jacobian @ tangents[0]
+
+    tolerance = max(TOLERANCE, float(jnp.finfo(first.dtype).eps))
+    options: dict[str, Any] = {"max_steps": max_steps, "throw": False}
+    if isinstance(solver, optx.AbstractMinimiser):
+        _, _, jacobian, _ = problem.evaluate(first)
+        scale = jnp.sum(jacobian**2)  # minimisers start with a Hessian of 1
+        solution = optx.minimise(
+            lambda flat, _: 0.5 * jnp.sum(residuals(flat) ** 2) / scale, solver, first, **options
+        )
+    else:
+        if solver is None:
+            solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+            solver = eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion())
+        solution = optx.least_squares(lambda flat, _: residuals(flat), solver, first, **options)
+    converged = solution.result == optx.RESULTS.successful
+    return jnp.asarray(solution.value), solution.stats["num_steps"], converged
 
 
 class _TrustRegion(optx.ClassicalTrustRegion):
@@ -119,185 +334,27 @@ class _TrustRegion(optx.ClassicalTrustRegion):
         return jnp.where(ended, 0.0, step_size), accept | ended, *rest
 
 
-def _minimum(solution: optx.Solution) -> Minimum:
-    converged = solution.result == optx.RESULTS.successful
-    return jnp.asarray(solution.value), solution.stats["num_steps"], converged
-
-
-class SearchEnds(NamedTuple):
-    """Parameters at the end of several searches, and chi^2 there; infinite if it is nan."""
-
-    flats: Float[Array, "starts p"]
-    chi2: Float[Array, "starts"]
-
-
 def best_of_starts(
-    residuals: Residuals, search: Search, starts: Float[Array, "starts p"], max_steps: int
-) -> tuple[Minimum, SearchEnds]:
-    """Search from several starts; return the deepest minimum, with the steps of all searches.
+    problem: Problem, starts: Numbers, max_steps: int, solver: Any = None
+) -> tuple[Minimum, tuple[Numbers, Numbers]]:
+    """Search from several starts; return the deepest minimum, and all with their chi^2.
 
-    Args:
-        residuals: function of the parameters.
-        search: `least_squares` or `quasi_newton`.
-        starts: initial guesses.
-        max_steps: maximum number of iterations from each start.
+    chi^2 is infinite where it is nan. The steps are those of all searches.
     """
+    xp = array_module(problem.measurements, starts)
 
-    def search_from(start: Array) -> tuple[Minimum, Array]:
-        minimum = search(residuals, start, max_steps)
-        chi2 = jnp.sum(residuals(minimum[0]) ** 2)
-        return minimum, jnp.where(jnp.isnan(chi2), jnp.inf, chi2)
+    def search_from(start: Numbers) -> tuple[Minimum, Numbers]:
+        minimum = search(problem, start, max_steps, solver)
+        chi2 = xp.sum(problem.evaluate(minimum[0])[1] ** 2)
+        return minimum, xp.where(xp.isnan(chi2), xp.inf, chi2)
 
     if len(starts) == 1:
         minimum, chi2 = search_from(starts[0])
-        return minimum, SearchEnds(minimum[0][None], chi2[None])
-    (flats, steps, converged), chi2 = jax.lax.map(search_from, starts)
-    best = jnp.argmin(chi2)
-    return (flats[best], jnp.sum(steps), converged[best]), SearchEnds(flats, chi2)
-
-
-@eqx.filter_jit
-def fit_deterministic(
-    gas: Gas,
-    curve: CoolingCurve,
-    model: AbstractModel,
-    names: tuple[str, ...],
-    guesses: list[Gas],
-    num_particles: Float[Array, ""] | None = None,
-    replicas: Float[Array, ""] | float = 1.0,
-    method: str = "levenberg-marquardt",
-    max_steps: int = 100,
-    priors: Priors = NO_PRIORS,
-    error_degrees: dict[str, Float[Array, ""]] | None = None,
-    clock_accuracy: Float[Array, "times"] | None = None,
-) -> Fit:
-    """Fit a deterministic model, starting at the best of some guesses.
-
-    Arguments and result are those of `jaxgran.fit`. `error_degrees` are the degrees of freedom of
-    the errors, see `jaxgran.fitting.residuals.smooth_errors`. `clock_accuracy` is the relative
-    accuracy of the model's clock at each time; the clock is a free parameter if there are priors.
-    """
-    comparison = Comparison.of(
-        gas, curve, model, names, num_particles, replicas, priors, clock_accuracy
-    )
-    first = comparison.best_guess(guesses)
-    search = SEARCHES[method]
-    starts = first[None]
-    if "rotation" in comparison.weights:
-        of_gas = comparison.gas_parameters(first)
-        starts = search_starts(comparison.parameters, of_gas, first[of_gas.size :])
-    minimum, ends = best_of_starts(comparison.residuals, search, starts, max_steps)
-    flat, iterations, converged = minimum
-    if curve.temperature_error is None:
-        comparison = comparison.with_scatter_as_error(flat)
-        if priors.names:  # search again with the correct weight of the priors
-            flat, more, converged = search(comparison.residuals, flat, max_steps)
-            comparison, iterations = comparison.with_scatter_as_error(flat), iterations + more
-    result = _deterministic_result(
-        comparison, names, error_degrees or {}, first, flat, iterations, converged
-    )
-    if len(starts) == 1:
-        return result
-    estimates = jax.vmap(comparison.estimates)(ends.flats)
-    return dataclasses.replace(result, minima=Minima(estimates, ends.chi2))
-
-
-def _deterministic_result(
-    comparison: Comparison,
-    names: tuple[str, ...],
-    error_degrees: dict[str, Float[Array, ""]],
-    first: Float[Array, "q"],
-    flat: Float[Array, "q"],
-    iterations: Int[Array, ""],
-    converged: Bool[Array, ""],
-) -> Fit:
-    """Return the fit of a search that started at `first` and ended at `flat`."""
-    derivatives = jax.jacfwd(comparison.evaluate, argnums=(0, 1), has_aux=True)
-    (jacobian, clock_slope), (residuals, computed) = derivatives(flat, jnp.ones(()))
-    parts = comparison.split(residuals)
-    gain = _gain(comparison, flat, jacobian)
-    gains = comparison.split(gain)
-    used = jnp.sum(jnp.concatenate([*comparison.weights.values()]) > 0)
-    num_priors = residuals.size - comparison.num_measured
-    degrees_of_freedom = used + num_priors - flat.size
-    num_used = {name: jnp.sum(weights > 0) for name, weights in comparison.weights.items()}
-    degrees = num_used["measurement"] - comparison.num_free
-    tested = [(parts["measurement"], degrees, error_degrees.get("measurement"))]
-    for name in comparison.accuracies:
-        with_prior = jnp.concatenate([parts[name], parts[f"model of {QUANTITIES[name]}"]])
-        tested.append((with_prior, num_used[name], error_degrees.get(name)))
-    errors_known = comparison.curve.temperature_error is not None
-    goodness = goodness_of_fit(tested, degrees_of_freedom, errors_known=errors_known)
-    clock_gain = _clock_gain(comparison.split(clock_slope), gains)
-    shape = comparison.curve.times.shape
-    clock_error = jnp.broadcast_to(jnp.asarray(comparison.clock_accuracy, flat.dtype), shape)
-    shift = clock_gain @ clock_error
-    covariances = {"model": jnp.outer(shift, shift)}
-    covariances |= _covariances(comparison, gains, parts["measurement"], goodness.inflation)
-    return Fit(
-        names=names,
-        model=comparison.model,
-        estimate=comparison.estimates(flat),
-        covariances=covariances,
-        clock_error=clock_error,
-        gain=gains["measurement"] * comparison.weights["measurement"][None],
-        clock_gain=clock_gain,
-        sensitivity=jacobian[: comparison.num_measured, : comparison.num_free],
-        extrapolation=jnp.zeros(comparison.num_free, flat.dtype),
-        start=comparison.estimates(first),
-        gas=comparison.parameters.gas(comparison.gas_parameters(flat)),
-        start_time=jnp.asarray(
-            comparison.parameters.start(comparison.gas_parameters(flat)), flat.dtype
-        ),
-        priors=comparison.priors,
-        curve=dataclasses.replace(computed, times=comparison.curve.times),
-        weights=comparison.weights["measurement"],
-        residuals=parts["measurement"],
-        displacement_residuals=parts.get("displacement"),
-        rotation_residuals=parts.get("rotation"),
-        scatter=comparison.scatter,
-        chi2=goodness.chi2,
-        degrees_of_freedom=degrees_of_freedom,
-        reduced_chi2=goodness.reduced,
-        p_value=goodness.p_value,
-        iterations=iterations,
-        converged=converged & jnp.isfinite(goodness.chi2),
-    )
-
-
-def _gain(
-    comparison: Comparison, flat: Float[Array, "q"], jacobian: Float[Array, "residuals q"]
-) -> Float[Array, "p residuals"]:
-    """Derivative of each estimate, SI, in the residuals at fixed parameters."""
-    left, singular, right = jnp.linalg.svd(jacobian, full_matrices=False)
-    spread = right.T / jnp.maximum(singular, jnp.finfo(flat.dtype).tiny ** 0.5)[None]
-    return -jax.jacfwd(comparison.estimates)(flat) @ spread @ left.T
-
-
-def _clock_gain(
-    slope: dict[str, Float[Array, "part"]], gains: dict[str, Float[Array, "p part"]]
-) -> Float[Array, "p times"]:
-    """Derivative of each estimate, SI, in a relative change of the model's clock at each time.
-
-    Args:
-        slope: derivatives of the residuals in a factor of all times.
-        gains: derivatives of the estimates in the residuals.
-    """
-    measured = [name for name in ("measurement", "rotation", "displacement") if name in slope]
-    shifts = [gains[name] * slope[name][None] for name in measured]
-    return sum(shifts[1:], shifts[0])
-
-
-def _covariances(
-    comparison: Comparison,
-    gains: dict[str, Float[Array, "p part"]],
-    residuals: Float[Array, "times"],
-    inflation: Float[Array, ""],
-) -> dict[str, Float[Array, "p p"]]:
-    """Return the parts of the covariance, without that of a clock that is not a free parameter."""
-    covariances = {name: part @ part.T for name, part in gains.items()}
-    correlation = neighbour_correlation(residuals, comparison.weights["measurement"] > 0)
-    measured = correlation_factor(correlation) ** 2 * covariances["measurement"]
-    for name in {"rotation", "displacement"} & covariances.keys():
-        measured = measured + covariances.pop(name)
-    return covariances | {"measurement": inflation * measured}
+        return minimum, (minimum[0][None], chi2[None])
+    if xp is jnp:
+        (flats, steps, converged), chi2 = jax.lax.map(search_from, starts)
+    else:
+        ends = [search_from(start) for start in starts]
+        (flats, steps, converged), chi2 = jax.tree.map(lambda *x: np.stack(x), *ends)
+    best = xp.argmin(chi2)
+    return (flats[best], xp.sum(steps), converged[best]), (flats, chi2)

@@ -1,16 +1,15 @@
 """Parameters of a fit: their unconstrained scale, initial guesses from the data, and priors."""
 
-from typing import Any
+from functools import reduce
+from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran._utils.tracing import any_traced
-from jaxgran._utils.validation import POSITIVE, Domain
+from jaxgran._utils.tracing import any_traced, array_module
+from jaxgran._utils.validation import POSITIVE, Domain, float_array
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import ConstantRestitution, Viscoelastic
@@ -24,6 +23,9 @@ DENSITY = "density"
 """Name of a prior that is not of a float of a gas: the mass over the volume of a sphere."""
 
 ANY_TIME = Domain()
+
+Numbers = Any
+"""An array of NumPy, or of JAX under a transformation."""
 
 
 def domain_of(gas: Gas, name: str) -> Domain:
@@ -43,48 +45,44 @@ def size_of(gas: Gas, name: str) -> int:
     return 1 if name == START_TIME else gas.value(name).size
 
 
-class Parameters:
-    """Map between a gas and the array of its free parameters in their unconstrained scale.
+def with_floats(gas: Gas, values: dict[str, Any]) -> Gas:
+    """Return a gas with new values of some floats, whose ranges are not checked."""
+    if not values:
+        return gas
+    paths = [gas._float_fields[name].path for name in values]
+    return eqx.tree_at(
+        lambda gas: [reduce(getattr, path, gas) for path in paths],
+        gas,
+        [float_array(value) for value in values.values()],
+    )
 
-    The scale of a positive parameter is its logarithm (see `jaxgran._utils.validation.Domain`);
-    that of `START_TIME` is linear, in units of `time_scale`.
+
+class Unknown(NamedTuple):
+    """A parameter that a search varies.
+
+    Attributes:
+        name: of a float of the gas, `START_TIME`, or of a nuisance parameter.
+        label: of the measurement that it belongs to; None if all share it.
+        shape: of its value.
+        domain: its range, which gives its unconstrained scale.
+        unit: of the unconstrained scale of a parameter with an infinite range.
     """
 
-    def __init__(self, gas: Gas, names: tuple[str, ...], time_scale: ArrayLike = 1.0):
-        self._gas, self.names, self._time_scale = gas, names, time_scale
-        self._domains = [domain_of(gas, name) for name in names]
-        self._unravel = ravel_pytree(self._to_free(gas, 0.0))[1]
+    name: str
+    label: str | None
+    shape: tuple[int, ...]
+    domain: Domain
+    unit: ArrayLike = 1.0
 
-    def _to_free(self, gas: Gas, start: ArrayLike) -> list[Array]:
-        pairs = zip(self.names, self._domains, strict=True)
-        t0 = jnp.asarray(start / self._time_scale, gas.temperature.dtype)
-        return [t0 if n == START_TIME else domain.to_free(gas.value(n)) for n, domain in pairs]
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return int(np.prod(self.shape))
 
-    def flat(self, gas: Gas, start: ArrayLike = 0.0) -> Float[Array, "p"]:
-        """Return the free parameters, unconstrained, of a gas that began to cool at `start`."""
-        return ravel_pytree(self._to_free(gas, start))[0]
-
-    def values(self, flat: Float[Array, "p"]) -> dict[str, Array]:
-        """Return SI values by name."""
-        pairs = zip(self.names, self._domains, self._unravel(flat), strict=True)
-        return {
-            name: free * self._time_scale if name == START_TIME else domain.from_free(free)
-            for name, domain, free in pairs
-        }
-
-    def gas(self, flat: Float[Array, "p"]) -> Gas:
-        """Return the gas with these values."""
-        values = self.values(flat)
-        values.pop(START_TIME, None)
-        return self._gas.replace(**values)
-
-    def start(self, flat: Float[Array, "p"]) -> Array | float:
-        """Return the time at which the gas began to cool, s; 0 if it is not free."""
-        return self.values(flat).get(START_TIME, 0.0)
-
-    def estimates(self, flat: Float[Array, "p"]) -> Float[Array, "p"]:
-        """Return SI values in one array."""
-        return jnp.concatenate([jnp.ravel(value) for value in self.values(flat).values()])
+    @property
+    def title(self) -> str:
+        """Name in a `Fit`: that of a parameter of one measurement begins with its label."""
+        return self.name if not self.label else f"{self.label}: {self.name}"
 
 
 def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
@@ -100,96 +98,118 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         curve: the measured curve.
         free: names of the free parameters.
     """
-    guessed = _guess(gas, curve, free)
-    return gas.replace(**{name: guessed.value(name) for name in free if name != START_TIME})
-
-
-@eqx.filter_jit
-def _guess(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
-    """Compiled part of `guess_from_data`."""
+    xp = array_module(gas, curve)
+    times, T = xp.asarray(curve.times), xp.asarray(curve.temperature)
     power, line = _power_and_line(gas, curve)
-    scale = curve.temperature[0]
-    origin = (gas.temperature / scale) ** -power
-    haff = isinstance(gas.law, ConstantRestitution)
+    scale, origin = T[0], (xp.asarray(gas.temperature) / T[0]) ** -power
+    values: dict[str, Any] = {}
     if "temperature" in free:
-        origin, slope = _intercept_and_slope(curve, line)
-        gas = gas.replace(temperature=scale * origin ** (-1 / power))
+        origin, slope = _intercept_and_slope(times, line)
+        values["temperature"] = scale * origin ** (-1 / power)
     elif START_TIME in free:
-        _, slope = _intercept_and_slope(curve, line)
+        _, slope = _intercept_and_slope(times, line)
     else:
         weight = 1 / line
-        slope = jnp.sum(weight**2 * (line - origin) * curve.times)
-        slope = slope / jnp.sum((weight * curve.times) ** 2)
-    rate = jnp.maximum(slope / origin, 1e-9 / curve.times[-1]) * gas.mean_free_time
-    if haff and "coefficient" in free:
-        loss = jnp.clip(2 * gas.dimension * rate, 1e-6, 0.99)
-        gas = gas.replace(coefficient=jnp.sqrt(1 - loss))
+        slope = xp.sum(weight**2 * (line - origin) * times) / xp.sum((weight * times) ** 2)
+    rate = xp.maximum(slope / origin, 1e-9 / times[-1])
+    values |= _guess_law(with_floats(gas, values), rate, free)
+    values |= _guess_elements(gas, curve, free)
+    return with_floats(gas, {name: x for name, x in values.items() if name in free})
+
+
+def _guess_law(gas: Gas, rate: Numbers, free: tuple[str, ...]) -> dict[str, Any]:
+    xp = array_module(gas, rate)
+    scales = _scales(gas) if not any_traced(gas) else _law_scales(gas)
+    mean_free_time, alpha = map(xp.asarray, scales)
+    rate = rate * mean_free_time
+    if isinstance(gas.law, ConstantRestitution) and "coefficient" in free:
+        loss = xp.clip(2 * gas.dimension * rate, 1e-6, 0.99)
+        return {"coefficient": xp.sqrt(1 - loss)}
     if isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free:
         delta = rate / COOLING_RATE[gas.dimension]
         # To the next order in delta the cooling rate is that of delta (1 - q delta / 2): invert it.
         correction = 0.5 * COOLING_CORRECTION * delta
-        delta = delta / (1 - jnp.minimum(correction, 0.7))
-        gas = gas.replace(dissipative_constant=delta / (gas.alpha**0.4 * gas.temperature**0.1))
-    return _guess_elements(gas, curve, free)
+        delta = delta / (1 - xp.minimum(correction, 0.7))
+        T_0 = xp.asarray(gas.temperature)
+        return {"dissipative_constant": delta / (alpha**0.4 * T_0**0.1)}
+    return {}
 
 
-def guess_start_time(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Array | float:
+def _law_scales(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean free time, and alpha of viscoelastic spheres."""
+    viscoelastic = isinstance(gas.law, Viscoelastic)
+    return gas.mean_free_time, gas.alpha if viscoelastic else jnp.ones_like(gas.mass)
+
+
+_scales = eqx.filter_jit(_law_scales)
+
+
+def guess_start_time(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Numbers:
     """Return the time, s, at which the line of `guess_from_data` gives the T_0 of a gas.
 
     It is 0 if t0 is not free, or if T_0 is free too.
     """
     if START_TIME not in free or "temperature" in free:
         return 0.0
+    xp = array_module(gas, curve)
+    times, T = xp.asarray(curve.times), xp.asarray(curve.temperature)
     power, line = _power_and_line(gas, curve)
-    intercept, slope = _intercept_and_slope(curve, line)
-    t0 = ((gas.temperature / curve.temperature[0]) ** -power - intercept) / slope
-    duration = curve.times[-1]
-    return jnp.clip(jnp.where(slope > 0, t0, 0.0), -duration, 0.5 * duration)
+    intercept, slope = _intercept_and_slope(times, line)
+    t0 = ((xp.asarray(gas.temperature) / T[0]) ** -power - intercept) / slope
+    return xp.clip(xp.where(slope > 0, t0, 0.0), -times[-1], 0.5 * times[-1])
 
 
-def halving_time(curve: CoolingCurve) -> Float[Array, ""]:
+def halving_time(curve: CoolingCurve) -> Numbers:
     """Return the first time at which T is below half of its first value, or the last time."""
-    halved = (curve.temperature < 0.5 * curve.temperature[0]).at[-1].set(True)
-    return curve.times[jnp.argmax(halved)]
+    xp = array_module(curve)
+    times, T = xp.asarray(curve.times), xp.asarray(curve.temperature)
+    halved = xp.concatenate([T[:-1] < 0.5 * T[0], xp.ones(1, bool)])
+    return times[xp.argmax(halved)]
 
 
-def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, Float[Array, "times"]]:
+def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, Numbers]:
     """Return the negative power of T that is a straight line in time, and that line, 1 at first."""
+    T = array_module(curve).asarray(curve.temperature)
     power = 1 / 2 if isinstance(gas.law, ConstantRestitution) else 3 / 5
-    return power, (curve.temperature / curve.temperature[0]) ** -power
+    return power, (T / T[0]) ** -power
 
 
-def _intercept_and_slope(curve: CoolingCurve, line: Float[Array, "times"]) -> tuple[Array, Array]:
+def _intercept_and_slope(times: Numbers, line: Numbers) -> tuple[Numbers, Numbers]:
     """Fit a straight line by least squares with equal relative errors."""
-    weight = 1 / line
-    design = jnp.stack([weight, weight * curve.times], axis=1)
-    size = jnp.linalg.norm(design, axis=0)
-    intercept, slope = jnp.linalg.lstsq(design / size[None], weight * line)[0] / size
-    return jnp.maximum(intercept, 0.1 * line.min()), slope
+    xp, weight = array_module(times, line), 1 / line
+    design = xp.stack([weight, weight * times], axis=1)
+    size = xp.linalg.norm(design, axis=0)
+    intercept, slope = xp.linalg.lstsq(design / size[None], weight * line, rcond=None)[0] / size
+    return xp.maximum(intercept, 0.1 * line.min()), slope
 
 
-def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas:
+def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> dict[str, Any]:
     """Guess free floats of the elements that are at an end of their range.
 
     A fit in an unconstrained scale cannot start there. The guess of beta_t is 0, that of T_rot at
     t = 0 the first measured one or a tenth of T_0, and that of a drag rate a tenth of the mean
     cooling rate.
     """
-    measured = curve.rotational_temperature
-    T_rot = 0.1 * gas.temperature if measured is None else jnp.maximum(measured[0], measured[1])
-    mean_rate = jnp.log(curve.temperature[0] / curve.temperature[-1]) / curve.times[-1]
+    xp, measured = array_module(gas, curve), curve.rotational_temperature
+    times, T, T_0 = (xp.asarray(x) for x in (curve.times, curve.temperature, gas.temperature))
+    T_rot = 0.1 * T_0
+    if measured is not None:
+        T_rot = xp.maximum(xp.asarray(measured)[0], xp.asarray(measured)[1])
+    drag = 0.1 * xp.maximum(xp.log(T[0] / T[-1]) / times[-1], 1e-9 / times[-1])
     guesses = {
-        "tangential_restitution": jnp.zeros(()),
-        "rotational_temperature": jnp.maximum(T_rot, 1e-6 * gas.temperature),
-        "wall_coefficient": jnp.full((), 0.8),
-        "wall_tangential_restitution": jnp.zeros(()),
-        "drag_rate": 0.1 * jnp.maximum(mean_rate, 1e-9 / curve.times[-1]),
-        "drag_rotational_rate": 0.1 * jnp.maximum(mean_rate, 1e-9 / curve.times[-1]),
+        "tangential_restitution": xp.zeros(()),
+        "rotational_temperature": xp.maximum(T_rot, 1e-6 * T_0),
+        "wall_coefficient": xp.full((), 0.8),
+        "wall_tangential_restitution": xp.zeros(()),
+        "drag_rate": drag,
+        "drag_rotational_rate": drag,
     }
+    values = {}
     for name in guesses.keys() & set(free):
-        at_end = ~jnp.isfinite(gas.domains[name].to_free(gas.value(name)))
-        gas = gas.replace(**{name: jnp.where(at_end, guesses[name], gas.value(name))})
-    return gas
+        value = xp.asarray(gas.value(name))
+        at_end = ~xp.isfinite(gas.domains[name].to_free(value))
+        values[name] = xp.where(at_end, guesses[name], value)
+    return values
 
 
 class Priors(eqx.Module):
@@ -242,27 +262,44 @@ class Priors(eqx.Module):
         varied = ("mass" if name == DENSITY else name for name in self.names)
         return tuple(dict.fromkeys(name for name in varied if name not in free))
 
-    def residuals(self, gas: Gas, start: Array | float = 0.0) -> Float[Array, "priors"]:
-        """Return (value - known value) / standard error of each prior, in the unconstrained scale.
+    def residuals(
+        self, gas: Gas, values: dict[str, Numbers]
+    ) -> dict[str, tuple[Numbers, dict[str, Numbers]]]:
+        """Return (value - known value) / standard error of each prior, and its derivatives.
+
+        Both are in the unconstrained scale; the derivatives are those in SI values, shape (size,
+        size), by the name of the parameter.
 
         Args:
-            gas: the gas with the values.
-            start: the time at which it began to cool, s.
+            gas: the scene, for floats that are not varied.
+            values: SI values of the parameters that are varied, by name.
         """
-        parts = []
+        xp, rows = array_module(self, gas, values), {}
         for name, given, error in zip(self.names, self.given, self.errors, strict=True):
-            value = jnp.asarray(start) if name == START_TIME else _prior_value(gas, name)
-            domain = _prior_domain(gas, name)
-            scale, width = jax.jvp(domain.to_free, (given,), (error,))
-            parts.append(jnp.ravel((domain.to_free(value) - scale) / width))
-        return jnp.concatenate([jnp.zeros(0, gas.temperature.dtype), *parts])
+            domain, given, error = _prior_domain(gas, name), xp.asarray(given), xp.asarray(error)
+            width = error / domain.slope(given)
+
+            def value_of(name: str) -> Numbers:
+                return xp.asarray(values[name] if name in values else gas.value(name))
+
+            if name == DENSITY:
+                mass, diameter = value_of("mass"), value_of("diameter")
+                value = 6 / np.pi * mass / diameter**3
+                slopes = {"mass": 1 / (mass * width), "diameter": -3 / (diameter * width)}
+            else:
+                value = value_of(name)
+                slopes = {name: 1 / (domain.slope(value) * width)}
+            row = xp.ravel((domain.to_free(value) - domain.to_free(given)) / width)
+            diagonal = {
+                key: xp.diag(xp.broadcast_to(xp.ravel(slope), row.shape))
+                for key, slope in slopes.items()
+                if key in values
+            }
+            rows[name] = row, diagonal
+        return rows
 
 
 NO_PRIORS = Priors((), (), ())
-
-
-def _prior_value(gas: Gas, name: str) -> Float[Array, "..."]:
-    return gas.density if name == DENSITY else gas.value(name)
 
 
 def _prior_domain(gas: Gas, name: str) -> Domain:
@@ -286,7 +323,7 @@ def _check_prior(gas: Gas, name: str, pair: object) -> None:
     POSITIVE.check(
         f"priors: standard error of {name}", error, "Leave out values that are known exactly."
     )
-    if not np.all(np.isfinite(np.asarray(_prior_domain(gas, name).to_free(value)))):
+    if not np.all(np.isfinite(_prior_domain(gas, name).to_free(np.asarray(value, float)))):
         raise ValueError(
             f"priors: {name} = {value} lies on the end of its range {_prior_domain(gas, name)}: "
             "give a value inside the range"

@@ -1,28 +1,22 @@
 """Weighted residuals of a measured curve, their statistics, and the checks that all fits share."""
 
-from dataclasses import dataclass, replace
-from math import erfc, sqrt
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Num
+from jaxtyping import Array, Float
 
-from jaxgran._utils.tracing import any_traced
+from jaxgran._utils.tracing import any_traced, array_module
 from jaxgran._utils.validation import float_array, no_type_check
-from jaxgran.data.curve import COLUMNS, CoolingCurve, Run
-from jaxgran.fitting.parameters import (
-    NO_PRIORS,
-    START_TIME,
-    Parameters,
-    Priors,
-    guess_start_time,
-    halving_time,
-    size_of,
-)
+from jaxgran.data.curve import QUANTITIES, WITH_ERRORS, CoolingCurve, Run
+from jaxgran.data.curve_file import DropTest
+from jaxgran.fitting.parameters import START_TIME, Numbers, with_floats
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_model
+from jaxgran.models.linearise import COMPUTED, LINEARISED, linearise, with_all_elements
 from jaxgran.scene.gas import Gas
 
 MAGNITUDES = 1e-30, 1e30
@@ -47,13 +41,13 @@ def _check_magnitudes(curve: CoolingCurve) -> None:
     if any_traced(curve):
         return
     smallest, largest = MAGNITUDES
-    for column, field in COLUMNS.items():
-        values = getattr(curve, field)
+    for name, quantity in QUANTITIES.items():
+        values = getattr(curve, name) if quantity.measured else None
         if values is None:
             continue
-        least, values = smallest, np.asarray(values)
-        if column.endswith("_err"):
-            least = MIN_ERROR * np.asarray(getattr(curve, field.removesuffix("_error")))
+        least, column, values = smallest, quantity.column, np.asarray(values)
+        if name.endswith("_error"):
+            least = MIN_ERROR * np.asarray(getattr(curve, name.removesuffix("_error")))
         wrong = (values > 0) & ((values < least) | (values > largest))
         if np.any(wrong):
             i = int(np.argmax(wrong))
@@ -105,235 +99,322 @@ def log_temperatures(curve: CoolingCurve, rotation: bool) -> Float[Array, "*repl
     return jnp.concatenate(values, axis=-1)
 
 
-QUANTITIES = {"rotation": "T_rot", "displacement": "<dr^2>"}
-"""Quantities other than T that a fit may use, by the name of their residuals."""
+CLOCK, CLOCK_TREND = "clock", "clock trend"
+"""Nuisance parameters: mean and trend of the error of a model's clock, over its accuracy."""
+
+FACTORS = {"rotational_temperature": "model of T_rot", "displacement": "model of <dr^2>"}
+"""Nuisance parameters by quantity: the logarithm of a common factor of all its values."""
+
+FLOOR = "floor"
+"""Noise floor, m^2/s^2, added to the computed T: a parameter of an alternative explanation."""
+
+MODEL_ERROR = "model"
+"""Name of the part of an error budget due to the model's clock."""
+
+
+class Rows(NamedTuple):
+    """Weighted residuals of one kind.
+
+    Attributes:
+        kind: a field of a curve, "drop test", or the name of a prior or of a nuisance parameter.
+        label: of the measurement; None for priors of shared parameters.
+        values: the residuals, shape (n,).
+        slopes: their derivatives in SI values of parameters, shape (n, size), by name.
+        by_clock: their derivatives in a relative change of the model's time, each in its own time.
+    """
+
+    kind: str
+    label: str | None
+    values: Numbers
+    slopes: dict[str, Numbers]
+    by_clock: Numbers | None = None
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Weighted residuals of a measured curve as a function of the parameters of a model.
-
-    The parameters ``flat`` are those of the gas in their unconstrained scale: the free ones, then
-    those that vary because of a prior. Nuisance parameters follow. If there are priors, these are
-    the mean of the error of the model's clock and its trend in ln T, so that errors of the clock
-    are not attributed to the gas; and, if the quantities are used, the logarithm of a common factor
-    of all T_rot and that of a common factor of all values of D. All nuisance parameters have the
-    model's accuracy as prior.
+class Measurement:
+    """A measured curve with the weights of its quantities, to be compared with a model.
 
     Attributes:
+        label: in a fit of several measurements, otherwise "".
+        scene: the gas.
+        gas: the same with all elements that the model supports.
         curve: the measured curve.
-        model: the model that computes the curve.
-        parameters: the free parameters and those that vary because of a prior.
-        num_free: the number of elements of the free parameters.
-        priors: priors of floats of the gas.
-        weights: inverse relative errors of T ("measurement") and, if they are used, of T_rot
-            ("rotation") and <dr^2> ("displacement").
-        accuracies: relative accuracy of the model's T_rot ("rotation") and <dr^2> ("displacement"),
-            if they are used.
-        finite_size_factor: factor by which the measured gas cools faster because N is small.
-        clock_accuracy: relative accuracy of the model's clock, for the priors of its errors.
+        weights: inverse relative errors by field of the curve; those that are absent are not used.
+        accuracies: relative accuracy of the model's T_rot and <dr^2>, by field.
+        faster: factor by which the measured gas cools faster because N is small.
+        clock_accuracy: relative accuracy of the model's clock at each time.
+        position: ln T, linear from -1 at first to 1 at last, for the trend of errors of the clock.
+        offset: ln T of the fitted model minus that of `gas`, of a model with noise.
         scatter: relative error of T if the curve has none; None otherwise.
+        error_degrees: degrees of freedom of the errors, by field; {} if they are exact.
     """
 
+    label: str
+    scene: Gas
+    gas: Gas
     curve: CoolingCurve
-    model: AbstractModel
-    parameters: Parameters
-    num_free: int
-    priors: Priors
-    weights: dict[str, Array]
-    accuracies: dict[str, Float[Array, ""] | float]
-    finite_size_factor: Float[Array, ""] | float
-    clock_accuracy: Float[Array, "..."] | float
-    scatter: Float[Array, ""] | None = None
+    weights: dict[str, Numbers]
+    accuracies: dict[str, Numbers]
+    faster: Numbers
+    clock_accuracy: Numbers
+    position: Numbers
+    offset: Numbers = 0.0
+    scatter: Numbers | None = None
+    error_degrees: dict[str, Numbers] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls,
+        label: str,
         gas: Gas,
         curve: CoolingCurve,
         model: AbstractModel,
-        names: tuple[str, ...],
-        num_particles: Float[Array, ""] | None,
-        replicas: Float[Array, ""] | float = 1.0,
-        priors: Priors = NO_PRIORS,
-        clock_accuracy: Float[Array, "..."] | None = None,
-    ) -> "Comparison":
-        """Compare T and, if errors of the curve and of the model are known, T_rot and <dr^2>.
-
-        The default of `clock_accuracy` is the model's ``derivative_accuracy``.
-        """
+        num_particles: int | None,
+        replicas: int,
+        *,
+        use_displacement: bool,
+    ) -> "Measurement":
+        """Compare T and, if errors of the curve and of the model are known, T_rot and <dr^2>."""
+        curve, error_degrees = smooth_errors(curve, replicas)
+        xp = array_module(gas, curve)
         T, T_error = curve.temperature, curve.temperature_error
-        weights = {"measurement": _weights(T, T if T_error is None else T_error)}
-        accuracies: dict[str, Float[Array, ""] | float] = {}
+        weights = {"temperature": _weights(xp, T, T if T_error is None else T_error)}
+        accuracies: dict[str, Numbers] = {}
         if uses_rotation(gas, curve):
-            T_rot, error = curve.rotational_temperature, curve.rotational_temperature_error
-            assert T_rot is not None and error is not None
-            weights["rotation"] = _weights(T_rot, error)
-            accuracies["rotation"] = model.rotation_accuracy
+            name = "rotational_temperature"
+            weights[name] = _weights(xp, getattr(curve, name), curve.rotational_temperature_error)
+            accuracies[name] = model.rotation_accuracy
         accuracy = None
-        # A measured <dr^2> starts at t = 0 of the curve, not at t0.
-        if START_TIME not in (*names, *priors.names):
+        if use_displacement:  # a measured <dr^2> starts at t = 0 of the curve, not at t0
             accuracy = _displacement_accuracy(gas, curve, model, num_particles)
         if accuracy is not None:
-            assert curve.displacement is not None
+            accuracy, measured = xp.asarray(accuracy), xp.asarray(curve.displacement)
             total = (1 if num_particles is None else num_particles) * replicas
-            sampling = (2 / (gas.dimension * total)) ** 0.5 * curve.displacement
-            error = sampling if curve.displacement_error is None else curve.displacement_error
-            error = jnp.where(error > 0, jnp.hypot(error, accuracy * curve.displacement), 0.0)
-            weights["displacement"] = _weights(curve.displacement, error)
+            sampling = (2 / (gas.dimension * total)) ** 0.5 * measured
+            error = curve.displacement_error
+            error = sampling if error is None else xp.asarray(error)
+            error = xp.where(error > 0, xp.hypot(error, accuracy * measured), 0.0)
+            weights["displacement"] = _weights(xp, measured, error)
             accuracies["displacement"] = accuracy
-        varied = (*names, *priors.extra_parameters(names))
-        parameters = Parameters(gas, varied, halving_time(curve))
-        num_free = sum(size_of(gas, name) for name in names)
-        faster = 1.0 if num_particles is None else finite_size_cooling_factor(gas, num_particles)
-        accuracy = model.derivative_accuracy if clock_accuracy is None else clock_accuracy
+        faster = 1.0
+        if num_particles is not None:
+            faster = finite_size_cooling_factor(gas, float_array(num_particles))
         return cls(
+            label,
+            gas,
+            with_all_elements(gas, model),
             curve,
-            model,
-            parameters,
-            num_free,
-            priors,
             weights,
             accuracies,
-            finite_size_factor=faster,
-            clock_accuracy=accuracy,
-        )
-
-    def with_scatter_as_error(self, flat: Float[Array, "q"]) -> "Comparison":
-        """Return the comparison with the scatter of ln T, at some parameters, as its error."""
-        T, computed = self.curve.temperature, self.evaluate(flat)[1][1]
-        used = self.weights["measurement"] > 0
-        square = jnp.sum(jnp.where(used, _log_ratio(T, computed.temperature), 0.0) ** 2)
-        scatter = jnp.sqrt(square / (jnp.sum(used) - self.num_free))
-        # Data without noise have the round-off of this precision as error, not 0.
-        scatter = jnp.maximum(scatter, jnp.finfo(scatter.dtype).eps)
-        return replace(
-            self, weights={"measurement": jnp.where(used, 1 / scatter, 0.0)}, scatter=scatter
+            faster=xp.asarray(faster),
+            clock_accuracy=xp.full(curve.times.shape, model.derivative_accuracy),
+            position=_position(xp, xp.asarray(T)),
+            error_degrees=error_degrees,
         )
 
     @property
-    def num_measured(self) -> int:
-        """The number of residuals of measured values, which come before those of priors."""
-        return sum(weights.size for weights in self.weights.values())
-
-    @property
-    def num_nuisance(self) -> int:
-        """The number of nuisance parameters, which come after those of the gas."""
-        return 2 * bool(self.priors.names) + len(self.accuracies)
-
-    def gas_parameters(self, flat: Float[Array, "q"]) -> Float[Array, "r"]:
-        """Return the parameters of the gas."""
-        return flat[: flat.size - self.num_nuisance]
-
-    def clock_factors(
-        self, flat: Float[Array, "q"]
-    ) -> tuple[Float[Array, "times"], Float[Array, "_"]]:
-        """Return factors of the model's clock, and the residuals of their priors."""
-        if not self.priors.names:
-            return jnp.full_like(self.curve.times, self.finite_size_factor), flat[:0]
-        mean, trend = errors = flat[self.gas_parameters(flat).size :][:2]
-        log_T = jnp.log(self.curve.temperature)
-        position = 2 * (log_T - log_T[0]) / (log_T[-1] - log_T[0]) - 1
-        fitted = jnp.exp(self.clock_accuracy * (mean + trend * position))
-        return self.finite_size_factor * fitted, errors
-
-    def estimates(self, flat: Float[Array, "q"]) -> Float[Array, "p"]:
-        """Return SI values of the free parameters."""
-        return self.parameters.estimates(self.gas_parameters(flat))[: self.num_free]
+    def nuisances(self) -> tuple[str, ...]:
+        """Names of the nuisance parameters without those of the clock."""
+        return tuple(FACTORS[name] for name in self.accuracies)
 
     def evaluate(
-        self, flat: Float[Array, "q"], clock: Float[Array, "..."] | float = 1.0
-    ) -> tuple[Float[Array, "residuals"], tuple[Float[Array, "residuals"], CoolingCurve]]:
-        """Return the weighted residuals, and again with the computed curve for `jax.jacfwd`.
+        self,
+        model: AbstractModel,
+        values: dict[str, Numbers],
+        *,
+        linear: bool = True,
+        tolerance: float = 1.0,
+    ) -> tuple[list[Rows], dict[str, Numbers]]:
+        """Return the weighted residuals, with derivatives, and the computed curve as a dictionary.
 
         Args:
-            flat: the parameters.
-            clock: factor by which the times of the model are multiplied, or one for each time.
+            model: without noise.
+            values: SI values of floats of the gas, of `START_TIME` and of nuisance parameters.
+            linear: if False, the residuals have no derivatives in floats of the gas and in time,
+                and JAX can differentiate them.
+            tolerance: factor of the model's tolerance.
         """
-        gas = self.parameters.gas(self.gas_parameters(flat))
-        clock_factors, clock_residuals = self.clock_factors(flat)
-        start = self.parameters.start(self.gas_parameters(flat))
-        elapsed = (self.curve.times - start) * clock * clock_factors
-        if START_TIME in self.parameters.names:
-            computed = _simulate_around_start(self.model, gas, elapsed)
+        xp = array_module(self.gas, self.curve, values) if linear else jnp
+        domains = self.gas.domains
+        floats = {name: x for name, x in values.items() if name in domains}
+        times = xp.asarray(self.curve.times)
+        position = self.position
+        error = values.get(CLOCK, 0.0) + values.get(CLOCK_TREND, 0.0) * position
+        clock = self.faster * xp.exp(self.clock_accuracy * error)
+        elapsed = (times - values.get(START_TIME, 0.0)) * clock
+        around = START_TIME in values
+        if linear:
+            gas = with_floats(self.gas, floats)
+            logs, computed = _log_curve(model, gas, elapsed, around, tolerance)
         else:
-            computed = self.model.simulate(gas, elapsed, Run())
-        ratio = _log_ratio(self.curve.temperature, computed.temperature)
-        parts = [self.weights["measurement"] * ratio]
-        factors = dict(zip(self.accuracies, flat[flat.size - len(self.accuracies) :], strict=True))
-        if "rotation" in factors:
-            assert self.curve.rotational_temperature is not None
-            assert computed.rotational_temperature is not None
-            T_rot = self.curve.rotational_temperature, computed.rotational_temperature
-            ratio = _log_ratio(*T_rot) - factors["rotation"]
-            parts.append(self.weights["rotation"] * ratio)
-        if "displacement" in factors:
-            assert self.curve.displacement is not None
-            assert computed.displacement is not None and computed.collisions is not None
+            logs, computed = _log_values(model.simulate(self.scene, elapsed, Run()))
+        floor = values.get(FLOOR, 0.0)
+        hot = xp.exp(logs["temperature"].values)
+        share = hot / (hot + floor)
+        rows: list[Rows] = []
+        diffusive: Numbers = None
+        if "displacement" in self.weights:
+            collisions = computed["collisions"]
             # The common factor is one of D: the ballistic flight before collisions has no error.
-            diffusive = computed.collisions / (1 + computed.collisions)
-            ratio = _log_ratio(self.curve.displacement, computed.displacement)
-            ratio = ratio - factors["displacement"] * diffusive
-            parts.append(self.weights["displacement"] * ratio)
-        parts += [factors[name][None] / self.accuracies[name] for name in factors]
-        residuals = jnp.concatenate([*parts, clock_residuals, self.priors.residuals(gas, start)])
-        return residuals, (residuals, computed)
+            diffusive = collisions / (1 + collisions)
+        for name, weights in self.weights.items():
+            log, factor = logs[name], FACTORS.get(name)
+            value, scale, extra = log.values, 1.0, {}
+            if name == "temperature":
+                value, scale = xp.log(hot + floor) + self.offset, share
+                if FLOOR in values:
+                    extra[FLOOR] = (1 / (hot + floor))[:, None]
+            if factor in values:
+                column = xp.ones_like(times) if name != "displacement" else diffusive
+                value, extra[factor] = value + values[factor] * column, column[:, None]
+            measured = xp.asarray(getattr(self.curve, name))
+            # Not `value > -inf`: a curve of nan, which is not computed, would fit perfectly.
+            positive = (measured > 0) & ~xp.isneginf(value) & (weights > 0)
+            used = xp.where(positive, weights, 0.0)
+            difference = xp.log(xp.where(positive, measured, 1.0)) - xp.where(positive, value, 0.0)
+            factors = -used * scale
+            rate = xp.where(positive, factors * log.by_time, 0.0)
+            slopes = {
+                key: xp.where(positive[:, None], factors[:, None] * slope, 0.0)
+                for key, slope in log.by_float.items()
+                if key in floats
+            }
+            slopes |= {key: -used[:, None] * column for key, column in extra.items()}
+            by_clock = rate * elapsed
+            if around:
+                slopes[START_TIME] = (-rate * clock)[:, None]
+            if CLOCK in values:
+                slopes[CLOCK] = (by_clock * self.clock_accuracy)[:, None]
+                slopes[CLOCK_TREND] = (by_clock * self.clock_accuracy * position)[:, None]
+            rows.append(Rows(name, self.label, used * difference, slopes, by_clock))
+        rows += [
+            Rows(factor, self.label, *_of_prior(xp, values[factor], self.accuracies[name], factor))
+            for name, factor in FACTORS.items()
+            if factor in values and name in self.accuracies
+        ]
+        rows += [
+            Rows(MODEL_ERROR, self.label, *_of_prior(xp, values[name], 1.0, name))
+            for name in (CLOCK, CLOCK_TREND)
+            if name in values
+        ]
+        return rows, computed
 
-    def residuals(self, flat: Float[Array, "q"]) -> Float[Array, "residuals"]:
-        """Return all weighted residuals: of measured values, nuisance parameters and priors."""
-        return self.evaluate(flat)[0]
+    def as_curve(self, computed: dict[str, Numbers]) -> CoolingCurve:
+        """Return a computed curve without the quantities that the scene does not have."""
+        absent = () if self.scene.surface is not None else ("rotational_temperature",)
+        if self.scene.container is not None:
+            absent += "displacement", "diffusion"
+        fields: dict[str, Any] = {k: jnp.asarray(x) for k, x in computed.items() if k not in absent}
+        return CoolingCurve(times=self.curve.times, **fields)
 
-    def split(self, rows: Float[Array, "*_ residuals"]) -> dict[str, Float[Array, "*_ part"]]:
-        """Split the last axis by the kind of residual, named as in `Fit.covariances`."""
-        parts = [(name, weights.size) for name, weights in self.weights.items()]
-        parts += [(f"model of {QUANTITIES[name]}", 1) for name in self.accuracies]
-        if self.priors.names:
-            sizes = zip(self.priors.names, self.priors.given, strict=True)
-            parts += [("model", 2), *((name, given.size) for name, given in sizes)]
-        ends = np.cumsum([size for _, size in parts])[:-1]
-        names = [name for name, _ in parts]
-        return dict(zip(names, jnp.split(rows, ends, axis=-1), strict=True))
-
-    def best_guess(self, guesses: list[Gas]) -> Float[Array, "q"]:
-        """Return the parameters of the guess with the smallest chi^2."""
-        names = self.parameters.names
-        starts = [guess_start_time(guess, self.curve, names) for guess in guesses]
-        pairs = zip(guesses, starts, strict=True)
-        flats = jnp.stack([self.parameters.flat(*pair) for pair in pairs])
-        flats = jnp.pad(flats, ((0, 0), (0, self.num_nuisance)))
-        if len(guesses) == 1:
-            return flats[0]
-        costs = jnp.stack([jnp.sum(self.residuals(flat) ** 2) for flat in flats])
-        return flats[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
+    def with_scatter_as_error(self, rows: list[Rows], num_free: int) -> "Measurement":
+        """Return the comparison with the scatter of ln T in residuals of weight 1 as its error."""
+        residuals, weights = rows[0].values, self.weights["temperature"]
+        xp = array_module(residuals)
+        before = 1.0 if self.scatter is None else self.scatter
+        used = weights > 0
+        square = xp.sum(xp.where(used, residuals * before, 0.0) ** 2)
+        scatter = xp.sqrt(square / (xp.sum(used) - num_free))
+        # Data without noise have the round-off of this precision as error, not 0.
+        scatter = xp.maximum(scatter, xp.finfo(scatter.dtype).eps)
+        weights = {"temperature": xp.where(used, 1 / scatter, 0.0)}
+        return replace(self, weights=weights, scatter=scatter)
 
 
-def _simulate_around_start(
-    model: AbstractModel, gas: Gas, times: Float[Array, "times"]
-) -> CoolingCurve:
-    """Return the curve of a gas that has T_0 at t = 0, at times that may be negative.
+class _LogQuantity(NamedTuple):
+    values: Numbers
+    by_float: dict[str, Numbers]
+    by_time: Numbers
 
-    T is continued to t < 0 to first order in t, ``ln T(-t) = 2 ln T_0 - ln T(t)``, and so is
-    T_rot, unless the spheres began without rotation.
+
+def _log_values(curve: CoolingCurve) -> tuple[dict[str, _LogQuantity], dict[str, Array]]:
+    """Return logarithms of the quantities of a curve without derivatives, and its fields."""
+    fields = {name: getattr(curve, name) for name in COMPUTED}
+    known = {name: value for name, value in fields.items() if value is not None}
+    zero = jnp.zeros_like(curve.temperature)
+    logs = {
+        name: _LogQuantity(jnp.log(value), {}, zero)
+        for name, value in known.items()
+        if name in LINEARISED
+    }
+    return logs, known
+
+
+def _log_curve(
+    model: AbstractModel, gas: Gas, times: Numbers, around: bool, tolerance: float
+) -> tuple[dict[str, _LogQuantity], dict[str, Numbers]]:
+    """Return logarithms of the quantities of a curve with derivatives, and all its fields.
+
+    If `around` is True, times may be negative. T is continued to t < 0 to first order in t,
+    ``ln T(-t) = 2 ln T_0 - ln T(t)``, and so is T_rot, unless the spheres began without rotation.
     """
-    distance = jnp.where(times >= 0, times, -times)
-    order = jnp.argsort(distance)
-    computed = model.simulate(gas, distance[order], Run())
-    inverse_order = jnp.argsort(order)
+    xp = array_module(gas, times)
+    order = inverse = slice(None)
+    before, distance = xp.zeros(times.shape, bool), times
+    if around:
+        before, distance = times < 0, xp.abs(times)
+        order = xp.argsort(distance)
+        inverse = xp.argsort(order)
+    linear = linearise(model, gas, distance[order], tolerance)
+    values = {k: x[inverse] if x.ndim else x for k, x in linear.values.items()}
+    firsts = {"temperature": gas.temperature}
+    if "rotational_temperature" in gas.domains:
+        firsts["rotational_temperature"] = gas.value("rotational_temperature")
+    logs = {}
+    for name, by_time in linear.by_time.items():
+        value = values[name]
+        safe = xp.where(value > 0, value, 1.0)
+        log = xp.where(value > 0, xp.log(safe), xp.where(value <= 0, -xp.inf, xp.nan))
+        by_float = {key: by[name][inverse] / safe[:, None] for key, by in linear.by_float.items()}
+        if around and name in firsts:
+            first = xp.asarray(firsts[name])
+            log_first = xp.log(xp.where(first > 0, first, 1.0))
+            reflect = before & (first > 0)
+            log = xp.where(reflect, 2 * log_first - log, log)
+            by_float = {k: xp.where(reflect[:, None], -x, x) for k, x in by_float.items()}
+            added = xp.where(reflect, 2 / xp.where(first > 0, first, 1.0), 0.0)[:, None]
+            by_float[name] = by_float[name] + added  # the float has the name of the quantity
+            values[name] = xp.exp(log)
+        logs[name] = _LogQuantity(log, by_float, by_time[inverse] / safe)
+    return logs, values
 
-    def restore_order(values: Array | None) -> Array | None:
-        return None if values is None else values[inverse_order]
 
-    T, T_rot = computed.temperature[inverse_order], restore_order(computed.rotational_temperature)
-    if T_rot is not None:
-        T_rot = jnp.where(times >= 0, T_rot, gas.value("rotational_temperature") ** 2 / T_rot)
-    return CoolingCurve(
-        times=times,
-        temperature=jnp.where(times >= 0, T, gas.temperature**2 / T),
-        sonine=restore_order(computed.sonine),
-        collisions=restore_order(computed.collisions),
-        rotational_temperature=T_rot,
-        status=computed.status,
-    )
+def _of_prior(
+    xp: Any, value: Numbers, width: Numbers, name: str
+) -> tuple[Numbers, dict[str, Numbers]]:
+    """Return the residual of a nuisance parameter of mean 0, and its derivative."""
+    return xp.ravel(value / width), {name: xp.ones((1, 1)) / width}
+
+
+class DropTestRows(NamedTuple):
+    """A drop test of spheres of a gas, among the measurements of a fit."""
+
+    label: str
+    gas: Gas
+    test: DropTest
+
+    nuisances: tuple[str, ...] = ()
+
+    def evaluate(
+        self, model: AbstractModel, values: dict[str, Numbers], *, tolerance: float = 1.0
+    ) -> tuple[list[Rows], None]:
+        """Return the residuals of the impacts, with derivatives."""
+        xp = array_module(self.gas, values)
+        floats = {n: jnp.asarray(x) for n, x in values.items() if n in self.gas.domains}
+        residuals, slopes = _drop_test_residuals(self.gas, floats, self.test)
+        size = residuals.shape[0]
+        slopes = {name: xp.asarray(x).reshape(size, -1) for name, x in slopes.items()}
+        return [Rows("drop test", self.label, xp.asarray(residuals), slopes)], None
+
+
+@eqx.filter_jit
+def _drop_test_residuals(gas: Gas, floats: dict[str, Array], test: DropTest) -> tuple[Array, dict]:
+    def residuals(floats: dict[str, Array]) -> tuple[Array, Array]:
+        values = test.residuals(with_floats(gas, floats))
+        return values, values
+
+    slopes, values = jax.jacfwd(residuals, has_aux=True)(floats)
+    return values, slopes
 
 
 def finite_size_cooling_factor(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:
@@ -346,6 +427,11 @@ def finite_size_cooling_factor(gas: Gas, num_particles: Float[Array, ""]) -> Flo
     """
     if gas.container is not None:
         return jnp.ones_like(gas.temperature)
+    return _finite_size_factor(gas, num_particles)
+
+
+@eqx.filter_jit
+def _finite_size_factor(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:
     hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
     one = jnp.ones_like(gas.temperature)
     loss = 1 - gas.reduced_law.restitution(one) ** 2
@@ -354,10 +440,7 @@ def finite_size_cooling_factor(gas: Gas, num_particles: Float[Array, ""]) -> Flo
 
 
 def _displacement_accuracy(
-    gas: Gas,
-    curve: CoolingCurve,
-    model: AbstractModel,
-    num_particles: Float[Array, ""] | None,
+    gas: Gas, curve: CoolingCurve, model: AbstractModel, num_particles: int | None
 ) -> Float[Array, ""] | None:
     """Relative accuracy of the model's <dr^2>; None if the fit cannot use <dr^2>.
 
@@ -375,19 +458,16 @@ def _displacement_accuracy(
     return accuracy
 
 
-def _weights(values: Float[Array, "times"], error: Float[Array, "times"]) -> Float[Array, "times"]:
+def _position(xp: Any, T: Numbers) -> Numbers:
+    log_T = xp.log(xp.where(T > 0, T, 1.0))
+    return 2 * (log_T - log_T[0]) / (log_T[-1] - log_T[0]) - 1
+
+
+def _weights(xp: Any, values: Numbers, error: Numbers) -> Numbers:
     """Inverse relative errors; 0 where the error is 0, for a prescribed value."""
+    values, error = xp.asarray(values), xp.asarray(error)
     known = (values > 0) & (error > 0)
-    return jnp.where(known, values / jnp.where(known, error, 1.0), 0.0)
-
-
-def _log_ratio(
-    measured: Float[Array, "times"], computed: Float[Array, "times"]
-) -> Float[Array, "times"]:
-    # Not `computed > 0`: a curve of nan, which could not be computed, would be a perfect fit.
-    positive = (measured > 0) & ~(computed <= 0)
-    safe = jnp.where(positive, measured, 1.0), jnp.where(positive, computed, 1.0)
-    return jnp.log(safe[0]) - jnp.log(safe[1])
+    return xp.where(known, values / xp.where(known, error, 1.0), 0.0)
 
 
 MIN_RESIDUALS = 4
@@ -400,81 +480,52 @@ MAX_CORRELATION = 0.95
 """Largest magnitude of an estimated correlation."""
 
 
-@eqx.filter_jit
-def neighbour_correlation(
-    residuals: Num[Array, "n"], used: Bool[Array, "n"] | None = None
-) -> Float[Array, ""]:
+def neighbour_correlation(residuals: Numbers, used: Numbers = None) -> Numbers:
     """Correlation of neighbouring residuals, with outliers clipped, from -.95 to .95.
 
     Args:
         residuals: the residuals in the order of time.
         used: True for residuals that count; by default those that are not 0.
     """
-    used = residuals != 0 if used is None else used
-    number = jnp.sum(used)
-    packed = jnp.argsort(~used, stable=True)
-    known = jnp.where(used, residuals, jnp.nan)[packed]
-    spread = OUTLIER_DISTANCE * jnp.nanstd(known)
-    middle = jnp.nanmedian(known)
-    clipped = jnp.clip(known, middle - spread, middle + spread)
-    centred = jnp.nan_to_num(clipped - jnp.nanmean(clipped))
-    square = jnp.sum(centred**2)
+    xp = array_module(residuals, used)
+    used = xp.asarray(residuals != 0 if used is None else used)
+    number = xp.sum(used)
+    packed = xp.argsort(~used, stable=True)
+    known = xp.where(used, residuals, xp.nan)[packed]
+    if xp is np and number < MIN_RESIDUALS:
+        return np.zeros(())
+    spread = OUTLIER_DISTANCE * xp.nanstd(known)
+    middle = xp.nanmedian(known)
+    clipped = xp.clip(known, middle - spread, middle + spread)
+    centred = xp.nan_to_num(clipped - xp.nanmean(clipped))
+    square = xp.sum(centred**2)
     enough = (number >= MIN_RESIDUALS) & (square > 0)
-    correlation = jnp.sum(centred[1:] * centred[:-1]) / jnp.where(enough, square, 1.0)
-    return jnp.clip(jnp.where(enough, correlation, 0.0), -MAX_CORRELATION, MAX_CORRELATION)
+    correlation = xp.sum(centred[1:] * centred[:-1]) / xp.where(enough, square, 1.0)
+    return xp.clip(xp.where(enough, correlation, 0.0), -MAX_CORRELATION, MAX_CORRELATION)
 
 
-def runs_test(residuals: Num[np.ndarray, "n"]) -> tuple[int, float, float]:
-    """Wald & Wolfowitz's test of the runs of one sign in a sequence.
-
-    For ``a`` positive and ``b`` negative residuals in random order, n in total, the number of runs
-    has the mean ``m = 1 + 2 a b/n`` and the variance ``(m - 1)(m - 2)/(n - 1)``; its distribution
-    is approximated by a Gaussian.
-
-    Args:
-        residuals: the residuals in the order of time; those that are 0 do not count.
-
-    Returns:
-        The number of runs, m, and the probability of so few runs by chance, which is 1 for fewer
-        than `MIN_RESIDUALS` residuals or if all have the same sign.
-    """
-    positive = residuals[residuals != 0] > 0
-    n, a = positive.size, int(np.sum(positive))
-    number = int(np.sum(positive[1:] != positive[:-1])) + bool(n)
-    mean = 1 + 2 * a * (n - a) / max(n, 1)
-    variance = (mean - 1) * (mean - 2) / max(n - 1, 1)
-    if n < MIN_RESIDUALS or variance <= 0:
-        return number, mean, 1.0
-    return number, mean, 0.5 * erfc((mean - number) / sqrt(2 * variance))
-
-
-def correlation_factor(correlation: Float[Array, ""]) -> Float[Array, ""]:
+def correlation_factor(correlation: Numbers) -> Numbers:
     """Factor >= 1 by which correlated errors increase a standard error."""
-    positive = jnp.maximum(correlation, 0.0)
-    return jnp.sqrt((1 + positive) / (1 - positive))
+    xp = array_module(correlation)
+    positive = xp.maximum(correlation, 0.0)
+    return xp.sqrt((1 + positive) / (1 - positive))
 
 
-@eqx.filter_jit
-def chi2_scale(
-    residuals: Num[Array, "n"], num_parameters: Int[Array, ""] | int
-) -> Float[Array, ""]:
+def chi2_scale(residuals: Numbers, num_parameters: int) -> Numbers:
     """Scale of differences of chi^2: 1 for independent errors of the given size.
 
     Args:
         residuals: weighted residuals of the best fit; 0 where a point is not used.
         num_parameters: the number of parameters of that fit.
     """
-    degrees = jnp.maximum(jnp.sum(residuals != 0) - num_parameters, 1)
-    reduced = jnp.sum(residuals**2) / degrees
-    return correlation_factor(neighbour_correlation(residuals)) ** 2 * jnp.maximum(reduced, 1.0)
+    xp = array_module(residuals)
+    degrees = xp.maximum(xp.sum(residuals != 0) - num_parameters, 1)
+    reduced = xp.sum(residuals**2) / degrees
+    return correlation_factor(neighbour_correlation(residuals)) ** 2 * xp.maximum(reduced, 1.0)
 
 
-REPLICA_QUANTITIES = {
-    "measurement": "temperature",
-    "rotation": "rotational_temperature",
-    "displacement": "displacement",
-}
-"""Fields of a curve that have errors, by the names of `Comparison.weights`."""
+MEASURED = tuple(quantity.field for quantity in WITH_ERRORS)
+"""Fields of a curve that may have errors."""
 
 MIN_POINTS_PER_COEFFICIENT = 6
 """Minimum number of points for each coefficient of the polynomial of `smooth_errors`."""
@@ -483,9 +534,7 @@ NUM_SMOOTHING_STEPS = 60
 """Iterations of the fit of that polynomial; a step is at most 1 in the logarithm of a variance."""
 
 
-def smooth_errors(
-    curve: CoolingCurve, replicas: int
-) -> tuple[CoolingCurve, dict[str, Float[Array, ""]]]:
+def smooth_errors(curve: CoolingCurve, replicas: int) -> tuple[CoolingCurve, dict[str, Numbers]]:
     """Smooth the errors of a curve of few replicas, and return their degrees of freedom.
 
     The relative variance of each point, from R replicas, has R - 1 degrees of freedom and scatters
@@ -506,45 +555,39 @@ def smooth_errors(
     if replicas < 2 or curve.temperature_error is None:
         return curve, {}
     smooth, degrees = {}, {}
-    for name, field in REPLICA_QUANTITIES.items():
-        values, error = getattr(curve, field), getattr(curve, f"{field}_error")
-        if values is None or error is None:
-            continue
-        smooth[f"{field}_error"], degrees[name] = _smooth_error(
-            values, error, float_array(replicas)
-        )
+    for name in MEASURED:
+        values, error = getattr(curve, name), getattr(curve, f"{name}_error")
+        if values is not None and error is not None:
+            smooth[f"{name}_error"], degrees[name] = _smooth_error(values, error, replicas)
     return replace(curve, **smooth), degrees
 
 
-@eqx.filter_jit
-def _smooth_error(
-    values: Float[Array, "n"], error: Float[Array, "n"], replicas: Float[Array, ""]
-) -> tuple[Float[Array, "n"], Float[Array, ""]]:
+def _smooth_error(values: Numbers, error: Numbers, replicas: int) -> tuple[Numbers, Numbers]:
     """Return smooth errors of values, and their degrees of freedom."""
+    xp = array_module(values, error)
+    values, error = xp.asarray(values), xp.asarray(error)
     used = (values > 0) & (error > 0)
-    share = jnp.where(used, error, 1.0) / jnp.where(used, values, 1.0)
+    share = xp.where(used, error, 1.0) / xp.where(used, values, 1.0)
     expected, num_independent = _fit_variance(share**2, used)
-    degrees = (replicas - 1) * jnp.maximum(num_independent, 1.0)
-    return jnp.where(used, values * jnp.sqrt(expected), 0.0), degrees
+    degrees = (replicas - 1) * xp.maximum(num_independent, 1.0)
+    return xp.where(used, values * xp.sqrt(expected), 0.0), degrees
 
 
-def _fit_variance(
-    variance: Float[Array, "n"], used: Bool[Array, "n"]
-) -> tuple[Float[Array, "n"], Float[Array, ""]]:
+def _fit_variance(variance: Numbers, used: Numbers) -> tuple[Numbers, Numbers]:
     """Return the expectation of variances along a curve, and the number of independent points."""
-    position = jnp.linspace(-1.0, 1.0, variance.size, dtype=variance.dtype)
+    xp = array_module(variance, used)
+    position = np.linspace(-1.0, 1.0, variance.size)
     powers = min(2, variance.size // MIN_POINTS_PER_COEFFICIENT - 1)
-    design = jnp.stack([position**k for k in range(max(powers, 0) + 1)], axis=1)
-    inverse = jnp.linalg.pinv(design * used[:, None])
-
-    def step(_, coefficients: Array) -> Array:
-        excess = jnp.where(used, variance * jnp.exp(-design @ coefficients) - 1, 0.0)
-        return coefficients + jnp.clip(inverse @ excess, -1.0, 1.0)
-
-    number = jnp.maximum(jnp.sum(used), 1)
-    mean = jnp.sum(jnp.where(used, variance, 0.0)) / number
-    tiny = jnp.finfo(variance.dtype).tiny
-    first = jnp.zeros(design.shape[1], variance.dtype).at[0].set(jnp.log(jnp.maximum(mean, tiny)))
-    expected = jnp.exp(design @ jax.lax.fori_loop(0, NUM_SMOOTHING_STEPS, step, first))
-    correlation = jnp.maximum(neighbour_correlation(variance / expected - 1, used), 0.0)
+    design = xp.asarray(np.stack([position**k for k in range(max(powers, 0) + 1)], axis=1))
+    design = design.astype(variance.dtype)
+    inverse = xp.linalg.pinv(design * used[:, None])
+    number = xp.maximum(xp.sum(used), 1)
+    mean = xp.sum(xp.where(used, variance, 0.0)) / number
+    first = xp.log(xp.maximum(mean, xp.finfo(variance.dtype).tiny))
+    coefficients = first * xp.eye(1, design.shape[1])[0]
+    for _ in range(NUM_SMOOTHING_STEPS):
+        excess = xp.where(used, variance * xp.exp(-design @ coefficients) - 1, 0.0)
+        coefficients = coefficients + xp.clip(inverse @ excess, -1.0, 1.0)
+    expected = xp.exp(design @ coefficients)
+    correlation = xp.maximum(neighbour_correlation(variance / expected - 1, used), 0.0)
     return expected, number * (1 - correlation) / (1 + correlation)

@@ -1,18 +1,28 @@
-"""Result of a fit: estimates, their errors, goodness of fit, and other minima of chi^2."""
+"""Result of a fit, and its assembly from the linearised residuals."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils.formatting import TableRows, format_quantity, html_table, text_table
-from jaxgran._utils.tracing import any_traced, concrete_array
-from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.parameters import START_TIME, Parameters, Priors, size_of
+from jaxgran._utils.tracing import any_traced, array_module, as_jax_arrays, concrete_array
+from jaxgran.fitting.optimise import Problem
+from jaxgran.fitting.parameters import START_TIME, Numbers, Priors, with_floats
+from jaxgran.fitting.residuals import (
+    FACTORS,
+    MEASURED,
+    MODEL_ERROR,
+    Measurement,
+    Rows,
+    correlation_factor,
+    neighbour_correlation,
+)
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import FLOAT_UNITS, Gas
 
@@ -32,10 +42,14 @@ class Minima(NamedTuple):
     Attributes:
         estimates: estimates of the free parameters, SI.
         chi2: chi^2 of all residuals, including those of priors.
+        first: the first guess.
+        extrapolation: difference of the estimate and the mean of the simulations near it.
     """
 
-    estimates: Float[Array, "starts p"]
-    chi2: Float[Array, "starts"]
+    estimates: Numbers
+    chi2: Numbers
+    first: Numbers
+    extrapolation: Numbers
 
     def degenerate_solutions(
         self,
@@ -53,6 +67,8 @@ class Minima(NamedTuple):
             unit: unit of chi^2; above 1 if the errors of the curve are too small.
         """
         chi2 = np.asarray(self.chi2)
+        if len(chi2) < 2:
+            return np.zeros((0, len(estimate)))
         as_good = chi2 - np.min(chi2) < DEGENERATE_CHI2 * unit
         distance = np.asarray(self.estimates) - np.asarray(estimate)
         apart = np.max(np.abs(distance) / np.asarray(standard_error), axis=1) > DEGENERATE_CHI2**0.5
@@ -63,52 +79,70 @@ class Minima(NamedTuple):
         return np.array(solutions).reshape(-1, distance.shape[1])
 
 
+class Comparison(NamedTuple):
+    """Residuals of one measurement at the estimate, and what the estimate owes to them.
+
+    Attributes:
+        residuals: weighted residuals by field of the curve, or "drop test".
+        weights: inverse relative errors by field; 0 for points without weight.
+        gain: derivative of each estimate in each measured ln T, SI, shape (p, times).
+        clock_gain: derivative of each estimate in a relative change of the model's clock at each
+            time, SI, shape (p, times).
+        clock_error: relative error of the model's clock, in this scene, at the measured times.
+        sensitivity: derivative of the residuals in the unconstrained free parameters, shape
+            (residuals, p).
+        scatter: scatter of ln T about the model, used as the error of a curve without errors; None
+            for a curve with errors.
+        start_time: t0, the time at which the gas had T_0 and began to cool, s; 0 unless free.
+        num_particles: N of the measured gas; None if it is unknown.
+        replicas: number of runs over which the curve is a mean.
+    """
+
+    residuals: dict[str, Numbers]
+    weights: dict[str, Numbers]
+    gain: Numbers
+    clock_gain: Numbers
+    clock_error: Numbers
+    sensitivity: Numbers
+    scatter: Numbers = None
+    start_time: Numbers = 0.0
+    num_particles: int | None = None
+    replicas: int = 1
+
+
 class Fit(eqx.Module):
     """Result of a fit of p free parameters. Under `jax.vmap` all arrays have a batch axis.
+
+    In a fit of several measurements `gas`, `data` and `curve` are dictionaries by label, and the
+    name of a parameter that a measurement has separately begins with its label: "dense: t0".
 
     Attributes:
         names: names of the free parameters.
         model: the fitted model.
         estimate: estimates of the free parameters, SI, shape (p,).
         covariances: covariances of the estimates, SI, shape (p, p), by the source of the error:
-            "measurement", the errors of the curve, increased by the correlation of neighbouring
-            residuals, and by sqrt(reduced chi^2) if the model does not explain the curve;
-            "model", the error of the model's clock, `clock_error`; "model of <dr^2>" and "model of
-            T_rot", the error of a common factor of all these values; the name of a prior, for each
-            of the `priors`; "few particles", the randomness of single collisions, if N is known;
-            and for a stochastic model "simulation", its noise, estimated from its replicas, and
-            "slope", the bias or the noise of its derivatives.
-        clock_error: relative error of the model's clock, in this scene, at the measured times.
-        gain: derivative of each estimate in each measured ln T, SI, shape (p, times).
-        clock_gain: derivative of each estimate in a relative change of the model's clock at each
-            time, SI, shape (p, times).
-        sensitivity: derivative of the weighted residuals of T, and of <dr^2> if it was used, in the
-            unconstrained parameters (the logarithm of a positive one), shape (residuals, p).
-        extrapolation: difference of the estimate and the mean of the simulations from which it was
-            extrapolated, SI, shape (p,); 0 for a deterministic model.
-        start: the guess at which the search started, SI, shape (p,).
+            "measurement", the errors of the data, increased by the correlation of neighbouring
+            residuals, and by sqrt(reduced chi^2) if the model does not explain the data;
+            "model", the error of the model's clock; "model of <dr^2>" and "model of T_rot", the
+            error of a common factor of all these values; the name of a prior, for each of the
+            `priors`; "few particles", the randomness of single collisions, if N is known; and for a
+            stochastic model "simulation", its noise, estimated from its replicas, and "slope", the
+            bias or the noise of its derivatives.
         gas: the fitted gas, including fitted values of all floats that have priors.
-        start_time: t0, the time at which the gas had T_0 and began to cool, s; 0 unless free.
-        priors: the known values of other floats.
+        priors: the known values of other floats, by the label of the measurement; None for all.
+        data: the measurement.
         curve: the cooling curve of the fitted gas at the measured times; for a stochastic model
             that of the last simulation, one Gauss-Newton step before the estimate.
-        weights: inverse error of ln T_measured - ln T_model, smooth along a curve of few replicas;
-            0 for a point without weight.
-        residuals: ln T_measured - ln T_model times its weight.
-        displacement_residuals: weighted residuals of <dr^2>; None if it was not used.
-        rotation_residuals: weighted residuals of T_rot; None if it was not used.
-        scatter: scatter of ln T about the model, used as the error of a curve without errors; None
-            for a curve with errors.
-        chi2, degrees_of_freedom, reduced_chi2: goodness of fit of all weighted residuals; without
-            errors of the curve reduced chi^2 is 1.
-        p_value: probability of a chi^2 as large by chance, of T or of <dr^2>, whichever fits worse,
+        comparisons: residuals, weights and sensitivities of each measurement, by label ("" for a
+            single one).
+        chi2, degrees_of_freedom: goodness of fit of all weighted residuals.
+        p_value: probability of a chi^2 as large by chance, of the quantity that fits worst,
             including the uncertainty of errors from few replicas; nan if the curve has no errors.
-        iterations: steps of Levenberg-Marquardt, evaluations of L-BFGS, or simulations by a
-            stochastic model.
+        iterations: steps of the search, or simulations by a stochastic model.
         converged: True if the search reached its tolerance; for a stochastic model, if the last
             step was below 0.1 in the unconstrained scale.
-        minima: minima of chi^2 from several starts, of which the fit is the deepest; None if there
-            was a single start.
+        minima: minima of chi^2 at which searches from several starts ended; the first guess and the
+            extrapolation from simulations.
 
     >>> A, error = result.value("dissipative_constant")
     >>> f"{float(A):.3g} s", sorted(result.error_budget)
@@ -119,28 +153,52 @@ class Fit(eqx.Module):
     model: AbstractModel
     estimate: Float[Array, "p"]
     covariances: dict[str, Float[Array, "p p"]]
-    clock_error: Float[Array, "times"]
-    gain: Float[Array, "p times"]
-    clock_gain: Float[Array, "p times"]
-    sensitivity: Float[Array, "residuals p"]
-    extrapolation: Float[Array, "p"]
-    start: Float[Array, "p"]
-    gas: Gas
-    start_time: Float[Array, ""]
-    priors: Priors
-    curve: CoolingCurve
-    weights: Float[Array, "times"]
-    residuals: Float[Array, "times"]
-    displacement_residuals: Float[Array, "times"] | None
-    rotation_residuals: Float[Array, "times"] | None
-    scatter: Float[Array, ""] | None
+    gas: Any
+    priors: dict[str | None, Priors]
+    data: Any
+    curve: Any
+    comparisons: dict[str, Comparison]
     chi2: Float[Array, ""]
     degrees_of_freedom: Int[Array, ""]
-    reduced_chi2: Float[Array, ""]
     p_value: Float[Array, ""]
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
-    minima: Minima | None = None
+    minima: Minima
+
+    @property
+    def reduced_chi2(self) -> Float[Array, ""]:
+        """chi^2 per degree of freedom; 1 if the curve has no errors."""
+        return self.chi2 / self.degrees_of_freedom
+
+    @property
+    def comparison(self) -> Comparison:
+        """The comparison of a fit of one measurement."""
+        if len(self.comparisons) > 1:
+            raise ValueError(
+                "this is a fit of several measurements: use comparisons[label] with the label "
+                f"{' or '.join(self.comparisons)}"
+            )
+        return next(iter(self.comparisons.values()))
+
+    @property
+    def residuals(self) -> Float[Array, "times"]:
+        """ln T_measured - ln T_model times its weight, of a fit of one measurement."""
+        return self.comparison.residuals["temperature"]
+
+    @property
+    def start_time(self) -> Float[Array, ""]:
+        """t0, s, the time at which the gas had T_0 and began to cool; 0 unless free."""
+        return jnp.asarray(self.comparison.start_time)
+
+    @property
+    def scatter(self) -> Float[Array, ""] | None:
+        """Scatter of ln T about the model, used as the error of a curve without errors."""
+        return self.comparison.scatter
+
+    @property
+    def extrapolation(self) -> Float[Array, "p"]:
+        """Difference of the estimate and the mean of the simulations near it, SI; else 0."""
+        return self.minima.extrapolation
 
     @property
     def covariance(self) -> Float[Array, "p p"]:
@@ -172,7 +230,7 @@ class Fit(eqx.Module):
     @property
     def _summary(self) -> tuple[str, TableRows]:
         """Title and rows of a table of the estimates and the goodness of fit."""
-        is_single = not isinstance(self.sensitivity, Tracer) and self.sensitivity.ndim == 2
+        is_single = not isinstance(self.estimate, Tracer) and self.estimate.ndim == 1
         rows, undetermined = [], self.undetermined() if is_single else ()
         for name in self.names:
             estimate, error = (format_quantity(x, _unit(name)) for x in self.value(name))
@@ -206,28 +264,49 @@ class Fit(eqx.Module):
 
         See `jaxgran.fitting.result.Minima.degenerate_solutions`. Not for a batch of fits.
         """
-        if self.minima is None:
-            return np.zeros((0, len(self.estimate)))
         unit = max(float(self.reduced_chi2), 1.0)
         return self.minima.degenerate_solutions(self.estimate, self.standard_error, unit)
 
     def undetermined(self) -> tuple[str, ...]:
-        """Return the parameters that the curve does not determine, or only in a combination.
+        """Return the parameters that the data do not determine, or only in a combination.
 
         These are the parameters in those singular vectors of the sensitivity whose standard error
         exceeds 1 (a factor e), or whose singular value is below ``model.derivative_accuracy`` times
         the largest.
         """
-        _, singular, rotation = np.linalg.svd(np.asarray(self.sensitivity), full_matrices=False)
+        parts = [np.asarray(c.sensitivity) for c in self.comparisons.values()]
+        _, singular, rotation = np.linalg.svd(np.concatenate(parts), full_matrices=False)
         weak = (singular <= 1) | (singular < self.model.derivative_accuracy * singular[0])
         share = np.abs(rotation[weak])
         is_weak = np.any(share > 0.05 * share.max(axis=1, initial=0.0, keepdims=True), axis=0)
-        names = [name for name in self.names for _ in range(size_of(self.gas, name))]
-        return tuple(dict.fromkeys(n for n, w in zip(names, is_weak, strict=True) if w))
+        names = zip(self._element_names, is_weak, strict=True)
+        return tuple(dict.fromkeys(name for name, weak in names if weak))
+
+    @property
+    def _element_names(self) -> list[str]:
+        """Name of each element of `estimate`."""
+        gases = self.gas if isinstance(self.gas, dict) else {"": self.gas}
+        names = []
+        for name in self.names:
+            label, _, short = name.rpartition(": ")
+            gas = gases.get(label, next(iter(gases.values())))
+            names += [name] * (1 if short == START_TIME else gas.value(short).size)
+        return names
+
+    def weights(self) -> dict[str, Float[np.ndarray, "p"]]:
+        """Return the fraction of the information on each estimate from each measurement, by label.
+
+        The information of a measurement is that on the parameters while all are free.
+        """
+        parts = {k: np.asarray(c.sensitivity) for k, c in self.comparisons.items()}
+        total = np.sum([np.sum(x**2, axis=0) for x in parts.values()], axis=0)
+        total = np.maximum(total, np.finfo(float).tiny)
+        return {label: np.sum(x**2, axis=0) / total for label, x in parts.items()}
 
 
 def _unit(name: str) -> str:
-    return "s" if name == START_TIME else FLOAT_UNITS.get(name, "")
+    short = name.rpartition(": ")[2]
+    return "s" if short == START_TIME else FLOAT_UNITS.get(short, "")
 
 
 def _deviations(covariance: Float[Array, "p p"]) -> Float[Array, "p"]:
@@ -248,24 +327,31 @@ def describe_minima(names: tuple[str, ...], others: Float[np.ndarray, "others p"
     return f"chi^2 has another, equally good minimum at {' and at '.join(sets)}"
 
 
-def search_starts(
-    parameters: Parameters, first: Float[Array, "p"], nuisance: Float[Array, "_"]
-) -> Float[Array, "starts q"]:
+def search_starts(problem: Problem, first: Numbers) -> Numbers:
     """Return the starts of a search: the first guess and, if beta_t is free, several beta_t.
 
-    chi^2 has minima on both sides of the beta_t at which rotation takes most energy.
+    chi^2 has minima on both sides of the beta_t at which rotation takes most energy, if T_rot is
+    measured.
 
     Args:
-        parameters: parameters of the gas.
-        first: their first guess.
-        nuisance: first guess of the nuisance parameters.
+        problem: of the fit.
+        first: the first guess of its unknowns.
     """
-    flats = first[None]
-    if MULTIMODAL_PARAMETER in parameters.names:
-        gas, start_time = parameters.gas(first), parameters.start(first)
-        others = [gas.replace(**{MULTIMODAL_PARAMETER: beta}) for beta in MULTIMODAL_STARTS]
-        flats = jnp.stack([first, *(parameters.flat(other, start_time) for other in others)])
-    return jnp.concatenate([flats, jnp.tile(nuisance, (len(flats), 1))], axis=1)
+    xp = array_module(first)
+    uses_rotation = any("rotational_temperature" in m.weights for m in problem.curves)
+    if MULTIMODAL_PARAMETER not in {u.name for u in problem.unknowns} or not uses_rotation:
+        return first[None]
+    starts = [first]
+    for beta in MULTIMODAL_STARTS:
+        parts, begin = [], 0
+        for u in problem.unknowns:
+            part = first[begin : begin + u.size]
+            begin += u.size
+            if u.name == MULTIMODAL_PARAMETER:
+                part = xp.full_like(part, u.domain.to_free(np.asarray(beta)))
+            parts.append(part)
+        starts.append(xp.concatenate(parts))
+    return xp.stack(starts)
 
 
 class GoodnessOfFit(NamedTuple):
@@ -278,15 +364,15 @@ class GoodnessOfFit(NamedTuple):
         inflation: factor of the covariance of the measurement.
     """
 
-    chi2: Float[Array, ""]
-    reduced: Float[Array, ""]
-    p_value: Float[Array, ""]
-    inflation: Float[Array, ""]
+    chi2: Numbers
+    reduced: Numbers
+    p_value: Numbers
+    inflation: Numbers
 
 
 def goodness_of_fit(
-    parts: list[tuple[Float[Array, "_"], Int[Array, ""], Float[Array, ""] | None]],
-    degrees_of_freedom: Int[Array, ""],
+    parts: list[tuple[Numbers, Numbers, Numbers | None]],
+    degrees_of_freedom: Numbers,
     *,
     errors_known: bool,
 ) -> GoodnessOfFit:
@@ -306,28 +392,169 @@ def goodness_of_fit(
         degrees_of_freedom: degrees of freedom of all residuals.
         errors_known: True if the errors of the curve are known.
     """
-    parts_chi2 = jnp.stack([jnp.sum(jnp.asarray(residuals) ** 2) for residuals, *_ in parts])
-    chi2 = jnp.sum(parts_chi2)
+    xp = array_module(parts)
+    parts_chi2 = xp.stack([xp.sum(residuals**2) for residuals, *_ in parts])
+    chi2 = xp.sum(parts_chi2)
     reduced = chi2 / degrees_of_freedom
     if not errors_known:
-        return GoodnessOfFit(chi2, reduced, jnp.full((), jnp.nan), reduced)
-    degrees = jnp.stack([jnp.maximum(number, 1) for _, number, _ in parts])
+        return GoodnessOfFit(chi2, reduced, xp.full((), xp.nan), reduced)
+    degrees = xp.stack([xp.maximum(number, 1) for _, number, _ in parts])
     error_degrees = [of_errors for *_, of_errors in parts]
     p_values = [
-        _p_value(x, n, m) for x, n, m in zip(parts_chi2, degrees, error_degrees, strict=True)
+        _p_value(xp, x, n, m) for x, n, m in zip(parts_chi2, degrees, error_degrees, strict=True)
     ]
-    worst = jnp.min(jnp.stack(p_values))
-    p_value = -jnp.expm1(len(parts) * jnp.log1p(-worst)) if len(parts) > 1 else worst
+    worst = xp.min(xp.stack(p_values))
+    p_value = -xp.expm1(len(parts) * xp.log1p(-worst)) if len(parts) > 1 else worst
     unexplained = p_value < SIGNIFICANCE
-    inflation = jnp.where(unexplained, jnp.maximum(jnp.max(parts_chi2 / degrees), 1.0), 1.0)
+    inflation = xp.where(unexplained, xp.maximum(xp.max(parts_chi2 / degrees), 1.0), 1.0)
     return GoodnessOfFit(chi2, reduced, p_value, inflation)
 
 
-def _p_value(
-    chi2: Float[Array, ""], degrees: Int[Array, ""], error_degrees: Float[Array, ""] | None
-) -> Float[Array, ""]:
+def _p_value(xp: Any, chi2: Numbers, degrees: Numbers, error_degrees: Numbers | None) -> Numbers:
     """Probability of a chi^2 as large; `error_degrees` is None for exact errors."""
     if error_degrees is None:
-        return jax.scipy.stats.chi2.sf(chi2, degrees)
+        stats = jax.scipy.stats if xp is jnp else scipy.stats
+        return stats.chi2.sf(chi2, degrees)
     share = error_degrees / (error_degrees + chi2)  # of the F distribution
-    return jax.scipy.special.betainc(error_degrees / 2, degrees / 2, share)
+    special = jax.scipy.special if xp is jnp else scipy.special
+    return special.betainc(error_degrees / 2, degrees / 2, share)
+
+
+def assemble_fit(
+    problem: Problem,
+    flat: Numbers,
+    *,
+    first: Numbers,
+    ends: tuple[Numbers, Numbers],
+    iterations: Numbers,
+    converged: Numbers,
+) -> Fit:
+    """Return the fit of a deterministic model from its residuals, linearised where a search ended.
+
+    Args:
+        problem: the measurements and unknowns.
+        flat: the unknowns at the end of the search.
+        first: those of the first guess.
+        ends: unknowns and chi^2 at the ends of all searches.
+        iterations, converged: see `Fit`.
+    """
+    rows, _, jacobian, fields = problem.evaluate(flat)
+    computed = {m.label: m.as_curve(fields[m.label]) for m in problem.curves}
+    xp, p = array_module(flat, rows), problem.num_free
+    left, singular, right = xp.linalg.svd(jacobian, full_matrices=False)
+    spread = right.T / xp.maximum(singular, xp.finfo(flat.dtype).tiny ** 0.5)[None]
+    gain = -problem.slopes(flat)[:p, None] * (spread @ left.T)[:p]
+    ends_of_rows = np.cumsum([row.values.shape[0] for row in rows])[:-1]
+    gains = xp.split(gain, ends_of_rows, axis=1)
+    jacobians = xp.split(jacobian[:, :p], ends_of_rows, axis=0)
+    by_label = {m.label: m for m in problem.measurements}
+    goodness, degrees_of_freedom = _test_all(xp, problem, rows, flat)
+    covariances: dict[str, Numbers] = {}
+    for row, part in zip(rows, gains, strict=True):
+        name, covariance = row.kind, part @ part.T
+        if name in MEASURED or name == "drop test":
+            if name == "temperature":
+                used = next(m.weights[name] for m in problem.curves if m.label == row.label) > 0
+                factor = correlation_factor(neighbour_correlation(row.values, used))
+                covariance = factor**2 * covariance
+            name, covariance = "measurement", goodness.inflation * covariance
+        covariances[name] = covariances.get(name, 0.0) + covariance
+    values = problem.values(flat)
+    comparisons = {}
+    for label, m in by_label.items():
+        own = [
+            (row, g, j)
+            for row, g, j in zip(rows, gains, jacobians, strict=True)
+            if row.label == label and (row.kind in MEASURED or row.kind == "drop test")
+        ]
+        comparisons[label] = Comparison(
+            residuals={row.kind: row.values for row, *_ in own},
+            weights=m.weights if isinstance(m, Measurement) else {},
+            gain=own[0][1] * (m.weights["temperature"] if isinstance(m, Measurement) else 1.0),
+            clock_gain=sum(g * row.by_clock[None] for row, g, _ in own if row.by_clock is not None)
+            + xp.zeros_like(own[0][1]),
+            clock_error=m.clock_accuracy + xp.zeros_like(own[0][0].values)
+            if isinstance(m, Measurement)
+            else xp.zeros_like(own[0][0].values),
+            sensitivity=xp.concatenate([j for *_, j in own]),
+            scatter=m.scatter if isinstance(m, Measurement) else None,
+            start_time=xp.asarray(values[label].get(START_TIME, 0.0), flat.dtype),
+        )
+    if MODEL_ERROR not in covariances:  # the clock is not a free parameter
+        shifts = [c.clock_gain @ c.clock_error for c in comparisons.values()]
+        covariances[MODEL_ERROR] = sum(xp.outer(shift, shift) for shift in shifts)
+    gases = {label: _fitted_gas(m, values[label]) for label, m in by_label.items()}
+    data = {k: m.curve if isinstance(m, Measurement) else m.test for k, m in by_label.items()}
+    single = len(by_label) == 1
+    label = next(iter(by_label))
+    minima = Minima(
+        estimates=xp.stack([problem.estimates(x) for x in ends[0]]),
+        chi2=ends[1],
+        first=problem.estimates(first),
+        extrapolation=xp.zeros(p, flat.dtype),
+    )
+    arrays = as_jax_arrays(
+        {
+            "estimate": problem.estimates(flat),
+            "covariances": covariances,
+            "comparisons": comparisons,
+            "chi2": goodness.chi2,
+            "degrees_of_freedom": degrees_of_freedom,
+            "p_value": goodness.p_value,
+            "iterations": iterations,
+            "converged": converged & xp.isfinite(goodness.chi2),
+            "minima": minima,
+        }
+    )
+    return Fit(
+        names=tuple(u.title for u in _free_unknowns(problem)),
+        model=problem.model,
+        gas=gases[label] if single else gases,
+        priors=problem.priors,
+        data=data[label] if single else data,
+        curve=computed.get(label) if single else computed,
+        **arrays,
+    )
+
+
+def _free_unknowns(problem: Problem) -> list:
+    unknowns, size = [], 0
+    for unknown in problem.unknowns:
+        if size < problem.num_free:
+            unknowns.append(unknown)
+        size += unknown.size
+    return unknowns
+
+
+def _fitted_gas(m: Any, values: dict[str, Numbers]) -> Gas:
+    scene = m.scene if isinstance(m, Measurement) else m.gas
+    return with_floats(scene, {name: x for name, x in values.items() if name in scene.domains})
+
+
+def _test_all(
+    xp: Any, problem: Problem, rows: list[Rows], flat: Numbers
+) -> tuple[GoodnessOfFit, Numbers]:
+    """Test each quantity of each measurement; return this and all degrees of freedom."""
+    tested, used, num_priors = [], 0, 0
+    factors = {(row.label, row.kind): row.values for row in rows if row.kind in FACTORS.values()}
+    degrees_of_errors: dict[Any, Any] = {m.label: m.error_degrees for m in problem.curves}
+    for row in rows:
+        if row.kind == "drop test":
+            number = row.values.shape[0]
+            tested.append((row.values, number, None))
+        elif row.kind in MEASURED:
+            m = next(m for m in problem.curves if m.label == row.label)
+            number = xp.sum(m.weights[row.kind] > 0)
+            values, own = row.values, 0
+            if row.kind == "temperature":
+                own = problem.num_free if len(problem.measurements) == 1 else 0
+            elif (factor := factors.get((row.label, FACTORS[row.kind]))) is not None:
+                values = xp.concatenate([values, factor])
+            tested.append((values, number - own, degrees_of_errors[row.label].get(row.kind)))
+        else:
+            num_priors += row.values.shape[0]
+            continue
+        used = used + number
+    degrees_of_freedom = xp.asarray(used + num_priors - flat.shape[0])
+    known = all(m.curve.temperature_error is not None for m in problem.curves)
+    return goodness_of_fit(tested, degrees_of_freedom, errors_known=known), degrees_of_freedom

@@ -15,18 +15,28 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from tqdm import tqdm
 
-from jaxgran._utils.tracing import any_traced
+from jaxgran._utils.tracing import any_traced, as_jax_arrays
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.fitting.error_budget import parameter_effects
-from jaxgran.fitting.optimise import fit_deterministic
-from jaxgran.fitting.parameters import NO_PRIORS, Parameters, Priors, guess_from_data
+from jaxgran.fitting.optimise import Problem, best_of_starts
+from jaxgran.fitting.parameters import (
+    NO_PRIORS,
+    Priors,
+    Unknown,
+    domain_of,
+    guess_from_data,
+    with_floats,
+)
 from jaxgran.fitting.residuals import (
+    MODEL_ERROR,
+    Measurement,
     correlation_factor,
     log_temperatures,
     neighbour_correlation,
+    smooth_errors,
     uses_rotation,
 )
-from jaxgran.fitting.result import Fit, goodness_of_fit
+from jaxgran.fitting.result import Comparison, Fit, Minima, goodness_of_fit, search_starts
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
@@ -85,33 +95,42 @@ def fit_stochastic(
     progress: bool = True,
     max_simulations: int = 8,
     priors: Priors = NO_PRIORS,
-    error_degrees: dict[str, Float[Array, ""]] | None = None,
+    replicas: int = 1,
 ) -> Fit:
     """Fit a stochastic model, starting at a guess, by default the result of kinetic theory.
 
-    Arguments, result and errors are those of `jaxgran.fit`; `error_degrees` are those of
-    `fit_deterministic`.
+    Arguments, result and errors are those of `jaxgran.fit`.
     """
     if any_traced(gas, curve, guess, model, key):
         raise ValueError(
             "a fit of a stochastic model cannot run inside jax.jit or jax.vmap: fit one curve at a "
             "time, outside of them"
         )
+    curve, error_degrees = smooth_errors(curve, replicas)
     guess = _guess_of_kinetic_theory(gas, curve, names) if guess is None else guess
-    parameters = Parameters(gas, names)
-    first = parameters.flat(guess)
+    unknowns = tuple(
+        Unknown(name, None, gas.value(name).shape, domain_of(gas, name)) for name in names
+    )
+    problem = Problem((), model, unknowns, sum(u.size for u in unknowns), {}, {})
+    first = np.concatenate(
+        [np.ravel(u.domain.to_free(np.asarray(guess.value(u.name)))) for u in unknowns]
+    )
+
+    def gas_at(flat: Any) -> Gas:
+        return with_floats(gas, {u.name: value for u, value in problem.parts(flat)})
+
     if not np.all(np.isfinite(first)):
         at = ", ".join(f"{name} = {guess.value(name)}" for name in names)
         raise ValueError(
             f"a fit cannot start at {at}: positive parameters are fitted in their logarithm. Give "
             "start inside their ranges, or leave it out"
         )
-    model.check_scene(parameters.gas(first))
+    model.check_scene(gas_at(first))
     key = jax.random.key(0) if key is None else key
 
     def simulate(flat, number):
         run = Run(jax.random.fold_in(key, number), progress)
-        computed = model.simulate(parameters.gas(flat), curve.times, run)
+        computed = model.simulate(gas_at(flat), curve.times, run)
         _check_replicas(model, computed)
         return computed
 
@@ -130,14 +149,14 @@ def fit_stochastic(
         progress=progress,
     )
     return _stochastic_result(
-        model,
-        parameters,
-        names,
+        problem,
+        gas_at(search.flat),
+        curve,
         first,
         search,
         priors,
         error if errors_known else None,
-        error_degrees or {},
+        error_degrees,
     )
 
 
@@ -178,79 +197,99 @@ def _guess_of_kinetic_theory(gas: Gas, curve: CoolingCurve, names: tuple[str, ..
         smooth = dataclasses.replace(gas, surface=None)
         curve = dataclasses.replace(curve, rotational_temperature=None)
         curve = dataclasses.replace(curve, rotational_temperature_error=None)
-    guesses = [guess_from_data(smooth, curve, free)]
-    fitted = fit_deterministic(smooth, curve, KineticTheory(), free, guesses).gas
-    return gas.replace(**{name: fitted.value(name) for name in free})
+    model = KineticTheory()
+    m = Measurement.of("", smooth, curve, model, None, 1, use_displacement=True)
+    problem = Problem.of((m,), model, free, (), {}, clock_is_free=False)
+    first = problem.flat({"": guess_from_data(m.gas, curve, free)})
+    (flat, *_), _ = best_of_starts(problem, search_starts(problem, first), 100)
+    values = problem.values(flat)[""]
+    return with_floats(gas, {name: values[name] for name in free})
 
 
 def _stochastic_result(
-    model: AbstractModel,
-    parameters: Parameters,
-    names: tuple[str, ...],
-    first: Float[Array, "p"],
+    problem: Problem,
+    gas: Gas,
+    curve: CoolingCurve,
+    first: Float[np.ndarray, "p"],
     search: SearchResult,
     priors: Priors,
     error: Float[np.ndarray, "points"] | None,
-    error_degrees: dict[str, Float[Array, ""]],
+    error_degrees: dict[str, Any],
 ) -> Fit:
     """Return the fit, in SI units, from the result of a search."""
-    flat, num_times = jnp.asarray(search.flat), search.computed.times.size
-    residuals, sensitivity, weights = map(
-        jnp.asarray, (search.residuals, search.sensitivity, search.weights)
-    )
-    degrees_of_freedom, scatter = jnp.sum(residuals != 0) - flat.size, None
+    flat, num_times = search.flat, search.computed.times.size
+    residuals, sensitivity, weights = search.residuals, search.sensitivity, search.weights
+    degrees_of_freedom, scatter = np.sum(residuals != 0) - flat.size, None
     if error is None:
-        scatter = jnp.sqrt(jnp.sum(residuals**2) / degrees_of_freedom)
+        scatter = np.sqrt(np.sum(residuals**2) / degrees_of_freedom)
         residuals, sensitivity, weights = (x / scatter for x in (residuals, sensitivity, weights))
-    residuals, rotation_residuals = residuals[:num_times], residuals[num_times:]
-    used = residuals != 0
-    tested = [(residuals, jnp.sum(used) - flat.size, error_degrees.get("measurement"))]
-    rotation = rotation_residuals.size > 0
-    if rotation:
-        num_used = jnp.sum(rotation_residuals != 0)
-        tested.append((rotation_residuals, num_used, error_degrees.get("rotation")))
+    names = ["temperature", "rotational_temperature"][: residuals.size // num_times]
+    by_name = dict(zip(names, np.split(residuals, len(names)), strict=True))
+    used = by_name["temperature"] != 0
+    tested = [
+        (x, np.sum(x != 0) - (flat.size if name == "temperature" else 0), error_degrees.get(name))
+        for name, x in by_name.items()
+    ]
     goodness = goodness_of_fit(tested, degrees_of_freedom, errors_known=error is not None)
-    scale = jax.jacfwd(parameters.estimates)(flat)
-    gain = scale @ jnp.asarray(search.gain)
-    gas = parameters.gas(flat)
+    scale = problem.slopes(flat)[:, None]
+    gain = scale * search.gain
+    rotation = len(names) > 1
     slope, changes = parameter_effects(gas, priors, search.computed, rotation)
-    shares = gain * (scatter if error is None else jnp.asarray(error)[None])
-    measured = goodness.inflation * _measurement_covariance(shares, residuals, used)
-    covariances = {"measurement": measured, "simulation": scale @ search.noise_covariance @ scale.T}
+    shares = gain * (scatter if error is None else error[None])
+    measured = goodness.inflation * _measurement_covariance(shares, by_name["temperature"], used)
+    covariances = {
+        "measurement": measured,
+        MODEL_ERROR: np.zeros_like(measured),
+        "simulation": scale * search.noise_covariance * scale.T,
+    }
     covariances |= {name: gain @ x @ x.T @ gain.T for name, x in changes.items()}
     delays = -gain * slope[None]
-    return Fit(
-        names=names,
-        model=model,
-        estimate=parameters.estimates(flat),
-        covariances=covariances,
-        clock_error=jnp.zeros(used.shape),
+    comparison = Comparison(
+        residuals=by_name,
+        weights=dict(zip(names, np.split(weights, len(names)), strict=True)),
         gain=gain[:, :num_times],
-        clock_gain=sum(jnp.split(delays, slope.size // num_times, axis=1), start=jnp.zeros(())),
+        clock_gain=np.sum(np.split(delays, len(names), axis=1), axis=0),
+        clock_error=np.zeros(num_times),
         sensitivity=sensitivity,
-        extrapolation=scale @ jnp.asarray(search.extrapolation),
-        start=parameters.estimates(first),
-        gas=gas,
-        start_time=jnp.zeros(()),
-        priors=priors,
-        curve=search.computed,
-        weights=weights[:num_times],
-        residuals=residuals,
-        displacement_residuals=None,
-        rotation_residuals=rotation_residuals if rotation else None,
         scatter=scatter,
-        chi2=goodness.chi2,
-        degrees_of_freedom=degrees_of_freedom,
-        reduced_chi2=goodness.reduced,
-        p_value=goodness.p_value,
-        iterations=jnp.asarray(search.num_simulations),
-        converged=jnp.asarray(search.converged),
+        start_time=np.zeros(()),
+    )
+    estimate = problem.estimates(flat)
+    minima = Minima(
+        estimate[None],
+        np.asarray([goodness.chi2]),
+        problem.estimates(first),
+        scale[:, 0] * search.extrapolation,
+    )
+    arrays = as_jax_arrays(
+        {
+            "estimate": estimate,
+            "covariances": covariances,
+            "comparisons": {"": comparison},
+            "chi2": goodness.chi2,
+            "degrees_of_freedom": degrees_of_freedom,
+            "p_value": goodness.p_value,
+            "iterations": np.asarray(search.num_simulations),
+            "converged": np.asarray(search.converged),
+            "minima": minima,
+        }
+    )
+    return Fit(
+        names=tuple(u.name for u in problem.unknowns),
+        model=problem.model,
+        gas=gas,
+        priors={None: priors} if priors.names else {},
+        data=curve,
+        curve=search.computed,
+        **arrays,
     )
 
 
 def _measurement_covariance(
-    shares: Float[Array, "p points"], residuals: Float[Array, "times"], used: Bool[Array, "times"]
-) -> Float[Array, "p p"]:
+    shares: Float[np.ndarray, "p points"],
+    residuals: Float[np.ndarray, "times"],
+    used: Bool[np.ndarray, "times"],
+) -> Float[np.ndarray, "p p"]:
     """Covariance by the errors of T, which may be correlated, and by those of T_rot if used."""
     factor = correlation_factor(neighbour_correlation(residuals, used)) ** 2
     by_T, by_rotation = shares[:, : residuals.size], shares[:, residuals.size :]

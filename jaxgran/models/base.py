@@ -95,6 +95,13 @@ class AbstractModel(eqx.Module):
                 )
         self.check(gas)
 
+    def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
+        """Return the curve inside the compiled program of a fit: by default that of `simulate`.
+
+        A model that solves equations multiplies its tolerance by `tolerance`.
+        """
+        return self.simulate(gas, times, Run())
+
     def check_save(self, save: Any) -> None:
         """Raise ValueError if `save` is not a function, or the model has no particles."""
         if save is None:

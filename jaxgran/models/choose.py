@@ -14,14 +14,16 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils import status
 from jaxgran._utils.formatting import TableRows, html_table, text_table
+from jaxgran._utils.tracing import grid_size, pad_to
 from jaxgran._utils.validation import POSITIVE, checked_float, checked_times, no_type_check
-from jaxgran.data.curve import CoolingCurve, Run
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import check_softness, check_volume, checked_gas, describe_walls
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.error_model import ErrorModel, flow_share
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.linearise import curve_of_program
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas
 from jaxgran.theory.equations import softness_factor
@@ -29,7 +31,7 @@ from jaxgran.theory.equations import softness_factor
 NUM_PARTICLES = 4000
 """Particles of a particle model if the user gives no number."""
 
-NUM_TIMES = 65
+NUM_TIMES = 64
 """Number of times at which an `ErrorModel` samples the cooling gas."""
 
 
@@ -192,9 +194,10 @@ def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> Er
         ValueError: for a gas so soft that the softness correction is invalid.
         RuntimeError: if kinetic theory cannot reach the end.
     """
-    grid = jnp.linspace(0, jnp.log1p(end / gas.mean_free_time), NUM_TIMES)
+    mean_free_time = float(gas.mean_free_time)
+    grid = np.linspace(0, np.log1p(end / mean_free_time), NUM_TIMES)
     known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
-    curve = KineticTheory().simulate(known, jnp.expm1(grid) * gas.mean_free_time, Run())
+    curve = curve_of_program(KineticTheory(), known, np.expm1(grid) * mean_free_time)
     error_model = error_model_along(gas, curve, num_particles)
     softest = int(np.argmax(error_model.softness))
     hottest = np.exp(error_model.log_temperature[softest] / 2)
@@ -220,7 +223,9 @@ def error_model_along(
         "collisions": zero if curve.collisions is None else curve.collisions,
         "sonine": zero if curve.sonine is None else curve.sonine,
     }
-    scales = _scales(gas, curve.temperature)
+    size = temperature.size
+    scales = _scales(gas, pad_to(temperature, grid_size(size)))
+    scales = {name: np.asarray(value)[:size] for name, value in scales.items()}
     values = {name: np.asarray(value, float) for name, value in (values | scales).items()}
     critical, flow = values.pop("critical_box"), np.zeros_like(values["time"])
     scatter = flow

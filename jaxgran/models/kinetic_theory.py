@@ -1,5 +1,6 @@
 """Kinetic theory of a homogeneous gas: seven ordinary differential equations."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -163,15 +164,25 @@ class KineticTheory(AbstractModel):
         """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
         size = times.size
         padded = pad_to(times, padded_length(size))
-        curve = self._simulate(gas, padded)
+        # Traced twice if it were compiled within another program.
+        computed = self.curve_in_fit if any_traced(gas, times) else self._compiled_curve
+        curve = computed(gas, padded, 1.0)
+        if gas.container is not None:  # walls would limit <dr^2>
+            curve = dataclasses.replace(curve, diffusion=None, displacement=None)
         return jax.tree.map(lambda x: truncate_to(x, size) if x.ndim else x, curve)
 
     @eqx.filter_jit
-    def _simulate(self, gas: Gas, times: Float[Array, "times"]) -> CoolingCurve:
+    def _compiled_curve(
+        self, gas: Gas, times: Float[Array, "times"], tolerance: float
+    ) -> CoolingCurve:
+        return self.curve_in_fit(gas, times, tolerance)
+
+    def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
+        """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
         unit_time = gas.path_length / gas.impact_speed
         scene = scene_at_start(gas), Density.from_gas(gas, self.softness, self.correlations)
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
-        integrator = Integrator(self.solver, rtol, self.max_steps)
+        integrator = Integrator(self.solver, rtol * tolerance, self.max_steps)
         equations = self._equations(gas.dimension)
         state, fault = moments_at(scene, times / unit_time, equations, integrator)
         theta = jnp.exp(state.log_temperature)
@@ -183,15 +194,14 @@ class KineticTheory(AbstractModel):
             optional["third_sonine"] = state.third_sonine + nan_if_failed
         if state.rotation is not None:
             optional["rotational_temperature"] = temperature * state.rotation
-        if gas.container is None:  # walls would limit <dr^2>
-            diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
-            optional["diffusion"] = diffusion + nan_if_failed
-            optional["displacement"] = state.displacement * length**2 + nan_if_failed
+        diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
         return CoolingCurve(
             times=times,
             temperature=temperature,
             sonine=state.sonine + nan_if_failed,
             collisions=state.collisions + nan_if_failed,
+            diffusion=diffusion + nan_if_failed,
+            displacement=state.displacement * length**2 + nan_if_failed,
             status=fault,
             **optional,
         )

@@ -193,12 +193,12 @@ class Integrator(NamedTuple):
 
     Attributes:
         solver: of diffrax.
-        rtol: relative tolerance.
+        rtol: relative tolerance; may be traced.
         max_steps: largest number of steps of one curve.
     """
 
     solver: diffrax.AbstractSolver
-    rtol: float
+    rtol: Any
     max_steps: int
 
 

@@ -34,7 +34,7 @@ def test_the_parts_add_up():
     np.testing.assert_allclose(result.standard_error**2, squares, rtol=1e-12)
     assert set(result.error_budget) == {"measurement", "model", "few particles"}
     # A wrong clock is a wrong A, by a little more, since the rate grows less than A.
-    clock = float(jnp.max(result.clock_error))
+    clock = float(jnp.max(result.comparison.clock_error))
     assert 0.003 < clock < 0.02 and clock < relative(result, "model") < 1.4 * clock
 
 
@@ -110,8 +110,8 @@ def test_the_clock_is_that_of_the_scene():
     choice = jaxgran.choose_model(gas, times, num_particles=n, models=[jaxgran.KineticTheory()])
     assert relative(unknown, "model") < 0.04 < 0.09 < relative(known, "model") < 0.13
     # T errs by more than the clock: by |d ln T / d ln t|, at most 5/3 (the grids of times differ).
-    ratio = choice.error / float(jnp.max(known.clock_error))
-    assert 1.3 < ratio < 1.8, (choice.error, known.clock_error)
+    clock_error = float(jnp.max(known.comparison.clock_error))
+    assert 1.3 < choice.error / clock_error < 1.8, (choice.error, clock_error)
 
 
 @pytest.mark.slow
@@ -227,13 +227,13 @@ def test_a_diagnosis_tells_the_bias_of_the_derivatives():
         model=jaxgran.HardSpheres(500, replicas=2),
         curve=ran,
         covariances=covariances,
-        extrapolation=jnp.zeros(1),
+        comparisons={"": result.comparison._replace(num_particles=500)},
     )
-    weights = result.sensitivity[:, 0] ** 2
+    weights = result.comparison.sensitivity[:, 0] ** 2
     expected = float(jnp.sum(weights * bias) / jnp.sum(weights))
     assert 0.1 < expected < 0.3
     assert mean_derivative_bias(fitted) == pytest.approx(expected, rel=1e-12)
-    whole = with_scene_errors(fitted, 500, 1)
+    whole = with_scene_errors(fitted)
     assert relative(whole, "slope") == pytest.approx(
         relative(fitted, "measurement") * np.sqrt((1 + expected) ** 2 - 1), rel=1e-9
     )

@@ -67,9 +67,10 @@ def test_roughness_and_A_are_found_together(model):
     assert float(result.standard_error[0] / result.estimate[0]) < 0.1
     assert float(result.standard_error[1]) < 0.08
     assert "model of T_rot" in result.error_budget
-    said = " ".join(jaxgran.diagnose(result, curve).reasons)
-    assert "rough spheres of constant beta_t, far from walls" in said
-    assert "loss terms were not tested: tangential_restitution" in said
+    diagnosis = jaxgran.diagnose(result, curve)
+    assert "rough spheres of constant beta_t, far from walls" in " ".join(diagnosis.reasons)
+    low, high = diagnosis.ranges[FREE[0]]  # with beta_t free there is a range, too
+    assert low[0] < float(gas.value(FREE[0])) < high[0]
 
 
 def test_of_two_minima_in_beta_t_the_deeper_one_is_found_and_said_where_as_deep():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.residuals import runs_test, smooth_errors
+from jaxgran.fitting.residuals import smooth_errors
 from jaxgran.fitting.result import goodness_of_fit
 from tests.beads import glass_beads
 from tests.fitting.curves import synthetic
@@ -38,7 +38,7 @@ def test_errors_become_smooth():
     assert off[0] < 0.14 < 0.4 < off[1]
     _, degrees = smooth_errors(curves[0], R)
     # Neighbours are independent: what is found of a correlation is chance, 1/sqrt(40).
-    assert 0.55 * 2 * N < float(degrees["measurement"]) <= 2 * N
+    assert 0.55 * 2 * N < float(degrees["temperature"]) <= 2 * N
 
 
 def test_a_set_value_stays_without_weight_and_one_run_has_no_scatter():
@@ -59,7 +59,7 @@ def p_values(smoothed):
         if smoothed:
             curve, degrees = smooth_errors(curve, R)
         residuals = (curve.temperature - 1) / curve.temperature_error
-        tested = [(residuals, jnp.asarray(N), degrees.get("measurement"))]
+        tested = [(residuals, jnp.asarray(N), degrees.get("temperature"))]
         found.append(float(goodness_of_fit(tested, jnp.asarray(N), errors_known=True).p_value))
     return np.array(found)
 
@@ -84,36 +84,8 @@ def test_fit_and_likelihood_use_them():
     taken, few = (jaxgran.fit(gas, ragged, replicas=replicas) for replicas in (1, R))
     assert float(taken.p_value) < 1e-4 < 0.01 < float(few.p_value)
     # The weights are even: the errors were 1 % of T everywhere.
-    assert np.min(few.weights) / 100 > 0.6 and np.max(few.weights) / 100 < 1.7
+    weights = few.comparison.weights["temperature"]
+    assert np.min(weights) / 100 > 0.6 and np.max(weights) / 100 < 1.7
     expected = -0.5 * float(jnp.sum(few.residuals**2))
     value = jaxgran.log_likelihood(few.gas, ragged, replicas=R)
     assert float(value) == pytest.approx(expected, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    "signs, runs, mean, chance",
-    [
-        # Wald & Wolfowitz: a = b = 10: mean 11, variance 90/19.
-        ("+" * 10 + "-" * 10, 2, 11.0, 1.8e-5),
-        ("+-" * 10, 20, 11.0, 1.0),
-        ("++--" * 5, 10, 11.0, 0.323),
-        ("+" * 8, 1, 1.0, 1.0),
-    ],
-)
-def test_runs(signs, runs, mean, chance):
-    found = runs_test(np.array([1.0 if sign == "+" else -1.0 for sign in signs]))
-    assert found[:2] == (runs, mean)
-    assert found[2] == pytest.approx(chance, rel=0.02, abs=1e-4)
-
-
-@pytest.mark.slow
-def test_runs_are_told():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(3))
-    wave = jnp.exp(0.002 * jnp.sign(jnp.sin(jnp.linspace(0.0, 12.0, curve.times.size))))
-    exact = jaxgran.cool(gas, curve.times).temperature
-    waved = jaxgran.CoolingCurve(curve.times, exact * wave, temperature_error=0.01 * exact)
-    diagnosis = jaxgran.diagnose(jaxgran.fit(gas, waved), waved)
-    assert diagnosis.explains and diagnosis.verdict.endswith("come in runs of one sign.")
-    assert diagnosis.runs_p_value < 1e-3
-    assert any("residuals rarely change sign" in reason for reason in diagnosis.reasons)

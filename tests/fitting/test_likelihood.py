@@ -29,7 +29,7 @@ def test_is_the_chi2_of_the_fit(displacement):
     step = 1e-3
     curvature = float(moved(step) - 2 * moved(0.0) + moved(-step)) / step**2
     alone = jaxgran.fit(gas.replace(temperature=result.estimate[1]), curve)
-    found = alone.gain[0] / alone.estimate[0]
+    found = alone.comparison.gain[0] / alone.estimate[0]
     if not displacement:
         variance = float(jnp.sum((found * 0.01) ** 2))
         assert curvature == pytest.approx(-1 / variance, rel=0.02)

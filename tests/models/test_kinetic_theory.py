@@ -271,13 +271,13 @@ def test_bad_options_are_refused(beads):
 
 
 def test_values_do_not_recompile(beads):
-    cool = KineticTheory._simulate.__wrapped__  # as it is inside its own jit
+    cool = KineticTheory._compiled_curve.__wrapped__  # as it is inside its own jit
     checked = eqx.filter_jit(eqx.debug.assert_max_traces(cool, max_traces=1))
     times = jnp.geomspace(1.0, 4.0, WINDOW)
     for a in (1e-7, 1e-6):
         for t0 in (0.01, 0.5):
             gas = beads(0.15).replace(dissipative_constant=a, temperature=t0)
-            checked(HARD, gas, times * t0)
+            checked(HARD, gas, times * t0, 1.0)
 
 
 def test_another_number_of_times_compiles_nothing(beads, caplog):

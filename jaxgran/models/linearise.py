@@ -1,0 +1,114 @@
+"""A cooling curve with its derivatives in all floats of a gas, by one compiled program.
+
+Fits, diagnoses and the choice of a model call this program for all curves of a kind of gas: times
+are padded to a grid of lengths, and a gas that lacks an element gets one without effect, so that
+alternative explanations of a curve are other numbers of the same program.
+"""
+
+import dataclasses
+from functools import cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxgran._utils.tracing import any_traced, as_jax_arrays, fast_compilation, grid_size, pad_to
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.models.base import AbstractModel
+from jaxgran.scene.elements import Rough, StokesDrag, Walls
+from jaxgran.scene.gas import Gas
+
+LINEARISED = "temperature", "rotational_temperature", "displacement", "collisions"
+"""Fields of a curve that are linearised, if the model computes them."""
+
+COMPUTED = (*LINEARISED, "sonine", "third_sonine", "diffusion", "status")
+"""Fields of a curve that are computed."""
+
+REMOTE_WALLS = 1e9
+"""Side of a box without effect, m."""
+
+
+class LinearisedCurve(NamedTuple):
+    """A curve and its derivatives; the arrays are those of NumPy unless they are traced.
+
+    Attributes:
+        values: the fields of `COMPUTED` that the model computes, by name.
+        by_float: derivatives of the fields of `LINEARISED`, by name of the float and of the field,
+            shape (times, size of the float).
+        by_time: their derivatives in time, by name, shape (times,).
+    """
+
+    values: dict[str, Any]
+    by_float: dict[str, dict[str, Any]]
+    by_time: dict[str, Any]
+
+
+def with_all_elements(gas: Gas, model: AbstractModel) -> Gas:
+    """Return a gas with each element that the model supports; those added have no effect."""
+    missing = {
+        "surface": lambda: Rough(-1.0),
+        "container": lambda: Walls(REMOTE_WALLS, restitution=1.0),
+        "drag": lambda: StokesDrag(0.0),
+    }
+    added = {
+        name: make()
+        for name, make in missing.items()
+        if name in model.elements and getattr(gas, name) is None
+    }
+    return dataclasses.replace(gas, **added)
+
+
+def linearise(
+    model: AbstractModel, gas: Gas, times: Any, tolerance: float = 1.0
+) -> LinearisedCurve:
+    """Return the curve of a gas by a deterministic model, and its derivatives.
+
+    Args:
+        model: without noise.
+        gas: the scene.
+        times: t, s, not decreasing, >= 0.
+        tolerance: factor of the model's tolerance.
+    """
+    size = times.shape[-1]
+    if any_traced(gas, times):
+        return _linearised(model, gas, jnp.asarray(times), jnp.asarray(tolerance))
+    padded = pad_to(np.asarray(times), grid_size(size))
+    computed = _compiled(jax.default_backend())(model, gas, padded, np.asarray(tolerance))
+    return jax.tree.map(lambda x: np.asarray(x)[:size] if x.ndim else np.asarray(x), computed)
+
+
+def curve_of_program(
+    model: AbstractModel, gas: Gas, times: Float[np.ndarray, "times"]
+) -> CoolingCurve:
+    """Return the curve of a gas without <dr^2>, by the program that fits share."""
+    values = dict(linearise(model, with_all_elements(gas, model), times).values)
+    for name in ("displacement", "diffusion"):
+        values.pop(name, None)
+    return CoolingCurve(**as_jax_arrays({"times": times} | values))
+
+
+def _linearised(model: AbstractModel, gas: Gas, times: Array, tolerance: Array) -> LinearisedCurve:
+    floats = {name: gas.value(name) for name in gas.domains}
+
+    def curve(floats: dict[str, Array], delay: Array) -> tuple[dict, dict]:
+        computed = model.curve_in_fit(gas.replace(**floats), times + delay, tolerance)
+        fields = {name: getattr(computed, name) for name in COMPUTED}
+        known = {name: value for name, value in fields.items() if value is not None}
+        return {name: known[name] for name in LINEARISED if name in known}, known
+
+    delay = jnp.zeros((), times.dtype)
+    slopes, values = jax.jacfwd(curve, argnums=(0, 1), has_aux=True)(floats, delay)
+    by_float = {
+        name: {q: by[name].reshape(times.size, -1) for q, (by, _) in slopes.items()}
+        for name in floats
+    }
+    return LinearisedCurve(values, by_float, {q: rate for q, (_, rate) in slopes.items()})
+
+
+@cache
+def _compiled(backend: str) -> Any:
+    options: dict[str, Any] = {"compiler_options": fast_compilation(backend)}
+    return eqx.filter_jit(_linearised, **options)
