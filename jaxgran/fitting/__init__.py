@@ -1,11 +1,12 @@
 """Fits of the parameters of a gas to measured cooling curves.
 
-- `fit`: the public function `fit`, the checks of their arguments and warnings.
+- `fit`: the public function `fit`, the checks of its arguments and warnings.
 - `parameters`: the free parameters in an unconstrained scale, initial guesses, priors.
-- `residuals`: weighted residuals of a curve, their statistics, errors from few replicas.
-- `optimise`: minimisers, and fits of deterministic models.
+- `residuals`: weighted residuals of a measurement with their derivatives, their statistics, errors
+  from few replicas.
+- `optimise`: all measurements and unknowns of a fit, and the search.
 - `stochastic`: fits of stochastic models by a search through repeated simulations.
-- `result`: `Fit`, the result of a fit, and goodness of fit.
+- `result`: `Fit`, its assembly from the linearised residuals, and goodness of fit.
 - `error_budget`: errors that depend on the fitted gas: of the clock, few particles, derivatives.
 - `alternatives`: alternative explanations of a curve, and the range of the parameters over them.
 - `diagnosis`: interpretation of a fit in words, and `log_likelihood` for samplers.

@@ -4,6 +4,7 @@
 - `base`: the interface of a model.
 - `kinetic_theory`, `dsmc`, `hard_spheres`, `soft_spheres`: the models, cheapest first; `spheres`
   is the base of the last two.
+- `linearise`: the program that fits, diagnoses and the choice of a model share.
 - `choose`: choice of a model, by the errors that `error_model` estimates.
 - `checks`: checks of arguments and scenes.
 
