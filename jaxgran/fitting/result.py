@@ -44,12 +44,14 @@ class Minima(NamedTuple):
         chi2: chi^2 of all residuals, including those of priors.
         first: the first guess.
         extrapolation: difference of the estimate and the mean of the simulations near it.
+        iterations: steps of all searches, or simulations by a stochastic model.
     """
 
     estimates: Numbers
     chi2: Numbers
     first: Numbers
     extrapolation: Numbers
+    iterations: Numbers
 
     def degenerate_solutions(
         self,
@@ -138,11 +140,10 @@ class Fit(eqx.Module):
         chi2, degrees_of_freedom: goodness of fit of all weighted residuals.
         p_value: probability of a chi^2 as large by chance, of the quantity that fits worst,
             including the uncertainty of errors from few replicas; nan if the curve has no errors.
-        iterations: steps of the search, or simulations by a stochastic model.
         converged: True if the search reached its tolerance; for a stochastic model, if the last
             step was below 0.1 in the unconstrained scale.
-        minima: minima of chi^2 at which searches from several starts ended; the first guess and the
-            extrapolation from simulations.
+        minima: the search: minima of chi^2 at which it ended from several starts, the first guess,
+            the number of iterations, the extrapolation from simulations.
 
     >>> A, error = result.value("dissipative_constant")
     >>> f"{float(A):.3g} s", sorted(result.error_budget)
@@ -161,7 +162,6 @@ class Fit(eqx.Module):
     chi2: Float[Array, ""]
     degrees_of_freedom: Int[Array, ""]
     p_value: Float[Array, ""]
-    iterations: Int[Array, ""]
     converged: Bool[Array, ""]
     minima: Minima
 
@@ -194,6 +194,11 @@ class Fit(eqx.Module):
     def scatter(self) -> Float[Array, ""] | None:
         """Scatter of ln T about the model, used as the error of a curve without errors."""
         return self.comparison.scatter
+
+    @property
+    def iterations(self) -> Int[Array, ""]:
+        """Steps of the search, or simulations by a stochastic model."""
+        return self.minima.iterations
 
     @property
     def extrapolation(self) -> Float[Array, "p"]:
@@ -492,6 +497,7 @@ def assemble_fit(
         chi2=ends[1],
         first=problem.estimates(first),
         extrapolation=xp.zeros(p, flat.dtype),
+        iterations=iterations,
     )
     arrays = as_jax_arrays(
         {
@@ -501,7 +507,6 @@ def assemble_fit(
             "chi2": goodness.chi2,
             "degrees_of_freedom": degrees_of_freedom,
             "p_value": goodness.p_value,
-            "iterations": iterations,
             "converged": converged & xp.isfinite(goodness.chi2),
             "minima": minima,
         }

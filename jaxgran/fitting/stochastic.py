@@ -260,6 +260,7 @@ def _stochastic_result(
         np.asarray([goodness.chi2]),
         problem.estimates(first),
         scale[:, 0] * search.extrapolation,
+        np.asarray(search.num_simulations),
     )
     arrays = as_jax_arrays(
         {
@@ -269,7 +270,6 @@ def _stochastic_result(
             "chi2": goodness.chi2,
             "degrees_of_freedom": degrees_of_freedom,
             "p_value": goodness.p_value,
-            "iterations": np.asarray(search.num_simulations),
             "converged": np.asarray(search.converged),
             "minima": minima,
         }
