@@ -117,7 +117,7 @@ def test_auto_takes_kinetic_theory_where_it_will_do(tmp_path):
     [
         (["nowhere.csv"], "no such file"),
         (["--set", "Y=-1"], "youngs_modulus must lie in"),
-        (["--set", "youngs=1"], "give KEY=VALUE with KEY one of eta"),
+        (["--set", "youngs=1"], "give KEY=VALUE with KEY one of"),
         (["--set", "N=many"], "header line N"),
         (["bare.csv"], "the header lacks eta, diameter"),
     ],
