@@ -176,6 +176,7 @@ def test_bad_particle_numbers_are_refused(n):
 number = st.floats(allow_nan=True, allow_infinity=True) | st.floats(1e-6, 1e6)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # questions about unusual values
 @given(st.lists(st.tuples(number, number, number), max_size=6))
 @settings(max_examples=300, deadline=None)
 def test_any_rows_are_read_or_refused_with_a_reason(rows):

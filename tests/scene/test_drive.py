@@ -142,9 +142,9 @@ def test_the_header_of_a_curve_gives_the_strength():
 @pytest.mark.parametrize("eps", [0.5, 0.9])
 def test_the_steady_state_is_where_theory_comes_to_rest(eps):
     gas = constant(eps)
-    steady, curve = jaxgran.steady_state(gas), driven(gas, [2000.0, 3000.0])
+    steady, curve = jaxgran.steady_state(gas), driven(gas, [2000.0, 3000.0], rtol=1e-10)
     np.testing.assert_allclose(steady.temperature, curve.temperature[1], rtol=1e-8)
-    np.testing.assert_allclose(steady.sonine, curve.sonine[1], rtol=1e-6)  # of the solver's 1e-9
+    np.testing.assert_allclose(steady.sonine, curve.sonine[1], rtol=1e-6)  # a_2 is about .02
     assert steady.rotational_temperature is None
     slope = jax.grad(lambda x: jaxgran.steady_state(gas.replace(drive_strength=x)).temperature)
     strength = gas.value("drive_strength")
