@@ -156,6 +156,10 @@ def fit(
     _check_request(scenes, data, names, separate, max_steps)
     names, separate, key = tuple(names), tuple(separate), checked_key(key)
     all_priors = _priors_by_label(scenes, priors)
+    for label, curve in curves.items():
+        if unused := unused_rotation(scenes[label], curve):
+            warnings.warn(unused, stacklevel=2)
+    _check_model(model, solver, names, separate, all_priors, scenes, several, bool(curves))
     first = next(iter(curves), "")
     given = {*names, *separate, *(all_priors[None].names if None in all_priors else ())}
     prior_names = {name for some in all_priors.values() for name in some.names}
@@ -165,10 +169,6 @@ def fit(
             width = START_TIME_PRIOR * halving_time(curves[label])
             some = all_priors.get(where, Priors((), (), ()))
             all_priors[where] = some.add(START_TIME, 0.0, width)
-    for label, curve in curves.items():
-        if unused := unused_rotation(scenes[label], curve):
-            warnings.warn(unused, stacklevel=2)
-    _check_model(model, solver, names, separate, all_priors, scenes, several)
     if model.stochastic:
         steps = 8 if max_steps is None else max_steps
         result = fit_stochastic(
@@ -427,6 +427,7 @@ def _check_model(
     priors: dict[str | None, Priors],
     scenes: dict[str, Gas],
     several: bool,
+    has_curves: bool,
 ) -> None:
     kinds = optx.AbstractLeastSquaresSolver, optx.AbstractMinimiser
     if solver is not None and not isinstance(solver, kinds):
@@ -443,11 +444,13 @@ def _check_model(
             f"a stochastic model is fitted by least squares, got solver={solver!r:.60}. Leave "
             "solver out"
         )
-    if model.stochastic and several:
+    if model.stochastic and (several or not has_curves):
         raise ValueError(
-            f"several measurements are fitted by a model without noise, got {type(model).__name__}."
-            " Use jaxgran.KineticTheory(), or fit the curves one by one"
+            "several measurements and drop tests are fitted by a model without noise, got "
+            f"{type(model).__name__}. Use jaxgran.KineticTheory(), or fit the curves one by one"
         )
+    if not has_curves and START_TIME in (*names, *separate, *prior_names):
+        raise ValueError(f"{START_TIME} needs a cooling curve, and there are drop tests alone")
     if model.stochastic and START_TIME in (*names, *prior_names):
         raise ValueError(
             f"{START_TIME} is fitted through kinetic theory only, got {type(model).__name__}. Fit "

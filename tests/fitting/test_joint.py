@@ -91,6 +91,19 @@ def test_bad_requests_are_refused(change, message):
         jaxgran.fit(asked.pop("gas"), asked.pop("data"), **asked)
 
 
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"model": jaxgran.DSMC(10, replicas=2)}, "drop tests are fitted by a model without noise"),
+        ({"free": (*A, "t0")}, "t0 needs a cooling curve"),
+    ],
+)
+def test_what_a_drop_test_alone_cannot_do_is_refused(change, message):
+    gas = glass_beads(0.15)
+    with pytest.raises(ValueError, match=message):
+        jaxgran.fit(gas, drop_test(gas), **change)
+
+
 def test_a_curve_without_errors_has_no_weight():
     gas = glass_beads(0.15)
     bare = jaxgran.CoolingCurve(times=[0.1, 0.2, 0.3], temperature=[0.01, 0.009, 0.008])
