@@ -39,7 +39,6 @@ def test_a_drop_test_gives_its_constant(onto_plate):
     assert jaxgran.diagnose(alone).explains
 
 
-@pytest.mark.slow
 def test_curves_and_drops_together():
     dilute, dense = glass_beads(0.15), glass_beads(0.15).replace(packing_fraction=0.15)
     hot = dense.replace(temperature=4 * dense.temperature)
@@ -59,7 +58,8 @@ def test_curves_and_drops_together():
     assert sum(share[0] for share in result.weights().values()) == pytest.approx(1)
     diagnosis = jaxgran.diagnose(result)
     low, high = diagnosis.ranges[A[0]]
-    assert diagnosis.explains and low[0] < truth < high[0]
+    assert low[0] < truth < high[0] and not any(x.preferred for x in diagnosis.alternatives)
+    assert "though the curve fits" in diagnosis.verdict  # contacts of the dense gas last too long
     # Alone, with a clock known within 1.5 %, each curve knows less.
     for label in ("dilute", "dense"):
         alone = jaxgran.fit(gases[label], data[label], free=(A[0], "temperature"))
@@ -68,7 +68,8 @@ def test_curves_and_drops_together():
     other = dilute.replace(dissipative_constant=1.3 * truth)
     data["drops"] = drop_test(other, jax.random.key(2))
     contradicted = jaxgran.fit(gases, data, separate=("temperature",))
-    assert contradicted.p_value < 1e-4 and not jaxgran.diagnose(contradicted).explains
+    assert contradicted.p_value < 1e-4
+    assert "does not explain" in jaxgran.diagnose(contradicted).verdict
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,6 @@ def test_wrong_uses_of_t0_are_refused(measured):
         jaxgran.fit(gas, {"a": curve, "b": curve}, free=(A, "t0"))
 
 
-@pytest.mark.slow  # another program
 def test_curves_of_one_material_have_their_own_clocks(measured):
     gas, curve = measured
     late = 20.0 * float(curve.times[0])
