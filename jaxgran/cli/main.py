@@ -23,7 +23,7 @@ from jaxgran.cli.common import (
     models_by_name,
     use_compilation_cache,
 )
-from jaxgran.data.files import check_writable, header_count, header_number
+from jaxgran.data.files import check_writable, header_count, header_number, name_in_errors
 from jaxgran.data.tables import header_in_si, read_text
 from jaxgran.models.choose import NUM_PARTICLES, default_models
 
@@ -220,10 +220,9 @@ def _read_scene(path: Path, until: float | None) -> SimpleNamespace:
 
 def _read_toml(path: Path) -> dict[str, str]:
     """Return the keys of a TOML file as those of a header."""
-    try:
-        values = tomllib.loads(read_text(path, "eta, diameter, ..."))
+    with name_in_errors(path):
+        try:
+            values = tomllib.loads(read_text(path, "eta, diameter, ..."))
+        except tomllib.TOMLDecodeError as error:
+            raise ValueError(f"not TOML ({error}). Write lines such as eta = 0.05.") from None
         return header_in_si({key: str(value) for key, value in values.items()})
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: not TOML ({error}). Write lines such as eta = 0.05.") from None
-    except ValueError as error:
-        raise ValueError(f"{path}, {error}".removeprefix(f"{path}, {path}")) from None

@@ -4,6 +4,7 @@ A CSV file holds a measured curve, or tracks of particles, under header lines th
 an npz file holds every array of a curve. `jaxgran.data.tables` reads the tables.
 """
 
+import io
 import json
 import re
 import warnings
@@ -27,7 +28,7 @@ from jaxgran._utils.validation import (
     no_type_check,
 )
 from jaxgran.data.curve import MIN_POINTS, QUANTITIES, CoolingCurve, from_arrays, to_arrays
-from jaxgran.data.files import header_count, header_number, write_atomically
+from jaxgran.data.files import header_count, header_number, name_in_errors, write_atomically
 from jaxgran.data.plausibility import ask_about_columns, ask_about_header
 from jaxgran.data.tables import UNIT_KEYS, Table, checked_path, read_table
 from jaxgran.data.tracks import (
@@ -76,8 +77,13 @@ ELEMENTS: tuple[tuple[str, Any, tuple[str, ...]], ...] = (
 )
 """Field of `Gas`, class, and header keys that it needs, of each element."""
 
-ABSENT = ("walls", "roughness", "drag", "friction")
-"""Effects that the header key ``absent`` may name."""
+ABSENT = {
+    "walls": ("container_side", "wall_restitution"),
+    "roughness": ("beta_t",),
+    "drag": ("gamma",),
+    "friction": ("friction",),
+}
+"""Effects that the header key ``absent`` may name, and the keys that describe them."""
 
 TEMPERATURE_COLUMNS = {
     "mean_speed": "mean speed <|v|>",
@@ -90,34 +96,18 @@ TEMPERATURE_COLUMNS = {
 EXACT_DENSITY_ERROR = 1e-4
 """Relative error of the prior of a density without an error, where the diameter has one."""
 
+_MIXTURE = "grains of a mixture have a temperature for each kind, and one T is too few"
+_STICKING = "grains that stick lose all of their speed below some speed, and grow"
+
 UNSUPPORTED_KEYS = {
-    "gravity": (
-        0.0,
-        "under gravity density and T change with height, but gases in jaxgran are homogeneous",
-    ),
-    "polydispersity": (
-        0.0,
-        "grains of unequal masses have unequal temperatures, and one T is too few",
-    ),
-    "diameter_2": (
-        None,
-        "grains of a mixture have a temperature for each kind, and one T is too few",
-    ),
-    "density_2": (
-        None,
-        "grains of a mixture have a temperature for each kind, and one T is too few",
-    ),
-    "aspect_ratio": (
-        1.0,
-        "rods and ellipsoids collide at a rate that depends on their orientation, and smooth "
-        "impacts make them rotate, but grains in jaxgran are spheres",
-    ),
-    "cohesion": (0.0, "grains that stick lose all of their speed below some speed, and grow"),
-    "surface_energy": (0.0, "grains that stick lose all of their speed below some speed, and grow"),
-    "charge": (
-        0.0,
-        "charged grains are deflected without touching, but grains in jaxgran fly freely",
-    ),
+    "gravity": (0.0, "under gravity density and T change with height, but gases are homogeneous"),
+    "polydispersity": (0.0, "grains of unequal masses have unequal temperatures"),
+    "diameter_2": (None, _MIXTURE),
+    "density_2": (None, _MIXTURE),
+    "aspect_ratio": (1.0, "rods and ellipsoids collide at another rate and rotate"),
+    "cohesion": (0.0, _STICKING),
+    "surface_energy": (0.0, _STICKING),
+    "charge": (0.0, "charged grains are deflected without touching, but grains fly freely"),
 }
 """Keys of effects that no model has: the value that means "no effect" (or None), and the reason."""
 
@@ -164,50 +154,44 @@ def read_curve(
     >>> header, again.times.shape
     ({'eta': '0.05'}, (4,))
     """
-    path = checked_path(path, WANTED)
-    if path.suffix == ARCHIVE_SUFFIX:
-        return _read_archive(path)
-    given = {} if header is None else dict(header)
-    if is_trajectory(path):
-        return curve_of_trajectory(path, given)
-    table = read_table(path, WANTED, _columns_to_read)
-    table.header.update(given)
-    if "x" in table.columns:
-        elements = read_elements(table.header)
-        return curve_of_tracks(path, table.columns, table.header, table.lines, elements)
-    if len(table.lines) < MIN_POINTS:
-        raise ValueError(
-            f"{path}: {len(table.lines)} rows of numbers, at least {MIN_POINTS} are needed; "
-            "measure the cooling at more times"
-        )
-    try:
-        columns, header = _with_temperature(table)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    fields = {quantity.column: quantity.field for quantity in QUANTITIES.values()}
-    curve = from_arrays({fields[name]: jnp.asarray(x) for name, x in columns.items()})
-    curve.check(lambda i: f"{path}, line {table.lines[i]}")
-    ask_about_columns(curve, header, _gas_or_none(header))
+    path, given = checked_path(path, WANTED), {} if header is None else dict(header)
+    questions: list[str] = []
+    with name_in_errors(path):
+        if path.suffix == ARCHIVE_SUFFIX:
+            return _read_archive(path)
+        if is_trajectory(path):
+            return curve_of_trajectory(path, given)
+        table = read_table(path, WANTED, _columns_to_read)
+        header = table.header | given
+        if "x" in table.columns:
+            elements = read_elements(header)
+            curve, questions = curve_of_tracks(table.columns, header, table.lines, elements)
+        else:
+            columns = _with_temperature(table, header)
+            fields = {quantity.column: quantity.field for quantity in QUANTITIES.values()}
+            curve = from_arrays({fields[name]: jnp.asarray(x) for name, x in columns.items()})
+            curve.check(lambda i: f"line {table.lines[i]}")
+            questions = list(ask_about_columns(curve, header, _gas_or_none(header)))
+    for question in questions:
+        warnings.warn(f"{path}: {question}", stacklevel=2)
     return curve, header
 
 
-def _columns_to_read(i: int, names: list[str]) -> list[str]:
-    """Return the columns; raise ValueError if one in line i is unknown, missing or repeated."""
+def _columns_to_read(names: list[str]) -> list[str]:
+    """Return the columns; raise ValueError if one is unknown, missing or repeated."""
     if "x" in names or "id" in names:
-        return track_columns(i, names)
+        return track_columns(names)
     temperatures = [name for name in ("T", *TEMPERATURE_COLUMNS) if name in names]
     known = {quantity.column for quantity in QUANTITIES.values()}
     known |= {end for name in temperatures for end in (name, f"{name}_err")}
     unknown = [name for name in names if name not in known]
     missing = ([] if "t" in names else ["t"]) + ([] if temperatures else ["T"])
     if len(temperatures) > 1:
-        raise ValueError(
-            f"line {i}: {' and '.join(temperatures)} each give the temperature; keep one"
-        )
+        raise ValueError(f"{' and '.join(temperatures)} each give the temperature; keep one")
     if unknown or missing or len(set(names)) < len(names):
         measured = [q.column for q in QUANTITIES.values() if q.measured]
         raise ValueError(
-            f"line {i}: the columns are {', '.join(names)}; "
+            f"the columns are {', '.join(names)}; "
             + (f"missing: {', '.join(missing)}; " if missing else "")
             + (f"not known: {', '.join(unknown)}; " if unknown else "")
             + f"name them t,T and, where measured, {', '.join(measured[2:])}, each once. In place "
@@ -217,63 +201,50 @@ def _columns_to_read(i: int, names: list[str]) -> list[str]:
     return names
 
 
-def _with_temperature(table: Table) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return columns with T in place of one of `TEMPERATURE_COLUMNS`, and the header.
+def _with_temperature(table: Table, header: dict[str, str]) -> dict[str, np.ndarray]:
+    """Return columns with T = <v^2>/d in place of one of `TEMPERATURE_COLUMNS`.
 
-    The entry T_from of the header says how T was computed.
+    The velocities are taken for isotropic and Maxwellian. The entry T_from is added to the header.
 
     Raises:
-        ValueError: for a negative value, or an energy of particles of unknown mass.
+        ValueError: for too few rows, a value that is not positive, or an energy of particles of
+            unknown mass.
     """
-    columns, header = dict(table.columns), dict(table.header)
+    if len(table.lines) < MIN_POINTS:
+        raise ValueError(
+            f"{len(table.lines)} rows of numbers, at least {MIN_POINTS} are needed; measure the "
+            "cooling at more times"
+        )
+    columns, d = dict(table.columns), header_count(header, "dimension") or 3
     for name in TEMPERATURE_COLUMNS.keys() & columns.keys():
-        values = columns.pop(name)
+        values, error, power = columns.pop(name), columns.pop(f"{name}_err", None), 1.0
         if np.any(values <= 0):
             i = int(np.argmax(values <= 0))
             raise ValueError(
                 f"line {table.lines[i]}: {name} is {values[i]:g}, it must be a positive number; "
                 "correct or remove this row"
             )
-        error = columns.pop(f"{name}_err", None)
-        columns["T"], power, header["T_from"] = _temperature_from_column(name, values, header)
+        if name == "mean_speed":
+            factor, words = (pi / 8, "pi/8") if d == 3 else (2 / pi, "2/pi")
+            T, power = factor * values**2, 2.0
+            header["T_from"] = f"T = ({words}) mean_speed^2, for Maxwellian velocities"
+        elif name == "energy":
+            if not {"diameter", "density"} <= header.keys():
+                raise ValueError(
+                    "a column energy needs the mass of a particle: add diameter and density to the "
+                    "header, or give T = <v^2>/d itself"
+                )
+            size, density = (header_number(header, key) for key in ("diameter", "density"))
+            T = 2 * values / (d * float(sphere_mass(size, density)))
+            header["T_from"] = f"T = 2 energy / ({d} m), for energies in J per particle"
+        else:
+            T = values / (2 if name == "v2_xy" else 1)
+            what = "v2_xy / 2" if name == "v2_xy" else name
+            header["T_from"] = f"T = {what}, for isotropic velocities"
+        columns["T"] = T
         if error is not None:
-            columns["T_err"] = power * columns["T"] * error / values
-    return columns, header
-
-
-def _temperature_from_column(
-    name: str, values: np.ndarray, header: dict[str, str]
-) -> tuple[np.ndarray, float, str]:
-    """Compute T = <v^2>/d from a related column, for isotropic Maxwellian velocities.
-
-    Args:
-        name: name of the column, one of `TEMPERATURE_COLUMNS`.
-        values: in SI.
-        header: with dimension (default 3) and, for an energy, diameter and density.
-
-    Returns:
-        T, m^2/s^2; the power of the column in it; and the equation, in words.
-
-    Raises:
-        ValueError: for an energy of particles of unknown mass.
-    """
-    three = (header_count(header, "dimension") or 3) == 3
-    if name == "mean_speed":
-        factor, words = (pi / 8, "pi/8") if three else (2 / pi, "2/pi")
-        return factor * values**2, 2.0, f"T = ({words}) mean_speed^2, for Maxwellian velocities"
-    if name == "vx2":
-        return values, 1.0, "T = vx2, for isotropic velocities"
-    if name == "v2_xy":
-        return values / 2, 1.0, "T = v2_xy / 2, for isotropic velocities"
-    if not {"diameter", "density"} <= header.keys():
-        raise ValueError(
-            "a column energy needs the mass of a particle: add diameter and density to the header, "
-            "or give T = <v^2>/d itself"
-        )
-    diameter, density = (header_number(header, key) for key in ("diameter", "density"))
-    mass = float(sphere_mass(diameter, density))
-    d = 3 if three else 2
-    return 2 * values / (d * mass), 1.0, f"T = 2 energy / ({d} m), for energies in J per particle"
+            columns["T_err"] = power * T * error / values
+    return columns
 
 
 @no_type_check
@@ -301,8 +272,19 @@ def read_gas(header: dict[str, str]) -> Gas:
     """
     _check_header(header)
     gas = _make_gas(header)
-    ask_about_header({key: header_number(header, key) for key in _numbers(header)})
-    _warn_of_unknown_keys(header)
+    numbers = [key for key in header if key in BY_SYMBOL and header[key] != GUESS]
+    for question in ask_about_header({key: header_number(header, key) for key in numbers}):
+        warnings.warn(question, stacklevel=2)
+    known = dict.fromkeys((*REQUIRED, *BY_SYMBOL, *OPTIONAL_KEYS, *UNIT_KEYS))
+    others = {*known, *PRIOR_KEYS, *PROVENANCE_KEYS, *UNSUPPORTED_KEYS}
+    # Comments that are no single word are not keys.
+    unknown = [key for key in header if key.isidentifier() and key not in others]
+    if unknown:
+        warnings.warn(
+            f"ignoring unknown header keys: {', '.join(unknown)}. Known keys are "
+            f"{', '.join(known)}, and errors such as eta_err",
+            stacklevel=2,
+        )
     return gas
 
 
@@ -311,11 +293,6 @@ def _check_header(header: Any) -> None:
         raise ValueError(
             f"header must be a dictionary, as read_curve returns it, got {header!r:.60}"
         )
-
-
-def _numbers(header: dict[str, str]) -> list[str]:
-    """Return the keys of parameters whose value is a number."""
-    return [key for key in header if key in BY_SYMBOL and header[key] != GUESS]
 
 
 def _gas_or_none(header: dict[str, str]) -> Gas | None:
@@ -348,7 +325,14 @@ def _make_gas(header: dict[str, str]) -> Gas:
         dimension=d,
         **read_elements(header),
     )
-    _check_container_volume(header, gas)
+    if gas.container is not None and "N" in header:
+        number, eta = header_number(header, "N"), float(gas.packing_fraction)
+        ratio = container_volume_ratio(gas, number)
+        if abs(ratio - 1) > VOLUME_TOLERANCE:
+            raise ValueError(
+                f"N, eta and container_side contradict: {number:g} spheres in this container have "
+                f"eta = {eta * ratio:.4g}, but the header gives {eta:.4g}; correct one of them"
+            )
     return gas
 
 
@@ -368,7 +352,13 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
         ValueError: for a key that needs another one, a value outside its range, and for effects
             that no model has: gravity, mixtures, rods, ellipsoids, cohesion and charges.
     """
-    _check_supported(header)
+    for key, (neutral, reason) in UNSUPPORTED_KEYS.items():
+        if key in header and (neutral is None or header_number(header, key) != neutral):
+            advice = "" if neutral is None else f" or set it to {neutral:g}"
+            raise ValueError(
+                f"the header gives {key}: {reason}. No model of jaxgran supports it; fit a curve "
+                f"of equal spheres without it, and leave {key} out{advice}"
+            )
     kinds = [kind for _, kind, _ in ELEMENTS]
     symbols = {p.symbol for kind in kinds for p in fields_of(kind.__name__).values()}
     values = {
@@ -399,43 +389,6 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
             )
         elements[name] = kind(**{fields[key]: values[key] for key in given})
     return elements
-
-
-def _check_supported(header: dict[str, str]) -> None:
-    for key, (neutral, reason) in UNSUPPORTED_KEYS.items():
-        if key in header and (neutral is None or header_number(header, key) != neutral):
-            advice = "" if neutral is None else f" or set it to {neutral:g}"
-            raise ValueError(
-                f"the header gives {key}: {reason}. No model of jaxgran supports it; fit a curve "
-                f"of equal spheres without it, and leave {key} out{advice}"
-            )
-
-
-def _check_container_volume(header: dict[str, str], gas: Gas) -> None:
-    """Raise ValueError if N, eta, diameter and container_side of a header contradict."""
-    if gas.container is None or "N" not in header:
-        return
-    number = header_number(header, "N")
-    ratio = container_volume_ratio(gas, number)
-    if abs(ratio - 1) > VOLUME_TOLERANCE:
-        raise ValueError(
-            f"N, eta and container_side contradict: {number:g} spheres in this container have eta "
-            f"= {float(gas.packing_fraction) * ratio:.4g}, but the header gives "
-            f"{float(gas.packing_fraction):.4g}; correct one of them"
-        )
-
-
-def _warn_of_unknown_keys(header: dict[str, str]) -> None:
-    """Warn of unknown header keys. Comments that are no single word are not keys."""
-    keys = dict.fromkeys((*REQUIRED, *BY_SYMBOL, *OPTIONAL_KEYS, *UNIT_KEYS))
-    known = {*keys, *PRIOR_KEYS, *PROVENANCE_KEYS, *UNSUPPORTED_KEYS}
-    unknown = [key for key in header if key.isidentifier() and key not in known]
-    if unknown:
-        warnings.warn(
-            f"ignoring unknown header keys: {', '.join(unknown)}. Known keys are "
-            f"{', '.join(keys)}, and errors such as eta_err",
-            stacklevel=3,
-        )
 
 
 @no_type_check
@@ -498,18 +451,12 @@ def read_absent(header: dict[str, str]) -> tuple[str, ...]:
     """
     _check_header(header)
     names = tuple(filter(None, re.split(r"[\s,;]+", header.get("absent", ""))))
-    keys = {
-        "walls": ("container_side", "wall_restitution"),
-        "roughness": ("beta_t",),
-        "drag": ("gamma",),
-        "friction": ("friction",),
-    }
     for name in names:
         if name not in ABSENT:
             raise ValueError(
                 f"header line absent: {name!r} is not known; give some of {', '.join(ABSENT)}"
             )
-        if given := [key for key in keys[name] if key in header]:
+        if given := [key for key in ABSENT[name] if key in header]:
             raise ValueError(f"the header declares {name} absent and gives {given[0]}; remove one")
     return names
 
@@ -545,7 +492,9 @@ def write_curve(
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists; choose another name or set overwrite=True")
     if path.suffix == ARCHIVE_SUFFIX:
-        return _write_archive(path, curve, header)
+        arrays: dict[str, Any] = {name: np.asarray(x) for name, x in to_arrays(curve).items()}
+        arrays[HEADER_ENTRY] = np.array(json.dumps(header))
+        return write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
     fields = {q.column: getattr(curve, q.field) for q in QUANTITIES.values()}
     present = {name: np.asarray(v) for name, v in fields.items() if v is not None}
     broken = [key for key, value in header.items() if len(f"{key}{value}".splitlines()) > 1]
@@ -564,28 +513,17 @@ HEADER_ENTRY = "header"
 """Entry of an npz file that holds the header, as JSON; all others are arrays."""
 
 
-def _write_archive(path: Path, curve: CoolingCurve, header: dict[str, str]) -> None:
-    """Write all arrays of a curve, without loss, to an npz file; see `to_arrays` for their names.
-
-    Lists of saved arrays are read back as tuples.
-    """
-    arrays: dict[str, Any] = {name: np.asarray(x) for name, x in to_arrays(curve).items()}
-    arrays[HEADER_ENTRY] = np.array(json.dumps(header))
-    write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
-
-
 def _read_archive(path: Path) -> tuple[CoolingCurve, dict[str, str]]:
+    content = io.BytesIO(path.read_bytes())
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(content, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop(HEADER_ENTRY)))
         return from_arrays({name: jnp.asarray(x) for name, x in arrays.items()}), header
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path") from None
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise ValueError(
-            f"{path}: not a file that this version of jaxgran.write_curve wrote ({error}); give "
-            "such a file, or a CSV file"
+            f"not a file that this version of jaxgran.write_curve wrote ({error}); give such a "
+            "file, or a CSV file"
         ) from None
 
 
@@ -669,17 +607,15 @@ def read_drop_test(path: str | Path, *, onto_plate: bool = False) -> DropTest:
     (3,)
     """
     wanted = ",".join(DROP_TEST_COLUMNS)
-    path = checked_path(path, wanted)
 
-    def columns_to_read(i: int, names: list[str]) -> list[str]:
+    def columns_to_read(names: list[str]) -> list[str]:
         if sorted(names) != sorted(DROP_TEST_COLUMNS):
-            raise ValueError(f"line {i}: the columns are {', '.join(names)}; name them {wanted}")
+            raise ValueError(f"the columns are {', '.join(names)}; name them {wanted}")
         return names
 
-    columns = read_table(path, wanted, columns_to_read).columns
-    if not columns["v"].size:
-        raise ValueError(f"{path}: no rows of numbers under {wanted}; add one row for each impact")
-    try:
+    path = checked_path(path, wanted)
+    with name_in_errors(path):
+        columns = read_table(path, wanted, columns_to_read).columns
+        if not columns["v"].size:
+            raise ValueError(f"no rows of numbers under {wanted}; add one row for each impact")
         return DropTest(columns["v"], columns["eps"], columns["eps_err"], onto_plate)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None

@@ -1,14 +1,41 @@
-"""Atomic writing of files, and numbers of the header of a curve."""
+"""Reading and atomic writing of files, and numbers of the header of a curve."""
 
 import errno
+import gzip
 import os
 import stat
 import tempfile
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+
+@contextmanager
+def name_in_errors(path: Path) -> Iterator[None]:
+    """Name a file in the errors of reading it, all of which become ValueError."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; check the path") from None
+    except IsADirectoryError:
+        raise ValueError(f"{path}: not a text file but a folder; name a file") from None
+    except (EOFError, gzip.BadGzipFile, zlib.error):
+        raise ValueError(f"{path}: an incomplete or damaged .gz file; pack it again") from None
+    except PermissionError as error:
+        raise ValueError(f"{path}: {error.strerror}; check its permissions") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: it is no text file; GSD files end in .gsd") from None
+    except (ValueError, OSError, RuntimeError) as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the content of a file, unpacked if its name ends in .gz."""
+    return gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
 
 
 def write_atomically(path: str | Path, write: Callable[[Any], Any]) -> None:

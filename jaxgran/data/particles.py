@@ -7,12 +7,9 @@ leaves out angular velocities, units and times, accepts chemical elements alone 
 writes XYZ with 8 decimals.
 """
 
-import gzip
 import re
 import shlex
-import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
 from importlib.metadata import version
@@ -24,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.data.curve import Particles
-from jaxgran.data.files import check_writable
+from jaxgran.data.files import check_writable, name_in_errors, read_bytes
 
 GSD = ".gsd"
 XYZ = ".xyz"
@@ -146,19 +143,6 @@ def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None =
         return _to_particles(*checked_frame(frames[frame](), dimension))
 
 
-@contextmanager
-def name_in_errors(path: Path) -> Iterator[None]:
-    """Name the file in errors of its content."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: it is no text file; GSD files end in .gsd") from None
-    except (ValueError, OSError, RuntimeError, EOFError, zlib.error) as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
 def open_frames(path: Path) -> list[Callable[[], Frame]]:
     """Return a function for each frame of a file, which reads it."""
     if path.suffix == GSD:
@@ -166,8 +150,7 @@ def open_frames(path: Path) -> list[Callable[[], Frame]]:
             raise FileNotFoundError
         with _import_gsd().open(str(path), "r") as file:
             return [partial(_read_gsd, path, k) for k in range(len(file))]
-    content = path.read_bytes()
-    text = (gzip.decompress(content) if path.suffix == ".gz" else content).decode()
+    text = read_bytes(path).decode()
     if text.lstrip().startswith("ITEM:"):
         return _open_dump(text)
     if text.split(maxsplit=1)[:1] and text.split(maxsplit=1)[0].isdigit():

@@ -4,7 +4,7 @@ Most of them come from units. Each question names the value, what is usual, and 
 would make it usual; it is a warning, and the values are used as they are.
 """
 
-import warnings
+from collections.abc import Iterator
 from math import sqrt
 
 import numpy as np
@@ -58,41 +58,36 @@ MAX_ERROR_RATIO = 10.0
 """Ratio of T_err to the scatter of N particles, or its inverse, above which a question is asked."""
 
 
-def _ask(question: str) -> None:
-    warnings.warn(question, stacklevel=4)
-
-
 def _is_usual(name: str, value: float) -> bool:
     low, high = USUAL_RANGES.get(name, (-np.inf, np.inf))
     return low <= value <= high
 
 
-def ask_about_header(values: dict[str, float]) -> None:
-    """Warn of unusual values of header keys, in SI."""
+def ask_about_header(values: dict[str, float]) -> Iterator[str]:
+    """Yield questions about unusual values of header keys, in SI."""
     for key, value in values.items():
         if not _is_usual(key, value):
-            _ask_about_value(key, value, f"{key}: ")
+            yield _unit_question(key, value, f"{key}: ")
 
 
-def _ask_about_value(name: str, value: float, line: str) -> None:
+def _unit_question(name: str, value: float, line: str) -> str:
     low, high = USUAL_RANGES[name]
     base = UNITS[name]
     question = "check its unit"
     for unit in OTHER_UNITS[base]:
         in_si = unit_in(unit, base) * value
         if _is_usual(name, in_si):
-            rewritten = (
-                f"{line}{in_si:.6g}, or {line}{value:g} {unit}"
-                if line
-                else (f"{name} ({unit}) as the name of the column")
-            )
+            rewritten = f"{line}{in_si:.6g}, or {line}{value:g} {unit}"
+            rewritten = rewritten if line else f"{name} ({unit}) as the name of the column"
             question = f"is it in {unit}? Then write {rewritten}"
             break
-    _ask(f"{name} is {value:.6g} {base}, and usual is {low:g} to {high:g}: {question}")
+    return f"{name} is {value:.6g} {base}, and usual is {low:g} to {high:g}: {question}"
 
 
-def ask_about_columns(curve: CoolingCurve, header: dict[str, str], gas: Gas | None) -> None:
-    """Warn of unusual values of columns, and of columns that contradict a usual header.
+def ask_about_columns(
+    curve: CoolingCurve, header: dict[str, str], gas: Gas | None
+) -> Iterator[str]:
+    """Yield questions about unusual values of columns, and columns that contradict the header.
 
     Args:
         curve: the columns, in SI.
@@ -104,20 +99,30 @@ def ask_about_columns(curve: CoolingCurve, header: dict[str, str], gas: Gas | No
         if quantity.measured and values is not None and not quantity.column.endswith("_err"):
             largest = float(np.max(np.asarray(values)))
             if largest > 0 and not _is_usual(quantity.column, largest):
-                _ask_about_value(quantity.column, largest, "")
+                yield _unit_question(quantity.column, largest, "")
     if gas is None or gas.drive is not None:
         return
     if not all(_is_usual(key, float(header[key])) for key in REQUIRED if key in header):
         return  # `ask_about_header` asks first
     number = float(header["N"]) if "N" in header else None
-    _ask_about_start(curve, header, gas, number)
+    yield from _ask_about_start(curve, header, gas, number)
     if number is not None and curve.temperature_error is not None:
-        _ask_about_errors(curve, gas, number, float(header.get("replicas", 1)))
+        replicas = float(header.get("replicas", 1))
+        share = np.asarray(curve.temperature_error) / np.asarray(curve.temperature)
+        expected = sqrt(2 / (gas.dimension * number * replicas))
+        ratios = {"larger": share[1:].min() / expected, "smaller": expected / share.max()}
+        for word, ratio in ratios.items():
+            if ratio > MAX_ERROR_RATIO:
+                yield (
+                    f"T_err is at least {ratio:.2g} times {word} than the scatter of T of N = "
+                    f"{number:g} particles in {replicas:g} run(s): are N, replicas and T_err those "
+                    "of this curve, and is T_err a standard error of the mean?"
+                )
 
 
 def _ask_about_start(
     curve: CoolingCurve, header: dict[str, str], gas: Gas, number: float | None
-) -> None:
+) -> Iterator[str]:
     """Compare T at first with T0, the clock with T0, and the loss with the mean free time."""
     times = np.asarray(curve.times) - float(header.get("t0", 0.0))
     T, T0 = np.asarray(curve.temperature), float(gas.temperature)
@@ -133,18 +138,27 @@ def _ask_about_start(
     known = 3 * float(header.get("T0_err", 0.0)) / T0
     at_zero = max(origin - slope * times[0], 1e-9) ** (-1 / 0.6)
     if first > MAX_RATIO + chance + known:
-        _ask(_scale_question(first, gas, number))
+        yield _scale_question(first, gas, number)
     elif begin > MAX_LATENESS * halving and begin > 0.5 * times[0]:
-        _ask(
+        yield (
             f"T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s and not at 0, by the first rows: does "
             "the clock of the file start earlier than the gas? Then subtract that time, or fit it: "
             "--free A t0. Or is T0 another one? Then --free A T0"
         )
     elif at_zero < 1 / (MAX_RATIO + chance + known):
-        _ask(_scale_question(at_zero, gas, number))
+        yield _scale_question(at_zero, gas, number)
     loss = gas.dimension * slope / (0.6 * origin) / float(gas.collision_frequency)
     if T[-1] < 0.8 * T[0] and not USUAL_LOSS[0] <= loss <= USUAL_LOSS[1]:
-        _ask(_time_question(loss, halving, gas))
+        units = [unit for unit in OTHER_UNITS["s"] if 1e-3 < loss / unit_in(unit, "s") < 1]
+        question = "are t, eta, diameter and T0 in the units that the file says?"
+        if units:
+            question = f"is t in {' or '.join(units)}? Then name the column t ({units[0]})"
+        if loss < 1:
+            question += "; is it in steps or frames? Then multiply it by their duration"
+        yield (
+            f"T falls to a half in {halving / float(gas.mean_free_time):.3g} mean free times of "
+            f"the header's gas (eta, diameter, T0), and usual is .1 to 1e3: {question}"
+        )
 
 
 def _scale_question(ratio: float, gas: Gas, number: float | None) -> str:
@@ -171,33 +185,3 @@ def _scale_question(ratio: float, gas: Gas, number: float | None) -> str:
         f"T is {ratio * T0:.4g} at first, {ratio:.3g} times the header's T0 = {T0:g} m^2/s^2: "
         f"{question}; or correct T0, or fit it: --free A T0"
     )
-
-
-def _time_question(loss: float, halving: float, gas: Gas) -> str:
-    """Return the question for a decay that is too slow or too fast for the mean free time."""
-    free_times = halving / float(gas.mean_free_time)
-    units = [unit for unit in OTHER_UNITS["s"] if 1e-3 < loss / unit_in(unit, "s") < 1]
-    question = "are t, eta, diameter and T0 in the units that the file says?"
-    if units:
-        question = f"is t in {' or '.join(units)}? Then name the column t ({units[0]})"
-    if loss < 1:
-        question += "; is it in steps or frames? Then multiply it by their duration"
-    return (
-        f"T falls to a half in {free_times:.3g} mean free times of the header's gas (eta, diameter,"
-        f" T0), and usual is .1 to 1e3: {question}"
-    )
-
-
-def _ask_about_errors(curve: CoolingCurve, gas: Gas, number: float, replicas: float) -> None:
-    share = np.asarray(curve.temperature_error) / np.asarray(curve.temperature)
-    expected = sqrt(2 / (gas.dimension * number * replicas))
-    for word, ratio in (
-        ("larger", share[1:].min() / expected),
-        ("smaller", expected / share.max()),
-    ):
-        if ratio > MAX_ERROR_RATIO:
-            _ask(
-                f"T_err is at least {ratio:.2g} times {word} than the scatter of T of N = "
-                f"{number:g} particles in {replicas:g} run(s): are N, replicas and T_err those of "
-                "this curve, and is T_err a standard error of the mean?"
-            )

@@ -7,10 +7,8 @@ header keys length_unit, time_unit and speed_unit are converted to SI by pint.
 
 import codecs
 import csv
-import gzip
 import math
 import re
-import zlib
 from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
@@ -20,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxgran.data.curve import QUANTITIES
+from jaxgran.data.files import read_bytes
 from jaxgran.scene.parameters import BY_SYMBOL
 
 UNIT_KEYS = {"length_unit": "m", "time_unit": "s", "speed_unit": "m/s"}
@@ -88,62 +87,45 @@ def read_text(path: Path, columns: str) -> str:
         columns: names of the columns that it should have, for the message.
 
     Raises:
-        ValueError: if the file cannot be read, is empty or is no text.
+        ValueError: if the file is empty or is no text.
+        OSError: if it cannot be read.
     """
-    wanted = f"give a CSV file with the columns {columns}"
-    try:
-        content = path.read_bytes()
-        content = gzip.decompress(content) if path.suffix == ".gz" else content
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path") from None
-    except IsADirectoryError:
-        raise ValueError(f"{path}: not a text file but a folder; {wanted}") from None
-    except (EOFError, gzip.BadGzipFile, zlib.error):
-        raise ValueError(f"{path}: an incomplete or damaged .gz file; pack it again") from None
-    except OSError as error:
-        raise ValueError(
-            f"{path}: cannot be read ({error.strerror}); check its permissions"
-        ) from None
+    content = read_bytes(path)
     encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8")
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:
         text = content.decode("latin-1")
     if _BINARY.search(text):
-        raise ValueError(f"{path}: not a text file but a binary one; {wanted}, saved as UTF-8")
+        raise ValueError(
+            f"not a text file but a binary one; give a CSV file with the columns {columns}, saved "
+            "as UTF-8"
+        )
     if not text.strip():
-        raise ValueError(f"{path}: the file is empty; it needs the columns {columns}")
+        raise ValueError(f"the file is empty; it needs the columns {columns}")
     return text
 
 
 def read_table(
-    path: Path, wanted: str, columns_to_read: Callable[[int, list[str]], Iterable[str]]
+    path: Path, wanted: str, columns_to_read: Callable[[list[str]], Iterable[str]]
 ) -> Table:
     """Read header lines, a line of names, and rows of finite numbers.
 
     Args:
         path: the file.
         wanted: the names of its columns, for messages.
-        columns_to_read: from the number of the line of names and the names without units, the
-            columns whose numbers are read; raises ValueError, without the path, for wrong names.
+        columns_to_read: from the names of the columns without units, those whose numbers are read;
+            raises ValueError for wrong names.
 
     Raises:
         ValueError: saying what is wrong, in which line, and what to do.
+        OSError: if the file cannot be read.
     """
-    text = read_text(path, wanted).replace("\r\n", "\n").replace("\r", "\n")
-    try:
-        return _parse(text, wanted, columns_to_read)
-    except ValueError as error:
-        raise ValueError(f"{path}, {error}") from None
-
-
-def _parse(
-    text: str, wanted: str, columns_to_read: Callable[[int, list[str]], Iterable[str]]
-) -> Table:
     header: dict[str, str] = {}
     names: list[str] = []
-    cells: dict[int, list[str]] = {}
+    rows: dict[int, list[str]] = {}
     separator, first = "", 0
+    text = read_text(path, wanted).replace("\r\n", "\n").replace("\r", "\n")
     for i, line in enumerate(text.split("\n"), start=1):
         bare = line.strip(' "\t,;|')
         if bare.startswith("#"):
@@ -152,32 +134,41 @@ def _parse(
             separator = next((mark for mark in SEPARATORS if mark in line), " ")
             first, names = i, _names(i, line, separator, wanted)
         elif bare:
-            cells[i] = _split(line, separator, len(names))
+            rows[i] = _split(line, separator, len(names))
     if not names:
         raise ValueError(f"line {i}: the file ends without columns; it needs {wanted}")
     units = _pop_units(header)
     told = [_name_and_unit(name) for name in names]
     bare_names = [name for name, _ in told]
-    chosen = list(columns_to_read(first, [name for name in bare_names if name]))
-    at = [bare_names.index(name) for name in chosen]
+    try:
+        chosen = list(columns_to_read([name for name in bare_names if name]))
+    except ValueError as error:
+        raise ValueError(f"line {first}: {error}") from None
     factors = [_factor_of(name, dict(told), units, "column") for name in bare_names]
-    comma = _decimal_comma(cells, at, separator)
-    values = _plain_values(cells, names, at)
-    if values is None:
-        rows = [_numbers(i, row, names, at, separator, comma) for i, row in cells.items()]
-        values = np.array(rows, dtype=float).reshape(len(rows), len(at))
-    values = values * [factors[k] for k in at]
+    at = [bare_names.index(name) for name in chosen]
+    comma = _decimal_comma(rows, at, separator)
+    values = []
+    for i, row in rows.items():
+        values.append(
+            [_number(row[k], comma) for k in at] if len(row) == len(names) else [math.nan]
+        )
+        if not all(map(math.isfinite, values[-1])):
+            advice = "correct or remove this row"
+            if len(row) > len(names) and separator == ",":
+                advice += "; if numbers have decimal commas, separate the columns by semicolons"
+            raise ValueError(
+                f"line {i}: expected {len(names)} finite numbers ({','.join(names)}) between "
+                f"{SEPARATORS[separator]}, got {separator.join(row)!r}; {advice}"
+            )
+    columns = np.reshape(values, (len(rows), len(at))).T * np.array([[factors[k]] for k in at])
     header = _convert_header(header, units, comma)
-    return Table(header, dict(zip(chosen, values.T, strict=True)), list(cells))
+    return Table(header, dict(zip(chosen, columns, strict=True)), list(rows))
 
 
 def _split(line: str, separator: str, length: int) -> list[str]:
     """Return the cells of a line, without empty ones beyond a length, as spreadsheets add them."""
-    if separator == " ":
-        cells = line.split()
-    elif '"' not in line:
-        cells = line.split(separator)
-    else:
+    cells = line.split()
+    if separator != " ":
         (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
     cells = [cell.strip(' \t"') for cell in cells]
     while len(cells) > length and not cells[-1]:
@@ -197,9 +188,9 @@ def _names(i: int, line: str, separator: str, wanted: str) -> list[str]:
     return names
 
 
-def _decimal_comma(cells: dict[int, list[str]], at: list[int], separator: str) -> bool:
+def _decimal_comma(rows: dict[int, list[str]], at: list[int], separator: str) -> bool:
     """Return whether the numbers of some columns have decimal commas."""
-    read = [(i, row[k]) for i, row in cells.items() for k in at if k < len(row)]
+    read = [(i, row[k]) for i, row in rows.items() for k in at if k < len(row)]
     comma = next(((i, cell) for i, cell in read if "," in cell), None)
     point = next(((i, cell) for i, cell in read if "." in cell), None)
     if comma is not None and (point is not None or separator == ","):
@@ -219,38 +210,13 @@ def _plain_number(text: str, comma: bool) -> str:
     return re.sub("[dD]", "e", text.replace(",", "."))
 
 
-def _plain_values(
-    cells: dict[int, list[str]], names: list[str], at: list[int]
-) -> np.ndarray | None:
-    """Return the numbers of all rows if they are plain, ten times faster than row by row."""
-    if any(len(row) != len(names) for row in cells.values()):
-        return None
-    chosen = [[row[k] for k in at] for row in cells.values()]
+def _number(text: str, comma: bool) -> float:
+    """Return a number of a cell, or nan for other text."""
     try:
-        values = np.array(chosen, dtype=float).reshape(len(cells), len(at))
+        return math.nan if "_" in text else float(text)
     except ValueError:
-        return None
-    is_plain = np.all(np.isfinite(values)) and not any("_" in x for row in chosen for x in row)
-    return values if is_plain else None
-
-
-def _numbers(
-    i: int, row: list[str], names: list[str], at: list[int], separator: str, comma: bool
-) -> list[float]:
-    """Return the numbers of some cells of line i, which must be finite."""
-    values = [math.nan]
-    if len(row) == len(names):
-        plain = [_plain_number(row[k], comma) for k in at]
-        values = [float(x) if _NUMBER.fullmatch(x) else math.nan for x in plain]
-    if not np.all(np.isfinite(values)):
-        advice = "correct or remove this row"
-        if len(row) > len(names) and separator == ",":
-            advice += "; if numbers have decimal commas, separate the columns by semicolons"
-        raise ValueError(
-            f"line {i}: expected {len(names)} finite numbers ({','.join(names)}) between "
-            f"{SEPARATORS[separator]}, got {separator.join(row)!r}; {advice}"
-        )
-    return values
+        plain = _plain_number(text, comma)
+        return math.nan if plain == text else float(plain)
 
 
 def _add_header_line(header: dict[str, str], i: int, line: str) -> None:

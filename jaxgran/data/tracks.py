@@ -1,7 +1,6 @@
 """T(t) of particles that are followed: from tracks, positions in frames, and from trajectories."""
 
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from math import pi
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from scipy.stats import chi2
 
 from jaxgran.data.curve import MIN_POINTS, CoolingCurve
 from jaxgran.data.files import header_count, header_number
-from jaxgran.data.particles import Frame, checked_frame, name_in_errors, open_frames
+from jaxgran.data.particles import Frame, checked_frame, open_frames
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.laws import ConstantRestitution
@@ -117,29 +116,28 @@ def is_trajectory(path: Path) -> bool:
         return False
 
 
-def track_columns(i: int, names: list[str]) -> list[str]:
+def track_columns(names: list[str]) -> list[str]:
     """Return the columns of tracks that are read; further ones are ignored.
 
     Raises:
-        ValueError: for a missing column, in line i.
+        ValueError: for a missing column.
     """
     chosen = [next((name for name in kind if name in names), None) for kind in (IDENTITIES, CLOCKS)]
     coordinates = [name for name in COORDINATES if name in names]
     if None in chosen or coordinates[:2] != ["x", "y"]:
         raise ValueError(
-            f"line {i}: the columns are {', '.join(names)}; tracks of particles have id,t,x,y and, "
-            "where measured, z (or particle and frame, as trackpy names them)"
+            f"the columns are {', '.join(names)}; tracks of particles have id,t,x,y and, where "
+            "measured, z (or particle and frame, as trackpy names them)"
         )
     return [*map(str, chosen), *coordinates]
 
 
 def curve_of_tracks(
-    path: Path,
     columns: Mapping[str, np.ndarray],
-    header: Mapping[str, str],
+    header: dict[str, str],
     lines: list[int],
     elements: dict[str, Any],
-) -> tuple[CoolingCurve, dict[str, str]]:
+) -> tuple[CoolingCurve, list[str]]:
     """Return T(t) of particles whose positions are known in frames.
 
     Velocities are differences over neighbouring frames, ``u = (x(t_2) - x(t_1))/(t_2 - t_1)``, of
@@ -166,98 +164,128 @@ def curve_of_tracks(
     correlated, as the particles are the same.
 
     Args:
-        path: of the file, for messages.
         columns: those of `track_columns`, in SI; rows in any order. Positions continue when a
             particle leaves a periodic box, unless the header gives ``box_side``.
-        header: in SI; with ``frame_rate``, frames per second, for frames without times.
+        header: in SI; with ``frame_rate``, frames per second, for frames without times. It is
+            changed: T_from says how T was computed, and the keys of tracks are removed.
         lines: line number of each row.
         elements: those of the gas that the header describes, as arguments of `jaxgran.Gas`.
 
     Returns:
-        The curve, and the header, whose entry T_from says how T was computed.
+        The curve, and questions about its accuracy.
 
     Raises:
         ValueError: for fewer than 3 particles or 4 frames, a particle twice in a frame, and
             positions that are wrapped into a box.
     """
-    header = dict(header)
-    steps = list(_steps(path, columns, header, lines))
-    _check_wrapped(path, steps, header)
+    steps = _steps(columns, header, lines)
+    left_out, questions = _wrong_identities(steps, header)
     usable = [step for step in steps if len(step.ids) >= MIN_TRACKS]
     if len(usable) < MIN_POINTS:
-        number = len(np.unique(columns[_first(IDENTITIES, columns)]))
+        number = len(np.unique(columns["id" if "id" in columns else "particle"]))
         raise ValueError(
-            f"{path}, line {lines[-1] if lines else 1}: the file ends after tracks of {number} "
-            f"particle(s) in {len(steps) + 1} frames; at least {MIN_TRACKS} particles in "
-            f"{MIN_POINTS + 1} frames are needed to remove the drift and estimate errors"
+            f"line {lines[-1] if lines else 1}: the file ends after tracks of {number} particle(s) "
+            f"in {len(steps) + 1} frames; at least {MIN_TRACKS} particles in {MIN_POINTS + 1} "
+            "frames are needed to remove the drift and estimate errors"
         )
     n, d = max(len(step.ids) for step in usable), usable[0].displacement.shape[1]
-    factor, notes = _momentum_correction(path, n, d, header)
-    T, error = np.array(
-        [_temperature_and_error(step.displacement / step.duration) for step in usable]
-    ).T
-    notes += _compare_with_median(path, T, usable)
-    notes += _count_left_out(path, steps)
+    factor, notes = _momentum_correction(n, d, header)
+    velocities = [step.displacement / step.duration for step in usable]
+    T, error = np.transpose([_temperature_and_error(velocity) for velocity in velocities])
+    difference, chance = _difference_from_median(T, velocities)
+    notes += [f"{100 * difference:+.2g} % from T by the median of the speeds", *left_out]
+    if abs(np.log1p(difference)) > 3 * chance + MAX_SONINE:
+        questions.append(
+            f"T by the mean square of the speeds is {100 * difference:+.2g} % from T by their "
+            "median: identities may be wrong, or the gas may consist of unequal parts"
+        )
     T, error = factor * T, factor * error
+    rate, fitted_notes, fitted_questions = _fit_memory(usable, T, header, elements)
+    notes, questions = notes + fitted_notes, questions + fitted_questions
     duration = np.array([step.duration for step in usable])
-    rate, words = _fit_memory(path, usable, T, header, _enskog_rate(header, elements))
-    notes += words
-    T, words = _correct_localisation(path, T, duration, header)
-    notes += words
-    T_true, words = _correct_impacts(path, T, duration, rate)
-    notes += words
+    shares = {}
+    if "localisation_error" in header:
+        e = header_number(header, "localisation_error")
+        added = 2 * (e / duration) ** 2
+        if np.any(added >= T):
+            k = int(np.argmax(added >= T))
+            raise ValueError(
+                f"between frames {k} and {k + 1} particles move no further than "
+                f"localisation_error = {e:g} m; leave out this and later frames, or use frames "
+                "further apart"
+            )
+        share = float(np.max(added / T))
+        shares["localisation_error adds up to {} to T", "leave out the last frames"] = share
+        notes.append(f"localisation_error removed, at most {100 * share:.2g} % of T")
+        T = T - added
+    else:
+        notes.append("errors of positions not known (localisation_error)")
+    true = T
+    if rate == 0:
+        notes.append("impacts between frames not corrected (the velocities show none)")
+    else:
+        for _ in range(NUM_ITERATIONS):
+            true = T / _displacement_factor(rate * duration * np.sqrt(true))
+        share = float(np.max(1 - T / true))
+        words = "impacts between frames take up to {} from T"
+        shares[words, "use frames closer together"] = share
+        notes.append(f"impacts between frames corrected, at most {100 * share:.2g} % of T")
+    questions += [
+        f"{words.format(f'{100 * share:.2g} %')}, too much for an accurate correction: {advice}"
+        for (words, advice), share in shares.items()
+        if share > MAX_CORRECTION
+    ]
     curve = CoolingCurve(
         times=jnp.asarray([step.time for step in usable]),
-        temperature=jnp.asarray(T_true),
-        temperature_error=jnp.asarray(error * T_true / T),
+        temperature=jnp.asarray(true),
+        temperature_error=jnp.asarray(error * true / T),
     )
     header["T_from"] = f"T = <(u - <u>)^2>/d, u over neighbouring frames; {'; '.join(notes)}"
-    curve.check(f"{path}: T between frames {{0}} and the next".format)
-    return curve, {
-        key: value for key, value in header.items() if key not in ("box_side", "frame_rate")
-    }
-
-
-def _first(names: tuple[str, ...], columns: Mapping[str, Any]) -> str:
-    return next(name for name in names if name in columns)
+    curve.check("T between frames {} and the next".format)
+    for key in ("box_side", "frame_rate"):
+        header.pop(key, None)
+    return curve, questions
 
 
 def _steps(
-    path: Path, columns: Mapping[str, np.ndarray], header: dict[str, str], lines: list[int]
-) -> Iterator[Step]:
-    ids, clock = columns[_first(IDENTITIES, columns)], _first(CLOCKS, columns)
+    columns: Mapping[str, np.ndarray], header: dict[str, str], lines: list[int]
+) -> list[Step]:
+    ids = columns["id" if "id" in columns else "particle"]
     position = np.stack([columns[name] for name in COORDINATES if name in columns], axis=1)
     if np.any(fractions := ids != np.round(ids)):
         i = int(np.argmax(fractions))
-        raise ValueError(f"{path}, line {lines[i]}: id is {ids[i]:g}; number the particles")
-    t = columns[clock]
-    if clock == "frame":
-        if "frame_rate" not in header:
-            raise ValueError(
-                f"{path}: the tracks have frames without times; add '# frame_rate: ...', in frames "
-                "per second, to the header (1 for T in m^2 per frame^2)"
-            )
-        t = t / header_number(header, "frame_rate")
+        raise ValueError(f"line {lines[i]}: id is {ids[i]:g}; number the particles")
+    if "t" in columns:
+        t = columns["t"]
+    elif "frame_rate" in header:
+        t = columns["frame"] / header_number(header, "frame_rate")
+    else:
+        raise ValueError(
+            "the tracks have frames without times; add '# frame_rate: ...', in frames per second, "
+            "to the header (1 for T in m^2 per frame^2)"
+        )
     order = np.lexsort((ids, t))
     repeated = (np.diff(t[order]) == 0) & (np.diff(ids[order]) == 0)
     if np.any(repeated):
         i, j = sorted(order[int(np.argmax(repeated)) :][:2])
         raise ValueError(
-            f"{path}, line {lines[j]}: particle {ids[j]:g} at t = {t[j]:g} s is given again, after "
-            f"line {lines[i]}; remove one"
+            f"line {lines[j]}: particle {ids[j]:g} at t = {t[j]:g} s is given again, after line "
+            f"{lines[i]}; remove one"
         )
-    side = header_number(header, "box_side") if "box_side" in header else None
+    side = header_number(header, "box_side") if "box_side" in header else np.inf
     frames = np.split(order, np.flatnonzero(np.diff(t[order])) + 1)
+    steps = []
     for before, after in zip(frames, frames[1:], strict=False):
         shared, i, j = np.intersect1d(
             ids[before], ids[after], assume_unique=True, return_indices=True
         )
         start, end = position[before[i]], position[after[j]]
-        if side is not None:
+        if side < np.inf:
             end = end - side * np.round((end - start) / side)
         times = float(t[before[0]]), float(t[after[0]])
         lost, new = np.delete(position[before], i, axis=0), np.delete(position[after], j, axis=0)
-        yield _step(times, shared.astype(int), start, end, lost, new)
+        steps.append(_step(times, shared.astype(int), start, end, lost, new))
+    return steps
 
 
 def _step(
@@ -317,53 +345,40 @@ def _step(
     )
 
 
-def _check_wrapped(path: Path, steps: list[Step], header: dict[str, str]) -> None:
-    too_long, folded = (sum(x) for x in zip(*((s.too_long, s.folded) for s in steps), strict=True))
+def _wrong_identities(steps: list[Step], header: dict[str, str]) -> tuple[list[str], list[str]]:
+    """Return a note and a question on displacements that were left out; raise if wrapped."""
+    counts = [(step.too_long, step.folded, step.swapped, len(step.ids)) for step in steps]
+    too_long, folded, swapped, kept = np.sum(counts, axis=0, dtype=int, initial=0).tolist()
     if "box_side" not in header and 2 * folded > max(too_long, 4):
         side = max(np.max(step.spread) for step in steps)
         raise ValueError(
-            f"{path}: {folded} displacements are as long as the box: are the positions wrapped? "
-            f"Give its side, {side:.3g} m or slightly more, in the header as '# box_side: ...', or "
-            "unwrap them"
+            f"{folded} displacements are as long as the box: are the positions wrapped? Give its "
+            f"side, {side:.3g} m or slightly more, in the header as '# box_side: ...', or unwrap "
+            "them"
         )
-
-
-def _count_left_out(path: Path, steps: list[Step]) -> list[str]:
-    too_long, swapped = (
-        sum(x) for x in zip(*((s.too_long, s.swapped) for s in steps), strict=True)
-    )
-    total = too_long + swapped + sum(len(step.ids) for step in steps)
+    total = too_long + swapped + kept
     if not too_long + swapped:
-        return []
+        return [], []
     words = f"{too_long + swapped} of {total} displacements left out as those of wrong identities"
-    if too_long > 1 + MAX_TAIL * CHANCE * len(steps) or swapped > MAX_SWAPPED * total:
-        warnings.warn(
-            f"{path}: {words}: {too_long} are longer than the distribution of speeds allows, and "
-            f"{swapped} shorter if two particles exchange their identities; check the tracks",
-            stacklevel=4,
-        )
-    return [words]
+    if too_long <= 1 + MAX_TAIL * CHANCE * len(steps) and swapped <= MAX_SWAPPED * total:
+        return [words], []
+    question = (
+        f"{words}: {too_long} are longer than the distribution of speeds allows, and {swapped} "
+        "shorter if two particles exchange their identities; check the tracks"
+    )
+    return [words], [question]
 
 
-def _compare_with_median(path: Path, T: np.ndarray, steps: list[Step]) -> list[str]:
-    """Return a note on T by the median of the speeds; warn if it differs by more than chance."""
-    d = steps[0].displacement.shape[1]
-    medians = []
-    for step in steps:
-        u = (step.displacement - step.displacement.mean(axis=0)) / step.duration
-        medians.append(np.median(np.sum(u**2, axis=1)) / chi2.median(d))
+def _difference_from_median(T: np.ndarray, velocities: list[np.ndarray]) -> tuple[float, float]:
+    """Return the relative difference of T from that by the median speed, and its size by chance."""
+    d = velocities[0].shape[1]
+    squares = [np.sum((u - u.mean(axis=0)) ** 2, axis=1) for u in velocities]
+    medians = [np.median(square) / chi2.median(d) for square in squares]
     share = float(np.mean(np.log(T / np.maximum(medians, np.finfo(float).tiny))))
-    number = float(np.mean([len(step.ids) for step in steps]))
     # Variances of a median and of a mean of squares of Maxwellian speeds; the latter is the least.
     of_median = 1 / (2 * chi2.median(d) * chi2.pdf(chi2.median(d), d))
-    chance = float(np.sqrt((of_median**2 - 2 / d) / number))
-    if abs(share) > 3 * chance + MAX_SONINE:
-        warnings.warn(
-            f"{path}: T by the mean square of the speeds is {100 * np.expm1(share):+.2g} % from T "
-            "by their median: identities may be wrong, or the gas may consist of unequal parts",
-            stacklevel=4,
-        )
-    return [f"{100 * np.expm1(share):+.2g} % from T by the median of the speeds"]
+    number = float(np.mean([len(u) for u in velocities]))
+    return float(np.expm1(share)), float(np.sqrt((of_median**2 - 2 / d) / number))
 
 
 def _temperature_and_error(velocity: Float[np.ndarray, "n d"]) -> tuple[float, float]:
@@ -375,94 +390,65 @@ def _temperature_and_error(velocity: Float[np.ndarray, "n d"]) -> tuple[float, f
     return float(square.sum() / (d * (n - 1))), float(np.sqrt((n - 1) * np.var(left)))
 
 
-def _momentum_correction(
-    path: Path, n: int, d: int, header: dict[str, str]
-) -> tuple[float, list[str]]:
+def _momentum_correction(n: int, d: int, header: dict[str, str]) -> tuple[float, list[str]]:
     """Return (N - 1)/N, or 1 if N is unknown or walls change the momentum; and notes on both."""
     dimension = header_count(header, "dimension") or 3
     if d > dimension:
         raise ValueError(
-            f"{path}: a gas of dimension {dimension} has no tracks with {d} coordinates; correct "
-            "the header or leave out z"
+            f"a gas of dimension {dimension} has no tracks with {d} coordinates; correct the "
+            "header or leave out z"
         )
     projected = ["two of three coordinates, for isotropic velocities"] if d < dimension else []
     N = header_count(header, "N")
     if N is None:
         return 1.0, [f"drift of {n} particles removed", *projected]
     if n > N:
-        raise ValueError(
-            f"{path}: the header gives N = {N}, but {n} particles are tracked; correct N"
-        )
+        raise ValueError(f"the header gives N = {N}, but {n} particles are tracked; correct N")
     free = "container_side" not in header
     return (N - 1) / N if free else 1.0, [f"drift of {n} of {N} particles removed", *projected]
 
 
-def _correct_localisation(
-    path: Path, T: Float[np.ndarray, "times"], duration: np.ndarray, header: dict[str, str]
-) -> tuple[Float[np.ndarray, "times"], list[str]]:
-    """Return T without the scatter of measured positions, and a note."""
-    if "localisation_error" not in header:
-        return T, ["errors of positions not known (localisation_error)"]
-    error = header_number(header, "localisation_error")
-    if error < 0:
-        raise ValueError(f"{path}: header line localisation_error: must be >= 0, got {error:g}")
-    added = 2 * (error / duration) ** 2
-    if np.any(added >= T):
-        k = int(np.argmax(added >= T))
-        raise ValueError(
-            f"{path}: between frames {k} and {k + 1} particles move no further than "
-            f"localisation_error = {error:g} m; leave out this and later frames, or use frames "
-            "further apart"
-        )
-    share = float(np.max(added / T))
-    _warn_of_correction(path, "localisation_error adds", share, "to", "leave out the last frames")
-    return T - added, [f"localisation_error removed, at most {100 * share:.2g} % of T"]
-
-
-def _enskog_rate(header: dict[str, str], elements: dict[str, Any]) -> float | None:
-    """Return nu_v/sqrt(T) of elastic spheres, 1/m, or None if eta or diameter is not known."""
-    if not {"eta", "diameter"} <= header.keys():
-        return None
-    gas = Gas(
-        ConstantRestitution(1.0),
-        diameter=header_number(header, "diameter"),
-        mass=1.0,
-        packing_fraction=header_number(header, "eta"),
-        temperature=1.0,
-        dimension=header_count(header, "dimension") or 3,
-        **elements,
-    )
-    return 2 / gas.dimension * float(gas.collision_frequency)
-
-
 def _fit_memory(
-    path: Path, steps: list[Step], T: np.ndarray, header: dict[str, str], enskog: float | None
-) -> tuple[float, list[str]]:
-    """Return nu_v/sqrt(T), 1/m, from the correlations of displacements, and notes.
+    steps: list[Step], T: np.ndarray, header: dict[str, str], elements: dict[str, Any]
+) -> tuple[float, list[str], list[str]]:
+    """Return nu_v/sqrt(T), 1/m, from the correlations of displacements; notes and questions.
 
     With the velocity autocorrelation ``exp(-nu_v t)`` and an error e of the positions
 
         <dx_k^2> = T f_k + 2 e^2,    <dx_k dx_l> = T h_k h_l exp(-nu_v gap) - e^2 (if they touch),
 
     where f and h are integrals over the intervals and gap is the time between these. Enskog's rate
-    is known with the error `ENSKOG_ERROR`. An e that the header lacks and that is significant is
-    added to the header.
+    of elastic spheres, if the header gives eta and diameter, is known with the error
+    `ENSKOG_ERROR`. An e that the header lacks and that is significant is added to the header.
     """
+    enskog = None
+    if {"eta", "diameter"} <= header.keys():
+        gas = Gas(
+            ConstantRestitution(1.0),
+            diameter=header_number(header, "diameter"),
+            mass=1.0,
+            packing_fraction=header_number(header, "eta"),
+            temperature=1.0,
+            dimension=header_count(header, "dimension") or 3,
+            **elements,
+        )
+        enskog = 2 / gas.dimension * float(gas.collision_frequency)
+    given = "localisation_error" in header
+    e = header_number(header, "localisation_error") if given else 0.0
+    if e < 0:
+        raise ValueError(f"header line localisation_error: must be >= 0, got {e:g}")
     i, j, correlation, weight = _correlations(steps)
     if not (np.all(T > 0) and len(correlation)):
-        return enskog or 0.0, []
-    time = np.array([step.time for step in steps])
-    duration = np.array([step.duration for step in steps])
+        return enskog or 0.0, [], []
+    time, duration = np.transpose([(step.time, step.duration) for step in steps])
     D = T * duration**2
     unit = float(np.median(D))
     gap = np.maximum(time[j] - time[i] - (duration[j] + duration[i]) / 2, 0.0)
     touch = gap < 1e-6 * duration[i]
-    given = "localisation_error" in header
-    e_squared = header_number(header, "localisation_error") ** 2 / unit if given else 0.0
     prior = None if enskog is None else enskog * unit**0.5
 
     def residuals(parameters: np.ndarray) -> np.ndarray:
-        rate, square = [*parameters, e_squared][:2]
+        rate, square = [*parameters, e**2 / unit][:2]
         moved = np.maximum(D / unit - 2 * square, 1e-3)
         x = rate * np.sqrt(moved)
         for _ in range(NUM_ITERATIONS):
@@ -478,7 +464,7 @@ def _fit_memory(
         found = least_squares(residuals, start, bounds=bounds)
         return found.x, np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
 
-    notes: list[str] = []
+    notes, questions = [], []
     start = [prior or 0.1]
     found, error = fit(start)
     if not given:
@@ -488,16 +474,15 @@ def _fit_memory(
             e = float(np.sqrt(both[1] * unit))
             header["localisation_error"] = repr(e)
             notes = [f"localisation_error not given, and estimated as {e:.2g} m"]
-            warnings.warn(f"{path}: {notes[0]}; measure it and add it to the header", stacklevel=4)
+            questions = [f"{notes[0]}; measure it and add it to the header"]
     if prior is None and found[0] < MIN_SIGMAS * error[0]:
-        return 0.0, notes
+        return 0.0, notes, questions
     if prior is not None and abs(found[0] / prior - 1) > MAX_RATE_ERROR:
-        warnings.warn(
-            f"{path}: velocities change {found[0] / prior:.2g} times as fast as impacts at this "
-            "eta and diameter change them: check these and the tracks",
-            stacklevel=4,
+        questions.append(
+            f"velocities change {found[0] / prior:.2g} times as fast as impacts at this eta and "
+            "diameter change them: check these and the tracks"
         )
-    return found[0] / unit**0.5, notes
+    return found[0] / unit**0.5, notes, questions
 
 
 def _correlations(steps: list[Step]) -> tuple[np.ndarray, ...]:
@@ -520,36 +505,11 @@ def _mean_memory(x: np.ndarray) -> np.ndarray:
     return np.where(x < 1e-6, 1.0, -np.expm1(-safe) / safe)
 
 
-def _correct_impacts(
-    path: Path, T: Float[np.ndarray, "times"], duration: np.ndarray, rate: float
-) -> tuple[Float[np.ndarray, "times"], list[str]]:
-    """Return T corrected for impacts between frames, and a note."""
-    if rate == 0:
-        return T, ["impacts between frames not corrected (the velocities show none)"]
-    true = T
-    for _ in range(NUM_ITERATIONS):
-        true = T / _displacement_factor(rate * duration * np.sqrt(true))
-    share = float(np.max(1 - T / true))
-    _warn_of_correction(
-        path, "impacts between frames take", share, "from", "use frames closer together"
-    )
-    return true, [f"impacts between frames corrected, at most {100 * share:.2g} % of T"]
-
-
 def _displacement_factor(x: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
     """Return ``2 (exp(-x) - 1 + x)/x^2``, T from displacements over x relaxation times, over T."""
     small = x < 1e-3
     safe = np.where(small, 1.0, x)
     return np.where(small, 1 - x / 3, 2 * (np.expm1(-safe) + safe) / safe**2)
-
-
-def _warn_of_correction(path: Path, cause: str, share: float, direction: str, advice: str) -> None:
-    if share > MAX_CORRECTION:
-        warnings.warn(
-            f"{path}: {cause} up to {100 * share:.2g} % {direction} T, too much for an accurate "
-            f"correction: {advice}",
-            stacklevel=5,
-        )
 
 
 def curve_of_trajectory(
@@ -577,22 +537,23 @@ def curve_of_trajectory(
             without times.
     """
     header = dict(header)
-    values: dict[str, list[float]] = {}
-    with name_in_errors(path):
-        for k, read in enumerate(open_frames(path)):
-            try:
-                frame, d = checked_frame(read(), header_count(header, "dimension"))
-                _add_to_header(header, frame, d)
-                quantities = {"times": _time(k, frame, header), **_quantities(frame, header)}
-            except ValueError as error:
-                raise ValueError(f"frame {k}: {error}") from None
-            for name, value in quantities.items():
-                values.setdefault(name, []).append(value)
-        fields: dict[str, Any] = {name: jnp.asarray(x) for name, x in values.items()}
-        curve = CoolingCurve(**fields)
-        curve.check("frame {}".format)
+    rows: list[dict[str, float]] = []
+    for k, read in enumerate(open_frames(path)):
+        try:
+            frame, d = checked_frame(read(), header_count(header, "dimension"))
+            _add_to_header(header, frame, d)
+            rows.append({"times": _time(k, frame, header), **_quantities(frame, header)})
+        except ValueError as error:
+            raise ValueError(f"frame {k}: {error}") from None
+    if not rows:
+        raise ValueError("it has no frames")
+    fields: Any = {
+        name: jnp.asarray([row[name] for row in rows if name in row]) for name in rows[0]
+    }
+    curve = CoolingCurve(**fields)
+    curve.check("frame {}".format)
     if curve.times[0] == 0:
-        header.setdefault("T0", repr(values["temperature"][0]))
+        header.setdefault("T0", repr(rows[0]["temperature"]))
     header["T_from"] = "T = <v^2>/d of the particles of each frame, in the frame at rest"
     return curve, {key: x for key, x in header.items() if key not in ("timestep", "frame_rate")}
 
