@@ -60,7 +60,8 @@ def array_module(*trees: Any) -> Any:
 def as_jax_arrays(tree: Any) -> Any:
     """Return a pytree in which arrays and numbers of NumPy have become arrays of JAX."""
     numpy = np.ndarray, np.generic
-    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, numpy) else x, tree)
+    # jnp.asarray would compile a program for each length.
+    return jax.tree.map(lambda x: concrete_array(x) if isinstance(x, numpy) else x, tree)
 
 
 def grid_size(size: int) -> int:

@@ -251,9 +251,9 @@ def _describe_alternatives(
         yield f"known to be absent: {', '.join(absent)}"
     if any(curve_and_gas(result, k)[1].drive is not None for k in result.comparisons):
         yield "additional loss terms were not tested: the gas is driven"
-    name = result.names[0]
+    name, estimate = result.names[0], np.asarray(result.estimate)[0]
     for alternative in alternatives:
-        value = _describe_range(alternative.low[0], alternative.high[0], result.estimate[0])
+        value = _describe_range(alternative.low[0], alternative.high[0], estimate)
         if alternative.preferred:
             yield (
                 f"{alternative.name} added to the model decreases chi^2 by "

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran._utils.tracing import as_jax_arrays
+from jaxgran._utils.tracing import as_jax_arrays, concrete_array
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.parameters import Priors, with_floats
 from jaxgran.fitting.residuals import MODEL_ERROR, Measurement
@@ -95,7 +95,7 @@ def _error_model(curve: CoolingCurve, gas: Gas, comparison: Comparison) -> Error
     before = np.zeros(int(times[0] > 0), times.dtype)
 
     def with_start(values: ArrayLike, first: Any = 0.0) -> Array:
-        return jnp.asarray(np.concatenate([before + np.asarray(first), np.asarray(values)]))
+        return concrete_array(np.concatenate([before + np.asarray(first), np.asarray(values)]))
 
     curve_from_start = CoolingCurve(
         times=with_start(times),

@@ -49,9 +49,9 @@ def with_floats(gas: Gas, values: dict[str, Any]) -> Gas:
     """Return a gas with new values of some floats, whose ranges are not checked."""
     if not values:
         return gas
-    paths = [gas._float_fields[name].path for name in values]
+    fields = gas._float_fields
     return eqx.tree_at(
-        lambda gas: [reduce(getattr, path, gas) for path in paths],
+        lambda gas: [reduce(getattr, fields[name].path, gas) for name in values],
         gas,
         [float_array(value) for value in values.values()],
     )

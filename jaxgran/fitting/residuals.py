@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran._utils.tracing import any_traced, array_module
+from jaxgran._utils.tracing import any_traced, array_module, as_jax_arrays
 from jaxgran._utils.validation import float_array, no_type_check
 from jaxgran.data.curve import QUANTITIES, WITH_ERRORS, CoolingCurve, Run
 from jaxgran.data.curve_file import DropTest
@@ -304,8 +304,8 @@ class Measurement:
         absent = () if self.scene.surface is not None else ("rotational_temperature",)
         if self.scene.container is not None:
             absent += "displacement", "diffusion"
-        fields: dict[str, Any] = {k: jnp.asarray(x) for k, x in computed.items() if k not in absent}
-        return CoolingCurve(times=self.curve.times, **fields)
+        fields: dict[str, Any] = {k: x for k, x in computed.items() if k not in absent}
+        return CoolingCurve(times=self.curve.times, **as_jax_arrays(fields))
 
     def with_scatter_as_error(self, rows: list[Rows], num_free: int) -> "Measurement":
         """Return the comparison with the scatter of ln T in residuals of weight 1 as its error."""
@@ -357,8 +357,8 @@ def _log_curve(
         inverse = xp.argsort(order)
     linear = linearise(model, gas, distance[order], tolerance)
     values = {k: x[inverse] if x.ndim else x for k, x in linear.values.items()}
-    firsts = {"temperature": gas.temperature}
-    if "rotational_temperature" in gas.domains:
+    firsts = {"temperature": gas.temperature} if around else {}
+    if around and "rotational_temperature" in gas.domains:
         firsts["rotational_temperature"] = gas.value("rotational_temperature")
     logs = {}
     for name, by_time in linear.by_time.items():
@@ -366,7 +366,7 @@ def _log_curve(
         safe = xp.where(value > 0, value, 1.0)
         log = xp.where(value > 0, xp.log(safe), xp.where(value <= 0, -xp.inf, xp.nan))
         by_float = {key: by[name][inverse] / safe[:, None] for key, by in linear.by_float.items()}
-        if around and name in firsts:
+        if name in firsts:
             first = xp.asarray(firsts[name])
             log_first = xp.log(xp.where(first > 0, first, 1.0))
             reflect = before & (first > 0)
