@@ -385,10 +385,11 @@ def import_extra(name: str, extra: str = "notebook") -> Any:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
-        if error.name != name:
+        package = name.partition(".")[0]
+        if error.name != package:
             raise
         raise ModuleNotFoundError(
-            f'this needs {name}: pip install "jaxgran[{extra}]"', name=name
+            f'this needs {package}: pip install "jaxgran[{extra}]"', name=package
         ) from None
 
 

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxgran.data.curve import Particles
+from jaxgran.data.curve import Particles, import_extra
 from jaxgran.data.files import check_writable, name_in_errors, read_bytes
 
 GSD = ".gsd"
@@ -62,8 +62,14 @@ XYZ_VECTORS = {
 }
 """Names of the columns of properties of an extended XYZ file."""
 
-EQUAL = ("type", "element", "species", "Z", "diameter", "radius", "mass", "masses", "density")
-"""Columns that must be equal for all particles: gases of jaxgran consist of equal spheres."""
+EQUAL = {
+    **dict.fromkeys(("type", "element", "species", "Z")),
+    **dict.fromkeys(("diameter", "radius"), (1, 0)),
+    **dict.fromkeys(("mass", "masses"), (0, 1)),
+    "density": (-3, 1),
+}
+"""Columns that must be equal for all particles, as gases of jaxgran consist of equal spheres, and
+the powers of m and kg in the unit of numbers."""
 
 DUMP_ITEMS = ("UNITS", "TIMESTEP", "TIME", "NUMBER OF ATOMS", "BOX BOUNDS", "ATOMS")
 
@@ -71,31 +77,27 @@ SLANTED = "its box is slanted; only rectangular boxes are supported"
 
 
 class Frame(NamedTuple):
-    """Content of one frame of a file, in SI.
+    """Particles of one frame of a file, in SI, in the d dimensions of their gas.
 
     Attributes:
-        position: m, shape (N, 3).
-        velocity: m/s, shape (N, 3), or None if the frame has none.
-        low: low corner of the box, m.
-        sides: of the box, m.
+        position: m, shape (N, d), relative to the low corner of the box.
+        velocity: m/s, shape (N, d).
+        sides: of the box, m, shape (d,).
         spin: angular velocity, 1/s, or None.
-        equal: columns that must be equal for all particles, by name.
-        periodic: whether the box is periodic in x, y, z.
+        equal: columns that are equal for all particles, by name.
+        periodic: whether the box is periodic.
         time: s, or None if the file gives no time.
         step: number of the time step, or None.
-        dimension: 2 or 3, or None if the file does not give it.
     """
 
     position: np.ndarray
-    velocity: np.ndarray | None
-    low: np.ndarray
+    velocity: np.ndarray
     sides: np.ndarray
     spin: np.ndarray | None
     equal: dict[str, np.ndarray]
-    periodic: tuple[bool, ...] = (True, True, True)
-    time: float | None = None
-    step: int | None = None
-    dimension: int | None = None
+    periodic: bool
+    time: float | None
+    step: int | None
 
 
 def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None = None) -> Particles:
@@ -140,11 +142,18 @@ def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None =
         frames = open_frames(path)
         if not -len(frames) <= frame < len(frames):
             raise ValueError(f"it has {len(frames)} frames, there is no frame {frame}")
-        return _to_particles(*checked_frame(frames[frame](), dimension))
+        read = frames[frame](dimension)
+    is_cube = np.ptp(read.sides) <= TOLERANCE * read.sides[0]
+    return Particles(
+        position=jnp.asarray(read.position[None]),
+        velocity=jnp.asarray(read.velocity[None]),
+        box_side=jnp.asarray(read.sides[0] if is_cube else read.sides),
+        angular_velocity=None if read.spin is None else jnp.asarray(read.spin[None]),
+    )
 
 
-def open_frames(path: Path) -> list[Callable[[], Frame]]:
-    """Return a function for each frame of a file, which reads it."""
+def open_frames(path: Path) -> list[Callable[[int | None], Frame]]:
+    """Return a function for each frame of a file, which reads it, given its dimension or None."""
     if path.suffix == GSD:
         if not path.exists():
             raise FileNotFoundError
@@ -152,28 +161,83 @@ def open_frames(path: Path) -> list[Callable[[], Frame]]:
             return [partial(_read_gsd, path, k) for k in range(len(file))]
     text = read_bytes(path).decode()
     if text.lstrip().startswith("ITEM:"):
-        return _open_dump(text)
-    if text.split(maxsplit=1)[:1] and text.split(maxsplit=1)[0].isdigit():
-        return _open_xyz(text)
-    return [partial(_read_data, text)]
+        read, parts = _read_dump, _parts_of_dump(text)
+    elif text.split(maxsplit=1)[:1] and text.split(maxsplit=1)[0].isdigit():
+        read, parts = _read_xyz, _parts_of_xyz(text)
+    else:
+        return [partial(_read_data, text)]
+    frames: list[Any] = [partial(read, part) for part in parts]
+    if not text.endswith("\n"):
+        frames[-1:] = [_refuse_cut]
+    return frames
 
 
-def checked_frame(frame: Frame, dimension: int | None) -> tuple[Frame, int]:
-    """Return a frame of equal particles, positions relative to the low corner, and its dimension.
+def _refuse_cut(dimension: int | None) -> Frame:
+    raise ValueError(
+        "it ends within a line, so that its last number may be cut off: end the last line if the "
+        "file is complete, or read a frame before the last one"
+    )
+
+
+def _frame(
+    columns: dict[str, np.ndarray],
+    low: np.ndarray,
+    sides: np.ndarray,
+    dimension: int | None,
+    *,
+    units: str = "si",
+    periodic: tuple[bool, ...] = (True, True, True),
+    time: float | None = None,
+    step: int | None = None,
+) -> Frame:
+    """Return a frame in SI of columns of text or numbers, sorted by id.
 
     Raises:
         ValueError: for values, boxes and particles that `read_particles` does not support.
     """
-    if frame.velocity is None:
+    if units.lower() not in UNITS:
+        raise ValueError(
+            f"its units are {units!r}, without a size in m: convert it to SI. Known units are "
+            f"{', '.join(UNITS)}"
+        )
+    length, second, kilogram = UNITS[units.lower()]
+    if "id" in columns:
+        ids = columns["id"].astype(int)
+        if len(set(ids)) < len(ids):
+            raise ValueError("it has an id twice; remove one of its particles")
+        columns = {name: column[np.argsort(ids)] for name, column in columns.items()}
+
+    def vector(names: tuple[str, ...]) -> np.ndarray | None:
+        known = [columns[name].astype(float) for name in names if name in columns]
+        return np.stack(known, axis=1) if len(known) == len(names) else None
+
+    d = dimension or 3
+    position = next((x for names in POSITIONS if (x := vector(names)) is not None), None)
+    velocity = vector(VELOCITY)
+    spin = vector(SPIN) if SPIN[0] in columns else vector(SPIN[-1:])
+    if position is None:
+        raise ValueError(f"it has no columns {' or '.join(map(' '.join, POSITIONS))}")
+    if velocity is None:
         raise ValueError(
             "it has no velocities in this frame: write the columns vx vy vz (LAMMPS), velo (XYZ; "
             "not momenta), or particles/velocity into every frame (GSD; HOOMD needs "
             "dynamic=['property', 'momentum'] for it)"
         )
-    d = dimension or frame.dimension or 3
-    low, sides, periodic = frame.low[:d], frame.sides[:d], all(frame.periodic[:d])
-    position, velocity = frame.position[:, :d] - low, frame.velocity[:, :d]
-    different = [name for name, values in frame.equal.items() if not _all_equal(values)]
+    if not columns.keys() & {"x", "xu"}:
+        position = low + position * sides
+    sides, low = length * sides[:d], length * low[:d]
+    position, velocity = length * position[:, :d] - low, length / second * velocity
+    equal, different = {}, []
+    for name in EQUAL.keys() & columns.keys():
+        powers, values = EQUAL[name], columns[name]
+        if powers is None:
+            is_equal = len(set(values)) <= 1
+        else:
+            values = length ** powers[0] * kilogram ** powers[1] * values.astype(float)
+            is_equal = np.ptp(values) <= FLOAT32_TOLERANCE * np.max(np.abs(values))
+        equal[name] = values
+        different += [] if is_equal else [name]
+    is_periodic, still = all(periodic[:d]), not np.any(velocity[:, 2]) and np.any(velocity)
     for wrong, message in (
         (
             different,
@@ -186,50 +250,31 @@ def checked_frame(frame: Frame, dimension: int | None) -> tuple[Frame, int]:
         ),
         (not np.all(sides > 0), f"its box has the sides {sides}, which must be positive"),
         (
-            any(frame.periodic[:d]) and not periodic,
+            any(periodic[:d]) and not is_periodic,
             "its box is periodic in some directions only; boxes of jaxgran are periodic, or have "
             "walls, on all sides",
         ),
         (
-            not periodic and np.any((position < 0) | (position > sides)),
+            not is_periodic and np.any((position < 0) | (position > sides)),
             "some particles are outside of its box, which is not periodic",
         ),
         (
-            dimension is None and frame.dimension is None and _is_flat(position, velocity),
+            dimension is None and still and np.ptp(position[:, 2]) == 0,
             "all its particles move in one plane: give dimension=2 for disks, or 3",
         ),
     ):
         if wrong:
             raise ValueError(message)
-    if periodic:
+    if is_periodic:
         position = np.mod(position, sides)
         position = np.where(position < sides, position, 0.0)  # rounding may give a side
-    spin = frame.spin if frame.spin is None or d == 3 else frame.spin[:, -1:]
-    return frame._replace(position=position, velocity=velocity, sides=sides, spin=spin), d
+    if spin is not None:
+        spin = (spin if d == 3 else spin[:, -1:]) / second
+    time = None if time is None else second * time
+    return Frame(position, velocity[:, :d], sides, spin, equal, is_periodic, time, step)
 
 
-def _is_flat(position: np.ndarray, velocity: np.ndarray) -> bool:
-    still = not np.any(velocity[:, 2]) and np.any(velocity)
-    return bool(still and np.ptp(position[:, 2]) == 0)
-
-
-def _all_equal(values: np.ndarray) -> bool:
-    if values.dtype.kind not in "fiu":
-        return len(set(values)) <= 1
-    return bool(np.ptp(values) <= FLOAT32_TOLERANCE * np.max(np.abs(values)))
-
-
-def _to_particles(frame: Frame, d: int) -> Particles:
-    is_cube = np.ptp(frame.sides) <= TOLERANCE * frame.sides[0]
-    return Particles(
-        position=jnp.asarray(frame.position[None]),
-        velocity=jnp.asarray(frame.velocity)[None],
-        box_side=jnp.asarray(frame.sides[0] if is_cube else frame.sides),
-        angular_velocity=None if frame.spin is None else jnp.asarray(frame.spin[None]),
-    )
-
-
-def _read_gsd(path: Path, k: int) -> Frame:
+def _read_gsd(path: Path, k: int, dimension: int | None) -> Frame:
     with _import_gsd().open(str(path), "r") as file:
         snapshot = file[k]
         # gsd returns the velocities of the first frame for a frame without, and 0 for the first. It
@@ -237,46 +282,24 @@ def _read_gsd(path: Path, k: int) -> Frame:
         known = file.file.application.startswith("jaxgran") or file.file.chunk_exists(
             k, "particles/velocity"
         )
-    particles = snapshot.particles
-    sides, tilts = np.split(np.asarray(snapshot.configuration.box, float), 2)
+    particles, box = snapshot.particles, snapshot.configuration
+    sides, tilts = np.split(np.asarray(box.box, float), 2)
     if np.any(tilts != 0):
         raise ValueError(SLANTED)
     spin, time = (snapshot.log.get(name) for name in ("particles/angular_velocity", "time"))
-    return Frame(
-        position=np.asarray(particles.position, float),
-        velocity=np.asarray(particles.velocity, float) if known else None,
-        low=-sides / 2,
-        sides=sides,
-        spin=None if spin is None else np.reshape(spin, (int(particles.N), -1)),
-        equal={
-            "type": particles.typeid,
-            "diameter": particles.diameter,
-            "mass": particles.mass,
-        },
-        time=None if time is None else float(time[0]),
-        step=int(snapshot.configuration.step),
-        dimension=int(snapshot.configuration.dimensions),
-    )
+    columns = {"type": particles.typeid, "diameter": particles.diameter, "mass": particles.mass}
+    columns |= zip("xyz", np.asarray(particles.position, float).T, strict=True)
+    if known:
+        columns |= zip(VELOCITY, np.asarray(particles.velocity, float).T, strict=True)
+    if spin is not None:
+        spin = np.reshape(spin, (int(particles.N), -1)).T
+        columns |= zip(SPIN[-len(spin) :], spin, strict=True)
+    time, dimension = None if time is None else float(time[0]), dimension or int(box.dimensions)
+    return _frame(columns, -sides / 2, sides, dimension, time=time, step=int(box.step))
 
 
-def _readers(
-    read: Callable[[Any], Frame], parts: list[Any], text: str
-) -> list[Callable[[], Frame]]:
-    """Return readers of the parts of a text, whose last line must be complete."""
-    frames: list[Callable[[], Frame]] = [partial(read, part) for part in parts]
-    if not text.endswith("\n"):
-        frames[-1:] = [_refuse_cut]
-    return frames
-
-
-def _refuse_cut() -> Frame:
-    raise ValueError(
-        "it ends within a line, so that its last number may be cut off: end the last line if the "
-        "file is complete, or read a frame before the last one"
-    )
-
-
-def _open_dump(text: str) -> list[Callable[[], Frame]]:
+def _parts_of_dump(text: str) -> list[dict[str, tuple[list[str], str]]]:
+    """Return words and lines of each item of each frame of a LAMMPS dump, by name."""
     frames, items = [], {}
     for section in re.split(r"^ITEM: ", text, flags=re.MULTILINE)[1:]:
         head, _, body = section.partition("\n")
@@ -285,12 +308,10 @@ def _open_dump(text: str) -> list[Callable[[], Frame]]:
         if name == "ATOMS":
             frames.append(items)
             items = {"UNITS": items["UNITS"]} if "UNITS" in items else {}
-    if items.keys() - {"UNITS"}:
-        frames.append(items)
-    return _readers(_read_dump, frames, text)
+    return frames + ([items] if items.keys() - {"UNITS"} else [])
 
 
-def _read_dump(items: dict[str, tuple[list[str], str]]) -> Frame:
+def _read_dump(items: dict[str, tuple[list[str], str]], dimension: int | None) -> Frame:
     if not {"BOX BOUNDS", "ATOMS", "NUMBER OF ATOMS"} <= items.keys():
         raise ValueError("the frame of the LAMMPS dump is incomplete")
     flags, bounds = items["BOX BOUNDS"]
@@ -301,22 +322,21 @@ def _read_dump(items: dict[str, tuple[list[str], str]]) -> Frame:
     low, high = np.array([line.split()[:2] for line in bounds.splitlines()[:3]], float).T
     names, body = items["ATOMS"]
     rows = [line.split() for line in body.splitlines() if line.strip()]
-    count = int(items["NUMBER OF ATOMS"][1])
-    step, time = (
-        items[name][1].strip() if name in items else None for name in ("TIMESTEP", "TIME")
-    )
-    return _frame_of_columns(
-        _table(rows, names, count),
+    words = {name: body.strip() for name, (_, body) in items.items()}
+    return _frame(
+        _table(rows, names, int(words["NUMBER OF ATOMS"])),
         low,
         high - low,
-        units=items["UNITS"][1].strip() if "UNITS" in items else "si",
+        dimension,
+        units=words.get("UNITS", "si"),
         periodic=tuple("p" in flag for flag in flags) or (True,) * 3,
-        time=None if time is None else float(time),
-        step=None if step is None else int(step),
+        time=float(words["TIME"]) if "TIME" in words else None,
+        step=int(words["TIMESTEP"]) if "TIMESTEP" in words else None,
     )
 
 
-def _open_xyz(text: str) -> list[Callable[[], Frame]]:
+def _parts_of_xyz(text: str) -> list[list[str]]:
+    """Return the lines of each frame of an extended XYZ file."""
     lines, frames, at = text.splitlines(), [], 0
     while at < len(lines):
         if not lines[at].strip():
@@ -327,10 +347,10 @@ def _open_xyz(text: str) -> list[Callable[[], Frame]]:
         end = at + 2 + int(lines[at])
         frames.append(lines[at:end])
         at = end
-    return _readers(_read_xyz, frames, text)
+    return frames
 
 
-def _read_xyz(lines: list[str]) -> Frame:
+def _read_xyz(lines: list[str], dimension: int | None) -> Frame:
     head = lines[1] if len(lines) > 1 else ""
     info = dict(part.split("=", 1) for part in shlex.split(head) if "=" in part)
     info = {key.lower(): value for key, value in info.items()}
@@ -349,19 +369,20 @@ def _read_xyz(lines: list[str]) -> Frame:
         several = XYZ_VECTORS.get(name, [f"{name}_{k}" for k in range(number)])
         # In a plane the only component of the angular velocity is that of z.
         names += [name] if number == 1 and name not in XYZ_VECTORS else several[-number:]
-    table = _table([line.split() for line in lines[2:]], names, int(lines[0]))
-    return _frame_of_columns(
-        table,
+    if dimension is None and "dimension" in info:
+        dimension = int(info["dimension"])
+    return _frame(
+        _table([line.split() for line in lines[2:]], names, int(lines[0])),
         np.array(info.get("origin", "0 0 0").split(), float),
         np.diag(lattice),
+        dimension,
         units=info.get("units", "si"),
         periodic=tuple(x in "Tt1" for x in re.findall("[TtFf01]", info.get("pbc", "TTT"))),
         time=float(info["time"]) if "time" in info else None,
-        dimension=int(info["dimension"]) if "dimension" in info else None,
     )
 
 
-def _read_data(text: str) -> Frame:
+def _read_data(text: str, dimension: int | None) -> Frame:
     bounds = [re.search(rf"^\s*(\S+)\s+(\S+)\s+{x}lo {x}hi", text, re.MULTILINE) for x in "xyz"]
     if not all(bounds):
         raise ValueError(
@@ -379,7 +400,8 @@ def _read_data(text: str) -> Frame:
     if np.any(atoms["id"] != velocities["id"]):
         raise ValueError("its sections Atoms and Velocities have different ids")
     units = re.search(r"^.*units = (\w+)", text)
-    return _frame_of_columns(atoms | velocities, low, high - low, units[1] if units else "si")
+    units = units[1] if units else "si"
+    return _frame(atoms | velocities, low, high - low, dimension, units=units)
 
 
 def _section(
@@ -402,58 +424,6 @@ def _table(rows: list[list[str]], names: Sequence[str], count: int) -> dict[str,
         )
     columns = np.array(rows, object).reshape(count, len(names)).T
     return dict(zip(names, columns, strict=True))
-
-
-def _frame_of_columns(
-    table: dict[str, np.ndarray],
-    low: np.ndarray,
-    sides: np.ndarray,
-    units: str = "si",
-    **others: Any,
-) -> Frame:
-    """Return a frame in SI of columns, sorted by id."""
-    if units.lower() not in UNITS:
-        raise ValueError(
-            f"its units are {units!r}, without a size in m: convert it to SI. Known units are "
-            f"{', '.join(UNITS)}"
-        )
-    length, second, kilogram = UNITS[units.lower()]
-    if "id" in table:
-        ids = table["id"].astype(int)
-        if len(set(ids)) < len(ids):
-            raise ValueError("it has an id twice; remove one of its particles")
-        table = {name: column[np.argsort(ids)] for name, column in table.items()}
-
-    def vector(names: tuple[str, ...]) -> np.ndarray | None:
-        known = [table[name].astype(float) for name in names if name in table]
-        return np.stack(known, axis=1) if len(known) == len(names) else None
-
-    position = next((x for names in POSITIONS if (x := vector(names)) is not None), None)
-    if position is None:
-        raise ValueError(f"it has no columns {' or '.join(map(' '.join, POSITIONS))}")
-    if not table.keys() & {"x", "xu"}:
-        position = low + position * sides
-    velocity = vector(VELOCITY)
-    spin = vector(SPIN) if SPIN[0] in table else vector(SPIN[-1:])
-    factors = {"diameter": length, "radius": length, "mass": kilogram, "masses": kilogram}
-    factors |= {"density": kilogram / length**3}
-    equal = {name: table[name] for name in EQUAL if name in table}
-    equal |= {
-        name: factor * equal[name].astype(float)
-        for name, factor in factors.items()
-        if name in equal
-    }
-    time = others.pop("time", None)
-    return Frame(
-        position=length * position,
-        velocity=None if velocity is None else length / second * velocity,
-        low=length * low,
-        sides=length * sides,
-        spin=None if spin is None else spin / second,
-        equal=equal,
-        time=None if time is None else second * time,
-        **others,
-    )
 
 
 class Sphere(NamedTuple):
@@ -526,13 +496,7 @@ class Trajectory:
 
 
 def _import_gsd() -> Any:
-    try:
-        return import_module("gsd.hoomd")
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            'files of type .gsd need gsd: pip install "jaxgran[trajectories]", or use .xyz',
-            name=error.name,
-        ) from None
+    return import_extra("gsd.hoomd", "trajectories")
 
 
 def _append_gsd(path: Path, k: int, time: float, replica: Particles, sphere: Sphere) -> None:

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from jaxgran.data.curve import MIN_POINTS, CoolingCurve
 from jaxgran.data.files import header_count, header_number
-from jaxgran.data.particles import Frame, checked_frame, open_frames
+from jaxgran.data.particles import Frame, open_frames
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.laws import ConstantRestitution
@@ -540,8 +540,8 @@ def curve_of_trajectory(
     rows: list[dict[str, float]] = []
     for k, read in enumerate(open_frames(path)):
         try:
-            frame, d = checked_frame(read(), header_count(header, "dimension"))
-            _add_to_header(header, frame, d)
+            frame = read(header_count(header, "dimension"))
+            _add_to_header(header, frame)
             rows.append({"times": _time(k, frame, header), **_quantities(frame, header)})
         except ValueError as error:
             raise ValueError(f"frame {k}: {error}") from None
@@ -558,9 +558,9 @@ def curve_of_trajectory(
     return curve, {key: x for key, x in header.items() if key not in ("timestep", "frame_rate")}
 
 
-def _add_to_header(header: dict[str, str], frame: Frame, d: int) -> None:
+def _add_to_header(header: dict[str, str], frame: Frame) -> None:
     """Add what a frame says of the gas; raise ValueError if the header contradicts it."""
-    N, equal = len(frame.position), frame.equal
+    (N, d), equal = frame.position.shape, frame.equal
     told: dict[str, float] = {"N": N, "dimension": d}
     if "diameter" in equal or "radius" in equal:
         sigma = float(equal["diameter"][0] if "diameter" in equal else 2 * equal["radius"][0])
@@ -570,7 +570,7 @@ def _add_to_header(header: dict[str, str], frame: Frame, d: int) -> None:
                 told["density"] = float(equal["density"][0])
             elif "mass" in equal:
                 told["density"] = float(equal["mass"][0] / sphere_mass(sigma, 1.0))
-            if all(frame.periodic):
+            if frame.periodic:
                 volume = float(np.prod(frame.sides))
                 told["eta"] = N * (pi / 6 if d == 3 else pi / 4) * sigma**d / volume
     for key, value in told.items():
@@ -596,9 +596,7 @@ def _time(k: int, frame: Frame, header: dict[str, str]) -> float:
 
 def _quantities(frame: Frame, header: dict[str, str]) -> dict[str, float]:
     """Return T and T_rot of a frame, and their errors, by the names of the fields of a curve."""
-    assert frame.velocity is not None
-    n, d = frame.velocity.shape
-    velocity = frame.velocity - frame.velocity.mean(axis=0) * all(frame.periodic[:d])
+    velocity = frame.velocity - frame.velocity.mean(axis=0) * frame.periodic
     values: dict[str, float] = {}
     energies = {"temperature": np.mean(velocity**2, axis=1)}
     if frame.spin is not None and "diameter" in header:
@@ -608,6 +606,6 @@ def _quantities(frame: Frame, header: dict[str, str]) -> dict[str, float]:
     for name, each in energies.items():
         values |= {
             name: float(np.mean(each)),
-            f"{name}_error": float(np.std(each, ddof=1) / n**0.5),
+            f"{name}_error": float(np.std(each, ddof=1) / len(each) ** 0.5),
         }
     return values
