@@ -14,16 +14,12 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran import plotting
 from jaxgran._utils import status
 from jaxgran._utils.validation import ANY
 from jaxgran.data.curve import Run
 from jaxgran.particles import dynamics as moving
 from jaxgran.particles import run
-from jaxgran.particles.dynamics import run_segments
 from jaxgran.particles.run import _PROGRAMS, block_until_ready, in_thread, run_through_times
-from jaxgran.particles.soft.dynamics import DRIFT_TOLERANCE
-from jaxgran.particles.state import advance_time
 from jaxgran.scene.laws import ReducedLaw, RestitutionLaw
 from tests.beads import glass_beads
 
@@ -148,11 +144,6 @@ def test_a_checkpoint_that_cannot_be_written_is_told_before_the_run(tmp_path):
         cool(model=SOFT, checkpoint=tmp_path)
 
 
-def test_curves_of_lists_are_curves():
-    assert isinstance(CURVE.times, jax.Array)
-    CURVE.check()
-
-
 @pytest.mark.parametrize("name, value", [("packing_fraction", 0.9), ("dissipative_constant", -1.0)])
 def test_a_member_of_a_batch_out_of_range_says_so(name, value):
     good = float(GAS.value(name))
@@ -160,13 +151,6 @@ def test_a_member_of_a_batch_out_of_range_says_so(name, value):
     curve = jax.vmap(lambda x: cool(GAS.replace(**{name: x})))(values)
     assert curve.status[0] == status.OK and np.isfinite(curve.temperature[0])
     assert curve.status[1] == status.OUT_OF_RANGE.bit and np.isnan(curve.temperature[1])
-
-
-def test_bad_times_of_a_member_end_no_other():
-    times = jnp.array([[1.0, 2.0], [2.0, 1.0], [-1.0, 1.0]]) * TAU
-    curve = jax.vmap(lambda t: cool(times=t))(times)
-    assert list(curve.status) == [status.OK] + 2 * [status.OUT_OF_RANGE.bit]
-    np.testing.assert_allclose(curve.temperature[0], cool(times=times[0]).temperature)
 
 
 @pytest.mark.slow
@@ -180,20 +164,6 @@ def test_all_that_a_curve_does_not_determine_is_named():
     loose = [n for n in free if result.value(n)[1] > result.value(n)[0]]
     assert len(loose) > 2 and set(loose) <= set(result.undetermined())
     assert "temperature" not in result.undetermined()
-
-
-@pytest.mark.slow
-def test_a_picture_of_a_long_curve_draws_some_of_it(tmp_path):
-    times = np.linspace(0.1, 100.0, 200_000) * TAU
-    T = cool(times=times).temperature
-    curve = jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=0.02 * T)
-    result = jaxgran.fit(GAS, curve)
-    shown = plotting._drawn_indices(curve.times)
-    assert 500 < shown.size <= plotting.MAX_DRAWN and {0, times.size - 1} <= set(shown)
-    with pytest.raises(ValueError, match=r"axes must be two.*shape \(3,\)"):
-        jaxgran.plot_fit(result, curve, np.zeros(3))
-    plotting.save_fit(result, curve, "long", tmp_path / "long.png")
-    assert (tmp_path / "long.png").stat().st_size < 500_000
 
 
 # --- derivatives ---------------------------------------------------------------------------------
@@ -285,55 +255,6 @@ def test_waiting_can_be_interrupted(wait):
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, old)
     assert time.monotonic() - began < 1.5
-
-
-def soft_spheres(gas=GAS, replicas=1):
-    """Dynamics of soft spheres and their first state."""
-    model = jaxgran.SoftSpheres(20, replicas=replicas)
-    scene = model.scene(gas)
-    dynamics = model.dynamics(scene, model.planned(scene, 3))
-    start = cool(gas, [0.0], model=model).particles
-    inputs = start.position / gas.diameter, start.velocity / jnp.sqrt(gas.temperature)
-    return dynamics, dynamics.begin(*(x.reshape(-1, 3) for x in inputs), jnp.asarray(0.3))
-
-
-@pytest.mark.slow
-def test_a_shortened_step_recovers():
-    dynamics, state = soft_spheres()
-    state = state._replace(internal=state.internal._replace(refinement=jnp.asarray(4.0)))
-    end = jnp.asarray(3.0)
-    after, fault, _ = jax.jit(lambda s: run_segments(dynamics, s, end, "sweep", 1, None))(state)
-    assert fault == status.OK and after.internal.refinement == 1 and after.time == end
-    assert np.all(np.abs(after.internal.drift) < 1e-3)  # over some 600 blocks
-
-
-@pytest.mark.slow
-def test_small_energy_errors_add_up():
-    dynamics, state = soft_spheres()
-    drift = jnp.full(1, 0.5 * DRIFT_TOLERANCE)
-    for factor, fault in ((1, status.OK), (3, status.ENERGY_DRIFT.bit)):
-        begun = state._replace(internal=state.internal._replace(drift=factor * drift))
-        run = jax.jit(lambda s: run_segments(dynamics, s, jnp.asarray(1.0), "sweep", 1, None))
-        assert run(begun)[1] == fault
-
-
-@pytest.mark.slow
-def test_the_clock_of_single_precision_keeps_time():
-    step, count = 0.004, 300_000
-    state = soft_spheres()[1]
-    single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, state)
-    # Unlike a plain sum, which gains .7 % in each step from t = 1024 on.
-    end = jnp.float32(1e9)
-    after = jax.jit(
-        lambda s: jax.lax.fori_loop(
-            0, count, lambda _, s: advance_time(s, jnp.float32(step), end, jnp.asarray(False)), s
-        )
-    )(single)
-    assert after.time.dtype == jnp.float32
-    exact = count * float(np.float32(step))
-    np.testing.assert_allclose(after.time, exact, rtol=2e-7)
-    plain = np.cumsum(np.full(count, step, np.float32), dtype=np.float32)[-1]
-    assert abs(plain / exact - 1) > 1e-4
 
 
 @pytest.mark.slow

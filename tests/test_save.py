@@ -64,36 +64,6 @@ def test_is_of_the_particles_at_each_time(gas, model):
         np.testing.assert_allclose(curve.replicas.saved["S"][1][:, -1], own, rtol=1e-10)
 
 
-@pytest.mark.parametrize("model", [slow(MODELS[0]), MODELS[1], slow(MODELS[2])], ids=name_of)
-def test_compiles(gas, model):
-    sized = model if isinstance(model, jaxgran.DSMC) else model.sized_for(gas)
-    t = times(gas)[:2]
-    curve = jax.jit(lambda gas: jaxgran.cool(gas, t, model=sized, save=save))(gas)
-    np.testing.assert_allclose(curve.saved["T"], curve.temperature, rtol=1e-10)
-    if not isinstance(model, jaxgran.DSMC):
-        last = curve.particles
-        own = [observables.structure_factor(x, last.box_side, 2)[1] for x in last.position]
-        np.testing.assert_allclose(curve.replicas.saved["S"][1][:, -1], own, rtol=1e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", MODELS[1:], ids=lambda model: type(model).__name__)
-def test_derivatives_of_the_curve_are_the_same(gas, model):
-    t = times(gas)[:2]
-
-    def curve(a, save):
-        return jaxgran.cool(
-            gas.replace(dissipative_constant=a), t, model=model, save=save, progress=False
-        )
-
-    a = gas.value("dissipative_constant")
-    saving, plain = jax.jacfwd(curve)(a, save), jax.jacfwd(curve)(a, None)
-    np.testing.assert_array_equal(saving.temperature, plain.temperature)
-    assert jnp.all(jnp.isnan(saving.saved["T"]))  # not known, and not taken for 0
-    slope = jax.grad(lambda a: curve(a, save).temperature[-1])(a)
-    np.testing.assert_allclose(slope, plain.temperature[-1], rtol=1e-9)
-
-
 def test_particles_themselves(gas):
     t, model = times(gas), jaxgran.HardSpheres(100, replicas=2)
     curve = jaxgran.cool(gas, t, model=model, save="particles", progress=False)
@@ -123,20 +93,6 @@ def test_spins_of_rough_spheres(gas):
     for model in MODELS[1:]:
         curve = jaxgran.cool(rough, times(gas), model=model, save=rotation, progress=False)
         np.testing.assert_allclose(curve.saved, curve.rotational_temperature, rtol=1e-10)
-
-
-def test_a_run_is_resumed_with_what_it_saved(gas, tmp_path):
-    model, t = jaxgran.DSMC(100, replicas=2), times(gas)
-    run = {"model": model, "save": save, "progress": False}
-    whole = jaxgran.cool(gas, t, **run)
-    path = tmp_path / "run.npz"
-    jaxgran.cool(gas, t, checkpoint=path, **run)
-    again = jaxgran.cool(gas, t, checkpoint=path, **run)
-    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(a, b)
-    other = run | {"save": lambda p: save(p)}
-    with pytest.raises(ValueError, match="save was .*test_save.save .* and is .*lambda"):
-        jaxgran.cool(gas, t, checkpoint=path, **other)
 
 
 def test_a_file_keeps_what_was_saved(gas, tmp_path):

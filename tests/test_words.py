@@ -50,13 +50,5 @@ def test_floats_of_parts_are_attributes_of_the_gas():
         np.testing.assert_array_equal(again.dissipative_constant, gas.dissipative_constant)
 
 
-def test_an_invalid_model_is_answered_with_a_suggestion():
-    with pytest.raises(ValueError, match="got 'dsmc'. Use KineticTheory"):
-        jaxgran.cool(glass_beads(), [1.0], model="dsmc")
-    message = r"model must be an instance, got the class DSMC; did you mean DSMC\(N\)\?"
-    with pytest.raises(ValueError, match=message):
-        jaxgran.cool(glass_beads(), [1.0], model=jaxgran.DSMC)
-
-
 def test_completion_shows_only_public_names():
     assert set(dir(jaxgran)) == {*jaxgran.__all__, "plot_curve", "plot_fit"}

@@ -1,10 +1,9 @@
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxgran._utils import status
-from jaxgran._utils.status import FAULTS, LIST_FULL, NOT_FINITE, OK, STALLED, explain, flag, has
+from jaxgran._utils.status import FAULTS, LIST_FULL, OK, STALLED, explain, flag, has
 
 
 def test_every_fault_has_a_bit_of_its_own():
@@ -23,19 +22,6 @@ def test_flag_and_has(fault):
         assert bool(has(raised, other)) == (other == fault)
         assert not has(clear, other)
         assert has(raised | flag(other, True), fault)
-
-
-def test_status_of_a_batch():
-    when = jnp.array([[True, False], [True, True]])
-
-    @jax.jit
-    def of(when):
-        return flag(LIST_FULL, when) | flag(NOT_FINITE, ~when) | flag(STALLED, True)
-
-    result = of(when)
-    np.testing.assert_array_equal(result, [[33, 48], [33, 33]])
-    np.testing.assert_array_equal(has(result, LIST_FULL), when)
-    np.testing.assert_array_equal(jax.jit(lambda s: has(s, NOT_FINITE))(result), ~when)
 
 
 def test_explain():

@@ -10,8 +10,7 @@ import pytest
 
 import experiments.fit_cooling_curve as fit_cooling_curve
 import jaxgran
-from experiments.support.record import figures
-from jaxgran.cli.common import MODELS, choose_or_make_model, finite_or_null
+from jaxgran.cli.common import MODELS, choose_or_make_model
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 DENSE = EXPERIMENTS / "data" / "lammps_cooling_dense.csv"
@@ -105,13 +104,6 @@ def test_models_are_found_by_their_names(name, model):
             choose_or_make_model(options, None, None, (), None)
 
 
-@pytest.mark.slow
-def test_auto_takes_kinetic_theory_where_it_will_do(tmp_path):
-    done = run("fit_cooling_curve.py", "--model", "auto", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "Kinetic theory: the cheapest model whose estimated error of T" in done.stdout
-
-
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -164,23 +156,6 @@ def test_main_job_ends_with_one_line(arguments, words, tmp_path, monkeypatch, ca
 
 
 @pytest.mark.slow
-def test_main_job_writes_json_that_others_can_read(tmp_path, monkeypatch, capsys):
-    def refuse(word):
-        raise AssertionError(f"{word} is no JSON")
-
-    (tmp_path / "bare.csv").write_text(HEADER + ROWS)
-    options = "bare.csv", "--free", "A", "Y", "nu"  # of which only a combination is determined
-    code, said, _ = main_job(monkeypatch, capsys, tmp_path, *options)
-    assert code == 0
-    summary = json.loads(said.splitlines()[-1], parse_constant=refuse)
-    assert summary["A"] is None and summary["nu_std_err"] is None
-    assert said.count("not determined") == 3  # and not as a number with a huge error
-    (record,) = (tmp_path / "results").rglob("*.json")
-    json.loads(record.read_text(), parse_constant=refuse)
-    assert finite_or_null({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}
-
-
-@pytest.mark.slow
 def test_drop_tower_runs(tmp_path):
     done = run("fit/drop_tower.py", "--runs", 1, "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -200,19 +175,6 @@ def test_wrong_physics_runs(tmp_path):
             assert row["compatible"] == 0 or row["inside"] == 0, row
         if "rough" in row["name"] or "walls" in row["name"]:
             assert row["told_held"] == 2
-
-
-@pytest.mark.slow
-def test_main_job_reads_the_header_a_not(tmp_path):
-    # A header's A is only compared with: another one changes no estimate.
-    text = DENSE.read_text().replace("# A: 8e-05", "# A: 1")
-    (tmp_path / "other.csv").write_text(text)
-    done = run("fit_cooling_curve.py", "other.csv", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    (recorded,) = figures("lammps_curves_dense")["parameters"]
-    # Of the same fit with the header as it is, to the solver's tolerance of 1e-8, many times over.
-    found = json.loads(done.stdout.splitlines()[-1])["A"]
-    assert found == pytest.approx(recorded["estimate"], rel=1e-4)
 
 
 @pytest.mark.slow

@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import jaxgran
@@ -69,14 +68,6 @@ def test_more_exact_data_narrow_the_range():
         low, high = jaxgran.diagnose(result).ranges[A]
         widths.append(float(high[0] - low[0]))
     assert widths[1] < 0.6 * widths[0]
-
-
-def test_an_alternative_at_no_amplitude_is_the_fit():
-    gas = glass_beads(0.1)
-    result = jaxgran.fit(gas, measured(gas))
-    for alternative in jaxgran.diagnose(result).alternatives:
-        assert alternative.amplitude == 0 and alternative.improvement == pytest.approx(0, abs=1e-3)
-        np.testing.assert_allclose(alternative.estimate, result.estimate, rtol=1e-3)
 
 
 def test_unknown_absent_elements_are_refused():

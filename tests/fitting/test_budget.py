@@ -114,30 +114,6 @@ def test_the_clock_is_that_of_the_scene():
     assert 1.3 < choice.error / clock_error < 1.8, (choice.error, clock_error)
 
 
-@pytest.mark.slow
-def test_without_errors_the_residuals_have_their_scatter():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(5), relative_error=0.03)
-    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature)
-    result = jaxgran.fit(gas, bare)
-    assert result.names == BOTH and float(result.reduced_chi2) == pytest.approx(1)
-    assert float(jnp.std(result.residuals)) == pytest.approx(1, abs=0.1)
-    assert float(result.scatter) == pytest.approx(0.03, rel=0.25)
-
-
-@pytest.mark.slow
-def test_a_prior_counts_in_a_curve_without_errors():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(6), relative_error=0.05)
-    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature)
-    T_0 = float(gas.temperature)
-    loose, tight = (
-        jaxgran.fit(gas, bare, priors={"temperature": (1.3 * T_0, e * T_0)}) for e in (10.0, 1e-4)
-    )
-    assert abs(loose.estimate[1] / T_0 - 1) < 0.1
-    assert tight.estimate[1] == pytest.approx(1.3 * T_0, rel=1e-3)
-
-
 @pytest.mark.parametrize(
     "priors, message",
     [

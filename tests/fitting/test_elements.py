@@ -143,19 +143,6 @@ def test_A_is_right_where_the_scene_is_known(elements):
 
 
 @pytest.mark.slow
-def test_alternatives_know_the_elements_of_the_scene():
-    gas = dataclasses.replace(glass_beads(), container=jaxgran.Walls(0.05, restitution=0.8))
-    curve = measured(gas)
-    result = jaxgran.fit(gas, curve, free=("dissipative_constant", "temperature"))
-    diagnosis = jaxgran.diagnose(result, curve)
-    assert not any(x.preferred for x in diagnosis.alternatives)
-    names = [alternative.name for alternative in diagnosis.alternatives]
-    assert "an additional loss at constant eps, as by rough grains" in names
-    low, high = diagnosis.ranges["dissipative_constant"]
-    assert low < float(gas.value("dissipative_constant")) < high
-
-
-@pytest.mark.slow
 def test_a_measured_T_rot_of_smooth_spheres_is_said_to_be_unused(beads):
     gas = dataclasses.replace(glass_beads(), surface=ROUGH)
     with pytest.warns(UserWarning, match="T_rot.*is not used.*surface"):

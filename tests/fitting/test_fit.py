@@ -49,18 +49,6 @@ def test_guess_uses_the_data_not_the_gas():
 
 
 @pytest.mark.slow
-def test_starts_far_away_reach_the_same_answer():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(3))
-    best = jaxgran.fit(gas, curve)
-    for factor in (0.01, 100.0):
-        far = gas.replace(dissipative_constant=gas.value("dissipative_constant") * factor)
-        result = jaxgran.fit(gas, curve, start=far)
-        assert bool(result.converged)
-        np.testing.assert_allclose(result.estimate, best.estimate, rtol=1e-6)
-
-
-@pytest.mark.slow
 @pytest.mark.figures
 def test_intervals_cover_the_truth(record):
     # 500 noisy curves: a 95 % interval must cover in 93 to 97 % (2 standard errors of 500 trials).
@@ -134,20 +122,6 @@ def test_displacement_adds_information():
 
 
 @pytest.mark.slow
-def test_constant_restitution_is_fitted_too():
-    gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(0.85),
-        diameter=1.0,
-        mass=1.0,
-        packing_fraction=0.05,
-        temperature=1.0,
-    )
-    result = jaxgran.fit(gas, synthetic(gas, jax.random.key(7)), free=("coefficient",))
-    e, error = result.value("coefficient")
-    assert abs(e - 0.85) < 3 * error < 0.01
-
-
-@pytest.mark.slow
 def test_series_coefficients_are_fitted_together():
     law = jaxgran.RestitutionSeries([-0.2], [0.2])
     gas = jaxgran.Gas(law, diameter=1.0, mass=1.0, packing_fraction=0.05, temperature=1.0)
@@ -170,17 +144,6 @@ def test_parameters_that_cannot_be_told_apart_are_named():
             result = jaxgran.fit(gas, curve, free=free, model=model)
     diagnosis = jaxgran.diagnose(result, curve)
     assert any("does not determine" in reason for reason in diagnosis.reasons)
-
-
-@pytest.mark.slow
-def test_float32_warns():
-    with jax.enable_x64(False):
-        gas = glass_beads(0.15)
-        curve = synthetic(gas, jax.random.key(10))
-        with pytest.warns(UserWarning, match="fitting in float32"):
-            result = jaxgran.fit(gas, curve)
-    a, error = result.value("dissipative_constant")
-    assert abs(a - gas.value("dissipative_constant")) < 4 * error
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import optimistix as optx
 import pytest
 
 import jaxgran
-from tests.fitting.curves import synthetic
 
 
 @pytest.mark.slow
@@ -29,39 +28,6 @@ def test_fit_through_dsmc_agrees_with_kinetic_theory(beads):
     assert error < 0.025 * true
     assert 0 < result.error_budget["simulation"][0] < error
     assert "DSMC" in jaxgran.diagnose(result, curve).verdict
-
-
-@pytest.mark.slow
-def test_noise_of_a_simulation_is_counted_once_without_error_bars(beads):
-    # Measured with a scatter of 3 %, simulated with a noise of 1 %: told the scatter, or left to
-    # find it in the residuals, the same error, to the 11 % that 40 points tell it and as much again
-    # that the weights differ by (and three times the noise if it were inflated).
-    gas = beads(0.15)
-    curve = synthetic(gas, jax.random.key(13), relative_error=0.03)
-    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature)
-    model = jaxgran.DSMC(1000, replicas=3)
-    told, left = (
-        jaxgran.fit(
-            gas, c, model=model, free=("dissipative_constant",), max_steps=6, progress=False
-        )
-        for c in (curve, bare)
-    )
-    np.testing.assert_allclose(left.standard_error, told.standard_error, rtol=0.35)
-
-
-@pytest.mark.slow
-def test_the_key_is_that_of_the_simulations(beads):
-    gas = beads(0.15)
-    times = jnp.geomspace(0.3, 3.0, 8) * gas.mean_free_time
-    curve = jaxgran.CoolingCurve(times=times, temperature=jaxgran.cool(gas, times).temperature)
-    model = jaxgran.DSMC(100, replicas=2)
-    options = {"free": ("dissipative_constant",), "model": model}
-    options |= {"max_steps": 1, "progress": False}
-    default = jaxgran.fit(gas, curve, **options)
-    assert default.model is model and default.iterations == 1
-    same, other = (jaxgran.fit(gas, curve, **options, key=jax.random.key(k)) for k in (0, 1))
-    np.testing.assert_array_equal(default.estimate, same.estimate)
-    assert default.estimate[0] != other.estimate[0]
 
 
 def with_rotation(gas, model, error=0.02, end=30.0):

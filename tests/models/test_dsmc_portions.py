@@ -8,7 +8,6 @@ import pytest
 
 import jaxgran
 from jaxgran.particles.dsmc.collisions import MIN_SUBSET_SIZE, num_subsets, subset_of
-from tests.beads import glass_beads
 
 
 @pytest.mark.parametrize("n", [2, 15, 31, 257, 1000, 4096])
@@ -74,22 +73,3 @@ def test_walls_a_fraction_of_a_mean_free_path_apart_are_met_by_the_fast_spheres_
     assert float(fine.temperature[-1] / gas.temperature) < 0.8
     # Impacts of 20 000 spheres on walls, some each: sqrt(1/20 000) of a loss of .2, .2 % of T.
     np.testing.assert_allclose(curve.temperature, fine.temperature, rtol=0.006)
-
-
-def test_a_replica_takes_its_own_turns():
-    gas = dataclasses.replace(
-        glass_beads(),
-        surface=jaxgran.Rough(0.3, rotational_temperature=4e-3),
-        container=jaxgran.Walls(0.05, restitution=0.8, tangential_restitution=0.2),
-        drag=jaxgran.StokesDrag(1.0),
-        drive=jaxgran.WhiteNoise(0.05),
-    )
-    times = jnp.array([1.0, 4.0]) * gas.mean_free_time
-    two, three = (
-        jaxgran.cool(gas, times, model=jaxgran.DSMC(500, replicas=n), progress=False)
-        for n in (2, 3)
-    )
-    for name in ("temperature", "rotational_temperature", "collisions"):
-        each = [np.asarray(getattr(curve.replicas, name)) for curve in (two, three)]
-        # Two programs round sums in another order.
-        np.testing.assert_allclose(each[0], each[1][:2], rtol=1e-9)

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.models.hard_spheres import HardSpheres, reduced_hard_scene
-from jaxgran.particles import run
+from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.hard.dynamics import MIN_SKIN, HardDynamics
-from jaxgran.particles.run import _run_segments
 from tests.pairs import find_pairs
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
@@ -67,12 +65,9 @@ def serial(gas, start, end):
 @pytest.mark.parametrize(
     "dimension, packing_fraction, law",
     [
-        pytest.param(2, 0.1, 0.9, marks=pytest.mark.slow),
-        pytest.param(2, 0.6, 0.8, marks=pytest.mark.slow),
         (3, 0.02, jaxgran.Viscoelastic(5e7, 0.22, 1e-6)),
-        pytest.param(3, 0.3, jaxgran.RestitutionSeries([-0.1], [0.2]), marks=pytest.mark.slow),
+        pytest.param(2, 0.6, 0.8, marks=pytest.mark.slow),
         pytest.param(3, 0.45, 1.0, marks=pytest.mark.slow),
-        pytest.param(3, 0.2, 0.4, marks=pytest.mark.slow),
     ],
 )
 def test_impacts_are_those_of_a_serial_code(dimension, packing_fraction, law):
@@ -109,7 +104,7 @@ def closest(particles) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "dimension, packing_fraction, eps",
-    [pytest.param(2, 0.6, 0.7, marks=pytest.mark.slow), (3, 0.45, 1.0)],
+    [(2, 0.6, 0.7), (3, 0.45, 1.0)],
 )
 def test_spheres_stay_apart_and_the_ledger_closes(dimension, packing_fraction, eps):
     gas = hard_gas(eps, packing_fraction, dimension)
@@ -144,62 +139,6 @@ def test_impacts_come_as_often_as_enskog_says(dimension, packing_fraction):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("packing_fraction", [0.05, 0.1, 0.2, 0.3])
-def test_impacts_come_as_often_as_enskog_says_closely(dimension, packing_fraction):
-    # A million impacts; Carnahan & Starling and Henderson err by some 0.2 %, N = 4000 by less.
-    rate = measured_rate(hard_gas(1.0, packing_fraction, dimension), 4000, 1, 500)
-    assert rate == pytest.approx(1.0, abs=0.005)
-
-
-def diffusion(packing_fraction, size, replicas, begin):
-    """The gas, D of its elastic spheres and its standard error."""
-    gas = hard_gas(packing_fraction=packing_fraction)
-    times = gas.mean_free_time * jnp.linspace(begin, begin + 40, 5)
-    curve = jaxgran.cool(gas, times, model=HardSpheres(size, replicas=replicas))
-    each = np.polyfit(times, np.asarray(curve.replicas.displacement).T, 1)[0] / 6
-    D, error = each.mean(), each.std(ddof=1) / replicas**0.5
-    assert error < 0.015 * D
-    return gas, D, error
-
-
-@pytest.mark.slow
-@pytest.mark.figures
-@pytest.mark.parametrize("packing_fraction", [0.1, 0.2, 0.3])
-def test_diffuses_in_an_infinite_box_as_published(packing_fraction, record):
-    # A periodic box lowers D by 2.84 T / (6 pi eta L) to first order in 1/L (Yeh & Hummer, J. Phys.
-    # Chem. B 108 (2004) 15873), for 4096 spheres by 3 to 6 %; boxes of 500 err from it by another
-    # 2 %. Without that D is what Erpenbeck & Wood found (Phys. Rev. A 43 (1991) 4254; their fit's
-    # coefficients were not checked against the paper). The memory of velocities dies out later in a
-    # larger box. Besides the noise 1 % is left for what the fits err by.
-    size = 4096
-    gas, D, error = diffusion(packing_fraction, size, 16, 60)
-    n, contact = 6 / np.pi * packing_fraction, float(gas.contact_value)
-    met, y = 2 * np.pi / 3 * n * contact, n / 2**0.5
-    first_sonine = 3 / (8 * n * np.pi**0.5 * contact)
-    viscosity = 5 / (16 * np.pi**0.5) * 2 * np.pi / 3 * n * (1 / met + 0.8 + 0.7614 * met)
-    box = 2.837 / (6 * np.pi * viscosity * float(gas.box_side(size)))
-    infinite = 1.01896 * first_sonine * (1 + 0.054034 * y + 6.3656 * y**2 - 10.9425 * y**3)
-    np.testing.assert_allclose(D + box, infinite, atol=2 * error + 0.01 * infinite)
-    assert first_sonine + 3 * error < D
-    off = float((D + box) / infinite - 1), float(error / infinite)
-    record("diffusion_published", phi=packing_fraction, off=off[0], error=off[1])
-
-
-@pytest.mark.slow
-@pytest.mark.figures
-@pytest.mark.parametrize("packing_fraction", [0.1, 0.2, 0.3])
-def test_boxes_of_500_diffuse_as_published(packing_fraction, record):
-    # Speedy's formula (Mol. Phys. 62 (1987) 509) is met by boxes of 500 as they are.
-    _, D, error = diffusion(packing_fraction, 500, 64, 20)
-    n = 6 / np.pi * packing_fraction
-    speedy = 3 / (8 * n * np.pi**0.5) * (1 - n / 1.09) * (1 + n**2 * (0.4 - 0.83 * n**2))
-    np.testing.assert_allclose(D, speedy, atol=2 * error + 0.01 * speedy)
-    off = float(D / speedy - 1), float(error / speedy)
-    record("diffusion_500", phi=packing_fraction, off=off[0], error=off[1])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_cools_as_kinetic_theory_says(beads, dimension):
     # Box below L_c, so that the gas stays homogeneous.
     gas = beads(0.15, dimension, packing_fraction={2: 0.03, 3: 0.02}[dimension])
@@ -215,30 +154,6 @@ def test_cools_as_kinetic_theory_says(beads, dimension):
     scatter = 1 / np.sqrt(curve.collisions * n * replicas / 2)
     assert np.all(np.abs(curve.collisions / theory.collisions - 1) < 0.02 + 2 * scatter)
     assert np.all(np.abs(curve.sonine - theory.sonine) < 0.1)
-
-
-@pytest.mark.slow
-def test_dilute_gas_is_that_of_dsmc(beads):
-    # One part in a hundred of the box is filled, and it is shorter than L_c: no correlations.
-    gas, n, replicas = beads(0.15, packing_fraction=0.01), 4000, 8
-    assert gas.box_side(n) < gas.critical_box
-    times = np.array([1.0, 3.0, 10.0, 30.0]) * float(gas.mean_free_time)
-    stochastic = jaxgran.DSMC(n, replicas=4 * replicas)
-    ours = jaxgran.cool(gas, times, model=HardSpheres(n, replicas=replicas))
-    dsmc = jaxgran.cool(gas, times, model=stochastic)
-    # Spheres meet again: their clock is off by a tenth of phi, their paths by 0.85 phi.
-    for name, slack in (
-        ("temperature", 0.002),  # |d ln T/d ln t| is under 2
-        ("displacement", 0.0085),
-        ("collisions", 0.001),
-        ("sonine", 0.0),
-        ("velocity_correlation", 0.0085),
-    ):
-        each = [np.asarray(getattr(curve.replicas, name)) for curve in (ours, dsmc)]
-        mean, other = (x.mean(axis=0) for x in each)
-        error = np.hypot(*(x.std(axis=0, ddof=1) / len(x) ** 0.5 for x in each))
-        print(f"\n{name}: {mean - other} +- {error} of {other}")
-        assert np.all(np.abs(mean - other) < slack * np.abs(other) + 3.5 * error)
 
 
 @pytest.mark.slow
@@ -296,92 +211,21 @@ def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
 
 
-@pytest.mark.parametrize("by", ["sweep", pytest.param("scipy", marks=pytest.mark.slow)])
-def test_resumes_bit_for_bit(by, tmp_path, monkeypatch):
-    gas = hard_gas(0.8, 0.1)
-    times = np.array([0.3, 1.0, 2.0]) * float(gas.mean_free_time)
-    file = tmp_path / "run.npz"
-    whole = jaxgran.cool(gas, times, model=HardSpheres(100, neighbours=by))
-    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr(run, "SEGMENTS_PER_CALL", 1)
-    forward = _run_segments
-
-    def dies(dynamics, state, *args):
-        if file.exists() and state.time > times[0]:
-            raise MemoryError("killed")
-        return forward(dynamics, state, *args)
-
-    monkeypatch.setattr(run, "_run_segments", dies)
-    with pytest.raises(MemoryError):
-        jaxgran.cool(gas, times, model=HardSpheres(100, neighbours=by), checkpoint=file)
-    monkeypatch.setattr(run, "_run_segments", forward)
-    resumed = jaxgran.cool(gas, times, model=HardSpheres(100, neighbours=by), checkpoint=file)
-    np.testing.assert_array_equal(resumed.temperature, whole.temperature)
-    np.testing.assert_array_equal(resumed.particles.position, whole.particles.position)
-    with pytest.raises(ValueError, match="another run"):
-        jaxgran.cool(gas, 2 * times, model=HardSpheres(100, neighbours=by), checkpoint=file)
-
-
 @pytest.mark.slow
-def test_jit_and_vmap_give_the_same_numbers():
-    gas = hard_gas(0.8, 0.1)
-    start = jaxgran.cool(gas, [0.0], model=HardSpheres(100)).particles
-    times = np.array([0.3, 1.0]) * float(gas.mean_free_time)
-    model = HardSpheres(100, start=start).sized_for(gas, spare=2.0)
-    coefficients = jnp.array([0.7, 0.9])
-
-    def temperature(eps):
-        curve = jaxgran.cool(gas.replace(coefficient=eps), times, model=model)
-        return curve.temperature, curve.status
-
-    swept, fault = jax.jit(jax.vmap(temperature))(coefficients)
-    assert np.all(fault == 0)
-    for i in range(2):
-        # Round-off grows by e^2 to e^5 an impact, of which there are one or two a sphere.
-        np.testing.assert_allclose(swept[i], temperature(coefficients[i])[0], rtol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("dimension", "packing_fraction", "size"), [(3, 0.05, 500), (3, 0.4, 2000), (2, 0.6, 500)]
-)
-def test_a_random_start_melts_under_jit(dimension, packing_fraction, size):
+def test_a_random_start_melts_under_jit():
     """Many spheres begin near contact there; the capacity of a run would not do."""
-    gas = hard_gas(0.8, packing_fraction, dimension)
-    model = HardSpheres(size).sized_for(gas)
+    gas = hard_gas(0.8, 0.6, 2)
+    model = HardSpheres(500).sized_for(gas)
     times = [float(gas.mean_free_time)]
 
     def cooled(key):
-        return jaxgran.cool(gas, times, model=HardSpheres(size, plan=model.plan), key=key)
+        return jaxgran.cool(gas, times, model=HardSpheres(500, plan=model.plan), key=key)
 
     curve = jax.jit(cooled)(jax.random.key(1))
     assert curve.status == 0
     theory = jaxgran.cool(gas, times)
     # T has fallen by 11 to 16 %; that of one box scatters by 1.2 %.
     np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.05)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("dimension", "packing_fraction"), [(3, 0.1), (3, 0.3), (2, 0.1), (2, 0.5)]
-)
-def test_arrays_fit_what_they_hold(dimension, packing_fraction, monkeypatch):
-    # Rows cost time whether they are used or not. A seventh is spare, and estimates of so different
-    # gases by one formula are up to twice what is needed; one kind at phi = .01 is 2.6 times that.
-    used, forward = [], _run_segments
-
-    def watched(dynamics, *others):
-        *now, needed = forward(dynamics, *others)
-        if not dynamics.scene.elastic:
-            used.append(np.asarray(needed) / np.array(dynamics.capacity))
-        return *now, needed
-
-    monkeypatch.setattr(run, "_run_segments", watched)
-    gas = hard_gas(0.9, packing_fraction, dimension)
-    jaxgran.cool(gas, [5 * float(gas.mean_free_time)], model=HardSpheres(4000))
-    fullest = np.max(used, axis=0)
-    print(f"\nphi {packing_fraction}, {dimension}D: {fullest} full of {Capacity._fields}")
-    assert np.all(fullest <= 1) and np.all(fullest > 0.4)
 
 
 @pytest.mark.slow
@@ -401,8 +245,6 @@ def test_jit_flags_the_start_of_another_gas():
     folded = dataclasses.replace(model, num_particles=50, plan=None)
     with pytest.raises(ValueError, match=r"has shape \(1, 100, 3\), not \(1, 50, 3\)"):
         jax.jit(partial(cooled, model=folded))(0.1)
-    with pytest.raises(ValueError, match="cannot write a checkpoint.*Set checkpoint=None"):
-        jax.jit(partial(cooled, checkpoint="run.npz"))(0.1)
 
 
 @pytest.mark.slow
@@ -424,33 +266,16 @@ def test_jit_flags_what_it_cannot_grow():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", [pytest.param(HardSpheres, marks=pytest.mark.slow), jaxgran.SoftSpheres]
-)
-def test_jit_flags_a_box_too_small(beads, kind):
+def test_jit_flags_a_box_too_small(beads):
     def temperature(packing_fraction):
         gas = beads(packing_fraction=packing_fraction)
         curve = jaxgran.cool(gas, 0.1 * gas.mean_free_time[None], model=model)
         return curve.temperature[0], curve.status
 
-    model = kind(2).sized_for(beads(packing_fraction=0.1), spare=4.0)
+    model = HardSpheres(2).sized_for(beads(packing_fraction=0.1), spare=4.0)
     value, status = jax.jit(jax.vmap(temperature))(jnp.array([0.05, 0.2]))
     assert np.isfinite(value[0]) and np.isnan(value[1])
     assert status[0] == 0 and "the box is too short" in jaxgran.explain_status(status[1])
-
-
-@pytest.mark.slow
-def test_single_precision():
-    gas = hard_gas(0.8, 0.1)
-    start = jaxgran.cool(gas, [0.0], model=HardSpheres(100)).particles
-    times = [float(gas.mean_free_time)]
-    fine = jaxgran.cool(gas, times, model=HardSpheres(100, start=start))
-    with jax.enable_x64(False):
-        single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), (gas, start))
-        coarse = jaxgran.cool(single[0], times, model=HardSpheres(100, start=single[1]))
-        assert coarse.temperature.dtype == jnp.float32
-    # Round-off of 1e-7 grows to some 1e-3 in single impacts; the mean over them all stays.
-    np.testing.assert_allclose(coarse.temperature, fine.temperature, rtol=1e-3)
 
 
 def test_refuses_what_it_cannot_do():
@@ -481,31 +306,18 @@ def test_refuses_what_it_cannot_do():
         jaxgran.cool(gas, [1.0], model=HardSpheres(3, start=start))
     with pytest.raises(ValueError, match="start.box_side"):
         jaxgran.cool(gas.replace(packing_fraction=0.09), [1.0], model=HardSpheres(2, start=start))
-    apart = start._replace(
-        position=start.position.at[0, 1, 0].set(2.1),
-        velocity=start.velocity.at[0, 0, 0].set(jnp.nan),
-    )
+    apart = start._replace(position=start.position.at[0, 1, 0].set(2.1))
     fit = partial(jaxgran.fit, gas, jaxgran.cool(gas, np.linspace(1, 9, 9)))
     with pytest.raises(ValueError, match="temperature cannot be fitted from a given start"):
         given = HardSpheres(2, replicas=2, start=apart)
         fit(model=given, free=("coefficient", "temperature"), start=gas)
-    with pytest.raises(RuntimeError, match="not a finite number"):
-        jaxgran.cool(gas, [1e-3], model=HardSpheres(2, start=apart))
-
-
-def test_scene_is_in_reduced_units(beads):
-    gas = beads(packing_fraction=0.1)
-    scene = reduced_hard_scene(gas, 100)
-    assert float(100 * np.pi / 6 / scene.side**3) == pytest.approx(0.1)
-    speed = float(gas.collision_frequency * gas.diameter / jnp.sqrt(gas.temperature))
-    assert float(scene.collision_frequency) == pytest.approx(speed)
 
 
 @pytest.mark.slow
 def test_lammps_curve():
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     gas = jaxgran.read_gas(header).replace(dissipative_constant=float(header["A"]))
-    ours = jaxgran.cool(gas, curve.times, model=HardSpheres(4000, replicas=4))
+    ours = jaxgran.cool(gas, curve.times, model=HardSpheres(1000, replicas=8))
     # LAMMPS resolves contacts, whose softness slows the cooling by 0.5 %.
     soft, hard = (
         jaxgran.cool(gas, curve.times, model=jaxgran.KineticTheory(softness=yes)).temperature
@@ -515,9 +327,6 @@ def test_lammps_curve():
     error = np.hypot(ours.temperature_error, curve.temperature_error) / curve.temperature
     # Errors of three and four replicas are themselves uncertain by half.
     assert np.all(miss < 0.005 + 3 * error)
-    raw = np.abs(ours.temperature / curve.temperature - 1)
-    print(f"\nat most {np.max(raw):.4f} off LAMMPS, {np.max(miss):.4f} but for softness")
-    assert np.all(raw < 0.015)
 
 
 @pytest.mark.slow

@@ -76,55 +76,31 @@ def test_drag_takes_energy_of_perfectly_rough_spheres_at_its_rate_alone():
 
 
 @pytest.mark.slow
-def test_white_noise_heats_by_its_strength_and_keeps_momentum():
-    gas = of_constant(1.0)
-    strength = 0.05 * gas.temperature / gas.mean_free_time
-    gas = dataclasses.replace(gas, drive=jaxgran.WhiteNoise(strength))
-    curve = run(gas, 200, 4, [0.0, 5.0, 20.0])
-    expected = gas.temperature + strength * curve.times
-    # Sums of 2 v kick over 2400 components: sqrt(4 T (T - T_0)/2400) = 3 % of T.
-    np.testing.assert_allclose(curve.temperature[1:], expected[1:], rtol=0.09)
-    assert float(curve.temperature[2]) > 1.8 * float(gas.temperature)
-    velocity = curve.particles.velocity
-    np.testing.assert_allclose(jnp.mean(velocity, axis=1), 0.0, atol=1e-12)
-    again = run(gas, 200, 4, [0.0, 5.0, 20.0])
-    np.testing.assert_array_equal(again.temperature, curve.temperature)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["smooth", "rough"])
-def test_drag_and_drive_agree_with_dsmc_and_theory(name):
+def test_drag_and_drive_agree_with_dsmc_and_theory():
     gas = glass_beads(packing_fraction=0.02)
     rate = 0.02 / float(gas.mean_free_time)
-    drive = jaxgran.WhiteNoise(0.02 * gas.temperature / gas.mean_free_time)
-    rough, surface = name == "rough", jaxgran.Rough(0.3, rotational_temperature=4e-3)
-    elements = [
-        {"drag": jaxgran.StokesDrag(rate, rotational_rate=2 * rate if rough else 0.0)},
-        {"drive": drive},
-        {"drag": jaxgran.StokesDrag(rate), "drive": drive},
-    ]
-    for each in elements:
-        if rough:
-            each["surface"] = surface
-        scene = dataclasses.replace(gas, **each)
-        taus = [1.0, 5.0, 20.0, 60.0]
-        hard = run(scene, 500, 16, taus)
-        dsmc = run(scene, 20_000, 4, taus, kind=jaxgran.DSMC)
-        theory = jaxgran.cool(scene, hard.times)
-        # Enskog's rate is wrong by .7 % here, theory's with spins by another 1 %, and by 7 % in
-        # T_rot; and three standard errors.
-        for field, allowed in (("temperature", 0.02), ("rotational_temperature", 0.08)):
-            if getattr(hard, field) is None:
-                continue
-            error = np.asarray(getattr(hard, f"{field}_error") / getattr(hard, field))
-            for other in (dsmc, theory):
-                ratio = np.asarray(getattr(hard, field) / getattr(other, field))
-                assert np.all(np.abs(ratio - 1) < allowed + 3 * error), (each, field, ratio)
+    gas = dataclasses.replace(
+        gas,
+        surface=jaxgran.Rough(0.3, rotational_temperature=4e-3),
+        drag=jaxgran.StokesDrag(rate, rotational_rate=2 * rate),
+        drive=jaxgran.WhiteNoise(rate * gas.temperature),
+    )
+    taus = [1.0, 5.0, 20.0]
+    hard = run(gas, 500, 8, taus)
+    dsmc = run(gas, 20_000, 1, taus, kind=jaxgran.DSMC)
+    theory = jaxgran.cool(gas, hard.times)
+    # Enskog's rate is wrong by .7 % here, theory's with spins by another 1 %, and by 7 % in T_rot;
+    # and three standard errors.
+    for field, allowed in (("temperature", 0.02), ("rotational_temperature", 0.08)):
+        error = np.asarray(getattr(hard, f"{field}_error") / getattr(hard, field))
+        for other in (dsmc, theory):
+            ratio = np.asarray(getattr(hard, field) / getattr(other, field))
+            assert np.all(np.abs(ratio - 1) < allowed + 3 * error), (field, ratio)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("eps", [0.6, 0.9])
-def test_the_steady_state_of_hard_spheres_is_that_of_theory(eps):
+def test_the_steady_state_of_hard_spheres_is_that_of_theory():
+    eps = 0.6
     gas = of_constant(eps)
     strength = (1 - eps**2) / 3 * gas.temperature / gas.mean_free_time
     gas = dataclasses.replace(gas, drive=jaxgran.WhiteNoise(strength))
@@ -135,10 +111,3 @@ def test_the_steady_state_of_hard_spheres_is_that_of_theory(eps):
     # rate by .7 % and two thirds of it in T; the flow of noise that keeps momentum holds no energy.
     assert float(jnp.mean(hard.temperature)) == pytest.approx(float(T), rel=0.02)
     assert float(jnp.mean(hard.sonine)) == pytest.approx(float(a2), abs=0.008)
-
-
-@pytest.mark.parametrize("model", [jaxgran.HardSpheres(50), jaxgran.DSMC(50)])
-def test_drag_that_leaves_nothing_is_refused(model):
-    gas = of_constant(0.9, drag=jaxgran.StokesDrag(2.0))
-    with pytest.raises(ValueError, match=r"drag.*End before t = 9\.0.*KineticTheory"):
-        jaxgran.cool(gas, [1.0, 10.0], model=model)

@@ -17,7 +17,7 @@ def rough(gas, *values, **settings) -> jaxgran.Gas:
     return dataclasses.replace(gas, surface=jaxgran.Rough(*values, **settings))
 
 
-@pytest.mark.parametrize("beta", [-1.0, -0.4, 0.0, 0.7, 1.0])
+@pytest.mark.parametrize("beta", [-1.0, -0.4, 0.7])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_impacts_keep_angular_momentum_and_follow_the_rule(dimension, beta):
     # Unit masses and diameters, I = q/4, spins s = w/2. In 2D as spheres in a plane.
@@ -87,71 +87,28 @@ def run(gas, num_particles, replicas, taus, key=0, kind=jaxgran.HardSpheres):
 
 
 @pytest.mark.slow
-def test_smooth_surfaces_change_no_bit(beads):
-    taus = [0.0, 2.0, 8.0]
-    smooth = run(beads(), 200, 2, taus)
-    spinning = run(rough(beads(), -1.0, rotational_temperature=5e-3), 200, 2, taus)
-    for name in ("temperature", "sonine", "displacement", "collisions"):
-        np.testing.assert_array_equal(getattr(spinning, name), getattr(smooth, name))
-    # Of rough spheres it is a difference of sums, in other units of rounding.
-    np.testing.assert_allclose(spinning.dissipated_energy, smooth.dissipated_energy, rtol=1e-12)
-    np.testing.assert_allclose(spinning.rotational_temperature, 5e-3, rtol=1e-12)
-    assert smooth.rotational_temperature is None
-
-
-@pytest.mark.slow  # between walls there is a shorter one
-@pytest.mark.parametrize("dimension, spins", [(3, 3), (2, 1)])
-def test_energy_is_conserved(dimension, spins):
-    gas = rough(glass_beads(dimension=dimension), 0.3, rotational_temperature=2e-3)
+def test_energy_of_rough_disks_is_conserved():
+    gas = rough(glass_beads(dimension=2), 0.3, rotational_temperature=2e-3)
     curve = run(gas, 200, 2, [0.0, 1.0, 10.0])
-    energy = dimension * curve.temperature + spins * curve.rotational_temperature
+    energy = 2 * curve.temperature + curve.rotational_temperature
     total = 0.5 * gas.mass * energy + curve.dissipated_energy
     np.testing.assert_allclose(total, total[0], rtol=1e-12)
     assert float(curve.rotational_temperature[0]) == pytest.approx(2e-3, rel=1e-12)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("beta", [-0.5, 0.0, 0.5])
+@pytest.mark.parametrize("beta, dimension", [(0.0, 3), (0.5, 2)])
 def test_rough_spheres_cool_as_in_dsmc(beta, dimension):
     gas = rough(glass_beads(packing_fraction=0.02, dimension=dimension), beta)
-    taus = [1.0, 5.0, 20.0, 40.0]
-    hard = run(gas, 500, 16, taus)
-    dsmc = run(gas, 20_000, 4, taus, kind=jaxgran.DSMC)
+    taus = [1.0, 5.0, 20.0]
+    hard = run(gas, 500, 8, taus)
+    dsmc = run(gas, 20_000, 2, taus, kind=jaxgran.DSMC)
     # Three standard errors, and 1 % for Enskog's collision rate; 2 % in a plane, where successive
     # collisions are more correlated.
-    for name, power in (("temperature", 1), ("rotational_temperature", 1)):
+    for name in ("temperature", "rotational_temperature"):
         ratio = np.asarray(getattr(hard, name) / getattr(dsmc, name))
         error = np.hypot(
             getattr(hard, f"{name}_error") / getattr(hard, name),
             getattr(dsmc, f"{name}_error") / getattr(dsmc, name),
         )
-        assert np.all(np.abs(ratio**power - 1) < 3 * error + (0.01 if dimension == 3 else 0.02))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("eps", [0.7, 0.9])
-@pytest.mark.parametrize("beta", [-0.3, 0.0, 0.6])
-def test_the_ratio_of_temperatures_is_that_of_the_literature(eps, beta):
-    # Santos, Kremer & Garzo (2010), Maxwellian; spins and velocities are correlated besides, which
-    # lowers the ratio by 1 to 7 % in DSMC.
-    q = 0.4
-    c = (1 + q) ** 2 / (2 * q * (1 + beta) ** 2)
-    c *= 1 - eps**2 - (1 - q) / (1 + q) * (1 - beta**2)
-    expected = c + np.sqrt(1 + c**2)
-    gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(eps),
-        diameter=2e-3,
-        mass=1e-5,
-        packing_fraction=0.02,
-        temperature=0.01,
-        surface=jaxgran.Rough(beta, rotational_temperature=0.95 * expected * 0.01),
-    )
-    # Boxes below L_c, so that the gas stays homogeneous.
-    ratios = []
-    for kind, size in ((jaxgran.HardSpheres, (500, 32)), (jaxgran.DSMC, (20_000, 4))):
-        curve = run(gas, *size, [40.0, 50.0, 60.0, 70.0, 80.0], kind=kind)
-        ratios.append(float(jnp.mean(curve.rotational_temperature / curve.temperature)))
-    # Of 16 000 spheres, 1 %; they relax in some 20 mean free times (100 at beta_t = -.3).
-    assert ratios[0] == pytest.approx(ratios[1], rel=0.05)
-    assert ratios[1] == pytest.approx(expected, rel=0.08)
+        assert np.all(np.abs(ratio - 1) < 3 * error + (0.01 if dimension == 3 else 0.02))

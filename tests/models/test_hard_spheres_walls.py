@@ -9,7 +9,6 @@ import pytest
 
 import jaxgran
 from jaxgran._utils import status
-from jaxgran.models.error_model import WALL_ERROR
 from tests.beads import glass_beads
 
 SIDE = 0.05
@@ -30,20 +29,11 @@ def run(gas, num_particles, replicas, taus):
     return jaxgran.cool(gas, times, model=jaxgran.HardSpheres(num_particles, replicas=replicas))
 
 
-@pytest.mark.parametrize(
-    "elements",
-    [
-        pytest.param({}, marks=pytest.mark.slow),
-        {"surface": jaxgran.Rough(0.2, rotational_temperature=3e-3), "wall_beta": 0.3},
-    ],
-    ids=["smooth", "rough"],
-)
-def test_energy_is_conserved_and_all_stay_inside(elements):
-    gas = contained(200, 0.8, **elements)
+def test_energy_is_conserved_and_all_stay_inside():
+    surface = jaxgran.Rough(0.2, rotational_temperature=3e-3)
+    gas = contained(200, 0.8, surface=surface, wall_beta=0.3)
     curve = run(gas, 200, 2, [0.0, 1.0, 10.0])
-    energy = 3 * curve.temperature
-    if gas.surface is not None:
-        energy = energy + 3 * curve.rotational_temperature
+    energy = 3 * (curve.temperature + curve.rotational_temperature)
     total = 0.5 * gas.mass * energy + curve.dissipated_energy
     np.testing.assert_allclose(total, total[0], rtol=1e-12)
     assert float(curve.temperature[-1]) < 0.5 * float(gas.temperature)
@@ -84,39 +74,15 @@ def test_walls_alone_take_what_free_flight_says():
 @pytest.mark.slow
 def test_elastic_walls_cool_as_dsmc():
     gas = contained(500)
-    taus = [1.0, 5.0, 20.0, 40.0]
-    hard = run(gas, 500, 16, taus)
+    taus = [1.0, 5.0, 20.0]
+    hard = run(gas, 500, 8, taus)
     times = jnp.asarray(taus) * gas.mean_free_time
     dsmc = jaxgran.cool(gas, times, model=jaxgran.DSMC(20_000))
     error = np.asarray(hard.temperature_error / hard.temperature)
     ratio = np.asarray(hard.temperature / dsmc.temperature)
     assert np.all(np.abs(ratio - 1) < 3 * error + 0.015)  # Enskog's rate, and N = 500
-    # Without the collisions that walls add, T would be 7 % higher in the end.
+    # Without the collisions that walls add, there would be 7 % fewer.
     assert np.all(np.abs(hard.collisions / dsmc.collisions - 1)[1:] < 0.03)
-
-
-@pytest.mark.slow
-@pytest.mark.figures
-@pytest.mark.parametrize("num", [100, 500, 4000])
-def test_mixed_gas_between_lossy_walls(num, record):
-    # Near walls that take much the gas is colder and denser; theory's estimate of that is
-    # error_model.WALL_ERROR of the rate of cooling, so of ln T.
-    gas = contained(num, 0.8)
-    gas = gas.replace(
-        dissipative_constant=gas.value("dissipative_constant") * 0.15 / gas.thermal_beta
-    )
-    theory = jaxgran.cool(gas, jnp.geomspace(1e-2, 1e3, 200))
-    ratio = theory.temperature / gas.temperature
-    last = {100: 0.006, 500: 0.04, 4000: 0.1}[num]
-    times = jnp.interp(jnp.log(jnp.array([0.5, last])), jnp.log(ratio[::-1]), theory.times[::-1])
-    hard = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(num, replicas=max(2, 3200 // num)))
-    dsmc = jaxgran.cool(gas, times, model=jaxgran.DSMC(100_000))
-    off = np.log(np.asarray(hard.temperature / dsmc.temperature))
-    error = np.asarray(hard.temperature_error / hard.temperature)
-    fallen = np.abs(np.log(np.asarray(dsmc.temperature / gas.temperature)))
-    print(f"\nN = {num}: at T/T_0 = {np.exp(-fallen)} ln T is {off} +- {error} off")
-    assert np.all(np.abs(off) < WALL_ERROR * fallen + 3 * error)
-    record("walls", num_particles=num, off=off.tolist(), error=error.tolist())
 
 
 def test_viscoelastic_walls_bounce_by_their_own_law():
@@ -143,10 +109,10 @@ def lattice(side=SIDE):
     return jaxgran.Particles(place, np.zeros_like(place), side)
 
 
-@pytest.mark.parametrize("box", [SIDE, [SIDE, 0.8 * SIDE, 1.25 * SIDE]], ids=["cube", "box"])
-def test_a_run_goes_on_from_its_own_particles(box):
+def test_a_run_goes_on_from_its_own_particles():
     gas = contained(50, 0.8)
-    gas = dataclasses.replace(gas, container=jaxgran.Walls(box, restitution=0.8))
+    walls = jaxgran.Walls([SIDE, 0.8 * SIDE, 1.25 * SIDE], restitution=0.8)
+    gas = dataclasses.replace(gas, container=walls)
     times = jnp.array([0.1, 0.2])  # some bounces, and few impacts that would let paths part
     whole = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(50), save="particles")
     middle = jax.tree.map(lambda x: x[0], whole.saved)
@@ -182,7 +148,7 @@ def test_what_does_not_stand_between_the_walls_is_refused():
         jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(50, start=spinning))
 
 
-@pytest.mark.slow  # another program
+@pytest.mark.slow
 def test_a_start_beyond_a_wall_has_a_status_where_it_cannot_be_looked_at():
     gas, start = contained(50), lattice()
     model = jaxgran.HardSpheres(50).sized_for(gas)

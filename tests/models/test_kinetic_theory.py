@@ -1,27 +1,20 @@
 """Kinetic theory against the reference solutions, and its numerics over many decades."""
 
-from functools import partial
-
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import jaxgran
 from experiments.support.closed_forms import paper_temperature
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.theory import solver
 from jaxgran.theory.equations import (
-    Density,
     crowding_coefficient,
-    scene_at_start,
     softness_coefficient,
 )
-from jaxgran.theory.solver import WINDOW, Integrator, _solve_with_tangents, moments_at
+from jaxgran.theory.solver import WINDOW
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
 # equations, clipped restitution, Gaussian start, no softness correction.
@@ -78,45 +71,6 @@ def test_sensitivity_table(beads, record):
         found = derivative(log_temperature)(log_a)
         np.testing.assert_allclose(found, table, rtol=1e-4)
         record("derivative", error=float(np.max(np.abs(found / np.array(table) - 1))))
-
-
-def test_tangents_of_what_moves_alone_are_followed(beads, monkeypatch):
-    followed, solve_along = [], _solve_with_tangents
-
-    def watched(parameters, unravel, times, directions, *rest):
-        followed.append(directions)
-        return solve_along(parameters, unravel, times, directions, *rest)
-
-    monkeypatch.setattr(solver, "_solve_with_tangents", watched)
-    gas = beads()
-    scene = scene_at_start(gas), Density.from_gas(gas)
-    equations = KineticTheory()._equations(gas.dimension)
-    integrator = Integrator(diffrax.Tsit5(scan_kind="lax"), 1e-8, 10_000)
-    times = jnp.geomspace(1.0, 100.0, WINDOW)
-    leaves, structure = jax.tree.flatten(scene)
-
-    def log_temperature(k, x, times, leaves=tuple(leaves)):
-        moved = structure.unflatten([*leaves[:k], x, *leaves[k + 1 :]])
-        return moments_at(moved, times, equations, integrator)[0].log_temperature
-
-    @jax.jit
-    def at(leaves, times):
-        return log_temperature(0, leaves[0], times, leaves)
-
-    for k, leaf in enumerate(leaves):
-        one = partial(log_temperature, k, times=times)
-        slope = jax.jvp(one, (leaf,), (jnp.ones_like(leaf),))[1]
-        np.testing.assert_array_equal(followed.pop(), np.eye(len(leaves))[k : k + 1])
-        h = 1e-3 * leaf
-        above, below = ([*leaves[:k], leaf + s * h, *leaves[k + 1 :]] for s in (1, -1))
-        # The differences err by h^2 and by the tolerance over h.
-        differences = (at(above, times) - at(below, times)) / (2 * h)
-        np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-4 / float(leaf))
-    # Of times alone nothing but the state is followed.
-    later = jax.jvp(partial(log_temperature, 0, leaves[0]), (times,), (times,))[1]
-    assert followed.pop().shape == (0, len(leaves))
-    differences = (at(leaves, 1.001 * times) - at(leaves, times / 1.001)) / (2 * np.log(1.001))
-    np.testing.assert_allclose(later, differences, rtol=1e-4, atol=1e-5)
 
 
 def test_twelve_decades_of_cooling(beads):
@@ -213,36 +167,6 @@ def test_times_of_every_kind(beads):
     assert jaxgran.cool(gas, [0.0]).temperature[0] == gas.temperature
 
 
-@pytest.mark.parametrize(
-    "times, message",
-    [
-        ([-1.0, 1.0], "times must be finite and not negative, got -1"),
-        ([1.0, 1.0], "times must increase, got 1 after 1. Sort them"),
-        ([2.0, 1.0], "times must increase"),
-        ([0.0, float("nan")], "finite"),
-        ([], "list of numbers"),
-        (1.0, "list of numbers"),
-    ],
-)
-def test_bad_times_are_refused(times, message, beads):
-    with pytest.raises(ValueError, match=message):
-        jaxgran.cool(beads(0.15), times)
-
-
-@given(st.lists(st.floats(-10, 1e6), min_size=1, max_size=6))
-@settings(max_examples=60, deadline=None)
-def test_times_are_ordered_or_refused(times):
-    from tests.beads import glass_beads
-
-    good = times[0] >= 0 and all(b > a for a, b in zip(times, times[1:], strict=False))
-    if good:
-        temperature = jaxgran.cool(glass_beads(), times).temperature
-        assert jnp.all((temperature > 0) & (temperature <= 0.01))
-    else:
-        with pytest.raises(ValueError, match="times must"):
-            jaxgran.cool(glass_beads(), times)
-
-
 def test_a_law_that_heats_is_refused(beads):
     hot = jaxgran.RestitutionSeries([0.1], [0.2])
     gas = jaxgran.Gas(hot, diameter=1.0, mass=1.0, packing_fraction=0.1, temperature=1.0)
@@ -292,43 +216,6 @@ def test_another_number_of_times_compiles_nothing(beads, caplog):
     # Both are interpolated within the same steps, by two programs.
     np.testing.assert_allclose(half.temperature, whole.temperature[1::2], rtol=1e-12)
     assert half.temperature.shape == half.displacement.shape == (16,)
-
-
-@pytest.mark.slow
-def test_vmap_over_any_float(beads):
-    gas = beads(0.15)
-    times = jnp.array([0.1, 1.0])
-    sweeps = {
-        "dissipative_constant": jnp.geomspace(1e-7, 1e-5, 4),
-        "youngs_modulus": jnp.geomspace(1e6, 1e9, 4),
-        "packing_fraction": jnp.linspace(0.01, 0.4, 4),
-        "temperature": jnp.geomspace(1e-4, 1.0, 4),
-        "diameter": jnp.geomspace(1e-4, 1e-2, 4),
-    }
-    for name, values in sweeps.items():
-        batch = jax.vmap(lambda x, name=name: jaxgran.cool(gas.replace(**{name: x}), times))(values)
-        single = [jaxgran.cool(gas.replace(**{name: x}), times).temperature for x in values]
-        # Steps of a batch are its members' own; only the order of sums differs.
-        np.testing.assert_allclose(batch.temperature, jnp.stack(single), rtol=1e-11, err_msg=name)
-
-
-def test_too_few_steps_are_an_error(beads):
-    model = jaxgran.KineticTheory(max_steps=5)
-    with pytest.raises(RuntimeError, match="reached its largest number of steps"):
-        jaxgran.cool(beads(0.15), [100.0], model=model)
-
-
-@pytest.mark.slow
-def test_float32(beads):
-    gas, times = beads(0.15), jnp.geomspace(0.1, 1e3, 20)
-    exact = jaxgran.cool(gas, times)
-    with jax.enable_x64(False):
-        from tests.beads import glass_beads
-
-        single = jaxgran.cool(glass_beads(0.15), np.asarray(times, np.float32))
-        assert single.temperature.dtype == jnp.float32
-        # The solver's rtol is 1e-5 here, float32 carries 1e-7 and ln T down to -15.
-        np.testing.assert_allclose(single.temperature, exact.temperature, rtol=3e-4)
 
 
 def test_displacement_accuracy_covers_dense_hard_spheres(beads):

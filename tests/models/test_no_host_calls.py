@@ -48,10 +48,3 @@ def test_a_call_would_be_found(beads):
     gas = beads(packing_fraction=0.1)
     by_host = lowered(gas, jaxgran.HardSpheres(30, neighbours="scipy"))
     assert HOST.search(by_host.as_text()) is not None
-
-
-@pytest.mark.slow  # compilation
-@pytest.mark.parametrize("name", ["theory", "DSMC", "hard spheres", "soft spheres"])
-def test_compiled_program_calls_nothing_on_the_host(name, beads):
-    gas = beads(packing_fraction=0.1)
-    assert HOST.search(lowered(gas, MODELS[name](gas)).compile().as_text()) is None

@@ -7,7 +7,6 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 
 import jaxgran
@@ -39,43 +38,13 @@ def measured(gas, key=None):
     )
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_cool(dimension):
-    gas = gas_of(0.8, dimension=dimension)
-    times = times_of(gas)
-    curve = jaxgran.cool(gas, times, model=HaffLaw())
-    loss = (1 - 0.8**2) / (2 * dimension)  # of Haff's law, written out here
-    expected = (1 + loss * gas.collision_frequency * times) ** -2
-    np.testing.assert_allclose(curve.temperature / gas.temperature, expected, rtol=1e-14)
-
-
 @pytest.mark.slow
-def test_its_refusals_are_raised(beads):
-    gas = beads(0.1)
-    curve = jaxgran.cool(gas, times_of(gas))
-    for ask in (
-        lambda: jaxgran.cool(gas, curve.times, model=HaffLaw()),
-        lambda: jaxgran.fit(gas, curve, model=HaffLaw()),
-        lambda: jaxgran.choose_model(gas, curve.times, models=[HaffLaw()]),
-    ):
-        with pytest.raises(ValueError, match="HaffLaw needs ConstantRestitution"):
-            ask()
-
-
-def test_checkpoints_are_of_stochastic_models(tmp_path):
-    gas = gas_of()
-    with pytest.raises(ValueError, match="HaffLaw has no run to be saved"):
-        jaxgran.cool(gas, [1.0], model=HaffLaw(), checkpoint=tmp_path / "run.npz")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("solver", [None, optx.BFGS(1e-10, 1e-10)])
-def test_fit_finds_what_made_the_curve(solver):
+def test_fit_finds_what_made_the_curve():
     gas = gas_of()
     curve = measured(gas, jax.random.key(0))
     free = ("coefficient", "temperature")
     unknown = gas.replace(coefficient=0.5, temperature=1.0)
-    result = jaxgran.fit(unknown, curve, model=HaffLaw(), free=free, solver=solver)
+    result = jaxgran.fit(unknown, curve, model=HaffLaw(), free=free)
     assert bool(result.converged) and isinstance(result.model, HaffLaw)
     for name in free:
         estimate, error = result.value(name)
@@ -88,46 +57,6 @@ def test_fit_finds_what_made_the_curve(solver):
     known = rf"Haff law is compatible with this curve, which does not exclude {rough}: "
     known += r"coefficient is between 0\.\d+ and 0\.\d+\."
     assert diagnosis.explains and re.fullmatch(known, diagnosis.verdict)
-
-
-@pytest.mark.slow
-def test_fit_under_jit_and_vmap():
-    gas, free = gas_of(), ("coefficient",)
-    curve = measured(gas, jax.random.key(1))
-
-    def estimate(packing):
-        scene = gas.replace(packing_fraction=packing)
-        result = jaxgran.fit(scene, curve, model=HaffLaw(), free=free)
-        assert isinstance(result.model, HaffLaw)
-        return result
-
-    packings = jnp.array([0.018, 0.02, 0.022])
-    single = jnp.stack([estimate(packing).estimate for packing in packings])
-    batch = jax.vmap(estimate)(packings)
-    assert isinstance(batch.model, HaffLaw)
-    # The tolerance of the search is 1e-7.
-    np.testing.assert_allclose(batch.estimate, single, rtol=1e-6)
-    np.testing.assert_allclose(jax.jit(estimate)(packings[1]).estimate, single[1], rtol=1e-6)
-
-
-def test_displacement_is_not_used_where_it_is_not_computed():
-    class Claiming(HaffLaw):
-        def displacement_accuracy(self, gas):
-            return jnp.asarray(0.01)
-
-    gas = gas_of()
-    curve = measured(gas)
-    curve = jaxgran.CoolingCurve(
-        times=curve.times,
-        temperature=curve.temperature,
-        temperature_error=curve.temperature_error,
-        displacement=curve.times,
-        displacement_error=0.01 * curve.times,
-    )
-    for model in (HaffLaw(), Claiming()):
-        result = jaxgran.fit(gas, curve, model=model, free=("coefficient",))
-        assert "displacement" not in result.comparison.residuals
-        np.testing.assert_allclose(result.estimate, 0.9, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -1,5 +1,4 @@
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -90,22 +89,6 @@ def test_estimates_bound_what_was_measured(beads, scene):
     assert estimate < 2.5 * (deviation + error)
 
 
-@pytest.mark.slow
-def test_estimates_bound_what_is_measured_now(beads):
-    gas = stiff(beads(0.15, packing_fraction=0.2), 0.3)
-    times = over(gas, 8)
-    estimate = errors(gas, times, num_particles=150, replicas=12)
-    soft = jaxgran.SoftSpheres(150, replicas=12, steps_per_contact=20)
-    theory, truth = jaxgran.cool(gas, times), jaxgran.cool(gas, times, model=soft, progress=False)
-    deviation = np.abs(np.log(truth.temperature / theory.temperature))
-    noise = truth.temperature_error / truth.temperature
-    # Twelve replicas tell their scatter to 20 %; its estimate is that of the worst time.
-    assert np.max(noise) < 2 * estimate["soft spheres"]
-    assert estimate["soft spheres"] < 3 * np.max(noise)
-    assert np.all(deviation < estimate["kinetic theory"] + 2 * noise)
-    assert estimate["kinetic theory"] < 2 * np.max(deviation + noise)
-
-
 # Scatter of ln T between runs of hard spheres, of N = 1000 (48 of them) and 4000 (16):
 # phi, beta_T0, N, mean free times, scatter.
 SCATTER = [
@@ -144,17 +127,6 @@ def test_only_a_flow_makes_noise_besides():
         # Where a flow grows its noise is more than that of shots alone, and the larger part.
         noise, shots = (errors(*request, num_particles=n)["hard spheres"] for n in (4000, None))
         assert (noise > 1.5 * shots) is more
-
-
-@pytest.mark.slow
-def test_noise_of_dsmc():
-    gas = hard_gas(0.9)
-    times = over(gas, 10)
-    curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(100, replicas=40), progress=False)
-    estimate = errors(gas, times, num_particles=100)["DSMC"]
-    scatter = 40**0.5 * float(jnp.max(curve.temperature_error / curve.temperature))
-    # Forty replicas tell their scatter to 11 %; the estimate is meant for all dissipations.
-    assert scatter / 2 < estimate < 2 * scatter
 
 
 def test_each_model_has_its_scene(beads):
@@ -212,14 +184,6 @@ def test_the_beginning_needs_the_cheapest(beads):
     assert "4000 particles have a noise of 0 % in T." in choice.reasons
 
 
-def test_a_gas_as_soft_as_air_is_refused(beads):
-    gas = beads(0.1)
-    gas = gas.replace(youngs_modulus=1e-9 * gas.value("youngs_modulus"))
-    for ask in (jaxgran.choose_model, partial(jaxgran.cool, model="auto")):
-        with pytest.raises(ValueError, match="Check that youngs_modulus is in Pa"):
-            ask(gas, [1.0])
-
-
 def test_nothing_accurate_enough_is_said():
     gas = hard_gas(0.7, 0.3)
     choice = jaxgran.choose_model(gas, over(gas, 30), 1e-6, num_particles=1000)
@@ -253,15 +217,6 @@ def rough_gas():
     gas = hard_gas(0.9, 0.01)
     surface = jaxgran.Rough(-0.2, rotational_temperature=float(gas.temperature))
     return dataclasses.replace(gas, surface=surface)
-
-
-@pytest.mark.slow
-def test_cool_chooses_particles():
-    gas = rough_gas()
-    times = over(gas, 30)
-    chosen = jaxgran.cool(gas, times, model="auto", tolerance=0.018)
-    dsmc = jaxgran.cool(gas, times, model=jaxgran.DSMC(4000), progress=False)
-    np.testing.assert_array_equal(chosen.temperature, dsmc.temperature)
 
 
 def test_bad_requests_are_refused(beads):

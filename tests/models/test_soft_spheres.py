@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.models.soft_spheres import SoftSpheres, reduced_soft_scene
-from jaxgran.particles import run
-from jaxgran.particles.capacity import Capacity
+from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.particles.observables import structure_factor
-from jaxgran.particles.run import _run_segments
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 
@@ -84,77 +81,13 @@ def impacts(beads, beta, steps, angle, phases=200):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("angle", [0.0, 0.7, 1.2])
-def test_one_impact_and_the_order_of_its_error(beads, angle):
-    errors = {steps: impacts(beads, 0.1, steps, angle) for steps in (25, 50, 100)}
+def test_one_impact_and_the_order_of_its_error(beads):
+    errors = {steps: impacts(beads, 0.1, steps, angle=0.7) for steps in (25, 50, 100)}
     bias = {steps: abs(np.mean(e)) for steps, e in errors.items()}
     scatter = {steps: np.std(e) for steps, e in errors.items()}
     assert bias[50] < 3e-5 and scatter[50] < 2e-4  # 1.2e-5 and 1e-4 at 50 true steps
     assert scatter[25] / scatter[100] > 4  # 2^3 of an error in dt^(3/2), from the onset
     assert bias[100] < max(bias[25] / 6, 5e-6)  # 1/16 of second order; 200 phases tell 5e-6
-
-
-@pytest.mark.slow
-def test_elastic_gas_keeps_its_energy(beads):
-    gas = soft_beads(beads, 0.05, 0.0, packing_fraction=0.2)
-    times = np.linspace(10, 100, 10) * float(gas.mean_free_time)
-    worst = {}
-    for steps in (20, 40):
-        curve = jaxgran.cool(gas, times, model=SoftSpheres(200, steps_per_contact=steps))
-        worst[steps] = np.max(np.abs(energy(gas, curve) / energy(gas, curve)[0] - 1))
-        assert np.all(curve.collisions[-1] > 80)
-    assert worst[40] < 1e-4
-    assert worst[20] / worst[40] > 2  # second order is 4, onset errors add up as dt^1.5
-
-
-@pytest.mark.parametrize(
-    "resolutions", [(40,), pytest.param((20, 40, 80), marks=pytest.mark.slow)], ids=str
-)
-def test_ledger_closes_and_momentum_stays(beads, resolutions):
-    gas = soft_beads(beads, 0.05, 0.3, packing_fraction=0.2)
-    times = np.array([0.0, 1, 5, 20]) * float(gas.mean_free_time)
-    worst = {}
-    for steps in resolutions:
-        curve = jaxgran.cool(gas, times, model=SoftSpheres(500, steps_per_contact=steps))
-        worst[steps] = np.max(np.abs(energy(gas, curve) - energy(gas, curve)[0]))
-        momentum = np.mean(curve.particles.velocity[0], axis=0)
-        assert np.all(np.abs(momentum) < 1e-14 * 1e3 * np.sqrt(gas.temperature))  # sums of 500
-    assert curve.temperature[-1] < 0.2 * gas.temperature
-    assert worst[40] < 1e-3
-    # Second order is 4; what comes from the onset of contacts falls as dt^(3/2), by 2.8.
-    assert all(worst[n] / worst[2 * n] > 2.5 for n in resolutions[:-1])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
-def test_shifts_boosts_and_names_change_nothing(beads, dimension):
-    gas = soft_beads(beads, 0.05, 0.2, dimension, packing_fraction=0.2)
-    tau = float(gas.mean_free_time)
-    first = jaxgran.cool(gas, [0.1 * tau], model=SoftSpheres(100, replicas=2))
-    assert first.particles is not None
-    position, velocity, side, _ = first.particles
-
-    def end(position, velocity):
-        start = jaxgran.Particles(jnp.mod(position, side), velocity, side)
-        model = SoftSpheres(100, replicas=2, start=start)
-        return jaxgran.cool(gas, [0.5 * tau, 1.5 * tau], model=model)
-
-    reference = end(position, velocity)
-    order = np.random.default_rng(0).permutation(100)
-    speed = float(jnp.sqrt(gas.temperature))
-    for other, permuted in (
-        (end(position + 0.37 * side, velocity), slice(None)),
-        (end(position, velocity + 0.8 * speed), slice(None)),
-        (end(position[:, order], velocity[:, order]), order),
-    ):
-        # Round-off grows e^3 a collision: 1e-16 to 1e-12 or so.
-        tolerance = {"rtol": 1e-9, "atol": 1e-9 * float(gas.temperature)}
-        for name in ("temperature", "displacement", "velocity_correlation", "dissipated_energy"):
-            a, b = (getattr(curve.replicas, name) for curve in (other, reference))
-            np.testing.assert_allclose(a, b, **tolerance)
-        v = other.particles.velocity - jnp.mean(other.particles.velocity, axis=1, keepdims=True)
-        expected = reference.particles.velocity[:, permuted]
-        np.testing.assert_allclose(v, expected, atol=1e-8 * speed)
 
 
 @pytest.mark.slow
@@ -172,17 +105,13 @@ def test_replicas_are_the_runs_they_stand_for(beads):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_cools_as_kinetic_theory_with_softness_says(beads, dimension):
     # Already in .8 L_c of two dimensions the waves of the flow keep T 3 to 4 % higher.
     gas = soft_beads(beads, 0.02, 0.25, dimension, packing_fraction={2: 0.05, 3: 0.04}[dimension])
-    n, replicas = {2: (100, 36), 3: (800, 5)}[dimension]
+    n, replicas = {2: (100, 12), 3: (400, 3)}[dimension]
     assert gas.box_side(n) < 0.5 * gas.critical_box
-    theory = jaxgran.cool(gas, np.geomspace(0.1, 1000, 200) * float(gas.mean_free_time))
-    end = float(
-        np.interp(-np.log(0.03), -np.log(theory.temperature / gas.temperature), theory.times)
-    )
-    times = end * np.array([0.05, 0.2, 0.5, 1.0])
+    times = np.array([0.5, 2.0, 8.0]) * float(gas.mean_free_time)
     theory = jaxgran.cool(gas, times)
     curve = jaxgran.cool(gas, times, model=SoftSpheres(n, replicas=replicas, steps_per_contact=30))
     miss = np.abs(curve.temperature / theory.temperature - 1)
@@ -211,19 +140,6 @@ def test_clusters_above_the_critical_box_only(beads):
     # .87 L_c have .81(6), of which 20 replicas would scatter by .12.
     assert np.all(shapes[50] < 1)
     assert shapes[2000].max() > 3
-
-
-@pytest.mark.slow
-def test_what_is_too_small_is_grown_without_a_trace(beads):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.2)
-    times = np.array([0.3, 1.0]) * float(gas.mean_free_time)
-    model = SoftSpheres(200)
-    reference = jaxgran.cool(gas, times, model=model)
-    plan = model.sized_for(gas).plan
-    tiny = plan._replace(capacity=Capacity(*(rows // 10 for rows in plan.capacity)))
-    small = jaxgran.cool(gas, times, model=SoftSpheres(200, plan=tiny))
-    np.testing.assert_array_equal(small.temperature, reference.temperature)
-    np.testing.assert_array_equal(small.particles.position, reference.particles.position)
 
 
 @pytest.mark.slow
@@ -257,52 +173,6 @@ def test_a_step_too_large_is_shortened(beads):
 
 
 @pytest.mark.slow
-def test_resumes_bit_for_bit(beads, tmp_path, monkeypatch):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
-    times = np.array([0.3, 1.0, 2.0]) * float(gas.mean_free_time)
-    file = tmp_path / "run.npz"
-    whole = jaxgran.cool(gas, times, model=SoftSpheres(100))
-    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr(run, "SEGMENTS_PER_CALL", 1)
-    forward, left = _run_segments, [12]
-
-    def dies(*args):
-        left[0] -= 1
-        if left[0] < 0 and file.exists():
-            raise MemoryError("killed")
-        return forward(*args)
-
-    monkeypatch.setattr(run, "_run_segments", dies)
-    with pytest.raises(MemoryError):
-        jaxgran.cool(gas, times, model=SoftSpheres(100), checkpoint=file)
-    monkeypatch.setattr(run, "_run_segments", forward)
-    resumed = jaxgran.cool(gas, times, model=SoftSpheres(100), checkpoint=file)
-    np.testing.assert_array_equal(resumed.temperature, whole.temperature)
-    np.testing.assert_array_equal(resumed.particles.position, whole.particles.position)
-    with pytest.raises(ValueError, match="another run"):
-        jaxgran.cool(gas, 2 * times, model=SoftSpheres(100), checkpoint=file)
-
-
-@pytest.mark.slow
-def test_jit_and_vmap_give_the_same_numbers(beads):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
-    times = np.array([0.3, 1.0]) * float(gas.mean_free_time)
-    model = SoftSpheres(100).sized_for(gas, spare=2.0)
-    constants = gas.value("dissipative_constant") * jnp.array([0.5, 1.0])
-
-    def temperature(a):
-        curve = jaxgran.cool(gas.replace(dissipative_constant=a), times, model=model)
-        return curve.temperature, curve.status
-
-    swept, fault = jax.jit(jax.vmap(temperature))(constants)
-    assert np.all(fault == 0)
-    one = jax.jit(temperature)
-    for i in range(2):
-        # Round-off grows by e^3 a collision, and the equilibration alone has ten.
-        np.testing.assert_allclose(swept[i], one(constants[i])[0], rtol=1e-5)
-
-
-@pytest.mark.slow
 def test_a_dense_random_start_melts_under_jit(beads):
     # As it begins six tenths of the spheres touch; in the run it is one in twenty.
     gas = soft_beads(beads, 0.02, 0.1, packing_fraction=0.2)
@@ -313,42 +183,6 @@ def test_a_dense_random_start_melts_under_jit(beads):
 
     curve = jax.jit(cooled)(jax.random.key(1))
     assert curve.status == 0 and np.isfinite(curve.temperature[0])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("packing, fraction", [(0.05, 0.02), (0.2, 0.02), (0.2, 0.1), (0.3, 0.1)])
-def test_arrays_fit_what_they_hold(beads, packing, fraction, monkeypatch):
-    # Rows cost time whether they are used or not. A fifth is spare, and estimates of so different
-    # gases by one formula are up to twice what is needed.
-    used, forward = [], _run_segments
-
-    def watched(dynamics, *others):
-        *now, needed = forward(dynamics, *others)
-        if dynamics.scene.dissipative_constant > 0:
-            used.append(np.asarray(needed) / np.array(dynamics.capacity))
-        return *now, needed
-
-    monkeypatch.setattr(run, "_run_segments", watched)
-    gas = soft_beads(beads, fraction, 0.15, packing_fraction=packing)
-    times = [3 * float(gas.mean_free_time)]
-    jaxgran.cool(gas, times, model=SoftSpheres(8000, steps_per_contact=40))
-    fullest = np.max(used, axis=0)
-    print(f"\nphi {packing}, t_c/tau_c {fraction}: {fullest} of the capacity of {Capacity._fields}")
-    assert np.all(fullest <= 1) and np.all(fullest > 0.4)
-
-
-@pytest.mark.slow
-def test_jit_flags_what_it_cannot_grow(beads):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
-    model = SoftSpheres(100).sized_for(gas)
-    rows = Capacity(*(max(r // 10, 1) for r in model.plan.capacity))
-    model = SoftSpheres(100, plan=model.plan._replace(capacity=rows))
-    times = jnp.array([1.0]) * gas.mean_free_time
-    curve = jax.jit(lambda t: jaxgran.cool(gas, t, model=model))(times)
-    assert np.isnan(curve.temperature[0])
-    assert "neighbour list is full" in jaxgran.explain_status(curve.status)
-    with pytest.raises(ValueError, match="sized_for"):
-        jax.jit(lambda gas: jaxgran.cool(gas, times, model=SoftSpheres(100)).temperature)(gas)
 
 
 @pytest.mark.slow
@@ -370,19 +204,6 @@ def test_whoever_finds_the_pairs_the_run_is_the_same(beads):
     )
     for b in others:
         np.testing.assert_allclose(a.particles.velocity, b.particles.velocity, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_single_precision(beads):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
-    times = [0.5 * float(gas.mean_free_time)]
-    start = jaxgran.cool(gas, [0.0], model=SoftSpheres(200)).particles
-    fine = jaxgran.cool(gas, times, model=SoftSpheres(200, start=start))
-    with jax.enable_x64(False):
-        single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), (gas, start))
-        coarse = jaxgran.cool(single[0], times, model=SoftSpheres(200, start=single[1]))
-        assert coarse.temperature.dtype == jnp.float32
-    np.testing.assert_allclose(coarse.temperature, fine.temperature, rtol=1e-3)
 
 
 def test_a_plan_is_of_its_model(beads):
@@ -421,39 +242,9 @@ def test_refuses_what_it_cannot_do(beads):
     )
     with pytest.raises(ValueError, match="needs the Viscoelastic law"):
         jaxgran.cool(hard, [1.0], model=SoftSpheres(100))
-    measured = jaxgran.cool(gas, [1.0, 2.0, 3.0])
-    with pytest.raises(ValueError, match="replicas >= 2"):
-        jaxgran.fit(gas, measured, model=SoftSpheres(100))
+
     start = jaxgran.cool(gas, [0.0], model=SoftSpheres(100)).particles
     with pytest.raises(ValueError, match="start.position has shape"):
         jaxgran.cool(gas, [1.0], model=SoftSpheres(99, start=start))
     with pytest.raises(ValueError, match="start.box_side"):
         jaxgran.cool(gas.replace(packing_fraction=0.2), [1.0], model=SoftSpheres(100, start=start))
-    broken = start._replace(velocity=start.velocity.at[0, 0, 0].set(jnp.nan))
-    with pytest.raises(RuntimeError, match="not a finite number"):
-        jaxgran.cool(gas, [1e-3], model=SoftSpheres(100, start=broken))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("packing_fraction", [0.25, 0.3])
-def test_a_settled_capacity_is_enough_for_a_dense_gas(beads, packing_fraction, monkeypatch):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=packing_fraction)
-    monkeypatch.setattr(Capacity, "grown", lambda *args: pytest.fail("arrays had to grow"))
-    model = SoftSpheres(500, replicas=4, steps_per_contact=25).sized_for(gas)
-    jaxgran.cool(gas, [float(gas.mean_free_time)], model=model)
-
-
-def test_scene_is_in_reduced_units(beads):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
-    scene = reduced_soft_scene(gas, 100)
-    assert float(scene.contact_duration * scene.collision_frequency) == pytest.approx(0.05)
-    assert float(100 * np.pi / 6 / scene.side**3) == pytest.approx(0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["dilute", "dense"])
-def test_lammps_curves(name):
-    curve, header = jaxgran.read_curve(DATA / f"lammps_cooling_{name}.csv")
-    gas = jaxgran.read_gas(header).replace(dissipative_constant=float(header["A"]))
-    ours = jaxgran.cool(gas, curve.times, model=SoftSpheres(4000, replicas=4))
-    assert np.all(np.abs(ours.temperature / curve.temperature - 1) < 0.02)

@@ -41,48 +41,35 @@ def energy(gas, curve):
     return np.asarray(total / total[0])
 
 
-SCENES = {
-    "walls": {"law": "own"},
-    "drag": {"drag": jaxgran.StokesDrag(0.3)},
-    "friction": {"surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=3e-3)},
-    "all": {
-        "law": "own",
-        "drag": jaxgran.StokesDrag(0.3, rotational_rate=0.5),
-        "surface": jaxgran.Frictional(0.5, 0.3, rotational_temperature=3e-3),
-    },
-}
 FRICTIONAL_WALLS = {"tangential_damping": 0.8, "friction": 0.4}
 
 
 def with_all(num=NUM) -> jaxgran.Gas:
     """Frictional spheres between frictional walls of three sides, with drag."""
-    gas = soft(num=num, **SCENES["all"])
+    surface = jaxgran.Frictional(0.5, 0.3, rotational_temperature=3e-3)
+    drag = jaxgran.StokesDrag(0.3, rotational_rate=0.5)
+    gas = soft(num=num, law="own", drag=drag, surface=surface)
     sides = float(gas.box_side(num)) * np.array([1.25, 1.0, 0.8])
     walls = jaxgran.Walls(sides, restitution=gas.law, **FRICTIONAL_WALLS)
     return dataclasses.replace(gas, container=walls)
 
 
-@pytest.mark.parametrize(
-    "name", ["all", *(pytest.param(k, marks=pytest.mark.slow) for k in SCENES)]
-)
-def test_ledger_closes_and_all_stay_inside(name):
-    gas = with_all() if name == "all" else soft(**SCENES[name])
+def test_ledger_closes_and_all_stay_inside():
+    gas = with_all()
     times = np.array([0.0, 1, 5, 20]) * float(gas.mean_free_time)
     curve = jaxgran.cool(gas, times, model=SoftSpheres(NUM, steps_per_contact=30))
     # As in the smooth gas: the onset of contacts leaves some 1e-4, falling as dt^(3/2).
     np.testing.assert_allclose(energy(gas, curve), 1.0, atol=5e-4)
     assert curve.temperature[-1] < 0.3 * gas.temperature
-    assert (curve.rotational_temperature is None) == (gas.surface is None)
-    if gas.container is not None:
-        place, side = np.asarray(curve.particles.position), np.asarray(gas.container.side)
-        overlap = 0.05 * float(gas.diameter)  # elastic impacts at 5 sqrt(T) overlap by 4 %
-        edge = 0.5 * float(gas.diameter) - overlap
-        assert np.all(place > edge) and np.all(place < side - edge)
-        assert curve.displacement is None and curve.flow_share is None
-        np.testing.assert_allclose(curve.particles.box_side, side)
-        # Walls push: unlike in a periodic box the gas as a whole does not stay at rest.
-        momentum = np.abs(np.mean(curve.particles.velocity[0], axis=0))
-        assert np.max(momentum) > 1e-3 * np.sqrt(curve.temperature[-1])
+    place, side = np.asarray(curve.particles.position), np.asarray(gas.container.side)
+    overlap = 0.05 * float(gas.diameter)  # elastic impacts at 5 sqrt(T) overlap by 4 %
+    edge = 0.5 * float(gas.diameter) - overlap
+    assert np.all(place > edge) and np.all(place < side - edge)
+    assert curve.displacement is None and curve.flow_share is None
+    np.testing.assert_allclose(curve.particles.box_side, side)
+    # Walls push: unlike in a periodic box the gas as a whole does not stay at rest.
+    momentum = np.abs(np.mean(curve.particles.velocity[0], axis=0))
+    assert np.max(momentum) > 1e-3 * np.sqrt(curve.temperature[-1])
 
 
 def two_spheres(gas, position, velocity, replicas=1):
@@ -128,18 +115,6 @@ def test_flight_with_drag_is_exact():
     np.testing.assert_allclose(end.velocity[0], velocity * np.exp(-rate * times[-1]), rtol=1e-11)
     apart = end.position[0] - place - velocity * fraction
     np.testing.assert_allclose(apart - side * np.round(apart / side), 0.0, atol=1e-12 * side)
-
-
-@pytest.mark.slow
-def test_elastic_gas_with_drag_cools_as_drag_alone():
-    # An elastic impact keeps energy: T exp(2 gamma t), with the energy of contacts, is constant.
-    gas = soft(0.02, 0.0, drag=jaxgran.StokesDrag(1.0))
-    times = np.array([0.1, 0.5, 1.0])
-    curve = jaxgran.cool(gas, times, model=SoftSpheres(NUM))
-    total = curve.temperature + 2 / 3 * curve.elastic_energy / gas.mass
-    # What is stored in contacts, 1 % of the energy, is not dragged meanwhile.
-    np.testing.assert_allclose(total / gas.temperature * np.exp(2 * times), 1.0, atol=0.02)
-    assert np.all(curve.collisions[-1] > 2)
 
 
 @pytest.mark.parametrize("z", [0.0, 1e-9, 0.99 * SERIES_LIMIT, 1.01 * SERIES_LIMIT, 2.0])
@@ -222,21 +197,11 @@ def test_steps_with_friction_are_of_second_order(mu):
     np.testing.assert_allclose((ends[0] - ends[1]) / (ends[1] - ends[2]), 4.0, rtol=0.04)
 
 
-@pytest.mark.slow
-def test_without_friction_frictional_spheres_are_smooth():
-    _, curve, *_ = oblique(jaxgran.Frictional(0.5, 0.0, rotational_temperature=1e-3))
-    _, smooth, *_ = oblique(None)
-    np.testing.assert_allclose(curve.particles.velocity, smooth.particles.velocity, atol=1e-13)
-    T_rot = np.asarray(curve.rotational_temperature)
-    np.testing.assert_allclose(T_rot, 1e-3, rtol=1e-12)  # spins go on
-
-
 @pytest.mark.parametrize(
     "change, message",
     [
         ({"law": 0.9}, "needs walls of the Viscoelastic law.*Use HardSpheres"),
         ({"law": "own", "num": 120}, "spheres of packing_fraction 0.05 need a container 0.833"),
-        ({"surface": jaxgran.Rough(0.1)}, "does not support `surface=Rough`.*DSMC"),
     ],
 )
 def test_what_it_cannot_take_is_refused_in_words(change, message):
@@ -245,21 +210,12 @@ def test_what_it_cannot_take_is_refused_in_words(change, message):
         jaxgran.cool(gas, [0.1], model=SoftSpheres(NUM))
 
 
-def test_friction_is_refused_by_the_other_models():
-    gas = soft(surface=jaxgran.Frictional(0.5, 0.3))
-    for model in (jaxgran.KineticTheory(), jaxgran.DSMC(100), jaxgran.HardSpheres(100)):
-        name = type(model).__name__
-        message = f"{name} does not support `surface=Frictional`.*SoftSpheres.*Rough"
-        with pytest.raises(ValueError, match=message):
-            jaxgran.cool(gas, [0.1], model=model)
+def test_walls_with_friction_need_a_tangential_damping():
+    law = glass_beads().law
     with pytest.raises(ValueError, match="friction must lie in"):
         jaxgran.Frictional(0.5, -0.1)
     with pytest.raises(ValueError, match="tangential_damping must lie in"):
         jaxgran.Frictional(-0.5, 0.1)
-
-
-def test_walls_with_friction_need_a_tangential_damping():
-    law = glass_beads().law
     with pytest.raises(ValueError, match="have friction but no tangential_damping.*Give both"):
         jaxgran.Walls(0.1, restitution=law, friction=0.1)
     with pytest.raises(ValueError, match="friction of the walls must lie in"):
@@ -274,12 +230,7 @@ def test_walls_with_friction_need_a_tangential_damping():
         SoftSpheres(NUM).check(gas)
 
 
-def test_a_start_outside_of_the_walls_is_refused():
-    gas = soft(1e-3, num=2, law="own")
-    side = float(gas.container.side)
-    start = two_spheres(gas, [[-1e-4, 1e-2, 1e-2], [0.5 * side] * 3], 0.0)
-    with pytest.raises(ValueError, match="sphere 0 of replica 0 .* outside of the walls"):
-        jaxgran.cool(gas, [0.1], model=SoftSpheres(2, start=start))
+def test_a_start_with_spins_is_refused():
     spinning = two_spheres(soft(num=2), [[1e-3] * 3, [4e-3] * 3], 0.0)._replace(
         angular_velocity=jnp.ones((1, 2, 3))
     )
@@ -391,75 +342,23 @@ def test_tangents_of_spins_are_exact_between_projections():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_derivatives_with_friction_are_those_of_differences(dimension):
-    num, replicas, step = 500, 32, 0.4
-    gas = with_all(num) if dimension == 3 else in_a_plane()
-    times = np.array([1.0, 5.0, 20.0]) * float(gas.mean_free_time)
-    model = SoftSpheres(num, replicas=replicas, steps_per_contact=20)
-    names = [name for name in FRICTION_FLOATS if name in gas.domains]
-    logs, at = both_temperatures(gas, model, times, names)
-    found = np.moveaxis(np.asarray(jax.jacfwd(logs)(at)), -1, 0)
-    for i, name in enumerate(names):
-        move = step * np.eye(len(names))[i]
-        differences = np.asarray(logs(at + move) - logs(at - move)) / (2 * step)
-        print(f"\n{name}:\n{found[i]}, differences\n{differences}")
-        # ln T of 16000 particles scatters by .006, ln T_rot by .007: differences by .013 and .016
-        # at least, two standard errors of which are allowed.
-        np.testing.assert_allclose(found[i], differences, atol=0.03, rtol=0.05)
-
-
-def in_a_plane() -> jaxgran.Gas:
-    """Frictional disks."""
-    gas = glass_beads(0.15, dimension=2, packing_fraction=0.1)
-    stiffer = (float(gas.contact_fraction) / 0.05) ** 2.5
-    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
-    gas = gas.replace(
-        dissipative_constant=gas.value("dissipative_constant") * 0.15 / gas.thermal_beta
-    )
-    surface = jaxgran.Frictional(0.5, 0.3, inertia=0.5, rotational_temperature=3e-3)
-    return dataclasses.replace(gas, surface=surface)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "elements, names",
-    [
-        (
-            {"law": "own"},
-            ["dissipative_constant", "youngs_modulus", "wall_dissipative_constant", "temperature"],
-        ),
-        ({"drag": jaxgran.StokesDrag(1.0)}, ["drag_rate", "dissipative_constant", "temperature"]),
-        ({"drag": jaxgran.StokesDrag(1.0)}, ["packing_fraction"]),
-    ],
-    ids=["walls", "drag", "density"],
-)
-def test_derivatives_are_those_of_differences_and_of_theory(elements, names):
-    num, replicas = 500, 8
-    gas = soft(num=num, **elements)
-    times = np.array([1.0, 5.0, 20.0]) * float(gas.mean_free_time)
-    model = SoftSpheres(num, replicas=replicas, steps_per_contact=20)
+def test_derivatives_with_walls_and_drag_are_those_of_theory():
+    names = ["dissipative_constant", "youngs_modulus", "wall_dissipative_constant"]
+    names += ["drag_rate", "temperature"]
+    gas = soft(num=500, law="own", drag=jaxgran.StokesDrag(1.0))
+    times = np.array([1.0, 5.0, 10.0]) * float(gas.mean_free_time)
+    model = SoftSpheres(500, replicas=4, steps_per_contact=20)
     logs, at = log_temperatures(gas, model, times, names)
-    found = np.asarray(jax.jacfwd(logs)(at)).T
     theory, _ = log_temperatures(gas, jaxgran.KineticTheory(), times, names)
-    expected = np.asarray(jax.jacfwd(theory)(at)).T
-    step = 0.5
-    for i, name in enumerate(names):
-        move = step * np.eye(len(names))[i]
-        ends = [logs(at + sign * move) for sign in (1, -1)]
-        differences = np.asarray(ends[0] - ends[1]) / (2 * step)
-        print(f"\n{name}: {found[i]}, differences {differences}, theory {expected[i]}")
-        # ln T of 4000 particles scatters by .8/sqrt(4000) = .013 at each end, so differences by
-        # .018; the theory of a mixed gas is off by some 5 % between walls.
-        np.testing.assert_allclose(found[i], differences, atol=0.04, rtol=0.05)
-        np.testing.assert_allclose(found[i], expected[i], atol=0.01, rtol=0.08)
+    # 10 000 collisions scatter the rates by 2 %, of derivatives by twice that; the theory of a
+    # mixed gas is off by some 5 % between walls.
+    expected = jax.jacfwd(theory)(at)
+    np.testing.assert_allclose(jax.jacfwd(logs)(at), expected, atol=0.015, rtol=0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["wall_side", "packing_fraction", "diameter"])
-def test_derivatives_that_are_not_known_are_refused(name):
+def test_derivatives_that_are_not_known_are_refused():
     gas, times = soft(law="own"), [1e-3]
-    logs, at = log_temperatures(gas, SoftSpheres(NUM).sized_for(gas), times, [name])
+    logs, at = log_temperatures(gas, SoftSpheres(NUM).sized_for(gas), times, ["wall_side"])
     with pytest.raises(ValueError, match="side of a container.*not known.*KineticTheory"):
         jax.eval_shape(jax.jacfwd(logs), at)
 

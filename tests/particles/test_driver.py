@@ -79,26 +79,6 @@ def test_records_are_taken_at_the_times():
     assert records["count"].dtype == np.int32
 
 
-def test_a_time_already_reached_takes_no_step():
-    calls = Calls(at=0)
-    state, records = quiet(start(), np.array([0.0]), calls, observe)
-    same(state, start())
-    np.testing.assert_array_equal(records["total"], [3.0])
-
-
-def test_advance_never_needs_to_look_beyond_the_next_time():
-    seen = []
-
-    def recorded(state, until):
-        seen.append((float(state.time), until))
-        return advance(state, until)
-
-    quiet(start(), TIMES, recorded, observe)
-    assert all(time < until for time, until in seen)
-    assert [until for _, until in seen] == [0.3] * 2 + [1.0] * 3 + [1.1] + [2.5] * 6
-    assert all(type(until) is float for _, until in seen)
-
-
 @pytest.mark.parametrize("at", [0, 1, 2, 4, 8, STEPS - 1])
 def test_an_interrupted_run_is_resumed(tmp_path, at):
     path = tmp_path / "run.npz"
@@ -111,15 +91,6 @@ def test_an_interrupted_run_is_resumed(tmp_path, at):
     assert rest.number == STEPS - at
     same(resumed, whole)
     assert all(isinstance(leaf, jax.Array) for leaf in resumed[0])
-
-
-def test_a_run_may_be_interrupted_often(tmp_path):
-    path = tmp_path / "run.npz"
-    whole = quiet(start(), TIMES, advance, observe)
-    for _ in range(5):
-        with pytest.raises(KeyboardInterrupt):
-            quiet(start(), TIMES, Calls(2), observe, path=path)
-    same(quiet(start(), TIMES, Calls(3), observe, path=path), whole)
 
 
 def test_a_run_that_dies_loses_little(tmp_path, monkeypatch):
@@ -156,46 +127,6 @@ def test_a_finished_run_is_read_back(tmp_path):
     same(quiet(start(), TIMES, Calls(0), observe, scene={"name": "toy"}, path=path), whole)
 
 
-def test_checkpoints_of_other_scenes_are_refused(tmp_path):
-    path = tmp_path / "run.npz"
-    quiet(start(), TIMES, advance, observe, scene={"name": "toy"}, path=path)
-    before = path.read_bytes()
-    with pytest.raises(ValueError, match="run.npz belongs to another run"):
-        quiet(start(), TIMES, advance, observe, scene={"name": "other"}, path=path)
-    assert path.read_bytes() == before
-
-
-def test_without_a_path_nothing_is_written(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(KeyboardInterrupt):
-        quiet(start(), TIMES, Calls(3), observe)
-    assert not list(tmp_path.iterdir())
-
-
-def test_resuming_compiles_nothing_anew(tmp_path):
-    traces = []
-
-    @jax.jit
-    def compiled(state, until):
-        traces.append(until)
-        return advance(state, until)
-
-    path = tmp_path / "run.npz"
-    number = [0]
-
-    def interrupted(state, until):
-        number[0] += 1
-        if number[0] == 4:
-            raise KeyboardInterrupt
-        return compiled(state, until)
-
-    with pytest.raises(KeyboardInterrupt):
-        quiet(compiled(start(), 0.0), TIMES, interrupted, observe, path=path)
-    count = len(traces)
-    quiet(compiled(start(), 0.0), TIMES, interrupted, observe, path=path)
-    assert len(traces) == count
-
-
 class Terminal(io.StringIO):
     def isatty(self):
         return True
@@ -220,16 +151,8 @@ def test_the_bar_shows_the_temperature(eager, capsys):
     assert last.startswith("toy: 100%") and "T/T_0 = 0.0168" in last and "left" in last
 
 
-def test_no_bar_where_none_is_wanted(eager, capsys):
-    assert shown(Terminal(), capsys, progress=False) == ""
-
-
 def test_no_bar_without_a_terminal(eager, capsys):
     assert shown(io.StringIO(), capsys) == ""
-
-
-def test_no_bar_for_a_moment(capsys):
-    assert shown(Terminal(), capsys).strip() == ""
 
 
 def test_compiling_is_said_until_the_program_runs():

@@ -8,7 +8,6 @@ from jaxgran.particles.setup import (
     _OverlapRemoval,
     host_positions,
     maxwellian_velocities,
-    normalise_velocities,
 )
 
 BALL = {2: np.pi / 4, 3: np.pi / 6}
@@ -34,14 +33,6 @@ def test_spheres_do_not_overlap(dimension, packing):
     boxes = x.reshape(replicas, n, dimension)
     assert all(smallest_distance(box, side) > 1 for box in boxes)
     assert not np.any(boxes[0] == boxes[1])
-
-
-def test_the_key_fixes_the_positions():
-    first, same, other = (
-        np.asarray(host_positions(jax.random.key(seed), 6.0, 1, 100, 3)) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(first, same)
-    assert not np.any(first == other)
 
 
 def test_dilute_positions_fill_the_box_evenly():
@@ -86,31 +77,7 @@ def test_velocities_are_maxwellian(dimension):
     np.testing.assert_allclose(covariance, np.eye(dimension), atol=5 / np.sqrt(len(v)))
 
 
-def test_the_key_fixes_the_velocities():
-    first, same, other = (
-        maxwellian_velocities(jax.random.key(seed), 2, 50, 3) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(first, same)
-    assert not np.any(first == other)
-    assert not np.any(first[:50] == first[50:])
-
-
-def test_settling_forgets_mean_and_scale():
-    v = jax.random.normal(jax.random.key(7), (60, 3))
-    settled = normalise_velocities(v, 3)
-    for other in (settled, 4.0 * v + 1.0):
-        np.testing.assert_allclose(normalise_velocities(other, 3), settled, atol=1e-14)  # round-off
-    alone = normalise_velocities(v[20:40], 1)
-    np.testing.assert_allclose(settled[20:40], alone, atol=1e-14)
-
-
 @pytest.mark.parametrize("n", [-1, 0, 1])
 def test_too_few_particles_are_refused(n):
     with pytest.raises(ValueError, match=f"num_particles must be at least 2, got {n}"):
         maxwellian_velocities(jax.random.key(0), 1, n, 3)
-
-
-def test_two_velocities_are_opposite():
-    v = maxwellian_velocities(jax.random.key(8), 1, 2, 3)
-    np.testing.assert_allclose(v[0], -v[1], atol=1e-15)  # round-off
-    np.testing.assert_allclose(jnp.sum(v[0] ** 2), 3.0, rtol=1e-14)

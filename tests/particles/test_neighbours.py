@@ -5,19 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 import jaxgran
-from jaxgran.particles.capacity import expected_lookahead
 from jaxgran.particles.neighbours import (
     MAX_LOOKAHEAD,
     choose_engine,
     displacement,
     sweep,
     tree_search,
-    unsorted_share,
     wrap,
 )
 from tests.pairs import find_pairs
@@ -100,29 +96,6 @@ def test_jax_md_finds_what_brute_force_finds(dimension, replicas, fraction):
     compare(dimension, replicas, 3.7, 3.7 * fraction, "jax-md")
 
 
-@pytest.mark.slow
-@given(
-    st.lists(st.tuples(*3 * [st.integers(0, 7)]), min_size=2, max_size=12),
-    st.sampled_from([2, 3]),
-    st.sampled_from([0.07, 0.3, 0.49]),  # no distance of grid points
-)
-@settings(max_examples=40, deadline=None)
-def test_points_of_a_grid(points, dimension, cutoff):
-    position = np.array(points, float)[:, :dimension] / 8
-    expected = brute_force(position, 1.0, cutoff)
-    for by in ("scipy", "sweep"):
-        on_a_grid(position, expected, cutoff, by)
-
-
-def on_a_grid(position, expected, cutoff, by):
-    pairs = find_pairs(jnp.asarray(position), 1.0, cutoff, capacity=66, by=by)
-    assert sorted(listed(pairs)) == sorted(expected)
-    for i, j, offset in zip(pairs.i, pairs.j, pairs.offset, strict=True):
-        if i != j:  # else a row past the last
-            apart = position[i] - position[j] - np.asarray(offset)
-            np.testing.assert_array_equal(apart, expected[int(i), int(j)])  # eighths are exact
-
-
 COMPILED = pytest.mark.parametrize("by", ["scipy", "sweep"])
 
 
@@ -173,17 +146,6 @@ def test_a_capacity_that_is_exceeded_is_reported():
             assert pairs.i.shape == pairs.j.shape == pairs.offset.shape[:1] == (capacity,)
             assert set(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)) < set(expected)
         assert search(capacity=len(expected)).count == len(expected)
-
-
-@pytest.mark.slow
-def test_lists_of_jax_md_grow_with_the_gas():
-    # A gas that has clumped since has the same shape, so the list kept for it is too small.
-    rng = np.random.default_rng(2)
-    side, cutoff = 2.0, 0.3
-    sparse = side * rng.random((30, 2))
-    for position in (sparse, 0.2 * sparse, sparse):
-        pairs = find_pairs(jnp.asarray(position), side, cutoff, capacity=500, by="jax-md")
-        assert set(listed(pairs)) == set(brute_force(position, side, cutoff))
 
 
 @COMPILED
@@ -364,19 +326,3 @@ def test_planes_of_a_lattice_are_in_reach_under_jit(beads):
         position, side, cutoff, replicas=1, capacity=capacity.pairs, ahead=most
     )
     assert count == 3 * 25**3 and 1200 < ahead <= most
-
-
-@pytest.mark.slow
-def test_very_many_disks_are_in_reach(beads):
-    # In order of x only by a coarse number, as the index takes most of its bits.
-    gas = beads(packing_fraction=0.1, dimension=2)
-    n = 600_000
-    side = float(gas.box_side(n) / gas.diameter)
-    rng = np.random.default_rng(9)
-    position = jnp.asarray(side * rng.random((n, 2)))
-    for skin in (0.2, 1.0):
-        reach = expected_lookahead(n, side, skin)
-        *_, ahead = sweep(position, side, 1 + skin, replicas=1, capacity=9, ahead=int(reach))
-        # From two widths of what is unsorted to three, and the scatter of counts.
-        least = reach - n * unsorted_share(n)
-        assert least - 5 * least**0.5 < ahead < reach + 5 * reach**0.5

@@ -12,14 +12,11 @@ from jaxgran.particles.observables import (
     cell_velocity,
     flow_share,
     flow_spectrum,
-    mean_square_displacement,
     number_fluctuation,
     pair_correlation,
     sonine,
     structure_factor,
-    temperature,
     third_sonine,
-    velocity_correlation,
     velocity_distribution,
 )
 
@@ -32,14 +29,6 @@ def lattice(per_side, dimension):
 def random_directions(n, dimension):
     v = np.random.default_rng(dimension).normal(size=(n, dimension))
     return v / np.linalg.norm(v, axis=1, keepdims=True)
-
-
-def test_temperature():
-    v = jnp.array([[3.0, 0.0, 0.0], [0.0, -3.0, 0.0], [1.0, 2.0, 2.0]])
-    assert temperature(v) == pytest.approx(3.0, rel=1e-15)
-    batch = jnp.stack([v, 2 * v])
-    np.testing.assert_allclose(temperature(batch), [3.0, 12.0], rtol=1e-15)
-    assert temperature(v[:, :2]) == pytest.approx(23 / 6, rel=1e-15)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -59,24 +48,6 @@ def test_sonine_of_known_distributions(dimension):
     maxwell = jax.random.normal(jax.random.key(0), (200_000, d))
     # Its standard error is sqrt(8 / (d (d + 2) n)).
     assert abs(sonine(maxwell)) < 4 * np.sqrt(8 / (d * (d + 2) * 200_000))
-
-
-def test_mean_square_displacement():
-    moved = jnp.array([[1.0, 2.0, 2.0], [0.0, 0.0, 5.0], [0.0, 1.0, 0.0]])
-    assert mean_square_displacement(moved) == pytest.approx(35 / 3, rel=1e-15)
-    batch = mean_square_displacement(jnp.stack([moved, jnp.zeros_like(moved)]))
-    np.testing.assert_allclose(batch, [35 / 3, 0.0], rtol=1e-15)
-
-
-def test_velocity_correlation():
-    v = jax.random.normal(jax.random.key(1), (100, 3))
-    # Round-off of sums of 300.
-    assert velocity_correlation(v, v) == pytest.approx(float(temperature(v)), rel=1e-14)
-    assert velocity_correlation(v, -0.5 * v) == pytest.approx(-0.5 * float(temperature(v)))
-    turned = jnp.stack([-v[:, 1], v[:, 0], 0 * v[:, 2]], axis=1)
-    assert velocity_correlation(v, turned) == pytest.approx(0.0, abs=1e-15)
-    batch = velocity_correlation(jnp.stack([v, v]), jnp.stack([v, 2 * v]))
-    np.testing.assert_allclose(batch, temperature(v) * jnp.array([1.0, 2.0]), rtol=1e-14)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -50,29 +50,6 @@ def test_a_replica_is_the_same_whatever_their_number(beads, two_devices):
     assert two.temperature_error.shape == TIMES.shape
 
 
-@pytest.mark.slow
-def test_a_start_is_parted_and_derivatives_are_of_the_same_runs(beads, two_devices):
-    gas = beads(packing_fraction=0.1)
-    start = cool(gas, "HardSpheres", 2).particles
-    model = jaxgran.HardSpheres(MODELS["HardSpheres"], replicas=2, start=start)
-
-    def temperature(a):
-        changed = gas.replace(dissipative_constant=a)
-        return jaxgran.cool(changed, TIMES, model=model, progress=False).replicas.temperature
-
-    a = gas.value("dissipative_constant")
-    values, slopes = jax.jvp(temperature, (a,), (a,))
-    np.testing.assert_array_equal(values, temperature(a))
-    assert slopes.shape == (2, 2) and np.all(slopes[:, -1] < 0)
-    for k in range(2):
-        part = start._replace(
-            position=start.position[k : k + 1], velocity=start.velocity[k : k + 1]
-        )
-        one = jaxgran.HardSpheres(MODELS["HardSpheres"], start=part)
-        alone = jaxgran.cool(gas, TIMES, model=one, progress=False)
-        np.testing.assert_array_equal(values[k], alone.temperature)
-
-
 def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
     gas, path = beads(packing_fraction=0.1), tmp_path / "run.ckpt"
     curve = cool(gas, "DSMC", 2, checkpoint=path)
@@ -129,14 +106,6 @@ def test_large_replicas_on_one_device_run_in_turn(name, beads, monkeypatch):
     two = cool(gas, name, 2, key=key)
     alone = cool(gas, name, 1, key=jax.random.fold_in(key, 1))
     np.testing.assert_array_equal(two.replicas.temperature[1], alone.temperature)
-
-
-def test_replicas_of_dsmc_share_nothing_in_one_array(beads):
-    gas, key = beads(packing_fraction=0.1), jax.random.key(4)
-    two, three = cool(gas, "DSMC", 2, key=key), cool(gas, "DSMC", 3, key=key)
-    for field in ("temperature", "collisions", "displacement"):
-        each = [np.asarray(getattr(curve.replicas, field)) for curve in (two, three)]
-        np.testing.assert_array_equal(each[0], each[1][:2])
 
 
 @pytest.mark.slow  # two devices need a process of their own, which compiles for each

@@ -97,22 +97,6 @@ def test_the_derivative_in_the_strength():
     assert float(forward[2]) == pytest.approx(2 / 3, rel=1e-7)
 
 
-@pytest.mark.slow
-def test_drag_alone_balances_the_drive():
-    # dT/dt = strength - 2 gamma T
-    gas = dataclasses.replace(constant(1.0), drag=jaxgran.StokesDrag(0.1))
-    curve = driven(gas, [1e3, 1e4])
-    steady = gas.value("drive_strength") / 0.2
-    expected = steady + (0.01 - steady) * jnp.exp(-0.2 * curve.times)
-    np.testing.assert_allclose(curve.temperature, expected, rtol=1e-8)
-
-
-def test_no_strength_is_no_drive():
-    with_none = driven(constant(0.8, rate=0.0), [10.0, 1000.0])
-    plain = driven(dataclasses.replace(constant(0.8), drive=None), [10.0, 1000.0])
-    np.testing.assert_allclose(with_none.temperature, plain.temperature, rtol=1e-12)
-
-
 def test_what_is_refused(beads):
     with pytest.raises(ValueError, match="strength of the drive"):
         jaxgran.WhiteNoise(-1.0)
@@ -211,56 +195,25 @@ def test_rough_spheres_that_were_driven_begin_with_the_steady_rotation(beta):
     np.testing.assert_allclose(slope, 0.01 * in_eta, rtol=1e-10)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("beta", [-0.5, 0.5])
-def test_rough_particles_are_released_from_the_steady_state(beta):
-    gas = rough(0.8, beta)
+def test_particles_are_released_from_the_steady_state():
+    gas = prepared(0.5)
     times = np.array([0.0, 0.5, 2.0, 5.0]) * float(gas.mean_free_time)
     theory = jaxgran.cool(gas, times)
-    for model in (jaxgran.DSMC(50_000, replicas=2), jaxgran.HardSpheres(500, replicas=32)):
-        curve = jaxgran.cool(gas, times, model=model)
-        np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.02)
-        # Spins and velocities are correlated: up to 7 % of T_rot, see test_dsmc_elements.py.
-        found = np.asarray(curve.rotational_temperature / theory.rotational_temperature)
-        print(f"\n{model.name}, beta_t = {beta}: T_rot over that of theory {found}")
-        np.testing.assert_allclose(found, 1.0, rtol=0.07)
-
-
-def test_dsmc_begins_in_the_steady_state():
-    gas = prepared(0.5)
-    times = np.array([0.0, 5.0]) * float(gas.mean_free_time)
     curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(20_000, replicas=2))
-    theory = jaxgran.cool(gas, times)
-    # a_2 of 40 000 particles scatters by sqrt(8/15/N) = .004; terms beyond a_2: .006 (eps = .5).
-    assert float(curve.sonine[0]) == pytest.approx(float(theory.sonine[0]), abs=0.018)
-    assert float(curve.sonine[0]) > 0.005
+    # Of 40 000 particles; terms beyond a_2 are .006.
+    noise = np.sqrt(8 / 15 / 40_000)
+    assert np.all(np.abs(curve.sonine - theory.sonine) < 3 * noise + 0.008)
     np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.02)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("eps", [0.5, 0.8])
-def test_particles_are_released_from_the_steady_state(eps):
-    gas = prepared(eps)
-    times = np.array([0.0, 0.5, 2.0, 5.0]) * float(gas.mean_free_time)
-    theory = jaxgran.cool(gas, times)
-    models = (jaxgran.DSMC(50_000, replicas=4), jaxgran.HardSpheres(500, replicas=32))
-    for model in models:
-        curve = jaxgran.cool(gas, times, model=model)
-        noise = np.sqrt(8 / 15 / (model.num_particles * model.replicas))
-        # Terms beyond a_2 are .006 at eps = .5; boxes of 500 spheres are not all of a gas.
-        assert np.all(np.abs(curve.sonine - theory.sonine) < 3 * noise + 0.008)
-        np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.02)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("eps", [0.5, 0.8])
+@pytest.mark.parametrize("eps, dimension", [(0.5, 3), (0.8, 2)])
 def test_dsmc_finds_the_steady_state_of_van_noije_and_ernst(eps, dimension):
     gas = constant(eps, dimension, rate=(1 - eps**2) / dimension)
     steady = jaxgran.steady_state(gas)
-    times = np.linspace(20.0, 60.0, 21) * float(gas.mean_free_time)
-    curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(20_000, replicas=4))
-    # 80 000 particles at some 10 times: .1 % of T, .001 of a_2, a few times; terms beyond a_2.
+    times = np.linspace(10.0, 30.0, 21) * float(gas.mean_free_time)
+    curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(20_000, replicas=2))
+    # 40 000 particles at some 5 times: .2 % of T, .002 of a_2, a few times; terms beyond a_2.
     assert float(jnp.mean(curve.temperature)) == pytest.approx(float(steady.temperature), rel=0.01)
     expected = sonine_of_van_noije_and_ernst(eps, dimension)
     assert float(jnp.mean(curve.sonine)) == pytest.approx(expected, abs=0.006 + 0.1 * abs(expected))

@@ -72,13 +72,6 @@ def test_the_temperatures_reach_the_ratio_of_the_literature(eps, beta, inertia):
     assert ratio == pytest.approx(expected, rel=2e-3)  # approached as a power of time
 
 
-def test_drag_alone_is_an_exponential():
-    gas = constant(1.0, drag=jaxgran.StokesDrag(2.0))
-    curve = cooled(gas, rtol=1e-9)
-    # The tolerance of the solver is one of ln T, which falls to -85.
-    np.testing.assert_allclose(jnp.log(curve.temperature / 0.01), -4 * curve.times, rtol=1e-8)
-
-
 def test_walls_take_energy_as_haff_has_it():
     # dT/dt = -(4/L) Z F (1 - e^2) sqrt(T/(2 pi)) T in a cube of free width L - sigma, where the
     # layer before the wall brings 2/(1 + e) of the impacts, warmer by the heat that flows to it
@@ -173,12 +166,6 @@ def test_derivatives_in_the_floats_of_elements_are_those_of_differences(beads):
         np.testing.assert_allclose(
             forward[:, k] * at[k], difference * at[k], rtol=1e-4, atol=2e-6, err_msg=names[k]
         )
-
-
-def test_soft_spheres_refuse_a_rough_surface_and_name_the_model_that_takes_it(beads):
-    gas = scene(beads(), surface=ELEMENTS["surface"])
-    with pytest.raises(ValueError, match="SoftSpheres does not support .*surface.*KineticTheory"):
-        jaxgran.cool(gas, TAUS * float(gas.mean_free_time), model=jaxgran.SoftSpheres(100))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,4 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -29,11 +28,6 @@ def test_contact_value_of_a_dilute_gas(dimension, second_virial):
     slope = jax.grad(lambda phi: contact_value(phi, dimension))(0.0)
     # Henderson's formula has 25/16 for 1.5640.
     np.testing.assert_allclose(slope, third * second_virial * per_packing, rtol=2e-3)
-
-
-def test_contact_value_of_many():
-    phi = jnp.array([0.1, 0.4])
-    np.testing.assert_allclose(contact_value(phi, 3), [0.95 / 0.729, 0.8 / 0.216], rtol=1e-14)
 
 
 @pytest.mark.parametrize("value, message", [(-1.0, "diameter"), ("wide", "diameter")])

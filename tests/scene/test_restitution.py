@@ -73,13 +73,6 @@ def test_fast_law_series():
     np.testing.assert_allclose(difference, C_CLIP * beta**2.5, rtol=0.2)
 
 
-def test_float32():
-    beta = jnp.geomspace(1e-6, 1e3, 50)
-    fast = viscoelastic_restitution(beta.astype(jnp.float32))
-    assert fast.dtype == jnp.float32
-    np.testing.assert_allclose(fast, viscoelastic_restitution(beta), rtol=2e-5)
-
-
 def test_laws_at_a_speed(beads):
     gas = beads(0.15)
     fast = gas.restitution(gas.impact_speed)
@@ -97,27 +90,6 @@ def test_series_of_viscoelastic_spheres(beads):
     exact = jaxgran.viscoelastic_restitution(0.02 * (v / gas.impact_speed) ** 0.2, clipped=False)
     np.testing.assert_allclose(law.restitution(v), exact, atol=1e-7)  # sixth term: .155 beta^6
     assert law.coefficients.shape == (5,)
-
-
-def test_a_law_of_ones_own():
-    class Ice(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
-        """Bridges, Hatzes & Lin: eps = min(1, 0.34 v^(-0.234)), v in cm/s."""
-
-        speed: jax.Array
-        domains = {}
-
-        def reduced(self, *, diameter, mass, speed):
-            return Ice(self.speed * speed)
-
-        def restitution(self, normal_speed):
-            return jnp.minimum(1.0, 0.34 * (100 * self.speed * normal_speed) ** -0.234)
-
-    gas = jaxgran.Gas(
-        Ice(jnp.ones(())), diameter=0.05, mass=0.06, packing_fraction=0.01, temperature=1e-4
-    )
-    np.testing.assert_allclose(gas.restitution(0.01), 0.34, rtol=1e-12)
-    curve = jaxgran.cool(gas, [1.0, 1e3, 1e6])
-    assert jnp.all(jnp.diff(curve.temperature) < 0)
 
 
 class Plastic(jaxgran.RestitutionLaw):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import sys
-import warnings
 
 import jax
 import jax.numpy as jnp
@@ -274,16 +273,6 @@ def test_invalid_input_is_refused_before_a_store_is_created(tmp_path, options, m
 
 
 @pytest.mark.slow
-def test_lists_have_the_axis_of_members_first():
-    law = jaxgran.RestitutionSeries((-0.1, -0.1), (0.0, 0.2))
-    gas = dataclasses.replace(GAS, law=law)
-    lists = jax.vmap(lambda c: gas.replace(coefficients=jnp.stack([-0.1, c])))
-    curves = sweep(lists(jnp.array([-0.1, -0.2, -0.3])))
-    alone = jaxgran.cool(gas.replace(coefficients=[-0.1, -0.3]), TIMES)
-    np.testing.assert_allclose(curves.temperature[2], alone.temperature, rtol=1e-9)
-
-
-@pytest.mark.slow
 def test_ambiguous_wall_sides_are_refused():
     walls = jaxgran.Walls([0.05, 0.06, 0.07], restitution=0.9)
     box = dataclasses.replace(GAS, container=walls)
@@ -291,9 +280,3 @@ def test_ambiguous_wall_sides_are_refused():
     assert curves.temperature.shape == (5, 3)
     with pytest.raises(ValueError, match="sides of one box or those of 3 cubes"):
         sweep(box.replace(temperature=jnp.ones(3) * 0.01))
-
-
-def test_a_valid_sweep_gives_no_warning(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        sweep(store=tmp_path / "sweep.zarr")

@@ -13,9 +13,8 @@ from jaxgran.data.curve import Run
 from jaxgran.gradients.tangents import ImpactTangents
 from jaxgran.scene.laws import ConstantRestitution, ReducedViscoelastic, RestitutionSeries
 from tests.beads import glass_beads
-from tests.models.test_dsmc import SENSITIVITY
 from tests.models.test_hard_spheres import hard_gas
-from tests.tangents.test_thermal import FLOATS, log_temperature
+from tests.tangents.test_thermal import FLOATS
 
 # One scene for kinetic theory and for the fit, so that it is compiled once.
 DILUTE = {"beta": 0.3, "packing_fraction": 0.03}
@@ -87,22 +86,6 @@ def test_slopes_in_every_float_are_those_of_kinetic_theory():
 
 
 @pytest.mark.slow
-@pytest.mark.figures
-def test_slope_is_that_of_the_sensitivity_table(beads, record):
-    gas, n, replicas = beads(0.15, packing_fraction=0.01), 1000, 8
-    assert gas.box_side(n) < gas.critical_box
-    times = np.array(list(SENSITIVITY)) * float(gas.mean_free_time)
-    f = log_temperature(gas, times, jaxgran.HardSpheres(n, replicas=replicas))
-    slopes = np.asarray(jax.jvp(f, (0.0,), (1.0,))[1])
-    mean, error = slopes.mean(axis=0), slopes.std(axis=0, ddof=1) / replicas**0.5
-    ratio, spread = mean / np.array(list(SENSITIVITY.values())), error / np.abs(mean)
-    print(f"\nslopes over those of the table: {ratio} +- {spread}")
-    # Enskog's clock, on which the table is, is off by .5 % and a tenth of the packing fraction.
-    assert np.all(np.abs(ratio - 1) < 0.006 + 3 * spread)
-    record("hard_sensitivity", off=(ratio - 1).tolist(), error=spread.tolist())
-
-
-@pytest.mark.slow
 def test_fit_finds_what_made_the_curve():
     gas = glass_beads(**DILUTE)
     times = jnp.geomspace(0.5, 8.0, 10) * gas.mean_free_time
@@ -159,16 +142,6 @@ def test_constant_restitution_has_the_slopes_of_haff(constant):
     np.testing.assert_array_equal(slopes[:, 2], 0.0)
 
 
-@pytest.mark.slow
-def test_forward_and_reverse_and_jit_agree(constant):
-    f, at, _, slopes = constant
-    reverse = jax.grad(lambda x: jnp.sum(f(x)))(at)
-    np.testing.assert_allclose(reverse, jnp.sum(slopes, 0), rtol=1e-12)  # the same run
-    both = jax.jit(jax.vmap(jax.jacfwd(f)))(jnp.stack([at, at]))
-    # In another order sums are rounded differently, which chaos grows: one impact a sphere.
-    np.testing.assert_allclose(both[:, :2], jnp.stack([slopes, slopes])[:, :2], rtol=1e-6)
-
-
 def test_a_checkpoint_keeps_the_tangents(constant, tmp_path):
     f, at, _, slopes = constant
     kept = partial(f, checkpoint=tmp_path / "a.npz")
@@ -203,48 +176,3 @@ def test_speed_is_a_unit_of_random_starts_and_not_of_given_ones(constant):
     np.testing.assert_allclose(slopes[:, 1], 1 + slopes[:, 0] / 2, rtol=1e-12)
     hotter = f(at.at[2].set(0.1), model=model)
     np.testing.assert_allclose(hotter, f(at, model=model), rtol=0, atol=1e-9)
-
-
-def over_differences(beads, beta, packing, replicas):
-    """By which share projected slopes exceed differences after 10 and 30 mean free times, its
-    standard error, and what the curve says of it."""
-    gas = beads(beta, packing_fraction=packing)
-    times = np.array([1.0, 3.0, 10.0, 15.0, 20.0, 30.0]) * float(gas.mean_free_time)
-    model, h = jaxgran.HardSpheres(500, replicas=replicas), 0.3
-    f = log_temperature(gas, times, model)
-    difference = (f(h) - f(-h)) / (2 * h)
-    got = jax.jvp(f, (0.0,), (1.0,))[1]
-    error = np.hypot(*(np.std(x, axis=0, ddof=1) / replicas**0.5 for x in (difference, got)))
-    mean = np.mean(difference, axis=0)
-    bias, spread = np.mean(got, axis=0) / mean - 1, error / np.abs(mean)
-    told = np.asarray(jaxgran.cool(gas, times, model=model).derivative_bias)
-    at = np.array([2, 5])
-    print(f"\nphi {packing:g}, beta {beta:g}: projected over differences {bias[at]} ", end="")
-    print(f"+- {spread[at]}, told {told[at]}")
-    return bias[at], spread[at], told[at]
-
-
-@pytest.mark.slow
-@pytest.mark.figures
-@pytest.mark.parametrize("beta, packing", [(0.2, 0.02), (0.1, 0.2)])
-def test_projected_slope_against_differences(beads, beta, packing, record):
-    bias, spread, told = over_differences(beads, beta, packing, 32)
-    # The difference itself bends by 2 % of h^2 at this step.
-    assert np.all(np.abs(bias) < np.maximum(0.05, 2 * spread))
-    assert np.all(told == 0)  # below L_c
-    off, error = bias.tolist(), spread.tolist()
-    record("hard_derivatives", phi=packing, beta=beta, off=off, error=error, told=told.tolist())
-
-
-@pytest.mark.slow
-@pytest.mark.figures
-def test_a_flow_biases_the_projected_slope_as_the_curve_says(beads, record):
-    """In 1.1 L_c flows keep T 4 to 9 % above kinetic theory's; how that depends on A is lost to a
-    memory of T alone, and differences in its place keep it (`tests.tangents.test_differences`)."""
-    bias, spread, told = over_differences(beads, 0.3, 0.2, 96)
-    assert np.all(bias > 3 * spread)
-    # The estimate is within a factor of 2 in all gases in which it was measured, 2.5 at 3 times.
-    ratio = np.abs(np.log(told / bias))
-    assert np.all(ratio < np.log(2) + 2 * spread / bias)
-    off, error = bias.tolist(), spread.tolist()
-    record("hard_derivatives", phi=0.2, beta=0.3, off=off, error=error, told=told.tolist())

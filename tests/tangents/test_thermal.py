@@ -68,8 +68,7 @@ def loss_slope(gas, angle, speed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("beta", [1e-6, 0.1, 0.5])
-@pytest.mark.parametrize("angle", [0.0, 0.7, 1.5])
+@pytest.mark.parametrize("beta, angle", [(0.1, 0.7), (0.5, 1.5)])
 def test_one_impact_has_the_slope_of_its_law(beads, beta, angle):
     # 1.5 rad grazes: the normal speed is 7 % of the speed.
     gas = soft_beads(beads, 1e-7, beta, packing_fraction=0.02)
@@ -110,32 +109,6 @@ def test_the_tangent_is_exact_between_projections(beads):
     # Two codes for one derivative, round-off grown by the chaos of one collision time: 1e-12.
     scale = float(jnp.max(jnp.abs(exact)))
     np.testing.assert_allclose(state.tangents.velocity[0], exact, atol=1e-8 * scale)
-
-
-def two_boxes(beads):
-    gas = soft_beads(beads, 0.05, 0.3, packing_fraction=0.15)
-    times = np.array([0.5, 2.0]) * float(gas.mean_free_time)
-    model = SoftSpheres(60, replicas=2).sized_for(gas, spare=3.0)
-    return log_temperature(gas, times, model)
-
-
-def test_forward_and_reverse_agree(beads):
-    f = two_boxes(beads)
-    reverse = jax.grad(lambda x: jnp.sum(f(x)))(0.0)
-    assert float(reverse) == pytest.approx(float(jnp.sum(slope(f))), rel=1e-12)
-
-
-@pytest.mark.slow
-def test_a_compiled_slope_is_the_same(beads):
-    # Compiled as one it would draw another random start.
-    gas = soft_beads(beads, 0.05, 0.3, packing_fraction=0.15)
-    free = float(gas.mean_free_time)
-    start = jaxgran.cool(gas, [free], model=SoftSpheres(60, replicas=2)).particles
-    model = SoftSpheres(60, replicas=2, start=start).sized_for(gas, spare=3.0)
-    f = log_temperature(gas, np.array([0.5, 2.0]) * free, model)
-    forward = slope(f)
-    # The sums may be taken in another order; chaos grows that: two collisions.
-    np.testing.assert_allclose(jax.jit(partial(slope, f))(), forward, rtol=1e-6)
 
 
 FLOATS = (
@@ -189,25 +162,11 @@ def test_the_ledger_closes_in_the_tangent_too(beads):
 
 
 @pytest.mark.slow
-def test_slope_with_respect_to_times_is_the_cooling_rate(beads):
-    gas = soft_beads(beads, 0.01, 0.2, packing_fraction=0.05)
-    times = np.array([4.0, 8.0]) * float(gas.mean_free_time)
-
-    def f(log_scale, model):
-        return jnp.log(jaxgran.cool(gas, times * jnp.exp(log_scale), model=model).temperature)
-
-    got = slope(partial(f, model=SoftSpheres(400, replicas=3, steps_per_contact=25)))
-    # 5 mean free times of 1200 particles: 3000 collisions, each with a loss as scattered as it is.
-    np.testing.assert_allclose(got, slope(partial(f, model=jaxgran.KineticTheory())), rtol=0.08)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("interval", [0.02, 0.05, 0.25])
-def test_slope_does_not_depend_on_the_interval(beads, interval):
+def test_slope_does_not_depend_on_the_interval(beads):
     # A dense soft gas: a tenth of the spheres is in contact whenever a projection comes.
     gas = soft_beads(beads, 0.1, 0.2, packing_fraction=0.2)
     times = np.array([3.0]) * float(gas.mean_free_time)
-    f = log_temperature(gas, times, SoftSpheres(300, replicas=4, projection=interval))
+    f = log_temperature(gas, times, SoftSpheres(300, replicas=4, projection=0.25))
     g = log_temperature(gas, times, SoftSpheres(300, replicas=4, projection=0.1))
     # The same trajectory: only what chaos does to the tangent in 2 mean free times differs.
     np.testing.assert_allclose(np.mean(slope(f)), np.mean(slope(g)), rtol=0.06)
@@ -267,61 +226,3 @@ def test_touching_two_and_three_bodies_have_finite_slopes(beads):
     for interval in (1e-6, 0.5):
         # Three bodies are no gas: who is hit next how fast is forgotten, the loss itself is not.
         assert float(slope(partial(f, interval=interval))) == pytest.approx(float(plain), rel=0.3)
-
-
-@pytest.mark.slow
-def test_float32(beads):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
-    times = np.array([0.5, 2.0]) * float(gas.mean_free_time)
-    model = SoftSpheres(200, replicas=2)
-    double = slope(log_temperature(gas, times, model))
-    with jax.enable_x64(False):
-        low = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), gas)
-        single = slope(log_temperature(low, times, model))
-        assert single.dtype == jnp.float32
-    # Other trajectories after a while, of 400 particles: means agree to their scatter.
-    np.testing.assert_allclose(np.mean(single, 0), np.mean(double, 0), rtol=0.15)
-
-
-@pytest.mark.slow
-def test_four_decades_of_cooling(beads):
-    gas = soft_beads(beads, 0.02, 0.5, packing_fraction=0.05)
-    times = np.geomspace(1, 3000, 8) * float(gas.mean_free_time)
-    model = SoftSpheres(64, replicas=4, steps_per_contact=20)
-    f = log_temperature(gas, times, model)
-    value, change = jax.jvp(f, (0.0,), (1.0,))
-    assert float(value[:, -1].mean() - np.log(float(gas.temperature))) < np.log(2e-4)
-
-    def of_theory(log_scale):
-        a = gas.value("dissipative_constant") * jnp.exp(log_scale)
-        return jnp.log(jaxgran.cool(gas.replace(dissipative_constant=a), times).temperature)
-
-    # 64 particles in four boxes: rates are known to 5 %.
-    np.testing.assert_allclose(change.mean(0), slope(of_theory), rtol=0.15, atol=0.03)
-
-
-@pytest.mark.slow
-def test_a_start_has_no_projected_slope(beads):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
-    first = jaxgran.cool(gas, [1e-4], model=SoftSpheres(20)).particles
-
-    def f(scale):
-        start = first._replace(velocity=scale * first.velocity)
-        return jaxgran.cool(gas, [1e-3], model=SoftSpheres(20, start=start)).temperature[0]
-
-    with pytest.raises(ValueError, match="chaos"):
-        jax.grad(f)(1.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fraction, packing", [(0.01, 0.05), (0.05, 0.2)])
-def test_projected_slope_against_differences(beads, fraction, packing):
-    gas = soft_beads(beads, fraction, 0.1, packing_fraction=packing)
-    times = np.array([10.0, 30.0]) * float(gas.mean_free_time)
-    model, h = SoftSpheres(500, replicas=32, steps_per_contact=25), 0.3
-    f = log_temperature(gas, times, model)
-    difference = (f(h) - f(-h)) / (2 * h)
-    got = slope(f)
-    error = np.hypot(*(np.std(x, axis=0, ddof=1) / 32**0.5 for x in (difference, got)))
-    mean = np.mean(difference, axis=0)
-    assert np.all(np.abs(np.mean(got, axis=0) - mean) < np.maximum(0.05 * np.abs(mean), 2 * error))

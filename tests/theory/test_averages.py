@@ -93,26 +93,3 @@ def test_a_table_with_slopes_is_the_table_its_derivative_and_those_given(highest
         # Terms of order 12^2 nearly cancel in a derivative.
         expected = jnp.stack([value, slope, other])
         np.testing.assert_allclose(both(jnp.asarray(x)), expected, atol=1e-11)
-
-
-@pytest.mark.slow
-def test_no_gas_leaves_its_rate_table(beads):
-    # Outside, a Chebyshev series means nothing. Gases from nearly elastic to plastic, all horizons.
-    def floor_and_end(beta, tau):
-        gas = beads(1.0)
-        gas = gas.replace(dissipative_constant=gas.value("dissipative_constant") * beta)
-        law, duration = gas.reduced_law, tau / gas.collision_frequency
-        duration = duration * gas.impact_speed / gas.path_length
-        table = RateTable.from_function(
-            lambda v: kinetics.impact_moments(law, v, 3), duration, 3, 20
-        )
-        times = tau[None] * gas.mean_free_time
-        curve = jaxgran.cool(
-            gas, times, model=jaxgran.KineticTheory(softness=False, correlations=False)
-        )
-        return table.lowest, jnp.log(curve.temperature[0] / gas.temperature)
-
-    betas, taus = jnp.meshgrid(jnp.geomspace(1e-3, 10.0, 25), jnp.geomspace(1e-2, 1e4, 25))
-    lowest, reached = jax.vmap(floor_and_end)(betas.ravel(), taus.ravel())
-    assert jnp.all(reached > lowest)
-    assert jnp.all(lowest > 5 * reached - 4.0)  # nor is the table needlessly long

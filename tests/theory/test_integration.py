@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.theory.solver import FIRST_STEP, integrate_at, padded_length
+from jaxgran.theory.solver import FIRST_STEP, integrate_at
 
 TIMES = np.linspace(0.0, 5.0, 64)
 
@@ -22,11 +22,6 @@ def solved(velocity, start, times, rtol=1e-9, max_steps=1000):
         controller=diffrax.PIDController(rtol=rtol, atol=rtol),
         max_steps=max_steps,
     )
-
-
-@pytest.mark.parametrize("size, length", [(1, 16), (16, 16), (17, 32), (50, 64), (65, 128)])
-def test_lengths_are_on_a_geometric_grid(size, length):
-    assert padded_length(size) == length
 
 
 @pytest.mark.parametrize("rtol", [1e-4, 1e-9])
