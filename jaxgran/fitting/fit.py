@@ -18,12 +18,14 @@ from jaxgran.data.curve_file import DropTest
 from jaxgran.fitting.error_budget import clock_accuracy, with_scene_errors
 from jaxgran.fitting.optimise import Problem, best_of_starts, search
 from jaxgran.fitting.parameters import (
+    LAW,
     START_TIME,
     Priors,
     domain_of,
     guess_from_data,
     halving_time,
     size_of,
+    with_names_of_law,
 )
 from jaxgran.fitting.residuals import (
     DropTestRows,
@@ -96,7 +98,8 @@ def fit(
             needs two or more replicas.
         free: names of the free parameters: floats of the gas or its law, such as "temperature"
             (T_0), or "t0", the time at which the gas had T_0 and began to cool, if the clock was
-            not started then. By default A (or a constant restitution) and, if T has no errors, T_0.
+            not started then; "law" stands for all numbers and arrays of the law. By default A (or a
+            constant restitution) and, if T has no errors, T_0.
             A cooling gas forgets its initial temperature: a free T_0 compensates for any start of
             the clock, and a curve does not determine both T_0 and t0; if both are free, t0 is
             constrained to 0 within the time in which T halves. If t0 is free, <dr^2> is not used.
@@ -153,6 +156,7 @@ def fit(
     counts = _numbers_by_label("num_particles", num_particles, data)
     runs = _numbers_by_label("replicas", replicas, data)
     names = _default_names(scenes, data, separate) if free is None else free
+    names = with_names_of_law((names,) if names == LAW else names, next(iter(scenes.values())))
     _check_request(scenes, data, names, separate, max_steps)
     names, separate, key = tuple(names), tuple(separate), checked_key(key)
     all_priors = _priors_by_label(scenes, priors)

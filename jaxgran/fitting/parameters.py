@@ -1,6 +1,5 @@
 """Parameters of a fit: their unconstrained scale, initial guesses from the data, and priors."""
 
-from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran._utils.tracing import any_traced, array_module
 from jaxgran._utils.validation import POSITIVE, Domain, float_array
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.scene.gas import Gas
+from jaxgran.scene.gas import Gas, law_fields
 from jaxgran.scene.laws import ConstantRestitution, Viscoelastic
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
@@ -21,6 +20,9 @@ began to cool: the only free parameter that is not a float of a gas."""
 
 DENSITY = "density"
 """Name of a prior that is not of a float of a gas: the mass over the volume of a sphere."""
+
+LAW = "law"
+"""Name that stands for all floats of the law of restitution."""
 
 ANY_TIME = Domain()
 
@@ -45,13 +47,27 @@ def size_of(gas: Gas, name: str) -> int:
     return 1 if name == START_TIME else gas.value(name).size
 
 
+def with_names_of_law(names: Any, gas: Gas) -> Any:
+    """Return names of free parameters with those of all floats of the law in place of `LAW`."""
+    if not isinstance(names, tuple | list) or LAW not in names:
+        return names
+    own = tuple(law_fields(gas.law))
+    if not own:
+        raise ValueError(
+            f'free="law", but the law {type(gas.law).__name__} has no floats. Declare its numbers '
+            "as fields of the type float, its arrays as jax.Array"
+        )
+    parts = [own if name == LAW else (name,) for name in names]
+    return tuple(dict.fromkeys(name for part in parts for name in part))
+
+
 def with_floats(gas: Gas, values: dict[str, Any]) -> Gas:
     """Return a gas with new values of some floats, whose ranges are not checked."""
     if not values:
         return gas
     fields = gas._float_fields
     return eqx.tree_at(
-        lambda gas: [reduce(getattr, fields[name].path, gas) for name in values],
+        lambda gas: [fields[name].get(gas) for name in values],
         gas,
         [float_array(value) for value in values.values()],
     )

@@ -32,6 +32,9 @@ DEGENERATE_CHI2 = 9.0
 MULTIMODAL_PARAMETER, MULTIMODAL_STARTS = "tangential_restitution", (-0.6, 0.0, 0.6)
 """Parameter in which chi^2 has several minima if T_rot is measured, and its start values."""
 
+MAX_ROWS = 20
+"""Number of estimates up to which a fit lists each element of its vectors."""
+
 SIGNIFICANCE = 0.01
 """Level of significance of the chi^2 test: a model with a smaller p-value is rejected."""
 
@@ -237,10 +240,13 @@ class Fit(eqx.Module):
         """Title and rows of a table of the estimates and the goodness of fit."""
         is_single = not isinstance(self.estimate, Tracer) and self.estimate.ndim == 1
         rows, undetermined = [], self.undetermined() if is_single else ()
-        for name in self.names:
-            estimate, error = (format_quantity(x, _unit(name)) for x in self.value(name))
+        shown = list(zip(self.names, self.names, strict=True))
+        if is_single and len(self.estimate) <= MAX_ROWS:
+            shown = list(zip(self.element_names, self._element_names, strict=True))
+        for element, name in shown:
+            estimate, error = (format_quantity(x, _unit(name)) for x in self.value(element))
             rows.append(
-                (name, "not determined" if name in undetermined else f"{estimate} +- {error}")
+                (element, "not determined" if name in undetermined else f"{estimate} +- {error}")
             )
         rows.append(
             (
@@ -252,12 +258,18 @@ class Fit(eqx.Module):
         return f"Fit of {self.model.name}", rows
 
     def value(self, name: str) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return the estimate and the standard error of one parameter."""
-        if name not in self.names:
+        """Return the estimate and the standard error of a parameter.
+
+        For a vector these are vectors; "coefficients[0]" is the name of one of its elements.
+        """
+        elements, names = self.element_names, self._element_names
+        found = [i for i, both in enumerate(zip(elements, names, strict=True)) if name in both]
+        if not found:
             raise ValueError(f"{name!r} was not free; free were {', '.join(self.names)}")
-        i = self.names.index(name)
+        i: Any = found[0] if elements[found[0]] == name else found
         estimate, error = self.estimate, self.standard_error
         if any_traced((estimate, error)):
+            i = np.asarray(i)
             return estimate[..., i], error[..., i]
         return (
             concrete_array(np.asarray(estimate)[..., i]),
@@ -288,15 +300,33 @@ class Fit(eqx.Module):
         return tuple(dict.fromkeys(name for name, weak in names if weak))
 
     @property
+    def element_names(self) -> tuple[str, ...]:
+        """Name of each element of `estimate`: "coefficients[0]" is the first of a vector."""
+        names: list[str] = []
+        for name, shape in self._shapes.items():
+            names += (
+                [f"{name}{[*map(int, i)]}".replace(" ", "") for i in np.ndindex(shape)]
+                if shape
+                else [name]
+            )
+        return tuple(names)
+
+    @property
     def _element_names(self) -> list[str]:
-        """Name of each element of `estimate`."""
+        """Name of the parameter of each element of `estimate`."""
+        return [name for name, shape in self._shapes.items() for _ in range(int(np.prod(shape)))]
+
+    @property
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the parameters, in a batch those of one member."""
         gases = self.gas if isinstance(self.gas, dict) else {"": self.gas}
-        names = []
+        shapes = {}
         for name in self.names:
             label, _, short = name.rpartition(": ")
             gas = gases.get(label, next(iter(gases.values())))
-            names += [name] * (1 if short == START_TIME else gas.value(short).size)
-        return names
+            batch = self.estimate.ndim - 1
+            shapes[name] = () if short == START_TIME else gas.value(short).shape[batch:]
+        return shapes
 
     def weights(self) -> dict[str, Float[np.ndarray, "p"]]:
         """Return the fraction of the information on each estimate from each measurement, by label.

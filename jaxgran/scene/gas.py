@@ -6,7 +6,6 @@ is the length scale of the shear instability.
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from functools import reduce
 from math import gamma, pi
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -19,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxgran._utils.formatting import TableRows, format_quantity, html_table, text_table
 from jaxgran._utils.validation import (
+    ANY,
     POSITIVE,
     Domain,
     UserNumber,
@@ -58,10 +58,16 @@ S = TypeVar("S", bound="NamedFloats")
 
 
 class FloatField(NamedTuple):
-    """Path of nested attributes to a float, and its allowed range."""
+    """Path to a float, of attributes (str) and items (tuples of one key), and its allowed range."""
 
-    path: tuple[str, ...]
+    path: tuple[Any, ...]
     domain: Domain
+
+    def get(self, module: Any) -> Any:
+        """Return the float of a module."""
+        for key in self.path:
+            module = getattr(module, key) if isinstance(key, str) else module[key[0]]
+        return module
 
 
 class NamedFloats(eqx.Module):
@@ -98,7 +104,7 @@ class NamedFloats(eqx.Module):
         fields = self._float_fields
         if name not in fields:
             raise ValueError(f"no float {name!r} in this gas; it has {', '.join(fields)}")
-        return reduce(getattr, fields[name].path, self)
+        return fields[name].get(self)
 
     def replace(self: S, **values: UserNumber) -> S:
         """Return a copy with new values of some floats.
@@ -116,10 +122,10 @@ class NamedFloats(eqx.Module):
             self.value(name)
             fields[name].domain.check(name, value)
 
-        def get(module):
-            return [reduce(getattr, fields[name].path, module) for name in values]
-
-        return eqx.tree_at(get, self, [float_array(value) for value in values.values()])
+        arrays = [float_array(value) for value in values.values()]
+        return eqx.tree_at(
+            lambda module: [fields[name].get(module) for name in values], self, arrays
+        )
 
     def _check_single(self, lists: tuple[str, ...]) -> None:
         """Raise ValueError for a batch; `lists` names the floats that may hold several numbers."""
@@ -131,7 +137,8 @@ class NamedFloats(eqx.Module):
                 raise ValueError(
                     f"{name} of the gas has shape {shape}, but only one number is allowed. For "
                     "many gases use jax.vmap(lambda gas: jaxgran.cool(gas, times))(gases), or "
-                    "call this for one gas at a time."
+                    "call this for one gas at a time; put the name of a vector of a law into "
+                    "`lists` of its class."
                 )
 
 
@@ -148,8 +155,34 @@ _PACKING_DOMAINS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
 def _checked_law(law: UserLaw) -> RestitutionLaw:
     if not isinstance(law, RestitutionLaw):
         raise ValueError(f"law must be a restitution law such as jaxgran.Viscoelastic, got {law!r}")
+    # Functions in a law, as those of a neural network, must not be leaves beside its arrays.
+    law = jax.tree.map(_without_function_leaf, law)
     check_reduced_units(law)
     return law
+
+
+def _without_function_leaf(leaf: Any) -> Any:
+    if isinstance(leaf, str):
+        raise ValueError(
+            f"a law must consist of numbers, arrays and functions, got {leaf!r}. Declare that "
+            "field as eqx.field(static=True)"
+        )
+    return jax.tree_util.Partial(leaf) if callable(leaf) else leaf
+
+
+def law_fields(law: RestitutionLaw) -> dict[str, FloatField]:
+    """Path and range of the floats of a law: those in its `domains`, then all further arrays.
+
+    The name of an array in a part of the law is its path, "net.layers[0].weight".
+    """
+    fields = {name: FloatField((name,), domain) for name, domain in law.domains.items()}
+    for keys, leaf in jax.tree_util.tree_flatten_with_path(law)[0]:
+        name = jax.tree_util.keystr(keys).removeprefix(".")
+        if name not in fields and eqx.is_inexact_array(leaf):
+            items = [(getattr(k, "idx", getattr(k, "key", None)),) for k in keys]
+            path = [getattr(k, "name", item) for k, item in zip(keys, items, strict=True)]
+            fields[name] = FloatField(tuple(path), ANY)
+    return fields
 
 
 class Gas(NamedFloats):
@@ -202,7 +235,7 @@ class Gas(NamedFloats):
         if self.dimension not in CLOSE_PACKING or isinstance(self.dimension, bool | float):
             raise ValueError(f"dimension must be 2 or 3, got {self.dimension!r}")
         own = fields_of("Gas")
-        shared = [name for name in self.law.domains if name in own]
+        shared = [name for name in law_fields(self.law) if name in own]
         if shared:
             raise ValueError(
                 f"the law {type(self.law).__name__} has a field {shared[0]!r}, which is also the "
@@ -217,8 +250,8 @@ class Gas(NamedFloats):
     @property
     def _float_fields(self) -> dict[str, FloatField]:
         gas_domains = domains_of("Gas") | {"packing_fraction": _PACKING_DOMAINS[self.dimension]}
-        law_domains = self.law.domains
-        fields = {name: FloatField(("law", name), domain) for name, domain in law_domains.items()}
+        law = law_fields(self.law).items()
+        fields = {name: FloatField(("law", *path), domain) for name, (path, domain) in law}
         fields |= {name: FloatField((name,), domain) for name, domain in gas_domains.items()}
         for prefix, path, part in self._elements():
             for name, domain in part.domains.items():
@@ -250,7 +283,8 @@ class Gas(NamedFloats):
         Raises:
             ValueError: if a float has more than one value; the message names it.
         """
-        self._check_single((*self.law.lists, "wall_side"))
+        parts = law_fields(self.law).keys() - self.law.domains.keys()
+        self._check_single((*self.law.lists, *parts, "wall_side"))
 
     @property
     def number_density(self) -> Float[Array, ""]:
