@@ -184,9 +184,16 @@ class Measurement:
             name = "rotational_temperature"
             weights[name] = _weights(xp, getattr(curve, name), curve.rotational_temperature_error)
             accuracies[name] = model.rotation_accuracy
+        # A measured <dr^2> starts at t = 0 of the curve, not at t0.
+        has_errors = curve.displacement_error is not None or num_particles is not None
         accuracy = None
-        if use_displacement:  # a measured <dr^2> starts at t = 0 of the curve, not at t0
-            accuracy = _displacement_accuracy(gas, curve, model, num_particles)
+        if (
+            use_displacement
+            and curve.displacement is not None
+            and has_errors
+            and T_error is not None
+        ):
+            accuracy = model.displacement_accuracy(gas)
         if accuracy is not None:
             accuracy, measured = xp.asarray(accuracy), xp.asarray(curve.displacement)
             total = (1 if num_particles is None else num_particles) * replicas
@@ -248,6 +255,11 @@ class Measurement:
             logs, computed = _log_curve(model, gas, elapsed, around, tolerance)
         else:
             logs, computed = _log_values(model.simulate(self.scene, elapsed, Run()))
+        if missing := ", ".join(name for name in self.weights if name not in logs):
+            raise ValueError(
+                f"{type(model).__name__} does not compute {missing} in this scene, though it gives "
+                "its accuracy. Let displacement_accuracy return None there."
+            )
         floor = values.get(FLOOR, 0.0)
         hot = xp.exp(logs["temperature"].values)
         share = hot / (hot + floor)
@@ -437,25 +449,6 @@ def _finite_size_factor(gas: Gas, num_particles: Float[Array, ""]) -> Float[Arra
     loss = 1 - gas.reduced_law.restitution(one) ** 2
     ratio = (1 - gas.reduced_law.restitution(hotter * one) ** 2) / jnp.where(loss > 0, loss, 1.0)
     return hotter * jnp.where(loss > 0, ratio, 1.0)
-
-
-def _displacement_accuracy(
-    gas: Gas, curve: CoolingCurve, model: AbstractModel, num_particles: int | None
-) -> Float[Array, ""] | None:
-    """Relative accuracy of the model's <dr^2>; None if the fit cannot use <dr^2>.
-
-    <dr^2> is used if it is measured and computed, and its error and that of T are known.
-    """
-    if curve.displacement is None or curve.temperature_error is None:
-        return None
-    if curve.displacement_error is None and num_particles is None:
-        return None
-    accuracy = model.displacement_accuracy(gas)
-    if accuracy is not None:
-        computed = eqx.filter_eval_shape(model.simulate, gas, curve.times, Run())
-        if computed.displacement is None or computed.collisions is None:
-            return None
-    return accuracy
 
 
 def _position(xp: Any, T: Numbers) -> Numbers:

@@ -178,7 +178,10 @@ class AbstractModel(eqx.Module):
         """
 
     def displacement_accuracy(self, gas: Gas) -> Float[Array, ""] | None:
-        """Relative accuracy of <dr^2>; None (the default) if a fit should not use <dr^2>."""
+        """Relative accuracy of <dr^2>; None (the default) if a fit should not use <dr^2>.
+
+        A model that returns a number computes <dr^2> and the number of collisions of this gas.
+        """
         return None
 
     @property

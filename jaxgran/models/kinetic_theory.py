@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils import status, validation
-from jaxgran._utils.tracing import any_traced, pad_to, truncate_to
+from jaxgran._utils.tracing import any_traced, array_module, pad_to, truncate_to
 from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
@@ -109,17 +109,22 @@ class KineticTheory(AbstractModel):
     elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive", "preparation")
     derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs
 
-    def displacement_accuracy(self, gas: Gas) -> Float[Array, ""]:
+    def displacement_accuracy(self, gas: Gas) -> Any:
         """Relative error of <dr^2> by the Sonine order of D and by correlated collisions.
+
+        It is None between walls.
 
         Hard spheres diffuse faster than in Enskog's theory by the share 0.85 phi up to phi = .2
         (Speedy, Mol. Phys. 62 (1987) 509); this is assumed for disks, too.
         """
-        correlation = 0.85 * jnp.minimum(gas.packing_fraction, 0.2)
+        if gas.container is not None:
+            return None
+        xp = array_module(gas)
+        correlation = 0.85 * xp.minimum(gas.packing_fraction, 0.2)
         sonine = 0.005 if self.order > 2 and self.sonine else {2: 0.024, 3: 0.017}[gas.dimension]
         if gas.surface is not None:  # spins and velocities are correlated: DSMC, beta_t = .5
             sonine += 0.07
-        return jnp.hypot(sonine, correlation)
+        return xp.hypot(sonine, correlation)
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; < 0 if the law heats it."""

@@ -293,9 +293,11 @@ def _solve_with_tangents(
     )
     table = table.with_slopes(jax.vmap(lambda x: table_along(x).coefficients)(directions))
 
+    @jax.jit  # traced once
     def derivative(state, rates, parameters):
         return equations.derivative(state, rates, unravel(parameters))
 
+    @jax.jit  # traced once
     def rows_derivative(rows):
         # Row 0 is the state; the others, its tangents, obey the linearised equation.
         rates, slope, *_ = at = table(rows[0, 0])
