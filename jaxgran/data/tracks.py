@@ -7,10 +7,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy  # which imports scipy.stats at its first use
 from jaxtyping import Float, Int
-from scipy.optimize import least_squares
-from scipy.spatial import KDTree
-from scipy.stats import chi2
 
 from jaxgran.data.curve import MIN_POINTS, CoolingCurve
 from jaxgran.data.files import header_count, header_number
@@ -306,7 +304,7 @@ def _step(
         lost: positions of particles that are in the first frame only, m.
         new: positions of particles that are in the second frame only, m.
     """
-    n, d = start.shape
+    (n, d), chi2 = start.shape, scipy.stats.chi2
     step = Step((times[0] + times[1]) / 2, times[1] - times[0], ids, end - start)
     drift = np.median(step.displacement, axis=0) if n else 0.0
     start = start + drift
@@ -325,7 +323,7 @@ def _step(
     wrong = too_long.copy()
     if scale**0.5 < MAX_STEP * (np.prod(spread) / n) ** (1 / d):
         reach = np.sqrt(scale * np.minimum(own, limit))
-        near = KDTree(end).query_ball_point(start, reach)
+        near = scipy.spatial.KDTree(end).query_ball_point(start, reach)
         pairs = [(i, j) for i, ends in enumerate(near) for j in ends if i != j]
         i, j = np.array(pairs, int).reshape(-1, 2).T
         exchanged = chi_squared(end[j] - start[i]), chi_squared(end[i] - start[j])
@@ -333,7 +331,7 @@ def _step(
         wrong[i[swapped]] = wrong[j[swapped]] = True
         for others, here in ((lost + drift, end), (new, start)):
             if len(others):
-                other = KDTree(others).query(here)[0] ** 2 / scale
+                other = scipy.spatial.KDTree(others).query(here)[0] ** 2 / scale
                 wrong |= own - other > MIN_GAIN
     return step._replace(
         ids=ids[~wrong],
@@ -371,7 +369,7 @@ def _wrong_identities(steps: list[Step], header: dict[str, str]) -> tuple[list[s
 
 def _difference_from_median(T: np.ndarray, velocities: list[np.ndarray]) -> tuple[float, float]:
     """Return the relative difference of T from that by the median speed, and its size by chance."""
-    d = velocities[0].shape[1]
+    d, chi2 = velocities[0].shape[1], scipy.stats.chi2
     squares = [np.sum((u - u.mean(axis=0)) ** 2, axis=1) for u in velocities]
     medians = [np.median(square) / chi2.median(d) for square in squares]
     share = float(np.mean(np.log(T / np.maximum(medians, np.finfo(float).tiny))))
@@ -461,7 +459,7 @@ def _fit_memory(
 
     def fit(start: list[float]) -> tuple[np.ndarray, np.ndarray]:
         bounds = [0.0] * len(start), [max(20.0, 2 * start[0]), 0.49][: len(start)]
-        found = least_squares(residuals, start, bounds=bounds)
+        found = scipy.optimize.least_squares(residuals, start, bounds=bounds)
         return found.x, np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
 
     notes, questions = [], []

@@ -447,11 +447,10 @@ def goodness_of_fit(
 
 def _p_value(xp: Any, chi2: Numbers, degrees: Numbers, error_degrees: Numbers | None) -> Numbers:
     """Probability of a chi^2 as large; `error_degrees` is None for exact errors."""
-    if error_degrees is None:
-        stats = jax.scipy.stats if xp is jnp else scipy.stats
-        return stats.chi2.sf(chi2, degrees)
-    share = error_degrees / (error_degrees + chi2)  # of the F distribution
     special = jax.scipy.special if xp is jnp else scipy.special
+    if error_degrees is None:
+        return special.gammaincc(degrees / 2, chi2 / 2)
+    share = error_degrees / (error_degrees + chi2)  # of the F distribution
     return special.betainc(error_degrees / 2, degrees / 2, share)
 
 
