@@ -211,24 +211,6 @@ def test_derivatives_are_those_of_kinetic_theory(beads):
     np.testing.assert_allclose(ours[1], theory[1], rtol=0.06, atol=0.015)
 
 
-def test_derivatives_are_those_of_the_runs(beads):
-    gas, zero, taus, n = beads(0.15), jnp.zeros(3), [1.0, 5.0], 20_000
-    at = partial(logs, gas=gas, taus=taus, model=DSMC(n))
-    forward = jax.jit(jax.jacfwd(at))(zero)
-    reverse = jax.jit(jax.jacrev(at))(zero)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-12)  # one linear rule
-    # The same random numbers on both sides; runs drift apart, which leaves sqrt(2) T_SCATTER.
-    h = 0.3  # d^3 ln T / d (ln A)^3 is below one: h^2/6
-    plain = jax.jit(at)
-    up, down = (plain(jnp.array([x, 0.0, 0.0])) for x in (h, -h))
-    difference = (up - down) / (2 * h)
-    noise = 2.5 * 2**0.5 / n**0.5 / (2 * h)
-    np.testing.assert_allclose(
-        forward[0, :, 0], difference[0], rtol=0.02, atol=noise * T_SCATTER + h**2 / 60
-    )
-    np.testing.assert_allclose(forward[1, :, 0], difference[1], rtol=0.02, atol=noise * MSD_SCATTER)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("law", ["constant", "series"])
 def test_derivatives_of_other_laws(law):

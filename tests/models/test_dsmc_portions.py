@@ -37,6 +37,7 @@ def elastic(strength, **elements) -> jaxgran.Gas:
     return dataclasses.replace(gas, drive=drive, **elements)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strength", [0.01, 0.6])  # one subset in half a step, and all of them
 def test_kicks_heat_by_the_strength_and_leave_the_gas_at_rest(strength):
     gas = elastic(strength)
@@ -59,6 +60,7 @@ def test_kicks_heat_by_the_strength_and_leave_the_gas_at_rest(strength):
     np.testing.assert_allclose(curve.displacement, theory.displacement, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_walls_a_fraction_of_a_mean_free_path_apart_are_met_by_the_fast_spheres_too():
     # A sphere meets walls up to 9 times in a step of .1 collisions: steps are shorter here.
     gas = elastic(0.0, container=jaxgran.Walls(8e-3, restitution=0.95))

@@ -29,6 +29,7 @@ def run(gas, num_particles, replicas, taus):
     return jaxgran.cool(gas, times, model=jaxgran.HardSpheres(num_particles, replicas=replicas))
 
 
+@pytest.mark.slow
 def test_energy_is_conserved_and_all_stay_inside():
     surface = jaxgran.Rough(0.2, rotational_temperature=3e-3)
     gas = contained(200, 0.8, surface=surface, wall_beta=0.3)

@@ -52,11 +52,11 @@ def test_fit_finds_what_made_the_curve():
         assert error < 0.01 * gas.value(name)
     assert np.all(result.error_budget["model"] > 0)
     diagnosis = jaxgran.diagnose(result, curve)
-    # A loss that grows as spins warm up is hardly told from a larger one: the noise allows it.
-    rough = "rough grains without initial rotation"
-    known = rf"Haff law is compatible with this curve, which does not exclude {rough}: "
-    known += r"coefficient is between 0\.\d+ and 0\.\d+\."
-    assert diagnosis.explains and re.fullmatch(known, diagnosis.verdict)
+    # A loss on walls, or one that grows as spins warm up, is hardly told from a larger one.
+    known = "Haff law is compatible with this curve, which does not exclude .*: coefficient is betw"
+    assert diagnosis.explains and re.match(known, diagnosis.verdict)
+    low, high = diagnosis.ranges["coefficient"]
+    assert low < 0.9 < high
 
 
 @pytest.mark.slow

@@ -54,6 +54,7 @@ def with_all(num=NUM) -> jaxgran.Gas:
     return dataclasses.replace(gas, container=walls)
 
 
+@pytest.mark.slow
 def test_ledger_closes_and_all_stay_inside():
     gas = with_all()
     times = np.array([0.0, 1, 5, 20]) * float(gas.mean_free_time)
