@@ -173,7 +173,7 @@ def limitations_of_instant_impacts(
         consequence: the relative clause about overlaps that are not small.
     """
     effects = []
-    duration, overlap = float(gas.contact_fraction), float(gas.mean_overlap)
+    duration, overlap, _ = map(float, _contact_and_box(gas))
     if duration > CONTACT_LIMIT:
         effects.append(
             f"contacts last {duration:.2g} of the mean free time, so spheres meet three at a time"
@@ -181,6 +181,11 @@ def limitations_of_instant_impacts(
     if overlap > OVERLAP_LIMIT:
         effects.append(f"spheres overlap by {100 * overlap:.2g} % of a diameter, {consequence}")
     return tuple(Limitation(words, True, SOFT_SPHERES_NEEDED) for words in effects)
+
+
+@eqx.filter_jit
+def _contact_and_box(gas: Gas) -> tuple[Array, Array, Array]:
+    return gas.contact_fraction, gas.mean_overlap, gas.critical_box
 
 
 def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Limitation, ...]:
@@ -202,7 +207,7 @@ def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Lim
         effects.append(f"walls are {side:.2g} mean free paths apart, and the gas is taken as mixed")
     elif num_particles is not None:
         diameter = float(gas.diameter)
-        box, critical = float(gas.box_side(num_particles)), float(gas.critical_box)
+        box, critical = float(gas.box_side(num_particles)), float(_contact_and_box(gas)[2])
         if box > critical:
             effects.append(
                 f"the box, {box / diameter:.3g} diameters, is above "
