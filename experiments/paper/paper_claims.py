@@ -18,6 +18,7 @@ import jaxgran
 from experiments.support.closed_forms import (
     RELAXATION_CORRECTION,
     SONINE_COEFFICIENT,
+    paper_averages,
     paper_displacement,
     paper_temperature,
 )
@@ -27,7 +28,7 @@ from jaxgran.data.files import header_number
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, C2
 from jaxgran.theory.averages import TERMS, collision_rate, impact_moments
-from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, paper_averages
+from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 SMALL = 1e-4
 """delta at which first-order coefficients are measured."""

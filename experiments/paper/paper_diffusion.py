@@ -31,10 +31,14 @@ from scipy.integrate import simpson
 
 import jaxgran
 from experiments.support import paper
-from experiments.support.closed_forms import RELAXATION_CORRECTION, paper_displacement
+from experiments.support.closed_forms import (
+    RELAXATION_CORRECTION,
+    paper_averages,
+    paper_displacement,
+)
 from experiments.support.scenes import beads, hard_beads
 from jaxgran.theory.averages import Rates, collision_rate, impact_moments
-from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, paper_averages
+from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 PACKING = 0.05
 THEORY = jaxgran.KineticTheory(softness=False, correlations=False)

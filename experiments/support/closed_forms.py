@@ -5,14 +5,57 @@ temperatures are over T_0. The paper is N. V. Brilliantov & T. Poeschel, Self-di
 gases, Phys. Rev. E 61, 1716 (2000); its equations are numbered as in the authors' preprint.
 """
 
-from math import gamma
+from math import gamma, pi, sqrt
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.scene.laws import C1, C_CLIP
-from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE, speed_moment
+from jaxgran.scene.geometry import sphere_surface
+from jaxgran.scene.laws import C1, C_CLIP, ReducedLaw, ReducedViscoelastic
+from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
+
+
+def speed_moment(power: float) -> float:
+    """Return ``int_0^inf g^(1 + power) exp(-g^2/2) dg``."""
+    return 2 ** (power / 2) * gamma(1 + power / 2)
+
+
+def paper_averages(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[Array, "3 3"]:
+    """Return the paper's truncated averages: Maxwellian velocities, two terms of the series of eps.
+
+    ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)``, and ``1/tau_v`` to order delta^2.
+
+    Args:
+        law: a `Viscoelastic` law in units of `Gas.impact_speed`.
+        speed: sqrt(T/T_0).
+        dimension: d; the paper has 3.
+
+    Returns:
+        An array like that of `jaxgran.theory.averages.impact_moments`, with the rows mu_2, 0 and
+        nu_v; only the first column is not 0.
+
+    Raises:
+        ValueError: for another law.
+
+    Reference: Brilliantov & Poeschel, Eqs. (32) and (36).
+    """
+    if not isinstance(law, ReducedViscoelastic):
+        raise ValueError(
+            f"the paper's truncated averages need the Viscoelastic law, got {type(law).__name__}; "
+            "use the exact averages for other laws"
+        )
+    beta = law.beta * speed**0.2
+    cooling = C1 * beta * speed_moment(2.2) - 11 / 10 * C1**2 * beta**2 * speed_moment(2.4)
+    relaxation = (
+        2 * speed_moment(2.0)
+        - C1 * speed_moment(2.2) * beta
+        + 3 / 5 * C1**2 * speed_moment(2.4) * beta**2
+    )
+    column = jnp.stack([cooling, jnp.zeros_like(beta), relaxation / dimension])
+    maxwellian = jnp.asarray([1.0, 0.0, 0.0], beta.dtype)
+    return sphere_surface(dimension) / sqrt(8 * pi) * jnp.outer(column, maxwellian)
+
 
 RELAXATION_CORRECTION = 3 / 4 * gamma(2.1) * C1 * 4**0.1
 """c in ``tau_E/tau_v = 1 - c delta`` at T_0, with the velocity relaxation time tau_v and that of

@@ -1,7 +1,6 @@
 """Checks of arguments and scenes, and descriptions of scenes, that several models share."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +18,7 @@ from jaxgran.particles.run import MIN_BOX
 from jaxgran.particles.setup import PACKING_LIMIT
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
-from jaxgran.theory.averages import impact_moments as exact_averages
+from jaxgran.theory.averages import impact_moments
 from jaxgran.theory.equations import max_thermal_speed, softness_factor
 
 CONTACT_LIMIT = 0.03
@@ -81,19 +80,19 @@ def check_cools(rate: ArrayLike) -> None:
 
 
 @eqx.filter_jit
-def first_cooling_rate(gas: Gas, averages: Callable = exact_averages) -> Float[Array, ""]:
+def first_cooling_rate(gas: Gas) -> Float[Array, ""]:
     """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; negative if the law heats it."""
-    mu_2 = averages(gas.reduced_law, jnp.ones_like(gas.temperature), gas.dimension)[0, 0]
+    mu_2 = impact_moments(gas.reduced_law, jnp.ones_like(gas.temperature), gas.dimension)[0, 0]
     return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
 
 
 @eqx.filter_jit
-def initial_cooling(gas: Gas, averages: Callable) -> tuple[Array, Array, Array]:
+def initial_cooling(gas: Gas) -> tuple[Array, Array, Array]:
     """Return `first_cooling_rate`, and at the highest T the softness factor and sqrt(T/T_0)."""
     one = jnp.ones_like(gas.temperature)
     hottest = one if gas.drive is None else max_thermal_speed(gas)
     factor = softness_factor(gas.reduced_law, hottest, gas.dimension)
-    return first_cooling_rate(gas, averages), factor, hottest
+    return first_cooling_rate(gas), factor, hottest
 
 
 def check_softness(gas: Gas, factor: ArrayLike, hottest: ArrayLike = 1.0) -> None:

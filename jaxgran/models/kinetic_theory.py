@@ -1,7 +1,6 @@
 """Kinetic theory of a homogeneous gas: seven ordinary differential equations."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import diffrax
@@ -18,8 +17,7 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ROUGHNESS_ERROR, ErrorModel
 from jaxgran.scene.gas import Gas
-from jaxgran.theory import averages
-from jaxgran.theory.equations import Density, Equations, paper_averages, scene_at_start
+from jaxgran.theory.equations import Density, Equations, scene_at_start
 from jaxgran.theory.solver import Integrator, moments_at, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
@@ -57,7 +55,6 @@ class KineticTheory(AbstractModel):
             spheres).
         correlations: correct for velocity correlations at finite density; with False this is
             Enskog's theory.
-        averages: "exact", or "paper" for its truncated b_1, b_2, tau_v (delta < 0.43; Maxwellian).
         rtol: relative tolerance of the adaptive solver; by default 1e-8 in float64, 1e-5 in
             float32. The relative error of T is about rtol, the error of <dr^2> about rtol in mean
             free paths squared.
@@ -80,7 +77,6 @@ class KineticTheory(AbstractModel):
     order: validation.UserInt = eqx.field(static=True, default=3)
     softness: validation.UserBool = eqx.field(static=True, default=True)
     correlations: validation.UserBool = eqx.field(static=True, default=True)
-    averages: str = eqx.field(static=True, default="exact")
     rtol: validation.UserFloat | None = eqx.field(static=True, default=None)
     solver: Any = eqx.field(static=True, default=diffrax.Tsit5(scan_kind="lax"))
     max_steps: validation.UserInt = eqx.field(static=True, default=200_000)
@@ -93,8 +89,6 @@ class KineticTheory(AbstractModel):
             raise ValueError(
                 f"order must be 2 or 3, got {self.order!r}. Use sonine=False for a Maxwellian gas."
             )
-        if self.averages not in ("exact", "paper"):
-            raise ValueError(f'averages must be "exact" or "paper", got {self.averages!r}')
         if self.rtol is not None:
             validation.checked_float(
                 "rtol", self.rtol, TOLERANCES, "Leave it out for 1e-8 (float32: 1e-5)."
@@ -128,13 +122,13 @@ class KineticTheory(AbstractModel):
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; < 0 if the law heats it."""
-        return checks.first_cooling_rate(gas, self._averages)
+        return checks.first_cooling_rate(gas)
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""
         if any_traced(gas):
             return
-        rate, factor, hottest = checks.initial_cooling(gas, self._averages)
+        rate, factor, hottest = checks.initial_cooling(gas)
         if self.softness:
             checks.check_softness(gas, factor, hottest)
         checks.check_cools(rate)
@@ -188,7 +182,8 @@ class KineticTheory(AbstractModel):
         scene = scene_at_start(gas), Density.from_gas(gas, self.softness, self.correlations)
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
         integrator = Integrator(self.solver, rtol * tolerance, self.max_steps)
-        equations = self._equations(gas.dimension)
+        order = self.order if self.sonine else 2
+        equations = Equations(gas.dimension, order, not self.sonine, self.softness)
         state, fault = moments_at(scene, times / unit_time, equations, integrator)
         theta = jnp.exp(state.log_temperature)
         length = gas.path_length
@@ -210,13 +205,3 @@ class KineticTheory(AbstractModel):
             status=fault,
             **optional,
         )
-
-    @property
-    def _averages(self) -> Callable[..., Array]:
-        """Averages over impacts, a function of law, speed and dimension."""
-        return averages.impact_moments if self.averages == "exact" else paper_averages
-
-    def _equations(self, dimension: int) -> Equations:
-        maxwellian = not self.sonine or self.averages == "paper"
-        order = 2 if maxwellian else self.order
-        return Equations(dimension, order, maxwellian, self.softness, self._averages)

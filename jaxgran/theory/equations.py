@@ -1,16 +1,15 @@
 """The differential equations of a homogeneous gas: T, a_2, a_3, D, <dr^2>, collisions and T_rot.
 
-The file defines the state of a gas (`Moments`, `Density`), the averages over impacts to the paper's
-order, the equations (`Equations`), the rates of change by the elements of a scene (roughness,
-walls, drag, a drive), two corrections of finite density (correlated velocities and soft contacts),
-and the steady states of gases that white noise drives.
+The file defines the state of a gas (`Moments`, `Density`), the equations (`Equations`), the rates
+of change by the elements of a scene (roughness, walls, drag, a drive), two corrections of finite
+density (correlated velocities and soft contacts), and the steady states of gases that white noise
+drives.
 
 Units are those of `jaxgran.theory.averages`; functions of a `Gas` use SI units. "The paper" is
 Brilliantov & Poeschel, Self-diffusion in granular gases, Phys. Rev. E 61, 1716 (2000), whose
 equations are numbered here as in the authors' preprint.
 """
 
-from collections.abc import Callable
 from functools import partial
 from math import gamma, log, pi, sqrt
 from typing import NamedTuple
@@ -26,7 +25,7 @@ from jaxgran.scene.contact import ELASTIC_CONTACT_TIME
 from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, NUM_SPIN_COMPONENTS, wall_impact_ratio
 from jaxgran.scene.gas import Gas, scaled_critical_wavenumber
 from jaxgran.scene.geometry import contact_value_slopes, impact_average, sphere_surface
-from jaxgran.scene.laws import C1, ReducedLaw, ReducedViscoelastic
+from jaxgran.scene.laws import C1, ReducedLaw
 from jaxgran.scene.reduced import ReducedRough, ReducedScene, ReducedWalls, reduced_scene
 from jaxgran.theory.averages import TERMS, ElementBounds, RateTable, collision_rate, impact_moments
 
@@ -98,55 +97,11 @@ SceneAndDensity = tuple[ReducedScene, Density]
 """Scene in reduced units, and the effects of its density."""
 
 
-def speed_moment(power: float) -> float:
-    """Return ``int_0^inf g^(1 + power) exp(-g^2/2) dg``."""
-    return 2 ** (power / 2) * gamma(1 + power / 2)
-
-
 COOLING_RATE = {d: 9 / 5 / d * 2**0.2 * C1 * gamma(2.1) for d in (2, 3)}
 """Initial cooling rate ``tau_c(0) / (tau_0 delta)`` by dimension: 0.83193 in 3D; Eq. (39)."""
 
 COOLING_CORRECTION = 33 / 20 * 2**0.2 * C1 * gamma(2.2) / gamma(2.1)
 """q, the ratio b_2/b_1 of the two terms of the cooling rate at T_0 and delta = 1: 2.3018."""
-
-
-def paper_averages(
-    law: ReducedLaw, speed: Float[Array, ""], dimension: int, order: int = 2
-) -> Float[Array, "3 3"]:
-    """Return the paper's truncated averages: Maxwellian velocities, two terms of the series of eps.
-
-    ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)``, and ``1/tau_v`` to order delta^2.
-
-    Args:
-        law: a `Viscoelastic` law in units of `Gas.impact_speed`.
-        speed: sqrt(T/T_0).
-        dimension: d; the paper has 3.
-        order: only 2.
-
-    Returns:
-        An array like that of `jaxgran.theory.averages.impact_moments`, with the rows mu_2, 0 and
-        nu_v; only the first column is not 0.
-
-    Raises:
-        ValueError: for another law.
-
-    Reference: Brilliantov & Poeschel, Eqs. (32) and (36).
-    """
-    if not isinstance(law, ReducedViscoelastic):
-        raise ValueError(
-            f"the paper's truncated averages need the Viscoelastic law, got {type(law).__name__}; "
-            "use the exact averages for other laws"
-        )
-    beta = law.beta * speed**0.2
-    cooling = C1 * beta * speed_moment(2.2) - 11 / 10 * C1**2 * beta**2 * speed_moment(2.4)
-    relaxation = (
-        2 * speed_moment(2.0)
-        - C1 * speed_moment(2.2) * beta
-        + 3 / 5 * C1**2 * speed_moment(2.4) * beta**2
-    )
-    column = jnp.stack([cooling, jnp.zeros_like(beta), relaxation / dimension])
-    maxwellian = jnp.asarray([1.0, 0.0, 0.0], beta.dtype)
-    return sphere_surface(dimension) / sqrt(8 * pi) * jnp.outer(column, maxwellian)
 
 
 class Equations(NamedTuple):
@@ -157,14 +112,12 @@ class Equations(NamedTuple):
         order: of the Sonine expansion: 2 has a_2, 3 also a_3.
         maxwellian: if True, a_2 stays 0.
         softness: if True, soft contacts slow the cooling.
-        averages: over impacts, a function of law, speed, dimension and order.
     """
 
     dimension: int
     order: int
     maxwellian: bool
     softness: bool
-    averages: Callable[..., Array]
 
     def initial(self, scene: SceneAndDensity, like: Array) -> Float[Array, "moments"]:
         """Return the `Moments` at t = 0 as one array, of the dtype of `like`."""
@@ -176,7 +129,7 @@ class Equations(NamedTuple):
     def table(self, scene: SceneAndDensity, duration: Array) -> RateTable:
         """Return the averages at all temperatures that the gas reaches in a time."""
         law, d = scene[0].law, self.dimension
-        averages = partial(self.averages, law, dimension=d, order=self.order)
+        averages = partial(impact_moments, law, dimension=d, order=self.order)
         bounds = element_bounds(scene[0], d)
         return RateTable.from_function(averages, duration, d, law.num_nodes, bounds)
 
