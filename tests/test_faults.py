@@ -153,19 +153,6 @@ def test_a_member_of_a_batch_out_of_range_says_so(name, value):
     assert curve.status[1] == status.OUT_OF_RANGE.bit and np.isnan(curve.temperature[1])
 
 
-@pytest.mark.slow
-def test_all_that_a_curve_does_not_determine_is_named():
-    times = np.geomspace(0.1, 100.0, 20) * TAU
-    T = cool(times=times).temperature
-    curve = jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=0.02 * T)
-    free = "dissipative_constant", "temperature", "youngs_modulus", "packing_fraction", "diameter"
-    with pytest.warns(UserWarning, match="does not determine"):
-        result = jaxgran.fit(GAS, curve, free=free)
-    loose = [n for n in free if result.value(n)[1] > result.value(n)[0]]
-    assert len(loose) > 2 and set(loose) <= set(result.undetermined())
-    assert "temperature" not in result.undetermined()
-
-
 # --- derivatives ---------------------------------------------------------------------------------
 
 MODELS = [
@@ -216,8 +203,7 @@ def test_a_run_that_stands_still_ends():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [jaxgran.SoftSpheres, jaxgran.HardSpheres])
-@pytest.mark.parametrize("x64", [True, False])
+@pytest.mark.parametrize("kind, x64", [(jaxgran.SoftSpheres, False), (jaxgran.HardSpheres, True)])
 def test_blocks_that_stand_still_end(kind, x64, monkeypatch):
     with jax.enable_x64(x64):
         gas = glass_beads(0.3, packing_fraction=0.1)
@@ -319,27 +305,6 @@ def test_heavily_damped_impacts_end(beta):
 
 
 # --- files ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_checkpoints_know_their_law(tmp_path):
-    path = tmp_path / "x.ckpt"
-    cool(GAS, model=SOFT, checkpoint=path)
-    law = jaxgran.Viscoelastic(*(GAS.value(n) for n in GAS.law.domains), clipped=False)
-    other = jaxgran.Gas(
-        law, **{n: GAS.value(n) for n in GAS.domains if n not in law.domains}, dimension=3
-    )
-    with pytest.raises(ValueError, match="scene.clipped was True and is False"):
-        cool(other, model=SOFT, checkpoint=path)
-    for wrong, words in (
-        (jaxgran.SoftSpheres(21), "num_particles was 20 and is 21"),
-        (jaxgran.SoftSpheres(20, steps_per_contact=50), "steps_per_contact was 40 and is 50"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            cool(GAS, model=wrong, checkpoint=path)
-    denser = GAS.replace(packing_fraction=0.11)
-    with pytest.raises(ValueError, match="scene.side was float64"):
-        cool(denser, model=SOFT, checkpoint=path)
 
 
 OWN_LAW = """

@@ -7,15 +7,6 @@ from hypothesis import strategies as st
 from jaxgran._utils.validation import ANY, FRACTION, POSITIVE, Domain, checked_times, float_array
 
 
-def test_numbers_are_strongly_typed():
-    for value in (2, 2.0, np.float32(2), np.array(2), jnp.asarray(2)):
-        assert float_array(value) == 2.0
-        assert (
-            float_array(value).dtype == jnp.result_type(float) and not float_array(value).weak_type
-        )
-    assert float_array([1, 2.5]).shape == (2,)
-
-
 @pytest.mark.parametrize("value", ["steel", object(), [1.0, [2.0]]])
 def test_what_is_no_number_is_refused(value):
     with pytest.raises(ValueError, match="expected a number or an array of numbers, got"):

@@ -4,12 +4,12 @@ import io
 import json
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxgran
 from jaxgran.data import checkpoint, files
 from jaxgran.data.checkpoint import describe_run, differences, load, save
 from jaxgran.data.files import write_atomically
@@ -70,12 +70,8 @@ def test_other_scenes_are_refused(path):
     "like",
     [
         np.zeros((2, 3)),  # another shape of as many numbers
-        np.zeros((3, 2, 1)),
         np.zeros((3, 2), np.float32),
-        np.zeros((3, 2), np.int64),
         [np.zeros((3, 2)), 0],
-        (),
-        0.0,
     ],
 )
 def test_other_arrays_are_refused(path, like):
@@ -209,76 +205,30 @@ def test_any_end_of_writing_keeps_the_old_file(path, what):
     same_bits(load(path, ABC, state()), state())
 
 
-class Model(eqx.Module):
-    value: jax.Array
-    order: int = eqx.field(static=True, default=2)
-
-
 def test_descriptions_tell_everything_apart():
     key = jax.random.key
     trees = [
         {"a": 1.0, "b": np.arange(3)},
         {"a": np.nextafter(1.0, 2), "b": np.arange(3)},  # any number
         {"a": 1.0, "b": np.array([0, 1, 3])},
-        {"a": -1.0, "b": np.arange(3)},
         {"a": 1, "b": np.arange(3)},  # any type
         {"a": True, "b": np.arange(3)},
-        {"a": np.float32(1.0), "b": np.arange(3)},
-        {"a": 1.0, "b": np.arange(3, dtype=np.int32)},
         {"a": 1.0, "b": np.arange(3)[None]},  # any shape
-        {"a": 1.0, "b": (0, 1, 2)},
         {"a": 1.0, "c": np.arange(3)},  # any structure
-        {"a": 1.0, "b": np.arange(3), "c": None},
         {"a": 1.0},
-        (1.0, np.arange(3)),
-        [1.0, np.arange(3)],
         0.0,
         -0.0,
         0,  # the bits of 0.0
-        np.zeros(2),
-        np.zeros(2, np.int64),
-        np.zeros(2, np.uint64),
-        "abc",
-        "abd",
-        None,
-        (),
-        Model(jnp.ones(2)),
-        Model(jnp.ones(2), order=3),  # any static choice
+        jaxgran.DSMC(10),
+        jaxgran.DSMC(10, replicas=2),  # any static choice
         key(0),
         key(1),
-        key(0, impl="rbg"),
-        {"key": key(0)},
-        jax.random.split(key(0), 2),
     ]
     words = [describe_run(run=tree) for tree in trees]
     for i, first in enumerate(words):
         for j, second in enumerate(words):
             assert (first == second) == (i == j), (first, second)
             assert bool(differences(first, second)) == (i != j)
-
-
-def law(factor):
-    class Law(eqx.Module):
-        function: object = eqx.field(static=True)
-
-        def restitution(self, speed):
-            return factor * speed
-
-    return Law
-
-
-def test_descriptions_are_of_values_not_of_objects():
-    first, second = (
-        (Model(jnp.arange(3.0)), jax.random.key(5), {"x": 1.5, "y": "text"}) for _ in range(2)
-    )
-    assert describe_run(a=first) == describe_run(a=second)
-    assert describe_run(a=jnp.arange(3.0)) == describe_run(a=np.arange(3.0))
-    assert describe_run(a=np.arange(6.0)[::2]) == describe_run(a=np.array([0.0, 2.0, 4.0]))
-    one, two = (law(3)(np.square) for _ in range(2))
-    assert describe_run(law=one) == describe_run(law=two)
-    assert differences(describe_run(law=one), describe_run(law=law(3)(np.sqrt)))
-    assert not any("0x" in words for words in describe_run(law=one, f=lambda x: x).values())
-    assert describe_run(a=object()) == describe_run(a=object())
 
 
 def observable(number, factor=1.0):

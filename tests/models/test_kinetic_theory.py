@@ -1,7 +1,6 @@
 """Kinetic theory against the reference solutions, and its numerics over many decades."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +13,6 @@ from jaxgran.theory.equations import (
     crowding_coefficient,
     softness_coefficient,
 )
-from jaxgran.theory.solver import WINDOW
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
 # equations, clipped restitution, Gaussian start, no softness correction.
@@ -187,16 +185,6 @@ def test_bad_options_are_refused():
         jaxgran.KineticTheory(order=4)
     with pytest.raises(ValueError, match="gas must be a jaxgran.Gas, got float"):
         jaxgran.cool(1.0, [1.0])  # pyright: ignore
-
-
-def test_values_do_not_recompile(beads):
-    cool = KineticTheory._compiled_curve.__wrapped__  # as it is inside its own jit
-    checked = eqx.filter_jit(eqx.debug.assert_max_traces(cool, max_traces=1))
-    times = jnp.geomspace(1.0, 4.0, WINDOW)
-    for a in (1e-7, 1e-6):
-        for t0 in (0.01, 0.5):
-            gas = beads(0.15).replace(dissipative_constant=a, temperature=t0)
-            checked(HARD, gas, times * t0, 1.0)
 
 
 def test_another_number_of_times_compiles_nothing(beads, caplog):

@@ -10,8 +10,7 @@ import pytest
 from scipy.linalg import hadamard
 
 import jaxgran
-from jaxgran.models.soft_spheres import SoftSpheres, reduced_soft_scene
-from jaxgran.particles.setup import reduced_start
+from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.particles.soft.forces import SERIES_LIMIT, flight_time
 from tests.beads import glass_beads
 
@@ -296,50 +295,6 @@ def test_derivatives_with_friction_of_a_short_run_are_differences():
     # leave out spheres in contact, of which there are many so soon.
     np.testing.assert_allclose(found[1] @ moves, expected[1], atol=5e-4, rtol=0)
     assert np.all(np.any(np.abs(found) > 1e-5, axis=(0, 1)))
-
-
-@pytest.mark.slow
-def test_tangents_of_spins_are_exact_between_projections():
-    num, floats = 30, FRICTION_FLOATS[:-2] + ["drag_rotational_rate"]
-    gas = with_all(num)
-    end = 0.4 * float(gas.mean_free_time)
-    first = jaxgran.cool(gas, [0.0], model=SoftSpheres(num)).particles
-    start = first._replace(angular_velocity=None)
-    values = jnp.stack([gas.value(name) for name in floats])
-    model = SoftSpheres(num, start=start, projection=None).sized_for(gas, spare=4.0)
-
-    def spins(logs):
-        changed = gas.replace(**dict(zip(floats, values * jnp.exp(logs), strict=True)))
-        last = jaxgran.cool(changed, [end], model=model, progress=False).particles
-        return last.angular_velocity[0] * gas.diameter / 2 / jnp.sqrt(gas.temperature)
-
-    exact = jnp.moveaxis(jax.jacfwd(spins)(jnp.zeros(len(floats))), -1, 0)
-
-    def material(logs):
-        changed = gas.replace(**dict(zip(floats, values * jnp.exp(logs), strict=True)))
-        return reduced_soft_scene(changed, num).material
-
-    scene = reduced_soft_scene(gas, num)
-    directions = jax.tree.map(
-        lambda x: jnp.moveaxis(x, -1, 0), jax.jacfwd(material)(jnp.zeros(len(floats)))
-    )
-    never = dataclasses.replace(model, projection=1e3)
-    dynamics = never.dynamics(scene, never.plan)
-    reduced = reduced_start(start, gas, differentiable=False)
-    assert reduced is not None
-    position, velocity = reduced
-    state = dynamics.begin(position, velocity, 0.4)
-    state = dynamics.sample_spins(state, jax.random.key(0), state)
-    state = dynamics.with_tangents(state, directions)
-    until = end * float(jnp.sqrt(gas.temperature) / gas.diameter)
-    while float(state.time) < until:
-        now = dynamics.run_segment(state, until, "sweep")
-        assert int(now.status) == 0
-        state = now.state
-    found = state.tangents.rotation.spin
-    # Two codes for one derivative: round-off, measured as 3e-16.
-    scale = jnp.max(jnp.abs(exact), axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(found / scale, exact / scale, atol=1e-12)
 
 
 @pytest.mark.slow

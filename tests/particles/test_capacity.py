@@ -4,19 +4,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran._utils import status
-from jaxgran.particles.capacity import Capacity, Neighbourhood
-
-
-def test_a_capacity_grows_where_it_must():
-    capacity = Capacity(pairs=100, lookahead=10, near=50, contacts=20, members=20)
-    needed = jnp.array([80, 30, 50, 10, 21], jnp.int32)
-    fault = capacity.exceeded_by(needed)
-    assert status.has(fault, status.LIST_FULL) and status.has(fault, status.CONTACTS_FULL)
-    grown = capacity.grown([int(x) for x in needed])
-    assert grown.pairs == 100 and grown.near == 50 and grown.contacts == 20
-    assert grown.lookahead > 30 and grown.members > 21
-    assert grown.exceeded_by(needed) == status.OK
+from jaxgran.particles.capacity import Neighbourhood
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -33,20 +21,6 @@ def test_the_neighbourhood_is_that_of_the_gas(beads, dimension):
     ):
         assert exact * (1 - 1e-9) <= rounded < 1.5 * exact
     assert around.listed == pytest.approx(around.in_contact + 3.0)
-
-
-@pytest.mark.parametrize("kind", [jaxgran.SoftSpheres, jaxgran.HardSpheres])
-def test_a_loop_over_the_material_shares_programs(beads, kind):
-    model = kind(200)
-
-    def plans(name, values):
-        gas = beads(packing_fraction=0.2)
-        scenes = [model.scene(gas.replace(**{name: value})) for value in values]
-        return {model.planned(scene, 3) for scene in scenes}
-
-    assert len(plans("dissipative_constant", np.geomspace(1e-7, 1e-5, 30))) == 1
-    # Contact durations within a factor of 2.5: 4 points of the grid of capacities, 6 of blocks.
-    assert len(plans("youngs_modulus", np.geomspace(1e6, 1e7, 30))) <= 4 + 6
 
 
 def test_compiled_runs_of_few_hard_spheres_have_room(beads):

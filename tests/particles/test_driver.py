@@ -10,9 +10,8 @@ from tqdm import tqdm
 
 import jaxgran
 from jaxgran._utils import status
-from jaxgran.data import checkpoint
 from jaxgran.particles import run
-from jaxgran.particles.run import RunFailure, compiling, run_through_times, time
+from jaxgran.particles.run import RunFailure, compiling, run_through_times
 from tests.beads import glass_beads
 
 TIMES = np.array([0.0, 0.3, 1.0, 1.1, 2.5])
@@ -103,22 +102,6 @@ def test_a_run_that_dies_loses_little(tmp_path, monkeypatch):
     resumed = quiet(start(), TIMES, rest, observe, scene={"name": "toy"}, path=path)
     assert rest.number == STEPS - 7
     same(resumed, whole)
-
-
-def test_checkpoints_are_as_seldom_as_said(tmp_path, monkeypatch):
-    now, saves = [0.0], []
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(checkpoint, "save", lambda *args: saves.append(now[0]))
-
-    def slow(state, until):
-        now[0] += 25.0
-        return advance(state, until)
-
-    quiet(start(), TIMES, slow, observe, path=tmp_path / "run.npz")
-    assert saves == [75.0, 150.0, 225.0, 300.0, 300.0]  # after more than 60 s, and at the end
-    saves.clear()
-    quiet(start(), TIMES, slow, observe)
-    assert not saves
 
 
 def test_a_finished_run_is_read_back(tmp_path):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-import jaxgran
 from jaxgran.particles.neighbours import (
     MAX_LOOKAHEAD,
     choose_engine,
@@ -115,39 +114,6 @@ def test_pairs_across_the_faces(by):
     assert offset == {(0, 1): [-4.0, 0.0], (2, 3): [-4.0, -4.0]}
 
 
-def test_offset_outlasts_motion_without_wrapping():
-    rng = np.random.default_rng(1)
-    side = 3.7
-    position = side * rng.random((60, 3))
-    pairs = find_pairs(jnp.asarray(position), side, 0.8, capacity=400)
-    assert 0 < pairs.count <= 400
-    k = slice(int(pairs.count))
-    i, j = pairs.i[k], pairs.j[k]
-    moved = jnp.asarray(position + 0.2 * rng.uniform(-1, 1, position.shape))
-    inside = wrap(side, moved)
-    assert np.any(inside != moved)
-    np.testing.assert_allclose(
-        moved[i] - moved[j] - pairs.offset[k],
-        displacement(side, inside[i], inside[j]),
-        atol=1e-14 * side,  # round-off
-    )
-
-
-@pytest.mark.slow
-def test_a_capacity_that_is_exceeded_is_reported():
-    position = awkward(2, 2, 3.7)
-    cutoff = 3.7 * 0.15
-    expected = brute_force(position, 3.7, cutoff, 2)
-    for by in ("scipy", "sweep", "jax-md"):
-        search = partial(find_pairs, jnp.asarray(position), 3.7, cutoff, replicas=2, by=by)
-        for capacity in (1, len(expected) // 4, len(expected) - 1):
-            pairs = search(capacity=capacity)
-            assert pairs.count > capacity
-            assert pairs.i.shape == pairs.j.shape == pairs.offset.shape[:1] == (capacity,)
-            assert set(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)) < set(expected)
-        assert search(capacity=len(expected)).count == len(expected)
-
-
 @COMPILED
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_jit_and_vmap(dimension, by):
@@ -183,11 +149,6 @@ def test_numbers_that_are_not_finite_have_no_pairs(by):
     for bad in (jnp.nan, jnp.inf):
         position = jnp.ones((4, 3)).at[2, 1].set(bad)
         assert find_pairs(position, 4.0, 1.0, capacity=3, by=by).count == 0
-
-
-@COMPILED
-def test_one_particle_has_no_pairs(by):
-    assert find_pairs(jnp.ones((1, 3)), 4.0, 1.0, capacity=3, by=by).count == 0
 
 
 @pytest.mark.parametrize("side", [1.0, 3.7])
@@ -312,17 +273,3 @@ def test_a_sweep_over_too_many_is_refused():
     look = partial(sweep, side=1000.0, cutoff=1.0, replicas=1, capacity=9, ahead=2**10)
     with pytest.raises(ValueError, match="cannot look 1024 particles ahead: .* allow 992 ahead"):
         jax.eval_shape(look, position)
-
-
-def test_planes_of_a_lattice_are_in_reach_under_jit(beads):
-    # The first in a plane has the rest of it and all of the next within reach: 1249.
-    points = np.stack(np.meshgrid(*3 * [np.arange(25)], indexing="ij"), -1).reshape(-1, 3)
-    gas = beads(packing_fraction=0.1)
-    capacity = jaxgran.HardSpheres(25**3).sized_for(gas).plan.capacity
-    side = float(gas.box_side(25**3) / gas.diameter)
-    cutoff = 1.01 * side / 25
-    position, most = jnp.asarray(points * side / 25), capacity.lookahead
-    *_, count, ahead = sweep(
-        position, side, cutoff, replicas=1, capacity=capacity.pairs, ahead=most
-    )
-    assert count == 3 * 25**3 and 1200 < ahead <= most

@@ -36,16 +36,6 @@ def cooled(gas, taus=TAUS, **settings) -> jaxgran.CoolingCurve:
     return jaxgran.cool(gas, times, model=jaxgran.KineticTheory(**settings))
 
 
-def test_smooth_surfaces_change_nothing(beads):
-    smooth = cooled(beads())
-    rough = cooled(scene(beads(), surface=jaxgran.Rough(-1.0, rotational_temperature=3e-3)))
-    # Within the tolerance of the solver, whose steps follow T_rot too.
-    for name in ("temperature", "sonine", "displacement", "collisions"):
-        np.testing.assert_allclose(getattr(rough, name), getattr(smooth, name), rtol=1e-7)
-    np.testing.assert_allclose(rough.rotational_temperature, 3e-3, rtol=1e-7)
-    assert smooth.rotational_temperature is None
-
-
 @pytest.mark.parametrize("dimension, spins", [(3, 3), (2, 1)])
 def test_perfectly_rough_elastic_spheres_keep_their_energy(dimension, spins):
     surface = jaxgran.Rough(1.0, rotational_temperature=2e-3)

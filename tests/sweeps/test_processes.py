@@ -64,10 +64,3 @@ def test_two_processes_with_two_devices_each(tmp_path, expected):
     for out, _ in outputs:  # all devices, devices of the process, members
         assert "done 4 2 (10, 3)" in out
     check(store, expected)
-
-
-@pytest.mark.slow
-def test_more_processes_than_members(tmp_path):
-    codes, chunks, outputs = run(3, tmp_path / "sweep.zarr", 2)
-    assert codes == [0, 0, 0] and sorted(sum(chunks, [])) == [0]
-    assert all("(2, 3)" in out for out, _ in outputs)

@@ -1,6 +1,5 @@
 """Derivatives through hard spheres: projected at every impact."""
 
-import dataclasses
 from functools import partial
 
 import jax
@@ -162,17 +161,3 @@ def test_a_start_has_no_projected_slope():
     for derivative in (jax.grad, jax.jacfwd):
         with pytest.raises(ValueError, match="chaos"):
             derivative(f)(1.0)
-
-
-@pytest.mark.slow
-def test_speed_is_a_unit_of_random_starts_and_not_of_given_ones(constant):
-    f, at, model, _ = constant
-    random = dataclasses.replace(model, start=None)
-
-    def both(model):
-        return jax.jacfwd(lambda x: f(at.at[1:].set(x), model=model))(jnp.zeros(2))
-
-    slopes = both(random)  # T(t) = T_0 f(t sqrt(T_0))
-    np.testing.assert_allclose(slopes[:, 1], 1 + slopes[:, 0] / 2, rtol=1e-12)
-    hotter = f(at.at[2].set(0.1), model=model)
-    np.testing.assert_allclose(hotter, f(at, model=model), rtol=0, atol=1e-9)

@@ -107,20 +107,6 @@ def test_paper_averages_are_the_first_two_terms(beads):
         paper_averages(jaxgran.ConstantRestitution(0.9), jnp.ones(()), 3)
 
 
-def test_velocity_relaxation_as_printed(beads):
-    # The paper's Eq. (32) with its own coefficients: 1 - 3/4 Gamma(21/10) C1 delta 4^.1 + ...
-    from math import gamma
-
-    from jaxgran.scene.laws import C1
-
-    gas = beads(0.15)
-    paper = paper_averages(gas.reduced_law, jnp.ones(()), 3)[2, 0]
-    elastic = paper_averages(beads(0.0).reduced_law, jnp.ones(()), 3)[2, 0]
-    small = float(gas.delta) * 4**0.1
-    printed = 1 - 0.75 * gamma(2.1) * C1 * small + 27 / 40 * gamma(2.2) * C1**2 * small**2
-    np.testing.assert_allclose(paper / elastic, printed, rtol=1e-12)
-
-
 @pytest.mark.slow
 def test_displacement_of_constant_restitution():
     for d, e in ((3, 0.6), (2, 0.9)):
