@@ -141,9 +141,25 @@ def test_the_budget_is_explained(measured, capsys):
     assert "error of A, in per cent" in out and "the model's clock in this scene" in out
 
 
+def test_a_single_curve_begins_with_the_range(measured, capsys):
+    text = (measured / "thin.csv").read_text()
+    (measured / "thin.csv").write_text("# absent: walls\n" + text)
+    arguments = ["fit", "thin.csv", "--absent", "roughness", "drag", "--out", "d"]
+    assert main(arguments) == 0
+    out, answer = _answer(capsys)
+    assert out.startswith(f"A = {answer['A']:.3g} s, 95 % range {answer['A_low']:.3g} to ")
+    assert list(answer)[:3] == ["A", "A_low", "A_high"] and answer["verdict"] == "determined"
+    assert "if nothing else is there" in out and "absent: walls, roughness, drag" in out
+    assert not any(word in out for word in ("walls that dissipate", "rough grains", "linear drag"))
+    assert main([*arguments, "--quick", "--overwrite"]) == 0
+    out, answer = _answer(capsys)
+    assert "alternatives were not compared" in out and answer["A_low"] is None
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
+        (["thin.csv", "--absent", "gravity"], "'gravity' is not known; give some of walls"),
         (["thin.csv", "thin.csv"], "given twice"),
         (["thin.csv", "dense.csv", "--model", "dsmc"], "fitted with kinetic-theory"),
         (["thin.csv", "dense.csv", "--free", "T0", "--set", "A=3e-6"], "share none of these"),

@@ -60,7 +60,7 @@ def results(found: dict, said: str) -> dict:
     """Return the figures of the documents: estimates, true values, verdict, lines of the table."""
     rows = found["parameters"]
     lines = said.splitlines()
-    first = next(i for i, line in enumerate(lines) if line.split()[:1] == ["estimate"])
+    first = next(i for i, line in enumerate(lines) if line.split()[:1] == ["95"])
     budget = next(line for line in lines if line.startswith(f"error of {rows[0]['parameter']}"))
     return {
         "parameters": [
@@ -68,7 +68,7 @@ def results(found: dict, said: str) -> dict:
             | {"true": row["header"]}
             for row in rows
         ],
-        "explains": found["explains"],
+        "verdict": found["verdict"],
         "reduced_chi2": found["reduced_chi2"],
         "printed": [*lines[first : first + 1 + len(rows)], budget],
     }

@@ -76,6 +76,9 @@ class FitOptions:
         set: Header values KEY=VALUE that replace those of the file.
         out: Output folder; by default a new one in results.
         overwrite: Replace existing files in the output folder.
+        absent: Effects that are known to be absent (walls, roughness, drag, friction), in addition
+            to those of the header line `# absent: walls`.
+        quick: Leave out the search of alternative explanations, which takes most of the time.
         explain: Print the error budget as a table that explains each part.
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
@@ -92,6 +95,8 @@ class FitOptions:
     set: Annotated[tuple[str, ...], Several] = ()
     out: Path | None = None
     overwrite: bool = False
+    absent: Annotated[tuple[str, ...], Several] = ()
+    quick: bool = False
     explain: bool = False
     no_cache: bool = False
 
@@ -203,18 +208,14 @@ def environment() -> dict:
     }
 
 
-def alternative_as_json(alternative) -> dict[str, Any]:
-    """Return the fields of an alternative, with lists for arrays."""
-    fields = alternative._asdict().items()
-    return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in fields}
-
-
-def finite_or_null(value: Any) -> Any:
-    """Replace nan and inf in lists and dictionaries by None, which is null in JSON."""
+def as_json(value: Any) -> Any:
+    """Return dictionaries and lists as JSON takes them: lists for arrays, None for nan and inf."""
     if isinstance(value, dict):
-        return {key: finite_or_null(part) for key, part in value.items()}
+        return {key: as_json(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        value = np.asarray(value).tolist()
     if isinstance(value, list | tuple):
-        return [finite_or_null(part) for part in value]
+        return [as_json(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 

@@ -1,9 +1,8 @@
-"""The command `jaxgran fit`: fits of one measured curve, and joint fits of several measurements.
+"""The command `jaxgran fit`: one measurement, or several of one material.
 
 Reads files, prints tables, and writes a picture and a JSON file.
 """
 
-import dataclasses
 import json
 import time
 import warnings
@@ -19,10 +18,9 @@ from jaxgran import plotting
 from jaxgran.cli.common import (
     MODELS,
     FitOptions,
-    alternative_as_json,
+    as_json,
     choose_or_make_model,
     environment,
-    finite_or_null,
     gas_of,
     models_by_name,
     output_files,
@@ -32,233 +30,233 @@ from jaxgran.data.curve_file import GUESS
 from jaxgran.data.files import header_count, header_number, write_atomically
 from jaxgran.fitting.fit import free_by_default
 from jaxgran.fitting.residuals import unused_rotation
-from jaxgran.fitting.result import SIGNIFICANCE
+from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE
 from jaxgran.models.choose import default_models
-from jaxgran.scene.parameters import BY_SYMBOL, PARAMETERS, SCENE
+from jaxgran.scene.parameters import BY_SYMBOL, MATERIAL, PARAMETERS, SCENE, symbol_of, unit_of
 
 MAX_KEY = 2**63
 """Upper bound of the seeds of `jax.random.key`."""
 
 JOINT_MODEL = MODELS[0]
-"""The only model of joint fits: kinetic theory."""
+"""The only model of fits of several measurements: kinetic theory."""
 
 
-def run_fit(options: FitOptions, started: float) -> None:
-    """Fit one curve, print the result and write it.
+def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
+    """Fit curves and drop tests of one material, print the result and write it.
 
     Args:
+        paths: files of cooling curves.
         options: of the command.
         started: start of the job on the clock `time.perf_counter`.
     """
-    with warnings.catch_warnings(record=True) as input_warnings:  # about units and tracks
-        warnings.simplefilter("always", UserWarning)
-        curve, header = jaxgran.read_curve(options.curve)
-        header |= parse_settings(options.set)
-        gas, priors = gas_of(header, options.free), jaxgran.read_priors(header)
-    free_symbols = options.free or free_keys(free_by_default(gas, curve))
-    options = dataclasses.replace(options, free=tuple(free_symbols))
-    gas = with_given_constant(gas, header, options.free)
-    n = header_count(header, "N")
-    replicas = header_count(header, "replicas") or 1
+    files = [path.resolve() for path in (*paths, *options.drop_test)]
+    several = len(files) > 1
+    if repeated := [str(path) for path in files if files.count(path) > 1]:
+        raise ValueError(f"{repeated[0]} is given twice. Give each measurement once.")
+    if several and options.model != JOINT_MODEL:
+        raise ValueError(
+            f"--model {options.model}: several measurements are fitted with {JOINT_MODEL}. Fit the "
+            "curves one by one with other models."
+        )
+    if abs(options.key) >= MAX_KEY:
+        raise ValueError(f"--key {options.key} is too large. Give a whole number below 2^63.")
     picture, record = output_files(options)
-    free = tuple(BY_SYMBOL[key].name for key in options.free)
-    model, reasons = choose_or_make_model(options, gas, curve, free, n)
-    (model_name,) = models_by_name([model])
-    imported = time.perf_counter() - started
-    arguments = {"free": free, "priors": priors, "num_particles": n, "replicas": replicas}
-    result, first_seconds, fit_seconds = timed_fit(options, gas, curve, model, arguments)
-    diagnosis = jaxgran.diagnose(result, curve, n)
-    rows = parameter_rows(options, result, diagnosis, header)
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    plotting.save_fit(result, curve, picture_title(options, rows, diagnosis), picture)
-    summary = {
-        **{row["parameter"]: row["estimate"] for row in rows},
-        **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},
-        "model": model_name,
-        "reduced_chi2": round(float(result.reduced_chi2), 4),
-        "converged": bool(result.converged),
-        **{f"{row['parameter']}_low": row["low"] for row in rows},
-        **{f"{row['parameter']}_high": row["high"] for row in rows},
-        "explains": diagnosis.explains,
-        "seconds": round(time.perf_counter() - started, 2),
-        "compile_seconds": round(first_seconds - fit_seconds, 2),
-        "fit_seconds": round(fit_seconds, 4),
+    free = options.free or (("A", "T0") if several else ())
+    if free and all(BY_SYMBOL[key].belongs_to == SCENE for key in free) and several:
+        raise ValueError(f"--free {' '.join(free)}: the curves share none of these. Add A.")
+    gases, data, headers, priors, checks = {}, {}, {}, {}, []
+    for path in paths:
+        with warnings.catch_warnings(record=True) as asked:  # about units and tracks
+            warnings.simplefilter("always", UserWarning)
+            curve, header = jaxgran.read_curve(path)
+            header |= parse_settings(options.set)
+            gas = gas_of(header, free)
+        free = free or tuple(map(symbol_of, free_by_default(gas, curve)))
+        label = path.stem if path.stem not in data else str(path)
+        gases[label], data[label], headers[label] = _with_A(gas, header, free), curve, header
+        checks += [str(warning.message) for warning in asked]
+        if "N" not in header and (unused := unused_rotation(gas, curve)):
+            checks.append(unused)
+        for name, pair in jaxgran.read_priors(header).items():
+            shared = name != "density" and PARAMETERS[name].belongs_to == MATERIAL
+            priors.setdefault(f"{label}: {name}" if several and not shared else name, pair)
+    for path in options.drop_test:  # of spheres like those of the first curve
+        label = path.stem if path.stem not in data else str(path)
+        data[label] = jaxgran.read_drop_test(path, onto_plate=options.onto_plate)
+        gases[label] = next(iter(gases.values()))
+    declared = [
+        jaxgran.read_absent(
+            header | {"absent": " ".join((header.get("absent", ""), *options.absent))}
+        )
+        for header in headers.values()
+    ]
+    arguments: dict[str, Any] = {
+        "absent": tuple(x for x in declared[0] if all(x in others for others in declared)),
+        "free": tuple(BY_SYMBOL[key].name for key in free),
+        "num_particles": {label: header_count(header, "N") for label, header in headers.items()},
+        "priors": priors,
+        "replicas": {k: header_count(h, "replicas") or 1 for k, h in headers.items()},
     }
+    label, model, reasons = next(iter(data)), models_by_name(default_models(2))[JOINT_MODEL], ()
+    if several:
+        scene_names = [BY_SYMBOL[key].name for key in free if BY_SYMBOL[key].belongs_to == SCENE]
+        arguments["separate"] = tuple(scene_names)
+        arguments["free"] = tuple(x for x in arguments["free"] if x not in scene_names)
+        measured = gases, data
+    else:
+        arguments |= {key: arguments[key][label] for key in ("num_particles", "replicas")}
+        measured = gases[label], data[label]
+        N = arguments["num_particles"]
+        model, reasons = choose_or_make_model(options, *measured, arguments["free"], N)
+    begin = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the diagnosis repeats them
+        key = jax.random.key(options.key) if model.stochastic else None
+        result = jaxgran.fit(*measured, model=model, key=key, **arguments)
+        jax.block_until_ready(result.chi2)
+    fit_seconds = time.perf_counter() - begin
+    diagnosis = jaxgran.diagnose(result, quick=options.quick)
+    rows = [_row(name, result, diagnosis, headers) for name in result.names]
+    (model_name,) = models_by_name([model])
+    entries = ("", "estimate"), ("_low", "low"), ("_high", "high"), ("_std_err", "std_err")
+    agree = {"agree": float(result.p_value) > SIGNIFICANCE} if several else {}
+    summary = as_json(
+        {
+            **{f"{row['parameter']}{end}": row[key] for row in rows for end, key in entries},
+            "verdict": diagnosis.grade,
+            "model": model_name,
+            "reduced_chi2": round(float(result.reduced_chi2), 4),
+            "p_value": float(result.p_value),
+            **agree,
+            "converged": bool(result.converged),
+            "seconds": round(time.perf_counter() - started, 2),
+            "fit_seconds": round(fit_seconds, 4),
+        }
+    )
     details = {
-        "curve": options.curve.name,
-        "chosen": reasons,
-        "header": header,
-        "parameters": rows,
-        "covariance": np.asarray(result.covariance).tolist(),
+        "headline": diagnosis.headline,
+        "narrowing": diagnosis.narrowing,
         "diagnosis": {"verdict": diagnosis.verdict, "reasons": diagnosis.reasons},
-        "alternatives": [alternative_as_json(x) for x in diagnosis.alternatives],
-        "import_seconds": round(imported, 2),
+        "alternatives": [alternative._asdict() for alternative in diagnosis.alternatives],
+        "parameters": rows,
+        "covariance": result.covariance,
+        "weight": result.weights(),
+        "chosen": reasons,
+        "header": headers if several else headers[label],
         **environment(),
     }
-    summary = finite_or_null(summary)
-    text = json.dumps(finite_or_null(summary | details), indent=2, allow_nan=False) + "\n"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    title = f"{label.replace('_', ' ')}: {diagnosis.headline}"
+    if several:
+        fitted = {key: (data[key], curve) for key, curve in result.curve.items()}
+        plotting.save_curves(fitted, diagnosis.headline, picture)
+    else:
+        plotting.save_fit(result, data[label], title, picture)
+    text = json.dumps(summary | as_json(details), indent=2, allow_nan=False) + "\n"
     write_atomically(record, lambda f: f.write(text.encode()))
-    print_scene(options, gas, curve, header, result)
-    print_warnings(input_warnings, unused_rotation(gas, curve))
-    print_impacts(result.gas, float(curve.temperature[-1]), n)
-    print_model(model_name, result, reasons)
-    print_rows(rows)
+
+    print("\n".join(filter(None, (diagnosis.headline, diagnosis.narrowing, diagnosis.verdict))))
+    for label, header in headers.items():
+        gas = result.gas[label] if several else result.gas
+        print_scene(label, gas, data[label], header)
+    for text in checks:
+        print(f"check    {text}")
+    steps = "simulations" if model.stochastic else "steps of least squares"
+    print(f"model    {model_name}, {int(result.iterations)} {steps}")
+    for i, reason in enumerate(reasons):
+        print(f"{'' if i else 'chosen':9}- {reason}")
+    print_parameters(rows)
     print_budget(rows, options.explain)
     print_alternatives(rows[0]["parameter"], diagnosis)
-    print_verdict(diagnosis)
+    if several:
+        print_measurements(rows[0]["parameter"], result)
+    print("\n" + "\n".join(f"  - {reason}" for reason in diagnosis.reasons))
     print(f"\nwritten  {picture}\n         {record}\n")
     print(json.dumps(summary, allow_nan=False))
 
 
-def free_keys(floats: tuple[str, ...]) -> list[str]:
-    """Return the arguments of --free for floats of a gas."""
-    return [PARAMETERS[name].symbol for name in floats]
-
-
-def with_given_constant(gas, header, free: Sequence[str]):
+def _with_A(gas: Any, header: dict[str, str], free: Sequence[str]) -> Any:
     """Return the gas with the header's A, if A is not free."""
-    if "A" in header:
-        given = gas.replace(dissipative_constant=header_number(header, "A"))
-        return gas if "A" in free else given
     if "A" in free:
         return gas
+    if "A" in header:
+        return gas.replace(dissipative_constant=header_number(header, "A"))
     raise ValueError(
         f"--free {' '.join(free)} leaves A fixed, and the file does not give it. Add --set A=VALUE "
         "(in s), or free A too."
     )
 
 
-def timed_fit(options: FitOptions, gas, curve, model, arguments: dict[str, Any]):
-    """Return the fit, the seconds of its first run, and those of a run without compilation."""
-    if abs(options.key) >= MAX_KEY:
-        raise ValueError(f"--key {options.key} is too large. Give a whole number below 2^63.")
-    key = jax.random.key(options.key) if model.stochastic else None
-
-    def fit():
-        begin = time.perf_counter()
-        result = jaxgran.fit(gas, curve, model=model, key=key, **arguments)
-        jax.block_until_ready(result.chi2)
-        return result, time.perf_counter() - begin
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the diagnosis repeats them
-        result, first_seconds = fit()
-        fit_seconds = first_seconds
-        if not model.stochastic:
-            result, fit_seconds = fit()
-    return result, first_seconds, fit_seconds
-
-
-def parameter_rows(options: FitOptions, result, diagnosis, header) -> list[dict]:
-    """Return estimate and errors of each free parameter; nan if the curve does not determine it."""
-    rows, undetermined = [], result.undetermined()
-    for key in options.free:
-        name, unit = BY_SYMBOL[key].name, BY_SYMBOL[key].unit
-        estimate, error = (float(x) for x in result.value(name))
-        limits = range_over_alternatives(diagnosis, name)
-        if name in undetermined:
-            estimate, error, *limits = 4 * [float("nan")]
-        i = result.names.index(name)
-        rows.append(
-            {
-                "parameter": key,
-                "unit": unit,
-                "estimate": estimate,
-                "std_err": error,
-                "error_budget": {part: float(x[i]) for part, x in result.error_budget.items()},
-                **dict(zip(("low", "high"), limits, strict=True)),
-                "header": None if header.get(key, GUESS) == GUESS else header_number(header, key),
-            }
-        )
-    return rows
+def _row(name: str, result: Any, diagnosis: Any, headers: dict[str, dict[str, str]]) -> dict:
+    """Return estimate, errors, range and value in the file of a free parameter."""
+    label, _, short = name.rpartition(": ")
+    header = headers[label] if label else next(iter(headers.values()))
+    key, (estimate, error) = symbol_of(short), map(float, result.value(name))
+    if name in result.undetermined():
+        estimate = error = float("nan")
+    low, high = (float(np.squeeze(x)) for x in diagnosis.ranges.get(name, (np.nan, np.nan)))
+    i = result.names.index(name)
+    return {
+        "parameter": symbol_of(name),
+        "unit": unit_of(name),
+        "estimate": estimate,
+        "std_err": error,
+        "error_budget": {part: float(x[i]) for part, x in result.error_budget.items()},
+        "low": low,
+        "high": high,
+        "header": None if header.get(key, GUESS) == GUESS else header_number(header, key),
+    }
 
 
-def range_over_alternatives(diagnosis, name: str) -> list[float]:
-    """Return the 95 % range of a parameter over all alternatives that fit as well as the best.
-
-    Both limits are nan if there is none.
-    """
-    return [float(np.squeeze(x)) for x in diagnosis.ranges.get(name, (np.nan, np.nan))]
-
-
-def picture_title(options: FitOptions, rows: list[dict], diagnosis) -> str:
-    """Return the title of the picture: the first parameter and the verdict."""
-    first = rows[0]
-    answer = "not determined"
-    if not np.isnan(first["estimate"]):
-        answer = format_with_error(first["estimate"], first["std_err"], first["unit"])
-    name = options.curve.stem.replace("_", " ")
-    return f"{name}: {first['parameter']} = {answer}\n{diagnosis.verdict}"
+def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print columns below their heads, the first one aligned to the left."""
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    print()
+    for row in (head, *rows):
+        cells = [f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)]
+        print("  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip())
 
 
-def format_with_error(value: float, error: float, unit: str) -> str:
-    """Format a value and its standard error, such as (2.959 ± 0.051)·10⁻⁶ s."""
-    power = int(np.floor(np.log10(abs(value)))) if value else 0
-    if not np.isfinite(error) or error <= 0 or -2 < power < 4:
-        return f"{value:.4g} ± {error:.2g} {unit}".strip()
-    digits = max(power - int(np.floor(np.log10(error))) + 1, 0)
-    raised = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    value, error = value / 10.0**power, error / 10.0**power
-    return f"({value:.{digits}f} ± {error:.{digits}f})·10{raised} {unit}".strip()
-
-
-def print_scene(options: Any, gas, curve, header, result) -> None:
-    """Print the curve and the gas that was fitted to it."""
-    T = np.asarray(curve.temperature)
-    print(f"curve    {options.curve.name}: {T.size} points, t = 0 .. {curve.times[-1]:.3g} s,")
+def print_scene(label: str, gas: Any, curve: Any, header: dict[str, str]) -> None:
+    """Print a curve, the gas that was fitted to it, and its impacts."""
+    T, N = np.asarray(curve.temperature), header_count(header, "N")
+    print(f"\ncurve    {label}: {T.size} points, t = 0 .. {curve.times[-1]:.3g} s,")
     print(f"         T falls to {T[-1] / T[0]:.3g} of its first value")
     if "T_from" in header:
         print(f"         {header['T_from']}")
     print(
         f"gas      phi = {float(gas.packing_fraction):.3g}, tau_c = "
         f"{float(gas.mean_free_time):.3g} s, t_c/tau_c = {float(gas.contact_fraction):.2g}, "
-        f"beta_T0 = {float(result.gas.thermal_beta):.3g} (fitted)"
+        f"beta_T0 = {float(gas.thermal_beta):.3g} (fitted)"
     )
-
-
-def print_warnings(input_warnings, unused: str | None) -> None:
-    """Print warnings about the input, and which part of it was not used."""
-    for text in [*(warning.message for warning in input_warnings), *([unused] if unused else [])]:
-        print(f"check    {text}")
-
-
-def print_impacts(gas, last_T: float, num_particles: int | None) -> None:
-    """Print eps at the rms impact speeds of the first and of the last T, and the mean free path."""
-    first, last = (float(gas.restitution(np.sqrt(2 * T))) for T in (gas.temperature, last_T))
+    first, last = (float(gas.restitution(np.sqrt(2 * x))) for x in (gas.temperature, T[-1]))
     print(f"impacts  eps = {first:.3g} at the thermal speed of t = 0, {last:.3g} at the last one;")
     print(f"         mean free path {1e3 * float(gas.mean_free_path):.3g} mm", end="")
-    if num_particles is not None:
-        box = 1e3 * float(gas.box_side(num_particles))
+    if N is not None:
         shape = "cube" if gas.dimension == 3 else "square"
-        print(f", in a box of {box:.3g} mm if it is a {shape}", end="")
-    print()
-    if isinstance(gas.law, jaxgran.Viscoelastic):
-        print("         short contacts depend on A Y^(2/5) only: 10 % in Y is 4 % in A")
+        print(f", in a box of {1e3 * float(gas.box_side(N)):.3g} mm if it is a {shape}", end="")
+    print("\n         short contacts depend on A Y^(2/5) only: 10 % in Y is 4 % in A")
 
 
-def print_model(name: str, result, reasons) -> None:
-    """Print the model, its number of steps, and why it was chosen."""
-    steps = "simulations" if result.model.stochastic else "steps of least squares"
-    print(f"model    {name}, {int(result.iterations)} {steps}")
-    if reasons:
-        print("chosen", "\n".join(f"         - {reason}" for reason in reasons).lstrip())
-
-
-def print_rows(rows: list[dict]) -> None:
-    """Print the table of estimates."""
-    print(f"\n{'':10}{'estimate':>13} {'+-':>10} {'95 % incl. alternatives':>24}  in file")
+def print_parameters(rows: list[dict]) -> None:
+    """Print the ranges and the estimates."""
+    cells = []
     for row in rows:
-        print(f"{row['parameter']:3} {row['unit']:5} ", end="")
-        if np.isnan(row["estimate"]):
-            print(f"{'not determined':>13}")
-            continue
-        limits = f"{row['low']:.3g} .. {row['high']:.3g}"
-        limits = "not computed" if np.isnan(row["low"]) else limits
-        print(f"{row['estimate']:13.5g} {row['std_err']:10.2g} {limits:>24}", end="")
-        if row["header"]:
-            print(f"  {row['header']:.5g} ({100 * (row['estimate'] / row['header'] - 1):+.2f} %)")
-        else:
-            print()
+        low, high, estimate = row["low"], row["high"], row["estimate"]
+        value = f"{estimate:.5g} +- {row['std_err']:.2g}"
+        value += " (rejected)" if estimate < low or estimate > high else ""
+        difference = f"{row['header']:.5g}" if row["header"] else ""
+        if difference and not np.isnan(estimate):
+            difference += f" ({100 * (estimate / row['header'] - 1):+.2f} %)"
+        cells.append(
+            (
+                f"{row['parameter']:3} {row['unit']}",
+                "not computed" if np.isnan(low) else f"{low:.3g} .. {high:.3g}",
+                "not determined" if np.isnan(estimate) else value,
+                difference,
+            )
+        )
+    print_table(("", "95 % incl. alternatives", CONDITIONAL, "in file"), cells)
 
 
 BUDGET_PARTS = {
@@ -277,7 +275,7 @@ def print_budget(rows: list[dict], explain: bool) -> None:
         if np.isnan(row["estimate"]):
             continue
         parts = sorted(row["error_budget"].items(), key=lambda part: -part[1])
-        is_time = row["parameter"] == "t0"  # which may be 0
+        is_time = row["parameter"].endswith("t0")  # which may be 0
         scale, unit = (1e-3, "ms") if is_time else (abs(row["estimate"]) / 100, "%")
         shares = [(name, x / scale) for name, x in parts if x > 0]
         if not explain:
@@ -291,158 +289,26 @@ def print_budget(rows: list[dict], explain: bool) -> None:
             print(f"  {share:8.2g}  {name}: {meaning}")
 
 
-def print_alternatives(name: str, diagnosis) -> None:
+def print_alternatives(name: str, diagnosis: Any) -> None:
     """Print the alternatives: their improvement of chi^2 and the values of the first parameter."""
-    if not diagnosis.alternatives:
-        return
-    head = "alternative explanation"
-    width = max(len(head), *(len(alternative.name) for alternative in diagnosis.alternatives))
-    print(f"\n{head:{width}}  chi^2 drop {name:>9} {'95 %':>20}  distinguishable")
-    for alternative in diagnosis.alternatives:
-        limits = f"{alternative.low[0]:.3g} .. {alternative.high[0]:.3g}"
-        print(f"{alternative.name:{width}}  {alternative.improvement:10.2g}", end="")
-        print(f" {alternative.estimate[0]:9.3g} {limits:>20}  {_distinguishable(alternative)}")
+    cells = []
+    for x in diagnosis.alternatives:
+        needed = f"no (needs {x.error_reduction_needed:.2g}x smaller errors)"
+        answer = "preferred by the data" if x.preferred else "yes" if x.distinguishable else needed
+        limits = f"{x.low[0]:.3g} .. {x.high[0]:.3g}"
+        cells.append((x.name, f"{x.improvement:.2g}", f"{x.estimate[0]:.3g}", limits, answer))
+    if cells:
+        head = "alternative explanation", "chi^2 drop", name, "95 %", "distinguishable"
+        print_table(head, cells)
 
 
-def _distinguishable(alternative) -> str:
-    if alternative.preferred:
-        return "preferred by the data"
-    if alternative.distinguishable:
-        return "yes"
-    return f"no (needs {alternative.error_reduction_needed:.2g}x smaller errors)"
-
-
-def print_verdict(diagnosis) -> None:
-    """Print the verdict and its reasons."""
-    print(f"\n{diagnosis.verdict}")
-    for reason in diagnosis.reasons:
-        print(f"  - {reason}")
-
-
-def run_joint_fit(curves: list[Path], options: FitOptions, started: float) -> None:
-    """Fit curves and drop tests of one material jointly, print the result and write it.
-
-    Args:
-        curves: files of cooling curves.
-        options: of the command.
-        started: start of the job on the clock `time.perf_counter`.
-    """
-    if options.model != JOINT_MODEL:
-        raise ValueError(
-            f"--model {options.model}: several measurements are fitted with {JOINT_MODEL}. Fit the "
-            "curves one by one with other models."
-        )
-    picture, record = output_files(options)
-    free = options.free or ("A", "T0")
-    parameters = [BY_SYMBOL[key] for key in free]
-    shared = tuple(p.name for p in parameters if p.belongs_to != SCENE)
-    separate = tuple(p.name for p in parameters if p.belongs_to == SCENE)
-    if not shared:
-        raise ValueError(f"--free {' '.join(free)}: the curves share none of these. Add A.")
-    files = [path.resolve() for path in (*curves, *options.drop_test)]
-    if repeated := [str(path) for path in files if files.count(path) > 1]:
-        raise ValueError(f"{repeated[0]} is given twice. Give each measurement once.")
-    data, gases, numbers, runs = {}, {}, {}, {}
-    for path in curves:
-        curve, header = jaxgran.read_curve(path)
-        header |= parse_settings(options.set)
-        label = _label(path, data)
-        gases[label] = with_given_constant(gas_of(header, free), header, free)
-        numbers[label], runs[label] = header_count(header, "N"), header_count(header, "replicas")
-        data[label] = curve
-    for path in options.drop_test:  # of spheres like those of the first curve
-        label = _label(path, data)
-        data[label] = jaxgran.read_drop_test(path, onto_plate=options.onto_plate)
-        gases[label] = next(iter(gases.values()))
-    result = jaxgran.fit(
-        gases,
-        data,
-        free=shared,
-        separate=separate,
-        model=models_by_name(default_models(2))[JOINT_MODEL],
-        num_particles=numbers,
-        replicas={label: n or 1 for label, n in runs.items()},
-    )
-    diagnosis = jaxgran.diagnose(result)
-    rows = joint_rows(result, diagnosis)
-    print_joint_fit(result, rows)
-    print_alternatives(rows[0]["parameter"], diagnosis)
-    print_verdict(diagnosis)
-    agree = float(result.p_value) > SIGNIFICANCE
-    summary = {
-        **{row["parameter"]: row["estimate"] for row in rows},
-        **{f"{row['parameter']}_std_err": row["std_err"] for row in rows},
-        **{f"{row['parameter']}_low": row["low"] for row in rows},
-        **{f"{row['parameter']}_high": row["high"] for row in rows},
-        "model": options.model,
-        "agree": agree,
-        "p_value": float(result.p_value),
-        "converged": bool(result.converged),
-        "explains": diagnosis.explains,
-        "seconds": round(time.perf_counter() - started, 2),
-    }
-    summary = finite_or_null(summary)
-    details = {
-        "weight": {label: x.tolist() for label, x in result.weights().items()},
-        "chi2": {label: _chi2(c) for label, c in result.comparisons.items()},
-        "parameters": rows,
-        "diagnosis": {"verdict": diagnosis.verdict, "reasons": diagnosis.reasons},
-        "alternatives": [alternative_as_json(x) for x in diagnosis.alternatives],
-        **environment(),
-    }
-    text = json.dumps(finite_or_null(summary | details), indent=2, allow_nan=False) + "\n"
-    record.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(record, lambda f: f.write(text.encode()))
-    fitted = result.curve if isinstance(result.curve, dict) else {}
-    plotted = {label: (data[label], curve) for label, curve in fitted.items()}
-    plotting.save_curves(plotted, diagnosis.verdict, picture)
-    print(f"\nwritten  {picture}\n         {record}\n")
-    print(json.dumps(summary, allow_nan=False))
-
-
-def _chi2(comparison) -> float:
-    return sum(float(np.sum(np.asarray(x) ** 2)) for x in comparison.residuals.values())
-
-
-def joint_rows(result, diagnosis) -> list[dict]:
-    """Return estimate, error and range of each parameter of several measurements."""
-    rows = []
-    for name in result.names:
-        label, _, short = name.rpartition(": ")
-        key, unit = PARAMETERS[short].symbol, PARAMETERS[short].unit
-        low, high = range_over_alternatives(diagnosis, name)
-        rows.append(
-            {
-                "parameter": f"{label}: {key}" if label else key,
-                "unit": unit,
-                "estimate": float(result.value(name)[0]),
-                "std_err": float(result.value(name)[1]),
-                "low": low,
-                "high": high,
-            }
-        )
-    return rows
-
-
-def _label(path: Path, taken: dict) -> str:
-    """Return the stem of a file, or its whole path if the stem is taken."""
-    return path.stem if path.stem not in taken else str(path)
-
-
-def print_joint_fit(result, rows: list[dict]) -> None:
-    """Print the estimates, and the misfit and the weight of each measurement."""
-    width = max(10, *(len(f"{row['parameter']} {row['unit']}") + 1 for row in rows))
-    print(f"{'':{width}}{'estimate':>13} {'+-':>10} {'95 % incl. alternatives':>24}")
-    for row in rows:
-        limits = f"{row['low']:.3g} .. {row['high']:.3g}"
-        limits = "not computed" if np.isnan(row["low"]) else limits
-        print(f"{row['parameter'] + ' ' + row['unit']:{width}}{row['estimate']:13.5g} ", end="")
-        print(f"{row['std_err']:10.2g} {limits:>24}")
-    width = max(map(len, result.comparisons))
-    print(f"\n{'':{width}}  points    chi^2  weight in {rows[0]['parameter']}")
-    for label, weight in result.weights().items():
-        comparison = result.comparisons[label]
-        points = sum(int(np.sum(np.asarray(x) != 0)) for x in comparison.residuals.values())
-        print(f"{label:{width}}  {points:6d}  {_chi2(comparison):7.1f}  {weight[0]:.2f}")
+def print_measurements(name: str, result: Any) -> None:
+    """Print the misfit and the weight of each measurement, and whether they agree."""
+    cells, weights = [], result.weights()
+    for label, comparison in result.comparisons.items():
+        residuals = np.concatenate([np.asarray(x) for x in comparison.residuals.values()])
+        points, chi2 = np.sum(residuals != 0), np.sum(residuals**2)
+        cells.append((label, f"{points}", f"{chi2:.1f}", f"{weights[label][0]:.2f}"))
+    print_table(("", "points", "chi^2", f"weight in {name}"), cells)
     agreement = "do not contradict" if float(result.p_value) > SIGNIFICANCE else "contradict"
     print(f"\nThe measurements {agreement} each other (p = {float(result.p_value):.2g}).")

@@ -97,16 +97,12 @@ def _app(started: float, default_curve: Path | None) -> App:
         check_tolerance(options.tolerance)
         if not options.no_cache:
             use_compilation_cache()
-        from jaxgran.cli.fit import run_fit, run_joint_fit
+        from jaxgran.cli.fit import run_fit
 
         curves = curves or (() if default_curve is None else (default_curve,))
         if not curves:
             raise ValueError("no curve is given. Name a file: jaxgran fit CURVE.csv.")
-        options = dataclasses.replace(options, curve=curves[0])
-        if len(curves) + len(options.drop_test) > 1:
-            run_joint_fit(list(curves), options, started)
-        else:
-            run_fit(options, started)
+        run_fit(curves, dataclasses.replace(options, curve=curves[0]), started)
 
     app.command(fit)
     app.command(cool)

@@ -8,10 +8,11 @@ alternative, or exclude it; otherwise the parameters are only as certain as the 
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
 
 from jaxgran.data.curve import CoolingCurve
@@ -19,11 +20,8 @@ from jaxgran.fitting.error_budget import curve_and_gas
 from jaxgran.fitting.optimise import Problem, search
 from jaxgran.fitting.parameters import START_TIME, domain_of
 from jaxgran.fitting.residuals import FLOOR, DropTestRows, Measurement, chi2_scale
-from jaxgran.fitting.result import Fit
+from jaxgran.fitting.result import SIGNIFICANCE, Fit
 from jaxgran.models.kinetic_theory import KineticTheory
-
-PREFERRED_CHI2 = 6.63
-"""Decrease of chi^2 above which the data prefer an alternative (1 % by chance)."""
 
 ALLOWED_CHI2 = 3.84
 """Increase of chi^2 over its minimum up to which an amplitude is allowed (5 % by chance)."""
@@ -75,8 +73,14 @@ MAX_CHANGE = 1.0
 SUPPORTED = {"surface", "container", "drag"}
 """Elements of a scene that alternatives add."""
 
-ABSENT = {"walls": "wall_side", "roughness": "tangential_restitution", "drag": "drag_rate"}
-"""Names of elements that a user may declare to be absent, and the parameter of each."""
+DECLARABLE = {
+    "walls": ("wall_side", "container_side, wall_restitution"),
+    "roughness": ("tangential_restitution", "beta_t, T_rot"),
+    "drag": ("drag_rate", "gamma"),
+    "friction": ("friction", "friction"),
+}
+"""Parameter of each of the effects `jaxgran.data.curve_file.ABSENT`, and what describes it in a
+file."""
 
 
 class Kind(NamedTuple):
@@ -111,6 +115,7 @@ class Alternative(NamedTuple):
 
     Attributes:
         name: description of the added element or error.
+        effect: its name in ``absent`` of `jaxgran.fit`; "" for an error of the measurement.
         amplitude: the best amplitude: the share of the initial cooling rate (walls, drag) or of
             the last T (floor), 1 + beta_t, or the delay of the clock over the cooling time.
         allowed: the smallest and the largest amplitude that the data allow.
@@ -118,7 +123,8 @@ class Alternative(NamedTuple):
             chi^2 (1 for independent errors of the given size).
         estimate: estimate of the free parameters at the best amplitude, SI.
         low, high: range of each free parameter over the allowed amplitudes, SI, 95 %.
-        preferred: True if the data prefer this alternative to the fitted law (1 % by chance).
+        preferred: True if the data prefer this alternative to the fitted law; by chance they
+            prefer any of the alternatives in 1 % of fits.
         distinguishable: True if the data distinguish the alternative from the fitted law: it
             changes the first parameter by less than 10 % beyond the error of the fitted law.
         error_reduction_needed: factor by which the errors must decrease to distinguish it; 1 if it
@@ -126,6 +132,7 @@ class Alternative(NamedTuple):
     """
 
     name: str
+    effect: str
     amplitude: float
     allowed: tuple[float, float]
     improvement: float
@@ -137,56 +144,96 @@ class Alternative(NamedTuple):
     error_reduction_needed: float
 
 
-def compare_alternatives(result: Fit, absent: tuple[str, ...] = ()) -> tuple[Alternative, ...]:
+def compare_alternatives(
+    result: Fit, absent: tuple[str, ...] = ()
+) -> tuple[Alternative, tuple[Alternative, ...]] | None:
     """Compare a fitted law with its alternatives, using T and, if it was fitted, T_rot.
 
     Args:
         result: a fit by `jaxgran.fit`.
-        absent: elements that are known to be absent, see `ABSENT`.
+        absent: effects that are known to be absent, see `jaxgran.data.curve_file.ABSENT`.
 
     Returns:
-        The alternatives, those that fit best first; () if the fitted gas does not cool or is
-        driven.
+        The fitted law itself, and the alternatives to it, those that fit best first: none if the
+        fitted gas is driven, or for drop tests alone. None if the law cannot be computed.
     """
     gases = [curve_and_gas(result, label)[1] for label in result.comparisons]
-    if any(gas.drive is not None for gas in gases):
-        return ()
     problem, starts = _problem(result)
-    kinds = _kinds(result, problem, absent)
-    base = _trial(problem, 0.0, _first(problem, result, starts))
-    if base is None:
-        return ()
-    scale = _scale(base, len(result.names))
-    trials = {kind: _profile(problem, kind, base, scale) for kind in kinds}
-    best = min((t for some in trials.values() for t in some), key=lambda t: t.chi2, default=base)
-    scale = _scale(best, len(result.names))
+    kinds = _kinds(result, problem, absent) if all(gas.drive is None for gas in gases) else []
+    bases = _minima(problem, result, _first(problem, result, starts))
+    if not bases:
+        return None
+    scale = _scale(bases[0], result)[0]
+    trials = {kind: [_profile(problem, kind, base, scale) for base in bases] for kind in kinds}
+    everything = [t for valleys in trials.values() for valley in valleys for t in valley]
+    scale, degrees = _scale(min([*bases, *everything], key=lambda t: t.chi2), result)
+    significant = scipy.stats.f.isf(SIGNIFICANCE / max(len(kinds), 1), 1, degrees)
     # Errors that the trials, which have no noise, do not include.
     parts = [result.error_budget.get(part, 0.0) for part in ("simulation", "few particles")]
     noise = np.hypot(*map(np.asarray, parts))
     positive = np.array(
         [domain_of(gases[0], n.rpartition(": ")[2]).low >= 0 for n in result._element_names]
     )
-    alternatives = [
-        _alternative(kind.name, some, base, scale, noise, positive) for kind, some in trials.items()
-    ]
-    return tuple(sorted(alternatives, key=lambda alternative: -alternative.improvement))
+
+    def summarise(
+        kind: Kind | None, valleys: list[list[Trial]], law: Alternative | None = None
+    ) -> Alternative:
+        rows = []
+        for trials in valleys:  # interpolated between the amplitudes
+            margins = [1.96 * np.hypot(scale**0.5 * trial.error, noise) for trial in trials]
+            values = np.array(
+                [
+                    [t.chi2, t.amplitude, *(t.estimate - margin), *(t.estimate + margin)]
+                    for t, margin in zip(trials, margins, strict=True)
+                ]
+            )
+            fine = np.linspace(0, len(trials) - 1, 40 * (len(trials) - 1) + 1)
+            known = np.arange(len(trials))
+            rows.append(np.stack([np.interp(fine, known, column) for column in values.T], axis=1))
+        best = min((trial for trials in valleys for trial in trials), key=lambda trial: trial.chi2)
+        values = np.concatenate(rows)
+        values = values[values[:, 0] <= best.chi2 + ALLOWED_CHI2 * scale]
+        low, high = np.min(values[:, 2:], axis=0), np.max(values[:, 2:], axis=0)
+        low, high = low[: positive.size], high[positive.size :]
+        low = np.where(positive, np.maximum(low, 0.0), low)
+        improvement, wider = float((bases[0].chi2 - best.chi2) / scale), 0.0
+        if law is not None:
+            wider = max(law.low[0] - low[0], high[0] - law.high[0]) / abs(law.estimate[0])
+        parameter = "" if kind is None else kind.parameter
+        return Alternative(
+            name="" if kind is None else kind.name,
+            effect=next((name for name, x in DECLARABLE.items() if x[0] == parameter), ""),
+            amplitude=best.amplitude,
+            allowed=(float(np.min(values[:, 1])), float(np.max(values[:, 1]))),
+            improvement=improvement,
+            estimate=best.estimate,
+            low=low,
+            high=high,
+            preferred=improvement > significant,
+            distinguishable=bool(wider < DISTINGUISHABLE_SHARE),
+            error_reduction_needed=float(max(wider / DISTINGUISHABLE_SHARE, 1.0)),
+        )
+
+    law = summarise(None, [[base] for base in bases])
+    alternatives = [summarise(kind, valleys, law) for kind, valleys in trials.items()]
+    return law, tuple(sorted(alternatives, key=lambda alternative: -alternative.improvement))
 
 
 def ranges_over_alternatives(
-    result: Fit, alternatives: tuple[Alternative, ...]
+    result: Fit, explanations: Sequence[Alternative]
 ) -> dict[str, tuple[Float[np.ndarray, "size"], Float[np.ndarray, "size"]]]:
-    """Return the 95 % range of each free parameter over all alternatives that fit best.
+    """Return the 95 % range of each free parameter over all explanations that fit best.
 
-    These are the alternatives whose improvement is within `ALLOWED_CHI2` of the largest one.
+    These are those whose improvement is within `ALLOWED_CHI2` of the largest one.
 
     Args:
         result: a fit by `jaxgran.fit`.
-        alternatives: its alternatives.
+        explanations: the fitted law and its alternatives.
     """
-    best = max(alternative.improvement for alternative in alternatives)
-    as_good = [a for a in alternatives if a.improvement >= best - ALLOWED_CHI2]
-    low = np.min([a.low for a in as_good], axis=0)
-    high = np.max([a.high for a in as_good], axis=0)
+    best = max(explanation.improvement for explanation in explanations)
+    as_good = [x for x in explanations if x.improvement >= best - ALLOWED_CHI2]
+    low = np.min([x.low for x in as_good], axis=0)
+    high = np.max([x.high for x in as_good], axis=0)
     names = np.array(result._element_names)
     return {name: (low[names == name], high[names == name]) for name in result.names}
 
@@ -276,6 +323,30 @@ def _first(problem: Problem, result: Fit, starts: dict[str, float]) -> np.ndarra
     return flat
 
 
+def _minima(problem: Problem, result: Fit, first: np.ndarray) -> list[Trial]:
+    """Return the minima of chi^2 that the data allow, the deepest one first."""
+    p, ends = problem.num_free, np.asarray(result.minima.estimates, float)
+    chi2, starts = np.asarray(result.minima.chi2), [first]
+    near = EXCLUDED_CHI2 * max(float(result.reduced_chi2), 1.0)
+    for estimate in ends[chi2 - np.min(chi2) < near]:
+        if not np.allclose(estimate, result.estimate, rtol=DISTINGUISHABLE_SHARE):
+            flat, begin = first.copy(), 0
+            for u in problem.unknowns:
+                if begin < p and np.isfinite([u.domain.low, u.domain.high]).any():
+                    part = slice(begin, begin + u.size)
+                    flat[part] = u.domain.to_free(estimate[part])
+                begin += u.size
+            starts.append(flat)
+    trials = [_trial(problem, 0.0, start) for start in starts]
+    found = sorted((t for t in trials if t is not None), key=lambda trial: trial.chi2)
+    minima: list[Trial] = []
+    for trial in found:
+        known = any(np.allclose(trial.estimate, x.estimate, rtol=1e-2) for x in minima)
+        if not known and trial.chi2 <= found[0].chi2 + ALLOWED_CHI2 * _scale(found[0], result)[0]:
+            minima.append(trial)
+    return minima
+
+
 def _kinds(result: Fit, problem: Problem, absent: tuple[str, ...]) -> list[Kind]:
     """Return the kinds of alternatives to a fit."""
     scenes = [m.scene for m in problem.curves]
@@ -315,7 +386,7 @@ def _kinds(result: Fit, problem: Problem, absent: tuple[str, ...]) -> list[Kind]
     if not known & {START_TIME, "temperature"}:
         both = DELAYS, tuple(-x for x in DELAYS)
         possible.append(Kind("an error of the start time or of T_0", START_TIME, both, delay))
-    known |= {ABSENT[name] for name in absent}
+    known |= {DECLARABLE[name][0] for name in absent}
     known |= {name for gas in scenes for name in gas.domains}
     return [kind for kind in possible if kind.parameter not in known and scenes]
 
@@ -369,9 +440,12 @@ def _minimise(problem: Problem, first: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return flat, np.zeros_like(flat)
 
 
-def _scale(trial: Trial, num_parameters: int) -> float:
-    scales = [float(chi2_scale(x, num_parameters)) for x in trial.residuals.values()]
-    return max(scales, default=1.0)
+def _scale(trial: Trial, result: Fit) -> tuple[float, float]:
+    """Return the scale of differences of chi^2, and the degrees of freedom of its estimate."""
+    parts = [chi2_scale(x, len(result.names)) for x in trial.residuals.values()]
+    scale, degrees = max(((float(x), float(n)) for x, n in parts), default=(1.0, np.inf))
+    scatters = [comparison.scatter for comparison in result.comparisons.values()]
+    return scale, np.inf if all(x is None for x in scatters) else degrees
 
 
 def _profile(problem: Problem, kind: Kind, base: Trial, scale: float) -> list[Trial]:
@@ -420,46 +494,3 @@ def _refined(
         trials.append(trial)
         low, high = (trial, high) if trial.chi2 <= target else (low, trial)
     return trials
-
-
-def _alternative(
-    name: str,
-    trials: list[Trial],
-    base: Trial,
-    scale: float,
-    noise: Any,
-    positive: np.ndarray,
-) -> Alternative:
-    """Return an alternative from its trials in the order of their amplitudes.
-
-    chi^2 and the estimates are interpolated between the amplitudes.
-    """
-    chi2 = np.array([trial.chi2 for trial in trials])
-    estimate = np.array([trial.estimate for trial in trials])
-    margin = 1.96 * np.hypot(scale**0.5 * np.array([trial.error for trial in trials]), noise)
-    fine = np.linspace(0, len(trials) - 1, 40 * (len(trials) - 1) + 1)
-
-    def interpolate(values: np.ndarray) -> np.ndarray:
-        return np.interp(fine, np.arange(len(trials)), values)
-
-    allowed = interpolate(chi2) <= chi2.min() + ALLOWED_CHI2 * scale
-    columns = range(estimate.shape[1])
-    low = np.array([interpolate(estimate[:, k] - margin[:, k])[allowed].min() for k in columns])
-    high = np.array([interpolate(estimate[:, k] + margin[:, k])[allowed].max() for k in columns])
-    i = next(i for i, trial in enumerate(trials) if trial is base)
-    fitted, fitted_margin = estimate[i, 0], margin[i, 0]
-    wider = max(fitted - fitted_margin - low[0], high[0] - fitted - fitted_margin) / abs(fitted)
-    improvement = float((base.chi2 - chi2.min()) / scale)
-    amplitudes = interpolate(np.array([trial.amplitude for trial in trials]))[allowed]
-    return Alternative(
-        name=name,
-        amplitude=float(trials[int(np.argmin(chi2))].amplitude),
-        allowed=(float(amplitudes.min()), float(amplitudes.max())),
-        improvement=improvement,
-        estimate=estimate[int(np.argmin(chi2))],
-        low=np.where(positive, np.maximum(low, 0.0), low),
-        high=high,
-        preferred=improvement > PREFERRED_CHI2,
-        distinguishable=bool(wider < DISTINGUISHABLE_SHARE),
-        error_reduction_needed=float(max(wider / DISTINGUISHABLE_SHARE, 1.0)),
-    )

@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxgran._utils.formatting import text_table
 from jaxgran._utils.validation import POSITIVE, no_type_check
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve_file import ABSENT
 from jaxgran.fitting.alternatives import (
-    ABSENT,
-    PREFERRED_CHI2,
+    ALLOWED_CHI2,
+    DECLARABLE,
     Alternative,
     compare_alternatives,
     ranges_over_alternatives,
@@ -24,11 +26,12 @@ from jaxgran.fitting.residuals import (
     check_deterministic,
     neighbour_correlation,
 )
-from jaxgran.fitting.result import SIGNIFICANCE, Comparison, Fit, describe_minima
+from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE, Comparison, Fit, describe_minima
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.checks import describe_walls
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.parameters import symbol_of, unit_of
 
 MAX_SCATTER = 0.3
 """Relative scatter of T about a model above which it does not explain a curve without errors."""
@@ -41,32 +44,50 @@ NEGLIGIBLE_SHARE = 0.01
 """Share of an estimate below which the low end of a range counts as 0."""
 
 
+DETERMINED, NOT_DETERMINED, NOT_CONSISTENT = "determined", "not determined", "not consistent"
+"""Grades of `Diagnosis.grade`."""
+
+MAX_RATIO = 3.0
+"""Ratio of the ends of a range from which on a positive parameter is not determined."""
+
+
 class Diagnosis(NamedTuple):
     """Interpretation of a fit.
 
     Attributes:
-        explains: True if the search converged, the misfit is not significant, the model has no
-            decisive limitation in the scene, no alternative is preferred, and no other minimum of
-            chi^2 is as good.
-        verdict: one sentence, and what to do if the model does not explain the curve.
+        headline: the first free parameter with its 95 % range over all explanations that the data
+            and the scene do not exclude.
+        narrowing: which knowledge would narrow this range, and to which one; "" if none would.
+        grade: "determined" if the model is consistent with the curve, and no alternative that the
+            data allow changes the first parameter by more than 10 % beyond its error; "not
+            determined" if the model is consistent alone; "not consistent" if the search did not
+            converge, the misfit is significant, the data prefer an alternative, or the model has a
+            decisive limitation in the scene.
+        verdict: a sentence that says this, and what to do if the model is not consistent.
         reasons: reasons for the verdict, one sentence each.
         correlation: correlation of neighbouring residuals of T, the largest of all measurements; 0
             for independent errors.
         alternatives: other explanations of the curve, those that fit best first.
-        ranges: 95 % range of each free parameter, SI, over all alternatives that fit as well as the
+        ranges: 95 % range of each free parameter, SI, over all explanations that fit as well as the
             best one. It is much wider than the error of a parameter that depends on the
             alternative.
 
-    >>> jaxgran.diagnose(result, curve).verdict[:40]
-    'Kinetic theory is compatible with this c'
+    >>> jaxgran.diagnose(result, curve).headline[:24]
+    'A = 3e-06 s, 95 % range '
     """
 
-    explains: bool
+    headline: str
+    narrowing: str
+    grade: str
     verdict: str
     reasons: tuple[str, ...]
     correlation: float
     alternatives: tuple[Alternative, ...]
     ranges: dict[str, tuple[Float[np.ndarray, "size"], Float[np.ndarray, "size"]]]
+
+    def __repr__(self) -> str:
+        rows = [("", text) for text in (self.narrowing, self.verdict) if text]
+        return text_table(self.headline, [*rows, *(("-", reason) for reason in self.reasons)])
 
 
 @no_type_check
@@ -76,6 +97,7 @@ def diagnose(
     num_particles: int | None = None,
     *,
     absent: tuple[str, ...] = (),
+    quick: bool = False,
 ) -> Diagnosis:
     """Decide whether the model of a fit explains the measurements, and give the reasons.
 
@@ -83,22 +105,22 @@ def diagnose(
         result: the result of `jaxgran.fit` (not batched).
         data: not needed: the result holds the measurement.
         num_particles: N of the measured gas, by default that given to `jaxgran.fit`.
-        absent: elements that are known to be absent, of "walls", "roughness" and "drag": these
-            explanations are left out.
+        absent: further effects that are known to be absent, see `jaxgran.fit`.
+        quick: leave the search of alternatives out, which takes most of the time; then there are no
+            ranges.
 
     Raises:
         ValueError: if `result` is not a `Fit`, or for an unknown name in `absent`.
 
-    >>> jaxgran.diagnose(result).explains
-    True
+    >>> jaxgran.diagnose(result).grade
+    'determined'
     """
     if not isinstance(result, Fit) or not isinstance(data, CoolingCurve | dict | None):
         raise ValueError(
             "diagnose needs the result of jaxgran.fit and the fitted curve, got "
             f"{type(result).__name__} and {type(data).__name__}"
         )
-    if isinstance(absent, str) or not set(absent) <= set(ABSENT):
-        raise ValueError(f"absent must be a tuple of {', '.join(ABSENT)}, got {absent!r}")
+    absent = tuple(dict.fromkeys((*result.absent, *checked_absent(absent))))
     p_value, converged = float(result.p_value), bool(result.converged)
     misfit, notes, limitations, correlations = p_value < SIGNIFICANCE, [], [], []
     for label, comparison in result.comparisons.items():
@@ -116,35 +138,96 @@ def diagnose(
             if limitation.words not in {known.words for known in limitations}:
                 limitations.append(limitation)
         prefix = f"{label}: " if label else ""
-        if N is not None and gas.container is None:
+        if N is not None and gas.container is None and "walls" not in absent:
             notes.append(f"{prefix}the box of {N} spheres {describe_walls(gas, N)}")
-        described = _describe_residuals(residuals[used], times[used], correlation, p_value)
+        expected = _expected_scatter(gas, N, comparison.replicas)
+        if comparison.errors_of_particles:
+            notes.append(
+                f"{prefix}the curve gives no errors of T_rot: those of {N} particles are used, "
+                f"{100 * expected:.2g} % of T"
+            )
+        errors = 1 / np.asarray(comparison.weights["temperature"])[used]
+        described = _describe_residuals(
+            residuals[used], times[used], correlation, p_value, float(np.median(errors)), expected
+        )
         notes += [prefix + note for note in described]
     limitations = tuple(sorted(limitations, key=lambda limitation: not limitation.decisive))
-    alternatives, ranges = (), {}
-    if converged and np.isfinite(result.chi2):
-        alternatives = compare_alternatives(result, tuple(absent))
-    if alternatives:
-        ranges = ranges_over_alternatives(result, alternatives)
+    explanations, alternatives, ranges = None, (), {}
+    if converged and np.isfinite(result.chi2) and not quick:
+        explanations = compare_alternatives(result, absent)
+    if explanations is not None:
+        law, alternatives = explanations
+        ranges = ranges_over_alternatives(result, (law, *alternatives))
     reasons = [
         _describe_chi2(result),
         *_describe_measurements(result),
-        *_describe_alternatives(result, alternatives, absent),
+        *_describe_alternatives(result, alternatives, absent, quick),
         *notes,
         *(limitation.words for limitation in limitations),
         *_describe_search(result),
         *describe_derivative_bias(result),
     ]
-    verdict = _verdict(result, misfit, limitations, alternatives, ranges)
-    explains = (
-        converged
-        and not misfit
-        and not any(limitation.decisive for limitation in limitations)
-        and not any(alternative.preferred for alternative in alternatives)
-        and not len(result.degenerate_solutions())
+    grade, verdict = _verdict(result, misfit, limitations, alternatives, ranges)
+    return Diagnosis(
+        _headline(result, ranges),
+        "" if explanations is None else _narrowing(result, *explanations, ranges),
+        grade,
+        verdict,
+        tuple(reasons),
+        max(correlations, default=0.0),
+        alternatives,
+        ranges,
     )
-    largest = max(correlations, default=0.0)
-    return Diagnosis(explains, verdict, tuple(reasons), largest, alternatives, ranges)
+
+
+def checked_absent(absent: Any) -> tuple[str, ...]:
+    """Return the names of effects that a user declares absent, or raise ValueError."""
+    if isinstance(absent, str) or not set(absent) <= set(ABSENT):
+        raise ValueError(f"absent must be a tuple of {', '.join(ABSENT)}, got {absent!r}")
+    return tuple(absent)
+
+
+def _headline(result: Fit, ranges: dict[str, Any]) -> str:
+    """Return the first parameter with its range; without it if that lies outside of the range."""
+    name = result.names[0]
+    symbol, unit = symbol_of(name), unit_of(name)
+    estimate, error = (float(np.ravel(x)[0]) for x in result.value(name))
+    if name not in ranges:
+        return f"{symbol} = {estimate:.4g} +- {error:.2g} {unit}".rstrip() + f" {CONDITIONAL}"
+    low, high = (float(x[0]) for x in ranges[name])
+    is_wide = low < NEGLIGIBLE_SHARE * abs(estimate) or high > MAX_RATIO * low
+    if not low <= estimate <= high or (low >= 0 and is_wide):
+        return f"{symbol} is {_format_range(low, high, estimate, unit)} (95 %)"
+    span = f"{low:.3g} to {high:.3g} {unit}".rstrip()
+    return f"{symbol} = {estimate:.3g} {unit}".rstrip() + f", 95 % range {span}"
+
+
+def _format_range(low: float, high: float, estimate: float, unit: str) -> str:
+    if 0 <= low < NEGLIGIBLE_SHARE * abs(estimate):
+        return f"below {high:.3g} {unit}".rstrip()
+    return f"between {low:.3g} and {high:.3g} {unit}".rstrip()
+
+
+def _narrowing(
+    result: Fit,
+    law: Alternative,
+    alternatives: tuple[Alternative, ...],
+    ranges: dict[str, tuple[np.ndarray, np.ndarray]],
+) -> str:
+    """Return which effects, known to be absent, would narrow the range of the first parameter."""
+    wide = [x for x in alternatives if x.effect and not x.distinguishable]
+    others = [law, *(x for x in alternatives if x not in wide)]
+    best = max(x.improvement for x in (law, *alternatives))
+    if not wide or max(x.improvement for x in others) < best - ALLOWED_CHI2:
+        return ""
+    name, effects = result.names[0], sorted(x.effect for x in wide)
+    low, high = (float(x[0]) for x in ranges_over_alternatives(result, others)[name])
+    given = ", ".join(DECLARABLE[effect][1] for effect in effects)
+    value = _format_range(low, high, float(np.asarray(result.estimate)[0]), unit_of(name))
+    return (
+        f"if there is no {' and no '.join(effects)}, {symbol_of(name)} is {value}: declare "
+        f"`absent: {', '.join(effects)}`, or give {given}"
+    )
 
 
 def _is_misfit(
@@ -160,9 +243,15 @@ def _is_misfit(
     in time too, but N gives their size.
     """
     scatter = float(np.asarray(comparison.scatter))
-    expected = np.sqrt(2 / (gas.dimension * num_particles)) if num_particles else 0.0
+    expected = _expected_scatter(gas, num_particles)
     is_systematic = correlation > SYSTEMATIC_CORRELATION / np.sqrt(residuals.size)
     return scatter > MAX_SCATTER or bool(is_systematic and scatter > 2 * expected)
+
+
+def _expected_scatter(gas: Gas, num_particles: int | None, replicas: int = 1) -> float:
+    """Return the relative fluctuation of T of N particles, 0 if N is unknown."""
+    total = gas.dimension * (num_particles or 0) * replicas
+    return (2 / total) ** 0.5 if total else 0.0
 
 
 def _describe_measurements(result: Fit) -> Iterator[str]:
@@ -174,7 +263,8 @@ def _describe_measurements(result: Fit) -> Iterator[str]:
         chi2 = sum(float(np.sum(np.asarray(x) ** 2)) for x in comparison.residuals.values())
         number = sum(int(np.sum(np.asarray(x) != 0)) for x in comparison.residuals.values())
         yield (
-            f"{label}: chi^2 is {chi2:.3g} for {number} points; its weight in {result.names[0]} is "
+            f"{label}: chi^2 is {chi2:.3g} for {number} points; its weight in "
+            f"{symbol_of(result.names[0])} is "
             f"{weights[label][0]:.2f}"
         )
 
@@ -185,8 +275,8 @@ def _verdict(
     limitations: tuple[Limitation, ...],
     alternatives: tuple[Alternative, ...],
     ranges: dict[str, Any],
-) -> str:
-    """Return the verdict on the model of a fit.
+) -> tuple[str, str]:
+    """Return the grade of a fit, and the verdict in words.
 
     Args:
         result: the fit.
@@ -195,35 +285,40 @@ def _verdict(
         alternatives: alternatives to the model, those that fit best first.
         ranges: range of each parameter over the alternatives.
     """
-    name = result.model.name
-    if not bool(result.converged):
-        return "The search did not converge: do not trust its estimates."
-    if len(result.degenerate_solutions()) and not misfit:
-        return "Other parameters fit this curve as well: do not trust these estimates."
-    plural = name.endswith("s")
-    name = name[:1].upper() + name[1:]
-    decisive = any(limitation.decisive for limitation in limitations)
+    name, remedy = result.model.name, " ".join(limitation.remedy for limitation in limitations[:1])
+    be = "are" if name.endswith("s") else "is"
+    name, symbol = name[:1].upper() + name[1:], symbol_of(result.names[0])
     preferred = [alternative for alternative in alternatives if alternative.preferred]
+    decisive = any(limitation.decisive for limitation in limitations)
+    if not bool(result.converged):
+        return NOT_CONSISTENT, "The search did not converge: do not trust its estimates."
     if misfit or preferred:
-        do, its = ("do", "their") if plural else ("does", "its")
-        verdict = f"{name} {do} not explain this curve: do not trust {its} estimates."
+        verdict = f"{name} {be} not consistent with this curve: do not trust the estimates."
         if preferred:
             verdict += f" The data prefer a model with {preferred[0].name}."
-    elif decisive:
+        return NOT_CONSISTENT, f"{verdict} {remedy}".rstrip()
+    if decisive:
         verdict = f"{name} cannot be trusted in this scene, though the curve fits."
-    elif limitations:
-        s = "" if plural else "s"
-        return f"{name} fit{s} this curve, but the scene is at the edge of the model's validity."
+        return NOT_CONSISTENT, f"{verdict} {remedy}"
+    consistent = f"{name} {be} consistent with this curve"
+    edge = " The scene is at the edge of the model's validity." if limitations else ""
+    possible = [a.name for a in alternatives if not a.distinguishable]
+    group = result.undetermined()
+    if len(result.degenerate_solutions()):
+        why = "other parameters fit this curve as well"
+    elif group:
+        why = f"this curve does not determine {' and '.join(map(symbol_of, group))}"
+    elif not ranges:
+        why = "alternatives were not compared"
     else:
-        verdict = f"{name} {'are' if plural else 'is'} compatible with this curve."
-        possible = [a.name for a in alternatives if not a.distinguishable]
-        if possible:
-            low, high = (x[0] for x in ranges[result.names[0]])
-            value = _describe_range(low, high, result.estimate[0])
-            verdict = f"{verdict[:-1]}, which does not exclude {possible[0]}: "
-            verdict += f"{result.names[0]} is {value}."
-        return verdict
-    return " ".join([verdict, *(limitation.remedy for limitation in limitations[:1])])
+        low, high = (float(x[0]) for x in ranges[result.names[0]])
+        unit, estimate = unit_of(result.names[0]), float(np.asarray(result.estimate)[0])
+        value = f"{symbol} is {_format_range(low, high, estimate, unit)}"
+        if not possible and not (low >= 0 and high > MAX_RATIO * low):
+            return DETERMINED, f"{consistent}, which determines {symbol}: {value}.{edge}"
+        why = f"{possible[0]} cannot be excluded, and " if possible else ""
+        why += value
+    return NOT_DETERMINED, f"{consistent}, which does not determine {symbol}: {why}.{edge}"
 
 
 def _describe_chi2(result: Fit) -> str:
@@ -243,36 +338,39 @@ def _describe_chi2(result: Fit) -> str:
 
 
 def _describe_alternatives(
-    result: Fit, alternatives: tuple[Alternative, ...], absent: tuple[str, ...]
+    result: Fit, alternatives: tuple[Alternative, ...], absent: tuple[str, ...], quick: bool
 ) -> Iterator[str]:
     """Yield clauses about preferred or possible alternatives, with the first parameter there."""
     yield _describe_assumptions(result)
     if absent:
         yield f"known to be absent: {', '.join(absent)}"
+    if quick:
+        yield "alternatives were not compared, as requested"
     if any(curve_and_gas(result, k)[1].drive is not None for k in result.comparisons):
         yield "additional loss terms were not tested: the gas is driven"
-    name, estimate = result.names[0], np.asarray(result.estimate)[0]
+    if result.model.stochastic and alternatives:
+        yield "the range over alternatives is that of kinetic theory, shifted to the fitted curve"
+    name, estimate = result.names[0], float(np.asarray(result.estimate)[0])
     for alternative in alternatives:
-        value = _describe_range(alternative.low[0], alternative.high[0], estimate)
+        low, high = float(alternative.low[0]), float(alternative.high[0])
+        value = f"{symbol_of(name)} is then {_format_range(low, high, estimate, unit_of(name))}"
         if alternative.preferred:
             yield (
                 f"{alternative.name} added to the model decreases chi^2 by "
-                f"{alternative.improvement:.3g} (significant at 1 % above {PREFERRED_CHI2:.3g}): "
-                f"{name} is then {value}"
+                f"{alternative.improvement:.3g}, which happens by chance in less than 1 % of fits: "
+                f"{value}"
             )
+            if not low <= estimate <= high:
+                yield (
+                    f"the estimate {estimate:.3g} lies outside of this range, because it is that "
+                    "without the preferred alternative"
+                )
         elif not alternative.distinguishable:
             yield (
-                f"{alternative.name} cannot be excluded: {name} is then {value}; to exclude it, "
-                "the errors of the curve and of the model must be "
-                f"{alternative.error_reduction_needed:.2g} times smaller"
+                f"{alternative.name} cannot be excluded: {value}; to exclude it, the errors of the "
+                f"curve and of the model must be {alternative.error_reduction_needed:.2g} times "
+                "smaller"
             )
-
-
-def _describe_range(low: float, high: float, estimate: Any) -> str:
-    """Return a range in words, as an upper bound if its low end is negligible."""
-    if 0 <= low < NEGLIGIBLE_SHARE * float(np.asarray(estimate)):
-        return f"anything below {high:.3g}, an upper bound"
-    return f"between {low:.3g} and {high:.3g}"
 
 
 def _describe_assumptions(result: Fit) -> str:
@@ -290,6 +388,8 @@ def _describe_residuals(
     times: Float[np.ndarray, "used"],
     correlation: float,
     p_value: float,
+    error: float,
+    expected: float,
 ) -> Iterator[str]:
     """Yield clauses about correlation and outliers.
 
@@ -298,6 +398,8 @@ def _describe_residuals(
         times: t, s, of the residuals.
         correlation: correlation of neighbouring residuals.
         p_value: p-value of the fit, nan if the errors are unknown.
+        error: median relative error of T.
+        expected: that of the fluctuations of N particles, 0 if N is unknown.
     """
     if correlation > 2 / np.sqrt(residuals.size):
         text = f"neighbouring residuals are correlated (coefficient {correlation:.2f})"
@@ -316,6 +418,12 @@ def _describe_residuals(
             f"the residuals are only {share:.2g} of the errors of T, less than expected by chance: "
             "these errors are too large, or they are common to the points"
         )
+        if 0 < 2 * expected < error:
+            yield (
+                f"T_err is {100 * error:.2g} % of T, but N particles fluctuate by only "
+                f"{100 * expected:.2g} %: give T_err = {expected:.2g} T, or leave it out, so that "
+                "the scatter is used; the ranges are too wide otherwise"
+            )
     far = np.abs(residuals) > 5
     if not np.isnan(p_value) and 0 < far.sum() <= max(2, residuals.size // 20):
         at = ", ".join(f"t = {t:.3g} s" for t in times[far])
@@ -335,7 +443,7 @@ def _describe_search(result: Fit) -> Iterator[str]:
         )
     group = result.undetermined()
     if group:
-        yield f"this curve does not determine {' and '.join(group)}"
+        yield f"this curve does not determine {' and '.join(map(symbol_of, group))}"
     if others := describe_minima(result.names, result.degenerate_solutions()):
         yield others
 

@@ -15,6 +15,7 @@ from jaxgran._utils.tracing import any_traced, array_module
 from jaxgran._utils.validation import checked_int, no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import DropTest
+from jaxgran.fitting.diagnosis import checked_absent, diagnose
 from jaxgran.fitting.error_budget import clock_accuracy, with_scene_errors
 from jaxgran.fitting.optimise import Problem, best_of_starts, search
 from jaxgran.fitting.parameters import (
@@ -32,6 +33,7 @@ from jaxgran.fitting.residuals import (
     Measurement,
     check_curve,
     unused_rotation,
+    with_errors_of_particles,
 )
 from jaxgran.fitting.result import (
     Fit,
@@ -44,6 +46,7 @@ from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.parameters import symbol_of
 
 START_TIME_PRIOR = 1.0
 """Standard error of the prior of t0 where T_0 is free too, over the time in which T halves."""
@@ -67,6 +70,7 @@ def fit(
     max_steps: int | None = None,
     key: PRNGKeyArray | None = None,
     progress: bool = True,
+    absent: tuple[str, ...] = (),
 ) -> Fit:
     """Estimate parameters of a gas from one measurement, or from several together.
 
@@ -131,9 +135,13 @@ def fit(
         key: key of the random numbers of a stochastic model, by default `jax.random.key(0)`: two
             calls without a key return the same numbers.
         progress: show progress bars on a terminal during simulations.
+        absent: effects that are known to be absent, of "walls", "roughness", "drag" and "friction":
+            `jaxgran.diagnose` then does not consider these explanations. The estimates do not
+            depend on it.
 
     Returns:
-        `Fit`; `jaxgran.diagnose` interprets it in words. Under `jax.vmap` and `jax.jit` its errors
+        `Fit`; `jaxgran.diagnose` gives the range of the parameters over all explanations that the
+        data do not exclude, and `print` shows it first. Under `jax.vmap` and `jax.jit` its errors
         contain the model's ``derivative_accuracy`` instead of the error of the clock in this scene,
         and omit the randomness of few particles.
 
@@ -158,9 +166,13 @@ def fit(
     names = _default_names(scenes, data, separate) if free is None else free
     names = with_names_of_law((names,) if names == LAW else names, next(iter(scenes.values())))
     _check_request(scenes, data, names, separate, max_steps)
+    absent = checked_absent(absent)
     names, separate, key = tuple(names), tuple(separate), checked_key(key)
     all_priors = _priors_by_label(scenes, priors)
-    for label, curve in curves.items():
+    as_given = dict(curves)
+    for label, curve in as_given.items():
+        curve = with_errors_of_particles(scenes[label], curve, counts[label], runs[label] or 1)
+        curves[label] = data[label] = curve
         if unused := unused_rotation(scenes[label], curve):
             warnings.warn(unused, stacklevel=2)
     _check_model(model, solver, names, separate, all_priors, scenes, several, bool(curves))
@@ -194,10 +206,14 @@ def fit(
     if any_traced(result.chi2, data, scenes):
         return result
     comparisons = {
-        label: c._replace(num_particles=counts[label], replicas=runs[label] or 1)
+        label: c._replace(
+            num_particles=counts[label],
+            replicas=runs[label] or 1,
+            errors_of_particles=data[label] is not as_given.get(label, data[label]),
+        )
         for label, c in result.comparisons.items()
     }
-    result = replace(result, comparisons=comparisons)
+    result = replace(result, comparisons=comparisons, absent=absent, interpret=diagnose)
     _check_computed(result)
     _warn(result)
     if np.isfinite(result.chi2):
@@ -510,7 +526,8 @@ def _warn(result: Fit) -> None:
         elif {"dissipative_constant", "youngs_modulus"} <= {*group}:
             why += " (in a gas of hard spheres A and Y enter only as A Y^(2/5))"
         warnings.warn(
-            f"the curve does not determine {' and '.join(group)}: {why}. Free fewer parameters",
+            f"the curve does not determine {' and '.join(map(symbol_of, group))}: {why}. Free "
+            "fewer parameters",
             stacklevel=3,
         )
     if others := describe_minima(result.names, result.degenerate_solutions()):

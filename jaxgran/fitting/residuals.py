@@ -81,8 +81,26 @@ def unused_rotation(gas: Gas, curve: CoolingCurve) -> str | None:
     lacking = {"T_err": curve.temperature_error, "T_rot_err": curve.rotational_temperature_error}
     names = [name for name, error in lacking.items() if error is None]
     if names:
-        return f"the measured T_rot is not used: its weights need {' and '.join(names)}"
+        return f"the measured T_rot is not used: its weights need {' and '.join(names)}, or N"
     return None
+
+
+def with_errors_of_particles(
+    gas: Gas, curve: CoolingCurve, num_particles: int | None, replicas: int
+) -> CoolingCurve:
+    """Return a curve with the errors that its T_rot needs, from the fluctuations of N particles.
+
+    Relative errors that the curve lacks are ``sqrt(2/(d N R))`` of T and ``sqrt(2/(d_rot N R))`` of
+    T_rot, with R replicas. Without N, T_rot or a surface the curve is returned unchanged.
+    """
+    if num_particles is None or gas.surface is None or curve.rotational_temperature is None:
+        return curve
+    total, errors = num_particles * replicas, {}
+    degrees = {"temperature": gas.dimension, "rotational_temperature": 2 * gas.dimension - 3}
+    for name, d in degrees.items():
+        if getattr(curve, f"{name}_error") is None:
+            errors[f"{name}_error"] = (2 / (d * total)) ** 0.5 * getattr(curve, name)
+    return replace(curve, **errors) if errors else curve
 
 
 def uses_rotation(gas: Gas, curve: CoolingCurve) -> bool:
@@ -504,17 +522,23 @@ def correlation_factor(correlation: Numbers) -> Numbers:
     return xp.sqrt((1 + positive) / (1 - positive))
 
 
-def chi2_scale(residuals: Numbers, num_parameters: int) -> Numbers:
-    """Scale of differences of chi^2: 1 for independent errors of the given size.
+def chi2_scale(residuals: Numbers, num_parameters: int) -> tuple[Numbers, Numbers]:
+    """Return the scale of differences of chi^2, and the effective degrees of freedom.
+
+    The scale is 1 for independent errors of the given size. Where it is estimated, a difference
+    over the scale has the F distribution with these degrees: n correlated points count as
+    ``n (1 - c)/(1 + c)``.
 
     Args:
         residuals: weighted residuals of the best fit; 0 where a point is not used.
         num_parameters: the number of parameters of that fit.
     """
     xp = array_module(residuals)
-    degrees = xp.maximum(xp.sum(residuals != 0) - num_parameters, 1)
-    reduced = xp.sum(residuals**2) / degrees
-    return correlation_factor(neighbour_correlation(residuals)) ** 2 * xp.maximum(reduced, 1.0)
+    number = xp.sum(residuals != 0)
+    reduced = xp.sum(residuals**2) / xp.maximum(number - num_parameters, 1)
+    factor = correlation_factor(neighbour_correlation(residuals)) ** 2
+    degrees = xp.maximum(number / factor - num_parameters, 1)
+    return factor * xp.maximum(reduced, 1.0), degrees
 
 
 MEASURED = tuple(quantity.field for quantity in WITH_ERRORS)

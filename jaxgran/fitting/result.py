@@ -1,5 +1,6 @@
 """Result of a fit, and its assembly from the linearised residuals."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -7,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils.formatting import TableRows, format_quantity, html_table, text_table
@@ -24,19 +24,23 @@ from jaxgran.fitting.residuals import (
     neighbour_correlation,
 )
 from jaxgran.models.base import AbstractModel
-from jaxgran.scene.gas import FLOAT_UNITS, Gas
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.parameters import symbol_of, unit_of
 
 DEGENERATE_CHI2 = 9.0
 """Difference of chi^2 up to which two minima are equally good: three standard errors."""
 
 MULTIMODAL_PARAMETER, MULTIMODAL_STARTS = "tangential_restitution", (-0.6, 0.0, 0.6)
-"""Parameter in which chi^2 has several minima if T_rot is measured, and its start values."""
+"""Parameter in which chi^2 has several minima, and its start values."""
 
 MAX_ROWS = 20
 """Number of estimates up to which a fit lists each element of its vectors."""
 
 SIGNIFICANCE = 0.01
 """Level of significance of the chi^2 test: a model with a smaller p-value is rejected."""
+
+CONDITIONAL = "if nothing else is there"
+"""Name of estimates and standard errors that hold if the scene is complete."""
 
 
 class Minima(NamedTuple):
@@ -101,6 +105,7 @@ class Comparison(NamedTuple):
         start_time: t0, the time at which the gas had T_0 and began to cool, s; 0 unless free.
         num_particles: N of the measured gas; None if it is unknown.
         replicas: number of runs over which the curve is a mean.
+        errors_of_particles: True if errors that the curve lacks are those of N particles.
     """
 
     residuals: dict[str, Numbers]
@@ -113,6 +118,24 @@ class Comparison(NamedTuple):
     start_time: Numbers = 0.0
     num_particles: int | None = None
     replicas: int = 1
+    errors_of_particles: bool = False
+
+
+class GoodnessOfFit(NamedTuple):
+    """Goodness of fit.
+
+    Attributes:
+        chi2: sum of squared weighted residuals.
+        degrees_of_freedom: number of residuals minus that of the parameters.
+        p_value: probability of a chi^2 as large by chance, of the quantity that fits worst,
+            including the uncertainty of errors from few replicas; nan if the curve has no errors.
+        inflation: factor of the covariance of the measurement.
+    """
+
+    chi2: Numbers
+    degrees_of_freedom: Numbers
+    p_value: Numbers
+    inflation: Numbers
 
 
 class Fit(eqx.Module):
@@ -140,13 +163,13 @@ class Fit(eqx.Module):
             that of the last simulation, one Gauss-Newton step before the estimate.
         comparisons: residuals, weights and sensitivities of each measurement, by label ("" for a
             single one).
-        chi2, degrees_of_freedom: goodness of fit of all weighted residuals.
-        p_value: probability of a chi^2 as large by chance, of the quantity that fits worst,
-            including the uncertainty of errors from few replicas; nan if the curve has no errors.
+        goodness: chi^2 of all weighted residuals, its degrees of freedom, and its p-value.
         converged: True if the search reached its tolerance; for a stochastic model, if the last
             step was below 0.1 in the unconstrained scale.
         minima: the search: minima of chi^2 at which it ended from several starts, the first guess,
             the number of iterations, the extrapolation from simulations.
+        absent: effects that are known to be absent, as given to `jaxgran.fit`.
+        interpret: `jaxgran.diagnose`, whose range comes first where a fit is printed.
 
     >>> A, error = result.value("dissipative_constant")
     >>> f"{float(A):.3g} s", sorted(result.error_budget)
@@ -162,11 +185,26 @@ class Fit(eqx.Module):
     data: Any
     curve: Any
     comparisons: dict[str, Comparison]
-    chi2: Float[Array, ""]
-    degrees_of_freedom: Int[Array, ""]
-    p_value: Float[Array, ""]
+    goodness: GoodnessOfFit
     converged: Bool[Array, ""]
     minima: Minima
+    absent: tuple[str, ...] = eqx.field(static=True, default=())
+    interpret: Callable[["Fit"], Any] | None = eqx.field(static=True, default=None)
+
+    @property
+    def chi2(self) -> Float[Array, ""]:
+        """Sum of squares of all weighted residuals."""
+        return self.goodness.chi2
+
+    @property
+    def degrees_of_freedom(self) -> Int[Array, ""]:
+        """Number of residuals minus that of the parameters."""
+        return self.goodness.degrees_of_freedom
+
+    @property
+    def p_value(self) -> Float[Array, ""]:
+        """Probability of a chi^2 as large by chance; nan if the curve has no errors."""
+        return self.goodness.p_value
 
     @property
     def reduced_chi2(self) -> Float[Array, ""]:
@@ -237,25 +275,29 @@ class Fit(eqx.Module):
 
     @property
     def _summary(self) -> tuple[str, TableRows]:
-        """Title and rows of a table of the estimates and the goodness of fit."""
-        is_single = not isinstance(self.estimate, Tracer) and self.estimate.ndim == 1
-        rows, undetermined = [], self.undetermined() if is_single else ()
+        """Title and rows of a table of the estimates and the goodness of fit.
+
+        The title is the headline of `jaxgran.diagnose`, which takes about a second: the first
+        number is the one that readers copy, and the standard error alone is too small by factors
+        of 5 to 12 where the scene contains something that the fit was not told of.
+        """
+        title, rows, undetermined = f"Fit of {self.model.name}", [], ()
         shown = list(zip(self.names, self.names, strict=True))
-        if is_single and len(self.estimate) <= MAX_ROWS:
-            shown = list(zip(self.element_names, self._element_names, strict=True))
+        if not any_traced(self.estimate) and self.estimate.ndim == 1:
+            undetermined = self.undetermined()
+            if len(self.estimate) <= MAX_ROWS:
+                shown = list(zip(self.element_names, self._element_names, strict=True))
+            if self.interpret is not None and len(self.estimate) <= MAX_ROWS:
+                diagnosis = self.interpret(self)
+                title = diagnosis.headline
+                rows = [("", text) for text in (diagnosis.narrowing, diagnosis.verdict) if text]
+        rows.append((CONDITIONAL, ""))
         for element, name in shown:
-            estimate, error = (format_quantity(x, _unit(name)) for x in self.value(element))
-            rows.append(
-                (element, "not determined" if name in undetermined else f"{estimate} +- {error}")
-            )
-        rows.append(
-            (
-                "reduced chi^2",
-                f"{format_quantity(self.reduced_chi2)}, p = {format_quantity(self.p_value)}",
-            )
-        )
-        rows.append(("converged", str(self.converged)))
-        return f"Fit of {self.model.name}", rows
+            value = " +- ".join(format_quantity(x, unit_of(name)) for x in self.value(element))
+            value = "not determined" if name in undetermined else value
+            rows.append((symbol_of(element), value))
+        chi2 = f"{format_quantity(self.reduced_chi2)}, p = {format_quantity(self.p_value)}"
+        return title, [*rows, ("reduced chi^2", chi2), ("converged", str(self.converged))]
 
     def value(self, name: str) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return the estimate and the standard error of a parameter.
@@ -339,11 +381,6 @@ class Fit(eqx.Module):
         return {label: np.sum(x**2, axis=0) / total for label, x in parts.items()}
 
 
-def _unit(name: str) -> str:
-    short = name.rpartition(": ")[2]
-    return "s" if short == START_TIME else FLOAT_UNITS.get(short, "")
-
-
 def _deviations(covariance: Float[Array, "p p"]) -> Float[Array, "p"]:
     if any_traced(covariance):
         return jnp.sqrt(jnp.diagonal(covariance, axis1=-2, axis2=-1))
@@ -356,7 +393,7 @@ def describe_minima(names: tuple[str, ...], others: Float[np.ndarray, "others p"
     if not len(others):
         return None
     sets = (
-        ", ".join(f"{name} = {value:.3g}" for name, value in zip(names, other, strict=False))
+        ", ".join(f"{symbol_of(name)} = {x:.3g}" for name, x in zip(names, other, strict=False))
         for other in others
     )
     return f"chi^2 has another, equally good minimum at {' and at '.join(sets)}"
@@ -365,16 +402,14 @@ def describe_minima(names: tuple[str, ...], others: Float[np.ndarray, "others p"
 def search_starts(problem: Problem, first: Numbers) -> Numbers:
     """Return the starts of a search: the first guess and, if beta_t is free, several beta_t.
 
-    chi^2 has minima on both sides of the beta_t at which rotation takes most energy, if T_rot is
-    measured.
+    chi^2 has minima on both sides of the beta_t at which rotation takes most energy.
 
     Args:
         problem: of the fit.
         first: the first guess of its unknowns.
     """
     xp = array_module(first)
-    uses_rotation = any("rotational_temperature" in m.weights for m in problem.curves)
-    if MULTIMODAL_PARAMETER not in {u.name for u in problem.unknowns} or not uses_rotation:
+    if MULTIMODAL_PARAMETER not in {u.name for u in problem.unknowns}:
         return first[None]
     starts = [first]
     for beta in MULTIMODAL_STARTS:
@@ -387,22 +422,6 @@ def search_starts(problem: Problem, first: Numbers) -> Numbers:
             parts.append(part)
         starts.append(xp.concatenate(parts))
     return xp.stack(starts)
-
-
-class GoodnessOfFit(NamedTuple):
-    """Goodness of fit.
-
-    Attributes:
-        chi2: sum of squared weighted residuals.
-        reduced: chi^2 per degree of freedom.
-        p_value: probability of a chi^2 as large by chance; nan if the errors are unknown.
-        inflation: factor of the covariance of the measurement.
-    """
-
-    chi2: Numbers
-    reduced: Numbers
-    p_value: Numbers
-    inflation: Numbers
 
 
 def goodness_of_fit(
@@ -430,9 +449,9 @@ def goodness_of_fit(
     xp = array_module(parts)
     parts_chi2 = xp.stack([xp.sum(residuals**2) for residuals, *_ in parts])
     chi2 = xp.sum(parts_chi2)
-    reduced = chi2 / degrees_of_freedom
     if not errors_known:
-        return GoodnessOfFit(chi2, reduced, xp.full((), xp.nan), reduced)
+        unknown = xp.full((), xp.nan)
+        return GoodnessOfFit(chi2, degrees_of_freedom, unknown, chi2 / degrees_of_freedom)
     degrees = xp.stack([xp.maximum(number, 1) for _, number, _ in parts])
     error_degrees = [of_errors for *_, of_errors in parts]
     p_values = [
@@ -442,7 +461,7 @@ def goodness_of_fit(
     p_value = -xp.expm1(len(parts) * xp.log1p(-worst)) if len(parts) > 1 else worst
     unexplained = p_value < SIGNIFICANCE
     inflation = xp.where(unexplained, xp.maximum(xp.max(parts_chi2 / degrees), 1.0), 1.0)
-    return GoodnessOfFit(chi2, reduced, p_value, inflation)
+    return GoodnessOfFit(chi2, degrees_of_freedom, p_value, inflation)
 
 
 def _p_value(xp: Any, chi2: Numbers, degrees: Numbers, error_degrees: Numbers | None) -> Numbers:
@@ -482,7 +501,7 @@ def assemble_fit(
     gains = xp.split(gain, ends_of_rows, axis=1)
     jacobians = xp.split(jacobian[:, :p], ends_of_rows, axis=0)
     by_label = {m.label: m for m in problem.measurements}
-    goodness, degrees_of_freedom = _test_all(xp, problem, rows, flat)
+    goodness = _test_all(xp, problem, rows, flat)
     covariances: dict[str, Numbers] = {}
     for row, part in zip(rows, gains, strict=True):
         name, covariance = row.kind, part @ part.T
@@ -533,9 +552,7 @@ def assemble_fit(
             "estimate": problem.estimates(flat),
             "covariances": covariances,
             "comparisons": comparisons,
-            "chi2": goodness.chi2,
-            "degrees_of_freedom": degrees_of_freedom,
-            "p_value": goodness.p_value,
+            "goodness": goodness,
             "converged": converged & xp.isfinite(goodness.chi2),
             "minima": minima,
         }
@@ -565,10 +582,8 @@ def _fitted_gas(m: Any, values: dict[str, Numbers]) -> Gas:
     return with_floats(scene, {name: x for name, x in values.items() if name in scene.domains})
 
 
-def _test_all(
-    xp: Any, problem: Problem, rows: list[Rows], flat: Numbers
-) -> tuple[GoodnessOfFit, Numbers]:
-    """Test each quantity of each measurement; return this and all degrees of freedom."""
+def _test_all(xp: Any, problem: Problem, rows: list[Rows], flat: Numbers) -> GoodnessOfFit:
+    """Test each quantity of each measurement."""
     tested, used, num_priors = [], 0, 0
     factors = {(row.label, row.kind): row.values for row in rows if row.kind in FACTORS.values()}
     degrees_of_errors: dict[Any, Any] = {m.label: m.error_degrees for m in problem.curves}
@@ -591,4 +606,4 @@ def _test_all(
         used = used + number
     degrees_of_freedom = xp.asarray(used + num_priors - flat.shape[0])
     known = all(m.curve.temperature_error is not None for m in problem.curves)
-    return goodness_of_fit(tested, degrees_of_freedom, errors_known=known), degrees_of_freedom
+    return goodness_of_fit(tested, degrees_of_freedom, errors_known=known)

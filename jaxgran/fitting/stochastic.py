@@ -267,9 +267,7 @@ def _stochastic_result(
             "estimate": estimate,
             "covariances": covariances,
             "comparisons": {"": comparison},
-            "chi2": goodness.chi2,
-            "degrees_of_freedom": degrees_of_freedom,
-            "p_value": goodness.p_value,
+            "goodness": goodness,
             "converged": np.asarray(search.converged),
             "minima": minima,
         }

@@ -102,6 +102,18 @@ ADVICE = {
 """A sentence that ends the message on a value outside its domain, by name."""
 
 
+def symbol_of(name: str) -> str:
+    """Return the symbol of a parameter, which may begin with a label: "thin: T0"; else its name."""
+    label, separator, short = name.rpartition(": ")
+    symbol = PARAMETERS[short].symbol if short in PARAMETERS else ""
+    return f"{label}{separator}{symbol or short}"
+
+
+def unit_of(name: str) -> str:
+    """Return the unit of a parameter, which may begin with a label; "" if it has none."""
+    return FLOAT_UNITS.get(name.rpartition(": ")[2], "")
+
+
 def fields_of(owner: str) -> dict[str, Parameter]:
     """Return the parameters that are fields of a class, by the name of the field."""
     prefix = PREFIXES.get(owner, "")

@@ -29,10 +29,14 @@ def test_main_job_without_arguments(tmp_path):
     assert "eps = 0.9" in done.stdout and "mean free path 4.15 mm" in done.stdout
     assert abs(summary["A"] / 3e-6 - 1) < 0.02
     assert abs(summary["A"] - 3e-6) < 2 * summary["A_std_err"]
-    assert summary["converged"] and summary["explains"] and summary["model"] == "kinetic-theory"
+    assert (
+        summary["converged"]
+        and summary["verdict"] == "not determined"
+        and summary["model"] == "kinetic-theory"
+    )
     # Points of the same runs share their noise: where theory is right they scatter by half of it.
     assert 0.2 < summary["reduced_chi2"] < 1.5
-    assert "Kinetic theory is compatible with this curve, which does not exclude" in done.stdout
+    assert "Kinetic theory is consistent with this curve" in done.stdout
     assert 1e-6 < summary["A_low"] < 2.7e-6 and 3e-6 < summary["A_high"] < 3.3e-6
     folder = tmp_path / "results" / "lammps_cooling_dilute-kinetic-theory"
     picture, record = sorted(folder.iterdir(), reverse=True)
@@ -59,7 +63,7 @@ def test_main_job_says_what_it_cannot_explain(tmp_path):
     done = run("fit_cooling_curve.py", DENSE, "--free", "A", "T0", "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "This scene needs soft spheres" in done.stdout
-    assert not json.loads(done.stdout.splitlines()[-1])["explains"]
+    assert json.loads(done.stdout.splitlines()[-1])["verdict"] == "not consistent"
     # Nothing is written over unless asked.
     before = {path: path.read_bytes() for path in (tmp_path / "here").iterdir()}
     again = run("fit_cooling_curve.py", DENSE, "--out", "here", cwd=tmp_path)

@@ -21,7 +21,7 @@ def test_a_search_that_was_cut_short_is_said_to_be():
     result = jaxgran.fit(gas, curve, max_steps=1)
     assert not bool(result.converged)
     diagnosis = jaxgran.diagnose(result, curve)
-    assert not diagnosis.explains and "did not converge" in diagnosis.verdict
+    assert diagnosis.grade == "not consistent" and "did not converge" in diagnosis.verdict
     assert any("increase max_steps" in reason for reason in diagnosis.reasons)
 
 
@@ -33,8 +33,8 @@ def test_dense_measured_curve_is_not_explained():
     assert 0.8 < result.estimate[0] / a_true < 0.95
     assert a_true - result.estimate[0] > 3 * result.error_budget["measurement"][0]
     diagnosis = jaxgran.diagnose(result, curve, n)
-    assert not diagnosis.explains
-    assert "does not explain this curve" in diagnosis.verdict
+    assert diagnosis.grade == "not consistent"
+    assert "is not consistent with this curve" in diagnosis.verdict
     assert "needs soft spheres" in diagnosis.verdict
     text = " ".join(diagnosis.reasons)
     for word in ("reduced chi^2", "hotter (+)", "three at a time", "overlap", "above L_c"):
@@ -69,43 +69,45 @@ class Stub(jaxgran.KineticTheory):
 EDGE = Limitation("the gas is dense", False, "Take positions.")
 DECISIVE = Limitation("contacts last", True, "Take contacts.")
 GOOD, BAD = 0.5, 0.001
-NOT_EXPLAINED = "Stub does not explain this curve: do not trust its estimates."
+NOT_EXPLAINED = "Stub is not consistent with this curve: do not trust the estimates."
 
 
 @pytest.mark.parametrize(
-    "limitations, p_value, explains, verdict",
+    "limitations, p_value, grade, verdict",
     [
         (
             (),
             GOOD,
-            True,
+            "determined",
             # The clock is known to .5 %: no alternative changes A by more than its error.
-            r"Stub is compatible with this curve\.",
+            r"Stub is consistent with this curve, which determines A: A is between \S+ and \S+ s\.",
         ),
         (
             (EDGE,),
             GOOD,
-            True,
-            "Stub fits this curve, but the scene is at the edge of the model's validity.",
+            "determined",
+            "Stub is consistent with .* The scene is at the edge of the model's validity.",
         ),
         (
             (DECISIVE, EDGE),
             GOOD,
-            False,
+            "not consistent",
             "Stub cannot be trusted in this scene, though the curve fits. Take contacts.",
         ),
-        ((), BAD, False, NOT_EXPLAINED),
-        ((EDGE,), BAD, False, f"{NOT_EXPLAINED} Take positions."),
-        ((DECISIVE, EDGE), BAD, False, f"{NOT_EXPLAINED} Take contacts."),
+        ((), BAD, "not consistent", NOT_EXPLAINED),
+        ((EDGE,), BAD, "not consistent", f"{NOT_EXPLAINED} Take positions."),
+        ((DECISIVE, EDGE), BAD, "not consistent", f"{NOT_EXPLAINED} Take contacts."),
     ],
 )
-def test_verdicts(result, limitations, p_value, explains, verdict):
+def test_verdicts(result, limitations, p_value, grade, verdict):
     fitted, curve = result
     fitted = dataclasses.replace(
-        fitted, model=Stub(given=limitations), p_value=jnp.asarray(p_value)
+        fitted,
+        model=Stub(given=limitations),
+        goodness=fitted.goodness._replace(p_value=jnp.asarray(p_value)),
     )
     diagnosis = jaxgran.diagnose(fitted, curve)
-    assert diagnosis.explains == explains and re.fullmatch(verdict, diagnosis.verdict)
+    assert diagnosis.grade == grade and re.fullmatch(verdict, diagnosis.verdict)
     assert {limitation.words for limitation in limitations} <= set(diagnosis.reasons)
 
 
@@ -127,5 +129,5 @@ def test_errors_that_are_too_large_are_named(too_large, said):
     error = 0.02 * too_large * T
     measured = jaxgran.CoolingCurve(curve.times, T, temperature_error=error)
     found = jaxgran.diagnose(jaxgran.fit(gas, measured), measured)
-    assert found.explains
+    assert found.grade != "not consistent"
     assert any("errors are too large" in reason for reason in found.reasons) == said

@@ -186,8 +186,7 @@ def test_dilute_measured_curve(free):
         assert abs(a / a_true - 1) < 0.02  # asked: 2 %; what kinetic theory leaves out is 1.3 %
         assert abs(a - a_true) < result.error_budget["model"][0]
         diagnosis = jaxgran.diagnose(result, curve, n)
-        assert diagnosis.explains
-        assert diagnosis.verdict.startswith("Kinetic theory is compatible with this curve")
+        assert diagnosis.verdict.startswith("Kinetic theory is consistent with this curve")
         low, high = diagnosis.ranges["dissipative_constant"]
         assert low < a_true < high
 
@@ -206,7 +205,7 @@ def test_wrong_error_bars_widen_the_error():
     assert result.p_value < 0.01
     found, expected = (fit.error_budget["measurement"] for fit in (result, honest))
     np.testing.assert_allclose(found, expected, rtol=0.3)
-    assert not jaxgran.diagnose(result, boast).explains
+    assert jaxgran.diagnose(result, boast).grade == "not consistent"
 
 
 @pytest.mark.slow
@@ -226,7 +225,9 @@ def test_a_fit_is_shown_by_its_estimates():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(0))
     shown = jaxgran.fit(gas, curve, free=("dissipative_constant", "temperature"))
-    assert repr(shown).startswith("Fit of kinetic theory\n  dissipative_constant")
+    title, *rows = repr(shown).splitlines()
+    assert title == jaxgran.diagnose(shown).headline and "95 %" in title
+    assert any(row.startswith("  if nothing else is there") for row in rows)
     assert "converged" in shown._repr_html_()
 
 
@@ -236,7 +237,7 @@ def test_a_rotation_that_is_not_used_is_said():
     T = jnp.geomspace(0.01, 0.001, 8)
     bare = jaxgran.CoolingCurve(jnp.arange(1.0, 9.0), T, rotational_temperature=0.1 * T)
     assert "no surface" in str(unused_rotation(gas, bare))
-    assert "its weights need T_err and T_rot_err" in str(unused_rotation(rough, bare))
+    assert "its weights need T_err and T_rot_err, or N" in str(unused_rotation(rough, bare))
     known = dataclasses.replace(
         bare, temperature_error=0.1 * T, rotational_temperature_error=0.1 * T
     )

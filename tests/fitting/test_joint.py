@@ -36,7 +36,7 @@ def test_a_drop_test_gives_its_constant(onto_plate):
     assert result.weights()["one"][0] == pytest.approx(0.5, abs=0.01)
     alone = jaxgran.fit(unknown, one)
     assert float(alone.standard_error[0]) == pytest.approx(2**0.5 * float(error), rel=0.05)
-    assert jaxgran.diagnose(alone).explains
+    assert jaxgran.diagnose(alone).grade == "determined"
 
 
 def test_curves_and_drops_together():
@@ -69,7 +69,7 @@ def test_curves_and_drops_together():
     data["drops"] = drop_test(other, jax.random.key(2))
     contradicted = jaxgran.fit(gases, data, separate=("temperature",))
     assert contradicted.p_value < 1e-4
-    assert "does not explain" in jaxgran.diagnose(contradicted).verdict
+    assert "is not consistent" in jaxgran.diagnose(contradicted).verdict
 
 
 @pytest.mark.parametrize(

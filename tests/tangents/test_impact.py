@@ -105,7 +105,7 @@ def test_fit_finds_what_made_the_curve():
         assert float(error) < 0.15 * true
     assert np.all(result.error_budget["simulation"] > 0)
     assert result.model.name == "hard spheres"
-    assert "Hard spheres are compatible" in jaxgran.diagnose(result, curve).verdict
+    assert "Hard spheres are consistent" in jaxgran.diagnose(result, curve).verdict
 
 
 COEFFICIENT = 0.8
