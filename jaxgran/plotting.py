@@ -4,6 +4,7 @@
 """
 
 import textwrap
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,12 @@ def colour_of(model: str) -> str:
     return COLOURS.get(model, "#5f5f5f")
 
 
-TEMPERATURE_LABEL = r"temperature $T=\langle v^2\rangle/d$ (m$^2$/s$^2$)"
+LABELS = {
+    "temperature": r"temperature $T=\langle v^2\rangle/d$ (m$^2$/s$^2$)",
+    "rotational_temperature": r"rotational temperature $T_\mathrm{rot}$ (m$^2$/s$^2$)",
+    "displacement": r"mean square displacement $\langle\Delta r^2\rangle$ (m$^2$)",
+}
+"""Labels of axes by quantity."""
 
 
 def plot_curve(curve: CoolingCurve, axes: Axes | None = None, **style: Any) -> Axes:
@@ -71,21 +77,17 @@ def plot_curve(curve: CoolingCurve, axes: Axes | None = None, **style: Any) -> A
             f"the times of this curve have shape {np.shape(curve.times)}. Plot one curve at a "
             "time, such as jax.tree.map(lambda x: x[0], curves)."
         )
-    axes = _current_axes() if axes is None else axes
+    if axes is None:
+        from matplotlib import pyplot
+
+        axes = pyplot.gca()  # a notebook displays it
     shown = _drawn_indices(curve.times)
     t, T = (np.asarray(x)[shown] for x in (curve.times, curve.temperature))
     error = None if curve.temperature_error is None else np.asarray(curve.temperature_error)[shown]
     look: dict[str, Any] = {"lw": 1.8, "elinewidth": 1.0} | style
     axes.errorbar(t, T, error, **look)
-    axes.set(xscale="log", yscale="log", xlabel="time t (s)", ylabel=TEMPERATURE_LABEL)
+    axes.set(xscale="log", yscale="log", xlabel="time t (s)", ylabel=LABELS["temperature"])
     return axes
-
-
-def _current_axes() -> Axes:
-    """Return the current axes of pyplot, which a notebook displays."""
-    from matplotlib import pyplot
-
-    return pyplot.gca()
 
 
 def plot_fit(result: Fit, curve: CoolingCurve, axes: Any = None) -> np.ndarray:
@@ -113,16 +115,11 @@ def plot_fit(result: Fit, curve: CoolingCurve, axes: Any = None) -> np.ndarray:
             f"axes must be two, for T and for the residuals, got shape {axes.shape}. Make them by "
             "matplotlib.pyplot.subplots(2, sharex=True)."
         )
-    top, bottom = axes
-    fitted = result.model.name
-    measured, error = curve.temperature, curve.temperature_error
-    _draw_fit(top, curve.times, measured, error, result.curve.temperature, fitted)
-    _draw_residuals(bottom, curve.times, result.residuals, fitted)
-    top.set_ylabel(TEMPERATURE_LABEL)
+    _draw_fit(axes, result, curve, "temperature")
     T = np.asarray(curve.temperature)
-    top.set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
-    _draw_power_laws(top, result.curve)
-    top.legend(frameon=False, loc="lower left")
+    axes[0].set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
+    _draw_power_laws(axes[0], result.curve)
+    axes[0].legend(frameon=False, loc="lower left")
     return axes
 
 
@@ -135,41 +132,16 @@ def save_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> 
         title: above the picture.
         path: of the file; its suffix is the format, PNG without one.
     """
-    panels = [
-        (
-            curve.rotational_temperature,
-            curve.rotational_temperature_error,
-            result.curve.rotational_temperature,
-            result.comparison.residuals.get("rotational_temperature"),
-            r"rotational temperature $T_\mathrm{rot}$ (m$^2$/s$^2$)",
-            "lower left",
-        ),
-        (
-            curve.displacement,
-            curve.displacement_error,
-            result.curve.displacement,
-            result.comparison.residuals.get("displacement"),
-            r"mean square displacement $\langle\Delta r^2\rangle$ (m$^2$)",
-            "upper left",
-        ),
-    ]
-    panels = [panel for panel in panels if panel[3] is not None]
-    figure = Figure(figsize=(max(8.0, 4.0 + 4.0 * len(panels)), 6.4), layout="constrained")
-    axes = figure.subplots(
-        2,
-        1 + len(panels),
-        sharex=True,
-        squeeze=False,
-        gridspec_kw={"height_ratios": [3, 1]},
-    )
+    names = "rotational_temperature", "displacement"
+    further = [name for name in names if name in result.comparison.residuals]
+    figure = Figure(figsize=(max(8.0, 4.0 + 4.0 * len(further)), 6.4), layout="constrained")
+    heights = {"height_ratios": [3, 1]}
+    axes = figure.subplots(2, 1 + len(further), sharex=True, squeeze=False, gridspec_kw=heights)
     plot_fit(result, curve, axes[:, 0])
-    fitted = result.model.name
-    for (top, bottom), panel in zip(axes[:, 1:].T, panels, strict=True):
-        measured, error, computed, residuals, label, corner = panel
-        _draw_fit(top, curve.times, measured, error, computed, fitted)
-        _draw_residuals(bottom, curve.times, residuals, fitted)
-        top.set_ylabel(label)
-        top.legend(frameon=False, loc=corner)
+    for name, panel in zip(further, axes[:, 1:].T, strict=True):
+        _draw_fit(panel, result, curve, name)
+        corner = "upper left" if name == "displacement" else "lower left"
+        panel[0].legend(frameon=False, loc=corner)
     _save(figure, title, path)
 
 
@@ -184,14 +156,13 @@ def save_curves(curves: dict[str, tuple[CoolingCurve, CoolingCurve | None]], tit
     figure = Figure(figsize=(8.0, 5.4), layout="constrained")
     axes = figure.subplots()
     shades = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#222222"]
-    markers = "osD^v<>"
-    for i, (label, (curve, computed)) in enumerate(curves.items()):
-        look = {"color": shades[i % len(shades)], "label": label}
-        if computed is None:
-            plot_curve(curve, axes, **look)
-            continue
-        plot_curve(curve, axes, fmt=markers[i % len(markers)], ms=3.5, lw=0, **look)
-        plot_curve(computed, axes, color=look["color"])
+    for shade, marker, (label, (curve, computed)) in zip(
+        cycle(shades), cycle("osD^v<>"), curves.items(), strict=False
+    ):
+        points = {} if computed is None else {"fmt": marker, "ms": 3.5, "lw": 0}
+        plot_curve(curve, axes, color=shade, label=label, **points)
+        if computed is not None:
+            plot_curve(computed, axes, color=shade)
     axes.legend(frameon=False, loc="lower left")
     _save(figure, title, path)
 
@@ -205,15 +176,30 @@ def _save(figure: Figure, title: str, path: str | Path) -> None:
     write_atomically(path, lambda f: figure.savefig(f, dpi=150, format=picture_format))
 
 
-def _draw_fit(axis, times, measured, error, computed, fitted: str) -> None:
-    """Draw measured values with error bars, and the fitted curve, at t > 0."""
-    shown = _drawn_indices(times)
-    t, measured, computed = (np.asarray(x)[shown] for x in (times, measured, computed))
+def _draw_fit(axes: Any, result: Fit, curve: CoolingCurve, name: str) -> None:
+    """Draw a measured quantity with error bars, the fitted one and the residuals, at t > 0."""
+    top, bottom = axes
+    shown = _drawn_indices(curve.times)
+    t, measured, computed, residuals = (
+        np.asarray(x)[shown]
+        for x in (
+            curve.times,
+            getattr(curve, name),
+            getattr(result.curve, name),
+            result.comparison.residuals[name],
+        )
+    )
+    error = getattr(curve, f"{name}_error")
     error = None if error is None else np.asarray(error)[shown]
-    label = "measured" if len(times) <= MAX_DRAWN else f"measured: {t.size} of {len(times)}"
-    axis.errorbar(t, measured, error, fmt="o", ms=3.5, color=INK, label=label, zorder=2)
-    axis.plot(t, computed, color=colour_of(fitted), lw=1.8, label=f"{fitted}, fitted", zorder=3)
-    axis.set(xscale="log", yscale="log")
+    number, model = np.size(curve.times), result.model.name
+    label = "measured" if number <= MAX_DRAWN else f"measured: {t.size} of {number}"
+    top.errorbar(t, measured, error, fmt="o", ms=3.5, color=INK, label=label, zorder=2)
+    top.plot(t, computed, color=colour_of(model), lw=1.8, label=f"{model}, fitted", zorder=3)
+    top.set(xscale="log", yscale="log", ylabel=LABELS[name])
+    bottom.axhspan(-1, 1, color=COLOURS["guide"], alpha=0.2, lw=0)
+    bottom.axhline(0, color=colour_of(model), lw=1.4)
+    bottom.plot(t, residuals, "o", ms=3.5, color=INK)
+    bottom.set(xlabel="time t (s)", ylabel="residual / error")
 
 
 def _drawn_indices(times) -> np.ndarray:
@@ -224,14 +210,6 @@ def _drawn_indices(times) -> np.ndarray:
         return shown
     t = times[shown]
     return shown[np.unique(np.searchsorted(t[:-1], np.geomspace(t[0], t[-1], MAX_DRAWN)))]
-
-
-def _draw_residuals(axis, times, residuals, fitted: str) -> None:
-    shown = _drawn_indices(times)
-    axis.axhspan(-1, 1, color=COLOURS["guide"], alpha=0.2, lw=0)
-    axis.axhline(0, color=colour_of(fitted), lw=1.4)
-    axis.plot(np.asarray(times)[shown], np.asarray(residuals)[shown], "o", ms=3.5, color=INK)
-    axis.set(xlabel="time t (s)", ylabel="residual / error")
 
 
 def _draw_power_laws(axis, curve: CoolingCurve) -> None:
@@ -250,15 +228,7 @@ def _draw_power_laws(axis, curve: CoolingCurve) -> None:
     ):
         first = t[-1] * (T[-1] / top) ** (-1 / power)
         times = np.geomspace(first, t[-1], 50)
-        values = T[-1] * (times / t[-1]) ** power
-        axis.plot(times, values, style, color=COLOURS["guide"], lw=1.2, zorder=1)
-        shift = {"left": 4, "right": -4}[side]
-        axis.annotate(
-            label,
-            (first, top),
-            xytext=(shift, 2),
-            textcoords="offset points",
-            ha=side,
-            va="center",
-            color=COLOURS["guide"],
-        )
+        grey, shift = {"color": COLOURS["guide"]}, {"left": 4, "right": -4}[side]
+        axis.plot(times, T[-1] * (times / t[-1]) ** power, style, lw=1.2, zorder=1, **grey)
+        place = {"xytext": (shift, 2), "textcoords": "offset points", "ha": side, "va": "center"}
+        axis.annotate(label, (first, top), **place, **grey)

@@ -12,7 +12,6 @@ import json
 import os
 import shutil
 import time
-import uuid
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache, partial
@@ -30,18 +29,9 @@ from tqdm import tqdm
 
 from jaxgran._utils import status
 from jaxgran._utils.validation import checked_int, checked_times, no_type_check
+from jaxgran.data import curve as curves
 from jaxgran.data.checkpoint import describe_run
-from jaxgran.data.curve import (
-    QUANTITIES,
-    STATUS,
-    TIME,
-    CoolingCurve,
-    Particles,
-    from_arrays,
-    import_extra,
-    label_of,
-    to_arrays,
-)
+from jaxgran.data.curve import STATUS, TIME, CoolingCurve, Particles
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.cool import cool
@@ -51,14 +41,6 @@ from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.run import block_until_ready
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import FLOAT_UNITS
-
-Keys = Key[Array, "members"]
-
-Save = Callable[[Particles], Any] | Literal["particles"] | None
-"""The option `save` of `jaxgran.cool`."""
-
-Arrays = dict[str, Any]
-"""Arrays by name, as of `jaxgran.data.curve.to_arrays`."""
 
 DEFAULT_CHUNK = {False: 1024, True: 16}
 """Members per chunk, by whether the model is stochastic."""
@@ -153,14 +135,13 @@ def sweep(
         raise ValueError(f"store must be a path, got {store!r:.60}")
     if store is None and jax.process_count() > 1:
         raise ValueError(
-            f"a sweep over {jax.process_count()} processes needs a store. Give store, a folder "
-            "that all processes can access."
+            f"a sweep over {jax.process_count()} processes needs store, a folder that all share"
         )
     number, path = len(keys), None if store is None else Path(store)
     if chunk is not None:
         chunk = min(checked_int("chunk", chunk, 1), number)
-    elif path is not None and not _is_absent(path):
-        chunk = int(_identity_of_store(path)["chunk"])
+    elif path is not None and (stored := _stored_identity(path)):
+        chunk = int(stored["chunk"])
     else:
         chunk = min(DEFAULT_CHUNK[model.stochastic], -(-number // jax.process_count()))
 
@@ -174,10 +155,8 @@ def sweep(
 
     supported = (i for i in range(number) if why_unsupported(i) is None)
     if (stand_in := next(supported, None)) is None:
-        raise ValueError(
-            f"{type(model).__name__} supports no member of this sweep; member 0: "
-            f"{why_unsupported(0)}"
-        )
+        name = type(model).__name__
+        raise ValueError(f"{name} supports no member of this sweep; member 0: {why_unsupported(0)}")
     models = [model]
     if isinstance(model, AbstractSpheres) and model.plan is None:
         sized_for = [_member(gases, i) for i in (stand_in, *supported)]
@@ -189,25 +168,22 @@ def sweep(
         for name, x in _records(like).items()
     }
     if path is not None:
-        identity = _identity(
-            chunk=chunk, gases=gases, key=keys, times=times, model=model, save=save
-        )
+        parts = {"gases": gases, "key": keys, "times": times, "model": model, "save": save}
         labels = _labels(gases, swept, np.asarray(times))
-        arrays = _open_store(path, identity, arrays, labels, save == "particles")
+        arrays = _open_store(path, _identity(chunk, parts), arrays, labels, save == "particles")
     chunks = [slice(i, min(i + chunk, number)) for i in range(0, number, chunk)]
     mine = chunks[jax.process_index() :: jax.process_count()]
     missing = [rows for rows in mine if np.any(arrays[STATUS][rows] == MISSING)]
     for rows in tqdm(missing, desc="chunks", delay=3, disable=None if progress else True):
         members = np.arange(rows.start, rows.stop)
-        reasons = {i: why for i in members.tolist() if (why := why_unsupported(i)) is not None}
-        if reasons:
-            first = next(iter(reasons))
+        unsupported = np.array([why_unsupported(i) is not None for i in members.tolist()])
+        if np.any(unsupported):
+            first = int(members[unsupported][0])
             warnings.warn(
-                f"{len(reasons)} of members {members[0]} to {members[-1]} cannot be simulated and "
-                f"are nan; the first of them is {first}: {reasons[first]}",
+                f"{unsupported.sum()} of members {members[0]} to {members[-1]} cannot be simulated "
+                f"and are nan; the first of them is {first}: {why_unsupported(first)}",
                 stacklevel=2,
             )
-        unsupported = np.isin(members, list(reasons))
         chosen = _rows((gases, keys), np.where(unsupported, stand_in, members))
         computed = _run_chunk(models, chosen, times, chunk, save)
         computed[STATUS][unsupported] = status.UNSUPPORTED.bit
@@ -218,10 +194,10 @@ def sweep(
     while np.any(arrays[STATUS][:] == MISSING):  # JAX ends this process if another one dies
         time.sleep(POLL_SECONDS)
     known = {name: jnp.asarray(arrays[name][:]) for name in _records(like)}
-    return jax.vmap(lambda known: from_arrays({"times": times} | known, like))(known)
+    return jax.vmap(lambda known: curves.from_arrays({"times": times} | known, like))(known)
 
 
-def _checked_members(gases: Any, key: Any) -> tuple[Gas, Keys, list[str]]:
+def _checked_members(gases: Any, key: Any) -> tuple[Gas, Key[Array, "members"], list[str]]:
     """Return gases and keys with an axis of members, and the names of floats that were given one.
 
     Raises:
@@ -230,11 +206,19 @@ def _checked_members(gases: Any, key: Any) -> tuple[Gas, Keys, list[str]]:
     """
     how = "jax.vmap(lambda a: gas.replace(dissipative_constant=a))(values)"
     if not isinstance(gases, Gas):
+        got = type(gases).__name__
         raise ValueError(
-            "gases must be one jaxgran.Gas whose floats have an axis of members, got a "
-            f"{type(gases).__name__}. Build it by {how}."
+            f"gases must be one Gas with an axis of members, got a {got}. Build it by {how}"
         )
-    keys, swept = _checked_keys(key), _swept_names(gases)
+    keys = jax.random.key(0) if key is None else key
+    is_array = isinstance(keys, jax.Array)
+    if is_array and keys.dtype == jnp.uint32 and keys.ndim in (1, 2):
+        keys = jax.random.wrap_key_data(keys)
+    if not (is_array and jnp.issubdtype(keys.dtype, jax.dtypes.prng_key) and keys.ndim <= 1):
+        raise ValueError(
+            f"key must be a key such as jax.random.key(5), or an array of keys, got {key!r:.60}"
+        )
+    swept = _swept_names(gases)
     lengths = {} if keys.ndim == 0 else {"key": len(keys)}
     lengths |= {name: len(gases.value(name)) for name in swept}
     if not lengths:
@@ -256,20 +240,6 @@ def _checked_members(gases: Any, key: Any) -> tuple[Gas, Keys, list[str]]:
     return gases.replace(**repeated), keys, swept
 
 
-def _checked_keys(key: Any) -> Key[Array, "..."]:
-    """Return one typed key, or an array of them with one axis."""
-    if key is None:
-        return jax.random.key(0)
-    if isinstance(key, jax.Array):
-        if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim <= 1:
-            return key
-        if key.dtype == jnp.uint32 and key.ndim in (1, 2):
-            return jax.random.wrap_key_data(key)
-    raise ValueError(
-        f"key must be a key such as jax.random.key(5), or an array of keys, got {key!r:.60}"
-    )
-
-
 def _swept_names(gases: Gas) -> list[str]:
     """Return the names of the floats that have an axis of members.
 
@@ -277,27 +247,24 @@ def _swept_names(gases: Gas) -> list[str]:
         ValueError: for floats with further axes, and for wall sides that may belong to one box or
             to several cubes.
     """
-    ndims = {name: np.ndim(gases.value(name)) for name in gases.domains}
-    single = {name: int(name in gases.law.lists) for name in ndims if name != WALL_SIDE}
-    plain = [name for name in single if ndims[name] > single[name]]
-    for name, ndim in ndims.items():
-        if ndim - single.get(name, 1) > 1:
+    shapes = {name: np.shape(gases.value(name)) for name in gases.domains}
+    for name, shape in shapes.items():
+        if len(shape) - (name in (*gases.law.lists, WALL_SIDE)) > 1:
             raise ValueError(
-                f"{name} has shape {np.shape(gases.value(name))}, but a sweep has only one axis of "
-                "members. Flatten the axes, as in jnp.meshgrid(...)[0].ravel()."
+                f"{name} has shape {shape}, but a sweep has only one axis of members. Flatten the "
+                "axes, as in jnp.meshgrid(...)[0].ravel()."
             )
-    if ndims.get(WALL_SIDE, 0) == 0:
-        return plain
-    length = len(gases.value(WALL_SIDE))
-    if ndims[WALL_SIDE] == 2 or length != gases.dimension or len(plain) == len(single):
-        return [*plain, WALL_SIDE]
-    if not plain:
-        return plain  # one box of d sides
-    raise ValueError(
-        f"{WALL_SIDE} of shape {np.shape(gases.value(WALL_SIDE))} is ambiguous: the sides of one "
-        f"box or those of {length} cubes. Give every float of gases an axis of members, as "
-        "jax.vmap returns them."
-    )
+    sides = shapes.pop(WALL_SIDE, ())
+    swept = [name for name, x in shapes.items() if len(x) > (name in gases.law.lists)]
+    is_one_box = sides == (gases.dimension,) and not swept
+    if sides == () or is_one_box:
+        return swept
+    if sides == (gases.dimension,) and len(swept) < len(shapes):
+        raise ValueError(
+            f"{WALL_SIDE} of shape {sides} is ambiguous: the sides of one box or those of "
+            f"{sides[0]} cubes. Give every float of gases an axis of members, as jax.vmap does."
+        )
+    return [*swept, WALL_SIDE]
 
 
 def _rows(tree: Any, rows: Any) -> Any:
@@ -328,32 +295,25 @@ def _sized_for_all(model: AbstractSpheres, gases: Sequence[Gas], spare: float) -
     return dataclasses.replace(model, plan=Plan(plans[0].replicas, pace, run, equilibration))
 
 
-def _run_member(
-    gas: Gas,
-    key: PRNGKeyArray,
-    *,
-    model: AbstractModel,
-    times: Float[Array, "times"],
-    save: Save,
-) -> CoolingCurve:
+def _run_member(gas: Gas, key: PRNGKeyArray, *, model, times, save) -> CoolingCurve:
     """Return the curve of one member, with a status and without particles."""
     curve = cool(gas, times, model=model, key=key, save=save)
     fault = status.OK if curve.status is None else curve.status
     return dataclasses.replace(curve, particles=None, status=jnp.asarray(fault, jnp.int32))
 
 
-def _records(curve: CoolingCurve) -> Arrays:
+def _records(curve: CoolingCurve) -> dict[str, Any]:
     """Return the arrays of a member by name, without the times, which all members share."""
-    return {name: array for name, array in to_arrays(curve).items() if name != "times"}
+    return {name: array for name, array in curves.to_arrays(curve).items() if name != "times"}
 
 
 def _run_chunk(
     models: Sequence[AbstractModel],
-    members: tuple[Gas, Keys],
+    members: tuple[Gas, Key[Array, "members"]],
     times: Float[Array, "times"],
     chunk: int,
-    save: Save,
-) -> Arrays:
+    save: Any,
+) -> dict[str, np.ndarray]:
     """Compute at most `chunk` members on all devices of this process.
 
     The last member is repeated until every device has the same number. If members of a particle
@@ -361,10 +321,9 @@ def _run_chunk(
     """
     number, mesh = len(members[1]), Mesh(np.array(jax.local_devices()[:chunk]), (DEVICE,))
     rows = np.minimum(np.arange(-(-chunk // mesh.size) * mesh.size), number - 1)
-    gases, keys = _rows(members, rows)
-    arrays: Arrays = {}
+    arrays: dict[str, np.ndarray] = {}
     for model in models:
-        out = block_until_ready(_run_on_devices(model, gases, keys, times, mesh, save))
+        out = block_until_ready(_run_on_devices(model, _rows(members, rows), times, mesh, save))
         arrays = {name: np.array(values)[:number] for name, values in out.items()}
         if not np.any(arrays[STATUS] & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)):
             break
@@ -372,17 +331,10 @@ def _run_chunk(
 
 
 @eqx.filter_jit
-def _run_on_devices(
-    model: AbstractModel,
-    gases: Gas,
-    keys: Keys,
-    times: Float[Array, "times"],
-    mesh: Mesh,
-    save: Save,
-) -> Arrays:
+def _run_on_devices(model: AbstractModel, members: Any, times: Array, mesh: Mesh, save: Any) -> Any:
     arrays, rest = eqx.partition((model, times), eqx.is_array)
 
-    def run_members(arrays, gases, keys):
+    def run_members(arrays, members):
         model, times = eqx.combine(arrays, rest)
 
         def run_member(member):
@@ -391,27 +343,21 @@ def _run_on_devices(
         # On a CPU many particles run faster one member after the other: under jax.vmap a loop runs
         # for all members until the slowest one ends. Also, their numbers are then independent.
         if model.stochastic and jax.default_backend() == "cpu":
-            return jax.lax.map(run_member, (gases, keys))
-        return jax.vmap(run_member)((gases, keys))
+            return jax.lax.map(run_member, members)
+        return jax.vmap(run_member)(members)
 
-    members, same = PartitionSpec(DEVICE), PartitionSpec()
+    specs = PartitionSpec(), PartitionSpec(DEVICE)
     # With check_vma, shard_map would require the loops of a member to declare an axis of devices.
     sharded = jax.shard_map(
-        run_members,
-        mesh=mesh,
-        in_specs=(same, members, members),
-        out_specs=members,
-        check_vma=False,
+        run_members, mesh=mesh, in_specs=specs, out_specs=specs[1], check_vma=False
     )
-    return sharded(arrays, gases, keys)
+    return sharded(arrays, members)
 
 
-def _identity(chunk: int, **parts: Any) -> dict[str, Any]:
+def _identity(chunk: int, parts: dict[str, Any]) -> dict[str, Any]:
     """Return what identifies a sweep: the chunk, the version, and a hash of each other part."""
-    hashes = {
-        name: hashlib.sha256(json.dumps(describe_run(part=part)).encode()).hexdigest()[:16]
-        for name, part in parts.items()
-    }
+    descriptions = {name: json.dumps(describe_run(part=part)) for name, part in parts.items()}
+    hashes = {name: hashlib.sha256(x.encode()).hexdigest()[:16] for name, x in descriptions.items()}
     return {"chunk": chunk, "version of jaxgran": version("jaxgran")} | hashes
 
 
@@ -424,7 +370,7 @@ def _labels(gases: Gas, swept: list[str], times: np.ndarray) -> dict[str, tuple]
     labels = {MEMBER: (MEMBER, np.arange(number)), TIME: (TIME, times, {"units": "s"})}
     for name in swept:
         values = np.asarray(gases.value(name))
-        label = f"initial_{name}" if name in QUANTITIES else name
+        label = f"initial_{name}" if name in curves.QUANTITIES else name
         dims = (MEMBER, *(f"{label}_{k}" for k in range(values.ndim - 1)))
         if np.all(values == values[:1]):
             dims, values = dims[1:], values[0]
@@ -440,30 +386,27 @@ def _open_store(
     are_particles: bool,
 ) -> Any:
     """Return the Zarr group of a sweep; create it, with all labels and no finished chunk."""
-    zarr, xarray = import_extra("zarr", "sweep"), import_extra("xarray", "sweep")
-    if _is_absent(path):
+    zarr, xarray = (curves.import_extra(name, "sweep") for name in ("zarr", "xarray"))
+    if _stored_identity(path) is None and jax.process_index() == 0:
         variables, encoding = {}, {}
         for name, values in empty.items():
             dims, attributes = (), {"long_name": "faults, see jaxgran.explain_status"}
             if name != STATUS:
-                dims, attributes = label_of(name, values.ndim - 1, are_particles)
+                dims, attributes = curves.label_of(name, values.ndim - 1, are_particles)
             variables[name] = (MEMBER, *dims), values, attributes
             fill = _empty(name, values.dtype)
             encoding[name] = {"chunks": (identity["chunk"], *values.shape[1:]), "fill_value": fill}
         dataset = xarray.Dataset(variables, labels, {ATTRIBUTE: identity})
-        # Renamed at the end, so that one of several processes creates it, and the others keep it.
-        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+        temporary = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of a format that may change: nothing is shared
                 dataset.to_zarr(temporary, encoding=encoding, zarr_format=3)
-            os.rename(temporary, path)
-        except OSError:
-            if _is_absent(path):
-                raise
+            os.rename(temporary, path)  # complete, or not there
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
-    stored = _identity_of_store(path)
+    while (stored := _stored_identity(path)) is None:
+        time.sleep(POLL_SECONDS)
     differ = [name for name in identity if stored.get(name) != identity[name]]
     if differ:
         raise ValueError(
@@ -473,15 +416,15 @@ def _open_store(
     return zarr.open_group(path, mode="r+")
 
 
-def _identity_of_store(path: Path) -> dict[str, Any]:
-    zarr = import_extra("zarr", "sweep")
+def _stored_identity(path: Path) -> dict[str, Any] | None:
+    """Return the identity of the sweep of a store, or None if there is no store yet."""
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return None
     try:
-        return dict(zarr.open_group(path, mode="r").attrs[ATTRIBUTE])
+        return dict(
+            curves.import_extra("zarr", "sweep").open_group(path, mode="r").attrs[ATTRIBUTE]
+        )
     except Exception as error:  # zarr raises any type for a folder that holds something else
         raise ValueError(
             f"{path} is not the store of a sweep ({error}). Name another folder, or remove it."
         ) from None
-
-
-def _is_absent(path: Path) -> bool:
-    return not path.exists() or (path.is_dir() and not any(path.iterdir()))
