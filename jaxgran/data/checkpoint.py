@@ -1,8 +1,8 @@
 """Checkpoints: the state of a run in a file, from which only the same run can be resumed.
 
-The first line of a file is a JSON object: format, version of jaxgran, a description of everything
-that determines the run (see `describe_run`, whose words are equal in every process), and the
-SHA-256 digest of the remaining bytes. These are what `equinox.tree_serialise_leaves` writes.
+The first line of a file is a JSON object: a description of everything that determines the run (see
+`describe_run`, whose words are equal in every process), with the format and the version of jaxgran,
+and the SHA-256 digest of the remaining bytes, which `equinox.tree_serialise_leaves` writes.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxgran.data.files import write_atomically
 
-FORMAT = 4
+FORMAT = "5"
 
 MAX_NAMED = 4
 """Largest number of differences between two runs that an error message names."""
@@ -50,15 +50,9 @@ def save(path: str | Path, scene: dict[str, str], tree: Any) -> None:
     """
     body = io.BytesIO()
     eqx.tree_serialise_leaves(body, tree)
-    header = {
-        "format": FORMAT,
-        "version": version("jaxgran"),
-        "scene": scene | _arrays(tree),
-        "digest": hashlib.sha256(body.getbuffer()).hexdigest(),
-    }
-    write_atomically(
-        path, lambda file: file.write(json.dumps(header).encode() + b"\n" + body.getbuffer())
-    )
+    digest = hashlib.sha256(body.getbuffer()).hexdigest()
+    header = json.dumps({"scene": _described(scene, tree), "digest": digest}).encode()
+    write_atomically(path, lambda file: file.write(header + b"\n" + body.getbuffer()))
 
 
 def load(path: str | Path, scene: dict[str, str], like: Any) -> Any:
@@ -79,39 +73,33 @@ def load(path: str | Path, scene: dict[str, str], like: Any) -> Any:
     try:
         line, _, body = Path(path).read_bytes().partition(b"\n")
         header = json.loads(line)
-        form, written_by = header["format"], header["version"]
         old, digest = dict(header["scene"]), header["digest"]
     except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
         raise ValueError(
             f"{path} is no checkpoint of jaxgran ({error}). Name another file, or remove it"
         ) from None
-    if (form, written_by) != (FORMAT, version("jaxgran")):
-        raise ValueError(
-            f"{path} was written by jaxgran {written_by} in format {form}, this is "
-            f"{version('jaxgran')} with format {FORMAT}, which may compute different steps. Finish "
-            "the run with that version, or remove the file"
-        )
     damaged = (
         f"{path} is damaged: its arrays do not match its header. Name another file, or remove it"
     )
-    if hashlib.sha256(body).hexdigest() != digest:
-        raise ValueError(damaged)
-    if differ := differences(old, scene | _arrays(like)):
+    if differ := differences(old, _described(scene, like)):
         more = f" and {len(differ) - MAX_NAMED} more" if len(differ) > MAX_NAMED else ""
         raise ValueError(
             f"{path} belongs to another run: {'; '.join(differ[:MAX_NAMED])}{more}. Name another "
             "file, or remove this one to start a new run"
         )
+    if hashlib.sha256(body).hexdigest() != digest:
+        raise ValueError(damaged)
     try:
         return eqx.tree_deserialise_leaves(io.BytesIO(body), like)
     except (RuntimeError, ValueError):  # a file made by hand
         raise ValueError(damaged) from None
 
 
-def _arrays(tree: Any) -> dict[str, str]:
-    """Return type and shape of every leaf, such as "float64(3, 2)"."""
+def _described(scene: dict[str, str], tree: Any) -> dict[str, str]:
+    """Return a description of a run with that of its state, such as "float64(3, 2)"."""
     words = [f"{getattr(x, 'dtype', type(x).__name__)}{np.shape(x)}" for x in jax.tree.leaves(tree)]
-    return {"types and shapes of the state": ", ".join(words)}
+    made_by = {"format": FORMAT, "version of jaxgran": version("jaxgran")}
+    return made_by | scene | {"types and shapes of the state": ", ".join(words)}
 
 
 def differences(old: dict[str, str], new: dict[str, str]) -> list[str]:

@@ -319,8 +319,17 @@ class CoolingCurve(eqx.Module):
                     f"{quantity.column} has shape {np.shape(values)}, but there are {times.size} "
                     "times; give one value for each time"
                 )
-            if quantity.measured:
-                _check_column(quantity.column, np.asarray(values), times, place)
+            values, column = np.asarray(values), quantity.column
+            zero_allowed = np.zeros(times.shape, bool)
+            zero_allowed[0] = column != "T" and (column == "t" or times[0] == 0)
+            wrong = ~np.isfinite(values) | ~((values > 0) | zero_allowed & (values == 0))
+            if quantity.measured and np.any(wrong):
+                i = int(np.argmax(wrong))
+                zero = " (zero is allowed only in a first row at t = 0)" if column != "T" else ""
+                raise ValueError(
+                    f"{place(i)}: {column} is {values[i]:g}, it must be a positive number{zero}; "
+                    "correct or remove this row"
+                )
         not_later = np.flatnonzero(np.diff(times) <= 0)
         if not_later.size:
             i = int(not_later[0]) + 1
@@ -328,25 +337,6 @@ class CoolingCurve(eqx.Module):
                 f"{place(i)}: t is {times[i]:g} after {times[i - 1]:g}; times must increase: "
                 "sort the rows by time and remove repeated ones"
             )
-
-
-def _check_column(
-    column: str,
-    values: np.ndarray,
-    times: Float[np.ndarray, "times"],
-    place: Callable[[int], str],
-) -> None:
-    zero_allowed = np.zeros(times.shape, bool)
-    if column != "T":
-        zero_allowed[0] = column == "t" or times[0] == 0
-    wrong = ~np.isfinite(values) | ~((values > 0) | zero_allowed & (values == 0))
-    if np.any(wrong):
-        i = int(np.argmax(wrong))
-        raise ValueError(
-            f"{place(i)}: {column} is {values[i]:g}, it must be a positive number"
-            + ("" if column == "T" else " (zero is allowed only in a first row at t = 0)")
-            + "; correct or remove this row"
-        )
 
 
 class Run(NamedTuple):
@@ -397,8 +387,6 @@ TIME, REPLICA, STATUS, SAVED = "time", "replica", "status", "saved"
 OF_REPLICAS = "_of_replicas"
 """Ending of the names of arrays that have an axis of replicas."""
 
-_SAVED_FIELDS = (SAVED, f"{SAVED}_error", f"{SAVED}{OF_REPLICAS}")
-
 _PARTICLES = {
     "position": ("m", REPLICA, "particle", "axis"),
     "velocity": ("m/s", REPLICA, "particle", "axis"),
@@ -419,37 +407,27 @@ def to_arrays(curve: CoolingCurve) -> dict[str, Any]:
     Raises:
         ValueError: for a key of a saved dictionary that would make a name ambiguous.
     """
-    each = curve.replicas
-    arrays = {name: getattr(curve, name) for name in (*QUANTITIES, STATUS)}
-    if each is not None:
-        of_each = {f"{name}{OF_REPLICAS}": getattr(each, name) for name in QUANTITIES}
-        del of_each[f"times{OF_REPLICAS}"]
-        arrays |= of_each
-    if curve.particles is not None:
-        arrays |= curve.particles._asdict()
-    for field, tree in _saved_trees(curve).items():
-        arrays |= {_name_at(field, path): x for path, x in jax.tree.flatten_with_path(tree)[0]}
-    return {name: array for name, array in arrays.items() if array is not None}
+    arrays = dict(zip(_names_of_leaves(curve), jax.tree.leaves(curve), strict=True))
+    arrays.pop(f"times{OF_REPLICAS}", None)
+    return arrays
 
 
-def _saved_trees(curve: CoolingCurve) -> dict[str, Any]:
-    """Return the saved trees of a curve by the first part of the names of their arrays."""
-    each = None if curve.replicas is None else curve.replicas.saved
-    trees = zip(_SAVED_FIELDS, (curve.saved, curve.saved_error, each), strict=True)
-    return {field: tree for field, tree in trees if tree is not None}
-
-
-def _name_at(field: str, path: tuple[Any, ...]) -> str:
-    """Return the name of a saved array at a place, after a check that it is unique."""
-    keys = [jax.tree_util.keystr((key,), simple=True) for key in path]
-    for entry, key in zip(path, keys, strict=True):
-        is_index = isinstance(entry, jax.tree_util.SequenceKey)
-        if "." in key or "/" in key or (key.isdigit() and not is_index):
-            raise ValueError(
-                f"save returns a dictionary with the key {key!r}: keys name arrays of a file or of "
-                'an xarray.Dataset. Use words without "." and "/"'
-            )
-    return ".".join([field, *keys])
+def _names_of_leaves(curve: CoolingCurve) -> list[str]:
+    """Return the name of each leaf of a curve, after a check that it is unique."""
+    names = []
+    for path, _ in jax.tree.flatten_with_path(curve)[0]:
+        keys = [jax.tree_util.keystr((key,), simple=True) for key in path]
+        for entry, key in zip(path, keys, strict=True):
+            is_index = isinstance(entry, jax.tree_util.SequenceKey)
+            if "." in key or "/" in key or (key.isdigit() and not is_index):
+                raise ValueError(
+                    f"save returns a dictionary with the key {key!r}: keys name arrays of a file "
+                    'or of an xarray.Dataset. Use words without "." and "/"'
+                )
+        if keys[0] == "replicas":
+            keys = [f"{keys[1]}{OF_REPLICAS}", *keys[2:]]
+        names.append(".".join(keys[1:] if keys[0] == "particles" else keys))
+    return names
 
 
 def from_arrays(arrays: dict[str, Any], like: CoolingCurve | None = None) -> CoolingCurve:
@@ -457,32 +435,30 @@ def from_arrays(arrays: dict[str, Any], like: CoolingCurve | None = None) -> Coo
 
     Args:
         arrays: by name.
-        like: a curve whose saved trees have the same structure; by default saved arrays come back
-            in dictionaries, tuples and `Particles`.
+        like: a curve of the same structure; by default saved arrays come back in dictionaries,
+            tuples and `Particles`.
 
     Raises:
         ValueError: for a name that is not of an array of a curve.
     """
-    groups: dict[str, dict[str, Any]] = {}
+    arrays = {f"times{OF_REPLICAS}": arrays["times"]} | arrays
+    if like is not None:
+        leaves = [arrays[name] for name in _names_of_leaves(like)]
+        return jax.tree.unflatten(jax.tree.structure(like), leaves)
+    places = {}
     for name, array in arrays.items():
         group, _, place = name.partition(".")
-        groups.setdefault(group, {})[place] = array
-    quantities = {name: groups.pop(name)[""] for name in (*QUANTITIES, STATUS) if name in groups}
-    names = {f"{name}{OF_REPLICAS}": name for name in QUANTITIES}
-    each = {names[key]: groups.pop(key)[""] for key in names.keys() & groups.keys()}
-    last = {name: groups.pop(name)[""] for name in _PARTICLES if name in groups}
-    saved = {name: _nest(groups.pop(name)) for name in _SAVED_FIELDS if name in groups}
-    if groups:
-        raise ValueError(f"{next(iter(groups))} is not the name of an array of a curve")
-    for field, tree in ({} if like is None else _saved_trees(like)).items():
-        paths, structure = jax.tree.flatten_with_path(tree)
-        leaves = [arrays[_name_at(field, path)] for path, _ in paths]
-        saved[field] = jax.tree.unflatten(structure, leaves)
-    saved_of_each = saved.pop(_SAVED_FIELDS[-1], None)
-    times = quantities["times"]
-    replicas = CoolingCurve(times=times, **each, saved=saved_of_each) if each else None
-    particles = Particles(**last) if last else None
-    return CoolingCurve(**quantities, **saved, replicas=replicas, particles=particles)
+        if group in _PARTICLES:
+            name = f"particles.{name}"
+        elif group.endswith(OF_REPLICAS):
+            name = f"replicas.{group.removesuffix(OF_REPLICAS)}.{place}".rstrip(".")
+        places[name] = array
+    fields = _nest(places)
+    replicas = fields.pop("replicas")
+    known = {field.name for field in dataclasses.fields(CoolingCurve)}
+    if unknown := sorted((fields.keys() | replicas.keys()) - known):
+        raise ValueError(f"{unknown[0]} is not the name of an array of a curve")
+    return CoolingCurve(**fields, replicas=CoolingCurve(**replicas) if len(replicas) > 1 else None)
 
 
 def _nest(arrays: dict[str, Any]) -> Any:
@@ -518,7 +494,7 @@ def label_of(
         unit, *dims = _PARTICLES[place or group]
         dims = [*(first if place else ()), *dims]
         return tuple(dims[:ndim]), {"units": unit, "long_name": (place or group).replace("_", " ")}
-    if group in _SAVED_FIELDS:  # of a function of the user, who knows its unit
+    if group.startswith(SAVED):  # of a function of the user, who knows its unit
         base = f"{SAVED}.{place}" if place else SAVED
         axes = (f"{base}.axis{k}" for k in range(ndim - len(first)))
         return (*first, *axes), {"long_name": name.replace("_", " ")}
