@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 
 import jax
 import jax.numpy as jnp
@@ -176,6 +178,17 @@ def test_incompatible_measurements_are_refused(measured, capsys, arguments, word
     assert main(["fit", *arguments]) == 2
     out, err = capsys.readouterr()
     assert err.startswith("error: ") and words in err and len(err.splitlines()) == 1
+
+
+def test_an_interrupt_while_jax_is_imported_ends_the_command_quietly():
+    line = "import sys; print(1, flush=True); from jaxgran_command import main; sys.exit(main())"
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", line, "fit", "none.csv"], **pipes) as process:
+        process.stdout.readline()
+        time.sleep(0.3)
+        process.send_signal(signal.SIGINT)
+        assert process.communicate()[1] == ""
+    assert process.returncode == -signal.SIGINT
 
 
 @pytest.mark.parametrize("fault, code", [(KeyboardInterrupt, 130), (BrokenPipeError, 0)])

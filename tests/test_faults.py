@@ -137,6 +137,13 @@ def test_whole_numbers_of_numpy_are_taken():
     assert type(model.num_particles) is int and model == jaxgran.DSMC(50, replicas=2)
 
 
+@pytest.mark.parametrize("model", [jaxgran.KineticTheory(), jaxgran.DSMC(50), SOFT])
+def test_every_model_can_be_sized(model):
+    sized = model.sized_for(GAS)
+    assert type(sized) is type(model)
+    assert (sized is model) == (model is not SOFT)
+
+
 def test_a_checkpoint_that_cannot_be_written_is_told_before_the_run(tmp_path):
     with pytest.raises(OSError, match="cannot write"):
         cool(model=SOFT, checkpoint=tmp_path / "none" / "x.ckpt")

@@ -1,5 +1,6 @@
 """Diagnosis of a fit in words, and the likelihood of a measured curve."""
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.formatting import text_table
 from jaxgran._utils.validation import POSITIVE, no_type_check
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import QUANTITIES, CoolingCurve
 from jaxgran.data.curve_file import ABSENT
 from jaxgran.fitting.alternatives import (
     ALLOWED_CHI2,
@@ -20,6 +21,7 @@ from jaxgran.fitting.alternatives import (
     ranges_over_alternatives,
 )
 from jaxgran.fitting.error_budget import curve_and_gas, describe_derivative_bias
+from jaxgran.fitting.fit import fit
 from jaxgran.fitting.residuals import (
     Measurement,
     check_curve,
@@ -39,6 +41,15 @@ MAX_SCATTER = 0.3
 SYSTEMATIC_CORRELATION = 3.0
 """Correlation of neighbouring residuals, in standard errors for independent ones, above which a
 model does not explain a curve without errors."""
+
+MAX_SIGMAS = 5.0
+"""Residual of an outlier, over that of most points and over its error."""
+
+MIN_OUTLIER = 0.004
+"""Least error of T, relative, that is assumed for the points of a curve without errors."""
+
+MIN_JUDGED = 10
+"""Points needed to tell an outlier from the scatter of the others."""
 
 NEGLIGIBLE_SHARE = 0.01
 """Share of an estimate below which the low end of a range counts as 0."""
@@ -129,7 +140,7 @@ def diagnose(
             continue
         N = comparison.num_particles if num_particles is None else num_particles
         residuals = np.asarray(comparison.residuals["temperature"])
-        times, used = np.asarray(curve.times), residuals != 0
+        used = residuals != 0
         correlation = float(neighbour_correlation(residuals[used]))
         correlations.append(correlation)
         if comparison.scatter is not None:
@@ -148,9 +159,10 @@ def diagnose(
             )
         errors = 1 / np.asarray(comparison.weights["temperature"])[used]
         described = _describe_residuals(
-            residuals[used], times[used], correlation, p_value, float(np.median(errors)), expected
+            residuals[used], correlation, p_value, float(np.median(errors)), expected
         )
-        notes += [prefix + note for note in described]
+        outliers = [] if quick else _describe_outliers(result, label)
+        notes += [prefix + note for note in (*described, *outliers)]
     limitations = tuple(sorted(limitations, key=lambda limitation: not limitation.decisive))
     explanations, alternatives, ranges = None, (), {}
     if converged and np.isfinite(result.chi2) and not quick:
@@ -385,17 +397,15 @@ def _describe_assumptions(result: Fit) -> str:
 
 def _describe_residuals(
     residuals: Float[np.ndarray, "used"],
-    times: Float[np.ndarray, "used"],
     correlation: float,
     p_value: float,
     error: float,
     expected: float,
 ) -> Iterator[str]:
-    """Yield clauses about correlation and outliers.
+    """Yield clauses about correlation and the size of the errors.
 
     Args:
         residuals: weighted residuals that are not 0.
-        times: t, s, of the residuals.
         correlation: correlation of neighbouring residuals.
         p_value: p-value of the fit, nan if the errors are unknown.
         error: median relative error of T.
@@ -424,10 +434,41 @@ def _describe_residuals(
                 f"{100 * expected:.2g} %: give T_err = {expected:.2g} T, or leave it out, so that "
                 "the scatter is used; the ranges are too wide otherwise"
             )
-    far = np.abs(residuals) > 5
-    if not np.isnan(p_value) and 0 < far.sum() <= max(2, residuals.size // 20):
-        at = ", ".join(f"t = {t:.3g} s" for t in times[far])
-        yield f"far outliers at {at}: check their error bars"
+
+
+def _describe_outliers(result: Fit, label: str) -> Iterator[str]:
+    """Yield a clause on points far from all others, and the first parameter without them."""
+    comparison = result.comparisons[label]
+    residuals = np.abs(np.asarray(comparison.residuals["temperature"]))
+    typical = float(np.median(residuals[residuals > 0])) / 0.6745  # Gaussian: the standard error
+    limit = max(1.0, typical)
+    if comparison.scatter is not None:  # the unit is the scatter, to which outliers contribute
+        limit = max(typical, MIN_OUTLIER / float(np.asarray(comparison.scatter)))
+    far, number = np.flatnonzero(residuals > MAX_SIGMAS * limit), int(np.sum(residuals > 0))
+    if number < MIN_JUDGED or not 0 < far.size <= max(2, number // 20):
+        return
+    curve = result.data[label] if isinstance(result.data, dict) else result.data
+    at = ", ".join(f"t = {curve.times[k]:.3g} s (row {k + 1})" for k in far)
+    words = f"far outliers at {at}: check them and their error bars"
+    if len(result.comparisons) > 1 or result.model.stochastic:
+        yield words
+        return
+    rest = np.delete(np.arange(residuals.size), far)
+    known = {name: getattr(curve, name) for name in QUANTITIES}
+    curve = CoolingCurve(**{name: x[rest] for name, x in known.items() if x is not None})
+    priors: Any = {
+        name: (value, error)
+        for some in result.priors.values()
+        for name, value, error in zip(some.names, some.given, some.errors, strict=True)
+    }
+    sizes = {"num_particles": comparison.num_particles, "replicas": comparison.replicas}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        other = fit(
+            result.gas, curve, model=result.model, free=result.names, priors=priors, **sizes
+        )
+    value, error = (float(np.ravel(x)[0]) for x in (other.estimate, other.standard_error))
+    yield f"{words}; without them {result.names[0]} is {value:.3g} +- {error:.2g}"
 
 
 def _describe_search(result: Fit) -> Iterator[str]:

@@ -102,6 +102,14 @@ class AbstractModel(eqx.Module):
         """
         return self.simulate(gas, times, Run())
 
+    def sized_for(self, gas: Gas, spare: float = 2.0) -> "AbstractModel":
+        """Return this model with fixed sizes of its arrays, for `jax.jit`.
+
+        That is the model itself, unless its arrays grow with the need, as those of
+        `jaxgran.HardSpheres` and `jaxgran.SoftSpheres` do.
+        """
+        return self
+
     def check_save(self, save: Any) -> None:
         """Raise ValueError if `save` is not a function, or the model has no particles."""
         if save is None:

@@ -181,6 +181,20 @@ def test_units_of_speeds_are_those_of_T(tmp_path):
     assert float(gas.temperature) == pytest.approx(0.02)
 
 
+@pytest.mark.parametrize("error", [0.01 * T, None], ids=["with errors", "without"])
+def test_an_outlier_is_named_with_its_row_and_left_out_for_comparison(error):
+    outlier = T * np.where(np.arange(25) == 12, 3.0, 1.0)
+    curve = jaxgran.CoolingCurve(TIMES, outlier, temperature_error=error)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the verdict
+        reasons = jaxgran.diagnose(jaxgran.fit(GAS, curve, num_particles=2000)).reasons
+    found = re.search(
+        r"outliers at t = .* s \(row 13\).*_constant is ([\d.e-]+) \+- ([\d.e-]+)", str(reasons)
+    )
+    value, uncertainty = map(float, found.groups())
+    assert abs(value - TRUE_A) < 2 * uncertainty < 0.1 * TRUE_A
+
+
 ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "latin-1", "utf-32")
 LENGTHS, DURATIONS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}, {"s": 1.0, "ms": 1e-3, "min": 60.0}
 
