@@ -21,7 +21,6 @@ from jaxgran.fitting.alternatives import (
     ranges_over_alternatives,
 )
 from jaxgran.fitting.error_budget import curve_and_gas, describe_derivative_bias
-from jaxgran.fitting.fit import fit
 from jaxgran.fitting.residuals import (
     Measurement,
     check_curve,
@@ -453,6 +452,8 @@ def _describe_outliers(result: Fit, label: str) -> Iterator[str]:
     if len(result.comparisons) > 1 or result.model.stochastic:
         yield words
         return
+    from jaxgran.fitting.fit import fit
+
     rest = np.delete(np.arange(residuals.size), far)
     known = {name: getattr(curve, name) for name in QUANTITIES}
     curve = CoolingCurve(**{name: x[rest] for name, x in known.items() if x is not None})
