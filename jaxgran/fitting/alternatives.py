@@ -238,6 +238,34 @@ def ranges_over_alternatives(
     return {name: (low[names == name], high[names == name]) for name in result.names}
 
 
+def estimate_without(
+    result: Fit, label: str, points: np.ndarray
+) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]] | None:
+    """Return estimates, and their errors, by kinetic theory without some points of a measurement.
+
+    Args:
+        result: a fit by `jaxgran.fit`.
+        label: of the measurement.
+        points: their indices.
+    """
+    problem, starts = _problem(result)
+    scale, measurements = 1.0, []
+    for m in problem.measurements:
+        if m.label == label and isinstance(m, Measurement):
+            weights = {name: np.array(x) for name, x in m.weights.items()}
+            for x in weights.values():
+                x[points] = 0.0
+            m = dataclasses.replace(m, weights=weights)
+            scale = np.count_nonzero(weights["temperature"]) - len(result.names)
+        measurements.append(m)
+    problem = dataclasses.replace(problem, measurements=tuple(measurements))
+    trial = _trial(problem, 0.0, _first(problem, result, starts))
+    if trial is None:
+        return None
+    without_errors = result.comparisons[label].scatter is not None
+    return trial.estimate, trial.error * ((trial.chi2 / scale) ** 0.5 if without_errors else 1.0)
+
+
 def _problem(result: Fit) -> tuple[Problem, dict[str, float]]:
     """Return the problem of a fit with a free clock and kinetic theory, and t0 by label."""
     # A model that supports all alternatives is that of the trials, too.

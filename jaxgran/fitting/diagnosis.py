@@ -1,6 +1,5 @@
 """Diagnosis of a fit in words, and the likelihood of a measured curve."""
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -11,13 +10,14 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.formatting import text_table
 from jaxgran._utils.validation import POSITIVE, no_type_check
-from jaxgran.data.curve import QUANTITIES, CoolingCurve
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import ABSENT
 from jaxgran.fitting.alternatives import (
     ALLOWED_CHI2,
     DECLARABLE,
     Alternative,
     compare_alternatives,
+    estimate_without,
     ranges_over_alternatives,
 )
 from jaxgran.fitting.error_budget import curve_and_gas, describe_derivative_bias
@@ -446,30 +446,15 @@ def _describe_outliers(result: Fit, label: str) -> Iterator[str]:
     far, number = np.flatnonzero(residuals > MAX_SIGMAS * limit), int(np.sum(residuals > 0))
     if number < MIN_JUDGED or not 0 < far.size <= max(2, number // 20):
         return
-    curve = result.data[label] if isinstance(result.data, dict) else result.data
-    at = ", ".join(f"t = {curve.times[k]:.3g} s (row {k + 1})" for k in far)
+    curve, _ = curve_and_gas(result, label)
+    assert curve is not None
+    times = np.asarray(curve.times)
+    at = ", ".join(f"t = {times[k]:.3g} s (row {k + 1})" for k in far)
     words = f"far outliers at {at}: check them and their error bars"
-    if len(result.comparisons) > 1 or result.model.stochastic:
-        yield words
-        return
-    from jaxgran.fitting.fit import fit
-
-    rest = np.delete(np.arange(residuals.size), far)
-    known = {name: getattr(curve, name) for name in QUANTITIES}
-    curve = CoolingCurve(**{name: x[rest] for name, x in known.items() if x is not None})
-    priors: Any = {
-        name: (value, error)
-        for some in result.priors.values()
-        for name, value, error in zip(some.names, some.given, some.errors, strict=True)
-    }
-    sizes = {"num_particles": comparison.num_particles, "replicas": comparison.replicas}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        other = fit(
-            result.gas, curve, model=result.model, free=result.names, priors=priors, **sizes
-        )
-    value, error = (float(np.ravel(x)[0]) for x in (other.estimate, other.standard_error))
-    yield f"{words}; without them {result.names[0]} is {value:.3g} +- {error:.2g}"
+    if (others := estimate_without(result, label, far)) is not None:
+        value, error = (float(x[0]) for x in others)
+        words += f"; without them {result.names[0]} is {value:.3g} +- {error:.2g}"
+    yield words
 
 
 def _describe_search(result: Fit) -> Iterator[str]:
