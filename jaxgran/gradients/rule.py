@@ -103,21 +103,45 @@ def differentiable(
     @partial(outputs.defjvp, symbolic_zeros=True)
     def outputs_jvp(primals: tuple[Inputs], tangents: tuple[Inputs]):
         (inputs,), (change,) = primals, tangents
-        _refuse_derivative_in_start(change)
-        _refuse_derivative_in_geometry(non_differentiable(change.scene))
+        if _changes(change.start):
+            raise ValueError(
+                "the derivative in the positions or velocities of a start is not available: chaos "
+                "destroys it after a few collisions. Hold the start fixed with "
+                "jax.lax.stop_gradient, or for a short run use SoftSpheres(projection=None)"
+            )
+        if _changes(non_differentiable(change.scene)):
+            raise ValueError(
+                "the derivative in the side of a container, or in the diameter or packing_fraction "
+                "of the gas in it, is not known. Hold them fixed with jax.lax.stop_gradient, take "
+                "differences of runs, or use KineticTheory()"
+            )
         inputs = first_order_only(inputs)
         directions, amounts = _directions(
             material(inputs.scene), material(change.scene), inputs.times.dtype
         )
         out = run(inputs, directions=directions)
-        density_change, time_change = _clock_changes(inputs, change)
-        along = _record_tangents(
-            out.records, amounts, density_change, time_change, out.velocity.shape[1]
+        # In a gas that is denser by some share everything happens earlier by this share.
+        zero = jnp.zeros((), inputs.times.dtype)
+        frequency, times = change.scene.collision_frequency, change.times
+        density_change = (
+            frequency / inputs.scene.collision_frequency if _changes(frequency) else zero
         )
+        time_change = (times if _changes(times) else zero) + inputs.times * density_change
+        along, plain = {}, _plain(out.records)
+        for name in [name for name in plain if f"{name}.rate" in out.records]:
+            along[name] = out.records[f"{name}.rate"] * time_change[:, None]
+            along[name] += _DENSITY_POWER.get(name, 0.0) * density_change * plain[name]
+            along[name] += jnp.einsum("tpr,p->tr", out.records[f"{name}.along"], amounts)
+        if "dissipated_energy" in along:  # the energy balance holds in the tangents, too
+            d = out.velocity.shape[1]
+            inside = along.get("elastic_energy", 0.0)
+            if "rotational_temperature" in along:
+                inside = inside + 0.5 * NUM_SPIN_COMPONENTS[d] * along["rotational_temperature"]
+            along["dissipated_energy"] = -0.5 * d * along["temperature"] - inside
         changes = amounts, density_change, time_change
-        for name in set(_plain(out.records)) - set(along) | _NON_DIFFERENTIABLE & set(out.records):
-            along[name] = nan_tangent_like(out.records[name], *changes)
-        return out._replace(records=_plain(out.records)), Outputs(
+        for name in set(plain) - set(along) | _NON_DIFFERENTIABLE & set(plain):
+            along[name] = nan_tangent_like(plain[name], *changes)
+        return out._replace(records=plain), Outputs(
             position=nan_tangent(out.position.shape, *changes),
             velocity=nan_tangent(out.velocity.shape, *changes),
             records=along,
@@ -128,32 +152,14 @@ def differentiable(
     return outputs
 
 
-def _is_zero(leaf: Any) -> bool:
-    return isinstance(leaf, SymbolicZero)
+def _changes(tangents: Any) -> bool:
+    leaves = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+    return not all(isinstance(leaf, SymbolicZero) for leaf in leaves)
 
 
 def _plain(records: dict[str, Array]) -> dict[str, Array]:
     """The records without the derivatives that `with_tangents` adds."""
     return {name: x for name, x in records.items() if "." not in name}
-
-
-def _refuse_derivative_in_start(change: Inputs) -> None:
-    leaves = jax.tree.leaves(change.start, is_leaf=_is_zero)
-    if not all(_is_zero(leaf) for leaf in leaves):
-        raise ValueError(
-            "the derivative in the positions or velocities of a start is not available: chaos "
-            "destroys it after a few collisions. Hold the start fixed with jax.lax.stop_gradient, "
-            "or for a short run use SoftSpheres(projection=None)"
-        )
-
-
-def _refuse_derivative_in_geometry(changes: Any) -> None:
-    if not all(_is_zero(leaf) for leaf in jax.tree.leaves(changes, is_leaf=_is_zero)):
-        raise ValueError(
-            "the derivative in the side of a container, or in the diameter or packing_fraction of "
-            "the gas in it, is not known. Hold them fixed with jax.lax.stop_gradient, take "
-            "differences of runs, or use KineticTheory()"
-        )
 
 
 def _directions(
@@ -168,7 +174,7 @@ def _directions(
     """
     leaves, structure = jax.tree.flatten(numbers)
     tangents = structure.flatten_up_to(changes)
-    changing = [not _is_zero(tangent) for tangent in tangents]
+    changing = [_changes(tangent) for tangent in tangents]
     parts = [jnp.ravel(x) for x, followed in zip(tangents, changing, strict=True) if followed]
     amounts = jnp.concatenate([jnp.zeros(0, dtype), *parts])
     ends = list(accumulate(len(part) for part in parts))[:-1]
@@ -178,57 +184,6 @@ def _directions(
         for x, followed in zip(leaves, changing, strict=True)
     ]
     return structure.unflatten(directions), amounts
-
-
-def _clock_changes(
-    inputs: Inputs, change: Inputs
-) -> tuple[Float[Array, ""], Float[Array, "times"]]:
-    """The relative change of the collision frequency, and the change of the times with it.
-
-    In a gas that is denser by some share everything happens earlier by this share.
-    """
-    zero = jnp.zeros((), inputs.times.dtype)
-    density_change = change.scene.collision_frequency
-    if _is_zero(density_change):
-        density_change = zero
-    else:
-        density_change = density_change / inputs.scene.collision_frequency
-    times = zero if _is_zero(change.times) else change.times
-    return density_change, times + inputs.times * density_change
-
-
-def _record_tangents(
-    records: dict[str, Array],
-    amounts: Float[Array, "directions"],
-    density_change: Float[Array, ""],
-    time_change: Float[Array, "times"],
-    dimension: int,
-) -> dict[str, Array]:
-    """The tangents of the records.
-
-    Args:
-        records: of the run, with those that `with_tangents` adds. Records without them are left
-            out, because their tangents are not known.
-        amounts: changes of the material along the directions.
-        density_change: relative change of the collision frequency.
-        time_change: change of the times.
-        dimension: d.
-    """
-    tangents = {}
-    for name, x in _plain(records).items():
-        if f"{name}.rate" not in records:
-            continue
-        tangents[name] = records[f"{name}.rate"] * time_change[:, None]
-        tangents[name] += _DENSITY_POWER.get(name, 0.0) * density_change * x
-        tangents[name] += jnp.einsum("tpr,p->tr", records[f"{name}.along"], amounts)
-    if "dissipated_energy" not in tangents:
-        return tangents
-    # The energy balance holds in the tangents, too.
-    inside = tangents.get("elastic_energy", 0.0)
-    if "rotational_temperature" in tangents:
-        inside = inside + 0.5 * NUM_SPIN_COMPONENTS[dimension] * tangents["rotational_temperature"]
-    tangents["dissipated_energy"] = -0.5 * dimension * tangents["temperature"] - inside
-    return tangents
 
 
 _NON_DIFFERENTIABLE = {"sonine", "flow_share"}
@@ -290,7 +245,7 @@ def _first_order_identity(numbers: Any) -> Any:
 @partial(_first_order_identity.defjvp, symbolic_zeros=True)
 def _first_order_identity_jvp(primals, tangents):
     (numbers,), (along,) = primals, tangents
-    if not all(isinstance(tangent, SymbolicZero) for tangent in jax.tree.leaves(along)):
+    if _changes(along):
         raise ValueError(
             "no second derivative is available through a particle model. Take the difference of "
             "two first derivatives (jax.grad, jax.jvp or jax.jacfwd at two values of the "
@@ -353,19 +308,39 @@ def by_differences(
         none = jax.tree.map(lambda x: x[:0], directions)
         if not any(len(leaf) for leaf in jax.tree.leaves(directions)):
             return run(inputs, directions=none)  # only times or the density change
-        scene = inputs.scene
-        ends, slope, span = jax.vmap(partial(_difference_ends, scene, step))(directions)
-        _check_loss(slope)
-        out = run(inputs, directions=none)
-        ends = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), ends)
+        scene, material, traced = inputs.scene, inputs.scene.material, any_traced(inputs)
+        slope = jax.vmap(lambda along: jax.jvp(scene.log_loss, (material,), (along,))[1])(
+            directions
+        )
+        if not any_traced(slope) and not bool(jnp.all(jnp.isfinite(slope))):
+            raise ValueError(
+                "a derivative by differences changes the loss of an impact by a factor, but this "
+                "gas has no loss. Give it one, or leave differences out for projected derivatives"
+            )
+        # A number on which the loss does not depend changes nothing.
+        known = jnp.isfinite(slope) & (slope != 0)
+        signs = jnp.expm1(jnp.array([step, -step], slope.dtype))
+        sizes = jnp.where(known[:, None], signs[None] / jnp.where(known, slope, 1.0)[:, None], 0.0)
+
+        def end(size: Array, along: Any) -> Any:
+            return jax.tree.map(lambda number, along: number + size * along, material, along)
+
+        ends = jax.vmap(jax.vmap(end, (0, None)))(sizes, directions)
+        losses = jax.vmap(jax.vmap(scene.log_loss))(ends)
+        span = losses[:, 0] - losses[:, 1]
+        share = jnp.where(slope == 0, 0.0, slope / jnp.where(span == 0, jnp.nan, span))
 
         def run_at(material: Any) -> tuple[dict[str, Array], Array]:
             other = shifted(inputs._replace(scene=scene.with_material(material)))
             return other.records, other.status
 
-        shifted_records, status = _map_ends(run_at, ends, traced=any_traced(inputs))
-        # A number on which the loss does not depend changes nothing.
-        share = jnp.where(slope == 0, 0.0, slope / jnp.where(span == 0, jnp.nan, span))
+        out = run(inputs, directions=none)
+        ends = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), ends)
+        if traced:  # compiled once, or called from the host one by one
+            shifted_records, status = jax.lax.map(run_at, ends)
+        else:
+            each = [run_at(jax.tree.map(lambda x, i=i: x[i], ends)) for i in range(sizes.size)]
+            shifted_records, status = jax.tree.map(lambda *x: jnp.stack(x), *each)
         records = dict(out.records)
         for name, values in shifted_records.items():
             if f"{name}.along" in records:
@@ -379,40 +354,6 @@ def by_differences(
         return out._replace(records=records, status=fault)
 
     return outputs
-
-
-def _difference_ends(
-    scene: Any, step: float, direction: Any
-) -> tuple[Any, Float[Array, ""], Float[Array, ""]]:
-    """The two materials of a difference along a direction, dL/da, and ``L_+ - L_-``."""
-    material = scene.material
-    slope = jax.jvp(scene.log_loss, (material,), (direction,))[1]
-    known = jnp.isfinite(slope) & (slope != 0)
-    step_size = jnp.expm1(jnp.array([step, -step], slope.dtype)) / jnp.where(known, slope, 1.0)
-
-    def end(step_size: Array) -> Any:
-        return jax.tree.map(lambda number, along: number + step_size * along, material, direction)
-
-    ends = jax.vmap(end)(jnp.where(known, step_size, 0.0))
-    losses = jax.vmap(scene.log_loss)(ends)
-    return ends, slope, losses[0] - losses[1]
-
-
-def _check_loss(slope: Float[Array, "p"]) -> None:
-    if not any_traced(slope) and not bool(jnp.all(jnp.isfinite(slope))):
-        raise ValueError(
-            "a derivative by differences changes the loss of an impact by a factor, but this gas "
-            "has no loss. Give it one, or leave differences out for projected derivatives"
-        )
-
-
-def _map_ends(function: Callable[[Any], Any], ends: Any, traced: bool) -> Any:
-    """Results of a function of each material: compiled once, or called from the host one by one."""
-    if traced:
-        return jax.lax.map(function, ends)
-    count = len(jax.tree.leaves(ends)[0])
-    results = [function(jax.tree.map(lambda x, i=i: x[i], ends)) for i in range(count)]
-    return jax.tree.map(lambda *x: jnp.stack(x), *results)
 
 
 def _record_difference(name: str, base: Array, upper: Array, lower: Array) -> Array:

@@ -7,7 +7,7 @@ change of clock: with velocities s times as large, and with ``alpha s^2`` and ``
 alpha and A, the particles follow the same paths s times as fast. So the tangent of a state in a
 parameter p is projected onto ``c = d ln T/dp`` and the tangent of the clock:
 
-- `ThermalTangents`: gases of lasting contacts, with `RotationTangents` for their spins;
+- `ContactTangents`: gases of lasting contacts;
 - `ImpactTangents`: gases of instantaneous impacts;
 - `ExchangeTangents`: gases that exchange energy with rotation, walls, drag and a drive;
 - `PathTangents`: displacements and the velocity correlation of a gas;
@@ -225,137 +225,36 @@ class PathTangents(NamedTuple):
         return jnp.where(known[None], self.displacement_along / safe[None], 0.0)
 
 
-class ElementMaterial(NamedTuple):
-    """Parameters of walls and drag, or their tangents; None for those that a scene lacks.
-
-    Attributes:
-        wall_alpha, wall_constant: alpha and A of contacts with walls.
-        drag: gamma.
-        spin_drag: rate at which spins slow down.
-    """
-
-    wall_alpha: Any = None
-    wall_constant: Any = None
-    drag: Any = None
-    spin_drag: Any = None
-
-    def wall_material(self) -> tuple[Any, Any]:
-        """Return (alpha, A) of contacts with walls."""
-        return self.wall_alpha, self.wall_constant
-
-
-class FrictionMaterial(NamedTuple):
-    """Parameters of friction, or their tangents; None for those that a scene lacks.
-
-    Attributes:
-        damping, friction, inertia, ratio: of the spheres, as in `SoftSurface`.
-        wall_damping, wall_friction: of walls.
-    """
-
-    damping: Any
-    friction: Any
-    inertia: Any
-    ratio: Any
-    wall_damping: Any = None
-    wall_friction: Any = None
-
-
-class RotationTangents(NamedTuple):
-    """Tangents of the spins of frictional spheres along p directions.
-
-    A gas with friction remembers T and T_rot. A change of clock by c increases velocities and spins
-    alike and leaves the coefficients of friction as they are. The rest of the tangent of a spin,
-    without ``(c/2) s``, is exact between projections; each projection replaces it by its component
-    along s, which is the change of ``T_rot/T``.
-
-    Attributes:
-        directions: in the parameters of friction.
-        spin: tangents of the spins, without the part (c/2) s.
-        rotational_gain: energy that rotation gained in contacts per mean free time, over that of
-            translation, as a function of the ratio of both energies.
-    """
-
-    directions: FrictionMaterial
-    spin: Float[Array, "p n spins"]
-    rotational_gain: LinearRatio
-
-    @classmethod
-    def initial(
-        cls,
-        directions: FrictionMaterial,
-        inertia: Float[Array, ""],
-        ratio: Float[Array, ""],
-        spin: Float[Array, "n spins"],
-        replicas: int,
-    ) -> "RotationTangents":
-        """Return the tangents of spins of ``q s^2 = ratio``.
-
-        They are nan along a ratio that is 0, because the spins are a square root of it.
-        """
-        along = directions.ratio
-        growth = jnp.where(along == 0, 0.0, along / ratio) - directions.inertia / inertia
-        zeros = jnp.zeros(replicas, spin.dtype)
-        return cls(directions, 0.5 * growth[:, None, None] * spin[None], LinearRatio(*[zeros] * 5))
-
-    def project_if_due(
-        self,
-        spin: Float[Array, "n spins"],
-        gain: Float[Array, "p replicas"],
-        free: Bool[Array, "n"],
-        due: ArrayLike,
-    ) -> "RotationTangents":
-        """Return the tangents after a projection that adds a gain to c, or unchanged unless due.
-
-        Args:
-            spin: of the spheres.
-            gain: of c.
-            free: spheres without contact, which are projected.
-            due: True if it is time for a projection.
-        """
-        replicas = gain.shape[1]
-        size = len(spin) // replicas
-        rest = self.spin - 0.5 * jnp.repeat(gain, size, axis=1)[:, :, None] * spin[None]
-        share = along_spin(rest, jnp.where(free[:, None], spin, 0.0), replicas)
-        along = jnp.repeat(share, size, axis=1)[:, :, None] * spin[None]
-        new = jnp.where(free[None, :, None], along, rest)
-        return self._replace(spin=jnp.where(due, new, self.spin))
-
-    def log_temperature(
-        self, spin: Float[Array, "n spins"], inertia: Array, c: Float[Array, "p replicas"]
-    ) -> Float[Array, "p replicas"]:
-        """Return the tangents of ln T_rot: the sum of those of q, the clock and the spins."""
-        share = along_spin(self.spin, spin, c.shape[1])
-        return (self.directions.inertia / inertia)[:, None] + c + 2 * share
-
-
-def along_spin(
-    rest: Float[Array, "p n spins"], spin: Float[Array, "n spins"], replicas: int
+def component_along(
+    rest: Float[Array, "p n k"], vectors: Float[Array, "n k"], replicas: int
 ) -> Float[Array, "p replicas"]:
-    """Return the component of each replica's rest along its spins, relative to the spins.
+    """Return the component of each replica's rest along its vectors, relative to the vectors.
 
-    It is 0 where no sphere rotates.
+    It is 0 where all vectors are 0.
     """
-    spins = spin.reshape(replicas, -1)
-    product = jnp.sum(rest.reshape(len(rest), *spins.shape) * spins[None], -1)
-    return ratio_or_zero(product, jnp.sum(spins * spins, -1)[None])
+    flat = vectors.reshape(replicas, -1)
+    product = jnp.sum(rest.reshape(len(rest), *flat.shape) * flat[None], -1)
+    return ratio_or_zero(product, jnp.sum(flat * flat, -1)[None])
 
 
-class ThermalTangents(NamedTuple):
-    """Tangents of the state of a gas of lasting contacts along p directions.
+class ContactTangents(NamedTuple):
+    """Tangents of the state of a gas of lasting contacts along p directions in its material.
 
-    The directions are in (alpha, A), walls and drag. The tangent of a state has three parts:
+    The tangent of a state has three parts:
 
-    - ``c = d ln T/dp``, which stands for velocities ``(c/2) v`` and for the corresponding changes
-      of alpha and A;
+    - ``c = d ln T/dp``, which stands for velocities ``(c/2) v``, spins ``(c/2) s`` and for the
+      corresponding changes of the material;
     - the tangent of the clock, the integral of ``-(c/2) dt``, at a fixed place in the sequence of
       collisions;
-    - the exact rest of the tangents of positions and velocities.
+    - the exact rest of the tangents of positions, velocities and spins.
 
-    At regular intervals the rest is projected onto v (thermal projection): its energy is added to
-    c, and the part orthogonal to v is dropped. Spheres in contact are projected after they part.
+    At regular intervals the rest is projected (thermal projection): its component along v is added
+    to c, and the part orthogonal to v is dropped. A gas with friction remembers T and T_rot, so
+    that the rest of the spins is replaced by its component along s, the change of ``T_rot/T``.
+    Spheres in contact are projected after they part.
 
     Attributes:
-        alpha, dissipative_constant: the directions.
+        directions: in the material, a pytree like it, stacked along a first axis.
         log_temperature: c = d ln T.
         clock: tangent of the time at a fixed place in the sequence of collisions.
         position: tangent of the positions.
@@ -363,17 +262,14 @@ class ThermalTangents(NamedTuple):
         free: True for spheres that touch no other one.
         elapsed: time since the last projection.
         thermal_elapsed: the integral of T^(1/2) over this time.
-        interval: between projections, in mean free times.
-        damping: q delta of the trend.
         rates: of the gas.
         paths: tangents of the paths of the particles, up to the last projection.
-        elements: directions in walls and drag; None where the gas has neither.
-        drag: gamma; None without drag.
-        rotation: tangents of spins; None for spheres without friction.
+        spin: tangents of the spins, without the part (c/2) s; None for smooth spheres.
+        rotational_gain: energy that rotation gained in contacts per mean free time, over that of
+            translation, as a function of the ratio of both energies; None for smooth spheres.
     """
 
-    alpha: Float[Array, "p"]
-    dissipative_constant: Float[Array, "p"]
+    directions: Any
     log_temperature: Float[Array, "p replicas"]
     clock: Float[Array, "p replicas"]
     position: Float[Array, "p n d"]
@@ -381,162 +277,90 @@ class ThermalTangents(NamedTuple):
     free: Bool[Array, "n"]
     elapsed: Float[Array, ""]
     thermal_elapsed: Float[Array, "replicas"]
-    interval: Float[Array, ""]
-    damping: Float[Array, ""]
     rates: RateSums
     paths: PathTangents
-    elements: ElementMaterial | None = None
-    drag: Float[Array, ""] | None = None
-    rotation: RotationTangents | None = None
+    spin: Float[Array, "p n spins"] | None = None
+    rotational_gain: LinearRatio | None = None
 
-    def cooling(self, temperature: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
-        """Return ``-d ln T/dt`` at a temperature, by contacts and drag."""
-        by_contacts = self.rates.cooling(self.trend(temperature))
-        return by_contacts if self.drag is None else by_contacts + 2 * self.drag
+    @classmethod
+    def initial(
+        cls,
+        directions: Any,
+        velocity: Float[Array, "n d"],
+        replicas: int,
+        spin: Float[Array, "p n spins"] | None = None,
+    ) -> "ContactTangents":
+        """Return the tangents of an initial state that depends on the material by its spins only.
 
-    def trend(self, temperature: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
-        """Return the dependence of the cooling rate on T, ``T^(3/5) / (1 + q delta T^(1/10))``.
-
-        It has the first two terms of the rate in the dissipation delta.
+        Args:
+            directions: p directions in the material.
+            velocity: of the state, for its shape and dtype.
+            replicas: number of boxes.
+            spin: tangents of the spins; None for smooth spheres.
         """
-        return temperature**0.6 / (1 + self.damping * temperature**0.1)
-
-    def material(self, scene_alpha: ArrayLike, scene_constant: ArrayLike) -> tuple[Array, Array]:
-        """Return the tangents of alpha and A, each (p, replicas), with the change of clock by c."""
-        c = self.log_temperature
-        alpha = self.alpha[:, None] - c * scene_alpha
-        return alpha, self.dissipative_constant[:, None] + 0.5 * c * scene_constant
-
-    def element_material(self, scene: ElementMaterial) -> ElementMaterial:
-        """Return the tangents of the parameters of walls and drag, with the change of clock by c.
-
-        gamma is a rate and changes as such.
-        """
-        along, c = self.elements, self.log_temperature
-        assert along is not None
-
-        def with_clock(direction: Any, power: float, value: Any) -> Any:
-            return None if value is None else direction[:, None] + power * c * value
-
-        return ElementMaterial(
-            wall_alpha=with_clock(along.wall_alpha, -1.0, scene.wall_alpha),
-            wall_constant=with_clock(along.wall_constant, 0.5, scene.wall_constant),
-            drag=with_clock(along.drag, -0.5, scene.drag),
-            spin_drag=with_clock(along.spin_drag, -0.5, scene.spin_drag),
+        p, dtype = len(jax.tree.leaves(directions)[0]), velocity.dtype
+        zeros, by_replica = jnp.zeros((p, replicas), dtype), jnp.zeros(replicas, dtype)
+        particle_zeros = jnp.zeros((p, *velocity.shape), dtype)
+        return cls(
+            directions=directions,
+            log_temperature=zeros,
+            clock=zeros,
+            position=particle_zeros,
+            velocity=particle_zeros,
+            free=jnp.ones(len(velocity), bool),
+            elapsed=jnp.zeros((), dtype),
+            thermal_elapsed=by_replica,
+            rates=RateSums.zero(replicas, dtype),
+            paths=PathTangents.initial(p, replicas, dtype),
+            spin=spin,
+            rotational_gain=None if spin is None else LinearRatio(*[by_replica] * 5),
         )
 
+    def projected(
+        self,
+        velocity: Float[Array, "n d"],
+        cooling: Float[Array, "replicas"],
+        spin: Float[Array, "n spins"] | None = None,
+    ) -> "ContactTangents":
+        """Return the tangents after a thermal projection of the spheres that touch no other one.
 
-def initial_tangents(
-    alpha: Float[Array, "p"],
-    dissipative_constant: Float[Array, "p"],
-    velocity: Float[Array, "n d"],
-    replicas: int,
-    interval: ArrayLike,
-    damping: ArrayLike,
-    elements: ElementMaterial | None = None,
-    drag: Float[Array, ""] | None = None,
-) -> ThermalTangents:
-    """Return the tangents of an initial state, which does not depend on the parameters.
+        Args:
+            velocity: of the particles, in the frame in which each replica is at rest.
+            cooling: ``-d ln T/dt``.
+            spin: of the particles; None for smooth spheres.
+        """
+        c, free = self.log_temperature, self.free[:, None]
+        replicas, d = c.shape[1], velocity.shape[1]
+        gain = 2 * component_along(self.velocity, jnp.where(free, velocity, 0.0), replicas)
+        squares = velocity.reshape(replicas, -1) ** 2
+        temperature = jnp.mean(squares, -1)
+        size = len(velocity) // replicas
 
-    Args:
-        alpha, dissipative_constant: the p directions in (alpha, A).
-        velocity: of the state, for its shape and dtype.
-        replicas: number of boxes.
-        interval: between projections, in mean free times.
-        damping: q delta of `ThermalTangents.trend`.
-        elements, drag: as in `ThermalTangents`.
-    """
-    p, dtype = len(alpha), velocity.dtype
-    zeros = jnp.zeros((p, replicas), dtype)
-    particle_zeros = jnp.zeros((p, *velocity.shape), dtype)
-    return ThermalTangents(
-        alpha=alpha,
-        dissipative_constant=dissipative_constant,
-        log_temperature=zeros,
-        clock=zeros,
-        position=particle_zeros,
-        velocity=particle_zeros,
-        free=jnp.ones(len(velocity), bool),
-        elapsed=jnp.zeros((), dtype),
-        thermal_elapsed=jnp.zeros(replicas, dtype),
-        interval=jnp.asarray(interval, dtype),
-        damping=jnp.asarray(damping, dtype),
-        rates=RateSums.zero(replicas, dtype),
-        paths=PathTangents.initial(p, replicas, dtype),
-        elements=elements,
-        drag=drag,
-    )
+        def of_particles(values: Float[Array, "p replicas"]) -> Float[Array, "p n 1"]:
+            return jnp.repeat(values, size, axis=1)[:, :, None]
 
-
-class Projection(NamedTuple):
-    """Tangents that a projection changes.
-
-    Attributes:
-        log_temperature: c = d ln T, including the energy of the rest.
-        clock: tangent of the clock.
-        paths: tangents of the paths.
-    """
-
-    log_temperature: Float[Array, "p replicas"]
-    clock: Float[Array, "p replicas"]
-    paths: PathTangents
-
-
-def thermal_projection(tangents: ThermalTangents, velocity: Float[Array, "n d"]) -> Projection:
-    """Return the projection, at this time, of the spheres that touch no other one.
-
-    Args:
-        tangents: of the state.
-        velocity: of the particles, in the frame in which each replica is at rest.
-    """
-    c = tangents.log_temperature
-    replicas, d = c.shape[1], velocity.shape[1]
-    components = velocity.reshape(replicas, -1)
-    v = jnp.where(tangents.free[:, None], velocity, 0.0).reshape(replicas, -1)
-    rest = tangents.velocity.reshape(len(c), *v.shape)
-    gain = ratio_or_zero(2 * jnp.sum(rest * v[None], -1), jnp.sum(v * v, -1)[None])
-    temperature = jnp.mean(components * components, -1)
-    one = jnp.ones_like(temperature)
-    return Projection(
-        log_temperature=c + gain,
-        clock=tangents.clock - 0.5 * (c + 0.5 * gain) * tangents.elapsed,
-        paths=tangents.paths.after(
-            tangents.thermal_elapsed,
-            gain,
-            collision_rate=tangents.rates.collision(one),
-            cooling=ratio_or_zero(tangents.cooling(temperature), jnp.sqrt(temperature)),
-            dimension=d,
-        ),
-    )
-
-
-def project_if_due(
-    tangents: ThermalTangents,
-    velocity: Float[Array, "n d"],
-    due: ArrayLike,
-    spin: Float[Array, "n spins"] | None = None,
-) -> ThermalTangents:
-    """Return the tangents after a thermal projection now, or unchanged unless it is due."""
-    new = thermal_projection(tangents, velocity)
-    replicas = new.clock.shape[1]
-    gain = new.log_temperature - tangents.log_temperature
-    particle_gain = jnp.repeat(gain, len(velocity) // replicas, axis=1)
-    replaced = due & tangents.free[None, :, None]
-    in_contact = tangents.velocity - 0.5 * particle_gain[:, :, None] * velocity[None]
-    rest = jnp.where(due, in_contact, tangents.velocity)
-    old = Projection(tangents.log_temperature, tangents.clock, tangents.paths)
-    now = jax.tree.map(lambda new, old: jnp.where(due, new, old), new, old)
-    rotation = tangents.rotation
-    if rotation is not None and spin is not None:
-        rotation = rotation.project_if_due(spin, gain, tangents.free, due)
-    return tangents._replace(
-        rotation=rotation,
-        **now._asdict(),
-        position=jnp.where(replaced, 0.0, tangents.position),
-        velocity=jnp.where(replaced, 0.0, rest),
-        elapsed=jnp.where(due, 0.0, tangents.elapsed),
-        thermal_elapsed=jnp.where(due, 0.0, tangents.thermal_elapsed),
-    )
+        spin_tangent = self.spin
+        if spin_tangent is not None and spin is not None:
+            rest = spin_tangent - 0.5 * of_particles(gain) * spin[None]
+            share = component_along(rest, jnp.where(free, spin, 0.0), replicas)
+            spin_tangent = jnp.where(free[None], of_particles(share) * spin[None], rest)
+        rest = self.velocity - 0.5 * of_particles(gain) * velocity[None]
+        return self._replace(
+            log_temperature=c + gain,
+            clock=self.clock - 0.5 * (c + 0.5 * gain) * self.elapsed,
+            position=jnp.where(free[None], 0.0, self.position),
+            velocity=jnp.where(free[None], 0.0, rest),
+            elapsed=jnp.zeros_like(self.elapsed),
+            thermal_elapsed=jnp.zeros_like(self.thermal_elapsed),
+            paths=self.paths.after(
+                self.thermal_elapsed,
+                gain,
+                collision_rate=self.rates.collision(jnp.ones_like(temperature)),
+                cooling=ratio_or_zero(cooling, jnp.sqrt(temperature)),
+                dimension=d,
+            ),
+            spin=spin_tangent,
+        )
 
 
 class ImpactTangents(NamedTuple):

@@ -19,10 +19,10 @@ from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
 from jaxgran.particles.setup import check_inside
 from jaxgran.particles.soft.dynamics import SoftDynamics
-from jaxgran.particles.soft.forces import BOX_MARGIN, SoftDrag, SoftScene, SoftSurface, SoftWalls
-from jaxgran.scene.elements import Frictional, StokesDrag, Walls
+from jaxgran.scene.elements import Frictional
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import Viscoelastic
+from jaxgran.scene.reduced import ReducedContact, ReducedFriction, SphereScene, sphere_scene
 
 PROJECTION = 0.1
 """Mean free times between thermal projections of a derivative."""
@@ -138,9 +138,21 @@ class SoftSpheres(AbstractSpheres):
         with jax.ensure_compile_time_eval():
             self.check_box(gas)
             checks.check_volume(gas, self.num_particles)
-            if gas.container is not None:
-                _check_walls(gas.container)
-                check_inside(self.start, gas.container, 0.0, gas.dimension)
+            if (walls := gas.container) is not None:
+                check_inside(self.start, walls, 0.0, gas.dimension)
+                if not isinstance(walls.restitution, Viscoelastic):
+                    raise ValueError(
+                        "SoftSpheres needs walls of the Viscoelastic law, which has a force "
+                        f"(elastic for A = 0); these have {type(walls.restitution).__name__}. Use "
+                        "HardSpheres, DSMC or KineticTheory, or Walls(side, "
+                        "restitution=jaxgran.Viscoelastic(...))."
+                    )
+                if walls.tangential_restitution is not None:
+                    raise ValueError(
+                        "tangential_restitution of the walls belongs to instantaneous impacts. "
+                        "Give the walls tangential_damping and friction instead, or use "
+                        "HardSpheres."
+                    )
         if gas.surface and self.start is not None and self.start.angular_velocity is not None:
             raise ValueError(
                 "SoftSpheres draws the angular velocities of a start. Give the start without them, "
@@ -159,24 +171,39 @@ class SoftSpheres(AbstractSpheres):
         """Return no limitations: soft spheres resolve every contact."""
         return ()
 
-    def scene(self, gas: Gas) -> SoftScene:
+    def scene(self, gas: Gas) -> SphereScene:
         """Return the gas in units of its diameter, mass and initial temperature."""
-        return reduced_soft_scene(gas, self.num_particles)
+        law: Any = gas.law  # `check` refuses others than Viscoelastic, also of walls
+        surface, walls, material = gas.surface, gas.container, {}
+        if isinstance(surface, Frictional):
+            material["surface"] = ReducedFriction(
+                surface.tangential_damping,
+                surface.friction,
+                surface.inertia,
+                surface.rotational_temperature / gas.temperature,
+            )
+        if walls is not None:
+            wall_law: Any = walls.restitution
+            material["wall_law"] = ReducedContact.of(wall_law.of_wall(), gas)
+            if walls.tangential_damping is not None and walls.friction is not None:
+                material["wall_surface"] = ReducedFriction(walls.tangential_damping, walls.friction)
+        return sphere_scene(gas, self.num_particles, ReducedContact.of(law, gas), **material)
 
     def unreachable_times(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
         """Return a mask without times: soft spheres do not transform time, and reach all."""
         return jnp.zeros(times.shape, bool)
 
-    def filled_side(self, scene: SoftScene) -> Array:
+    def filled_side(self, scene: SphereScene) -> Array:
         """Return the side of the box, or of a cube of the container's volume."""
         return scene.filled_side
 
-    def non_differentiable(self, scene: SoftScene) -> Any:
+    def non_differentiable(self, scene: SphereScene) -> Any:
         """Return the lengths and the collision frequency between walls, otherwise nothing."""
-        walls = scene.walls
-        return () if walls is None else (scene.side, walls.sides, scene.collision_frequency)
+        if scene.container is None:
+            return ()
+        return scene.side, scene.container, scene.collision_frequency
 
-    def dynamics(self, scene: SoftScene, plan: Plan) -> SoftDynamics:
+    def dynamics(self, scene: SphereScene, plan: Plan) -> SoftDynamics:
         """Return the equations of motion of the spheres."""
         projection = concrete_array(self.projection or np.inf, scene.side.dtype)
         pace: SoftPace = plan.pace
@@ -187,16 +214,19 @@ class SoftSpheres(AbstractSpheres):
         """Return the setting that a plan repeats."""
         return {"steps_per_contact": self.steps_per_contact}
 
-    def planned(self, scene: SoftScene, dimension: int, spare: float | None = None) -> Plan:
+    def planned(self, scene: SphereScene, dimension: int, spare: float | None = None) -> Plan:
         """Return static sizes; capacities were measured for phi = .01 to .4 (disks: .5) and
         t_c/tau_c = .003 to .3."""
         d, n = dimension, self.replicas * self.num_particles
         filled, ahead = float(scene.filled_side), 1.0
         around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
-        if scene.walls is not None:  # the sweep runs along the first axis
-            ahead = max(1.0, filled / float(scene.walls.sides[0]))
+        if scene.container is not None:  # the sweep runs along the first axis
+            ahead = max(1.0, filled / float(scene.container[0]))
         duration = Grid.of(n).round_up(float(scene.contact_duration))
-        steps = self._steps_per_block(float(scene.contact_duration))
+        # A block lasts at most a contact, less if spheres fly far in that time.
+        contacts_flown = MAX_SPEED * float(scene.contact_duration) / BLOCK_FLIGHT
+        shorter = BLOCK_LENGTHS.round_up(max(1.0, contacts_flown))
+        steps = max(round(self.steps_per_contact / shorter), 8)
         block = steps / self.steps_per_contact
         flight = MAX_SPEED * duration * block
         near = 0.75 * around.in_contact * around.contact_value * ((1 + 5 * flight) ** d - 1)
@@ -211,84 +241,3 @@ class SoftSpheres(AbstractSpheres):
         lookahead = min(ahead * around.lookahead, self.num_particles)
         sizes = capacities(expected, lookahead, spare or 1.2, extra, n)
         return Plan(self.replicas, SoftPace(self.steps_per_contact, steps), *sizes)
-
-    def _steps_per_block(self, contact_duration: float) -> int:
-        """Return the steps of a block: at most a contact, fewer if spheres fly far in that time."""
-        shorter = BLOCK_LENGTHS.round_up(max(1.0, MAX_SPEED * contact_duration / BLOCK_FLIGHT))
-        return max(round(self.steps_per_contact / shorter), 8)
-
-
-def _check_walls(walls: Walls) -> None:
-    """Raise ValueError for walls without a force."""
-    if not isinstance(walls.restitution, Viscoelastic):
-        raise ValueError(
-            "SoftSpheres needs walls of the Viscoelastic law, which has a force (elastic for "
-            f"A = 0); these have {type(walls.restitution).__name__}. Use HardSpheres, DSMC or "
-            "KineticTheory, or Walls(side, restitution=jaxgran.Viscoelastic(...))."
-        )
-    if walls.tangential_restitution is not None:
-        raise ValueError(
-            "tangential_restitution of the walls belongs to instantaneous impacts. Give the walls "
-            "tangential_damping and friction instead, or use HardSpheres."
-        )
-
-
-def reduced_soft_scene(gas: Gas, num_particles: int) -> SoftScene:
-    """Return a gas of viscoelastic spheres in units of its diameter, mass and initial T."""
-    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    law: Any = gas.law  # `SoftSpheres.check` refuses others
-    side, walls = gas.box_side(num_particles) / gas.diameter, None
-    if gas.container is not None:
-        walls = _reduced_walls(gas, gas.container)
-        side = jnp.max(walls.sides) + BOX_MARGIN
-    return SoftScene(
-        side=side,
-        alpha=gas.alpha * gas.diameter**0.5 * unit_time**2,
-        dissipative_constant=law.dissipative_constant / unit_time,
-        contact_duration=gas.contact_duration / unit_time,
-        collision_frequency=_reduced_frequency(gas, unit_time),
-        clipped=law.clipped,
-        walls=walls,
-        drag=None if gas.drag is None else _reduced_drag(gas, gas.drag),
-        surface=_reduced_surface(gas),
-    )
-
-
-def _reduced_walls(gas: Gas, container: Walls) -> SoftWalls:
-    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    law: Any = container.restitution  # `_check_walls` refuses others than Viscoelastic
-    alpha = law.of_wall().alpha(diameter=gas.diameter, mass=gas.mass)
-    return SoftWalls(
-        sides=jnp.broadcast_to(container.side, (gas.dimension,)) / gas.diameter,
-        alpha=alpha * gas.diameter**0.5 * unit_time**2,
-        dissipative_constant=law.dissipative_constant / unit_time,
-        clipped=law.clipped,
-        damping=container.tangential_damping,
-        friction=container.friction,
-    )
-
-
-def _reduced_frequency(gas: Gas, unit_time: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the collisions per particle and unit of time at T = 1.
-
-    Between walls it has no derivative in T_0, since `SoftSpheres.non_differentiable` refuses
-    derivatives in the collision frequency.
-    """
-    if gas.container is None:
-        return gas.collision_frequency * unit_time
-    constant = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
-    return constant.collision_frequency * gas.diameter / jnp.sqrt(constant.temperature)
-
-
-def _reduced_drag(gas: Gas, drag: StokesDrag) -> SoftDrag:
-    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    per_collision = unit_time / _reduced_frequency(gas, unit_time)
-    return SoftDrag(drag.rate * per_collision, drag.rotational_rate * per_collision)
-
-
-def _reduced_surface(gas: Gas) -> SoftSurface | None:
-    """Return the surface of the spheres in reduced units, or None if they are smooth."""
-    s, T = gas.surface, gas.temperature
-    if not isinstance(s, Frictional):
-        return None
-    return SoftSurface(s.tangential_damping, s.friction, s.inertia, s.rotational_temperature / T)

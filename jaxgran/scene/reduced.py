@@ -1,14 +1,22 @@
-"""A scene in reduced units: speeds in `Gas.impact_speed`, lengths in `Gas.path_length`."""
+"""A scene in reduced units.
 
+- `reduced_scene`, for kinetic theory and DSMC: speeds in `Gas.impact_speed`, lengths in
+  `Gas.path_length`.
+- `sphere_scene`, for spheres in boxes: the diameter, the mass and the initial temperature are 1.
+"""
+
+from collections.abc import Callable
 from math import pi
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.scene.elements import Rough
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.laws import ReducedLaw
+from jaxgran.scene.laws import ReducedLaw, Viscoelastic
 
 
 class ReducedRough(NamedTuple):
@@ -50,10 +58,13 @@ class ReducedWalls(NamedTuple):
 
 
 class ReducedDrag(NamedTuple):
-    """`StokesDrag` in reduced units: the rates of velocities and of angular velocities."""
+    """`StokesDrag` in reduced units: the rates of velocities and of angular velocities.
+
+    The second is None in a `SphereScene` of smooth spheres.
+    """
 
     rate: Float[Array, ""]
-    rotational_rate: Float[Array, ""]
+    rotational_rate: Any
 
 
 class ReducedDrive(NamedTuple):
@@ -102,3 +113,166 @@ def reduced_scene(gas: Gas) -> ReducedScene:
         drive = ReducedDrive(gas.drive.strength * (length / speed) / gas.temperature)
     prepared = None if gas.preparation is None else ()
     return ReducedScene(gas.reduced_law, surface, walls, drag, drive, prepared)
+
+
+class ReducedContact(eqx.Module):
+    """Contacts of `Viscoelastic` spheres, or of a sphere and a wall, in units of `sphere_scene`.
+
+    Attributes:
+        alpha: elastic constant over effective mass.
+        dissipative_constant: A.
+        clipped: whether a contact ends where the force vanishes; otherwise it ends where the
+            overlap does.
+    """
+
+    alpha: Float[Array, "..."]
+    dissipative_constant: Float[Array, "..."]
+    clipped: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, law: Viscoelastic, gas: Gas) -> "ReducedContact":
+        """Return the contacts of two spheres of a gas with a law."""
+        time = gas.diameter / jnp.sqrt(gas.temperature)
+        alpha = law.alpha(diameter=gas.diameter, mass=gas.mass) * gas.diameter**0.5 * time**2
+        return cls(alpha, law.dissipative_constant / time, law.clipped)
+
+    def log_loss(self) -> Float[Array, ""]:
+        """Return ln of an impact's loss, ``A alpha^(2/5)`` up to a constant factor."""
+        return jnp.log(self.dissipative_constant) + 0.4 * jnp.log(self.alpha)
+
+
+class ReducedFriction(NamedTuple):
+    """Friction of contacts: `Frictional` in units of `sphere_scene`, or that of walls.
+
+    Attributes:
+        damping: x_t.
+        friction: mu.
+        inertia: q; None for walls.
+        ratio: T_rot/T at t = 0; None for walls.
+    """
+
+    damping: Float[Array, ""]
+    friction: Float[Array, ""]
+    inertia: Any = None
+    ratio: Any = None
+
+
+class SphereMaterial(NamedTuple):
+    """The numbers of a `SphereScene` in which derivatives are taken; None for missing elements.
+
+    All numbers are per collision, so that in a denser gas the same happens sooner. Tangents have
+    the same structure.
+
+    Attributes:
+        law: of impacts or contacts.
+        surface: of spheres that rotate.
+        wall_law, wall_surface: of the walls of a container.
+        wall_frequency: impacts on the two walls across each axis of a mixed gas, over the collision
+            frequency; None where spheres resolve their contacts.
+        drag: rates over the collision frequency.
+        drive: growth of T over the collision frequency by white noise.
+    """
+
+    law: Any
+    surface: Any = None
+    wall_law: Any = None
+    wall_surface: Any = None
+    wall_frequency: Any = None
+    drag: ReducedDrag | None = None
+    drive: ReducedDrive | None = None
+
+    def faster(self, factor: ArrayLike) -> "SphereMaterial":
+        """Return the material of contacts in which spheres take the same paths a factor faster."""
+
+        def of(law: ReducedContact) -> ReducedContact:
+            return ReducedContact(
+                law.alpha * factor**2, law.dissipative_constant / factor, law.clipped
+            )
+
+        return self._with_laws(of)._replace(drag=jax.tree.map(lambda x: x * factor, self.drag))
+
+    def lossless(self) -> "SphereMaterial":
+        """Return the material of smooth spheres in a vacuum, between elastic walls."""
+
+        def of(law: ReducedContact) -> ReducedContact:
+            return ReducedContact(law.alpha, 0.0 * law.alpha, law.clipped)
+
+        drag = jax.tree.map(lambda x: 0.0 * x, self.drag)
+        return self._with_laws(of)._replace(surface=None, wall_surface=None, drag=drag)
+
+    def _with_laws(self, change: Callable[[Any], Any]) -> "SphereMaterial":
+        wall_law = None if self.wall_law is None else change(self.wall_law)
+        return self._replace(law=change(self.law), wall_law=wall_law)
+
+
+class SphereScene(NamedTuple):
+    """Spheres in a box, in units of their diameter, their mass and the initial temperature.
+
+    In a container positions are coordinates from a corner, and the centre of a sphere that touches
+    no wall lies between 1/2 and the container's side less 1/2. The periodic box is a cube longer
+    than the container by a diameter, so that no sphere meets another one through its boundary.
+
+    Attributes:
+        side: of the periodic box.
+        container: sides of the container; None without walls.
+        collision_frequency: collisions per particle and time at T = 1.
+        contact_duration: mean duration of an elastic contact at T = 1; 0 for instantaneous impacts.
+        material: the numbers in which derivatives are taken.
+    """
+
+    side: Float[Array, ""]
+    container: Float[Array, "d"] | None
+    collision_frequency: Float[Array, ""]
+    contact_duration: Float[Array, ""]
+    material: SphereMaterial
+
+    @property
+    def galilean_invariant(self) -> bool:
+        """True if any frame at constant velocity will do: there are no walls and no drag."""
+        return self.container is None and self.material.drag is None
+
+    @property
+    def filled_side(self) -> Float[Array, ""]:
+        """Side of a cube (square) with the volume that is open to the spheres."""
+        if self.container is None:
+            return self.side
+        return jnp.prod(self.container) ** (1 / len(self.container))
+
+    def with_material(self, material: SphereMaterial) -> "SphereScene":
+        """Return this scene with other numbers of its material."""
+        return self._replace(material=material)
+
+    def log_loss(self, material: SphereMaterial) -> Float[Array, ""]:
+        """Return ln of the loss of an impact in a material."""
+        return material.law.log_loss()
+
+
+def sphere_scene(gas: Gas, num_particles: int, law: Any, **material: Any) -> SphereScene:
+    """Return spheres in a box in reduced units.
+
+    Args:
+        gas: the scene.
+        num_particles: N in the box.
+        law: of impacts or contacts, in reduced units.
+        material: further fields of `SphereMaterial`, but for drag and drive.
+    """
+    side, container, nu = gas.box_side(num_particles) / gas.diameter, None, gas.collision_frequency
+    if gas.container is not None:
+        container = jnp.broadcast_to(gas.container.side, (gas.dimension,)) / gas.diameter
+        side = jnp.max(container) + 1
+    drag = drive = None
+    if gas.drag is not None:
+        rotational = None if gas.surface is None else gas.drag.rotational_rate / nu
+        drag = ReducedDrag(gas.drag.rate / nu, rotational)
+    if gas.drive is not None:
+        drive = ReducedDrive(gas.drive.strength / (nu * gas.temperature))
+    # It does not depend on T_0, and between walls its derivative is refused.
+    fixed = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
+    unit_time = fixed.diameter / jnp.sqrt(fixed.temperature)
+    return SphereScene(
+        side=side,
+        container=container,
+        collision_frequency=fixed.collision_frequency * unit_time,
+        contact_duration=gas.contact_duration / (gas.diameter / jnp.sqrt(gas.temperature)),
+        material=SphereMaterial(law, drag=drag, drive=drive, **material),
+    )

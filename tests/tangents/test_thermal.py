@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.gradients.tangents import initial_tangents, thermal_projection
-from jaxgran.models.soft_spheres import SoftSpheres, reduced_soft_scene
+from jaxgran.models.soft_spheres import SoftSpheres
+from jaxgran.scene.reduced import ReducedContact
 from tests.models.test_soft_spheres import soft_beads
 
 
@@ -28,16 +28,15 @@ def slope(f, at=0.0):
     return jax.jvp(f, (jnp.asarray(at),), (jnp.ones(()),))[1]
 
 
-def followed(gas, position, velocity, replicas, end, interval, steps=40, sensitive_to=(0.0, 1.0)):
-    """A state in reduced units after some time, with its tangent in (alpha, A)."""
-    num = len(position) // replicas
-    model = SoftSpheres(num, replicas=replicas, steps_per_contact=steps).sized_for(gas, spare=4.0)
-    scene = reduced_soft_scene(gas, num)
+def followed(gas, position, velocity, replicas, end, interval):
+    """A state in reduced units after some time, with its tangent in A."""
+    model = SoftSpheres(len(position) // replicas, replicas=replicas, projection=interval)
+    model = model.sized_for(gas, spare=4.0)
+    scene = model.scene(gas)
     dynamics = model.dynamics(scene, model.plan)
     state = dynamics.begin(jnp.asarray(position), jnp.asarray(velocity), 0.4)
-    directions = [jnp.array([x]) for x in sensitive_to]
-    along = initial_tangents(*directions, state.velocity, replicas, interval, 0.0)
-    state = state._replace(tangents=along)
+    law = ReducedContact(jnp.zeros(1), jnp.ones(1), scene.material.law.clipped)
+    state = dynamics.with_tangents(state, scene.material._replace(law=law))
     while float(state.time) < end:
         now = dynamics.run_segment(state, end, "sweep")
         assert int(now.status) == 0
@@ -73,15 +72,15 @@ def test_one_impact_has_the_slope_of_its_law(beads, beta, angle):
     # 1.5 rad grazes: the normal speed is 7 % of the speed.
     gas = soft_beads(beads, 1e-7, beta, packing_fraction=0.02)
     gaps = 1e-4 * (1 + np.arange(16) / 16)
-    scene = reduced_soft_scene(gas, 2)
+    scene = SoftSpheres(2).scene(gas)
     position, velocity = pairs_that_meet(gas, angle, gaps)
     end = 6 * float(scene.contact_duration) / np.cos(angle) ** 0.2 + 2e-4
     # Projected many times during contact, only before and after it, and not at all.
     for interval in (1e-9, 1e-4, 1e3):
         state, scene = followed(gas, position, velocity, len(gaps), end, interval)
         assert bool(jnp.all(state.tangents.free))
-        c = thermal_projection(state.tangents, state.velocity).log_temperature
-        got = float(jnp.mean(c) * scene.dissipative_constant)
+        c = state.tangents.projected(state.velocity, jnp.zeros(len(gaps))).log_temperature
+        got = float(jnp.mean(c) * scene.material.law.dissipative_constant)
         speed = 2.0 * float(jnp.sqrt(gas.temperature))
         # The onset's sqrt(xi) in steps of t_c/40 leaves 1e-3 of a slope on average over its phase.
         assert got == pytest.approx(loss_slope(gas, angle, speed), rel=5e-3)
@@ -95,16 +94,16 @@ def test_the_tangent_is_exact_between_projections(beads):
     start = jaxgran.cool(gas.replace(dissipative_constant=0.0), times, model=model).particles
     position = np.asarray(start.position[0] / gas.diameter)
     velocity = np.asarray(start.velocity[0] / jnp.sqrt(gas.temperature))
-    scene = reduced_soft_scene(gas, 100)
+    scene = SoftSpheres(100).scene(gas)
     end = 0.8 / float(scene.collision_frequency)
 
     def plain(constant):
         pieces = SoftSpheres(100, start=start, projection=None)
-        a = gas.value("dissipative_constant") * constant / scene.dissipative_constant
+        a = gas.value("dissipative_constant") * constant / scene.material.law.dissipative_constant
         curve = jaxgran.cool(gas.replace(dissipative_constant=a), times, model=pieces)
         return curve.particles.velocity[0] / jnp.sqrt(gas.temperature)
 
-    exact = slope(plain, scene.dissipative_constant)
+    exact = slope(plain, scene.material.law.dissipative_constant)
     state, _ = followed(gas, position, velocity, 1, end, 1e3)
     # Two codes for one derivative, round-off grown by the chaos of one collision time: 1e-12.
     scale = float(jnp.max(jnp.abs(exact)))
@@ -160,7 +159,7 @@ def test_slope_does_not_depend_on_the_interval(beads):
 @pytest.mark.slow
 def test_touching_two_and_three_bodies_have_finite_slopes(beads):
     gas = soft_beads(beads, 0.02, 0.2, packing_fraction=0.02)
-    scene = reduced_soft_scene(gas, 3)
+    scene = SoftSpheres(3).scene(gas)
     side = float(scene.side)
     middle = np.full(3, side / 2)
     e = np.eye(3)

@@ -6,26 +6,20 @@ them out of the derivative.
 """
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from jaxgran._utils import status
 from jaxgran.gradients import rule
 from jaxgran.gradients.tangents import (
-    ElementMaterial,
-    FrictionMaterial,
-    RotationTangents,
-    ThermalTangents,
-    initial_tangents,
-    project_if_due,
+    ContactTangents,
+    component_along,
     ratio_or_zero,
-    thermal_projection,
     update_rates,
 )
 from jaxgran.particles import observables
@@ -39,21 +33,17 @@ from jaxgran.particles.dynamics import (
 )
 from jaxgran.particles.neighbours import Pairs
 from jaxgran.particles.soft.forces import (
+    PAIR,
+    WALL,
     ContactCandidates,
-    ContactWork,
-    ElementSums,
-    ElementWork,
-    SoftScene,
     Spheres,
     block_members,
     elastic_energy,
     fly,
-    integrate_smooth,
-    integrate_with_elements,
-    near_walls,
+    integrate,
     overlap,
     select_contact_candidates,
-    wall_energy,
+    wall_overlap,
 )
 from jaxgran.particles.state import (
     State,
@@ -64,10 +54,10 @@ from jaxgran.particles.state import (
     fastest,
     initial_spins,
     kinetic_energy,
-    temperature,
     time_left,
     wrap_positions,
 )
+from jaxgran.scene.reduced import ReducedDrag, SphereMaterial, SphereScene
 from jaxgran.theory.equations import COOLING_CORRECTION
 
 WORK_TOLERANCE = 0.1
@@ -116,22 +106,35 @@ class SoftProgress(NamedTuple):
     Attributes:
         extra: particles whose contacts were detected only after a block had been integrated.
         reach_factor: factor by which the reach of the next block is enlarged.
-        num_blocks: number of blocks with this neighbour list.
     """
 
     extra: Bool[Array, "n"]
     reach_factor: Float[Array, ""]
-    num_blocks: Int[Array, ""]
 
 
-class _BlockResult(NamedTuple):
-    """Result of one block, not yet accepted."""
+class Block(NamedTuple):
+    """Result of one block, not yet accepted.
+
+    Attributes:
+        state: after the block, at its old time, with tangents that are not yet projected.
+        lost_in_contacts: energy lost in contacts, of pairs and at walls.
+        lost: energy lost in contacts and to drag.
+        exchanged: work of the elastic forces, with all its parts counted as positive.
+        begun: number of contacts of pairs that began.
+        free: True for particles without contact.
+        unexpected: particles that touched another one or a wall although not all of their
+            neighbours belong to the candidates.
+        max_square_move: square of the largest distance that a member moved.
+    """
 
     state: State
-    work: ContactWork
-    max_square_move: Array  # square of the largest distance that a member moved
-    sums: ElementSums | None  # energies by walls and drag
-    hit_walls: Array | None  # particles that touched a wall without being expected to
+    lost_in_contacts: Float[Array, "replicas"]
+    lost: Float[Array, "replicas"]
+    exchanged: Float[Array, "replicas"]
+    begun: Int[Array, "replicas"]
+    free: Bool[Array, "n"]
+    unexpected: Bool[Array, "n"]
+    max_square_move: Float[Array, ""]
 
 
 class SoftDynamics(AbstractDynamics):
@@ -144,7 +147,7 @@ class SoftDynamics(AbstractDynamics):
         projection: mean free times between thermal projections of tangents.
     """
 
-    scene: SoftScene
+    scene: SphereScene
     replicas: int = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
     steps_per_contact: int = eqx.field(static=True)
@@ -157,16 +160,23 @@ class SoftDynamics(AbstractDynamics):
         return SoftState(zeros, jnp.ones((), dtype), jnp.zeros((), jnp.int32), zeros)
 
     def elastic(self) -> "SoftDynamics":
-        return dataclasses.replace(self, scene=self.scene.lossless())
+        """Return the dynamics of smooth spheres in a vacuum, between elastic walls."""
+        scene = self.scene
+        return dataclasses.replace(self, scene=scene.with_material(scene.material.lossless()))
 
-    def with_tangents(self, state: State, directions: tuple[Any, ...]) -> State:
-        tangents = initial_soft_tangents(self.scene, state, directions, self.projection)
+    def with_tangents(self, state: State, directions: SphereMaterial) -> State:
+        spin, surface, along = state.internal.spin, self.scene.material.surface, directions.surface
+        if spin is not None:
+            # Spins of q s^2 = ratio: nan along a ratio that is 0, of which they are a square root.
+            growth = jnp.where(along.ratio == 0, 0.0, along.ratio / surface.ratio)
+            growth -= along.inertia / surface.inertia
+            spin = 0.5 * growth[:, None, None] * spin[None]
+        tangents = ContactTangents.initial(directions, state.velocity, self.replicas, spin)
         return state._replace(tangents=tangents)
 
     @property
     def region(self) -> Array | None:
-        walls = self.scene.walls
-        return None if walls is None else walls.sides - 1
+        return None if self.scene.container is None else self.scene.container - 1
 
     @property
     def galilean_invariant(self) -> bool:
@@ -176,7 +186,7 @@ class SoftDynamics(AbstractDynamics):
         return velocity, state.internal.spin
 
     def sample_spins(self, state: State, key: PRNGKeyArray, equilibrated: State) -> State:
-        surface = self.scene.surface
+        surface = self.scene.material.surface
         if surface is None:
             return state
         spin = initial_spins(key, state.velocity, self.replicas, surface.ratio / surface.inertia)
@@ -192,19 +202,17 @@ class SoftDynamics(AbstractDynamics):
     def advance(
         self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
     ) -> Progress:
-        xi, _, touching = overlap(state.position, pairs.i, pairs.j, pairs.offset)
+        x, material = state.position, self.scene.material
+        xi, _, touching = overlap(x, pairs.i, pairs.j, pairs.offset)
         touching &= jnp.arange(len(xi)) < pairs.count
-        stored = elastic_energy(jnp.where(touching, xi, 0.0), self.scene.alpha)
-        replica = pairs.i // (len(state.position) // self.replicas)
+        stored = elastic_energy(jnp.where(touching, xi, 0.0), material.law, PAIR)
+        replica = pairs.i // (len(x) // self.replicas)
         elastic = jnp.zeros_like(state.internal.elastic).at[replica].add(stored)
-        if self.scene.walls is not None:
-            wall_energies = wall_energy(self.scene.walls, state.position)
-            elastic += jnp.sum(wall_energies.reshape(self.replicas, -1), axis=1)
-        internal = SoftProgress(
-            extra=jnp.zeros(len(state.position), bool),
-            reach_factor=jnp.ones((), state.position.dtype),
-            num_blocks=jnp.zeros((), jnp.int32),
-        )
+        if self.scene.container is not None:
+            depth = wall_overlap(self.scene.container, x)[0]
+            stored = jnp.sum(elastic_energy(depth, material.wall_law, WALL), axis=-1)
+            elastic += jnp.sum(stored.reshape(self.replicas, -1), axis=1)
+        internal = SoftProgress(jnp.zeros(len(x), bool), jnp.ones((), x.dtype))
         state = state._replace(internal=state.internal._replace(elastic=elastic))
         first = initial_progress(state, pairs, self.capacity, internal)
         block = partial(self._advance_block, listed=listed, pairs=pairs, end=end)
@@ -231,35 +239,18 @@ class SoftDynamics(AbstractDynamics):
             internal.extra,
             self.replicas,
             self.capacity[2:],
-            near_walls(self.scene.walls, old.position, old.velocity, duration),
+            self.scene.container,
         )
-        result = self._integrate_block(old, candidates, duration)
-        new = result.state
-        new = advance_time(new, duration, end, num_left <= 1)
+        block = self._integrate_block(old, candidates, duration)
+        new = advance_time(block.state, duration, end, num_left <= 1)
         if old.tangents is not None:
-            old_spin = old.internal.spin
-            tangents = tangents_after_block(
-                new, old_spin, candidates, result.work, result.sums, duration, self.scene
-            )
-            new = new._replace(tangents=tangents)
-        work = result.work
+            new = new._replace(tangents=self._project_if_due(old, new, block, duration))
 
         # A sphere outside the candidates was hit, or one went farther than the reach.
-        unexpected = work.touched & ~candidates.expected
-        partners = candidates.members[jnp.stack([candidates.a, candidates.b], 1)]
-        hit_particles = jnp.where(unexpected[:, None], partners, len(old.position))
-        extra = internal.extra.at[hit_particles].set(True, mode="drop")
-        too_far = result.max_square_move > reach**2
-        repeat = jnp.any(unexpected) | too_far
-        if result.hit_walls is not None:
-            extra = extra.at[result.hit_walls].set(True, mode="drop")
-            repeat |= jnp.any(result.hit_walls < len(old.position))
-
+        too_far = block.max_square_move > reach**2
+        repeat = too_far | jnp.any(block.unexpected)
         displacement = jnp.sqrt(jnp.max(jnp.sum((new.position - listed) ** 2, -1)))
-        sum_by_replica = partial(candidates.sum_by_replica, replicas=self.replicas)
-        error, allowed = energy_error(self.scene, old, new, work, sum_by_replica, result.sums)
-        new = self._record_energy_error(new, error)
-        fault = self._block_status(old, new, error, allowed, candidates, displacement)
+        new, fault = self._check_block(old, new, block, candidates, displacement)
         accepted = (fault == status.OK) & ~repeat
         enlarged = jnp.where(too_far, 2 * internal.reach_factor, internal.reach_factor)
         return Progress(
@@ -268,23 +259,29 @@ class SoftDynamics(AbstractDynamics):
             status=fault,
             needed=jnp.maximum(now.needed, candidates.needed),
             internal=SoftProgress(
-                extra=jnp.where(accepted, False, extra),
+                extra=jnp.where(accepted, False, internal.extra | block.unexpected),
                 reach_factor=jnp.where(accepted, 1.0, enlarged),
-                num_blocks=internal.num_blocks + 1,
             ),
         )
 
     def _block_duration(self, state: State, end: ArrayLike) -> tuple[Array, Array, Array]:
         """Return the duration of the next block, the number of blocks of this length until the end,
         and the temperature of the hottest replica, with the energy in its contacts."""
+        scene, velocity = self.scene, centred(state.velocity, self.replicas)
+        if not scene.galilean_invariant:  # walls and drag do not move with the centre of mass
+            velocity = state.velocity.reshape(velocity.shape)
         # Without the energy in contacts a step would lengthen while all energy is stored there.
         stored = 2 * self.replicas / state.position.size * state.internal.elastic
-        hottest = jnp.max(temperature_lab_frame(self.scene, state.velocity, self.replicas) + stored)
+        hottest = jnp.max(observables.temperature(velocity) + stored)
         if state.internal.spin is not None:
-            hottest_spins = rotational_temperature(self.scene, state.internal.spin, self.replicas)
+            hottest_spins = rotational_temperature(scene, state.internal.spin, self.replicas)
             hottest = jnp.maximum(hottest, jnp.max(hottest_spins))
+        shortest_contact, material = scene.contact_duration, scene.material
+        if material.wall_law is not None:  # durations go as alpha^(-2/5) v^(-1/5)
+            on_wall = shortest_contact * (material.law.alpha / material.wall_law.alpha) ** 0.4
+            shortest_contact = jnp.minimum(shortest_contact, on_wall)
         per_contact = self.steps_per_contact * state.internal.refinement
-        longest_step = self.scene.shortest_contact * hottest**-0.1 / per_contact
+        longest_step = shortest_contact * hottest**-0.1 / per_contact
         longest = self.steps_per_block * longest_step
         time_until_end = time_left(state, end)
         num_left = jnp.maximum(jnp.ceil(time_until_end / longest * (1 - 1e-9)), 1.0)
@@ -292,82 +289,124 @@ class SoftDynamics(AbstractDynamics):
 
     def _integrate_block(
         self, state: State, candidates: ContactCandidates, duration: Array
-    ) -> _BlockResult:
-        """Return the state after the block, at its old time and with tangents not yet projected."""
-        all_spheres = Spheres(state.position, state.velocity, state.internal.spin)
-        members = block_members(self.scene, all_spheres, candidates.members)
-        update = integrate_with_tangents(
-            members,
-            all_spheres,
-            self.scene,
-            candidates,
-            duration,
-            self.steps_per_block,
-            state.tangents,
-        )
+    ) -> Block:
+        scene, replicas, members = self.scene, self.replicas, candidates.members
+        n = len(state.position)
+        replica_of_particle = jnp.arange(n) // (n // replicas)
+        replica_of_member = jnp.minimum(members // (n // replicas), replicas - 1)
 
-        def put_members(values, new):
-            return values.at[candidates.members].set(new, mode="drop")
-
-        sum_by_replica = partial(candidates.sum_by_replica, replicas=self.replicas)
-        internal = state.internal._replace(elastic=sum_by_replica(update.work.stored))
-        flown, drag_loss = fly(self.scene, all_spheres, duration, self.scene.element_material)
-        new = state._replace(
-            position=put_members(flown.x, update.x),
-            velocity=put_members(flown.v, update.v),
-            dissipated=state.dissipated + sum_by_replica(update.work.dissipated),
-            collisions=state.collisions + sum_by_replica(update.work.begun),
-            internal=internal,
-            tangents=update.tangents,
-        )
-        sums = hit_walls = None
-        if update.element_work is not None:
-            sums = ElementSums.from_work(
-                update.element_work, candidates.members, drag_loss, self.replicas, len(flown.x)
+        def move(spheres: Spheres, material: SphereMaterial):
+            """Return all spheres after free flight, the members after the block, and energies."""
+            stepped, work = integrate(
+                scene,
+                block_members(scene, spheres, members),
+                material._replace(
+                    law=_of_rows(material.law, candidates.replica),
+                    wall_law=_of_rows(material.wall_law, replica_of_member),
+                    drag=_of_rows(material.drag, replica_of_member),
+                ),
+                candidates,
+                duration,
+                self.steps_per_block,
             )
-            spin = None if flown.spin is None else put_members(flown.spin, update.spin)
-            internal = internal._replace(elastic=internal.elastic + sums.stored, spin=spin)
-            new = new._replace(internal=internal, dissipated=new.dissipated + sums.lost)
-            if candidates.expected_at_walls is not None:
-                hit_walls = jnp.where(
-                    update.element_work.touched & ~candidates.expected_at_walls,
-                    candidates.members,
-                    len(flown.x),
-                )
-        max_square_move = jnp.max(jnp.sum((update.x - members.x) ** 2, -1))
-        return _BlockResult(new, update.work, max_square_move, sums, hit_walls)
+            drag = _of_rows(material.drag, replica_of_particle)
+            flown, lost_to_drag = fly(scene, spheres, duration, material._replace(drag=drag))
+            return (flown, stepped), (work, lost_to_drag)
 
-    def _record_energy_error(self, new: State, error: Float[Array, "replicas"]) -> State:
-        """Add the energy error of a block, and double the step again after enough good blocks."""
+        def put_members(values: Array, new: Array) -> Array:
+            return values.at[members].set(new, mode="drop")
+
+        def sum_members(values: Array, others: ArrayLike = 0.0) -> Float[Array, "replicas"]:
+            all_particles = put_members(jnp.broadcast_to(others, (n,)).astype(values.dtype), values)
+            return jnp.sum(all_particles.reshape(replicas, -1), axis=1)
+
+        spheres = Spheres(state.position, state.velocity, state.internal.spin)
+        tangents = state.tangents
+        if tangents is None or len(tangents.clock) == 0:
+            ends, (work, lost_to_drag) = move(spheres, scene.material)
+        else:
+            material, material_tangents = _material_by_replica(scene.material, tangents)
+            ends, end_tangents, (work, lost_to_drag) = jax.vmap(
+                lambda *tangent: jax.jvp(move, (spheres, material), tangent, has_aux=True),
+                out_axes=(None, 0, None),
+            )(Spheres(tangents.position, tangents.velocity, tangents.spin), material_tangents)
+            x, v, spin = jax.tree.map(jax.vmap(put_members), *end_tangents)
+            tangents = tangents._replace(position=x, velocity=v, spin=spin)
+        pairs, walls, member_loss = work
+        x, v, spin = jax.tree.map(put_members, *ends)
+
+        def mark_partners(mask: Bool[Array, "contacts"]) -> Bool[Array, "n"]:
+            partners = members[jnp.stack([candidates.a, candidates.b], 1)]
+            rows = jnp.where(mask[:, None], partners, n)
+            return jnp.zeros(n, bool).at[rows].set(True, mode="drop")
+
+        def sum_pairs(values: Array) -> Shaped[Array, "replicas"]:
+            return jnp.zeros(replicas, values.dtype).at[candidates.replica].add(values)
+
+        lost, exchanged, stored = map(sum_pairs, (pairs.dissipated, pairs.exchanged, pairs.stored))
+        touching = mark_partners(pairs.touching)
+        unexpected = mark_partners(pairs.touched & ~candidates.expected)
+        if walls is not None:
+            lost += sum_members(walls.dissipated)
+            exchanged += sum_members(walls.exchanged)
+            stored += sum_members(walls.stored)
+            touching |= put_members(jnp.zeros(n, bool), walls.touching)
+            surprise = walls.touched & ~candidates.expected_at_walls
+            unexpected |= put_members(jnp.zeros(n, bool), surprise)
+        lost_with_drag = lost
+        if member_loss is not None and lost_to_drag is not None:
+            lost_with_drag = lost + sum_members(member_loss, lost_to_drag)
+        begun = sum_pairs(pairs.begun)
+        moved = ends[1].x - block_members(scene, spheres, members).x
+        return Block(
+            state=state._replace(
+                position=x,
+                velocity=v,
+                dissipated=state.dissipated + lost_with_drag,
+                collisions=state.collisions + begun,
+                internal=state.internal._replace(elastic=stored, spin=spin),
+                tangents=tangents,
+            ),
+            lost_in_contacts=lost,
+            lost=lost_with_drag,
+            exchanged=exchanged,
+            begun=begun,
+            free=~touching,
+            unexpected=unexpected,
+            max_square_move=jnp.max(jnp.sum(moved**2, -1)),
+        )
+
+    def _check_block(
+        self,
+        old: State,
+        new: State,
+        block: Block,
+        candidates: ContactCandidates,
+        displacement: Array,
+    ) -> tuple[State, Int[Array, ""]]:
+        """Return the state with the energy error of a block, and its status.
+
+        The step is doubled again after enough good blocks.
+
+        Args:
+            old, new: the state before and after the block.
+            block, candidates: the block and its pairs.
+            displacement: largest distance that a sphere moved since the neighbour list was built.
+        """
+        before, after = (self._energy(state) for state in (old, new))
+        total = jnp.where(before > 0, before, 1.0)
+        error = (after - before + block.lost) / total
+        allowed = WORK_TOLERANCE * block.exchanged / total + ENERGY_TOLERANCE
         internal = new.internal
-        num_good = internal.num_good + 1
+        num_good, drift = internal.num_good + 1, internal.drift + error
         recovers = (num_good >= RECOVERY_BLOCKS) & (internal.refinement > 1)
         internal = internal._replace(
             num_good=jnp.where(recovers, 0, num_good),
             refinement=jnp.where(recovers, 0.5 * internal.refinement, internal.refinement),
-            drift=internal.drift + error,
+            drift=drift,
         )
-        return new._replace(internal=internal)
-
-    def _block_status(
-        self,
-        old: State,
-        new: State,
-        error: Float[Array, "replicas"],
-        allowed: Float[Array, "replicas"],
-        candidates: ContactCandidates,
-        displacement: Array,
-    ) -> Int[Array, ""]:
-        """Return the status of a block.
-
-        Args:
-            old, new: the state before and after it.
-            error, allowed: see `energy_error`.
-            candidates: the pairs.
-            displacement: largest distance that a sphere moved since the neighbour list was built.
-        """
         energy_wrong = jnp.any(jnp.abs(error) > allowed)
-        drifted = jnp.any(jnp.abs(new.internal.drift) > DRIFT_TOLERANCE)
+        drifted = jnp.any(jnp.abs(drift) > DRIFT_TOLERANCE)
         list_status = self.capacity.exceeded_by(candidates.needed)
         finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
         exceeded = status.flag(status.SKIN_EXCEEDED, displacement > 0.5 * old.skin)
@@ -375,7 +414,56 @@ class SoftDynamics(AbstractDynamics):
         fault |= status.flag(status.STEP_TOO_LARGE, energy_wrong & finite)
         fault |= status.flag(status.ENERGY_DRIFT, drifted & ~energy_wrong & finite)
         # A block whose arrays were too short lacks pairs or particles.
-        return jnp.where(list_status > 0, list_status, fault)
+        fault = jnp.where(list_status > 0, list_status, fault)
+        return new._replace(internal=internal), fault
+
+    def _energy(self, state: State) -> Float[Array, "replicas"]:
+        energy = kinetic_energy(state.velocity, self.replicas)
+        if state.internal.spin is not None:
+            inertia = self.scene.material.surface.inertia
+            energy += inertia * kinetic_energy(state.internal.spin, self.replicas)
+        return energy + state.internal.elastic
+
+    def _project_if_due(
+        self, old: State, new: State, block: Block, duration: ArrayLike
+    ) -> ContactTangents:
+        """Return the tangents after a block, projected if a projection is due."""
+        tangents, scene, replicas = new.tangents, self.scene, self.replicas
+        velocity = peculiar_velocity(scene, new.velocity, replicas)
+        T, velocity = observables.temperature(velocity), velocity.reshape(new.velocity.shape)
+        energy = kinetic_energy(velocity, replicas)
+        lost, gain_ratio, spin = block.lost_in_contacts, tangents.rotational_gain, new.internal.spin
+        if spin is not None:  # in contacts rotation gained its change less that by drag
+            first, last = (kinetic_energy(s, replicas) for s in (old.internal.spin, spin))
+            gain = last - first
+            if (drag := drag_rates(scene)) is not None:
+                gain += drag.rotational_rate * duration * (first + last)
+            gain = scene.material.surface.inertia * gain
+            lost += gain
+            passed = duration * jnp.sqrt(T) * scene.collision_frequency
+            ratio = ratio_or_zero(rotational_temperature(scene, spin, replicas), T)
+            gain_ratio = gain_ratio.after(passed, gain, energy * passed, ratio)
+        tangents = tangents._replace(
+            free=block.free,
+            rates=update_rates(
+                tangents.rates,
+                lost=lost,
+                collisions=2 * replicas / len(new.position) * block.begun,
+                energy=energy + new.internal.elastic,
+                temperature=T,
+                trend=cooling_trend(scene, T),
+                duration=duration,
+                collision_frequency=scene.collision_frequency,
+            ),
+            elapsed=tangents.elapsed + duration,
+            thermal_elapsed=tangents.thermal_elapsed + duration * jnp.sqrt(T),
+            rotational_gain=gain_ratio,
+        )
+        passed = tangents.elapsed * jnp.sqrt(jnp.mean(T))
+        due = passed * scene.collision_frequency >= self.projection
+        cooling = cooling_rate(scene, tangents, T)
+        projected = tangents.projected(velocity, cooling, spin)
+        return jax.tree.map(lambda new, old: jnp.where(due, new, old), projected, tangents)
 
     def recover(self, now: Progress, before: State) -> tuple[State, Int[Array, ""]]:
         """Halve a step that was too large, and lengthen a skin that was exceeded."""
@@ -397,390 +485,82 @@ class SoftDynamics(AbstractDynamics):
         return recovered, jnp.where(unrecoverable, now.status, now.status & fatal)
 
 
-def peculiar_velocity(
-    scene: SoftScene, velocity: Float[Array, "n d"], replicas: int
-) -> Float[Array, "n d"]:
-    """Return velocities in the frame of each centre of mass, or in that of the walls."""
-    if scene.walls is not None:
-        return velocity
-    return centred(velocity, replicas).reshape(velocity.shape)
+def _of_rows(numbers: Any, replica: Int[Array, "rows"]) -> Any:
+    """Return numbers by replica as one number per row, and numbers of all replicas as they are."""
+    return jax.tree.map(lambda x: x[replica] if jnp.ndim(x) else x, numbers)
 
 
-def scene_temperature(
-    scene: SoftScene, velocity: Float[Array, "n d"], replicas: int
-) -> Float[Array, "replicas"]:
-    """Return T of each replica, in the frame of `peculiar_velocity`."""
-    if scene.walls is None:
-        return temperature(velocity, replicas)
-    return observables.temperature(velocity.reshape(replicas, -1, velocity.shape[-1]))
+def _material_by_replica(
+    material: SphereMaterial, tangents: ContactTangents
+) -> tuple[SphereMaterial, SphereMaterial]:
+    """Return the material and its tangents, by replica for all that a change of clock changes.
 
-
-def temperature_lab_frame(
-    scene: SoftScene, velocity: Float[Array, "n d"], replicas: int
-) -> Float[Array, "replicas"]:
-    """Return T of each replica for the choice of the time step.
-
-    It includes the velocity of the centre of mass where there are walls or drag, which do not move
-    with it.
+    Velocities that are (1 + c/2) times as large in the same material are those of a slower clock
+    in the material for spheres that are (1 - c/2) times as fast.
     """
-    if scene.galilean_invariant:
-        return temperature(velocity, replicas)
-    return observables.temperature(velocity.reshape(replicas, -1, velocity.shape[-1]))
+    c, one = tangents.log_temperature, jnp.ones_like(tangents.elapsed)
+    by_clock = jax.jvp(material.faster, (one,), (-0.5 * one,))[1]
+
+    def without_surfaces(numbers: SphereMaterial) -> SphereMaterial:
+        return numbers._replace(surface=None, wall_surface=None)
+
+    changes = jax.tree.map(
+        lambda direction, change: direction[:, None] + c * change,
+        *map(without_surfaces, (tangents.directions, by_clock)),
+    )
+    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, c.shape[1:]), without_surfaces(material))
+
+    def with_surfaces_of(numbers: SphereMaterial, source: SphereMaterial) -> SphereMaterial:
+        return numbers._replace(surface=source.surface, wall_surface=source.wall_surface)
+
+    return with_surfaces_of(rows, material), with_surfaces_of(changes, tangents.directions)
+
+
+def drag_rates(scene: SphereScene) -> ReducedDrag | None:
+    """Return the rates of drag in the unit of time of a scene."""
+    return jax.tree.map(lambda rate: rate * scene.collision_frequency, scene.material.drag)
+
+
+def cooling_trend(
+    scene: SphereScene, temperature: Float[Array, "replicas"]
+) -> Float[Array, "replicas"]:
+    """Return the dependence of the cooling rate on T, ``T^(3/5) / (1 + q delta T^(1/10))``.
+
+    It has the first two terms of the rate in the dissipation delta.
+    """
+    law = scene.material.law
+    damping = COOLING_CORRECTION * law.dissipative_constant * law.alpha**0.4
+    return temperature**0.6 / (1 + damping * temperature**0.1)
+
+
+def cooling_rate(
+    scene: SphereScene, tangents: ContactTangents, temperature: Float[Array, "replicas"]
+) -> Float[Array, "replicas"]:
+    """Return ``-d ln T/dt`` at a temperature, by contacts and drag."""
+    by_contacts = tangents.rates.cooling(cooling_trend(scene, temperature))
+    drag = drag_rates(scene)
+    return by_contacts if drag is None else by_contacts + 2 * drag.rate
+
+
+def peculiar_velocity(
+    scene: SphereScene, velocity: Float[Array, "n d"], replicas: int
+) -> Float[Array, "replicas N d"]:
+    """Return velocities in the frame of each centre of mass, or in that of the walls."""
+    if scene.container is None:
+        return centred(velocity, replicas)
+    return velocity.reshape(replicas, -1, velocity.shape[-1])
 
 
 def rotational_temperature(
-    scene: SoftScene, spin: Float[Array, "n spins"], replicas: int
+    scene: SphereScene, spin: Float[Array, "n spins"], replicas: int
 ) -> Float[Array, "replicas"]:
     """Return T_rot of each replica, ``q <s^2>/d_rot``."""
-    assert scene.surface is not None
     spin_by_replica = spin.reshape(replicas, -1, spin.shape[-1])
-    return scene.surface.inertia * observables.temperature(spin_by_replica)
-
-
-def total_kinetic_energy(scene: SoftScene, state: State) -> Float[Array, "replicas"]:
-    """Return the kinetic energy of translation and rotation of each replica."""
-    replicas, spin = len(state.internal.elastic), state.internal.spin
-    energy = kinetic_energy(state.velocity, replicas)
-    if spin is None or scene.surface is None:
-        return energy
-    return energy + scene.surface.inertia * kinetic_energy(spin, replicas)
-
-
-def energy_error(
-    scene: SoftScene,
-    old: State,
-    new: State,
-    work: ContactWork,
-    sum_by_replica: Callable[[Array], Array],
-    sums: ElementSums | None,
-) -> tuple[Float[Array, "replicas"], Float[Array, "replicas"]]:
-    """Return the energy that a block added over all energy, and the allowed value.
-
-    Args:
-        scene: the gas.
-        old, new: the state before and after the block.
-        work: energies of pairs in it.
-        sum_by_replica: sums values of pairs over each replica.
-        sums: energies by walls and drag; None where the gas has no elements.
-    """
-    before = total_kinetic_energy(scene, old) + old.internal.elastic
-    after = total_kinetic_energy(scene, new) + new.internal.elastic
-    gain = after - before + sum_by_replica(work.dissipated)
-    total = jnp.where(before > 0, before, 1.0)
-    exchanged = sum_by_replica(work.exchanged) / total
-    if sums is not None:
-        gain, exchanged = gain + sums.lost, exchanged + sums.exchanged / total
-    return gain / total, WORK_TOLERANCE * exchanged + ENERGY_TOLERANCE
-
-
-class MemberUpdate(NamedTuple):
-    """The members after the steps of a block.
-
-    Attributes:
-        x, v: positions and velocities.
-        spin: spins; None of smooth spheres.
-        work: energies and contacts of pairs.
-        element_work: energies by walls and drag; None where the gas has no elements.
-        tangents: tangents of all particles; None in a run without tangents.
-    """
-
-    x: Float[Array, "members d"]
-    v: Float[Array, "members d"]
-    spin: Float[Array, "members spins"] | None
-    work: ContactWork
-    element_work: ElementWork | None
-    tangents: ThermalTangents | None
-
-
-def integrate_with_tangents(
-    members: Spheres,
-    all_spheres: Spheres,
-    scene: SoftScene,
-    candidates: ContactCandidates,
-    duration: Array,
-    num_steps: int,
-    tangents: ThermalTangents | None,
-) -> MemberUpdate:
-    """Return the members after the steps of a block, with the exact tangents of all particles.
-
-    The tangents of members are pushed forward through the steps; those of all other particles are
-    pushed through free flight.
-
-    Args:
-        members: the spheres to step.
-        all_spheres: all particles before the block.
-        scene: the gas.
-        candidates: the pairs that may touch, and their particles.
-        duration: of the block.
-        num_steps: number of steps in the block.
-        tangents: tangents of all particles; None in a run without tangents.
-    """
-    take_steps = partial(
-        _take_steps, scene=scene, candidates=candidates, duration=duration, num_steps=num_steps
-    )
-    if tangents is None or len(tangents.alpha) == 0:
-        stepped, energies = take_steps(
-            members,
-            scene.alpha,
-            scene.dissipative_constant,
-            scene.element_material,
-            scene.friction_material,
-        )
-        return MemberUpdate(*stepped, *energies, tangents)
-    stepped, energies, stepped_tangents = _step_with_tangents(
-        take_steps, members, all_spheres, scene, candidates, duration, tangents
-    )
-    rotation = tangents.rotation
-    if rotation is not None:
-        rotation = rotation._replace(spin=stepped_tangents.spin)
-    tangents = tangents._replace(
-        position=stepped_tangents.x, velocity=stepped_tangents.v, rotation=rotation
-    )
-    return MemberUpdate(*stepped, *energies, tangents)
-
-
-def _step_with_tangents(
-    take_steps: Callable[..., tuple[Spheres, tuple[ContactWork, ElementWork | None]]],
-    members: Spheres,
-    all_spheres: Spheres,
-    scene: SoftScene,
-    candidates: ContactCandidates,
-    duration: Array,
-    tangents: ThermalTangents,
-) -> tuple[Spheres, tuple[ContactWork, ElementWork | None], Spheres]:
-    """Return the members after a block, the energies, and the tangents of all particles."""
-    ones = jnp.ones(len(candidates.a), members.x.dtype)
-    to_members = partial(_broadcast_to_members, size=len(members.x))
-    pair_material = scene.alpha, scene.dissipative_constant
-    primals = (
-        members,
-        *(number * ones for number in pair_material),
-        to_members(scene.element_material),
-        scene.friction_material,
-    )
-    take_rows = jax.vmap(lambda v: v.at[candidates.members].get(mode="fill", fill_value=0.0))
-    pair_tangents = (
-        tangent[:, candidates.replica] for tangent in tangents.material(*pair_material)
-    )
-    element_tangents, by_replica = ElementMaterial(), ElementMaterial()
-    if tangents.elements is not None:
-        by_replica = tangents.element_material(scene.element_material)
-        size = len(tangents.free) // tangents.log_temperature.shape[1]
-        replica = jnp.minimum(candidates.members // size, tangents.log_temperature.shape[1] - 1)
-        element_tangents = jax.vmap(to_members, axis_size=len(tangents.alpha))(
-            jax.tree.map(lambda x: x[:, replica], by_replica)
-        )
-
-    def push(*tangent):
-        return jax.jvp(take_steps, primals, tangent, has_aux=True)
-
-    rotation = tangents.rotation
-    spin = None if rotation is None else rotation.spin
-    particle_tangents = Spheres(tangents.position, tangents.velocity, spin)
-    friction_tangents = None if rotation is None else rotation.directions
-    stepped, stepped_tangents, energies = jax.vmap(push, out_axes=(None, 0, None))(
-        jax.tree.map(take_rows, particle_tangents),
-        *pair_tangents,
-        element_tangents,
-        friction_tangents,
-    )
-    put_rows = jax.vmap(lambda v, new: v.at[candidates.members].set(new, mode="drop"))
-    if by_replica.drag is None:
-        flown = particle_tangents._replace(x=tangents.position + duration * tangents.velocity)
-    else:
-        flown = _fly_tangents(particle_tangents, all_spheres, scene, duration, by_replica)
-    return stepped, energies, jax.tree.map(put_rows, flown, stepped_tangents)
-
-
-def _fly_tangents(
-    tangents: Spheres,
-    all_spheres: Spheres,
-    scene: SoftScene,
-    duration: Array,
-    material_tangents: ElementMaterial,
-) -> Spheres:
-    """Return the tangents of all particles after a flight with drag.
-
-    Args:
-        tangents: of the particles before the flight.
-        all_spheres: the particles before it.
-        scene: the gas.
-        duration: of the flight.
-        material_tangents: of the rates of drag, by replica. Those of the inertia do not matter: it
-            is not in the equation of a free spin.
-    """
-    material = scene.element_material
-
-    def fly_with_rates(spheres: Spheres, drag: Array, spin_drag: Array | None) -> Spheres:
-        rates = ElementMaterial(drag=drag, spin_drag=spin_drag)
-        return fly(scene, spheres, duration, rates)[0]
-
-    def push(tangent: Spheres, drag: Array, spin_drag: Array | None) -> Spheres:
-        num_spheres = len(all_spheres.x)
-        rate_tangents = jax.tree.map(
-            lambda x: jnp.repeat(x, num_spheres // len(x)), (drag, spin_drag)
-        )
-        rates = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (num_spheres,)), (material.drag, material.spin_drag)
-        )
-        primals, tangent_in = (all_spheres, *rates), (tangent, *rate_tangents)
-        return jax.jvp(fly_with_rates, primals, tangent_in)[1]
-
-    return jax.vmap(push)(tangents, material_tangents.drag, material_tangents.spin_drag)
-
-
-def _broadcast_to_members(material: ElementMaterial, size: int) -> ElementMaterial:
-    """Return numbers of walls as columns with one row per member, and rates of drag as vectors."""
-    vectors = jax.tree.map(lambda value: jnp.broadcast_to(value, (size,)), material)
-    columns = jax.tree.map(lambda value: value[:, None], vectors)
-    return columns._replace(drag=vectors.drag, spin_drag=vectors.spin_drag)
-
-
-def _take_steps(
-    members: Spheres,
-    alpha: Any,
-    dissipative_constant: Any,
-    element_material: ElementMaterial,
-    friction_material: FrictionMaterial | None,
-    scene: SoftScene,
-    candidates: ContactCandidates,
-    duration: Array,
-    num_steps: int,
-) -> tuple[Spheres, tuple[ContactWork, ElementWork | None]]:
-    if not scene.has_elements:
-        x, v, work = integrate_smooth(
-            members.x,
-            members.v,
-            alpha,
-            dissipative_constant,
-            candidates,
-            duration,
-            num_steps,
-            scene.clipped,
-        )
-        return Spheres(x, v, None), (work, None)
-    members, work, element_work = integrate_with_elements(
-        members,
-        alpha,
-        dissipative_constant,
-        element_material,
-        scene.with_friction_material(friction_material),
-        candidates,
-        duration,
-        num_steps,
-    )
-    return members, (work, element_work)
-
-
-def initial_soft_tangents(
-    scene: SoftScene, state: State, directions: tuple[Any, ...], interval: ArrayLike
-) -> ThermalTangents:
-    """Return the tangents of an initial state, along directions in `SoftScene.material`."""
-    alpha, constant, *element_directions = directions
-    damping = COOLING_CORRECTION * scene.dissipative_constant * scene.alpha**0.4
-    replicas, elements, drag = len(state.internal.elastic), None, scene.element_material.drag
-    if element_directions:
-        elements, *element_directions = element_directions
-        # Convert rates over the collision frequency into rates.
-        rates = {"drag": elements.drag, "spin_drag": elements.spin_drag}
-        rates = jax.tree.map(lambda rate: rate * scene.collision_frequency, rates)
-        elements = elements._replace(**rates)
-    tangents = initial_tangents(
-        alpha, constant, state.velocity, replicas, interval, damping, elements, drag
-    )
-    if scene.surface is None:
-        return tangents
-    (friction_material,), surface = element_directions, scene.surface
-    rotation = RotationTangents.initial(
-        friction_material, surface.inertia, surface.ratio, state.internal.spin, replicas
-    )
-    return tangents._replace(rotation=rotation)
-
-
-def tangents_after_block(
-    new: State,
-    old_spin: Array | None,
-    candidates: ContactCandidates,
-    work: ContactWork,
-    sums: ElementSums | None,
-    duration: ArrayLike,
-    scene: SoftScene,
-) -> ThermalTangents:
-    """Return the tangents after a block, projected if a projection is due.
-
-    Args:
-        new: the state after the block, with tangents integrated over it but not projected.
-        old_spin: spins before it; None of smooth spheres.
-        candidates: the pairs of the block.
-        work: energies and contacts of the pairs.
-        sums: energies by walls and drag; None where the gas has no elements.
-        duration: of the block.
-        scene: the gas.
-    """
-    tangents, replicas = new.tangents, len(new.internal.elastic)
-    partners = candidates.members[jnp.stack([candidates.a, candidates.b], 1)]
-    touching_members = jnp.where(work.touching[:, None], partners, len(new.position))
-    velocity = peculiar_velocity(scene, new.velocity, replicas)
-    T = scene_temperature(scene, velocity, replicas)
-    lost, energy = (
-        candidates.sum_by_replica(work.dissipated, replicas),
-        kinetic_energy(velocity, replicas),
-    )
-    lost = lost if sums is None else lost + sums.lost_to_walls
-    if tangents.rotation is not None:
-        rotational_gain = _rotational_gain(scene, old_spin, new.internal.spin, duration, replicas)
-        lost += rotational_gain
-        passed = duration * jnp.sqrt(T) * scene.collision_frequency
-        temperature_ratio = ratio_or_zero(
-            rotational_temperature(scene, new.internal.spin, replicas), T
-        )
-        gain_ratio = tangents.rotation.rotational_gain.after(
-            passed, rotational_gain, energy * passed, temperature_ratio
-        )
-        tangents = tangents._replace(
-            rotation=tangents.rotation._replace(rotational_gain=gain_ratio)
-        )
-    rates = update_rates(
-        tangents.rates,
-        lost=lost,
-        collisions=2
-        * replicas
-        / len(new.position)
-        * candidates.sum_by_replica(work.begun, replicas),
-        energy=energy + new.internal.elastic,
-        temperature=T,
-        trend=tangents.trend(T),
-        duration=duration,
-        collision_frequency=scene.collision_frequency,
-    )
-    free = jnp.ones_like(tangents.free).at[touching_members].set(False, mode="drop")
-    if sums is not None:
-        free &= ~sums.touches_wall
-    tangents = tangents._replace(
-        free=free,
-        rates=rates,
-        elapsed=tangents.elapsed + duration,
-        thermal_elapsed=tangents.thermal_elapsed + duration * jnp.sqrt(T),
-    )
-    passed = tangents.elapsed * jnp.sqrt(jnp.mean(T))
-    due = passed * scene.collision_frequency >= tangents.interval
-    return project_if_due(tangents, velocity, due, new.internal.spin)
-
-
-def _rotational_gain(
-    scene: SoftScene, before: Array | None, after: Array, duration: ArrayLike, replicas: int
-) -> Float[Array, "replicas"]:
-    """Return the energy that rotation gained in contacts: its change less that by drag."""
-    assert before is not None and scene.surface is not None
-    old, new = kinetic_energy(before, replicas), kinetic_energy(after, replicas)
-    gain = new - old
-    if (rate := scene.element_material.spin_drag) is not None:
-        gain += rate * duration * (old + new)
-    return scene.surface.inertia * gain
+    return scene.material.surface.inertia * observables.temperature(spin_by_replica)
 
 
 @partial(jax.jit, static_argnames="replicas")
-def soft_records(state: State, scene: SoftScene, replicas: int) -> dict[str, Array]:
+def soft_records(state: State, scene: SphereScene, replicas: int) -> dict[str, Array]:
     """Return the records of a state; with tangents, also those that `rule.with_tangents` adds.
 
     The derivative of T is that of the run up to the projection; those of the other records are
@@ -788,66 +568,44 @@ def soft_records(state: State, scene: SoftScene, replicas: int) -> dict[str, Arr
     """
     values, travelled, velocity = common_records(state, scene.side, replicas)
     values["elastic_energy"] = state.internal.elastic / velocity.shape[1]
-    if scene.walls is not None:  # the frame is that of the walls
+    undefined = set()
+    if scene.container is not None:  # the frame is that of the walls
         velocity = state.velocity.reshape(velocity.shape)
         values["temperature"] = observables.temperature(velocity)
         values["sonine"] = observables.sonine(velocity)
         values["velocity_correlation"] = observables.velocity_correlation(
             state.first_velocity.reshape(velocity.shape), velocity
         )
-    if state.internal.spin is not None:  # it is None during equilibration
-        values["rotational_temperature"] = rotational_temperature(
-            scene, state.internal.spin, replicas
-        )
-    tangents = state.tangents
-    if tangents is None:
-        return _drop_undefined(values, scene)
-    T, U = values["temperature"], values["elastic_energy"]
-    cooling, collision_rate = tangents.cooling(T), tangents.rates.collision(T)
-    c, clock, paths = thermal_projection(tangents, velocity.reshape(state.velocity.shape))
-    derivatives, rates = derivatives_of_records(
-        values, travelled, velocity, c, paths, cooling, collision_rate
+        # Walls bound displacements, and there are no periodic waves between them.
+        undefined = {"displacement", "flow_share"}
+    spin = state.internal.spin
+    if spin is not None:  # it is None during equilibration
+        values["rotational_temperature"] = rotational_temperature(scene, spin, replicas)
+    known = {name: x for name, x in values.items() if name not in undefined}
+    if state.tangents is None:
+        return known
+    tangents, T, U = state.tangents, values["temperature"], values["elastic_energy"]
+    cooling = cooling_rate(scene, tangents, T)
+    projected = tangents.projected(velocity.reshape(state.velocity.shape), cooling)
+    c, collision_rate = projected.log_temperature, tangents.rates.collision(T)
+    along, rates = derivatives_of_records(
+        values, travelled, velocity, c, projected.paths, cooling, collision_rate
     )
-    stiffer = (tangents.alpha / scene.alpha)[:, None]
-    derivatives["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
+    stiffer = (tangents.directions.law.alpha / scene.material.law.alpha)[:, None]
+    along["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
     rates["elastic_energy"] = -1.4 * cooling * U
-    values, unknown = _drop_undefined(values, scene), {}
-    if tangents.rotation is not None:
-        known = "rotational_temperature"
-        derivatives[known], rates[known] = _rotation_derivatives(state, scene, values)
-        # The tangents of paths are known only for smooth spheres.
-        names = {"displacement", "velocity_correlation"} & set(values)
-        unknown = {name: values.pop(name) for name in names}
-    return rule.with_tangents(values, derivatives, rates, clock) | unknown
-
-
-def _rotation_derivatives(
-    state: State, scene: SoftScene, values: dict[str, Array]
-) -> tuple[Array, Array]:
-    """Return the derivatives of T_rot along the directions at a fixed place, and in time."""
-    tangents, spin, T = state.tangents, state.internal.spin, values["temperature"]
-    assert scene.surface is not None and spin is not None
-    rotation, T_rot = tangents.rotation, values["rotational_temperature"]
-    logs = rotation.log_temperature(spin, scene.surface.inertia, tangents.log_temperature)
-    d, d_rot = state.velocity.shape[1], spin.shape[1]
-    rate = (
-        d
-        / d_rot
-        * rotation.rotational_gain.at(ratio_or_zero(T_rot, T))
-        * scene.collision_frequency
-        * T**1.5
-    )
-    if (spin_drag := scene.element_material.spin_drag) is not None:
-        rate -= 2 * spin_drag * T_rot
-    return logs * T_rot[None], rate
-
-
-def _drop_undefined(values: dict[str, Array], scene: SoftScene) -> dict[str, Array]:
-    """Drop the records that a container leaves undefined.
-
-    Walls bound the displacement of a sphere, and there are no periodic waves between them.
-    """
-    if scene.walls is None:
-        return values
-    undefined = "displacement", "flow_share"
-    return {name: value for name, value in values.items() if name not in undefined}
+    if spin is None:
+        return rule.with_tangents(known, along, rates, projected.clock)
+    name, inertia = "rotational_temperature", scene.material.surface.inertia
+    T_rot = values[name]
+    logs = (tangents.directions.surface.inertia / inertia)[:, None] + tangents.log_temperature
+    logs += 2 * component_along(tangents.spin, spin, replicas)
+    gain = tangents.rotational_gain.at(ratio_or_zero(T_rot, T))
+    rate = velocity.shape[-1] / spin.shape[1] * gain * scene.collision_frequency * T**1.5
+    if (drag := drag_rates(scene)) is not None:
+        rate -= 2 * drag.rotational_rate * T_rot
+    along[name], rates[name] = logs * T_rot[None], rate
+    # The tangents of paths are known only for smooth spheres.
+    names = {"displacement", "velocity_correlation"} & set(known)
+    without_tangents = {name: known.pop(name) for name in names}
+    return rule.with_tangents(known, along, rates, projected.clock) | without_tangents
