@@ -251,7 +251,7 @@ def test_waiting_can_be_interrupted(wait):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [jaxgran.SoftSpheres, jaxgran.HardSpheres, jaxgran.DSMC])
+@pytest.mark.parametrize("kind", [jaxgran.HardSpheres, jaxgran.DSMC])
 def test_single_precision_has_no_trend(kind):
     model = kind(50, replicas=32)
     gas = glass_beads(0.01, packing_fraction=0.1)

@@ -72,13 +72,9 @@ def test_t0_and_the_first_temperature_are_not_found_together(measured):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("law", ["viscoelastic", "constant"])
-def test_what_is_not_found_leaves_the_constant_of_the_material(measured, law):
-    gas, curve = measured
-    name = A
-    if law == "constant":
-        gas = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
-        name, curve = "coefficient", synthetic(gas, jax.random.key(0))
+def test_what_is_not_found_leaves_the_constant_of_the_material(measured):
+    gas = dataclasses.replace(measured[0], law=jaxgran.ConstantRestitution(0.9))
+    name, curve = "coefficient", synthetic(gas, jax.random.key(0))
     both = fitted_together(gas, curve, name)
     # The constant of the material does not depend on where the course begins.
     alone = jaxgran.fit(gas, curve, free=(name, "temperature"))

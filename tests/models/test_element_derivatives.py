@@ -32,35 +32,6 @@ def scene(*names) -> jaxgran.Gas:
 ALL = ("surface", "container", "drag", "drive")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["DSMC", "HardSpheres"])
-def test_forward_is_reverse_in_every_float_at_once(kind):
-    gas = scene(*ALL)
-    model = {"DSMC": jaxgran.DSMC(100), "HardSpheres": jaxgran.HardSpheres(N)}[kind]
-    if kind == "HardSpheres":
-        model = model.sized_for(gas)
-    times = jnp.array([0.5, 1.0]) * gas.mean_free_time
-
-    def total(gas):
-        curve = jaxgran.cool(gas, times, model=model)
-        weights = jnp.array([1.0, 2.0])
-        parts = (curve.temperature, curve.rotational_temperature)
-        return sum(jnp.sum(weights * jnp.log(x)) for x in parts) + curve.collisions[1]
-
-    leaves, structure = jax.tree.flatten(gas)
-    change = structure.unflatten([(0.3 + 0.1 * k) * x for k, x in enumerate(leaves)])
-    forward = jax.jvp(total, (gas,), (change,))[1]
-    gradient = jax.grad(total)(gas)
-    reverse = sum(
-        jnp.sum(g * x)
-        for g, x in zip(jax.tree.leaves(gradient), jax.tree.leaves(change), strict=True)
-    )
-    assert float(reverse) == pytest.approx(float(forward), rel=1e-9)  # sums in another order
-    assert all(bool(jnp.all(jnp.isfinite(g))) for g in jax.tree.leaves(gradient))
-    with pytest.raises(ValueError, match="second derivative"):
-        jax.jvp(jax.grad(total), (gas,), (change,))
-
-
 FLOATS = {
     "tangential_restitution": 0.0,
     "inertia": 0.0,

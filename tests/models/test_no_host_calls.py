@@ -16,15 +16,7 @@ MODELS = {
     "hard spheres": lambda gas: jaxgran.HardSpheres(30, replicas=2),
     "soft spheres": lambda gas: jaxgran.SoftSpheres(30, replicas=2),
     "hard spheres, many": lambda gas: jaxgran.HardSpheres(200_000),
-    "hard spheres, start": lambda gas: jaxgran.HardSpheres(30, start=start_of(gas)),
-    "soft spheres, start": lambda gas: jaxgran.SoftSpheres(30, start=start_of(gas)),
 }
-
-
-def start_of(gas):
-    side, apart = gas.box_side(30), 2.2e-3 * jnp.stack(jnp.meshgrid(*[jnp.arange(4.0)] * 3), -1)
-    position = apart.reshape(1, -1, 3)[:, :30]
-    return jaxgran.Particles(position, 0.1 * jnp.sin(1e4 * position), side)
 
 
 def lowered(gas, model):

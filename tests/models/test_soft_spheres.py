@@ -152,6 +152,19 @@ def test_whoever_finds_the_pairs_the_run_is_the_same(beads):
         np.testing.assert_allclose(a.particles.velocity, b.particles.velocity, atol=1e-9)
 
 
+@pytest.mark.slow
+def test_single_precision(beads):
+    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
+    times = [0.5 * float(gas.mean_free_time)]
+    start = jaxgran.cool(gas, [0.0], model=SoftSpheres(200)).particles
+    fine = jaxgran.cool(gas, times, model=SoftSpheres(200, start=start))
+    with jax.enable_x64(False):
+        single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), (gas, start))
+        coarse = jaxgran.cool(single[0], times, model=SoftSpheres(200, start=single[1]))
+        assert coarse.temperature.dtype == jnp.float32
+    np.testing.assert_allclose(coarse.temperature, fine.temperature, rtol=1e-3)
+
+
 def test_a_plan_is_of_its_model(beads):
     gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.1)
     sized = SoftSpheres(100).sized_for(gas)

@@ -151,11 +151,8 @@ def test_compiling_is_not_said_where_no_bar_would_be(stream, progress):
     assert stream.getvalue() == ""
 
 
-@pytest.mark.parametrize(
-    "model", [jaxgran.DSMC(23), pytest.param(jaxgran.HardSpheres(23), marks=pytest.mark.slow)]
-)
-def test_a_run_says_that_it_compiles_once(model):
-    said = []
+def test_a_run_says_that_it_compiles_once():
+    said, model = [], jaxgran.DSMC(23)
     for _ in range(2):
         with redirect_stderr(Terminal()) as stream:
             jaxgran.cool(glass_beads(), [1e-3], model=model)

@@ -79,14 +79,3 @@ def test_one_point_for_all_is_parted(monkeypatch):
     x, fault = relaxed_positions(jax.random.key(3), 8.0, (1, 3, 3), 0.4, (50, 3))
     assert fault == status.OK
     assert closest(np.asarray(x), 8.0) >= 1 + GAP / 2
-
-
-@pytest.mark.slow
-def test_boxes_of_several_sides_under_vmap():
-    sides = jnp.array([side_of(0.1, 3), side_of(0.3, 3)])
-    keys = jax.random.split(jax.random.key(2), 2)
-    x, fault = jax.vmap(in_a_box)(keys, sides)
-    assert np.all(fault == status.OK)
-    for k in range(2):
-        # Sums in another order, over some hundred pushes that are no chaotic motion.
-        np.testing.assert_allclose(x[k], in_a_box(keys[k], sides[k])[0], atol=1e-9)

@@ -3,11 +3,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import jaxgran
-from jaxgran.scene.geometry import CLOSE_PACKING
 
 
 def test_derived_scales(beads):
@@ -33,22 +30,6 @@ def test_derived_scales(beads):
     assert round(float(gas.thermal_beta), 3) == 0.090
     assert round(float(gas.contact_fraction), 3) == 0.006
     assert float(gas.box_side(4000) / gas.diameter) == pytest.approx(34.73, abs=0.01)
-
-
-def test_dense_scene_scales():
-    # The dense measured scene: beta_T0 = .53, t_c/tau_c = .17, box 22 sigma, above L_c.
-    law = jaxgran.Viscoelastic(2e6, 0.35, 8e-5)
-    gas = jaxgran.Gas(
-        law,
-        diameter=0.004,
-        mass=jaxgran.sphere_mass(0.004, 1200.0),
-        packing_fraction=0.2,
-        temperature=0.04,
-    )
-    assert round(float(gas.thermal_beta), 2) == 0.53
-    assert round(float(gas.contact_fraction), 2) == 0.17
-    assert round(float(gas.box_side(4000) / gas.diameter)) == 22
-    assert gas.box_side(4000) > gas.critical_box
 
 
 def test_contact_duration_is_the_mean_over_impacts(beads):
@@ -118,26 +99,6 @@ def test_bad_scenes_are_refused(values, message):
     )
     with pytest.raises(ValueError, match=message):
         jaxgran.Gas(**(scene | values))  # pyright: ignore
-
-
-@given(phi=st.floats(-1, 2), dimension=st.sampled_from([2, 3]))
-@settings(max_examples=100, deadline=None)
-def test_packing_is_in_range_or_refused(phi, dimension):
-    def build():
-        return jaxgran.Gas(
-            jaxgran.ConstantRestitution(0.9),
-            diameter=1.0,
-            mass=1.0,
-            packing_fraction=phi,
-            temperature=1.0,
-            dimension=dimension,
-        )
-
-    if 0 < phi < CLOSE_PACKING[dimension]:
-        build()
-    else:
-        with pytest.raises(ValueError, match="packing_fraction"):
-            build()
 
 
 def test_replace_knows_names_and_ranges(beads):

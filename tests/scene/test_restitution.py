@@ -154,16 +154,6 @@ def test_bad_laws_are_refused(build, message):
         build()
 
 
-@given(st.floats(allow_nan=True, allow_infinity=True))
-@settings(max_examples=200, deadline=None)
-def test_constant_restitution_is_in_range_or_refused(e):
-    if 0 <= e <= 1:
-        jaxgran.ConstantRestitution(e)
-    else:
-        with pytest.raises(ValueError, match="coefficient"):
-            jaxgran.ConstantRestitution(e)
-
-
 @given(st.floats(0, 1e6))
 @settings(max_examples=200, deadline=None)
 def test_restitution_is_a_fraction(beta):

@@ -180,6 +180,7 @@ def test_the_bias_follows_from_the_energy_of_the_flow():
     np.testing.assert_allclose(at_last, slope_bias(jnp.full(1, 0.04)), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_curve_tells_the_bias_where_the_gas_has_a_flow():
     """0 in a box below L_c; above it, from the flow of the run itself."""
     gas = glass_beads(0.5, packing_fraction=0.2)

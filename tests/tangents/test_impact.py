@@ -84,30 +84,6 @@ def test_slopes_in_every_float_are_those_of_kinetic_theory():
     np.testing.assert_allclose(share, theory[0][:, 0] / np.log(expected), rtol=0.025)
 
 
-@pytest.mark.slow
-def test_fit_finds_what_made_the_curve():
-    gas = glass_beads(**DILUTE)
-    times = jnp.geomspace(0.5, 8.0, 10) * gas.mean_free_time
-    exact = jaxgran.cool(
-        gas, times, model=jaxgran.KineticTheory(softness=False, correlations=False)
-    ).temperature
-    curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
-    # Temperature too, which makes this the program of the test before.
-    free = "dissipative_constant", "temperature"
-    model, key = dilute_model(gas), jax.random.key(3)
-    wrong = gas.replace(dissipative_constant=1.3 * gas.value("dissipative_constant"))
-    result = jaxgran.fit(gas, curve, model=model, free=free, start=wrong, max_steps=4, key=key)
-    for name, slack in (("dissipative_constant", 0.02), ("temperature", 0.0)):
-        estimate, error = result.value(name)
-        true = float(gas.value(name))
-        # Kinetic theory and hard spheres differ by some 1 % in the cooling rate.
-        assert abs(float(estimate) / true - 1) < 3 * float(error) / true + slack
-        assert float(error) < 0.15 * true
-    assert np.all(result.error_budget["simulation"] > 0)
-    assert result.model.name == "hard spheres"
-    assert "Hard spheres are consistent" in jaxgran.diagnose(result, curve).verdict
-
-
 COEFFICIENT = 0.8
 
 
