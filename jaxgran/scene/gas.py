@@ -1,13 +1,11 @@
 """The scene: a homogeneous gas of equal spheres, and the physical scales that follow from it.
 
-`NamedFloats` reads and replaces the floats of a gas and of its elements by name. `critical_length`
-is the length scale of the shear instability.
+`critical_length` is the length scale of the shear instability.
 """
 
-from abc import abstractmethod
 from collections.abc import Iterator
 from math import gamma, pi
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -54,8 +52,6 @@ from jaxgran.scene.laws import (
 )
 from jaxgran.scene.parameters import ADVICE, FLOAT_UNITS, PREFIXES, domains_of, fields_of
 
-S = TypeVar("S", bound="NamedFloats")
-
 
 class FloatField(NamedTuple):
     """Path to a float, of attributes (str) and items (tuples of one key), and its allowed range."""
@@ -68,78 +64,6 @@ class FloatField(NamedTuple):
         for key in self.path:
             module = getattr(module, key) if isinstance(key, str) else module[key[0]]
         return module
-
-
-class NamedFloats(eqx.Module):
-    """A module whose floats, including those of its parts, are read and replaced by name."""
-
-    def __repr__(self) -> str:
-        return text_table(describe_scene(self), describe_floats(self))
-
-    def _repr_html_(self) -> str:
-        return html_table(describe_scene(self), describe_floats(self))
-
-    def __getattr__(self, name: str) -> Any:
-        # Python calls this only for names that are not attributes, such as floats of parts.
-        if not name.startswith("_") and "law" in vars(self) and name in self._float_fields:
-            return self.value(name)
-        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-
-    @property
-    @abstractmethod
-    def _float_fields(self) -> dict[str, FloatField]:
-        """Path and range of every float, by name."""
-
-    @property
-    def domains(self) -> dict[str, Domain]:
-        """Allowed range of every float, by name."""
-        return {name: field.domain for name, field in self._float_fields.items()}
-
-    def value(self, name: str) -> Float[Array, "..."]:
-        """Value of the float with this name.
-
-        Raises:
-            ValueError: for an unknown name.
-        """
-        fields = self._float_fields
-        if name not in fields:
-            raise ValueError(f"no float {name!r} in this gas; it has {', '.join(fields)}")
-        return fields[name].get(self)
-
-    def replace(self: S, **values: UserNumber) -> S:
-        """Return a copy with new values of some floats.
-
-        For example ``gas.replace(dissipative_constant=1e-6)``.
-
-        Args:
-            values: new values, by name of the float.
-
-        Raises:
-            ValueError: for an unknown name or a value outside its range.
-        """
-        fields = self._float_fields
-        for name, value in values.items():
-            self.value(name)
-            fields[name].domain.check(name, value)
-
-        arrays = [float_array(value) for value in values.values()]
-        return eqx.tree_at(
-            lambda module: [fields[name].get(module) for name in values], self, arrays
-        )
-
-    def _check_single(self, lists: tuple[str, ...]) -> None:
-        """Raise ValueError for a batch; `lists` names the floats that may hold several numbers."""
-        if all(jnp.shape(leaf) == () for leaf in jax.tree.leaves(self)):
-            return
-        for name in self._float_fields:
-            shape = jnp.shape(self.value(name))
-            if shape != () and name not in lists:
-                raise ValueError(
-                    f"{name} of the gas has shape {shape}, but only one number is allowed. For "
-                    "many gases use jax.vmap(lambda gas: jaxgran.cool(gas, times))(gases), or "
-                    "call this for one gas at a time; put the name of a vector of a law into "
-                    "`lists` of its class."
-                )
 
 
 if TYPE_CHECKING:
@@ -185,7 +109,7 @@ def law_fields(law: RestitutionLaw) -> dict[str, FloatField]:
     return fields
 
 
-class Gas(NamedFloats):
+class Gas(eqx.Module):
     """A homogeneous gas of equal spheres in its initial state.
 
     Every float can be traced, differentiated and batched with `jax.vmap`.
@@ -247,6 +171,55 @@ class Gas(NamedFloats):
             check_not_subnormal(name, value)
         elements.check_elements(self)
 
+    def __repr__(self) -> str:
+        return text_table(*self._words)
+
+    def _repr_html_(self) -> str:
+        return html_table(*self._words)
+
+    def __getattr__(self, name: str) -> Any:
+        # Python calls this only for names that are not attributes, such as floats of parts.
+        if not name.startswith("_") and "law" in vars(self) and name in self._float_fields:
+            return self.value(name)
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+    @property
+    def domains(self) -> dict[str, Domain]:
+        """Allowed range of every float, by name."""
+        return {name: field.domain for name, field in self._float_fields.items()}
+
+    def value(self, name: str) -> Float[Array, "..."]:
+        """Value of the float with this name.
+
+        Raises:
+            ValueError: for an unknown name.
+        """
+        fields = self._float_fields
+        if name not in fields:
+            raise ValueError(f"no float {name!r} in this gas; it has {', '.join(fields)}")
+        return fields[name].get(self)
+
+    def replace(self, **values: UserNumber) -> "Gas":
+        """Return a copy with new values of some floats.
+
+        For example ``gas.replace(dissipative_constant=1e-6)``.
+
+        Args:
+            values: new values, by name of the float.
+
+        Raises:
+            ValueError: for an unknown name or a value outside its range.
+        """
+        fields = self._float_fields
+        for name, value in values.items():
+            self.value(name)
+            fields[name].domain.check(name, value)
+
+        arrays = [float_array(value) for value in values.values()]
+        return eqx.tree_at(
+            lambda module: [fields[name].get(module) for name in values], self, arrays
+        )
+
     @property
     def _float_fields(self) -> dict[str, FloatField]:
         gas_domains = domains_of("Gas") | {"packing_fraction": _PACKING_DOMAINS[self.dimension]}
@@ -283,8 +256,32 @@ class Gas(NamedFloats):
         Raises:
             ValueError: if a float has more than one value; the message names it.
         """
-        parts = law_fields(self.law).keys() - self.law.domains.keys()
-        self._check_single((*self.law.lists, *parts, "wall_side"))
+        if all(jnp.shape(leaf) == () for leaf in jax.tree.leaves(self)):
+            return
+        for name in self.domains:
+            shape = jnp.shape(self.value(name))
+            if shape != () and name not in (*self.law.lists, "wall_side"):
+                raise ValueError(
+                    f"{name} of the gas has shape {shape}, but only one number is allowed. For "
+                    "many gases use jax.vmap(lambda gas: jaxgran.cool(gas, times))(gases), or "
+                    "call this for one gas at a time."
+                )
+
+    @property
+    def _words(self) -> tuple[str, TableRows]:
+        """Title and rows of a table: every float with its unit; of one untraced gas its scales."""
+        elements = "".join(f", with {name}" for name in self.elements)
+        title = f"Gas of {type(self.law).__name__} spheres, d = {self.dimension}{elements}"
+        units = [(name, FLOAT_UNITS.get(name, "")) for name in self.domains]
+        rows = [(name, format_quantity(self.value(name), unit)) for name, unit in units]
+        leaves = jax.tree.leaves(self)
+        if any(isinstance(leaf, Tracer) or np.ndim(leaf) > 0 for leaf in leaves):
+            return title, rows
+        rows.append(("mean free time", format_quantity(self.mean_free_time, "s")))
+        if hasattr(self.law, "dissipative_constant"):
+            rows.append(("beta", format_quantity(self.thermal_beta, "at v = sqrt(2 T_0)")))
+            rows.append(("t_c/tau_c", format_quantity(self.contact_fraction)))
+        return title, rows
 
     @property
     def number_density(self) -> Float[Array, ""]:
@@ -507,24 +504,3 @@ def critical_length(
         jnp.where(inelastic, loss, 1.0)
     )
     return jnp.where(inelastic, 2 * pi / root, jnp.inf)
-
-
-def describe_floats(gas: Any) -> TableRows:
-    """Rows of a table: every float with its unit; for one untraced gas also its scales."""
-    rows = [
-        (name, format_quantity(gas.value(name), FLOAT_UNITS.get(name, ""))) for name in gas.domains
-    ]
-    leaves = jax.tree.leaves(gas)
-    if any(isinstance(leaf, Tracer) or np.ndim(leaf) > 0 for leaf in leaves):
-        return rows
-    rows.append(("mean free time", format_quantity(gas.mean_free_time, "s")))
-    if hasattr(gas.law, "dissipative_constant"):
-        rows.append(("beta", format_quantity(gas.thermal_beta, "at v = sqrt(2 T_0)")))
-        rows.append(("t_c/tau_c", format_quantity(gas.contact_fraction)))
-    return rows
-
-
-def describe_scene(gas: Any) -> str:
-    """Title of a gas: its law, dimension and elements."""
-    elements = "".join(f", with {name}" for name in gas.elements)
-    return f"Gas of {type(gas.law).__name__} spheres, d = {gas.dimension}{elements}"
