@@ -72,23 +72,6 @@ def test_main_job_says_what_it_cannot_explain(tmp_path):
     assert {path: path.read_bytes() for path in (tmp_path / "here").iterdir()} == before
 
 
-@pytest.mark.slow
-def test_auto_judges_the_box_that_was_measured():
-    curve, header = jaxgran.read_curve(DENSE)
-    gas, size = jaxgran.read_gas(header), int(header["N"])
-    free = ("dissipative_constant",)
-    fitted = jaxgran.fit(gas, curve, free=free).gas
-    ratio = float(fitted.box_side(size) / fitted.critical_box)
-    for particles in (None, 300):
-        options = argparse.Namespace(
-            model="auto", tolerance=0.02, particles=particles, replicas=3, key=0
-        )
-        model, reasons = choose_or_make_model(options, gas, curve, free, size)
-        assert isinstance(model, jaxgran.SoftSpheres)
-        assert model.num_particles == (particles or size)
-        assert f"in a box of {ratio:.2g} L_c" in " ".join(reasons)
-
-
 @pytest.mark.parametrize(
     "name, model",
     [
@@ -193,12 +176,6 @@ def test_particle_benchmark_runs(tmp_path):
     assert row["collisions_per_s"] > 0 and 0.5 < row["temperature_ratio"] < 1
     for lammps in row["lammps"].values():  # where it is installed
         assert lammps["temperature_ratio"] == pytest.approx(row["temperature_ratio"], rel=0.01)
-
-
-@pytest.mark.slow
-def test_stochastic_benchmark_runs(tmp_path):
-    (row,) = rows_of("benchmark_particles", "dsmc", tmp_path)
-    assert row["collisions_per_s"] > 0 and 0.05 < row["temperature_ratio"] < 0.9
 
 
 @pytest.mark.slow

@@ -40,7 +40,6 @@ from refits of the dilute curve at other values."""
 @pytest.mark.parametrize(
     "names, part, slope",
     [
-        (("packing_fraction",), "packing_fraction", PHI),
         (("diameter", "density"), "diameter", DIAMETER),
     ],
 )

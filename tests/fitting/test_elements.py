@@ -111,30 +111,9 @@ def test_a_T_rot_that_theory_misses_as_a_whole_is_no_misfit():
 
 
 @pytest.mark.slow
-def test_T_alone_does_not_tell_roughness_from_A():
-    gas = dataclasses.replace(glass_beads(), surface=ROUGH)
-    curve = measured(gas)
-    alone = dataclasses.replace(
-        curve, rotational_temperature=None, rotational_temperature_error=None
-    )
-    with pytest.warns(UserWarning, match="does not determine A and beta_t"):
-        result = jaxgran.fit(unknown(gas), alone, free=FREE)
-    said = " ".join(jaxgran.diagnose(result, alone).reasons)
-    assert "does not determine A and beta_t" in said
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "elements",
-    [
-        {"surface": jaxgran.Rough(-0.5)},
-        {"container": jaxgran.Walls(0.05, restitution=0.8)},
-    ],
-    ids=lambda elements: str(*elements),
-)
-def test_A_is_right_where_the_scene_is_known(elements):
-    # The same curves, fitted as smooth spheres far from walls, give an A wrong by 1.3 to 5.
-    gas = dataclasses.replace(glass_beads(), **elements)
+def test_A_is_right_where_the_scene_is_known():
+    # The same curve, fitted without walls, gives an A wrong by 1.3.
+    gas = dataclasses.replace(glass_beads(), container=jaxgran.Walls(0.05, restitution=0.8))
     curve = measured(gas, jaxgran.DSMC(10_000))
     free = ("dissipative_constant", "temperature")
     result = jaxgran.fit(gas.replace(dissipative_constant=0.0), curve, free=free)

@@ -171,14 +171,8 @@ def test_too_few_points_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "free",
-    [
-        ("dissipative_constant",),
-        pytest.param(("dissipative_constant", "temperature"), marks=pytest.mark.slow),
-    ],
-)
-def test_dilute_measured_curve(free):
+def test_dilute_measured_curve():
+    free = ("dissipative_constant", "temperature")
     gas, curve, a_true, n, replicas = measured("dilute")
     for particles in (None, n):
         result = jaxgran.fit(gas, curve, free=free, num_particles=particles, replicas=replicas)

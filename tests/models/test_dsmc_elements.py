@@ -65,7 +65,6 @@ def test_impacts_follow_the_rule_of_rough_spheres(dimension, eps, beta):
 
 
 SCENES = {
-    "rough": {"surface": jaxgran.Rough(0.0)},
     "viscoelastic walls": {
         "container": jaxgran.Walls(
             [0.05, 0.06, 0.08], restitution=jaxgran.Viscoelastic(5e7, 0.22, 3e-6)
@@ -83,7 +82,6 @@ SCENES = {
     "name, dimension",
     [
         ("all", 3),
-        pytest.param("rough", 3, marks=pytest.mark.slow),
         pytest.param("viscoelastic walls", 3, marks=pytest.mark.slow),
         pytest.param("all", 2, marks=pytest.mark.slow),
     ],

@@ -38,9 +38,8 @@ def elastic(strength, **elements) -> jaxgran.Gas:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("strength", [0.01, 0.6])  # one subset in half a step, and all of them
-def test_kicks_heat_by_the_strength_and_leave_the_gas_at_rest(strength):
-    gas = elastic(strength)
+def test_kicks_heat_by_the_strength_and_leave_the_gas_at_rest():
+    gas = elastic(0.01)  # one subset in half a step
     times = jnp.array([1.0, 3.0, 10.0]) * gas.mean_free_time
     model = jaxgran.DSMC(20_000)
     curve = jaxgran.cool(gas, times, model=model, save="particles", progress=False)

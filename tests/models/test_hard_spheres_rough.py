@@ -97,18 +97,17 @@ def test_energy_of_rough_disks_is_conserved():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("beta, dimension", [(0.0, 3), (0.5, 2)])
-def test_rough_spheres_cool_as_in_dsmc(beta, dimension):
-    gas = rough(glass_beads(packing_fraction=0.02, dimension=dimension), beta)
+def test_rough_disks_cool_as_in_dsmc():
+    gas = rough(glass_beads(packing_fraction=0.02, dimension=2), 0.5)
     taus = [1.0, 5.0, 20.0]
     hard = run(gas, 500, 8, taus)
     dsmc = run(gas, 20_000, 2, taus, kind=jaxgran.DSMC)
-    # Three standard errors, and 1 % for Enskog's collision rate; 2 % in a plane, where successive
-    # collisions are more correlated.
+    # Three standard errors, and 2 % for Enskog's collision rate: in a plane successive collisions
+    # are correlated.
     for name in ("temperature", "rotational_temperature"):
         ratio = np.asarray(getattr(hard, name) / getattr(dsmc, name))
         error = np.hypot(
             getattr(hard, f"{name}_error") / getattr(hard, name),
             getattr(dsmc, f"{name}_error") / getattr(dsmc, name),
         )
-        assert np.all(np.abs(ratio - 1) < 3 * error + (0.01 if dimension == 3 else 0.02))
+        assert np.all(np.abs(ratio - 1) < 3 * error + 0.02)

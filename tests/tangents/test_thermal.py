@@ -67,9 +67,8 @@ def loss_slope(gas, angle, speed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("beta, angle", [(0.1, 0.7), (0.5, 1.5)])
-def test_one_impact_has_the_slope_of_its_law(beads, beta, angle):
-    # 1.5 rad grazes: the normal speed is 7 % of the speed.
+def test_one_impact_has_the_slope_of_its_law(beads):
+    beta, angle = 0.5, 1.2
     gas = soft_beads(beads, 1e-7, beta, packing_fraction=0.02)
     gaps = 1e-4 * (1 + np.arange(16) / 16)
     scene = SoftSpheres(2).scene(gas)
