@@ -258,13 +258,16 @@ class Gas(eqx.Module):
         """
         if all(jnp.shape(leaf) == () for leaf in jax.tree.leaves(self)):
             return
+        parts = law_fields(self.law).keys() - self.law.domains.keys()
+        lists = (*self.law.lists, *parts, "wall_side")
         for name in self.domains:
             shape = jnp.shape(self.value(name))
-            if shape != () and name not in (*self.law.lists, "wall_side"):
+            if shape != () and name not in lists:
                 raise ValueError(
                     f"{name} of the gas has shape {shape}, but only one number is allowed. For "
                     "many gases use jax.vmap(lambda gas: jaxgran.cool(gas, times))(gases), or "
-                    "call this for one gas at a time."
+                    "call this for one gas at a time; put the name of a vector of a law into "
+                    "`lists` of its class."
                 )
 
     @property
