@@ -22,6 +22,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxgran._utils.validation import no_type_check
+
 __all__ = [
     "cell_density",
     "cell_velocity",
@@ -202,6 +204,7 @@ def velocity_distribution(
     return histogram(c, edges) / (n * shell_volumes(edges, d))
 
 
+@no_type_check
 def pair_correlation(
     position: Float[Array, "particles d"],
     side: ArrayLike,
@@ -229,6 +232,11 @@ def pair_correlation(
     >>> bool(jnp.all(jnp.abs(g - 1) < 0.05))
     True
     """
+    if position.ndim != 2:
+        raise ValueError(
+            f"position must have the shape (N, d) of one replica, got {position.shape}: take "
+            "particles.position[0], or average over replicas by jax.vmap"
+        )
     n, d = position.shape
     edges = checked_edges(edges)
     centres = n if centres is None else centres

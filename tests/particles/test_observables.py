@@ -50,6 +50,11 @@ def test_sonine_of_known_distributions(dimension):
     assert abs(sonine(maxwell)) < 4 * np.sqrt(8 / (d * (d + 2) * 200_000))
 
 
+def test_positions_of_several_replicas_are_refused_in_words():
+    with pytest.raises(ValueError, match=r"one replica, got \(1, 50, 3\): take particles.position"):
+        pair_correlation(jnp.zeros((1, 50, 3)), 1.0, [0.1, 0.2])
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_ideal_gas_has_no_pair_correlation(dimension):
     n, side = 1500, 3.7
