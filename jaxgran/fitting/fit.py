@@ -4,6 +4,7 @@ import warnings
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -20,6 +21,7 @@ from jaxgran.fitting.error_budget import clock_accuracy, with_scene_errors
 from jaxgran.fitting.optimise import Problem, best_of_starts, search
 from jaxgran.fitting.parameters import (
     LAW,
+    NO_PRIORS,
     START_TIME,
     Priors,
     domain_of,
@@ -33,6 +35,7 @@ from jaxgran.fitting.residuals import (
     Measurement,
     check_curve,
     unused_rotation,
+    uses_rotation,
     with_errors_of_particles,
 )
 from jaxgran.fitting.result import (
@@ -183,20 +186,24 @@ def fit(
         for label in list(curves) if START_TIME in separate else [first]:
             where = label if START_TIME in separate else None
             width = START_TIME_PRIOR * halving_time(curves[label])
-            some = all_priors.get(where, Priors((), (), ()))
+            some = all_priors.get(where, NO_PRIORS)
             all_priors[where] = some.add(START_TIME, 0.0, width)
     if model.stochastic:
-        steps = 8 if max_steps is None else max_steps
+        if any_traced(scenes, data, start, model, key):
+            raise ValueError(
+                "a fit of a stochastic model cannot run inside jax.jit or jax.vmap: fit one curve "
+                "at a time, outside of them"
+            )
         result = fit_stochastic(
             scenes[first],
             curves[first],
             model,
             names,
-            start,
-            key,
+            _guess_of_kinetic_theory(scenes[first], curves[first], names, start),
+            jax.random.key(0) if key is None else key,
             progress,
-            steps,
-            all_priors.get(None, Priors((), (), ())),
+            8 if max_steps is None else max_steps,
+            all_priors.get(None, NO_PRIORS),
             runs[first] or 1,
         )
     else:
@@ -281,9 +288,35 @@ def _fit_deterministic(
         if priors:  # search again with the correct weight of the priors
             flat, more, converged = search(problem, flat, steps, solver)
             problem, iterations = problem.with_scatter_as_error(flat), iterations + more
+    rows, _, jacobian, fields = problem.evaluate(flat)
+    computed = {m.label: m.as_curve(fields[m.label]) for m in problem.curves}
     return assemble_fit(
-        problem, flat, first=first, ends=ends, iterations=iterations, converged=converged
+        problem,
+        flat,
+        (rows, jacobian, computed),
+        first=first,
+        ends=ends,
+        iterations=iterations,
+        converged=converged,
     )
+
+
+def _guess_of_kinetic_theory(
+    gas: Gas, curve: CoolingCurve, names: tuple[str, ...], start: Gas | None
+) -> Gas:
+    """Return the start or, without one, a fit of those parameters that theory determines."""
+    smooth = replace(gas, surface=None) if "friction" in gas.elements else gas  # not supported
+    determined = {"dissipative_constant", "coefficient", "temperature"}
+    if uses_rotation(smooth, curve):
+        determined |= {"tangential_restitution", "rotational_temperature"}
+    free = tuple(name for name in names if name in determined)
+    if start is not None or not free:
+        return gas if start is None else start
+    count: dict[str, int | None] = {"": None}
+    result = _fit_deterministic(
+        {"": smooth}, {"": curve}, KineticTheory(), free, (), {}, None, count, count, None, None
+    )
+    return with_values_of(gas, result.gas, free)
 
 
 def with_values_of(gas: Gas, other: Gas, names: tuple[str, ...]) -> Gas:

@@ -139,13 +139,15 @@ class Rows(NamedTuple):
         values: the residuals, shape (n,).
         slopes: their derivatives in SI values of parameters, shape (n, size), by name.
         by_clock: their derivatives in a relative change of the model's time, each in its own time.
+        share: the measured error of each over its whole error; 1 without noise of simulations.
     """
 
     kind: str
     label: str | None
     values: Numbers
     slopes: dict[str, Numbers]
-    by_clock: Numbers | None = None
+    by_clock: Numbers = 0.0
+    share: Numbers = 1.0
 
 
 @dataclass(frozen=True)
@@ -236,6 +238,11 @@ class Measurement:
             position=_position(xp, xp.asarray(T)),
             error_degrees=error_degrees,
         )
+
+    @property
+    def data(self) -> CoolingCurve:
+        """The measured curve."""
+        return self.curve
 
     @property
     def nuisances(self) -> tuple[str, ...]:
@@ -417,13 +424,24 @@ def _of_prior(
 
 
 class DropTestRows(NamedTuple):
-    """A drop test of spheres of a gas, among the measurements of a fit."""
+    """A drop test of spheres of a gas, among the measurements of a fit.
+
+    It has the attributes of a `Measurement` that all fits use.
+    """
 
     label: str
-    gas: Gas
-    test: DropTest
-
+    scene: Gas
+    data: DropTest
     nuisances: tuple[str, ...] = ()
+    weights: dict[str, Numbers] = {}
+    error_degrees: dict[str, Numbers] = {}
+    clock_accuracy: float = 0.0
+    scatter: None = None
+
+    @property
+    def gas(self) -> Gas:
+        """The gas of the spheres; it needs no further elements."""
+        return self.scene
 
     def evaluate(
         self, model: AbstractModel, values: dict[str, Numbers], *, tolerance: float = 1.0
@@ -431,7 +449,7 @@ class DropTestRows(NamedTuple):
         """Return the residuals of the impacts, with derivatives."""
         xp = array_module(self.gas, values)
         floats = {n: jnp.asarray(x) for n, x in values.items() if n in self.gas.domains}
-        residuals, slopes = _drop_test_residuals(self.gas, floats, self.test)
+        residuals, slopes = _drop_test_residuals(self.gas, floats, self.data)
         size = residuals.shape[0]
         slopes = {name: xp.asarray(x).reshape(size, -1) for name, x in slopes.items()}
         return [Rows("drop test", self.label, xp.asarray(residuals), slopes)], None

@@ -12,19 +12,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils.formatting import TableRows, format_quantity, html_table, text_table
 from jaxgran._utils.tracing import any_traced, array_module, as_jax_arrays, concrete_array
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.optimise import Problem
 from jaxgran.fitting.parameters import START_TIME, Numbers, Priors, with_floats
 from jaxgran.fitting.residuals import (
     FACTORS,
     MEASURED,
     MODEL_ERROR,
-    Measurement,
     Rows,
     correlation_factor,
     neighbour_correlation,
 )
 from jaxgran.models.base import AbstractModel
-from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of, unit_of
 
 DEGENERATE_CHI2 = 9.0
@@ -476,26 +475,31 @@ def _p_value(xp: Any, chi2: Numbers, degrees: Numbers, error_degrees: Numbers | 
 def assemble_fit(
     problem: Problem,
     flat: Numbers,
+    linear: tuple[list[Rows], Numbers, dict[str, CoolingCurve]],
     *,
     first: Numbers,
     ends: tuple[Numbers, Numbers],
     iterations: Numbers,
     converged: Numbers,
+    resolution: float = 0.0,
 ) -> Fit:
-    """Return the fit of a deterministic model from its residuals, linearised where a search ended.
+    """Return a fit from its residuals, linearised where the search ended.
 
     Args:
         problem: the measurements and unknowns.
         flat: the unknowns at the end of the search.
-        first: those of the first guess.
+        linear: the residuals there, their Jacobian, and the computed curves by label.
+        first: the unknowns of the first guess.
         ends: unknowns and chi^2 at the ends of all searches.
         iterations, converged: see `Fit`.
+        resolution: ratio to the largest singular value of the Jacobian below which others count
+            as 0: the parameters have no error in those directions.
     """
-    rows, _, jacobian, fields = problem.evaluate(flat)
-    computed = {m.label: m.as_curve(fields[m.label]) for m in problem.curves}
+    rows, jacobian, computed = linear
     xp, p = array_module(flat, rows), problem.num_free
     left, singular, right = xp.linalg.svd(jacobian, full_matrices=False)
-    spread = right.T / xp.maximum(singular, xp.finfo(flat.dtype).tiny ** 0.5)[None]
+    inverse = 1 / xp.maximum(singular, xp.finfo(flat.dtype).tiny ** 0.5)
+    spread = right.T * xp.where(singular < resolution * singular[0], 0.0, inverse)[None]
     gain = -problem.slopes(flat)[:p, None] * (spread @ left.T)[:p]
     ends_of_rows = np.cumsum([row.values.shape[0] for row in rows])[:-1]
     gains = xp.split(gain, ends_of_rows, axis=1)
@@ -504,7 +508,8 @@ def assemble_fit(
     goodness = _test_all(xp, problem, rows, flat)
     covariances: dict[str, Numbers] = {}
     for row, part in zip(rows, gains, strict=True):
-        name, covariance = row.kind, part @ part.T
+        name, part = row.kind, part * row.share
+        covariance = part @ part.T
         if name in MEASURED or name == "drop test":
             if name == "temperature":
                 used = next(m.weights[name] for m in problem.curves if m.label == row.label) > 0
@@ -522,23 +527,23 @@ def assemble_fit(
         ]
         comparisons[label] = Comparison(
             residuals={row.kind: row.values for row, *_ in own},
-            weights=m.weights if isinstance(m, Measurement) else {},
-            gain=own[0][1] * (m.weights["temperature"] if isinstance(m, Measurement) else 1.0),
-            clock_gain=sum(g * row.by_clock[None] for row, g, _ in own if row.by_clock is not None)
-            + xp.zeros_like(own[0][1]),
-            clock_error=m.clock_accuracy + xp.zeros_like(own[0][0].values)
-            if isinstance(m, Measurement)
-            else xp.zeros_like(own[0][0].values),
+            weights=m.weights,
+            gain=own[0][1] * m.weights.get("temperature", 1.0),
+            clock_gain=sum(g * row.by_clock for row, g, _ in own),
+            clock_error=m.clock_accuracy + xp.zeros_like(own[0][0].values),
             sensitivity=xp.concatenate([j for *_, j in own]),
-            scatter=m.scatter if isinstance(m, Measurement) else None,
+            scatter=m.scatter,
             start_time=xp.asarray(values[label].get(START_TIME, 0.0), flat.dtype),
         )
     if MODEL_ERROR not in covariances:  # the clock is not a free parameter
         shifts = [c.clock_gain @ c.clock_error for c in comparisons.values()]
         covariances[MODEL_ERROR] = sum(xp.outer(shift, shift) for shift in shifts)
-    gases = {label: _fitted_gas(m, values[label]) for label, m in by_label.items()}
-    data = {k: m.curve if isinstance(m, Measurement) else m.test for k, m in by_label.items()}
-    single = len(by_label) == 1
+    gases = {}
+    for label, m in by_label.items():
+        floats = {name: x for name, x in values[label].items() if name in m.scene.domains}
+        gases[label] = with_floats(m.scene, floats)
+    data = {label: m.data for label, m in by_label.items()}
+    single, sizes = len(by_label) == 1, np.cumsum([u.size for u in problem.unknowns])
     label = next(iter(by_label))
     minima = Minima(
         estimates=xp.stack([problem.estimates(x) for x in ends[0]]),
@@ -558,7 +563,7 @@ def assemble_fit(
         }
     )
     return Fit(
-        names=tuple(u.title for u in _free_unknowns(problem)),
+        names=tuple(u.title for u, end in zip(problem.unknowns, sizes, strict=True) if end <= p),
         model=problem.model,
         gas=gases[label] if single else gases,
         priors=problem.priors,
@@ -568,42 +573,24 @@ def assemble_fit(
     )
 
 
-def _free_unknowns(problem: Problem) -> list:
-    unknowns, size = [], 0
-    for unknown in problem.unknowns:
-        if size < problem.num_free:
-            unknowns.append(unknown)
-        size += unknown.size
-    return unknowns
-
-
-def _fitted_gas(m: Any, values: dict[str, Numbers]) -> Gas:
-    scene = m.scene if isinstance(m, Measurement) else m.gas
-    return with_floats(scene, {name: x for name, x in values.items() if name in scene.domains})
-
-
 def _test_all(xp: Any, problem: Problem, rows: list[Rows], flat: Numbers) -> GoodnessOfFit:
     """Test each quantity of each measurement."""
-    tested, used, num_priors = [], 0, 0
-    factors = {(row.label, row.kind): row.values for row in rows if row.kind in FACTORS.values()}
-    degrees_of_errors: dict[Any, Any] = {m.label: m.error_degrees for m in problem.curves}
+    by_label: dict[str | None, Any] = {m.label: m for m in problem.measurements}
+    factors: dict[Any, Numbers] = {(row.label, row.kind): row.values for row in rows}
+    tested, num_priors = [], 0
     for row in rows:
-        if row.kind == "drop test":
-            number = row.values.shape[0]
-            tested.append((row.values, number, None))
-        elif row.kind in MEASURED:
-            m = next(m for m in problem.curves if m.label == row.label)
-            number = xp.sum(m.weights[row.kind] > 0)
-            values, own = row.values, 0
-            if row.kind == "temperature":
-                own = problem.num_free if len(problem.measurements) == 1 else 0
-            elif (factor := factors.get((row.label, FACTORS[row.kind]))) is not None:
-                values = xp.concatenate([values, factor])
-            tested.append((values, number - own, degrees_of_errors[row.label].get(row.kind)))
-        else:
+        if row.kind not in (*MEASURED, "drop test"):
             num_priors += row.values.shape[0]
             continue
-        used = used + number
+        m, values = by_label[row.label], row.values
+        weights = m.weights.get(row.kind)
+        number = values.shape[0] if weights is None else xp.sum(weights > 0)
+        own = problem.num_free if row.kind == "temperature" and len(by_label) == 1 else 0
+        if (factor := factors.get((row.label, FACTORS.get(row.kind)))) is not None:
+            values = xp.concatenate([values, factor])
+        tested.append((values, number, own, m.error_degrees.get(row.kind)))
+    used = sum(number for _, number, *_ in tested)
     degrees_of_freedom = xp.asarray(used + num_priors - flat.shape[0])
     known = all(m.curve.temperature_error is not None for m in problem.curves)
-    return goodness_of_fit(tested, degrees_of_freedom, errors_known=known)
+    parts = [(values, number - own, errors) for values, number, own, errors in tested]
+    return goodness_of_fit(parts, degrees_of_freedom, errors_known=known)

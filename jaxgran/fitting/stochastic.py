@@ -15,30 +15,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from tqdm import tqdm
 
-from jaxgran._utils.tracing import any_traced, as_jax_arrays
+from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.fitting.error_budget import parameter_effects
-from jaxgran.fitting.optimise import Problem, best_of_starts
-from jaxgran.fitting.parameters import (
-    NO_PRIORS,
-    Priors,
-    Unknown,
-    domain_of,
-    guess_from_data,
-    with_floats,
-)
-from jaxgran.fitting.residuals import (
-    MODEL_ERROR,
-    Measurement,
-    correlation_factor,
-    log_temperatures,
-    neighbour_correlation,
-    smooth_errors,
-    uses_rotation,
-)
-from jaxgran.fitting.result import Comparison, Fit, Minima, goodness_of_fit, search_starts
+from jaxgran.fitting.optimise import Problem
+from jaxgran.fitting.parameters import Priors, with_floats
+from jaxgran.fitting.residuals import Measurement, Rows, log_temperatures
+from jaxgran.fitting.result import Fit, assemble_fit
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
 
 MAX_STEP = 0.7
@@ -67,7 +51,6 @@ class SearchResult(NamedTuple):
             a point is not used.
         sensitivity: derivative of the weighted residuals.
         extrapolation: `flat` minus the mean of the parameters of the simulations.
-        gain: derivative of `flat` in each measured value; 0 where a point is not used.
         noise_covariance: covariance of `flat` due to the noise of the simulations.
         num_simulations: the number of simulations.
         converged: True if the last step was below `AVERAGING_DISTANCE`.
@@ -79,7 +62,6 @@ class SearchResult(NamedTuple):
     residuals: Float[np.ndarray, "points"]
     sensitivity: Float[np.ndarray, "points p"]
     extrapolation: Float[np.ndarray, "p"]
-    gain: Float[np.ndarray, "p points"]
     noise_covariance: Float[np.ndarray, "p p"]
     num_simulations: int
     converged: bool
@@ -90,34 +72,24 @@ def fit_stochastic(
     curve: CoolingCurve,
     model: AbstractModel,
     names: tuple[str, ...],
-    guess: Gas | None = None,
-    key: PRNGKeyArray | None = None,
-    progress: bool = True,
-    max_simulations: int = 8,
-    priors: Priors = NO_PRIORS,
-    replicas: int = 1,
+    guess: Gas,
+    key: PRNGKeyArray,
+    progress: bool,
+    max_simulations: int,
+    priors: Priors,
+    replicas: int,
 ) -> Fit:
-    """Fit a stochastic model, starting at a guess, by default the result of kinetic theory.
+    """Fit a stochastic model, starting at a guess.
 
     Arguments, result and errors are those of `jaxgran.fit`.
     """
-    if any_traced(gas, curve, guess, model, key):
-        raise ValueError(
-            "a fit of a stochastic model cannot run inside jax.jit or jax.vmap: fit one curve at a "
-            "time, outside of them"
-        )
-    curve, error_degrees = smooth_errors(curve, replicas)
-    guess = _guess_of_kinetic_theory(gas, curve, names) if guess is None else guess
-    unknowns = tuple(
-        Unknown(name, None, gas.value(name).shape, domain_of(gas, name)) for name in names
-    )
-    problem = Problem((), model, unknowns, sum(u.size for u in unknowns), {}, {})
-    first = np.concatenate(
-        [np.ravel(u.domain.to_free(np.asarray(guess.value(u.name)))) for u in unknowns]
-    )
+    m = Measurement.of("", gas, curve, model, None, replicas, use_displacement=False)
+    m, curve = dataclasses.replace(m, accuracies={}), m.curve
+    problem = Problem.of((m,), model, names, (), {}, clock_is_free=False)
+    first = np.asarray(problem.flat({"": guess}))
 
     def gas_at(flat: Any) -> Gas:
-        return with_floats(gas, {u.name: value for u, value in problem.parts(flat)})
+        return with_floats(gas, problem.values(flat)[""])
 
     if not np.all(np.isfinite(first)):
         at = ", ".join(f"{name} = {guess.value(name)}" for name in names)
@@ -126,172 +98,66 @@ def fit_stochastic(
             "start inside their ranges, or leave it out"
         )
     model.check_scene(gas_at(first))
-    key = jax.random.key(0) if key is None else key
 
     def simulate(flat, number):
         run = Run(jax.random.fold_in(key, number), progress)
         computed = model.simulate(gas_at(flat), curve.times, run)
-        _check_replicas(model, computed)
+        if computed.replicas is None or len(computed.replicas.temperature) < 2:
+            raise ValueError(
+                f"a fit of {type(model).__name__} needs curves with at least two replicas, whose "
+                "scatter gives the noise: simulate must return CoolingCurve.of_replicas(...)"
+            )
         return computed
 
-    rotation = uses_rotation(gas, curve)
-    errors_known = curve.temperature_error is not None
-    error, used = _relative_errors(curve, rotation)
+    known, size = np.concatenate(list(m.weights.values())), len(m.weights)
+    used = (known > 0) & (np.tile(np.asarray(curve.times), size) > 0)
+    has_errors = curve.temperature_error is not None
+    error = np.where(used, 1 / np.where(used, known, 1.0), 0.0) if has_errors else 0 * known
     search = search_by_simulation(
         simulate,
-        np.asarray(first),
-        np.asarray(log_temperatures(curve, rotation)),
+        first,
+        np.asarray(log_temperatures(curve, size > 1)),
         error,
         used,
-        rotation=rotation,
+        rotation=size > 1,
         resolution=model.derivative_accuracy,
         max_simulations=max_simulations,
         progress=progress,
     )
-    return _stochastic_result(
-        problem,
-        gas_at(search.flat),
-        curve,
-        first,
-        search,
-        priors,
-        error if errors_known else None,
-        error_degrees,
-    )
-
-
-def _relative_errors(
-    curve: CoolingCurve, rotation: bool
-) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:
-    """Return relative errors of T, and of T_rot if it is used, and which points have a weight."""
-    pairs: list[tuple[Any, Any]] = [(curve.temperature, curve.temperature_error)]
-    if rotation:
-        pairs.append((curve.rotational_temperature, curve.rotational_temperature_error))
-    values = np.concatenate([np.asarray(value) for value, _ in pairs])
-    used = (np.tile(np.asarray(curve.times), len(pairs)) > 0) & (values > 0)
-    if curve.temperature_error is None:
-        return np.zeros_like(values), used
-    errors = np.concatenate([np.asarray(error) for _, error in pairs])
-    return errors / np.where(values > 0, values, 1.0), used & (errors > 0)
-
-
-def _check_replicas(model: AbstractModel, computed: CoolingCurve) -> None:
-    replicas = computed.replicas
-    if replicas is None or len(replicas.temperature) < 2:
-        raise ValueError(
-            f"a fit of {type(model).__name__} needs curves with at least two replicas, whose "
-            "scatter gives the noise: simulate must return CoolingCurve.of_replicas(...)"
-        )
-
-
-def _guess_of_kinetic_theory(gas: Gas, curve: CoolingCurve, names: tuple[str, ...]) -> Gas:
-    """Fit kinetic theory for those parameters that it can determine."""
-    determined = {"dissipative_constant", "coefficient", "temperature"}
-    if uses_rotation(gas, curve):
-        determined |= {"tangential_restitution", "rotational_temperature"}
-    free = tuple(name for name in names if name in determined)
-    if not free:
-        return gas
-    smooth = gas
-    if "friction" in gas.elements:  # not supported by kinetic theory
-        smooth = dataclasses.replace(gas, surface=None)
-        curve = dataclasses.replace(curve, rotational_temperature=None)
-        curve = dataclasses.replace(curve, rotational_temperature_error=None)
-    model = KineticTheory()
-    m = Measurement.of("", smooth, curve, model, None, 1, use_displacement=True)
-    problem = Problem.of((m,), model, free, (), {}, clock_is_free=False)
-    first = problem.flat({"": guess_from_data(m.gas, curve, free)})
-    (flat, *_), _ = best_of_starts(problem, search_starts(problem, first), 100)
-    values = problem.values(flat)[""]
-    return with_floats(gas, {name: values[name] for name in free})
-
-
-def _stochastic_result(
-    problem: Problem,
-    gas: Gas,
-    curve: CoolingCurve,
-    first: Float[np.ndarray, "p"],
-    search: SearchResult,
-    priors: Priors,
-    error: Float[np.ndarray, "points"] | None,
-    error_degrees: dict[str, Any],
-) -> Fit:
-    """Return the fit, in SI units, from the result of a search."""
-    flat, num_times = search.flat, search.computed.times.size
-    residuals, sensitivity, weights = search.residuals, search.sensitivity, search.weights
-    degrees_of_freedom, scatter = np.sum(residuals != 0) - flat.size, None
-    if error is None:
-        scatter = np.sqrt(np.sum(residuals**2) / degrees_of_freedom)
+    flat, residuals, weights = search.flat, search.residuals, search.weights
+    sensitivity, scatter = search.sensitivity, None
+    if not has_errors:
+        scatter = np.sqrt(np.sum(residuals**2) / (np.sum(residuals != 0) - flat.size))
         residuals, sensitivity, weights = (x / scatter for x in (residuals, sensitivity, weights))
-    names = ["temperature", "rotational_temperature"][: residuals.size // num_times]
-    by_name = dict(zip(names, np.split(residuals, len(names)), strict=True))
-    used = by_name["temperature"] != 0
-    tested = [
-        (x, np.sum(x != 0) - (flat.size if name == "temperature" else 0), error_degrees.get(name))
-        for name, x in by_name.items()
+    slope, changes = parameter_effects(gas_at(flat), priors, search.computed, size > 1)
+    share = weights * error if has_errors else np.ones_like(weights)
+    parts = [np.split(x, size) for x in (residuals, weights, -weights * slope, share)]
+    rows = [
+        Rows(name, "", values, {}, by_clock, of_measurement)
+        for name, values, _, by_clock, of_measurement in zip(m.weights, *parts, strict=True)
     ]
-    goodness = goodness_of_fit(tested, degrees_of_freedom, errors_known=error is not None)
+    m = dataclasses.replace(m, weights=dict(zip(m.weights, parts[1], strict=True)), scatter=scatter)
+    result = assemble_fit(
+        dataclasses.replace(problem, measurements=(m,)),
+        flat,
+        (rows, -sensitivity, {"": search.computed}),
+        first=first,
+        ends=(flat[None], np.sum(residuals**2)[None]),
+        iterations=np.asarray(search.num_simulations),
+        converged=np.asarray(search.converged),
+        resolution=model.derivative_accuracy,
+    )
     scale = problem.slopes(flat)[:, None]
-    gain = scale * search.gain
-    rotation = len(names) > 1
-    slope, changes = parameter_effects(gas, priors, search.computed, rotation)
-    shares = gain * (scatter if error is None else error[None])
-    measured = goodness.inflation * _measurement_covariance(shares, by_name["temperature"], used)
-    covariances = {
-        "measurement": measured,
-        MODEL_ERROR: np.zeros_like(measured),
-        "simulation": scale * search.noise_covariance * scale.T,
-    }
+    gain = scale * np.linalg.pinv(sensitivity, rcond=model.derivative_accuracy) * weights[None]
+    covariances = {"simulation": scale * search.noise_covariance * scale.T}
     covariances |= {name: gain @ x @ x.T @ gain.T for name, x in changes.items()}
-    delays = -gain * slope[None]
-    comparison = Comparison(
-        residuals=by_name,
-        weights=dict(zip(names, np.split(weights, len(names)), strict=True)),
-        gain=gain[:, :num_times],
-        clock_gain=np.sum(np.split(delays, len(names), axis=1), axis=0),
-        clock_error=np.zeros(num_times),
-        sensitivity=sensitivity,
-        scatter=scatter,
-        start_time=np.zeros(()),
-    )
-    estimate = problem.estimates(flat)
-    minima = Minima(
-        estimate[None],
-        np.asarray([goodness.chi2]),
-        problem.estimates(first),
-        scale[:, 0] * search.extrapolation,
-        np.asarray(search.num_simulations),
-    )
-    arrays = as_jax_arrays(
-        {
-            "estimate": estimate,
-            "covariances": covariances,
-            "comparisons": {"": comparison},
-            "goodness": goodness,
-            "converged": np.asarray(search.converged),
-            "minima": minima,
-        }
-    )
-    return Fit(
-        names=tuple(u.name for u in problem.unknowns),
-        model=problem.model,
-        gas=gas,
+    extrapolation = as_jax_arrays(scale[:, 0] * search.extrapolation)
+    return dataclasses.replace(
+        result,
+        covariances=result.covariances | as_jax_arrays(covariances),
         priors={None: priors} if priors.names else {},
-        data=curve,
-        curve=search.computed,
-        **arrays,
+        minima=result.minima._replace(extrapolation=extrapolation),
     )
-
-
-def _measurement_covariance(
-    shares: Float[np.ndarray, "p points"],
-    residuals: Float[np.ndarray, "times"],
-    used: Bool[np.ndarray, "times"],
-) -> Float[np.ndarray, "p p"]:
-    """Covariance by the errors of T, which may be correlated, and by those of T_rot if used."""
-    factor = correlation_factor(neighbour_correlation(residuals, used)) ** 2
-    by_T, by_rotation = shares[:, : residuals.size], shares[:, residuals.size :]
-    return factor * by_T @ by_T.T + by_rotation @ by_rotation.T
 
 
 class _Simulation(NamedTuple):
@@ -302,20 +168,6 @@ class _Simulation(NamedTuple):
     slope: Float[np.ndarray, "used p"]  # derivative of the values
     deviation: Float[np.ndarray, "replicas used"]  # values of each replica minus their mean
     variance: Float[np.ndarray, "used"]  # variance of the mean over replicas
-
-
-class _Average(NamedTuple):
-    """Estimate from the mean of simulations near each other."""
-
-    flat: Float[np.ndarray, "p"]
-    sigma: Float[np.ndarray, "used"]  # standard error of each residual; 1 if errors are unknown
-    gain: Float[np.ndarray, "p used"]  # derivative of `flat` in the measured values
-    error_covariance: Float[np.ndarray, "p p"]  # of `flat`, by the errors of the measurement
-    noise_covariance: Float[np.ndarray, "p p"]  # of `flat`, by the noise of the simulations
-
-    @property
-    def covariance(self) -> Float[np.ndarray, "p p"]:
-        return self.error_covariance + self.noise_covariance
 
 
 def search_by_simulation(
@@ -362,22 +214,28 @@ def search_by_simulation(
             simulation, curve = _run_simulation(simulate, flat, len(simulations), used, rotation)
             simulations.append(simulation)
             near = [s for s in simulations if np.abs(s.flat - flat).max() < AVERAGING_DISTANCE]
-            average = _average(near, measured, error if known else None, resolution)
-            step = average.flat - flat
+            estimate, sigma, error_covariance, noise_covariance = _average(
+                near, measured, error if known else None, resolution
+            )
+            step = estimate - flat
             step *= min(1.0, MAX_STEP / max(np.abs(step).max(), 1e-300))
             converged = bool(np.abs(step).max() < AVERAGING_DISTANCE)
             flat = flat + step
-            variance = np.diag(average.covariance)
-            low_noise = np.all(np.diag(average.noise_covariance) <= MAX_NOISE_SHARE**2 * variance)
+            variance = np.diag(error_covariance + noise_covariance)
+            low_noise = np.all(np.diag(noise_covariance) <= MAX_NOISE_SHARE**2 * variance)
             in_errors = np.abs(step / np.sqrt(variance)).max()
             bar.update()
             bar.set_postfix_str(f"last step {in_errors:.2g} standard errors")
             ended = converged and len(near) > 1 and (low_noise or not known)
             if ended or len(simulations) == max_simulations:
                 break
-    weights, residuals, sensitivity = _residuals_at(flat, near, measured, average.sigma, used)
-    gain = np.zeros((len(flat), len(used)))
-    gain[:, used] = average.gain
+    weights, residuals = np.zeros((2, len(used)))
+    sensitivity = np.zeros((len(used), len(flat)))
+    weights[used] = 1 / sigma
+    # Extrapolated from each simulation, and averaged.
+    differences = [measured - s.values - s.slope @ (flat - s.flat) for s in near]
+    residuals[used] = np.mean(differences, axis=0) / sigma
+    sensitivity[used] = np.mean([s.slope for s in near], axis=0) / sigma[:, None]
     return SearchResult(
         flat=flat,
         computed=curve,
@@ -385,8 +243,7 @@ def search_by_simulation(
         residuals=residuals,
         sensitivity=sensitivity,
         extrapolation=flat - np.mean([s.flat for s in near], axis=0),
-        gain=gain,
-        noise_covariance=average.noise_covariance,
+        noise_covariance=noise_covariance,
         num_simulations=len(simulations),
         converged=converged,
     )
@@ -423,8 +280,11 @@ def _average(
     measured: Float[np.ndarray, "used"],
     error: Float[np.ndarray, "used"] | None,
     resolution: float,
-) -> _Average:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the mean of the Gauss-Newton estimates of some simulations.
+
+    With it come the standard error of each residual (1 if errors are unknown), and the covariances
+    of the mean by the errors of the measurement and by the noise of the simulations.
 
     Args:
         near: the simulations, the newest one last.
@@ -443,10 +303,9 @@ def _average(
         noise_covariances.append(shift.T @ shift)
     # The errors of the measurement are common to all estimates: the newest simulation gives them.
     newest = near[-1].slope / sigma[:, None]
-    gain = np.linalg.pinv(newest, rcond=resolution) / sigma
-    share = gain * (np.ones_like(sigma) if error is None else error)
+    share = np.linalg.pinv(newest, rcond=resolution) * (1.0 if error is None else error / sigma)
     noise_covariance = np.mean(noise_covariances, axis=0) / len(near)
-    return _Average(np.mean(estimates, axis=0), sigma, gain, share @ share.T, noise_covariance)
+    return np.mean(estimates, axis=0), sigma, share @ share.T, noise_covariance
 
 
 def _variance_of_mean(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:
@@ -456,24 +315,3 @@ def _variance_of_mean(deviation: Float[np.ndarray, "replicas used"]) -> Float[np
     window = np.ones(min(NOISE_WINDOW, num_times))
     num_averaged = np.convolve(np.ones(num_times), window, "same")
     return np.convolve(variance, window, "same") / num_averaged
-
-
-def _residuals_at(
-    flat: Float[np.ndarray, "p"],
-    near: list[_Simulation],
-    measured: Float[np.ndarray, "used"],
-    sigma: Float[np.ndarray, "used"],
-    used: Bool[np.ndarray, "points"],
-) -> tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"], Float[np.ndarray, "points p"]]:
-    """Return weights, weighted residuals and their derivative at the estimate.
-
-    The residuals are extrapolated from each simulation and averaged.
-    """
-    differences = [measured - s.values - s.slope @ (flat - s.flat) for s in near]
-    slope = np.mean([s.slope for s in near], axis=0)
-    weights, residuals = np.zeros(len(used)), np.zeros(len(used))
-    sensitivity = np.zeros((len(used), len(flat)))
-    weights[used] = 1 / sigma
-    residuals[used] = np.mean(differences, axis=0) / sigma
-    sensitivity[used] = slope / sigma[:, None]
-    return weights, residuals, sensitivity
