@@ -50,6 +50,10 @@ MIN_OUTLIER = 0.004
 MIN_JUDGED = 10
 """Points needed to tell an outlier from the scatter of the others."""
 
+UNKNOWN_SCATTER = 0.025
+"""Relative scatter of T, correlated in time, that some hundred particles have where N is unknown:
+without errors and N no misfit smaller than twice of it can be told from chance."""
+
 NEGLIGIBLE_SHARE = 0.01
 """Share of an estimate below which the low end of a range counts as 0."""
 
@@ -254,7 +258,7 @@ def _is_misfit(
     in time too, but N gives their size.
     """
     scatter = float(np.asarray(comparison.scatter))
-    expected = _expected_scatter(gas, num_particles)
+    expected = _expected_scatter(gas, num_particles) or UNKNOWN_SCATTER
     is_systematic = correlation > SYSTEMATIC_CORRELATION / np.sqrt(residuals.size)
     return scatter > MAX_SCATTER or bool(is_systematic and scatter > 2 * expected)
 
@@ -453,7 +457,7 @@ def _describe_outliers(result: Fit, label: str) -> Iterator[str]:
     words = f"far outliers at {at}: check them and their error bars"
     if (others := estimate_without(result, label, far)) is not None:
         value, error = (float(x[0]) for x in others)
-        words += f"; without them {result.names[0]} is {value:.3g} +- {error:.2g}"
+        words += f"; without them {symbol_of(result.names[0])} is {value:.3g} +- {error:.2g}"
     yield words
 
 

@@ -30,6 +30,10 @@ OVERLAP_LIMIT = 0.01
 CORRELATED_PACKING = {2: 0.4, 3: 0.25}
 """Packing fraction above which successive collisions are correlated, by dimension."""
 
+MAX_WALL_DISTANCE = 50.0
+"""Distance of walls, in mean free paths, up to which theory was compared with hard spheres: the
+error of the clock includes what was found (`jaxgran.models.error_model.WALL_ERROR`)."""
+
 SOFT_SPHERES_NEEDED = "This scene needs soft spheres, which resolve every contact in time."
 POSITIONS_NEEDED = "This scene needs particles with positions."
 
@@ -203,7 +207,11 @@ def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Lim
         )
     if gas.container is not None:
         side = float(np.min(gas.container.side) / gas.mean_free_path)
-        effects.append(f"walls are {side:.2g} mean free paths apart, and the gas is taken as mixed")
+        if side > MAX_WALL_DISTANCE:
+            effects.append(
+                f"walls are {side:.2g} mean free paths apart, and the gas is taken as mixed, which "
+                f"was compared with hard spheres up to {MAX_WALL_DISTANCE:g}"
+            )
     elif num_particles is not None:
         diameter = float(gas.diameter)
         box, critical = float(gas.box_side(num_particles)), float(_contact_and_box(gas)[2])
