@@ -70,7 +70,7 @@ def results(found: dict, said: str) -> dict:
         ],
         "verdict": found["verdict"],
         "reduced_chi2": found["reduced_chi2"],
-        "printed": [*lines[first : first + 1 + len(rows)], budget],
+        "printed": [lines[0], "", *lines[first : first + 1 + len(rows)], budget],
     }
 
 
