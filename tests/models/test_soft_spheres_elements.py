@@ -284,8 +284,7 @@ def test_derivatives_with_friction_of_a_short_run_are_differences():
     model = SoftSpheres(NUM, projection=100.0, steps_per_contact=30)
     logs, at = both_temperatures(gas, model, times, FRICTION_FLOATS)
     found = np.asarray(jax.jacfwd(logs)(at))
-    np.testing.assert_allclose(jax.jacrev(logs)(at), found, rtol=1e-10, atol=1e-15)
-    # Along four directions in all floats, of mixed signs; float by float in a slow test.
+    # Along four directions in all floats, of mixed signs.
     moves = hadamard(16)[:4, 1 : 1 + len(at)].T.astype(float)
     each = [logs(at + h * move) - logs(at - h * move) for move in moves.T]
     expected = np.stack(each, axis=-1) / (2 * h)

@@ -23,6 +23,7 @@ def test_the_neighbourhood_is_that_of_the_gas(beads, dimension):
     assert around.listed == pytest.approx(around.in_contact + 3.0)
 
 
+@pytest.mark.slow
 def test_compiled_runs_of_few_hard_spheres_have_room(beads):
     # Windows of 8 impacts scatter in length: of 60 keys 3 needed more pairs than they had.
     gas = beads(packing_fraction=0.05, youngs_modulus=5e5)

@@ -18,6 +18,9 @@ REFERENCE = [
     (5.0, 0.0016506820717733, 0.068899657679239, 2.0051302797),
 ]
 
+SLOPES = [(0.01, -1.13698828), (0.1, -0.991601507), (0.5, -0.548253884), (1.0, -0.291955441)]
+"""beta and d eps / d beta, clipped."""
+
 solve = jax.jit(impact, static_argnames=("clipped", "rtol"))
 
 
@@ -49,10 +52,7 @@ def test_heavy_damping_limits():
     np.testing.assert_allclose(result, 5.15838170427e-10, rtol=1e-10)
 
 
-@pytest.mark.parametrize(
-    "beta, slope",
-    [(0.01, -1.13698828), (0.1, -0.991601507), (0.5, -0.548253884), (1.0, -0.291955441)],
-)
+@pytest.mark.parametrize("beta, slope", SLOPES)
 def test_derivative_of_restitution(beta, slope):
     result = jax.jacfwd(lambda b: solve(b).restitution)(beta)
     np.testing.assert_allclose(result, slope, rtol=5e-9)  # the reference has nine digits
