@@ -65,7 +65,13 @@ PRIOR_KEYS = {f"{symbol}_err": p.name for symbol, p in BY_SYMBOL.items() if symb
 """Header keys of standard errors, and the names of their priors in `jaxgran.fit`."""
 
 GUESS = "guess"
-GUESSES = {"beta_t": 0.0, "gamma": 0.0, "wall_restitution": 1.0, "wall_beta_t": 0.0}
+GUESSES = {
+    "beta_t": 0.0,
+    "friction": 0.3,
+    "gamma": 0.0,
+    "wall_restitution": 1.0,
+    "wall_beta_t": 0.0,
+}
 """Header keys whose value may be "guess", and the values from which a fit then starts."""
 
 ELEMENTS: tuple[tuple[str, Any, tuple[str, ...]], ...] = (
@@ -341,9 +347,10 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
 
     Args:
         header: for rough spheres beta_t and, if they are not 0.4 and 0, reduced_inertia,
-            4 I/(m sigma^2), and T_rot_0, T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2; for lasting
-            contacts with friction tangential_damping and friction (`jaxgran.Frictional`, numbers
-            without a unit) in place of beta_t; for walls container_side, of a cube, m,
+            4 I/(m sigma^2), and T_rot_0, T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2, and, if they
+            slide, Coulomb's coefficient friction; for lasting contacts with friction
+            tangential_damping and friction (`jaxgran.Frictional`, numbers without a unit) in place
+            of beta_t; for walls container_side, of a cube, m,
             wall_restitution and, for rough walls, wall_beta_t; for drag gamma, 1/s, of
             dv/dt = -gamma v; for a drive by white noise drive_strength, m^2/s^3, of
             dT/dt = drive_strength.
@@ -366,14 +373,14 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
         for key, text in header.items()
         if key in symbols | {"wall_restitution"}
     }
-    lasting = {"friction", "tangential_damping"} & values.keys()
-    if lasting and "beta_t" in values:
+    lasting, rough = "tangential_damping" in values, "beta_t" in values
+    if lasting and rough:
         raise ValueError(
-            "the header gives both beta_t (instantaneous impacts) and friction (lasting "
-            "contacts). Leave out beta_t for SoftSpheres(N), or friction and tangential_damping "
-            "for the other models"
+            "the header gives both beta_t (instantaneous impacts) and tangential_damping (lasting "
+            "contacts). Leave out beta_t for SoftSpheres(N), or tangential_damping for the other "
+            "models"
         )
-    unused = Rough if lasting else Frictional
+    unused = Rough if lasting or ("friction" in values and not rough) else Frictional
     elements = {}
     for name, kind, required in ELEMENTS:
         fields = {p.symbol: field for field, p in fields_of(kind.__name__).items()}

@@ -42,6 +42,9 @@ DRAG_SHARES = (0.001, 0.005, 0.02, 0.06, 0.2, 0.5, 0.9)
 ROUGHNESS = (0.02, 0.08, 0.25, 0.6, 1.0, 1.4, 1.75, 1.9)
 """Values of 1 + beta_t of rough spheres."""
 
+SLIDING = (0.3, 1.0, 2.5, 6.0, 15.0)
+"""Values of 1/mu of rough spheres that slide."""
+
 DELAYS = (0.003, 0.02, 0.1, 0.3)
 """Errors of the start of the clock, over the initial cooling time, of both signs."""
 
@@ -409,6 +412,11 @@ def _kinds(result: Fit, problem: Problem, absent: tuple[str, ...]) -> list[Kind]
             lambda x, label: {"tangential_restitution": x - 1},
         ),
     ]
+    if all("tangential_restitution" in gas.domains for gas in scenes):
+        kind = Kind(
+            "grains that slide", "friction", (SLIDING,), lambda x, label: {"friction": 1 / x}
+        )
+        possible.append(kind)
     known = {name.rpartition(": ")[2] for name in result.names}
     known |= {name for some in result.priors.values() for name in some.names}
     if not known & {START_TIME, "temperature"}:

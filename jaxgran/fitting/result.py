@@ -457,7 +457,9 @@ def goodness_of_fit(
         _p_value(xp, x, n, m) for x, n, m in zip(parts_chi2, degrees, error_degrees, strict=True)
     ]
     worst = xp.min(xp.stack(p_values))
-    p_value = -xp.expm1(len(parts) * xp.log1p(-worst)) if len(parts) > 1 else worst
+    p_value = (
+        -xp.expm1(len(parts) * xp.log1p(-xp.minimum(worst, 1 - 1e-12))) if len(parts) > 1 else worst
+    )
     unexplained = p_value < SIGNIFICANCE
     inflation = xp.where(unexplained, xp.maximum(xp.max(parts_chi2 / degrees), 1.0), 1.0)
     return GoodnessOfFit(chi2, degrees_of_freedom, p_value, inflation)

@@ -60,9 +60,9 @@ class DSMC(AbstractModel):
     draws disjoint random pairs, and then pairs that share a particle with these, as often as
     drawing one pair after the other would. Means over N particles have errors of O(1/N).
 
-    Supports all elements of a scene but friction: rough spheres; walls, which all particles of the
-    homogeneous gas hit with the same probability, more often the more energy the walls take
-    (`jaxgran.scene.elements`); drag, exactly, by collisions in transformed time
+    Supports all elements of a scene but `jaxgran.Frictional`: rough spheres; walls, which all
+    particles of the homogeneous gas hit with the same probability, more often the more energy the
+    walls take (`jaxgran.scene.elements`); drag, exactly, by collisions in transformed time
     (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32); a drive, with half of the kicks
     at the beginning of each step and half at its end, on subsets of the particles in turn
     (`jaxgran.particles.dsmc.collisions`); and a driven start, for which a drive returns the energy

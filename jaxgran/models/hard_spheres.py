@@ -62,11 +62,11 @@ class HardSpheres(AbstractSpheres):
     The gas starts from random positions and Maxwellian velocities of exactly T_0 and no momentum,
     after an elastic equilibration of 10 mean free times.
 
-    Supports all elements of a scene but friction: rough spheres; containers, cubes or boxes of
-    given sides, with exact impacts on their walls, in place of the periodic box; drag, exactly, by
-    impacts in transformed time (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32); a
-    drive, with kicks at both ends of each window of some .05 mean free times; and a driven start,
-    for which a drive returns the energy that impacts take during 10 mean free times.
+    Supports all elements of a scene but `jaxgran.Frictional`: rough spheres; containers, cubes or
+    boxes of given sides, with exact impacts on their walls, in place of the periodic box; drag,
+    exactly, by impacts in transformed time (`jaxgran.particles.state`), up to gamma t = 18 (8 in
+    float32); a drive, with kicks at both ends of each window of some .05 mean free times; and a
+    driven start, for which a drive returns the energy that impacts take during 10 mean free times.
 
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer. It lives on

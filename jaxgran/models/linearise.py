@@ -30,6 +30,9 @@ COMPUTED = (*LINEARISED, "sonine", "third_sonine", "diffusion", "status")
 REMOTE_WALLS = 1e9
 """Side of a box without effect, m."""
 
+STICKING = 1e6
+"""Coefficient of friction without effect."""
+
 
 class LinearisedCurve(NamedTuple):
     """A curve and its derivatives; the arrays are those of NumPy unless they are traced.
@@ -58,6 +61,8 @@ def with_all_elements(gas: Gas, model: AbstractModel) -> Gas:
         for name, make in missing.items()
         if name in model.elements and getattr(gas, name) is None
     }
+    if isinstance(gas.surface, Rough) and gas.surface.friction is None:
+        added["surface"] = dataclasses.replace(gas.surface, friction=STICKING)
     return dataclasses.replace(gas, **added)
 
 

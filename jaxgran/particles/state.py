@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from jaxgran.gradients.tangents import PathTangents
 from jaxgran.particles import neighbours, observables
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
-from jaxgran.scene.reduced import ReducedDrag
+from jaxgran.scene.reduced import ReducedDrag, ReducedRough
 
 S = TypeVar("S")
 
@@ -351,7 +351,8 @@ def tangential_impulse(
     normal: Float[Array, "pairs d"],
     where: Bool[Array, "pairs"],
     eta: Float[Array, ""],
-    inertia: Float[Array, ""],
+    surface: ReducedRough,
+    normal_kick: Float[Array, "pairs"],
 ) -> TangentialImpulse:
     """Return the tangential part of impacts, ``-eta`` times the slip: see `jaxgran.Rough`.
 
@@ -360,10 +361,15 @@ def tangential_impulse(
         spin: sum of the spins of both partners; a wall has none.
         normal: unit vector from the first to the second.
         where: mask of the impacts with friction.
-        eta: share of the slip that becomes the kick.
-        inertia: q = 4 I/(m sigma^2).
+        eta: share of the slip that becomes the kick of spheres that stick.
+        surface: of the spheres.
+        normal_kick: size of the normal part of the velocity change of the first partner.
     """
     sideways = relative - jnp.sum(relative * normal, axis=-1, keepdims=True) * normal
     slip = jnp.where(where[:, None], sideways + surface_direction(spin, normal), 0.0)
     kick = -eta * slip
-    return TangentialImpulse(sideways, slip, kick, torque(normal, kick) / inertia)
+    if surface.friction is not None:
+        square = jnp.sum(kick**2, axis=-1)
+        length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+        kick = kick * jnp.minimum(surface.friction * normal_kick / length, 1.0)[:, None]
+    return TangentialImpulse(sideways, slip, kick, torque(normal, kick) / surface.inertia)

@@ -40,6 +40,18 @@ def optional_element(*classes: type) -> Any:
     return eqx.field(converter=check_class, default=None, kw_only=True)
 
 
+def _number_or_none(name: str) -> Callable[[Any], Array | None]:
+    def convert(value: Any) -> Array | None:
+        return None if value is None else number_named(name)(value)
+
+    return convert
+
+
+def _domains_of_given(element: Any) -> dict[str, Domain]:
+    domains = domains_of(type(element).__name__)
+    return {name: x for name, x in domains.items() if getattr(element, name) is not None}
+
+
 class Rough(eqx.Module):
     """Rough spheres, which rotate: the tangential velocity at contact is multiplied by -beta_t.
 
@@ -52,17 +64,25 @@ class Rough(eqx.Module):
     v_j changes by the opposite of the change of v_i, and w_j by the same amount as w_i. The energy
     lost in the tangential motion is ``(m/4) q/(1 + q) (1 - beta_t^2) u_t^2``.
 
+    With `friction` Coulomb's limit holds: the tangential impulse is at most mu times the normal
+    one. Where ``eta |u_t|`` exceeds ``mu (1 + eps)/2 |u_n|`` the spheres slide, and ``eta u_t`` is
+    shortened to this length; in steeper impacts they stick. Impacts on rough walls have the mu of
+    the spheres.
+
     Args:
         tangential_restitution: beta_t, in [-1, 1], equal for all impacts; -1 is smooth.
         inertia: q = 4 I/(m sigma^2), in (0, 1]: 2/5 for a solid sphere, 2/3 for a hollow sphere,
             1/2 for a disk.
         rotational_temperature: T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2, >= 0, with d_rot = 3
             (1 in a plane).
+        friction: mu, Coulomb's coefficient, >= 0; None for no limit.
 
     Raises:
         ValueError: for a value outside its range.
 
-    Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997).
+    Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997). The law with friction is that of
+    Walton (1993), as Foerster, Louge, Chang & Allia measured it on beads, Phys. Fluids 6, 1108
+    (1994).
 
     >>> rough = dataclasses.replace(gas, surface=jaxgran.Rough(0.5, rotational_temperature=0.002))
     >>> float(rough.value("tangential_restitution"))
@@ -76,8 +96,14 @@ class Rough(eqx.Module):
     rotational_temperature: Float[Array, ""] = eqx.field(
         converter=number_named("rotational_temperature"), default=0.0
     )
+    friction: Float[Array, ""] | None = eqx.field(
+        converter=_number_or_none("friction"), default=None
+    )
 
-    domains: ClassVar[dict[str, Domain]] = domains_of("Rough")
+    @property
+    def domains(self) -> dict[str, Domain]:
+        """Allowed range of each float."""
+        return _domains_of_given(self)
 
     def __check_init__(self):
         check_fields(self, "Rough")
@@ -142,13 +168,6 @@ def _wall_law(law: UserWallLaw) -> RestitutionLaw:
     return ConstantRestitution(law)
 
 
-def _number_or_none(name: str) -> Callable[[Any], Array | None]:
-    def convert(value: Any) -> Array | None:
-        return None if value is None else number_named(name)(value)
-
-    return convert
-
-
 class Walls(eqx.Module):
     """Flat walls at rest around the gas: a cube (square), or a box of given sides.
 
@@ -199,7 +218,7 @@ class Walls(eqx.Module):
     @property
     def domains(self) -> dict[str, Domain]:
         """Allowed range of each float of the walls, without those of their law."""
-        return {k: d for k, d in domains_of("Walls").items() if getattr(self, k) is not None}
+        return _domains_of_given(self)
 
     def more_collisions(self, diameter: Array, dimension: int) -> Float[Array, ""]:
         """Ratio of the collision frequency to that without walls at the same mean density.

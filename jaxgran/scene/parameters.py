@@ -48,7 +48,7 @@ _ROWS = (
     ("coefficient", "", "", FRACTION, MATERIAL, "ConstantRestitution"),
     ("tangential_restitution", "beta_t", "", TANGENTIAL, MATERIAL, "Rough"),
     ("tangential_damping", "tangential_damping", "", NON_NEGATIVE, MATERIAL, "Frictional"),
-    ("friction", "friction", "", NON_NEGATIVE, MATERIAL, "Frictional"),
+    ("friction", "friction", "", NON_NEGATIVE, MATERIAL, "Frictional", "Rough"),
     ("inertia", "reduced_inertia", "", INERTIA, MATERIAL, "Rough", "Frictional"),
     ("rotational_temperature", "T_rot_0", "m^2/s^2", NON_NEGATIVE, SCENE, "Rough", "Frictional"),
     ("wall_side", "container_side", "m", POSITIVE, SCENE, "Walls"),

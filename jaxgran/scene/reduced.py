@@ -26,11 +26,13 @@ class ReducedRough(NamedTuple):
         beta: tangential restitution beta_t.
         inertia: q.
         ratio: T_rot/T at t = 0.
+        friction: mu; None without Coulomb's limit.
     """
 
     beta: Float[Array, ""]
     inertia: Float[Array, ""]
     ratio: Float[Array, ""]
+    friction: Float[Array, ""] | None = None
 
     @property
     def eta(self) -> Float[Array, ""]:
@@ -97,8 +99,9 @@ def reduced_scene(gas: Gas) -> ReducedScene:
     d, length, speed = gas.dimension, gas.path_length, gas.impact_speed
     surface = walls = drag = drive = None
     if isinstance(gas.surface, Rough):
-        ratio = gas.surface.rotational_temperature / gas.temperature
-        surface = ReducedRough(gas.surface.tangential_restitution, gas.surface.inertia, ratio)
+        rough = gas.surface
+        ratio = rough.rotational_temperature / gas.temperature
+        surface = ReducedRough(rough.tangential_restitution, rough.inertia, ratio, rough.friction)
     if gas.container is not None:
         box = gas.container
         law = box.restitution.on_wall(diameter=gas.diameter, mass=gas.mass, speed=speed)

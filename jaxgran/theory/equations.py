@@ -12,7 +12,7 @@ equations are numbered here as in the authors' preprint.
 
 from functools import partial
 from math import gamma, log, pi, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -338,10 +338,17 @@ def element_rates(
         dimension: d.
     """
     total = ElementRates(*[jnp.zeros_like(speed)] * 4)
-    if scene.surface is not None:
+    if (surface := scene.surface) is not None:
         rate = collision_rate(sonine, dimension) * speed
-        rates = _friction_rates(scene.surface.eta, scene.surface.inertia, rate, ratio, dimension)
-        total = _add(total, rates)
+        rates = [rate, rate]
+        if surface.friction is not None:
+            sliding = partial(sliding_shares, surface, surface.eta, ratio, dimension)
+
+            def sticks(g: Array, k: int) -> Array:
+                return sliding((1 + scene.law.restitution(g * speed)) / 2 * g)[k]
+
+            rates = [rate * impact_average(partial(sticks, k=k), speed) for k in (0, 1)]
+        total = _add(total, _friction_rates(surface.eta, surface.inertia, rates, ratio, dimension))
     if scene.walls is not None:
         rates = _wall_rates(scene.walls, scene.surface, speed, ratio, dimension)
         total = _add(total, rates)
@@ -362,27 +369,67 @@ def _add(a: ElementRates, b: ElementRates) -> ElementRates:
 
 
 def _friction_rates(
-    eta: Array, inertia: Array, rate: Array | float, ratio: Array | float, d: int
+    eta: Array, inertia: Array, rates: Any, ratio: Array | float, d: int
 ) -> ElementRates:
     """Rates of change by the tangential part of impacts between spheres.
 
-    The number of impacts per particle and unit of time is nu (`rate`).
-    ``dT/dt = -(2 (d-1)/d) nu (eta (1 - eta) T - eta^2 T_rot/q)`` and
-    ``dT_rot/dt = -(2 (d-1)/d_rot) nu (eta/q) ((1 - eta/q) T_rot - eta T)``: the mean squared
+    With nu impacts per particle and unit of time
+    ``dT/dt = -(2 (d-1)/d) nu (eta T - eta^2 (T + T_rot/q))`` and
+    ``dT_rot/dt = -(2 (d-1)/(q d_rot)) nu (eta T_rot - eta^2 (T + T_rot/q))``: the mean squared
     tangential velocity of two colliding spheres is 2 (d-1) T for their centres and 2 (d-1) T_rot/q
     for their surfaces. Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997).
+
+    The two `rates` are nu in the terms with eta and with eta^2, smaller where spheres slide, see
+    `sliding_shares`.
     """
-    strength = 2 * (d - 1) * rate
+    once, twice = (2 * (d - 1) * rate * x for rate, x in zip(rates, (eta, eta**2), strict=True))
+    square = 1 + ratio / inertia
     return ElementRates(
-        cooling=strength / d * (eta * (1 - eta) - eta**2 * ratio / inertia),
-        rotation=-strength
-        / NUM_SPIN_COMPONENTS[d]
-        * eta
-        / inertia
-        * ((1 - eta / inertia) * ratio - eta),
-        relaxation=strength / (2 * d) * eta,
+        cooling=(once - twice * square) / d,
+        rotation=-(once * ratio - twice * square) / (NUM_SPIN_COMPONENTS[d] * inertia),
+        relaxation=once / (2 * d),
         sonine=jnp.zeros_like(eta),
     )
+
+
+MAX_STICKING = 20.0
+"""Largest kick over eta times the typical slip, beyond which no sphere slides in double precision.
+"""
+
+
+def sliding_shares(
+    surface: ReducedRough,
+    eta: Float[Array, ""],
+    ratio: Float[Array, ""] | float,
+    dimension: int,
+    normal_kick: Float[Array, "..."],
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return the factors of the mean tangential impulse and of its square by Coulomb's limit.
+
+    The slip u_t of Maxwellian velocities and spins has d - 1 Gaussian components of variance
+    ``s^2 = 2 (T + T_rot/q)``, and spheres stick where eta u_t is below mu times the normal kick w.
+    With ``y = mu w/(sqrt(2) eta s)`` the averages of u_t times the impulse and of its square, over
+    those without a limit, are ``1 - exp(-y^2) + (sqrt(pi)/2) y erfc(y)`` and ``1 - exp(-y^2)`` in
+    3D, ``erf(y)`` and ``erf(y) - (2/sqrt(pi)) y exp(-y^2) + 2 y^2 erfc(y)`` in 2D.
+
+    Args:
+        surface: with friction.
+        eta: coefficient of `Rough`.
+        ratio: T_rot/T.
+        dimension: d.
+        normal_kick: w over sqrt(2 T), any shape.
+
+    Returns:
+        Two factors, from 0 where all slide to 1 where all stick.
+    """
+    assert surface.friction is not None
+    slip = jnp.sqrt(2 * (1 + ratio / surface.inertia)) * jnp.maximum(eta, 1e-9)
+    y = jnp.minimum(surface.friction * normal_kick / slip, MAX_STICKING)
+    sticking, tail = -jnp.expm1(-(y**2)), jax.scipy.special.erfc(y)
+    if dimension == 3:
+        return sticking + sqrt(pi) / 2 * y * tail, sticking
+    once = 1 - tail
+    return once, once - 2 / sqrt(pi) * y * jnp.exp(-(y**2)) + 2 * y**2 * tail
 
 
 def _wall_rates(
@@ -397,22 +444,38 @@ def _wall_rates(
     those of a free gas.
     """
 
-    def axis_rates(frequency: Array) -> tuple[Array, Array]:
+    eta = jnp.zeros_like(speed)
+    if walls.beta is None:
+        surface = None
+    if surface is not None and walls.beta is not None:
+        eta = surface.eta_on_wall(walls.beta) / 2
+
+    def axis_rates(frequency: Array) -> tuple[Array, list[Array]]:
         def share(g: Array) -> Array:
             eps = walls.law.restitution(g * speed / sqrt(2))
             return wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
 
         lost = impact_average(lambda g: share(g) * _wall_loss(walls, speed, g), speed)
-        # Energy lost over T, and number of impacts, both per unit of time and sqrt(T/T_0).
-        return frequency * lost, frequency * impact_average(share, speed)
+        impacts = [frequency * impact_average(share, speed)] * 2
+        if surface is not None and surface.friction is not None:
+            sliding = partial(sliding_shares, surface, eta, ratio, d)
 
-    lost, impacts = (speed * jnp.sum(x) for x in jax.vmap(axis_rates)(walls.frequency))
+            def sticks(g: Array, k: int) -> Array:
+                kick = (1 + walls.law.restitution(g * speed / sqrt(2))) / 2 * g
+                return share(g) * sliding(kick)[k]
+
+            impacts = [frequency * impact_average(partial(sticks, k=k), speed) for k in (0, 1)]
+        # Energy lost over T, and numbers of impacts, per unit of time and sqrt(T/T_0).
+        return frequency * lost, impacts
+
+    by_axis = jax.vmap(axis_rates)(walls.frequency)
+    lost, impacts = jax.tree.map(lambda x: speed * jnp.sum(x), by_axis)
     zero = jnp.zeros_like(speed)
     total = ElementRates(2 / d * lost, zero, zero, zero)
-    if surface is None or walls.beta is None:
+    if surface is None:
         return total
-    eta = surface.eta_on_wall(walls.beta) / 2
-    return _add(total, _friction_rates(eta, surface.inertia, 2 * impacts, ratio, d))
+    rates = [2 * rate for rate in impacts]
+    return _add(total, _friction_rates(eta, surface.inertia, rates, ratio, d))
 
 
 def _wall_loss(walls: ReducedWalls, speed: Array, g: Array) -> Array:
@@ -430,7 +493,8 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
     by_speed, constant = 0.0, 0.0
     if scene.surface is not None:
         rate = collision_rate(0.0, dimension)
-        friction = _friction_rates(scene.surface.eta, scene.surface.inertia, rate, 0.0, dimension)
+        surface, both = scene.surface, (rate, rate)
+        friction = _friction_rates(surface.eta, surface.inertia, both, 0.0, dimension)
         by_speed = by_speed + friction.cooling
     if scene.walls is not None:
         by_speed = by_speed + _wall_cooling_bound(scene.walls, scene.surface, dimension)
@@ -458,7 +522,7 @@ def _wall_cooling_bound(
         surface.eta_on_wall(walls.beta) / 2,
         MAX_WALL_IMPACT_RATIO * jnp.sum(walls.frequency),
     )
-    return bound + _friction_rates(eta, surface.inertia, 2 * rate, 0.0, d).cooling
+    return bound + _friction_rates(eta, surface.inertia, (2 * rate, 2 * rate), 0.0, d).cooling
 
 
 MAX_WAVENUMBER = {2: (0.181, 3.10), 3: (0.926, 2.19)}
@@ -748,12 +812,18 @@ def _steady_rates(
 
 
 def _steady_ratio(speed: Array, sonine: Array, scene: ReducedScene, d: int) -> Array:
-    """T_rot/T at which ``dT_rot/dt``, which is linear in it, is 0; 0 for smooth spheres."""
+    """T_rot/T at which ``dT_rot/dt`` is 0, which is linear in it without friction; 0 if smooth."""
+    ratio = jnp.zeros_like(speed)
     if scene.surface is None:
-        return jnp.zeros_like(speed)
-    gain, both = (element_rates(scene, speed, r, sonine, d).rotation for r in (0.0, 1.0))
-    loss = gain - both
-    return jnp.where(loss > 0, gain / jnp.where(loss > 0, loss, 1.0), 0.0)
+        return ratio
+    for _ in range(1 if scene.surface.friction is None else _NEWTON_STEPS):
+        gain, slope = jax.jvp(
+            lambda r: element_rates(scene, speed, r, sonine, d).rotation,
+            (ratio,),
+            (jnp.ones_like(ratio),),
+        )
+        ratio = jnp.where(slope < 0, ratio - gain / jnp.where(slope < 0, slope, -1.0), 0.0)
+    return ratio
 
 
 def scene_at_start(gas: Gas) -> ReducedScene:

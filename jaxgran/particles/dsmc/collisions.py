@@ -256,7 +256,8 @@ def collide(
     )
     if scene.surface is None or spin is None:
         return outcome
-    return _with_tangential(outcome, scene.surface, relative, spin, jnp.stack(normal, axis=-1), hit)
+    normal = jnp.stack(normal, axis=-1)
+    return _with_tangential(outcome, scene.surface, relative, spin, normal, hit, push)
 
 
 def _with_tangential(
@@ -266,9 +267,10 @@ def _with_tangential(
     spin: Float[Array, "pairs spins"],
     normal: Float[Array, "pairs d"],
     hit: Bool[Array, "pairs"],
+    push: Float[Array, "pairs"],
 ) -> Outcome:
     """Return the outcome with the tangential part of the impacts; see `jaxgran.Rough`."""
-    tangential = tangential_impulse(relative, spin, normal, hit, surface.eta, surface.inertia)
+    tangential = tangential_impulse(relative, spin, normal, hit, surface.eta, surface, push)
     kick, spin_change = tangential.kick, tangential.spin_change
     loss = -2 * jnp.sum(kick * (tangential.sideways + kick))  # of translation alone
     return outcome._replace(
@@ -369,11 +371,12 @@ def hit_walls(
     eps = walls.law.restitution(jnp.where(speed > 0, speed * drag_factor, 1.0))
     ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
     hit = (chance < ratio * per_speed * speed) & (speed > 0)
-    kick = -jnp.where(hit, (1 + eps) * speed, 0.0)[:, None] * outwards
+    push = jnp.where(hit, (1 + eps) * speed, 0.0)
+    kick = -push[:, None] * outwards
     spin_change = jnp.zeros_like(spin)
     if surface is not None and walls.beta is not None:
         eta = surface.eta_on_wall(walls.beta)
-        tangential = tangential_impulse(velocity, spin, outwards, hit, eta, surface.inertia)
+        tangential = tangential_impulse(velocity, spin, outwards, hit, eta, surface, push)
         kick, spin_change = kick + tangential.kick, tangential.spin_change
     # The number of impacts is not differentiable, so weights of value 1 carry its derivative.
     weight = frequency * ratio

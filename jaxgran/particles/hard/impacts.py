@@ -194,7 +194,7 @@ def pair_effect(scene: HardScene, impact: ImpactEvents) -> ImpactEffect:
     if scene.surface is None or impact.spin is None:
         return effect
     return _add_tangential_impulse(
-        effect, impact, decay, scene.surface.eta, scene.surface.inertia, num_spheres=2
+        effect, impact, decay, scene.surface.eta, scene.surface, num_spheres=2
     )
 
 
@@ -213,7 +213,7 @@ def wall_effect(scene: HardScene, impact: ImpactEvents, axis: Int[Array, "rows"]
         no_change = jnp.zeros_like(impact.spin)
         return effect._replace(spin_change=no_change, rotational_gain=no_change[:, 0])
     return _add_tangential_impulse(
-        effect, impact, decay, surface.eta_on_wall(walls.beta), surface.inertia, num_spheres=1
+        effect, impact, decay, surface.eta_on_wall(walls.beta), surface, num_spheres=1
     )
 
 
@@ -249,14 +249,20 @@ def _add_tangential_impulse(
     impact: ImpactEvents,
     decay: DragDecay | None,
     eta: Float[Array, ""],
-    inertia: Float[Array, ""],
+    surface: ReducedRough,
     num_spheres: int,
 ) -> ImpactEffect:
     """Add the tangential part of impacts on `num_spheres` spheres, of which each bears a share."""
     assert impact.spin is not None
     spin_factor = 1.0 if decay is None else decay.spin[:, None]
     impulse: TangentialImpulse = tangential_impulse(
-        impact.relative, impact.spin * spin_factor, impact.normal, ~impact.elastic, eta, inertia
+        impact.relative,
+        impact.spin * spin_factor,
+        impact.normal,
+        ~impact.elastic,
+        eta,
+        surface,
+        -jnp.sum(effect.kick * impact.normal, axis=-1),
     )
     if num_spheres == 2:
         lost = -0.5 * jnp.sum(impulse.kick * (impulse.sideways + impulse.kick), -1)
@@ -264,7 +270,9 @@ def _add_tangential_impulse(
         lost = -jnp.sum(impulse.kick * (impulse.sideways + 0.5 * impulse.kick), -1)
     spin_change = impulse.spin_change / spin_factor
     rotational_gain = (
-        inertia / 2 * jnp.sum(spin_change * (impact.spin * 2 / num_spheres + spin_change), -1)
+        surface.inertia
+        / 2
+        * jnp.sum(spin_change * (impact.spin * 2 / num_spheres + spin_change), -1)
     )
     return ImpactEffect(
         effect.kick + impulse.kick, effect.lost + lost, spin_change, rotational_gain
