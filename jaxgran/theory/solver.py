@@ -30,7 +30,7 @@ FIRST_STEP = 0.01
 """First step, before the error of a step is known; it is shortened where it is too long."""
 
 WINDOW = 16
-"""Number of output times that are interpolated together; their total must be a multiple of it."""
+"""Number of output times that are interpolated together."""
 
 
 def padded_length(size: int) -> int:
@@ -57,7 +57,7 @@ def integrate_at(
     Args:
         vector_field: a function of a time and a state.
         start: y(0), any shape.
-        times: not decreasing, >= 0; their number is a multiple of `WINDOW`.
+        times: not decreasing, >= 0.
         solver: an explicit one with ``scan_kind="lax"`` compiles fastest. Other methods than
             explicit Runge-Kutta are run by `diffrax.diffeqsolve`.
         controller: of the step sizes.
@@ -138,6 +138,8 @@ def _fill_values(
 ) -> tuple[Array, Int[Array, ""]]:
     """Values with those up to a reached time filled in, and the number of known ones."""
 
+    window = min(WINDOW, times.size)
+
     def next_time(known):
         return times[jnp.minimum(known, times.size - 1)]
 
@@ -146,10 +148,10 @@ def _fill_values(
 
     def fill(at):
         values, known = at
-        begin = jnp.minimum(known, times.size - WINDOW)
-        t = jax.lax.dynamic_slice_in_dim(times, begin, WINDOW)
-        old = jax.lax.dynamic_slice_in_dim(values, begin, WINDOW)
-        inside = (begin + jnp.arange(WINDOW) >= known) & (t <= reached)
+        begin = jnp.minimum(known, times.size - window)
+        t = jax.lax.dynamic_slice_in_dim(times, begin, window)
+        old = jax.lax.dynamic_slice_in_dim(values, begin, window)
+        inside = (begin + jnp.arange(window) >= known) & (t <= reached)
         inside = jnp.expand_dims(inside, tuple(range(1, old.ndim)))
         new = jnp.where(inside, jax.vmap(evaluate)(t), old)
         values = jax.lax.dynamic_update_slice_in_dim(values, new, begin, 0)
@@ -212,7 +214,7 @@ def moments_at(
 
     Args:
         scene: its floats can be differentiated.
-        times: not decreasing, >= 0; their number is a multiple of `WINDOW`.
+        times: not decreasing, >= 0.
         equations: of the moments.
         integrator: of the equations.
 

@@ -76,3 +76,12 @@ def test_what_does_not_end_says_so():
     # As far as it came it is right, with the tolerance times the growth of errors, y^2 <= 100.
     early = TIMES < 0.9
     np.testing.assert_allclose(values[early, 0], 1 / (1 - TIMES[early]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("number", [1, 4, 20])
+def test_any_number_of_times_will_do(number):
+    """Fits under jax.vmap have the times of the curve, which are not padded."""
+    times = np.linspace(0.5, 3.0, number)
+    values, reached = solved(lambda t, y: -y, [1.0], times)
+    assert reached
+    np.testing.assert_allclose(values[:, 0], np.exp(-times), rtol=1e-7)
