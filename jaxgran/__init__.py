@@ -42,7 +42,7 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.particles import observables
 from jaxgran.scene.contact import Impact, contact_force, elastic_constant, impact
-from jaxgran.scene.elements import DrivenStart, Frictional, Rough, StokesDrag, Walls, WhiteNoise
+from jaxgran.scene.elements import Frictional, Rough, StokesDrag, Walls, WhiteNoise
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.laws import (
@@ -64,7 +64,6 @@ __all__ = [
     "CoolingCurve",
     "Diagnosis",
     "Domain",
-    "DrivenStart",
     "DropTest",
     "ErrorModel",
     "Fit",

@@ -36,7 +36,7 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.cool import cool
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.spheres import AbstractSpheres, Plan
+from jaxgran.models.spheres import AbstractSpheres
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.run import block_until_ready
 from jaxgran.scene.gas import Gas
@@ -287,12 +287,13 @@ def _empty(name: str, dtype: Any) -> Any:
 def _sized_for_all(model: AbstractSpheres, gases: Sequence[Gas], spare: float) -> AbstractSpheres:
     """Return a model with arrays long enough, and blocks of steps short enough, for all gases."""
     plans = [plan for gas in gases if (plan := model.sized_for(gas, spare).plan) is not None]
-    pace = type(plans[0].pace)(*map(min, zip(*(plan.pace for plan in plans), strict=True)))
+    steps = min(plan.steps for plan in plans)
     run, equilibration = (
         Capacity(*map(max, zip(*capacities, strict=True)))
         for capacities in zip(*((p.capacity, p.equilibration_capacity) for p in plans), strict=True)
     )
-    return dataclasses.replace(model, plan=Plan(plans[0].replicas, pace, run, equilibration))
+    plan = plans[0]._replace(steps=steps, capacity=run, equilibration_capacity=equilibration)
+    return dataclasses.replace(model, plan=plan)
 
 
 def _run_member(gas: Gas, key: PRNGKeyArray, *, model, times, save) -> CoolingCurve:

@@ -45,7 +45,7 @@ SHORT = 2
 """Index of the last time before chaos: .5 mean free times."""
 
 BEADS = glass_beads(0.3, packing_fraction=0.2)
-ALL = ("surface", "container", "drag", "drive", "preparation")
+ALL = ("surface", "container", "drag", "drive")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -231,7 +231,6 @@ ELEMENTS = {
     "container": Walls(SIDE, restitution=0.8),
     "drag": StokesDrag(RATE),
     "drive": WhiteNoise(0.01 * RATE),
-    "preparation": jaxgran.DrivenStart(),
 }
 
 
@@ -324,29 +323,12 @@ def check_drive(case):
         np.testing.assert_allclose(curve.dissipated_energy, 0.0, atol=1e-20)
 
 
-def check_preparation(case):
-    gas = dataclasses.replace(BEADS, preparation=jaxgran.DrivenStart())
-    curve = case.run(gas)
-    assert int(curve.status) == 0
-    assert float(curve.temperature[0]) == pytest.approx(float(gas.temperature), rel=1e-12)
-    assert np.all(np.diff(curve.temperature) <= 0)
-    if curve.dissipated_energy is not None:
-        total = total_energy(gas, curve)
-        np.testing.assert_allclose(total, total[0], rtol=ledger_accuracy(case))
-    if not case.model.stochastic:
-        strength = gas.temperature * case.model.cooling_rate(gas)
-        steady = jaxgran.steady_state(dataclasses.replace(BEADS, drive=WhiteNoise(strength)))
-        # This drive keeps T_0 within some percent, and a_2 hardly depends on T.
-        assert float(curve.sonine[0]) == pytest.approx(float(steady.sonine), rel=0.05)
-
-
 CHECKS = {
     "surface": check_surface,
     "friction": check_friction,
     "container": check_container,
     "drag": check_drag,
     "drive": check_drive,
-    "preparation": check_preparation,
 }
 
 

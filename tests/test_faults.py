@@ -18,8 +18,7 @@ from jaxgran._utils import status
 from jaxgran._utils.validation import ANY
 from jaxgran.data.curve import Run
 from jaxgran.particles import dynamics as moving
-from jaxgran.particles import run
-from jaxgran.particles.run import _PROGRAMS, block_until_ready, in_thread, run_through_times
+from jaxgran.particles.run import block_until_ready, in_thread, run_through_times
 from jaxgran.scene.laws import ReducedLaw, RestitutionLaw
 from tests.beads import glass_beads
 
@@ -216,7 +215,6 @@ def test_blocks_that_stand_still_end(kind, x64, monkeypatch):
         gas = glass_beads(0.3, packing_fraction=0.1)
         monkeypatch.setattr(moving, "MIN_FLIGHT", 1e9)  # no flight is long enough
         monkeypatch.setattr(moving, "MAX_STALLED", 3)
-        monkeypatch.setattr(run, "_PROGRAMS", type(_PROGRAMS)())
         jax.clear_caches()
         curve = kind(20).simulate(gas, jnp.array([TAU]), Run())
         jax.clear_caches()

@@ -19,7 +19,6 @@ SUPPORTED_BY = {
     "container": "KineticTheory, DSMC, HardSpheres or SoftSpheres",
     "drag": "KineticTheory, DSMC, HardSpheres or SoftSpheres",
     "drive": "KineticTheory, DSMC or HardSpheres",
-    "preparation": "KineticTheory, DSMC or HardSpheres",
 }
 """Models that support each element of a scene (see `Gas.elements`)."""
 

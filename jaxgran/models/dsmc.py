@@ -40,8 +40,7 @@ from jaxgran.particles.run import (
 )
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import ReducedScene
-from jaxgran.theory.equations import scene_at_start
+from jaxgran.scene.reduced import ReducedScene, reduced_scene
 
 MAX_STEP = 0.1
 """Largest number of collisions per particle and step: a step draws a particle at most twice."""
@@ -65,8 +64,7 @@ class DSMC(AbstractModel):
     walls take (`jaxgran.scene.elements`); drag, exactly, by collisions in transformed time
     (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32); a drive, with half of the kicks
     at the beginning of each step and half at its end, on subsets of the particles in turn
-    (`jaxgran.particles.dsmc.collisions`); and a driven start, for which a drive returns the energy
-    that collisions take during 10 mean free times. With elements the derivatives of T, T_rot and
+    (`jaxgran.particles.dsmc.collisions`). With elements the derivatives of T, T_rot and
     collisions are known (`jaxgran.gradients.tangents`), others are nan.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
@@ -101,7 +99,7 @@ class DSMC(AbstractModel):
 
     stochastic: ClassVar[bool] = True
     saves: ClassVar[bool] = True
-    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive", "preparation")
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
     derivative_accuracy: ClassVar[float] = 0.01
 
     def __check_init__(self):
@@ -141,7 +139,7 @@ class DSMC(AbstractModel):
         unreachable_times = checks.unreachable_with_drag(gas, times)
         words = _key_words(run)
         scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
-        scene, reduced = scene_at_start(gas), times * gas.impact_speed / gas.path_length
+        scene, reduced = reduced_scene(gas), times * gas.impact_speed / gas.path_length
         if scene.drag is not None:
             reduced = transformed_times(scene.drag, reduced)
         units = self._units(gas)

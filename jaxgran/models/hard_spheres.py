@@ -1,7 +1,7 @@
 """Hard spheres: instantaneous impacts in a periodic box, resolved event by event."""
 
 import math
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -24,9 +24,8 @@ from jaxgran.particles.hard.prediction import BOX_MARGIN, HardWalls
 from jaxgran.particles.setup import check_inside, min_distance, overlap_by_rounding
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import ReducedDrag, ReducedDrive
+from jaxgran.scene.reduced import ReducedDrag, ReducedDrive, reduced_scene
 from jaxgran.theory.averages import collision_rate
-from jaxgran.theory.equations import scene_at_start
 
 WINDOW_SHARE = 0.05
 """Impacts per particle in a window."""
@@ -38,12 +37,6 @@ CONTACT_TIMES = Domain(0.0, 0.1, low_allowed=True, high_allowed=True)
 
 ALLOWED_OVERLAP = 1e-9
 """Overlap in diameters that is allowed in a given start."""
-
-
-class HardPace(NamedTuple):
-    """Static settings of the windows: see `HardDynamics`."""
-
-    share: float
 
 
 class HardSpheres(AbstractSpheres):
@@ -65,8 +58,7 @@ class HardSpheres(AbstractSpheres):
     Supports all elements of a scene but `jaxgran.Frictional`: rough spheres; containers, cubes or
     boxes of given sides, with exact impacts on their walls, in place of the periodic box; drag,
     exactly, by impacts in transformed time (`jaxgran.particles.state`), up to gamma t = 18 (8 in
-    float32); a drive, with kicks at both ends of each window of some .05 mean free times; and a
-    driven start, for which a drive returns the energy that impacts take during 10 mean free times.
+    float32); a drive, with kicks at both ends of each window of some .05 mean free times.
 
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer. It lives on
@@ -125,7 +117,7 @@ class HardSpheres(AbstractSpheres):
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 7.0
-    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive", "preparation")
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
 
     def __check_init__(self):
         self.check_counts()
@@ -189,11 +181,7 @@ class HardSpheres(AbstractSpheres):
 
     def dynamics(self, scene: HardScene, plan: Plan) -> HardDynamics:
         """Return the equations of motion of the spheres."""
-        return HardDynamics(scene, plan.replicas, plan.capacity, plan.pace.share, ALLOWED_OVERLAP)
-
-    def pace_fixed(self) -> dict[str, Any]:
-        """Return no settings: a plan repeats none of this model."""
-        return {}
+        return HardDynamics(scene, plan.replicas, plan.capacity, plan.steps, ALLOWED_OVERLAP)
 
     def clock(self, scene: HardScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
         """Return the transformed times of a gas with drag, otherwise the times."""
@@ -226,13 +214,13 @@ class HardSpheres(AbstractSpheres):
         if scene.walls is not None:  # the sweep runs along the first axis
             ahead = min(ahead * max(1.0, filled / float(scene.walls.sides[0])), self.num_particles)
         sizes = capacities(expected, ahead, spare or 1.15, extra, n)
-        return Plan(self.replicas, HardPace(share), *sizes)
+        return Plan(self.replicas, None, share, *sizes)
 
 
 def reduced_hard_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:
     """Return a gas of hard spheres in units of its diameter, mass and initial temperature."""
     unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    side, scene = gas.box_side(num_particles) / gas.diameter, scene_at_start(gas)
+    side, scene = gas.box_side(num_particles) / gas.diameter, reduced_scene(gas)
     nu = gas.collision_frequency
     walls = drag = drive = None
     if gas.container is not None and scene.walls is not None:
@@ -254,5 +242,4 @@ def reduced_hard_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) 
         walls=walls,
         drag=drag,
         drive=drive,
-        prepared=scene.prepared,
     )

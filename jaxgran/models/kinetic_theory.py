@@ -17,11 +17,15 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ROUGHNESS_ERROR, ErrorModel
 from jaxgran.scene.gas import Gas
-from jaxgran.theory.equations import Density, Equations, scene_at_start
+from jaxgran.scene.reduced import reduced_scene
+from jaxgran.theory.equations import Density, Equations
 from jaxgran.theory.solver import Integrator, moments_at, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
+
+SONINES = validation.Domain(-0.4, 1.0)
+"""Values of a_2 at t = 0; that of spheres of one speed is -0.4, of disks -0.5."""
 
 
 class KineticTheory(AbstractModel):
@@ -41,7 +45,7 @@ class KineticTheory(AbstractModel):
     Supports all elements of a scene but lasting friction, in a homogeneous gas: rough spheres, with
     T_rot, where spins and velocities are assumed to be independent and Gaussian (T within 2 % of
     DSMC, T_rot/T within 3 %, within 7 % in 3D and 9 % in 2D if they slide); walls, with the denser
-    layer before them (`jaxgran.scene.elements`); drag; a drive by white noise; and a driven start.
+    layer before them (`jaxgran.scene.elements`); drag; a drive by white noise.
     Between walls the curve has no D and <dr^2>.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
@@ -56,6 +60,8 @@ class KineticTheory(AbstractModel):
             spheres).
         correlations: correct for velocity correlations at finite density; with False this is
             Enskog's theory.
+        initial_sonine: a_2 at t = 0, in (-0.4, 1); that of `jaxgran.steady_state` for a gas that
+            white noise has driven.
         rtol: relative tolerance of the adaptive solver; by default 1e-8 in float64, 1e-5 in
             float32. The relative error of T is about rtol, the error of <dr^2> about rtol in mean
             free paths squared.
@@ -78,6 +84,7 @@ class KineticTheory(AbstractModel):
     order: validation.UserInt = eqx.field(static=True, default=3)
     softness: validation.UserBool = eqx.field(static=True, default=True)
     correlations: validation.UserBool = eqx.field(static=True, default=True)
+    initial_sonine: validation.UserFloat = eqx.field(static=True, default=0.0)
     rtol: validation.UserFloat | None = eqx.field(static=True, default=None)
     solver: Any = eqx.field(static=True, default=diffrax.Tsit5(scan_kind="lax"))
     max_steps: validation.UserInt = eqx.field(static=True, default=200_000)
@@ -90,6 +97,12 @@ class KineticTheory(AbstractModel):
             raise ValueError(
                 f"order must be 2 or 3, got {self.order!r}. Use sonine=False for a Maxwellian gas."
             )
+        advice = "It is that of the velocities at t = 0, and 0 for a Maxwellian gas."
+        validation.checked_float("initial_sonine", self.initial_sonine, SONINES, advice)
+        if self.initial_sonine and not self.sonine:
+            raise ValueError(
+                f"initial_sonine = {self.initial_sonine} needs sonine=True: a_2 stays 0 otherwise."
+            )
         if self.rtol is not None:
             validation.checked_float(
                 "rtol", self.rtol, TOLERANCES, "Leave it out for 1e-8 (float32: 1e-5)."
@@ -101,7 +114,7 @@ class KineticTheory(AbstractModel):
         validation.checked_int("max_steps", self.max_steps, 1, "Leave it out for 200000.")
 
     stochastic: ClassVar[bool] = False
-    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive", "preparation")
+    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
     derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs
 
     def displacement_accuracy(self, gas: Gas) -> Any:
@@ -180,11 +193,13 @@ class KineticTheory(AbstractModel):
     def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
         unit_time = gas.path_length / gas.impact_speed
-        scene = scene_at_start(gas), Density.from_gas(gas, self.softness, self.correlations)
+        scene = reduced_scene(gas), Density.from_gas(gas, self.softness, self.correlations)
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
         integrator = Integrator(self.solver, rtol * tolerance, self.max_steps)
         order = self.order if self.sonine else 2
-        equations = Equations(gas.dimension, order, not self.sonine, self.softness)
+        equations = Equations(
+            gas.dimension, order, not self.sonine, self.softness, self.initial_sonine
+        )
         state, fault = moments_at(scene, times / unit_time, equations, integrator)
         theta = jnp.exp(state.log_temperature)
         length = gas.path_length

@@ -1,7 +1,7 @@
 """Soft spheres: every contact resolved in time, in a periodic box."""
 
 import math
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -38,13 +38,6 @@ BLOCK_LENGTHS = Grid(ratio=1.2, spare=1.0)
 
 INTEGRATION_ERROR = 0.001
 """Relative error of T by the time steps, with which eps is right to 1e-4."""
-
-
-class SoftPace(NamedTuple):
-    """Static settings of the time steps: see `SoftDynamics`."""
-
-    steps_per_contact: int
-    steps_per_block: int
 
 
 class SoftSpheres(AbstractSpheres):
@@ -206,13 +199,8 @@ class SoftSpheres(AbstractSpheres):
     def dynamics(self, scene: SphereScene, plan: Plan) -> SoftDynamics:
         """Return the equations of motion of the spheres."""
         projection = concrete_array(self.projection or np.inf, scene.side.dtype)
-        pace: SoftPace = plan.pace
-        steps = pace.steps_per_contact, pace.steps_per_block
+        steps = self.steps_per_contact, plan.steps
         return SoftDynamics(scene, plan.replicas, plan.capacity, *steps, projection)
-
-    def pace_fixed(self) -> dict[str, Any]:
-        """Return the setting that a plan repeats."""
-        return {"steps_per_contact": self.steps_per_contact}
 
     def planned(self, scene: SphereScene, dimension: int, spare: float | None = None) -> Plan:
         """Return static sizes; capacities were measured for phi = .01 to .4 (disks: .5) and
@@ -240,4 +228,4 @@ class SoftSpheres(AbstractSpheres):
         extra = 1.3 * around.in_contact
         lookahead = min(ahead * around.lookahead, self.num_particles)
         sizes = capacities(expected, lookahead, spare or 1.2, extra, n)
-        return Plan(self.replicas, SoftPace(self.steps_per_contact, steps), *sizes)
+        return Plan(self.replicas, self.steps_per_contact, steps, *sizes)

@@ -38,54 +38,6 @@ DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
 """Allowed steps of differences: the lower value of alpha must stay positive."""
 
 
-def check_difference_step(differences: Any, projected: bool) -> None:
-    """Raise ValueError for a step of differences out of range, or with plain derivatives."""
-    if differences is None:
-        return
-    advice = "In the logarithm of an impact's loss: 0.3, or None for projected derivatives."
-    checked_float("differences", differences, DIFFERENCE_STEPS, advice)
-    if not projected:
-        raise ValueError(
-            f"differences = {differences} and projection = None ask for two kinds of derivative. "
-            "Leave one of them out."
-        )
-
-
-def check_gas_for_differences(differences: float | None, gas: Gas) -> None:
-    """Raise ValueError for derivatives by differences of a gas with elements."""
-    if differences is not None and gas.elements:
-        raise ValueError(
-            "derivatives by differences need smooth spheres in free flight, and this gas has "
-            f"{', '.join(gas.elements)}. Leave differences out of the model, or take differences "
-            "of runs yourself."
-        )
-
-
-def with_derivative_rule(
-    outputs: Callable[..., Outputs],
-    run: Run,
-    differences: float | None,
-    projected: bool,
-    non_differentiable: Callable[[Any], Any],
-) -> Callable[[Inputs], Outputs]:
-    """Return a run as a function of its inputs, with its rule of differentiation.
-
-    Args:
-        outputs: the run, a function of inputs, directions, and options.
-        run: the options.
-        differences: step of derivatives by differences of whole runs, or None.
-        projected: True for projected derivatives or differences, False for plain derivatives.
-        non_differentiable: see `jaxgran.gradients.rule.differentiable`.
-    """
-    outputs = partial(outputs, run=run)
-    if not projected:
-        return outputs
-    if differences is not None:
-        shifted = partial(outputs, run=Run(run.key, run.progress))  # these runs write no files
-        outputs = by_differences(outputs, shifted, differences)
-    return differentiable(outputs, lambda scene: scene.material, non_differentiable)
-
-
 S = TypeVar("S", bound="AbstractSpheres")
 
 
@@ -94,13 +46,15 @@ class Plan(NamedTuple):
 
     Attributes:
         replicas: number of boxes.
-        pace: static settings of the steps, which differ between kinds of spheres.
+        steps_per_contact: see `SoftSpheres`; None for hard spheres.
+        steps: time steps in a block of soft spheres, impacts per particle in a window of hard ones.
         capacity: sizes of the arrays of the run.
         equilibration_capacity: sizes of the arrays in the first mean free times of equilibration.
     """
 
     replicas: int
-    pace: Any
+    steps_per_contact: int | None
+    steps: Any
     capacity: Capacity
     equilibration_capacity: Capacity
 
@@ -155,10 +109,6 @@ class AbstractSpheres(AbstractModel):
     @abstractmethod
     def dynamics(self, scene: Any, plan: Plan) -> AbstractDynamics:
         """Return the equations of motion of the spheres."""
-
-    @abstractmethod
-    def pace_fixed(self) -> dict[str, Any]:
-        """Return the settings of this model that `Plan.pace` repeats, by name."""
 
     def clock(self, scene: Any, times: Float[Array, "times"]) -> Float[Array, "times"]:
         """Return the times of the run at reduced times."""
@@ -218,15 +168,20 @@ class AbstractSpheres(AbstractModel):
             times=self.clock(scene, times * jnp.sqrt(gas.temperature) / gas.diameter),
             start=reduced_start(self.start, gas, differentiable=not self.projected),
             key=run.key,
+            units=self._units(gas, scene.side),
         )
-        inputs = inputs._replace(units=self._units(gas, inputs.scene.side))
 
         def outputs(inputs: Inputs, directions: Any = None, run: Run = run) -> Outputs:
             return self._outputs(inputs, directions, gas.dimension, run)
 
-        differentiable_outputs = with_derivative_rule(
-            outputs, run, self.differences, self.projected, self.non_differentiable
-        )
+        differentiable_outputs: Callable[..., Outputs] = outputs
+        if self.differences is not None:
+            shifted = partial(outputs, run=Run(run.key, run.progress))  # these write no files
+            differentiable_outputs = by_differences(outputs, shifted, self.differences)
+        if self.projected:
+            differentiable_outputs = differentiable(
+                differentiable_outputs, lambda scene: scene.material, self.non_differentiable
+            )
         out = differentiable_outputs(inputs)
         return self._curve(gas, times, inputs.units, out, unreachable_times, run.save)
 
@@ -265,7 +220,12 @@ class AbstractSpheres(AbstractModel):
         )
         if not any_traced(inputs):
             model = dataclasses.replace(self, start=None, plan=None)
-            return simulate_on_host(sim, run, {"model": model, "pace": plan.pace})
+            settings = {"model": model, "steps": plan.steps}
+            if directions is None:
+                return simulate_on_host(sim, run, settings)
+            # In a rule of differentiation operations on known numbers would be staged.
+            on_host = partial(simulate_on_host, sim, run, settings)
+            return particle_run.in_threads([on_host], [particle_run.chosen_device()])[0]
         checks.refuse_files(self, run)
         if self.neighbours == "jax-md":
             raise ValueError(
@@ -278,11 +238,11 @@ class AbstractSpheres(AbstractModel):
         """Return the plan of the model, or a new one if all numbers that it needs are known."""
         name = type(self).__name__
         if self.plan is not None:
-            planned = {"replicas": self.plan.replicas} | self.plan.pace._asdict()
-            for setting, value in ({"replicas": self.replicas} | self.pace_fixed()).items():
-                if planned[setting] != value:
+            for setting in ("replicas", "steps_per_contact"):
+                planned, value = getattr(self.plan, setting), getattr(self, setting, None)
+                if planned != value:
                     raise ValueError(
-                        f"this {name} was sized for {setting} = {planned[setting]!r}, and now has "
+                        f"this {name} was sized for {setting} = {planned!r}, and now has "
                         f"{value!r}. Call sized_for(gas) again."
                     )
             return self.plan
@@ -335,12 +295,25 @@ class AbstractSpheres(AbstractModel):
         for name, lowest in ({"num_particles": 2, "replicas": 1} | minimum).items():
             checked_int(name, getattr(self, name), lowest)
         neighbours.choose_engine(self.neighbours)
-        check_difference_step(self.differences, self.projected)
+        if self.differences is None:
+            return
+        advice = "In the logarithm of an impact's loss: 0.3, or None for projected derivatives."
+        checked_float("differences", self.differences, DIFFERENCE_STEPS, advice)
+        if not self.projected:
+            raise ValueError(
+                f"differences = {self.differences} and projection = None ask for two kinds of "
+                "derivative. Leave one of them out."
+            )
 
     def check_box(self, gas: Gas) -> None:
         """Raise ValueError for a gas too dense, a box too small, or a start of another gas."""
         check_start(self.start, gas, self.replicas, self.num_particles)
-        check_gas_for_differences(self.differences, gas)
+        if self.differences is not None and gas.elements:
+            raise ValueError(
+                "derivatives by differences need smooth spheres in free flight, and this gas has "
+                f"{', '.join(gas.elements)}. Leave differences out of the model, or take "
+                "differences of runs yourself."
+            )
         checks.check_packing(gas, self.num_particles, random=self.start is None)
 
     def noise(self, error_model: ErrorModel) -> tuple[float, float]:

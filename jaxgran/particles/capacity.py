@@ -7,10 +7,12 @@ differ little share a compiled program.
 
 from collections.abc import Sequence
 from math import ceil, log, pi
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+import numpy as np
+from jaxtyping import Array, ArrayLike, Int
 
 from jaxgran._utils import status
 from jaxgran.particles.neighbours import unsorted_share
@@ -154,21 +156,20 @@ def capacities(
     return (equilibration if rows <= MAX_SHARED_ROWS else run), equilibration
 
 
-def skin_for_pairs(
-    listed_more: float, num_particles: int, side: ArrayLike, dimension: int
-) -> Array:
+def skin_for_pairs(listed_more: float, num_particles: int, side: ArrayLike, dimension: int) -> Any:
     """Return the skin, in diameters, that adds `listed_more` listed pairs per particle."""
+    xp = jnp if isinstance(side, jax.Array) else np  # on the host nothing is compiled
     volume = num_particles * sphere_surface(dimension) / (2 * dimension)
-    in_contact = volume / jnp.asarray(side**dimension)
-    return jnp.minimum((1 + listed_more / in_contact) ** (1 / dimension) - 1, max_skin(side))
+    in_contact = volume / xp.asarray(side**dimension)
+    return xp.minimum((1 + listed_more / in_contact) ** (1 / dimension) - 1, max_skin(side))
 
 
-def expected_lookahead(num_particles: int, side: ArrayLike, skin: ArrayLike) -> float:
+def expected_lookahead(num_particles: int, side: float, skin: float) -> float:
     """Return the look-ahead, in particles, of a sweep in a homogeneous gas with a skin."""
-    along_x = jnp.minimum((1 + jnp.asarray(skin)) / jnp.asarray(side), 0.5)
+    along_x = min((1 + float(skin)) / float(side), 0.5)
     return float(num_particles * (along_x + 3 * unsorted_share(num_particles)))
 
 
-def max_skin(side: ArrayLike) -> Float[Array, ""]:
+def max_skin(side: ArrayLike) -> Any:
     """Return the longest skin, in diameters, with which no pair is listed with two images."""
-    return 0.5 * jnp.asarray(side) * (1 - 1e-6) - 1
+    return 0.5 * side * (1 - 1e-6) - 1

@@ -108,23 +108,8 @@ class AbstractDynamics(eqx.Module):
         """True if the dynamics is invariant under a constant velocity of the frame."""
         return True
 
-    @property
-    def preparation_dynamics(self) -> "AbstractDynamics | None":
-        """Dynamics towards the initial steady state; None if a run begins in equilibrium."""
-        return None
-
-    def start_preparation(self, state: State, key: PRNGKeyArray) -> State:
-        """Add the spins and the key of kicks that `preparation_dynamics` needs."""
-        return state
-
-    def sample_spins(self, state: State, key: PRNGKeyArray, equilibrated: State) -> State:
-        """Draw the random fields of a state at t = 0: the spins, unless a preparation gave them.
-
-        Args:
-            state: state at t = 0 without them.
-            key: key of the run.
-            equilibrated: state after equilibration and preparation.
-        """
+    def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
+        """Draw the random fields of a state at t = 0: the spins, and the key of a drive."""
         return state
 
     def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:

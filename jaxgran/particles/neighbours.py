@@ -3,7 +3,8 @@
 Compiled code cannot make an array whose length depends on the number of pairs. Arrays have a fixed
 capacity instead, and the number of pairs is counted, so that the caller notices an overflow.
 
-Only this module imports jax_md, and only when a box is used: the import takes seconds.
+Only this module imports jax_md, and only for a list that jax-md builds: the import takes seconds,
+and compiles some hundred programs.
 """
 
 from functools import lru_cache, partial
@@ -263,22 +264,9 @@ class Pairs(NamedTuple):
     lookahead: Int[Array, ""]
 
 
-def displacement(
-    side: ArrayLike, a: Float[Array, "... d"], b: Float[Array, "... d"]
-) -> Float[Array, "... d"]:
-    """Return the shortest displacement ``a - b`` in a periodic cube (square), by jax-md."""
-    from jax_md import space
-
-    shortest, _ = space.periodic(jnp.asarray(side, jnp.result_type(float)))
-    return jnp.vectorize(shortest, signature="(d),(d)->(d)")(a, b)
-
-
 def wrap(side: ArrayLike, position: Float[Array, "... d"]) -> Float[Array, "... d"]:
-    """Move positions by multiples of the side into [0, side), by jax-md."""
-    from jax_md import space
-
-    _, shift = space.periodic(jnp.asarray(side))
-    inside = shift(position, jnp.zeros_like(position))
+    """Move positions by multiples of the side into [0, side)."""
+    inside = jnp.mod(position, side)
     return jnp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
 
 

@@ -22,16 +22,14 @@ more run one after the other even on one CPU device: one array does not save tim
 of DSMC share nothing but the array: each has its own steps and random numbers.
 """
 
-import queue
 import sys
 import threading
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -42,7 +40,7 @@ from jaxtyping import Array, ArrayLike, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced, concrete_array
+from jaxgran._utils.tracing import concrete_array
 from jaxgran.data import checkpoint
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import Particles, Run
@@ -62,9 +60,6 @@ from jaxgran.particles.state import State, centred, copy_buffers, empty_records,
 EQUILIBRATION_COLLISIONS = 10.0
 """Duration of the equilibration, in mean free times."""
 
-PREPARATION_COLLISIONS = 10.0
-"""Duration of the preparation of a steady state after it, in mean free times."""
-
 SETTLING_COLLISIONS = 2.0
 """Mean free times of equilibration after which the capacity of the run is sufficient."""
 
@@ -80,9 +75,6 @@ MAX_ROWS_PER_PARTICLE = 100
 
 SEGMENTS_PER_CALL = 8
 """Largest number of segments in one call of compiled code; progress is shown between calls."""
-
-MAX_PROGRAMS = 32
-"""Largest number of compiled programs in memory; the one unused for longest is released first."""
 
 MIN_SPHERES_PER_RUN = 8192
 """Least number of spheres in a replica with which replicas run one after the other. On one core
@@ -120,20 +112,9 @@ class Simulation(NamedTuple):
     save: Callable[[Particles], Any] | None = None
 
     @property
-    def needs_equilibration(self) -> bool:
-        """True if the start is random."""
-        return self.inputs.start is None
-
-    @property
     def equilibration_time(self) -> Array:
         """Duration of the equilibration."""
         return EQUILIBRATION_COLLISIONS / self.dynamics.scene.collision_frequency
-
-    @property
-    def preparation_end(self) -> Array:
-        """End of the preparation, counted from the beginning of the equilibration."""
-        total = EQUILIBRATION_COLLISIONS + PREPARATION_COLLISIONS
-        return total / self.dynamics.scene.collision_frequency
 
     @property
     def key(self) -> PRNGKeyArray:
@@ -193,43 +174,29 @@ class Simulation(NamedTuple):
 
         return write
 
-    def first_state(self) -> State:
-        """Return the state at the beginning: of the equilibration, or of a run of a given start."""
+    def first_state(self, traced: bool, fault: Any = status.OK) -> tuple[State, Any]:
+        """Return the state before the equilibration, or that of a given start, and the status.
+
+        Args:
+            traced: whether a random start must not call the host.
+            fault: status before.
+        """
+        dynamics = self.dynamics
         if self.inputs.start is not None:
-            return self._given_state(self.inputs.start)
-        dynamics = self.dynamics
+            position, velocity = self.inputs.start
+            return dynamics.begin(position, velocity - self.drift, self.skin), fault
         position_key, velocity_key = jax.random.split(self.key)
-        size = dynamics.replicas, self.num_particles, self.dimension
-        position = host_positions(position_key, dynamics.scene.side, *size, dynamics.region)
-        return self._random_state(position, velocity_key)
-
-    def first_state_traced(self, fault: Array) -> tuple[State, Array]:
-        """Return the first state without a call to the host, and the status, from that before."""
-        if self.inputs.start is not None:
-            return self._given_state(self.inputs.start), fault
-        dynamics = self.dynamics
-        position_key, velocity_key = jax.random.split(self.key)
-        position, fault = relaxed_positions(
-            position_key,
-            dynamics.scene.side,
-            (dynamics.replicas, self.num_particles, self.dimension),
-            self.skin,
-            (self.equilibration_capacity.pairs, self.equilibration_capacity.lookahead),
-            dynamics.region,
-            fault,
-        )
-        return self._random_state(position, velocity_key), fault
-
-    def _given_state(self, start: tuple[Array, Array]) -> State:
-        position, velocity = start
-        return self.dynamics.begin(position, velocity - self.drift, self.skin)
-
-    def _random_state(self, position: Array, velocity_key: PRNGKeyArray) -> State:
-        dynamics = self.dynamics
-        position = position if dynamics.region is None else position + 0.5
-        size = dynamics.replicas, self.num_particles, self.dimension
+        size, region = (dynamics.replicas, self.num_particles, self.dimension), dynamics.region
+        side, sizes = dynamics.scene.side, self.equilibration_capacity[:2]
+        if traced:
+            position, fault = relaxed_positions(
+                position_key, side, size, self.skin, sizes, region, fault
+            )
+        else:
+            position = host_positions(position_key, side, *size, region)
+        position = position if region is None else position + 0.5
         velocity = maxwellian_velocities(velocity_key, *size)
-        return dynamics.begin(position, velocity, self.skin)
+        return dynamics.begin(position, velocity, self.skin), fault
 
     def cooling_state(self, equilibrated: State) -> State:
         """Return the state at t = 0 after equilibration, with tangents if there are directions.
@@ -237,10 +204,10 @@ class Simulation(NamedTuple):
         The first call of `AbstractDynamics.advance` counts the energy in contacts.
         """
         velocity = equilibrated.velocity
-        if self.needs_equilibration:
+        if self.inputs.start is None:
             velocity = normalise_velocities(velocity, self.dynamics.replicas)
         state = self.dynamics.begin(equilibrated.position, velocity, equilibrated.skin)
-        state = self.dynamics.sample_spins(state, self.key, equilibrated)
+        state = self.dynamics.sample_spins(state, self.key)
         if self.directions is None:
             return state
         return self.dynamics.with_tangents(state, self.directions)
@@ -253,15 +220,12 @@ def simulate_traced(sim: Simulation) -> Outputs:
     side = dynamics.scene.side
     # In a smaller box a new neighbour list is stale at once, and the loop would not end.
     fault = status.flag(status.BOX_TOO_SMALL, side < MIN_BOX)
-    state, fault = sim.first_state_traced(fault)
-    if sim.needs_equilibration:
+    state, fault = sim.first_state(True, fault)
+    if sim.inputs.start is None:
         elastic = dynamics.elastic().with_capacity(sim.equilibration_capacity)
         state, fault, _ = run_segments(
             elastic, state, sim.equilibration_time, engine, 0, None, fault
         )
-        if (preparation := dynamics.preparation_dynamics) is not None:
-            state, until = preparation.start_preparation(state, sim.key), sim.preparation_end
-            state, fault, _ = run_segments(preparation, state, until, engine, 0, None, fault)
     else:
         fault |= dynamics.check_start(state)
     # One segment until t = 0 counts the energy in contacts.
@@ -290,20 +254,13 @@ def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Out
         run: its options.
         settings: further settings that determine the result, by name, for the checkpoint.
     """
-    if sim.directions is None:
-        return _simulate_on_host(sim, run, settings)
-    # In a rule of differentiation operations on known numbers would be staged.
-    with jax.ensure_compile_time_eval():
-        return _simulate_on_host(sim, run, settings)
-
-
-def _simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
     write = sim.writer(run)  # raises an error before the equilibration if there cannot be a file
-    dynamics, fault, state = sim.dynamics, status.OK, sim.first_state()
+    dynamics = sim.dynamics
+    state, fault = sim.first_state(False)
     engine = neighbours.choose_engine(sim.engine, dynamics.capacity.lookahead)
     # An interruption saves the state before the current call, which then must not be donated.
     donate = run.checkpoint is None
-    if sim.needs_equilibration and not (
+    if sim.inputs.start is None and not (
         run.checkpoint is not None and Path(run.checkpoint).exists()
     ):
         state, fault = _equilibrate(sim, state, engine, run.progress)
@@ -339,7 +296,7 @@ def _simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Ou
 
 
 def _equilibrate(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[State, int]:
-    """Return the state after equilibration and preparation, and the status."""
+    """Return the state after equilibration, and the status."""
     elastic = sim.dynamics.elastic()
     settled = SETTLING_COLLISIONS / float(elastic.scene.collision_frequency)
 
@@ -351,21 +308,6 @@ def _equilibrate(sim: Simulation, state: State, engine: str, progress: bool) -> 
     state, end = copy_buffers(state), np.asarray([sim.equilibration_time])
     state, _, fault = run_through_times(
         state, end, advance, elastic.observe, progress=progress, label="equilibrating"
-    )
-    steady = sim.dynamics.preparation_dynamics
-    if steady is None or fault != status.OK:
-        return state, fault
-    prepare = partial(
-        _advance_growing,
-        dynamics=steady,
-        capacity=steady.capacity,
-        engine=engine,
-        progress=progress,
-    )
-    state = copy_buffers(steady.start_preparation(state, sim.key))
-    end = np.asarray([sim.preparation_end])
-    state, _, fault = run_through_times(
-        state, end, prepare, steady.observe, progress=progress, label="preparing"
     )
     return state, fault
 
@@ -418,9 +360,12 @@ def _run_segments(
     """
     if engine == "sweep":
         until = np.asarray(end, state.time.dtype)
-        state, fault, needed = block_until_ready(
-            compiled_segments(dynamics, state, until, engine, progress, donate)
-        )
+        program = engine, state.position.shape, until.dtype, jax.tree.structure((dynamics, state))
+        with compiling(progress and needs_compilation(program)):
+            result = compiled_segments(donate)(
+                dynamics, state, until, engine, min_segments=1, max_segments=SEGMENTS_PER_CALL
+            )
+        state, fault, needed = block_until_ready(result)
         return state, int(fault), np.asarray(needed).tolist()
     now = block_until_ready(dynamics.run_segment(state, end, engine))
     fault = int(now.status)
@@ -548,48 +493,18 @@ def _update_bar(bar: tqdm, state: Any, observe: Callable[[Any], dict[str, jax.Ar
         bar.set_postfix_str(f"T/T_0 = {ratio:.3g}", refresh=False)
 
 
-_PROGRAMS: OrderedDict[Any, jax.stages.Compiled] = OrderedDict()
-"""Programs of `compiled_segments`, by the arguments for which they were compiled. Unlike the cache
-of `jax.jit` it is bounded, and shared by plain runs and those inside a rule of differentiation."""
+@cache
+def compiled_segments(donate: bool) -> Callable[..., tuple[State, Array, Array]]:
+    """Return `run_segments` for the host driver; with `donate` a call deletes its given state.
 
-
-def compiled_segments(
-    dynamics: AbstractDynamics,
-    state: State,
-    end: np.ndarray,
-    engine: str,
-    progress: bool = False,
-    donate: bool = False,
-) -> tuple[State, Array, Array]:
-    """Run up to `SEGMENTS_PER_CALL` segments, compiled for types and static fields of the input.
-
-    With `donate` the new state overwrites the given one, which is deleted. The given one must come
-    from `copy_buffers` or from an earlier call.
+    That state must come from `copy_buffers` or from an earlier call.
     """
-    fixed, fixed_tree = jax.tree.flatten((dynamics, end))
-    donated, state_tree = jax.tree.flatten(state)
-
-    def segments(donated: list[Array], fixed: list[Array]) -> tuple[State, Array, Array]:
-        dynamics, end = fixed_tree.unflatten(fixed)
-        state = state_tree.unflatten(donated)
-        return run_segments(
-            dynamics, state, end, engine, min_segments=1, max_segments=SEGMENTS_PER_CALL
-        )
-
-    leaves = donated, fixed
-    if any_traced(leaves):  # constants within a transformation of something else
-        return jax.jit(segments)(*leaves)
-    types = tuple((x.shape, x.dtype, getattr(x, "sharding", None)) for x in (*donated, *fixed))
-    key = engine, SEGMENTS_PER_CALL, fixed_tree, state_tree, types, donate
-    if (program := _PROGRAMS.pop(key, None)) is None:  # one operation, safe between threads
-        jitted = jax.jit(segments, donate_argnums=0 if donate else ())
-        with compiling(progress):
-            options = cpu_compiler_options()
-            program = outside_transformations(lambda: jitted.lower(*leaves).compile(options))
-    _PROGRAMS[key] = program
-    if len(_PROGRAMS) > MAX_PROGRAMS:
-        _PROGRAMS.popitem(last=False)
-    return program(*leaves)
+    return jax.jit(
+        run_segments,
+        static_argnames=("engine", "min_segments", "max_segments"),
+        donate_argnames="state" if donate else (),
+        compiler_options=cpu_compiler_options(),
+    )
 
 
 def cpu_compiler_options() -> dict[str, str | bool] | None:
@@ -629,8 +544,8 @@ def compiling(progress: bool) -> Iterator[None]:
 
 
 _STOP: ContextVar[threading.Event | None] = ContextVar("stop", default=None)
-"""Event that ends the runs of all replicas: a key pressed by the user reaches only the main
-thread."""
+"""Event that ends the calls of `in_threads`: a key pressed by the user reaches only the main
+thread. None in the main thread."""
 
 
 def block_until_ready(arrays: T) -> T:
@@ -639,8 +554,8 @@ def block_until_ready(arrays: T) -> T:
     Polling whether they are ready would take 3 to 8 % of a run's time.
 
     Raises:
-        KeyboardInterrupt: also in a thread of `run_replicas`, once another replica has failed or
-            was interrupted.
+        KeyboardInterrupt: also in a thread of `in_threads`, once another one has failed or was
+            interrupted.
     """
     arrays = in_thread(lambda: jax.block_until_ready(arrays))
     if (stop := _STOP.get()) is not None and stop.is_set():
@@ -655,31 +570,47 @@ def in_thread(function: Callable[[], T]) -> T:
     then goes on in the background. JAX transformations and JAX configuration of the calling thread
     do not apply in the new one.
     """
-    results: queue.SimpleQueue[tuple[bool, object]] = queue.SimpleQueue()
+    future: Future[T] = Future()
 
     def call() -> None:
         try:
-            results.put((True, function()))
+            future.set_result(function())
         except BaseException as error:
-            results.put((False, error))
+            future.set_exception(error)
 
     threading.Thread(target=call, daemon=True).start()
-    succeeded, result = results.get()
-    if not succeeded:
-        assert isinstance(result, BaseException)
-        raise result
-    return result  # type: ignore[return-value]
+    return future.result()
 
 
-def outside_transformations(function: Callable[[], T]) -> T:
-    """Call a function in a new thread, outside of any JAX transformation."""
-    x64, device = jax.config.read("jax_enable_x64"), chosen_device()
+def in_threads(functions: Sequence[Callable[[], T]], devices: Sequence[Any]) -> list[T]:
+    """Call functions outside of JAX transformations, each in a thread with a device of its own.
 
-    def call() -> T:
-        with jax.enable_x64(x64), jax.default_device(device):
-            return function()
+    Programs that they compile are those of runs outside of transformations. An interruption from
+    the keyboard, or an error of one, ends all at their next `block_until_ready`.
+    """
+    x64, stop = jax.config.read("jax_enable_x64"), _STOP.get() or threading.Event()
 
-    return in_thread(call)
+    def call(function: Callable[[], T], device: Any) -> T:
+        _STOP.set(stop)
+        try:
+            with jax.enable_x64(x64), jax.default_device(device):
+                return function()
+        except BaseException:
+            stop.set()
+            raise
+
+    with ThreadPoolExecutor(len(functions)) as pool:
+        futures = [pool.submit(call, *each) for each in zip(functions, devices, strict=True)]
+        try:
+            wait(futures)
+        except BaseException:
+            stop.set()
+            raise
+    errors = [error for future in futures if (error := future.exception()) is not None]
+    # Where one has failed, the others are interrupted.
+    for error in sorted(errors, key=lambda error: isinstance(error, KeyboardInterrupt)):
+        raise error
+    return [future.result() for future in futures]
 
 
 def chosen_device() -> Any:
@@ -702,14 +633,12 @@ def replica_devices(replicas: int, spheres: int = 0) -> Devices:
 def run_replicas(
     run_one: Callable[[int, Run], T], replicas: int, run: Run, devices: Devices
 ) -> list[T]:
-    """Run all replicas separately, replica k on device k modulo their number.
+    """Run all replicas separately, replica k on device k modulo their number; see `in_threads`.
 
-    An interruption from the keyboard, or an error of one replica, ends all of them; after an
-    interruption each saves its checkpoint.
+    After an interruption each saves its checkpoint.
 
     Args:
-        run_one: function that runs replica k alone. It is called in a thread outside of any JAX
-            transformation.
+        run_one: function that runs replica k alone.
         replicas: number of replicas.
         run: options; replica k has the key ``fold_in(key, k)`` and its own files.
         devices: CPU devices.
@@ -723,36 +652,24 @@ def run_replicas(
             "device(s) each replica here has its own checkpoint. Resume it on one CPU device, or "
             "name another file"
         )
-    x64, stop = jax.config.read("jax_enable_x64"), threading.Event()
     key = jax.random.key(0) if run.key is None else run.key
-    results: dict[int, T] = {}
-    errors: list[BaseException] = []
 
-    def run_on_device(first: int) -> None:
-        _STOP.set(stop)
-        try:
-            with jax.enable_x64(x64), jax.default_device(devices[first]):
-                for k in range(first, replicas, len(devices)):
-                    options = run._replace(
-                        key=jax.random.fold_in(key, k),
-                        progress=run.progress and first == 0,
-                        checkpoint=run.checkpoint and Path(f"{run.checkpoint}.{k}"),
-                        trajectory=run.trajectory and file_of_replica(run.trajectory, k),
-                    )
-                    results[k] = run_one(k, options)
-        except BaseException as error:
-            errors.append(error)
-            stop.set()
+    def run_some(first: int) -> list[T]:
+        return [
+            run_one(
+                k,
+                run._replace(
+                    key=jax.random.fold_in(key, k),
+                    progress=run.progress and first == 0,
+                    checkpoint=run.checkpoint and Path(f"{run.checkpoint}.{k}"),
+                    trajectory=run.trajectory and file_of_replica(run.trajectory, k),
+                ),
+            )
+            for k in range(first, replicas, len(devices))
+        ]
 
-    with ThreadPoolExecutor(len(devices)) as pool:
-        try:
-            wait([pool.submit(run_on_device, first) for first in range(len(devices))])
-        except BaseException:
-            stop.set()
-            raise
-    if errors:
-        raise errors[0]  # the others are interruptions that it caused
-    return [results[k] for k in range(replicas)]
+    by_device = in_threads([partial(run_some, first) for first in range(len(devices))], devices)
+    return [by_device[k % len(devices)][k // len(devices)] for k in range(replicas)]
 
 
 def replica_inputs(inputs: Inputs, k: int, num_particles: int, run: Run) -> Inputs:

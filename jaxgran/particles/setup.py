@@ -4,7 +4,7 @@ A random start has Maxwellian velocities and positions without overlap, which ar
 host or in compiled code. A start given by a user is checked and reduced to the units of the run.
 """
 
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced, concrete_array
+from jaxgran._utils.tracing import any_traced, array_module, concrete_array
 from jaxgran.data.curve import Particles, UserParticles
 from jaxgran.particles import neighbours
 from jaxgran.particles.neighbours import Pairs, tree_search
@@ -94,8 +94,12 @@ def host_positions(
     Raises:
         RuntimeError: if overlaps are left after many pushes because the packing is too dense.
     """
-    uniform = uniform_points(key, replicas * num_particles, dimension)
-    return concrete_array(_OverlapRemoval(replicas)(uniform, side, region))
+    uniform = np.asarray(uniform_points(key, replicas * num_particles, dimension))
+    length, sides = float(np.asarray(side)), None if region is None else np.asarray(region, float)
+    boxes = uniform.reshape(replicas, -1, dimension).astype(float)
+    boxes = boxes * (length if sides is None else sides)
+    x = np.concatenate([_push_apart(x, length, sides) for x in boxes]).astype(uniform.dtype)
+    return concrete_array(np.where(x >= uniform.dtype.type(length), uniform.dtype.type(0), x))
 
 
 def uniform_points(key: PRNGKeyArray, number: int, dimension: int) -> Float[Array, "particles d"]:
@@ -103,68 +107,49 @@ def uniform_points(key: PRNGKeyArray, number: int, dimension: int) -> Float[Arra
     return jax.random.uniform(key, (number, dimension), jnp.result_type(float))
 
 
-class _OverlapRemoval(NamedTuple):
-    """Removal of overlaps of spheres at random points in [0, 1), on the host.
-
-    Attributes:
-        replicas: number of boxes.
-        gap, max_pushes: see `GAP` and `MAX_PUSHES`.
-    """
-
-    replicas: int
-    gap: float = GAP
-    max_pushes: int = MAX_PUSHES
-
-    def __call__(self, uniform, side, region=None):
-        uniform, side = np.asarray(uniform), float(side)
-        region = None if region is None else np.asarray(region, float)
-        boxes = uniform.reshape(self.replicas, -1, uniform.shape[-1]).astype(float)
-        boxes = boxes * (side if region is None else region)
-        x = np.concatenate([self._relax(x, side, region) for x in boxes]).astype(uniform.dtype)
-        return np.where(x >= uniform.dtype.type(side), uniform.dtype.type(0), x)
-
-    def _relax(
-        self, x: Float[np.ndarray, "n d"], side: float, region: Float[np.ndarray, "d"] | None
-    ) -> Float[np.ndarray, "n d"]:
-        cutoff, built, random = min(1.4, side / 2), None, np.random.default_rng(len(x))
-        volume = side ** x.shape[1] if region is None else float(np.prod(region + 1))
-        max_extra_gap = float(largest_extra_gap(len(x), x.shape[1], volume))
-        i = j = np.empty(0, int)
-        for _ in range(self.max_pushes):
-            moved = np.inf if built is None else np.sqrt(np.max(np.sum((x - built) ** 2, axis=1)))
-            if 2 * moved > cutoff - 1 - 2 * self.gap:
-                # x stays unwrapped, so that the distance moved since then can be computed.
-                i, j = _close_pairs(_wrap_all(x, side), side, cutoff)
-                built = x.copy()
-            separation = x[i] - x[j]
-            separation -= side * np.round(separation / side)
-            distance = np.sqrt(np.sum(separation**2, axis=1))
-            close = distance < 1 + self.gap / 2
-            if not close.any():
-                return _wrap_all(x, side)
-            separation, distance = separation[close], distance[close]
-            # Coincident points are separated along the first axis.
-            separation[distance == 0, 0] = distance[distance == 0] = COINCIDENT
-            target = 1 + self.gap + max_extra_gap * random.random(len(distance))
-            push = (0.5 * (target - distance) / distance)[:, None] * separation
-            for axis in range(x.shape[1]):
-                x[:, axis] += np.bincount(i[close], push[:, axis], len(x))
-                x[:, axis] -= np.bincount(j[close], push[:, axis], len(x))
-            if region is not None:
-                x = np.clip(x, 0.0, region)
-        raise RuntimeError(
-            f"{len(x)} spheres at this packing still overlap after {self.max_pushes} pushes. Lower "
-            "the packing fraction"
-        )
+def _push_apart(
+    x: Float[np.ndarray, "n d"], side: float, region: Float[np.ndarray, "d"] | None
+) -> Float[np.ndarray, "n d"]:
+    cutoff, built, random = min(1.4, side / 2), None, np.random.default_rng(len(x))
+    volume = side ** x.shape[1] if region is None else float(np.prod(region + 1))
+    max_extra_gap = float(largest_extra_gap(len(x), x.shape[1], volume))
+    i = j = np.empty(0, int)
+    for _ in range(MAX_PUSHES):
+        moved = np.inf if built is None else np.sqrt(np.max(np.sum((x - built) ** 2, axis=1)))
+        if 2 * moved > cutoff - 1 - 2 * GAP:
+            # x stays unwrapped, so that the distance moved since then can be computed.
+            i, j = _close_pairs(_wrap_all(x, side), side, cutoff)
+            built = x.copy()
+        separation = x[i] - x[j]
+        separation -= side * np.round(separation / side)
+        distance = np.sqrt(np.sum(separation**2, axis=1))
+        close = distance < 1 + GAP / 2
+        if not close.any():
+            return _wrap_all(x, side)
+        separation, distance = separation[close], distance[close]
+        # Coincident points are separated along the first axis.
+        separation[distance == 0, 0] = distance[distance == 0] = COINCIDENT
+        target = 1 + GAP + max_extra_gap * random.random(len(distance))
+        push = (0.5 * (target - distance) / distance)[:, None] * separation
+        for axis in range(x.shape[1]):
+            x[:, axis] += np.bincount(i[close], push[:, axis], len(x))
+            x[:, axis] -= np.bincount(j[close], push[:, axis], len(x))
+        if region is not None:
+            x = np.clip(x, 0.0, region)
+    raise RuntimeError(
+        f"{len(x)} spheres at this packing still overlap after {MAX_PUSHES} pushes. Lower "
+        "the packing fraction"
+    )
 
 
-def largest_extra_gap(n: int, d: int, volume: ArrayLike) -> Float[Array, ""]:
+def largest_extra_gap(n: int, d: int, volume: ArrayLike) -> Any:
     """Return the largest random gap that is added to `GAP`.
 
     With equal gaps all pairs that were pushed would touch again at the same moment.
     """
-    packing_fraction = n / jnp.asarray(volume) * {2: np.pi / 4, 3: np.pi / 6}[d]
-    return 0.1 * jnp.maximum(0.0, 1 - 1.5 * packing_fraction / PACKING_LIMIT[d])
+    xp = array_module(volume)
+    packing_fraction = n / xp.asarray(volume) * {2: np.pi / 4, 3: np.pi / 6}[d]
+    return 0.1 * xp.maximum(0.0, 1 - 1.5 * packing_fraction / PACKING_LIMIT[d])
 
 
 def _wrap_all(x: Float[np.ndarray, "n d"], side: float) -> Float[np.ndarray, "n d"]:
@@ -181,75 +166,6 @@ def _close_pairs(
         if count <= capacity:
             return i[:count], j[:count]
         capacity = int(1.5 * count)
-
-
-class _Relaxation(NamedTuple):
-    """State of spheres that are pushed apart.
-
-    Attributes:
-        position: positions of all spheres.
-        num_pushes: number of pushes so far.
-        overlap: whether any spheres overlapped before the last push.
-        fault: status.
-    """
-
-    position: Float[Array, "n d"]
-    num_pushes: Int[Array, ""]
-    overlap: Bool[Array, ""]
-    fault: Int[Array, ""]
-
-
-class _RelaxationSetup(NamedTuple):
-    """Constants of a relaxation: arguments of `relaxed_positions`, and the largest extra gap."""
-
-    key: PRNGKeyArray
-    side: ArrayLike
-    replicas: int
-    skin: ArrayLike
-    capacity: tuple[int, int]
-    region: Float[Array, "1 d"] | None
-    max_extra_gap: Float[Array, ""]
-
-    def push_until_stale(self, now: _Relaxation) -> _Relaxation:
-        """Build a neighbour list, and push until it is stale or no overlap is left."""
-        built, cutoff = neighbours.wrap(self.side, now.position), 1 + jnp.asarray(self.skin)
-        listed = neighbours.search_pairs(
-            built, self.side, cutoff, self.replicas, self.capacity, "sweep"
-        )
-        pairs = neighbours.with_offsets(built, self.side, listed)
-        full = (pairs.count > self.capacity[0]) | (pairs.lookahead > self.capacity[1])
-
-        def unfinished(carry: tuple[_Relaxation, Array]) -> Array:
-            now, stale = carry
-            return now.overlap & ~stale & (now.num_pushes < MAX_PUSHES)
-
-        def push(carry: tuple[_Relaxation, Array]) -> tuple[_Relaxation, Array]:
-            now, _ = carry
-            x, overlap = self._push(now.position, pairs, now.num_pushes)
-            moved = jnp.sqrt(jnp.max(jnp.sum((x - built) ** 2, axis=1)))
-            now = now._replace(position=x, num_pushes=now.num_pushes + 1, overlap=overlap)
-            return now, 2 * moved > self.skin - 2 * GAP
-
-        now, _ = jax.lax.while_loop(unfinished, push, (now._replace(position=built), full))
-        failed = now.overlap & (now.num_pushes >= MAX_PUSHES)
-        fault = status.flag(status.LIST_FULL, full) | status.flag(status.OVERLAPS_REMAIN, failed)
-        return now._replace(fault=now.fault | fault)
-
-    def _push(self, x: Array, pairs: Pairs, k: Array) -> tuple[Array, Array]:
-        """Return the positions after push k of all overlapping pairs, and whether there are any."""
-        separation = x[pairs.i] - x[pairs.j] - pairs.offset
-        square = jnp.sum(separation * separation, axis=1)
-        distance = jnp.sqrt(jnp.where(square > 0, square, COINCIDENT**2))
-        # Coincident points are separated along the first axis.
-        first_axis = jnp.zeros_like(separation).at[:, 0].set(COINCIDENT)
-        separation = jnp.where((square > 0)[:, None], separation, first_axis)
-        in_use = jnp.arange(self.capacity[0]) < pairs.count
-        close = in_use & (distance < 1 + GAP / 2)
-        random = jax.random.uniform(jax.random.fold_in(self.key, k), distance.shape, x.dtype)
-        target = 1 + GAP + self.max_extra_gap * random
-        push = jnp.where(close, 0.5 * (target - distance) / distance, 0.0)[:, None] * separation
-        x = x.at[pairs.i].add(push).at[pairs.j].add(-push)
-        return x if self.region is None else jnp.clip(x, 0.0, self.region), jnp.any(close)
 
 
 def relaxed_positions(
@@ -278,19 +194,58 @@ def relaxed_positions(
     """
     replicas, num_particles, dimension = size
     volume = jnp.asarray(side) ** dimension if region is None else jnp.prod(region + 1)
-    row = None if region is None else region[None]
-    extra_gap = largest_extra_gap(num_particles, dimension, volume)
-    setup = _RelaxationSetup(key, side, replicas, skin, capacity, row, extra_gap)
+    max_extra_gap = largest_extra_gap(num_particles, dimension, volume)
+    cutoff = 1 + jnp.asarray(skin)
     points = uniform_points(key, replicas * num_particles, dimension)
-    points = points * (jnp.asarray(side) if row is None else row)
-    zero = jnp.zeros((), jnp.int32)
-    first = _Relaxation(points, zero, jnp.ones((), bool), jnp.asarray(fault, jnp.int32))
+    points = points * (jnp.asarray(side) if region is None else region[None])
 
-    def unfinished(now: _Relaxation) -> Array:
-        return now.overlap & (now.fault == status.OK)
+    def push(x: Array, pairs: Pairs, k: Array) -> tuple[Array, Array]:
+        """Return the positions after push k of all overlapping pairs, and whether there are any."""
+        separation = x[pairs.i] - x[pairs.j] - pairs.offset
+        square = jnp.sum(separation * separation, axis=1)
+        distance = jnp.sqrt(jnp.where(square > 0, square, COINCIDENT**2))
+        # Coincident points are separated along the first axis.
+        first_axis = jnp.zeros_like(separation).at[:, 0].set(COINCIDENT)
+        separation = jnp.where((square > 0)[:, None], separation, first_axis)
+        in_use = jnp.arange(capacity[0]) < pairs.count
+        close = in_use & (distance < 1 + GAP / 2)
+        random = jax.random.uniform(jax.random.fold_in(key, k), distance.shape, x.dtype)
+        target = 1 + GAP + max_extra_gap * random
+        push = jnp.where(close, 0.5 * (target - distance) / distance, 0.0)[:, None] * separation
+        x = x.at[pairs.i].add(push).at[pairs.j].add(-push)
+        return x if region is None else jnp.clip(x, 0.0, region[None]), jnp.any(close)
 
-    last = jax.lax.while_loop(unfinished, setup.push_until_stale, first)
-    return neighbours.wrap(side, last.position), last.fault
+    def push_until_stale(carry: tuple[Array, Array, Array, Array]) -> tuple:
+        """Build a neighbour list, and push until it is stale or no overlap is left."""
+        x, num_pushes, overlap, fault = carry
+        built = neighbours.wrap(side, x)
+        listed = neighbours.search_pairs(built, side, cutoff, replicas, capacity, "sweep")
+        pairs = neighbours.with_offsets(built, side, listed)
+        full = (pairs.count > capacity[0]) | (pairs.lookahead > capacity[1])
+
+        def unfinished(carry: tuple) -> Array:
+            _, num_pushes, overlap, stale = carry
+            return overlap & ~stale & (num_pushes < MAX_PUSHES)
+
+        def push_all(carry: tuple) -> tuple:
+            x, num_pushes, _, _ = carry
+            x, overlap = push(x, pairs, num_pushes)
+            moved = jnp.sqrt(jnp.max(jnp.sum((x - built) ** 2, axis=1)))
+            return x, num_pushes + 1, overlap, 2 * moved > skin - 2 * GAP
+
+        first = built, num_pushes, overlap, full
+        x, num_pushes, overlap, _ = jax.lax.while_loop(unfinished, push_all, first)
+        failed = overlap & (num_pushes >= MAX_PUSHES)
+        fault |= status.flag(status.LIST_FULL, full) | status.flag(status.OVERLAPS_REMAIN, failed)
+        return x, num_pushes, overlap, fault
+
+    def unfinished(carry: tuple) -> Array:
+        _, _, overlap, fault = carry
+        return overlap & (fault == status.OK)
+
+    first = points, jnp.zeros((), jnp.int32), jnp.ones((), bool), jnp.asarray(fault, jnp.int32)
+    x, _, _, fault = jax.lax.while_loop(unfinished, push_until_stale, first)
+    return neighbours.wrap(side, x), fault
 
 
 def check_start(start: UserParticles | None, gas: Gas, replicas: int, num_particles: int) -> None:

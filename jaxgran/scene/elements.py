@@ -301,31 +301,8 @@ class WhiteNoise(eqx.Module):
         check_fields(self, "WhiteNoise", " of the drive")
 
 
-class DrivenStart(eqx.Module):
-    """Initial state of a gas that white noise drove into a steady state at T_0 until t = 0.
-
-    The velocities are not Maxwellian at t = 0: a_2 starts at its value in the steady state, in
-    which ``da_2/dt = 0`` and the noise supplies all the energy that impacts, also on walls,
-    dissipate. For rough spheres T_rot starts at the value for which ``dT_rot/dt = 0``; leave their
-    rotational_temperature out. Drag, if the gas has it, acts from t = 0 on.
-
-    Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution.
-
-    >>> gentle = dataclasses.replace(gas, preparation=jaxgran.DrivenStart())
-    >>> type(gentle.preparation).__name__
-    'DrivenStart'
-    """
-
-
 def check_elements(gas: Any) -> None:
     """Raise ValueError for elements of a gas that cannot be combined."""
-    if gas.preparation is not None and gas.surface is not None:
-        rotation = gas.surface.rotational_temperature
-        if is_known(rotation) and np.any(np.asarray(rotation) != 0):
-            raise ValueError(
-                "preparation=DrivenStart() determines T_rot at t = 0, but rotational_temperature = "
-                f"{np.asarray(rotation)} m^2/s^2 is given, too. Leave one of the two out."
-            )
     if gas.drag is not None and gas.surface is None:
         rate = gas.drag.rotational_rate
         if is_known(rate) and np.any(np.asarray(rate) != 0):

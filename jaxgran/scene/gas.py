@@ -28,7 +28,6 @@ from jaxgran._utils.validation import (
 from jaxgran.scene import elements
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
 from jaxgran.scene.elements import (
-    DrivenStart,
     Frictional,
     Rough,
     StokesDrag,
@@ -128,8 +127,6 @@ class Gas(eqx.Module):
         container: `jaxgran.Walls`; None for a periodic box or an unbounded gas.
         drag: `jaxgran.StokesDrag`; None for a vacuum.
         drive: `jaxgran.WhiteNoise`, which heats the gas; None for a gas that cools.
-        preparation: `jaxgran.DrivenStart` for a gas that was driven before t = 0; None for
-            Maxwellian velocities at t = 0.
 
     Raises:
         ValueError: for a value outside its range.
@@ -153,7 +150,6 @@ class Gas(eqx.Module):
     container: Walls | None = optional_element(Walls)
     drag: StokesDrag | None = optional_element(StokesDrag)
     drive: WhiteNoise | None = optional_element(WhiteNoise)
-    preparation: DrivenStart | None = optional_element(DrivenStart)
 
     def __check_init__(self):
         if self.dimension not in CLOSE_PACKING or isinstance(self.dimension, bool | float):
@@ -246,7 +242,7 @@ class Gas(eqx.Module):
     @property
     def elements(self) -> tuple[str, ...]:
         """Names of the elements of this gas; "friction" stands for a `Frictional` surface."""
-        names = ("surface", "container", "drag", "drive", "preparation")
+        names = ("surface", "container", "drag", "drive")
         given = tuple(name for name in names if getattr(self, name) is not None)
         return ("friction", *given[1:]) if isinstance(self.surface, Frictional) else given
 

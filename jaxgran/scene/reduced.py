@@ -76,17 +76,13 @@ class ReducedDrive(NamedTuple):
 
 
 class ReducedScene(NamedTuple):
-    """A gas in units of `Gas.impact_speed` and `Gas.path_length`; None for each missing element.
-
-    `prepared` is () for a gas with `DrivenStart`, which has no numbers.
-    """
+    """A gas in units of `Gas.impact_speed` and `Gas.path_length`; None for each missing element."""
 
     law: ReducedLaw
     surface: ReducedRough | None = None
     walls: ReducedWalls | None = None
     drag: ReducedDrag | None = None
     drive: ReducedDrive | None = None
-    prepared: tuple[()] | None = None
 
 
 def reduced_scene(gas: Gas) -> ReducedScene:
@@ -114,8 +110,7 @@ def reduced_scene(gas: Gas) -> ReducedScene:
         drag = ReducedDrag(gas.drag.rate * time, gas.drag.rotational_rate * time)
     if gas.drive is not None:
         drive = ReducedDrive(gas.drive.strength * (length / speed) / gas.temperature)
-    prepared = None if gas.preparation is None else ()
-    return ReducedScene(gas.reduced_law, surface, walls, drag, drive, prepared)
+    return ReducedScene(gas.reduced_law, surface, walls, drag, drive)
 
 
 class ReducedContact(eqx.Module):

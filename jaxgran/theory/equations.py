@@ -112,19 +112,19 @@ class Equations(NamedTuple):
         order: of the Sonine expansion: 2 has a_2, 3 also a_3.
         maxwellian: if True, a_2 stays 0.
         softness: if True, soft contacts slow the cooling.
+        initial_sonine: a_2 at t = 0.
     """
 
     dimension: int
     order: int
     maxwellian: bool
     softness: bool
+    initial_sonine: float = 0.0
 
     def initial(self, scene: SceneAndDensity, like: Array) -> Float[Array, "moments"]:
         """Return the `Moments` at t = 0 as one array, of the dtype of `like`."""
         first = Moments.initial(scene[0], like, self.order)
-        if scene[0].prepared is None or self.maxwellian:
-            return first
-        return steady_moments(first, *scene, self.dimension, self.order)
+        return first.at[1].set(self.initial_sonine) if self.initial_sonine else first
 
     def table(self, scene: SceneAndDensity, duration: Array) -> RateTable:
         """Return the averages at all temperatures that the gas reaches in a time."""
@@ -679,7 +679,7 @@ MAX_LOG_TEMPERATURE = 60.0
 """Largest |ln T/T_0| of a steady state."""
 
 _NEWTON_STEPS = 8
-"""Newton steps from a_2 = 0 to a steady a_2, at most .1, exact to rounding."""
+"""Newton steps to a steady T_rot/T of spheres that slide, exact to rounding."""
 
 
 class SteadyState(NamedTuple):
@@ -824,40 +824,3 @@ def _steady_ratio(speed: Array, sonine: Array, scene: ReducedScene, d: int) -> A
         )
         ratio = jnp.where(slope < 0, ratio - gain / jnp.where(slope < 0, slope, -1.0), 0.0)
     return ratio
-
-
-def scene_at_start(gas: Gas) -> ReducedScene:
-    """Return the scene of a gas, with the steady T_rot/T if white noise has driven the gas at T_0.
-
-    This ratio has ``dT_rot/dt = 0`` by impacts, including those on walls; drag begins at t = 0.
-    """
-    scene = reduced_scene(gas)
-    if scene.prepared is None or scene.surface is None:
-        return scene
-    undriven, like = scene._replace(drive=None, drag=None), jnp.ones_like(gas.temperature)
-    ratio = _steady_ratio(like, jnp.zeros_like(like), undriven, gas.dimension)
-    return scene._replace(surface=scene.surface._replace(ratio=ratio))
-
-
-def steady_moments(
-    first: Float[Array, "moments"], scene: ReducedScene, density: Density, d: int, order: int
-) -> Float[Array, "moments"]:
-    """Return the initial moments with a_2 (and a_3) of a gas that white noise has driven at T_0.
-
-    The noise has replaced the energy that impacts and walls took.
-    """
-    undriven = scene._replace(drive=None, drag=None)
-
-    def sonine_rates(sonine: Array) -> Array:
-        rate = _steady_rates(
-            jnp.concatenate([jnp.zeros_like(sonine[:1]), sonine]), undriven, density, d
-        )
-        return rate[1:] + rate[0] * jnp.arange(2.0, order + 1, dtype=sonine.dtype) * sonine
-
-    sonine = jnp.zeros(order - 1, first.dtype)
-    for _ in range(_NEWTON_STEPS):
-        sonine = sonine - jnp.linalg.solve(jax.jacfwd(sonine_rates)(sonine), sonine_rates(sonine))
-    moments = Moments.from_array(first, order)._replace(sonine=sonine[0])
-    if order > 2:
-        moments = moments._replace(third_sonine=sonine[1])
-    return jnp.stack([value for value in moments if value is not None])

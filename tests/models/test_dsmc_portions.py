@@ -7,20 +7,21 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.dsmc.collisions import MIN_SUBSET_SIZE, num_subsets, subset_of
+from jaxgran.particles.dsmc.collisions import MIN_SUBSET_SIZE, change_subsets, num_subsets
 
 
 @pytest.mark.parametrize("n", [2, 15, 31, 257, 1000, 4096])
 def test_every_particle_belongs_to_one_subset(n):
-    rows = jnp.arange(float(n))[:, None]
-    count, yes = np.zeros(n, int), jnp.ones((), bool)
-    sizes = []
-    for k in range(num_subsets(n)):
-        part = subset_of(jnp.asarray(k), n, yes)
-        chosen = np.asarray(part.of(rows), int)[np.asarray(part.counted), 0]
-        count[chosen] += 1
-        sizes.append(len(chosen))
-    assert np.all(count == 1)
+    parts, sizes, one = num_subsets(n), [], jnp.ones((), int)
+
+    def count(i, rows, belongs):
+        return rows + belongs[:, None], jnp.sum(belongs)
+
+    seen = jnp.zeros((n, 1))
+    for k in range(parts):
+        seen, size = change_subsets(seen, jnp.asarray(k), one, one, count, 0 * one)
+        sizes.append(int(size))
+    assert np.all(seen == 1)
     assert max(sizes) - min(sizes) <= 1 and min(sizes) >= min(n, MIN_SUBSET_SIZE) - 1
 
 

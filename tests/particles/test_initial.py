@@ -5,7 +5,7 @@ import pytest
 
 from jaxgran.particles.observables import sonine, temperature
 from jaxgran.particles.setup import (
-    _OverlapRemoval,
+    _push_apart,
     host_positions,
     maxwellian_velocities,
 )
@@ -50,15 +50,19 @@ def test_two_spheres_in_the_smallest_box():
 
 
 def test_coincident_points_are_parted():
-    x = _OverlapRemoval(1)(np.full((3, 3), 0.5), 8.0)
+    x = _push_apart(np.full((3, 3), 4.0), 8.0, None)
     assert smallest_distance(x, 8.0) > 1
 
 
 @pytest.mark.parametrize("dimension, packing", [(3, 0.8), (2, 0.95)])
-def test_too_dense_is_refused(dimension, packing):
-    uniform = np.random.default_rng(0).random((60, dimension))
+def test_too_dense_is_refused(dimension, packing, monkeypatch):
+    monkeypatch.setattr("jaxgran.particles.setup.MAX_PUSHES", 50)
+    uniform, side = (
+        np.random.default_rng(0).random((60, dimension)),
+        box_side(packing, 60, dimension),
+    )
     with pytest.raises(RuntimeError, match="60 spheres .* after 50 pushes. Lower the packing"):
-        _OverlapRemoval(1, max_pushes=50)(uniform, box_side(packing, 60, dimension))
+        _push_apart(side * uniform, side, None)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

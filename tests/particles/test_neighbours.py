@@ -10,7 +10,6 @@ from scipy.spatial import KDTree
 from jaxgran.particles.neighbours import (
     MAX_LOOKAHEAD,
     choose_engine,
-    displacement,
     sweep,
     tree_search,
     wrap,
@@ -157,18 +156,6 @@ def test_wrap_lands_inside(side):
     # Coordinates of up to 26 are rounded at 4e-15.
     np.testing.assert_allclose(inside + sides * side, position, atol=1e-14)
     np.testing.assert_array_equal(wrap(side, jnp.asarray(inside)), inside)
-
-
-def test_displacement_is_the_shortest():
-    rng = np.random.default_rng(5)
-    a, b = 3.7 * rng.random((2, 50, 3))
-    images = np.array(list(itertools.product([-3.7, 0.0, 3.7], repeat=3)))
-    lengths = np.linalg.norm((a - b)[:, None] + images[None], axis=-1)
-    apart = displacement(3.7, jnp.asarray(a), jnp.asarray(b))
-    # Round-off.
-    np.testing.assert_allclose(np.linalg.norm(apart, axis=-1), lengths.min(axis=1), rtol=1e-13)
-    sides = (apart - (a - b)) / 3.7
-    np.testing.assert_allclose(sides, np.round(sides), atol=1e-14)
 
 
 def test_engine_follows_the_device_and_the_gas(monkeypatch):

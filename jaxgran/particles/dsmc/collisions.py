@@ -432,29 +432,6 @@ def kick_growth(
     )
 
 
-def kick_all(
-    particles: Float[Array, "N components"],
-    key: PRNGKeyArray,
-    growth: Float[Array, ""],
-    time: Float[Array, ""],
-    d: int,
-    at_rest: bool,
-) -> Float[Array, "N components"]:
-    """Return particles after random kicks that let T/T_0 grow.
-
-    Args:
-        particles: v, x - v t and spins.
-        key: key of the random numbers.
-        growth: growth of T/T_0.
-        time: t, as in x - v t.
-        d: dimension.
-        at_rest: True if the kicks conserve the momentum.
-    """
-    change = jnp.sqrt(growth / 2) * random_kicks(key, particles[:, :d], at_rest)
-    moved = [particles[:, :d] + change, particles[:, d : 2 * d] - time * change]
-    return jnp.concatenate([*moved, particles[:, 2 * d :]], axis=1)
-
-
 def _limit_step(
     scene: ReducedScene,
     temperature: Float[Array, "*replicas"],
@@ -480,50 +457,54 @@ MIN_SUBSET_SIZE = 16
 """Minimum number of particles in a subset, whose kicks together conserve its momentum."""
 
 
-class Subset(NamedTuple):
-    """Subset of the particles: some neighbouring rows.
-
-    Attributes:
-        first: the first row.
-        counted: mask of the rows that belong to the subset.
-    """
-
-    first: Int[Array, ""]
-    counted: Bool[Array, "rows"]
-
-    def of(self, particles: Float[Array, "N components"]) -> Float[Array, "rows components"]:
-        """Return the rows of the subset."""
-        return jax.lax.dynamic_slice_in_dim(particles, self.first, len(self.counted))
-
-    def written(self, particles: Float[Array, "N components"], rows: Array) -> Array:
-        """Return all particles with new rows."""
-        return jax.lax.dynamic_update_slice_in_dim(particles, rows, self.first, 0)
-
-
 def num_subsets(num_particles: int) -> int:
     return max(min(MAX_SUBSETS, num_particles // MIN_SUBSET_SIZE), 1)
 
 
-def subset_of(index: Int[Array, ""], num_particles: int, active: Bool[Array, ""]) -> Subset:
-    """Return a subset of the particles; each particle belongs to exactly one."""
-    n, parts = num_particles, num_subsets(num_particles)
-    begin, end = index * n // parts, (index + 1) * n // parts
-    rows = -(-n // parts)
-    first = jnp.minimum(begin, n - rows)
-    row = first + jnp.arange(rows, dtype=first.dtype)
-    return Subset(first, (row >= begin) & (row < end) & active)
+Sums = TypeVar("Sums")
 
 
-class SubsetCounts(NamedTuple):
-    """Numbers of subsets that take part in a step.
+def change_subsets(
+    particles: Float[Array, "N components"],
+    first: Int[Array, ""],
+    count: Int[Array, ""],
+    largest: Int[Array, ""],
+    change: Callable[..., tuple[Array, Sums]],
+    zero: Sums,
+) -> tuple[Float[Array, "N components"], Sums]:
+    """Change some subsets of the particles of one replica; return them and sums over the changes.
 
-    Attributes:
-        kicks: subsets that a drive kicks in half of the step; None without a drive.
-        walls: subsets that may hit walls; None without walls.
+    A subset consists of neighbouring rows; each particle belongs to exactly one.
+
+    Args:
+        particles: the particles of the replica.
+        first: number of the first subset; they follow each other periodically.
+        count: number of subsets.
+        largest: the largest such number of all replicas, which share the loop.
+        change: a function of the number of the subset, rows of particles and a mask of those that
+            belong to the subset. It returns the changed rows and the sums.
+        zero: sums without changes.
     """
+    n, parts = len(particles), num_subsets(len(particles))
+    size = -(-n // parts)
 
-    kicks: Int[Array, "*replicas"] | None
-    walls: Int[Array, "*replicas"] | None
+    def change_one(i: Int[Array, ""], carry: tuple[Array, Sums]) -> tuple[Array, Sums]:
+        particles, sums = carry
+        index = ((first + i) & (2**30 - 1)) % parts
+        begin, end = index * n // parts, (index + 1) * n // parts
+        top = jnp.minimum(begin, n - size)
+        row = top + jnp.arange(size, dtype=top.dtype)
+        belongs = (row >= begin) & (row < end) & (i < count)
+        rows, more = change(i, jax.lax.dynamic_slice_in_dim(particles, top, size), belongs)
+        particles = jax.lax.dynamic_update_slice_in_dim(particles, rows, top, 0)
+        return particles, jax.tree.map(jnp.add, sums, more)
+
+    return jax.lax.fori_loop(0, largest, change_one, (particles, zero))
+
+
+SubsetCounts = tuple[Int[Array, "*replicas"] | None, Int[Array, "*replicas"] | None]
+"""Numbers of subsets that a drive kicks in half of a step, and of those that may hit walls in the
+step; None without a drive or walls."""
 
 
 def subsets_per_step(
@@ -555,88 +536,7 @@ def subsets_per_step(
         drag_factor = drag_decay_or_one(scene.drag, clock).velocity
         impacts = _max_wall_impacts(scene, temperature, drag_factor, ds, scheme.dimension)
         walls = at_least(parts * impacts)
-    return SubsetCounts(kicks, walls)
-
-
-Sums = TypeVar("Sums")
-
-
-def hit_walls_of_subsets(
-    particles: Float[Array, "N components"],
-    key: PRNGKeyArray,
-    drawn: Int[Array, ""],
-    largest: Int[Array, ""],
-    hit: Callable[[Array, Array], tuple[Array, Sums]],
-    zero: Sums,
-) -> tuple[Float[Array, "N components"], Sums]:
-    """Let the particles of one replica hit walls in a step; return them and sums over impacts.
-
-    Args:
-        particles: the particles of the replica.
-        key: key of the step.
-        drawn: number of subsets that may hit walls.
-        largest: the largest such number of all replicas, which share the loop.
-        hit: a function of particles and of a random number for each. It returns the particles after
-            impacts of those whose expected number of impacts is larger, and the sums.
-        zero: sums of no impacts.
-    """
-    n, parts = len(particles), num_subsets(len(particles))
-    bits = jax.random.bits(jax.random.fold_in(key, MAX_SUBSETS), (), jnp.uint16)
-    first = (bits % parts).astype(jnp.int32)
-
-    def hit_subset(i: Int[Array, ""], carry: tuple[Array, Sums]) -> tuple[Array, Sums]:
-        particles, sums = carry
-        subset = subset_of((first + i) % parts, n, i < drawn)
-        bits = jax.random.bits(jax.random.fold_in(key, i), subset.counted.shape, jnp.uint16)
-        chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
-        rows, more = hit(subset.of(particles), jnp.where(subset.counted, chance, jnp.inf))
-        return subset.written(particles, rows), jax.tree.map(jnp.add, sums, more)
-
-    return jax.lax.fori_loop(0, largest, hit_subset, (particles, zero))
-
-
-def kick_subsets(
-    particles: Float[Array, "N components"],
-    key: PRNGKeyArray,
-    kicked: Int[Array, ""],
-    largest: Int[Array, ""],
-    half_steps: UInt32[Array, ""],
-    growth: Float[Array, ""],
-    time: Float[Array, ""],
-    d: int,
-    at_rest: bool,
-) -> tuple[Float[Array, "N components"], Float[Array, ""]]:
-    """Apply half of the kicks of a step to one replica; return particles and growth of T/T_0.
-
-    Args:
-        particles: v, x - v t and spins.
-        key: key of this half of the step.
-        kicked: number of subsets that are kicked.
-        largest: the largest such number of all replicas, which share the loop.
-        half_steps: number of earlier halves.
-        growth: mean growth of T/T_0.
-        time: t, as in x - v t.
-        d: dimension.
-        at_rest: True if the kicks conserve the momentum.
-    """
-    n, parts = len(particles), num_subsets(len(particles))
-    size = jnp.sqrt(growth / 2 * (parts / kicked))
-
-    def kick_subset(i: Int[Array, ""], carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        particles, gain = carry
-        index = ((kicked * half_steps.astype(jnp.int32) + i) & (2**30 - 1)) % parts
-        subset = subset_of(index, n, i < kicked)
-        rows = subset.of(particles)
-        v = rows[:, :d]
-        kick = random_kicks(jax.random.fold_in(key, i), v, at_rest, subset.counted)
-        kick = jnp.where(subset.counted[:, None], size * kick, 0.0)
-        after = [v + kick, rows[:, d : 2 * d] - time * kick, rows[:, 2 * d :]]
-        particles = subset.written(particles, jnp.concatenate(after, axis=-1))
-        return particles, gain + jnp.sum(kick * (2 * v + kick))
-
-    zero = jnp.zeros((), particles.dtype)
-    particles, gain = jax.lax.fori_loop(0, largest, kick_subset, (particles, zero))
-    return particles, 2 * gain / (n * d)
+    return kicks, walls
 
 
 def _update_tangents(
@@ -674,53 +574,13 @@ def _update_tangents(
     return mobility, tangents
 
 
-class CandidatePairs(NamedTuple):
-    """Candidate pairs of a step.
+CandidatePairs = tuple[Array, Array | None, Array]
+"""Candidate pairs of a step: relative velocities, sums of the spins in the state (None for smooth
+spheres) and random bits."""
 
-    Attributes:
-        relative: relative velocities.
-        spin: sums of the spins in the state; None for smooth spheres.
-        bits: random bits.
-    """
-
-    relative: Float[Array, "pairs d"]
-    spin: Float[Array, "pairs spins"] | None
-    bits: UInt32[Array, "2 pairs"]
-
-
-class EnergyGains(NamedTuple):
-    """Gains of both energies and their tangents, for `ExchangeTangents`.
-
-    The energies are sum v^2 of translation, and q sum s^2 of the spins in the state.
-
-    Attributes:
-        gains: gains of translation and rotation.
-        along: tangents in the parameters of the scene, in time, and in the logarithms of all
-            velocities and of all spins.
-    """
-
-    gains: Float[Array, "2"]
-    along: Float[Array, "changes 2"]
-
-
-class StepEvents(NamedTuple):
-    """Events of a step.
-
-    Attributes:
-        pairs: candidate pairs.
-        walls: gains by impacts on walls; None without walls.
-        ceiling, share: as for `collide`.
-        start, ds: the time at the start of the step, and its length.
-        num_particles: N.
-    """
-
-    pairs: tuple[CandidatePairs, CandidatePairs]
-    walls: EnergyGains | None
-    ceiling: Float[Array, ""]
-    share: Float[Array, ""]
-    start: Float[Array, ""]
-    ds: Float[Array, ""]
-    num_particles: int
+EnergyGains = tuple[Float[Array, "2"], Float[Array, "changes 2"]]
+"""Gains of sum v^2 and of q sum s^2 of the spins in the state, and their tangents: in the
+parameters of the scene, in time, and in the logarithms of all velocities and of all spins."""
 
 
 def initial_exchange_tangents(
@@ -742,20 +602,17 @@ def initial_exchange_tangents(
     return ExchangeTangents(many, many[:, :, 0] * 0)
 
 
-def _energies(
-    particles: Float[Array, "N components"], scene: ReducedScene, d: int
-) -> Float[Array, "2"]:
-    """Return sum v^2, and q sum s^2 of the spins in the state."""
-    inertia = 0.0 if scene.surface is None else scene.surface.inertia
-    translation, rotation = particles[:, :d], particles[:, 2 * d :]
-    return jnp.stack([jnp.sum(translation**2), inertia * jnp.sum(rotation**2)])
-
-
 def _update_exchange_tangents(
     old: ExchangeTangents,
     scene: ReducedScene,
     before: Float[Array, "2"],
-    step: StepEvents,
+    candidates: tuple[CandidatePairs, CandidatePairs],
+    wall_gains: EnergyGains | None,
+    ceiling: Float[Array, ""],
+    share: Float[Array, ""],
+    start: Float[Array, ""],
+    ds: Float[Array, ""],
+    num_particles: int,
     collisions: Float[Array, ""],
 ) -> ExchangeTangents:
     """Return the tangents after a step.
@@ -764,17 +621,40 @@ def _update_exchange_tangents(
         old: the tangents before the step.
         scene: in reduced units.
         before: the two energies before the step.
-        step: its events.
+        candidates, wall_gains: the candidate pairs, and the gains by impacts on walls.
+        ceiling, share: as for `collide`.
+        start, ds: the time at the start of the step, and its length.
+        num_particles: N.
         collisions: the number of its collisions.
     """
-    impacts = _energy_gains(partial(_impact_gains, step=step), scene, step.ds)
-    kicks = _energy_gains(partial(_drive_gains, step=step), scene, step.ds)
+
+    def by_collisions(scene, velocity, spin, time_scale):
+        middle = start + ds / 2
+        scene, decay, faster, turning = _scale_motion(scene, velocity, spin, time_scale, middle)
+        drag_factor = None if scene.drag is None else decay.velocity
+        total = jnp.zeros(2, ds.dtype)
+        for relative, spins, bits in candidates:
+            spins = None if spins is None else spins * turning
+            outcome = collide(
+                relative * faster, bits, ceiling, share, scene, False, spins, drag_factor
+            )
+            total = total + jnp.stack([-outcome.loss, outcome.rotational_gain / decay.spin**2])
+        return total
+
+    def by_drive(scene, velocity, spin, time_scale):
+        if scene.drive is None:
+            return jnp.zeros(2, ds.dtype)
+        drag, d = _scale_drag(scene, time_scale), candidates[0][0].shape[1]
+        growth = sum(kick_growth(scene.drive, drag, start, ds, place) for place in (0.0, 1.0))
+        return jnp.stack([num_particles * d / 2 * growth, jnp.zeros_like(ds)])
+
+    gains, along = _energy_gains(by_collisions, scene, ds)
+    kicks, along_kicks = _energy_gains(by_drive, scene, ds)
     # The rate of impacts depends on the speeds; kicks do not depend on them.
-    kicks = kicks._replace(along=kicks.along.at[-2].add(-kicks.gains))
-    total = jax.tree.map(jnp.add, impacts, kicks)
-    if step.walls is not None:
-        total = jax.tree.map(jnp.add, total, step.walls)
-    return old.after(before, total.gains, total.along, collisions)
+    gains, along = gains + kicks, along + along_kicks.at[-2].add(-kicks)
+    if wall_gains is not None:
+        gains, along = gains + wall_gains[0], along + wall_gains[1]
+    return old.after(before, gains, along, collisions)
 
 
 def _wall_gains(
@@ -802,7 +682,7 @@ def _energy_gains(
         return jnp.concatenate([ravel_pytree(in_scene)[0], jnp.stack(in_motion)])
 
     slopes = jax.vmap(row)(jnp.eye(2, dtype=zero.dtype)).T
-    return EnergyGains(gains, jnp.concatenate([slopes[:-3], slopes[-1:], slopes[-3:-1]]))
+    return gains, jnp.concatenate([slopes[:-3], slopes[-1:], slopes[-3:-1]])
 
 
 def _scale_motion(
@@ -822,42 +702,6 @@ def _scale_drag(scene: ReducedScene, share: Array) -> ReducedDrag | None:
     if scene.drag is None:
         return None
     return ReducedDrag(*(rate * (1 + share) for rate in scene.drag))
-
-
-def _impact_gains(
-    scene: ReducedScene, velocity: Array, spin: Array, time_scale: Array, step: StepEvents
-) -> Float[Array, "2"]:
-    """Return the gains by collisions, with velocities and spins scaled by factors exp(...)."""
-    middle = step.start + step.ds / 2
-    scene, decay, faster, turning = _scale_motion(scene, velocity, spin, time_scale, middle)
-    drag_factor = None if scene.drag is None else decay.velocity
-    total = jnp.zeros(2, step.ds.dtype)
-    for pairs in step.pairs:
-        spins = None if pairs.spin is None else pairs.spin * turning
-        outcome = collide(
-            pairs.relative * faster,
-            pairs.bits,
-            step.ceiling,
-            step.share,
-            scene,
-            False,
-            spin=spins,
-            drag_factor=drag_factor,
-        )
-        total = total + jnp.stack([-outcome.loss, outcome.rotational_gain / decay.spin**2])
-    return total
-
-
-def _drive_gains(
-    scene: ReducedScene, velocity: Array, spin: Array, time_scale: Array, step: StepEvents
-) -> Float[Array, "2"]:
-    """Return the gains by a drive, which do not depend on velocities and spins."""
-    if scene.drive is None:
-        return jnp.zeros(2, step.ds.dtype)
-    drag = _scale_drag(scene, time_scale)
-    growth = sum(kick_growth(scene.drive, drag, step.start, step.ds, place) for place in (0.0, 1.0))
-    d = step.pairs[0].relative.shape[1]
-    return jnp.stack([step.num_particles * d / 2 * growth, jnp.zeros_like(step.ds)])
 
 
 RECOUNT_INTERVAL = 32
@@ -912,7 +756,8 @@ def _step(
     """
     key = jax.random.fold_in(key, state.steps)
     dt = share * scheme.scaled_step / jnp.sqrt(state.temperature)
-    counts = subsets.kicks, largest.kicks
+    (kicks, walls), (most_kicks, most_walls) = subsets, largest
+    counts = kicks, most_kicks
     apply_drive = partial(_apply_drive, key=key, dt=dt, counts=counts, scene=scene, scheme=scheme)
     before, state = state, apply_drive(state, clock=state.clock, place=0)
     exchanging = tangents and isinstance(state.tangents, ExchangeTangents)
@@ -920,8 +765,8 @@ def _step(
         state, key, dt, share, scene, scheme, tangents and not exchanging
     )
     loss, wall_gains = sums.loss, None
-    if subsets.walls is not None and largest.walls is not None:
-        counts = subsets.walls, largest.walls
+    if walls is not None and most_walls is not None:
+        counts = walls, most_walls
         particles, wall_loss, wall_gains = _apply_walls(
             state, key, dt, particles, counts, scene, scheme.dimension, exchanging
         )
@@ -944,9 +789,21 @@ def _step(
         return new
     if isinstance(before.tangents, ExchangeTangents):
         ceiling = CEILING * jnp.sqrt(state.temperature)
-        step = StepEvents(pairs, wall_gains, ceiling, share, state.clock, dt, scheme.num_particles)
-        energies = _energies(before.particles, scene, scheme.dimension)
-        along = _update_exchange_tangents(before.tangents, scene, energies, step, sums.num)
+        inertia = 0.0 if scene.surface is None else scene.surface.inertia
+        v, s = before.particles[:, : scheme.dimension], before.particles[:, 2 * scheme.dimension :]
+        along = _update_exchange_tangents(
+            before.tangents,
+            scene,
+            jnp.stack([jnp.sum(v**2), inertia * jnp.sum(s**2)]),
+            pairs,
+            wall_gains,
+            ceiling,
+            share,
+            state.clock,
+            dt,
+            scheme.num_particles,
+            sums.num,
+        )
         return new._replace(tangents=along)
     ds, energy_after = share * scheme.scaled_step, energy * temperature
     mobility, along = _update_tangents(
@@ -972,14 +829,21 @@ def _apply_drive(
     kicked, largest = counts
     if scene.drive is None or kicked is None or largest is None:
         return state
-    d = scheme.dimension
+    d, parts = scheme.dimension, num_subsets(scheme.num_particles)
     growth = kick_growth(scene.drive, scene.drag, clock, dt, float(place))
-    key = jax.random.fold_in(key, 2 + place)
-    halves = 2 * state.steps + place
-    at_rest = scene.walls is None
-    particles, grown = kick_subsets(
-        state.particles, key, kicked, largest, halves, growth, state.clock, d, at_rest
-    )
+    key, at_rest = jax.random.fold_in(key, 2 + place), scene.walls is None
+    size, time = jnp.sqrt(growth / 2 * (parts / kicked)), state.clock
+
+    def kick(i: Array, rows: Array, belongs: Array) -> tuple[Array, Array]:
+        v = rows[:, :d]
+        kicks = random_kicks(jax.random.fold_in(key, i), v, at_rest, belongs)
+        kicks = jnp.where(belongs[:, None], size * kicks, 0.0)
+        after = [v + kicks, rows[:, d : 2 * d] - time * kicks, rows[:, 2 * d :]]
+        return jnp.concatenate(after, axis=-1), jnp.sum(kicks * (2 * v + kicks))
+
+    first, zero = kicked * (2 * state.steps + place).astype(jnp.int32), jnp.zeros((), growth.dtype)
+    particles, gain = change_subsets(state.particles, first, kicked, largest, kick, zero)
+    grown = 2 * gain / (scheme.num_particles * d)
     return state._replace(particles=particles, temperature=state.temperature + grown)
 
 
@@ -1036,10 +900,7 @@ def _apply_collisions(
     new = old + jnp.concatenate(changes, axis=-1)
     first_spins = None if first_spins is None else first_spins / spin_factor
     second_spins = None if second_spins is None else second_spins / spin_factor
-    pairs = (
-        CandidatePairs(firsts, first_spins, bits[:, :first]),
-        CandidatePairs(seconds, second_spins, bits[:, first:-2]),
-    )
+    pairs = (firsts, first_spins, bits[:, :first]), (seconds, second_spins, bits[:, first:-2])
     return state.particles.at[index].set(new, **options), sums, pairs
 
 
@@ -1062,7 +923,14 @@ def _apply_walls(
     decay = drag_decay_or_one(scene.drag, middle)
     axis, one = (state.steps % d).astype(jnp.int32), jnp.ones(())
 
-    def hit_rows(rows: Array, chance: Array) -> tuple[Array, tuple[Array, EnergyGains | None]]:
+    key = jax.random.fold_in(key, 1)
+    drawn, largest = counts
+    parts = num_subsets(len(particles))
+
+    def hit_rows(i: Array, rows: Array, belongs: Array) -> tuple[Array, tuple]:
+        bits = jax.random.bits(jax.random.fold_in(key, i), belongs.shape, jnp.uint16)
+        chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
+        chance = jnp.where(belongs, chance, jnp.inf)
         velocity, spin = rows[:, :d], rows[:, 2 * d :]
 
         def hit(scene: ReducedScene, faster: Array, turning: Array, drag: Array) -> WallImpacts:
@@ -1073,14 +941,15 @@ def _apply_walls(
         after = [impacts.velocity, rows[:, d : 2 * d], impacts.spin / decay.spin]
         return jnp.concatenate(after, axis=-1), (impacts.loss, gains)
 
-    shapes = jax.eval_shape(hit_rows, particles[:1], particles[:1, 0])[1]
+    shapes = jax.eval_shape(hit_rows, jnp.int32(0), particles[:1], jnp.ones(1, bool))[1]
     zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    key = jax.random.fold_in(key, 1)
-    particles, (loss, gains) = hit_walls_of_subsets(particles, key, *counts, hit_rows, zero)
+    bits = jax.random.bits(jax.random.fold_in(key, MAX_SUBSETS), (), jnp.uint16)
+    first = (bits % parts).astype(jnp.int32)
+    particles, (loss, gains) = change_subsets(particles, first, drawn, largest, hit_rows, zero)
     return particles, loss, gains
 
 
-def _advance(
+def advance(
     state: DSMCState,
     end: Float[Array, ""],
     scene: ReducedScene,
@@ -1125,14 +994,11 @@ def _advance(
     return state._replace(time=jnp.maximum(time, state.time))
 
 
-advance = jax.jit(_advance, static_argnames=("scheme", "tangents"))
-
-
 @cache
 def compiled_advance(donate: bool) -> Callable[..., DSMCState]:
     """Return `advance` for the host driver; with `donate` a call deletes its initial state."""
     return jax.jit(
-        _advance,
+        advance,
         static_argnames=("scheme", "tangents"),
         donate_argnames="state" if donate else (),
         compiler_options=cpu_compiler_options(),

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PRNGKeyArray, UInt32
+from jaxtyping import Array, Float, UInt32
 
 from jaxgran._utils import status
 from jaxgran.data.curve import Particles
@@ -26,9 +26,8 @@ from jaxgran.particles.dsmc.collisions import (
     DSMCTangents,
     Scheme,
     initial_exchange_tangents,
-    kick_all,
 )
-from jaxgran.particles.setup import maxwellian_velocities, normalise_velocities
+from jaxgran.particles.setup import maxwellian_velocities
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import (
     DragDecay,
@@ -41,9 +40,6 @@ from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedDrag, ReducedScene
 from jaxgran.theory import averages
-
-DRIVE_TIME = 10.0
-"""Mean free times during which a drive prepares the steady state of a driven start."""
 
 
 @partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
@@ -70,7 +66,7 @@ def initial_dsmc_state(
         tangents = initial_exchange_tangents(
             scene, num_parameters, scheme.num_particles, d, replicas
         )
-    state = DSMCState(
+    return DSMCState(
         time=jnp.zeros((), v.dtype),
         clock=zero,
         clock_rest=zero,
@@ -82,39 +78,11 @@ def initial_dsmc_state(
         mobility=zero,
         tangents=tangents,
     )
-    if scene is None or scene.prepared is None:
-        return state
-    return state._replace(particles=steady_start(state, key, scene, scheme))
 
 
 def has_elements(scene: ReducedScene) -> bool:
-    """Return False for smooth spheres in free flight that start as a Maxwellian gas."""
+    """Return False for smooth spheres in free flight."""
     return any(element is not None for element in scene[1:])
-
-
-def steady_start(
-    state: DSMCState, key: PRNGKeyArray, scene: ReducedScene, scheme: Scheme
-) -> Float[Array, "replicas N components"]:
-    """Return particles in the steady state of white noise that returns the losses of impacts."""
-    undriven, d = ReducedScene(scene.law, scene.surface, scene.walls), scheme.dimension
-    rate = averages.collision_rate(0.0, d) * scheme.scaled_step
-    words = jax.random.bits(jax.random.fold_in(key, 1), (2,), jnp.uint32)
-    share = jnp.ones(len(state.clock), state.clock.dtype)
-
-    def step_and_heat(i, before):
-        after = collisions.step(before, words, share, undriven, scheme, False)
-        growth = jnp.maximum(1 - after.temperature, 0.0)
-        keys = jax.random.split(jax.random.fold_in(threefry_key(words), i), len(share))
-        kick = jax.vmap(kick_all, (0, 0, 0, None, None, None))
-        kicked = kick(after.particles, keys, growth, jnp.zeros(()), d, scene.walls is None)
-        velocity = normalise_velocities(kicked[..., :d].reshape(-1, d), len(share)) / sqrt(2)
-        velocity = velocity.reshape(kicked[..., :d].shape)
-        parts = [velocity, jnp.zeros_like(velocity), kicked[..., 2 * d :]]
-        particles = jnp.concatenate(parts, axis=-1)
-        return after._replace(particles=particles, temperature=share)
-
-    steps = jnp.ceil(DRIVE_TIME / rate).astype(jnp.int32)
-    return jax.lax.fori_loop(0, steps, step_and_heat, state).particles
 
 
 ALLOWED_MISSED = 1e-4

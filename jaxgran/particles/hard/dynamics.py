@@ -1,8 +1,7 @@
 """Dynamics of hard spheres in windows of time, with a drive, records and tangents.
 
 Many impacts are executed at once in each window. White noise drives the spheres by random kicks:
-each window begins and ends with half of its kicks. The same kicks prepare the steady state of a
-drive. Units as in `jaxgran.particles.hard.impacts`.
+each window begins and ends with half of its kicks. Units as in `jaxgran.particles.hard.impacts`.
 """
 
 import dataclasses
@@ -28,13 +27,12 @@ from jaxgran.particles.dynamics import (
 )
 from jaxgran.particles.hard.impacts import (
     MAX_ROUNDS,
-    HardMaterial,
     HardScene,
     HardTangents,
     ImpactWork,
     execute_impacts,
 )
-from jaxgran.particles.hard.prediction import ImpactCandidates, Paths, select_impact_candidates
+from jaxgran.particles.hard.prediction import ImpactCandidates, select_impact_candidates
 from jaxgran.particles.neighbours import Pairs
 from jaxgran.particles.setup import min_distance, overlap_by_rounding
 from jaxgran.particles.state import (
@@ -45,8 +43,8 @@ from jaxgran.particles.state import (
     derivatives_of_records,
     drag_decay,
     fastest,
+    initial_spins,
     kinetic_energy,
-    maxwellian_spins,
     random_kicks,
     temperature,
     threefry_key,
@@ -97,20 +95,6 @@ class HardState(NamedTuple):
     key: UInt32[Array, "3"] | None = None
 
 
-class HardProgress(NamedTuple):
-    """Progress of hard spheres within one neighbour list, see `Progress`.
-
-    Attributes:
-        bound_factor: factor by which the bound on speeds is raised.
-        num_windows, num_failed, num_rounds: counted since this neighbour list was built.
-    """
-
-    bound_factor: Float[Array, ""]
-    num_windows: Int[Array, ""]
-    num_failed: Int[Array, ""]
-    num_rounds: Int[Array, ""]
-
-
 class HardDynamics(AbstractDynamics):
     """Dynamics of hard spheres in windows of time.
 
@@ -119,8 +103,6 @@ class HardDynamics(AbstractDynamics):
         share: impacts per particle in a window.
         overlap: largest overlap of positions given by a user that are accepted as those of hard
             spheres.
-        max_windows: with one neighbour list, for tests.
-        restores_energy: whether kicks restore the energy that impacts dissipate, so that T stays 1.
     """
 
     scene: HardScene
@@ -128,8 +110,6 @@ class HardDynamics(AbstractDynamics):
     capacity: Capacity = eqx.field(static=True)
     share: float = eqx.field(static=True)
     overlap: float = eqx.field(static=True, default=1e-9)
-    max_windows: int = eqx.field(static=True, default=1_000_000)
-    restores_energy: bool = eqx.field(static=True, default=False)
 
     def initial_internal(self, num_rows, dtype) -> HardState:
         # The first window is short: at random positions many spheres are near contact.
@@ -143,21 +123,7 @@ class HardDynamics(AbstractDynamics):
         )
 
     def elastic(self) -> "HardDynamics":
-        return dataclasses.replace(self, scene=self.scene.for_equilibration(elastic=True))
-
-    @property
-    def preparation_dynamics(self) -> "HardDynamics | None":
-        if self.scene.prepared is None:
-            return None
-        return dataclasses.replace(
-            self, scene=self.scene.for_equilibration(elastic=False), restores_energy=True
-        )
-
-    def start_preparation(self, state: State, key: PRNGKeyArray) -> State:
-        state = initial_random_state(state, self.scene, self.replicas, key)
-        return state._replace(
-            internal=state.internal._replace(key=counted_key(jax.random.fold_in(key, 4)))
-        )
+        return dataclasses.replace(self, scene=self.scene.for_equilibration())
 
     @property
     def region(self) -> Array | None:
@@ -168,11 +134,19 @@ class HardDynamics(AbstractDynamics):
     def galilean_invariant(self) -> bool:
         return self.scene.walls is None and self.scene.drag is None
 
-    def sample_spins(self, state: State, key: PRNGKeyArray, equilibrated: State) -> State:
-        state = initial_random_state(state, self.scene, self.replicas, key)
-        if equilibrated.internal.spin is None:
-            return state
-        return state._replace(internal=state.internal._replace(spin=equilibrated.internal.spin))
+    def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
+        n, d = state.velocity.shape
+        internal, surface = state.internal, self.scene.surface
+        if surface is not None:
+            spin = initial_spins(
+                key, state.velocity, self.replicas, surface.ratio / surface.inertia
+            )
+            gain = jnp.zeros(self.replicas, spin.dtype)
+            internal = internal._replace(spin=spin, rotational_gain=gain)
+        if self.scene.drive is not None:
+            words = jax.random.bits(jax.random.fold_in(key, 3), (2,), jnp.uint32)
+            internal = internal._replace(key=jnp.concatenate([words, jnp.zeros(1, jnp.uint32)]))
+        return state._replace(internal=internal)
 
     def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
         spin, drag = state.internal.spin, self.scene.drag
@@ -181,9 +155,9 @@ class HardDynamics(AbstractDynamics):
         decay = drag_decay(self.scene.decay_rates, state.time + state.time_rest)
         return velocity * decay.velocity, None if spin is None else spin * decay.true_spin
 
-    def with_tangents(self, state: State, directions: ReducedLaw | HardMaterial) -> State:
+    def with_tangents(self, state: State, directions: ReducedLaw | HardScene) -> State:
         velocity = state.velocity
-        if isinstance(directions, HardMaterial):
+        if isinstance(directions, HardScene):
             n, d = len(velocity) // self.replicas, velocity.shape[1]
             tangents = HardTangents.at_start(self.scene, directions, self.replicas, n, d)
         else:
@@ -202,45 +176,55 @@ class HardDynamics(AbstractDynamics):
             closest = jnp.minimum(closest, image)
         return status.flag(status.OVERLAPPING, closest < 1 - tolerance)
 
-    def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, ArrayLike]:
+    @jax.jit
+    def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, Array]:
         """Prepare a neighbour list of the positions in the middle of its life.
 
         Free flight leads there, and the list lives twice as long as one of the current positions.
         """
-        return _prepare(self, state, end)
+        side, walls = self.scene.side, self.scene.walls
+        speed = jnp.max(fastest(state.velocity, self.replicas))
+        life = 0.95 * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
+        time_until_end = time_left(state, end)
+        flown = 0.5 * jnp.minimum(life, time_until_end) * state.velocity
+        if walls is not None:
+            inside = jnp.clip(state.position + flown, 0.5, walls.sides[None] - 0.5)
+            flown = inside - state.position
+        listed = neighbours.wrap(side, state.position + flown)
+        image = jnp.round((state.position + flown - listed) / side).astype(jnp.int32)
+        prepared = state._replace(position=listed - flown, image=state.image + image)
+        return prepared, listed, jnp.where(life < time_until_end, state.time + life, end)
 
     def advance(
         self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
     ) -> Progress:
-        zero = jnp.zeros((), jnp.int32)
-        internal = HardProgress(jnp.ones((), state.position.dtype), zero, zero, zero)
-        first = initial_progress(state, pairs, self.capacity, internal)
+        bound_factor = jnp.ones((), state.position.dtype)
+        first = initial_progress(state, pairs, self.capacity, bound_factor)
         window = partial(self._advance_window, listed=listed, pairs=pairs, end=end)
         return repeat_until(end, window, first)
 
     def _advance_window(
         self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike
     ) -> Progress:
-        """Run one window, and accept it if no sphere exceeded the speed bound and no check
-        failed."""
-        old, internal = now.state, now.internal
+        """Run one window, and accept it if no sphere exceeded the speed bound and no check failed.
+
+        `Progress.internal` is the factor by which the bound on speeds is raised.
+        """
+        old, bound_factor = now.state, now.internal
         time_until_end, scene = time_left(old, end), self.scene
         window = window_length(old, scene, self.replicas)
         num_left = jnp.maximum(jnp.ceil(time_until_end / window * (1 - 1e-9)), 1.0)
         duration = time_until_end / num_left
         kicked = apply_drive(old, scene, self.replicas, duration, 0.0)
-        bound = SPEED_MARGIN * internal.bound_factor * fastest(kicked.velocity, self.replicas)
+        bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
         candidates = select_impact_candidates(
             old.position, kicked.velocity, pairs, duration, bound, self.capacity, scene.walls
         )
-        work = self._execute_impacts(kicked, listed, candidates, duration)
+        work = execute_impacts(kicked, listed, candidates, scene, duration, self.replicas)
         member_bound = bound[jnp.minimum(candidates.replica, self.replicas - 1)]
         too_fast = jnp.any(work.max_speed2 > member_bound**2)
         new = self._state_after_window(kicked, candidates, work, duration)
-        if self.restores_energy:
-            new = restore_energy(new, scene, self.replicas, new.dissipated - old.dissipated)
-        else:
-            new = apply_drive(new, scene, self.replicas, duration, 1.0)
+        new = apply_drive(new, scene, self.replicas, duration, 1.0)
         new = advance_time(new, duration, end, num_left <= 1)
 
         list_status = self.capacity.exceeded_by(candidates.needed)
@@ -258,46 +242,12 @@ class HardDynamics(AbstractDynamics):
         next_duration = jnp.minimum(state.internal.window, time_left(state, end))
         next_position = state.position + state.velocity * next_duration
         next_distance2 = jnp.max(jnp.sum((next_position - listed) ** 2, -1))
-        enough = internal.num_windows + 1 >= self.max_windows
         return Progress(
             state=state,
-            stale=(accepted & (next_distance2 > (0.5 * old.skin) ** 2)) | enough,
+            stale=accepted & (next_distance2 > (0.5 * old.skin) ** 2),
             status=jnp.where(repeat, status.OK, fault).astype(jnp.int32),
             needed=jnp.maximum(now.needed, candidates.needed),
-            internal=HardProgress(
-                bound_factor=jnp.where(repeat, 1.3 * internal.bound_factor, 1.0),
-                num_windows=internal.num_windows + 1,
-                num_failed=internal.num_failed + ~accepted,
-                num_rounds=internal.num_rounds + work.num_rounds,
-            ),
-        )
-
-    def _execute_impacts(
-        self, state: State, listed: Array, candidates: ImpactCandidates, duration: Array
-    ) -> ImpactWork:
-        def of_members(values):
-            return values.at[candidates.members].get(mode="fill", fill_value=0.0)
-
-        T = temperature(state.velocity, self.replicas)
-        T = jnp.maximum(T, jnp.finfo(T.dtype).tiny)
-        scene = self.scene
-        contact_duration = scene.contact_time / (scene.collision_frequency * jnp.sqrt(T))
-        internal = state.internal
-        paths = Paths(
-            of_members(state.position),
-            of_members(state.velocity),
-            -of_members(internal.age),
-            None if internal.spin is None else of_members(internal.spin),
-        )
-        return execute_impacts(
-            paths,
-            of_members(listed),
-            candidates,
-            scene,
-            state.time + state.time_rest,
-            duration,
-            contact_duration,
-            state.tangents,
+            internal=jnp.where(repeat, 1.3 * bound_factor, 1.0),
         )
 
     def _state_after_window(
@@ -367,58 +317,6 @@ class HardDynamics(AbstractDynamics):
         return recovered, now.status & fatal
 
 
-@jax.jit
-def _prepare(dynamics: HardDynamics, state: State, end: ArrayLike) -> tuple[State, Array, Array]:
-    side, replicas = dynamics.scene.side, dynamics.replicas
-    speed = jnp.max(fastest(state.velocity, replicas))
-    life = 0.95 * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
-    time_until_end = time_left(state, end)
-    flown = 0.5 * jnp.minimum(life, time_until_end) * state.velocity
-    if dynamics.scene.walls is not None:
-        farthest = dynamics.scene.walls.sides[None] - 0.5
-        flown = jnp.clip(state.position + flown, 0.5, farthest) - state.position
-    listed = neighbours.wrap(side, state.position + flown)
-    image = jnp.round((state.position + flown - listed) / side).astype(jnp.int32)
-    prepared = state._replace(position=listed - flown, image=state.image + image)
-    return prepared, listed, jnp.where(life < time_until_end, state.time + life, end)
-
-
-def initial_random_state(state: State, scene: HardScene, replicas: int, key: PRNGKeyArray) -> State:
-    """Return the state at t = 0 with random spins of rough spheres, and the key of a drive."""
-    n, d = state.velocity.shape
-    internal = state.internal
-    if scene.surface is not None:
-        spin_key = jax.random.fold_in(key, 2)  # 0 and 1 are of positions and velocities
-        shape = replicas, n // replicas, NUM_SPIN_COMPONENTS[d]
-        mean_square = (scene.surface.ratio / scene.surface.inertia).astype(state.velocity.dtype)
-        spin = maxwellian_spins(spin_key, shape, mean_square).reshape(n, NUM_SPIN_COMPONENTS[d])
-        internal = internal._replace(spin=spin, rotational_gain=jnp.zeros(replicas, spin.dtype))
-    if scene.drive is not None:
-        internal = internal._replace(key=counted_key(jax.random.fold_in(key, 3)))
-    return state._replace(internal=internal)
-
-
-def counted_key(key: PRNGKeyArray) -> Array:
-    """Return two words of a key and 0, the number of kicks made with it so far."""
-    words = jax.random.bits(key, (2,), jnp.uint32)
-    return jnp.concatenate([words, jnp.zeros(1, jnp.uint32)])
-
-
-def apply_kicks(
-    state: State, scene: HardScene, replicas: int, variance: Float[Array, "replicas"]
-) -> State:
-    """Return the state after random kicks with a given variance of each velocity component."""
-    if state.internal.key is None:
-        return state
-    key = jax.random.fold_in(threefry_key(state.internal.key[:2]), state.internal.key[2])
-    by_replica = state.velocity.reshape(replicas, -1, state.velocity.shape[-1])
-    keys = jax.random.split(key, replicas)
-    kicks = jax.vmap(random_kicks, (0, 0, None))(keys, by_replica, scene.walls is None)
-    velocity = by_replica + jnp.sqrt(variance)[:, None, None] * kicks
-    internal = state.internal._replace(key=state.internal.key.at[2].add(jnp.uint32(1)))
-    return state._replace(velocity=velocity.reshape(state.velocity.shape), internal=internal)
-
-
 def apply_drive(
     state: State, scene: HardScene, replicas: int, duration: ArrayLike, place: float
 ) -> State:
@@ -426,10 +324,18 @@ def apply_drive(
 
     Time and window are those before the window; the velocities may already have had kicks.
     """
-    if scene.drive is None:
+    counted_key = state.internal.key
+    if scene.drive is None or counted_key is None:
         return state
     variance = kick_variance(scene, state.time + state.time_rest, duration, place)
-    return apply_kicks(state, scene, replicas, jnp.broadcast_to(variance, (replicas,)))
+    keys = jax.random.split(
+        jax.random.fold_in(threefry_key(counted_key[:2]), counted_key[2]), replicas
+    )
+    by_replica = state.velocity.reshape(replicas, -1, state.velocity.shape[-1])
+    kicks = jax.vmap(random_kicks, (0, 0, None))(keys, by_replica, scene.walls is None)
+    velocity = (by_replica + jnp.sqrt(variance) * kicks).reshape(state.velocity.shape)
+    internal = state.internal._replace(key=counted_key.at[2].add(jnp.uint32(1)))
+    return state._replace(velocity=velocity, internal=internal)
 
 
 def kick_variance(
@@ -458,31 +364,6 @@ def window_length(state: State, scene: HardScene, replicas: int) -> Float[Array,
     safe_growth = jnp.where(growth > 0, growth, 1.0)
     longest = jnp.where(growth > 0, MAX_KICK * lowest / safe_growth, jnp.inf)
     return jnp.minimum(state.internal.window, longest)
-
-
-def window_heating(
-    scene: HardScene, material: HardMaterial, start_time: Float[Array, ""], duration: ArrayLike
-) -> Float[Array, ""]:
-    """Return the growth of T by the kicks of a window, as a function of the material."""
-    scene = scene.with_material(material)
-    before = kick_variance(scene, start_time, duration, 0.0)
-    return before + kick_variance(scene, start_time, duration, 1.0)
-
-
-def restore_energy(
-    state: State, scene: HardScene, replicas: int, lost: Float[Array, "replicas"]
-) -> State:
-    """Return the state after kicks that restore the energy lost, scaled to T = 1 exactly.
-
-    A gas that is driven in this way approaches the steady state of white noise.
-    """
-    n, d = state.velocity.shape
-    # Spins of rough spheres may return more energy than impacts dissipate; then only scale.
-    variance = 2 * jnp.maximum(lost, 0.0) / (n // replicas * d)
-    state = apply_kicks(state, scene, replicas, variance)
-    by_replica = state.velocity.reshape(replicas, -1)
-    size = jnp.sqrt(jnp.mean(by_replica**2, axis=1, keepdims=True))
-    return state._replace(velocity=(by_replica / size).reshape(state.velocity.shape))
 
 
 def projected_tangents_after(
@@ -553,11 +434,13 @@ def exchange_tangents_after(
     if scene.walls is not None:
         gains = gains.at[:, :, candidates.replica].add(work.wall_gains, mode="drop")
     if scene.drive is not None:
-        start_time = old.time + old.time_rest
-        heating = partial(window_heating, scene, start_time=start_time, duration=duration)
-        heating_energy, linear = jax.linearize(
-            lambda material: n * d / 2 * heating(material), scene.material
-        )
+
+        def heating(material: HardScene) -> Array:
+            changed, start_time = scene.with_material(material), old.time + old.time_rest
+            halves = [kick_variance(changed, start_time, duration, place) for place in (0.0, 1.0)]
+            return n * d / 2 * (halves[0] + halves[1])
+
+        heating_energy, linear = jax.linearize(heating, scene.material)
         # Heating does not depend on the speeds, unlike the frequency of impacts.
         gains = gains.at[:-2, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
         gains = gains.at[-2, 0].add(-heating_energy)

@@ -20,35 +20,23 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
 from jaxgran.particles.hard.prediction import (
-    FirstImpacts,
     HardWalls,
     ImpactCandidates,
-    PairRows,
     Paths,
     first_impacts,
 )
-from jaxgran.particles.state import DragDecay, TangentialImpulse, drag_decay, tangential_impulse
+from jaxgran.particles.state import (
+    DragDecay,
+    State,
+    TangentialImpulse,
+    drag_decay,
+    tangential_impulse,
+    temperature,
+)
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
 from jaxgran.scene.gas import mean_loss
 from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedDrag, ReducedDrive, ReducedRough
-
-
-class HardMaterial(NamedTuple):
-    """Numbers of a scene with elements in which derivatives are taken.
-
-    Attributes:
-        law, surface, drag, drive: as in `HardScene`.
-        wall_law, wall_beta, wall_frequency: of `HardWalls`.
-    """
-
-    law: ReducedLaw
-    surface: ReducedRough | None
-    drag: ReducedDrag | None
-    drive: ReducedDrive | None
-    wall_law: ReducedLaw | None
-    wall_beta: Float[Array, "..."] | None
-    wall_frequency: Float[Array, "..."] | None
 
 
 class HardScene(NamedTuple):
@@ -62,12 +50,10 @@ class HardScene(NamedTuple):
             elastic.
         elastic: whether all impacts are elastic and smooth.
         surface: of rough spheres; None of smooth ones.
-        walls: of a container; None where the box is periodic.
         drag: rates over the collision frequency; None in a vacuum. Time and velocities are then
             transformed, see `jaxgran.particles.state`.
         drive: growth of T over the collision frequency by white noise; None where there is none.
-        prepared: () where the gas begins in the steady state of such a drive; None where it does
-            not.
+        walls: of a container; None where the box is periodic.
     """
 
     side: Float[Array, ""]
@@ -76,10 +62,9 @@ class HardScene(NamedTuple):
     contact_time: Float[Array, ""]
     elastic: Bool[Array, ""]
     surface: ReducedRough | None = None
-    walls: HardWalls | None = None
     drag: ReducedDrag | None = None
     drive: ReducedDrive | None = None
-    prepared: tuple[()] | None = None
+    walls: HardWalls | None = None
 
     @property
     def has_elements(self) -> bool:
@@ -87,18 +72,16 @@ class HardScene(NamedTuple):
         return any(x is not None for x in (self.surface, self.walls, self.drag, self.drive))
 
     @property
-    def material(self) -> ReducedLaw | HardMaterial:
-        """The numbers of the law and of the elements, in which derivatives are taken.
+    def material(self) -> Any:
+        """The numbers in which derivatives are taken: those of the law, or a scene of the elements.
 
         All are per collision, so that in a denser gas the same happens sooner.
         """
         if not self.has_elements:
             return self.law
-        material = HardMaterial(self.law, self.surface, self.drag, self.drive, None, None, None)
-        if self.walls is None:
-            return material
-        _, law, beta, frequency = self.walls
-        return material._replace(wall_law=law, wall_beta=beta, wall_frequency=frequency)
+        geometry = {"side": None, "collision_frequency": None, "contact_time": None}
+        walls = None if self.walls is None else self.walls._replace(sides=None)
+        return self._replace(elastic=None, walls=walls, **geometry)
 
     def log_loss(self, material: ReducedLaw) -> Float[Array, ""]:
         """Return ln of ``I/(1 - I)``, I the share of normal energy that impacts dissipate."""
@@ -109,24 +92,21 @@ class HardScene(NamedTuple):
         """Return this scene with other numbers of its material."""
         if not self.has_elements:
             return self._replace(law=material)
-        walls = self.walls
-        if walls is not None:
-            law: Any = material.wall_law
-            frequency: Any = material.wall_frequency
-            walls = walls._replace(law=law, beta=material.wall_beta, frequency=frequency)
-        return self._replace(
-            law=material.law,
-            surface=material.surface,
+        walls = None if self.walls is None else material.walls._replace(sides=self.walls.sides)
+        side, _, frequency, contact_time, elastic = self[:5]
+        return material._replace(
+            side=side,
+            collision_frequency=frequency,
+            contact_time=contact_time,
+            elastic=elastic,
             walls=walls,
-            drag=material.drag,
-            drive=material.drive,
         )
 
-    def for_equilibration(self, elastic: bool) -> "HardScene":
-        """Return the scene without drag and drive; with elastic and smooth impacts or not."""
+    def for_equilibration(self) -> "HardScene":
+        """Return the scene with elastic and smooth impacts, without drag and drive."""
         drag = None if self.drag is None else ReducedDrag(*(0 * x for x in self.drag))
         drive = None if self.drive is None else ReducedDrive(0 * self.drive.strength)
-        return self._replace(elastic=self.elastic | elastic, drag=drag, drive=drive)
+        return self._replace(elastic=jnp.ones((), bool), drag=drag, drive=drive)
 
     @property
     def decay_rates(self) -> ReducedDrag:
@@ -317,7 +297,7 @@ class HardTangents(NamedTuple):
         """Return the tangents of the gains of both energies in impacts, see
         `ExchangeTangents.after`."""
 
-        def energies(material: HardMaterial, velocity: Array, spin: Array) -> Array:
+        def energies(material: HardScene, velocity: Array, spin: Array) -> Array:
             if scene.surface is not None and material.surface is not None:
                 # At a given energy spins are smaller where the inertia is larger.
                 spin = spin - 0.5 * jnp.log(material.surface.inertia / scene.surface.inertia)
@@ -387,14 +367,12 @@ class ImpactWork(NamedTuple):
 
 
 def execute_impacts(
-    paths: Paths,
-    listed: Float[Array, "slots d"],
+    state: State,
+    listed: Float[Array, "n d"],
     candidates: ImpactCandidates,
     scene: HardScene,
-    start_time: Float[Array, ""],
     duration: ArrayLike,
-    contact_duration: Float[Array, "replicas"],
-    tangents: ImpactTangents | HardTangents | None,
+    replicas: int,
 ) -> ImpactWork:
     """Execute all impacts of a window, in rounds of independent impacts.
 
@@ -402,63 +380,131 @@ def execute_impacts(
     changed. The earliest impact of all is always one of them.
 
     Args:
-        paths: of the members of the selection.
+        state: at the beginning of the window; with tangents, gains of energy along their
+            directions are computed.
         listed: the places for which the neighbour list was built.
-        candidates: the selection.
+        candidates: the pairs that may touch.
         scene: the gas.
-        start_time: time at which the window begins.
         duration: of the window.
-        contact_duration: time after a sphere's last impact within which its next one is elastic.
-        tangents: for the gains of energy along their directions; None in a run without tangents.
+        replicas: number of boxes.
     """
-    contact_duration = contact_duration[jnp.minimum(candidates.replica, len(contact_duration) - 1)]
+
+    def of_members(values):
+        return values.at[candidates.members].get(mode="fill", fill_value=0.0)
+
+    internal, tangents, start_time = state.internal, state.tangents, state.time + state.time_rest
+    spin = None if internal.spin is None else of_members(internal.spin)
+    x, v, listed = (of_members(values) for values in (state.position, state.velocity, listed))
+    paths = Paths(x, v, -of_members(internal.age), spin)
+    T = temperature(state.velocity, replicas)
+    T = jnp.maximum(T, jnp.finfo(T.dtype).tiny)
+    # An impact is elastic within this time of a sphere's last one.
+    contact_duration = scene.contact_time / (scene.collision_frequency * jnp.sqrt(T))
+    contact_duration = contact_duration[jnp.minimum(candidates.replica, replicas - 1)]
+    rows, slots = candidates.rows, jnp.arange(len(v), dtype=jnp.int32)
+    a, b, num_rows = rows.a, rows.b, len(rows.a)
+    index = jnp.arange(num_rows, dtype=jnp.int32)
 
     def one_round(work: ImpactWork) -> ImpactWork:
-        impacts, executable, row = _select_executable(
-            work.paths, candidates.rows, duration, scene.walls
-        )
-        s, too_soon, events = _impact_events(
-            impacts, executable, work.paths, candidates.rows, contact_duration, scene, start_time
-        )
+        paths = work.paths
+        next_impacts = first_impacts(paths, rows, duration, scene.walls)
+        times, first, final = next_impacts.times, next_impacts.first, next_impacts.final
+        executable = jnp.isfinite(times)
+        for k in (a, b):
+            executable &= (times == first[k]) & (times == final[k])
+        # Of several impacts at exactly the same time, a sphere takes the one in the first row.
+        rank = jnp.where(executable, index, num_rows)
+        row = jnp.full(len(slots), num_rows, jnp.int32).at[a].min(rank).at[b].min(rank)
+        executable &= (row[a] == index) & (row[b] == index)
+
+        s = jnp.where(executable, times, 0.0)
+        r = next_impacts.r + next_impacts.w * s[:, None]
+        normal = r / jnp.where(executable, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
+        speed = jnp.where(executable, -jnp.sum(next_impacts.w * normal, -1), 1.0)
+        too_soon = s - jnp.maximum(paths.last[a], paths.last[b]) < contact_duration[a]
+        spin = None if paths.spin is None else paths.spin[a] + paths.spin[b]
+        elastic = too_soon | scene.elastic | ~executable
+        events = ImpactEvents(start_time + s, -normal, next_impacts.w, speed, spin, elastic)
         effect = pair_effect(scene, events)
-        new = _apply_pair_impacts(
-            work, effect, s, too_soon, executable, row, candidates.rows, listed
-        )
-        new = new._replace(
-            gains=work.gains + _pair_gains(tangents, scene, events, executable, too_soon)
-        )
-        if impacts.wall_impacts is None or scene.walls is None:
-            return new
-        unpaired = row == len(candidates.rows.a)
-        return _apply_wall_impacts(
-            work, new, impacts, unpaired, listed, contact_duration, scene, start_time, tangents
+        gains = work.gains
+        if isinstance(tangents, HardTangents):  # each of two spheres loses half of the energy
+            gains = gains + 2 * tangents.gains(scene, events, executable, pair_effect)
+        elif tangents is not None:  # the law's unit of speed is sqrt(2)
+            more = 2 * tangents.gains(scene.law, events.speed * 0.5**0.5)
+            gains = gains + jnp.where((executable & ~too_soon & ~scene.elastic)[None], more, 0.0)
+
+        # From the rows of pairs to the slots of their spheres.
+        unpaired, row = row == num_rows, jnp.minimum(row, num_rows - 1)
+        hit = executable[row] & ((a[row] == slots) | (b[row] == slots))
+        sign = jnp.where(hit, jnp.where(a[row] == slots, 1.0, -1.0), 0.0)
+        effect = jax.tree.map(lambda x: x[row], effect)
+        effect = effect._replace(kick=sign[:, None] * effect.kick)
+        s, too_soon = jnp.where(hit, s[row], 0.0), too_soon[row]
+        x = paths.x - effect.kick * s[:, None]
+        impacts, wall_impacts, wall_gains = work.impacts + hit, work.wall_impacts, work.wall_gains
+        regularised = work.regularised + (hit & too_soon)
+        if next_impacts.wall_impacts is not None and wall_impacts is not None:
+            wall_times, axis = next_impacts.wall_impacts
+            at_wall = unpaired & jnp.isfinite(wall_times)
+            at_wall &= (wall_times == first) & (wall_times == final)
+            wall_s = jnp.where(at_wall, wall_times, 0.0)
+            too_soon = wall_s - paths.last < contact_duration
+            is_axis = axis[:, None] == jnp.arange(paths.v.shape[1])[None]
+            outwards = jnp.where(is_axis, jnp.sign(paths.v), 0.0)
+            speed = jnp.where(at_wall, jnp.sum(paths.v * outwards, axis=1), 1.0)
+            elastic = too_soon | scene.elastic | ~at_wall
+            events = ImpactEvents(
+                start_time + wall_s, outwards, paths.v, speed, paths.spin, elastic
+            )
+            on_wall = wall_effect(scene, events, axis)
+            if isinstance(tangents, HardTangents):
+                with_frequency = partial(wall_effect_for_tangents, axis=axis)
+                wall_gains = wall_gains + tangents.gains(scene, events, at_wall, with_frequency)
+            effect = jax.tree.map(partial(_where_rows, at_wall), on_wall, effect)
+            s, hit = jnp.where(at_wall, wall_s, s), hit | at_wall
+            after = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
+            x = _where_rows(at_wall, after, x)
+            wall_impacts = wall_impacts + at_wall
+            # An impact of two spheres counts twice.
+            regularised = regularised + 2 * (at_wall & too_soon)
+
+        v, spin, rotational_gain = paths.v + effect.kick, paths.spin, work.rotational_gain
+        if spin is not None and rotational_gain is not None:
+            spin = spin + _where_rows(hit, effect.spin_change, jnp.zeros_like(spin))
+            rotational_gain = rotational_gain + jnp.where(hit, effect.rotational_gain, 0.0)
+        distance2 = jnp.sum((paths.x + paths.v * s[:, None] - listed) ** 2, -1)
+        return ImpactWork(
+            paths=Paths(x, v, jnp.where(hit, s, paths.last), spin),
+            dissipated=work.dissipated + jnp.where(hit, effect.lost, 0.0),
+            rotational_gain=rotational_gain,
+            impacts=impacts,
+            wall_impacts=wall_impacts,
+            regularised=regularised,
+            max_distance2=jnp.maximum(work.max_distance2, jnp.where(hit, distance2, 0.0)),
+            max_speed2=jnp.maximum(work.max_speed2, jnp.sum(v * v, -1)),
+            pending=jnp.any(hit),
+            num_rounds=work.num_rounds + 1,
+            gains=gains,
+            wall_gains=wall_gains,
         )
 
     def unfinished(work: ImpactWork):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
-    first = _initial_work(paths, scene, tangents, len(candidates.rows.a))
-    return jax.lax.while_loop(unfinished, one_round, first)
-
-
-def _initial_work(
-    paths: Paths, scene: HardScene, tangents: ImpactTangents | HardTangents | None, num_rows: int
-) -> ImpactWork:
-    num_slots = len(paths.v)
-    zero_counts, zeros = jnp.zeros(num_slots, jnp.int32), jnp.zeros(num_slots, paths.x.dtype)
-    shape, wall_shape = (0, num_rows), (0, 2, num_slots)
+    counts, zeros = jnp.zeros_like(slots), jnp.zeros(len(slots), paths.x.dtype)
+    shape, wall_shape = (0, num_rows), (0, 2, len(slots))
     if isinstance(tangents, ImpactTangents):
         shape = len(tangents.log_temperature) + 1, num_rows
     elif tangents is not None:
         shape = tangents.num_changes, 2, num_rows
-        wall_shape = (0 if scene.walls is None else tangents.num_changes), 2, num_slots
-    return ImpactWork(
+        wall_shape = (0 if scene.walls is None else tangents.num_changes), 2, len(slots)
+    work = ImpactWork(
         paths=paths,
         dissipated=zeros,
         rotational_gain=None if paths.spin is None else zeros,
-        impacts=zero_counts,
-        wall_impacts=None if scene.walls is None else zero_counts,
-        regularised=zero_counts,
+        impacts=counts,
+        wall_impacts=None if scene.walls is None else counts,
+        regularised=counts,
         max_distance2=zeros,
         max_speed2=zeros,
         pending=jnp.array(True),
@@ -466,164 +512,8 @@ def _initial_work(
         gains=jnp.zeros(shape, zeros.dtype),
         wall_gains=jnp.zeros(wall_shape, zeros.dtype),
     )
+    return jax.lax.while_loop(unfinished, one_round, work)
 
 
-def _select_executable(
-    paths: Paths, rows: PairRows, duration: ArrayLike, walls: HardWalls | None
-) -> tuple[FirstImpacts, Bool[Array, "rows"], Int[Array, "slots"]]:
-    """Return the next impacts, which are executable now, and the row of each particle's impact.
-
-    A particle without an executable impact has a row beyond the last.
-    """
-    a, b = rows.a, rows.b
-    index = jnp.arange(len(a), dtype=jnp.int32)
-    impacts = first_impacts(paths, rows, duration, walls)
-    executable = jnp.isfinite(impacts.times)
-    for k in (a, b):
-        executable &= (impacts.times == impacts.first[k]) & (impacts.times == impacts.final[k])
-    # Of several impacts at exactly the same time, a sphere takes the one in the first row.
-    rank = jnp.where(executable, index, len(a))
-    row = jnp.full(len(paths.v), len(a), jnp.int32).at[a].min(rank).at[b].min(rank)
-    return impacts, executable & (row[a] == index) & (row[b] == index), row
-
-
-def _impact_events(
-    impacts: FirstImpacts,
-    executable: Bool[Array, "rows"],
-    paths: Paths,
-    rows: PairRows,
-    contact_duration: Float[Array, "slots"],
-    scene: HardScene,
-    start_time: Float[Array, ""],
-) -> tuple[Float[Array, "rows"], Bool[Array, "rows"], ImpactEvents]:
-    """Return the times of executable impacts of pairs, whether they come too soon, and the
-    events."""
-    s = jnp.where(executable, impacts.times, 0.0)
-    r = impacts.r + impacts.w * s[:, None]
-    normal = r / jnp.where(executable, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
-    speed = jnp.where(executable, -jnp.sum(impacts.w * normal, -1), 1.0)
-    too_soon = s - jnp.maximum(paths.last[rows.a], paths.last[rows.b]) < contact_duration[rows.a]
-    spin = None if paths.spin is None else paths.spin[rows.a] + paths.spin[rows.b]
-    elastic = too_soon | scene.elastic | ~executable
-    return s, too_soon, ImpactEvents(start_time + s, -normal, impacts.w, speed, spin, elastic)
-
-
-def _apply_pair_impacts(
-    work: ImpactWork,
-    effect: ImpactEffect,
-    time: Float[Array, "rows"],
-    too_soon: Bool[Array, "rows"],
-    executable: Bool[Array, "rows"],
-    row: Int[Array, "slots"],
-    rows: PairRows,
-    listed: Float[Array, "slots d"],
-) -> ImpactWork:
-    """Return the particles after the executable impacts of pairs, and the sums with these
-    impacts."""
-    paths, slot_indices = work.paths, jnp.arange(len(row), dtype=jnp.int32)
-    row = jnp.minimum(row, len(rows.a) - 1)
-    hit = executable[row] & ((rows.a[row] == slot_indices) | (rows.b[row] == slot_indices))
-    s = jnp.where(hit, time[row], 0.0)
-    sign = jnp.where(hit, jnp.where(rows.a[row] == slot_indices, 1.0, -1.0), 0.0)
-    kick = sign[:, None] * effect.kick[row]
-    position = paths.x + paths.v * s[:, None]
-    v = paths.v + kick
-    spin, rotational_gain = paths.spin, work.rotational_gain
-    if spin is not None and rotational_gain is not None and effect.spin_change is not None:
-        assert effect.rotational_gain is not None
-        spin = spin + jnp.where(hit[:, None], effect.spin_change[row], 0.0)
-        rotational_gain = rotational_gain + jnp.where(hit, effect.rotational_gain[row], 0.0)
-    distance2 = jnp.where(hit, jnp.sum((position - listed) ** 2, -1), 0.0)
-    return work._replace(
-        paths=Paths(paths.x - kick * s[:, None], v, jnp.where(hit, s, paths.last), spin),
-        dissipated=work.dissipated + jnp.where(hit, effect.lost[row], 0.0),
-        rotational_gain=rotational_gain,
-        impacts=work.impacts + hit,
-        regularised=work.regularised + (hit & too_soon[row]),
-        max_distance2=jnp.maximum(work.max_distance2, distance2),
-        max_speed2=jnp.maximum(work.max_speed2, jnp.sum(v * v, -1)),
-        pending=jnp.any(executable),
-        num_rounds=work.num_rounds + 1,
-    )
-
-
-def _apply_wall_impacts(
-    old: ImpactWork,
-    new: ImpactWork,
-    impacts: FirstImpacts,
-    unpaired: Bool[Array, "slots"],
-    listed: Float[Array, "slots d"],
-    contact_duration: Float[Array, "slots"],
-    scene: HardScene,
-    start_time: Float[Array, ""],
-    tangents: ImpactTangents | HardTangents | None,
-) -> ImpactWork:
-    """Return the particles after a round, with the impacts on walls that no other impact can
-    precede.
-
-    Args:
-        old, new: before the round, and after its impacts of pairs.
-        impacts: the next ones, before the round.
-        unpaired: particles without an impact of a pair in this round.
-        listed, contact_duration, scene, start_time, tangents: as for `execute_impacts`.
-    """
-    assert (
-        impacts.wall_impacts is not None
-        and scene.walls is not None
-        and new.wall_impacts is not None
-    )
-    paths, (times, axis) = old.paths, impacts.wall_impacts
-    hit = unpaired & jnp.isfinite(times) & (times == impacts.first) & (times == impacts.final)
-    s = jnp.where(hit, times, 0.0)
-    too_soon = s - paths.last < contact_duration
-    is_axis = axis[:, None] == jnp.arange(paths.v.shape[1])[None]
-    outwards = jnp.where(is_axis, jnp.sign(paths.v), 0.0)
-    speed = jnp.where(hit, jnp.sum(paths.v * outwards, axis=1), 1.0)
-    events = ImpactEvents(
-        start_time + s, outwards, paths.v, speed, paths.spin, too_soon | scene.elastic | ~hit
-    )
-    effect = wall_effect(scene, events, axis)
-    kick = jnp.where(hit[:, None], effect.kick, 0.0)
-    position = paths.x + paths.v * s[:, None]
-    v = jnp.where(hit[:, None], paths.v + kick, new.paths.v)
-    x = jnp.where(hit[:, None], position - v * s[:, None], new.paths.x)
-    spin, rotational_gain = new.paths.spin, new.rotational_gain
-    if spin is not None and rotational_gain is not None and effect.spin_change is not None:
-        assert effect.rotational_gain is not None
-        spin = spin + jnp.where(hit[:, None], effect.spin_change, 0.0)
-        rotational_gain = rotational_gain + jnp.where(hit, effect.rotational_gain, 0.0)
-    gains = new.wall_gains
-    if isinstance(tangents, HardTangents):
-        gains = gains + tangents.gains(
-            scene, events, hit, partial(wall_effect_for_tangents, axis=axis)
-        )
-    distance2 = jnp.where(hit, jnp.sum((position - listed) ** 2, -1), 0.0)
-    return new._replace(
-        paths=Paths(x, v, jnp.where(hit, s, new.paths.last), spin),
-        dissipated=new.dissipated + jnp.where(hit, effect.lost, 0.0),
-        rotational_gain=rotational_gain,
-        wall_impacts=new.wall_impacts + hit,
-        regularised=new.regularised + 2 * (hit & too_soon),  # an impact of two spheres counts twice
-        max_distance2=jnp.maximum(new.max_distance2, distance2),
-        max_speed2=jnp.maximum(new.max_speed2, jnp.sum(v * v, -1)),
-        pending=new.pending | jnp.any(hit),
-        wall_gains=gains,
-    )
-
-
-def _pair_gains(
-    tangents: ImpactTangents | HardTangents | None,
-    scene: HardScene,
-    events: ImpactEvents,
-    executable: Bool[Array, "rows"],
-    too_soon: Bool[Array, "rows"],
-) -> Float[Array, "changes *energies rows"]:
-    """Return the tangents of the energy gained in executable impacts of pairs."""
-    if tangents is None:
-        return jnp.zeros((0, len(executable)), events.speed.dtype)
-    if isinstance(tangents, HardTangents):
-        # Each of two spheres loses half of it.
-        return 2 * tangents.gains(scene, events, executable, pair_effect)
-    # The law's unit of speed is sqrt(2).
-    gains = 2 * tangents.gains(scene.law, events.speed * 0.5**0.5)
-    return jnp.where((executable & ~too_soon & ~scene.elastic)[None], gains, 0.0)
+def _where_rows(mask: Bool[Array, "rows"], x: Any, y: Any) -> Array:
+    return jnp.where(mask if x.ndim == 1 else mask[:, None], x, y)

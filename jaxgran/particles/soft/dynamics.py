@@ -185,7 +185,7 @@ class SoftDynamics(AbstractDynamics):
     def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
         return velocity, state.internal.spin
 
-    def sample_spins(self, state: State, key: PRNGKeyArray, equilibrated: State) -> State:
+    def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
         surface = self.scene.material.surface
         if surface is None:
             return state
