@@ -22,7 +22,7 @@ Deliberate faults in the package, and the tests here that found each:
 14. factor: drag at half its rate in kinetic theory: the element drag.
 15. random numbers: replicas of DSMC share those of their collisions: replicas and keys.
 
-The tests marked `optimised` run a second time with the slow ones, compiled as users have them.
+The tests marked `optimised` run once more, compiled as users have them: pytest -m optimised
 """
 
 import dataclasses
