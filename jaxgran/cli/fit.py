@@ -169,7 +169,8 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     print_budget(rows, options.explain)
     print_alternatives(rows[0]["parameter"], diagnosis)
     if several:
-        print_measurements(rows[0]["parameter"], result)
+        agreement = "do not contradict" if agree["agree"] else "contradict"
+        print(f"\nThe measurements {agreement} each other (p = {float(result.p_value):.2g}).")
     print("\n" + "\n".join(f"  - {reason}" for reason in diagnosis.reasons))
     print(f"\nwritten  {picture}\n         {record}\n")
     print(json.dumps(summary, allow_nan=False))
@@ -300,15 +301,3 @@ def print_alternatives(name: str, diagnosis: Any) -> None:
     if cells:
         head = "alternative explanation", "chi^2 drop", name, "95 %", "distinguishable"
         print_table(head, cells)
-
-
-def print_measurements(name: str, result: Any) -> None:
-    """Print the misfit and the weight of each measurement, and whether they agree."""
-    cells, weights = [], result.weights()
-    for label, comparison in result.comparisons.items():
-        residuals = np.concatenate([np.asarray(x) for x in comparison.residuals.values()])
-        points, chi2 = np.sum(residuals != 0), np.sum(residuals**2)
-        cells.append((label, f"{points}", f"{chi2:.1f}", f"{weights[label][0]:.2f}"))
-    print_table(("", "points", "chi^2", f"weight in {name}"), cells)
-    agreement = "do not contradict" if float(result.p_value) > SIGNIFICANCE else "contradict"
-    print(f"\nThe measurements {agreement} each other (p = {float(result.p_value):.2g}).")

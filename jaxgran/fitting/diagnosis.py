@@ -321,7 +321,7 @@ def _verdict(
     group = result.undetermined()
     if len(result.degenerate_solutions()):
         why = "other parameters fit this curve as well"
-    elif group:
+    elif result.names[0] in group:
         why = f"this curve does not determine {' and '.join(map(symbol_of, group))}"
     elif not ranges:
         why = "alternatives were not compared"

@@ -166,7 +166,10 @@ def fit(
     curves = {label: x for label, x in data.items() if isinstance(x, CoolingCurve)}
     counts = _numbers_by_label("num_particles", num_particles, data)
     runs = _numbers_by_label("replicas", replicas, data)
-    names = _default_names(scenes, data, separate) if free is None else free
+    first = next(iter(curves), next(iter(data)))
+    names = free
+    if free is None:
+        names = tuple(x for x in free_by_default(scenes[first], data[first]) if x not in separate)
     names = with_names_of_law((names,) if names == LAW else names, next(iter(scenes.values())))
     _check_request(scenes, data, names, separate, max_steps)
     absent = checked_absent(absent)
@@ -179,7 +182,6 @@ def fit(
         if unused := unused_rotation(scenes[label], curve):
             warnings.warn(unused, stacklevel=2)
     _check_model(model, solver, names, separate, all_priors, scenes, several, bool(curves))
-    first = next(iter(curves), "")
     given = {*names, *separate, *(all_priors[None].names if None in all_priors else ())}
     prior_names = {name for some in all_priors.values() for name in some.names}
     if {START_TIME, "temperature"} <= given and not {START_TIME, "temperature"} & prior_names:
@@ -279,7 +281,10 @@ def _fit_deterministic(
     first = problem.flat(guesses)
     if start is not None:
         complete = {m.label: with_values_of(guesses[m.label], start, free) for m in measurements}
-        first = _better(problem, first, problem.flat(complete))
+        xp = array_module(first, complete)
+        flats = xp.stack([first, problem.flat(complete)])
+        costs = xp.stack([xp.sum(problem.evaluate(flat)[1] ** 2) for flat in flats])
+        first = flats[xp.argmin(xp.where(xp.isnan(costs), xp.inf, costs))]
     steps = 100 if max_steps is None else max_steps
     starts = search_starts(problem, first)
     (flat, iterations, converged), ends = best_of_starts(problem, starts, steps, solver)
@@ -322,14 +327,6 @@ def _guess_of_kinetic_theory(
 def with_values_of(gas: Gas, other: Gas, names: tuple[str, ...]) -> Gas:
     """Return a gas with the values that another one has for some parameters."""
     return gas.replace(**{n: other.value(n) for n in names if n in other.domains})
-
-
-def _better(problem: Problem, first: Any, second: Any) -> Any:
-    """Return the guess with the smaller chi^2."""
-    xp = array_module(first, second)
-    flats = xp.stack([first, second])
-    costs = xp.stack([xp.sum(problem.evaluate(flat)[1] ** 2) for flat in flats])
-    return flats[xp.argmin(xp.where(xp.isnan(costs), xp.inf, costs))]
 
 
 def _by_label(gas: Any, data: Any) -> tuple[dict[str, Gas], dict[str, Data]]:
@@ -400,34 +397,17 @@ def _priors_by_label(scenes: dict[str, Gas], priors: Any) -> dict[str | None, Pr
     }
 
 
-def _default_names(
-    scenes: dict[str, Gas], data: dict[str, Data], separate: tuple[str, ...]
-) -> tuple[str, ...]:
-    for label, measured in data.items():
-        if isinstance(measured, CoolingCurve):
-            names = free_by_default(scenes[label], measured)
-            return tuple(name for name in names if name not in separate)
-    gas = next(iter(scenes.values()))
-    return (_constant_of(gas),)
-
-
 @no_type_check
-def free_by_default(gas: Gas, curve: CoolingCurve) -> tuple[str, ...]:
+def free_by_default(gas: Gas, data: Data) -> tuple[str, ...]:
     """Return A, or a constant restitution, and T_0 if the errors of T are not known."""
-    constant = _constant_of(gas)
-    if curve.temperature_error is None:
-        return (constant, "temperature")
-    return (constant,)
-
-
-def _constant_of(gas: Gas) -> str:
     constants = [name for name in ("dissipative_constant", "coefficient") if name in gas.domains]
     if not constants:
         raise ValueError(
             f"the law {type(gas.law).__name__} has neither A nor a constant coefficient: give "
             f"free, names among {', '.join(gas.domains)}"
         )
-    return constants[0]
+    is_bare = isinstance(data, CoolingCurve) and data.temperature_error is None
+    return (constants[0], "temperature") if is_bare else (constants[0],)
 
 
 @no_type_check

@@ -15,7 +15,7 @@ WRITTEN = {
     "Saving and loading everything": "run.npz",
 }
 SAID = {
-    "Your own data: speeds in ms and mm": "Kinetic theory is compatible with this curve",
+    "Your own data: speeds in ms and mm": "Kinetic theory is consistent with this curve",
     "Your own law of restitution": "0.972",
     "Saving and loading everything": "two replicas (2, 100, 3) True",
 }

@@ -60,10 +60,11 @@ def test_a_gas_begun_before_the_file_is_found(measured):
 
 
 def fitted_together(gas, curve, name):
-    with pytest.warns(UserWarning, match="temperature and t0: .*a cooling gas forgets its initial"):
+    with pytest.warns(UserWarning, match="T0 and t0: .*a cooling gas forgets its initial"):
         both = jaxgran.fit(gas, curve, free=(name, "temperature", "t0"))
     assert both.undetermined() == ("temperature", "t0") and bool(both.converged)
     assert repr(both).count("not determined") == 2
+    assert "does not determine T0 and t0" not in jaxgran.diagnose(both).verdict  # A is determined
     return both
 
 
@@ -81,7 +82,7 @@ def test_what_is_not_found_leaves_the_constant_of_the_material(measured):
     error = float(alone.error_budget["measurement"][0])
     assert float(both.estimate[0]) == pytest.approx(float(alone.estimate[0]), abs=error)
     diagnosis = jaxgran.diagnose(both, curve)
-    assert any("does not determine temperature and t0" in x for x in diagnosis.reasons)
+    assert any("does not determine T0 and t0" in x for x in diagnosis.reasons)
     low, high = diagnosis.ranges[name]
     assert low < gas.value(name) < high
 
