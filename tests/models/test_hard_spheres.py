@@ -295,7 +295,7 @@ def test_refuses_what_it_cannot_do():
 def test_lammps_curve():
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     gas = jaxgran.read_gas(header).replace(dissipative_constant=float(header["A"]))
-    ours = jaxgran.cool(gas, curve.times, model=HardSpheres(1000, replicas=8))
+    ours = jaxgran.cool(gas, curve.times, model=HardSpheres(4000, replicas=4))
     # LAMMPS resolves contacts, whose softness slows the cooling by 0.5 %.
     soft, hard = (
         jaxgran.cool(gas, curve.times, model=jaxgran.KineticTheory(softness=yes)).temperature
