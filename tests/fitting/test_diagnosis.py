@@ -43,8 +43,10 @@ def test_dense_measured_curve_is_not_explained():
 
 def test_a_valid_scene_has_no_limitations():
     gas = glass_beads(0.09)
+    between_walls = dataclasses.replace(gas, container=jaxgran.Walls(0.1, restitution=0.9))
     for model in default_models(4000):
         assert model.limitations(gas, 4000) == ()
+        assert model.limitations(between_walls, None) == ()
 
 
 def test_every_model_has_limitations_in_a_dense_scene():
@@ -128,6 +130,7 @@ def test_errors_that_are_too_large_are_named(too_large, said):
     T = curve.temperature * jnp.exp(noise)
     error = 0.02 * too_large * T
     measured = jaxgran.CoolingCurve(curve.times, T, temperature_error=error)
-    found = jaxgran.diagnose(jaxgran.fit(gas, measured), measured)
+    found = jaxgran.diagnose(jaxgran.fit(gas, measured), num_particles=4000, quick=True)
     assert found.grade != "not consistent"
     assert any("errors are too large" in reason for reason in found.reasons) == said
+    assert any("give T_err = 0.013 T, or leave" in reason for reason in found.reasons) == said

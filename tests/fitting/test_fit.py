@@ -8,7 +8,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting.parameters import guess_from_data
-from jaxgran.fitting.residuals import unused_rotation
+from jaxgran.fitting.residuals import unused_rotation, with_errors_of_particles
 from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
 
@@ -234,6 +234,11 @@ def test_a_rotation_that_is_not_used_is_said():
         bare, temperature_error=0.1 * T, rotational_temperature_error=0.1 * T
     )
     assert unused_rotation(rough, known) is None
+    # With N the errors that lack are those of its fluctuations; those that are given stay.
+    of_250 = with_errors_of_particles(rough, bare, 250, 1)
+    np.testing.assert_allclose(of_250.rotational_temperature_error, 0.1 * (2 / 750) ** 0.5 * T)
+    assert unused_rotation(rough, of_250) is None
+    assert with_errors_of_particles(rough, known, 250, 1) is known
     # Said before a long search.
     with pytest.warns(UserWarning, match="its weights need T_err"), pytest.raises(ValueError):
         jaxgran.fit(rough, bare, solver="none")
