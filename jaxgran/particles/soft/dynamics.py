@@ -166,12 +166,13 @@ class SoftDynamics(AbstractDynamics):
 
     def with_tangents(self, state: State, directions: SphereMaterial) -> State:
         spin, surface, along = state.internal.spin, self.scene.material.surface, directions.surface
+        spin_tangent = None
         if spin is not None:
             # Spins of q s^2 = ratio: nan along a ratio that is 0, of which they are a square root.
             growth = jnp.where(along.ratio == 0, 0.0, along.ratio / surface.ratio)
             growth -= along.inertia / surface.inertia
-            spin = 0.5 * growth[:, None, None] * spin[None]
-        tangents = ContactTangents.initial(directions, state.velocity, self.replicas, spin)
+            spin_tangent = 0.5 * growth[:, None, None] * spin[None]
+        tangents = ContactTangents.initial(directions, state.velocity, self.replicas, spin_tangent)
         return state._replace(tangents=tangents)
 
     @property
@@ -335,24 +336,24 @@ class SoftDynamics(AbstractDynamics):
         pairs, walls, member_loss = work
         x, v, spin = jax.tree.map(put_members, *ends)
 
-        def mark_partners(mask: Bool[Array, "contacts"]) -> Bool[Array, "n"]:
-            partners = members[jnp.stack([candidates.a, candidates.b], 1)]
-            rows = jnp.where(mask[:, None], partners, n)
-            return jnp.zeros(n, bool).at[rows].set(True, mode="drop")
+        def mark(particles: Bool[Array, "n"], mask: Array, rows: Int[Array, "..."]) -> Array:
+            return particles.at[jnp.where(mask, rows, n)].set(True, mode="drop")
 
         def sum_pairs(values: Array) -> Shaped[Array, "replicas"]:
             return jnp.zeros(replicas, values.dtype).at[candidates.replica].add(values)
 
         lost, exchanged, stored = map(sum_pairs, (pairs.dissipated, pairs.exchanged, pairs.stored))
-        touching = mark_partners(pairs.touching)
-        unexpected = mark_partners(pairs.touched & ~candidates.expected)
+        partners = members[jnp.stack([candidates.a, candidates.b], 1)]
+        nowhere, surprise = jnp.zeros(n, bool), pairs.touched & ~candidates.expected
+        touching = mark(nowhere, pairs.touching[:, None], partners)
+        unexpected = mark(nowhere, surprise[:, None], partners)
         if walls is not None:
             lost += sum_members(walls.dissipated)
             exchanged += sum_members(walls.exchanged)
             stored += sum_members(walls.stored)
-            touching |= put_members(jnp.zeros(n, bool), walls.touching)
+            touching = mark(touching, walls.touching, members)
             surprise = walls.touched & ~candidates.expected_at_walls
-            unexpected |= put_members(jnp.zeros(n, bool), surprise)
+            unexpected = mark(unexpected, surprise, members)
         lost_with_drag = lost
         if member_loss is not None and lost_to_drag is not None:
             lost_with_drag = lost + sum_members(member_loss, lost_to_drag)

@@ -369,38 +369,18 @@ class ContactWork(NamedTuple):
     Attributes:
         dissipated: energy lost.
         exchanged: work of the elastic force, with all its parts counted as positive.
-        begun: number of contacts that began.
+        begun: number of contacts that began; None at walls.
         touching: whether there is a contact now.
-        touched, stored: whether there was one at any time, and elastic energy, at the end.
+        touched: whether there was one at any time.
+        stored: elastic energy at the end.
     """
 
     dissipated: Float[Array, "rows"]
     exchanged: Float[Array, "rows"]
-    begun: Int[Array, "rows"]
-    touching: Bool[Array, "rows"]
+    begun: Any = None
+    touching: Any = None
     touched: Any = None
     stored: Any = None
-
-    @classmethod
-    def zero(cls, touching: Bool[Array, "rows"], dtype) -> "ContactWork":
-        """Return the work before a block."""
-        zeros = jnp.zeros(touching.shape, dtype)
-        return cls(zeros, zeros, jnp.zeros(touching.shape, jnp.int32), touching)
-
-    def after(self, lost: Array, exchanged: Array, touching: Array) -> "ContactWork":
-        """Return the work after further energies, with the contacts of now."""
-        return ContactWork(
-            self.dissipated + lost,
-            self.exchanged + exchanged,
-            self.begun + (touching & ~self.touching),
-            touching,
-        )
-
-    def at_end(self, at_start: Array, touching: Array, stored: Array) -> "ContactWork":
-        """Return the work of a block. Contacts may also begin in the last half drift."""
-        begun = self.begun + (touching & ~self.touching)
-        touched = (begun > 0) | at_start
-        return self._replace(begun=begun, touching=touching, touched=touched, stored=stored)
 
 
 class BlockWork(NamedTuple):
@@ -454,13 +434,21 @@ def integrate(
         force = normal_force(xi, xi_dot, material.law, PAIR, dt)
         kick = (dt * force.force)[:, None] * normal
         v = v.at[a].add(kick).at[b].add(-kick)
-        pairs = pairs.after(dt * force.lost, dt * force.exchanged, touching)
+        pairs = pairs._replace(
+            dissipated=pairs.dissipated + dt * force.lost,
+            exchanged=pairs.exchanged + dt * force.exchanged,
+            begun=pairs.begun + (touching & ~pairs.touching),
+            touching=touching,
+        )
         if container is not None and walls is not None:
             depth, outwards, at_wall = wall_overlap(container, x)
             push = normal_force(depth, outwards * v, wall_law, WALL, dt)
             v = v - dt * push.force * outwards
-            lost, exchanged = (dt * jnp.sum(power, -1) for power in (push.lost, push.exchanged))
-            walls = walls.after(lost, exchanged, at_wall)
+            walls = walls._replace(
+                dissipated=walls.dissipated + dt * jnp.sum(push.lost, -1),
+                exchanged=walls.exchanged + dt * jnp.sum(push.exchanged, -1),
+                touched=walls.touched | at_wall,
+            )
             if material.wall_surface is not None:
                 v, spin, lost = wall_friction(v, spin, depth, outwards, push, material, dt)
                 walls = walls._replace(dissipated=walls.dissipated + lost)
@@ -472,20 +460,31 @@ def integrate(
         spheres, lost = fly(scene, Spheres(x, v, spin), dt, material)
         return spheres, BlockWork(pairs, walls, jax.tree.map(jnp.add, lost_to_drag, lost))
 
-    pairs_at_start, walls_at_start, walls = overlap(members.x, a, b, offset)[2], None, None
+    touching_at_start, zeros = overlap(members.x, a, b, offset)[2], jnp.zeros(len(a), dtype)
+    num_begun = jnp.zeros(len(a), jnp.int32)
+    pairs, walls = ContactWork(zeros, zeros, num_begun, touching_at_start), None
     if container is not None:
-        walls_at_start = wall_overlap(container, members.x)[2]
-        walls = ContactWork.zero(walls_at_start, dtype)
+        zeros = jnp.zeros(len(members.x), dtype)
+        walls = ContactWork(zeros, zeros, touched=wall_overlap(container, members.x)[2])
     members, lost = fly(scene, members, 0.5 * dt, material)
-    work = BlockWork(ContactWork.zero(pairs_at_start, dtype), walls, lost)
-    members, work = jax.lax.fori_loop(0, num_steps, step, (members, work))
+    carry = members, BlockWork(pairs, walls, lost)
+    members, (pairs, walls, lost_to_drag) = jax.lax.fori_loop(0, num_steps, step, carry)
     members, lost = fly(scene, members, -0.5 * dt, material)
 
+    # Contacts may also begin in the last half drift.
     xi, _, touching = overlap(members.x, a, b, offset)
-    stored = elastic_energy(xi, material.law, PAIR)
-    pairs, walls = work.pairs.at_end(pairs_at_start, touching, stored), work.walls
+    begun = pairs.begun + (touching & ~pairs.touching)
+    pairs = pairs._replace(
+        begun=begun,
+        touching=touching,
+        touched=(begun > 0) | touching_at_start,
+        stored=elastic_energy(xi, material.law, PAIR),
+    )
     if container is not None and walls is not None:
-        xi, _, touching = wall_overlap(container, members.x)
-        stored = jnp.sum(elastic_energy(xi, wall_law, WALL), axis=-1)
-        walls = walls.at_end(walls_at_start, touching, stored)
-    return members, BlockWork(pairs, walls, jax.tree.map(jnp.add, work.lost_to_drag, lost))
+        depth, _, touching = wall_overlap(container, members.x)
+        walls = walls._replace(
+            touching=touching,
+            touched=walls.touched | touching,
+            stored=jnp.sum(elastic_energy(depth, wall_law, WALL), axis=-1),
+        )
+    return members, BlockWork(pairs, walls, jax.tree.map(jnp.add, lost_to_drag, lost))
