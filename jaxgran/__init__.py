@@ -31,6 +31,7 @@ from jaxgran.data.curve_file import (
 from jaxgran.data.particles import read_particles
 from jaxgran.fitting.diagnosis import Diagnosis, diagnose, log_likelihood
 from jaxgran.fitting.fit import fit
+from jaxgran.fitting.learnt_law import restitution_band
 from jaxgran.fitting.result import Fit
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.choose import Choice, choose_model
@@ -50,6 +51,7 @@ from jaxgran.scene.laws import (
     ReducedLaw,
     RestitutionLaw,
     RestitutionSeries,
+    RestitutionSpline,
     Viscoelastic,
     viscoelastic_restitution,
 )
@@ -77,6 +79,7 @@ __all__ = [
     "ReducedLaw",
     "RestitutionLaw",
     "RestitutionSeries",
+    "RestitutionSpline",
     "Rough",
     "Run",
     "SoftSpheres",
@@ -101,6 +104,7 @@ __all__ = [
     "read_gas",
     "read_particles",
     "read_priors",
+    "restitution_band",
     "sphere_mass",
     "steady_state",
     "sweep",

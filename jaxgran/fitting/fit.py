@@ -16,12 +16,15 @@ from jaxgran._utils.tracing import any_traced, array_module
 from jaxgran._utils.validation import checked_int, no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import DropTest
+from jaxgran.fitting.descent import MAX_LINEARISED, Descent
 from jaxgran.fitting.diagnosis import checked_absent, diagnose
 from jaxgran.fitting.error_budget import clock_accuracy, with_scene_errors
-from jaxgran.fitting.optimise import Problem, best_of_starts, search
+from jaxgran.fitting.learnt_law import describe_unvisited_knots
+from jaxgran.fitting.optimise import Problem, best_of_starts, is_transformation, search
 from jaxgran.fitting.parameters import (
     LAW,
     NO_PRIORS,
+    SMOOTHNESS,
     START_TIME,
     Priors,
     domain_of,
@@ -48,7 +51,7 @@ from jaxgran.fitting.stochastic import fit_stochastic
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.scene.gas import Gas
+from jaxgran.scene.gas import Gas, law_fields
 from jaxgran.scene.parameters import symbol_of
 
 START_TIME_PRIOR = 1.0
@@ -63,16 +66,17 @@ def fit(
     data: Data | dict[str, Data],
     *,
     model: AbstractModel | None = None,
-    free: tuple[str, ...] | None = None,
+    free: tuple[str, ...] | str | None = None,
     separate: tuple[str, ...] = (),
     priors: dict[str, tuple[float, float]] | None = None,
     start: Gas | None = None,
     num_particles: int | dict[str, int] | None = None,
     replicas: int | dict[str, int] = 1,
-    solver: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | None = None,
+    solver: Any = None,
     max_steps: int | None = None,
     key: PRNGKeyArray | None = None,
     progress: bool = True,
+    throw: bool = True,
     absent: tuple[str, ...] = (),
 ) -> Fit:
     """Estimate parameters of a gas from one measurement, or from several together.
@@ -132,12 +136,19 @@ def fit(
             (`jaxgran.fitting.residuals.smooth_errors`).
         solver: of optimistix, such as ``optimistix.BFGS(rtol=1e-8, atol=1e-8)``, which is compiled
             for this fit (deterministic models only); by default Levenberg-Marquardt, on the host
-            around one program that all fits of such gases share.
-        max_steps: maximum number of steps, >= 1, by default 100, or of simulations of a stochastic
-            model, by default 8.
+            around one program that all fits of such gases share. Or a gradient transformation of
+            optax, such as ``optax.adam(0.05)``, for laws of many parameters: each step takes one
+            gradient of chi^2 in the unconstrained scale, through a stochastic model that of one
+            simulation with new random numbers, and the estimate is then the mean of the last half
+            of the steps. Its course is ``result.minima.trace``. With more than 30 parameters and a
+            stochastic model the errors are nan.
+        max_steps: maximum number of steps, >= 1, by default 100 (of optax, 1000), or of simulations
+            of a stochastic model, by default 8 (of optax, 100).
         key: key of the random numbers of a stochastic model, by default `jax.random.key(0)`: two
             calls without a key return the same numbers.
         progress: show progress bars on a terminal during simulations.
+        throw: raise RuntimeError if a descent by optax diverges. With False the result is the best
+            step so far, and `converged` is False.
         absent: effects that are known to be absent, of "walls", "roughness", "drag" and "friction":
             `jaxgran.diagnose` then does not consider these explanations. The estimates do not
             depend on it.
@@ -152,7 +163,8 @@ def fit(
         ValueError: for an unknown parameter or solver, an invalid curve (see `CoolingCurve.check`),
             no more points with a weight than parameters, or a scene that the model does not support
             or cannot fit.
-        RuntimeError: if the model cannot compute the curve where the search ends. Under `jax.vmap`,
+        RuntimeError: if a descent diverges, or the model cannot compute the curve where the search
+            ends. Under `jax.vmap`,
             where nothing can be raised, chi2 and the errors of that fit are nan, `converged` is
             False and `curve.status` holds the reason.
 
@@ -175,6 +187,14 @@ def fit(
     absent = checked_absent(absent)
     names, separate, key = tuple(names), tuple(separate), checked_key(key)
     all_priors = _priors_by_label(scenes, priors)
+    law = next(iter(scenes.values())).law
+    if law.prior_residuals().size and not {*names}.isdisjoint(law_fields(law)):
+        if getattr(model, "stochastic", False) and solver is None:
+            raise ValueError(
+                f"a smoothness prior, which {type(law).__name__} has, needs KineticTheory() or a "
+                f"solver of optax, as optax.adam(0.05), got {type(model).__name__} without solver"
+            )
+        all_priors[None] = all_priors.get(None, NO_PRIORS).add(SMOOTHNESS, 0.0, 1.0)
     as_given = dict(curves)
     for label, curve in as_given.items():
         curve = with_errors_of_particles(scenes[label], curve, counts[label], runs[label] or 1)
@@ -190,7 +210,11 @@ def fit(
             width = START_TIME_PRIOR * halving_time(curves[label])
             some = all_priors.get(where, NO_PRIORS)
             all_priors[where] = some.add(START_TIME, 0.0, width)
+    descent = None
+    if is_transformation(solver) and not any_traced(data, scenes, priors):
+        solver = descent = Descent(solver, progress, throw)
     if model.stochastic:
+        steps = (8 if descent is None else 100) if max_steps is None else max_steps
         if any_traced(scenes, data, start, model, key):
             raise ValueError(
                 "a fit of a stochastic model cannot run inside jax.jit or jax.vmap: fit one curve "
@@ -204,9 +228,10 @@ def fit(
             _guess_of_kinetic_theory(scenes[first], curves[first], names, start),
             jax.random.key(0) if key is None else key,
             progress,
-            8 if max_steps is None else max_steps,
-            all_priors.get(None, NO_PRIORS),
+            steps,
+            all_priors.get(None, NO_PRIORS).without(SMOOTHNESS),
             runs[first] or 1,
+            None if descent is None else descent.by_simulation,
         )
     else:
         result = _fit_deterministic(
@@ -214,6 +239,8 @@ def fit(
         )
     if any_traced(result.chi2, data, scenes):
         return result
+    if descent is not None:
+        result = replace(result, minima=result.minima._replace(trace=descent.trace))
     comparisons = {
         label: c._replace(
             num_particles=counts[label],
@@ -227,6 +254,14 @@ def fit(
     _warn(result)
     if np.isfinite(result.chi2):
         result = with_scene_errors(result)
+    if model.stochastic and len(result.estimate) > MAX_LINEARISED:
+        warnings.warn(
+            f"no errors are given of {len(result.estimate)} parameters fitted through "
+            f"{type(model).__name__}: judge them by several fits with other keys",
+            stacklevel=2,
+        )
+        missing = {name: jnp.full_like(x, jnp.nan) for name, x in result.covariances.items()}
+        result = replace(result, covariances=missing)
     return result
 
 
@@ -285,7 +320,7 @@ def _fit_deterministic(
         flats = xp.stack([first, problem.flat(complete)])
         costs = xp.stack([xp.sum(problem.evaluate(flat)[1] ** 2) for flat in flats])
         first = flats[xp.argmin(xp.where(xp.isnan(costs), xp.inf, costs))]
-    steps = 100 if max_steps is None else max_steps
+    steps = (1000 if isinstance(solver, Descent) else 100) if max_steps is None else max_steps
     starts = search_starts(problem, first)
     (flat, iterations, converged), ends = best_of_starts(problem, starts, steps, solver)
     if any(m.curve.temperature_error is None for m in problem.curves):
@@ -463,19 +498,20 @@ def _check_model(
     has_curves: bool,
 ) -> None:
     kinds = optx.AbstractLeastSquaresSolver, optx.AbstractMinimiser
-    if solver is not None and not isinstance(solver, kinds):
+    if not (solver is None or isinstance(solver, kinds) or is_transformation(solver)):
         raise ValueError(
             "solver must be a least-squares solver or a minimiser of optimistix, such as "
-            f"optimistix.BFGS(rtol=1e-8, atol=1e-8), got {solver!r:.60}"
+            "optimistix.BFGS(rtol=1e-8, atol=1e-8), or a gradient transformation of optax, such as "
+            f"optax.adam(0.05), got {solver!r:.60}"
         )
     if isinstance(model, str):
         raise ValueError(f"model must be a jaxgran model, got {model!r}. See jaxgran.choose_model")
     checked_model(model)
     gas, prior_names = next(iter(scenes.values())), priors[None].names if None in priors else ()
-    if model.stochastic and solver is not None:
+    if model.stochastic and not (solver is None or is_transformation(solver)):
         raise ValueError(
-            f"a stochastic model is fitted by least squares, got solver={solver!r:.60}. Leave "
-            "solver out"
+            "a stochastic model is fitted by least squares, without a solver, or by a gradient "
+            f"transformation of optax, such as optax.adam(0.05), got {solver!r:.60}"
         )
     if model.stochastic and (several or not has_curves):
         raise ValueError(
@@ -529,6 +565,8 @@ def _warn(result: Fit) -> None:
             'jax.config.update("jax_enable_x64", True) first',
             stacklevel=3,
         )
+    if unvisited := describe_unvisited_knots(result):
+        warnings.warn(unvisited, stacklevel=3)
     group = result.undetermined()
     if group:
         why = "it hardly depends on this parameter"

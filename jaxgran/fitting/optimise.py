@@ -7,7 +7,7 @@ optimistix.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import scipy
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import any_traced, array_module
 from jaxgran._utils.validation import Domain
@@ -46,6 +46,21 @@ TOLERANCE = 1e-8
 
 MAX_DISTANCE = 25.0
 """Largest change of an unconstrained parameter in a search: a factor 7e10 of a positive one."""
+
+
+class Trace(NamedTuple):
+    """Course of a gradient descent.
+
+    Attributes:
+        loss: chi^2 at each step, with the residuals of priors.
+        parameters: free parameters at each step, SI, shape (steps, p).
+        reason: why it ended.
+    """
+
+    loss: Float[np.ndarray, "steps"]
+    parameters: Float[np.ndarray, "steps p"]
+    reason: str
+
 
 Minimum = tuple[Numbers, Numbers, Numbers]
 """Parameters at the end of a search, the number of iterations, and True if it converged."""
@@ -122,9 +137,15 @@ class Problem:
         """The measured curves."""
         return tuple(m for m in self.measurements if isinstance(m, Measurement))
 
+    @property
+    def is_traced(self) -> bool:
+        """True under a transformation of the measurements or the priors."""
+        known = [m.curve if isinstance(m, Measurement) else m.test for m in self.measurements]
+        return any_traced(known, [m.gas for m in self.measurements], self.priors)
+
     def flat(self, guesses: dict[str, Gas]) -> Numbers:
         """Return the unknowns of gases, by label, in their unconstrained scale, in one array."""
-        xp = array_module(self.measurements, guesses)
+        xp = jnp if self.is_traced else array_module(guesses)
         by_label = {m.label: m for m in self.measurements}
         parts = []
         for u in self.unknowns:
@@ -243,6 +264,11 @@ def is_converged(residuals: Numbers, jacobian: Numbers) -> Numbers:
     return step < CONVERGED_STEP * xp.sqrt(xp.mean(residuals**2))
 
 
+def is_transformation(solver: Any) -> bool:
+    """Tell whether a solver is a gradient transformation of optax."""
+    return all(callable(getattr(solver, name, None)) for name in ("init", "update"))
+
+
 def search(
     problem: Problem,
     first: Numbers,
@@ -256,10 +282,14 @@ def search(
         problem: of a fit.
         first: the first guess, in the unconstrained scale.
         max_steps: maximum number of steps.
-        solver: of optimistix; None for Levenberg-Marquardt.
+        solver: of optimistix or optax, None for Levenberg-Marquardt; or a function, like this one,
+            of problem, first and max_steps.
         tolerance: relative tolerance of the parameters and of the sum of squares.
     """
-    if solver is None and not any_traced(problem.measurements, problem.priors, first):
+    if callable(solver):
+        minimum: Any = solver(problem, np.asarray(first), max_steps)
+        return minimum
+    if solver is None and not (problem.is_traced or any_traced(first)):
         return _search_on_host(problem, np.asarray(first), max_steps, tolerance)
     return _search_compiled(problem, jnp.asarray(first), max_steps, solver)
 
@@ -304,6 +334,8 @@ def _search_compiled(problem: Problem, first: Array, max_steps: int, solver: Any
 
     tolerance = max(TOLERANCE, float(jnp.finfo(first.dtype).eps))
     options: dict[str, Any] = {"max_steps": max_steps, "throw": False}
+    if is_transformation(solver):
+        solver = optx.OptaxMinimiser(solver, rtol=tolerance, atol=tolerance)
     if isinstance(solver, optx.AbstractMinimiser):
         _, _, jacobian, _ = problem.evaluate(first)
         scale = jnp.sum(jacobian**2)  # minimisers start with a Hessian of 1
@@ -341,7 +373,7 @@ def best_of_starts(
 
     chi^2 is infinite where it is nan. The steps are those of all searches.
     """
-    xp = array_module(problem.measurements, starts)
+    xp = jnp if problem.is_traced else array_module(starts)
 
     def search_from(start: Numbers) -> tuple[Minimum, Numbers]:
         minimum = search(problem, start, max_steps, solver)

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -23,6 +24,9 @@ DENSITY = "density"
 
 LAW = "law"
 """Name that stands for all floats of the law of restitution."""
+
+SMOOTHNESS = "smoothness"
+"""Name of the prior that a law of restitution brings."""
 
 ANY_TIME = Domain()
 
@@ -235,7 +239,8 @@ class Priors(eqx.Module):
 
     Attributes:
         names: names of the floats, or "density", which lets the mass vary, or "t0", the time at
-            which the gas began to cool.
+            which the gas began to cool, or "smoothness", which stands for
+            `jaxgran.RestitutionLaw.prior_residuals`.
         given: known values, SI.
         errors: standard errors, SI.
     """
@@ -273,9 +278,14 @@ class Priors(eqx.Module):
             (*self.errors, jnp.asarray(error)),
         )
 
+    def without(self, name: str) -> "Priors":
+        """Return these priors without one of them."""
+        rows = [x for x in zip(self.names, self.given, self.errors, strict=True) if x[0] != name]
+        return Priors(*zip(*rows, strict=True)) if rows else NO_PRIORS
+
     def extra_parameters(self, free: tuple[str, ...]) -> tuple[str, ...]:
         """Return the floats that vary because of a prior and are not free parameters."""
-        varied = ("mass" if name == DENSITY else name for name in self.names)
+        varied = ("mass" if n == DENSITY else n for n in self.names if n != SMOOTHNESS)
         return tuple(dict.fromkeys(name for name in varied if name not in free))
 
     def residuals(
@@ -292,6 +302,12 @@ class Priors(eqx.Module):
         """
         xp, rows = array_module(self, gas, values), {}
         for name, given, error in zip(self.names, self.given, self.errors, strict=True):
+            if name == SMOOTHNESS:
+                floats = {n: jnp.asarray(values[n]) for n in law_fields(gas.law) if n in values}
+                row, slopes = _law_prior(gas, floats)
+                by_name = {n: xp.asarray(x).reshape(row.size, -1) for n, x in slopes.items()}
+                rows[name] = xp.asarray(row), by_name
+                continue
             domain, given, error = _prior_domain(gas, name), xp.asarray(given), xp.asarray(error)
             width = error / domain.slope(given)
 
@@ -313,6 +329,16 @@ class Priors(eqx.Module):
             }
             rows[name] = row, diagonal
         return rows
+
+
+@eqx.filter_jit
+def _law_prior(gas: Gas, floats: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
+    def residuals(floats: dict[str, Array]) -> tuple[Array, Array]:
+        row = with_floats(gas, floats).law.prior_residuals()
+        return row, row
+
+    slopes, row = jax.jacfwd(residuals, has_aux=True)(floats)
+    return row, slopes
 
 
 NO_PRIORS = Priors((), (), ())

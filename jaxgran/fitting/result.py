@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgran._utils.formatting import TableRows, format_quantity, html_table, text_table
 from jaxgran._utils.tracing import any_traced, array_module, as_jax_arrays, concrete_array
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.optimise import Problem
+from jaxgran.fitting.optimise import Problem, Trace
 from jaxgran.fitting.parameters import START_TIME, Numbers, Priors, with_floats
 from jaxgran.fitting.residuals import (
     FACTORS,
@@ -24,6 +24,7 @@ from jaxgran.fitting.residuals import (
     neighbour_correlation,
 )
 from jaxgran.models.base import AbstractModel
+from jaxgran.scene.gas import law_fields
 from jaxgran.scene.parameters import symbol_of, unit_of
 
 DEGENERATE_CHI2 = 9.0
@@ -51,6 +52,8 @@ class Minima(NamedTuple):
         first: the first guess.
         extrapolation: difference of the estimate and the mean of the simulations near it.
         iterations: steps of all searches, or simulations by a stochastic model.
+        trace: chi^2 and estimates at each step of a gradient descent, and why it ended
+            (`jaxgran.fitting.optimise.Trace`); None for other searches.
     """
 
     estimates: Numbers
@@ -58,6 +61,7 @@ class Minima(NamedTuple):
     first: Numbers
     extrapolation: Numbers
     iterations: Numbers
+    trace: Trace | None = None
 
     def degenerate_solutions(
         self,
@@ -286,7 +290,7 @@ class Fit(eqx.Module):
             undetermined = self.undetermined()
             if len(self.estimate) <= MAX_ROWS:
                 shown = list(zip(self.element_names, self._element_names, strict=True))
-            if self.interpret is not None and len(self.estimate) <= MAX_ROWS:
+            if self.interpret is not None and len(self.estimate) == len(self.names):
                 diagnosis = self.interpret(self)
                 title = diagnosis.headline
                 rows = [("", text) for text in (diagnosis.narrowing, diagnosis.verdict) if text]
@@ -296,7 +300,9 @@ class Fit(eqx.Module):
             value = "not determined" if name in undetermined else value
             rows.append((symbol_of(element), value))
         chi2 = f"{format_quantity(self.reduced_chi2)}, p = {format_quantity(self.p_value)}"
-        return title, [*rows, ("reduced chi^2", chi2), ("converged", str(self.converged))]
+        trace = self.minima.trace
+        converged = f"{self.converged}{f': {trace.reason}' if trace else ''}"
+        return title, [*rows, ("reduced chi^2", chi2), ("converged", converged)]
 
     def value(self, name: str) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return the estimate and the standard error of a parameter.
@@ -330,15 +336,19 @@ class Fit(eqx.Module):
 
         These are the parameters in those singular vectors of the sensitivity whose standard error
         exceeds 1 (a factor e), or whose singular value is below ``model.derivative_accuracy`` times
-        the largest.
+        the largest. Parameters of a law with a smoothness prior, and arrays in parts of a law,
+        such as a neural network, are not among them.
         """
         parts = [np.asarray(c.sensitivity) for c in self.comparisons.values()]
+        gas = next(iter(self.gas.values())) if isinstance(self.gas, dict) else self.gas
+        without_meaning = law_fields(gas.law).keys() - gas.law.domains.keys()
+        left_out = law_fields(gas.law) if gas.law.prior_residuals().size else without_meaning
         _, singular, rotation = np.linalg.svd(np.concatenate(parts), full_matrices=False)
         weak = (singular <= 1) | (singular < self.model.derivative_accuracy * singular[0])
         share = np.abs(rotation[weak])
         is_weak = np.any(share > 0.05 * share.max(axis=1, initial=0.0, keepdims=True), axis=0)
         names = zip(self._element_names, is_weak, strict=True)
-        return tuple(dict.fromkeys(name for name, weak in names if weak))
+        return tuple(dict.fromkeys(name for name, weak in names if weak and name not in left_out))
 
     @property
     def element_names(self) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.fitting.error_budget import parameter_effects
 from jaxgran.fitting.optimise import Problem
-from jaxgran.fitting.parameters import Priors, with_floats
+from jaxgran.fitting.parameters import SMOOTHNESS, Priors, with_floats
 from jaxgran.fitting.residuals import Measurement, Rows, log_temperatures
 from jaxgran.fitting.result import Fit, assemble_fit
 from jaxgran.models.base import AbstractModel
@@ -78,10 +78,13 @@ def fit_stochastic(
     max_simulations: int,
     priors: Priors,
     replicas: int,
+    search_by: Callable[..., SearchResult] | None = None,
 ) -> Fit:
     """Fit a stochastic model, starting at a guess.
 
-    Arguments, result and errors are those of `jaxgran.fit`.
+    Arguments, result and errors are those of `jaxgran.fit`. `search_by` is another search than
+    `search_by_simulation`, which also gets the prior residuals of the law and the map to SI
+    values.
     """
     m = Measurement.of("", gas, curve, model, None, replicas, use_displacement=False)
     m, curve = dataclasses.replace(m, accuracies={}), m.curve
@@ -113,7 +116,12 @@ def fit_stochastic(
     used = (known > 0) & (np.tile(np.asarray(curve.times), size) > 0)
     has_errors = curve.temperature_error is not None
     error = np.where(used, 1 / np.where(used, known, 1.0), 0.0) if has_errors else 0 * known
-    search = search_by_simulation(
+
+    def prior(flat: Any) -> Any:
+        return gas_at(flat).law.prior_residuals()
+
+    options: Any = {} if search_by is None else {"prior": prior, "estimates": problem.estimates}
+    search = (search_by or search_by_simulation)(
         simulate,
         first,
         np.asarray(log_temperatures(curve, size > 1)),
@@ -123,6 +131,7 @@ def fit_stochastic(
         resolution=model.derivative_accuracy,
         max_simulations=max_simulations,
         progress=progress,
+        **options,
     )
     flat, residuals, weights = search.flat, search.residuals, search.weights
     sensitivity, scatter = search.sensitivity, None
@@ -137,10 +146,15 @@ def fit_stochastic(
         for name, values, _, by_clock, of_measurement in zip(m.weights, *parts, strict=True)
     ]
     m = dataclasses.replace(m, weights=dict(zip(m.weights, parts[1], strict=True)), scatter=scatter)
+    jacobian = -sensitivity
+    if search_by is not None and prior(flat).size:
+        rows.append(Rows(SMOOTHNESS, None, np.asarray(prior(flat)), {}))
+        along = np.asarray(jax.jacfwd(prior)(jnp.asarray(flat)))
+        jacobian = np.concatenate([jacobian, along])
     result = assemble_fit(
         dataclasses.replace(problem, measurements=(m,)),
         flat,
-        (rows, -sensitivity, {"": search.computed}),
+        (rows, jacobian, {"": search.computed}),
         first=first,
         ends=(flat[None], np.sum(residuals**2)[None]),
         iterations=np.asarray(search.num_simulations),
@@ -160,7 +174,7 @@ def fit_stochastic(
     )
 
 
-class _Simulation(NamedTuple):
+class Simulation(NamedTuple):
     """One simulation at some parameters, at the used points."""
 
     flat: Float[np.ndarray, "p"]
@@ -211,10 +225,10 @@ def search_by_simulation(
     hidden = None if progress else True  # None hides the bar where there is no terminal
     with tqdm(total=max_simulations, disable=hidden, desc="fit", unit="simulation") as bar:
         while True:
-            simulation, curve = _run_simulation(simulate, flat, len(simulations), used, rotation)
+            simulation, curve = run_simulation(simulate, flat, len(simulations), used, rotation)
             simulations.append(simulation)
             near = [s for s in simulations if np.abs(s.flat - flat).max() < AVERAGING_DISTANCE]
-            estimate, sigma, error_covariance, noise_covariance = _average(
+            estimate, sigma, error_covariance, noise_covariance = average_estimates(
                 near, measured, error if known else None, resolution
             )
             step = estimate - flat
@@ -229,6 +243,23 @@ def search_by_simulation(
             ended = converged and len(near) > 1 and (low_noise or not known)
             if ended or len(simulations) == max_simulations:
                 break
+    return search_result(
+        flat, near, measured, sigma, noise_covariance, used, curve, len(simulations), converged
+    )
+
+
+def search_result(
+    flat: Float[np.ndarray, "p"],
+    near: list[Simulation],
+    measured: Float[np.ndarray, "used"],
+    sigma: Float[np.ndarray, "used"],
+    noise_covariance: Float[np.ndarray, "p p"],
+    used: Bool[np.ndarray, "points"],
+    computed: CoolingCurve,
+    num_simulations: int,
+    converged: bool,
+) -> SearchResult:
+    """Return the result of a search from the simulations near its end."""
     weights, residuals = np.zeros((2, len(used)))
     sensitivity = np.zeros((len(used), len(flat)))
     weights[used] = 1 / sigma
@@ -238,24 +269,24 @@ def search_by_simulation(
     sensitivity[used] = np.mean([s.slope for s in near], axis=0) / sigma[:, None]
     return SearchResult(
         flat=flat,
-        computed=curve,
+        computed=computed,
         weights=weights,
         residuals=residuals,
         sensitivity=sensitivity,
         extrapolation=flat - np.mean([s.flat for s in near], axis=0),
         noise_covariance=noise_covariance,
-        num_simulations=len(simulations),
+        num_simulations=num_simulations,
         converged=converged,
     )
 
 
-def _run_simulation(
+def run_simulation(
     simulate: Callable[[Array, int], CoolingCurve],
     flat: Float[np.ndarray, "p"],
     number: int,
     used: Bool[np.ndarray, "points"],
     rotation: bool,
-) -> tuple[_Simulation, CoolingCurve]:
+) -> tuple[Simulation, CoolingCurve]:
     """Run one simulation with its derivatives; return it and its curve."""
 
     def values_of(flat):
@@ -270,13 +301,13 @@ def _run_simulation(
     parts = np.split(replica_values, 1 + rotation, axis=1), np.split(used, 1 + rotation)
     used_values = [part[:, used_part] for part, used_part in zip(*parts, strict=True)]
     deviations = [part - part.mean(axis=0) for part in used_values]
-    variance = np.concatenate([_variance_of_mean(part) for part in deviations])
+    variance = np.concatenate([variance_of_mean(part) for part in deviations])
     value, slope = np.asarray(value)[used], np.asarray(slope)[used]
-    return _Simulation(flat, value, slope, np.concatenate(deviations, axis=1), variance), curve
+    return Simulation(flat, value, slope, np.concatenate(deviations, axis=1), variance), curve
 
 
-def _average(
-    near: list[_Simulation],
+def average_estimates(
+    near: list[Simulation],
     measured: Float[np.ndarray, "used"],
     error: Float[np.ndarray, "used"] | None,
     resolution: float,
@@ -308,7 +339,7 @@ def _average(
     return np.mean(estimates, axis=0), sigma, share @ share.T, noise_covariance
 
 
-def _variance_of_mean(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:
+def variance_of_mean(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:
     """Variance of the mean over replicas, averaged over neighbouring times."""
     replicas, num_times = deviation.shape
     variance = np.sum(deviation**2, axis=0) / (replicas * (replicas - 1))

@@ -20,9 +20,13 @@ from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import (
     ANY,
     NON_NEGATIVE,
+    POSITIVE,
     Domain,
     UserBool,
+    UserFloat,
+    UserNumber,
     check_bool,
+    checked_float,
     float_array,
     number_named,
 )
@@ -110,6 +114,14 @@ class RestitutionLaw(eqx.Module):
         Override it if it can be computed without cancellation for eps near 1.
         """
         return 1 - self.restitution(normal_speed)
+
+    def prior_residuals(self) -> Float[Array, "residuals"]:
+        """Prior knowledge of the numbers of this law, as residuals of unit variance.
+
+        Fits in which numbers of the law are free add their squares to chi^2. There are none by
+        default.
+        """
+        return jnp.zeros(0)
 
     def reduced(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> "ReducedLaw":
         """Return the law of two equal spheres, in units of their diameter and a reference speed.
@@ -573,3 +585,111 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
     def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         terms = zip(self.coefficients, self.exponents, strict=True)
         return jnp.asarray(-sum(c * normal_speed**gamma for c, gamma in terms))
+
+
+class RestitutionSpline(RestitutionLaw):
+    """Law without a formula: a monotone curve through values of eps at given speeds.
+
+    ``eps(v) = exp(-L(v))``, where ln L is a monotone cubic spline of ln v (Fritsch & Butland) and a
+    straight line, ``L ~ v^p``, outside the knots. L increases with v, so that eps decreases from 1
+    and stays in (0, 1). The parameters are ``drops``: L at the first knot, and its increments from
+    each knot to the next, all positive.
+
+    In fits the exponent ``p = d ln L/d ln v`` has a smoothness prior: over a factor of ten in v it
+    changes by `smoothness` (one standard deviation of a random walk), since a curve T(t) averages
+    over speeds. Viscoelastic spheres have p = 1/5 or a little less, a constant eps has p = 0.
+
+    Args:
+        speeds: knots, normal approach speeds, m/s, > 0, increasing, two or more;
+            `visited_speeds` gives the range that a measured curve determines.
+        values: eps at the knots, in (0, 1), decreasing; by default that of L = 0.1 at the last
+            knot and p = 1/5. In fits this is the first guess.
+        smoothness: standard deviation of p over a factor of ten in v, > 0.
+
+    Raises:
+        ValueError: for speeds that do not increase or values that do not decrease.
+
+    Reference: Fritsch & Butland, SIAM J. Sci. Stat. Comput. 5, 300 (1984).
+
+    >>> law = jaxgran.RestitutionSpline([1e-3, 1e-2, 1e-1], [0.97, 0.95, 0.92])
+    >>> round(float(law.restitution(jnp.asarray(1e-2))), 6)
+    0.95
+    >>> low, high = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
+    >>> f"{low:.2g} to {high:.2g} m/s"
+    '0.027 to 0.39 m/s'
+    """
+
+    speeds: tuple[float, ...] = eqx.field(static=True)
+    drops: Float[Array, "knots"]
+    smoothness: float = eqx.field(static=True)
+
+    domains: ClassVar[dict[str, Domain]] = {"drops": POSITIVE}
+    lists: ClassVar[tuple[str, ...]] = ("drops",)
+
+    def __init__(
+        self,
+        speeds: UserNumber,
+        values: UserNumber | None = None,
+        smoothness: UserFloat = 0.3,
+    ):
+        knots = np.asarray(float_array(speeds, "speeds"), float)
+        if knots.ndim != 1 or knots.size < 2 or np.any(np.diff(knots) <= 0) or knots[0] <= 0:
+            raise ValueError(f"speeds must be two or more increasing numbers > 0, got {speeds!r}")
+        self.speeds = tuple(map(float, knots))
+        self.smoothness = checked_float("smoothness", smoothness, POSITIVE)
+        default = np.exp(-0.1 * (knots / knots[-1]) ** 0.2)
+        eps = float_array(default if values is None else values, "values")
+        drops = -jnp.diff(jnp.log(eps), prepend=0.0)
+        if drops.shape != knots.shape or not any_traced(drops) and not np.all(drops > 0):
+            raise ValueError(
+                f"values must be {knots.size} numbers in (0, 1), one for each speed, that decrease "
+                f"with the speed, got {values!r}"
+            )
+        self.drops = drops
+
+    @staticmethod
+    def visited_speeds(temperature: ArrayLike) -> tuple[float, float]:
+        """Return the range of normal impact speeds, m/s, that determines how a gas cools.
+
+        At one temperature the speeds v of impacts are distributed as ``v exp(-v^2/(4 T))`` and
+        their losses as ``v^3 exp(-v^2/(4 T))``. The range is from the 5 % quantile of the losses at
+        the lowest T to the 95 % quantile at the highest.
+
+        Args:
+            temperature: all T of a curve, m^2/s^2, > 0.
+        """
+        T = np.asarray(temperature)
+        T = T[T > 0]
+        low, high = 2 * np.sqrt(np.array([0.35536, 4.74386]) * [T.min(), T.max()])
+        return float(low), float(high)
+
+    def _log_L(self) -> Float[Array, "knots"]:
+        return jnp.log(jnp.cumsum(self.drops))
+
+    def prior_residuals(self) -> Float[Array, "residuals"]:
+        x = np.log(self.speeds)
+        decades = (x[2:] - x[:-2]) / (2 * np.log(10))
+        exponents = jnp.diff(self._log_L()) / np.diff(x)
+        return jnp.diff(exponents) / (self.smoothness * np.sqrt(decades))
+
+    def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return 1 - self.loss(normal_speed)
+
+    def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        x, y = np.log(self.speeds), self._log_L()
+        width = np.diff(x)
+        slope = jnp.diff(y) / width
+        # Weighted harmonic means of the slopes on both sides.
+        left, right = width[:-1] + 2 * width[1:], 2 * width[:-1] + width[1:]
+        inner = (left + right) * slope[1:] * slope[:-1] / (left * slope[1:] + right * slope[:-1])
+        at_knots = jnp.concatenate([slope[:1], inner, slope[-1:]])
+        log_speed = jnp.log(jnp.maximum(normal_speed, jnp.finfo(y.dtype).tiny))
+        inside = jnp.clip(log_speed, x[0], x[-1])
+        i = jnp.searchsorted(jnp.asarray(x[1:-1]), inside)
+        h = jnp.asarray(width)[i]
+        t = (inside - jnp.asarray(x)[i]) / h
+        first, last = at_knots[i], at_knots[i + 1]
+        cubic = first + last - 2 * slope[i]
+        log_L = y[i] + h * t * (first + t * (slope[i] - first - (1 - t) * cubic))
+        outside = jnp.where(log_speed < x[0], at_knots[0], at_knots[-1]) * (log_speed - inside)
+        return -jnp.expm1(-jnp.exp(log_L + outside))

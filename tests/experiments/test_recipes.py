@@ -22,7 +22,19 @@ SAID = {
 
 
 def test_every_asked_recipe_is_there_and_short():
-    asked = "data", "law", "sweep", "store", "film", "loading", "state", "cores", "GPU"
+    asked = (
+        "data",
+        "law",
+        "formula",
+        "network",
+        "sweep",
+        "store",
+        "film",
+        "loading",
+        "state",
+        "cores",
+        "GPU",
+    )
     assert len(RECIPES) == len(asked)
     for name, code in zip(asked, RECIPES, strict=True):
         assert name in code

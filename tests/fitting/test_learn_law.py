@@ -4,9 +4,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+import scipy.interpolate
 
 import jaxgran
+from jaxgran import CoolingCurve
 from tests.beads import glass_beads
 
 
@@ -113,3 +116,145 @@ def test_all_floats_of_a_law_are_free():
 
     with pytest.raises(ValueError, match='free="law", but the law Fixed has no floats'):
         jaxgran.fit(gas_of(Fixed()), curve_of(gas), free="law")
+
+
+SERIES = gas_of(jaxgran.RestitutionSeries([-0.2, 0.03], [0.2, 0.4]))
+
+
+def test_gradient_descent():
+    curve, guess = curve_of(SERIES), SERIES.replace(coefficients=[-0.15, 0.0])
+    options = {"free": ("coefficients",), "progress": False}
+    result = jaxgran.fit(guess, curve, solver=optax.adam(0.01), **options)
+    best = jaxgran.fit(guess, curve, **options)
+    # It ends where 50 steps lower chi^2 by less than .01: within a tenth of a standard error.
+    np.testing.assert_allclose(result.estimate, best.estimate, atol=0.5 * best.standard_error.max())
+    assert result.converged and result.chi2 < 1
+    trace = result.minima.trace
+    assert trace.loss.shape == (int(result.iterations),)
+    assert trace.parameters.shape == (int(result.iterations), 2)
+    assert trace.reason in repr(result)
+    short = jaxgran.fit(guess, curve, solver=optax.adam(0.01), max_steps=3, **options)
+    assert not short.converged and "3, was reached" in short.minima.trace.reason
+
+
+def test_a_descent_that_diverges_says_what_to_do():
+    curve, guess = curve_of(SERIES), SERIES.replace(coefficients=[-0.18, 0.0])
+    options = {"free": ("coefficients",), "solver": optax.sgd(1.0), "progress": False}
+    with pytest.raises(RuntimeError, match=r"at step 1.*Lower the learning rate.*clip_by_global"):
+        jaxgran.fit(guess, curve, **options)
+    result = jaxgran.fit(guess, curve, throw=False, **options)
+    assert not result.converged and "diverges" in result.minima.trace.reason
+    np.testing.assert_allclose(result.estimate, [-0.18, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "solver, message",
+    [("adam", "gradient transformation of optax"), (optax.lbfgs(), "line search")],
+)
+def test_solvers_that_are_not_taken(solver, message):
+    with pytest.raises(ValueError, match=message):
+        jaxgran.fit(SERIES, curve_of(SERIES), free="law", solver=solver, progress=False)
+
+
+def spline_gas(curve, num_knots=8):
+    speeds = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
+    return gas_of(jaxgran.RestitutionSpline(np.geomspace(*speeds, num_knots)))
+
+
+def test_spline():
+    speeds, values = [1e-3, 1e-2, 3e-2, 1e-1], [0.97, 0.95, 0.9, 0.85]
+    law = jaxgran.RestitutionSpline(speeds, values)
+    np.testing.assert_allclose(law.restitution(jnp.asarray(speeds)), values, rtol=1e-12)
+    x = np.log(np.asarray(speeds))
+    inside = np.geomspace(1e-2, 3e-2, 5)
+    cubic = scipy.interpolate.PchipInterpolator(x, np.log(-np.log(values)))(np.log(inside))
+    np.testing.assert_allclose(law.restitution(jnp.asarray(inside)), np.exp(-np.exp(cubic)))
+    v = jnp.geomspace(1e-9, 1e3, 200)
+    eps = law.restitution(v)
+    assert jnp.all(jnp.diff(eps) < 0) and jnp.all((eps > 0) & (eps < 1))
+    np.testing.assert_allclose(law.loss(v), 1 - eps, atol=1e-15)
+    slope = jax.grad(lambda v: law.restitution(v))
+    assert jnp.isfinite(slope(0.0)) and jnp.isfinite(slope(1e-2))
+    # A power law of -ln eps is smooth.
+    power = jaxgran.RestitutionSpline(speeds, np.exp(-(np.asarray(speeds) ** 0.3)))
+    np.testing.assert_allclose(power.prior_residuals(), 0.0, atol=1e-10)
+    np.testing.assert_allclose(power.restitution(v), jnp.exp(-(v**0.3)), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (([1.0],), "two or more increasing"),
+        (([2.0, 1.0],), "two or more increasing"),
+        (([0.1, 1.0], [0.8, 0.9]), "that decrease"),
+        (([0.1, 1.0], [1.0, 0.9]), r"in \(0, 1\)"),
+        (([0.1, 1.0], [0.9, 0.8, 0.7]), "must be 2 numbers"),
+        (([0.1, 1.0], [0.9, 0.8], 0.0), "smoothness"),
+    ],
+)
+def test_splines_that_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jaxgran.RestitutionSpline(*arguments)
+
+
+def test_a_law_is_learnt_from_a_curve():
+    true = glass_beads(0.15)
+    curve = curve_of(true)
+    learner = spline_gas(curve)
+    result = jaxgran.fit(learner, curve, free="law")
+    band = jaxgran.restitution_band(result)
+    eps = true.restitution(band.speeds)
+    assert np.all((band.low < eps) & (eps < band.high))
+    assert np.all((band.high - band.low)[2:-2] < 0.04)
+    assert {"measurement", "smoothness", "model"} == {*result.error_budget}
+    assert result.undetermined() == ()
+    chi2, p, fitted = band.compare(true.replace(dissipative_constant=1e-7), "dissipative_constant")
+    assert chi2 < 0.3 and p > 0.5  # the curve has no noise
+    A = true.value("dissipative_constant")
+    np.testing.assert_allclose(fitted.value("dissipative_constant"), A, rtol=0.02)
+    constant = gas_of(jaxgran.ConstantRestitution(0.9))
+    chi2, p, _ = band.compare(constant, "coefficient")
+    assert chi2 > 10 and p < 1e-6
+    wide = jaxgran.RestitutionSpline(np.geomspace(1e-4, 1.0, 8))
+    with pytest.warns(UserWarning, match=r"knots at 0.0001, .* outside the impact speeds 0.0095"):
+        jaxgran.fit(gas_of(wide), curve, free="law")
+    with pytest.raises(ValueError, match="no number of the law was free"):
+        jaxgran.restitution_band(jaxgran.fit(true, curve, free=("temperature",)))
+
+
+def test_a_law_is_learnt_through_simulations():
+    curve = curve_of(glass_beads(0.15), num_points=12, relative_error=0.02)
+    learner, model = spline_gas(curve, 4), jaxgran.DSMC(500, replicas=2)
+    with pytest.raises(ValueError, match=r"needs KineticTheory\(\) or a solver of optax"):
+        jaxgran.fit(learner, curve, model=model, free="law")
+    options = {"model": model, "free": "law", "progress": False}
+    result = jaxgran.fit(learner, curve, solver=optax.adam(0.1), max_steps=30, **options)
+    assert result.minima.trace.loss[-1] < 0.05 * result.minima.trace.loss[0]
+    band = jaxgran.restitution_band(result)
+    eps = glass_beads(0.15).restitution(band.speeds)
+    assert np.all(np.abs(np.log(np.log(band.restitution) / np.log(eps))) < 0.3)
+    assert np.all(result.standard_error > 0)
+
+
+@pytest.mark.slow  # compiles the search
+def test_curves_of_different_lengths_are_fitted_at_once():
+    # Points with an error of 0 have no weight: a short curve is filled up with them.
+    curves = [curve_of(SERIES, n) for n in (20, 12)]
+    last = curves[1].times[-1]
+    pad = CoolingCurve(
+        jnp.append(curves[1].times, last * jnp.linspace(1.1, 2, 8)),
+        jnp.append(curves[1].temperature, jnp.full(8, curves[1].temperature[-1])),
+        temperature_error=jnp.append(curves[1].temperature_error, jnp.zeros(8)),
+    )
+    batch = jax.tree.map(lambda *x: jnp.stack(x), curves[0], pad)
+    guess = SERIES.replace(coefficients=[-0.15, 0.0])
+
+    def fitted(curve):
+        result = jaxgran.fit(guess, curve, free=("coefficients",))
+        return result.estimate, result.chi2
+
+    estimates, chi2 = jax.vmap(fitted)(batch)
+    np.testing.assert_allclose(estimates, [SERIES.value("coefficients")] * 2, atol=1e-5)
+    alone = jaxgran.fit(guess, curves[1], free=("coefficients",))
+    np.testing.assert_allclose(estimates[1], alone.estimate, atol=1e-5)
+    np.testing.assert_allclose(chi2[1], alone.chi2, atol=1e-4)
