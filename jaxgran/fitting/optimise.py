@@ -140,8 +140,8 @@ class Problem:
     @property
     def is_traced(self) -> bool:
         """True under a transformation of the measurements or the priors."""
-        known = [m.curve if isinstance(m, Measurement) else m.test for m in self.measurements]
-        return any_traced(known, [m.gas for m in self.measurements], self.priors)
+        known = [(m.data, m.gas) for m in self.measurements]
+        return any_traced(known, self.priors)
 
     def flat(self, guesses: dict[str, Gas]) -> Numbers:
         """Return the unknowns of gases, by label, in their unconstrained scale, in one array."""
