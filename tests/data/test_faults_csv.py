@@ -189,7 +189,7 @@ def test_an_outlier_is_named_with_its_row_and_left_out_for_comparison(error):
         warnings.simplefilter("ignore")  # the verdict
         reasons = jaxgran.diagnose(jaxgran.fit(GAS, curve, num_particles=2000)).reasons
     found = re.search(
-        r"outliers at t = .* s \(row 13\).*_constant is ([\d.e-]+) \+- ([\d.e-]+)", str(reasons)
+        r"outliers at t = .* s \(row 13\).*A is ([\d.e-]+) \+- ([\d.e-]+)", str(reasons)
     )
     value, uncertainty = map(float, found.groups())
     # The wave in T is .5 %; with the outlier A is 15 % too small.
