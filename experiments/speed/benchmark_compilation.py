@@ -86,7 +86,7 @@ def measured(num_points: int | None = None) -> tuple[Any, Any]:
     t, T, error = (np.asarray(x)[1:] for x in of)  # at t = 0 nothing is measured
     times = t if num_points is None else np.geomspace(t[0], t[-1], num_points)
     columns = times, np.interp(times, t, T), np.interp(times, t, error)
-    times, T, error = map(jnp.asarray, columns)
+    times, T, error = map(jax.device_put, columns)  # jnp.asarray compiles for each length
     return jaxgran.read_gas(header), jaxgran.CoolingCurve(times, T, temperature_error=error)
 
 
