@@ -453,7 +453,7 @@ def _trial(problem: Problem, amplitude: float, first: np.ndarray) -> Trial | Non
     by_label = {
         row.label or "": row.values + change
         for row, change in zip(rows, changes, strict=True)
-        if row.kind == "temperature"
+        if row.measured and row.kind == "temperature"
     }
     chi2 = float(np.sum((residuals + change) ** 2))
     return Trial(amplitude, chi2, problem.estimates(flat), error, by_label, flat)

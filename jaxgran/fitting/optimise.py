@@ -217,7 +217,7 @@ class Problem:
             at = self.measurements[0].label if label is None else label
             gas = next(m.gas for m in self.measurements if m.label == at)
             parts = priors.residuals(gas, values[at])
-            rows += [Rows(name, label, *row) for name, row in parts.items()]
+            rows += [Rows(name, label, *row, of_prior=True) for name, row in parts.items()]
         xp = array_module(flat, rows)
         jacobian = self._jacobian(xp, flat, rows)
         return rows, xp.concatenate([row.values for row in rows]), jacobian, computed

@@ -140,6 +140,7 @@ class Rows(NamedTuple):
         slopes: their derivatives in SI values of parameters, shape (n, size), by name.
         by_clock: their derivatives in a relative change of the model's time, each in its own time.
         share: the measured error of each over its whole error; 1 without noise of simulations.
+        of_prior: True for a prior, which may have the name of a measured field, "temperature".
     """
 
     kind: str
@@ -148,6 +149,12 @@ class Rows(NamedTuple):
     slopes: dict[str, Numbers]
     by_clock: Numbers = 0.0
     share: Numbers = 1.0
+    of_prior: bool = False
+
+    @property
+    def measured(self) -> bool:
+        """True if these are residuals of a measurement."""
+        return not self.of_prior and (self.kind in MEASURED or self.kind == "drop test")
 
 
 @dataclass(frozen=True)

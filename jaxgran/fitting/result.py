@@ -17,7 +17,6 @@ from jaxgran.fitting.optimise import Problem, Trace
 from jaxgran.fitting.parameters import START_TIME, Numbers, Priors, with_floats
 from jaxgran.fitting.residuals import (
     FACTORS,
-    MEASURED,
     MODEL_ERROR,
     Rows,
     correlation_factor,
@@ -520,9 +519,9 @@ def assemble_fit(
     goodness = _test_all(xp, problem, rows, flat)
     covariances: dict[str, Numbers] = {}
     for row, part in zip(rows, gains, strict=True):
-        name, part = row.kind, part * row.share
+        name, part = row.kind, part * _as_row(row.share)
         covariance = part @ part.T
-        if name in MEASURED or name == "drop test":
+        if row.measured:
             if name == "temperature":
                 used = next(m.weights[name] for m in problem.curves if m.label == row.label) > 0
                 factor = correlation_factor(neighbour_correlation(row.values, used))
@@ -535,13 +534,13 @@ def assemble_fit(
         own = [
             (row, g, j)
             for row, g, j in zip(rows, gains, jacobians, strict=True)
-            if row.label == label and (row.kind in MEASURED or row.kind == "drop test")
+            if row.label == label and row.measured
         ]
         comparisons[label] = Comparison(
             residuals={row.kind: row.values for row, *_ in own},
             weights=m.weights,
-            gain=own[0][1] * m.weights.get("temperature", 1.0),
-            clock_gain=sum(g * row.by_clock for row, g, _ in own),
+            gain=own[0][1] * _as_row(m.weights.get("temperature", 1.0)),
+            clock_gain=sum(g * _as_row(row.by_clock) for row, g, _ in own),
             clock_error=m.clock_accuracy + xp.zeros_like(own[0][0].values),
             sensitivity=xp.concatenate([j for *_, j in own]),
             scatter=m.scatter,
@@ -585,13 +584,17 @@ def assemble_fit(
     )
 
 
+def _as_row(values: Numbers) -> Numbers:
+    return values[None] if np.ndim(values) else values
+
+
 def _test_all(xp: Any, problem: Problem, rows: list[Rows], flat: Numbers) -> GoodnessOfFit:
     """Test each quantity of each measurement."""
     by_label: dict[str | None, Any] = {m.label: m for m in problem.measurements}
     factors: dict[Any, Numbers] = {(row.label, row.kind): row.values for row in rows}
     tested, num_priors = [], 0
     for row in rows:
-        if row.kind not in (*MEASURED, "drop test"):
+        if not row.measured:
             num_priors += row.values.shape[0]
             continue
         m, values = by_label[row.label], row.values

@@ -67,7 +67,6 @@ def test_inputs_are_propagated(names, part, slope):
     assert low < a_true < high
 
 
-@pytest.mark.slow
 def test_a_prior_and_a_curve_share_what_they_know():
     """Both measurements contain T_0: the estimate is the mean by inverse variances."""
     gas = glass_beads(0.15)

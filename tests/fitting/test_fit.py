@@ -200,7 +200,6 @@ def test_wrong_error_bars_widen_the_error():
     assert jaxgran.diagnose(result, boast).grade == "not consistent"
 
 
-@pytest.mark.slow
 def test_fit_under_vmap_over_a_float_of_the_gas():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(12))
