@@ -1,23 +1,27 @@
-"""What is the result of a fit of A if the curve contains physics that the model leaves out?
+"""What is the result of a fit of A if the curve contains physics that the fit is not told of?
 
-    python experiments/fit/wrong_physics.py [--draws 20] [--rows walls] [--record] [--out FILE]
+    python experiments/fit/wrong_physics.py [--runs 100] [--rows walls] [--record] [--out FILE]
 
-Makes cooling curves of 2 mm beads (phi = .05, A = 3e-6 s; 30 points, 3 % noise) that contain rough
-grains, walls, drag, a noise floor or a constant eps, fits A and T_0 with kinetic theory of smooth
-viscoelastic spheres, and prints for each: fitted over true A, how often the verdict still says
-"consistent", and how often the range of A over all alternatives contains the true A. A curve of
-constant eps has no A: there the range must reach down to 1 % of the fitted A. If the scene can
-contain the roughness, the walls or the drag, the curve is fitted again with them; `told` is that A
-and `told_held` how often its 95 % interval contains the true one.
+Each curve is T(t) of one run of 250 hard spheres (2 mm beads, phi = .03, A = 3e-6 s), until T has
+fallen to 3 %, at 30 times, without errors; the fit knows N. What the gas contains and what the fit
+is told differ between the rows: `told` names it, A and T_0 are free, and beta_t where it says so,
+with T_rot measured. Prints for each row
 
-The curves are simulated with hard spheres, in 16 boxes of 50 mm with 1492 spheres each, until T
-has fallen to 2 % (walls: between walls); the noise is added to their mean. Contacts of hard spheres
+- A: fitted over true A, median;
+- scatter: the standard deviation of ln A over the runs, and expected: that by the error bar;
+- held: runs whose error bar "if nothing else is there" (95 %) contains the true A;
+- inside: runs whose range over all explanations contains it;
+- grades: how many runs are determined, not determined, not consistent.
+
+In the row "fast grains lost" spheres beyond 2.2 sqrt(2 T) are not seen. Contacts of hard spheres
 have no duration, so kinetic theory is used with `softness=False`.
 """
 
 import argparse
-import dataclasses
+import warnings
+from collections import Counter
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,109 +31,153 @@ import jaxgran
 from experiments.support.record import add_recording, figures, write_results
 from jaxgran.models.checks import first_cooling_rate
 
-TRUE_A = 3e-6
-NUM_POINTS, NOISE = 30, 0.03
-BOX, NUM_PARTICLES, REPLICAS = 0.05, 1492, 16  # m; phi = .05
-LAST = 0.02
+TRUE_A, NUM_PARTICLES, PHI = 3e-6, 250, 0.03
+NUM_POINTS, LAST = 30, 0.03
+NORMAL = 1.96
+SEEN = 2.2
+"""Largest speed that is seen, in sqrt(2 T)."""
+
 THEORY = jaxgran.KineticTheory(softness=False)
 
 
-def beads() -> jaxgran.Gas:
+def beads(**elements: Any) -> jaxgran.Gas:
     diameter = 2e-3
     return jaxgran.Gas(
         jaxgran.Viscoelastic(5e7, 0.22, TRUE_A),
         diameter=diameter,
         mass=jaxgran.sphere_mass(diameter, 2500.0),
-        packing_fraction=NUM_PARTICLES * np.pi / 6 * (diameter / BOX) ** 3,
+        packing_fraction=PHI,
         temperature=0.01,
+        **elements,
     )
 
 
-def measured(gas: jaxgran.Gas) -> tuple[jax.Array, jax.Array]:
-    """Return times until T has fallen to its last share, and T of hard spheres at these times."""
-    error_model = jnp.geomspace(1e-2, 1e4, 400) * gas.mean_free_time
-    T = jaxgran.cool(gas, error_model, model=THEORY).temperature / gas.temperature
-    end = float(jnp.interp(-np.log(LAST), -jnp.log(T), error_model))
-    times = jnp.geomspace(end / 300, end, NUM_POINTS)
-    model = jaxgran.HardSpheres(NUM_PARTICLES, replicas=REPLICAS)
-    return times, jaxgran.cool(gas, times, model=model, progress=False).temperature
+SIDE = float(beads().box_side(NUM_PARTICLES))
+WALLS = {"container": jaxgran.Walls(SIDE, restitution=0.9)}
+ROUGH_WALLS = {
+    "container": jaxgran.Walls(SIDE, restitution=0.9, tangential_restitution=-0.3),
+    "surface": jaxgran.Rough(-0.3),
+}
+SLIDING = {"surface": jaxgran.Rough(0.5, friction=0.2)}
+DRAG = {"drag": jaxgran.StokesDrag(0.015 * float(first_cooling_rate(beads())))}
 
 
-def drag(gas: jaxgran.Gas) -> jaxgran.StokesDrag:
-    """Return linear drag whose initial losses are 3 % of those of collisions."""
-    return jaxgran.StokesDrag(0.03 * float(first_cooling_rate(gas)) / 2)
+class Row(NamedTuple):
+    """What a gas contains, and what its fit is told.
+
+    Attributes:
+        name: of the gas.
+        gas: elements of the gas.
+        told: "all", "nothing", or in words.
+        fitted: elements of the gas of the fit.
+        free: free parameters besides A and T_0; with beta_t, T_rot is measured.
+        floor: noise floor over T_0.
+        seen: largest speed that is seen, in sqrt(2 T).
+    """
+
+    name: str
+    gas: dict[str, Any]
+    told: str
+    fitted: dict[str, Any]
+    free: tuple[str, ...] = ()
+    floor: float = 0.0
+    seen: float | None = None
 
 
-SCENES = [
-    # name of the row; difference from the gas of the fit; noise floor over T_0
-    ("nothing else", {}, 0.0),
-    ("rough grains, beta_t = -.8", {"surface": jaxgran.Rough(-0.8)}, 0.0),
-    ("rough grains, beta_t = -.5", {"surface": jaxgran.Rough(-0.5)}, 0.0),
-    ("rough grains, beta_t = 0", {"surface": jaxgran.Rough(0.0)}, 0.0),
-    ("walls of a 50 mm box, eps_w = .9", {"container": jaxgran.Walls(BOX, restitution=0.9)}, 0.0),
-    ("walls of a 50 mm box, eps_w = .8", {"container": jaxgran.Walls(BOX, restitution=0.8)}, 0.0),
-    ("constant eps = .9", {"law": jaxgran.ConstantRestitution(0.9)}, 0.0),
-    ("constant eps = .8", {"law": jaxgran.ConstantRestitution(0.8)}, 0.0),
-    ("constant eps = .65", {"law": jaxgran.ConstantRestitution(0.65)}, 0.0),
-    ("drag, 3 % of the first losses", {"drag": drag(beads())}, 0.0),
-    ("a noise floor of 1 % of T_0", {}, 0.01),
-]
+BETA = ("tangential_restitution",)
+ROUGH, GUESS = {"surface": jaxgran.Rough(-0.3)}, {"surface": jaxgran.Rough(0.0)}
+ROWS = (
+    Row("smooth, periodic", {}, "all", {}),
+    Row("walls, eps_w = .9", WALLS, "all", WALLS),
+    Row("walls, eps_w = .9", WALLS, "nothing", {}),
+    Row("rough, beta_t = -.3", ROUGH, "all", ROUGH),
+    Row("rough, beta_t = -.3", ROUGH, "nothing", {}),
+    Row("rough between rough walls", ROUGH_WALLS, "beta_t free", ROUGH_WALLS | GUESS, BETA),
+    Row("sliding, mu = .2, beta_0 = .5", SLIDING, "all", SLIDING),
+    Row("sliding, mu = .2, beta_0 = .5", SLIDING, "beta_t = .5", {"surface": jaxgran.Rough(0.5)}),
+    Row("sliding, mu = .2, beta_0 = .5", SLIDING, "beta_t free", GUESS, BETA),
+    Row("sliding, mu = .2, beta_0 = .5", SLIDING, "nothing", {}),
+    Row("drag, 3 % of the first losses", DRAG, "nothing", {}),
+    Row("a noise floor of 1 % of T_0", {}, "nothing", {}, floor=0.01),
+    Row("fast grains lost", {}, "nothing", {}, seen=SEEN),
+)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--draws", type=int, default=20, help="of the noise (default: 20)")
+    parser.add_argument("--runs", type=int, default=100, help="of each gas (default: 100)")
     parser.add_argument("--rows", default="", help="only those whose name contains this")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     add_recording(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    rows = {row["name"]: row for row in figures("wrong_physics")["rows"]} if options.rows else {}
-    for name, other, floor in SCENES:
-        if options.rows in name:
-            rows[name] = row(name, other, floor, options.draws)
-            print(rows[name], flush=True)
-    ordered = [rows[name] for name, *_ in SCENES if name in rows]
+    key = lambda row: (row["name"], row["told"])  # noqa: E731
+    known = figures("wrong_physics")["rows"] if options.rows else []
+    rows = {key(row): row for row in known}
+    for row in ROWS:
+        if options.rows in row.name:
+            rows[row.name, row.told] = found = statistics(row, options.runs)
+            print(found, flush=True)
+    ordered = [rows[row[0], row[2]] for row in ROWS if (row[0], row[2]) in rows]
     write_results("wrong_physics", options, options.out, rows=ordered)
 
 
-def row(name: str, other: dict, floor: float, draws: int) -> dict:
-    """Compute a row of the table; for a curve without A, A is compared with 3e-6 s."""
-    gas = beads()
-    scene = dataclasses.replace(gas, **other)
-    has_elements, true = bool(scene.elements), 0.0 if "law" in other else TRUE_A
-    times, T = measured(scene)
-    exact = T + floor * float(gas.temperature)
-    found, compatible, ranges, inside = [], 0, [], 0
-    found_so, held = [], 0
-    for draw in range(draws):
-        noise = np.random.default_rng(draw).standard_normal(NUM_POINTS)
-        T = exact * jnp.exp(NOISE * noise)
-        curve = jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=NOISE * T)
-        free = ("dissipative_constant", "temperature")
-        result = jaxgran.fit(gas, curve, model=THEORY, free=free)
-        diagnosis = jaxgran.diagnose(result, curve)
-        low, high = (float(x[0]) for x in diagnosis.ranges["dissipative_constant"])
-        found.append(float(result.estimate[0]) / TRUE_A)
-        ranges.append((low / TRUE_A, high / TRUE_A))
-        compatible += diagnosis.grade != "not consistent"
-        inside += low <= max(true, 0.01 * float(result.estimate[0])) <= high
-        if has_elements:
-            result = jaxgran.fit(scene, curve, model=THEORY, free=free)
-            A, error = (float(x) for x in result.value("dissipative_constant"))
-            found_so.append(A / TRUE_A)
-            held += abs(A - true) < 1.96 * error
+def measured(row: Row, runs: int) -> tuple[Any, jaxgran.CoolingCurve]:
+    """Return times until T has fallen to its last share, and the curves of all runs."""
+    gas = beads(**row.gas)
+    trial = jnp.geomspace(1e-2, 1e4, 400) * gas.mean_free_time
+    T = jaxgran.cool(gas, trial, model=THEORY).temperature / gas.temperature
+    end = float(jnp.interp(-np.log(LAST), -jnp.log(T), trial))
+    model = jaxgran.HardSpheres(NUM_PARTICLES, replicas=runs)
+    save = None if row.seen is None else seen
+    times = np.geomspace(end / 300, end, NUM_POINTS)
+    return times, jaxgran.cool(gas, times, model=model, save=save, progress=False)
+
+
+def seen(particles: Any) -> Any:
+    """Return T of the spheres whose speed is below `SEEN`."""
+    square = jnp.sum(particles.velocity**2, axis=-1)
+    near = square < SEEN**2 * 2 * jnp.mean(square) / 3
+    return jnp.sum(jnp.where(near, square, 0.0)) / (3 * jnp.sum(near))
+
+
+def statistics(row: Row, runs: int) -> dict[str, Any]:
+    """Fit each run, and return statistics."""
+    times, curve = measured(row, runs)
+    assert curve.replicas is not None
+    each = curve.replicas.temperature if row.seen is None else curve.replicas.saved
+    rotation = None if not row.free else curve.replicas.rotational_temperature
+    gas, found = beads(**row.fitted), []
+    for run, T in enumerate(np.asarray(each) + row.floor * float(gas.temperature)):
+        one = jaxgran.CoolingCurve(
+            times=jnp.asarray(times),
+            temperature=jnp.asarray(T),
+            rotational_temperature=None if rotation is None else rotation[run],
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            free = "dissipative_constant", "temperature", *row.free
+            result = jaxgran.fit(gas, one, model=THEORY, free=free, num_particles=NUM_PARTICLES)
+            diagnosis = jaxgran.diagnose(result)
+        A, error = (float(x) / TRUE_A for x in result.value("dissipative_constant"))
+        ends = diagnosis.ranges.get("dissipative_constant", (np.nan, np.nan))
+        found.append((A, error, *(float(np.squeeze(x)) / TRUE_A for x in ends), diagnosis.grade))
+    A, error, low, high = np.array([one[:4] for one in found]).T
+    known = np.isfinite(low)
     return {
-        "name": name,
-        "draws": draws,
-        "A": float(np.median(found)),
-        "compatible": int(compatible),
-        "range": [float(x) for x in np.median(ranges, axis=0)],
-        "inside": int(inside),
-        "told": float(np.median(found_so)) if found_so else None,
-        "told_held": int(held),
+        "name": row.name,
+        "told": row.told,
+        "runs": runs,
+        "A": float(np.median(A)),
+        "scatter": float(np.std(np.log(A), ddof=1)) if runs > 1 else None,
+        "expected": float(np.median(error / A)),
+        "held": int(np.sum(np.abs(A - 1) < NORMAL * error)),
+        "inside": int(np.sum((low <= 1) & (high >= 1))),
+        "computed": int(np.sum(known)),
+        "range": [float(np.median(x[known])) if known.any() else None for x in (low, high)],
+        "grades": dict(Counter(one[4] for one in found)),
     }
 
 
