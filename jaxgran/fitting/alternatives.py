@@ -444,7 +444,7 @@ def _trial(problem: Problem, amplitude: float, first: np.ndarray) -> Trial | Non
     """Fit the unknowns of a problem; None if it cannot be computed."""
     flat, step = _minimise(problem, first)
     rows, residuals, jacobian, _ = problem.evaluate(flat)
-    if not np.all(np.isfinite(residuals)):
+    if not (np.all(np.isfinite(residuals)) and np.all(np.isfinite(jacobian))):
         return None
     flat, p, change = flat + step, problem.num_free, jacobian @ step
     inverse = np.linalg.pinv(jacobian)
@@ -465,7 +465,7 @@ def _minimise(problem: Problem, first: np.ndarray) -> tuple[np.ndarray, np.ndarr
     for _ in range(MAX_STEPS):
         _, residuals, jacobian, _ = problem.evaluate(flat)
         before, chi2 = chi2, np.sum(residuals**2)
-        if not chi2 < before:
+        if not (chi2 < before and np.all(np.isfinite(jacobian))):
             break
         step = -np.linalg.pinv(jacobian) @ residuals
         largest = np.max(np.abs(step[: problem.num_free]))

@@ -4,9 +4,12 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.fitting import alternatives
+from jaxgran.fitting.optimise import Problem, search
 from tests.beads import glass_beads
 
 A = "dissipative_constant"
@@ -76,3 +79,23 @@ def test_unknown_absent_elements_are_refused():
     result = jaxgran.fit(gas, measured(gas))
     with pytest.raises(ValueError, match="absent must be a tuple of walls, roughness, drag"):
         jaxgran.diagnose(result, absent=("gravity",))
+
+
+def test_the_last_step_of_a_trial_needs_no_further_curve(monkeypatch):
+    gas = glass_beads(0.1)
+    result = jaxgran.fit(gas, measured(gas, jax.random.key(0)), free=(A, "temperature"))
+    problem, starts = alternatives._problem(result)
+    first = alternatives._first(problem, result, starts)
+    flat, *_ = search(problem, first, 100)  # to its own tolerance, 1e-8
+    _, residuals, jacobian, _ = problem.evaluate(flat)
+    inverse = np.linalg.pinv(jacobian)
+    covariance = inverse @ inverse.T
+    error = np.sqrt(np.diag(covariance))
+    curves, evaluate = [], Problem._evaluate
+    monkeypatch.setattr(Problem, "_evaluate", lambda *x: curves.append(1) or evaluate(*x))
+    # A is 2 standard errors off, and the others are where they fit best with it.
+    trial = alternatives._trial(problem, 0.0, flat + 2.0 * covariance[0] / error[0])
+    assert len(curves) == 1
+    # What the linear step leaves is of second order in these 2 standard errors.
+    assert trial.chi2 == pytest.approx(float(residuals @ residuals), abs=0.02)
+    np.testing.assert_allclose(trial.flat[:2], flat[:2], atol=0.05 * np.min(error[:2]))
