@@ -1,6 +1,7 @@
 """Fits of the parameters of a gas to one measurement, or to several together."""
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +25,7 @@ from jaxgran.fitting.optimise import Problem, best_of_starts, is_transformation,
 from jaxgran.fitting.parameters import (
     LAW,
     NO_PRIORS,
+    SHARED,
     SMOOTHNESS,
     START_TIME,
     Priors,
@@ -194,7 +196,7 @@ def fit(
                 f"a smoothness prior, which {type(law).__name__} has, needs KineticTheory() or a "
                 f"solver of optax, as optax.adam(0.05), got {type(model).__name__} without solver"
             )
-        all_priors[None] = all_priors.get(None, NO_PRIORS).add(SMOOTHNESS, 0.0, 1.0)
+        all_priors[SHARED] = all_priors.get(SHARED, NO_PRIORS).add(SMOOTHNESS, 0.0, 1.0)
     as_given = dict(curves)
     for label, curve in as_given.items():
         curve = with_errors_of_particles(scenes[label], curve, counts[label], runs[label] or 1)
@@ -202,11 +204,11 @@ def fit(
         if unused := unused_rotation(scenes[label], curve):
             warnings.warn(unused, stacklevel=2)
     _check_model(model, solver, names, separate, all_priors, scenes, several, bool(curves))
-    given = {*names, *separate, *(all_priors[None].names if None in all_priors else ())}
+    given = {*names, *separate, *(all_priors[SHARED].names if SHARED in all_priors else ())}
     prior_names = {name for some in all_priors.values() for name in some.names}
     if {START_TIME, "temperature"} <= given and not {START_TIME, "temperature"} & prior_names:
         for label in list(curves) if START_TIME in separate else [first]:
-            where = label if START_TIME in separate else None
+            where = label if START_TIME in separate else SHARED
             width = START_TIME_PRIOR * halving_time(curves[label])
             some = all_priors.get(where, NO_PRIORS)
             all_priors[where] = some.add(START_TIME, 0.0, width)
@@ -229,7 +231,7 @@ def fit(
             jax.random.key(0) if key is None else key,
             progress,
             steps,
-            all_priors.get(None, NO_PRIORS).without(SMOOTHNESS),
+            all_priors.get(SHARED, NO_PRIORS).without(SMOOTHNESS),
             runs[first] or 1,
             None if descent is None else descent.by_simulation,
         )
@@ -250,7 +252,8 @@ def fit(
         for label, c in result.comparisons.items()
     }
     result = replace(result, comparisons=comparisons, absent=absent, interpret=diagnose)
-    _check_computed(result)
+    curves = result.curve.values() if isinstance(result.curve, dict) else [result.curve]
+    _check_computed(model, result.names, result.estimate, [vars(c) for c in curves if c])
     _warn(result)
     if np.isfinite(result.chi2):
         result = with_scene_errors(result)
@@ -271,7 +274,7 @@ def _fit_deterministic(
     model: AbstractModel,
     names: tuple[str, ...],
     separate: tuple[str, ...],
-    priors: dict[str | None, Priors],
+    priors: dict[str, Priors],
     start: Gas | None,
     counts: dict[str, int | None],
     runs: dict[str, int | None],
@@ -323,6 +326,9 @@ def _fit_deterministic(
     steps = (1000 if isinstance(solver, Descent) else 100) if max_steps is None else max_steps
     starts = search_starts(problem, first)
     (flat, iterations, converged), ends = best_of_starts(problem, starts, steps, solver)
+    if not any_traced(flat, data, scenes):
+        _, fields = problem.evaluate(flat)[2:]
+        _check_computed(model, free, problem.estimates(flat), fields.values())
     if any(m.curve.temperature_error is None for m in problem.curves):
         problem = problem.with_scatter_as_error(flat)
         if priors:  # search again with the correct weight of the priors
@@ -414,22 +420,19 @@ def _numbers_by_label(name: str, given: Any, data: dict[str, Data]) -> dict[str,
     return {label: numbers.get(label) for label in data}
 
 
-def _priors_by_label(scenes: dict[str, Gas], priors: Any) -> dict[str | None, Priors]:
-    """Return the priors of shared parameters (None) and of those of each measurement."""
+def _priors_by_label(scenes: dict[str, Gas], priors: Any) -> dict[str, Priors]:
+    """Return the priors of shared parameters (`SHARED`) and of those of each measurement."""
     gas = next(iter(scenes.values()))
     if not isinstance(priors, dict):
         checked = Priors.of(gas, priors)
-        return {None: checked} if checked.names else {}
-    parts: dict[str | None, dict[str, Any]] = {}
+        return {SHARED: checked} if checked.names else {}
+    parts: dict[str, dict[str, Any]] = {}
     for name, pair in priors.items():
         label, _, short = str(name).rpartition(": ")
         if label and label not in scenes:
             raise ValueError(f"priors: no measurement {label!r}; there are {list(scenes)}")
-        parts.setdefault(label or None, {})[short] = pair
-    return {
-        label: Priors.of(gas if label is None else scenes[label], some)
-        for label, some in parts.items()
-    }
+        parts.setdefault(label, {})[short] = pair
+    return {label: Priors.of(scenes.get(label, gas), some) for label, some in parts.items()}
 
 
 @no_type_check
@@ -492,7 +495,7 @@ def _check_model(
     solver: Any,
     names: tuple[str, ...],
     separate: tuple[str, ...],
-    priors: dict[str | None, Priors],
+    priors: dict[str, Priors],
     scenes: dict[str, Gas],
     several: bool,
     has_curves: bool,
@@ -507,7 +510,7 @@ def _check_model(
     if isinstance(model, str):
         raise ValueError(f"model must be a jaxgran model, got {model!r}. See jaxgran.choose_model")
     checked_model(model)
-    gas, prior_names = next(iter(scenes.values())), priors[None].names if None in priors else ()
+    gas, prior_names = next(iter(scenes.values())), priors[SHARED].names if SHARED in priors else ()
     if model.stochastic and not (solver is None or is_transformation(solver)):
         raise ValueError(
             "a stochastic model is fitted by least squares, without a solver, or by a gradient "
@@ -545,16 +548,16 @@ def _check_model(
     model.check_fit((*names, *separate))
 
 
-def _check_computed(result: Fit) -> None:
-    curves = result.curve if isinstance(result.curve, dict) else {"": result.curve}
-    for curve in curves.values():
-        fault = status.OK if curve is None or curve.status is None else int(curve.status)
+def _check_computed(model: AbstractModel, names: Any, estimate: Any, curves: Iterable[Any]) -> None:
+    """Raise RuntimeError if one of the curves, dictionaries of fields, was not computed."""
+    for curve in curves:
+        fault = int(curve.get("status") or status.OK)
         if fault != status.OK:
-            values = zip(result.names, np.asarray(result.estimate), strict=False)
+            values = zip(names, np.asarray(estimate), strict=False)
             at = ", ".join(f"{name} = {value:.3g}" for name, value in values)
             raise RuntimeError(
-                f"{type(result.model).__name__} could not compute the curve at {at}, where the "
-                f"search ended: {status.explain(fault)}"
+                f"{type(model).__name__} could not compute the curve at {at}, where the search "
+                f"ended: {status.explain(fault)}"
             )
 
 

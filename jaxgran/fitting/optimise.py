@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from jaxgran._utils.tracing import any_traced, array_module
 from jaxgran._utils.validation import Domain
 from jaxgran.fitting.parameters import (
+    SHARED,
     START_TIME,
     Numbers,
     Priors,
@@ -76,7 +77,7 @@ class Problem:
         unknowns: the free parameters, then those that vary because of a prior, then nuisance
             parameters.
         num_free: number of elements of the free parameters.
-        priors: of shared parameters (None) and of those of one measurement, by its label.
+        priors: of shared parameters (`SHARED`) and of those of one measurement, by its label.
         fixed: SI values of further parameters, by label and name.
         tolerance: factor of the model's tolerance.
     """
@@ -85,7 +86,7 @@ class Problem:
     model: AbstractModel
     unknowns: tuple[Unknown, ...]
     num_free: int
-    priors: dict[str | None, Priors]
+    priors: dict[str, Priors]
     fixed: dict[str, dict[str, Numbers]]
     tolerance: float = 1.0
     _last: dict[bytes, Any] = field(init=False, default_factory=dict, compare=False)
@@ -97,7 +98,7 @@ class Problem:
         model: AbstractModel,
         free: tuple[str, ...],
         separate: tuple[str, ...],
-        priors: dict[str | None, Priors],
+        priors: dict[str, Priors],
         *,
         clock_is_free: bool,
     ) -> "Problem":
@@ -122,11 +123,11 @@ class Problem:
         unknowns = [unknown(name, None, gas) for name in free]
         unknowns += [unknown(name, m.label, m.gas) for name in separate for m in curves]
         num_free = sum(u.size for u in unknowns)
-        by_label = {None: gas} | {m.label: m.gas for m in measurements}
+        by_label = {SHARED: gas} | {m.label: m.gas for m in measurements}
         for label, some in priors.items():
             known = tuple(u.name for u in unknowns if u.label in (None, label))
             extra = some.extra_parameters(known)
-            unknowns += [unknown(name, label, by_label[label]) for name in extra]
+            unknowns += [unknown(name, label or None, by_label[label]) for name in extra]
         for m in curves:
             names = ((CLOCK, CLOCK_TREND) if clock_is_free else ()) + m.nuisances
             unknowns += [Unknown(name, m.label, (), Domain()) for name in names]
@@ -214,10 +215,10 @@ class Problem:
             if curve is not None:
                 computed[m.label] = curve
         for label, priors in self.priors.items():
-            at = self.measurements[0].label if label is None else label
+            at = label or self.measurements[0].label
             gas = next(m.gas for m in self.measurements if m.label == at)
             parts = priors.residuals(gas, values[at])
-            rows += [Rows(name, label, *row, of_prior=True) for name, row in parts.items()]
+            rows += [Rows(name, label or None, *row, of_prior=True) for name, row in parts.items()]
         xp = array_module(flat, rows)
         jacobian = self._jacobian(xp, flat, rows)
         return rows, xp.concatenate([row.values for row in rows]), jacobian, computed

@@ -25,6 +25,9 @@ DENSITY = "density"
 LAW = "law"
 """Name that stands for all floats of the law of restitution."""
 
+SHARED = ""
+"""Label of the priors of parameters that all measurements share."""
+
 SMOOTHNESS = "smoothness"
 """Name of the prior that a law of restitution brings."""
 

@@ -159,7 +159,7 @@ class Fit(eqx.Module):
             stochastic model "simulation", its noise, estimated from its replicas, and "slope", the
             bias or the noise of its derivatives.
         gas: the fitted gas, including fitted values of all floats that have priors.
-        priors: the known values of other floats, by the label of the measurement; None for all.
+        priors: the known values of other floats, by the label of the measurement; "" for all.
         data: the measurement.
         curve: the cooling curve of the fitted gas at the measured times; for a stochastic model
             that of the last simulation, one Gauss-Newton step before the estimate.
@@ -183,7 +183,7 @@ class Fit(eqx.Module):
     estimate: Float[Array, "p"]
     covariances: dict[str, Float[Array, "p p"]]
     gas: Any
-    priors: dict[str | None, Priors]
+    priors: dict[str, Priors]
     data: Any
     curve: Any
     comparisons: dict[str, Comparison]
@@ -334,18 +334,22 @@ class Fit(eqx.Module):
         """Return the parameters that the data do not determine, or only in a combination.
 
         These are the parameters in those singular vectors of the sensitivity whose standard error
-        exceeds 1 (a factor e), or whose singular value is below ``model.derivative_accuracy`` times
-        the largest. Parameters of a law with a smoothness prior, and arrays in parts of a law,
-        such as a neural network, are not among them.
+        exceeds 1 (a factor e), or, with each parameter scaled to a sensitivity of 1, whose singular
+        value is below ``model.derivative_accuracy`` times the largest. Parameters of a law with a
+        smoothness prior, and arrays in parts of a law, such as a neural network, are not among
+        them.
         """
-        parts = [np.asarray(c.sensitivity) for c in self.comparisons.values()]
         gas = next(iter(self.gas.values())) if isinstance(self.gas, dict) else self.gas
         without_meaning = law_fields(gas.law).keys() - gas.law.domains.keys()
         left_out = law_fields(gas.law) if gas.law.prior_residuals().size else without_meaning
-        _, singular, rotation = np.linalg.svd(np.concatenate(parts), full_matrices=False)
-        weak = (singular <= 1) | (singular < self.model.derivative_accuracy * singular[0])
-        share = np.abs(rotation[weak])
-        is_weak = np.any(share > 0.05 * share.max(axis=1, initial=0.0, keepdims=True), axis=0)
+        sensitivity = np.concatenate([np.asarray(c.sensitivity) for c in self.comparisons.values()])
+        size = np.maximum(np.linalg.norm(sensitivity, axis=0), np.finfo(float).tiny)
+        is_weak = np.zeros(len(size), bool)
+        for scale, limit in ((1.0, 1.0), (size, self.model.derivative_accuracy)):
+            _, singular, rotation = np.linalg.svd(sensitivity / scale, full_matrices=False)
+            least = limit * (singular[0] if scale is size else 1.0)
+            share = np.abs(rotation[singular <= least])
+            is_weak |= np.any(share > 0.05 * share.max(axis=1, initial=0.0, keepdims=True), axis=0)
         names = zip(self._element_names, is_weak, strict=True)
         return tuple(dict.fromkeys(name for name, weak in names if weak and name not in left_out))
 
@@ -508,7 +512,8 @@ def assemble_fit(
     """
     rows, jacobian, computed = linear
     xp, p = array_module(flat, rows), problem.num_free
-    left, singular, right = xp.linalg.svd(jacobian, full_matrices=False)
+    # NumPy does not decompose nan; chi^2 and the curve tell of it.
+    left, singular, right = xp.linalg.svd(xp.nan_to_num(jacobian), full_matrices=False)
     inverse = 1 / xp.maximum(singular, xp.finfo(flat.dtype).tiny ** 0.5)
     spread = right.T * xp.where(singular < resolution * singular[0], 0.0, inverse)[None]
     gain = -problem.slopes(flat)[:p, None] * (spread @ left.T)[:p]
