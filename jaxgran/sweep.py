@@ -28,7 +28,7 @@ from jaxtyping import Array, ArrayLike, Float, Key, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils import status
-from jaxgran._utils.validation import checked_int, checked_times, no_type_check
+from jaxgran._utils.validation import check_bool, checked_int, checked_times, no_type_check
 from jaxgran.data import curve as curves
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import STATUS, TIME, CoolingCurve, Particles
@@ -128,6 +128,7 @@ def sweep(
     >>> jaxgran.sweep(gases, times, progress=False).temperature.shape
     (2, 4)
     """
+    check_bool(progress=progress)
     times, (gases, keys, swept) = checked_times(times), _checked_members(gases, key)
     model = checks.checked_model(KineticTheory() if model is None else model)
     model.check_save(save)

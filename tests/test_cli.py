@@ -75,8 +75,12 @@ def test_choose_prints_reasons(scene, capsys):
         (["cool", "scene.toml", "--until", "1", "--out", "folder", "--overwrite"], "cannot write"),
         (["cool", "scene.toml", "--until", "1", "--out", "a.png"], "is the name of the picture"),
         (["cool", "units.toml", "--until", "1"], "length_unit: 's' is not known as a unit of m"),
-        (["fit", "nowhere.csv", "--particles", "1.5"], "must be a whole number, got 1.5"),
-        (["fit", "nowhere.csv", "--key", "2.5"], "must be a whole number, got 2.5"),
+        (
+            ["fit", "nowhere.csv", "--particles", "1.5"],
+            "must be a whole number below 2^63, got 1.5",
+        ),
+        (["fit", "nowhere.csv", "--key", "2.5"], "must be a whole number below 2^63, got 2.5"),
+        (["cool", "scene.toml", "--until", "1", "--key", "1e30"], "whole number below 2^63"),
         (["fit", "nowhere.csv", "--tolerance", "nan"], "--tolerance must lie in (0, inf), got nan"),
         (["choose", "scene.toml", "--until", "1", "--tolerance", "-1"], "--tolerance must lie"),
         (["cool", "bad.toml", "--until", "1"], "not TOML"),
@@ -133,7 +137,78 @@ def test_a_contradicting_drop_test_is_reported(measured, capsys):
     # As many measurements as above, so that the program is compiled already.
     assert main(["fit", "thin.csv", "dense.csv", "--drop-test", "others.csv", "--out", "b"]) == 0
     out, answer = _answer(capsys)
-    assert not answer["agree"] and answer["p_value"] < 1e-4 and "contradict each other" in out
+    assert not answer["agree"] and answer["p_value"] < 1e-4
+    assert "contradict each other, or the model" in out
+
+
+def test_errors_of_headers_are_priors_of_joint_fits(measured, capsys):
+    """What is of the material is known once, what is of a curve for each."""
+    for name in ("thin.csv", "dense.csv"):
+        text = (measured / name).read_text()
+        (measured / name).write_text(f"# N: 100\n# Y_err: 5e6\n# eta_err: 0.002\n{text}")
+    assert main(["fit", "thin.csv", "dense.csv", "--quick", "--out", "p"]) == 0
+    out, answer = _answer(capsys)
+    assert 0.04 < answer["A_std_err"] / answer["A"] < 0.1  # 10 % in Y is 4 % in A
+    record = json.loads((measured / "p" / "thin-kinetic-theory.json").read_text())
+    budget = record["parameters"][0]["error_budget"]
+    assert budget["youngs_modulus"] / answer["A"] == pytest.approx(0.04, rel=0.1)
+    assert budget["packing_fraction"] > 0 and budget["few particles"] > 0
+
+
+def test_curves_with_one_floor_of_noise_are_misfits_not_contradictions(measured, capsys):
+    for name in ("thin.csv", "dense.csv"):
+        curve, header = jaxgran.read_curve(name)
+        higher = jaxgran.CoolingCurve(
+            curve.times, curve.temperature + 2e-5, temperature_error=curve.temperature_error
+        )
+        jaxgran.write_curve(name, higher, header, overwrite=True)
+    assert main(["fit", "thin.csv", "dense.csv", "--out", "f"]) == 0
+    out, answer = _answer(capsys)
+    assert answer["verdict"] == "not consistent" and not answer["agree"]
+    assert "thin: chi^2 is" in out and "dense: chi^2 is" in out  # the misfit of each
+    assert "a noise floor in T" in out
+    assert answer["A_low"] < 3e-6 < answer["A_high"]
+
+
+def test_a_drop_test_stands_alone(measured, capsys):
+    header = "# diameter: 2 mm\n# density: 2500\n# Y: 50 MPa\n# nu: 0.22\n"
+    (measured / "alone.csv").write_text(header + (measured / "drops.csv").read_text())
+    assert main(["fit", "--drop-test", "alone.csv", "--out", "e"]) == 0
+    out, answer = _answer(capsys)
+    assert abs(answer["A"] / 3e-6 - 1) < 3 * answer["A_std_err"] / 3e-6 < 0.1
+    assert "drops    alone: 20 impacts" in out and answer["verdict"] == "determined"
+
+
+def test_a_late_clock_is_told_and_leaves_A_determined(measured, capsys):
+    curve, header = jaxgran.read_curve("thin.csv")
+    late = jaxgran.CoolingCurve(
+        1e4 + curve.times, curve.temperature, temperature_error=curve.temperature_error
+    )
+    jaxgran.write_curve("late.csv", late, header)
+    assert main(["fit", "late.csv", "--free", "A", "t0", "--quick", "--out", "l"]) == 0
+    captured = capsys.readouterr()
+    assert "check: " in captured.err and "--free A t0" in captured.err
+    assert "t = 10000.1 .. 10050 s" in captured.out
+    answer = json.loads(captured.out.splitlines()[-1])
+    assert abs(answer["A"] / 3e-6 - 1) < 3 * answer["A_std_err"] / 3e-6 < 0.1
+    assert answer["t0"] == pytest.approx(1e4, abs=0.1)
+
+
+def test_a_question_comes_before_the_error_that_it_explains(measured, capsys):
+    curve, header = jaxgran.read_curve("thin.csv")
+    steps = jaxgran.CoolingCurve(
+        1e7 * curve.times, curve.temperature, temperature_error=curve.temperature_error
+    )
+    jaxgran.write_curve("steps.csv", steps, header)
+    assert main(["fit", "steps.csv", "--quick", "--out", "s"]) == 2
+    check, error = capsys.readouterr().err.splitlines()[-2:]
+    assert "is it in steps or frames" in check and "could not compute the curve" in error
+
+
+def test_two_particles_are_too_few_for_a_fit(measured, capsys):
+    arguments = ["--model", "dsmc", "--particles", "10", "--replicas", "2", "--quick"]
+    assert main(["fit", "thin.csv", *arguments, "--free", "A", "--out", "two"]) == 0
+    assert "10 particles are too few for their noise to be known" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -166,6 +241,8 @@ def test_a_single_curve_begins_with_the_range(measured, capsys):
         (["thin.csv", "dense.csv", "--model", "dsmc"], "fitted with kinetic-theory"),
         (["thin.csv", "dense.csv", "--free", "T0", "--set", "A=3e-6"], "share none of these"),
         (["thin.csv", "--drop-test", "dense.csv"], "name them v,eps,eps_err"),
+        (["drops.csv"], "those of a drop test: give it to read_drop_test, or to --drop-test"),
+        (["--drop-test", "drops.csv"], "the header lacks diameter, density, Y, nu"),
         (
             ["thin.csv", "--free", "A", "beta_t"],
             "Add `# beta_t: guess` to the file, or --set beta_t",

@@ -26,6 +26,7 @@ GAS = glass_beads(0.3, packing_fraction=0.1)
 TAU = float(GAS.mean_free_time)
 CURVE = jaxgran.CoolingCurve(times=[0.1, 0.2, 0.3, 0.4], temperature=[4e-3, 3e-3, 2e-3, 1e-3])
 SOFT = jaxgran.SoftSpheres(20)
+MASKED = np.ma.masked_all(1)
 
 
 class NoRestitution(RestitutionLaw):
@@ -64,9 +65,23 @@ class OfMass(RestitutionLaw, ReducedLaw):
         return 0.9 * jnp.ones_like(normal_speed)
 
 
+class BelowZero(RestitutionLaw):
+    """A law that is meant for slow impacts."""
+
+    slope: float
+
+    def restitution(self, normal_speed):
+        return 1 - self.slope * normal_speed
+
+
 def with_law(law):
     values = {"diameter": 1.0, "mass": 1.0, "packing_fraction": 0.1, "temperature": 1.0}
     return jaxgran.Gas(law, **values)
+
+
+def chi2(scale):
+    curve = dataclasses.replace(CURVE, temperature=scale * CURVE.temperature)
+    return jaxgran.fit(GAS, curve).chi2
 
 
 def cool(gas=GAS, times=(TAU,), **options):
@@ -108,6 +123,29 @@ REFUSED = [
     ("a law's float named as the gas's", lambda: with_law(OfMass()), "'mass'.*rename it"),
     ("a law without restitution", lambda: NoRestitution(), "define restitution"),
     ("a law in wrong units", lambda: with_law(InMetres()), "0.04979 at 0.3 m/s .* leave `reduced`"),
+    (
+        "a law below 0",
+        lambda: cool(with_law(BelowZero(1.0))),
+        "eps = -[0-9.]+ at a speed of impact",
+    ),
+    ("a law that is nan", lambda: cool(with_law(BelowZero(jnp.nan))), "must be|must lie"),
+    ("the derivative of a fit", lambda: jax.grad(chi2)(1.0), "no derivative .*log_likelihood"),
+    ("that of a compiled fit", lambda: jax.jacfwd(jax.jit(chi2))(1.0), "no derivative in the gas"),
+    ("a text for throw", lambda: jaxgran.cool(GAS, (TAU,), throw="no"), "throw must be True or"),
+    (
+        "a number for progress",
+        lambda: jaxgran.cool(GAS, (TAU,), progress=5),
+        "progress must be True",
+    ),
+    ("a number for it in a fit", lambda: jaxgran.fit(GAS, CURVE, progress=5), "progress must be"),
+    ("an array without some values", lambda: jaxgran.DropTest(MASKED, [0.9], [0.01]), "are masked"),
+    ("no particles", lambda: jaxgran.read_particles(None), "must be the name of a file, got None"),
+    (
+        "a list for a header",
+        lambda: jaxgran.read_curve("a.csv", [1]),
+        "header must be a dictionary",
+    ),
+    ("None in a header", lambda: jaxgran.read_gas({"eta": None}), "dictionary of texts"),
     ("a law that is not reduced", lambda: with_law(NotReduced()), "must return a .*ReducedLaw"),
 ]
 
@@ -282,12 +320,20 @@ def two_spheres(gas, distance, speed):
     return jaxgran.Particles(position[None], velocity[None], side)
 
 
+def test_soft_spheres_that_start_overlapping_are_told():
+    gas = GAS.replace(packing_fraction=0.02)
+    jaxgran.SoftSpheres(2, start=two_spheres(gas, 1.01, 0.1)).check(gas)
+    with pytest.warns(UserWarning, match="overlap: the energy of their contacts, .* J, becomes"):
+        jaxgran.SoftSpheres(2, start=two_spheres(gas, 0.95, 0.1)).check(gas)
+
+
 @pytest.mark.slow
 def test_soft_spheres_start_overlapped_and_at_rest():
     overlap = 0.05
     gas = GAS.replace(dissipative_constant=0.0, packing_fraction=0.02)
     start = two_spheres(gas, 1 - overlap, 0.0)
-    curve = cool(gas, [0.0, 0.1 * TAU, TAU], model=jaxgran.SoftSpheres(2, start=start))
+    with pytest.warns(UserWarning, match="overlap"):
+        curve = cool(gas, [0.0, 0.1 * TAU, TAU], model=jaxgran.SoftSpheres(2, start=start))
     kinetic = 1.5 * gas.mass * curve.temperature
     assert kinetic[0] == 0 and kinetic[-1] > 0
     total = kinetic + curve.elastic_energy

@@ -137,6 +137,9 @@ def float_array(value: UserNumber, name: str = "") -> Float[Array, "..."]:
     Raises:
         ValueError: if the value cannot be converted.
     """
+    if np.ma.is_masked(value):
+        of = f" of {name}" if name else ""
+        raise ValueError(f"some values{of} are masked. Leave these points out of all quantities.")
     try:
         if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
             return jnp.asarray(value, dtype=jnp.result_type(float))
@@ -217,16 +220,15 @@ def checked_float(name: str, value: Any, domain: Domain, advice: str = "") -> fl
     return float(value)
 
 
-def check_bool(name: str, value: Any) -> None:
-    """Raise ValueError unless the value is True or False."""
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} must be True or False, got {value!r}")
+def check_bool(**values: Any) -> None:
+    """Raise ValueError unless the values, by name, are True or False."""
+    for name, value in values.items():
+        if not isinstance(value, bool | np.bool_):
+            raise ValueError(f"{name} must be True or False, got {value!r}")
 
 
 def list_to_array(value: Any) -> Any:
     """Convert a list, tuple or NumPy array of numbers to a JAX array; return others unchanged."""
-    if np.ma.is_masked(value):
-        raise ValueError("some values are masked. Leave these points out of all quantities.")
     return float_array(value) if isinstance(value, list | tuple | np.ndarray) else value
 
 

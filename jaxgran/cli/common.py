@@ -34,16 +34,17 @@ MODELS: tuple[str, ...] = get_args(ModelOrAuto)
 Several = Parameter(consume_multiple=True)
 
 
+MAX_NUMBER = 2**63
+"""Upper bound of whole numbers, as of the seeds of `jax.random.key`."""
+
+
 def _whole_number(_: object, tokens: Sequence[Token]) -> int:
     """Return the whole number of an option, which may be written as 1e4."""
     text = tokens[0].value
-    try:
-        number = float(text)
-        if number.is_integer():
-            return int(text) if text.lstrip("+-").isdigit() else int(number)
-    except ValueError:
-        pass
-    raise ValueError(f"must be a whole number, got {text}")
+    number = int(text) if text.lstrip("+-").isdigit() else float(text)
+    if not (abs(number) < MAX_NUMBER and number == int(number)):
+        raise ValueError(f"must be a whole number below 2^63, got {text}")
+    return int(number)
 
 
 WholeNumber = Annotated[int, Parameter(converter=_whole_number)]
@@ -61,9 +62,10 @@ class FitOptions:
     """Options of `jaxgran fit`.
 
     Attributes:
-        curve: The first curve.
+        curve: The first file.
         drop_test: One or more CSV files with columns v,eps,eps_err: single impacts of the spheres
-            of the first curve, fitted jointly with it.
+            of the first curve, fitted jointly with it; without a curve their own header gives
+            diameter, density, Y and nu.
         onto_plate: The impacts of the drop tests are on a thick plate of the same material.
         model: Model to use; auto takes the cheapest one whose estimated error is within the
             tolerance.

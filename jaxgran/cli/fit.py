@@ -26,7 +26,7 @@ from jaxgran.cli.common import (
     output_files,
     parse_settings,
 )
-from jaxgran.data.curve_file import GUESS
+from jaxgran.data.curve_file import GUESS, read_drops
 from jaxgran.data.files import header_count, header_number, write_atomically
 from jaxgran.fitting.fit import free_by_default
 from jaxgran.fitting.residuals import unused_rotation
@@ -34,11 +34,11 @@ from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE
 from jaxgran.models.choose import default_models
 from jaxgran.scene.parameters import BY_SYMBOL, MATERIAL, PARAMETERS, SCENE, symbol_of, unit_of
 
-MAX_KEY = 2**63
-"""Upper bound of the seeds of `jax.random.key`."""
-
 JOINT_MODEL = MODELS[0]
-"""The only model of fits of several measurements: kinetic theory."""
+"""The only model of fits of drop tests and of several measurements: kinetic theory."""
+
+ANY_GAS = {"eta": "0.1", "T0": "1"}
+"""Header keys that single impacts do not depend on."""
 
 
 def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
@@ -53,37 +53,35 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     several = len(files) > 1
     if repeated := [str(path) for path in files if files.count(path) > 1]:
         raise ValueError(f"{repeated[0]} is given twice. Give each measurement once.")
-    if several and options.model != JOINT_MODEL:
+    if (several or not paths) and options.model != JOINT_MODEL:
         raise ValueError(
-            f"--model {options.model}: several measurements are fitted with {JOINT_MODEL}. Fit the "
-            "curves one by one with other models."
+            f"--model {options.model}: drop tests and several measurements are fitted with "
+            f"{JOINT_MODEL}. Fit the curves one by one with other models."
         )
-    if abs(options.key) >= MAX_KEY:
-        raise ValueError(f"--key {options.key} is too large. Give a whole number below 2^63.")
     picture, record = output_files(options)
     free = options.free or (("A", "T0") if several else ())
     if free and all(BY_SYMBOL[key].belongs_to == SCENE for key in free) and several:
         raise ValueError(f"--free {' '.join(free)}: the curves share none of these. Add A.")
-    gases, data, headers, priors, checks = {}, {}, {}, {}, []
-    for path in paths:
-        with warnings.catch_warnings(record=True) as asked:  # about units and tracks
-            warnings.simplefilter("always", UserWarning)
-            curve, header = jaxgran.read_curve(path)
-            header |= parse_settings(options.set)
-            gas = gas_of(header, free)
-        free = free or tuple(map(symbol_of, free_by_default(gas, curve)))
+    gases, data, headers, priors = {}, {}, {}, {}
+    for path in (*paths, *options.drop_test):
         label = path.stem if path.stem not in data else str(path)
-        gases[label], data[label], headers[label] = _with_A(gas, header, free), curve, header
-        checks += [str(warning.message) for warning in asked]
-        if "N" not in header and (unused := unused_rotation(gas, curve)):
-            checks.append(unused)
+        if path in options.drop_test:
+            data[label], header = read_drops(path, options.onto_plate)
+            if paths:  # of spheres like those of the first curve
+                gases[label] = next(iter(gases.values()))
+                continue
+            header = ANY_GAS | header
+        else:
+            data[label], header = jaxgran.read_curve(path)
+        header |= parse_settings(options.set)
+        gas = gas_of(header, free)
+        free = free or tuple(map(symbol_of, free_by_default(gas, data[label])))
+        gases[label], headers[label] = _with_A(gas, header, free), header
+        if path in paths and "N" not in header and (unused := unused_rotation(gas, data[label])):
+            warnings.warn(unused, stacklevel=2)
         for name, pair in jaxgran.read_priors(header).items():
             shared = name != "density" and PARAMETERS[name].belongs_to == MATERIAL
             priors.setdefault(f"{label}: {name}" if several and not shared else name, pair)
-    for path in options.drop_test:  # of spheres like those of the first curve
-        label = path.stem if path.stem not in data else str(path)
-        data[label] = jaxgran.read_drop_test(path, onto_plate=options.onto_plate)
-        gases[label] = next(iter(gases.values()))
     declared = [
         jaxgran.read_absent(
             header | {"absent": " ".join((header.get("absent", ""), *options.absent))}
@@ -150,7 +148,7 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     if several:
         fitted = {key: (data[key], curve) for key, curve in result.curve.items()}
         plotting.save_curves(fitted, diagnosis.headline, picture)
-    else:
+    elif paths:
         plotting.save_fit(result, data[label], title, picture)
     text = json.dumps(summary | as_json(details), indent=2, allow_nan=False) + "\n"
     write_atomically(record, lambda f: f.write(text.encode()))
@@ -159,8 +157,6 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     for label, header in headers.items():
         gas = result.gas[label] if several else result.gas
         print_scene(label, gas, data[label], header)
-    for text in checks:
-        print(f"check    {text}")
     steps = "simulations" if model.stochastic else "steps of least squares"
     print(f"model    {model_name}, {int(result.iterations)} {steps}")
     for i, reason in enumerate(reasons):
@@ -169,10 +165,12 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     print_budget(rows, options.explain)
     print_alternatives(rows[0]["parameter"], diagnosis)
     if several:
-        agreement = "do not contradict" if agree["agree"] else "contradict"
-        print(f"\nThe measurements {agreement} each other (p = {float(result.p_value):.2g}).")
+        agreement = "do not contradict each other"
+        if not agree["agree"]:
+            agreement = "contradict each other, or the model"
+        print(f"\nThe measurements {agreement} (p = {float(result.p_value):.2g}).")
     print("\n" + "\n".join(f"  - {reason}" for reason in diagnosis.reasons))
-    print(f"\nwritten  {picture}\n         {record}\n")
+    print("\nwritten  " + "\n         ".join(map(str, (picture, record)[not paths :])) + "\n")
     print(json.dumps(summary, allow_nan=False))
 
 
@@ -219,9 +217,13 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def print_scene(label: str, gas: Any, curve: Any, header: dict[str, str]) -> None:
-    """Print a curve, the gas that was fitted to it, and its impacts."""
-    T, N = np.asarray(curve.temperature), header_count(header, "N")
-    print(f"\ncurve    {label}: {T.size} points, t = 0 .. {curve.times[-1]:.3g} s,")
+    """Print a curve, the gas that was fitted to it, and its impacts; or a drop test."""
+    if isinstance(curve, jaxgran.DropTest):
+        v = np.asarray(curve.speed)
+        print(f"\ndrops    {label}: {v.size} impacts, v = {v.min():.3g} .. {v.max():.3g} m/s")
+        return
+    T, N, times = np.asarray(curve.temperature), header_count(header, "N"), curve.times
+    print(f"\ncurve    {label}: {T.size} points, t = {times[0]:.6g} .. {times[-1]:.6g} s,")
     print(f"         T falls to {T[-1] / T[0]:.3g} of its first value")
     if "T_from" in header:
         print(f"         {header['T_from']}")

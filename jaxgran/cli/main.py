@@ -52,6 +52,7 @@ def main(
     words = sys.argv[1:] if arguments is None else list(arguments)
     try:
         with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
             warnings.showwarning = _print_warning
             app(words, exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()
@@ -99,10 +100,11 @@ def _app(started: float, default_curve: Path | None) -> App:
             use_compilation_cache()
         from jaxgran.cli.fit import run_fit
 
-        curves = curves or (() if default_curve is None else (default_curve,))
-        if not curves:
+        if not (curves or options.drop_test) and default_curve is not None:
+            curves = (default_curve,)
+        if not (files := (*curves, *options.drop_test)):
             raise ValueError("no curve is given. Name a file: jaxgran fit CURVE.csv.")
-        run_fit(curves, dataclasses.replace(options, curve=curves[0]), started)
+        run_fit(curves, dataclasses.replace(options, curve=files[0]), started)
 
     app.command(fit)
     app.command(cool)

@@ -28,9 +28,15 @@ from jaxgran._utils.validation import (
     no_type_check,
 )
 from jaxgran.data.curve import MIN_POINTS, QUANTITIES, CoolingCurve, from_arrays, to_arrays
-from jaxgran.data.files import header_count, header_number, name_in_errors, write_atomically
+from jaxgran.data.files import (
+    checked_path,
+    header_count,
+    header_number,
+    name_in_errors,
+    write_atomically,
+)
 from jaxgran.data.plausibility import ask_about_columns, ask_about_header
-from jaxgran.data.tables import UNIT_KEYS, Table, checked_path, read_table
+from jaxgran.data.tables import UNIT_KEYS, Table, header_entry, read_table
 from jaxgran.data.tracks import (
     TRACK_KEYS,
     curve_of_tracks,
@@ -54,6 +60,8 @@ from jaxgran.scene.parameters import BY_SYMBOL, REQUIRED, fields_of
 
 WANTED = "t,T[,T_err][,msd][,msd_err]"
 """Columns of a file, for messages."""
+
+CSV_FILE = f"a CSV file with the columns {WANTED}"
 
 OPTIONAL_KEYS = ("N", "dimension", "replicas", "absent", "T_from", *TRACK_KEYS)
 """Further known header keys, neither of the gas nor of its elements."""
@@ -160,7 +168,8 @@ def read_curve(
     >>> header, again.times.shape
     ({'eta': '0.05'}, (4,))
     """
-    path, given = checked_path(path, WANTED), {} if header is None else dict(header)
+    path, given = checked_path(path, CSV_FILE), {} if header is None else header
+    _check_header(given)
     questions: list[str] = []
     with name_in_errors(path):
         if path.suffix == ARCHIVE_SUFFIX:
@@ -187,6 +196,11 @@ def _columns_to_read(names: list[str]) -> list[str]:
     """Return the columns; raise ValueError if one is unknown, missing or repeated."""
     if "x" in names or "id" in names:
         return track_columns(names)
+    if {"v", "eps"} <= {*names}:
+        raise ValueError(
+            f"the columns are {', '.join(names)}, those of a drop test: give it to read_drop_test, "
+            "or to --drop-test"
+        )
     temperatures = [name for name in ("T", *TEMPERATURE_COLUMNS) if name in names]
     known = {quantity.column for quantity in QUANTITIES.values()}
     known |= {end for name in temperatures for end in (name, f"{name}_err")}
@@ -295,9 +309,10 @@ def read_gas(header: dict[str, str]) -> Gas:
 
 
 def _check_header(header: Any) -> None:
-    if not isinstance(header, dict):
+    kinds = str, int, float, np.number
+    if not isinstance(header, dict) or not all(isinstance(x, kinds) for x in header.values()):
         raise ValueError(
-            f"header must be a dictionary, as read_curve returns it, got {header!r:.60}"
+            f"header must be a dictionary of texts, as read_curve returns it, got {header!r:.60}"
         )
 
 
@@ -492,8 +507,9 @@ def write_curve(
     >>> jaxgran.read_curve("all.npz")[1]["note"]
     'every array'
     """
-    path = checked_path(path, WANTED)
+    path = checked_path(path, CSV_FILE)
     _check_header(header)
+    check_bool(overwrite=overwrite)
     if not isinstance(curve, CoolingCurve):
         raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
     if path.exists() and not overwrite:
@@ -504,10 +520,15 @@ def write_curve(
         return write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
     fields = {q.column: getattr(curve, q.field) for q in QUANTITIES.values()}
     present = {name: np.asarray(v) for name, v in fields.items() if v is not None}
-    broken = [key for key, value in header.items() if len(f"{key}{value}".splitlines()) > 1]
-    if broken:
-        raise ValueError(f"header key {broken[0]!r}: key and value must be one line of text each")
-    lines = [f"# {key}: {value}" for key, value in header.items()]
+    lines = []
+    for key, value in header.items():
+        line = f"{key}: {value}"
+        if len(line.splitlines()) > 1 or header_entry(line) != (key, str(value).strip()):
+            raise ValueError(
+                f"header key {key!r}: key and value must be one line of text each, and the key "
+                "without : and ="
+            )
+        lines.append(f"# {line}")
     lines.append(",".join(present))
     lines += [",".join(f"{x:.17g}" for x in row) for row in zip(*present.values(), strict=True)]
     text = "\n".join(lines) + "\n"
@@ -566,7 +587,7 @@ class DropTest(eqx.Module):
     onto_plate: UserBool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        check_bool("onto_plate", self.onto_plate)
+        check_bool(onto_plate=self.onto_plate)
         POSITIVE.check("speed", self.speed, "Give normal speeds in m/s.")
         advice = "Give the speed after over that before an impact."
         POSITIVE.check("restitution", self.restitution, advice)
@@ -613,6 +634,11 @@ def read_drop_test(path: str | Path, *, onto_plate: bool = False) -> DropTest:
     >>> jaxgran.read_drop_test("drops.csv").restitution.shape
     (3,)
     """
+    return read_drops(path, onto_plate)[0]
+
+
+def read_drops(path: str | Path, onto_plate: bool) -> tuple[DropTest, dict[str, str]]:
+    """Return a drop test and the header of its file, in SI: see `read_drop_test`."""
     wanted = ",".join(DROP_TEST_COLUMNS)
 
     def columns_to_read(names: list[str]) -> list[str]:
@@ -620,9 +646,9 @@ def read_drop_test(path: str | Path, *, onto_plate: bool = False) -> DropTest:
             raise ValueError(f"the columns are {', '.join(names)}; name them {wanted}")
         return names
 
-    path = checked_path(path, wanted)
+    path = checked_path(path, f"a CSV file with the columns {wanted}")
     with name_in_errors(path):
-        columns = read_table(path, wanted, columns_to_read).columns
+        header, columns, _ = read_table(path, wanted, columns_to_read)
         if not columns["v"].size:
             raise ValueError(f"no rows of numbers under {wanted}; add one row for each impact")
-        return DropTest(columns["v"], columns["eps"], columns["eps_err"], onto_plate)
+        return DropTest(columns["v"], columns["eps"], columns["eps_err"], onto_plate), header

@@ -14,6 +14,13 @@ from typing import Any
 import numpy as np
 
 
+def checked_path(path: Any, kind: str) -> Path:
+    """Return the path of a file; raise ValueError if it is no name of a file."""
+    if not isinstance(path, str | Path):
+        raise ValueError(f"path must be the name of a file, got {path!r:.60}; give {kind}")
+    return Path(path)
+
+
 @contextmanager
 def name_in_errors(path: Path) -> Iterator[None]:
     """Name a file in the errors of reading it, all of which become ValueError."""
@@ -118,7 +125,7 @@ def header_number(header: dict[str, str], key: str) -> float:
     """
     try:
         number = float(header[key])
-    except ValueError:
+    except (TypeError, ValueError):
         number = float("nan")
     if not np.isfinite(number):
         raise ValueError(f"header line {key}: {header[key]!r} is not a finite number")

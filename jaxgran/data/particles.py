@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxgran._utils.validation import no_type_check
 from jaxgran.data.curve import Particles, import_extra
-from jaxgran.data.files import check_writable, name_in_errors, read_bytes
+from jaxgran.data.files import check_writable, checked_path, name_in_errors, read_bytes
 
 GSD = ".gsd"
 XYZ = ".xyz"
@@ -100,6 +101,7 @@ class Frame(NamedTuple):
     step: int | None
 
 
+@no_type_check
 def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None = None) -> Particles:
     """Read the particles of one frame, as a start for `HardSpheres` or `SoftSpheres`.
 
@@ -135,7 +137,7 @@ def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None =
     >>> bool(jnp.all(same.velocity == particles.velocity))
     True
     """
-    path = Path(path)
+    path = checked_path(path, "a LAMMPS dump or data file, extended XYZ, or GSD")
     if dimension not in (None, 2, 3):
         raise ValueError(f"dimension must be 2 or 3, or None, got {dimension!r}")
     with name_in_errors(path):

@@ -69,16 +69,6 @@ class Table(NamedTuple):
     lines: list[int]
 
 
-def checked_path(path: Any, columns: str) -> Path:
-    """Return the path of a CSV file; raise ValueError if it is no name of a file."""
-    if not isinstance(path, str | Path):
-        raise ValueError(
-            f"path must be the name of a file, got {path!r:.60}; give a CSV file with the columns "
-            f"{columns}"
-        )
-    return Path(path)
-
-
 def read_text(path: Path, columns: str) -> str:
     """Return the text of a CSV file in UTF-8, UTF-16, UTF-32 or Latin-1, also compressed (.gz).
 
@@ -219,23 +209,28 @@ def _number(text: str, comma: bool) -> float:
         return math.nan if plain == text else float(plain)
 
 
-def _add_header_line(header: dict[str, str], i: int, line: str) -> None:
-    """Add ``key: value``, or ``key = value`` where the key is one word; skip other comments."""
+def header_entry(line: str) -> tuple[str, str] | None:
+    """Return key and value of ``key: value``, or ``key = value`` if the key is one word."""
     match = re.match("([^:=]*)([:=])(.*)", line)
     if match is None:
-        return
+        return None
     key, mark, value = (part.strip() for part in match.groups())
     name = _NAME.fullmatch(key)
-    if name is None and (mark == "=" or key in header):
-        return
     if name is not None and _base_unit(name["name"]) is not None:
-        key, unit = name["name"], name["bracket"] or name["slash"]
-        value = f"{value} {unit}" if unit else value
-    if key in header:
+        unit = name["bracket"] or name["slash"]
+        return name["name"], f"{value} {unit}" if unit else value
+    return None if mark == "=" and name is None else (key, value)
+
+
+def _add_header_line(header: dict[str, str], i: int, line: str) -> None:
+    """Add a line that is an entry; skip other comments, and sentences that begin alike."""
+    key, value = header_entry(line) or ("", "")
+    if key and key not in header:
+        header[key] = value
+    elif key and _NAME.fullmatch(key):
         raise ValueError(
             f"line {i}: {key} is given again, as {value} after {header[key]}; remove one"
         )
-    header[key] = value
 
 
 def _base_unit(name: str) -> str | None:

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.formatting import text_table
-from jaxgran._utils.validation import POSITIVE, no_type_check
+from jaxgran._utils.validation import POSITIVE, check_bool, no_type_check
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.curve_file import ABSENT
+from jaxgran.data.curve_file import ABSENT, DropTest
 from jaxgran.fitting.alternatives import (
     ALLOWED_CHI2,
     DECLARABLE,
@@ -46,6 +46,9 @@ MAX_SIGMAS = 5.0
 
 MIN_OUTLIER = 0.004
 """Least error of T, relative, that is assumed for the points of a curve without errors."""
+
+MIN_PARTICLES = 50
+"""Particles of a model from which on the noise of its curves is known."""
 
 MIN_JUDGED = 10
 """Points needed to tell an outlier from the scatter of the others."""
@@ -107,7 +110,7 @@ class Diagnosis(NamedTuple):
 @no_type_check
 def diagnose(
     result: Fit,
-    data: CoolingCurve | dict | None = None,
+    data: CoolingCurve | DropTest | dict | None = None,
     num_particles: int | None = None,
     *,
     absent: tuple[str, ...] = (),
@@ -129,11 +132,12 @@ def diagnose(
     >>> jaxgran.diagnose(result).grade
     'determined'
     """
-    if not isinstance(result, Fit) or not isinstance(data, CoolingCurve | dict | None):
+    if not isinstance(result, Fit) or not isinstance(data, CoolingCurve | DropTest | dict | None):
         raise ValueError(
             "diagnose needs the result of jaxgran.fit and the fitted curve, got "
             f"{type(result).__name__} and {type(data).__name__}"
         )
+    check_bool(quick=quick)
     absent = tuple(dict.fromkeys((*result.absent, *checked_absent(absent))))
     p_value, converged = float(result.p_value), bool(result.converged)
     misfit, notes, limitations, correlations = p_value < SIGNIFICANCE, [], [], []
@@ -461,10 +465,23 @@ def _describe_outliers(result: Fit, label: str) -> Iterator[str]:
     yield words
 
 
+def describe_few_particles(model: AbstractModel) -> str:
+    """Return a clause on a particle model that is too small for its noise to be known, or ""."""
+    number = getattr(model, "num_particles", MIN_PARTICLES)
+    if number >= MIN_PARTICLES:
+        return ""
+    return (
+        f"{number} particles are too few for their noise to be known, and cool faster than a gas: "
+        f"give the model {MIN_PARTICLES} or more"
+    )
+
+
 def _describe_search(result: Fit) -> Iterator[str]:
     """Yield clauses about convergence, noise of simulations and undetermined parameters."""
     if not bool(result.converged):
         yield "the search did not converge: increase max_steps or free fewer parameters"
+    if few := describe_few_particles(result.model):
+        yield few
     noise = result.error_budget.get("simulation")
     if noise is not None:
         share = np.asarray(noise / result.standard_error)

@@ -14,11 +14,11 @@ from jaxtyping import PRNGKeyArray
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, array_module
-from jaxgran._utils.validation import checked_int, no_type_check
+from jaxgran._utils.validation import check_bool, checked_int, no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import DropTest
 from jaxgran.fitting.descent import MAX_LINEARISED, Descent
-from jaxgran.fitting.diagnosis import checked_absent, diagnose
+from jaxgran.fitting.diagnosis import checked_absent, describe_few_particles, diagnose
 from jaxgran.fitting.error_budget import clock_accuracy, with_scene_errors
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.optimise import Problem, best_of_starts, is_transformation, search
@@ -31,6 +31,7 @@ from jaxgran.fitting.parameters import (
     Priors,
     domain_of,
     guess_from_data,
+    guess_from_drops,
     halving_time,
     size_of,
     with_names_of_law,
@@ -175,7 +176,10 @@ def fit(
     '3e-06 s'
     """
     several = isinstance(data, dict)
+    check_bool(progress=progress, throw=throw)
     scenes, data = _by_label(gas, data)
+    if any_traced(scenes, data):
+        scenes, data = _without_derivative((scenes, data))
     model = KineticTheory() if model is None else model
     curves = {label: x for label, x in data.items() if isinstance(x, CoolingCurve)}
     counts = _numbers_by_label("num_particles", num_particles, data)
@@ -291,7 +295,7 @@ def _fit_deterministic(
         gas = scenes[label]
         if isinstance(measured, DropTest):
             measurements.append(DropTestRows(label, gas, measured))
-            guesses[label] = gas
+            guesses[label] = guess_from_drops(gas, measured, free)
             continue
         model.check_scene(gas if start is None else start)
         m = Measurement.of(
@@ -548,6 +552,20 @@ def _check_model(
     model.check_fit((*names, *separate))
 
 
+@jax.custom_jvp
+def _without_derivative(tree: Any) -> Any:
+    return tree
+
+
+@_without_derivative.defjvp
+def _refuse_derivative(primals: Any, tangents: Any) -> Any:
+    raise ValueError(
+        "jaxgran.fit has no derivative in the gas or the measurements: differentiate "
+        "jaxgran.log_likelihood, or take differences of fits. result.comparison.gain tells how far "
+        "each point moves the estimate"
+    )
+
+
 def _check_computed(model: AbstractModel, names: Any, estimate: Any, curves: Iterable[Any]) -> None:
     """Raise RuntimeError if one of the curves, dictionaries of fields, was not computed."""
     for curve in curves:
@@ -568,6 +586,8 @@ def _warn(result: Fit) -> None:
             'jax.config.update("jax_enable_x64", True) first',
             stacklevel=3,
         )
+    if few := describe_few_particles(result.model):
+        warnings.warn(few, stacklevel=3)
     if unvisited := describe_unvisited_knots(result):
         warnings.warn(unvisited, stacklevel=3)
     group = result.undetermined()

@@ -11,8 +11,9 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran._utils.tracing import any_traced, array_module
 from jaxgran._utils.validation import POSITIVE, Domain, float_array
 from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve_file import DropTest
 from jaxgran.scene.gas import Gas, law_fields
-from jaxgran.scene.laws import ConstantRestitution, Viscoelastic
+from jaxgran.scene.laws import C1, ConstantRestitution, Viscoelastic
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 START_TIME = "t0"
@@ -138,6 +139,18 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
     values |= _guess_law(with_floats(gas, values), rate, free)
     values |= _guess_elements(gas, curve, free)
     return with_floats(gas, {name: x for name, x in values.items() if name in free})
+
+
+def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> Gas:
+    """Return the gas with A as in ``eps = exp(-C1 beta)`` of the median impact, if it was 0."""
+    is_free = isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free
+    if not is_free or any_traced(gas, test) or gas.law.dissipative_constant > 0:
+        return gas
+    speed, eps = np.median(np.asarray(test.speed)), np.median(np.asarray(test.restitution))
+    law = gas.law.of_wall() if test.onto_plate else gas.law
+    alpha = law.alpha(diameter=gas.diameter, mass=gas.mass)
+    loss = -np.log(np.clip(eps, 1e-3, 0.999))
+    return gas.replace(dissipative_constant=loss / (1.5 * C1 * alpha**0.4 * speed**0.2))
 
 
 def _guess_law(gas: Gas, rate: Numbers, free: tuple[str, ...]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from jaxgran.particles.run import MIN_BOX
 from jaxgran.particles.setup import PACKING_LIMIT
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.geometry import NODES
 from jaxgran.theory.averages import impact_moments
 from jaxgran.theory.equations import max_thermal_speed, softness_factor
 
@@ -74,9 +75,21 @@ def checked_key(key: Any) -> PRNGKeyArray | None:
     raise ValueError(f"key must be a key such as jax.random.key(5), got {key!r:.60}")
 
 
-def check_cools(rate: ArrayLike) -> None:
-    """Raise ValueError if `first_cooling_rate` is negative: the law of restitution heats."""
-    if not isinstance(rate, Tracer) and np.any(np.asarray(rate) < 0):
+MAX_CHECKED_SPEED = 3.7
+"""Normal speed, over sqrt(2 T), that a thousandth of the impacts of a gas exceed."""
+
+
+def check_cools(rate: ArrayLike, lowest: ArrayLike) -> None:
+    """Raise ValueError for a law with eps < 0, or one that heats: see `first_cooling_rate`."""
+    if isinstance(rate, Tracer):
+        return
+    if not np.all(np.asarray(lowest) >= 0):
+        raise ValueError(
+            f"the law of restitution gives eps = {float(np.min(lowest)):.3g} at a speed of impacts "
+            "in this gas, but eps must be a number >= 0: limit it, as in jnp.clip(eps, 0.0, 1.0), "
+            "or lower T_0"
+        )
+    if np.any(np.asarray(rate) < 0):
         raise ValueError(
             "the law of restitution makes this gas heat up: its mean eps over impacts is above 1 "
             "(a truncated series beyond its range). Lower T_0 or A, or use another law."
@@ -84,14 +97,20 @@ def check_cools(rate: ArrayLike) -> None:
 
 
 @eqx.filter_jit
-def first_cooling_rate(gas: Gas) -> Float[Array, ""]:
-    """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; negative if the law heats it."""
-    mu_2 = impact_moments(gas.reduced_law, jnp.ones_like(gas.temperature), gas.dimension)[0, 0]
-    return 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
+def first_cooling_rate(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas, and eps at its lowest.
+
+    The rate is negative if the law heats the gas; eps is that at speeds to `MAX_CHECKED_SPEED`.
+    """
+    one, law = jnp.ones_like(gas.temperature), gas.reduced_law
+    mu_2 = impact_moments(law, one, gas.dimension)[0, 0]
+    speeds = jnp.asarray(NODES[NODES < MAX_CHECKED_SPEED], one.dtype)
+    rate = 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
+    return rate, jnp.min(law.restitution(speeds))
 
 
 @eqx.filter_jit
-def initial_cooling(gas: Gas) -> tuple[Array, Array, Array]:
+def initial_cooling(gas: Gas) -> tuple[tuple[Array, Array], Array, Array]:
     """Return `first_cooling_rate`, and at the highest T the softness factor and sqrt(T/T_0)."""
     one = jnp.ones_like(gas.temperature)
     hottest = one if gas.drive is None else max_thermal_speed(gas)

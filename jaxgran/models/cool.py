@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import ArrayLike, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran._utils.validation import checked_times, no_type_check
+from jaxgran._utils.validation import check_bool, checked_times, no_type_check
 from jaxgran.data.curve import CoolingCurve, Particles, Run
 from jaxgran.data.files import check_writable
 from jaxgran.models import checks
@@ -92,6 +92,7 @@ def cool(
     [0.00784, 0.00524, 0.00205, 0.00053]
     """
     gas, times, key = checks.checked_gas(gas), checked_times(times), checks.checked_key(key)
+    check_bool(progress=progress, throw=throw)
     model = KineticTheory() if model is None else model
     if model == "auto":
         tolerance = 0.02 if tolerance is None else tolerance

@@ -90,9 +90,9 @@ class KineticTheory(AbstractModel):
     max_steps: validation.UserInt = eqx.field(static=True, default=200_000)
 
     def __check_init__(self):
-        validation.check_bool("sonine", self.sonine)
-        validation.check_bool("softness", self.softness)
-        validation.check_bool("correlations", self.correlations)
+        validation.check_bool(
+            sonine=self.sonine, softness=self.softness, correlations=self.correlations
+        )
         if self.order not in (2, 3) or isinstance(self.order, bool | float):
             raise ValueError(
                 f"order must be 2 or 3, got {self.order!r}. Use sonine=False for a Maxwellian gas."
@@ -136,7 +136,7 @@ class KineticTheory(AbstractModel):
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; < 0 if the law heats it."""
-        return checks.first_cooling_rate(gas)
+        return checks.first_cooling_rate(gas)[0]
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""
@@ -145,7 +145,7 @@ class KineticTheory(AbstractModel):
         rate, factor, hottest = checks.initial_cooling(gas)
         if self.softness:
             checks.check_softness(gas, factor, hottest)
-        checks.check_cools(rate)
+        checks.check_cools(*rate)
 
     def estimated_error(self, error_model: ErrorModel) -> float:
         """Estimated relative error of T, which follows from `rate_error`."""

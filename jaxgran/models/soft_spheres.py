@@ -1,15 +1,17 @@
 """Soft spheres: every contact resolved in time, in a periodic box."""
 
 import math
+import warnings
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # which imports scipy.spatial at its first use
 from jaxtyping import Array, Bool, Float
 
-from jaxgran._utils.tracing import concrete_array
+from jaxgran._utils.tracing import any_traced, concrete_array
 from jaxgran._utils.validation import POSITIVE, UserFloat, UserInt, checked_float, python_int
 from jaxgran.data.curve import UserParticles
 from jaxgran.models import checks
@@ -19,6 +21,7 @@ from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
 from jaxgran.particles.setup import check_inside
 from jaxgran.particles.soft.dynamics import SoftDynamics
+from jaxgran.scene.contact import elastic_constant
 from jaxgran.scene.elements import Frictional
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import Viscoelastic
@@ -35,6 +38,9 @@ BLOCK_FLIGHT = 0.08
 
 BLOCK_LENGTHS = Grid(ratio=1.2, spare=1.0)
 """Grid of the lengths of blocks, in mean contact durations: each length needs a compilation."""
+
+MAX_STORED_ENERGY = 0.5
+"""Energy of the contacts of a start, over the kinetic energy, without a warning."""
 
 INTEGRATION_ERROR = 0.001
 """Relative error of T by the time steps, with which eps is right to 1e-4."""
@@ -146,10 +152,33 @@ class SoftSpheres(AbstractSpheres):
                         "Give the walls tangential_damping and friction instead, or use "
                         "HardSpheres."
                     )
+        self._ask_about_overlaps(gas)
         if gas.surface and self.start is not None and self.start.angular_velocity is not None:
             raise ValueError(
                 "SoftSpheres draws the angular velocities of a start. Give the start without them, "
                 "start._replace(angular_velocity=None), and rotational_temperature of the surface."
+            )
+
+    def _ask_about_overlaps(self, gas: Gas) -> None:
+        """Warn if contacts of the start store much energy, which becomes thermal motion."""
+        start = self.start
+        if start is None or any_traced(gas, start):
+            return
+        side = np.broadcast_to(np.asarray(start.box_side, float), (gas.dimension,))
+        stored, diameter = 0.0, float(gas.diameter)
+        for x in np.asarray(start.position, float):
+            tree = scipy.spatial.KDTree(x % side, boxsize=None if gas.container else side)
+            distance = tree.sparse_distance_matrix(tree, diameter, output_type="coo_matrix").data
+            stored += np.sum((diameter - distance[distance > 0]) ** 2.5) / 2
+        law = gas.law
+        stored *= 0.4 * float(elastic_constant(law.youngs_modulus, law.poisson_ratio, diameter))
+        kinetic = float(gas.mass) / 2 * float(jnp.sum(start.velocity**2))
+        if stored > MAX_STORED_ENERGY * kinetic:
+            warnings.warn(
+                f"spheres of the start overlap: the energy of their contacts, {stored:.3g} J, "
+                f"becomes thermal motion, which has {kinetic:.3g} J. Move them apart, or leave "
+                "start out for a random one.",
+                stacklevel=4,
             )
 
     def estimated_error(self, error_model: ErrorModel) -> float:

@@ -449,7 +449,7 @@ class Viscoelastic(RestitutionLaw):
     advice: ClassVar[dict[str, str]] = ADVICE
 
     def __check_init__(self):
-        check_bool("clipped", self.clipped)
+        check_bool(clipped=self.clipped)
 
     def alpha(self, *, diameter: ArrayLike, mass: ArrayLike) -> Float[Array, ""]:
         """Elastic constant over effective mass, ``alpha = rho / m_eff`` with ``m_eff = m / 2``.

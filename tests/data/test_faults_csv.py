@@ -276,7 +276,7 @@ def test_drop_tests_are_read_like_curves(tmp_path):
     "call, words",
     [
         (lambda: jaxgran.read_curve(None), "path must be the name of a file, got None"),
-        (lambda: jaxgran.read_gas(None), "header must be a dictionary, as read_curve returns it"),
+        (lambda: jaxgran.read_gas(None), "header must be a dictionary of texts, as read_curve"),
         (lambda: jaxgran.read_priors("eta"), "header must be a dictionary"),
         (lambda: jaxgran.write_curve("a.csv", CURVE, None), "header must be a dictionary"),
         (lambda: jaxgran.write_curve("a.csv", None, {}), "curve must be a jaxgran.CoolingCurve"),
@@ -284,6 +284,8 @@ def test_drop_tests_are_read_like_curves(tmp_path):
             lambda: jaxgran.write_curve("a.csv", CURVE, {"note": "a\n# eta: 9"}),
             "'note': key and value must be one line",
         ),
+        (lambda: jaxgran.write_curve("a.csv", CURVE, {"a: eta": "9"}), "without : and ="),
+        (lambda: jaxgran.write_curve("a.csv", CURVE, {}, overwrite=1), "overwrite must be True"),
         (
             lambda: jaxgran.CoolingCurve(TIMES, np.ma.masked_less(T, 0.01)),
             "masked",
