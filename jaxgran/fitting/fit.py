@@ -177,9 +177,9 @@ def fit(
     """
     several = isinstance(data, dict)
     check_bool(progress=progress, throw=throw)
+    if any_traced(gas, data):
+        gas, data = _without_derivative((gas, data))
     scenes, data = _by_label(gas, data)
-    if any_traced(scenes, data):
-        scenes, data = _without_derivative((scenes, data))
     model = KineticTheory() if model is None else model
     curves = {label: x for label, x in data.items() if isinstance(x, CoolingCurve)}
     counts = _numbers_by_label("num_particles", num_particles, data)

@@ -143,11 +143,13 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
 
 def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> Gas:
     """Return the gas with A as in ``eps = exp(-C1 beta)`` of the median impact, if it was 0."""
-    is_free = isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free
-    if not is_free or any_traced(gas, test) or gas.law.dissipative_constant > 0:
+    law = gas.law
+    if not isinstance(law, Viscoelastic) or "dissipative_constant" not in free:
+        return gas
+    if any_traced(gas, test) or law.dissipative_constant > 0:
         return gas
     speed, eps = np.median(np.asarray(test.speed)), np.median(np.asarray(test.restitution))
-    law = gas.law.of_wall() if test.onto_plate else gas.law
+    law = law.of_wall() if test.onto_plate else law
     alpha = law.alpha(diameter=gas.diameter, mass=gas.mass)
     loss = -np.log(np.clip(eps, 1e-3, 0.999))
     return gas.replace(dissipative_constant=loss / (1.5 * C1 * alpha**0.4 * speed**0.2))

@@ -161,8 +161,8 @@ class SoftSpheres(AbstractSpheres):
 
     def _ask_about_overlaps(self, gas: Gas) -> None:
         """Warn if contacts of the start store much energy, which becomes thermal motion."""
-        start = self.start
-        if start is None or any_traced(gas, start):
+        start, law = self.start, gas.law
+        if start is None or any_traced(gas, start) or not isinstance(law, Viscoelastic):
             return
         side = np.broadcast_to(np.asarray(start.box_side, float), (gas.dimension,))
         stored, diameter = 0.0, float(gas.diameter)
@@ -170,7 +170,6 @@ class SoftSpheres(AbstractSpheres):
             tree = scipy.spatial.KDTree(x % side, boxsize=None if gas.container else side)
             distance = tree.sparse_distance_matrix(tree, diameter, output_type="coo_matrix").data
             stored += np.sum((diameter - distance[distance > 0]) ** 2.5) / 2
-        law = gas.law
         stored *= 0.4 * float(elastic_constant(law.youngs_modulus, law.poisson_ratio, diameter))
         kinetic = float(gas.mass) / 2 * float(jnp.sum(start.velocity**2))
         if stored > MAX_STORED_ENERGY * kinetic:
