@@ -1,16 +1,46 @@
-"""The gas of most tests."""
+"""The gases of most tests, and their particles."""
+
+import jax.numpy as jnp
+import numpy as np
 
 import jaxgran
+
+SI = {"diameter": 2e-3, "mass": 1e-5, "temperature": 0.01}
 
 
 def glass_beads(beta: float = 0.15, dimension: int = 3, **values) -> jaxgran.Gas:
     """A gas of 2 mm beads whose impacts at the thermal speed have a given beta."""
-    gas = jaxgran.Gas(
-        jaxgran.Viscoelastic(5e7, 0.22, 1e-6),
-        diameter=0.002,
-        mass=jaxgran.sphere_mass(0.002, 2500.0),
-        packing_fraction=0.05,
-        temperature=0.01,
-        dimension=dimension,
-    )
+    law = jaxgran.Viscoelastic(5e7, 0.22, 1e-6)
+    scene = SI | {"mass": jaxgran.sphere_mass(0.002, 2500.0)}
+    gas = jaxgran.Gas(law, packing_fraction=0.05, dimension=dimension, **scene)
     return gas.replace(dissipative_constant=1e-6 * beta / gas.thermal_beta).replace(**values)
+
+
+def soft_beads(fraction=0.02, beta=0.15, dimension=3, **values) -> jaxgran.Gas:
+    """Glass beads whose contacts last a given part of the mean free time."""
+    gas = glass_beads(beta, dimension, **values)
+    stiffer = (float(gas.contact_fraction) / fraction) ** 2.5
+    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
+    scale = beta / gas.thermal_beta if beta else 0.0
+    return gas.replace(dissipative_constant=gas.value("dissipative_constant") * scale)
+
+
+def hard_gas(law=0.9, packing_fraction=0.05, dimension=3, **values) -> jaxgran.Gas:
+    """A gas of diameter, mass and temperature 1: SI and reduced units are the same."""
+    if not isinstance(law, jaxgran.RestitutionLaw):
+        law = jaxgran.ConstantRestitution(law)
+    values = {"diameter": 1.0, "mass": 1.0, "temperature": 1.0} | values
+    return jaxgran.Gas(law, packing_fraction=packing_fraction, dimension=dimension, **values)
+
+
+def lattice(gas, n, replicas=1) -> jaxgran.Particles:
+    """Spheres near the sites of a cubic lattice, at T: a start that needs no equilibration."""
+    rng, d, side = np.random.default_rng(0), gas.dimension, float(gas.box_side(n))
+    sites = int(np.ceil(n ** (1 / d)))
+    grid = np.stack(np.meshgrid(*[np.arange(sites)] * d), -1).reshape(-1, d)[:n]
+    room = 0.45 * (side / sites - float(gas.diameter))
+    position = side / sites * (grid + 0.5) + room * rng.uniform(-1, 1, (replicas, n, d))
+    velocity = rng.normal(size=(replicas, n, d))
+    velocity -= velocity.mean(axis=1, keepdims=True)
+    velocity *= np.sqrt(gas.temperature / np.mean(velocity**2, axis=(1, 2), keepdims=True))
+    return jaxgran.Particles(jnp.asarray(position), jnp.asarray(velocity), gas.box_side(n))

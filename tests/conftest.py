@@ -61,8 +61,8 @@ def pytest_configure(config):
         os.environ["MPLBACKEND"] = "agg"  # no window
         os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxgran-tests-")
         config.add_cleanup(partial(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True))
-        if config.option.markexpr in ("not slow", "slow"):
-            # Tests mostly compile. Those marked `optimised` run what users run, too.
+        if config.option.markexpr == "not slow":
+            # These tests mostly compile. The slow ones run the programs of users.
             os.environ["XLA_FLAGS"] = f"{FAST_BUILD} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 

@@ -1,5 +1,6 @@
 """The command line, run in this process."""
 
+import argparse
 import json
 import os
 import signal
@@ -13,7 +14,13 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.cli.common import MODELS, NO_CACHE_VARIABLE, models_by_name, use_compilation_cache
+from jaxgran.cli.common import (
+    MODELS,
+    NO_CACHE_VARIABLE,
+    choose_or_make_model,
+    models_by_name,
+    use_compilation_cache,
+)
 from jaxgran.cli.main import main
 from jaxgran.models.choose import default_models
 
@@ -249,12 +256,25 @@ def test_a_single_curve_begins_with_the_range(measured, capsys):
         ),
         (["thin.csv", "--set", "beta_t=guess"], "asks for a fit of beta_t: add --free A beta_t"),
         (["thin.csv", "--set", "T0=2 kg"], "--set: header line T0: 'kg' is not known"),
+        (["thin.csv", "--set", "Y=-1"], "youngs_modulus must lie in"),
+        (["thin.csv", "--set", "youngs=1"], "give KEY=VALUE with KEY one of"),
+        (["thin.csv", "--set", "N=many"], "header line N"),
+        (["thin.csv", "--set", "N=1e30"], "header line N"),
+        (["thin.csv", "--key", str(10**30)], "too large"),
+        (["thin.csv", "--set", "Y=0.05"], "in Pa"),
+        (["thin.csv", "--free", "T0"], "leaves A fixed"),
+        (
+            ["thin.csv", "--model", "hard-spheres", "--particles", "0"],
+            "num_particles must be a whole",
+        ),
+        (["thin.csv", "--out", "scene.toml"], "is not a writable folder"),
     ],
 )
 def test_incompatible_measurements_are_refused(measured, capsys, arguments, words):
     assert main(["fit", *arguments]) == 2
     out, err = capsys.readouterr()
     assert err.startswith("error: ") and words in err and len(err.splitlines()) == 1
+    assert not (measured / "results").exists()
 
 
 def test_an_interrupt_while_jax_is_imported_ends_the_command_quietly():
@@ -283,6 +303,25 @@ def test_interrupts_and_closed_pipes_end_quietly(scene, monkeypatch, capfd, faul
 def test_every_command_has_help(capsys, command):
     assert main([*command, "--help"]) == 0
     assert "Usage: jaxgran" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "name, model",
+    [
+        ("kinetic-theory", jaxgran.KineticTheory()),
+        ("dsmc", jaxgran.DSMC(100, replicas=3)),
+        ("hard-spheres", jaxgran.HardSpheres(100, replicas=3)),
+        ("soft-spheres", jaxgran.SoftSpheres(100, replicas=3)),
+    ],
+)
+def test_models_are_found_by_their_names(name, model):
+    assert name in MODELS
+    options = argparse.Namespace(model=name, particles=100, replicas=3, curve="curve.csv")
+    assert choose_or_make_model(options, None, None, (), None) == (model, ())
+    options.particles = None
+    if model.stochastic:
+        with pytest.raises(ValueError, match="curve.csv does not give N. Add --particles"):
+            choose_or_make_model(options, None, None, (), None)
 
 
 def test_model_names_are_complete():

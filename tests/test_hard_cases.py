@@ -16,6 +16,7 @@ import jaxgran
 from experiments.support.closed_forms import haff
 from experiments.support.scenes import beads
 from jaxgran import DSMC, HardSpheres, SoftSpheres
+from tests.beads import hard_gas
 
 FREE = "dissipative_constant"
 THEORY = jaxgran.KineticTheory(softness=False, order=2, correlations=False)
@@ -42,19 +43,6 @@ def cool(gas, times, model):
 
 def log_ratio(gas, times):
     return np.log(np.asarray(cool(gas, times, THEORY).temperature / gas.temperature))
-
-
-def unit_gas(restitution, packing_fraction, dimension=3):
-    """Return a gas of diameter, mass and temperature 1."""
-    law = jaxgran.ConstantRestitution(restitution)
-    return jaxgran.Gas(
-        law,
-        diameter=1.0,
-        mass=1.0,
-        packing_fraction=packing_fraction,
-        temperature=1.0,
-        dimension=dimension,
-    )
 
 
 def spheres(position, velocity, side):
@@ -91,7 +79,7 @@ def speeds():
 
 def angles():
     """head-on, oblique, grazing; touching; across a corner"""
-    gas = unit_gas(0.7, 2 * np.pi / 6 / 10.0**3)
+    gas = hard_gas(0.7, 2 * np.pi / 6 / 10.0**3)
     # In float32 the position of an impact has an error of 1e-6 in a box of ten diameters.
     allowed = either(1e-12, 1e-5)
     for offset in either((0.0, 0.6, 0.999, 1 - 1e-9), (0.0, 0.6, 0.999)):
@@ -108,7 +96,7 @@ def angles():
 
 def own_image():
     """own image in the smallest box"""
-    gas = unit_gas(1.0, 2 * np.pi / 6 / (2.1 * (1 + 1e-5)) ** 3)
+    gas = hard_gas(1.0, 2 * np.pi / 6 / (2.1 * (1 + 1e-5)) ** 3)
     v = np.array([[1.0, 0.7, -0.4], [-1.0, -0.7, 0.4]])
     start = spheres([[0.1, 0.2, 0.3], [1.2, 1.1, 1.3]], v, gas.box_side(2))
     curve = cool(gas, [20.0], HardSpheres(2, start=start))
@@ -124,7 +112,7 @@ def order_flips():
         if v[i] > v[i + 1]:
             v[i : i + 2] += 0.5 * (1 + e) * (v[i] - v[i + 1]) * np.array([-1, 1])
         i = 1 - i
-    gas = unit_gas(e, 3 * np.pi / 6 / 10.0**3)
+    gas = hard_gas(e, 3 * np.pi / 6 / 10.0**3)
     for shift in either((1e-13, -1e-13, 0.0), (3e-6, -3e-6, 0.0)):
         x = [[3.0, 5, 5], [5.0, 5, 5], [7.0 + shift, 5, 5]]
         start = spheres(x, [[1.0, 0, 0], [0.0, 0, 0], [-1.0, 0, 0]], 10.0)
@@ -178,7 +166,7 @@ def weak_dissipation():
 def thin_and_dense():
     """phi from 1e-4 to .6, and eps = 0"""
     for d, phi, e, allowed in ((3, 1e-4, 0.9, 0.15), (2, 0.6, 0.9, 0.15), (3, 0.05, 0.0, 0.4)):
-        gas = unit_gas(e, phi, d)
+        gas = hard_gas(e, phi, d)
         curve = cool(gas, taus(gas, 5.0), HardSpheres(100))
         balance = d / 2 * curve.temperature[0] + curve.dissipated_energy[0]
         name = f"{d}D, phi = {phi:g}, eps = {e:g}"
@@ -190,7 +178,7 @@ def thin_and_dense():
 
 def deep_cold():
     """T/T_0 down to 1e-12, 1e-6, 1e-4"""
-    gas, tau = unit_gas(0.5, 0.05), 2e3 / 0.125
+    gas, tau = hard_gas(0.5, 0.05), 2e3 / 0.125
     expected = float(haff(tau, 0.5))
     T = float(cool(gas, taus(gas, tau), HardSpheres(50)).temperature[0])
     # Of ln T. The late T goes as the inverse square of the rate, which 50 spheres scatter.
@@ -219,17 +207,6 @@ def si_units():
     yield "KineticTheory, ln T", float(np.max(np.abs(values - values[0]))), either(1e-9, 5e-4)
     # The same random numbers, and so the same collisions until round-off changes one.
     yield "DSMC", worst(runs, runs[0]), either(1e-9, 1e-3)
-
-
-def output_times():
-    """times: one and many"""
-    gas = beads(0.05, 0.15, 0.02)
-    few, many = (
-        cool(gas, taus(gas, *tau), SoftSpheres(50)).temperature[-1]
-        for tau in ([1.0], np.linspace(0.005, 1.0, 200))
-    )
-    # More times change the phases of steps at first touch: 1e-4 per impact.
-    yield "SoftSpheres, 1 and 200", worst(few, many), 3e-2
 
 
 def measured(gas):
@@ -261,23 +238,6 @@ def corrupted_curves():
         yield name, off if said else np.inf, 3.0
 
 
-def one_of_a_batch():
-    """one member of a batch fails"""
-    gas = beads(0.05, 0.15, 0.05)
-    some = gas.value(FREE) * jnp.array([1.0, jnp.nan, 0.5])
-    times = jnp.array(taus(gas, 0.5))
-
-    @jax.jit
-    def run(x):
-        curve = cool(gas.replace(**{FREE: x}), times, DSMC(50))
-        return curve.temperature[0], curve.status
-
-    T, status = jax.vmap(run)(some)
-    right = np.isnan(T[1]) and "outside its range" in jaxgran.explain_status(int(status[1]))
-    right = right and not np.any(status[::2])
-    yield "DSMC, others", worst(T[::2], [run(x)[0] for x in some[::2]]) if right else np.inf, 1e-9
-
-
 BOTH, DOUBLE, SINGLE = ("float64", "float32"), ("float64",), ("float32",)
 CASES = {
     speeds: DOUBLE,
@@ -285,14 +245,12 @@ CASES = {
     own_image: BOTH,
     weak_dissipation: SINGLE,
     si_units: SINGLE,
-    one_of_a_batch: DOUBLE,
 }
 SLOW_CASES = {
     order_flips: BOTH,
     four_bodies: DOUBLE,
     thin_and_dense: DOUBLE,
     deep_cold: DOUBLE,
-    output_times: DOUBLE,
     corrupted_curves: DOUBLE,
 }
 """The precisions of each case; other files test the other one."""

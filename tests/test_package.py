@@ -25,12 +25,6 @@ def test_every_public_name_is_there_and_explained():
         assert getattr(jaxgran, name).__doc__
 
 
-def test_imports_keep_to_the_floors():
-    linter = Path(sys.executable).with_name("lint-imports")
-    done = subprocess.run([linter, "--no-cache"], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
-
-
 def test_no_model_is_known_by_its_class_outside_models():
     names = "KineticTheory|DSMC|HardSpheres|SoftSpheres"
     for file in FILES:

@@ -51,22 +51,6 @@ def test_is_of_the_particles_at_each_time(gas):
     np.testing.assert_allclose(curve.replicas.saved["S"][1][:, -1], own, rtol=1e-10)
 
 
-def test_particles_themselves(gas):
-    t, model = times(gas), HARD
-    curve = jaxgran.cool(gas, t, model=model, save="particles", progress=False)
-    assert curve.saved.position.shape == curve.saved.velocity.shape == (3, 2, 100, 3)
-    assert curve.saved_error is None
-    np.testing.assert_array_equal(curve.saved.position[-1], curve.particles.position)
-    np.testing.assert_array_equal(curve.saved.velocity[-1], curve.particles.velocity)
-    # One of them is a start: the run goes on as it did, up to the chaos of two mean free times.
-    middle = jax.tree.map(lambda x: x[1], curve.saved)
-    cooler = gas.replace(temperature=curve.temperature[1])
-    later = jaxgran.cool(
-        cooler, t[2:] - t[1], model=dataclasses.replace(model, start=middle), progress=False
-    )
-    assert later.temperature[-1] == pytest.approx(float(curve.temperature[-1]), rel=1e-6)
-
-
 @pytest.mark.slow
 def test_spins_of_rough_spheres(gas):
     rough = dataclasses.replace(

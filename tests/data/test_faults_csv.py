@@ -268,8 +268,19 @@ def test_drop_tests_are_read_like_curves(tmp_path):
             np.testing.assert_allclose(getattr(drops, name), getattr(plain, name), rtol=1e-12)
     above = write_drops(path, "v,eps,eps_err\n0.02,1.01,0.02\n0.1,0.92,0.01\n")
     assert np.max(above.restitution) == 1.01  # within its error
-    with pytest.raises(ValueError, match="at most 1 within its error, got 1.2 .- 0.02"):
-        write_drops(path, "v,eps,eps_err\n0.02,1.2,0.02\n")
+    for text, message in (
+        ("v,eps,eps_err\n0.02,1.2,0.02\n", "at most 1 within its error, got 1.2 .- 0.02"),
+        ("v,e\n1,2\n", "line 1: the columns are v, e; name them v,eps,eps_err"),
+        ("v,eps,eps_err\n0.1,0.9\n", "line 2: expected 3 finite numbers .*, got '0.1,0.9'"),
+        ("v,eps,eps_err\n", "no rows of numbers"),
+        ("v,eps,eps_err\n0.1,0.9,0\n", "error must lie in"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_drops(path, text)
+    with pytest.raises(ValueError, match="no such file"):
+        jaxgran.read_drop_test(tmp_path / "missing.csv")
+    with pytest.raises(ValueError, match="lists of equal length"):
+        jaxgran.DropTest([0.1, 0.2], [0.9], [0.01])
 
 
 @pytest.mark.parametrize(

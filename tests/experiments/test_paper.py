@@ -1,17 +1,22 @@
 """The scripts that reproduce the paper, in runs of seconds."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from experiments.paper.paper_claims import check
 from experiments.support.record import figures
 from jaxgran.scene.laws import C1, C2
-from tests.experiments.test_experiments import run
+from tests.experiments.scripts import run
+
+PAPER = Path(__file__).parents[2] / "experiments" / "paper"
 
 
 def run_part(script, part, folder):
-    return run(f"paper/{script}.py", "--only", part, "--smoke", "--out", "here", cwd=folder)
+    """Run a small part of a script; return what it records."""
+    run(PAPER / f"{script}.py", "--only", part, "--smoke", "--out", "here", folder=folder)
+    return json.loads((folder / "here" / f"{part}.json").read_text())
 
 
 def test_claims_keep_what_is_found_over_what_is_printed():
@@ -22,11 +27,9 @@ def test_claims_keep_what_is_found_over_what_is_printed():
 
 @pytest.mark.slow
 def test_clustering_leaves_haffs_law(tmp_path):
-    done = run_part("paper_clustering", "paper_clustering", tmp_path)
-    assert done.returncode == 0, done.stderr
+    record = run_part("paper_clustering", "paper_clustering", tmp_path)
     for name in ("paper_clustering.png", "paper_clustering_fields.png"):
         assert (tmp_path / "here" / name).stat().st_size > 20_000
-    record = json.loads((tmp_path / "here" / "paper_clustering.json").read_text())
     (scene,) = record["scenes"].values()
     assert scene["viscoelastic"]["gamma_0"] == pytest.approx(scene["constant"]["gamma_0"])
     # At e = .6 even 500 disks depart from Haff's law: by 10 % in T after 4.3 +- 0.9 collisions.
@@ -98,18 +101,15 @@ def test_recorded_figures_reproduce_the_paper(name):
     [("paper_cooling", "paper_restitution"), ("paper_diffusion", "paper_velocity_correlation")],
 )
 def test_scripts_run(script, name, tmp_path):
-    done = run_part(script, name, tmp_path)
-    assert done.returncode == 0, done.stderr
+    record = run_part(script, name, tmp_path)
     assert (tmp_path / "here" / f"{name}.png").stat().st_size > 20_000
-    record = json.loads((tmp_path / "here" / f"{name}.json").read_text())
     assert record["config"] and record["made_by"]["packages"] and record["run_s"] > 0
     PARTS[name](record["found"])
 
 
 @pytest.mark.slow
 def test_claims_that_need_no_particles_hold(tmp_path):
-    done = run("paper/paper_claims.py", "--out", "here", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    run(PAPER / "paper_claims.py", "--out", "here", folder=tmp_path)
     rows = json.loads((tmp_path / "here" / "paper_claims.json").read_text())["rows"]
     verdicts = {row["name"]: row["verdict"] for row in rows}
     assert verdicts["39"] == "agree" and verdicts["41"] == "corrected"
@@ -118,10 +118,9 @@ def test_claims_that_need_no_particles_hold(tmp_path):
 
 @pytest.mark.slow
 def test_a_film_is_made_of_a_trajectory(tmp_path):
-    done = run_part("paper_clustering", "clustering_film", tmp_path)
-    assert done.returncode == 0, done.stderr
+    run_part("paper_clustering", "clustering_film", tmp_path)
     for name in ("film.gif", "clustering_film.png", "run.gsd"):
         assert (tmp_path / "here" / name).stat().st_size > 5_000
     again = ("--trajectory", "here/run.gsd", "--out", "there")
-    done = run("paper/paper_clustering.py", *again, cwd=tmp_path)
-    assert "film.gif, 4 frames" in done.stdout, done.stderr
+    printed = run(PAPER / "paper_clustering.py", *again, folder=tmp_path)
+    assert "film.gif, 4 frames" in printed

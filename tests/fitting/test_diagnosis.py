@@ -59,57 +59,43 @@ def test_every_model_has_limitations_in_a_dense_scene():
     assert hard == dsmc[:2] and soft == ()
 
 
-class Stub(jaxgran.KineticTheory):
-    """Kinetic theory with given limitations."""
-
-    given: tuple[Limitation, ...] = ()
-
-    def limitations(self, gas, num_particles=None):
-        return self.given
-
-
 EDGE = Limitation("the gas is dense", False, "Take positions.")
 DECISIVE = Limitation("contacts last", True, "Take contacts.")
 GOOD, BAD = 0.5, 0.001
-NOT_EXPLAINED = "Stub is not consistent with this curve: do not trust the estimates."
+CONSISTENT = " is consistent with this curve"
+NOT_EXPLAINED = " is not consistent with this curve: do not trust the estimates."
+UNTRUSTED = " cannot be trusted in this scene, though the curve fits."
 
 
 @pytest.mark.parametrize(
     "limitations, p_value, grade, verdict",
     [
+        # The clock is known to .5 %: no alternative changes A by more than its error.
         (
             (),
             GOOD,
             "determined",
-            # The clock is known to .5 %: no alternative changes A by more than its error.
-            r"Stub is consistent with this curve, which determines A: A is between \S+ and \S+ s\.",
+            rf"{CONSISTENT}, which determines A: A is between \S+ and \S+ s\.",
         ),
         (
             (EDGE,),
             GOOD,
             "determined",
-            "Stub is consistent with .* The scene is at the edge of the model's validity.",
+            f"{CONSISTENT}.* The scene is at the edge of the model's validity.",
         ),
-        (
-            (DECISIVE, EDGE),
-            GOOD,
-            "not consistent",
-            "Stub cannot be trusted in this scene, though the curve fits. Take contacts.",
-        ),
+        ((DECISIVE, EDGE), GOOD, "not consistent", f"{UNTRUSTED} Take contacts."),
         ((), BAD, "not consistent", NOT_EXPLAINED),
         ((EDGE,), BAD, "not consistent", f"{NOT_EXPLAINED} Take positions."),
         ((DECISIVE, EDGE), BAD, "not consistent", f"{NOT_EXPLAINED} Take contacts."),
     ],
 )
-def test_verdicts(result, limitations, p_value, grade, verdict):
+def test_verdicts(result, monkeypatch, limitations, p_value, grade, verdict):
     fitted, curve = result
-    fitted = dataclasses.replace(
-        fitted,
-        model=Stub(given=limitations),
-        goodness=fitted.goodness._replace(p_value=jnp.asarray(p_value)),
-    )
-    diagnosis = jaxgran.diagnose(fitted, curve)
-    assert diagnosis.grade == grade and re.fullmatch(verdict, diagnosis.verdict)
+    monkeypatch.setattr(jaxgran.KineticTheory, "limitations", lambda *_, **__: limitations)
+    goodness = fitted.goodness._replace(p_value=jnp.asarray(p_value))
+    diagnosis = jaxgran.diagnose(dataclasses.replace(fitted, goodness=goodness), curve)
+    assert diagnosis.grade == grade
+    assert re.fullmatch("Kinetic theory" + verdict, diagnosis.verdict)
     assert {limitation.words for limitation in limitations} <= set(diagnosis.reasons)
 
 

@@ -9,7 +9,7 @@ import pytest
 import jaxgran
 from jaxgran.fitting.parameters import guess_from_data
 from jaxgran.fitting.residuals import unused_rotation, with_errors_of_particles
-from tests.beads import glass_beads
+from tests.beads import glass_beads, hard_gas
 from tests.fitting.curves import measured, synthetic
 
 
@@ -113,7 +113,7 @@ def test_displacement_adds_information():
 @pytest.mark.slow
 def test_series_coefficients_are_fitted_together():
     law = jaxgran.RestitutionSeries([-0.2], [0.2])
-    gas = jaxgran.Gas(law, diameter=1.0, mass=1.0, packing_fraction=0.05, temperature=1.0)
+    gas = hard_gas(law)
     start = gas.replace(coefficients=[-0.1])
     curve = synthetic(gas, jax.random.key(8))
     result = jaxgran.fit(gas, curve, free=("coefficients",), start=start)

@@ -112,25 +112,3 @@ def test_a_curve_without_errors_has_no_weight():
         jaxgran.fit(gas, {"a": drop_test(gas), "b": bare})
     with pytest.raises(ValueError, match="measurement 'b' must be a jaxgran.CoolingCurve or a"):
         jaxgran.fit(gas, {"a": drop_test(gas), "b": 3})
-
-
-def test_drop_tests_are_read(tmp_path):
-    path = tmp_path / "drops.csv"
-    path.write_text("# glass on glass\nv,eps,eps_err\n0.1,0.9,0.01\n0.2,0.88,0.01\n")
-    drops = jaxgran.read_drop_test(path, onto_plate=True)
-    np.testing.assert_array_equal(drops.speed, [0.1, 0.2])
-    assert drops.onto_plate
-    for text, message in (
-        ("v,e\n1,2\n", "line 1: the columns are v, e; name them v,eps,eps_err"),
-        ("v,eps,eps_err\n0.1,0.9\n", "line 2: expected 3 finite numbers .*, got '0.1,0.9'"),
-        ("v,eps,eps_err\n", "no rows of numbers"),
-        ("v,eps,eps_err\n0.1,1.9,0.01\n", "must be at most 1 within its error, got 1.9"),
-        ("v,eps,eps_err\n0.1,0.9,0\n", "error must lie in"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=message):
-            jaxgran.read_drop_test(path)
-    with pytest.raises(ValueError, match="no such file"):
-        jaxgran.read_drop_test(tmp_path / "missing.csv")
-    with pytest.raises(ValueError, match="lists of equal length"):
-        jaxgran.DropTest([0.1, 0.2], [0.9], [0.01])

@@ -9,6 +9,7 @@ import optimistix as optx
 import pytest
 
 import jaxgran
+from tests.beads import soft_beads
 
 
 def with_rotation(gas, model, error=0.02, end=30.0):
@@ -62,13 +63,8 @@ def test_fit_through_particles_refuses_what_it_cannot_do(beads):
 
 
 @pytest.mark.slow
-def test_fit_through_soft_spheres_finds_what_made_the_curve(beads):
-    gas = beads(0.3, packing_fraction=0.2)
-    stiff = (float(gas.contact_fraction) / 0.1) ** 2.5
-    gas = gas.replace(youngs_modulus=stiff * gas.value("youngs_modulus"))
-    gas = gas.replace(
-        dissipative_constant=gas.value("dissipative_constant") * 0.3 / gas.thermal_beta
-    )
+def test_fit_through_soft_spheres_finds_what_made_the_curve():
+    gas = soft_beads(0.1, 0.3, packing_fraction=0.2)
     times = jnp.geomspace(0.3, 6.0, 12) * gas.mean_free_time
     model = jaxgran.SoftSpheres(200, replicas=3, steps_per_contact=20)
     curve = jaxgran.cool(gas, times, model=model, key=jax.random.key(7), progress=False)

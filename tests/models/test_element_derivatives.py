@@ -53,21 +53,26 @@ not those of a mixed gas."""
 @pytest.mark.parametrize("kind", ["DSMC", "HardSpheres"])
 def test_derivatives_are_those_of_theory(kind):
     gas = scene(*ALL)
-    model = {"DSMC": jaxgran.DSMC(10_000), "HardSpheres": jaxgran.HardSpheres(N, replicas=8)}[kind]
+    model = {"DSMC": jaxgran.DSMC(4000), "HardSpheres": jaxgran.HardSpheres(N, replicas=8)}[kind]
     times = jnp.array([3.0, 10.0]) * gas.mean_free_time
 
     def logarithms(values, model):
         changed = gas.replace(**dict(zip(FLOATS, values, strict=True)))
         curve = jaxgran.cool(changed, times, model=model)
-        return jnp.log(jnp.stack([curve.temperature, curve.rotational_temperature]))
+        logs = jnp.log(jnp.stack([curve.temperature, curve.rotational_temperature]))
+        return logs, logs
 
     at = jnp.stack([gas.value(name) for name in FLOATS])
-    each = [jax.jacfwd(logarithms)(at, m) for m in (model, jaxgran.KineticTheory())]
-    found, theory = (np.moveaxis(np.asarray(x), -1, 0) for x in each)
+    each = [jax.jacfwd(logarithms, has_aux=True)(at, m) for m in (model, jaxgran.KineticTheory())]
+    found, theory = (np.moveaxis(np.asarray(x), -1, 0) for x, _ in each)
+    off = np.asarray(each[0][1] - each[1][1])
+    # 3 standard errors of 4000 spheres and, of T, the layer before walls (error_model.WALL_ERROR),
+    # which DSMC lacks as theory does; of T_rot theory's own 7 %.
+    layer = 0.04 if kind == "HardSpheres" else 0.02
+    assert np.all(np.abs(off) < np.array([[0.04 + layer], [0.04 + 0.07]])), off
     for k, (name, more) in enumerate(FLOATS.items()):
         # Theory itself is wrong by 5 % of T_rot/T, and by 2 % of the rate between walls; some 10^4
         # collisions scatter by 2 %, of the largest derivative.
-        print(f"\n{kind} {name}: {found[k].ravel()}, theory {theory[k].ravel()}")
         allowed = 0.12 + (more if kind == "HardSpheres" else 0.0)
         largest = np.max(np.abs(theory[k]), axis=1)[:, None]
         assert np.all(np.abs(found[k] - theory[k]) < allowed * largest + 0.01), name

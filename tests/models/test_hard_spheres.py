@@ -10,17 +10,10 @@ import pytest
 import jaxgran
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.particles.capacity import Capacity
+from tests.beads import hard_gas, lattice
 from tests.pairs import find_pairs
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
-
-
-def hard_gas(law=1.0, packing_fraction=0.1, dimension=3, **values) -> jaxgran.Gas:
-    """A gas of diameter, mass and temperature 1: SI and reduced units are the same."""
-    if not isinstance(law, jaxgran.RestitutionLaw):
-        law = jaxgran.ConstantRestitution(law)
-    values = {"diameter": 1.0, "mass": 1.0, "temperature": 1.0, **values}
-    return jaxgran.Gas(law, packing_fraction=packing_fraction, dimension=dimension, **values)
 
 
 def serial(gas, start, end):
@@ -71,7 +64,7 @@ def serial(gas, start, end):
 def test_impacts_are_those_of_a_serial_code(dimension, packing_fraction, law):
     gas = hard_gas(law, packing_fraction, dimension)
     tau, n = float(gas.mean_free_time), 40
-    start = jaxgran.cool(gas, [0.1 * tau], model=HardSpheres(n)).particles
+    start = lattice(gas, n)
     num_impacts = 0
     for _ in range(4):
         curve = jaxgran.cool(gas, [3 * tau], model=HardSpheres(n, contact_time=0.0, start=start))
@@ -100,25 +93,20 @@ def closest(particles) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "dimension, packing_fraction, eps",
-    [(2, 0.6, 0.7), (3, 0.45, 1.0)],
-)
-def test_spheres_stay_apart_and_the_ledger_closes(dimension, packing_fraction, eps):
-    gas = hard_gas(eps, packing_fraction, dimension)
+def test_disks_stay_apart_and_the_ledger_closes():
+    gas = hard_gas(0.7, 0.6, 2)
     start = None
     for _ in range(2):
         times = np.array([1.0, 5.0]) * float(gas.mean_free_time)
         curve = jaxgran.cool(gas, times, model=HardSpheres(100, replicas=2, start=start))
         assert closest(curve.particles) > 1 - 1e-9
         before = 1.0 if start is None else np.mean(np.asarray(start.velocity) ** 2)
-        total = dimension / 2 * curve.temperature + curve.dissipated_energy
+        total = curve.temperature + curve.dissipated_energy
         # Some hundred impacts, each with a round-off of 1e-16 of the energy.
-        np.testing.assert_allclose(total, dimension / 2 * before, rtol=1e-12)
+        np.testing.assert_allclose(total, before, rtol=1e-12)
         momentum = np.mean(curve.particles.velocity, axis=1)
         np.testing.assert_allclose(momentum, 0.0, atol=1e-13)
         start = curve.particles
-    assert curve.temperature[-1] == pytest.approx(before, rel=1e-12) or eps < 1
 
 
 @pytest.mark.slow
@@ -176,7 +164,7 @@ def test_a_dense_dissipative_cluster_does_not_stall():
 
 def test_a_fast_sphere_outruns_no_list():
     gas = hard_gas(0.8, 0.3)
-    still = jaxgran.cool(gas, [0.0], model=HardSpheres(40)).particles
+    still = lattice(gas, 40)
     velocity = (1e-3 * still.velocity).at[0, 0, 0].set(10.0)
     start = still._replace(velocity=velocity)
     curve = jaxgran.cool(gas, [0.5], model=HardSpheres(40, start=start, contact_time=0.0))
@@ -192,7 +180,7 @@ def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     model = HardSpheres(100)
     reference = jaxgran.cool(gas, times, model=model)
     plan = model.sized_for(gas).plan
-    tiny = plan._replace(capacity=Capacity(*(rows // 5 for rows in plan.capacity)))
+    tiny = plan._replace(capacity=Capacity(*(rows // 3 for rows in plan.capacity)))
     small = jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
     # In another order sums are rounded differently, and that grows in the ten impacts of the
     # equilibration; rows are only added at the end, so the order is the same.
@@ -206,23 +194,23 @@ def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
 def test_a_random_start_melts_under_jit():
     """Many spheres begin near contact there; the capacity of a run would not do."""
     gas = hard_gas(0.8, 0.6, 2)
-    model = HardSpheres(500).sized_for(gas)
+    model = HardSpheres(200).sized_for(gas)
     times = [float(gas.mean_free_time)]
 
     def cooled(key):
-        return jaxgran.cool(gas, times, model=HardSpheres(500, plan=model.plan), key=key)
+        return jaxgran.cool(gas, times, model=HardSpheres(200, plan=model.plan), key=key)
 
     curve = jax.jit(cooled)(jax.random.key(1))
     assert curve.status == 0
     theory = jaxgran.cool(gas, times)
-    # T has fallen by 11 to 16 %; that of one box scatters by 1.2 %.
+    # T has fallen by 11 to 16 %; that of one box scatters by 2 %.
     np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.05)
 
 
 @pytest.mark.slow
 def test_jit_flags_the_start_of_another_gas():
     gas = hard_gas(0.8, 0.1)
-    start = jaxgran.cool(gas, [0.0], model=HardSpheres(100)).particles
+    start = lattice(gas, 100)
     model, end = HardSpheres(100, start=start).sized_for(gas, spare=3.0), float(gas.mean_free_time)
 
     def cooled(packing_fraction, model=model, **options):
@@ -243,17 +231,16 @@ def test_jit_flags_what_it_cannot_grow():
     gas = hard_gas(0.8, 0.1)
     plan = HardSpheres(100).sized_for(gas).plan
     tenth = Capacity(*(max(rows // 10, 1) for rows in plan.capacity))
-    model = HardSpheres(100, plan=plan._replace(capacity=tenth))
-    curve = jax.jit(lambda t: jaxgran.cool(gas, t, model=model))(jnp.array([1.0]))
-    assert np.isnan(curve.temperature[0])
-    assert "neighbour list is full" in jaxgran.explain_status(curve.status)
+    # A list that is cut short is no list, though no window needs it at t = 0.
+    start = lattice(gas, 100)
+    model = HardSpheres(100, plan=plan._replace(capacity=tenth), start=start)
+    cooled = jax.jit(lambda t: jaxgran.cool(gas, t, model=model))
+    for end in (0.0, 1.0):
+        curve = cooled(jnp.array([end]))
+        assert np.isnan(curve.temperature[0]) == (end > 0)
+        assert "neighbour list is full" in jaxgran.explain_status(curve.status)
     with pytest.raises(ValueError, match="sized_for"):
         jax.jit(lambda gas: jaxgran.cool(gas, [1.0], model=HardSpheres(100)).temperature)(gas)
-    # A list that is cut short is no list, though no window needs it.
-    start = jaxgran.cool(gas, [0.0], model=HardSpheres(100)).particles
-    given = dataclasses.replace(model, start=start)
-    curve = jax.jit(lambda t: jaxgran.cool(gas, t, model=given))(jnp.array([0.0]))
-    assert "neighbour list is full" in jaxgran.explain_status(curve.status)
 
 
 def test_refuses_what_it_cannot_do():
@@ -295,7 +282,7 @@ def test_refuses_what_it_cannot_do():
 def test_lammps_curve():
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     gas = jaxgran.read_gas(header).replace(dissipative_constant=float(header["A"]))
-    ours = jaxgran.cool(gas, curve.times, model=HardSpheres(4000, replicas=4))
+    ours = jaxgran.cool(gas, curve.times, model=HardSpheres(1000, replicas=4))
     # LAMMPS resolves contacts, whose softness slows the cooling by 0.5 %.
     soft, hard = (
         jaxgran.cool(gas, curve.times, model=jaxgran.KineticTheory(softness=yes)).temperature

@@ -13,6 +13,7 @@ from jaxgran.theory.equations import (
     crowding_coefficient,
     softness_coefficient,
 )
+from tests.beads import hard_gas
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
 # equations, clipped restitution, Gaussian start, no softness correction.
@@ -110,13 +111,7 @@ def test_ballistic_start_and_diffusive_end(beads):
 def test_constant_restitution_diffusion():
     # Quasi-steady D nu / T = (d/2) 4/(1+e)^2 of the Maxwellian gas.
     e = 0.8
-    gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(e),
-        diameter=1.0,
-        mass=1.0,
-        packing_fraction=0.1,
-        temperature=1.0,
-    )
+    gas = hard_gas(e, 0.1)
     times = jnp.array([3e3]) * gas.mean_free_time
     curve = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(sonine=False, correlations=False))
     frequency = gas.collision_frequency * jnp.sqrt(curve.temperature / gas.temperature)
@@ -167,7 +162,7 @@ def test_times_of_every_kind(beads):
 
 def test_a_law_that_heats_is_refused():
     hot = jaxgran.RestitutionSeries([0.1], [0.2])
-    gas = jaxgran.Gas(hot, diameter=1.0, mass=1.0, packing_fraction=0.1, temperature=1.0)
+    gas = hard_gas(hot)
     with pytest.raises(ValueError, match="makes this gas heat up"):
         jaxgran.cool(gas, [1.0])
 

@@ -11,16 +11,15 @@ import pytest
 import jaxgran
 from experiments.fit.own_model import HaffLaw
 from experiments.support.closed_forms import haff
+from tests.beads import SI, hard_gas
 
 MEMBERS = sorted(
     jaxgran.AbstractModel.__abstractmethods__ | jaxgran.AbstractModel.__abstractclassvars__
 )
 
 
-def gas_of(coefficient=0.9, **values):
-    law = jaxgran.ConstantRestitution(coefficient)
-    scene = {"diameter": 0.002, "mass": 1e-5, "packing_fraction": 0.02, "temperature": 0.01}
-    return jaxgran.Gas(law, **scene | values)
+def gas_of(coefficient=0.9):
+    return hard_gas(coefficient, 0.02, **SI)
 
 
 def times_of(gas, num=40):

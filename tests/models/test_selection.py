@@ -7,27 +7,8 @@ import pytest
 
 import jaxgran
 from jaxgran.models.soft_spheres import INTEGRATION_ERROR
+from tests.beads import hard_gas, soft_beads
 from tests.fitting.curves import measured
-
-
-def stiff(gas, contact_fraction, beta=0.15):
-    """Return the gas with contacts of another duration."""
-    stiffer = (float(gas.contact_fraction) / contact_fraction) ** 2.5
-    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
-    return gas.replace(
-        dissipative_constant=gas.value("dissipative_constant") * beta / gas.thermal_beta
-    )
-
-
-def hard_gas(coefficient, packing_fraction=0.05, **values):
-    return jaxgran.Gas(
-        jaxgran.ConstantRestitution(coefficient),
-        diameter=1.0,
-        mass=1.0,
-        packing_fraction=packing_fraction,
-        temperature=1.0,
-        **values,
-    )
 
 
 def errors(*request, **options):
@@ -79,9 +60,9 @@ MEASURED = {
 
 
 @pytest.mark.parametrize("scene", MEASURED)
-def test_estimates_bound_what_was_measured(beads, scene):
+def test_estimates_bound_what_was_measured(scene):
     phi, contact, dimension, n, beta, duration, deviation, error = MEASURED[scene]
-    gas = stiff(beads(0.15, dimension, packing_fraction=phi), contact, beta)
+    gas = soft_beads(contact, beta, dimension, packing_fraction=phi)
     estimate = errors(gas, over(gas, duration), num_particles=n)["kinetic theory"]
     # Estimates are sums of magnitudes of what is known to within some ten per cent: they must not
     # be too low by more than a fifth, nor too high by more than a factor of two and a half.
@@ -104,8 +85,8 @@ SCATTER = [
 
 
 @pytest.mark.parametrize("phi, beta, n, duration, scatter", SCATTER)
-def test_noise_is_that_of_runs(beads, phi, beta, n, duration, scatter):
-    gas = stiff(beads(0.15, packing_fraction=phi), 1e-4, beta)
+def test_noise_is_that_of_runs(phi, beta, n, duration, scatter):
+    gas = soft_beads(1e-4, beta, packing_fraction=phi)
     times = [duration * float(gas.mean_free_time)]
 
     def noise(replicas):
@@ -146,13 +127,13 @@ def test_each_model_has_its_scene(beads):
         "Soft spheres: SoftSpheres does not support `surface=Rough`"
     )
 
-    clustering = stiff(beads(0.15, packing_fraction=0.2), 1e-3, 0.6)
+    clustering = soft_beads(1e-3, 0.6, packing_fraction=0.2)
     request = clustering, over(clustering, 40)
     choice = jaxgran.choose_model(*request, num_particles=4000)
     assert isinstance(choice.model, jaxgran.HardSpheres)
     assert "L_c" in " ".join(choice.reasons)
 
-    soft = stiff(clustering, 0.2, 0.6)
+    soft = soft_beads(0.2, 0.6, packing_fraction=0.2)
     choice = jaxgran.choose_model(soft, over(soft, 40), num_particles=4000)
     assert isinstance(choice.model, jaxgran.SoftSpheres)
 

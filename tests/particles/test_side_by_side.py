@@ -37,17 +37,26 @@ def cool(gas, name, replicas, **options):
     return jaxgran.cool(gas, TIMES, model=model, progress=False, **options)
 
 
-def test_a_replica_is_the_same_whatever_their_number(beads, two_devices):
+def fastest(particles):
+    return jnp.sort(jnp.sum(particles.velocity**2, axis=1))[-2:]
+
+
+def test_a_replica_is_the_same_whatever_their_number(beads, two_devices, tmp_path):
     gas, key, name = beads(packing_fraction=0.1), jax.random.key(4), "HardSpheres"
-    two, three = cool(gas, name, 2, key=key), cool(gas, name, 3, key=key)
-    for field in ("temperature", "collisions", "displacement"):
+    files = {"save": fastest, "trajectory": tmp_path / "run.xyz"}
+    two = cool(gas, name, 2, key=key, **files)
+    three = cool(gas, name, 3, key=key, save=fastest)
+    for field in ("temperature", "collisions", "displacement", "saved"):
         each = [np.asarray(getattr(curve.replicas, field)) for curve in (two, three)]
         np.testing.assert_array_equal(each[0], each[1][:2])
-    alone = cool(gas, name, 1, key=jax.random.fold_in(key, 1))
+    alone = cool(gas, name, 1, key=jax.random.fold_in(key, 1), save=fastest)
     np.testing.assert_array_equal(two.replicas.temperature[1], alone.temperature)
+    np.testing.assert_array_equal(two.replicas.saved[1], alone.replicas.saved[0])
     np.testing.assert_array_equal(two.particles.velocity, three.particles.velocity[:2])
     np.testing.assert_array_equal(two.particles.position[1], alone.particles.position[0])
     assert two.temperature_error.shape == TIMES.shape
+    assert two.saved.shape == (2, 2)  # times, and the two numbers of `fastest`
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.0.xyz", "run.1.xyz"]
 
 
 def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
@@ -60,20 +69,6 @@ def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
     path.touch()
     with pytest.raises(ValueError, match="written by replicas in one array"):
         cool(gas, "DSMC", 2, checkpoint=path)
-
-
-def test_what_is_saved_and_written_is_that_of_each_replica(beads, two_devices, tmp_path):
-    gas, key = beads(packing_fraction=0.1), jax.random.key(4)
-    files = {"save": fastest, "trajectory": tmp_path / "run.xyz"}
-    two = cool(gas, "HardSpheres", 2, key=key, **files)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.0.xyz", "run.1.xyz"]
-    alone = cool(gas, "HardSpheres", 1, key=jax.random.fold_in(key, 1), save=fastest)
-    np.testing.assert_array_equal(two.replicas.saved[1], alone.replicas.saved[0])
-    assert two.saved.shape == (2, 2)  # times, and the two numbers of `fastest`
-
-
-def fastest(particles):
-    return jnp.sort(jnp.sum(particles.velocity**2, axis=1))[-2:]
 
 
 def test_an_error_of_one_ends_the_others_and_is_raised():

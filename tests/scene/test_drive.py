@@ -8,19 +8,13 @@ import pytest
 
 import jaxgran
 from jaxgran.data.curve_file import read_elements
+from tests.beads import SI, hard_gas
 
 RATE = 3e-3  # of the drive, T_0 per mean free time
 
 
 def constant(eps, dimension=3, rate=RATE, temperature=0.01) -> jaxgran.Gas:
-    gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(eps),
-        diameter=2e-3,
-        mass=1e-5,
-        packing_fraction=0.02,
-        temperature=0.01,
-        dimension=dimension,
-    )
+    gas = hard_gas(eps, 0.02, dimension, **SI)
     strength = rate * gas.temperature / gas.mean_free_time
     gas = dataclasses.replace(gas, drive=jaxgran.WhiteNoise(strength))
     return gas.replace(temperature=temperature)

@@ -11,6 +11,7 @@ from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, wall_impact_ratio
 from jaxgran.scene.reduced import reduced_scene
 from jaxgran.theory.averages import impact_moments
 from jaxgran.theory.equations import Density, Moments, moment_rates
+from tests.beads import SI, hard_gas
 
 TAUS = np.geomspace(1.0, 300.0, 8)
 
@@ -20,15 +21,7 @@ def scene(gas, **elements) -> jaxgran.Gas:
 
 
 def constant(eps, dimension=3, **elements) -> jaxgran.Gas:
-    return jaxgran.Gas(
-        jaxgran.ConstantRestitution(eps),
-        diameter=2e-3,
-        mass=1e-5,
-        packing_fraction=0.02,
-        temperature=0.01,
-        dimension=dimension,
-        **elements,
-    )
+    return hard_gas(eps, 0.02, dimension, **SI, **elements)
 
 
 def cooled(gas, taus=TAUS, **settings) -> jaxgran.CoolingCurve:
@@ -196,18 +189,12 @@ def test_bad_elements_are_refused(make, message):
         make()
 
 
+HEADER = {"N": "200", "eta": "0.0067", "diameter": "0.002", "density": "2500", "Y": "5e7"}
+HEADER |= {"nu": "0.22", "T0": "0.01"}
 FRICTION = {"friction": "0.3", "tangential_damping": "0.5", "T_rot_0": "2e-3"}
 
 
 def test_elements_are_read_from_a_header():
-    header = {
-        "eta": "0.05",
-        "diameter": "2e-3",
-        "density": "2500",
-        "Y": "5e7",
-        "nu": "0.2",
-        "T0": "0.01",
-    }
     extra = {
         "beta_t": "-0.2",
         "T_rot_0": "2e-3",
@@ -216,7 +203,7 @@ def test_elements_are_read_from_a_header():
         "wall_beta_t": "0.1",
         "gamma": "0.3",
     }
-    gas = jaxgran.read_gas(header | extra)
+    gas = jaxgran.read_gas(HEADER | extra)
     assert gas.elements == ("surface", "container", "drag")
     assert float(gas.value("inertia")) == 0.4
     read = {name: float(gas.value(name)) for name in gas.domains}
@@ -231,24 +218,13 @@ def test_elements_are_read_from_a_header():
         (FRICTION | {"friction": "-1"}, r"friction must lie in \[0, inf\)"),
     ):
         with pytest.raises(ValueError, match=message):
-            jaxgran.read_gas(header | wrong)
+            jaxgran.read_gas(HEADER | wrong)
     with pytest.warns(UserWarning, match="ignoring unknown header keys: mu.*are eta.*friction"):
-        jaxgran.read_gas(header | {"mu": "0.5", "A comment of some words": "x"})
-    gas = jaxgran.read_gas(header | FRICTION)
+        jaxgran.read_gas(HEADER | {"mu": "0.5", "A comment of some words": "x"})
+    gas = jaxgran.read_gas(HEADER | FRICTION)
     assert gas.elements == ("friction",)
     found = [float(gas.value(name)) for name in ("tangential_damping", "friction", "inertia")]
     assert found == [0.5, 0.3, 0.4] and float(gas.value("rotational_temperature")) == 2e-3
-
-
-HEADER = {
-    "N": "200",
-    "eta": "0.0067",
-    "diameter": "0.002",
-    "density": "2500",
-    "Y": "5e7",
-    "nu": "0.22",
-    "T0": "0.01",
-}
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import jaxgran
+from tests.beads import hard_gas
 
 
 def test_derived_scales(beads):
@@ -55,13 +56,7 @@ def test_two_dimensions(beads):
 
 
 def test_hard_gas_has_no_stiffness():
-    gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(0.9),
-        diameter=1.0,
-        mass=1.0,
-        packing_fraction=0.1,
-        temperature=1.0,
-    )
+    gas = hard_gas(0.9, 0.1)
     assert gas.contact_fraction == 0.0
     assert gas.mean_overlap == 0.0
     k_c = float(gas.number_density) * np.sqrt(32 * np.pi / 15 * (1 - 0.81))

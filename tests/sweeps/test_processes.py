@@ -44,23 +44,16 @@ def check(store, expected):
     assert not np.any(stored.status)
 
 
+@pytest.mark.slow
 def test_a_sweep_is_resumed_after_a_process_was_killed(tmp_path, expected):
     store = tmp_path / "sweep.zarr"
     codes, chunks, outputs = run(2, store, 10, die_at=3)
     assert codes[1] == -signal.SIGKILL and codes[0] != 0
     assert "another task died" in outputs[0][1]
     assert chunks == [[0, 2, 4], [1]]
-    codes, again, _ = run(1, store, 10)
+    codes, again, outputs = run(2, store, 10)
     # No chunk is lost or computed twice.
-    assert codes == [0] and again == [[3]]
-    check(store, expected)
-
-
-@pytest.mark.slow
-def test_two_processes_with_two_devices_each(tmp_path, expected):
-    store = tmp_path / "sweep.zarr"
-    codes, chunks, outputs = run(2, store, 10)
-    assert codes == [0, 0] and chunks == [[0, 2, 4], [1, 3]]
+    assert codes == [0, 0] and sum(again, []) == [3]
     for out, _ in outputs:  # all devices, devices of the process, members
         assert "done 4 2 (10, 3)" in out
     check(store, expected)

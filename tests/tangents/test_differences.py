@@ -12,8 +12,7 @@ import jaxgran
 from jaxgran.data.curve import Run
 from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable, with_tangents
 from jaxgran.models.error_model import slope_bias, slope_bias_of_run
-from tests.beads import glass_beads
-from tests.models.test_soft_spheres import soft_beads
+from tests.beads import glass_beads, soft_beads
 
 TIMES = jnp.array([0.0, 1e-3, 0.3, 2.0, 50.0])
 
@@ -125,8 +124,8 @@ def in_g(more, less, base, span):
 
 
 @pytest.mark.slow
-def test_soft_spheres_have_the_difference_of_two_runs(beads):
-    gas = soft_beads(beads, 0.05, 0.3, packing_fraction=0.15)
+def test_soft_spheres_have_the_difference_of_two_runs():
+    gas = soft_beads(0.05, 0.3, packing_fraction=0.15)
     times = jnp.array([0.5, 1.0]) * gas.mean_free_time  # before rounding has grown
     settings = {"num_particles": 30, "replicas": 2, "steps_per_contact": 12}
     f = sliced(gas, jaxgran.SoftSpheres(**settings, differences=0.3), times, "dissipative_constant")

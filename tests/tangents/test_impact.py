@@ -11,16 +11,7 @@ import jaxgran
 from jaxgran.data.curve import Run
 from jaxgran.gradients.tangents import ImpactTangents
 from jaxgran.scene.laws import ConstantRestitution, ReducedViscoelastic, RestitutionSeries
-from tests.beads import glass_beads
-from tests.models.test_hard_spheres import hard_gas
-from tests.tangents.test_thermal import FLOATS
-
-# One scene for kinetic theory and for the fit, so that it is compiled once.
-DILUTE = {"beta": 0.3, "packing_fraction": 0.03}
-
-
-def dilute_model(gas, **settings):
-    return jaxgran.HardSpheres(500, replicas=4, **settings).sized_for(gas, spare=2.0)
+from tests.beads import hard_gas, lattice
 
 
 @pytest.mark.parametrize(
@@ -56,34 +47,6 @@ def test_gains_are_slopes_of_the_loss(law):
     np.testing.assert_allclose(along.gains(law, g), jnp.stack(expected), atol=1e-9)
 
 
-@pytest.mark.slow
-def test_slopes_in_every_float_are_those_of_kinetic_theory():
-    gas = glass_beads(**DILUTE)
-    times = np.array([2.0, 8.0]) * float(gas.mean_free_time)
-    values = {name: gas.value(name) for name in FLOATS}
-
-    def records(model, log_scales):
-        scaled = {n: v * jnp.exp(s) for (n, v), s in zip(values.items(), log_scales, strict=True)}
-        curve = jaxgran.cool(gas.replace(**scaled), times, model=model)
-        logs = jnp.log(jnp.stack([curve.temperature, curve.collisions, curve.displacement]))
-        return logs, curve.temperature / gas.temperature
-
-    def jacobian(model):
-        slopes = jax.jacfwd(partial(records, model), has_aux=True)
-        return map(np.asarray, slopes(jnp.zeros(len(FLOATS))))
-
-    particles, ratio = jacobian(dilute_model(gas))
-    theory, expected = jacobian(jaxgran.KineticTheory(softness=False, correlations=False))
-    # 8000 collisions scatter the rates by some 2 %, 2000 by 5 %.
-    np.testing.assert_allclose(particles[0], theory[0], rtol=0.08, atol=0.03)
-    np.testing.assert_allclose(particles[1], theory[1], rtol=0.08, atol=0.03)
-    np.testing.assert_allclose(particles[2], theory[2], rtol=0.1, atol=0.03)
-    # Impacts that happen to be strong make cooling and its slope in A alike larger: of the
-    # scatter, 1 % is left.
-    share = particles[0][:, 0] / np.log(ratio)
-    np.testing.assert_allclose(share, theory[0][:, 0] / np.log(expected), rtol=0.025)
-
-
 COEFFICIENT = 0.8
 
 
@@ -91,7 +54,7 @@ COEFFICIENT = 0.8
 def constant():
     """A gas of constant restitution, its model, and ln T of (e, ln of all times, ln T_0)."""
     gas = hard_gas(COEFFICIENT, 0.1)
-    start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(100, replicas=8)).particles
+    start = lattice(gas, 100, replicas=8)
     model = jaxgran.HardSpheres(100, replicas=8, start=start).sized_for(gas, spare=2.0)
     times = jnp.array([0.3, 1.0, 3.0]) * gas.mean_free_time
 
@@ -104,7 +67,6 @@ def constant():
     return f, at, model, jax.jacfwd(f)(at)
 
 
-@pytest.mark.slow
 def test_constant_restitution_has_the_slopes_of_haff(constant):
     f, at, _, slopes = constant
     e, cooled = COEFFICIENT, 1 - jnp.exp(f(at) / 2)

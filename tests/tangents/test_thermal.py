@@ -10,18 +10,7 @@ import pytest
 import jaxgran
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.reduced import ReducedContact
-from tests.models.test_soft_spheres import soft_beads
-
-
-def log_temperature(gas, times, model, name="dissipative_constant"):
-    """ln T of each replica, as a function of ln(one float of the gas) - its value."""
-    value = gas.value(name)
-
-    def of(log_scale):
-        curve = jaxgran.cool(gas.replace(**{name: value * jnp.exp(log_scale)}), times, model=model)
-        return jnp.log(curve.replicas.temperature)
-
-    return of
+from tests.beads import lattice, soft_beads
 
 
 def slope(f, at=0.0):
@@ -67,9 +56,9 @@ def loss_slope(gas, angle, speed):
 
 
 @pytest.mark.slow
-def test_one_impact_has_the_slope_of_its_law(beads):
+def test_one_impact_has_the_slope_of_its_law():
     beta, angle = 0.5, 1.2
-    gas = soft_beads(beads, 1e-7, beta, packing_fraction=0.02)
+    gas = soft_beads(1e-7, beta, packing_fraction=0.02)
     gaps = 1e-4 * (1 + np.arange(16) / 16)
     scene = SoftSpheres(2).scene(gas)
     position, velocity = pairs_that_meet(gas, angle, gaps)
@@ -86,11 +75,10 @@ def test_one_impact_has_the_slope_of_its_law(beads):
 
 
 @pytest.mark.slow
-def test_the_tangent_is_exact_between_projections(beads):
-    gas = soft_beads(beads, 0.05, 0.2, packing_fraction=0.15)
-    model = SoftSpheres(100, replicas=1)
+def test_the_tangent_is_exact_between_projections():
+    gas = soft_beads(0.05, 0.2, packing_fraction=0.15)
     times = [0.8 * float(gas.mean_free_time)]
-    start = jaxgran.cool(gas.replace(dissipative_constant=0.0), times, model=model).particles
+    start = lattice(gas, 100)
     position = np.asarray(start.position[0] / gas.diameter)
     velocity = np.asarray(start.velocity[0] / jnp.sqrt(gas.temperature))
     scene = SoftSpheres(100).scene(gas)
@@ -121,8 +109,8 @@ FLOATS = (
 
 
 @pytest.mark.slow
-def test_slopes_in_every_float_are_those_of_kinetic_theory(beads):
-    gas = soft_beads(beads, 0.005, 0.3, packing_fraction=0.03)
+def test_slopes_in_every_float_are_those_of_kinetic_theory():
+    gas = soft_beads(0.005, 0.3, packing_fraction=0.03)
     times = np.array([2.0, 8.0]) * float(gas.mean_free_time)
     values = {name: gas.value(name) for name in FLOATS}
 
@@ -145,19 +133,8 @@ def test_slopes_in_every_float_are_those_of_kinetic_theory(beads):
 
 
 @pytest.mark.slow
-def test_slope_does_not_depend_on_the_interval(beads):
-    # A dense soft gas: a tenth of the spheres is in contact whenever a projection comes.
-    gas = soft_beads(beads, 0.1, 0.2, packing_fraction=0.2)
-    times = np.array([3.0]) * float(gas.mean_free_time)
-    f = log_temperature(gas, times, SoftSpheres(300, replicas=4, projection=0.25))
-    g = log_temperature(gas, times, SoftSpheres(300, replicas=4, projection=0.1))
-    # The same trajectory: only what chaos does to the tangent in 2 mean free times differs.
-    np.testing.assert_allclose(np.mean(slope(f)), np.mean(slope(g)), rtol=0.06)
-
-
-@pytest.mark.slow
-def test_touching_two_and_three_bodies_have_finite_slopes(beads):
-    gas = soft_beads(beads, 0.02, 0.2, packing_fraction=0.02)
+def test_touching_two_and_three_bodies_have_finite_slopes():
+    gas = soft_beads(0.02, 0.2, packing_fraction=0.02)
     scene = SoftSpheres(3).scene(gas)
     side = float(scene.side)
     middle = np.full(3, side / 2)

@@ -9,6 +9,7 @@ import jaxgran
 from jaxgran.scene.laws import ReducedViscoelastic
 from jaxgran.theory import averages as kinetics
 from jaxgran.theory.averages import RateTable
+from tests.beads import hard_gas
 
 
 def test_averages_of_constant_restitution():
@@ -45,14 +46,7 @@ def test_averages_agree_with_sampled_impacts():
     [(3, 0.5, 0.0476), (3, 0.8, -0.0145), (3, 0.9, -0.0152), (2, 0.5, 0.0733), (2, 0.9, -0.0301)],
 )
 def test_stationary_kurtosis(d, e, a2):
-    gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(e),
-        diameter=1.0,
-        mass=1.0,
-        packing_fraction=0.01,
-        temperature=1.0,
-        dimension=d,
-    )
+    gas = hard_gas(e, 0.01, d)
     curve = jaxgran.cool(gas, jnp.array([300.0]) * gas.mean_free_time)
     assert curve.sonine is not None
     # The Sonine theory neglects a_3: at e = .5 it is 11 % (3D) and 15.4 % (2D) above simulation.

@@ -1,5 +1,7 @@
 """Closed forms, each against an independent number or the equations it solves."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,11 +22,7 @@ from experiments.support.closed_forms import (
 )
 from jaxgran.theory import averages as kinetics
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
-
-
-def hard_gas(e: float, dimension: int = 3) -> jaxgran.Gas:
-    law, one = jaxgran.ConstantRestitution(e), {"diameter": 1.0, "mass": 1.0, "temperature": 1.0}
-    return jaxgran.Gas(law, packing_fraction=0.1, dimension=dimension, **one)
+from tests.beads import hard_gas
 
 
 def test_constants_of_the_expansion():
@@ -73,13 +71,7 @@ def test_expansion_is_right_to_its_order(beads):
             law = jaxgran.Viscoelastic(
                 5e7, 0.22, gas.value("dissipative_constant") * scale, clipped
             )
-            gas = jaxgran.Gas(
-                law,
-                diameter=gas.diameter,
-                mass=gas.mass,
-                packing_fraction=0.05,
-                temperature=gas.temperature,
-            )
+            gas = dataclasses.replace(gas, law=law)
             tau = jnp.geomspace(0.01, 1e4, 40) / delta
             model = jaxgran.KineticTheory(sonine=False, softness=False, correlations=False)
             theta = jaxgran.cool(gas, tau * gas.mean_free_time, model=model).temperature / 0.01
@@ -110,7 +102,7 @@ def test_paper_averages_are_the_first_two_terms(beads):
 @pytest.mark.slow
 def test_displacement_of_constant_restitution():
     for d, e in ((3, 0.6), (2, 0.9)):
-        gas = hard_gas(e, d)
+        gas = hard_gas(e, dimension=d)
         tau = jnp.geomspace(0.01, 1e6, 50)
         model = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-9)
         curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)

@@ -7,6 +7,7 @@ import pytest
 
 import jaxgran
 from jaxgran.theory.averages import NUM_RESTITUTIONS, collision_changes
+from tests.beads import hard_gas
 
 # a_2, a_3, D n sigma^(d-1)/sqrt(2 T) of the homogeneous cooling state: direct simulation by a code
 # of its own in C, 1e5 particles over 25 relaxations of D. Errors: a_2 1e-4 (1.7e-4 for small eps),
@@ -33,14 +34,7 @@ MODEL = jaxgran.KineticTheory(correlations=False, rtol=1e-6)
 
 def cooling_state(dimension, eps):
     """a_2, a_3 and D, relaxed: all eps as one batch, so that each dimension is compiled once."""
-    gas = jaxgran.Gas(
-        jaxgran.ConstantRestitution(0.5),
-        diameter=1.0,
-        mass=1.0,
-        packing_fraction=0.01,
-        temperature=1.0,
-        dimension=dimension,
-    )
+    gas = hard_gas(0.5, 0.01, dimension)
 
     def one(e):
         # 60 collisions by Haff's law, exp(-11) of the start of D at eps = .05.

@@ -8,24 +8,13 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-import jaxgran
 from jaxgran.theory.equations import MAX_WAVENUMBER, correlation_build_up, correlation_slowdown
-
-
-def disks_or_spheres(eps, phi, dimension):
-    return jaxgran.Gas(
-        jaxgran.ConstantRestitution(eps),
-        diameter=1.0,
-        mass=1.0,
-        packing_fraction=phi,
-        temperature=1.0,
-        dimension=dimension,
-    )
+from tests.beads import hard_gas
 
 
 @pytest.mark.parametrize("dimension, phi, eps", [(3, 0.1, 0.9), (3, 0.3, 0.8), (2, 0.2, 0.7)])
 def test_slowing_is_the_integral_over_the_modes(dimension, phi, eps):
-    gas = disks_or_spheres(eps, phi, dimension)
+    gas = hard_gas(eps, phi, dimension)
     k_c = 2 * pi / float(gas.critical_box)
     a, b = MAX_WAVENUMBER[dimension]
     shell = {2: 2 * pi, 3: 4 * pi}[dimension]
@@ -61,34 +50,3 @@ def test_correlations_build_up_from_none():
     np.testing.assert_allclose(
         correlation_build_up(jnp.array([0.0, 4.0, 400.0])), [0.0, 1 - 1 / np.e, 1.0]
     )
-
-
-@pytest.mark.slow
-def test_hard_disks_cool_as_theory_with_correlations():
-    # eps = .9 in boxes of .6 L_c: no wave but those of the theory.
-    dimension, n = 2, 150
-    gas = disks_or_spheres(0.9, 0.1, dimension)
-    times = jnp.expm1(jnp.array([8.0, 32.0]) * 0.19 / (2 * dimension)) * gas.mean_free_time
-    times = times / (0.19 / (2 * dimension))
-    with_them, without = (
-        np.asarray(
-            jaxgran.cool(gas, times, model=jaxgran.KineticTheory(correlations=c)).temperature
-        )
-        for c in (True, False)
-    )
-    rates = []
-    for seed in range(12):
-        model = jaxgran.HardSpheres(n, replicas=6000 // n)
-        curve = jaxgran.cool(gas, times, model=model, key=jax.random.key(seed), progress=False)
-        root = np.asarray(curve.replicas.temperature) ** -0.5
-        rates.append(root[:, 1] - root[:, 0])
-    rates = np.concatenate(rates) / (without[1] ** -0.5 - without[0] ** -0.5)
-    few = (1 / 2 - 3 / (4 * dimension) + 3 * 0.19 / dimension) / n  # of finite N, as measured
-    error = np.std(rates, ddof=1) / len(rates) ** 0.5
-    expected = (with_them[1] ** -0.5 - with_them[0] ** -0.5) / (
-        without[1] ** -0.5 - without[0] ** -0.5
-    )
-    print(f"\n{dimension}D: {np.mean(rates) - few:.4f} +- {error:.4f}, theory {expected:.4f}")
-    # Theory's own .2 %, and three errors; without correlations it is 1, six errors away.
-    assert abs(np.mean(rates) - few - expected) < 0.002 + 3 * error
-    assert 1 - (np.mean(rates) - few) > 3 * error

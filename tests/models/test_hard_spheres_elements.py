@@ -1,0 +1,243 @@
+"""Hard spheres with elements: rough, dragged, and in a container."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran._utils import status
+from jaxgran.particles.hard.impacts import HardScene, ImpactEvents, pair_effect
+from jaxgran.scene.reduced import ReducedDrag, ReducedRough
+from tests.beads import SI, glass_beads, hard_gas
+
+
+def run(gas, num_particles, replicas, taus):
+    times = jnp.asarray(taus) * gas.mean_free_time
+    return jaxgran.cool(gas, times, model=jaxgran.HardSpheres(num_particles, replicas=replicas))
+
+
+def test_laws_see_the_speeds_that_drag_has_left():
+    n, gamma = 20, 0.3
+    speed, time = jnp.linspace(0.1, 2.0, n), jnp.linspace(0.0, 2.5, n)
+    law = glass_beads(0.5).reduced_law
+    zero = jnp.zeros(())
+    scene = HardScene(*[zero] * 5, drag=ReducedDrag(jnp.asarray(gamma / 2), zero))
+    scene = scene._replace(law=law, collision_frequency=jnp.asarray(2.0))
+    normal = jnp.tile(jnp.array([1.0, 0.0, 0.0]), (n, 1))
+    impact = ImpactEvents(time, normal, speed[:, None] * normal, speed, None, jnp.zeros(n, bool))
+    eps = law.restitution(speed * (1 - gamma * time) / 2**0.5)
+    np.testing.assert_allclose(
+        pair_effect(scene, impact).lost, (1 - eps**2) * speed**2 / 8, rtol=1e-9
+    )
+
+
+@pytest.mark.slow
+def test_drag_takes_energy_of_perfectly_rough_spheres_at_its_rate_alone():
+    # In a box of three sides: impacts, on walls too, keep the energy, drag takes exp(-2 gamma t).
+    sides = np.array([0.02, 0.03, 0.05])
+    n = 150
+    gas = hard_gas(1.0, **SI).replace(packing_fraction=n * np.pi / 6 * 8e-9 / sides.prod())
+    gas = dataclasses.replace(
+        gas,
+        surface=jaxgran.Rough(1.0, rotational_temperature=4e-3),
+        container=jaxgran.Walls(sides, restitution=1.0, tangential_restitution=1.0),
+        drag=jaxgran.StokesDrag(1.5, rotational_rate=1.5),
+    )
+    curve = run(gas, n, 2, [0.0, 2.0, 10.0])
+    assert float(curve.times[-1]) * 1.5 > 0.5
+    energy = curve.temperature + curve.rotational_temperature
+    kept = energy * jnp.exp(3.0 * curve.times)
+    np.testing.assert_allclose(kept, 0.014, rtol=1e-12)  # sums of 300 numbers, some 1000 impacts
+    total = energy + curve.dissipated_energy / (1.5 * gas.mass)
+    np.testing.assert_allclose(total, 0.014, rtol=1e-12)
+    final = curve.particles
+    places = np.asarray(final.position)
+    assert np.all(places >= 1e-3 * (1 - 1e-9))
+    assert np.all(places <= (sides - 1e-3) * (1 + 1e-9))
+    assert np.all(places.max(axis=(0, 1)) > 0.85 * sides)  # all of the box is in use
+    T_rot = 0.4 * 1e-6 * jnp.mean(final.angular_velocity**2, axis=(0, 1)).sum() / 3
+    assert float(T_rot) == pytest.approx(float(curve.rotational_temperature[-1]), rel=1e-12)
+    T = jnp.mean(final.velocity**2)
+    assert float(T) == pytest.approx(float(curve.temperature[-1]), rel=1e-12)
+
+
+@pytest.mark.parametrize("beta", [-1.0, -0.4, 0.7])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_impacts_keep_angular_momentum_and_follow_the_rule(dimension, beta):
+    # Unit masses and diameters, I = q/4, spins s = w/2. In 2D as spheres in a plane.
+    q, eps, n = 0.4, 0.8, 50
+    rng = np.random.default_rng(1)
+    r, w = rng.normal(size=(2, n, 3))
+    v = np.stack([w, np.zeros_like(w)])
+    omega = rng.normal(size=(2, n, 3))
+    if dimension == 2:
+        r[:, 2] = v[..., 2] = 0
+        omega[..., :2] = 0
+    normal = r / np.linalg.norm(r, axis=1, keepdims=True)
+    approach = -np.sum(v[0] * normal, -1)
+    v[0] = np.where(approach[:, None] < 0, -v[0], v[0])
+    zero = jnp.zeros(())
+    shown, turning = (slice(None), slice(None)) if dimension == 3 else (slice(2), slice(2, 3))
+    scene = HardScene(
+        *[zero] * 5, surface=ReducedRough(jnp.asarray(beta), jnp.asarray(q), zero)
+    )._replace(law=jaxgran.ConstantRestitution(eps))
+    effect = pair_effect(
+        scene,
+        ImpactEvents(
+            time=jnp.zeros(n),
+            normal=-jnp.asarray(normal[:, shown]),
+            relative=jnp.asarray(v[0][:, shown]),
+            speed=jnp.abs(approach),
+            spin=jnp.asarray(omega.sum(0)[:, turning] / 2),
+            elastic=jnp.zeros(n, bool),
+        ),
+    )
+    change, spin_change = np.zeros((n, 3)), np.zeros((n, 3))
+    change[:, shown], spin_change[:, turning] = effect.kick, effect.spin_change
+    after = v + np.stack([change, -change])
+    spun = omega + 2 * spin_change[None]
+
+    def at_contact(v, omega):
+        return v[0] - v[1] - 0.5 * np.cross(omega[0] + omega[1], normal)
+
+    before, behind = at_contact(v, omega), at_contact(after, spun)
+
+    def parts(u):
+        along = np.sum(u * normal, -1, keepdims=True)
+        return along, u - along * normal
+
+    np.testing.assert_allclose(parts(behind)[0], -eps * parts(before)[0], atol=1e-12)
+    np.testing.assert_allclose(parts(behind)[1], -beta * parts(before)[1], atol=1e-12)
+    # Angular momentum about the point of contact.
+    lever = np.stack([0.5 * normal, -0.5 * normal])
+    rotational_gain = np.cross(lever, after - v) + q / 4 * (spun - omega)
+    np.testing.assert_allclose(rotational_gain.sum(0), 0, atol=1e-12)
+    np.testing.assert_allclose(rotational_gain, 0, atol=1e-12)  # of each sphere alone
+    translation, rotation = (
+        [c * np.sum(x**2, (0, 2)) for x in pair]
+        for c, pair in ((0.5, (v, after)), (q / 8, (omega, spun)))
+    )
+    np.testing.assert_allclose(translation[0] - translation[1], 2 * effect.lost, atol=1e-12)
+    np.testing.assert_allclose(rotation[1] - rotation[0], 2 * effect.rotational_gain, atol=1e-12)
+    normal_part, slip = (np.sum(x**2, -1) for x in parts(before))
+    lost = 0.25 * (1 - eps**2) * normal_part + 0.25 * q / (1 + q) * (1 - beta**2) * slip
+    np.testing.assert_allclose(2 * (effect.lost - effect.rotational_gain), lost, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_energy_of_rough_disks_is_conserved():
+    surface = jaxgran.Rough(0.3, rotational_temperature=2e-3)
+    gas = dataclasses.replace(glass_beads(dimension=2), surface=surface)
+    curve = run(gas, 60, 2, [0.0, 1.0, 10.0])
+    energy = 2 * curve.temperature + curve.rotational_temperature
+    total = 0.5 * gas.mass * energy + curve.dissipated_energy
+    np.testing.assert_allclose(total, total[0], rtol=1e-12)
+    assert float(curve.rotational_temperature[0]) == pytest.approx(2e-3, rel=1e-12)
+
+
+SIDE = 0.05
+
+
+def contained(num_particles, walls=1.0, beta=0.15) -> jaxgran.Gas:
+    """A gas of N spheres in a cube of 50 mm."""
+    phi = num_particles * np.pi / 6 * 8e-9 / SIDE**3
+    walls = jaxgran.Walls(SIDE, restitution=walls)
+    return dataclasses.replace(glass_beads(beta, packing_fraction=phi), container=walls)
+
+
+def test_viscoelastic_walls_bounce_by_their_own_law():
+    # Two elastic spheres: what is lost, is lost to the walls, at the eps of their speeds.
+    law = jaxgran.Viscoelastic(5e7, 0.22, 3e-5)
+    gas = contained(2, law, beta=0.0)
+    times = jnp.array([0.0, 1.0, 2.0])
+    curve = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(2))
+    total = 1.5 * gas.mass * curve.temperature + curve.dissipated_energy
+    np.testing.assert_allclose(total, total[0], rtol=1e-12)
+    # Some 5 bounces across each axis in a second, of 1 - eps^2 = .2 to .3 at 1 to 10 cm/s.
+    assert 0.05 < float(curve.temperature[-1] / gas.temperature) < 0.7
+
+
+def test_containers_that_do_not_fit_are_refused():
+    gas = contained(200).replace(packing_fraction=0.03)
+    with pytest.raises(ValueError, match="200 spheres of packing_fraction 0.03 need a container"):
+        jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(200))
+
+
+def at_rest(side=SIDE):
+    """50 spheres at rest on a lattice with 12.5 mm between them, off the walls."""
+    place = (np.argwhere(np.ones((4, 4, 4)))[None, :50] + 0.5) * SIDE / 4
+    return jaxgran.Particles(place, np.zeros_like(place), side)
+
+
+def test_a_run_goes_on_from_its_own_particles():
+    gas = contained(50, 0.8)
+    walls = jaxgran.Walls([SIDE, 0.8 * SIDE, 1.25 * SIDE], restitution=0.8)
+    gas = dataclasses.replace(gas, container=walls)
+    times = jnp.array([0.1, 0.2])  # some bounces, and few impacts that would let paths part
+    whole = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(50), save="particles")
+    middle = jax.tree.map(lambda x: x[0], whole.saved)
+    cooler = gas.replace(temperature=whole.temperature[0])
+    later = jaxgran.HardSpheres(50, start=middle)
+    curve = jaxgran.cool(cooler, times[1:] - times[0], model=later)
+    assert float(whole.temperature[1]) < 0.99 * float(whole.temperature[0])
+    np.testing.assert_allclose(curve.temperature[-1], whole.temperature[1], rtol=1e-6)
+    last = curve.particles
+    np.testing.assert_allclose(last.position, whole.particles.position, atol=1e-6 * SIDE)
+
+
+def test_what_does_not_stand_between_the_walls_is_refused():
+    gas, start = contained(50), at_rest()
+
+    def moved(place):
+        position = start.position.copy()
+        position[0, 7] = place
+        return jaxgran.HardSpheres(50, start=start._replace(position=position))
+
+    middle = SIDE / 4
+    with pytest.raises(ValueError, match="sphere 7 of replica 0 .* outside of the walls.* 0.05"):
+        jaxgran.cool(gas, [1e-3], model=moved([-1e-4, middle, middle]))
+    near = moved([middle, SIDE - 0.9e-3, middle])
+    with pytest.raises(ValueError, match="less than its radius, 0.001 m, from a wall"):
+        jaxgran.cool(gas, [1e-3], model=near)
+    jaxgran.cool(gas, [1e-3], model=moved([middle, SIDE - 1e-3, middle]))  # it touches the wall
+    with pytest.raises(ValueError, match="start.box_side is .* diameters, that of the gas"):
+        wrong = jaxgran.HardSpheres(50, start=at_rest(1.1 * SIDE))
+        jaxgran.cool(gas, [1e-3], model=wrong)
+    spinning = start._replace(angular_velocity=np.ones((1, 50, 3)))
+    with pytest.raises(ValueError, match="HardSpheres draws the angular velocities of a start"):
+        jaxgran.cool(gas, [1e-3], model=jaxgran.HardSpheres(50, start=spinning))
+
+
+@pytest.mark.slow
+def test_a_start_beyond_a_wall_has_a_status_where_it_cannot_be_looked_at():
+    gas, start = contained(50), at_rest()
+    model = jaxgran.HardSpheres(50).sized_for(gas)
+
+    @jax.jit
+    def faults(position):
+        own = dataclasses.replace(model, start=start._replace(position=position))
+        return jaxgran.cool(gas, [1e-3], model=own).status
+
+    assert faults(jnp.asarray(start.position)) == 0
+    beyond = start.position.copy()
+    beyond[0, 7, 1] = 0.9e-3
+    assert faults(jnp.asarray(beyond)) == status.OVERLAPPING.bit
+
+
+@pytest.mark.slow
+def test_walls_take_from_elastic_spheres_what_theory_says():
+    phi, eps = 0.02, 0.6
+    # Haff's law: T^(-1/2) grows linearly. The slope after the first sound times, to 1/5 of T^(1/2).
+    gas = glass_beads(packing_fraction=phi)
+    walls = jaxgran.Walls(gas.box_side(500), restitution=eps)
+    gas = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(1.0), container=walls)
+    theory = jaxgran.cool(gas, jnp.array([20.0]) * gas.mean_free_time)
+    rate = ((theory.temperature[0] / gas.temperature) ** -0.5 - 1) / theory.times[0]
+    times = jnp.array([0.5, 1.0, 2.5, 4.0]) / rate
+    hard = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(500, replicas=8))
+    slopes = np.diff((hard.temperature / gas.temperature) ** -0.5) / np.diff(times * rate)
+    # Four standard errors of a slope, .8 sqrt(2/(N replicas)), and error_model.WALL_ERROR.
+    assert np.all(np.abs(slopes - 1) < 4 * 0.8 * (2 / (500 * 8)) ** 0.5 + 0.04), slopes
