@@ -30,6 +30,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float
 
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.laws import ReducedLaw
 
 AVERAGING_TIME = 5.0
@@ -497,13 +498,35 @@ class ExchangeTangents(NamedTuple):
             return along[:-2] + by_scale + sooner * gained[None]
 
         middle = before + gained / 2
-        first = _ratio_if_positive(self.energies, before[None])
-        half = _ratio_if_positive(self.energies + growth(first) / 2, middle[None])
+        first = ratio_or_zero(self.energies, before[None])
+        half = ratio_or_zero(self.energies + growth(first) / 2, middle[None])
         new_collisions = sooner[:, 0] * collisions[None] + half[:, 0] / 2 * collisions[None]
         return ExchangeTangents(self.energies + growth(half), self.collisions + new_collisions)
 
+    def of_records(
+        self,
+        values: dict[str, Array],
+        log_decay: Float[Array, "2"],
+        decay_along: Float[Array, "p 2"],
+        time: Float[Array, ""],
+        num_particles: int,
+        dimension: int,
+    ) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Return the derivatives of T, T_rot and collisions along directions, and in time.
 
-def _ratio_if_positive(above: Array, below: Array) -> Array:
-    """The ratio, 0 where the denominator is not positive."""
-    known = below > 0
-    return jnp.where(known, above / jnp.where(known, below, 1.0), 0.0)
+        Args:
+            values: the records.
+            log_decay: logarithms of the decay of velocities and of spins by drag.
+            decay_along: their tangents.
+            time: at which the records are.
+            num_particles, dimension: N and d.
+        """
+        n, d, along = num_particles, dimension, {"collisions": 2 / num_particles * self.collisions}
+        for k, name in enumerate(("temperature", "rotational_temperature")):
+            if name in values:
+                size = n * (d, NUM_SPIN_COMPONENTS[d])[k] / 2
+                moved = jnp.exp(2 * log_decay[k]) * self.energies[:, k] / size
+                along[name] = moved + 2 * decay_along[:, k, None] * values[name][None]
+        elapsed = jnp.where(time > 0, time, 1.0)
+        rates = {name: x[-1] / elapsed for name, x in along.items()}
+        return {name: x[:-1] for name, x in along.items()}, rates

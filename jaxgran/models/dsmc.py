@@ -27,7 +27,7 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.particles import snapshot
-from jaxgran.particles.dsmc.collisions import Scheme
+from jaxgran.particles.dsmc.collisions import DSMCDynamics, Scheme
 from jaxgran.particles.dsmc.run import differentiable_run, host_run_parts
 from jaxgran.particles.run import (
     block_until_ready,
@@ -40,7 +40,7 @@ from jaxgran.particles.run import (
 )
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import ReducedScene, reduced_scene
+from jaxgran.scene.reduced import reduced_scene
 
 MAX_STEP = 0.1
 """Largest number of collisions per particle and step: a step draws a particle at most twice."""
@@ -139,58 +139,52 @@ class DSMC(AbstractModel):
         unreachable_times = checks.unreachable_with_drag(gas, times)
         words = _key_words(run)
         scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
-        scene, reduced = reduced_scene(gas), times * gas.impact_speed / gas.path_length
-        if scene.drag is not None:
-            reduced = transformed_times(scene.drag, reduced)
-        units = self._units(gas)
+        dynamics = DSMCDynamics(reduced_scene(gas), scheme)
+        reduced = times * gas.impact_speed / gas.path_length
+        if dynamics.scene.drag is not None:
+            reduced = transformed_times(dynamics.scene.drag, reduced)
+        units = snapshot.Units.of(gas, self.num_particles, gas.path_length, gas.impact_speed)
         if any_traced(gas, times, words):
             checks.refuse_files(self, run)
             options = {"units": units, "save": snapshot.save_function(run.save)}
             records = differentiable_run(
-                scene, reduced, words, replicas=self.replicas, scheme=scheme, **options
+                dynamics, reduced, words, replicas=self.replicas, **options
             )
         elif on := replica_devices(self.replicas):
             single = dataclasses.replace(self, replicas=1)
 
             def run_replica(k: int, run: Run) -> dict[str, Array]:
-                return single._run_on_host(scene, reduced, _key_words(run), scheme, units, run)
+                return single._run_on_host(dynamics, reduced, _key_words(run), units, run)
 
             records = join_records(run_replicas(run_replica, self.replicas, run, on))
         else:
-            records = self._run_on_host(scene, reduced, words, scheme, units, run)
+            records = self._run_on_host(dynamics, reduced, words, units, run)
         curve, failed = _curve(gas, times, records, unreachable_times)
         size = self.replicas, self.num_particles
         rough = gas.surface is not None
         like = snapshot.particle_shapes(units, size, gas.dimension, times.dtype, rough)
         return snapshot.attach_saved(curve, run.save, records, like, failed)
 
-    def _units(self, gas: Gas) -> snapshot.Units:
-        """Return the SI units of the particles that `save` sees."""
-        side = gas.box_side(self.num_particles) if gas.container is None else gas.container.side
-        speed = gas.impact_speed
-        return snapshot.Units(gas.path_length, speed, 2 * speed / gas.diameter, side, gas.mass)
-
     def _run_on_host(
         self,
-        scene: ReducedScene,
+        dynamics: DSMCDynamics,
         times: Float[Array, "times"],
         words: UInt32[Array, "2"],
-        scheme: Scheme,
         units: snapshot.Units,
         run: Run,
     ) -> dict[str, Array]:
         """Run on the host, with progress and checkpoints, and return the records."""
-        new = needs_compilation((scheme, self.replicas, jax.tree.structure(scene), times.dtype))
+        new = needs_compilation((jax.tree.structure(dynamics), self.replicas, times.dtype))
         with compiling(run.progress and new):
             start, advance, observe = host_run_parts(
-                scene, words, replicas=self.replicas, scheme=scheme, donate=run.checkpoint is None
+                dynamics, words, replicas=self.replicas, donate=run.checkpoint is None
             )
             recorded = partial(observe, units=units, save=snapshot.save_function(run.save))
             if new:  # compile with a call of zero steps; it may delete its state, so copy that
                 jax.block_until_ready(recorded(advance(jax.tree.map(jnp.copy, start), 0.0)))
         description = {}
         if run.checkpoint is not None:
-            fixed = {"scene": scene, "times": times, "key": words, "scheme": scheme, "model": self}
+            fixed = {"dynamics": dynamics, "times": times, "key": words, "model": self}
             description = describe_run(**fixed, save=run.save)
         _, records, fault = run_through_times(
             start,

@@ -19,12 +19,10 @@ from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Neighbourhood, capacities
 from jaxgran.particles.hard.dynamics import MIN_IMPACTS, SPEED_MARGIN, HardDynamics
-from jaxgran.particles.hard.impacts import HardScene
-from jaxgran.particles.hard.prediction import BOX_MARGIN, HardWalls
-from jaxgran.particles.setup import check_inside, min_distance, overlap_by_rounding
+from jaxgran.particles.setup import min_distance, overlap_by_rounding
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import ReducedDrag, ReducedDrive, reduced_scene
+from jaxgran.scene.reduced import SphereScene, reduced_scene, sphere_scene
 from jaxgran.theory.averages import collision_rate
 
 WINDOW_SHARE = 0.05
@@ -138,22 +136,13 @@ class HardSpheres(AbstractSpheres):
         """
         checks.check_cools(*checks.first_cooling_rate(gas))
         with jax.ensure_compile_time_eval():
-            self.check_box(gas)
+            self.check_box(gas, 0.5 - ALLOWED_OVERLAP)
             self._check_overlap(gas)
-            checks.check_volume(gas, self.num_particles)
-            if gas.container is not None:
-                radius = gas.diameter * (0.5 - ALLOWED_OVERLAP)
-                check_inside(self.start, gas.container, radius, gas.dimension)
-        if self.start is not None and self.start.angular_velocity is not None:
-            raise ValueError(
-                "HardSpheres draws the angular velocities of a start. Give the start without them, "
-                "start._replace(angular_velocity=None), and rotational_temperature of the surface."
-            )
 
     def _check_overlap(self, gas: Gas) -> None:
         if self.start is None or any_traced(gas, self.start):
             return  # the run checks traced values
-        start, side = self.start, reduced_hard_scene(gas, self.num_particles).side
+        start, side = self.start, self.scene(gas).side
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
         closest = float(min_distance(position, side, self.replicas, (8 * len(position), 0)))
         if closest < 1 - overlap_by_rounding(position, side, ALLOWED_OVERLAP):
@@ -175,30 +164,37 @@ class HardSpheres(AbstractSpheres):
         """Return limitations by contacts that last and overlap."""
         return checks.limitations_of_instant_impacts(gas)
 
-    def scene(self, gas: Gas) -> HardScene:
+    def scene(self, gas: Gas) -> SphereScene:
         """Return the gas in units of its diameter, mass and initial temperature."""
-        return reduced_hard_scene(gas, self.num_particles, self.contact_time)
+        material = reduced_scene(gas)
+        if (walls := material.walls) is not None:
+            per_collision = walls.frequency / collision_rate(0.0, gas.dimension)
+            material = material._replace(walls=walls._replace(frequency=per_collision))
+        return sphere_scene(gas, self.num_particles, material)
 
-    def dynamics(self, scene: HardScene, plan: Plan) -> HardDynamics:
+    def dynamics(self, scene: SphereScene, plan: Plan) -> HardDynamics:
         """Return the equations of motion of the spheres."""
-        return HardDynamics(scene, plan.replicas, plan.capacity, plan.steps, ALLOWED_OVERLAP)
+        contact_time = jnp.asarray(self.contact_time, scene.side.dtype)
+        return HardDynamics(
+            scene,
+            plan.replicas,
+            plan.capacity,
+            plan.steps,
+            contact_time,
+            jnp.zeros((), bool),
+            ALLOWED_OVERLAP,
+        )
 
-    def clock(self, scene: HardScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
+    def clock(self, scene: SphereScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
         """Return the transformed times of a gas with drag, otherwise the times."""
-        return times if scene.drag is None else transformed_times(scene.decay_rates, times)
+        drag = scene.drag_rates
+        return times if drag is None else transformed_times(drag, times)
 
-    def filled_side(self, scene: HardScene) -> Array:
-        """Return the side of the box, or of a cube of the container's volume."""
-        if scene.walls is None:
-            return scene.side
-        sides = scene.walls.sides
-        return jnp.prod(sides) ** (1 / len(sides))
-
-    def planned(self, scene: HardScene, dimension: int, spare: float | None = None) -> Plan:
+    def planned(self, scene: SphereScene, dimension: int, spare: float | None = None) -> Plan:
         """Return static sizes; capacities were measured for phi = .001 to .4 (disks: .6) and
         N = 125 to 50 000."""
         d, n = dimension, self.replicas * self.num_particles
-        filled = float(self.filled_side(scene))
+        filled = float(scene.filled_side)
         around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
         share = max(WINDOW_SHARE, 2 * MIN_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
@@ -211,35 +207,7 @@ class HardSpheres(AbstractSpheres):
         expected = around.listed, near, chosen, 1.25 * longest
         extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # random positions have more near pairs
         ahead = around.lookahead
-        if scene.walls is not None:  # the sweep runs along the first axis
-            ahead = min(ahead * max(1.0, filled / float(scene.walls.sides[0])), self.num_particles)
+        if scene.container is not None:  # the sweep runs along the first axis
+            ahead = min(ahead * max(1.0, filled / float(scene.container[0])), self.num_particles)
         sizes = capacities(expected, ahead, spare or 1.15, extra, n)
         return Plan(self.replicas, None, share, *sizes)
-
-
-def reduced_hard_scene(gas: Gas, num_particles: int, contact_time: float = 0.0) -> HardScene:
-    """Return a gas of hard spheres in units of its diameter, mass and initial temperature."""
-    unit_time = gas.diameter / jnp.sqrt(gas.temperature)
-    side, scene = gas.box_side(num_particles) / gas.diameter, reduced_scene(gas)
-    nu = gas.collision_frequency
-    walls = drag = drive = None
-    if gas.container is not None and scene.walls is not None:
-        sides = jnp.broadcast_to(gas.container.side / gas.diameter, (gas.dimension,))
-        often = scene.walls.frequency / collision_rate(0.0, gas.dimension)
-        walls = HardWalls(sides, scene.walls.law, scene.walls.beta, often)
-        side = jnp.max(sides) + BOX_MARGIN
-    if gas.drag is not None:
-        drag = ReducedDrag(gas.drag.rate / nu, gas.drag.rotational_rate / nu)
-    if gas.drive is not None:
-        drive = ReducedDrive(gas.drive.strength / (nu * gas.temperature))
-    return HardScene(
-        side=side,
-        law=gas.reduced_law,
-        collision_frequency=nu * unit_time,
-        contact_time=jnp.asarray(contact_time, gas.temperature.dtype),
-        elastic=jnp.zeros((), bool),
-        surface=scene.surface,
-        walls=walls,
-        drag=drag,
-        drive=drive,
-    )

@@ -14,18 +14,23 @@ from jaxtyping import Array, Bool, Float
 from jaxgran._utils.tracing import any_traced, concrete_array
 from jaxgran._utils.validation import POSITIVE, UserFloat, UserInt, checked_float, python_int
 from jaxgran.data.curve import UserParticles
-from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
-from jaxgran.particles.setup import check_inside
 from jaxgran.particles.soft.dynamics import SoftDynamics
 from jaxgran.scene.contact import elastic_constant
 from jaxgran.scene.elements import Frictional
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import Viscoelastic
-from jaxgran.scene.reduced import ReducedContact, ReducedFriction, SphereScene, sphere_scene
+from jaxgran.scene.reduced import (
+    ReducedContact,
+    ReducedFriction,
+    ReducedScene,
+    ReducedWalls,
+    SphereScene,
+    sphere_scene,
+)
 
 PROJECTION = 0.1
 """Mean free times between thermal projections of a derivative."""
@@ -135,10 +140,8 @@ class SoftSpheres(AbstractSpheres):
                 f"{type(gas.law).__name__}. Use KineticTheory, DSMC or HardSpheres."
             )
         with jax.ensure_compile_time_eval():
-            self.check_box(gas)
-            checks.check_volume(gas, self.num_particles)
+            self.check_box(gas, 0.0)
             if (walls := gas.container) is not None:
-                check_inside(self.start, walls, 0.0, gas.dimension)
                 if not isinstance(walls.restitution, Viscoelastic):
                     raise ValueError(
                         "SoftSpheres needs walls of the Viscoelastic law, which has a force "
@@ -153,11 +156,6 @@ class SoftSpheres(AbstractSpheres):
                         "HardSpheres."
                     )
         self._ask_about_overlaps(gas)
-        if gas.surface and self.start is not None and self.start.angular_velocity is not None:
-            raise ValueError(
-                "SoftSpheres draws the angular velocities of a start. Give the start without them, "
-                "start._replace(angular_velocity=None), and rotational_temperature of the surface."
-            )
 
     def _ask_about_overlaps(self, gas: Gas) -> None:
         """Warn if contacts of the start store much energy, which becomes thermal motion."""
@@ -195,28 +193,26 @@ class SoftSpheres(AbstractSpheres):
     def scene(self, gas: Gas) -> SphereScene:
         """Return the gas in units of its diameter, mass and initial temperature."""
         law: Any = gas.law  # `check` refuses others than Viscoelastic, also of walls
-        surface, walls, material = gas.surface, gas.container, {}
-        if isinstance(surface, Frictional):
-            material["surface"] = ReducedFriction(
-                surface.tangential_damping,
-                surface.friction,
-                surface.inertia,
-                surface.rotational_temperature / gas.temperature,
+        surface = walls = None
+        if isinstance(rough := gas.surface, Frictional):
+            surface = ReducedFriction(
+                rough.tangential_damping,
+                rough.friction,
+                rough.inertia,
+                rough.rotational_temperature / gas.temperature,
             )
-        if walls is not None:
-            wall_law: Any = walls.restitution
-            material["wall_law"] = ReducedContact.of(wall_law.of_wall(), gas)
-            if walls.tangential_damping is not None and walls.friction is not None:
-                material["wall_surface"] = ReducedFriction(walls.tangential_damping, walls.friction)
-        return sphere_scene(gas, self.num_particles, ReducedContact.of(law, gas), **material)
+        if (box := gas.container) is not None:
+            wall_law: Any = box.restitution
+            friction = None
+            if box.tangential_damping is not None and box.friction is not None:
+                friction = ReducedFriction(box.tangential_damping, box.friction)
+            walls = ReducedWalls(ReducedContact.of(wall_law.of_wall(), gas), None, friction)
+        material = ReducedScene(ReducedContact.of(law, gas), surface, walls)
+        return sphere_scene(gas, self.num_particles, material)
 
     def unreachable_times(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
         """Return a mask without times: soft spheres do not transform time, and reach all."""
         return jnp.zeros(times.shape, bool)
-
-    def filled_side(self, scene: SphereScene) -> Array:
-        """Return the side of the box, or of a cube of the container's volume."""
-        return scene.filled_side
 
     def non_differentiable(self, scene: SphereScene) -> Any:
         """Return the lengths and the collision frequency between walls, otherwise nothing."""

@@ -27,12 +27,14 @@ from jaxgran.particles.capacity import Capacity, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.run import Simulation, simulate_on_host, simulate_traced
 from jaxgran.particles.setup import (
+    check_inside,
     check_start,
     has_other_box,
     reduced_start,
     with_constant_temperature,
 )
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.reduced import SphereScene
 
 DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
 """Allowed steps of differences: the lower value of alpha must stay positive."""
@@ -99,18 +101,18 @@ class AbstractSpheres(AbstractModel):
         )
 
     @abstractmethod
-    def scene(self, gas: Gas) -> Any:
+    def scene(self, gas: Gas) -> SphereScene:
         """Return the gas in units of its diameter, mass and initial temperature."""
 
     @abstractmethod
-    def planned(self, scene: Any, dimension: int, spare: float | None = None) -> Plan:
+    def planned(self, scene: SphereScene, dimension: int, spare: float | None = None) -> Plan:
         """Return static sizes for a scene of known numbers, with a spare factor on capacities."""
 
     @abstractmethod
-    def dynamics(self, scene: Any, plan: Plan) -> AbstractDynamics:
+    def dynamics(self, scene: SphereScene, plan: Plan) -> AbstractDynamics:
         """Return the equations of motion of the spheres."""
 
-    def clock(self, scene: Any, times: Float[Array, "times"]) -> Float[Array, "times"]:
+    def clock(self, scene: SphereScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
         """Return the times of the run at reduced times."""
         return times
 
@@ -118,11 +120,7 @@ class AbstractSpheres(AbstractModel):
         """Return a mask of the times that the run cannot reach."""
         return checks.unreachable_with_drag(gas, times)
 
-    def filled_side(self, scene: Any) -> Array:
-        """Return the side, in diameters, of a cube of the volume that the spheres can fill."""
-        return scene.side
-
-    def non_differentiable(self, scene: Any) -> Any:
+    def non_differentiable(self, scene: SphereScene) -> Any:
         """Return the numbers of a scene in which the derivative of a run is not known."""
         return ()
 
@@ -162,13 +160,13 @@ class AbstractSpheres(AbstractModel):
         """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
         unreachable_times = self.unreachable_times(gas, times)
         gas = with_constant_temperature(self.start, gas)
-        scene = self.scene(gas)
+        scene, speed = self.scene(gas), jnp.sqrt(gas.temperature)
         inputs = Inputs(
             scene=scene,
-            times=self.clock(scene, times * jnp.sqrt(gas.temperature) / gas.diameter),
+            times=self.clock(scene, times * speed / gas.diameter),
             start=reduced_start(self.start, gas, differentiable=not self.projected),
             key=run.key,
-            units=self._units(gas, scene.side),
+            units=snapshot.Units.of(gas, self.num_particles, gas.diameter, speed),
         )
 
         def outputs(inputs: Inputs, directions: Any = None, run: Run = run) -> Outputs:
@@ -185,12 +183,6 @@ class AbstractSpheres(AbstractModel):
         out = differentiable_outputs(inputs)
         return self._curve(gas, times, inputs.units, out, unreachable_times, run.save)
 
-    def _units(self, gas: Gas, side: Array) -> snapshot.Units:
-        """Return the SI units of the particles that `save` sees."""
-        length, velocity = gas.diameter, jnp.sqrt(gas.temperature)
-        box_side = side * length if gas.container is None else gas.container.side
-        return snapshot.Units(length, velocity, 2 * velocity / length, box_side, gas.mass)
-
     def _outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
         """Run in reduced units: from the host if all numbers are known, otherwise compiled."""
         if not any_traced(inputs) and (
@@ -205,7 +197,7 @@ class AbstractSpheres(AbstractModel):
             runs = particle_run.run_replicas(run_replica, self.replicas, run, on)
             return particle_run.join_outputs(runs)
         plan = self._known_plan(inputs.scene, dimension)
-        side = self.filled_side(inputs.scene)
+        side = inputs.scene.filled_side
         skin = skin_for_pairs(self.listed_by_skin, self.num_particles, side, dimension)
         sim = Simulation(
             dynamics=self.dynamics(inputs.scene, plan),
@@ -234,7 +226,7 @@ class AbstractSpheres(AbstractModel):
             )
         return simulate_traced(sim)
 
-    def _known_plan(self, scene: Any, dimension: int) -> Plan:
+    def _known_plan(self, scene: SphereScene, dimension: int) -> Plan:
         """Return the plan of the model, or a new one if all numbers that it needs are known."""
         name = type(self).__name__
         if self.plan is not None:
@@ -305,8 +297,13 @@ class AbstractSpheres(AbstractModel):
                 "derivative. Leave one of them out."
             )
 
-    def check_box(self, gas: Gas) -> None:
-        """Raise ValueError for a gas too dense, a box too small, or a start of another gas."""
+    def check_box(self, gas: Gas, min_wall_distance: float) -> None:
+        """Raise ValueError for a gas too dense, a box too small, or a start of another gas.
+
+        Args:
+            gas: the gas.
+            min_wall_distance: least distance, in diameters, of a centre of the start from a wall.
+        """
         check_start(self.start, gas, self.replicas, self.num_particles)
         if self.differences is not None and gas.elements:
             raise ValueError(
@@ -315,6 +312,17 @@ class AbstractSpheres(AbstractModel):
                 "differences of runs yourself."
             )
         checks.check_packing(gas, self.num_particles, random=self.start is None)
+        checks.check_volume(gas, self.num_particles)
+        if self.start is None:
+            return
+        if gas.container is not None:
+            check_inside(self.start, gas.container, gas.diameter * min_wall_distance)
+        if self.start.angular_velocity is not None:
+            raise ValueError(
+                f"{type(self).__name__} draws the angular velocities of a start. Give the start "
+                "without them, start._replace(angular_velocity=None), and rotational_temperature "
+                "of the surface."
+            )
 
     def noise(self, error_model: ErrorModel) -> tuple[float, float]:
         """Standard errors of ln T by shot noise and by the random amplitudes of a flow."""

@@ -125,9 +125,9 @@ class Neighbourhood(NamedTuple):
         at_contact = float(contact_value(phi, dimension))
         frequency = 2 * dimension * in_contact * at_contact / pi**0.5
         listed = in_contact * (1 + skin) ** dimension
-        return cls(
-            in_contact, at_contact, frequency, listed, expected_lookahead(num_particles, side, skin)
-        )
+        along_x = min((1 + skin) / side, 0.5)
+        lookahead = num_particles * (along_x + 3 * unsorted_share(num_particles))
+        return cls(in_contact, at_contact, frequency, listed, lookahead)
 
 
 def capacities(
@@ -162,12 +162,6 @@ def skin_for_pairs(listed_more: float, num_particles: int, side: ArrayLike, dime
     volume = num_particles * sphere_surface(dimension) / (2 * dimension)
     in_contact = volume / xp.asarray(side**dimension)
     return xp.minimum((1 + listed_more / in_contact) ** (1 / dimension) - 1, max_skin(side))
-
-
-def expected_lookahead(num_particles: int, side: float, skin: float) -> float:
-    """Return the look-ahead, in particles, of a sweep in a homogeneous gas with a skin."""
-    along_x = min((1 + float(skin)) / float(side), 0.5)
-    return float(num_particles * (along_x + 3 * unsorted_share(num_particles)))
 
 
 def max_skin(side: ArrayLike) -> Any:

@@ -20,10 +20,20 @@ from jaxgran._utils import status
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.neighbours import ListedPairs, Pairs
-from jaxgran.particles.state import State, initial_state
+from jaxgran.particles.state import State
+from jaxgran.scene.reduced import SphereScene
 
 MAX_STALLED = 1000
 """Largest number of blocks or segments in a row that do not advance the time."""
+
+FATAL = (
+    status.LIST_FULL.bit
+    | status.CONTACTS_FULL.bit
+    | status.NOT_FINITE.bit
+    | status.STALLED.bit
+    | status.ENERGY_DRIFT.bit
+)
+"""Faults from which `AbstractDynamics.recover` does not recover."""
 
 MIN_FLIGHT = 1e-15
 """Flight of the fastest sphere, in diameters, below which the time counts as not advanced."""
@@ -56,7 +66,7 @@ class AbstractDynamics(eqx.Module):
         capacity: lengths of the arrays.
     """
 
-    scene: AbstractVar[Any]
+    scene: AbstractVar[SphereScene]
     replicas: AbstractVar[int]
     capacity: AbstractVar[Capacity]
 
@@ -98,23 +108,25 @@ class AbstractDynamics(eqx.Module):
     def with_tangents(self, state: State, directions: Any) -> State:
         """Add tangents along directions in the material to a state independent of the material."""
 
+    @abstractmethod
+    def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
+        """Draw the random fields of a state at t = 0: the spins, and the key of a drive."""
+
+    @abstractmethod
+    def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
+        """Return true velocities and spins, None without spins, from stored velocities."""
+
     @property
     def region(self) -> Float[Array, "d"] | None:
         """Sides of the region, which begins at 1/2, of the centres; None for the whole box."""
-        return None
+        return None if self.scene.container is None else self.scene.container - 1
 
-    @property
-    def galilean_invariant(self) -> bool:
-        """True if the dynamics is invariant under a constant velocity of the frame."""
-        return True
-
-    def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
-        """Draw the random fields of a state at t = 0: the spins, and the key of a drive."""
-        return state
-
-    def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
-        """Return true velocities and spins, None without spins, from stored velocities."""
-        return velocity, None
+    def invalid_block(self, new: State, needed: Int[Array, "kinds"]) -> Int[Array, ""]:
+        """Return the status of a block that lacks pairs or particles, or is not finite."""
+        list_status = self.capacity.exceeded_by(needed)
+        finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
+        not_finite = jnp.where(finite, status.OK, status.NOT_FINITE.bit)
+        return jnp.where(list_status > 0, list_status, not_finite)
 
     def check_start(self, state: State) -> Int[Array, ""]:
         """Return the status of positions given by a user."""
@@ -122,8 +134,20 @@ class AbstractDynamics(eqx.Module):
 
     def begin(self, position: Array, velocity: Array, skin: ArrayLike) -> State:
         """Return the state at t = 0 with given positions and velocities."""
-        internal = self.initial_internal(len(position), position.dtype)
-        return initial_state(position, velocity, self.scene.side, skin, self.replicas, internal)
+        dtype, inside = position.dtype, neighbours.wrap(self.scene.side, position)
+        return State(
+            time=jnp.zeros((), dtype),
+            time_rest=jnp.zeros((), dtype),
+            position=inside,
+            velocity=velocity,
+            image=jnp.zeros(position.shape, jnp.int32),
+            origin=inside,
+            first_velocity=velocity,
+            dissipated=jnp.zeros(self.replicas, dtype),
+            collisions=jnp.zeros(self.replicas, jnp.result_type(int)),
+            skin=jnp.asarray(skin, dtype),
+            internal=self.initial_internal(len(position), dtype),
+        )
 
     def with_capacity(self, capacity: Capacity) -> "AbstractDynamics":
         """Return the same dynamics with other lengths of arrays."""

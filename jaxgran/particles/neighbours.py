@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float, Int, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt32
 
 
 def rows_where(mask: Bool[Array, "all"], size: int) -> tuple[Int[Array, "{size}"], Int[Array, ""]]:
@@ -36,6 +36,38 @@ def rows_where(mask: Bool[Array, "all"], size: int) -> tuple[Int[Array, "{size}"
     words = jnp.sum(bits << jnp.arange(32, dtype=jnp.uint32)[None], axis=1, dtype=jnp.uint32)
     word, bit, count = bits_where(words, size)
     return jnp.where(jnp.arange(size) < count, 32 * word + bit, mask.size), count
+
+
+def select_members(
+    selected: Bool[Array, "all"],
+    i: Int[Array, "all"],
+    j: Int[Array, "all"],
+    others: Bool[Array, "n"],
+    capacity: tuple[int, int],
+) -> tuple[Int[Array, "rows"], Bool[Array, "rows"], Int[Array, "members"], Array, list[Array]]:
+    """Return the selected pairs, the particles that belong to them or to `others`, its members.
+
+    Args:
+        selected: mask of the pairs.
+        i, j: indices of both particles of each pair.
+        others: mask of further members.
+        capacity: largest numbers of pairs and of members.
+
+    Returns:
+        The rows of the pairs, and which of them are real; the members in increasing order, n in
+        empty slots; the slots of both particles of each pair; the numbers of pairs and of members.
+    """
+    n = len(others)
+    rows, num_rows = rows_where(selected, capacity[0])
+    real = jnp.arange(capacity[0]) < num_rows
+    rows = jnp.where(real, rows, 0)
+    ends = jnp.stack([i[rows], j[rows]])
+    is_member = others.at[jnp.where(real[None], ends, n)].set(True, mode="drop")
+    members, num_members = rows_where(is_member, capacity[1])
+    slots = jnp.arange(capacity[1], dtype=jnp.int32)
+    slot = jnp.zeros(n, jnp.int32).at[members].set(slots, mode="drop")
+    slots = jnp.where(real[None], slot[ends], 0)
+    return rows, real, members, slots, [num_rows, num_members]
 
 
 def bits_where(
@@ -125,115 +157,64 @@ def sweep(
         )
     unit = position.reshape(replicas, n, position.shape[-1]) / side
     unit = jnp.where(unit >= 1, 0.0, unit)  # by rounding
-    finite = jnp.all(jnp.isfinite(position))
-    order, unit = _sorted_along_x(unit)
-    grid = _Grid.of(unit)
-    reach = _Reach.of(side, cutoff, n, position.dtype)
-    words, num_compared = _near_bits(grid, reach, finite, num_words)
-    word, bit, count = bits_where(words.ravel(), capacity)
-    i, j = _decode_pairs(word, bit, order)
-    in_use = jnp.arange(capacity) < count
-    i, j = (jnp.where(in_use, k, 0) for k in (i, j))
-    return jnp.minimum(i, j), jnp.maximum(i, j), count, jnp.minimum(num_compared, n - 1)
 
-
-def _sorted_along_x(
-    unit: Float[Array, "replicas n d"],
-) -> tuple[Int[Array, "replicas n"], Float[Array, "replicas n d"]]:
-    """Return the order of the particles of each box along x, and their positions in that order."""
-    n = unit.shape[1]
-    # Sorting one integer of the coarse coordinate and the index takes a tenth of the time of
+    # Sorting one integer of the coarse coordinate x and the index takes a tenth of the time of
     # sorting two arrays.
-    index_bits = _index_bits(n)
-    coarse = (unit[..., 0] * 2.0 ** (31 - index_bits)).astype(jnp.int32) << index_bits
-    order = jax.lax.sort(coarse | jnp.arange(n, dtype=jnp.int32)[None]) & (2**index_bits - 1)
-    return order, jnp.take_along_axis(unit, order[..., None], axis=1)
+    bits = _index_bits(n)
+    coarse = (unit[..., 0] * 2.0 ** (31 - bits)).astype(jnp.int32) << bits
+    order = jax.lax.sort(coarse | jnp.arange(n, dtype=jnp.int32)[None]) & (2**bits - 1)
+    unit = jnp.take_along_axis(unit, order[..., None], axis=1)
 
+    # Coordinates as whole numbers of steps, continued periodically: the next image of the box
+    # follows the last particle, and then padding at a large distance.
+    here = [(unit[..., 0] * _X_STEPS).astype(jnp.int32)]
+    here += [((unit[..., k] - 0.5) * _YZ_STEPS).astype(jnp.int32) for k in range(1, unit.shape[-1])]
+    images = [here[0] + int(_X_STEPS), *here[1:]]
+    end = jnp.full((replicas, 2 * _WORD), jnp.iinfo(jnp.int32).max)
+    ahead_of = [jnp.concatenate([x, y, end], axis=1) for x, y in zip(here, images, strict=True)]
 
-class _Grid(NamedTuple):
-    """Coordinates of the particles, sorted along x, as whole numbers of grid steps."""
+    def following(axis: int, block: Array, count: int) -> Int[Array, "replicas {count}"]:
+        first = _WORD * block + 1
+        return jax.lax.dynamic_slice_in_dim(ahead_of[axis], first, count, axis=1)
 
-    here: tuple[Int[Array, "replicas n"], ...]  # one array per axis
-    ahead: tuple[Int[Array, "replicas more"], ...]  # continued periodically behind the last one
-
-    @classmethod
-    def of(cls, unit: Float[Array, "replicas n d"]) -> "_Grid":
-        x = (unit[..., 0] * _X_STEPS).astype(jnp.int32)
-        others = [
-            ((unit[..., k] - 0.5) * _YZ_STEPS).astype(jnp.int32) for k in range(1, unit.shape[-1])
-        ]
-        # The next image of the box follows the last particle, and then padding at a large distance.
-        end = jnp.full((len(unit), 2 * _WORD), jnp.iinfo(jnp.int32).max)
-        x_ahead = jnp.concatenate([x, x + int(_X_STEPS), end], axis=1)
-        others_ahead = [jnp.concatenate([y, y, end], axis=1) for y in others]
-        return cls((x, *others), (x_ahead, *others_ahead))
-
-    def following(self, axis: int, first: ArrayLike, count: int) -> Int[Array, "replicas {count}"]:
-        """Return the coordinates of `count` sorted particles, from index `first` on."""
-        return jax.lax.dynamic_slice_in_dim(self.ahead[axis], first, count, axis=1)
-
-
-class _Reach(NamedTuple):
-    """Cutoff in grid steps, enlarged by the rounding errors."""
-
-    square: Float[Array, ""]  # of the distance, in steps of y and z
-    farthest: Int[Array, ""]  # along x, in steps of x
-
-    @classmethod
-    def of(cls, side: ArrayLike, cutoff: ArrayLike, n: int, dtype: DTypeLike) -> "_Reach":
-        reach = cutoff / side * _YZ_STEPS + 8 + 4 * _YZ_STEPS * jnp.finfo(dtype).eps  # rounding
-        square = jnp.minimum(reach * reach * (1 + 1e-6), (_YZ_STEPS / 2) ** 2).astype(jnp.float32)
-        along_x = (reach * (_X_STEPS / _YZ_STEPS)).astype(jnp.int32)
-        return cls(square, along_x + 2 ** max(_index_bits(n) - 1, 1))
-
-
-def _near_bits(
-    grid: _Grid, reach: _Reach, finite: Bool[Array, ""], num_words: int
-) -> tuple[UInt32[Array, "{num_words} replicas n"], Int[Array, ""]]:
-    """Compare each particle with the following ones, and set a bit for each within the cutoff.
-
-    Returns:
-        The bits in words of 32, and the number of following particles that had to be compared.
-    """
-    replicas, n = grid.here[0].shape
+    # The cutoff in steps of y and z, and along x in steps of x, enlarged by the rounding errors.
+    reach = cutoff / side * _YZ_STEPS + 8 + 4 * _YZ_STEPS * jnp.finfo(position.dtype).eps
+    square = jnp.minimum(reach * reach * (1 + 1e-6), (_YZ_STEPS / 2) ** 2).astype(jnp.float32)
+    along_x = (reach * (_X_STEPS / _YZ_STEPS)).astype(jnp.int32) + 2 ** max(bits - 1, 1)
+    finite = jnp.all(jnp.isfinite(position))
 
     def compare_block(carry):
         block, words = carry
-        window = [
-            grid.following(axis, _WORD * block + 1, n + _WORD - 1) for axis in range(len(grid.here))
-        ]
+        window = [following(axis, block, n + _WORD - 1) for axis in range(len(here))]
         word = jnp.zeros((replicas, n), jnp.uint32)
         for bit in range(_WORD):
             apart = [
-                (there[:, bit : bit + n] - here).astype(jnp.float32)
-                for there, here in zip(window, grid.here, strict=True)
+                (there[:, bit : bit + n] - x).astype(jnp.float32)
+                for there, x in zip(window, here, strict=True)
             ]
             apart[0] *= _YZ_STEPS / _X_STEPS
-            near = sum(a * a for a in apart) < reach.square
+            near = sum(a * a for a in apart) < square
             word |= near.astype(jnp.uint32) << bit
         return block + 1, words.at[block].set(word, mode="drop")
 
     def unfinished(carry):
         block, _ = carry
-        nearest = jnp.min(grid.following(0, _WORD * block + 1, n) - grid.here[0])
-        return finite & (_WORD * block + 1 < n) & (nearest <= reach.farthest)
+        nearest = jnp.min(following(0, block, n) - here[0])
+        return finite & (_WORD * block + 1 < n) & (nearest <= along_x)
 
     words = jnp.zeros((num_words, replicas, n), jnp.uint32)
     blocks, words = jax.lax.while_loop(unfinished, compare_block, (jnp.int32(0), words))
-    return words, _WORD * blocks
 
-
-def _decode_pairs(
-    word: Int[Array, "pairs"], bit: Int[Array, "pairs"], order: Int[Array, "replicas n"]
-) -> tuple[Int[Array, "pairs"], Int[Array, "pairs"]]:
-    """Return the two particles of the pair of each set bit."""
-    replicas, n = order.shape
-    here = word % (replicas * n)
-    first = n * (here // n)
-    there = here - first + _WORD * (word // (replicas * n)) + bit + 1
+    # The two particles of the pair of each set bit.
+    word, bit, count = bits_where(words.ravel(), capacity)
+    index = word % (replicas * n)
+    first = n * (index // n)
+    there = index - first + _WORD * (word // (replicas * n)) + bit + 1
     there = first + jnp.where(there >= n, there - n, there)
     particle = (order + n * jnp.arange(replicas, dtype=jnp.int32)[:, None]).ravel()
-    return particle.at[here].get(mode="clip"), particle.at[there].get(mode="clip")
+    in_use = jnp.arange(capacity) < count
+    i, j = (jnp.where(in_use, particle.at[k].get(mode="clip"), 0) for k in (index, there))
+    return jnp.minimum(i, j), jnp.maximum(i, j), count, jnp.minimum(_WORD * blocks, n - 1)
 
 
 ENGINES = ("auto", "sweep", "scipy", "jax-md")

@@ -31,7 +31,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +55,7 @@ from jaxgran.particles.setup import (
     normalise_velocities,
     relaxed_positions,
 )
-from jaxgran.particles.state import State, centred, copy_buffers, empty_records, fill_nan_from
+from jaxgran.particles.state import State, centred, copy_buffers
 
 EQUILIBRATION_COLLISIONS = 10.0
 """Duration of the equilibration, in mean free times."""
@@ -128,7 +128,7 @@ class Simulation(NamedTuple):
         Its shape is (n, d). It is the number 0 for a random start, and where walls or drag are at
         rest.
         """
-        if self.inputs.start is None or not self.dynamics.galilean_invariant:
+        if self.inputs.start is None or not self.dynamics.scene.galilean_invariant:
             return jnp.zeros(())
         velocity = self.inputs.start[1]
         return velocity - centred(velocity, self.dynamics.replicas).reshape(velocity.shape)
@@ -255,38 +255,33 @@ def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Out
         settings: further settings that determine the result, by name, for the checkpoint.
     """
     write = sim.writer(run)  # raises an error before the equilibration if there cannot be a file
-    dynamics = sim.dynamics
+    dynamics, progress = sim.dynamics, run.progress
     state, fault = sim.first_state(False)
     engine = neighbours.choose_engine(sim.engine, dynamics.capacity.lookahead)
-    # An interruption saves the state before the current call, which then must not be donated.
-    donate = run.checkpoint is None
-    if sim.inputs.start is None and not (
-        run.checkpoint is not None and Path(run.checkpoint).exists()
-    ):
-        state, fault = _equilibrate(sim, state, engine, run.progress)
+    resumed = run.checkpoint is not None and Path(run.checkpoint).exists()
+    if sim.inputs.start is None and not resumed:
+        state, fault = _equilibrate(sim, copy_buffers(state), engine, progress)
     state = copy_buffers(sim.cooling_state(state))
 
     def advance(state: State, end: float) -> State:
-        return _advance_growing(
-            state, end, dynamics, dynamics.capacity, engine, run.progress, donate
-        )
+        # An interruption saves the state before the current call, which then must not be donated.
+        donate = run.checkpoint is None
+        return _advance(state, end, dynamics, dynamics.capacity, engine, progress, donate)
 
     try:
         if fault == status.OK:  # counts the energy in contacts
             state = advance(state, 0.0)
     except RunFailure as failure:
         fault, state = failure.fault, failure.state
-    times = np.asarray(sim.inputs.times)
     given = sim.inputs._asdict() | settings | {"directions": sim.directions, "save": sim.save}
-    scene = {} if run.checkpoint is None else describe_run(**given)
     state, records, fault = run_through_times(
         state,
-        times,
+        np.asarray(sim.inputs.times),
         advance,
         sim.observe,
         shown=dynamics.observe,
-        scene=scene,
-        progress=run.progress,
+        scene={} if run.checkpoint is None else describe_run(**given),
+        progress=progress,
         path=run.checkpoint,
         write=write,
         fault=fault,
@@ -303,9 +298,9 @@ def _equilibrate(sim: Simulation, state: State, engine: str, progress: bool) -> 
     def advance(state: State, end: float) -> State:
         crowded = float(state.time) < settled
         capacity = sim.equilibration_capacity if crowded else elastic.capacity
-        return _advance_growing(state, end, elastic, capacity, engine, progress)
+        return _advance(state, end, elastic, capacity, engine, progress, True)
 
-    state, end = copy_buffers(state), np.asarray([sim.equilibration_time])
+    end = np.asarray([sim.equilibration_time])
     state, _, fault = run_through_times(
         state, end, advance, elastic.observe, progress=progress, label="equilibrating"
     )
@@ -317,26 +312,39 @@ _GROWN: dict[Capacity, Capacity] = {}
 fail on the way to them nor compile again. Results do not depend on it."""
 
 
-def _advance_growing(
+def _advance(
     state: State,
     end: float,
     dynamics: AbstractDynamics,
     capacity: Capacity,
     engine: str,
     progress: bool,
-    donate: bool = True,
+    donate: bool,
 ) -> State:
     """Run some segments towards an end; enlarge arrays, from a given capacity, where necessary.
 
-    With `donate` the given state may be deleted. A failure then holds the last good state.
+    One compiled call runs several segments, or one segment if the host finds the pairs. With
+    `donate` the given state may be deleted. A failure then holds the last good state.
 
     Raises:
         RunFailure: for any other failure.
     """
+    until = np.asarray(end, state.time.dtype)
     while True:
         enlarged = _GROWN.get(capacity, capacity)
         sized = dynamics if dynamics.capacity == enlarged else dynamics.with_capacity(enlarged)
-        state, fault, needed = _run_segments(sized, state, end, engine, progress, donate)
+        if engine == "sweep":
+            program = state.position.shape, until.dtype, jax.tree.structure((sized, state))
+            with compiling(progress and needs_compilation(program)):
+                result = compiled_segments(donate)(
+                    sized, state, until, engine, min_segments=1, max_segments=SEGMENTS_PER_CALL
+                )
+            state, fault, needed = block_until_ready(result)
+        else:
+            now = block_until_ready(sized.run_segment(state, end, engine))
+            fault, needed = now.status, now.needed
+            state = now.state if int(fault) == status.OK else state
+        fault, needed = int(fault), np.asarray(needed).tolist()
         if fault == status.OK:
             return state
         full = fault & (status.LIST_FULL.bit | status.CONTACTS_FULL.bit)
@@ -344,32 +352,6 @@ def _advance_growing(
             raise RunFailure(fault, state)
         # The whole segment is repeated, because a list made within it has another order.
         _GROWN[capacity] = enlarged.grown(needed)
-
-
-def _run_segments(
-    dynamics: AbstractDynamics,
-    state: State,
-    end: float,
-    engine: str,
-    progress: bool,
-    donate: bool,
-) -> tuple[State, int, list[int]]:
-    """Run several segments in one compiled call, or one segment if the host finds the pairs.
-
-    After a failure of the latter the given state is returned, which therefore is never donated.
-    """
-    if engine == "sweep":
-        until = np.asarray(end, state.time.dtype)
-        program = engine, state.position.shape, until.dtype, jax.tree.structure((dynamics, state))
-        with compiling(progress and needs_compilation(program)):
-            result = compiled_segments(donate)(
-                dynamics, state, until, engine, min_segments=1, max_segments=SEGMENTS_PER_CALL
-            )
-        state, fault, needed = block_until_ready(result)
-        return state, int(fault), np.asarray(needed).tolist()
-    now = block_until_ready(dynamics.run_segment(state, end, engine))
-    fault = int(now.status)
-    return (now.state if fault == status.OK else state), fault, np.asarray(now.needed).tolist()
 
 
 class RunFailure(Exception):
@@ -383,29 +365,20 @@ class RunFailure(Exception):
         self.fault, self.state = fault, state
 
 
-@runtime_checkable
-class _Timed(Protocol):
-    @property
-    def time(self) -> Any: ...
-
-
-S = TypeVar("S", bound=_Timed)
-
-
 def run_through_times(
-    state: S,
+    state: Any,
     times: np.ndarray,
-    advance: Callable[[S, float], S],
-    observe: Callable[[S], dict[str, jax.Array]],
+    advance: Callable[[Any, float], Any],
+    observe: Callable[[Any], dict[str, jax.Array]],
     *,
-    write: Callable[[int, S], None] = lambda k, state: None,
-    shown: Callable[[S], dict[str, jax.Array]] | None = None,
+    write: Callable[[int, Any], None] = lambda k, state: None,
+    shown: Callable[[Any], dict[str, jax.Array]] | None = None,
     scene: dict[str, str] | None = None,
     progress: bool = True,
     label: str | None = None,
     path: str | Path | None = None,
     fault: int = status.OK,
-) -> tuple[S, dict[str, np.ndarray], int]:
+) -> tuple[Any, dict[str, np.ndarray], int]:
     """Advance a state through all times and record it at each.
 
     Args:
@@ -424,18 +397,31 @@ def run_through_times(
         fault: status before; unless it is ok the state is not advanced.
 
     Returns:
-        The last state; the records, whose first axis is that of the times, with nan from a failure
-        on; and the status.
+        The last state; the records, whose first axis is that of the times, with nan (integers: 0)
+        from a failure on; and the status.
     """
-    first = empty_records(observe(state), len(times))
-    num_done, state, records = _resumed(path, scene, state, first)
-    last_save, num_stalled = time.monotonic(), 0
+    observed = {name: np.asarray(value) for name, value in observe(state).items()}
+    records = {name: np.zeros((len(times), *x.shape), x.dtype) for name, x in observed.items()}
+    num_done, last_save, num_stalled = 0, time.monotonic(), 0
+    if path is not None and Path(path).exists():
+        done, loaded, records = checkpoint.load(path, scene or {}, (0, state, records))
+        num_done = int(done)
+        # JAX arrays of the same types do not make compiled functions compile again.
+        state = jax.tree.map(lambda new, old: concrete_array(new, old.dtype), loaded, state)
 
     def save():
         if path is not None:
             checkpoint.save(path, scene or {}, (num_done, state, records))
 
-    with _progress_bar(float(times[-1]), float(state.time), progress, label) as bar:
+    bar = tqdm(
+        total=float(times[-1]),
+        initial=float(state.time),
+        disable=None if progress else True,
+        delay=3,
+        desc=label,
+        bar_format="{l_bar}{bar}| {elapsed} elapsed, {remaining} left{postfix}",
+    )
+    with bar:
         try:
             if fault != status.OK:
                 raise RunFailure(fault)
@@ -445,7 +431,10 @@ def run_through_times(
                     num_stalled = num_stalled + 1 if float(state.time) <= now else 0
                     if num_stalled >= MAX_STALLED:
                         raise RunFailure(status.STALLED.bit)
-                    _update_bar(bar, state, shown or observe)
+                    bar.update(float(state.time) - bar.n)
+                    if not bar.disable:
+                        ratio = float(np.mean((shown or observe)(state)["temperature"]))
+                        bar.set_postfix_str(f"T/T_0 = {ratio:.3g}", refresh=False)
                     if time.monotonic() - last_save > CHECKPOINT_SECONDS:
                         save()
                         last_save = time.monotonic()
@@ -459,38 +448,9 @@ def run_through_times(
             raise
         except RunFailure as failure:
             fault, state = failure.fault, failure.state or state
-            fill_nan_from(records, num_done)
+            for values in records.values():
+                values[num_done:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
     return state, records, fault
-
-
-def _resumed(
-    path: str | Path | None, scene: dict[str, str] | None, state: S, records: dict[str, np.ndarray]
-) -> tuple[int, S, dict[str, np.ndarray]]:
-    """Return the number of finished times, the state and the records of a checkpoint, if any."""
-    if path is None or not Path(path).exists():
-        return 0, state, records
-    num_done, loaded, records = checkpoint.load(path, scene or {}, (0, state, records))
-    # JAX arrays of the same types do not make compiled functions compile again.
-    state = jax.tree.map(lambda new, old: concrete_array(new, old.dtype), loaded, state)
-    return int(num_done), state, records
-
-
-def _progress_bar(total: float, initial: float, progress: bool, label: str | None) -> tqdm:
-    return tqdm(
-        total=total,
-        initial=initial,
-        disable=None if progress else True,
-        delay=3,
-        desc=label,
-        bar_format="{l_bar}{bar}| {elapsed} elapsed, {remaining} left{postfix}",
-    )
-
-
-def _update_bar(bar: tqdm, state: Any, observe: Callable[[Any], dict[str, jax.Array]]) -> None:
-    bar.update(float(state.time) - bar.n)
-    if not bar.disable:
-        ratio = float(np.mean(observe(state)["temperature"]))
-        bar.set_postfix_str(f"T/T_0 = {ratio:.3g}", refresh=False)
 
 
 @cache

@@ -17,6 +17,7 @@ from jaxgran._utils.tracing import any_traced, array_module, concrete_array
 from jaxgran.data.curve import Particles, UserParticles
 from jaxgran.particles import neighbours
 from jaxgran.particles.neighbours import Pairs, tree_search
+from jaxgran.particles.snapshot import box_side
 from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
 
@@ -274,21 +275,12 @@ def check_start(start: UserParticles | None, gas: Gas, replicas: int, num_partic
         )
 
 
-def check_inside(
-    start: Particles | None, walls: Walls, min_wall_distance: ArrayLike, dimension: int
-) -> None:
-    """Raise ValueError if a sphere of a start is not between the walls.
-
-    Args:
-        start: particles given by the user.
-        walls: walls at 0 and at each side.
-        min_wall_distance: smallest allowed distance of a centre from a wall, m.
-        dimension: dimension d.
-    """
-    if start is None or any_traced(start.position, walls.side, min_wall_distance):
+def check_inside(start: Particles, walls: Walls, min_wall_distance: ArrayLike) -> None:
+    """Raise ValueError if the centre of a sphere is too close to a wall, at 0 or at a side."""
+    if any_traced(start.position, walls.side, min_wall_distance):
         return
-    least = float(np.asarray(min_wall_distance))
-    sides, position = np.broadcast_to(walls.side, (dimension,)), np.asarray(start.position)
+    least, position = float(np.asarray(min_wall_distance)), np.asarray(start.position)
+    sides = np.broadcast_to(walls.side, position.shape[-1:])
     outside = np.any((position < least) | (position > sides - least), axis=-1)
     if np.any(outside):
         replica, i = np.argwhere(outside)[0]
@@ -307,11 +299,6 @@ def has_other_box(start: Particles | None, gas: Gas, num_particles: int) -> Bool
         return jnp.array(False)
     ratio = jax.lax.stop_gradient(start.box_side / box_side(gas, num_particles))
     return ~jnp.all(jnp.abs(ratio - 1) < SAME_BOX + 10 * jnp.finfo(ratio.dtype).eps)
-
-
-def box_side(gas: Gas, num_particles: int) -> Float[Array, "..."]:
-    """Return the side of the periodic box of a gas, or the sides of its container, m."""
-    return gas.box_side(num_particles) if gas.container is None else gas.container.side
 
 
 def with_constant_temperature(start: Particles | None, gas: Gas) -> Gas:

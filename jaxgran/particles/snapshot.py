@@ -11,9 +11,15 @@ from jaxtyping import Array, Bool, Float
 
 from jaxgran.data.curve import CoolingCurve, Particles
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
+from jaxgran.scene.gas import Gas
 
 PREFIX = "saved:"
 """Prefix of the names of saved records, before the number of the leaf."""
+
+
+def box_side(gas: Gas, num_particles: int) -> Float[Array, "..."]:
+    """Return the side of the periodic box of a gas, or the sides of its container, m."""
+    return gas.box_side(num_particles) if gas.container is None else gas.container.side
 
 
 class Units(NamedTuple):
@@ -32,6 +38,12 @@ class Units(NamedTuple):
     spin: Float[Array, ""]
     box_side: Float[Array, "..."]
     mass: Float[Array, ""]
+
+    @classmethod
+    def of(cls, gas: Gas, num_particles: int, length: Array, velocity: Array) -> "Units":
+        """Return the units of N particles of a gas, with units of length and velocity."""
+        side = box_side(gas, num_particles)
+        return cls(length, velocity, 2 * velocity / gas.diameter, side, gas.mass)
 
 
 def particles(
@@ -81,15 +93,15 @@ def saved_records(save: Callable[[Particles], Any], particles: Particles) -> dic
 
 
 def _map_replicas(save: Callable[[Particles], Any], particles: Particles) -> Any:
+    def saved(replica: Particles) -> Any:
+        tree = save(replica)
+        if not jax.tree.leaves(tree):
+            raise ValueError(f"save must return arrays, in any tree, got {tree!r:.60} from it")
+        return jax.tree.map(_as_array, tree)
+
     spins = None if particles.angular_velocity is None else 0
     axes: Any = Particles(0, 0, None, spins)  # type: ignore[arg-type]
-    return jax.vmap(lambda replica: _as_arrays(save(replica)), (axes,))(particles)
-
-
-def _as_arrays(tree: Any) -> Any:
-    if not jax.tree.leaves(tree):
-        raise ValueError(f"save must return arrays, in any tree, got {tree!r:.60} from it")
-    return jax.tree.map(_as_array, tree)
+    return jax.vmap(saved, (axes,))(particles)
 
 
 def _as_array(leaf: Any) -> Array:

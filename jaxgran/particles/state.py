@@ -16,13 +16,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran.gradients.tangents import PathTangents
-from jaxgran.particles import neighbours, observables
+from jaxgran.particles import observables
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
-from jaxgran.scene.reduced import ReducedDrag, ReducedRough
+from jaxgran.scene.reduced import ReducedDrag, ReducedRough, SphereScene
 
 S = TypeVar("S")
 
@@ -60,31 +59,6 @@ class State(NamedTuple):
     tangents: Any = None
 
 
-def initial_state(
-    position: Float[Array, "n d"],
-    velocity: Float[Array, "n d"],
-    side: ArrayLike,
-    skin: ArrayLike,
-    replicas: int,
-    internal: Any,
-) -> State:
-    """Return the state at t = 0."""
-    dtype, inside = position.dtype, neighbours.wrap(side, position)
-    return State(
-        time=jnp.zeros((), dtype),
-        time_rest=jnp.zeros((), dtype),
-        position=inside,
-        velocity=velocity,
-        image=jnp.zeros(position.shape, jnp.int32),
-        origin=inside,
-        first_velocity=velocity,
-        dissipated=jnp.zeros(replicas, dtype),
-        collisions=jnp.zeros(replicas, jnp.result_type(int)),
-        skin=jnp.asarray(skin, dtype),
-        internal=internal,
-    )
-
-
 def copy_buffers(state: S) -> S:
     """Copy every array of a state to a new buffer, which may then be donated."""
     return jax.tree.map(jnp.copy, state)
@@ -105,15 +79,7 @@ def advance_time(state: State, duration: ArrayLike, end: ArrayLike, at_end: Arra
     )
 
 
-@jax.jit
-def wrap_positions(state: State, side: ArrayLike) -> State:
-    """Wrap every position into the box; the neighbour list must then be built anew."""
-    inside = neighbours.wrap(side, state.position)
-    image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
-    return state._replace(position=inside, image=image)
-
-
-def centred(values: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas N d"]:
+def centred(values: Float[Array, "... d"], replicas: int) -> Float[Array, "replicas N d"]:
     """Return values minus their mean over each replica."""
     by_replica = values.reshape(replicas, -1, values.shape[-1])
     return by_replica - jnp.mean(by_replica, axis=1, keepdims=True)
@@ -135,24 +101,31 @@ def fastest(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "repli
 
 
 def common_records(
-    state: State, side: ArrayLike, replicas: int
+    state: State, scene: SphereScene, replicas: int
 ) -> tuple[dict[str, Array], Float[Array, "replicas N d"], Float[Array, "replicas N d"]]:
-    """Return the records that soft and hard spheres share, centred displacements and velocities."""
-    velocity = centred(state.velocity, replicas)
-    displacement = centred(state.position - state.origin + side * state.image, replicas)
+    """Return the records that soft and hard spheres share, displacements and velocities.
+
+    They are relative to the centre of mass, between walls relative to the walls. Walls bound
+    displacements, and there are no periodic waves between them: these records are left out.
+    """
+    walled, shape = scene.container is not None, (replicas, -1, state.velocity.shape[-1])
+    velocity, first = (
+        x.reshape(shape) if walled else centred(x, replicas)
+        for x in (state.velocity, state.first_velocity)
+    )
+    displacement = centred(state.position - state.origin + scene.side * state.image, replicas)
     num_particles = velocity.shape[1]
-    position = state.position.reshape(velocity.shape)
     values = {
         "temperature": observables.temperature(velocity),
         "sonine": observables.sonine(velocity),
-        "displacement": observables.mean_square_displacement(displacement),
-        "velocity_correlation": observables.velocity_correlation(
-            centred(state.first_velocity, replicas), velocity
-        ),
+        "velocity_correlation": observables.velocity_correlation(first, velocity),
         "dissipated_energy": state.dissipated / num_particles,
         "collisions": 2 / num_particles * state.collisions,
-        "flow_share": jax.vmap(partial(observables.flow_share, side=side))(position, velocity),
     }
+    if not walled:
+        flow_share = jax.vmap(partial(observables.flow_share, side=scene.side))
+        values["displacement"] = observables.mean_square_displacement(displacement)
+        values["flow_share"] = flow_share(state.position.reshape(velocity.shape), velocity)
     return values, displacement, velocity
 
 
@@ -183,9 +156,10 @@ def derivatives_of_records(
     T, C = values["temperature"], values["velocity_correlation"]
     along = {
         "temperature": c * T[None],
-        "displacement": paths.log_displacement * values["displacement"][None],
         "velocity_correlation": (0.5 * c + paths.correlation_along) * C[None],
     }
+    if "displacement" in values:
+        along["displacement"] = paths.log_displacement * values["displacement"][None]
     rates = {
         "temperature": -cooling_rate * T,
         "displacement": 2 * jnp.mean(jnp.sum(displacement * velocity, -1), axis=1),
@@ -193,18 +167,6 @@ def derivatives_of_records(
         "collisions": collision_rate,
     }
     return along, rates
-
-
-def empty_records(observed: dict[str, jax.Array], num_times: int) -> dict[str, np.ndarray]:
-    """Return zeros for records at several times, with the types of those at one time."""
-    arrays = {name: np.asarray(value) for name, value in observed.items()}
-    return {name: np.zeros((num_times, *v.shape), v.dtype) for name, v in arrays.items()}
-
-
-def fill_nan_from(records: dict[str, np.ndarray], first: int) -> None:
-    """Set records to nan from one time on, and integers to 0."""
-    for values in records.values():
-        values[first:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
 
 
 class DragDecay(NamedTuple):
@@ -224,7 +186,8 @@ class DragDecay(NamedTuple):
 def drag_decay(drag: ReducedDrag, time: Float[Array, "..."]) -> DragDecay:
     """Return the decay until a transformed time, ``s = (1 - exp(-gamma t))/gamma``."""
     velocity = 1 - drag.rate * time
-    spin = jnp.exp(-drag.rotational_rate * true_time(drag, time))
+    rotational_rate = 0.0 if drag.rotational_rate is None else drag.rotational_rate
+    spin = jnp.exp(-rotational_rate * true_time(drag, time))
     return DragDecay(velocity, spin / velocity, spin)
 
 
@@ -334,13 +297,11 @@ class TangentialImpulse(NamedTuple):
 
     Attributes:
         sideways: tangential part of the relative velocity of the centres.
-        slip: tangential relative velocity of the surfaces at contact; 0 without friction.
         kick: velocity change of the first partner.
         spin_change: spin change, the same for both partners.
     """
 
     sideways: Float[Array, "pairs d"]
-    slip: Float[Array, "pairs d"]
     kick: Float[Array, "pairs d"]
     spin_change: Float[Array, "pairs spins"]
 
@@ -372,4 +333,4 @@ def tangential_impulse(
         square = jnp.sum(kick**2, axis=-1)
         length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
         kick = kick * jnp.minimum(surface.friction * normal_kick / length, 1.0)[:, None]
-    return TangentialImpulse(sideways, slip, kick, torque(normal, kick) / surface.inertia)
+    return TangentialImpulse(sideways, kick, torque(normal, kick) / surface.inertia)

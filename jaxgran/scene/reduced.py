@@ -2,21 +2,21 @@
 
 - `reduced_scene`, for kinetic theory and DSMC: speeds in `Gas.impact_speed`, lengths in
   `Gas.path_length`.
-- `sphere_scene`, for spheres in boxes: the diameter, the mass and the initial temperature are 1.
+- `sphere_scene`, for spheres in boxes: the diameter, the mass and the initial temperature are 1,
+  and rates are per collision.
 """
 
-from collections.abc import Callable
 from math import pi
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from jaxgran.scene.elements import Rough
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.laws import ReducedLaw, Viscoelastic
+from jaxgran.scene.gas import Gas, mean_loss
+from jaxgran.scene.laws import Viscoelastic
 
 
 class ReducedRough(NamedTuple):
@@ -48,15 +48,15 @@ class ReducedWalls(NamedTuple):
     """`Walls` in reduced units.
 
     Attributes:
-        law: law of restitution, in units of `Gas.impact_speed`.
+        law: of impacts on them, as in `ReducedScene`.
         frequency: impacts on the two walls across each axis per particle and unit of time, divided
-            by sqrt(T/T_0).
-        beta: beta_t of the walls; None if they are smooth.
+            by sqrt(T/T_0); None where spheres resolve their contacts.
+        surface: beta_t of the walls, or their `ReducedFriction`; None if they are smooth.
     """
 
-    law: ReducedLaw
-    frequency: Float[Array, "d"]
-    beta: Float[Array, ""] | None
+    law: Any
+    frequency: Any
+    surface: Any
 
 
 class ReducedDrag(NamedTuple):
@@ -76,17 +76,28 @@ class ReducedDrive(NamedTuple):
 
 
 class ReducedScene(NamedTuple):
-    """A gas in units of `Gas.impact_speed` and `Gas.path_length`; None for each missing element."""
+    """The law and the elements of a gas in reduced units; None for each missing element.
 
-    law: ReducedLaw
-    surface: ReducedRough | None = None
-    walls: ReducedWalls | None = None
-    drag: ReducedDrag | None = None
-    drive: ReducedDrive | None = None
+    Attributes:
+        law: of restitution, for speeds in units of `Gas.impact_speed`, or a `ReducedContact`.
+        surface: `ReducedRough`, or `ReducedFriction` of contacts.
+        walls, drag, drive: `ReducedWalls`, `ReducedDrag`, `ReducedDrive`.
+    """
+
+    law: Any
+    surface: Any = None
+    walls: Any = None
+    drag: Any = None
+    drive: Any = None
+
+    @property
+    def has_elements(self) -> bool:
+        """True unless there are only smooth spheres in free flight."""
+        return any(element is not None for element in self[1:])
 
 
 def reduced_scene(gas: Gas) -> ReducedScene:
-    """Return the law of restitution and the elements of a gas in reduced units.
+    """Return a gas of impacts with rates in the unit of time `path_length` over `impact_speed`.
 
     The density of centres at a hard wall is Z times the mean density (contact theorem). Here
     ``Z = 1 + 2^(d-1) phi g_2`` is the pressure of elastic spheres over that of a dilute gas. Hence
@@ -134,10 +145,6 @@ class ReducedContact(eqx.Module):
         alpha = law.alpha(diameter=gas.diameter, mass=gas.mass) * gas.diameter**0.5 * time**2
         return cls(alpha, law.dissipative_constant / time, law.clipped)
 
-    def log_loss(self) -> Float[Array, ""]:
-        """Return ln of an impact's loss, ``A alpha^(2/5)`` up to a constant factor."""
-        return jnp.log(self.dissipative_constant) + 0.4 * jnp.log(self.alpha)
-
 
 class ReducedFriction(NamedTuple):
     """Friction of contacts: `Frictional` in units of `sphere_scene`, or that of walls.
@@ -155,54 +162,6 @@ class ReducedFriction(NamedTuple):
     ratio: Any = None
 
 
-class SphereMaterial(NamedTuple):
-    """The numbers of a `SphereScene` in which derivatives are taken; None for missing elements.
-
-    All numbers are per collision, so that in a denser gas the same happens sooner. Tangents have
-    the same structure.
-
-    Attributes:
-        law: of impacts or contacts.
-        surface: of spheres that rotate.
-        wall_law, wall_surface: of the walls of a container.
-        wall_frequency: impacts on the two walls across each axis of a mixed gas, over the collision
-            frequency; None where spheres resolve their contacts.
-        drag: rates over the collision frequency.
-        drive: growth of T over the collision frequency by white noise.
-    """
-
-    law: Any
-    surface: Any = None
-    wall_law: Any = None
-    wall_surface: Any = None
-    wall_frequency: Any = None
-    drag: ReducedDrag | None = None
-    drive: ReducedDrive | None = None
-
-    def faster(self, factor: ArrayLike) -> "SphereMaterial":
-        """Return the material of contacts in which spheres take the same paths a factor faster."""
-
-        def of(law: ReducedContact) -> ReducedContact:
-            return ReducedContact(
-                law.alpha * factor**2, law.dissipative_constant / factor, law.clipped
-            )
-
-        return self._with_laws(of)._replace(drag=jax.tree.map(lambda x: x * factor, self.drag))
-
-    def lossless(self) -> "SphereMaterial":
-        """Return the material of smooth spheres in a vacuum, between elastic walls."""
-
-        def of(law: ReducedContact) -> ReducedContact:
-            return ReducedContact(law.alpha, 0.0 * law.alpha, law.clipped)
-
-        drag = jax.tree.map(lambda x: 0.0 * x, self.drag)
-        return self._with_laws(of)._replace(surface=None, wall_surface=None, drag=drag)
-
-    def _with_laws(self, change: Callable[[Any], Any]) -> "SphereMaterial":
-        wall_law = None if self.wall_law is None else change(self.wall_law)
-        return self._replace(law=change(self.law), wall_law=wall_law)
-
-
 class SphereScene(NamedTuple):
     """Spheres in a box, in units of their diameter, their mass and the initial temperature.
 
@@ -214,15 +173,16 @@ class SphereScene(NamedTuple):
         side: of the periodic box.
         container: sides of the container; None without walls.
         collision_frequency: collisions per particle and time at T = 1.
-        contact_duration: mean duration of an elastic contact at T = 1; 0 for instantaneous impacts.
-        material: the numbers in which derivatives are taken.
+        contact_duration: mean duration of an elastic contact at T = 1.
+        material: the numbers in which derivatives are taken. All rates are per collision, so that
+            in a denser gas the same happens sooner.
     """
 
     side: Float[Array, ""]
     container: Float[Array, "d"] | None
     collision_frequency: Float[Array, ""]
     contact_duration: Float[Array, ""]
-    material: SphereMaterial
+    material: ReducedScene
 
     @property
     def galilean_invariant(self) -> bool:
@@ -236,24 +196,30 @@ class SphereScene(NamedTuple):
             return self.side
         return jnp.prod(self.container) ** (1 / len(self.container))
 
-    def with_material(self, material: SphereMaterial) -> "SphereScene":
+    @property
+    def drag_rates(self) -> Any:
+        """`ReducedDrag` in the unit of time of the scene; None without drag."""
+        return jax.tree.map(lambda rate: rate * self.collision_frequency, self.material.drag)
+
+    def with_material(self, material: ReducedScene) -> "SphereScene":
         """Return this scene with other numbers of its material."""
         return self._replace(material=material)
 
-    def log_loss(self, material: SphereMaterial) -> Float[Array, ""]:
-        """Return ln of the loss of an impact in a material."""
-        return material.law.log_loss()
+    def log_loss(self, material: ReducedScene) -> Float[Array, ""]:
+        """Return ln of an impact's loss up to a constant.
+
+        It is ``A alpha^(2/5)`` of contacts, and otherwise ``I/(1 - I)`` with the share I of normal
+        energy that impacts dissipate.
+        """
+        law = material.law
+        if isinstance(law, ReducedContact):
+            return jnp.log(law.dissipative_constant) + 0.4 * jnp.log(law.alpha)
+        lost = mean_loss(law, self.side)
+        return jnp.log(lost) - jnp.log1p(-lost)
 
 
-def sphere_scene(gas: Gas, num_particles: int, law: Any, **material: Any) -> SphereScene:
-    """Return spheres in a box in reduced units.
-
-    Args:
-        gas: the scene.
-        num_particles: N in the box.
-        law: of impacts or contacts, in reduced units.
-        material: further fields of `SphereMaterial`, but for drag and drive.
-    """
+def sphere_scene(gas: Gas, num_particles: int, material: ReducedScene) -> SphereScene:
+    """Return N spheres in a box, with the law, the surface and the walls of a material."""
     side, container, nu = gas.box_side(num_particles) / gas.diameter, None, gas.collision_frequency
     if gas.container is not None:
         container = jnp.broadcast_to(gas.container.side, (gas.dimension,)) / gas.diameter
@@ -264,7 +230,7 @@ def sphere_scene(gas: Gas, num_particles: int, law: Any, **material: Any) -> Sph
         drag = ReducedDrag(gas.drag.rate / nu, rotational)
     if gas.drive is not None:
         drive = ReducedDrive(gas.drive.strength / (nu * gas.temperature))
-    # It does not depend on T_0, and between walls its derivative is refused.
+    # It does not depend on T_0, and between walls of soft spheres its derivative is refused.
     fixed = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
     unit_time = fixed.diameter / jnp.sqrt(fixed.temperature)
     return SphereScene(
@@ -272,5 +238,5 @@ def sphere_scene(gas: Gas, num_particles: int, law: Any, **material: Any) -> Sph
         container=container,
         collision_frequency=fixed.collision_frequency * unit_time,
         contact_duration=gas.contact_duration / (gas.diameter / jnp.sqrt(gas.temperature)),
-        material=SphereMaterial(law, drag=drag, drive=drive, **material),
+        material=material._replace(drag=drag, drive=drive),
     )

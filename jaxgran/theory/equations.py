@@ -445,10 +445,10 @@ def _wall_rates(
     """
 
     eta = jnp.zeros_like(speed)
-    if walls.beta is None:
+    if walls.surface is None:
         surface = None
-    if surface is not None and walls.beta is not None:
-        eta = surface.eta_on_wall(walls.beta) / 2
+    if surface is not None and walls.surface is not None:
+        eta = surface.eta_on_wall(walls.surface) / 2
 
     def axis_rates(frequency: Array) -> tuple[Array, list[Array]]:
         def share(g: Array) -> Array:
@@ -516,10 +516,10 @@ def _wall_cooling_bound(
     frequency = walls.frequency / collision_rate(0.0, d)
     share = wall_impact_ratio(jnp.zeros_like(frequency), frequency, d)
     bound = 2 / d * jnp.sum(walls.frequency * share)
-    if surface is None or walls.beta is None:
+    if surface is None or walls.surface is None:
         return bound
     eta, rate = (
-        surface.eta_on_wall(walls.beta) / 2,
+        surface.eta_on_wall(walls.surface) / 2,
         MAX_WALL_IMPACT_RATIO * jnp.sum(walls.frequency),
     )
     return bound + _friction_rates(eta, surface.inertia, (2 * rate, 2 * rate), 0.0, d).cooling

@@ -9,8 +9,8 @@ import pytest
 
 import jaxgran
 from jaxgran._utils import status
-from jaxgran.particles.hard.impacts import HardScene, ImpactEvents, pair_effect
-from jaxgran.scene.reduced import ReducedDrag, ReducedRough
+from jaxgran.particles.hard.impacts import ImpactEvents, impact_effect
+from jaxgran.scene.reduced import ReducedDrag, ReducedRough, ReducedScene, SphereScene
 from tests.beads import SI, glass_beads, hard_gas
 
 
@@ -23,14 +23,13 @@ def test_laws_see_the_speeds_that_drag_has_left():
     n, gamma = 20, 0.3
     speed, time = jnp.linspace(0.1, 2.0, n), jnp.linspace(0.0, 2.5, n)
     law = glass_beads(0.5).reduced_law
-    zero = jnp.zeros(())
-    scene = HardScene(*[zero] * 5, drag=ReducedDrag(jnp.asarray(gamma / 2), zero))
-    scene = scene._replace(law=law, collision_frequency=jnp.asarray(2.0))
+    material = ReducedScene(law, drag=ReducedDrag(jnp.asarray(gamma / 2), None))
+    scene = SphereScene(jnp.zeros(()), None, jnp.asarray(2.0), jnp.zeros(()), material)
     normal = jnp.tile(jnp.array([1.0, 0.0, 0.0]), (n, 1))
     impact = ImpactEvents(time, normal, speed[:, None] * normal, speed, None, jnp.zeros(n, bool))
     eps = law.restitution(speed * (1 - gamma * time) / 2**0.5)
     np.testing.assert_allclose(
-        pair_effect(scene, impact).lost, (1 - eps**2) * speed**2 / 8, rtol=1e-9
+        impact_effect(scene, impact).lost, (1 - eps**2) * speed**2 / 8, rtol=1e-9
     )
 
 
@@ -81,11 +80,10 @@ def test_impacts_keep_angular_momentum_and_follow_the_rule(dimension, beta):
     v[0] = np.where(approach[:, None] < 0, -v[0], v[0])
     zero = jnp.zeros(())
     shown, turning = (slice(None), slice(None)) if dimension == 3 else (slice(2), slice(2, 3))
-    scene = HardScene(
-        *[zero] * 5, surface=ReducedRough(jnp.asarray(beta), jnp.asarray(q), zero)
-    )._replace(law=jaxgran.ConstantRestitution(eps))
-    effect = pair_effect(
-        scene,
+    surface = ReducedRough(jnp.asarray(beta), jnp.asarray(q), zero)
+    material = ReducedScene(jaxgran.ConstantRestitution(eps), surface)
+    effect = impact_effect(
+        SphereScene(zero, None, zero, zero, material),
         ImpactEvents(
             time=jnp.zeros(n),
             normal=-jnp.asarray(normal[:, shown]),

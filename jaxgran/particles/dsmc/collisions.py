@@ -18,8 +18,9 @@ spheres need, and a sphere in them hits a wall with a larger probability.
 from collections.abc import Callable
 from functools import cache, partial
 from math import gcd, pi, sqrt
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,10 +38,10 @@ from jaxgran.particles.state import (
     threefry_key,
     true_duration,
 )
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
+from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.geometry import sphere_surface
 from jaxgran.scene.laws import ReducedLaw
-from jaxgran.scene.reduced import ReducedDrag, ReducedDrive, ReducedRough, ReducedScene
+from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory.averages import collision_rate
 
 CEILING = 5.0
@@ -126,7 +127,7 @@ class DSMCState(NamedTuple):
         missed: number of collisions missed because of the `CEILING`.
         steps: number of steps.
         mobility: M = D / sqrt(T/T_0), computed together with the tangents.
-        tangents: tangents in the parameters of the law, or of a scene with elements.
+        tangents: `DSMCTangents`, or `ExchangeTangents` of a scene with elements.
     """
 
     time: Float[Array, ""]
@@ -138,7 +139,7 @@ class DSMCState(NamedTuple):
     missed: Float[Array, "*replicas"]
     steps: UInt32[Array, "*replicas"]
     mobility: Float[Array, "*replicas"]
-    tangents: DSMCTangents | ExchangeTangents
+    tangents: Any
 
 
 @cache
@@ -254,22 +255,9 @@ def collide(
         along=along,
         along_speed=along_speed,
     )
-    if scene.surface is None or spin is None:
+    if (surface := scene.surface) is None or spin is None:
         return outcome
     normal = jnp.stack(normal, axis=-1)
-    return _with_tangential(outcome, scene.surface, relative, spin, normal, hit, push)
-
-
-def _with_tangential(
-    outcome: Outcome,
-    surface: ReducedRough,
-    relative: Float[Array, "pairs d"],
-    spin: Float[Array, "pairs spins"],
-    normal: Float[Array, "pairs d"],
-    hit: Bool[Array, "pairs"],
-    push: Float[Array, "pairs"],
-) -> Outcome:
-    """Return the outcome with the tangential part of the impacts; see `jaxgran.Rough`."""
     tangential = tangential_impulse(relative, spin, normal, hit, surface.eta, surface, push)
     kick, spin_change = tangential.kick, tangential.spin_change
     loss = -2 * jnp.sum(kick * (tangential.sideways + kick))  # of translation alone
@@ -320,135 +308,12 @@ FASTEST_SPEED = 3.5
 """Speed along an axis, in sqrt(2 T), up to which the rate of impacts on walls is right; one of 1e6
 particles is faster."""
 
+RECOUNT_INTERVAL = 32
+"""Number of steps between computations of T from the velocities.
 
-class WallImpacts(NamedTuple):
-    """Velocities and spins of some particles after impacts on walls.
-
-    Attributes:
-        velocity, spin: of each particle.
-        loss: decrease of sum v^2.
-        rotational_gain: increase of q sum s^2.
-    """
-
-    velocity: Float[Array, "N d"]
-    spin: Float[Array, "N spins"]
-    loss: Float[Array, ""]
-    rotational_gain: Float[Array, ""]
-
-
-def hit_walls(
-    scene: ReducedScene,
-    chance: Float[Array, "N"],
-    axis: Int[Array, ""],
-    velocity: Float[Array, "N d"],
-    spin: Float[Array, "N spins"],
-    ds: Float[Array, ""],
-    drag_factor: Float[Array, ""] | float,
-) -> WallImpacts:
-    """Let particles hit walls in a step, independent of their places.
-
-    A sphere between two walls hits one of them ``|v| ds/(L - sigma)`` times in a step, times the
-    ratio of the density before walls to the mean (`wall_impact_ratio`). Each step has walls across
-    one axis, in turn, with d times this number of impacts.
-
-    Args:
-        scene: in reduced units.
-        chance: a random number for each particle, which hits a wall if its number of impacts is
-            larger.
-        axis: the axis across which the walls are.
-        velocity, spin: before the step.
-        ds: length of the step.
-        drag_factor: ratio of physical velocities to these.
-    """
-    walls, surface = scene.walls, scene.surface
-    assert walls is not None
-    n, d = velocity.shape
-    frequency = walls.frequency[axis]
-    per_speed = frequency * (d * sqrt(pi)) * ds
-    across = (jnp.arange(d) == axis).astype(velocity.dtype)[None]
-    normal = jnp.sum(velocity * across, axis=1)
-    speed, outwards = jnp.abs(normal), jnp.sign(normal)[:, None] * across
-    eps = walls.law.restitution(jnp.where(speed > 0, speed * drag_factor, 1.0))
-    ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
-    hit = (chance < ratio * per_speed * speed) & (speed > 0)
-    push = jnp.where(hit, (1 + eps) * speed, 0.0)
-    kick = -push[:, None] * outwards
-    spin_change = jnp.zeros_like(spin)
-    if surface is not None and walls.beta is not None:
-        eta = surface.eta_on_wall(walls.beta)
-        tangential = tangential_impulse(velocity, spin, outwards, hit, eta, surface, push)
-        kick, spin_change = kick + tangential.kick, tangential.spin_change
-    # The number of impacts is not differentiable, so weights of value 1 carry its derivative.
-    weight = frequency * ratio
-    weight = weight / jax.lax.stop_gradient(weight)
-    inertia = 0.0 if surface is None else surface.inertia
-    loss = -jnp.sum(weight[:, None] * kick * (2 * velocity + kick))
-    rotational_gain = inertia * jnp.sum(weight[:, None] * spin_change * (2 * spin + spin_change))
-    return WallImpacts(velocity + kick, spin + spin_change, loss, rotational_gain)
-
-
-def _max_wall_impacts(
-    scene: ReducedScene,
-    temperature: Float[Array, "*replicas"],
-    drag_factor: Float[Array, "*replicas"] | float,
-    ds: Float[Array, "*replicas"],
-    d: int,
-) -> Float[Array, "*replicas"]:
-    """Return the number of wall impacts in a step of a sphere of the speed `FASTEST_SPEED`."""
-    walls = scene.walls
-    assert walls is not None
-    speed = FASTEST_SPEED * jnp.sqrt(temperature)
-    eps = walls.law.restitution(speed * drag_factor)[..., None]
-    frequency = jnp.broadcast_to(walls.frequency, (*eps.shape[:-1], d))
-    ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
-    return jnp.max(ratio * frequency, axis=-1) * (d * sqrt(pi)) * speed * ds
-
-
-def drag_decay_or_one(drag: ReducedDrag | None, time: Float[Array, "..."]) -> DragDecay:
-    """Return the factors of `drag_decay`, or ones without drag."""
-    if drag is None:
-        return DragDecay(*[jnp.ones_like(time)] * 3)
-    return drag_decay(drag, time)
-
-
-def kick_growth(
-    drive: ReducedDrive,
-    drag: ReducedDrag | None,
-    start: Float[Array, "*replicas"],
-    ds: Float[Array, "*replicas"],
-    place: float,
-) -> Float[Array, "*replicas"]:
-    """Return the growth of T/T_0 by half of the kicks of a step.
-
-    They come at its start (place 0) or end (1).
-    """
-    if drag is None:
-        return drive.strength * jnp.maximum(ds, 0.0) / 2
-    return (
-        drive.strength
-        * true_duration(drag, start, ds)
-        / 2
-        / drag_decay(drag, start + place * ds).velocity ** 2
-    )
-
-
-def _limit_step(
-    scene: ReducedScene,
-    temperature: Float[Array, "*replicas"],
-    clock: Float[Array, "*replicas"],
-    ds: Float[Array, "*replicas"],
-    d: int,
-) -> Float[Array, "*replicas"]:
-    """Limit the length of a step: spheres hit at most one wall, and kicks of a drive are small."""
-    if scene.walls is not None:
-        drag_factor = drag_decay_or_one(scene.drag, clock).velocity
-        ds = ds / jnp.maximum(_max_wall_impacts(scene, temperature, drag_factor, ds, d), 1.0)
-    if scene.drive is None:
-        return ds
-    growth = scene.drive.strength / drag_decay_or_one(scene.drag, clock).velocity ** 3
-    safe = jnp.where(growth > 0, growth, 1.0)
-    return jnp.where(growth > 0, jnp.minimum(ds, MAX_KICK * temperature / safe), ds)
-
+In between the losses update T. The rounding errors of this sum do not shrink as T falls, and in
+float32 they would dominate T once it has fallen to 1e-7 of its initial value.
+"""
 
 MAX_SUBSETS = 16
 """Number of subsets of many particles."""
@@ -502,77 +367,24 @@ def change_subsets(
     return jax.lax.fori_loop(0, largest, change_one, (particles, zero))
 
 
+class WallImpacts(NamedTuple):
+    """Velocities and spins of some particles after impacts on walls.
+
+    Attributes:
+        velocity, spin: of each particle.
+        loss: decrease of sum v^2.
+        rotational_gain: increase of q sum s^2.
+    """
+
+    velocity: Float[Array, "N d"]
+    spin: Float[Array, "N spins"]
+    loss: Float[Array, ""]
+    rotational_gain: Float[Array, ""]
+
+
 SubsetCounts = tuple[Int[Array, "*replicas"] | None, Int[Array, "*replicas"] | None]
 """Numbers of subsets that a drive kicks in half of a step, and of those that may hit walls in the
 step; None without a drive or walls."""
-
-
-def subsets_per_step(
-    temperature: Float[Array, "*replicas"],
-    clock: Float[Array, "*replicas"],
-    share: Float[Array, "*replicas"],
-    scene: ReducedScene,
-    scheme: Scheme,
-) -> SubsetCounts:
-    """Return the numbers of subsets that take part in a share of a step.
-
-    A drive kicks so many subsets in half of it that T of none grows by more than the share
-    `MAX_KICK`. Particles that are kicked in turn then have temperatures that differ by up to w T,
-    by which a_2 of all particles is too large by ``w^2/12``, at most 2e-4. So many subsets may hit
-    walls that one of the fastest spheres hits at most one.
-    """
-    parts = num_subsets(scheme.num_particles)
-    ds = share * scheme.scaled_step / jnp.sqrt(temperature)
-
-    def at_least(needed: Array) -> Array:
-        return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
-
-    kicks = walls = None
-    if scene.drive is not None:
-        growth = kick_growth(scene.drive, scene.drag, clock, ds, 0.0)
-        safe = jnp.where(temperature > 0, temperature, 1.0)
-        kicks = at_least(parts * growth / (MAX_KICK * safe))
-    if scene.walls is not None:
-        drag_factor = drag_decay_or_one(scene.drag, clock).velocity
-        impacts = _max_wall_impacts(scene, temperature, drag_factor, ds, scheme.dimension)
-        walls = at_least(parts * impacts)
-    return kicks, walls
-
-
-def _update_tangents(
-    old: DSMCTangents,
-    before: Float[Array, ""],
-    dimension: int,
-    sums: Outcome,
-    dt: Float[Array, ""],
-    ds: Float[Array, ""],
-    energy: Float[Array, ""],
-) -> tuple[Float[Array, ""], DSMCTangents]:
-    """Return M and the tangents after a step.
-
-    Args:
-        old, before: the tangents and M before the step.
-        dimension: d.
-        sums: sums over its collisions.
-        dt, ds: its length in time and in scaled time.
-        energy: sum v^2 after the step.
-    """
-    c = old.log_temperature
-    # The tangent of the velocities is (c/2) v, and the law contributes at every collision.
-    gain, fading = (sums.along + sums.along_speed[:, None] * (c / 2)[None]) / energy
-    # dM/ds = 1/2 - kappa M and its tangent, by the implicit midpoint rule.
-    half = sums.relaxation / energy / 2
-    mobility = ((1 - half) * before + ds / 2) / (1 + half)
-    along = ((1 - half) * old.mobility - fading * (before + mobility) / 2) / (1 + half)
-    tangents = DSMCTangents(
-        log_temperature=c + gain,
-        clock=old.clock - c / 2 * dt,
-        mobility=along,
-        displacement=old.displacement + dimension * ds * (old.mobility + along),
-        persistence=old.persistence - fading,
-    )
-    return mobility, tangents
-
 
 CandidatePairs = tuple[Array, Array | None, Array]
 """Candidate pairs of a step: relative velocities, sums of the spins in the state (None for smooth
@@ -583,397 +395,436 @@ EnergyGains = tuple[Float[Array, "2"], Float[Array, "changes 2"]]
 parameters of the scene, in time, and in the logarithms of all velocities and of all spins."""
 
 
-def initial_exchange_tangents(
-    scene: ReducedScene, num_parameters: int, num_particles: int, dimension: int, replicas: int
-) -> ExchangeTangents:
-    """Return the tangents at t = 0, with a first axis of replicas; the last one is that in time.
+class DSMCDynamics(eqx.Module):
+    """The steps of a gas.
 
-    T is then 1, and T_rot that of the scene.
-    """
-    zero = jnp.zeros_like(scene.law.restitution(jnp.ones(())))
-    energies = jnp.zeros((num_parameters + 1, 2), zero.dtype)
-    if scene.surface is not None:
-
-        def rotation(scene):
-            return num_particles * NUM_SPIN_COMPONENTS[dimension] / 2 * scene.surface.ratio
-
-        energies = energies.at[:-1, 1].set(ravel_pytree(jax.grad(rotation)(scene))[0])
-    many = jnp.broadcast_to(energies, (replicas, *energies.shape))
-    return ExchangeTangents(many, many[:, :, 0] * 0)
-
-
-def _update_exchange_tangents(
-    old: ExchangeTangents,
-    scene: ReducedScene,
-    before: Float[Array, "2"],
-    candidates: tuple[CandidatePairs, CandidatePairs],
-    wall_gains: EnergyGains | None,
-    ceiling: Float[Array, ""],
-    share: Float[Array, ""],
-    start: Float[Array, ""],
-    ds: Float[Array, ""],
-    num_particles: int,
-    collisions: Float[Array, ""],
-) -> ExchangeTangents:
-    """Return the tangents after a step.
-
-    Args:
-        old: the tangents before the step.
-        scene: in reduced units.
-        before: the two energies before the step.
-        candidates, wall_gains: the candidate pairs, and the gains by impacts on walls.
-        ceiling, share: as for `collide`.
-        start, ds: the time at the start of the step, and its length.
-        num_particles: N.
-        collisions: the number of its collisions.
+    Attributes:
+        scene: the gas in reduced units.
+        scheme: sizes of a step.
     """
 
-    def by_collisions(scene, velocity, spin, time_scale):
-        middle = start + ds / 2
-        scene, decay, faster, turning = _scale_motion(scene, velocity, spin, time_scale, middle)
-        drag_factor = None if scene.drag is None else decay.velocity
-        total = jnp.zeros(2, ds.dtype)
-        for relative, spins, bits in candidates:
-            spins = None if spins is None else spins * turning
-            outcome = collide(
-                relative * faster, bits, ceiling, share, scene, False, spins, drag_factor
+    scene: ReducedScene
+    scheme: Scheme = eqx.field(static=True)
+
+    def drag_decay(self, time: Float[Array, "..."]) -> DragDecay:
+        """Return the decay by drag until a time; ones without drag."""
+        if self.scene.drag is None:
+            return DragDecay(*[jnp.ones_like(time)] * 3)
+        return drag_decay(self.scene.drag, time)
+
+    def kick_growth(
+        self, start: Float[Array, "*replicas"], ds: Float[Array, "*replicas"], place: float
+    ) -> Float[Array, "*replicas"]:
+        """Return the growth of T/T_0 by half of the kicks of a step.
+
+        They come at its start (place 0) or end (1).
+        """
+        strength, drag = self.scene.drive.strength, self.scene.drag
+        if drag is None:
+            return strength * jnp.maximum(ds, 0.0) / 2
+        time = true_duration(drag, start, ds)
+        return strength * time / 2 / drag_decay(drag, start + place * ds).velocity ** 2
+
+    def max_wall_impacts(
+        self, state: DSMCState, ds: Float[Array, "*replicas"]
+    ) -> Float[Array, "*replicas"]:
+        """Return the number of wall impacts in a step of a sphere of the speed `FASTEST_SPEED`."""
+        walls, d = self.scene.walls, self.scheme.dimension
+        speed = FASTEST_SPEED * jnp.sqrt(state.temperature)
+        eps = walls.law.restitution(speed * self.drag_decay(state.clock).velocity)[..., None]
+        frequency = jnp.broadcast_to(walls.frequency, (*eps.shape[:-1], d))
+        ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
+        return jnp.max(ratio * frequency, axis=-1) * (d * sqrt(pi)) * speed * ds
+
+    def step_length(self, state: DSMCState) -> Float[Array, "*replicas"]:
+        """Return the length of a step: spheres hit at most one wall, and kicks are small."""
+        ds = self.scheme.scaled_step / jnp.sqrt(state.temperature)
+        if self.scene.walls is not None:
+            ds = ds / jnp.maximum(self.max_wall_impacts(state, ds), 1.0)
+        if self.scene.drive is None:
+            return ds
+        growth = self.scene.drive.strength / self.drag_decay(state.clock).velocity ** 3
+        safe = jnp.where(growth > 0, growth, 1.0)
+        return jnp.where(growth > 0, jnp.minimum(ds, MAX_KICK * state.temperature / safe), ds)
+
+    def subsets_per_step(self, state: DSMCState, share: Float[Array, "*replicas"]) -> SubsetCounts:
+        """Return the numbers of subsets that take part in a share of a step.
+
+        A drive kicks so many subsets in half of it that T of none grows by more than the share
+        `MAX_KICK`. Particles that are kicked in turn then have temperatures that differ by up to
+        w T, by which a_2 of all particles is too large by ``w^2/12``, at most 2e-4. So many subsets
+        may hit walls that one of the fastest spheres hits at most one.
+        """
+        parts, temperature = num_subsets(self.scheme.num_particles), state.temperature
+        ds = share * self.scheme.scaled_step / jnp.sqrt(temperature)
+
+        def at_least(needed: Array) -> Array:
+            return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
+
+        kicks = walls = None
+        if self.scene.drive is not None:
+            growth = self.kick_growth(state.clock, ds, 0.0)
+            safe = jnp.where(temperature > 0, temperature, 1.0)
+            kicks = at_least(parts * growth / (MAX_KICK * safe))
+        if self.scene.walls is not None:
+            walls = at_least(parts * self.max_wall_impacts(state, ds))
+        return kicks, walls
+
+    def step(
+        self,
+        state: DSMCState,
+        key: UInt32[Array, "2"],
+        share: Float[Array, "replicas"],
+        tangents: bool,
+    ) -> DSMCState:
+        """Do a share, 0 to 1, of the next step of each replica."""
+        replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(threefry_key(key), replicas)
+        subsets = self.subsets_per_step(state, share)
+        largest = jax.tree.map(jnp.max, subsets)
+        step_replica = partial(self._step, largest=largest, tangents=tangents)
+        axes = jax.tree.map(lambda _: 0, state)._replace(time=None)
+        state = jax.vmap(step_replica, (axes, 0, 0, 0), axes)(state, keys, subsets, share)
+        due = state.steps % RECOUNT_INTERVAL == 0
+
+        def recount(temperature):
+            velocity = state.particles[..., : self.scheme.dimension]
+            from_velocities = 2 * jnp.mean(velocity**2, axis=(1, 2))
+            return jnp.where(due, from_velocities, temperature)
+
+        temperature = jax.lax.cond(jnp.any(due), recount, lambda x: x, state.temperature)
+        return state._replace(temperature=temperature)
+
+    def _step(
+        self,
+        state: DSMCState,
+        key: PRNGKeyArray,
+        subsets: SubsetCounts,
+        share: Float[Array, ""],
+        largest: SubsetCounts,
+        tangents: bool,
+    ) -> DSMCState:
+        """Do a share, 0 to 1, of a step of one replica; random numbers do not depend on the share.
+
+        Each collision of the whole step takes place with this probability, so that the state within
+        a step is as accurate as at its end. `largest` are the largest numbers of subsets of all
+        replicas.
+        """
+        scheme, before = self.scheme, state
+        key = jax.random.fold_in(key, state.steps)
+        dt = share * scheme.scaled_step / jnp.sqrt(state.temperature)
+        kicks, walls = zip(subsets, largest, strict=True)
+        kick = partial(self._kick, key=key, dt=dt, counts=kicks, clock=state.clock)
+        state = kick(state, place=0)
+        exchanging = tangents and isinstance(state.tangents, ExchangeTangents)
+        particles, sums, pairs = self._collide(state, key, dt, share, tangents and not exchanging)
+        loss, wall_gains = sums.loss, None
+        if self.scene.walls is not None:
+            particles, wall_loss, wall_gains = self._hit_walls(
+                state, key, dt, particles, walls, exchanging
             )
-            total = total + jnp.stack([-outcome.loss, outcome.rotational_gain / decay.spin**2])
-        return total
-
-    def by_drive(scene, velocity, spin, time_scale):
-        if scene.drive is None:
-            return jnp.zeros(2, ds.dtype)
-        drag, d = _scale_drag(scene, time_scale), candidates[0][0].shape[1]
-        growth = sum(kick_growth(scene.drive, drag, start, ds, place) for place in (0.0, 1.0))
-        return jnp.stack([num_particles * d / 2 * growth, jnp.zeros_like(ds)])
-
-    gains, along = _energy_gains(by_collisions, scene, ds)
-    kicks, along_kicks = _energy_gains(by_drive, scene, ds)
-    # The rate of impacts depends on the speeds; kicks do not depend on them.
-    gains, along = gains + kicks, along + along_kicks.at[-2].add(-kicks)
-    if wall_gains is not None:
-        gains, along = gains + wall_gains[0], along + wall_gains[1]
-    return old.after(before, gains, along, collisions)
-
-
-def _wall_gains(
-    hit: Callable[..., WallImpacts], scene: ReducedScene, middle: Float[Array, ""]
-) -> EnergyGains:
-    """Return the gains by impacts on walls at the middle of a step; see `hit` in `_apply_walls`."""
-
-    def gains(scene, velocity, spin, time_scale):
-        scene, decay, faster, turning = _scale_motion(scene, velocity, spin, time_scale, middle)
-        impacts = hit(scene, faster, turning, decay.velocity)
-        return jnp.stack([-impacts.loss, impacts.rotational_gain / decay.spin**2])
-
-    return _energy_gains(gains, scene, middle)
-
-
-def _energy_gains(
-    function: Callable[..., Float[Array, "2"]], scene: ReducedScene, like: Float[Array, ""]
-) -> EnergyGains:
-    """Return the gains and tangents of a function of the scene, log velocity, log spin and time."""
-    zero = jnp.zeros_like(like)
-    gains, pull = jax.vjp(function, scene, zero, zero, zero)
-
-    def row(weights):
-        in_scene, *in_motion = pull(weights)
-        return jnp.concatenate([ravel_pytree(in_scene)[0], jnp.stack(in_motion)])
-
-    slopes = jax.vmap(row)(jnp.eye(2, dtype=zero.dtype)).T
-    return gains, jnp.concatenate([slopes[:-3], slopes[-1:], slopes[-3:-1]])
-
-
-def _scale_motion(
-    scene: ReducedScene, velocity: Array, spin: Array, time_scale: Array, middle: Array
-) -> tuple[ReducedScene, DragDecay, Array, Array]:
-    """Return the scene with scaled drag rates, its drag decay, and factors of velocity and spin."""
-    scene = scene._replace(drag=_scale_drag(scene, time_scale))
-    decay = drag_decay_or_one(scene.drag, middle)
-    faster, turning = jnp.exp(velocity), decay.spin * jnp.exp(spin)
-    if scene.surface is not None:  # at a given energy a larger inertia has smaller spins
-        inertia = scene.surface.inertia
-        turning = turning * jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
-    return scene, decay, faster, turning
-
-
-def _scale_drag(scene: ReducedScene, share: Array) -> ReducedDrag | None:
-    if scene.drag is None:
-        return None
-    return ReducedDrag(*(rate * (1 + share) for rate in scene.drag))
-
-
-RECOUNT_INTERVAL = 32
-"""Number of steps between computations of T from the velocities.
-
-In between the losses update T. The rounding errors of this sum do not shrink as T falls, and in
-float32 they would dominate T once it has fallen to 1e-7 of its initial value.
-"""
-
-
-def step(
-    state: DSMCState,
-    key: UInt32[Array, "2"],
-    share: Float[Array, "replicas"],
-    scene: ReducedScene,
-    scheme: Scheme,
-    tangents: bool,
-) -> DSMCState:
-    """Do a share, 0 to 1, of the next step of each replica."""
-    replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(threefry_key(key), replicas)
-    subsets = subsets_per_step(state.temperature, state.clock, share, scene, scheme)
-    largest = jax.tree.map(jnp.max, subsets)
-    step_replica = partial(_step, largest=largest, scene=scene, scheme=scheme, tangents=tangents)
-    axes = jax.tree.map(lambda _: 0, state)._replace(time=None)
-    state = jax.vmap(step_replica, (axes, 0, 0, 0), axes)(state, keys, subsets, share)
-    due = state.steps % RECOUNT_INTERVAL == 0
-
-    def recount(temperature):
-        velocity = state.particles[..., : scheme.dimension]
-        from_velocities = 2 * jnp.mean(velocity**2, axis=(1, 2))
-        return jnp.where(due, from_velocities, temperature)
-
-    temperature = jax.lax.cond(jnp.any(due), recount, lambda x: x, state.temperature)
-    return state._replace(temperature=temperature)
-
-
-def _step(
-    state: DSMCState,
-    key: PRNGKeyArray,
-    subsets: SubsetCounts,
-    share: Float[Array, ""],
-    largest: SubsetCounts,
-    scene: ReducedScene,
-    scheme: Scheme,
-    tangents: bool,
-) -> DSMCState:
-    """Do a share, 0 to 1, of a step of one replica; random numbers do not depend on the share.
-
-    Each collision of the whole step takes place with this probability, so that the state within
-    a step is as accurate as at its end.
-    """
-    key = jax.random.fold_in(key, state.steps)
-    dt = share * scheme.scaled_step / jnp.sqrt(state.temperature)
-    (kicks, walls), (most_kicks, most_walls) = subsets, largest
-    counts = kicks, most_kicks
-    apply_drive = partial(_apply_drive, key=key, dt=dt, counts=counts, scene=scene, scheme=scheme)
-    before, state = state, apply_drive(state, clock=state.clock, place=0)
-    exchanging = tangents and isinstance(state.tangents, ExchangeTangents)
-    particles, sums, pairs = _apply_collisions(
-        state, key, dt, share, scene, scheme, tangents and not exchanging
-    )
-    loss, wall_gains = sums.loss, None
-    if walls is not None and most_walls is not None:
-        counts = walls, most_walls
-        particles, wall_loss, wall_gains = _apply_walls(
-            state, key, dt, particles, counts, scene, scheme.dimension, exchanging
+            loss = loss + wall_loss
+        energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
+        temperature = state.temperature - loss / energy
+        passed = state.clock_rest + dt
+        clock = state.clock + passed
+        new = state._replace(
+            clock=clock,
+            clock_rest=passed - (clock - state.clock),
+            temperature=temperature,
+            particles=particles,
+            collisions=state.collisions + sums.num,
+            missed=state.missed + sums.missed,
+            steps=state.steps + (share > 0).astype(state.steps.dtype),
         )
-        loss = loss + wall_loss
-    energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
-    temperature = state.temperature - loss / energy
-    passed = state.clock_rest + dt
-    clock = state.clock + passed
-    new = state._replace(
-        clock=clock,
-        clock_rest=passed - (clock - state.clock),
-        temperature=temperature,
-        particles=particles,
-        collisions=state.collisions + sums.num,
-        missed=state.missed + sums.missed,
-        steps=state.steps + (share > 0).astype(state.steps.dtype),
-    )
-    new = apply_drive(new, clock=state.clock, place=1)
-    if not tangents:
+        new = kick(new, place=1)
+        if exchanging:
+            ceiling = CEILING * jnp.sqrt(state.temperature)
+            along = self._exchange_tangents(before, ceiling, share, dt, pairs, wall_gains, sums.num)
+            return new._replace(tangents=along)
+        if tangents:
+            ds, after = share * scheme.scaled_step, energy * temperature
+            mobility, along = self._scaled_time_tangents(before, sums, dt, ds, after)
+            return new._replace(mobility=mobility, tangents=along)
         return new
-    if isinstance(before.tangents, ExchangeTangents):
-        ceiling = CEILING * jnp.sqrt(state.temperature)
-        inertia = 0.0 if scene.surface is None else scene.surface.inertia
-        v, s = before.particles[:, : scheme.dimension], before.particles[:, 2 * scheme.dimension :]
-        along = _update_exchange_tangents(
-            before.tangents,
-            scene,
-            jnp.stack([jnp.sum(v**2), inertia * jnp.sum(s**2)]),
-            pairs,
-            wall_gains,
-            ceiling,
-            share,
-            state.clock,
-            dt,
-            scheme.num_particles,
-            sums.num,
+
+    def _kick(
+        self,
+        state: DSMCState,
+        key: PRNGKeyArray,
+        dt: Float[Array, ""],
+        counts: tuple[Int[Array, ""] | None, Int[Array, ""] | None],
+        clock: Float[Array, ""],
+        place: int,
+    ) -> DSMCState:
+        """Apply half of the kicks of a step, at its start (place 0) or end (1).
+
+        `counts` are the number of subsets of this replica and the largest of any replica.
+        """
+        kicked, largest = counts
+        if kicked is None or largest is None:
+            return state
+        d, parts = self.scheme.dimension, num_subsets(self.scheme.num_particles)
+        growth = self.kick_growth(clock, dt, float(place))
+        key, at_rest = jax.random.fold_in(key, 2 + place), self.scene.walls is None
+        size, time = jnp.sqrt(growth / 2 * (parts / kicked)), state.clock
+
+        def kick(i: Array, rows: Array, belongs: Array) -> tuple[Array, Array]:
+            v = rows[:, :d]
+            kicks = random_kicks(jax.random.fold_in(key, i), v, at_rest, belongs)
+            kicks = jnp.where(belongs[:, None], size * kicks, 0.0)
+            after = [v + kicks, rows[:, d : 2 * d] - time * kicks, rows[:, 2 * d :]]
+            return jnp.concatenate(after, axis=-1), jnp.sum(kicks * (2 * v + kicks))
+
+        first = kicked * (2 * state.steps + place).astype(jnp.int32)
+        zero = jnp.zeros((), growth.dtype)
+        particles, gain = change_subsets(state.particles, first, kicked, largest, kick, zero)
+        grown = 2 * gain / (self.scheme.num_particles * d)
+        return state._replace(particles=particles, temperature=state.temperature + grown)
+
+    def _collide(
+        self,
+        state: DSMCState,
+        key: PRNGKeyArray,
+        dt: Float[Array, ""],
+        share: Float[Array, ""],
+        tangents: bool,
+    ) -> tuple[Float[Array, "N components"], Outcome, tuple[CandidatePairs, CandidatePairs]]:
+        """Return the particles after the collisions of a step, sums over them, and candidates."""
+        d, first, second = self.scheme.dimension, self.scheme.first, self.scheme.second
+        bits = jax.random.bits(key, (2, first + second + 2), jnp.uint32)
+        i, j, k = draw_pairs(bits[:, -2:].ravel(), self.scheme)
+        index = jnp.concatenate([i, j, k])
+        options = {"mode": "promise_in_bounds", "unique_indices": True}
+        old = state.particles.at[index].get(**options)
+        v, spin, drag_factor, spin_factor = old[:, :d], old[:, 2 * d :], None, 1.0
+        # Collisions happen at the middle of the step, on average: x - v t changes by -kick t.
+        middle = state.clock + dt / 2
+        if self.scene.drag is not None:
+            decay = drag_decay(self.scene.drag, middle)
+            drag_factor, spin_factor = decay.velocity, decay.spin
+            spin = spin * spin_factor
+
+        rule = partial(
+            collide,
+            ceiling=CEILING * jnp.sqrt(state.temperature),
+            share=share,
+            scene=self.scene,
+            tangents=tangents,
+            drag_factor=drag_factor,
         )
-        return new._replace(tangents=along)
-    ds, energy_after = share * scheme.scaled_step, energy * temperature
-    mobility, along = _update_tangents(
-        before.tangents, state.mobility, scheme.dimension, sums, dt, ds, energy_after
-    )
-    return new._replace(mobility=mobility, tangents=along)
+        rough = self.scene.surface is not None
+        firsts = v[:first] - v[first : 2 * first]
+        first_spins = spin[:first] + spin[first : 2 * first] if rough else None
+        one = rule(firsts, bits[:, :first], spin=first_spins)
+        kick_before, second_spins = one.kick[:second], one.spin_change
+        if second_spins is not None:
+            second_spins = spin[:second] + second_spins[:second] + spin[2 * first :]
+        seconds = v[:second] + kick_before - v[2 * first :]
+        two = rule(seconds, bits[:, first:-2], spin=second_spins)
+        kicks = jnp.concatenate([kick_before + two.kick, one.kick[second:], -one.kick, -two.kick])
+        changes = [kicks, -middle * kicks]
+        if one.spin_change is not None and two.spin_change is not None:
+            both = one.spin_change[:second] + two.spin_change
+            changes.append(
+                jnp.concatenate([both, one.spin_change[second:], one.spin_change, two.spin_change])
+                / spin_factor
+            )
+        sums = jax.tree.map(jnp.add, *(x._replace(kick=0.0, spin_change=None) for x in (one, two)))
+        new = old + jnp.concatenate(changes, axis=-1)
+        first_spins = None if first_spins is None else first_spins / spin_factor
+        second_spins = None if second_spins is None else second_spins / spin_factor
+        pairs = (firsts, first_spins, bits[:, :first]), (seconds, second_spins, bits[:, first:-2])
+        return state.particles.at[index].set(new, **options), sums, pairs
 
+    def _hit_walls(
+        self,
+        state: DSMCState,
+        key: PRNGKeyArray,
+        dt: Float[Array, ""],
+        particles: Float[Array, "N components"],
+        counts: tuple[Any, Any],
+        tangents: bool,
+    ) -> tuple[Float[Array, "N components"], Float[Array, ""], EnergyGains | None]:
+        """Let particles hit walls in a step, independent of their places.
 
-def _apply_drive(
-    state: DSMCState,
-    key: PRNGKeyArray,
-    dt: Float[Array, ""],
-    counts: tuple[Int[Array, ""] | None, Int[Array, ""] | None],
-    scene: ReducedScene,
-    scheme: Scheme,
-    clock: Float[Array, ""],
-    place: int,
-) -> DSMCState:
-    """Apply half of the kicks of a step, at its start (place 0) or end (1).
+        A sphere between two walls hits one of them ``|v| ds/(L - sigma)`` times in a step, times
+        the ratio of the density before walls to the mean (`wall_impact_ratio`). Each step has walls
+        across one axis, in turn, with d times this number of impacts.
 
-    `counts` are the number of subsets of this replica and the largest of any replica.
-    """
-    kicked, largest = counts
-    if scene.drive is None or kicked is None or largest is None:
-        return state
-    d, parts = scheme.dimension, num_subsets(scheme.num_particles)
-    growth = kick_growth(scene.drive, scene.drag, clock, dt, float(place))
-    key, at_rest = jax.random.fold_in(key, 2 + place), scene.walls is None
-    size, time = jnp.sqrt(growth / 2 * (parts / kicked)), state.clock
+        Returns the particles, the loss of sum v^2, and the gains, None without tangents.
+        """
+        d, middle = self.scheme.dimension, state.clock + dt / 2
+        axis, one = (state.steps % d).astype(jnp.int32), jnp.ones(())
+        across = (jnp.arange(d) == axis).astype(particles.dtype)[None]
+        key, (drawn, largest) = jax.random.fold_in(key, 1), counts
+        parts = num_subsets(len(particles))
 
-    def kick(i: Array, rows: Array, belongs: Array) -> tuple[Array, Array]:
-        v = rows[:, :d]
-        kicks = random_kicks(jax.random.fold_in(key, i), v, at_rest, belongs)
-        kicks = jnp.where(belongs[:, None], size * kicks, 0.0)
-        after = [v + kicks, rows[:, d : 2 * d] - time * kicks, rows[:, 2 * d :]]
-        return jnp.concatenate(after, axis=-1), jnp.sum(kicks * (2 * v + kicks))
+        def hit_rows(i: Array, rows: Array, belongs: Array) -> tuple[Array, tuple]:
+            bits = jax.random.bits(jax.random.fold_in(key, i), belongs.shape, jnp.uint16)
+            chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
+            chance = jnp.where(belongs, chance, jnp.inf)
 
-    first, zero = kicked * (2 * state.steps + place).astype(jnp.int32), jnp.zeros((), growth.dtype)
-    particles, gain = change_subsets(state.particles, first, kicked, largest, kick, zero)
-    grown = 2 * gain / (scheme.num_particles * d)
-    return state._replace(particles=particles, temperature=state.temperature + grown)
+            def hit(
+                scene: ReducedScene, decay: DragDecay, faster: Array, turning: Array
+            ) -> WallImpacts:
+                velocity, spin = rows[:, :d] * faster, rows[:, 2 * d :] * turning
+                walls, surface = scene.walls, scene.surface
+                frequency = walls.frequency[axis]
+                normal = jnp.sum(velocity * across, axis=1)
+                speed, outwards = jnp.abs(normal), jnp.sign(normal)[:, None] * across
+                eps = walls.law.restitution(jnp.where(speed > 0, speed * decay.velocity, 1.0))
+                ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
+                often = ratio * (frequency * (d * sqrt(pi)) * dt) * speed
+                hits = (chance < often) & (speed > 0)
+                push = jnp.where(hits, (1 + eps) * speed, 0.0)
+                kick, spin_change = -push[:, None] * outwards, jnp.zeros_like(spin)
+                if surface is not None and walls.surface is not None:
+                    eta = surface.eta_on_wall(walls.surface)
+                    tangential = tangential_impulse(
+                        velocity, spin, outwards, hits, eta, surface, push
+                    )
+                    kick, spin_change = kick + tangential.kick, tangential.spin_change
+                # The number of impacts is not differentiable, so weights of value 1 carry its
+                # derivative.
+                weight = frequency * ratio
+                weight = (weight / jax.lax.stop_gradient(weight))[:, None]
+                inertia = 0.0 if surface is None else surface.inertia
+                loss = -jnp.sum(weight * kick * (2 * velocity + kick))
+                gain = inertia * jnp.sum(weight * spin_change * (2 * spin + spin_change))
+                return WallImpacts(velocity + kick, spin + spin_change, loss, gain)
 
+            def gained(dynamics: DSMCDynamics, decay: DragDecay, *factors: Array) -> Array:
+                impacts = hit(dynamics.scene, decay, *factors)
+                return jnp.stack([-impacts.loss, impacts.rotational_gain / decay.spin**2])
 
-def _apply_collisions(
-    state: DSMCState,
-    key: PRNGKeyArray,
-    dt: Float[Array, ""],
-    share: Float[Array, ""],
-    scene: ReducedScene,
-    scheme: Scheme,
-    tangents: bool,
-) -> tuple[Float[Array, "N components"], Outcome, tuple[CandidatePairs, CandidatePairs]]:
-    """Return the particles after the collisions of a step, sums over them, and the candidates."""
-    d, first, second = scheme.dimension, scheme.first, scheme.second
-    bits = jax.random.bits(key, (2, first + second + 2), jnp.uint32)
-    i, j, k = draw_pairs(bits[:, -2:].ravel(), scheme)
-    index = jnp.concatenate([i, j, k])
-    options = {"mode": "promise_in_bounds", "unique_indices": True}
-    old = state.particles.at[index].get(**options)
-    v, spin, drag_factor, spin_factor = old[:, :d], old[:, 2 * d :], None, 1.0
-    # Collisions happen at the middle of the step, on average: x - v t changes by -kick t.
-    middle = state.clock + dt / 2
-    if scene.drag is not None:
-        decay = drag_decay(scene.drag, middle)
-        drag_factor, spin_factor = decay.velocity, decay.spin
-        spin = spin * spin_factor
+            decay = self.drag_decay(middle)
+            impacts = hit(self.scene, decay, one, decay.spin)
+            gains = self._energy_gains(gained, middle) if tangents else None
+            after = [impacts.velocity, rows[:, d : 2 * d], impacts.spin / decay.spin]
+            return jnp.concatenate(after, axis=-1), (impacts.loss, gains)
 
-    rule = partial(
-        collide,
-        ceiling=CEILING * jnp.sqrt(state.temperature),
-        share=share,
-        scene=scene,
-        tangents=tangents,
-        drag_factor=drag_factor,
-    )
-    rough = scene.surface is not None
-    firsts = v[:first] - v[first : 2 * first]
-    first_spins = spin[:first] + spin[first : 2 * first] if rough else None
-    one = rule(firsts, bits[:, :first], spin=first_spins)
-    kick_before, second_spins = one.kick[:second], one.spin_change
-    if second_spins is not None:
-        second_spins = spin[:second] + second_spins[:second] + spin[2 * first :]
-    seconds = v[:second] + kick_before - v[2 * first :]
-    two = rule(seconds, bits[:, first:-2], spin=second_spins)
-    kicks = jnp.concatenate([kick_before + two.kick, one.kick[second:], -one.kick, -two.kick])
-    changes = [kicks, -middle * kicks]
-    if one.spin_change is not None and two.spin_change is not None:
-        both = one.spin_change[:second] + two.spin_change
-        changes.append(
-            jnp.concatenate([both, one.spin_change[second:], one.spin_change, two.spin_change])
-            / spin_factor
+        shapes = jax.eval_shape(hit_rows, jnp.int32(0), particles[:1], jnp.ones(1, bool))[1]
+        zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        bits = jax.random.bits(jax.random.fold_in(key, MAX_SUBSETS), (), jnp.uint16)
+        first = (bits % parts).astype(jnp.int32)
+        particles, (loss, gains) = change_subsets(particles, first, drawn, largest, hit_rows, zero)
+        return particles, loss, gains
+
+    def _scaled_time_tangents(
+        self, before: DSMCState, sums: Outcome, dt: Array, ds: Array, energy: Array
+    ) -> tuple[Float[Array, ""], DSMCTangents]:
+        """Return M and the tangents after a step of a length in time and in scaled time.
+
+        The energy is sum v^2 after the step.
+        """
+        old, c, d = before.tangents, before.tangents.log_temperature, self.scheme.dimension
+        # The tangent of the velocities is (c/2) v, and the law contributes at every collision.
+        gain, fading = (sums.along + sums.along_speed[:, None] * (c / 2)[None]) / energy
+        # dM/ds = 1/2 - kappa M and its tangent, by the implicit midpoint rule.
+        half = sums.relaxation / energy / 2
+        mobility = ((1 - half) * before.mobility + ds / 2) / (1 + half)
+        along = (1 - half) * old.mobility - fading * (before.mobility + mobility) / 2
+        along = along / (1 + half)
+        return mobility, DSMCTangents(
+            log_temperature=c + gain,
+            clock=old.clock - c / 2 * dt,
+            mobility=along,
+            displacement=old.displacement + d * ds * (old.mobility + along),
+            persistence=old.persistence - fading,
         )
-    sums = jax.tree.map(jnp.add, *(x._replace(kick=0.0, spin_change=None) for x in (one, two)))
-    new = old + jnp.concatenate(changes, axis=-1)
-    first_spins = None if first_spins is None else first_spins / spin_factor
-    second_spins = None if second_spins is None else second_spins / spin_factor
-    pairs = (firsts, first_spins, bits[:, :first]), (seconds, second_spins, bits[:, first:-2])
-    return state.particles.at[index].set(new, **options), sums, pairs
 
+    def _exchange_tangents(
+        self,
+        before: DSMCState,
+        ceiling: Float[Array, ""],
+        share: Float[Array, ""],
+        ds: Float[Array, ""],
+        candidates: tuple[CandidatePairs, CandidatePairs],
+        wall_gains: EnergyGains | None,
+        collisions: Float[Array, ""],
+    ) -> ExchangeTangents:
+        """Return the tangents after a step; see `collide` for its ceiling and share."""
+        d, start = self.scheme.dimension, before.clock
 
-def _apply_walls(
-    state: DSMCState,
-    key: PRNGKeyArray,
-    dt: Float[Array, ""],
-    particles: Float[Array, "N components"],
-    counts: tuple[Int[Array, ""], Int[Array, ""]],
-    scene: ReducedScene,
-    d: int,
-    tangents: bool,
-) -> tuple[Float[Array, "N components"], Float[Array, ""], EnergyGains | None]:
-    """Return the particles after impacts on walls in a step, the loss of sum v^2, and the gains.
+        def by_collisions(
+            dynamics: DSMCDynamics, decay: DragDecay, faster: Array, turning: Array
+        ) -> Array:
+            scene, total = dynamics.scene, jnp.zeros(2, ds.dtype)
+            drag_factor = None if scene.drag is None else decay.velocity
+            for relative, spins, bits in candidates:
+                spins = None if spins is None else spins * turning
+                outcome = collide(
+                    relative * faster, bits, ceiling, share, scene, False, spins, drag_factor
+                )
+                gain = outcome.rotational_gain / decay.spin**2
+                total = total + jnp.stack([-outcome.loss, gain])
+            return total
 
-    `counts` are the number of subsets of this replica and the largest of any replica. Without
-    tangents the gains are None.
-    """
-    middle = state.clock + dt / 2
-    decay = drag_decay_or_one(scene.drag, middle)
-    axis, one = (state.steps % d).astype(jnp.int32), jnp.ones(())
+        def by_drive(dynamics: DSMCDynamics, *_: Any) -> Array:
+            growth = sum(dynamics.kick_growth(start, ds, place) for place in (0.0, 1.0))
+            return jnp.stack([self.scheme.num_particles * d / 2 * growth, jnp.zeros_like(ds)])
 
-    key = jax.random.fold_in(key, 1)
-    drawn, largest = counts
-    parts = num_subsets(len(particles))
+        gains, along = self._energy_gains(by_collisions, start + ds / 2)
+        if self.scene.drive is not None:
+            kicks, along_kicks = self._energy_gains(by_drive, start + ds / 2)
+            # The rate of impacts depends on the speeds; kicks do not depend on them.
+            gains, along = gains + kicks, along + along_kicks.at[-2].add(-kicks)
+        if wall_gains is not None:
+            gains, along = gains + wall_gains[0], along + wall_gains[1]
+        v, s = before.particles[:, :d], before.particles[:, 2 * d :]
+        inertia = 0.0 if self.scene.surface is None else self.scene.surface.inertia
+        energies = jnp.stack([jnp.sum(v**2), inertia * jnp.sum(s**2)])
+        return before.tangents.after(energies, gains, along, collisions)
 
-    def hit_rows(i: Array, rows: Array, belongs: Array) -> tuple[Array, tuple]:
-        bits = jax.random.bits(jax.random.fold_in(key, i), belongs.shape, jnp.uint16)
-        chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
-        chance = jnp.where(belongs, chance, jnp.inf)
-        velocity, spin = rows[:, :d], rows[:, 2 * d :]
+    def _energy_gains(
+        self, gained: Callable[..., Float[Array, "2"]], middle: Float[Array, ""]
+    ) -> EnergyGains:
+        """Return the gains and tangents of a function at the middle of a step.
 
-        def hit(scene: ReducedScene, faster: Array, turning: Array, drag: Array) -> WallImpacts:
-            return hit_walls(scene, chance, axis, velocity * faster, spin * turning, dt, drag)
+        It is a function of the dynamics, the decay by drag, and factors of velocities and spins.
+        """
 
-        impacts = hit(scene, one, decay.spin, decay.velocity)
-        gains = _wall_gains(hit, scene, middle) if tangents else None
-        after = [impacts.velocity, rows[:, d : 2 * d], impacts.spin / decay.spin]
-        return jnp.concatenate(after, axis=-1), (impacts.loss, gains)
+        def gains(scene: ReducedScene, velocity: Array, spin: Array, time_scale: Array) -> Array:
+            drag = jax.tree.map(lambda rate: rate * (1 + time_scale), scene.drag)
+            dynamics = DSMCDynamics(scene._replace(drag=drag), self.scheme)
+            decay = dynamics.drag_decay(middle)
+            faster, turning = jnp.exp(velocity), decay.spin * jnp.exp(spin)
+            if scene.surface is not None:  # at a given energy a larger inertia has smaller spins
+                inertia = scene.surface.inertia
+                turning = turning * jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
+            return gained(dynamics, decay, faster, turning)
 
-    shapes = jax.eval_shape(hit_rows, jnp.int32(0), particles[:1], jnp.ones(1, bool))[1]
-    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    bits = jax.random.bits(jax.random.fold_in(key, MAX_SUBSETS), (), jnp.uint16)
-    first = (bits % parts).astype(jnp.int32)
-    particles, (loss, gains) = change_subsets(particles, first, drawn, largest, hit_rows, zero)
-    return particles, loss, gains
+        zero = jnp.zeros_like(middle)
+        values, pull = jax.vjp(gains, self.scene, zero, zero, zero)
+
+        def row(weights):
+            in_scene, *in_motion = pull(weights)
+            return jnp.concatenate([ravel_pytree(in_scene)[0], jnp.stack(in_motion)])
+
+        slopes = jax.vmap(row)(jnp.eye(2, dtype=zero.dtype)).T
+        return values, jnp.concatenate([slopes[:-3], slopes[-1:], slopes[-3:-1]])
 
 
 def advance(
+    dynamics: DSMCDynamics,
     state: DSMCState,
     end: Float[Array, ""],
-    scene: ReducedScene,
     key: UInt32[Array, "2"],
     max_steps: Int[Array, ""],
-    *,
-    scheme: Scheme,
     tangents: bool = False,
 ) -> DSMCState:
     """Advance each replica by whole steps to the last one that ends before a time.
 
     Args:
+        dynamics: of the gas.
         state: the initial state.
         end: the time.
-        scene: in reduced units.
         key: two 32-bit words of a key of random numbers.
         max_steps: maximum number of steps; `time` of the result is the time that they reach.
-        scheme: sizes of a step.
         tangents: True to compute tangents.
     """
-
-    def length(state):
-        whole = scheme.scaled_step / jnp.sqrt(state.temperature)
-        return _limit_step(scene, state.temperature, state.clock, whole, scheme.dimension)
+    scene, length = dynamics.scene, dynamics.step_length
 
     def due(state):
         return length(state) <= (end - state.clock) - state.clock_rest
@@ -986,8 +837,9 @@ def advance(
         state, steps_left = carry
         share = due(state).astype(state.clock.dtype)
         if scene.drive is not None or scene.walls is not None:
-            share = share * length(state) * jnp.sqrt(state.temperature) / scheme.scaled_step
-        return step(state, key, share, scene, scheme, tangents), steps_left - 1
+            share = share * length(state) * jnp.sqrt(state.temperature)
+            share = share / dynamics.scheme.scaled_step
+        return dynamics.step(state, key, share, tangents), steps_left - 1
 
     state, _ = jax.lax.while_loop(unfinished, step_due, (state, max_steps))
     time = jnp.where(jnp.any(due(state)), jnp.min(state.clock), end)
@@ -999,7 +851,7 @@ def compiled_advance(donate: bool) -> Callable[..., DSMCState]:
     """Return `advance` for the host driver; with `donate` a call deletes its initial state."""
     return jax.jit(
         advance,
-        static_argnames=("scheme", "tangents"),
+        static_argnames="tangents",
         donate_argnames="state" if donate else (),
         compiler_options=cpu_compiler_options(),
     )

@@ -21,16 +21,11 @@ from jaxgran.gradients.rule import first_order_only, nan_tangent, nan_tangent_li
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import observables, snapshot
 from jaxgran.particles.dsmc import collisions
-from jaxgran.particles.dsmc.collisions import (
-    DSMCState,
-    DSMCTangents,
-    Scheme,
-    initial_exchange_tangents,
-)
+from jaxgran.particles.dsmc.collisions import DSMCDynamics, DSMCState, DSMCTangents, Scheme
 from jaxgran.particles.setup import maxwellian_velocities
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import (
-    DragDecay,
+    centred,
     copy_buffers,
     drag_decay,
     maxwellian_spins,
@@ -38,34 +33,39 @@ from jaxgran.particles.state import (
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.laws import ReducedLaw
-from jaxgran.scene.reduced import ReducedDrag, ReducedScene
+from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory import averages
 
 
-@partial(jax.jit, static_argnames=("replicas", "scheme", "num_parameters"))
+@partial(jax.jit, static_argnames=("replicas", "num_parameters"))
 def initial_dsmc_state(
-    key: UInt32[Array, "2"],
-    replicas: int,
-    scheme: Scheme,
-    num_parameters: int,
-    scene: ReducedScene | None = None,
+    dynamics: DSMCDynamics, key: UInt32[Array, "2"], replicas: int, num_parameters: int
 ) -> DSMCState:
-    """Return the state at t = 0, with Maxwellian velocities and tangents in some parameters."""
-    d = scheme.dimension
+    """Return the state at t = 0, with Maxwellian velocities and tangents in some parameters.
+
+    T is then 1, and T_rot that of the scene.
+    """
+    scene, (d, n, *_) = dynamics.scene, dynamics.scheme
     key = jax.random.fold_in(threefry_key(key), 2**32 - 1)
-    v = maxwellian_velocities(key, replicas, scheme.num_particles, d).reshape(replicas, -1, d)
+    v = maxwellian_velocities(key, replicas, n, d).reshape(replicas, -1, d)
     parts = [v / sqrt(2), jnp.zeros_like(v)]
-    if scene is not None and scene.surface is not None:
-        shape = (replicas, scheme.num_particles, NUM_SPIN_COMPONENTS[d])
+    if scene.surface is not None:
         key = jax.random.fold_in(key, 0)
         mean_square = (scene.surface.ratio / (2 * scene.surface.inertia)).astype(v.dtype)
-        parts.append(maxwellian_spins(key, shape, mean_square))
+        parts.append(maxwellian_spins(key, (replicas, n, NUM_SPIN_COMPONENTS[d]), mean_square))
     zero, along = jnp.zeros(replicas, v.dtype), jnp.zeros((replicas, num_parameters), v.dtype)
     tangents = DSMCTangents(*[along] * len(DSMCTangents._fields))
-    if scene is not None and num_parameters and has_elements(scene):
-        tangents = initial_exchange_tangents(
-            scene, num_parameters, scheme.num_particles, d, replicas
-        )
+    if num_parameters and scene.has_elements:  # and the last tangent is that in time
+
+        def rotational_energy(scene: ReducedScene) -> Array:
+            return n * NUM_SPIN_COMPONENTS[d] / 2 * scene.surface.ratio
+
+        energies = jnp.zeros((num_parameters + 1, 2), v.dtype)
+        if scene.surface is not None:
+            slopes = ravel_pytree(jax.grad(rotational_energy)(scene))[0]
+            energies = energies.at[:-1, 1].set(slopes)
+        many = jnp.broadcast_to(energies, (replicas, *energies.shape))
+        tangents = ExchangeTangents(many, many[:, :, 0] * 0)
     return DSMCState(
         time=jnp.zeros((), v.dtype),
         clock=zero,
@@ -80,11 +80,6 @@ def initial_dsmc_state(
     )
 
 
-def has_elements(scene: ReducedScene) -> bool:
-    """Return False for smooth spheres in free flight."""
-    return any(element is not None for element in scene[1:])
-
-
 ALLOWED_MISSED = 1e-4
 """Largest share of collisions that a run may miss because of the ceiling of the collision rate."""
 
@@ -92,14 +87,13 @@ CHUNK = 4_000_000
 """Candidate pairs in one call of compiled code by the host driver, which takes about a second."""
 
 
-@partial(jax.jit, static_argnames=("scheme", "tangents", "save"))
+@partial(jax.jit, static_argnames=("tangents", "save"))
 def dsmc_records(
+    dynamics: DSMCDynamics,
     state: DSMCState,
     first: Float[Array, "replicas N d"],
-    scene: ReducedScene,
     key: UInt32[Array, "2"],
     *,
-    scheme: Scheme,
     tangents: bool = False,
     units: Units | None = None,
     save: Callable[[Particles], Any] | None = None,
@@ -109,24 +103,24 @@ def dsmc_records(
     The next step of each replica is done in part, up to this time, and then discarded.
 
     Args:
+        dynamics, key: of the run.
         state: the state of the gas.
         first: velocities at t = 0.
-        scene, key, scheme: the scene, key and scheme of the run.
         tangents: return three dictionaries instead: "values", the "rates" of their change with
             time, and "along", their tangents in the parameters of the law at this time.
         units, save: units of the particles, and a user's function of them.
     """
+    scene, scheme, replicas = dynamics.scene, dynamics.scheme, len(state.clock)
     left = (state.time - state.clock) - state.clock_rest
     share = left * jnp.sqrt(state.temperature) / scheme.scaled_step
-    state = collisions.step(state, key, jnp.clip(share, 0.0, 1.0), scene, scheme, tangents)
+    state = dynamics.step(state, key, jnp.clip(share, 0.0, 1.0), tangents)
     d = scheme.dimension
 
-    velocity = state.particles[..., :d]
+    velocity = v = state.particles[..., :d]
     if scene.walls is None:  # walls stop the gas as a whole
-        velocity = _centred(velocity)
-    displacement = _centred(
-        state.particles[..., d : 2 * d] + state.clock[:, None, None] * state.particles[..., :d]
-    )
+        velocity = centred(v, replicas)
+    position = state.particles[..., d : 2 * d] + state.clock[:, None, None] * v
+    displacement = centred(position, replicas)
     theta = 2 * observables.temperature(velocity)
     values = {
         "temperature": theta,
@@ -139,7 +133,10 @@ def dsmc_records(
         spin = jnp.mean(state.particles[..., 2 * d :] ** 2, axis=(1, 2))
         values["rotational_temperature"] = 2 * scene.surface.inertia * spin
     if scene.drag is not None:
-        values |= _without_drag(values, drag_decay(scene.drag, state.time))
+        left = drag_decay(scene.drag, state.time)  # true instead of transformed velocities
+        powers = {"temperature": left.velocity**2, "velocity_correlation": left.velocity}
+        powers["rotational_temperature"] = left.true_spin**2
+        values |= {name: powers[name] * values[name] for name in powers.keys() & values.keys()}
     fast = status.flag(status.TOO_FAST, state.missed > ALLOWED_MISSED * state.collisions + 1)
     values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
     if save is not None and units is not None:
@@ -152,17 +149,6 @@ def dsmc_records(
     rates = _rates(values, scene.law, d) | {"displacement": spreading}
     along = _tangents_at_time(values, rates, state.tangents)
     return {"values": values, "rates": rates, "along": along}
-
-
-def _centred(x: Float[Array, "replicas N d"]) -> Float[Array, "replicas N d"]:
-    return x - jnp.mean(x, axis=1, keepdims=True)
-
-
-def _without_drag(values: dict[str, Array], left: DragDecay) -> dict[str, Array]:
-    """Return the records that depend on velocities, in true instead of transformed velocities."""
-    powers = {"temperature": left.velocity**2, "velocity_correlation": left.velocity}
-    powers["rotational_temperature"] = left.true_spin**2
-    return {name: powers[name] * values[name] for name in powers.keys() & values.keys()}
 
 
 def _to_particles(state: DSMCState, scene: ReducedScene, d: int, units: Units) -> Particles:
@@ -205,30 +191,21 @@ def _exchange_derivatives(
 
     The rates come from the last direction of the tangents, in which time is scaled.
     """
-    n, d, time = scheme.num_particles, scheme.dimension, state.time
-    assert isinstance(state.tangents, ExchangeTangents)
-    energies, collided = state.tangents
+    time = state.time
 
     def logarithms(scene: ReducedScene, time_scale: Array) -> Array:
         if scene.drag is None:
             return jnp.zeros(2)
-        rates = ReducedDrag(*(rate * (1 + time_scale) for rate in scene.drag))
-        left = drag_decay(rates, time)
+        left = drag_decay(jax.tree.map(lambda rate: rate * (1 + time_scale), scene.drag), time)
         return jnp.log(jnp.stack([left.velocity, left.true_spin]))
 
-    log_left, pull = jax.vjp(logarithms, scene, jnp.zeros(()))
-    along_left = jax.vmap(lambda weights: ravel_pytree(pull(weights))[0])(jnp.eye(2))
-    along = {"collisions": 2 / n * collided}
-    for k, name in enumerate(("temperature", "rotational_temperature")):
-        if name in values:
-            size = n * (d, NUM_SPIN_COMPONENTS[d])[k] / 2
-            moved = jnp.exp(2 * log_left[k]) / size * energies[:, :, k]
-            along[name] = moved + 2 * along_left[k][None] * values[name][:, None]
-    after = jnp.where(time > 0, time, 1.0)
-    return {
-        "rates": {name: x[:, -1] / after for name, x in along.items()},
-        "along": {name: x[:, :-1] for name, x in along.items()},
-    }
+    decay, pull = jax.vjp(logarithms, scene, jnp.zeros(()))
+    decay_along = jax.vmap(lambda weights: ravel_pytree(pull(weights))[0])(jnp.eye(2)).T
+    tangents = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), state.tangents)
+    along, rates = tangents.of_records(
+        values, decay, decay_along, time, scheme.num_particles, scheme.dimension
+    )
+    return {"rates": rates, "along": jax.tree.map(jnp.transpose, along)}
 
 
 def _tangents_at_time(
@@ -248,39 +225,36 @@ def _tangents_at_time(
     }
 
 
-@partial(jax.jit, static_argnames=("replicas", "scheme", "tangents", "save"))
+@partial(jax.jit, static_argnames=("replicas", "tangents", "save"))
 def run_traced(
-    scene: ReducedScene,
+    dynamics: DSMCDynamics,
     times: Float[Array, "times"],
     key: UInt32[Array, "2"],
     *,
     replicas: int,
-    scheme: Scheme,
     tangents: bool,
     units: Units | None = None,
     save: Callable[[Particles], Any] | None = None,
 ) -> dict[str, Any]:
     """Return `dsmc_records` at all times, with a first axis of times. A pure function."""
-    num_parameters = ravel_pytree(scene)[0].size if tangents else 0
-    state = initial_dsmc_state(key, replicas, scheme, num_parameters, scene)
-    first = state.particles[..., : scheme.dimension]
-    max_steps = jnp.asarray(2**31 - 1, jnp.int32)
+    num_parameters = ravel_pytree(dynamics)[0].size if tangents else 0
+    state = initial_dsmc_state(dynamics, key, replicas, num_parameters)
+    first = state.particles[..., : dynamics.scheme.dimension]
+    max_steps, options = jnp.asarray(2**31 - 1, jnp.int32), {"units": units, "save": save}
 
     def advance_to(state, end):
-        options = {"scheme": scheme, "tangents": tangents}
-        state = collisions.advance(state, end, scene, key, max_steps, **options)
-        return state, dsmc_records(state, first, scene, key, units=units, save=save, **options)
+        state = collisions.advance(dynamics, state, end, key, max_steps, tangents)
+        return state, dsmc_records(dynamics, state, first, key, tangents=tangents, **options)
 
     return jax.lax.scan(advance_to, state, times)[1]
 
 
 def differentiable_run(
-    scene: ReducedScene,
+    dynamics: DSMCDynamics,
     times: Float[Array, "times"],
     key: UInt32[Array, "2"],
     *,
     replicas: int,
-    scheme: Scheme,
     units: Units,
     save: Callable[[Particles], Any] | None,
 ) -> dict[str, Array]:
@@ -288,10 +262,10 @@ def differentiable_run(
 
     The rule uses the tangents of the state.
     """
-    parameters, unravel = ravel_pytree(scene)
+    parameters, unravel = ravel_pytree(dynamics)
 
     def simulate(parameters, times, key, units, tangents):
-        options = {"replicas": replicas, "scheme": scheme, "units": units, "save": save}
+        options = {"replicas": replicas, "units": units, "save": save}
         return run_traced(unravel(parameters), times, key, tangents=tangents, **options)
 
     @jax.custom_jvp
@@ -300,14 +274,14 @@ def differentiable_run(
 
     @solve.defjvp
     def solve_jvp(at, along):
-        scene, (parameters, times, key, units) = unravel(at[0]), first_order_only(at)
+        parameters, times, key, units = first_order_only(at)
         out = simulate(parameters, times, key, units, True)
         values = out["values"]
         tangents = {
             name: rate * along[1][:, None] + out["along"][name] @ along[0]
             for name, rate in out["rates"].items()
         }
-        if not has_elements(scene):
+        if not dynamics.scene.has_elements:
             in_time = out["rates"]["sonine"] * along[1][:, None]
             tangents["sonine"] = in_time + nan_tangent(in_time.shape, along[0])
         for name in set(values) - set(tangents) - {"fault"}:
@@ -318,25 +292,22 @@ def differentiable_run(
 
 
 def host_run_parts(
-    scene: ReducedScene,
-    key: UInt32[Array, "2"],
-    *,
-    replicas: int,
-    scheme: Scheme,
-    donate: bool,
+    dynamics: DSMCDynamics, key: UInt32[Array, "2"], *, replicas: int, donate: bool
 ) -> tuple[DSMCState, Callable[[DSMCState, float], DSMCState], Callable[..., dict]]:
     """Return the parts of a run for the host: a state, and functions to advance and observe it.
 
     With `donate` a call to advance deletes its initial state.
     """
-    state = copy_buffers(initial_dsmc_state(key, replicas, scheme, 0, scene))
+    state, scheme = copy_buffers(initial_dsmc_state(dynamics, key, replicas, 0)), dynamics.scheme
     pairs = replicas * (scheme.first + scheme.second)
     max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
     first = state.particles[..., : scheme.dimension]
     compiled = collisions.compiled_advance(donate)
 
     def advance(state: DSMCState, end: float) -> DSMCState:
-        end_array = jnp.asarray(end, state.clock.dtype)
-        return compiled(state, end_array, scene, key, max_steps, scheme=scheme)
+        return compiled(dynamics, state, jnp.asarray(end, state.clock.dtype), key, max_steps)
 
-    return state, advance, partial(dsmc_records, first=first, scene=scene, key=key, scheme=scheme)
+    def observe(state: DSMCState, **options: Any) -> dict[str, Array]:
+        return dsmc_records(dynamics, state, first, key, **options)
+
+    return state, advance, observe

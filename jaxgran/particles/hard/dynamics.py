@@ -11,14 +11,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran._utils import status
 from jaxgran.gradients import rule
 from jaxgran.gradients.tangents import ImpactTangents, update_rates
-from jaxgran.particles import neighbours, observables
+from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import (
+    FATAL,
     AbstractDynamics,
     Progress,
     accept_if,
@@ -27,7 +28,6 @@ from jaxgran.particles.dynamics import (
 )
 from jaxgran.particles.hard.impacts import (
     MAX_ROUNDS,
-    HardScene,
     HardTangents,
     ImpactWork,
     execute_impacts,
@@ -53,7 +53,7 @@ from jaxgran.particles.state import (
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.laws import ReducedLaw
-from jaxgran.scene.reduced import ReducedDrag
+from jaxgran.scene.reduced import ReducedDrag, ReducedScene, SphereScene
 from jaxgran.theory import averages
 
 MIN_IMPACTS = 8
@@ -101,21 +101,26 @@ class HardDynamics(AbstractDynamics):
     Attributes:
         scene, replicas, capacity: see `AbstractDynamics`.
         share: impacts per particle in a window.
+        contact_time: in mean free times; the impact of a sphere within this time of its last one is
+            elastic.
+        all_elastic: whether all impacts are elastic and smooth.
         overlap: largest overlap of positions given by a user that are accepted as those of hard
             spheres.
     """
 
-    scene: HardScene
+    scene: SphereScene
     replicas: int = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
     share: float = eqx.field(static=True)
+    contact_time: Float[Array, ""]
+    all_elastic: Bool[Array, ""]
     overlap: float = eqx.field(static=True, default=1e-9)
 
     def initial_internal(self, num_rows, dtype) -> HardState:
         # The first window is short: at random positions many spheres are near contact.
         rate = self.scene.collision_frequency
-        if self.scene.walls is not None:
-            rate = rate + 2 / jnp.min(self.scene.walls.sides - 1)
+        if self.region is not None:
+            rate = rate + 2 / jnp.min(self.region)
         return HardState(
             age=jnp.full(num_rows, jnp.inf, dtype),
             regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
@@ -123,45 +128,36 @@ class HardDynamics(AbstractDynamics):
         )
 
     def elastic(self) -> "HardDynamics":
-        return dataclasses.replace(self, scene=self.scene.for_equilibration())
-
-    @property
-    def region(self) -> Array | None:
-        walls = self.scene.walls
-        return None if walls is None else walls.sides - 1
-
-    @property
-    def galilean_invariant(self) -> bool:
-        return self.scene.walls is None and self.scene.drag is None
+        material = self.scene.material
+        drag, drive = jax.tree.map(lambda x: 0 * x, (material.drag, material.drive))
+        scene = self.scene.with_material(material._replace(drag=drag, drive=drive))
+        return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
 
     def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
-        n, d = state.velocity.shape
-        internal, surface = state.internal, self.scene.surface
+        internal, surface = state.internal, self.scene.material.surface
         if surface is not None:
-            spin = initial_spins(
-                key, state.velocity, self.replicas, surface.ratio / surface.inertia
-            )
+            mean_square = surface.ratio / surface.inertia
+            spin = initial_spins(key, state.velocity, self.replicas, mean_square)
             gain = jnp.zeros(self.replicas, spin.dtype)
             internal = internal._replace(spin=spin, rotational_gain=gain)
-        if self.scene.drive is not None:
+        if self.scene.material.drive is not None:
             words = jax.random.bits(jax.random.fold_in(key, 3), (2,), jnp.uint32)
             internal = internal._replace(key=jnp.concatenate([words, jnp.zeros(1, jnp.uint32)]))
         return state._replace(internal=internal)
 
     def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
-        spin, drag = state.internal.spin, self.scene.drag
+        spin, drag = state.internal.spin, self.scene.drag_rates
         if drag is None:
             return velocity, spin
-        decay = drag_decay(self.scene.decay_rates, state.time + state.time_rest)
+        decay = drag_decay(drag, state.time + state.time_rest)
         return velocity * decay.velocity, None if spin is None else spin * decay.true_spin
 
-    def with_tangents(self, state: State, directions: ReducedLaw | HardScene) -> State:
-        velocity = state.velocity
-        if isinstance(directions, HardScene):
-            n, d = len(velocity) // self.replicas, velocity.shape[1]
-            tangents = HardTangents.at_start(self.scene, directions, self.replicas, n, d)
+    def with_tangents(self, state: State, directions: ReducedScene) -> State:
+        (n, d), replicas = state.velocity.shape, self.replicas
+        if self.scene.material.has_elements:
+            tangents = HardTangents.at_start(self.scene, directions, replicas, n // replicas, d)
         else:
-            tangents = ImpactTangents.initial(directions, self.replicas, velocity.dtype)
+            tangents = ImpactTangents.initial(directions.law, replicas, state.velocity.dtype)
         return state._replace(tangents=tangents)
 
     def observe(self, state: State) -> dict[str, Array]:
@@ -171,8 +167,8 @@ class HardDynamics(AbstractDynamics):
         x, side = state.position, self.scene.side
         closest = min_distance(x, side, self.replicas, self.capacity[:2], "sweep")
         tolerance = overlap_by_rounding(x, side, self.overlap)
-        if self.scene.walls is not None:  # a sphere and its image beyond a wall
-            image = 2 * jnp.min(jnp.minimum(x, self.scene.walls.sides[None] - x))
+        if (container := self.scene.container) is not None:  # a sphere and its image beyond a wall
+            image = 2 * jnp.min(jnp.minimum(x, container[None] - x))
             closest = jnp.minimum(closest, image)
         return status.flag(status.OVERLAPPING, closest < 1 - tolerance)
 
@@ -182,13 +178,13 @@ class HardDynamics(AbstractDynamics):
 
         Free flight leads there, and the list lives twice as long as one of the current positions.
         """
-        side, walls = self.scene.side, self.scene.walls
+        side, container = self.scene.side, self.scene.container
         speed = jnp.max(fastest(state.velocity, self.replicas))
         life = 0.95 * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
         time_until_end = time_left(state, end)
         flown = 0.5 * jnp.minimum(life, time_until_end) * state.velocity
-        if walls is not None:
-            inside = jnp.clip(state.position + flown, 0.5, walls.sides[None] - 0.5)
+        if container is not None:
+            inside = jnp.clip(state.position + flown, 0.5, container[None] - 0.5)
             flown = inside - state.position
         listed = neighbours.wrap(side, state.position + flown)
         image = jnp.round((state.position + flown - listed) / side).astype(jnp.int32)
@@ -212,32 +208,30 @@ class HardDynamics(AbstractDynamics):
         """
         old, bound_factor = now.state, now.internal
         time_until_end, scene = time_left(old, end), self.scene
-        window = window_length(old, scene, self.replicas)
+        window = self._window_length(old)
         num_left = jnp.maximum(jnp.ceil(time_until_end / window * (1 - 1e-9)), 1.0)
         duration = time_until_end / num_left
-        kicked = apply_drive(old, scene, self.replicas, duration, 0.0)
+        kicked = self._apply_drive(old, duration, 0.0)
         bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
         candidates = select_impact_candidates(
-            old.position, kicked.velocity, pairs, duration, bound, self.capacity, scene.walls
+            old.position, kicked.velocity, pairs, duration, bound, self.capacity, scene.container
         )
-        work = execute_impacts(kicked, listed, candidates, scene, duration, self.replicas)
+        work = execute_impacts(
+            kicked, listed, candidates, scene, duration, self.contact_time, self.all_elastic
+        )
         member_bound = bound[jnp.minimum(candidates.replica, self.replicas - 1)]
         too_fast = jnp.any(work.max_speed2 > member_bound**2)
         new = self._state_after_window(kicked, candidates, work, duration)
-        new = apply_drive(new, scene, self.replicas, duration, 1.0)
+        new = self._apply_drive(new, duration, 1.0)
         new = advance_time(new, duration, end, num_left <= 1)
 
-        list_status = self.capacity.exceeded_by(candidates.needed)
-        finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
         distance2 = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
         exceeded = jnp.maximum(distance2, jnp.max(work.max_distance2)) > (0.5 * old.skin) ** 2
         fault = status.flag(status.SKIN_EXCEEDED, exceeded)
         fault |= status.flag(status.STALLED, work.num_rounds >= MAX_ROUNDS)
-        fault = jnp.where(finite, fault, status.NOT_FINITE.bit)
-        # A window whose arrays were too short lacks pairs or particles.
-        fault = jnp.where(list_status > 0, list_status, fault)
-        accepted = (fault == status.OK) & ~too_fast
-        repeat = too_fast & finite & (list_status == 0)
+        invalid = self.invalid_block(new, candidates.needed)
+        fault = jnp.where(invalid > 0, invalid, fault)
+        accepted, repeat = (fault == status.OK) & ~too_fast, too_fast & (invalid == 0)
         state = accept_if(accepted, new, old)
         next_duration = jnp.minimum(state.internal.window, time_left(state, end))
         next_position = state.position + state.velocity * next_duration
@@ -290,13 +284,9 @@ class HardDynamics(AbstractDynamics):
                 key=internal.key,
             ),
         )
-        if isinstance(state.tangents, HardTangents):
-            tangents = exchange_tangents_after(state, self.scene, candidates, work, duration)
-        elif state.tangents is not None:
-            tangents = projected_tangents_after(new, self.scene, candidates, work, duration)
-        else:
+        if state.tangents is None:
             return new
-        return new._replace(tangents=tangents)
+        return new._replace(tangents=self._tangents_after(state, new, candidates, work, duration))
 
     def recover(self, now: Progress, before: State) -> tuple[State, Int[Array, ""]]:
         """Shorten the window if the skin was exceeded at once, and the skin of a crowded list."""
@@ -307,97 +297,108 @@ class HardDynamics(AbstractDynamics):
         crowded = now.needed[0] > MAX_LISTED_PER_PARTICLE * len(state.position)
         crowded &= now.status == status.OK
         shorter = jnp.maximum(0.8 * state.skin, jnp.minimum(state.skin, MIN_SKIN))
-        fatal = status.LIST_FULL.bit | status.CONTACTS_FULL.bit
-        fatal |= status.NOT_FINITE.bit | status.STALLED.bit
         window = jnp.where(shorten, 0.5 * state.internal.window, state.internal.window)
         recovered = state._replace(
             skin=jnp.where(crowded, shorter, state.skin),
             internal=state.internal._replace(window=window),
         )
-        return recovered, now.status & fatal
+        return recovered, now.status & FATAL
 
+    def _apply_drive(self, state: State, duration: ArrayLike, place: float) -> State:
+        """Return the state with half of the kicks of a window, at its begin (place 0) or end (1).
 
-def apply_drive(
-    state: State, scene: HardScene, replicas: int, duration: ArrayLike, place: float
-) -> State:
-    """Return the state with half of the kicks of a window, made at its begin (place 0) or end (1).
+        Time and window are those before the window; the velocities may already have had kicks.
+        """
+        counted_key, replicas = state.internal.key, self.replicas
+        if self.scene.material.drive is None or counted_key is None:
+            return state
+        variance = kick_variance(self.scene, state.time + state.time_rest, duration, place)
+        key = jax.random.fold_in(threefry_key(counted_key[:2]), counted_key[2])
+        by_replica = state.velocity.reshape(replicas, -1, state.velocity.shape[-1])
+        kicks = jax.vmap(random_kicks, (0, 0, None))(
+            jax.random.split(key, replicas), by_replica, self.scene.container is None
+        )
+        velocity = (by_replica + jnp.sqrt(variance) * kicks).reshape(state.velocity.shape)
+        internal = state.internal._replace(key=counted_key.at[2].add(jnp.uint32(1)))
+        return state._replace(velocity=velocity, internal=internal)
 
-    Time and window are those before the window; the velocities may already have had kicks.
-    """
-    counted_key = state.internal.key
-    if scene.drive is None or counted_key is None:
-        return state
-    variance = kick_variance(scene, state.time + state.time_rest, duration, place)
-    keys = jax.random.split(
-        jax.random.fold_in(threefry_key(counted_key[:2]), counted_key[2]), replicas
-    )
-    by_replica = state.velocity.reshape(replicas, -1, state.velocity.shape[-1])
-    kicks = jax.vmap(random_kicks, (0, 0, None))(keys, by_replica, scene.walls is None)
-    velocity = (by_replica + jnp.sqrt(variance) * kicks).reshape(state.velocity.shape)
-    internal = state.internal._replace(key=counted_key.at[2].add(jnp.uint32(1)))
-    return state._replace(velocity=velocity, internal=internal)
+    def _window_length(self, state: State) -> Float[Array, ""]:
+        """Return a length with which the kicks of a window are small beside the velocities."""
+        if self.scene.material.drive is None:
+            return state.internal.window
+        lowest, time = jnp.min(temperature(state.velocity, self.replicas)), state.time
+        growth = 2 * kick_variance(self.scene, time + state.time_rest, jnp.ones_like(lowest), 0.0)
+        safe_growth = jnp.where(growth > 0, growth, 1.0)
+        longest = jnp.where(growth > 0, MAX_KICK * lowest / safe_growth, jnp.inf)
+        return jnp.minimum(state.internal.window, longest)
+
+    def _tangents_after(
+        self,
+        old: State,
+        new: State,
+        candidates: ImpactCandidates,
+        work: ImpactWork,
+        duration: Array,
+    ) -> ImpactTangents | HardTangents:
+        """Return the tangents after a window, from the states before and after it."""
+        tangents, scene, replicas = old.tangents, self.scene, self.replicas
+        n, d = len(new.velocity) // replicas, new.velocity.shape[1]
+        lost = _sum_by_replica(work.dissipated, candidates, replicas)
+        impacts = _sum_by_replica(work.impacts, candidates, replicas)
+        replica = candidates.replica
+        gains = jnp.zeros((*work.gains.shape[:-1], replicas), lost.dtype)
+        gains = gains.at[..., replica[candidates.rows.a]].add(work.gains, mode="drop")
+        if isinstance(tangents, ImpactTangents):
+            T = temperature(new.velocity, replicas)
+            energy, trend = 0.5 * d * n * T, cooling_trend(scene.material.law, T, d)
+            rates = update_rates(
+                tangents.rates,
+                lost=lost,
+                collisions=impacts / n,
+                energy=energy,
+                temperature=T,
+                trend=trend,
+                duration=duration,
+                collision_frequency=scene.collision_frequency,
+            )
+            return tangents.after(gains, energy + 0.5 * lost, T, duration, rates, trend, d)
+        zero = jnp.zeros(replicas)
+        before, gained = jnp.stack([kinetic_energy(old.velocity, replicas), zero]), -lost[None]
+        gained = jnp.concatenate([gained, jnp.zeros_like(gained)])
+        if work.rotational_gain is not None:
+            spins = jnp.sum(old.internal.spin.reshape(replicas, -1) ** 2, axis=1)
+            before = before.at[1].set(scene.material.surface.inertia / 2 * spins)
+            gained = gained.at[1].set(_sum_by_replica(work.rotational_gain, candidates, replicas))
+        if scene.container is not None:
+            gains = gains.at[..., replica].add(work.wall_gains, mode="drop")
+        if scene.material.drive is not None:
+
+            def heating(material: ReducedScene) -> Array:
+                changed, start = scene.with_material(material), old.time + old.time_rest
+                halves = [kick_variance(changed, start, duration, place) for place in (0.0, 1.0)]
+                return n * d / 2 * (halves[0] + halves[1])
+
+            heat, linear = jax.linearize(heating, scene.material)
+            # Heating does not depend on the speeds, unlike the frequency of impacts.
+            gains = gains.at[:-2, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
+            gains = gains.at[-2, 0].add(-heat)
+            gained = gained.at[0].add(heat)
+        after = tangents.exchange.after(before, gained, gains, impacts / 2)
+        return tangents._replace(exchange=after)
 
 
 def kick_variance(
-    scene: HardScene, start_time: Float[Array, ""], duration: ArrayLike, place: float
+    scene: SphereScene, start: Float[Array, ""], duration: ArrayLike, place: float
 ) -> Float[Array, ""]:
-    """Return the variance of half of the kicks of a window, made at its begin (place 0) or end (1).
+    """Return the variance of half of the kicks of a window, at its begin (place 0) or end (1).
 
     With drag a kick decays as a velocity does, and time is transformed.
     """
-    assert scene.drive is not None
-    strength = scene.drive.strength * scene.collision_frequency
-    if scene.drag is None:
+    strength, drag = scene.material.drive.strength * scene.collision_frequency, scene.drag_rates
+    if drag is None:
         return strength * duration / 2
-    rates = scene.decay_rates
-    true_time = true_duration(rates, start_time, jnp.asarray(duration))
-    return strength * true_time / 2 / drag_decay(rates, start_time + place * duration).velocity ** 2
-
-
-def window_length(state: State, scene: HardScene, replicas: int) -> Float[Array, ""]:
-    """Return the length of a window, so short that its kicks are small compared to the
-    velocities."""
-    if scene.drive is None:
-        return state.internal.window
-    lowest = jnp.min(temperature(state.velocity, replicas))
-    growth = 2 * kick_variance(scene, state.time + state.time_rest, jnp.ones_like(lowest), 0.0)
-    safe_growth = jnp.where(growth > 0, growth, 1.0)
-    longest = jnp.where(growth > 0, MAX_KICK * lowest / safe_growth, jnp.inf)
-    return jnp.minimum(state.internal.window, longest)
-
-
-def projected_tangents_after(
-    new: State, scene: HardScene, candidates: ImpactCandidates, work: ImpactWork, duration: Array
-) -> ImpactTangents:
-    """Return the tangents of smooth spheres after a window.
-
-    Args:
-        new: the state after it, with the tangents before it.
-        scene: the gas.
-        candidates, work: the impacts of the window.
-        duration: of the window.
-    """
-    tangents, d = new.tangents, new.velocity.shape[1]
-    replicas = len(new.dissipated)
-    num_particles = len(new.velocity) // replicas
-    lost = _sum_by_replica(work.dissipated, candidates, replicas)
-    impacts = _sum_by_replica(work.impacts, candidates, replicas)
-    T = temperature(new.velocity, replicas)
-    energy = 0.5 * d * num_particles * T
-    trend = cooling_trend(scene.law, T, d)
-    rates = update_rates(
-        tangents.rates,
-        lost=lost,
-        collisions=impacts / num_particles,
-        energy=energy,
-        temperature=T,
-        trend=trend,
-        duration=duration,
-        collision_frequency=scene.collision_frequency,
-    )
-    gains = jnp.zeros((len(work.gains), replicas), energy.dtype)
-    gains = gains.at[:, candidates.replica[candidates.rows.a]].add(work.gains, mode="drop")
-    return tangents.after(gains, energy + 0.5 * lost, T, duration, rates, trend, d)
+    true_time = true_duration(drag, start, jnp.asarray(duration))
+    return strength * true_time / 2 / drag_decay(drag, start + place * duration).velocity ** 2
 
 
 def cooling_trend(
@@ -411,44 +412,6 @@ def cooling_trend(
     return jax.vmap(rate)(jnp.sqrt(temperature))
 
 
-def exchange_tangents_after(
-    old: State, scene: HardScene, candidates: ImpactCandidates, work: ImpactWork, duration: Array
-) -> HardTangents:
-    """Return the tangents of a gas with elements after a window.
-
-    Args:
-        old: the state before it.
-        scene, candidates, work, duration: as for `projected_tangents_after`.
-    """
-    tangents, replicas = old.tangents, len(old.dissipated)
-    n, d = len(old.velocity) // replicas, old.velocity.shape[1]
-    before = jnp.stack([kinetic_energy(old.velocity, replicas), jnp.zeros(replicas)])
-    gained = -_sum_by_replica(work.dissipated, candidates, replicas)[None]
-    gained = jnp.concatenate([gained, jnp.zeros_like(gained)])
-    if scene.surface is not None and work.rotational_gain is not None:
-        spins = jnp.sum(old.internal.spin.reshape(replicas, -1) ** 2, axis=1)
-        before = before.at[1].set(scene.surface.inertia / 2 * spins)
-        gained = gained.at[1].set(_sum_by_replica(work.rotational_gain, candidates, replicas))
-    gains = jnp.zeros((tangents.num_changes, 2, replicas), before.dtype)
-    gains = gains.at[:, :, candidates.replica[candidates.rows.a]].add(work.gains, mode="drop")
-    if scene.walls is not None:
-        gains = gains.at[:, :, candidates.replica].add(work.wall_gains, mode="drop")
-    if scene.drive is not None:
-
-        def heating(material: HardScene) -> Array:
-            changed, start_time = scene.with_material(material), old.time + old.time_rest
-            halves = [kick_variance(changed, start_time, duration, place) for place in (0.0, 1.0)]
-            return n * d / 2 * (halves[0] + halves[1])
-
-        heating_energy, linear = jax.linearize(heating, scene.material)
-        # Heating does not depend on the speeds, unlike the frequency of impacts.
-        gains = gains.at[:-2, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
-        gains = gains.at[-2, 0].add(-heating_energy)
-        gained = gained.at[0].add(heating_energy)
-    impacts = _sum_by_replica(work.impacts, candidates, replicas) / 2
-    return tangents._replace(exchange=tangents.exchange.after(before, gained, gains, impacts))
-
-
 def _sum_by_replica(values: Array, candidates: ImpactCandidates, replicas: int) -> Array:
     """Return the sums over the slots of each replica; an empty slot belongs to none."""
     sums = jnp.zeros(replicas, values.dtype)
@@ -456,96 +419,55 @@ def _sum_by_replica(values: Array, candidates: ImpactCandidates, replicas: int) 
 
 
 @partial(jax.jit, static_argnames="replicas")
-def hard_records(state: State, scene: HardScene, replicas: int) -> dict[str, Array]:
-    """Return the records of a state; with tangents, also those that `rule.with_tangents` adds."""
-    values, travelled, velocity = common_records(state, scene.side, replicas)
-    values["regularised"] = 2 / velocity.shape[1] * state.internal.regularised
-    if scene.has_elements:
-        return _records_with_elements(values, velocity, state, scene, replicas)
-    tangents = state.tangents
-    if tangents is None:
-        return values
-    T = values["temperature"]
-    cooling = tangents.rates.cooling(cooling_trend(scene.law, T, velocity.shape[-1]))
-    collision_rate, c = tangents.rates.collision(T), tangents.log_temperature
-    derivatives, rates = derivatives_of_records(
-        values, travelled, velocity, c, tangents.paths, cooling, collision_rate
-    )
-    return rule.with_tangents(values, derivatives, rates, tangents.clock)
+def hard_records(state: State, scene: SphereScene, replicas: int) -> dict[str, Array]:
+    """Return the records of a state; with tangents, also those that `rule.with_tangents` adds.
 
-
-def _records_with_elements(
-    values: dict[str, Array],
-    velocity: Float[Array, "replicas N d"],
-    state: State,
-    scene: HardScene,
-    replicas: int,
-) -> dict[str, Array]:
-    """Return the records of a scene with elements.
-
-    The dissipated energy includes all losses in impacts and to drag.
+    In a scene with elements the dissipated energy includes all losses in impacts and to drag.
     """
-    n, d = velocity.shape[1:]
-    initial_kinetic = kinetic_energy(state.first_velocity, replicas) / n
-    if scene.walls is not None:  # the frame is that of the walls, and displacements are bounded
-        velocity = state.velocity.reshape(velocity.shape)
-        values["temperature"] = observables.temperature(velocity)
-        values["sonine"] = observables.sonine(velocity)
-        del values["displacement"], values["flow_share"]
-    velocity_factor = spin_factor = jnp.ones(())
-    if scene.drag is not None:
-        velocity_factor, _, spin_factor = drag_decay(
-            scene.decay_rates, state.time + state.time_rest
+    values, displacement, velocity = common_records(state, scene, replicas)
+    material, tangents, (n, d) = scene.material, state.tangents, velocity.shape[1:]
+    values["regularised"] = 2 / n * state.internal.regularised
+    if not material.has_elements:
+        if tangents is None:
+            return values
+        T = values["temperature"]
+        cooling = tangents.rates.cooling(cooling_trend(material.law, T, d))
+        derivatives, rates = derivatives_of_records(
+            values,
+            displacement,
+            velocity,
+            tangents.log_temperature,
+            tangents.paths,
+            cooling,
+            tangents.rates.collision(T),
         )
-    lost = initial_kinetic - velocity_factor**2 * (initial_kinetic - state.dissipated / n)
+        return rule.with_tangents(values, derivatives, rates, tangents.clock)
+    velocity_factor = spin_factor = jnp.ones(())
+    if (drag := scene.drag_rates) is not None:
+        velocity_factor, _, spin_factor = drag_decay(drag, state.time + state.time_rest)
+    initial = kinetic_energy(state.first_velocity, replicas) / n
+    lost = initial - velocity_factor**2 * (initial - state.dissipated / n)
     values["temperature"] = values["temperature"] * velocity_factor**2
     values["velocity_correlation"] = values["velocity_correlation"] * velocity_factor
-    if scene.surface is not None and state.internal.spin is not None:  # None in equilibration
-        spin = state.internal.spin.reshape(replicas, -1)
-        rotational = scene.surface.inertia * jnp.mean(spin**2, axis=1)
-        values["rotational_temperature"] = rotational * spin_factor**2
-        initial_rotational = NUM_SPIN_COMPONENTS[d] / 2 * scene.surface.ratio
-        lost = (
-            lost
-            + initial_rotational
-            - spin_factor**2 * (initial_rotational + state.internal.rotational_gain / n)
-        )
+    if state.internal.spin is not None:  # None in equilibration
+        square = jnp.mean(state.internal.spin.reshape(replicas, -1) ** 2, axis=1)
+        values["rotational_temperature"] = material.surface.inertia * square * spin_factor**2
+        initial = NUM_SPIN_COMPONENTS[d] / 2 * material.surface.ratio
+        kept = spin_factor**2 * (initial + state.internal.rotational_gain / n)
+        lost = lost + initial - kept
     values["dissipated_energy"] = lost
-    if state.tangents is None:
+    if tangents is None:
         return values
-    return values | _element_derivatives(values, state, scene, n, d)
-
-
-def _element_derivatives(
-    values: dict[str, Array], state: State, scene: HardScene, n: int, d: int
-) -> dict[str, Array]:
-    """Return the derivatives of T, T_rot and collisions, as `rule.with_tangents` names them.
-
-    Derivatives in time follow from the last direction, in which everything happens sooner by the
-    same share of time.
-    """
-    directions, (energies, collisions) = state.tangents
-    time = state.time + state.time_rest
-    log_decay, decay_tangents = jnp.zeros(2), jnp.zeros((len(collisions), 2))
-    if scene.drag is not None:
+    time, decay, decay_along = state.time + state.time_rest, jnp.zeros(2), jnp.zeros((1, 2))
+    if material.drag is not None:
 
         def logarithms(drag: ReducedDrag) -> Array:
-            decay = drag_decay(scene._replace(drag=drag).decay_rates, time)
-            return jnp.log(jnp.stack([decay.velocity, decay.true_spin]))
+            changed = scene.with_material(material._replace(drag=drag))
+            left = drag_decay(changed.drag_rates, time)
+            return jnp.log(jnp.stack([left.velocity, left.true_spin]))
 
-        log_decay, linear = jax.linearize(logarithms, scene.drag)
-        decay_tangents = jax.vmap(linear)(directions.drag)
-    elapsed = jnp.where(time > 0, time, 1.0)
-    per_particle = 2 / n * collisions
-    derivatives = {
-        "collisions.along": per_particle[:-1],
-        "collisions.rate": per_particle[-1] / elapsed,
-    }
-    for k, name in enumerate(("temperature", "rotational_temperature")):
-        if name not in values:
-            continue
-        size = n * (d, NUM_SPIN_COMPONENTS[d])[k] / 2
-        along = jnp.exp(2 * log_decay[k]) * energies[:, k] / size
-        along = along + 2 * decay_tangents[:, k, None] * values[name][None]
-        derivatives |= {f"{name}.along": along[:-1], f"{name}.rate": along[-1] / elapsed}
-    return derivatives
+        decay, linear = jax.linearize(logarithms, material.drag)
+        decay_along = jax.vmap(linear)(tangents.directions.drag)
+    along, rates = tangents.exchange.of_records(values, decay, decay_along, time, n, d)
+    derivatives = {f"{name}.along": x for name, x in along.items()}
+    return values | derivatives | {f"{name}.rate": x for name, x in rates.items()}

@@ -1,4 +1,4 @@
-"""Hard spheres in reduced units, the effect of their impacts, and the impacts of a window of time.
+"""The effect of impacts of hard spheres, and the impacts of a window of time.
 
 Units here: the diameter, the mass and the first temperature are 1. Times and positions count as in
 `jaxgran.particles.hard.prediction`: an impact changes both the velocity of a path and its position
@@ -10,7 +10,6 @@ energy that each impact exchanges, as a function of the numbers of the material 
 all velocities and spins.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,101 +18,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
-from jaxgran.particles.hard.prediction import (
-    HardWalls,
-    ImpactCandidates,
-    Paths,
-    first_impacts,
-)
-from jaxgran.particles.state import (
-    DragDecay,
-    State,
-    TangentialImpulse,
-    drag_decay,
-    tangential_impulse,
-    temperature,
-)
+from jaxgran.particles.hard.prediction import ImpactCandidates, Paths, first_impacts
+from jaxgran.particles.state import State, drag_decay, tangential_impulse, temperature
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
-from jaxgran.scene.gas import mean_loss
-from jaxgran.scene.laws import ReducedLaw
-from jaxgran.scene.reduced import ReducedDrag, ReducedDrive, ReducedRough
-
-
-class HardScene(NamedTuple):
-    """A gas of hard spheres in units of its diameter, mass and first temperature.
-
-    Attributes:
-        side: of the periodic box.
-        law: of restitution, for speeds in units of sqrt(2).
-        collision_frequency: at T = 1.
-        contact_time: in mean free times; the impact of a sphere within this time of its last one is
-            elastic.
-        elastic: whether all impacts are elastic and smooth.
-        surface: of rough spheres; None of smooth ones.
-        drag: rates over the collision frequency; None in a vacuum. Time and velocities are then
-            transformed, see `jaxgran.particles.state`.
-        drive: growth of T over the collision frequency by white noise; None where there is none.
-        walls: of a container; None where the box is periodic.
-    """
-
-    side: Float[Array, ""]
-    law: ReducedLaw
-    collision_frequency: Float[Array, ""]
-    contact_time: Float[Array, ""]
-    elastic: Bool[Array, ""]
-    surface: ReducedRough | None = None
-    drag: ReducedDrag | None = None
-    drive: ReducedDrive | None = None
-    walls: HardWalls | None = None
-
-    @property
-    def has_elements(self) -> bool:
-        """True unless the scene has only smooth spheres in free flight."""
-        return any(x is not None for x in (self.surface, self.walls, self.drag, self.drive))
-
-    @property
-    def material(self) -> Any:
-        """The numbers in which derivatives are taken: those of the law, or a scene of the elements.
-
-        All are per collision, so that in a denser gas the same happens sooner.
-        """
-        if not self.has_elements:
-            return self.law
-        geometry = {"side": None, "collision_frequency": None, "contact_time": None}
-        walls = None if self.walls is None else self.walls._replace(sides=None)
-        return self._replace(elastic=None, walls=walls, **geometry)
-
-    def log_loss(self, material: ReducedLaw) -> Float[Array, ""]:
-        """Return ln of ``I/(1 - I)``, I the share of normal energy that impacts dissipate."""
-        lost = mean_loss(material, self.side)
-        return jnp.log(lost) - jnp.log1p(-lost)
-
-    def with_material(self, material: Any) -> "HardScene":
-        """Return this scene with other numbers of its material."""
-        if not self.has_elements:
-            return self._replace(law=material)
-        walls = None if self.walls is None else material.walls._replace(sides=self.walls.sides)
-        side, _, frequency, contact_time, elastic = self[:5]
-        return material._replace(
-            side=side,
-            collision_frequency=frequency,
-            contact_time=contact_time,
-            elastic=elastic,
-            walls=walls,
-        )
-
-    def for_equilibration(self) -> "HardScene":
-        """Return the scene with elastic and smooth impacts, without drag and drive."""
-        drag = None if self.drag is None else ReducedDrag(*(0 * x for x in self.drag))
-        drive = None if self.drive is None else ReducedDrive(0 * self.drive.strength)
-        return self._replace(elastic=jnp.ones((), bool), drag=drag, drive=drive)
-
-    @property
-    def decay_rates(self) -> ReducedDrag:
-        """Rates of drag in the units of the scene's time."""
-        assert self.drag is not None
-        rate, nu = self.drag, self.collision_frequency
-        return ReducedDrag(rate.rate * nu, rate.rotational_rate * nu)
+from jaxgran.scene.reduced import ReducedScene, SphereScene
 
 
 class ImpactEvents(NamedTuple):
@@ -165,98 +73,49 @@ class ImpactEffect(NamedTuple):
     rotational_gain: Float[Array, "rows"] | None = None
 
 
-def pair_effect(scene: HardScene, impact: ImpactEvents) -> ImpactEffect:
-    """Return the effect of impacts of two spheres, see `jaxgran.Rough`."""
-    decay = None if scene.drag is None else drag_decay(scene.decay_rates, impact.time)
-    eps = _restitution(scene, impact, decay)
-    kick = (-0.5 * (1 + eps) * impact.speed)[:, None] * impact.normal
-    effect = ImpactEffect(kick, 0.125 * (1 - eps * eps) * impact.speed**2)
-    if scene.surface is None or impact.spin is None:
-        return effect
-    return _add_tangential_impulse(
-        effect, impact, decay, scene.surface.eta, scene.surface, num_spheres=2
-    )
-
-
-def wall_effect(scene: HardScene, impact: ImpactEvents, axis: Int[Array, "rows"]) -> ImpactEffect:
-    """Return the effect of impacts on the walls across an axis, whose law is that of
-    `HardWalls`."""
-    walls, surface = scene.walls, scene.surface
-    assert walls is not None
-    decay = None if scene.drag is None else drag_decay(scene.decay_rates, impact.time)
-    eps = _restitution(scene._replace(law=walls.law), impact, decay)
-    kick = -((1 + eps) * impact.speed)[:, None] * impact.normal
-    effect = ImpactEffect(kick, 0.5 * (1 - eps**2) * impact.speed**2)
-    if surface is None or impact.spin is None:
-        return effect
-    if walls.beta is None:
-        no_change = jnp.zeros_like(impact.spin)
-        return effect._replace(spin_change=no_change, rotational_gain=no_change[:, 0])
-    return _add_tangential_impulse(
-        effect, impact, decay, surface.eta_on_wall(walls.beta), surface, num_spheres=1
-    )
-
-
-def wall_effect_for_tangents(
-    scene: HardScene, impact: ImpactEvents, axis: Int[Array, "rows"]
+def impact_effect(
+    scene: SphereScene, impact: ImpactEvents, axis: Int[Array, "rows"] | None = None
 ) -> ImpactEffect:
-    """Return the effect of impacts on walls with its dependence on their frequency, for tangents.
+    """Return the effect of impacts of two spheres, or on walls across an axis; see `jaxgran.Rough`.
 
-    The frequency is larger where walls are closer together or dissipate more. A tangent knows
-    neither the positions of walls nor those of spheres, but only how often a gas meets the walls,
-    see `wall_impact_ratio`. The value is that of `wall_effect`.
+    Walls that are closer together or dissipate more are hit more often, see `wall_impact_ratio`. A
+    tangent knows neither the positions of walls nor those of spheres, but only how often a gas
+    meets the walls: energies at walls have a factor of value 1 that carries this dependence.
     """
-    assert scene.walls is not None
-    effect = wall_effect(scene, impact, axis)
-    frequency = scene.walls.frequency[axis]
-    eps = -jnp.sum(effect.kick * impact.normal, -1) / impact.speed - 1
-    frequency = frequency * wall_impact_ratio(eps, frequency, impact.normal.shape[1])
-    share = frequency / jax.lax.stop_gradient(frequency)
-    rotational_gain = None if effect.rotational_gain is None else effect.rotational_gain * share
-    return effect._replace(lost=effect.lost * share, rotational_gain=rotational_gain)
-
-
-def _restitution(
-    scene: HardScene, impact: ImpactEvents, decay: DragDecay | None
-) -> Float[Array, "rows"]:
-    speed = impact.speed * 0.5**0.5  # the law's unit of speed is sqrt(2)
-    eps = scene.law.restitution(speed if decay is None else speed * decay.velocity)
-    return jnp.where(impact.elastic, 1.0, eps)
-
-
-def _add_tangential_impulse(
-    effect: ImpactEffect,
-    impact: ImpactEvents,
-    decay: DragDecay | None,
-    eta: Float[Array, ""],
-    surface: ReducedRough,
-    num_spheres: int,
-) -> ImpactEffect:
-    """Add the tangential part of impacts on `num_spheres` spheres, of which each bears a share."""
-    assert impact.spin is not None
-    spin_factor = 1.0 if decay is None else decay.spin[:, None]
-    impulse: TangentialImpulse = tangential_impulse(
-        impact.relative,
-        impact.spin * spin_factor,
-        impact.normal,
-        ~impact.elastic,
-        eta,
-        surface,
-        -jnp.sum(effect.kick * impact.normal, axis=-1),
-    )
-    if num_spheres == 2:
-        lost = -0.5 * jnp.sum(impulse.kick * (impulse.sideways + impulse.kick), -1)
-    else:
-        lost = -jnp.sum(impulse.kick * (impulse.sideways + 0.5 * impulse.kick), -1)
-    spin_change = impulse.spin_change / spin_factor
-    rotational_gain = (
-        surface.inertia
-        / 2
-        * jnp.sum(spin_change * (impact.spin * 2 / num_spheres + spin_change), -1)
-    )
-    return ImpactEffect(
-        effect.kick + impulse.kick, effect.lost + lost, spin_change, rotational_gain
-    )
+    material, speed = scene.material, impact.speed
+    law, surface, share = material.law, material.surface, 0.5
+    if axis is not None:
+        law, share = material.walls.law, 1.0  # a wall takes no part of the change of velocity
+    decay = None if material.drag is None else drag_decay(scene.drag_rates, impact.time)
+    law_speed = speed * 0.5**0.5  # the law's unit of speed is sqrt(2)
+    eps = law.restitution(law_speed if decay is None else law_speed * decay.velocity)
+    eps = jnp.where(impact.elastic, 1.0, eps)
+    push = share * (1 + eps) * speed
+    kick, lost = -push[:, None] * impact.normal, share**2 / 2 * (1 - eps**2) * speed**2
+    spin_change = rotational_gain = None
+    if surface is not None and impact.spin is not None:
+        spin_change = jnp.zeros_like(impact.spin)
+        rotational_gain = spin_change[:, 0]
+        if axis is None or material.walls.surface is not None:
+            eta = surface.eta if axis is None else surface.eta_on_wall(material.walls.surface)
+            spin_factor = 1.0 if decay is None else decay.spin[:, None]
+            spin = impact.spin * spin_factor
+            push = -jnp.sum(kick * impact.normal, -1)
+            impulse = tangential_impulse(
+                impact.relative, spin, impact.normal, ~impact.elastic, eta, surface, push
+            )
+            with_half = impulse.sideways + 0.5 / share * impulse.kick
+            kick, lost = kick + impulse.kick, lost - share * jnp.sum(impulse.kick * with_half, -1)
+            spin_change = impulse.spin_change / spin_factor
+            doubled = impact.spin * 2 * share + spin_change
+            rotational_gain = surface.inertia / 2 * jnp.sum(spin_change * doubled, -1)
+    if axis is not None:
+        frequency = material.walls.frequency[axis]
+        frequency = frequency * wall_impact_ratio(eps, frequency, impact.normal.shape[1])
+        weight = frequency / jax.lax.stop_gradient(frequency)
+        lost = lost * weight
+        rotational_gain = None if rotational_gain is None else rotational_gain * weight
+    return ImpactEffect(kick, lost, spin_change, rotational_gain)
 
 
 class HardTangents(NamedTuple):
@@ -273,44 +132,49 @@ class HardTangents(NamedTuple):
 
     @classmethod
     def at_start(
-        cls, scene: HardScene, directions: Any, replicas: int, num_particles: int, dimension: int
+        cls,
+        scene: SphereScene,
+        directions: ReducedScene,
+        replicas: int,
+        num_particles: int,
+        dimension: int,
     ) -> "HardTangents":
         """Return the tangents at t = 0, where T is 1 and T_rot is that of the material."""
-        directions = jax.tree.map(_append_time_direction, directions)
-        if scene.drag is not None:  # drag acts sooner, too
-            rates = jax.tree.map(lambda x, rate: x.at[-1].set(rate), directions.drag, scene.drag)
+        directions = jax.tree.map(
+            lambda x: jnp.concatenate([x, jnp.zeros_like(x, shape=(1, *x.shape[1:]))]), directions
+        )
+        if (drag := scene.material.drag) is not None:  # drag acts sooner, too
+            rates = jax.tree.map(lambda x, rate: x.at[-1].set(rate), directions.drag, drag)
             directions = directions._replace(drag=rates)
         p = len(jax.tree.leaves(directions)[0])
         energies = jnp.zeros((p, 2, replicas), scene.collision_frequency.dtype)
-        if scene.surface is not None:
+        if scene.material.surface is not None:
             rotational_energy = num_particles * NUM_SPIN_COMPONENTS[dimension] / 2
             energies = energies.at[:, 1].add(rotational_energy * directions.surface.ratio[:, None])
         return cls(directions, ExchangeTangents(energies, jnp.zeros((p, replicas), energies.dtype)))
 
     def gains(
         self,
-        scene: HardScene,
+        scene: SphereScene,
         impact: ImpactEvents,
         happens: Bool[Array, "rows"],
-        effect_of: Callable[[HardScene, ImpactEvents], ImpactEffect],
+        axis: Int[Array, "rows"] | None = None,
     ) -> Float[Array, "changes 2 rows"]:
         """Return the tangents of the gains of both energies in impacts, see
         `ExchangeTangents.after`."""
 
-        def energies(material: HardScene, velocity: Array, spin: Array) -> Array:
-            if scene.surface is not None and material.surface is not None:
+        def energies(material: ReducedScene, velocity: Array, spin: Array) -> Array:
+            if material.surface is not None:
                 # At a given energy spins are smaller where the inertia is larger.
-                spin = spin - 0.5 * jnp.log(material.surface.inertia / scene.surface.inertia)
-            effect = effect_of(scene.with_material(material), impact.scaled(velocity, spin))
-            rotational_gain = (
-                jnp.zeros_like(effect.lost)
-                if effect.rotational_gain is None
-                else effect.rotational_gain
-            )
-            return jnp.where(happens, jnp.stack([-effect.lost, rotational_gain]), 0.0)
+                inertia = scene.material.surface.inertia
+                spin = spin - 0.5 * jnp.log(material.surface.inertia / inertia)
+            scaled = impact.scaled(velocity, spin)
+            _, lost, _, gain = impact_effect(scene.with_material(material), scaled, axis)
+            gain = jnp.zeros_like(lost) if gain is None else gain
+            return jnp.where(happens, jnp.stack([-lost, gain]), 0.0)
 
         zero, one = (jnp.full((), x, impact.speed.dtype) for x in (0.0, 1.0))
-        material: Any = scene.material
+        material = scene.material
         _, linear = jax.linearize(energies, material, zero, zero)
         no_direction = jax.tree.map(jnp.zeros_like, material)
         by_direction = jax.vmap(lambda direction: linear(direction, zero, zero))(self.directions)
@@ -321,11 +185,6 @@ class HardTangents(NamedTuple):
     def num_changes(self) -> int:
         """Number of rows of `gains`."""
         return len(self.exchange.energies) + 2
-
-
-def _append_time_direction(leaf: Array) -> Array:
-    """Append a direction along which the number does not change."""
-    return jnp.concatenate([leaf, jnp.zeros((1, *leaf.shape[1:]), leaf.dtype)])
 
 
 MAX_ROUNDS = 100_000
@@ -370,9 +229,10 @@ def execute_impacts(
     state: State,
     listed: Float[Array, "n d"],
     candidates: ImpactCandidates,
-    scene: HardScene,
+    scene: SphereScene,
     duration: ArrayLike,
-    replicas: int,
+    contact_time: Float[Array, ""],
+    all_elastic: Bool[Array, ""],
 ) -> ImpactWork:
     """Execute all impacts of a window, in rounds of independent impacts.
 
@@ -386,7 +246,9 @@ def execute_impacts(
         candidates: the pairs that may touch.
         scene: the gas.
         duration: of the window.
-        replicas: number of boxes.
+        contact_time: in mean free times; an impact of a sphere within this time of its last one is
+            elastic.
+        all_elastic: whether all impacts are elastic and smooth.
     """
 
     def of_members(values):
@@ -396,10 +258,10 @@ def execute_impacts(
     spin = None if internal.spin is None else of_members(internal.spin)
     x, v, listed = (of_members(values) for values in (state.position, state.velocity, listed))
     paths = Paths(x, v, -of_members(internal.age), spin)
+    replicas = len(state.dissipated)
     T = temperature(state.velocity, replicas)
     T = jnp.maximum(T, jnp.finfo(T.dtype).tiny)
-    # An impact is elastic within this time of a sphere's last one.
-    contact_duration = scene.contact_time / (scene.collision_frequency * jnp.sqrt(T))
+    contact_duration = contact_time / (scene.collision_frequency * jnp.sqrt(T))
     contact_duration = contact_duration[jnp.minimum(candidates.replica, replicas - 1)]
     rows, slots = candidates.rows, jnp.arange(len(v), dtype=jnp.int32)
     a, b, num_rows = rows.a, rows.b, len(rows.a)
@@ -407,7 +269,7 @@ def execute_impacts(
 
     def one_round(work: ImpactWork) -> ImpactWork:
         paths = work.paths
-        next_impacts = first_impacts(paths, rows, duration, scene.walls)
+        next_impacts = first_impacts(paths, rows, duration, scene.container)
         times, first, final = next_impacts.times, next_impacts.first, next_impacts.final
         executable = jnp.isfinite(times)
         for k in (a, b):
@@ -423,15 +285,15 @@ def execute_impacts(
         speed = jnp.where(executable, -jnp.sum(next_impacts.w * normal, -1), 1.0)
         too_soon = s - jnp.maximum(paths.last[a], paths.last[b]) < contact_duration[a]
         spin = None if paths.spin is None else paths.spin[a] + paths.spin[b]
-        elastic = too_soon | scene.elastic | ~executable
+        elastic = too_soon | all_elastic | ~executable
         events = ImpactEvents(start_time + s, -normal, next_impacts.w, speed, spin, elastic)
-        effect = pair_effect(scene, events)
+        effect = impact_effect(scene, events)
         gains = work.gains
         if isinstance(tangents, HardTangents):  # each of two spheres loses half of the energy
-            gains = gains + 2 * tangents.gains(scene, events, executable, pair_effect)
+            gains = gains + 2 * tangents.gains(scene, events, executable)
         elif tangents is not None:  # the law's unit of speed is sqrt(2)
-            more = 2 * tangents.gains(scene.law, events.speed * 0.5**0.5)
-            gains = gains + jnp.where((executable & ~too_soon & ~scene.elastic)[None], more, 0.0)
+            more = 2 * tangents.gains(scene.material.law, events.speed * 0.5**0.5)
+            gains = gains + jnp.where((executable & ~too_soon & ~all_elastic)[None], more, 0.0)
 
         # From the rows of pairs to the slots of their spheres.
         unpaired, row = row == num_rows, jnp.minimum(row, num_rows - 1)
@@ -443,8 +305,8 @@ def execute_impacts(
         x = paths.x - effect.kick * s[:, None]
         impacts, wall_impacts, wall_gains = work.impacts + hit, work.wall_impacts, work.wall_gains
         regularised = work.regularised + (hit & too_soon)
-        if next_impacts.wall_impacts is not None and wall_impacts is not None:
-            wall_times, axis = next_impacts.wall_impacts
+        wall_times, axis = next_impacts.wall_times, next_impacts.wall_axis
+        if wall_times is not None and axis is not None and wall_impacts is not None:
             at_wall = unpaired & jnp.isfinite(wall_times)
             at_wall &= (wall_times == first) & (wall_times == final)
             wall_s = jnp.where(at_wall, wall_times, 0.0)
@@ -452,14 +314,13 @@ def execute_impacts(
             is_axis = axis[:, None] == jnp.arange(paths.v.shape[1])[None]
             outwards = jnp.where(is_axis, jnp.sign(paths.v), 0.0)
             speed = jnp.where(at_wall, jnp.sum(paths.v * outwards, axis=1), 1.0)
-            elastic = too_soon | scene.elastic | ~at_wall
+            elastic = too_soon | all_elastic | ~at_wall
             events = ImpactEvents(
                 start_time + wall_s, outwards, paths.v, speed, paths.spin, elastic
             )
-            on_wall = wall_effect(scene, events, axis)
+            on_wall = impact_effect(scene, events, axis)
             if isinstance(tangents, HardTangents):
-                with_frequency = partial(wall_effect_for_tangents, axis=axis)
-                wall_gains = wall_gains + tangents.gains(scene, events, at_wall, with_frequency)
+                wall_gains = wall_gains + tangents.gains(scene, events, at_wall, axis)
             effect = jax.tree.map(partial(_where_rows, at_wall), on_wall, effect)
             s, hit = jnp.where(at_wall, wall_s, s), hit | at_wall
             after = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
@@ -497,13 +358,13 @@ def execute_impacts(
         shape = len(tangents.log_temperature) + 1, num_rows
     elif tangents is not None:
         shape = tangents.num_changes, 2, num_rows
-        wall_shape = (0 if scene.walls is None else tangents.num_changes), 2, len(slots)
+        wall_shape = (0 if scene.container is None else tangents.num_changes), 2, len(slots)
     work = ImpactWork(
         paths=paths,
         dissipated=zeros,
         rotational_gain=None if paths.spin is None else zeros,
         impacts=counts,
-        wall_impacts=None if scene.walls is None else counts,
+        wall_impacts=None if scene.container is None else counts,
         regularised=counts,
         max_distance2=zeros,
         max_speed2=zeros,

@@ -3,9 +3,7 @@
 Units here: the diameter is 1. The time s counts from the start of a window. A path is given by its
 velocity and its position extrapolated back to s = 0, as in x(s) = x + v s.
 
-In a container positions are coordinates from a corner, so that centres lie between 1/2 and each
-side less 1/2. The periodic box, a cube, is longer than the longest side by a diameter: no sphere
-meets another one through its boundary.
+In a container positions are coordinates from a corner, as in `jaxgran.scene.reduced.SphereScene`.
 """
 
 from typing import NamedTuple
@@ -15,28 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.neighbours import Pairs, rows_where
-from jaxgran.scene.laws import ReducedLaw
-
-BOX_MARGIN = 1.0
-"""Diameters by which the periodic box is longer than the container."""
-
-
-class HardWalls(NamedTuple):
-    """Walls of a container.
-
-    Attributes:
-        sides: of the container.
-        law: of restitution on them, for speeds in units of sqrt(2).
-        beta: beta_t of impacts on them; None if they are smooth.
-        frequency: impacts on the two walls across each axis of a mixed gas, over the collision
-            frequency; for derivatives in the sides.
-    """
-
-    sides: Float[Array, "d"]
-    law: ReducedLaw
-    beta: Float[Array, ""] | None
-    frequency: Float[Array, "d"]
+from jaxgran.particles.neighbours import Pairs, rows_where, select_members
 
 
 class PairRows(NamedTuple):
@@ -105,28 +82,18 @@ class RelativeMotion(NamedTuple):
         return jnp.where(touch, since + ahead, jnp.inf)
 
 
-class WallImpactTimes(NamedTuple):
-    """Next impacts of particles on walls: their times, inf if there is none, and their axes."""
-
-    times: Float[Array, "slots"]
-    axis: Int[Array, "slots"]
-
-
 def next_wall_impacts(
-    walls: HardWalls,
-    x: Float[Array, "slots d"],
-    v: Float[Array, "slots d"],
-    last: Float[Array, "slots"],
-    end: ArrayLike,
-) -> WallImpactTimes:
-    """Return the next impacts on walls of particles on paths x + v s since their last impacts."""
-    target = jnp.where(v > 0, walls.sides[None] - 0.5, 0.5)
+    container: Float[Array, "d"], paths: Paths, end: ArrayLike
+) -> tuple[Float[Array, "slots"], Int[Array, "slots"]]:
+    """Return the times of the next impacts on walls, inf if there is none, and their axes."""
+    x, v = paths.x, paths.v
+    target = jnp.where(v > 0, container[None] - 0.5, 0.5)
     moving = v != 0
     times_by_axis = jnp.where(moving, (target - x) / jnp.where(moving, v, 1.0), jnp.inf)
     axis = jnp.argmin(times_by_axis, axis=1)
     # A sphere that rounding has left beyond a wall hits it at once.
-    times = jnp.maximum(jnp.min(times_by_axis, axis=1), jnp.maximum(last, 0.0))
-    return WallImpactTimes(jnp.where(times < end, times, jnp.inf), axis)
+    times = jnp.maximum(jnp.min(times_by_axis, axis=1), jnp.maximum(paths.last, 0.0))
+    return jnp.where(times < end, times, jnp.inf), axis
 
 
 class FirstImpacts(NamedTuple):
@@ -137,7 +104,7 @@ class FirstImpacts(NamedTuple):
             of each pair.
         motion: the same vectors as scalar products.
         times: of each pair's impact; inf if there is none before the end.
-        wall_impacts: of each particle; None without walls.
+        wall_times, wall_axis: of each particle's impact on a wall; None without walls.
         first: the earliest impact time of each particle on its current path.
         final: a lower bound on the time until which each particle's path is final.
     """
@@ -146,13 +113,14 @@ class FirstImpacts(NamedTuple):
     w: Float[Array, "rows d"]
     motion: RelativeMotion
     times: Float[Array, "rows"]
-    wall_impacts: WallImpactTimes | None
+    wall_times: Float[Array, "slots"] | None
+    wall_axis: Int[Array, "slots"] | None
     first: Float[Array, "slots"]
     final: Float[Array, "slots"]
 
 
 def first_impacts(
-    paths: Paths, rows: PairRows, end: ArrayLike, walls: HardWalls | None = None
+    paths: Paths, rows: PairRows, end: ArrayLike, container: Float[Array, "d"] | None = None
 ) -> FirstImpacts:
     """Return the next impact of each pair and of each particle before `end`."""
     a, b = rows.a, rows.b
@@ -162,12 +130,12 @@ def first_impacts(
     times = motion.impact_time(jnp.maximum(jnp.maximum(*last), 0.0))
     times = jnp.where(rows.real & (times < end), times, jnp.inf)
     first = jnp.full(len(paths.x), jnp.inf, times.dtype).at[a].min(times).at[b].min(times)
-    wall_impacts = None
-    if walls is not None:
-        wall_impacts = next_wall_impacts(walls, paths.x, paths.v, paths.last, end)
-        first = jnp.minimum(first, wall_impacts.times)
+    wall_times = wall_axis = None
+    if container is not None:
+        wall_times, wall_axis = next_wall_impacts(container, paths, end)
+        first = jnp.minimum(first, wall_times)
     final = _final_times(paths, rows, motion, first, end)
-    return FirstImpacts(r, w, motion, times, wall_impacts, first, final)
+    return FirstImpacts(r, w, motion, times, wall_times, wall_axis, first, final)
 
 
 def _final_times(
@@ -230,7 +198,7 @@ def select_impact_candidates(
     duration: ArrayLike,
     bound: Float[Array, "replicas"],
     capacity: Capacity,
-    walls: HardWalls | None = None,
+    container: Float[Array, "d"] | None = None,
 ) -> ImpactCandidates:
     """Select the pairs that touch in free flight, and all that may touch once paths have changed.
 
@@ -240,51 +208,25 @@ def select_impact_candidates(
         duration: of the window.
         bound: an upper bound on the speeds in each replica during the window.
         capacity: sizes of the arrays.
-        walls: of a container; particles that reach them are members, too.
+        container: its sides; particles that reach its walls are members, too.
     """
     n, size = len(x), len(x) // len(bound)
-    rows, num_near = _select_reachable_pairs(x, pairs, duration, bound, capacity.near)
-    free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, walls)
-    i, j = rows.a, rows.b
-    disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
-    closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
-    selected = rows.real & (jnp.isfinite(free.times) | closer)
-
-    picked, num_chosen = rows_where(selected, capacity.contacts)
-    real = jnp.arange(capacity.contacts) < num_chosen
-    picked = jnp.where(real, picked, 0)
-    i, j = i[picked], j[picked]
-    ends = jnp.where(real[None], jnp.stack([i, j]), n)
-    is_member = jnp.zeros(n, bool).at[ends].set(True, mode="drop")
-    if free.wall_impacts is not None:
-        is_member |= jnp.isfinite(free.wall_impacts.times)
-    members, num_members = rows_where(is_member, capacity.members)
-    slot_indices = jnp.arange(capacity.members, dtype=jnp.int32)
-    slot = jnp.zeros(n, jnp.int32).at[members].set(slot_indices, mode="drop")
-    a, b = (jnp.where(real, slot[k], 0) for k in (i, j))
-    rows = PairRows(a, b, rows.offset[picked], rows.bound[picked], real)
-    needed = jnp.stack([pairs.count, pairs.lookahead, num_near, num_chosen, num_members])
-    return ImpactCandidates(members, rows, members // size, needed)
-
-
-def _select_reachable_pairs(
-    x: Float[Array, "n d"],
-    pairs: Pairs,
-    duration: ArrayLike,
-    bound: Float[Array, "replicas"],
-    capacity: int,
-) -> tuple[PairRows, Int[Array, ""]]:
-    """Select the listed pairs that can touch at the largest speeds, a small part of the list.
-
-    Returns:
-        The pairs, whose slots are the indices of the particles, and their number.
-    """
-    size = len(x) // len(bound)
+    # The listed pairs that can touch at the largest speeds are a small part of the list.
     displacement = x[pairs.i] - x[pairs.j] - pairs.offset
     gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
     gap = jnp.where(jnp.arange(gap.size) < pairs.count, gap, jnp.inf)
-    near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, capacity)
-    real = jnp.arange(capacity) < num_near
+    near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, capacity.near)
+    real = jnp.arange(capacity.near) < num_near
     near = jnp.where(real, near, 0)
-    i, j = pairs.i[near], pairs.j[near]
-    return PairRows(i, j, pairs.offset[near], bound[i // size], real), num_near
+    i, j, offset = pairs.i[near], pairs.j[near], pairs.offset[near]
+    rows = PairRows(i, j, offset, bound[i // size], real)
+
+    free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, container)
+    disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
+    closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
+    selected = rows.real & (jnp.isfinite(free.times) | closer)
+    at_walls = jnp.zeros(n, bool) if free.wall_times is None else jnp.isfinite(free.wall_times)
+    picked, real, members, (a, b), counts = select_members(selected, i, j, at_walls, capacity[3:])
+    rows = PairRows(a, b, offset[picked], rows.bound[picked], real)
+    needed = jnp.stack([pairs.count, pairs.lookahead, num_near, *counts])
+    return ImpactCandidates(members, rows, members // size, needed)

@@ -6,6 +6,7 @@ them out of the derivative.
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,9 +23,10 @@ from jaxgran.gradients.tangents import (
     ratio_or_zero,
     update_rates,
 )
-from jaxgran.particles import observables
+from jaxgran.particles import neighbours, observables
 from jaxgran.particles.capacity import Capacity, max_skin
 from jaxgran.particles.dynamics import (
+    FATAL,
     AbstractDynamics,
     Progress,
     accept_if,
@@ -55,9 +57,8 @@ from jaxgran.particles.state import (
     initial_spins,
     kinetic_energy,
     time_left,
-    wrap_positions,
 )
-from jaxgran.scene.reduced import ReducedDrag, SphereMaterial, SphereScene
+from jaxgran.scene.reduced import ReducedContact, ReducedScene, SphereScene
 from jaxgran.theory.equations import COOLING_CORRECTION
 
 WORK_TOLERANCE = 0.1
@@ -160,11 +161,18 @@ class SoftDynamics(AbstractDynamics):
         return SoftState(zeros, jnp.ones((), dtype), jnp.zeros((), jnp.int32), zeros)
 
     def elastic(self) -> "SoftDynamics":
-        """Return the dynamics of smooth spheres in a vacuum, between elastic walls."""
-        scene = self.scene
-        return dataclasses.replace(self, scene=scene.with_material(scene.material.lossless()))
+        """Return the dynamics of smooth spheres without drag, between elastic walls."""
 
-    def with_tangents(self, state: State, directions: SphereMaterial) -> State:
+        def lossless(law: ReducedContact) -> ReducedContact:
+            return ReducedContact(law.alpha, 0.0 * law.alpha, law.clipped)
+
+        material = _with_laws(self.scene.material, lossless)
+        drag = jax.tree.map(lambda x: 0.0 * x, material.drag)
+        walls = material.walls and material.walls._replace(surface=None)
+        material = material._replace(surface=None, walls=walls, drag=drag)
+        return dataclasses.replace(self, scene=self.scene.with_material(material))
+
+    def with_tangents(self, state: State, directions: ReducedScene) -> State:
         spin, surface, along = state.internal.spin, self.scene.material.surface, directions.surface
         spin_tangent = None
         if spin is not None:
@@ -174,14 +182,6 @@ class SoftDynamics(AbstractDynamics):
             spin_tangent = 0.5 * growth[:, None, None] * spin[None]
         tangents = ContactTangents.initial(directions, state.velocity, self.replicas, spin_tangent)
         return state._replace(tangents=tangents)
-
-    @property
-    def region(self) -> Array | None:
-        return None if self.scene.container is None else self.scene.container - 1
-
-    @property
-    def galilean_invariant(self) -> bool:
-        return self.scene.galilean_invariant
 
     def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
         return velocity, state.internal.spin
@@ -196,9 +196,12 @@ class SoftDynamics(AbstractDynamics):
     def observe(self, state: State) -> dict[str, Array]:
         return soft_records(state, self.scene, self.replicas)
 
+    @jax.jit
     def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, ArrayLike]:
-        wrapped = wrap_positions(state, self.scene.side)
-        return wrapped, wrapped.position, end
+        side = self.scene.side
+        inside = neighbours.wrap(side, state.position)
+        image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
+        return state._replace(position=inside, image=image), inside, end
 
     def advance(
         self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
@@ -211,7 +214,7 @@ class SoftDynamics(AbstractDynamics):
         elastic = jnp.zeros_like(state.internal.elastic).at[replica].add(stored)
         if self.scene.container is not None:
             depth = wall_overlap(self.scene.container, x)[0]
-            stored = jnp.sum(elastic_energy(depth, material.wall_law, WALL), axis=-1)
+            stored = jnp.sum(elastic_energy(depth, material.walls.law, WALL), axis=-1)
             elastic += jnp.sum(stored.reshape(self.replicas, -1), axis=1)
         internal = SoftProgress(jnp.zeros(len(x), bool), jnp.ones((), x.dtype))
         state = state._replace(internal=state.internal._replace(elastic=elastic))
@@ -278,8 +281,8 @@ class SoftDynamics(AbstractDynamics):
             hottest_spins = rotational_temperature(scene, state.internal.spin, self.replicas)
             hottest = jnp.maximum(hottest, jnp.max(hottest_spins))
         shortest_contact, material = scene.contact_duration, scene.material
-        if material.wall_law is not None:  # durations go as alpha^(-2/5) v^(-1/5)
-            on_wall = shortest_contact * (material.law.alpha / material.wall_law.alpha) ** 0.4
+        if material.walls is not None:  # durations go as alpha^(-2/5) v^(-1/5)
+            on_wall = shortest_contact * (material.law.alpha / material.walls.law.alpha) ** 0.4
             shortest_contact = jnp.minimum(shortest_contact, on_wall)
         per_contact = self.steps_per_contact * state.internal.refinement
         longest_step = shortest_contact * hottest**-0.1 / per_contact
@@ -296,14 +299,17 @@ class SoftDynamics(AbstractDynamics):
         replica_of_particle = jnp.arange(n) // (n // replicas)
         replica_of_member = jnp.minimum(members // (n // replicas), replicas - 1)
 
-        def move(spheres: Spheres, material: SphereMaterial):
+        def move(spheres: Spheres, material: ReducedScene):
             """Return all spheres after free flight, the members after the block, and energies."""
+            walls = material.walls
+            if walls is not None:
+                walls = walls._replace(law=_of_rows(walls.law, replica_of_member))
             stepped, work = integrate(
                 scene,
                 block_members(scene, spheres, members),
                 material._replace(
                     law=_of_rows(material.law, candidates.replica),
-                    wall_law=_of_rows(material.wall_law, replica_of_member),
+                    walls=walls,
                     drag=_of_rows(material.drag, replica_of_member),
                 ),
                 candidates,
@@ -408,15 +414,11 @@ class SoftDynamics(AbstractDynamics):
         )
         energy_wrong = jnp.any(jnp.abs(error) > allowed)
         drifted = jnp.any(jnp.abs(drift) > DRIFT_TOLERANCE)
-        list_status = self.capacity.exceeded_by(candidates.needed)
-        finite = jnp.isfinite(jnp.sum(new.velocity)) & jnp.isfinite(jnp.sum(new.position))
-        exceeded = status.flag(status.SKIN_EXCEEDED, displacement > 0.5 * old.skin)
-        fault = jnp.where(finite, exceeded, status.NOT_FINITE.bit)
-        fault |= status.flag(status.STEP_TOO_LARGE, energy_wrong & finite)
-        fault |= status.flag(status.ENERGY_DRIFT, drifted & ~energy_wrong & finite)
-        # A block whose arrays were too short lacks pairs or particles.
-        fault = jnp.where(list_status > 0, list_status, fault)
-        return new._replace(internal=internal), fault
+        fault = status.flag(status.SKIN_EXCEEDED, displacement > 0.5 * old.skin)
+        fault |= status.flag(status.STEP_TOO_LARGE, energy_wrong)
+        fault |= status.flag(status.ENERGY_DRIFT, drifted & ~energy_wrong)
+        invalid = self.invalid_block(new, candidates.needed)
+        return new._replace(internal=internal), jnp.where(invalid > 0, invalid, fault)
 
     def _energy(self, state: State) -> Float[Array, "replicas"]:
         energy = kinetic_energy(state.velocity, self.replicas)
@@ -437,7 +439,7 @@ class SoftDynamics(AbstractDynamics):
         if spin is not None:  # in contacts rotation gained its change less that by drag
             first, last = (kinetic_energy(s, replicas) for s in (old.internal.spin, spin))
             gain = last - first
-            if (drag := drag_rates(scene)) is not None:
+            if (drag := scene.drag_rates) is not None:
                 gain += drag.rotational_rate * duration * (first + last)
             gain = scene.material.surface.inertia * gain
             lost += gain
@@ -474,8 +476,6 @@ class SoftDynamics(AbstractDynamics):
         shorten = status.has(now.status, status.STEP_TOO_LARGE)
         shorten |= exceeded & (state.skin >= longest)
         unrecoverable = shorten & (state.internal.refinement >= MAX_REFINEMENT)
-        fatal = status.LIST_FULL.bit | status.CONTACTS_FULL.bit | status.NOT_FINITE.bit
-        fatal |= status.STALLED.bit | status.ENERGY_DRIFT.bit
         halve = shorten & ~unrecoverable
         finer = jnp.where(halve, 2 * state.internal.refinement, state.internal.refinement)
         num_good = jnp.where(halve, 0, state.internal.num_good)
@@ -483,7 +483,7 @@ class SoftDynamics(AbstractDynamics):
         recovered = state._replace(
             skin=skin, internal=state.internal._replace(refinement=finer, num_good=num_good)
         )
-        return recovered, jnp.where(unrecoverable, now.status, now.status & fatal)
+        return recovered, jnp.where(unrecoverable, now.status, now.status & FATAL)
 
 
 def _of_rows(numbers: Any, replica: Int[Array, "rows"]) -> Any:
@@ -491,35 +491,48 @@ def _of_rows(numbers: Any, replica: Int[Array, "rows"]) -> Any:
     return jax.tree.map(lambda x: x[replica] if jnp.ndim(x) else x, numbers)
 
 
+def _with_laws(
+    material: ReducedScene, change: Callable[[ReducedContact], ReducedContact]
+) -> ReducedScene:
+    walls = material.walls and material.walls._replace(law=change(material.walls.law))
+    return material._replace(law=change(material.law), walls=walls)
+
+
+def _faster(material: ReducedScene, factor: ArrayLike) -> ReducedScene:
+    """Return the material in which spheres take the same paths a factor faster."""
+
+    def faster(law: ReducedContact) -> ReducedContact:
+        return ReducedContact(law.alpha * factor**2, law.dissipative_constant / factor, law.clipped)
+
+    drag = jax.tree.map(lambda x: x * factor, material.drag)
+    return _with_laws(material, faster)._replace(drag=drag)
+
+
 def _material_by_replica(
-    material: SphereMaterial, tangents: ContactTangents
-) -> tuple[SphereMaterial, SphereMaterial]:
+    material: ReducedScene, tangents: ContactTangents
+) -> tuple[ReducedScene, ReducedScene]:
     """Return the material and its tangents, by replica for all that a change of clock changes.
 
     Velocities that are (1 + c/2) times as large in the same material are those of a slower clock
     in the material for spheres that are (1 - c/2) times as fast.
     """
     c, one = tangents.log_temperature, jnp.ones_like(tangents.elapsed)
-    by_clock = jax.jvp(material.faster, (one,), (-0.5 * one,))[1]
+    by_clock = jax.jvp(partial(_faster, material), (one,), (-0.5 * one,))[1]
 
-    def without_surfaces(numbers: SphereMaterial) -> SphereMaterial:
-        return numbers._replace(surface=None, wall_surface=None)
+    def with_surfaces_of(numbers: ReducedScene, source: ReducedScene | None) -> ReducedScene:
+        walls, surface = numbers.walls, source and source.surface
+        if walls is not None:
+            walls = walls._replace(surface=source and source.walls.surface)
+        return numbers._replace(surface=surface, walls=walls)
 
-    changes = jax.tree.map(
-        lambda direction, change: direction[:, None] + c * change,
-        *map(without_surfaces, (tangents.directions, by_clock)),
+    def by_replica(change: Callable[..., Array], *numbers: ReducedScene) -> ReducedScene:
+        without_surfaces = [with_surfaces_of(each, None) for each in numbers]
+        return with_surfaces_of(jax.tree.map(change, *without_surfaces), numbers[0])
+
+    rows = by_replica(lambda x: jnp.broadcast_to(x, c.shape[1:]), material)
+    return rows, by_replica(
+        lambda direction, change: direction[:, None] + c * change, tangents.directions, by_clock
     )
-    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, c.shape[1:]), without_surfaces(material))
-
-    def with_surfaces_of(numbers: SphereMaterial, source: SphereMaterial) -> SphereMaterial:
-        return numbers._replace(surface=source.surface, wall_surface=source.wall_surface)
-
-    return with_surfaces_of(rows, material), with_surfaces_of(changes, tangents.directions)
-
-
-def drag_rates(scene: SphereScene) -> ReducedDrag | None:
-    """Return the rates of drag in the unit of time of a scene."""
-    return jax.tree.map(lambda rate: rate * scene.collision_frequency, scene.material.drag)
 
 
 def cooling_trend(
@@ -539,7 +552,7 @@ def cooling_rate(
 ) -> Float[Array, "replicas"]:
     """Return ``-d ln T/dt`` at a temperature, by contacts and drag."""
     by_contacts = tangents.rates.cooling(cooling_trend(scene, temperature))
-    drag = drag_rates(scene)
+    drag = scene.drag_rates
     return by_contacts if drag is None else by_contacts + 2 * drag.rate
 
 
@@ -567,24 +580,13 @@ def soft_records(state: State, scene: SphereScene, replicas: int) -> dict[str, A
     The derivative of T is that of the run up to the projection; those of the other records are
     estimated from it. The elastic energy goes as ``T^(7/5) alpha^(-2/5)``.
     """
-    values, travelled, velocity = common_records(state, scene.side, replicas)
+    values, travelled, velocity = common_records(state, scene, replicas)
     values["elastic_energy"] = state.internal.elastic / velocity.shape[1]
-    undefined = set()
-    if scene.container is not None:  # the frame is that of the walls
-        velocity = state.velocity.reshape(velocity.shape)
-        values["temperature"] = observables.temperature(velocity)
-        values["sonine"] = observables.sonine(velocity)
-        values["velocity_correlation"] = observables.velocity_correlation(
-            state.first_velocity.reshape(velocity.shape), velocity
-        )
-        # Walls bound displacements, and there are no periodic waves between them.
-        undefined = {"displacement", "flow_share"}
     spin = state.internal.spin
     if spin is not None:  # it is None during equilibration
         values["rotational_temperature"] = rotational_temperature(scene, spin, replicas)
-    known = {name: x for name, x in values.items() if name not in undefined}
     if state.tangents is None:
-        return known
+        return values
     tangents, T, U = state.tangents, values["temperature"], values["elastic_energy"]
     cooling = cooling_rate(scene, tangents, T)
     projected = tangents.projected(velocity.reshape(state.velocity.shape), cooling)
@@ -596,17 +598,17 @@ def soft_records(state: State, scene: SphereScene, replicas: int) -> dict[str, A
     along["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
     rates["elastic_energy"] = -1.4 * cooling * U
     if spin is None:
-        return rule.with_tangents(known, along, rates, projected.clock)
+        return rule.with_tangents(values, along, rates, projected.clock)
     name, inertia = "rotational_temperature", scene.material.surface.inertia
     T_rot = values[name]
     logs = (tangents.directions.surface.inertia / inertia)[:, None] + tangents.log_temperature
     logs += 2 * component_along(tangents.spin, spin, replicas)
     gain = tangents.rotational_gain.at(ratio_or_zero(T_rot, T))
     rate = velocity.shape[-1] / spin.shape[1] * gain * scene.collision_frequency * T**1.5
-    if (drag := drag_rates(scene)) is not None:
+    if (drag := scene.drag_rates) is not None:
         rate -= 2 * drag.rotational_rate * T_rot
     along[name], rates[name] = logs * T_rot[None], rate
     # The tangents of paths are known only for smooth spheres.
-    names = {"displacement", "velocity_correlation"} & set(known)
-    without_tangents = {name: known.pop(name) for name in names}
-    return rule.with_tangents(known, along, rates, projected.clock) | without_tangents
+    paths = {"displacement", "velocity_correlation"}
+    known = {name: x for name, x in values.items() if name not in paths}
+    return values | rule.with_tangents(known, along, rates, projected.clock)

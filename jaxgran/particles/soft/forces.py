@@ -13,10 +13,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.particles.neighbours import Pairs, rows_where
+from jaxgran.particles.neighbours import Pairs, rows_where, select_members
 from jaxgran.particles.state import surface_direction, torque
 from jaxgran.scene.contact import contact_force, midpoint_rate
-from jaxgran.scene.reduced import ReducedContact, ReducedFriction, SphereMaterial, SphereScene
+from jaxgran.scene.reduced import (
+    ReducedContact,
+    ReducedFriction,
+    ReducedScene,
+    SphereScene,
+)
 
 
 class ContactCandidates(NamedTuple):
@@ -68,19 +73,14 @@ def select_contact_candidates(
         container: its sides. Particles that touch a wall before or after free flight are members
             even without a pair.
     """
-    n = len(position)
-    max_near, max_contacts, max_members = capacities
+    n, max_near = len(position), capacities[0]
     displacement = position[pairs.i] - position[pairs.j] - pairs.offset
     near = jnp.sum(displacement * displacement, -1) < (1 + margin) ** 2
     near &= jnp.arange(near.size) < pairs.count
     rows, num_near = rows_where(near, max_near)
     real = jnp.arange(max_near) < num_near
-    i, j, offset, displacement = (
-        pairs.i[rows],
-        pairs.j[rows],
-        pairs.offset[rows],
-        displacement[rows],
-    )
+    i, j, offset = pairs.i[rows], pairs.j[rows], pairs.offset[rows]
+    displacement = displacement[rows]
 
     # Which of them come closer than a diameter in free flight.
     relative = velocity[i] - velocity[j]
@@ -101,22 +101,17 @@ def select_contact_candidates(
     active = mark_ends(extra | alone, touching)
     active = mark_ends(active, real & (active[i] | active[j]))
     selected = real & (active[i] | active[j])
-    is_member = mark_ends(alone, selected)
-    rows, num_contacts = rows_where(selected, max_contacts)
-    real = jnp.arange(max_contacts) < num_contacts
-    rows = jnp.where(real, rows, 0)
+    rows, real, members, (a, b), counts = select_members(selected, i, j, alone, capacities[1:])
     i, j, offset = i[rows], j[rows], offset[rows]
-    members, num_members = rows_where(is_member, max_members)
-    slot = jnp.cumsum(is_member, dtype=jnp.int32) - 1
     return ContactCandidates(
         members=members,
-        a=jnp.where(real, slot[i], 0),
-        b=jnp.where(real, slot[j], 0),
+        a=a,
+        b=b,
         offset=jnp.where(real[:, None], offset, 2.0),  # an empty row is a pair out of reach
         replica=i // (n // replicas),
         expected=active[i] & active[j],
         expected_at_walls=active.at[members].get(mode="fill", fill_value=True),
-        needed=jnp.stack([pairs.count, pairs.lookahead, num_near, num_contacts, num_members]),
+        needed=jnp.stack([pairs.count, pairs.lookahead, num_near, *counts]),
     )
 
 
@@ -158,7 +153,7 @@ def _column(values: Array) -> Array:
 
 
 def fly(
-    scene: SphereScene, spheres: Spheres, duration: ArrayLike, material: SphereMaterial
+    scene: SphereScene, spheres: Spheres, duration: ArrayLike, material: ReducedScene
 ) -> tuple[Spheres, Float[Array, "n"] | None]:
     """Return spheres after a flight, and the energy that each lost to drag, None without drag.
 
@@ -171,7 +166,7 @@ def fly(
     x, v, spin = spheres
     if material.drag is None:
         return Spheres(x + v * duration, v, spin), None
-    rate, spin_rate = jax.tree.map(lambda rate: rate * scene.collision_frequency, material.drag)
+    rate, spin_rate = scene.with_material(material).drag_rates
 
     def decayed(vectors: Array, rate: Array) -> tuple[Array, Array]:
         """Return vectors after the flight, and the loss of half their square."""
@@ -294,75 +289,6 @@ def tangential_kick(
     return kick, -jnp.sum(kick * (slip + 0.5 * response[:, None] * kick), -1)
 
 
-def pair_friction(
-    v: Float[Array, "members d"],
-    spin: Float[Array, "members spins"],
-    candidates: ContactCandidates,
-    xi: Float[Array, "contacts"],
-    towards: Float[Array, "contacts d"],
-    normal: NormalForce,
-    surface: ReducedFriction,
-    dt: ArrayLike,
-) -> tuple[Float[Array, "members d"], Float[Array, "members spins"], Float[Array, "contacts"]]:
-    """Return velocities and spins after the tangential kick of pairs, and the energy lost.
-
-    It follows the normal kick. The two commute for one contact: neither changes the velocity that
-    the other depends on.
-
-    Args:
-        v, spin: of the members.
-        candidates: the pairs.
-        xi, towards: overlaps, and unit vectors from a to b.
-        normal: the normal force.
-        surface: of the spheres.
-        dt: time step.
-    """
-    a, b, lever = candidates.a, candidates.b, 1 - xi  # the lever is the distance of the centres
-    relative = v[a] - v[b]
-    sideways = relative - jnp.sum(relative * towards, -1, keepdims=True) * towards
-    slip = sideways + lever[:, None] * surface_direction(spin[a] + spin[b], towards)
-    response = 2 * (1 + lever**2 / surface.inertia)
-    kick, lost = tangential_kick(slip, normal, surface, response, dt)
-    spin_change = (lever / surface.inertia)[:, None] * torque(towards, kick)
-    return (
-        v.at[a].add(kick).at[b].add(-kick),
-        spin.at[a].add(spin_change).at[b].add(spin_change),
-        lost,
-    )
-
-
-def wall_friction(
-    v: Float[Array, "members d"],
-    spin: Float[Array, "members spins"],
-    xi: Float[Array, "members d"],
-    outwards: Float[Array, "members d"],
-    normal: NormalForce,
-    material: SphereMaterial,
-    dt: ArrayLike,
-) -> tuple[Float[Array, "members d"], Float[Array, "members spins"], Float[Array, "members"]]:
-    """Return velocities and spins after the tangential kicks of walls, one axis after the other,
-    and the energy lost.
-
-    Args:
-        v, spin: of the members.
-        xi, outwards: see `wall_overlap`.
-        normal: the normal forces.
-        material: with the inertia of the spheres and the friction of the walls.
-        dt: time step.
-    """
-    lost, inertia = jnp.zeros(len(spin), spin.dtype), material.surface.inertia
-    for axis, along in enumerate(jnp.eye(v.shape[1], dtype=v.dtype)):
-        towards = outwards[:, axis, None] * along[None]
-        lever = 1 - 2 * xi[:, axis]  # distance from the wall
-        slip = v * (1 - along)[None] + lever[:, None] * surface_direction(spin, towards)
-        across = jax.tree.map(lambda x, axis=axis: x[:, axis], normal)
-        response = 1 + lever**2 / inertia
-        kick, taken = tangential_kick(slip, across, material.wall_surface, response, dt)
-        v, lost = v + kick, lost + taken
-        spin = spin + (lever / inertia)[:, None] * torque(towards, kick)
-    return v, spin, lost
-
-
 class ContactWork(NamedTuple):
     """Energies and contacts of a block, of each pair, or of each member at walls.
 
@@ -400,7 +326,7 @@ class BlockWork(NamedTuple):
 def integrate(
     scene: SphereScene,
     members: Spheres,
-    material: SphereMaterial,
+    material: ReducedScene,
     candidates: ContactCandidates,
     duration: ArrayLike,
     num_steps: int,
@@ -414,8 +340,8 @@ def integrate(
     Args:
         scene: the gas.
         members: empty slots are at rest inside the container.
-        material: each number of `law` one number or one per pair; of `wall_law` and `drag` one
-            number or one per member.
+        material: each number of its law one number or one per pair; of the law of walls and of
+            drag one number or one per member.
         candidates: the pairs.
         duration: of the block.
         num_steps: number of steps.
@@ -425,7 +351,39 @@ def integrate(
     """
     a, b, offset = candidates.a, candidates.b, candidates.offset
     dt, container, dtype = jnp.asarray(duration / num_steps), scene.container, members.x.dtype
-    wall_law = jax.tree.map(_column, material.wall_law)
+    surface, walls_material = material.surface, material.walls
+    wall_law = walls_material and jax.tree.map(_column, walls_material.law)
+
+    def rub_walls(v: Array, spin: Array, depth: Array, outwards: Array, push: NormalForce):
+        """Return velocities and spins after the tangential kicks of walls, one axis after the
+        other, and the energy that each member lost."""
+        lost = jnp.zeros(len(spin), spin.dtype)
+        for axis, along in enumerate(jnp.eye(v.shape[1], dtype=v.dtype)):
+            towards = outwards[:, axis, None] * along[None]
+            lever = 1 - 2 * depth[:, axis]  # distance from the wall
+            slip = v * (1 - along)[None] + lever[:, None] * surface_direction(spin, towards)
+            across = jax.tree.map(lambda x, axis=axis: x[:, axis], push)
+            response = 1 + lever**2 / surface.inertia
+            kick, taken = tangential_kick(slip, across, walls_material.surface, response, dt)
+            v, lost = v + kick, lost + taken
+            spin = spin + (lever / surface.inertia)[:, None] * torque(towards, kick)
+        return v, spin, lost
+
+    def rub_pairs(v: Array, spin: Array, xi: Array, towards: Array, force: NormalForce):
+        """Return velocities and spins after the tangential kicks of pairs, and the energy lost.
+
+        They follow the normal kicks. The two commute for one contact: neither changes the velocity
+        that the other depends on.
+        """
+        lever = 1 - xi  # the distance of the centres
+        relative = v[a] - v[b]
+        sideways = relative - jnp.sum(relative * towards, -1, keepdims=True) * towards
+        slip = sideways + lever[:, None] * surface_direction(spin[a] + spin[b], towards)
+        response = 2 * (1 + lever**2 / surface.inertia)
+        kick, lost = tangential_kick(slip, force, surface, response, dt)
+        spin_change = (lever / surface.inertia)[:, None] * torque(towards, kick)
+        spin = spin.at[a].add(spin_change).at[b].add(spin_change)
+        return v.at[a].add(kick).at[b].add(-kick), spin, lost
 
     def step(_, carry: tuple[Spheres, BlockWork]) -> tuple[Spheres, BlockWork]:
         (x, v, spin), (pairs, walls, lost_to_drag) = carry
@@ -449,13 +407,11 @@ def integrate(
                 exchanged=walls.exchanged + dt * jnp.sum(push.exchanged, -1),
                 touched=walls.touched | at_wall,
             )
-            if material.wall_surface is not None:
-                v, spin, lost = wall_friction(v, spin, depth, outwards, push, material, dt)
+            if walls_material.surface is not None:
+                v, spin, lost = rub_walls(v, spin, depth, outwards, push)
                 walls = walls._replace(dissipated=walls.dissipated + lost)
-        if material.surface is not None:
-            v, spin, lost = pair_friction(
-                v, spin, candidates, xi, -normal, force, material.surface, dt
-            )
+        if surface is not None:
+            v, spin, lost = rub_pairs(v, spin, xi, -normal, force)
             pairs = pairs._replace(dissipated=pairs.dissipated + lost)
         spheres, lost = fly(scene, Spheres(x, v, spin), dt, material)
         return spheres, BlockWork(pairs, walls, jax.tree.map(jnp.add, lost_to_drag, lost))
