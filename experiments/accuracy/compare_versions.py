@@ -1,6 +1,6 @@
 """Does this version give the same numbers as another version?
 
-    python experiments/accuracy/compare_versions.py CHECKOUT [--record] [--out FILE]
+    python experiments/accuracy/compare_versions.py CHECKOUT [--record] [--out DIR]
 
 CHECKOUT is the folder of the other version (``git worktree add --detach FOLDER COMMIT``). Both
 versions simulate the same ten scenes with all four models, with elements, derivatives and saved
@@ -12,15 +12,13 @@ identical.
 """
 
 import argparse
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from experiments.support.record import DATA, EXPERIMENTS, add_recording, write_results
+from experiments.support.record import DATA, EXPERIMENTS, process, run_parts
 
 # The scenes are written out because modules of other versions have other names.
 CASES = """
@@ -119,17 +117,8 @@ np.savez(sys.argv[2], **arrays)
 """
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("checkout", type=Path, help="folder of the other version")
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    add_recording(parser)
-    options = parser.parse_args()
-    if not (options.checkout / "jaxgran" / "__init__.py").is_file():
-        parser.error(f"{options.checkout} holds no folder jaxgran: give a checkout of a version")
-    before, now = (arrays_of(folder) for folder in (options.checkout, EXPERIMENTS.parent))
+def compare_versions(options: argparse.Namespace) -> dict:
+    before, now = (arrays_of(folder) for folder in (options.CHECKOUT, EXPERIMENTS.parent))
     rows = []
     for case in dict.fromkeys(key.partition("/")[0] for key in [*before, *now]):
         pair = [
@@ -142,8 +131,7 @@ def main() -> int:
             difference = max(relative_difference(x, pair[1][key]) for key, x in pair[0].items())
         rows.append({"case": case, "difference": difference})
         print(f"{case:45} {number:12} {difference or 'identical'}")
-    write_results("compare_versions", options, options.out, rows=rows)
-    return int(any(row["difference"] for row in rows))
+    return {"rows": rows}
 
 
 def relative_difference(one: np.ndarray, other: np.ndarray) -> float:
@@ -157,15 +145,9 @@ def relative_difference(one: np.ndarray, other: np.ndarray) -> float:
 
 def arrays_of(folder: Path) -> dict[str, np.ndarray]:
     """Return all arrays of the version in a folder, by case and number."""
-    environment = os.environ | {"PYTHONPATH": str(folder.resolve())}
     with tempfile.TemporaryDirectory() as results:
         file = Path(results) / "arrays.npz"
-        command = [sys.executable, "-c", CASES, str(DATA / "lammps_cooling_dilute.csv"), str(file)]
-        done = subprocess.run(
-            command, env=environment, cwd=folder, capture_output=True, text=True, check=False
-        )
-        if done.returncode:
-            raise SystemExit(f"the version in {folder} does not run:\n{done.stderr}")
+        process("-c", CASES, DATA / "lammps_cooling_dilute.csv", file, folder=folder)
         with np.load(file) as arrays:
             found = dict(arrays)
     package = Path(str(found.pop("package")))
@@ -175,4 +157,7 @@ def arrays_of(folder: Path) -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    settings = {"type": Path, "help": "folder of the other version"}
+    parts = {"compare_versions": compare_versions}
+    found = run_parts(__doc__, parts, smoke=False, CHECKOUT=settings)
+    sys.exit(any(row["difference"] for row in found["compare_versions"]["rows"]))

@@ -1,23 +1,29 @@
 """Is the derivative of the cooling curve of a chaotic gas accurate, and for how long?
 
-    python experiments/accuracy/gradient_health.py [--scenes dilute dense clustering]
+    python experiments/accuracy/gradient_health.py [--only gradient_health_dilute ...]
         [--smoke] [--record] [--out DIR]
 
-d ln T / d ln A of three gases after 1, 3, 10, 30 and 100 collisions per particle, by
+d ln T / d ln A by central finite differences of runs (the same initial states on both sides;
+kinetic theory corrects the truncation error of the step), compared with derivatives. Standard
+errors are over replicas. Relative errors mean little at times when ln T hardly depends on A.
 
-- central finite differences (many replicas, the same initial states on both sides; the truncation
-  error of the step is corrected by kinetic theory),
-- forward mode without projection ("plain"),
-- thermally projected forward and reverse mode,
-- kinetic theory;
+gradient_health_dilute, _dense, _clustering: soft spheres after 1, 3, 10, 30 and 100 collisions per
+particle, by forward mode without projection ("plain"), thermally projected forward and reverse
+mode, and kinetic theory; and the dependence of the projected derivative on the interval between
+projections.
 
-and the dependence of the projected derivative on the interval between projections. Standard errors
-are over replicas. `derivatives_in_flows.py` examines two more gases with a flow, disks and hard
-spheres. Prints tables, draws a
-picture with the recorded scenes that are not computed, and writes a JSON file of each scene.
+hard_derivatives: hard spheres after 10 and 30 mean free times, below L_c and in a box of 1.1 L_c.
+
+derivatives_in_flows: hard spheres and disks in boxes longer than L_c, after 3, 10, 30 and 100
+collisions: finite differences of many sets of replicas with separate keys, projected derivatives
+and the estimate of their bias (`CoolingCurve.derivative_bias`), and derivatives by differences of
+one set (``differences=0.3``), with another key.
 """
 
-import time
+import argparse
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,213 +31,232 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import figures, script_parser, write_picture, write_results
-from experiments.support.scenes import beads
-from jaxgran.plotting import COLOURS, INK
+from experiments.support.analysis import mean_and_error, over
+from experiments.support.plots import ELASTIC, GUIDE, HARD, INK, SOFT, THEORY, caption, panels
+from experiments.support.record import figures, run_parts
+from experiments.support.scenes import beads, cool, glass, times_of, with_A
 
 COLLISIONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 INTERVALS = (0.03, 0.1, 0.3, 1.0)
 STEP = 0.3  # of ln A, to either side
-# packing fraction, beta_T0, contact duration over mean free time, particles in a box, replicas
-SCENES = {
-    "dilute": (0.05, 0.1, 0.01, 500, 16),
-    "dense": (0.25, 0.05, 0.05, 500, 16),
-    "clustering": (0.3, 0.2, 0.05, 1000, 8),
-}
-# Sets of replicas for finite differences, which scatter more than tangents.
-SETS = {"dilute": 1, "dense": 1, "clustering": 6}
-FEW_REPLICAS = 4
-EARLY, EARLY_REPLICAS = 2, 64  # the first times, where derivatives are small, have more replicas
-PLAIN_HORIZON = 3  # times at which the plain derivative is computed; at the last it overflows
 STEPS_PER_CONTACT = 25
+# packing fraction, beta_T0, contact duration over mean free time, particles in a box, replicas,
+# sets of replicas for finite differences, which scatter more than tangents
+SOFT_SPHERES = {
+    "dilute": (0.05, 0.1, 0.01, 500, 16, 1),
+    "dense": (0.25, 0.05, 0.05, 500, 16, 1),
+    "clustering": (0.3, 0.2, 0.05, 1000, 8, 6),
+}
+EARLY = 2  # the first times, where derivatives are small, have more replicas
+PLAIN_HORIZON = 3  # times at which the plain derivative is computed; at the last it overflows
+# packing fraction, beta_T0, dimension, particles in a box, replicas, sets of the reference
+FLOWS = {"hard": (0.2, 0.3, 3, 500, 32, 6), "disks": (0.25, 0.3, 2, 300, 32, 12)}
+WORDS = {"hard": "hard spheres", "disks": "hard disks"}
 
 
-def main() -> None:
-    parser = script_parser(__doc__, "gradient_health")
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    results = {name: figures(f"gradient_health_{name}") for name in SCENES}
-    settings = {"step_of_ln_A": STEP, "steps_per_contact": STEPS_PER_CONTACT}
-    for name in options.scenes:
-        results[name] = examine(name, options.smoke)
-        file = f"gradient_health_{name}"
-        write_results(file, options, options.out / f"{file}.json", **results[name], **settings)
-    write_picture(draw(results), "gradient_health", options)
+class Slopes:
+    """d ln T / d ln A of a gas at some times, of each replica, shape (replicas, times)."""
 
+    def __init__(self, gas: jaxgran.Gas, times: np.ndarray):
+        self.gas, self.times, self.truncation = gas, times, np.zeros(len(times))
+        self.theory = self.forward(jaxgran.KineticTheory())[0][0]
+        self.truncation = self.differences(jaxgran.KineticTheory())[0] - self.theory
 
-def times_of(gas: jaxgran.Gas, collisions, size: int) -> np.ndarray:
-    """Return the times at which a particle has made these numbers of collisions on average.
-
-    By kinetic theory, or, if the box exceeds L_c, by a run of soft spheres: in clusters spheres
-    collide more often than kinetic theory predicts.
-    """
-
-    def times(model, t):
-        counts = np.asarray(jaxgran.cool(gas, t, model=model, progress=False).collisions)
-        return np.exp(np.interp(np.log(collisions), np.log(np.maximum(counts, 1e-9)), np.log(t)))
-
-    tau_c = float(gas.mean_free_time)
-    found = times(jaxgran.KineticTheory(), tau_c * np.geomspace(0.1, 1e6, 400))
-    if gas.box_side(size) < gas.critical_box:
-        return found
-    model = jaxgran.SoftSpheres(size, steps_per_contact=10)
-    return times(model, np.geomspace(0.1 * tau_c, found[-1], 60))
-
-
-def examine(name: str, smoke: bool) -> dict:
-    """Compute all results of a scene."""
-    begin, gas = time.perf_counter(), beads(*SCENES[name][:3])
-    collisions = COLLISIONS[:2] if smoke else COLLISIONS
-    (size, many), few, most = SCENES[name][3:], FEW_REPLICAS, EARLY_REPLICAS
-    if smoke:
-        size, many, few, most = 50, 2, 2, 4
-    times = times_of(gas, collisions, size)
-    constant = gas.value("dissipative_constant")
-
-    def log_temperatures(log_scale, model, times=times, seed=0):
-        changed = gas.replace(dissipative_constant=constant * jnp.exp(log_scale))
-        key = jax.random.key(seed)
-        curve = jaxgran.cool(changed, times, model=model, key=key, progress=not smoke)
+    def log_temperatures(self, shift, model, seed=0):
+        curve = cool(with_A(self.gas, shift), self.times, model, seed)
         each = curve.temperature[None] if curve.replicas is None else curve.replicas.temperature
-        return jnp.log(each), curve.collisions  # shape (replicas, times)
+        return jnp.log(each), curve
 
-    def forward(model, times=times):
-        begin = time.perf_counter()
-        zero = jnp.zeros(())
-        _, slope, counts = jax.jvp(
-            lambda x: log_temperatures(x, model, times), (zero,), (jnp.ones(()),), has_aux=True
+    def forward(self, model) -> tuple[np.ndarray, jaxgran.CoolingCurve]:
+        """Return the derivatives in forward mode, and the curve."""
+        _, slopes, curve = jax.jvp(
+            lambda x: self.log_temperatures(x, model), (0.0,), (1.0,), has_aux=True
         )
-        return np.asarray(slope), np.asarray(counts), time.perf_counter() - begin
+        return np.asarray(slopes), curve
 
-    def spheres(replicas, **settings):
-        return jaxgran.SoftSpheres(
-            size,
-            replicas=replicas,
-            steps_per_contact=STEPS_PER_CONTACT,
-            **settings,
+    def differences(self, model, seeds=(0,)) -> np.ndarray:
+        """Return finite differences, corrected by kinetic theory."""
+        ends = [
+            [np.asarray(self.log_temperatures(x * STEP, model, seed)[0]) for x in (1, -1)]
+            for seed in seeds
+        ]
+        slopes = [(right - left) / (2 * STEP) for right, left in ends]
+        return np.concatenate(slopes) - self.truncation
+
+    def until(self, count: int) -> "Slopes":
+        """Return the same for the first times."""
+        return Slopes(self.gas, self.times[:count])
+
+
+def soft_spheres(name: str, options: argparse.Namespace) -> dict:
+    (phi, beta, contact, size, many, sets), few, most = SOFT_SPHERES[name], 4, 64
+    collisions, intervals = COLLISIONS, INTERVALS
+    if options.smoke:
+        collisions, intervals, size, many, sets, few, most = (
+            COLLISIONS[:2],
+            (0.03, 0.1),
+            50,
+            2,
+            1,
+            2,
+            4,
         )
+    gas = beads(phi, beta, contact)
+    times = times_of(gas, collisions)
+    if gas.box_side(size) > gas.critical_box:
+        rough = jaxgran.SoftSpheres(size, steps_per_contact=10)
+        times = times_of(gas, collisions, rough, times[-1] / float(gas.mean_free_time), 60)
+    model = jaxgran.SoftSpheres(size, replicas=many, steps_per_contact=STEPS_PER_CONTACT)
+    slopes = Slopes(gas, times)
+    early, early_model = slopes.until(EARLY), replace(model, replicas=most)
+    late = slopes.differences(model, range(sets))
+    projected, curve = slopes.forward(model)
 
-    theory = jaxgran.KineticTheory()
-    exact = forward(theory)[0][0]
-    ends = [np.asarray(log_temperatures(s * STEP, theory)[0][0]) for s in (1, -1)]
-    truncation = (ends[0] - ends[1]) / (2 * STEP) - exact
+    def joined(first, rest):
+        pairs = zip(mean_and_error(first), mean_and_error(rest), strict=True)
+        return [np.concatenate([a, b[EARLY:]]) for a, b in pairs]
 
-    def differences(model, times, seed=0):
-        ends = [np.asarray(log_temperatures(s * STEP, model, times, seed)[0]) for s in (1, -1)]
-        return (ends[0] - ends[1]) / (2 * STEP) - truncation[: len(times)]
-
-    def joined(early, late):
-        pairs = zip(over_replicas(early), over_replicas(late), strict=True)
-        return tuple(np.concatenate([a[:EARLY], b[EARLY:]]) for a, b in pairs)
-
-    sets = 1 if smoke else SETS[name]
-    late = np.concatenate([differences(spheres(many), times, seed) for seed in range(sets)])
-    early = spheres(most), times[:EARLY]
-    slopes, counts, seconds = forward(spheres(many))
-    columns = {
-        "kinetic theory": (exact, 0 * exact),
-        "differences": joined(differences(*early), late),
-        "projected": joined(forward(*early)[0], slopes),
-    }
     # A plain derivative is computed under tracing, where arrays cannot be enlarged.
-    plain = spheres(few, projection=None).sized_for(gas)
-    columns["plain"] = over_replicas(forward(plain, times[:PLAIN_HORIZON])[0])
-    by_interval = {}
-    for interval in INTERVALS[:2] if smoke else INTERVALS:
-        slopes = forward(spheres(few, projection=interval))[0]
-        by_interval[interval] = over_replicas(slopes)
+    plain = replace(model, replicas=few, projection=None).sized_for(gas)
+    columns = {
+        "kinetic theory": [slopes.theory, 0 * slopes.theory],
+        "differences": joined(early.differences(early_model), late),
+        "projected": joined(early.forward(early_model)[0], projected),
+        "plain": mean_and_error(slopes.until(PLAIN_HORIZON).forward(plain)[0]),
+    }
+    models = {x: replace(model, replicas=few, projection=x) for x in intervals}
+    by_interval = {x: mean_and_error(slopes.forward(own)[0]) for x, own in models.items()}
     # Reverse mode: the gradient of the mean ln T at the last time, compared with forward mode.
-    model = spheres(few, projection=INTERVALS[1])
-    last = jax.grad(lambda x: jnp.mean(log_temperatures(x, model)[0][:, -1]))(0.0)
-    disagreement = abs(float(last) - by_interval[INTERVALS[1]][0][-1])
-
-    bias = columns["projected"][0] / columns["differences"][0] - 1
-    spread = np.hypot(columns["projected"][1], columns["differences"][1])
-    spread /= np.abs(columns["differences"][0])
-    print(f"\n{name}: phi, beta, t_c/tau_c = {SCENES[name][:3]}, N = {size}, {many} replicas")
-    print_errors("collisions", {"": (counts, 0 * counts)})
-    print_errors("d ln T/d ln A", columns)
-    print_errors("over differences, %", {"projected": (100 * bias, 100 * spread)})
-    print_errors("by interval, mean free times", by_interval)
-    print(f"reverse minus forward, last point: {disagreement:.1e}; one tangent run {seconds:.0f} s")
-    return {
-        "collisions": counts.tolist(),
-        "d_ln_T_d_ln_A": {n: [m.tolist(), e.tolist()] for n, (m, e) in columns.items()},
-        "projected_over_differences": [bias.tolist(), spread.tolist()],
-        "reverse_minus_forward": disagreement,
-        "by_interval": {str(k): [m.tolist(), e.tolist()] for k, (m, e) in by_interval.items()},
+    last = jax.grad(lambda x: jnp.mean(slopes.log_temperatures(x, models[intervals[1]])[0][:, -1]))(
+        0.0
+    )
+    found = {
+        "collisions": curve.collisions,
+        "d_ln_T_d_ln_A": columns,
+        "projected_over_differences": over(columns["projected"], columns["differences"]),
+        "reverse_minus_forward": abs(float(last) - by_interval[intervals[1]][0][-1]),
+        "by_interval": {str(x): values for x, values in by_interval.items()},
         "num_particles": size,
         "replicas": many,
         "early_replicas": most,
-        "late_differences": late.tolist(),  # of each replica
-        "tangent_seconds": seconds,
-        "seconds": time.perf_counter() - begin,
+        "late_differences": late,  # of each replica
+        "step_of_ln_A": STEP,
+        "steps_per_contact": STEPS_PER_CONTACT,
+    }
+    results = {each: figures(f"gradient_health_{each}") for each in SOFT_SPHERES} | {name: found}
+    return found | {"picture": {"gradient_health": draw(results)}}
+
+
+def hard_derivatives(options: argparse.Namespace) -> dict:
+    rows = []
+    for phi, beta, replicas in ((0.02, 0.2, 32), (0.2, 0.1, 32), (0.2, 0.3, 96)):
+        gas = glass(beta, phi)
+        slopes = Slopes(gas, np.array([10.0, 30.0]) * float(gas.mean_free_time))
+        model = jaxgran.HardSpheres(*((50, 2) if options.smoke else (500, replicas)))
+        projected, curve = slopes.forward(model)
+        off, error = over(mean_and_error(projected), mean_and_error(slopes.differences(model)))
+        row = {"off": off, "error": error, "told": curve.derivative_bias}
+        rows.append({"phi": phi, "beta": beta} | row)
+    return {"rows": rows}
+
+
+def derivatives_in_flows(options: argparse.Namespace) -> dict:
+    scenes = {name: in_flow(name, options.smoke) for name in FLOWS}
+    return {"step_of_ln_A": STEP, "scenes": scenes, "picture": draw_flows(scenes)}
+
+
+def in_flow(name: str, smoke: bool) -> dict:
+    (phi, beta, dimension, size, replicas, sets), collisions = FLOWS[name], COLLISIONS[1:]
+    if smoke:
+        collisions, size, replicas, sets = COLLISIONS[1:3], 60, 2, 1
+    gas, model = beads(phi, beta, 0.01, dimension), jaxgran.HardSpheres(size, replicas=replicas)
+    last = 60 * collisions[-1]
+    end = times_of(gas, collisions[-1], replace(model, replicas=2), last, 40)
+    # The bias follows from the flow at all times.
+    slopes = Slopes(gas, np.geomspace(0.3 * float(gas.mean_free_time), end, 40))
+    projected, curve = slopes.forward(model)
+    counts = np.asarray(curve.collisions)
+    at = [int(np.argmin(np.abs(counts - n))) for n in collisions]
+    each = {
+        "reference": slopes.differences(model, range(1, sets + 1)),
+        "projected": projected,
+        "differences": slopes.forward(replace(model, differences=STEP))[0],
+    }
+    columns = {kind: mean_and_error(values[:, at]) for kind, values in each.items()}
+    return {
+        "box_over_critical": float(gas.box_side(size) / gas.critical_box),
+        "num_particles": size,
+        "replicas": replicas,
+        "sets": sets,
+        "collisions": counts[at],
+        "d_ln_T_d_ln_A": columns,
+        "flow_share": np.asarray(curve.flow_share)[at],
+        "bias": over(columns["projected"], columns["reference"]),
+        "bias_of_differences": over(columns["differences"], columns["reference"]),
+        "derivative_bias": np.asarray(curve.derivative_bias)[at],
     }
 
 
-def print_errors(title: str, rows: dict) -> None:
-    for name, (mean, error) in rows.items():
-        cells = (f"{m:+12.4g} ± {e:7.2g}" for m, e in zip(mean, error, strict=True))
-        print(f"{title + ' ' + str(name):>45}{''.join(cells)}")
-
-
-def over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard error over the first axis."""
-    return values.mean(0), values.std(0, ddof=1) / len(values) ** 0.5
+def draw_flows(scenes: dict) -> Figure:
+    """Draw the derivatives of each gas by three methods, and without the estimated bias."""
+    figure = panels(len(scenes), size=(5, 4))
+    looks = {
+        "reference": ("o", INK, "differences of many runs"),
+        "projected": ("^", SOFT, "projected"),
+        "differences": ("s", HARD, "by differences"),
+    }
+    for axes, (name, found) in zip(figure.axes, scenes.items(), strict=True):
+        n = np.array(found["collisions"])
+        for shift, (kind, (marker, colour, label)) in enumerate(looks.items()):
+            mean, error = found["d_ln_T_d_ln_A"][kind]
+            fill = "none" if kind == "reference" else colour
+            look = {"fmt": marker, "color": colour, "mfc": fill, "ms": 6, "label": label}
+            axes.errorbar(n * 1.08 ** (shift - 1), mean, error, **look)
+        freed = np.array(found["d_ln_T_d_ln_A"]["projected"][0])
+        freed = freed / (1 + np.array(found["derivative_bias"]))
+        label = "projected, minus its estimated bias"
+        axes.plot(n, freed, "--", color=SOFT, lw=1.2, label=label, zorder=0)
+        labels = {"xlabel": "collisions per particle", "ylabel": "d ln T / d ln A"}
+        title = f"{WORDS[name]} in a box of {found['box_over_critical']:.1f} $L_c$"
+        caption(axes, title, "upper right", xscale="log", **labels)
+    return figure
 
 
 def draw(results: dict) -> Figure:
     """Draw the derivatives of two gases, their errors, and the effect of the interval."""
-    figure = Figure(figsize=(10, 8), layout="constrained")
-    (left, right), (errors, intervals) = figure.subplots(2, 2)
+    figure = panels(2, 2, size=(5, 4))
+    left, right, errors, intervals = figure.axes
     for axes, name in zip((left, right), results, strict=False):
-        draw_derivatives(axes, results[name])
-        axes.set_title(f"{name} gas: d ln T / d ln A by four methods", fontsize=10, loc="left")
-    left.set_ylabel("d ln T / d ln A")
-    left.legend(frameon=False, fontsize=9, loc="lower left")
-    for (name, result), colour, style in zip(
-        results.items(),
-        (INK, COLOURS["guide"], COLOURS["elastic"]),
-        ("o-", "s--", "^:"),
-        strict=False,
-    ):
+        draw_derivatives(axes, name, results[name])
+    looks = ((INK, "o-"), (GUIDE, "s--"), (ELASTIC, "^:"))
+    for (name, result), (colour, style) in zip(results.items(), looks, strict=False):
         bias, spread = (100 * np.asarray(x) for x in result["projected_over_differences"])
-        n = np.asarray(result.get("collisions", COLLISIONS))[: len(bias)]
-        look = {"color": colour, "ms": 5, "label": name}
-        errors.errorbar(n, bias, spread, fmt=style, **look)
+        look: dict[str, Any] = {"fmt": style, "color": colour, "ms": 5, "label": name}
+        errors.errorbar(np.asarray(result["collisions"])[: len(bias)], bias, spread, **look)
         if "by_interval" not in result:
             continue
         reference = np.asarray(result["d_ln_T_d_ln_A"]["differences"][0])
         at = min(3, len(reference) - 1)  # 30 collisions
-        x = [float(k) for k in result["by_interval"]]
         y, e = (np.array([v[k][at] for v in result["by_interval"].values()]) for k in (0, 1))
-        ratio = 100 * (y / reference[at] - 1)
-        intervals.errorbar(x, ratio, 100 * np.abs(e / reference[at]), fmt=style, **look)
-    for axes, title, label in (
-        (errors, "Error of the projected derivative", "collisions per particle"),
-        (
-            intervals,
-            "Error after 30 collisions, by interval",
-            "mean free times between projections",
-        ),
-    ):
+        x, ratio = [float(k) for k in result["by_interval"]], 100 * (y / reference[at] - 1)
+        intervals.errorbar(x, ratio, 100 * np.abs(e / reference[at]), **look)
+    labels = {"xscale": "log", "ylabel": "projected over differences − 1 (%)"}
+    for axes in (errors, intervals):
         axes.axhspan(-5, 5, color="0.92", zorder=0)
-        axes.set(xscale="log", xlabel=label, ylabel="projected over differences − 1 (%)")
-        axes.set_title(title, fontsize=10, loc="left")
-        axes.legend(frameon=False, fontsize=9, loc="upper left")
-    for axes in figure.axes:
-        axes.spines[["top", "right"]].set_visible(False)
+    title = "Error of the projected derivative"
+    caption(errors, title, "upper left", xlabel="collisions per particle", **labels)
+    title = "Error after 30 collisions, by interval"
+    caption(intervals, title, "upper left", xlabel="mean free times between projections", **labels)
     return figure
 
 
-def draw_derivatives(axes, result: dict) -> None:
+def draw_derivatives(axes, name: str, result: dict) -> None:
     """Draw the derivatives of one gas; write plain derivatives beyond the panel as text."""
     n = np.asarray(result["collisions"])
     styles = {
         "differences": ("o", INK, "finite differences"),
-        "projected": ("^", COLOURS["soft spheres"], "projected"),
-        "plain": ("x", COLOURS["hard spheres"], "plain forward mode"),
+        "projected": ("^", SOFT, "projected"),
+        "plain": ("x", HARD, "plain forward mode"),
     }
     low, high = -2.2, 0.5
     for shift, (column, (marker, colour, label)) in enumerate(styles.items()):
@@ -242,19 +267,19 @@ def draw_derivatives(axes, result: dict) -> None:
         axes.errorbar(at[inside], mean[inside], error[inside], fmt=marker, label=label, **look)
         outside = n[: len(mean)][~inside], mean[~inside], error[~inside]
         for x, m, e in zip(*outside, strict=True):
-            axes.annotate(
-                f"plain after {x:.0f}:\n{m:.1g} ± {e:.1g}",
-                (x, high - 0.02),
-                color=colour,
-                fontsize=8,
-                va="top",
-                ha="left",
-            )
-    theory = np.asarray(result["d_ln_T_d_ln_A"]["kinetic theory"][0])
-    colour = COLOURS["kinetic theory"]
-    axes.plot(n, theory, "--", color=colour, lw=1.2, label="kinetic theory", zorder=0)
-    axes.set(xscale="log", xlabel="collisions per particle", ylim=(low, high))
+            words = f"plain after {x:.0f}:\n{m:.1g} ± {e:.1g}"
+            axes.annotate(words, (x, high - 0.02), color=colour, fontsize=8, va="top")
+    theory = result["d_ln_T_d_ln_A"]["kinetic theory"][0]
+    axes.plot(n, theory, "--", color=THEORY, lw=1.2, label="kinetic theory", zorder=0)
+    labels = {"xlabel": "collisions per particle", "ylabel": "d ln T / d ln A"}
+    title = f"{name} gas: d ln T / d ln A by four methods"
+    caption(axes, title, "lower left", xscale="log", ylim=(low, high), **labels)
 
+
+PARTS = {f"gradient_health_{name}": partial(soft_spheres, name) for name in SOFT_SPHERES} | {
+    "hard_derivatives": hard_derivatives,
+    "derivatives_in_flows": derivatives_in_flows,
+}
 
 if __name__ == "__main__":
-    main()
+    run_parts(__doc__, PARTS)

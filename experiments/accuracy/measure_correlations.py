@@ -6,18 +6,18 @@ Hard spheres of constant restitution start from an elastic fluid and cool in box
 Their cooling rate over Enskog's, with a_2 and a_3 of kinetic theory, is measured in each box from
 T^(-1/2), which grows at a constant rate in Enskog's theory, and compared with
 `jaxgran.theory.equations` and `jaxgran.models.error_model`. For elastic spheres the collision rate
-over Enskog's is measured and compared with the virial series; its difference from 1 is a property
-of equilibrium and is divided out. The rates are corrected for finite N: without total momentum
-spheres collide faster, few spheres share the energy, and T^(-1/2) is not linear in it. The
-corrections are ``1/(2N) - 3/(4dN) + 3 (1 - eps^2)/(dN)`` of the cooling rate and
-``-1/(2N) + 1/(4dN)`` of the collision rate. They leave out the contact value of finite N, which is
-common to both.
+over Enskog's is measured; its difference from 1 is a property of equilibrium and is divided out.
+The rates are corrected for finite N: without total momentum spheres collide faster, few spheres
+share the energy, and T^(-1/2) is not linear in it. The corrections are ``1/(2N) - 3/(4dN) +
+3 (1 - eps^2)/(dN)`` of the cooling rate and ``-1/(2N) + 1/(4dN)`` of the collision rate. They leave
+out the contact value of finite N, which is common to both.
 
 Without --full: eps = .7, .9, 1 and errors of some .2 %; with --full also eps = .8 and .95, in boxes
 of the same length in L_c as those of eps = .7, and errors of some .15 %. (A box shorter than L_c/2
 lacks waves that the theory of a large box counts.)
 """
 
+import argparse
 from functools import cache
 from typing import NamedTuple
 
@@ -27,11 +27,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import script_parser, write_picture, write_results
-from experiments.support.scenes import hard_beads
+from experiments.support.analysis import mean_and_error, replicas_of
+from experiments.support.plots import DSMC, ELASTIC, HARD, INK, THEORY, caption, panels
+from experiments.support.record import run_parts
+from experiments.support.scenes import cool, hard_beads, times_of
 from jaxgran.models.error_model import flow_share
-from jaxgran.plotting import COLOURS, INK
-from jaxgran.scene.geometry import contact_value
 from jaxgran.theory.equations import correlation_build_up, correlation_slowdown
 
 MARKS = np.array([0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0])
@@ -61,12 +61,6 @@ def as_long(num_particles: int, restitution: float, dimension: int) -> int:
 TOGETHER = 6000
 """Number of spheres that are simulated at the same time."""
 
-VIRIAL = {
-    3: (0.625, 0.2869495, 0.110252, 0.03888198, 0.01302354, 0.0041832, 0.0013094, 0.0004035),
-    2: (0.78200444, 0.53223181, 0.33355604, 0.1988425, 0.1148728, 0.0649930, 0.0362193, 0.0199537),
-}
-"""B_n/B_2^(n-1), n = 3 to 10: Clisby & McCoy, J. Stat. Phys. 122, 15 (2006)."""
-
 
 class Point(NamedTuple):
     """A gas in boxes of N spheres."""
@@ -80,27 +74,19 @@ class Point(NamedTuple):
     def gas(self) -> jaxgran.Gas:
         return hard_beads(self.packing_fraction, self.restitution, self.dimension)
 
-    @property
-    def box(self) -> float:
-        """Return the side in L_c."""
-        return float(self.gas.box_side(self.num_particles) / self.gas.critical_box)
-
-
-def virial_excess(phi: float, d: int) -> float:
-    """Return the contact value of ten virial coefficients over Enskog's, less 1."""
-    y = 2 ** (d - 1) * phi  # B_2 n
-    series = 1 + sum(b * y**k for k, b in enumerate(VIRIAL[d], 1))
-    return series / float(contact_value(jnp.asarray(phi), d)) - 1
-
 
 @cache
 def enskog(point: Point) -> jaxgran.CoolingCurve:
     """Return the curve without correlations, at the times of `MARKS`."""
-    gas, model = point.gas, jaxgran.KineticTheory(correlations=False)
-    tau = jnp.concatenate([jnp.zeros(1), jnp.geomspace(1e-2, 4e3, 600)]) * gas.mean_free_time
-    collisions = jaxgran.cool(gas, tau, model=model).collisions
-    assert collisions is not None
-    return jaxgran.cool(gas, jnp.interp(MARKS[1:], collisions, tau), model=model)
+    model = jaxgran.KineticTheory(correlations=False)
+    return cool(point.gas, times_of(point.gas, MARKS[1:], model, 4e3, 600), model)
+
+
+def root(point: Point, temperature) -> np.ndarray:
+    """Return T^(-1/2) from the start on, on the last axis."""
+    first = np.asarray(point.gas.temperature)
+    T = np.concatenate([np.broadcast_to(first, (*temperature.shape[:-1], 1)), temperature], -1)
+    return T**-0.5
 
 
 def simulated(point: Point, impacts: float, seed: int) -> np.ndarray:
@@ -112,46 +98,32 @@ def simulated(point: Point, impacts: float, seed: int) -> np.ndarray:
     for batch in range(max(1, round(impacts / (replicas * n * MARKS[-1] / 2)))):
         key = jax.random.fold_in(jax.random.key(seed), batch)
         curve = jaxgran.cool(point.gas, theory.times, model=model, key=key, progress=False)
-        each = curve.replicas
-        assert each is not None and each.collisions is not None and theory.collisions is not None
         if point.restitution == 1:
-            found.append(np.diff(each.collisions, axis=1, prepend=0) / np.diff(MARKS))
-            continue
-        first = float(point.gas.temperature) ** -0.5
-        root, expected = (np.asarray(c.temperature) ** -0.5 for c in (each, theory))
-        steps = np.diff(root, axis=1, prepend=first) / np.diff(expected, prepend=first)
-        found.append(steps)
+            counts = replicas_of(curve, "collisions")
+            found.append(np.diff(counts, axis=1, prepend=0) / np.diff(MARKS))
+        else:
+            steps = np.diff(root(point, replicas_of(curve, "temperature")))
+            found.append(steps / np.diff(root(point, theory.temperature)))
     loss = 1 - point.restitution**2
     few = (1 / 2 - 3 / (4 * d) + 3 * loss / d if loss else -1 / 2 + 1 / (4 * d)) / n
     return np.concatenate(found) / (1 + few)
 
 
-def weighted(values: np.ndarray, first: int, elastic: bool, point: Point) -> np.ndarray:
+def weighted(values: np.ndarray, first: int, point: Point) -> np.ndarray:
     """Return the mean over the marks from the first on, weighted by the observed growth."""
-    theory = enskog(point)
-    if elastic:
-        weights = np.diff(MARKS)[first:]
-    else:
-        root = np.append(
-            float(point.gas.temperature) ** -0.5, np.asarray(theory.temperature) ** -0.5
-        )
-        # Weighted by collisions, not by T^(-1/2), whose last values would dominate.
-        weights = np.diff(np.log(root))[first:]
+    # Weighted by collisions, not by T^(-1/2), whose last values would dominate.
+    growth = np.log(root(point, enskog(point).temperature))
+    weights = np.diff(MARKS if point.restitution == 1 else growth)[first:]
     return values[..., first:] @ (weights / weights.sum())
 
 
 def measured(point: Point, impacts: float, seed: int) -> dict:
     """Measure the rates of one gas over Enskog's, on the plateau and as they build up."""
-    each, elastic = simulated(point, impacts, seed), point.restitution == 1
-    late = weighted(each, 0 if elastic else PLATEAU, elastic, point)
-    few = len(each) ** 0.5
-    return point._asdict() | {
-        "boxes": len(each),
-        "rate": float(late.mean()),
-        "error": float(late.std(ddof=1) / few),
-        "course": each.mean(axis=0).tolist(),
-        "course_error": (each.std(axis=0, ddof=1) / few).tolist(),
-    }
+    each = simulated(point, impacts, seed)
+    late = weighted(each, 0 if point.restitution == 1 else PLATEAU, point)
+    row = dict(zip(("rate", "error"), map(float, mean_and_error(late)), strict=True))
+    row |= dict(zip(("course", "course_error"), mean_and_error(each), strict=True))
+    return point._asdict() | {"boxes": len(each)} | row
 
 
 def strength(phi: float, eps: float, d: int) -> float:
@@ -185,21 +157,17 @@ def compared(row: dict, elastic: dict) -> dict:
     flow = 1 - h * loss * built - expected
     rate, error = row["rate"] / elastic["rate"], float(np.hypot(row["error"], elastic["error"]))
     share, grown, theory_rate = (
-        float(weighted(x, PLATEAU, False, point)) for x in (flow, built, expected)
+        float(weighted(x, PLATEAU, point)) for x in (flow, built, expected)
     )
     return row | {
-        "box": point.box,
         "rate": rate,
         "error": error,
         "flow": share,
         "theory": theory_rate,
-        "sigma": (theory_rate - rate) / error,
         "h": (1 - share - rate) / (loss * grown),
         "h_error": error / (loss * grown),
-        "h_theory": h,
-        "course": (np.asarray(row["course"]) / elastic["rate"]).tolist(),
-        "course_theory": expected.tolist(),
-        "course_flow": flow.tolist(),
+        "course": row["course"] / elastic["rate"],
+        "course_flow": flow,
     }
 
 
@@ -210,8 +178,7 @@ def build_up(rows: list[dict]) -> tuple[float, float]:
     for n_0 in trial:
         shape, total = -np.expm1(-middle / n_0), 0.0
         for row in rows:
-            y = 1 - np.asarray(row["course_flow"]) - np.asarray(row["course"])
-            w = np.asarray(row["course_error"]) ** -2.0
+            y, w = 1 - row["course_flow"] - row["course"], row["course_error"] ** -2.0
             a = np.sum(w * y * shape) / np.sum(w * shape**2)
             total += np.sum(w * (y - a * shape) ** 2)
         lowest.append(total)
@@ -220,51 +187,29 @@ def build_up(rows: list[dict]) -> tuple[float, float]:
     return float(trial[np.argmin(chi)]), float((near[-1] - near[0]) / 2)
 
 
-def said(row: dict) -> str:
-    names = (
-        "box",
-        "rate",
-        "error",
-        "theory",
-        "sigma",
-        "flow",
-        "h",
-        "h_error",
-        "h_theory",
-        "virial",
-    )
-    scene = ", ".join(f"{name} {row[name]:g}" for name in Point._fields)
-    return f"{scene}: " + ", ".join(f"{name} {row[name]:.4f}" for name in names if name in row)
-
-
 def draw(rows: list[dict]) -> Figure:
     """Draw h against phi, and the rate against the number of collisions."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    for axes, d in zip(figure.subplots(1, 2, sharey=True), (3, 2), strict=True):
+    figure = panels(2, size=(5, 4), sharey=True)
+    for axes, d in zip(figure.axes, (3, 2), strict=True):
         own = [r for r in rows if r["dimension"] == d and "h" in r]
         for k, eps in enumerate(sorted({r["restitution"] for r in own})):
             some = [r for r in own if r["restitution"] == eps]
             x = [r["packing_fraction"] * (1 + 0.04 * (k - 1)) for r in some]
             y, e = ([r[name] for r in some] for name in ("h", "h_error"))
-            marker, shade = "osv^D"[k], ("hard spheres", "elastic", "DSMC")[k % 3]
-            axes.errorbar(x, y, e, fmt=marker, ms=5, color=COLOURS[shade], label=f"ε = {eps:g}")
+            look = {"fmt": "osv^D"[k], "ms": 5, "color": (HARD, ELASTIC, DSMC)[k % 3]}
+            axes.errorbar(x, y, e, label=f"ε = {eps:g}", **look)
         phi = np.linspace(1e-3, 0.32, 60)
         for eps, line in ((0.9, "-"), (0.7, "--")):
-            h, blue = [strength(p, eps, d) for p in phi], COLOURS["kinetic theory"]
-            axes.plot(phi, h, line, color=blue, label=f"kinetic theory, ε = {eps:g}")
+            h = [strength(p, eps, d) for p in phi]
+            axes.plot(phi, h, line, color=THEORY, label=f"kinetic theory, ε = {eps:g}")
         axes.axhline(0, color=INK, lw=0.8)
-        axes.set(xlabel="packing fraction φ", title=f"{'spheres' if d == 3 else 'disks'}")
-        axes.legend(frameon=False, loc="upper left")
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].set_ylabel("h, loss of rate over 1 − ε²")
+        label = "h, loss of rate over 1 − ε²" if d == 3 else ""
+        title = "spheres" if d == 3 else "disks"
+        caption(axes, title, "upper left", xlabel="packing fraction φ", ylabel=label)
     return figure
 
 
-def main() -> None:
-    parser = script_parser(__doc__, "measure_correlations")
-    parser.add_argument("--full", action="store_true", help="the whole grid, errors below .15 %%")
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
+def measure_correlations(options: argparse.Namespace) -> dict:
     impacts = 2e4 if options.smoke else 1.6e6 if options.full else 7e5
     rows, elastic = [], {}
     for (d, phi), sizes in SIZES.items():
@@ -277,22 +222,16 @@ def main() -> None:
             for eps in (1.0, *epsilons):
                 row = measured(Point(d, phi, eps, n), impacts, seed=len(rows))
                 if eps == 1:
-                    elastic = row = row | {"virial": virial_excess(phi, d)}
+                    elastic = row
                 else:
                     row = compared(row, elastic)
                 rows.append(row)
-                print(said(row), flush=True)
+                print(row, flush=True)
     cooled = [r for r in rows if "h" in r]
-    chi = float(np.mean([r["sigma"] ** 2 for r in cooled]))
-    apart = max(cooled, key=lambda r: abs(r["theory"] - r["rate"]))
-    n_0, error = build_up(cooled)
-    print(f"mean square of the differences {chi:.1f} sigma^2; largest {said(apart)}")
-    print(f"correlations arise in N_0 = {n_0:.1f} +- {error:.1f} collisions per particle")
-    write_picture(draw(rows), "measure_correlations", options)
-    path = options.out / "measure_correlations.json"
-    results = {"rows": rows, "marks": MARKS.tolist(), "build_up": [n_0, error], "chi_squared": chi}
-    write_results("measure_correlations", options, path, **results)
+    found = {"rows": rows, "marks": MARKS, "build_up": build_up(cooled)}
+    return found | {"picture": draw(rows)}
 
 
 if __name__ == "__main__":
-    main()
+    settings = {"action": "store_true", "help": "the whole grid, errors below .15 %%"}
+    run_parts(__doc__, {"measure_correlations": measure_correlations}, full=settings)

@@ -7,23 +7,23 @@ the mean square of ln(T/T_wanted) over the logarithms of the strengths, along gr
 kinetic theory in reverse mode.
 """
 
+import argparse
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import script_parser, write_picture, write_results
+from experiments.support.plots import GUIDE, HARD, INK, THEORY, caption, panels
+from experiments.support.record import run_parts
 
 INTERVALS, POINTS = 12, 8
 LENGTH = 8.0  # of an interval, in mean free times
 BEADS = jaxgran.Viscoelastic(5e7, 0.22, 5e-6)
 
 
-def main() -> None:
-    options = script_parser(__doc__, "design_drive").parse_args()
-    jax.config.update("jax_enable_x64", True)
+def design_drive(options: argparse.Namespace) -> dict:
     gas = jaxgran.Gas(
         BEADS,
         diameter=2e-3,
@@ -60,22 +60,18 @@ def main() -> None:
         log_strengths, state, miss = step(log_strengths, state)
         misses.append(float(miss) ** 0.5)
     largest = float(jnp.max(jnp.abs(course(log_strengths) / wanted - 1)))
-    print(f"rms of ln(T/T_wanted): {misses[0]:.3g} at first, {misses[-1]:.2g} at last")
-    print(f"largest difference {100 * largest:.2g} %; strengths {np.exp(log_strengths)} m^2/s^3")
-    found = {"misses": misses, "largest": largest, "strengths": np.exp(log_strengths).tolist()}
-    write_results("design_drive", options, options.out / "design_drive.json", **found)
-    figure = Figure(figsize=(6, 4.5), layout="constrained")
-    top, bottom = figure.subplots(2, sharex=True, height_ratios=[2, 1])
-    top.plot(t, wanted, color="#222222", linestyle="--", label="wanted")
-    top.plot(t, course(first), color="#999999", label="first guess")
-    top.plot(t, course(log_strengths), color="#0072b2", label="with this drive")
-    top.set(ylabel="T (m²/s²)")
-    top.legend(frameon=False)
+    figure = panels(1, 2, size=(6, 2.25), sharex=True, height_ratios=[2, 1])
+    top, bottom = figure.axes
+    top.plot(t, wanted, color=INK, linestyle="--", label="wanted")
+    top.plot(t, course(first), color=GUIDE, label="first guess")
+    top.plot(t, course(log_strengths), color=THEORY, label="with this drive")
+    caption(top, ylabel="T (m²/s²)")
     edges = float(within[-1]) * np.arange(INTERVALS + 1)
-    bottom.stairs(np.exp(log_strengths), edges, fill=True, color="#d55e00")
-    bottom.set(xlabel="t (s)", ylabel="drive (m²/s³)")
-    write_picture(figure, "design_drive", options)
+    bottom.stairs(np.exp(log_strengths), edges, fill=True, color=HARD)
+    caption(bottom, xlabel="t (s)", ylabel="drive (m²/s³)")
+    found = {"misses": misses, "largest": largest, "strengths": np.exp(log_strengths)}
+    return found | {"picture": figure}
 
 
 if __name__ == "__main__":
-    main()
+    run_parts(__doc__, {"design_drive": design_drive})

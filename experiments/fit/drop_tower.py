@@ -12,24 +12,24 @@ The abstract does not give these values, which are assumed: 300 polymer spheres 
 of eps = .85, and beta_t = 0 of spheres and walls, for which T_rot/T stays near 2/3 in kinetic
 theory.
 
-Prints the values that the published numbers alone allow. Then simulates single runs of hard, rough
+Simulates single runs of hard, rough
 spheres between walls, adds errors of 5 % to T and T_rot, and fits each run twice with kinetic
 theory: as smooth spheres without walls, and as rough spheres between walls with beta_t free.
 """
 
+import argparse
 import dataclasses
-import warnings
-from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.optimize import root_scalar
 
 import jaxgran
-from experiments.support.record import script_parser, write_picture, write_results
-from jaxgran.plotting import COLOURS
+from experiments.support.analysis import fit_quietly
+from experiments.support.plots import GUIDE, INK, THEORY, caption, panels
+from experiments.support.record import run_parts
+from experiments.support.scenes import cool
 
 NUM_PARTICLES, DIAMETER, SIDE = 300, 6e-3, 0.1
 EPS, BETA_T, RATIO = 0.85, 0.0, 2 / 3
@@ -56,26 +56,13 @@ def scene() -> jaxgran.Gas:
     return gas.replace(dissipative_constant=np.exp(found.root))
 
 
-def print_allowed_pairs(q: float = 0.4) -> None:
-    """Print beta_t for which the steady T_rot/T is as published: Santos, Kremer & Garzo (2010)."""
-    print("T_rot/T = 2/3 alone allows these pairs (constant eps, Maxwellian):")
-    beta = np.linspace(-0.95, 1.0, 4000)
-    for eps in (1.0, 0.95, 0.9, 0.85, 0.8, 0.7):
-        c = (1 + q) ** 2 / (2 * q * (1 + beta) ** 2)
-        c *= 1 - eps**2 - (1 - q) / (1 + q) * (1 - beta**2)
-        excess = c + np.sqrt(1 + c * c) - RATIO
-        found = beta[:-1][excess[1:] * excess[:-1] < 0]
-        print(f"  eps = {eps:4.2f}: beta_t = {' or '.join(f'{b:.2f}' for b in found) or 'none'}")
-
-
 def twin(gas: jaxgran.Gas, key: int) -> jaxgran.CoolingCurve:
     """Simulate a single run of hard spheres, with errors of T and T_rot."""
-    theory = jaxgran.cool(gas, np.geomspace(0.01, 100.0, 400))
+    theory = cool(gas, np.geomspace(0.01, 100.0, 400))
     fallen = np.asarray(theory.temperature) < 0.05 * float(gas.temperature)
     end = float(theory.times[np.argmax(fallen)])
     times = np.linspace(end / POINTS, end, POINTS)
-    model = jaxgran.HardSpheres(NUM_PARTICLES)
-    exact = jaxgran.cool(gas, times, model=model, key=jax.random.key(key))
+    exact = cool(gas, times, jaxgran.HardSpheres(NUM_PARTICLES), key)
     rng = np.random.default_rng(key)
     T, T_rot = (
         jnp.asarray(x) * np.exp(ERROR * rng.standard_normal(POINTS))
@@ -97,44 +84,29 @@ def fitted(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> tuple[jaxgran.Fit, 
     alone = dataclasses.replace(
         curve, rotational_temperature=None, rotational_temperature_error=None
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # that A is not determined is recorded
-        free = ("dissipative_constant", "temperature")
-        first = jaxgran.fit(smooth, alone, free=free, num_particles=NUM_PARTICLES)
-        free = ("dissipative_constant", "tangential_restitution", "rotational_temperature")
-        return first, jaxgran.fit(unknown, curve, free=free, num_particles=NUM_PARTICLES)
+    free = ("dissipative_constant", "temperature")
+    first = fit_quietly(smooth, alone, free=free, num_particles=NUM_PARTICLES)
+    free = ("dissipative_constant", "tangential_restitution", "rotational_temperature")
+    return first, fit_quietly(unknown, curve, free=free, num_particles=NUM_PARTICLES)
 
 
-def main() -> None:
-    jax.config.update("jax_enable_x64", True)
-    parser = script_parser(__doc__, "drop_tower", smoke=False)
-    parser.add_argument("--runs", type=int, default=6, help="single runs (default: 6)")
-    options = parser.parse_args()
-    print_allowed_pairs()
+def drop_tower(options: argparse.Namespace) -> dict:
     gas = scene()
     A = float(gas.value("dissipative_constant"))
     curves = [twin(gas, key) for key in range(options.runs)]
     rows = [fitted(gas, curve) for curve in curves]
-    for key, (smooth, complete) in enumerate(rows):
-        print(
-            f"run {key}: smooth, no walls: A = {in_words(smooth, A)}; complete scene: A = "
-            f"{in_words(complete, A)}, beta_t = {complete.estimate[1]:.2f} +- "
-            f"{complete.standard_error[1]:.2f} (p = {float(complete.p_value):.2g})"
-        )
     right = [float(complete.estimate[0]) / A for _, complete in rows]
     errors = [float(complete.standard_error[0]) / A for _, complete in rows]
     found = [float(s.estimate[0]) / A for s, _ in rows if not s.undetermined()]
-    results = {
+    return {
         "A_over_true": right,
         "error_over_true": errors,
         "held": sum(abs(x - 1) < 1.96 * error for x, error in zip(right, errors, strict=True)),
         "runs": len(rows),
         "smooth_undetermined": len(rows) - len(found),
         "smooth_over_true": found,
+        "picture": draw(curves[0], rows[0], A),
     }
-    print(results)
-    write_picture(draw(curves[0], rows[0], A), "drop_tower", options)
-    write_results("drop_tower", options, None, **results)
 
 
 def in_words(result: jaxgran.Fit, A: float) -> str:
@@ -147,15 +119,15 @@ def in_words(result: jaxgran.Fit, A: float) -> str:
 def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float) -> Figure:
     """Draw T and T_rot of a run, with both fits."""
     smooth, complete = fits
-    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
-    axis = figure.subplots()
-    rotation: Any = curve.rotational_temperature, curve.rotational_temperature_error
-    for values, error, color, label in (
-        (curve.temperature, curve.temperature_error, "measured", "$T$, one simulated run"),
-        (*rotation, "guide", r"$T_\mathrm{rot}$, the same run"),
+    figure = panels(size=(7.0, 4.6))
+    (axes,) = figure.axes
+    for name, color, label in (
+        ("temperature", INK, "$T$, one simulated run"),
+        ("rotational_temperature", GUIDE, r"$T_\mathrm{rot}$, the same run"),
     ):
-        style = {"fmt": "o", "markersize": 4, "capsize": 2, "color": COLOURS[color]}
-        axis.errorbar(curve.times, values, error, label=label, **style)
+        style = {"fmt": "o", "markersize": 4, "capsize": 2, "color": color, "label": label}
+        values, error = getattr(curve, name), getattr(curve, f"{name}_error")
+        axes.errorbar(curve.times, values, error, **style)
     told = f"rough spheres between walls: A over the true A {in_words(complete, A)}"
     untold = f"smooth spheres, no walls: A over the true A {in_words(smooth, A)}"
     for values, style, label in (
@@ -163,12 +135,11 @@ def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float) -> Figure:
         (complete.curve.rotational_temperature, ":", None),
         (smooth.curve.temperature, "--", untold),
     ):
-        axis.plot(curve.times, values, style, color=COLOURS["kinetic theory"], label=label)
-    axis.set(yscale="log", xlabel="t (s)", ylabel="temperature (m²/s²)")
-    axis.legend(frameon=False, fontsize=9)
-    axis.spines[["top", "right"]].set_visible(False)
+        axes.plot(curve.times, values, style, color=THEORY, label=label)
+    caption(axes, yscale="log", xlabel="t (s)", ylabel="temperature (m²/s²)")
     return figure
 
 
 if __name__ == "__main__":
-    main()
+    settings = {"type": int, "default": 6, "help": "single runs (default: 6)"}
+    run_parts(__doc__, {"drop_tower": drop_tower}, smoke=False, runs=settings)

@@ -5,15 +5,14 @@
 
 A, and then A and T_0 together, are estimated from a cooling curve: by `jaxgran.fit`, whose
 simulations compute tangents, and by searches without derivatives (SciPy's bounded scalar search,
-Nelder-Mead, differential evolution and, for two parameters and if the package cma is installed,
-CMA-ES). All searches run the same simulator, minimise the same chi^2 of ln T, and start from half
-the true A and 1.2 times the true T_0. The bounds, for searches that need them, are a factor 3 in A
-and 1.5 in T_0 to either side of the start. Searches without derivatives use the same random numbers
-in every simulation, so that chi^2 is a function of the parameters; `jaxgran.fit` uses new random
-numbers each time.
+Nelder-Mead and differential evolution). All searches run the same simulator, minimise the same
+chi^2 of ln T, and start from half the true A and 1.2 times the true T_0. The bounds, for searches
+that need them, are a factor 3 in A and 1.5 in T_0 to either side of the start. Searches without
+derivatives use the same random numbers in every simulation, so that chi^2 is a function of the
+parameters; `jaxgran.fit` uses new random numbers each time.
 
 The table gives the number of simulations after which the best guess of a search stays within 2 % of
-the true values, and their run time without compilation. A simulation with tangents counts as one.
+the true values. A simulation with tangents counts as one.
 
 - stochastic: DSMC of the dense gas; the curve is a DSMC run with other random numbers. Its noise is
   far below 2 %.
@@ -25,7 +24,6 @@ the true values, and their run time without compilation. A simulation with tange
 import argparse
 import dataclasses
 from collections.abc import Callable
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -33,14 +31,8 @@ import numpy as np
 import scipy.optimize
 
 import jaxgran
-from experiments.support.paper import Clock
-from experiments.support.record import DATA, script_parser, write_results
-from jaxgran.data.files import header_number
-
-try:
-    import cma  # type: ignore[import-not-found]
-except ImportError:
-    cma = None
+from experiments.support.record import run_parts
+from experiments.support.scenes import cool, of_lammps
 
 PARAMETERS = ("dissipative_constant", "temperature")
 OFF = np.log([0.5, 1.2])  # the first guess over the true values, in logarithms
@@ -68,13 +60,11 @@ class Problem:
 
     def simulated(self, point: np.ndarray) -> jaxgran.CoolingCurve:
         """Return the curve at a point, always with the same random numbers."""
-        options = {"model": self.model, "key": jax.random.key(KEY), "progress": False}
-        return jaxgran.cool(self.at(point), self.curve.times, **options)
+        return cool(self.at(point), self.curve.times, self.model, KEY)
 
 
 def dense() -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
-    curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dense.csv")
-    gas = jaxgran.read_gas(header).replace(dissipative_constant=header_number(header, "A"))
+    gas, curve, _ = of_lammps("dense")
     keep = np.asarray(curve.times) < END * float(gas.mean_free_time)
     return gas, jax.tree.map(lambda x: x[keep], curve)
 
@@ -83,8 +73,7 @@ def stochastic(options: argparse.Namespace) -> Problem:
     gas, curve = dense()
     size = 1000 if options.smoke else 20_000
     model, other = (jaxgran.DSMC(size, replicas=replicas) for replicas in (2, 8))
-    key = jax.random.key(KEY + 1)
-    made = jaxgran.cool(gas, curve.times, model=other, key=key, progress=False)
+    made = cool(gas, curve.times, other, KEY + 1)
     columns = made.times, made.temperature, made.temperature_error
     # All replicas start from the same temperature.
     times, T, error = (x[made.times > 0] for x in columns if x is not None)
@@ -105,115 +94,70 @@ PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
 }
 
 
-def main() -> None:
-    parser = script_parser(__doc__, "fit_head_to_head")
-    parser.add_argument("--scenes", nargs="+", choices=PROBLEMS, default=list(PROBLEMS))
-    parser.add_argument("--replicas", type=int, default=4, help="replicas of N = 1000 soft spheres")
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    clock, rows = Clock(), []
+def fit_head_to_head(options: argparse.Namespace) -> dict:
+    rows = []
     for scene in ["stochastic"] if options.smoke else options.scenes:
         problem = PROBLEMS[scene](options)
         for count in (1, 2):
             rows += compare(scene, problem, count, options.smoke)
-    path = options.out / "fit_head_to_head.json"
-    seconds = sum(clock.times.values())
-    write_results("fit_head_to_head", options, path, rows=rows, seconds=seconds)
-    print(f"{seconds:.0f} s in all; written to {options.out}")
+    return {"rows": rows}
 
 
 def compare(scene: str, problem: Problem, count: int, smoke: bool) -> list[dict]:
-    # Compiles, and measures the scatter of the replicas.
+    # Measures the scatter of the replicas.
     warm, curve = problem.simulated(OFF[:count]), problem.curve
-    assert warm.temperature_error is not None and curve.temperature_error is not None
     scatter = np.asarray(warm.temperature_error / warm.temperature)[1:]
     error = np.asarray(curve.temperature_error / curve.temperature)[1:]
     sigma = np.hypot(error, np.sqrt(np.mean(scatter**2)))
-    with_derivatives(problem, count, most=1)
     searches: dict[str, Callable] = {"jaxgran.fit": with_derivatives}
     for name, search in WITHOUT.items():
-        if count == 1 and search is evolution_strategy or count == 2 and search is bounded:
-            continue
-        if cma is not None or search is not evolution_strategy:
+        if count == 1 or search is not bounded:
             searches[name] = without(search, sigma)
-    print(f"\n{scene}; free: {', '.join(PARAMETERS[:count])}")
     rows = []
     for name, search in searches.items():
-        guesses, seconds = search(problem, count, 3 if smoke else None)
+        guesses = search(problem, count, 3 if smoke else None)
         outside = [k for k, guess in enumerate(guesses) if np.abs(guess).max() >= WITHIN]
         first = outside[-1] + 1 if outside else 0  # from here on all guesses are within 2 %
-        settled = first < len(guesses)
         row = {
             "scene": scene,
             "search": name,
             "free": PARAMETERS[:count],
-            "simulations": first + 1 if settled else None,
-            "seconds": seconds[first] if settled else None,
+            "simulations": first + 1 if first < len(guesses) else None,
             "all_simulations": len(guesses),
-            "all_seconds": seconds[-1],
-            "last_error": (np.exp(guesses[-1]) - 1).tolist(),
-            "guesses": [np.exp(guess).tolist() for guess in guesses],
+            "last_error": np.exp(guesses[-1]) - 1,
+            "guesses": np.exp(guesses),
         }
         rows.append(row)
-        print({key: value for key, value in row.items() if key != "guesses"}, flush=True)
+        print(row, flush=True)
     return rows
 
 
-def watched(
-    model: jaxgran.AbstractModel, visit: Callable[[jaxgran.Gas], None]
-) -> jaxgran.AbstractModel:
-    """Return a model that calls `visit` with the gas before every run of the given model."""
-
-    class Watched(jaxgran.AbstractModel):
-        stochastic: ClassVar[bool] = model.stochastic
-        derivative_accuracy: ClassVar[float] = model.derivative_accuracy
-
-        def check(self, gas):
-            model.check(gas)
-
-        def simulate(self, gas, times, run):
-            visit(gas)
-            return model.simulate(gas, times, run)
-
-        def estimated_error(self, error_model):
-            return model.estimated_error(error_model)
-
-        def limitations(self, gas, num_particles=None):
-            return model.limitations(gas, num_particles)
-
-    return Watched()
-
-
-def with_derivatives(problem: Problem, count: int, most: int | None) -> tuple[list, list]:
-    """Return the guess of `jaxgran.fit` after each simulation, and the seconds until then."""
-    points, seconds, clock, names = [], [], Clock(), PARAMETERS[:count]
-
-    def visit(gas: jaxgran.Gas) -> None:
-        points.append([float(jax.lax.stop_gradient(gas.value(name))) for name in names])
-        seconds.append(clock.times["run_s"])
-
-    fitted = jaxgran.fit(
-        problem.gas,
-        problem.curve,
-        model=watched(problem.model, visit),
-        free=names,
-        start=problem.at(OFF[:count]),
-        max_steps=most,
-        key=jax.random.key(KEY),
-        progress=False,
-    )
+def with_derivatives(problem: Problem, count: int, most: int | None) -> list[np.ndarray]:
+    """Return the guess of `jaxgran.fit` after each simulation."""
+    names, guesses = PARAMETERS[:count], []
     true = np.asarray([float(problem.gas.value(name)) for name in names])
-    # The guess after a simulation is the point of the next one.
-    points = [*points[1:], np.asarray(fitted.estimate)]
-    guesses = [np.log(np.asarray(point) / true) for point in points]
-    return guesses, [*seconds[1:], clock.times["run_s"]]
+    for simulations in range(1, (most or MOST[count]) + 1):
+        fitted = jaxgran.fit(
+            problem.gas,
+            problem.curve,
+            model=problem.model,
+            free=names,
+            start=problem.at(OFF[:count]),
+            max_steps=simulations,
+            key=jax.random.key(KEY),
+            progress=False,
+        )
+        guesses.append(np.log(np.asarray(fitted.estimate) / true))
+        if fitted.iterations < simulations or fitted.converged:
+            break
+    return guesses
 
 
 def without(search: Callable, sigma: np.ndarray) -> Callable:
     """Return a function that runs a search by values of chi^2 only, as `with_derivatives`."""
 
-    def run(problem: Problem, count: int, most: int | None) -> tuple[list, list]:
-        guesses, values, seconds, clock = [], [], [], Clock()
+    def run(problem: Problem, count: int, most: int | None) -> list[np.ndarray]:
+        guesses, values = [], []
         measured = np.log(np.asarray(problem.curve.temperature))[1:]
 
         def chi2(point) -> float:
@@ -223,13 +167,12 @@ def without(search: Callable, sigma: np.ndarray) -> Callable:
             value = float(misfit @ misfit)
             guesses.append(point if not guesses or value < min(values) else guesses[-1])
             values.append(value)
-            seconds.append(clock.times["run_s"])
             return value
 
         first, reach = OFF[:count], REACH[:count]
         bounds = list(zip(first - reach, first + reach, strict=True))
         search(chi2, first, bounds, most or MOST[count])
-        return guesses, seconds
+        return guesses
 
     return run
 
@@ -251,20 +194,17 @@ def differential_evolution(chi2, first, bounds, most) -> None:
     scipy.optimize.differential_evolution(chi2, bounds, x0=first, **options)
 
 
-def evolution_strategy(chi2, first, bounds, most) -> None:
-    assert cma is not None
-    options = {"bounds": list(zip(*bounds, strict=True)), "CMA_stds": [0.5, 0.15]}
-    options |= {"maxfevals": most, "tolx": TOLERANCE, "seed": 1, "verbose": -9}
-    cma.fmin2(chi2, first, 1.0, options)
-
-
 WITHOUT = {
     "bounded scalar": bounded,
     "Nelder-Mead": nelder_mead,
     "differential evolution": differential_evolution,
-    "CMA-ES": evolution_strategy,
 }
 
 
 if __name__ == "__main__":
-    main()
+    run_parts(
+        __doc__,
+        {"fit_head_to_head": fit_head_to_head},
+        scenes={"nargs": "+", "choices": list(PROBLEMS), "default": list(PROBLEMS)},
+        replicas={"type": int, "default": 4, "help": "replicas of N = 1000 soft spheres"},
+    )

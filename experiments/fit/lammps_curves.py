@@ -1,17 +1,19 @@
 """Which A explains the six cooling curves simulated in LAMMPS?
 
-    python experiments/fit/lammps_curves.py [--cases dilute dense ...] [--record] [--out DIR]
+    python experiments/fit/lammps_curves.py [--only dilute dense ...] [--record] [--out DIR]
 
 Runs `jaxgran fit` on the curves of `data/`: kinetic theory on all, and soft spheres in the cases
 that name them (minutes). Prints the relative error of each A, and the parts of its error bar. With
 --record the figures and pictures of the documents are replaced, including the pictures `fit_*.png`.
 """
 
+import argparse
 import contextlib
 import io
 import json
+from functools import partial
 
-from experiments.support.record import DATA, PICTURES, script_parser, write_results
+from experiments.support.record import DATA, PICTURES, run_parts
 from jaxgran.cli.main import main as command
 
 NAMES = ("dilute", "dense", "phi003", "phi003_large", "phi010", "phi025")
@@ -31,29 +33,17 @@ SHOWN = ("dilute", "dense", "dense_soft_spheres")
 """Cases whose picture is in the documents."""
 
 
-def main() -> None:
-    parser = script_parser(__doc__, "lammps_curves", smoke=False)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=QUICK)
-    options = parser.parse_args()
-    summary = []
-    for case in options.cases:
-        folder = options.out / case
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said):
-            code = command(["fit", *CASES[case], "--out", str(folder), "--overwrite"])
-        print(said.getvalue())
-        if code:
-            raise SystemExit(code)
-        (record,), (picture,) = folder.glob("*.json"), folder.glob("*.png")
-        found = json.loads(record.read_text(encoding="utf-8"))
-        of = results(found, said.getvalue())
-        write_results(f"lammps_curves_{case}", options, None, **of)
-        row = of["parameters"][0]
-        miss, error = (100 * x / row["true"] for x in (row["estimate"], row["std_err"]))
-        summary.append(f"{case:<22} A {miss - 100:+.2f} +- {error:.2f} %; {of['printed'][-1]}")
-        if options.record and case in SHOWN:
-            (PICTURES / f"fit_{case}.png").write_bytes(picture.read_bytes())
-    print("\n".join(summary))
+def fit_case(case: str, options: argparse.Namespace) -> dict:
+    folder, said = options.out / case, io.StringIO()
+    with contextlib.redirect_stdout(said):
+        code = command(["fit", *CASES[case], "--out", str(folder), "--overwrite"])
+    print(said.getvalue())
+    if code:
+        raise SystemExit(code)
+    (record,), (picture,) = folder.glob("*.json"), folder.glob("*.png")
+    if options.record and case in SHOWN:
+        (PICTURES / f"fit_{case}.png").write_bytes(picture.read_bytes())
+    return results(json.loads(record.read_text(encoding="utf-8")), said.getvalue())
 
 
 def results(found: dict, said: str) -> dict:
@@ -75,4 +65,5 @@ def results(found: dict, said: str) -> dict:
 
 
 if __name__ == "__main__":
-    main()
+    parts = {case: partial(fit_case, case) for case in CASES}
+    run_parts(__doc__, parts, "lammps_curves_", smoke=False, default=QUICK)

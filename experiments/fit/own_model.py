@@ -12,11 +12,11 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.closed_forms import haff
-from experiments.support.record import script_parser, write_picture
+from experiments.support.plots import panels
+from experiments.support.record import run_parts
 from experiments.support.scenes import hard_beads
 
 
@@ -48,19 +48,13 @@ class HaffLaw(jaxgran.AbstractModel):
         return (jaxgran.Limitation("velocities are not Maxwellian", True, remedy),)
 
 
-def main() -> None:
-    parser = script_parser(__doc__, "own_model", smoke=False)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
+def own_model(_) -> dict:
     gas = hard_beads(packing_fraction=0.02, restitution=0.9)
     times = jnp.geomspace(1, 300, 9) * gas.mean_free_time
     theory = jaxgran.cool(gas, times)
     own = jaxgran.cool(gas, times, model=HaffLaw())
-    print("T of Haff's law over that of kinetic theory:", own.temperature / theory.temperature)
-
     models = (HaffLaw(), jaxgran.KineticTheory())
     choice = jaxgran.choose_model(gas, times, 0.05, models=models)
-    print(f"\n{choice.reasons[0]}")
 
     times = jnp.geomspace(0.3, 300, 40) * gas.mean_free_time
     exact = jaxgran.cool(gas, times).temperature
@@ -70,17 +64,17 @@ def main() -> None:
     )
     free = ("coefficient", "temperature")
     result = jaxgran.fit(gas.replace(coefficient=0.5), curve, model=HaffLaw(), free=free)
-    print("\nfit to a curve by kinetic theory with noise of 1 %, restitution .9, T_0 .01 m^2/s^2:")
-    for i, name in enumerate(free):
-        estimate, error = result.value(name)
-        clock = result.error_budget["model"][i]
-        print(f"{name}: {estimate:.5g} +- {error:.1g}, of the model's clock {clock:.1g}")
-    print(jaxgran.diagnose(result, curve).verdict)
-    figure = Figure(figsize=(6.0, 5.5), layout="constrained")
-    axes = figure.subplots(2, sharex=True, height_ratios=[3, 1])
-    jaxgran.plot_fit(result, curve, axes)
-    write_picture(figure, "own_model", options)
+    print(result)
+    figure = panels(1, 2, size=(6.0, 2.75), sharex=True, height_ratios=[3, 1])
+    jaxgran.plot_fit(result, curve, np.array(figure.axes))
+    return {
+        "T_over_theory": own.temperature / theory.temperature,
+        "choice": choice.reasons[0],
+        "fitted": {name: result.value(name) for name in free},
+        "verdict": jaxgran.diagnose(result, curve).verdict,
+        "picture": figure,
+    }
 
 
 if __name__ == "__main__":
-    main()
+    run_parts(__doc__, {"own_model": own_model}, smoke=False)

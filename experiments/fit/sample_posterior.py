@@ -4,11 +4,11 @@
 
 The curve is the dilute LAMMPS curve, with phi known within 4 % and T_0 within 1 %. The sampler uses
 `jaxgran.log_likelihood` and the priors of the fit: of phi, of T_0, and of the mean and the trend of
-the error of kinetic theory's clock. Prints both results and the effective samples per second, and
-writes a corner plot.
+the error of kinetic theory's clock. Finds both results and the effective samples per second, and
+draws a corner plot.
 """
 
-import json
+import argparse
 import time
 from typing import Any
 
@@ -21,8 +21,8 @@ from corner import corner
 from matplotlib.figure import Figure
 
 import jaxgran
-from experiments.support.record import DATA, script_parser, write_picture, write_results
-from jaxgran.plotting import COLOURS
+from experiments.support.plots import THEORY
+from experiments.support.record import DATA, run_parts
 
 FREE = ("dissipative_constant", "temperature")
 PRIORS = {"packing_fraction": 0.04, "temperature": 0.01}
@@ -35,12 +35,7 @@ less time than at 1e-9."""
 LABELS = ("A (1e-6 s)", "phi", "T_0 (1e-2 m²/s²)")
 
 
-def main() -> None:
-    parser = script_parser(__doc__, "sample_posterior", smoke=False)
-    parser.add_argument("--samples", type=int, default=1000, help="of a chain (default: 1000)")
-    parser.add_argument("--chains", type=int, default=4, help="parallel chains (default: 4)")
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
+def sample_posterior(options: argparse.Namespace) -> dict:
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     gas = jaxgran.read_gas(header)
     priors = {
@@ -57,11 +52,8 @@ def main() -> None:
         estimate, error = (float(x) for x in result.value(name))
         facts[name] = {"mean": float(values.mean()), "std": float(values.std())}
         facts[name] |= {"fit": estimate, "fit_std": error}
-    print(f"correlation of A and phi: {np.corrcoef(A, phi)[0, 1]:.3f}")
-    print(json.dumps(facts))
-    write_results("sample_posterior", options, None, **facts)
-    picture = draw(result, np.stack([A * 1e6, phi, T_0 * 100], axis=1))
-    write_picture(picture, "sample_posterior", options, dpi=100)
+    facts["correlation_of_A_and_phi"] = float(np.corrcoef(A, phi)[0, 1])
+    return facts | {"picture": draw(result, np.stack([A * 1e6, phi, T_0 * 100], axis=1))}
 
 
 def log_posterior(gas, curve, priors, result):
@@ -136,10 +128,13 @@ def draw(result: jaxgran.Fit, samples: np.ndarray) -> Figure:
         x = np.linspace(left, right, 200)
         normal = np.exp(-0.5 * ((x - estimate) / error) ** 2)
         top = axes[i, i].get_ylim()[1] * 0.95
-        axes[i, i].plot(x, normal * top, color=COLOURS["kinetic theory"], lw=2)
+        axes[i, i].plot(x, normal * top, color=THEORY, lw=2)
     axes[0, 2].text(0.0, 0.8, "grey: NUTS\nblue: fit, with its budget", fontsize=12)
     return figure
 
 
 if __name__ == "__main__":
-    main()
+    samples = {"type": int, "default": 1000, "help": "of a chain (default: 1000)"}
+    chains = {"type": int, "default": 4, "help": "parallel chains (default: 4)"}
+    parts = {"sample_posterior": sample_posterior}
+    run_parts(__doc__, parts, smoke=False, samples=samples, chains=chains)

@@ -1,11 +1,11 @@
 """What is the result of a fit of A if the curve contains physics that the fit is not told of?
 
-    python experiments/fit/wrong_physics.py [--runs 100] [--rows walls] [--record] [--out FILE]
+    python experiments/fit/wrong_physics.py [--runs 100] [--rows walls] [--record] [--out DIR]
 
 Each curve is T(t) of one run of 250 hard spheres (2 mm beads, phi = .03, A = 3e-6 s), until T has
 fallen to 3 %, at 30 times, without errors; the fit knows N. What the gas contains and what the fit
 is told differ between the rows: `told` names it, A and T_0 are free, and beta_t where it says so,
-with T_rot measured. Prints for each row
+with T_rot measured. Finds for each row
 
 - A: fitted over true A, median;
 - scatter: the standard deviation of ln A over the runs, and expected: that by the error bar;
@@ -18,17 +18,17 @@ have no duration, so kinetic theory is used with `softness=False`.
 """
 
 import argparse
-import warnings
+import dataclasses
 from collections import Counter
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.record import add_recording, figures, write_results
+from experiments.support.analysis import fit_quietly
+from experiments.support.record import figures, run_parts
+from experiments.support.scenes import cool, glass
 from jaxgran.models.checks import first_cooling_rate
 
 TRUE_A, NUM_PARTICLES, PHI = 3e-6, 250, 0.03
@@ -41,15 +41,8 @@ THEORY = jaxgran.KineticTheory(softness=False)
 
 
 def beads(**elements: Any) -> jaxgran.Gas:
-    diameter = 2e-3
-    return jaxgran.Gas(
-        jaxgran.Viscoelastic(5e7, 0.22, TRUE_A),
-        diameter=diameter,
-        mass=jaxgran.sphere_mass(diameter, 2500.0),
-        packing_fraction=PHI,
-        temperature=0.01,
-        **elements,
-    )
+    gas = glass(0.1, PHI).replace(dissipative_constant=TRUE_A)
+    return dataclasses.replace(gas, **elements)
 
 
 SIDE = float(beads().box_side(NUM_PARTICLES))
@@ -103,37 +96,26 @@ ROWS = (
 )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--runs", type=int, default=100, help="of each gas (default: 100)")
-    parser.add_argument("--rows", default="", help="only those whose name contains this")
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    add_recording(parser)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    key = lambda row: (row["name"], row["told"])  # noqa: E731
+def wrong_physics(options: argparse.Namespace) -> dict:
     known = figures("wrong_physics")["rows"] if options.rows else []
-    rows = {key(row): row for row in known}
+    rows = {(row["name"], row["told"]): row for row in known}
     for row in ROWS:
         if options.rows in row.name:
             rows[row.name, row.told] = found = statistics(row, options.runs)
             print(found, flush=True)
-    ordered = [rows[row[0], row[2]] for row in ROWS if (row[0], row[2]) in rows]
-    write_results("wrong_physics", options, options.out, rows=ordered)
+    return {"rows": [rows[row.name, row.told] for row in ROWS if (row.name, row.told) in rows]}
 
 
 def measured(row: Row, runs: int) -> tuple[Any, jaxgran.CoolingCurve]:
     """Return times until T has fallen to its last share, and the curves of all runs."""
     gas = beads(**row.gas)
     trial = jnp.geomspace(1e-2, 1e4, 400) * gas.mean_free_time
-    T = jaxgran.cool(gas, trial, model=THEORY).temperature / gas.temperature
+    T = cool(gas, trial, THEORY).temperature / gas.temperature
     end = float(jnp.interp(-np.log(LAST), -jnp.log(T), trial))
     model = jaxgran.HardSpheres(NUM_PARTICLES, replicas=runs)
     save = None if row.seen is None else seen
     times = np.geomspace(end / 300, end, NUM_POINTS)
-    return times, jaxgran.cool(gas, times, model=model, save=save, progress=False)
+    return times, cool(gas, times, model, save=save)
 
 
 def seen(particles: Any) -> Any:
@@ -146,7 +128,6 @@ def seen(particles: Any) -> Any:
 def statistics(row: Row, runs: int) -> dict[str, Any]:
     """Fit each run, and return statistics."""
     times, curve = measured(row, runs)
-    assert curve.replicas is not None
     each = curve.replicas.temperature if row.seen is None else curve.replicas.saved
     rotation = None if not row.free else curve.replicas.rotational_temperature
     gas, found = beads(**row.fitted), []
@@ -156,11 +137,9 @@ def statistics(row: Row, runs: int) -> dict[str, Any]:
             temperature=jnp.asarray(T),
             rotational_temperature=None if rotation is None else rotation[run],
         )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            free = "dissipative_constant", "temperature", *row.free
-            result = jaxgran.fit(gas, one, model=THEORY, free=free, num_particles=NUM_PARTICLES)
-            diagnosis = jaxgran.diagnose(result)
+        free = "dissipative_constant", "temperature", *row.free
+        result = fit_quietly(gas, one, model=THEORY, free=free, num_particles=NUM_PARTICLES)
+        diagnosis = jaxgran.diagnose(result)
         A, error = (float(x) / TRUE_A for x in result.value("dissipative_constant"))
         ends = diagnosis.ranges.get("dissipative_constant", (np.nan, np.nan))
         found.append((A, error, *(float(np.squeeze(x)) / TRUE_A for x in ends), diagnosis.grade))
@@ -182,4 +161,10 @@ def statistics(row: Row, runs: int) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main()
+    run_parts(
+        __doc__,
+        {"wrong_physics": wrong_physics},
+        smoke=False,
+        runs={"type": int, "default": 100, "help": "of each gas (default: 100)"},
+        rows={"default": "", "help": "only those whose name contains this"},
+    )

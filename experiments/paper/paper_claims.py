@@ -22,9 +22,8 @@ from experiments.support.closed_forms import (
     paper_displacement,
     paper_temperature,
 )
-from experiments.support.record import DATA, figures, script_parser, write_results
-from experiments.support.scenes import beads, hard_beads
-from jaxgran.data.files import header_number
+from experiments.support.record import figures, run_parts
+from experiments.support.scenes import beads, hard_beads, of_lammps
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, C2
 from jaxgran.theory.averages import TERMS, collision_rate, impact_moments
@@ -41,9 +40,7 @@ RATE = COOLING_RATE[3]
 AGREE, CORRECTED = "agree", "corrected"
 
 
-def main() -> None:
-    options = script_parser(__doc__, "paper_claims", smoke=False).parse_args()
-    jax.config.update("jax_enable_x64", True)
+def paper_claims(_) -> dict:
     found = {
         name: found.get("found", found)
         for name in ("restitution", "cooling", "velocity_correlation", "diffusion")
@@ -52,10 +49,8 @@ def main() -> None:
     }
     numbers = expansions() | laws() | curves(found) | clusters(found["clustering"])
     rows = claims(found, numbers)
-    path = options.out / "paper_claims.json"
-    write_results("paper_claims", options, path, numbers=numbers, rows=rows)
-    for row in rows:
-        print(f"{row['name']:24} {row['verdict'] if row['holds'] else 'DOES NOT HOLD'}")
+    print([row["name"] for row in rows if not row["holds"]], "do not hold")
+    return {"numbers": numbers, "rows": rows}
 
 
 def check(name: str, verdict: str, value, expected, tolerance, *compared: tuple) -> dict[str, Any]:
@@ -95,8 +90,6 @@ def expansions() -> dict[str, float]:
     (cooling, relaxation), (paper_cooling, _) = averages(SMALL)
     gas, curve = cooled(SMALL, [1.0001, 10.0, 1e4, 1e6])
     u, late = np.array([1e4, 1e6]), slice(2, None)
-    assert curve.sonine is not None and curve.diffusion is not None
-    assert curve.displacement is not None
     d_0 = 1.5 * float(gas.temperature * gas.mean_free_time)
     a_3 = (np.asarray(curve.diffusion)[late] / d_0 - u ** (-5 / 6)) * u / SMALL
     exact = np.asarray(curve.displacement)[late] / float(gas.temperature * gas.mean_free_time**2)
@@ -140,10 +133,8 @@ def laws() -> dict[str, Any]:
     leading = 54 / (RATE * 0.093) * (theta**-0.1 - 1)
     leading *= float(gas.temperature * gas.mean_free_time**2)
     collisions = np.asarray(late.collisions)
-    measured, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
-    gas = jaxgran.read_gas(header).replace(dissipative_constant=header_number(header, "A"))
+    gas, measured, _ = of_lammps("dilute")
     theory = jaxgran.cool(gas, measured.times)
-    assert measured.displacement is not None and theory.displacement is not None
     far = theory.displacement[1:] / measured.displacement[1:] - 1
     return {
         "first_temperature": float(paper_temperature(0.0, 0.093, corrected=False)),
@@ -309,4 +300,4 @@ def claims(found: dict, n: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    main()
+    run_parts(__doc__, {"paper_claims": paper_claims}, smoke=False)

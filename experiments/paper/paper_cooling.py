@@ -17,6 +17,7 @@ as measured by Bridges, Hatzes & Lin (Nature 309, 333, 1984), eps = min(1, 0.34 
 cm/s, is not such a power law: the exponent of its T(t) changes with time.
 """
 
+import argparse
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -27,12 +28,30 @@ from jaxtyping import Array, Float
 from matplotlib.ticker import NullFormatter
 
 import jaxgran
-from experiments.support import paper
+from experiments.support.analysis import (
+    Compared,
+    at_powers,
+    compared,
+    draw_forms,
+    from_here,
+    interpolate,
+    slope,
+)
 from experiments.support.closed_forms import haff, paper_temperature
-from experiments.support.scenes import beads, hard_beads
+from experiments.support.plots import (
+    CONSTANT,
+    ELASTIC,
+    GUIDE,
+    INK,
+    VISCOELASTIC,
+    caption,
+    panels,
+)
+from experiments.support.record import run_parts
+from experiments.support.scenes import beads, hard_beads, restitution_like
 from jaxgran._utils.validation import POSITIVE, Domain, float_array
 from jaxgran.scene.contact import impact
-from jaxgran.scene.laws import C1, C2, C_CLIP, UNCLIPPED_SERIES, viscoelastic_restitution
+from jaxgran.scene.laws import C1, C2, UNCLIPPED_SERIES, viscoelastic_restitution
 from jaxgran.theory.equations import COOLING_RATE
 
 RAMIREZ = (0.48358, 0.28528)
@@ -44,10 +63,10 @@ SHADES = ("#084594", "#2171b5", "#6baed6", "#bdc9e1")
 """Colours from the smallest gamma to the largest, from dark to light."""
 
 
-def restitution(smoke: bool) -> tuple:
+def restitution(options: argparse.Namespace) -> dict:
     config = {"rtol": 1e-13, "num_impacts": 60, "lowest": 1e-3, "highest": 2.0, "fit_top": 0.3}
     config["fit_degree"] = 16
-    config |= {"num_impacts": 16, "fit_degree": 12} if smoke else {}
+    config |= {"num_impacts": 16, "fit_degree": 12} if options.smoke else {}
     betas = np.geomspace(config["lowest"], config["highest"], config["num_impacts"])
     clipped, unclipped = (restitutions(betas, end, config["rtol"]) for end in (True, False))
     coefficients = recovered(config)
@@ -61,47 +80,42 @@ def restitution(smoke: bool) -> tuple:
     }
     errors = {name: np.abs(error) for name, error in errors.items()}
     title = "The paper's two terms of ε hold to 1 % up to β = 0.25, for both ends of contact"
-    figure = paper.figure(title, columns=2)
+    figure = panels(2, title=title)
     left, right = figure.axes
     for eps, style, color, label in (
-        (clipped, "-", paper.INK, "equation of motion, ends at F = 0"),
-        (unclipped, "--", paper.ELASTIC, "equation of motion, ends at ξ = 0 (paper)"),
-        (two, "-", paper.VISCOELASTIC, "paper, Eq. (1): two terms"),
-        (five, ":", paper.INK, "five terms"),
+        (clipped, "-", INK, "equation of motion, ends at F = 0"),
+        (unclipped, "--", ELASTIC, "equation of motion, ends at ξ = 0 (paper)"),
+        (two, "-", VISCOELASTIC, "paper, Eq. (1): two terms"),
+        (five, ":", INK, "five terms"),
     ):
         left.plot(betas, eps, style, color=color, label=label)
     labels = {"xlabel": "dissipation  β = (3/2) A α$^{2/5}$ v$^{1/5}$", "xscale": "log"}
-    paper.caption(left, "One impact", ylabel="restitution  ε", ylim=(-0.02, 1.02), **labels)
+    caption(left, "One impact", ylabel="restitution  ε", ylim=(-0.02, 1.02), **labels)
     looks = (
-        ("two terms, from ε that ends at ξ = 0", paper.VISCOELASTIC, "-"),
-        ("two terms, from ε that ends at F = 0", paper.VISCOELASTIC, ":"),
-        ("four terms of Ramírez et al. 1999", paper.ELASTIC, "-"),
-        ("four terms, corrected", paper.GUIDE, "-."),
-        ("the package's fast law, from F = 0", paper.INK, "-"),
+        ("two terms, from ε that ends at ξ = 0", VISCOELASTIC, "-"),
+        ("two terms, from ε that ends at F = 0", VISCOELASTIC, ":"),
+        ("four terms of Ramírez et al. 1999", ELASTIC, "-"),
+        ("four terms, corrected", GUIDE, "-."),
+        ("the package's fast law, from F = 0", INK, "-"),
     )
     for error, (label, color, style) in zip(errors.values(), looks, strict=True):
         seen = error > 1e-13
         right.plot(betas[seen], error[seen], style, color=color, label=label)
     labels |= {"ylabel": "error of ε", "yscale": "log", "ylim": (1e-13, 30)}
-    paper.caption(right, "Difference from the equation of motion", **labels)
+    caption(right, "Difference from the equation of motion", **labels)
     relative = {"F = 0": np.abs(two / clipped - 1), "xi = 0": np.abs(two / unclipped - 1)}
     found = {
         "recovered": coefficients,
-        "closed_forms": [C1, C2, C_CLIP],
         "orders": {
-            name: float(np.mean(paper.slope(betas[:10], errors[name][:10])[1]))
+            name: float(np.mean(slope(betas[:10], errors[name][:10])[1]))
             for name in ("two_terms_unclipped", "two_terms_clipped", "ramirez_four_terms")
         },
         "two_terms_good_to_one_per_cent": {
-            name: float(np.exp(paper.interpolate(0.01, miss, np.log(betas))))
+            name: float(np.exp(interpolate(0.01, miss, np.log(betas))))
             for name, miss in relative.items()
         },
-        "fast_law_error": float(errors["fast_law"].max()),
-        "beta": paper.listed(betas),
-        "restitution_clipped": paper.listed(clipped),
-        "restitution_unclipped": paper.listed(unclipped),
     }
-    return figure, config, found
+    return {"config": config, "found": found, "picture": figure}
 
 
 def restitutions(betas: np.ndarray, clipped: bool, rtol: float) -> np.ndarray:
@@ -123,54 +137,48 @@ def recovered(config: dict) -> dict[str, list[float]]:
         x = nodes * (top**0.5 if clipped else top)
         lost = restitutions(x**2 if clipped else x, clipped, config["rtol"]) - 1
         fitted = np.linalg.lstsq((x / x.max())[:, None] ** powers, lost, rcond=None)[0]
-        found["clipped" if clipped else "unclipped"] = paper.listed(
-            (fitted / x.max() ** powers)[:6]
-        )
+        found["clipped" if clipped else "unclipped"] = (fitted / x.max() ** powers)[:6]
     return found
 
 
-def cooling(smoke: bool) -> tuple:
+def cooling(options: argparse.Namespace) -> dict:
     config = {"num_particles": 20_000, "replicas": 8, "last": 1e6, "points": 22}
-    config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9} if smoke else {}
+    if options.smoke:
+        config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9}
     config |= {"packing_fraction": PACKING, "beta": 0.15, "seed": 0, "last_theory": 1e10}
     viscoelastic = beads(PACKING, config["beta"])
-    e, delta = paper.alike(viscoelastic), float(viscoelastic.delta)
+    e, delta = restitution_like(viscoelastic), float(viscoelastic.delta)
     gases = {
         "viscoelastic": (
             viscoelastic,
-            paper.VISCOELASTIC,
+            VISCOELASTIC,
             -5 / 3,
             f"viscoelastic, δ = {delta:.3f}",
         ),
-        "constant": (hard_beads(PACKING, e), paper.CONSTANT, -2.0, f"constant ε = {e:.3f}"),
+        "constant": (hard_beads(PACKING, e), CONSTANT, -2.0, f"constant ε = {e:.3f}"),
     }
     tau = np.geomspace(0.1, config["last_theory"], 133)
     title = (
         "Viscoelastic spheres cool as t$^{-5/3}$, spheres of constant ε as t$^{-2}$:"
         " both of the paper's laws hold at late times"
     )
-    figure = paper.figure(title, columns=3)
+    figure = panels(3, title=title)
     left, middle, right = figure.axes
     found: dict[str, Any] = {"restitution": e}
     for name, (gas, color, power, label) in gases.items():
         theory = jaxgran.KineticTheory(softness=False, correlations=False)
-        _, dsmc, T = compared(gas, tau, config, theory)
+        T = compared(gas, "temperature", float(gas.temperature), tau, config, theory)[2]
         T.draw(left, middle, color, f"{label}: theory", f"{name}: theory")
         middle.axhline(power, color=color, ls=":", lw=1)
         found[name] = {
             "largest_difference_of_theory": float(np.abs(1 / (1 + T.miss) - 1).max()),
-            "largest_standard_error": float((T.error / T.mean).max()),
             "exponent": {f"{t:.3g}": x for t, x in zip(T.middle, T.exponent, strict=True)},
-            "exponent_error": paper.listed(T.exponent_error),
-            "exponent_of_theory": paper.at_powers(0, 10, T.where, T.local),
-            "collisions": float(np.asarray(dsmc.collisions)[-1]),
-            "tau": paper.listed(T.at),
-            "temperature": paper.listed(T.mean),
-            "temperature_error": paper.listed(T.error),
+            "exponent_error": T.exponent_error,
+            "exponent_of_theory": at_powers(0, 10, T.where, T.local),
         }
         if name == "viscoelastic":
             late = np.abs(T.local - power) < 0.01 * abs(power)
-            found["exponent_within_1_per_cent_from"] = paper.from_here(late, T.where)
+            found["exponent_within_1_per_cent_from"] = from_here(late, T.where)
             u, t = 1 + COOLING_RATE[3] * delta * tau, jnp.asarray(tau)
             printed = paper_temperature(t, delta, corrected=False)
             forms = {
@@ -178,31 +186,19 @@ def cooling(smoke: bool) -> tuple:
                 "Eq. (38) as printed, to order δ": (printed, "--"),
                 "Eq. (38) corrected, to order δ$^2$": (paper_temperature(t, delta), "-"),
             }
-            found["closed_forms"] = paper.draw_forms(right, T, forms, (-1, 11))
+            found["closed_forms"] = draw_forms(right, T, forms, (-1, 11))
         else:
             expected = np.asarray(haff(tau, e)) / T.theory - 1
             right.plot(tau, expected, color=color, label="Haff, Eq. (44)")
-            found["haff"] = paper.listed(expected[::12])
+            found["haff"] = expected[::12]
     logs = {"xlabel": TIME, "xscale": "log"}
     title = "Temperature: — theory, ● DSMC"
-    paper.caption(left, title, ylabel="T / T$_0$", yscale="log", ylim=(1e-16, 3), **logs)
+    caption(left, title, ylabel="T / T$_0$", yscale="log", ylim=(1e-16, 3), **logs)
     title = "Local exponent; dotted: the paper's −5/3 and −2"
-    paper.caption(middle, title, ylabel=RATE, ylim=(-2.1, 0.05), **logs)
+    caption(middle, title, ylabel=RATE, ylim=(-2.1, 0.05), **logs)
     title = "Closed forms: difference from kinetic theory"
-    paper.caption(right, title, ylabel="T$_{formula}$ / T − 1", ylim=(-0.42, 0.62), **logs)
-    return figure, config, found
-
-
-def compared(gas: jaxgran.Gas, tau: np.ndarray, config: dict, theory: jaxgran.AbstractModel):
-    """Return the curves of theory and DSMC, and T/T_0 of both."""
-    of = jaxgran.cool(gas, tau * gas.mean_free_time, model=theory)
-    at = np.geomspace(0.1, config["last"], config["points"])
-    model = jaxgran.DSMC(config["num_particles"], config["replicas"])
-    key = jax.random.key(config["seed"])
-    dsmc = jaxgran.cool(gas, at * gas.mean_free_time, model=model, key=key)
-    T_0 = float(gas.temperature)
-    each = paper.replicas_of(dsmc, "temperature") / T_0
-    return of, dsmc, paper.Compared(tau, np.asarray(of.temperature) / T_0, at, each)
+    caption(right, title, ylabel="T$_{formula}$ / T − 1", ylim=(-0.42, 0.62), **logs)
+    return {"config": config, "found": found, "picture": figure}
 
 
 class Ice(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
@@ -241,15 +237,15 @@ def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return at, np.interp(-np.log(at), -np.log(theta), gamma)
 
 
-def exponents(smoke: bool) -> tuple:
+def exponents(options: argparse.Namespace) -> dict:
     config = {"gammas": (0.0, 0.2, 0.5, 1.0), "num_particles": 5000, "last": 1e5, "points": 19}
     config |= {"loss": 0.15, "ice_speed": 0.01, "packing_fraction": PACKING, "replicas": 8}
-    if smoke:
+    if options.smoke:
         config |= {"gammas": (0.0, 1.0), "num_particles": 1000, "replicas": 2}
         config |= {"last": 100.0, "points": 7}
     config |= {"seed": 3, "last_theory": 1e8}
     title = "1 − ε ~ v$^γ$ cools as t$^{−2/(1+γ)}$; ice has no fixed exponent and becomes elastic"
-    figure = paper.figure(title, columns=3)
+    figure = panels(3, title=title)
     left, middle, right = figure.axes
     tau = np.geomspace(0.1, config["last_theory"], 181)
     scene, gases = beads(PACKING, 0.1), {}
@@ -265,13 +261,12 @@ def exponents(smoke: bool) -> tuple:
         temperature=config["ice_speed"] ** 2 / 2,
     )
     found: dict[str, Any] = {}
-    for name, (gas, color, gamma) in {**gases, "ice": (frozen, paper.INK, None)}.items():
-        of, _, T = compared(gas, tau, config, jaxgran.KineticTheory())
+    for name, (gas, color, gamma) in {**gases, "ice": (frozen, INK, None)}.items():
+        unit, theory = float(gas.temperature), jaxgran.KineticTheory()
+        of, _, T = compared(gas, "temperature", unit, tau, config, theory)
         if gamma is None:
             theta, steepness = maxwellian(gas, tau)
-            off = np.abs(T.theory / theta - 1) >= 0.03
-            found["ice_by_kinetic_theory_fails_from"] = float(tau[off][0]) if off.any() else None
-            T = paper.Compared(tau, theta, T.at, T.each)
+            T = Compared(tau, theta, T.at, T.each)
             draw_ice(right, T, steepness, 100 * config["ice_speed"])
         label = name if gamma is None else f"{name}: −2/(1 + γ) = {-2 / (1 + gamma):.3g}"
         T.draw(left, None if gamma is None else middle, color, name, label)
@@ -280,46 +275,37 @@ def exponents(smoke: bool) -> tuple:
         ends = np.log(np.interp(T.at[-2:], tau, T.theory))
         found[name] = {
             "paper_exponent": None if gamma is None else -2 / (1 + gamma),
-            "paper_displacement_exponent": None if gamma is None else gamma / (1 + gamma),
             "exponent": float(T.exponent[-1]),
             "exponent_error": float(T.exponent_error[-1]),
             "exponent_of_theory": float(np.diff(ends)[0] / np.diff(np.log(T.at[-2:]))[0]),
             "last_exponent_of_theory": float(T.local[-1]),
-            "last_displacement_exponent": float(
-                paper.slope(tau, np.asarray(of.displacement))[1][-1]
-            ),
-            "dsmc_from_theory": paper.listed(T.miss),
-            "standard_error": paper.listed(T.error / T.mean),
-            "tau": paper.listed(T.at),
-            "temperature": paper.listed(T.mean),
-            "last_temperature": float(T.theory[-1]),
+            "last_displacement_exponent": float(slope(tau, np.asarray(of.displacement))[1][-1]),
         }
     elastic = 100 * float(Ice().threshold)
-    found["ice"]["threshold_cm_per_s"] = elastic
     logs = {"xlabel": TIME, "xscale": "log"}
     title = "Temperature: — theory, ● DSMC"
-    paper.caption(left, title, ylabel="T / T$_0$", yscale="log", **logs)
-    paper.caption(middle, "Local exponents; dotted: −2/(1 + γ)", ylabel=RATE, **logs)
+    caption(left, title, ylabel="T / T$_0$", yscale="log", **logs)
+    caption(middle, "Local exponents; dotted: −2/(1 + γ)", ylabel=RATE, **logs)
     title = f"Ice: elastic below {elastic:.3f} cm/s; time runs to the left"
     labels = {"xlabel": "thermal speed (2T)$^{1/2}$, cm/s", "ylabel": RATE}
-    paper.caption(right, title, xscale="log", ylim=(-2.1, 0.05), **labels)
+    caption(right, title, xscale="log", ylim=(-2.1, 0.05), **labels)
     right.xaxis.set_minor_formatter(NullFormatter())
-    return figure, config, found
+    return {"config": config, "found": found, "picture": figure}
 
 
-def draw_ice(axes, T: paper.Compared, steepness: np.ndarray, speed: float) -> None:
+def draw_ice(axes, T: Compared, steepness: np.ndarray, speed: float) -> None:
     """Draw the local exponents of ice over its thermal speed, past the initial transient."""
     aged, old = T.middle > 100, T.tau[1:] > 100
     at = speed * np.sqrt(T.theory[1:][old])
-    axes.plot(at, T.local[old], color=paper.INK, label="theory, Maxwellian")
+    axes.plot(at, T.local[old], color=INK, label="theory, Maxwellian")
     seen = speed * np.sqrt(np.sqrt(T.mean[1:] * T.mean[:-1]))[aged]
-    dots = {"fmt": "o", "ms": 3.5, "color": paper.INK, "label": "DSMC"}
+    dots = {"fmt": "o", "ms": 3.5, "color": INK, "label": "DSMC"}
     axes.errorbar(seen, T.exponent[aged], T.exponent_error[aged], **dots)
     label = "−2/(1 + γ), γ = d ln⟨1 − ε²⟩ / d ln T$^{1/2}$"
-    axes.plot(at, -2 / (1 + steepness[1:][old]), ":", color=paper.GUIDE, label=label)
+    axes.plot(at, -2 / (1 + steepness[1:][old]), ":", color=GUIDE, label=label)
 
 
 PARTS = {"paper_restitution": restitution, "paper_cooling": cooling, "paper_exponents": exponents}
 
 if __name__ == "__main__":
-    paper.run_parts(__doc__, PARTS)
+    run_parts(__doc__, PARTS)

@@ -19,9 +19,9 @@ exponent; and the range of times in which the paper expects its laws to hold, Eq
 with the range in which they do.
 """
 
+import argparse
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -30,13 +30,24 @@ import numpy as np
 from scipy.integrate import simpson
 
 import jaxgran
-from experiments.support import paper
+from experiments.support.analysis import (
+    at_powers,
+    compared,
+    draw_forms,
+    from_here,
+    interpolate,
+    mean_and_error,
+    replicas_of,
+    slope,
+)
 from experiments.support.closed_forms import (
     RELAXATION_CORRECTION,
     paper_averages,
     paper_displacement,
 )
-from experiments.support.scenes import beads, hard_beads
+from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, VISCOELASTIC, caption, panels
+from experiments.support.record import run_parts
+from experiments.support.scenes import beads, cool, hard_beads, restitution_like
 from jaxgran.theory.averages import Rates, collision_rate, impact_moments
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
@@ -68,11 +79,11 @@ FEW |= {"boxes": 0}
 def gases_of(beta: float) -> tuple[dict, float]:
     """Return gases with their colour and label, and the constant restitution."""
     viscoelastic = beads(PACKING, beta)
-    e = paper.alike(viscoelastic)
+    e = restitution_like(viscoelastic)
     return {
-        "elastic": (hard_beads(PACKING, 1.0), paper.ELASTIC, "elastic"),
-        "constant": (hard_beads(PACKING, e), paper.CONSTANT, f"constant ε = {e:.3f}"),
-        "viscoelastic": (viscoelastic, paper.VISCOELASTIC, f"viscoelastic, β = {beta}"),
+        "elastic": (hard_beads(PACKING, 1.0), ELASTIC, "elastic"),
+        "constant": (hard_beads(PACKING, e), CONSTANT, f"constant ε = {e:.3f}"),
+        "viscoelastic": (viscoelastic, VISCOELASTIC, f"viscoelastic, β = {beta}"),
     }, e
 
 
@@ -98,7 +109,7 @@ def decay_of_theory(gas: jaxgran.Gas, lags: np.ndarray) -> tuple[np.ndarray, np.
     The lags, in tau_E, must be dense enough for the trapezoidal rule.
     """
     times = lags * enskog_time(gas)
-    curve = jaxgran.cool(gas, times, model=THEORY)
+    curve = cool(gas, times, THEORY)
     theta = curve.temperature / gas.temperature
     nu = relaxation(gas.reduced_law, theta, curve.sonine, gas.dimension)[0]
     nu = np.asarray(nu * gas.impact_speed / gas.path_length)
@@ -110,25 +121,24 @@ def stochastic(gas: jaxgran.Gas, config: dict) -> dict:
     """Compute the autocorrelation by DSMC from a Maxwellian start, its tau_v and its integral."""
     lags = np.linspace(0, config["longest"], config["lags"])
     model = jaxgran.DSMC(config["num_particles"], config["replicas"])
-    key = jax.random.key(config["seed"])
-    return summary(jaxgran.cool(gas, lags * enskog_time(gas), model=model, key=key), lags)
+    return summary(cool(gas, lags * enskog_time(gas), model, config["seed"]), lags)
 
 
 def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray) -> dict:
     """Return means and standard errors over the replicas, as lists and numbers for JSON."""
-    each = paper.replicas_of(curve, "velocity_correlation")
+    each = replicas_of(curve, "velocity_correlation")
     each = each / each[:, :1]
-    collisions = paper.replicas_of(curve, "collisions").mean(axis=0)
+    collisions = replicas_of(curve, "collisions").mean(axis=0)
     early = (collisions > 0) & (collisions < 2.5)
     # Early -ln C = r N + s N^2: the relaxation time is 1/r collisions, and tau_E is 3/2 collisions.
     basis = np.stack([collisions[early], collisions[early] ** 2], axis=1)
     fits = np.linalg.lstsq(basis, -np.log(each[:, early]).T, rcond=None)[0][0]
-    correlation, error = paper.mean_and_error(each)
+    correlation, error = mean_and_error(each)
     row = {"lags": lags, "collisions": collisions, "correlation": correlation, "error": error}
-    found: dict[str, Any] = {name: paper.listed(values) for name, values in row.items()}
+    found: dict[str, Any] = {name: values for name, values in row.items()}
     integrals = np.asarray(simpson(each, x=lags, axis=1))
     for name, values in (("relaxation", 2 / 3 / fits), ("integral", integrals)):
-        found[name], found[f"{name}_error"] = map(float, paper.mean_and_error(values))
+        found[name], found[f"{name}_error"] = map(float, mean_and_error(values))
     return found
 
 
@@ -139,12 +149,12 @@ def in_boxes(gas: jaxgran.Gas, config: dict, ages: bool) -> dict[str, dict]:
         if not config["boxes"]:
             continue
         model = SPHERES[kind](config["num_spheres"], replicas=config["boxes"])
-        age, key = config["age"] * float(gas.mean_free_time), jax.random.key(config["seed"])
-        grown = jaxgran.cool(gas, [age / 2, age] if ages else [age / 100], model=model, key=key)
+        age = config["age"] * float(gas.mean_free_time)
+        grown = cool(gas, [age / 2, age] if ages else [age / 100], model, config["seed"])
         aged = gas.replace(temperature=float(grown.temperature[-1]))
         lags = np.linspace(0, config["longest"], config["sphere_lags"])
         later = replace(model, start=grown.particles)
-        curve = jaxgran.cool(aged, lags * enskog_time(aged), model=later)
+        curve = cool(aged, lags * enskog_time(aged), later)
         # From 4 tau_E on the velocities at t' no longer matter, whatever the age.
         i = int(np.searchsorted(lags, 4.0))
         (slope,), (error,) = diffusion_of(curve, aged, slice(i, None, len(lags) - 1 - i))
@@ -158,10 +168,10 @@ def diffusion_of(
     curve: jaxgran.CoolingCurve, gas: jaxgran.Gas, which: slice
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return d<dr^2>/(6 T tau_E dt) between times, where T tau_E dt ~ sqrt(T) dt ~ dN."""
-    spread = paper.replicas_of(curve, "displacement")[:, which]
-    collisions = paper.replicas_of(curve, "collisions")[:, which]
+    spread = replicas_of(curve, "displacement")[:, which]
+    collisions = replicas_of(curve, "collisions")[:, which]
     unit = 9 * float(gas.temperature * gas.mean_free_time**2)
-    return paper.mean_and_error(np.diff(spread) / np.diff(collisions) / unit)
+    return mean_and_error(np.diff(spread) / np.diff(collisions) / unit)
 
 
 def exact_relaxation(gas: jaxgran.Gas) -> float:
@@ -178,14 +188,14 @@ def printed_relaxation(gas: jaxgran.Gas) -> float:
     return float(2 / 3 * collision_rate(0.0, gas.dimension) / nu)
 
 
-def velocity_correlation(smoke: bool) -> tuple:
-    config = CORRELATION | (FEW if smoke else {})
+def velocity_correlation(options: argparse.Namespace) -> dict:
+    config = CORRELATION | (FEW if options.smoke else {})
     gases, e = gases_of(config["beta"])
     title = (
         "Dissipation lengthens the paths: velocities decay nearly exponentially in collisions,"
         " more slowly in time"
     )
-    figure = paper.figure(title, columns=3)
+    figure = panels(3, title=title)
     decay, counted, times = figure.axes
     found: dict[str, Any] = {"restitution": e}
     lags = np.linspace(0, config["longest"], 601)
@@ -200,7 +210,7 @@ def velocity_correlation(smoke: bool) -> tuple:
         counted.plot(collisions, expected, color=color, label=f"{label}: theory")
         for kind in [kind for kind in MARKERS if kind in row]:
             marker, every = MARKERS[kind]
-            of = {k: np.array(v)[::every] for k, v in row[kind].items() if isinstance(v, list)}
+            of = {k: v[::every] for k, v in row[kind].items() if np.ndim(v)}
             seen = of["correlation"] > 4 * of["error"]
             style = {"fmt": marker, "ms": 3.5, "color": color}
             style |= {"mfc": "none"} if kind in SPHERES else {}
@@ -210,11 +220,11 @@ def velocity_correlation(smoke: bool) -> tuple:
     shared = {"yscale": "log", "ylim": (2e-3, 1.2), "ylabel": "⟨v(t′)·v(t)⟩ / ⟨v(t′)²⟩"}
     kinds = "● DSMC, □ hard, △ soft spheres, — theory"
     title = f"Over time: slower than exp(−(t−t′)/τ$_v$(t′)), dashed\n{kinds}"
-    paper.caption(decay, title, xlabel="(t − t′) / τ$_E$(t′)", xlim=(0, 9), **shared)
+    caption(decay, title, xlabel="(t − t′) / τ$_E$(t′)", xlim=(0, 9), **shared)
     title = f"Over collisions: nearly exponential\n{kinds}"
-    paper.caption(counted, title, xlabel="collisions per particle since t′", xlim=(0, 9), **shared)
+    caption(counted, title, xlabel="collisions per particle since t′", xlim=(0, 9), **shared)
     found["relaxation"] = relaxation_times(times, config)
-    return figure, config, found
+    return {"config": config, "found": found, "picture": figure}
 
 
 def lost_at_thermal_speed(gas: jaxgran.Gas) -> float:
@@ -225,8 +235,8 @@ def relaxation_times(axes, config: dict) -> dict:
     """Draw tau_v/tau_E for several strengths of dissipation over 1 - eps at the thermal speed."""
     short, found = config | {"longest": 2.0, "lags": 11}, {}
     laws = {
-        "constant": ([hard_beads(PACKING, e) for e in config["restitutions"]], paper.CONSTANT),
-        "viscoelastic": ([beads(PACKING, b) for b in config["betas"]], paper.VISCOELASTIC),
+        "constant": ([hard_beads(PACKING, e) for e in config["restitutions"]], CONSTANT),
+        "viscoelastic": ([beads(PACKING, b) for b in config["betas"]], VISCOELASTIC),
     }
     for name, (gases, color) in laws.items():
         rows = [stochastic(gas, short) for gas in gases]
@@ -240,27 +250,27 @@ def relaxation_times(axes, config: dict) -> dict:
         columns = (found[name][key] for key in ("lost", "measured", "error"))
         axes.errorbar(*columns, fmt="o", ms=4, color=color, label=f"{name}: DSMC")
     x = np.linspace(0, 0.85, 60)
-    axes.plot(x, 2 / (2 - x), color=paper.CONSTANT, label="Eq. (31): 2 / (1 + ε)")
+    axes.plot(x, 2 / (2 - x), color=CONSTANT, label="Eq. (31): 2 / (1 + ε)")
     line = [beads(PACKING, b) for b in np.linspace(1e-3, 1.15, 40)]
     x = [lost_at_thermal_speed(gas) for gas in line]
-    color = paper.VISCOELASTIC
+    color = VISCOELASTIC
     axes.plot(x, [*map(exact_relaxation, line)], color=color, label="exact average of ε(v)")
     axes.plot(
         x, [*map(printed_relaxation, line)], "--", color=color, lw=1, label="Eq. (32), two terms"
     )
     labels = {"xlabel": "1 − ε at the thermal speed", "ylabel": "initial τ$_v$ / τ$_E$"}
-    paper.caption(axes, "The relaxation time, from the initial slope", **labels)
+    caption(axes, "The relaxation time, from the initial slope", **labels)
     return found
 
 
-def diffusion_coefficient(smoke: bool) -> tuple:
+def diffusion_coefficient(options: argparse.Namespace) -> dict:
     # The temperatures of the viscoelastic gas at t', over T_0; the last time in mean free times.
     config: dict[str, Any] = {"waits": (1.0, 0.1, 0.01, 0.001), "last": 3000.0, "points": 14}
-    config |= {"waits": (1.0,), "last": 30.0, "points": 6} if smoke else {}
-    config["correlation"] = CORRELATION | (FEW if smoke else {"seed": 1})
+    config |= {"waits": (1.0,), "last": 30.0, "points": 6} if options.smoke else {}
+    config["correlation"] = CORRELATION | (FEW if options.smoke else {"seed": 1})
     gases, e = gases_of(CORRELATION["beta"])
     title = "Three methods give the same D, and it is not T τ$_v$: the gas cools during τ$_v$"
-    figure = paper.figure(title, columns=3)
+    figure = panels(3, title=title)
     fall, ratio, kinds = figure.axes
     found: dict[str, Any] = {"restitution": e}
     for name, (gas, color, _) in gases.items():
@@ -269,19 +279,19 @@ def diffusion_coefficient(smoke: bool) -> tuple:
     tau = np.geomspace(0.3, config["last"], 200)
     u = 1 + COOLING_RATE[3] * delta * tau
     printed = u ** (-5 / 6) + (COOLING_CORRECTION + RELAXATION_CORRECTION) * delta / u
-    fall.plot(tau, printed, "--", lw=1, color=paper.VISCOELASTIC, label="Eq. (40), to order δ")
+    fall.plot(tau, printed, "--", lw=1, color=VISCOELASTIC, label="Eq. (40), to order δ")
     title = f"viscoelastic (β = {CORRELATION['beta']}) and constant ε = {e:.3f}"
     labels = {"xlabel": "time t / τ$_c$(0)", "ylabel": "D / D$_0$,  D$_0$ = T$_0$ τ$_E$(0)"}
-    paper.caption(fall, title, xscale="log", yscale="log", **labels)
-    ratio.plot([], [], color=paper.GUIDE, label="theory with memory")
-    ratio.plot([], [], "--", lw=1, color=paper.GUIDE, label="Eq. (34): D = T τ$_v$")
+    caption(fall, title, xscale="log", yscale="log", **labels)
+    ratio.plot([], [], color=GUIDE, label="theory with memory")
+    ratio.plot([], [], "--", lw=1, color=GUIDE, label="Eq. (34): D = T τ$_v$")
     for style, label in (("o", "DSMC, slope of ⟨Δr²⟩"), ("D", "DSMC, ∫⟨v(t′)·v(t)⟩dt")):
-        ratio.plot([], [], style, mfc="none", color=paper.GUIDE, label=label)
+        ratio.plot([], [], style, mfc="none", color=GUIDE, label=label)
     title = "D over T τ$_E$; the gas cools to the right"
     labels = {"xlabel": "T(t′) / T$_0$", "ylabel": "D / (T τ$_E$)"}
-    paper.caption(ratio, title, xscale="log", xlim=(2, 1e-5), ylim=(0.96, 1.62), **labels)
+    caption(ratio, title, xscale="log", xlim=(2, 1e-5), ylim=(0.96, 1.62), **labels)
     by_models(kinds, gases, found)
-    return figure, config, found
+    return {"config": config, "found": found, "picture": figure}
 
 
 def routes(name: str, gas: jaxgran.Gas, color: str, config: dict, fall, ratio) -> dict:
@@ -290,18 +300,17 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: dict, fall, ratio) -
     # D of elastic spheres is constant after a few collisions, and their collision rate is constant.
     last = config["last"] if name != "elastic" else min(config["last"], 30.0)
     tau, fine = np.geomspace(0.5, last, config["points"]), np.geomspace(0.02, last, 400)
-    of = jaxgran.cool(gas, fine * tau_c, model=THEORY)
+    of = cool(gas, fine * tau_c, THEORY)
     size = config["correlation"]
     model = jaxgran.DSMC(size["num_particles"], size["replicas"])
-    key = jax.random.key(size["seed"] + 1)
-    curve = jaxgran.cool(gas, tau * tau_c, model=model, key=key)
+    curve = cool(gas, tau * tau_c, model, size["seed"] + 1)
     slopes, errors = diffusion_of(curve, gas, slice(None))
     cooled = np.asarray(curve.temperature) / start
     middle = np.sqrt(cooled[1:] * cooled[:-1])
 
     def expected(quantity: str) -> np.ndarray:
         values = np.log(np.asarray(getattr(of, quantity)))
-        return np.diff(np.exp(paper.interpolate(tau, fine, values)))
+        return np.diff(np.exp(interpolate(tau, fine, values)))
 
     def printed(shares) -> list[float]:
         return [printed_relaxation(gas.replace(temperature=start * x)) for x in shares]
@@ -310,10 +319,10 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: dict, fall, ratio) -
     runs = [stochastic(gas.replace(temperature=start * wait), size) for wait in waits]
     unit = 9 * start * tau_c**2  # of <dr^2> per collision at D = T tau_E
     row = {
-        "temperature": paper.listed(middle),
-        "by_slope": paper.listed(slopes),
-        "by_slope_error": paper.listed(errors),
-        "by_slope_theory": paper.listed(expected("displacement") / expected("collisions") / unit),
+        "temperature": middle,
+        "by_slope": slopes,
+        "by_slope_error": errors,
+        "by_slope_theory": expected("displacement") / expected("collisions") / unit,
         "waits": list(waits),
         "by_integral": [run["integral"] for run in runs],
         "by_integral_error": [run["integral_error"] for run in runs],
@@ -358,13 +367,13 @@ def by_models(axes, gases: dict, found: dict) -> None:
     axes.set_yticks(range(len(labels)), labels)
     axes.invert_yaxis()
     title = "All models, T(t′) ≥ 0.4 T$_0$"
-    paper.caption(axes, title, xlabel="D / (T τ$_E$)", xlim=(0.95, 1.62))
+    caption(axes, title, xlabel="D / (T τ$_E$)", xlim=(0.95, 1.62))
 
 
-def diffusion(smoke: bool) -> tuple:
+def diffusion(options: argparse.Namespace) -> dict:
     config: dict[str, Any] = {"num_particles": 20_000, "last": 1e6, "points": 22, "replicas": 8}
     config |= {"last_theory": 1e14, "deltas": (0.1, 0.03, 0.01)}  # deltas of the ranges of times
-    if smoke:
+    if options.smoke:
         config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9}
         config |= {"last_theory": 1e10, "deltas": (0.1,)}
     config |= {"packing_fraction": PACKING, "beta": 0.15, "seed": 2}
@@ -374,103 +383,82 @@ def diffusion(smoke: bool) -> tuple:
         "Viscoelastic grains spread further: ⟨Δr²⟩ ~ t$^{1/6}$ instead of log t, but the exponent"
         " 1/6 is reached very late"
     )
-    figure = paper.figure(title, columns=2, rows=2)
+    figure = panels(2, 2, title)
     in_time, exponent, in_collisions, forms = figure.axes
     tau = np.geomspace(0.1, config["last_theory"], 400)
-    at = np.geomspace(0.1, config["last"], config["points"])
-    model = jaxgran.DSMC(config["num_particles"], config["replicas"])
     found: dict[str, Any] = {"restitution": e, "delta": delta}
     for name in ("viscoelastic", "constant"):
         gas, color, label = gases[name]
-        theory = reduced(gas, jaxgran.cool(gas, tau * gas.mean_free_time, model=THEORY))
-        key = jax.random.key(config["seed"])
-        curve = jaxgran.cool(gas, at * gas.mean_free_time, model=model, key=key)
-        dsmc = reduced(gas, curve)
-        each = paper.replicas_of(curve, "displacement") / dsmc.unit
-        spread = paper.Compared(tau, theory.spread, at, each)
+        unit = float(gas.temperature * gas.mean_free_time**2)
+        theory, dsmc, spread = compared(gas, "displacement", unit, tau, config, THEORY)
         label = f"viscoelastic, δ = {delta:.3f}" if name == "viscoelastic" else label
         spread.draw(in_time, exponent, color, f"{label}: theory", f"{name}: theory")
         shown = {"fmt": "o", "ms": 3.5, "color": color}
-        in_collisions.plot(theory.collisions, theory.spread, color=color, label=f"{label}: theory")
+        in_collisions.plot(theory.collisions, spread.theory, color=color, label=f"{label}: theory")
         in_collisions.errorbar(dsmc.collisions, spread.mean, spread.error, **shown)
-        steps = np.diff(theory.spread) / np.diff(theory.collisions)
-        steps = steps[theory.collisions[1:] > 20]
+        steps = np.diff(spread.theory) / np.diff(np.asarray(theory.collisions))
+        steps = steps[np.asarray(theory.collisions)[1:] > 20]
         found[name] = {
-            "tau": paper.listed(at),
-            "displacement": paper.listed(spread.mean),
-            "displacement_error": paper.listed(spread.error),
-            "collisions": paper.listed(dsmc.collisions),
-            "temperature": paper.listed(dsmc.theta),
-            "dsmc_from_theory": paper.listed(spread.miss),
-            "exponent": paper.listed(spread.exponent),
-            "exponent_error": paper.listed(spread.exponent_error),
-            "exponent_of_theory": paper.at_powers(0, 14, spread.where, spread.local),
-            "per_collision_in_1_5_ell2": paper.listed(steps[:: max(steps.size // 6, 1)] / 9),
+            "tau": spread.at,
+            "displacement": spread.mean,
+            "displacement_error": spread.error,
+            "collisions": dsmc.collisions,
+            "dsmc_from_theory": spread.miss,
+            "exponent": spread.exponent,
+            "exponent_error": spread.exponent_error,
+            "exponent_of_theory": at_powers(0, 14, spread.where, spread.local),
             "linear_in_collisions_within": float(np.ptp(steps) / steps.mean()),
         }
         if name == "viscoelastic":
             near = np.abs(spread.local - 1 / 6) < 1 / 60
-            found["exponent_within_10_per_cent_from"] = paper.from_here(near, spread.where)
+            found["exponent_within_10_per_cent_from"] = from_here(near, spread.where)
             rate, t = COOLING_RATE[3] * delta, jnp.asarray(tau)
             of = {
                 "leading: u$^{1/6}$ − 1": (54 / rate * ((1 + rate * tau) ** (1 / 6) - 1), ":"),
                 "Eq. (40) integrated": (paper_displacement(t, delta, corrected=False), "--"),
                 "corrected, to order δ": (paper_displacement(t, delta), "-"),
             }
-            found["closed_forms"] = paper.draw_forms(forms, spread, of, (1, 15))
+            found["closed_forms"] = draw_forms(forms, spread, of, (1, 15))
     # At small delta the solver's steps cover few collisions; longer times would take minutes.
     found["windows"] = [cooling_window(x, tau[tau < 1e12]) for x in config["deltas"]]
     for axes in (in_time, exponent, in_collisions):
-        axes.plot([], [], "o", ms=3.5, color=paper.GUIDE, label="DSMC")
+        axes.plot([], [], "o", ms=3.5, color=GUIDE, label="DSMC")
     length, logs = "⟨Δr²⟩ / (T$_0$ τ$_c$(0)²)", {"xlabel": "time t / τ$_c$(0)", "xscale": "log"}
     title = "Over time: a straight line is log t"
-    paper.caption(in_time, title, ylabel=length, xlim=(0.05, 2e10), ylim=(0, 9000), **logs)
-    exponent.axhline(1 / 6, color=paper.GUIDE, ls=":", lw=1.2)
-    exponent.annotate("the paper's 1/6", (2e-1, 1 / 6), color=paper.GUIDE, va="bottom", fontsize=8)
+    caption(in_time, title, ylabel=length, xlim=(0.05, 2e10), ylim=(0, 9000), **logs)
+    exponent.axhline(1 / 6, color=GUIDE, ls=":", lw=1.2)
+    exponent.annotate("the paper's 1/6", (2e-1, 1 / 6), color=GUIDE, va="bottom", fontsize=8)
     labels = {"ylabel": "d ln⟨Δr²⟩ / d ln t", "yscale": "log", "ylim": (0.015, 2.2)}
-    paper.caption(exponent, "Local exponent; a logarithm has 0", **labels, **logs)
+    caption(exponent, "Local exponent; a logarithm has 0", **labels, **logs)
     labels = {"xlabel": "collisions per particle  N", "ylabel": length}
     title = "Over collisions: both linear, nearly the same line"
-    paper.caption(in_collisions, title, xlim=(0, 600), ylim=(0, 7500), **labels)
+    caption(in_collisions, title, xlim=(0, 600), ylim=(0, 7500), **labels)
     forms.axhline(0, color="0.7", lw=0.8)
-    title = "Closed forms of the viscoelastic ⟨Δr²⟩: difference from theory"
-    labels = {"ylabel": "formula / theory − 1", "xlim": (3, None)}
-    paper.caption(forms, title, **labels, **logs)
-    return figure, config, found
-
-
-def reduced(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> SimpleNamespace:
-    """Return <dr^2> in units of T_0 tau_c(0)^2, the unit, collisions, and T/T_0."""
-    unit = float(gas.temperature * gas.mean_free_time**2)
-    assert curve.displacement is not None
-    spread, theta = curve.displacement / unit, curve.temperature / gas.temperature
-    spread, collisions, theta = map(np.asarray, (spread, curve.collisions, theta))
-    return SimpleNamespace(unit=unit, spread=spread, collisions=collisions, theta=theta)
+    title = "Closed forms, viscoelastic: difference from theory"
+    labels = {"ylabel": "formula / theory − 1", "xlim": (3, None), "ylim": (-0.6, 0.6)}
+    caption(forms, title, **labels, **logs)
+    return {"config": config, "found": found, "picture": figure}
 
 
 def cooling_window(delta: float, tau: np.ndarray) -> dict:
     """Return the paper's range of times for a given delta, and the accuracy of its laws there."""
     gas = beads(PACKING, 1.5 * 2**0.1 * delta)
-    curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=THEORY)
-    of = reduced(gas, curve)
-    middle, local = paper.slope(tau, of.spread)
+    curve = cool(gas, tau * gas.mean_free_time, THEORY)
+    theta = np.asarray(curve.temperature / gas.temperature)
+    middle, local = slope(tau, np.asarray(curve.displacement))
     # tau_c |dT/dt| / T is the share of T lost in a collision, -d ln T/dN.
-    lost = -np.diff(np.log(of.theta)) / np.diff(of.collisions)
-    relaxed = np.asarray(curve.diffusion) / (1.5 * of.unit / float(gas.mean_free_time))
+    lost = -np.diff(np.log(theta)) / np.diff(curve.collisions)
+    relaxed = np.asarray(curve.diffusion / (1.5 * gas.temperature * gas.mean_free_time))
     averages = jax.vmap(lambda x: paper_averages(gas.reduced_law, x, 3)[2, 0])
-    slowing = np.asarray(averages(jnp.sqrt(jnp.asarray(of.theta))))
-    off = np.abs(np.sqrt(of.theta) * float(np.sqrt(32 * np.pi) / 3) / slowing / relaxed - 1)
+    slowing = np.asarray(averages(jnp.sqrt(jnp.asarray(theta))))
+    off = np.abs(np.sqrt(theta) * float(np.sqrt(32 * np.pi) / 3) / slowing / relaxed - 1)
     last = delta ** (-11 / 5)
     return {
         "delta": delta,
-        "paper_from": 1 / delta,
-        "paper_to": last,
-        "exponent_at_paper_to": float(paper.interpolate(last, middle, local)),
+        "exponent_at_paper_to": float(interpolate(last, middle, local)),
         "lost_per_collision_at_start": float(lost[0]),
-        "lost_per_collision_at_paper_to": float(paper.interpolate(last, middle, lost)),
-        "exponent_within_10_per_cent_from": paper.from_here(np.abs(6 * local - 1) < 0.1, middle),
-        "t_tau_v_within_5_per_cent_from": paper.from_here(off < 0.05, tau),
-        "t_tau_v_within_1_per_cent_from": paper.from_here(off < 0.01, tau),
+        "lost_per_collision_at_paper_to": float(interpolate(last, middle, lost)),
+        "t_tau_v_within_5_per_cent_from": from_here(off < 0.05, tau),
     }
 
 
@@ -481,4 +469,4 @@ PARTS = {
 }
 
 if __name__ == "__main__":
-    paper.run_parts(__doc__, PARTS)
+    run_parts(__doc__, PARTS)

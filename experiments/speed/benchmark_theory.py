@@ -1,20 +1,45 @@
-"""How fast is kinetic theory? Ratios of times measured in one run.
+"""How fast is kinetic theory, how long do first curves, fits and runs take, in which version?
 
-    python experiments/speed/benchmark_theory.py [--smoke] [--record]
+    python experiments/speed/benchmark_theory.py [--only benchmark_kinetic_theory
+        benchmark_compilation] [--tasks TASK ...] [--checkout CHECKOUT] [--rounds 1] [--smoke]
+        [--record] [--out DIR]
+    python experiments/speed/benchmark_theory.py --only benchmark_versions --checkout CHECKOUT
+        [--rounds 5] [--record]
 
-1. 1000 cooling curves over five decades of time by `jax.vmap`, compared with a loop over SciPy's
-   solve_ivp (LSODA) on the same equations in NumPy at the same accuracy. The errors of both are
-   relative to a solution with a tighter tolerance.
-2. One derivative, in forward and in reverse mode, compared with one solution without it.
+benchmark_kinetic_theory: 1000 cooling curves over five decades of time by `jax.vmap`, compared with
+a loop over SciPy's solve_ivp (LSODA) on the same equations in NumPy at the same accuracy. The
+errors of both are relative to a solution with a tighter tolerance. One derivative, in forward and
+in reverse mode, compared with one solution without it. Run times are medians of repeats, without
+compilation, which is given separately.
 
-Run times are medians of repeats, without compilation, which is given separately. First calls, and
-the whole of `jaxgran fit`, are measured by `benchmark_compilation.py`.
+benchmark_compilation: tasks, each in a new process without a cache of compiled programs: seconds
+of each step, those of XLA's compiler, the number of programs compiled, and the ratio of the seconds
+to the reference, the first call of `jax.jit(jax.jacfwd(...))` of ln T of kinetic theory in A and
+T_0 in the same round. Seconds and ratios are medians over the rounds. With CHECKOUT, the folder of
+another version (``git worktree add --detach CHECKOUT COMMIT``), both versions run in turn, and are
+compared: ratio of seconds, now over before, and its standard error. The tasks are
+(`support/time_version.py`)
+
+    reference: the import, the Jacobian and the curve, their run times, and the numbers of
+        equations of their jaxprs.
+    fit: fit and diagnosis of a curve with 61 points, then of one with 47, then with other `free`.
+    lengths: fit and diagnosis of 20 curves of 20 lengths.
+    command: `jaxgran fit` as a process, with an empty cache, again, and without a cache.
+    SoftSpheres, HardSpheres, DSMC: runs of one mean free time; the last one of the first two
+        continues from the particles of the one before.
+
+benchmark_versions: the same for medians of repeated runs of larger gases and of kinetic theory,
+compiled before, by this version and by another one.
 """
 
 import argparse
 import json
+import statistics
+import tempfile
 import time
+from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -22,26 +47,24 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import jaxgran
-from experiments.support.record import add_recording, seconds, write_results
+from experiments.support.record import DATA, EXPERIMENTS, process, run_parts, seconds
+from experiments.support.scenes import glass
 from jaxgran.scene.geometry import NODES, sphere_surface
 from jaxgran.scene.laws import _CLIPPED, C1
 from jaxgran.theory.averages import averaging_matrix
 
+CURVE = DATA / "lammps_cooling_dilute.csv"
+MODELS = "SoftSpheres", "HardSpheres", "DSMC"
+TASKS = "reference", "fit", "lengths", "command", *MODELS
+REFERENCE = "first Jacobian"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
-REPEATS = 5
 SAME_EQUATIONS = {"order": 2, "softness": False, "correlations": False}
 """Options for which kinetic theory solves the equations that are written here for SciPy."""
 
 
 @cache
 def scene() -> jaxgran.Gas:
-    return jaxgran.Gas(
-        jaxgran.Viscoelastic(5e7, 0.22, 3e-6),
-        diameter=0.002,
-        mass=jaxgran.sphere_mass(0.002, 2500.0),
-        packing_fraction=0.05,
-        temperature=0.01,
-    )
+    return glass(0.1).replace(dissipative_constant=3e-6)
 
 
 @cache
@@ -101,7 +124,7 @@ def sweep_against_scipy(num_curves: int, num_scipy: int) -> dict[str, float]:
         return jax.jit(jax.vmap(lambda a: at(a, model)))
 
     ours, exact = curves(RTOL), np.asarray(curves(1e-12)(constants))
-    compile_s, run_s = seconds(lambda: ours(constants), REPEATS)
+    compile_s, run_s = seconds(lambda: ours(constants), 5)
     picked = np.linspace(0, num_curves - 1, num_scipy).astype(int)
     begin = time.perf_counter()
     looped = np.stack([scipy_curve(float(constants[i])) for i in picked])
@@ -139,19 +162,100 @@ def derivative_cost(repeats: int) -> dict[str, float]:
     return row
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--smoke", action="store_true", help="a run of seconds instead of a minute")
-    add_recording(parser)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
+def kinetic_theory(options: argparse.Namespace) -> dict:
     sweep = sweep_against_scipy(*((20, 2) if options.smoke else (1000, 50)))
-    derivative = derivative_cost(5 if options.smoke else 50)
-    write_results("benchmark_kinetic_theory", options, None, sweep=sweep, derivative=derivative)
-    print(json.dumps(sweep | derivative))
+    return {"sweep": sweep, "derivative": derivative_cost(5 if options.smoke else 50)}
 
+
+def command(folder: Path) -> dict[str, dict[str, float]]:
+    """Measure `jaxgran fit` as a process: with an empty cache, with its cache, and without one."""
+    main, found = "import sys; from jaxgran.cli.main import main; sys.exit(main(sys.argv[1:]))", {}
+    with tempfile.TemporaryDirectory() as out:
+        arguments = ["-c", main, "fit", CURVE, "--free", "A", "T0", "--out", out, "--overwrite"]
+        for name, more in (("cold", []), ("warm", []), ("no cache", ["--no-cache"])):
+            begin = time.perf_counter()
+            process(*arguments, *more, folder=folder, XDG_CACHE_HOME=out)
+            found[f"jaxgran fit, {name}"] = {"s": time.perf_counter() - begin}
+    return found
+
+
+def task(name: str, num: int, folder: Path) -> dict[str, dict[str, float]]:
+    """Return the steps of a task of the version in a folder."""
+    if name == "command":
+        return command(folder)
+    script = EXPERIMENTS / "support" / "time_version.py"
+    found = json.loads(process(script, name, CURVE, num, folder=folder).stdout.splitlines()[-1])
+    if not Path(found["package"]).is_relative_to(folder.resolve()):
+        raise SystemExit(f"not the version in {folder} was imported, but {found['package']}")
+    return found["steps"]
+
+
+def measured(tasks: Sequence[str], options: argparse.Namespace, num: int) -> tuple[dict, dict]:
+    """Return the steps of this version and of the other one, if any, and this over the other."""
+    folders = [EXPERIMENTS.parent, *([options.checkout] if options.checkout else [])]
+    rounds = {folder: [] for folder in folders}
+    for k in range(options.rounds):
+        for folder in folders[:: 1 - 2 * (k % 2)]:
+            steps = {step: row for name in tasks for step, row in task(name, num, folder).items()}
+            for row in steps.values():
+                if "s" in row and REFERENCE in steps:
+                    row["ratio"] = row["s"] / steps[REFERENCE]["s"]
+            rounds[folder].append(steps)
+    medians = [
+        {
+            name: {key: statistics.median(steps[name][key] for steps in each) for key in row}
+            for name, row in each[0].items()
+        }
+        for each in rounds.values()
+    ]
+    compared = {}
+    for name in medians[0] if options.checkout else ():
+        key = next(iter(medians[0][name]))
+        now, before = (np.array([steps[name][key] for steps in rounds[x]]) for x in folders)
+        error = np.std(now / before, ddof=1) / len(now) ** 0.5 if len(now) > 1 else np.nan
+        compared[name] = {"ratio": statistics.median(now / before), "error": error}
+    return dict(zip(("now", "before"), map(tables, medians), strict=False)), compared
+
+
+def tables(steps: dict[str, dict[str, float]]) -> dict[str, dict]:
+    """Return the runs of the particle models, the command, and all other steps."""
+    rest, rows = dict(steps), {}
+    for name in [name for name in steps if name.startswith(MODELS) and f"{name} again" in steps]:
+        row = rest.pop(name)
+        rows[name] = {"first_s": row.pop("s"), "again_s": rest.pop(f"{name} again")["s"], **row}
+    names = {"first_s": "jaxgran fit, cold", "again_s": "jaxgran fit, warm"}
+    job = {key: steps[name]["s"] for key, name in names.items() if name in steps}
+    return {"rows": rows, "main_job": job, "steps": rest}
+
+
+def compilation(options: argparse.Namespace) -> dict:
+    tasks, num = options.tasks, 500
+    if options.smoke:
+        tasks, num = ["reference", "DSMC"], 100
+    found, compared = measured(tasks, options, num)
+    now = {"num_particles": num, "rounds": options.rounds, **found.pop("now")}
+    return now | found | ({"compared": compared} if compared else {})
+
+
+def versions(options: argparse.Namespace) -> dict:
+    compared = measured(["speed"], options, 1 if options.smoke else 500)[1]
+    speeds = {name: x for name, x in compared.items() if name.startswith("speed of ")}
+    rows = [{"model": name.removeprefix("speed of "), **x} for name, x in speeds.items()]
+    return {"rows": rows}
+
+
+PARTS = {
+    "benchmark_kinetic_theory": kinetic_theory,
+    "benchmark_compilation": compilation,
+    "benchmark_versions": versions,
+}
 
 if __name__ == "__main__":
-    main()
+    run_parts(
+        __doc__,
+        PARTS,
+        default=list(PARTS)[:2],
+        tasks={"nargs": "+", "choices": TASKS, "default": TASKS},
+        checkout={"type": Path, "help": "folder of another version"},
+        rounds={"type": int, "default": 1},
+    )

@@ -9,8 +9,8 @@ per contact, in the largest box of the table and with three times the replicas. 
 twice, to separate compilation from run time. With --record, other scenes keep their recorded rows.
 """
 
+import argparse
 import datetime
-import json
 import re
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -23,20 +23,12 @@ from matplotlib.ticker import FuncFormatter
 from tqdm import tqdm
 
 import jaxgran
-from experiments.support.record import (
-    DATA,
-    figures,
-    script_parser,
-    seconds,
-    write_picture,
-    write_results,
-)
-from experiments.support.scenes import beads
-from jaxgran.data.files import header_number
-from jaxgran.plotting import COLOURS, INK
+from experiments.support.plots import GUIDE, INK, caption, panels
+from experiments.support.record import figures, run_parts, seconds
+from experiments.support.scenes import beads, cool, of_lammps
+from jaxgran.plotting import COLOURS
 
 MARKERS = {"kinetic theory": "D", "DSMC": "v", "hard spheres": "s", "soft spheres": "^"}
-MODELS = tuple(MARKERS)
 KEY = 1  # key of the rows; the reference has another key
 SIZES = {
     "dilute": (500, 2000, 8000),
@@ -61,13 +53,8 @@ class Scene(NamedTuple):
     reference: str
 
 
-def main() -> None:
-    parser = script_parser(__doc__, "speed_vs_error")
-    parser.add_argument("--scenes", nargs="+", choices=SIZES, default=list(SIZES))
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    stem = "speed_vs_error_smoke" if options.smoke else "speed_vs_error"
-    found = figures(stem)["scenes"] if options.record else {}
+def speed_vs_error(options: argparse.Namespace) -> dict:
+    found = figures("speed_vs_error")["scenes"] if options.record else {}
     for name in ("dense",) if options.smoke else options.scenes:
         jax.clear_caches()  # so that every scene compiles separately
         scene = clustering() if name == "clustering" else measured(name, options.smoke)
@@ -82,16 +69,12 @@ def main() -> None:
             "estimates": {c.model.name: c.error for c in choice.candidates if c.error is not None},
             "rows": [measure(scene, run) for run in tqdm(runs, disable=options.smoke)],
         }
-        print(name, json.dumps(found[name], indent=1))
-        results = {"scenes": found, "key": KEY, "replicas": REPLICAS}
-        write_results("speed_vs_error", options, options.out / f"{stem}.json", **results)
-    write_picture(draw(found), stem, options)
+    return {"scenes": found, "key": KEY, "replicas": REPLICAS, "picture": draw(found)}
 
 
 def measured(name: str, smoke: bool) -> Scene:
     """Return a gas whose curve was simulated in LAMMPS."""
-    curve, header = jaxgran.read_curve(DATA / f"lammps_cooling_{name}.csv")
-    gas = jaxgran.read_gas(header).replace(dissipative_constant=header_number(header, "A"))
+    gas, curve, header = of_lammps(name)
     used = slice(1, 6 if smoke else None)  # at t = 0 nothing is measured
     columns = curve.times, curve.temperature, curve.temperature_error
     label = f"LAMMPS, N = {header['N']}, {header['replicas']} replicas"
@@ -103,9 +86,8 @@ def clustering() -> Scene:
     """Return a gas in a box of four L_c, with soft spheres of finer time steps as reference."""
     gas = beads(*CLUSTERING)
     size, times = SIZES["clustering"][-1], CLUSTERING_TIMES * float(gas.mean_free_time)
-    key = jax.random.key(KEY + 1)
     model = jaxgran.SoftSpheres(size, replicas=3 * REPLICAS, steps_per_contact=80)
-    curve = jaxgran.cool(gas, times, model=model, key=key)
+    curve = cool(gas, times, model, KEY + 1)
     label = f"soft spheres, N = {size}, {3 * REPLICAS} replicas, 80 steps a contact"
     T, error = map(np.asarray, (curve.temperature, curve.temperature_error))
     return Scene(gas, times, T, error, label)
@@ -153,10 +135,8 @@ def measure(scene: Scene, row: Run) -> dict:
     curves = []
 
     def run():
-        key = jax.random.key(KEY)
-        curve = jaxgran.cool(gas, scene.times, model=row.model, key=key, progress=False)
-        curves.append(curve)
-        return curve.temperature
+        curves.append(cool(gas, scene.times, row.model, KEY))
+        return curves[-1].temperature
 
     compile_s, run_s = seconds(run, repeats=1)
     T = np.asarray(curves[-1].temperature, float)
@@ -179,16 +159,16 @@ def measure(scene: Scene, row: Run) -> dict:
 
 def draw(found: dict) -> Figure:
     """Draw the largest error over the run time; symbols grow with N."""
-    figure = Figure(figsize=(5.0 * len(found), 5.6), layout="constrained")
-    grid = figure.subplots(1, len(found), sharey=True, squeeze=False)
-    for axes, (name, results) in zip(grid[0], found.items(), strict=True):
+    figure = panels(len(found), size=(5.0, 5.6), sharey=True)
+    for axes, (name, results) in zip(figure.axes, found.items(), strict=True):
         panel(axes, results["rows"])
         title = f"{name} gas, against {results['reference'].split(', ')[0]}"
-        axes.set_title(title, fontsize=11, loc="left")
-        axes.set(xlabel="run time without compilation (s)")
-        axes.spines[["top", "right"]].set_visible(False)
-    grid[0][0].set(ylabel="largest error of T(t) (%)")
-    handles, labels = grid[0][0].get_legend_handles_labels()
+        labels = {
+            "xlabel": "run time without compilation (s)",
+            "ylabel": "largest error of T(t) (%)",
+        }
+        caption(axes, title, "none", **labels)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
     return figure
 
@@ -199,23 +179,23 @@ def panel(axes: Axes, rows: list[dict]) -> None:
     Rows of the table that differ in something else (float32, the tolerance, DSMC's step, softer
     spheres) are left out.
     """
-    for name in MODELS:
+    sizes = {}
+    for name, marker in MARKERS.items():
         mine = [row for row in rows if row["model"] == name]
-        by_size = [row for row in mine if is_usual(row)]
-        for k, row in enumerate(by_size):
-            label = name[:1].upper() + name[1:] if k == len(by_size) - 1 else None
-            point(axes, row, 4 + 3 * k, COLOURS[name], label)
-        axes.plot(*coordinates(by_size), color=COLOURS[name], lw=0.8, alpha=0.6)
-        steps = [row for row in mine if steps_of(row) not in (None, 40)]
-        for k, row in enumerate(steps):
-            point(axes, row, 6, "none", None)
-            shift, side = ((-6, 0), "right") if k == 0 else ((6, -11), "left")
-            shift = (6, 4) if k == len(steps) - 1 else shift
-            place = {"xytext": shift, "textcoords": "offset points", "fontsize": 8, "ha": side}
+        usual = [row for row in mine if is_usual(row)]
+        sizes[name] = ", ".join(row["knob"].split(",")[0].removeprefix("N ") for row in usual)
+        others = [row for row in mine if steps_of(row) not in (None, 40)]
+        for k, row in enumerate([*usual, *others]):
+            is_full = k < len(usual)
+            label = name[:1].upper() + name[1:] if k == len(usual) - 1 else None
+            look = {"ms": 4 + 3 * k if is_full else 6, "mfc": COLOURS[name] if is_full else "none"}
+            look |= {"fmt": marker, "lw": 0.7, "label": label, "color": COLOURS[name]}
             (x,), (y,) = coordinates([row])
-            axes.annotate(f"{steps_of(row)} steps", (x, y), color=COLOURS[name], **place)
-    numbers = {name: ", ".join(map(str, sizes_of(rows, name))) for name in MODELS[1:]}
-    words = f"N = {numbers['soft spheres']}\nDSMC: {numbers['DSMC']}"
+            axes.errorbar(x, y, 100 * row["standard_error"], **look)
+            if not is_full:
+                axes.annotate(f" {steps_of(row)} steps", (x, y), fontsize=8, color=COLOURS[name])
+        axes.plot(*coordinates(usual), color=COLOURS[name], lw=0.8, alpha=0.6)
+    words = f"N = {sizes['soft spheres']}\nDSMC: {sizes['DSMC']}"
     axes.text(0.02, 0.03, words, transform=axes.transAxes, fontsize=8.5, color=INK)
     # The Pareto front: rows for which no other is both faster and more accurate.
     front, best = [], np.inf
@@ -223,17 +203,10 @@ def panel(axes: Axes, rows: list[dict]) -> None:
         if row["error"] < best:
             best = row["error"]
             front.append(row)
-    look = {"color": COLOURS["guide"], "lw": 1, "zorder": 0, "label": "Pareto front"}
+    look = {"color": GUIDE, "lw": 1, "zorder": 0, "label": "Pareto front"}
     axes.step(*coordinates(front), where="post", **look)
     axes.set(xscale="log", yscale="log", ylim=(0.2, 60))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-
-
-def point(axes: Axes, row: dict, size: float, face: str, label: str | None) -> None:
-    """Draw a row with its error bar."""
-    look = {"fmt": MARKERS[row["model"]], "ms": size, "mfc": face, "lw": 0.7, "label": label}
-    error = 100 * row["standard_error"]
-    axes.errorbar(*coordinates([row]), error, color=COLOURS[row["model"]], **look)
 
 
 def coordinates(rows: list[dict]) -> tuple[list[float], list[float]]:
@@ -253,11 +226,6 @@ def steps_of(row: dict) -> int | None:
     return int(found[1]) if found else None
 
 
-def sizes_of(rows: list[dict], name: str) -> list[int]:
-    """Return N of the usual rows of a model."""
-    mine = [row["knob"] for row in rows if row["model"] == name and is_usual(row)]
-    return [int(knob.split(",")[0].split()[1]) for knob in mine]
-
-
 if __name__ == "__main__":
-    main()
+    settings = {"nargs": "+", "choices": list(SIZES), "default": list(SIZES)}
+    run_parts(__doc__, {"speed_vs_error": speed_vs_error}, scenes=settings)

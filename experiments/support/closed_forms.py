@@ -8,7 +8,6 @@ gases, Phys. Rev. E 61, 1716 (2000); its equations are numbered as in the author
 from math import gamma, pi, sqrt
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.scene.geometry import sphere_surface
@@ -185,37 +184,6 @@ def paper_temperature(
         + 20 / 9 * p * delta**1.5 * (u ** (-23 / 12) - u ** (-8 / 3))
         + delta**2 * second
     )
-
-
-def two_term_time(theta: ArrayLike, delta: ArrayLike) -> Float[Array, "..."]:
-    """Return the time at which T/T_0 is reached, by the two-term cooling equation in 3D.
-
-    With ``x = (T/T_0)^(1/10)``, ``k = q delta`` and ``b = 0.83193`` (`COOLING_RATE`), the equation
-    ``dT/dt = -b_1 T^(8/5) + b_2 T^(17/10)`` has the exact solution ``tau = 6/(b delta) [
-    sum_{j<6} k^j (x^(j-6) - 1)/(6 - j) - k^6 ln x + k^6 ln((1 - k x)/(1 - k))]``.
-
-    Args:
-        theta: T/T_0, in (0, 1], any shape.
-        delta: ``A alpha^(2/5) T_0^(1/10)``, in (0, 1/q); a gas with a larger delta would heat up.
-
-    Returns:
-        tau = nu_0 t, same shape.
-
-    Raises:
-        ValueError: for delta >= 1/q.
-
-    Reference: Brilliantov & Poeschel, Eq. (36), integrated by partial fractions.
-    """
-    limit = 1 / COOLING_CORRECTION
-    if np.any(np.asarray(delta) >= limit):
-        raise ValueError(
-            f"delta must lie in (0, {limit:.4f}), got {delta}. For larger values use "
-            "jaxgran.KineticTheory()"
-        )
-    x, k = jnp.asarray(theta) ** 0.1, COOLING_CORRECTION * jnp.asarray(delta)
-    powers = sum(k**j * (x ** (j - 6) - 1) / (6 - j) for j in range(6))
-    logs = k**6 * (jnp.log1p(-k * x) - jnp.log1p(-k) - jnp.log(x))
-    return jnp.asarray(6 / (COOLING_RATE[3] * jnp.asarray(delta)) * (powers + logs))
 
 
 def paper_displacement(

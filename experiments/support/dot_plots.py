@@ -3,7 +3,6 @@
 ``python experiments/documents.py --pictures`` draws them all; the entries of the gallery show them.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -104,6 +103,11 @@ def drawn(plot: DotPlot) -> Figure:
     return figure
 
 
+def of_rows(found: dict, label: str, value: str, axis: str, model: str = "", **plot) -> DotPlot:
+    """Return a picture with a dot for each row."""
+    return DotPlot(dots_of(found["rows"], label, value, model), axis, **plot)
+
+
 def wrong_physics(found: dict) -> DotPlot:
     dots = []
     for row in found["rows"]:
@@ -114,28 +118,24 @@ def wrong_physics(found: dict) -> DotPlot:
 
 
 def interval_coverage(found: dict) -> DotPlot:
-    dots = []
-    plain = dots_of(
-        found["rows"], "{model}, N = {num_particles}, φ = {phi:g}", "coverage", "{model}"
-    )
-    for row, dot in zip(found["rows"], plain, strict=True):
-        p = dot.value
-        error = (p * (1 - p) / row["runs"]) ** 0.5
-        dots.append(dot._replace(value=100 * p, low=100 * (p - error), high=100 * (p + error)))
+    rows = [row | {"percent": 100 * row["coverage"]} for row in found["rows"]]
+    dots = dots_of(rows, "{model}, N = {num_particles}, φ = {phi:g}", "percent", "{model}")
+    for k, row in enumerate(rows):
+        x, error = row["percent"], (row["coverage"] * (1 - row["coverage"]) / row["runs"]) ** 0.5
+        dots[k] = dots[k]._replace(low=x - 100 * error, high=x + 100 * error)
     return DotPlot(dots, "runs whose 95 % interval contains A, %", (95.0, "95 %"))
 
 
 def fit_head_to_head(found: dict) -> DotPlot:
     rows = [
-        row | {"scene": row["scene"].replace("stochastic", "dsmc"), "free": free}
+        row
+        | {"scene": row["scene"].replace("stochastic", "dsmc")}
+        | {"free": "A" if len(row["free"]) == 1 else "A and T₀"}
         for row in found["rows"]
         if row["simulations"]
-        for free in ["A" if len(row["free"]) == 1 else "A and T₀"]
     ]
-    dots = [
-        dot._replace(hollow="jaxgran" not in dot.label)
-        for dot in dots_of(rows, "{scene}, {free}: {search}", "simulations", "{scene}")
-    ]
+    dots = dots_of(rows, "{scene}, {free}: {search}", "simulations", "{scene}")
+    dots = [dot._replace(hollow="jaxgran" not in dot.label) for dot in dots]
     axis = "simulations until A is known to 2 %"
     return DotPlot(dots, axis, logarithmic=True, kinds=("with derivatives", "without"))
 
@@ -150,27 +150,23 @@ def hard_cases(found: dict) -> DotPlot:
 
 
 def benchmark_kinetic_theory(found: dict) -> DotPlot:
-    sweep, slope, cold = found["sweep"], found["derivative"], found["cold"]
-    count = sweep["num_curves"]
+    sweep, slope = found["sweep"], found["derivative"]
     seconds = {
         "one curve": slope["solve_ms"] / 1e3,
         "its derivative, forward": slope["forward_ms"] / 1e3,
         "its derivative, reverse": slope["reverse_ms"] / 1e3,
-        f"{count} curves, vmap": sweep["vmap_run_s"],
-        f"{count} curves, SciPy LSODA": sweep["scipy_s"],
-        "first curve in a new process, with compilation": cold["first_cool_s"],
-        "a whole fit in a new process, first time": cold["main_job_s"],
-        "a whole fit in a new process, second time": cold["main_job_again_s"],
+        f"{sweep['num_curves']} curves, vmap": sweep["vmap_run_s"],
+        f"{sweep['num_curves']} curves, SciPy LSODA": sweep["scipy_s"],
     }
     dots = [
-        Dot(name, x, model="kinetic theory", hollow="SciPy" in name) for name, x in seconds.items()
+        Dot(name, x, None, None, "kinetic theory", "SciPy" in name) for name, x in seconds.items()
     ]
     return DotPlot(dots, "seconds", logarithmic=True, kinds=("jaxgran", "SciPy"))
 
 
 def benchmark_replicas(found: dict) -> DotPlot:
     axis = "collisions per second on two CPU devices, over one core"
-    return DotPlot(dots_of(found["rows"], "{model}", "ratio", "{model}"), axis, (1.0, "one core"))
+    return of_rows(found, "{model}", "ratio", axis, "{model}", reference=(1.0, "one core"))
 
 
 def benchmark_million(found: dict) -> DotPlot:
@@ -182,45 +178,43 @@ def benchmark_million(found: dict) -> DotPlot:
         if case in row
     ]
     axis = "microseconds per collision, 10⁶ disks (or half of them)"
-    return DotPlot(dots_of(rows, "{model}, {case}", "x", "{model}"), axis, logarithmic=True)
+    return of_rows({"rows": rows}, "{model}, {case}", "x", axis, "{model}", logarithmic=True)
 
 
 def benchmark_compilation(found: dict) -> DotPlot:
     dots = []
-    for name, row in found["rows"].items():
+    command = {"jaxgran fit, each in a new process": found["main_job"]}
+    for name, row in (found["rows"] | command).items():
         model, *more = name.split(" ", 1)
-        dot = Dot(" ".join([named(model), *more]), row["first_s"], model=named(model))
+        known = "kinetic theory" if model == "jaxgran" else named(model)
+        label = name if model == "jaxgran" else " ".join([known, *more])
+        dot = Dot(label, row["first_s"], model=known)
         dots += [dot, dot._replace(value=row["again_s"], hollow=True)]
-    command = found["main_job"]
-    dot = Dot("jaxgran fit, each in a new process", command["first_s"], model="kinetic theory")
-    dots += [dot, dot._replace(value=command["again_s"], hollow=True)]
     return DotPlot(dots, "seconds", logarithmic=True, kinds=("first run", "again"))
 
 
 def benchmark_dsmc(found: dict) -> DotPlot:
-    dots = dots_of(found["rows"], "N = {num_particles}", "collisions_per_s", "DSMC")
-    return DotPlot(dots, "collisions per second", logarithmic=True)
+    axis = "collisions per second"
+    return of_rows(found, "N = {num_particles}", "collisions_per_s", axis, "DSMC", logarithmic=True)
 
 
-def over_lammps(rows: list[dict], label: str, model: str, *keys: str) -> DotPlot:
-    dots = []
-    for row in rows:
-        found = row["lammps"]
-        for key in keys:
-            found = found[key]
-        dots += dots_of([row | {"ratio": found}], label, "ratio", model)
+def over_lammps(rows: list[dict], label: str, model: str) -> DotPlot:
     axis = "collisions per second, over those of LAMMPS on one core"
-    return DotPlot(dots, axis, (1.0, "LAMMPS"), logarithmic=True)
+    reference = (1.0, "LAMMPS")
+    return of_rows(
+        {"rows": rows}, label, "over", axis, model, reference=reference, logarithmic=True
+    )
 
 
 def benchmark_hard_spheres(found: dict) -> DotPlot:
-    rows = [row for row in found["rows"] if row["lammps"]]
-    return over_lammps(rows, "N = {num_particles}", "hard spheres", "ratio")
+    rows = [row | {"over": row["lammps"]["ratio"]} for row in found["rows"] if row["lammps"]]
+    return over_lammps(rows, "N = {num_particles}", "hard spheres")
 
 
 def benchmark_particles(found: dict) -> DotPlot:
+    rows = [row | {"over": row["lammps"]["1"]["ratio"]} for row in found["rows"]]
     label = "N = {num_particles}, t_c/τ_c = {contact_fraction:g}"
-    return over_lammps(found["rows"], label, "soft spheres", "1", "ratio")
+    return over_lammps(rows, label, "soft spheres")
 
 
 def benchmark_derivatives(found: dict) -> DotPlot:
@@ -232,8 +226,8 @@ def benchmark_derivatives(found: dict) -> DotPlot:
             for way, cost in row["ways"].items()
             if way != "plain"
         ]
-    dots = dots_of(rows, "{model}, {way}", "ratio", "{model}")
-    return DotPlot(dots, "time over that of the plain run", (1.0, "plain run"))
+    axis, reference = "time over that of the plain run", (1.0, "plain run")
+    return of_rows({"rows": rows}, "{model}, {way}", "ratio", axis, "{model}", reference=reference)
 
 
 def benchmark_elements(found: dict) -> DotPlot:
@@ -270,23 +264,11 @@ def paper_claims(found: dict) -> DotPlot:
     return DotPlot(dots, "measured value over the paper's value", (1.0, "as printed"), kinds=kinds)
 
 
-PLOTS: dict[str, Callable[[dict], DotPlot]] = {
-    plot.__name__: plot
-    for plot in (
-        wrong_physics,
-        interval_coverage,
-        fit_head_to_head,
-        benchmark_kinetic_theory,
-        benchmark_replicas,
-        benchmark_million,
-        benchmark_compilation,
-        benchmark_dsmc,
-        benchmark_hard_spheres,
-        benchmark_particles,
-        benchmark_derivatives,
-        benchmark_elements,
-        benchmark_versions,
-        paper_claims,
-    )
-} | {"tests/hard_cases": hard_cases}
+EACH = (
+    (wrong_physics, interval_coverage, fit_head_to_head, paper_claims)
+    + (benchmark_kinetic_theory, benchmark_replicas, benchmark_million, benchmark_compilation)
+    + (benchmark_dsmc, benchmark_hard_spheres, benchmark_particles, benchmark_derivatives)
+    + (benchmark_elements, benchmark_versions)
+)
+PLOTS = {plot.__name__: plot for plot in EACH} | {"tests/hard_cases": hard_cases}
 """Functions by the name of the file of the figures; its last part is the name of the picture."""

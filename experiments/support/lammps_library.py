@@ -57,6 +57,9 @@ def granular_box(
             "neigh_modify every 1 delay 0 check yes",
             "comm_modify vel yes",
             f"fix move all {integrator}",
+            "thermo_style custom step ke",
+            "thermo 1000000000",
+            "thermo_modify norm no",
         ]
     )
     return lmp

@@ -1,8 +1,8 @@
-"""Timing of experiments, files of their results, and the figures that the documents quote.
+"""Run a script by parts, and write its results, its pictures and the figures of the documents.
 
 A script run with ``--record`` writes its results to ``experiments/figures/NAME.json``, with the
-version, the date, the machine and the precision of the run. The documents are generated from these
-files only (``python experiments/documents.py``).
+command, the version, the date, the machine and the precision of the run. The documents are
+generated from these files only (``python experiments/documents.py``).
 """
 
 import argparse
@@ -10,14 +10,19 @@ import datetime
 import json
 import os
 import platform
+import pprint
+import shlex
 import statistics
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from jaxgran.data.files import write_atomically
 
@@ -30,61 +35,81 @@ COUNTS = {1: "one", 2: "two", 4: "four", 8: "eight", 16: "sixteen"}
 BEGAN = time.perf_counter()
 
 
-def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
-    """Return seconds of compilation (first call less a later one) and the median of later calls."""
-    took = []
-    for _ in range(repeats + 1):
-        begin = time.perf_counter()
-        jax.block_until_ready(run())
-        took.append(time.perf_counter() - begin)
-    run_time = statistics.median(took[1:])
-    return max(took[0] - run_time, 0.0), run_time
+def run_parts(
+    doc: str | None,
+    parts: Mapping[str, Callable[[argparse.Namespace], dict]],
+    prefix: str = "",
+    smoke: bool = True,
+    default: Sequence[str] = (),
+    **more: dict[str, Any],
+) -> dict[str, dict]:
+    """Run the parts of a script that --only names, by default all, and write what they find.
 
+    Args:
+        doc: docstring of the script, its help.
+        parts: functions by name. Each takes the options and returns its results. "picture" among
+            them is a figure, or figures by name. Results are written to ``prefix + name`` in the
+            folder --out, by default ``results/SCRIPT``, and with --record to ``figures/``, too.
+        smoke: whether there are small runs of some seconds (--smoke).
+        default: parts that run without --only, if not all.
+        more: settings of further options; names in capitals are positional arguments.
 
-def add_recording(parser: argparse.ArgumentParser) -> None:
-    """Give a script the option --record."""
-    parser.add_argument(
-        "--record", action="store_true", help="write the figures and pictures of the documents"
-    )
-
-
-def script_parser(doc: str | None, name: str, smoke: bool = True) -> argparse.ArgumentParser:
-    """Return a parser with --smoke, --record and --out, a folder, by default ``results/NAME``."""
+    Returns:
+        The results of the parts.
+    """
+    script = Path(sys.argv[0]).stem
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.set_defaults(smoke=False, only=list(default or parts))
+    parser.add_argument("--out", type=Path, default=Path("results") / script)
+    parser.add_argument("--record", action="store_true", help="write figures of the documents")
     if smoke:
         parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
-    parser.add_argument("--out", type=Path, default=Path("results") / name)
-    add_recording(parser)
-    return parser
+    if len(parts) > 1:
+        parser.add_argument("--only", nargs="+", choices=list(parts))
+    for name, settings in more.items():
+        parser.add_argument(name if name.isupper() else f"--{name.replace('_', '-')}", **settings)
+    options = parser.parse_args()
+    if options.record and options.smoke:
+        parser.error("A smoke run is too small for the documents. Leave out --record.")
+    jax.config.update("jax_enable_x64", True)
+    results = {}
+    for part in options.only:
+        results[part] = found = parts[part](options)
+        name = prefix + part
+        pictures = found.pop("picture", {})
+        pictures = pictures if isinstance(pictures, dict) else {name: pictures}
+        pprint.pp(rounded(json.loads(as_json(found))), width=100, compact=True)
+        for path in (options.out / f"{name}.json", FIGURES / f"{name}.json")[: 1 + options.record]:
+            save(path, **found)
+        for folder in (options.out, PICTURES)[: 1 + options.record]:
+            for picture, figure in pictures.items():
+                figure.savefig(folder / f"{picture}.png", dpi=110)
+        print(f"written to {options.out / name}.json; {time.perf_counter() - BEGAN:.0f} s")
+    return results
 
 
-def write_results(name: str, options: argparse.Namespace, path: Path | None, **results) -> None:
-    """Write results to `path`, if there is one, and with --record to ``figures/NAME.json``.
-
-    Raises:
-        SystemExit: for --record with --smoke, since smoke runs are too small for the documents.
-    """
-    if path is not None:
-        save(path, **results)
-    if options.record:
-        if getattr(options, "smoke", False):
-            raise SystemExit("A smoke run is too small for the documents. Leave out --record.")
-        save(FIGURES / f"{name}.json", **results)
-        print(f"recorded in experiments/figures/{name}.json: run python experiments/documents.py")
+def rounded(found: Any) -> Any:
+    """Return results with four digits, and long lists without their middle."""
+    if isinstance(found, dict):
+        return {name: rounded(x) for name, x in found.items()}
+    if isinstance(found, list):
+        few = found if len(found) <= 24 else [*found[:3], "...", *found[-3:]]
+        return [rounded(x) for x in few]
+    return float(f"{found:.4g}") if isinstance(found, float) else found
 
 
-def write_picture(figure: Any, name: str, options: argparse.Namespace, dpi: int = 130) -> None:
-    """Write a picture to the folder --out, and with --record to ``pictures/NAME.png`` too."""
-    for folder in [options.out, *([PICTURES] if options.record else [])]:
-        folder.mkdir(parents=True, exist_ok=True)
-        figure.savefig(folder / f"{name}.png", dpi=dpi)
+def as_json(found: dict) -> str:
+    return json.dumps(found, indent=1, default=lambda array: np.asarray(array).tolist()) + "\n"
 
 
-def figures(name: str) -> dict[str, Any]:
-    """Return the last recorded results of the script of this name."""
-    return json.loads((FIGURES / f"{name}.json").read_text(encoding="utf-8"))
+def figures(name: str, default: Any = None) -> dict[str, Any]:
+    """Return the last recorded results of this name; the default if there are none."""
+    path = FIGURES / f"{name}.json"
+    if default is not None and not path.exists():
+        return default
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def save(path: Path, **results) -> None:
@@ -93,16 +118,22 @@ def save(path: Path, **results) -> None:
     If writing fails, an older file is unchanged and an OSError names the path.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"made_by": made_by()} | results, indent=1) + "\n"
+    text = as_json({"made_by": made_by()} | results)
     write_atomically(path, lambda f: f.write(text.encode()))
 
 
 def made_by() -> dict[str, Any]:
-    """Return version, date, machine, precision, seconds since the script began, and packages."""
+    """Return command, version, date, machine, precision, seconds so far, and packages."""
     device = jax.devices()[0]
     cores = os.cpu_count() or 1
     of_cores = f"{COUNTS.get(cores, cores)}-core CPU"
+    program = Path(sys.argv[0]).resolve()
+    command = [program.name]
+    if program.is_relative_to(EXPERIMENTS):
+        command = ["python", str(program.relative_to(EXPERIMENTS.parent))]
+    command += [Path(x).name if x.startswith((os.sep, "..", "~")) else x for x in sys.argv[1:]]
     return {
+        "command": shlex.join(command),
         "version": version("jaxgran"),
         "date": datetime.date.today().isoformat(),
         "machine": of_cores if device.platform == "cpu" else f"{device.device_kind}, {of_cores}",
@@ -118,3 +149,41 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
+    """Return seconds of compilation (first call less a later one) and the median of later calls."""
+    took = []
+    for _ in range(repeats + 1):
+        begin = time.perf_counter()
+        jax.block_until_ready(run())
+        took.append(time.perf_counter() - begin)
+    run_time = statistics.median(took[1:])
+    return max(took[0] - run_time, 0.0), run_time
+
+
+def process(
+    *arguments: Any, folder: Path = EXPERIMENTS.parent, **variables: str
+) -> subprocess.CompletedProcess:
+    """Run Python in a separate process, with the version of jaxgran in a folder.
+
+    Settings of JAX and of its caches are left out.
+
+    Raises:
+        SystemExit: with its messages, if it fails.
+    """
+    bare = {key: x for key, x in os.environ.items() if not key.startswith(("JAX", "XLA"))}
+    path = os.pathsep.join(filter(None, [str(folder.resolve()), os.environ.get("PYTHONPATH")]))
+    bare |= {"PYTHONPATH": path} | variables
+    command = [sys.executable, *map(str, arguments)]
+    done = subprocess.run(
+        command, env=bare, cwd=folder, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise SystemExit(f"the version in {folder} does not run:\n{done.stderr}")
+    return done
+
+
+def alone(script: str, *arguments: Any) -> dict:
+    """Run a script in a separate process and return its last printed line, which is JSON."""
+    return json.loads(process(script, *arguments).stdout.splitlines()[-1])

@@ -1,6 +1,15 @@
-"""Gases of several experiments."""
+"""Gases of several experiments, and their times."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import root_scalar
 
 import jaxgran
+from experiments.support.record import DATA
+from jaxgran.data.files import header_number
 
 
 def beads(
@@ -41,3 +50,66 @@ def hard_beads(packing_fraction: float, restitution: float, dimension: int = 3) 
         temperature=0.01,
         dimension=dimension,
     )
+
+
+def glass(beta: float, packing_fraction: float = 0.05, dimension: int = 3) -> jaxgran.Gas:
+    """Return beads of Y = 5e7 Pa."""
+    gas = beads(packing_fraction, beta, dimension=dimension).replace(youngs_modulus=5e7)
+    return gas.replace(dissipative_constant=gas.dissipative_constant * beta / gas.thermal_beta)
+
+
+def viscoelastic_like(gas: jaxgran.Gas) -> jaxgran.Gas:
+    """Return viscoelastic beads with the same initial cooling rate of a Maxwellian gas."""
+    theory = jaxgran.KineticTheory()
+
+    def alike(beta: float) -> jaxgran.Gas:
+        return beads(float(gas.packing_fraction), beta, dimension=gas.dimension)
+
+    def excess(beta: float) -> float:
+        return float(theory.cooling_rate(alike(beta)) - theory.cooling_rate(gas))
+
+    return alike(root_scalar(excess, bracket=(1e-3, 3.0)).root)
+
+
+def restitution_like(gas: jaxgran.Gas) -> float:
+    """Return the constant restitution with the initial cooling rate of this Maxwellian gas."""
+    rate = jaxgran.KineticTheory().cooling_rate(gas) / gas.collision_frequency
+    return float((1 - gas.dimension * rate) ** 0.5)
+
+
+def of_lammps(name: str) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve, dict[str, str]]:
+    """Return a gas with its true A, its curve simulated in LAMMPS, and the header of the file."""
+    curve, header = jaxgran.read_curve(DATA / f"lammps_cooling_{name}.csv")
+    gas = jaxgran.read_gas(header)
+    return gas.replace(dissipative_constant=header_number(header, "A")), curve, header
+
+
+def times_of(
+    gas: jaxgran.Gas,
+    collisions: Any,
+    model: jaxgran.AbstractModel | None = None,
+    last: float = 1e6,
+    points: int = 400,
+) -> np.ndarray:
+    """Return times at which a particle has made these numbers of collisions on average.
+
+    Args:
+        model: by default kinetic theory. In clusters spheres collide more often than it predicts.
+        last: of the times of the model, in mean free times.
+        points: number of these times.
+    """
+    trial = np.geomspace(1e-3 if model is None else 0.1, last, points) * float(gas.mean_free_time)
+    counts = jaxgran.cool(gas, jnp.asarray(trial), model=model, progress=False).collisions
+    x, y = np.append(0.0, np.asarray(counts)), np.append(0.0, trial)
+    return np.interp(collisions, x, y)
+
+
+def with_A(gas: jaxgran.Gas, shift: Any) -> jaxgran.Gas:
+    """Return the gas with A times exp(shift)."""
+    return gas.replace(dissipative_constant=gas.value("dissipative_constant") * jnp.exp(shift))
+
+
+def cool(gas: jaxgran.Gas, times, model=None, seed: int = 0, **options: Any) -> Any:
+    """Return the curve of a gas, without a progress bar."""
+    key = jax.random.key(seed)
+    return jaxgran.cool(gas, times, model=model, key=key, progress=False, **options)

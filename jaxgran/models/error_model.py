@@ -104,7 +104,7 @@ beta = .2, N = 1000 (1.4 L_c), 3, 7, 16, 78 +- 1, 1, 1, 3 % too large (this: 3, 
 spheres, phi = .2, beta = .3, N = 500 (1.1 L_c), 7, 17, 18, 21 +- 2, 3, 3, 3 % (3, 9, 28, 21 %);
 hard disks, phi = .25, beta = .3, N = 300 (2 L_c), 9, 21, 77 +- 4, 6, 30 % (4, 16, 670 %), after
 which ln T no longer depends on A, and the projected derivative is -1.7. a and b are fitted to these
-runs; ``experiments/accuracy/derivatives_in_flows.py`` measures the last two again, with smaller
+runs; ``experiments/accuracy/gradient_health.py`` measures the last two again, with smaller
 errors.
 """
 

@@ -270,7 +270,7 @@ class _RationalFit(NamedTuple):
     # eps = (1 + kappa beta)^(-decay) exp(beta P / Q). The power is the asymptotic decay for heavy
     # damping. P = decay kappa - C1 + beta p(x) and Q = 1 + beta q(x), where x is sqrt(beta) or beta
     # and the coefficients are in ascending order, were fitted to `contact.impact` by
-    # experiments/accuracy/derive_restitution.py. There is no odd power of sqrt(beta) below the
+    # experiments/accuracy/derive_coefficients.py. There is no odd power of sqrt(beta) below the
     # beta^(5/2) of the series; hence the first two derivatives at beta = 0 are finite.
     kappa: float
     decay: float

@@ -46,8 +46,8 @@ exponentially: cut off behind a_3 it gives an a_2 that is 6 % (3D) and 11 % (2D)
 eps = .5 and 28 % and 40 % at 0, and cut off behind a_4 one that is too large. The term in a_2^2 is
 that of a gas whose temperature varies in space or time. The numbers were chosen so that a_2 and a_3
 of the homogeneous cooling state agree with direct simulation by an independent code (constant eps
-from 0 to .95); ``experiments/accuracy/sonine_coefficients.py`` measures how well they agree for
-other gases.
+from 0 to .95); ``experiments/accuracy/particle_statistics.py`` measures how well they agree with
+DSMC.
 """
 
 

@@ -602,7 +602,7 @@ DIAMETER_REDUCTION = 0.4**-0.4 * gamma(1.4)
 exclude the same volume (Barker & Henderson).
 """
 
-# c(beta)/(d - 1) over `MEAN_OVERLAP`, fitted by experiments/accuracy/derive_softness.py.
+# c(beta)/(d - 1) over `MEAN_OVERLAP`, fitted by experiments/accuracy/derive_coefficients.py.
 _NUMERATOR = (1.24185842, 0.02178437)
 
 _DENOMINATOR = (1.75563384, 0.33641322)

@@ -103,7 +103,7 @@ def test_recorded_figures_reproduce_the_paper(name):
 def test_scripts_run(script, name, tmp_path):
     record = run_part(script, name, tmp_path)
     assert (tmp_path / "here" / f"{name}.png").stat().st_size > 20_000
-    assert record["config"] and record["made_by"]["packages"] and record["run_s"] > 0
+    assert record["config"] and record["made_by"]["packages"]
     PARTS[name](record["found"])
 
 
@@ -117,10 +117,7 @@ def test_claims_that_need_no_particles_hold(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_film_is_made_of_a_trajectory(tmp_path):
-    run_part("paper_clustering", "clustering_film", tmp_path)
-    for name in ("film.gif", "clustering_film.png", "run.gsd"):
-        assert (tmp_path / "here" / name).stat().st_size > 5_000
-    again = ("--trajectory", "here/run.gsd", "--out", "there")
-    printed = run(PAPER / "paper_clustering.py", *again, folder=tmp_path)
-    assert "film.gif, 4 frames" in printed
+def test_flow_and_clusters_grow(tmp_path):
+    record = run_part("paper_clustering", "clustering_film", tmp_path)
+    assert (tmp_path / "here" / "clustering_film.png").stat().st_size > 20_000
+    assert record["across"][-1][0] > 2 * record["across"][0][0]

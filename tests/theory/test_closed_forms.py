@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from experiments.support.closed_forms import (
     paper_averages,
     paper_displacement,
     paper_temperature,
-    two_term_time,
 )
 from jaxgran.theory import averages as kinetics
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
@@ -44,20 +42,6 @@ def test_haff(e, record):
     exact = haff(tau, e)
     np.testing.assert_allclose(curve.temperature, exact, rtol=1e-8)
     record("haff", eps=e, error=float(jnp.max(jnp.abs(curve.temperature / exact - 1))))
-
-
-def test_two_term_solution(beads):
-    gas = beads(0.15)
-    law, unit = gas.reduced_law, gas.impact_speed * gas.mean_free_time / gas.path_length
-
-    def rate(theta):  # d theta/d tau by the first two terms of the averages
-        return -2 / 3 * paper_averages(law, jnp.sqrt(theta), 3)[0, 0] * theta**1.5 * unit
-
-    theta = jnp.geomspace(1.0, 1e-10, 30)[1:]
-    slope = jax.vmap(jax.grad(lambda x: two_term_time(x, gas.delta)))(theta)
-    np.testing.assert_allclose(slope * jax.vmap(rate)(theta), 1.0, rtol=1e-9)
-    with pytest.raises(ValueError, match=r"delta must lie in \(0, 0.4345\), got 0.5"):
-        two_term_time(0.5, 0.5)
 
 
 @pytest.mark.slow
