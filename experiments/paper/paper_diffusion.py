@@ -435,7 +435,7 @@ def diffusion(options: argparse.Namespace) -> dict:
     caption(in_collisions, title, xlim=(0, 600), ylim=(0, 7500), **labels)
     forms.axhline(0, color="0.7", lw=0.8)
     title = "Closed forms, viscoelastic: difference from theory"
-    labels = {"ylabel": "formula / theory − 1", "xlim": (3, None), "ylim": (-0.6, 0.6)}
+    labels = {"ylabel": "formula / theory − 1", "xlim": (3, None), "ylim": (-0.25, 1.2)}
     caption(forms, title, **labels, **logs)
     return {"config": config, "found": found, "picture": figure}
 
