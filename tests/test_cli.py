@@ -162,6 +162,21 @@ def test_errors_of_headers_are_priors_of_joint_fits(measured, capsys):
     assert budget["packing_fraction"] > 0 and budget["few particles"] > 0
 
 
+@pytest.mark.parametrize("free", [("A",), ("A", "T0")])
+def test_late_clocks_of_headers_are_priors_of_joint_fits(measured, capsys, free):
+    for name in ("thin.csv", "dense.csv"):
+        curve, header = jaxgran.read_curve(name)
+        late = jaxgran.CoolingCurve(
+            5 + curve.times, curve.temperature, temperature_error=curve.temperature_error
+        )
+        clock = {"t0": "5", "t0_err": "0.01"}
+        jaxgran.write_curve(name, late, header | clock, overwrite=True)
+    assert main(["fit", "thin.csv", "dense.csv", "--free", *free, "--quick", "--out", "k"]) == 0
+    _, answer = _answer(capsys)
+    assert abs(answer["A"] / 3e-6 - 1) < 3 * answer["A_std_err"] / 3e-6 < 0.1
+    assert answer["agree"]
+
+
 def test_curves_with_one_floor_of_noise_are_misfits_not_contradictions(measured, capsys):
     for name in ("thin.csv", "dense.csv"):
         curve, header = jaxgran.read_curve(name)

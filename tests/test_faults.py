@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,7 @@ GAS = glass_beads(0.3, packing_fraction=0.1)
 TAU = float(GAS.mean_free_time)
 CURVE = jaxgran.CoolingCurve(times=[0.1, 0.2, 0.3, 0.4], temperature=[4e-3, 3e-3, 2e-3, 1e-3])
 SOFT = jaxgran.SoftSpheres(20)
+TESTS = Path(__file__).parent
 MASKED = np.ma.masked_all(1)
 
 
@@ -162,6 +164,31 @@ def test_refused(call, words):
     with pytest.raises((ValueError, TypeError), match=words) as error:
         call()
     assert error.type is ValueError or "abstract" in str(error.value)
+
+
+def test_the_table_of_faults_names_tests_that_exist():
+    text = (TESTS / "faults.md").read_text()
+    named = re.findall(r"([\w/]+\.py)(?:::(\w+)(?:\[(.*?)\])?)?", text.partition("|---")[2])
+    assert len(named) > 40
+    for file, function, case in named:
+        code = (TESTS / file).read_text()
+        assert not function or f"def {function}(" in code, function
+        assert not case or f'"{case}"' in code, case
+
+
+def test_statuses_are_explained():
+    assert jaxgran.explain_status(None) == jaxgran.explain_status(jnp.zeros(3, int)) == "ok"
+    several = np.array([0, status.STALLED.bit, status.STALLED.bit | status.LIST_FULL.bit])
+    words = jaxgran.explain_status(several)
+    assert "2 of 3 curves: the simulated time" in words and "1 of 3 curves: the neigh" in words
+    for wrong in (-1, 1.5, "x", 2 * status.FAULTS[-1].bit):
+        with pytest.raises(ValueError, match="status must be that of a curve"):
+            jaxgran.explain_status(wrong)
+
+
+def test_particles_of_all_replicas_are_told():
+    with pytest.raises(ValueError, match=r"got \(1, 5, 3\): take particles.position\[0\]"):
+        jaxgran.observables.pair_correlation(np.zeros((1, 5, 3)), 1.0, [0.0, 0.1])
 
 
 def test_whole_numbers_of_numpy_are_taken():

@@ -97,23 +97,7 @@ OVERLAPS_REMAIN = Fault(
     "randomly placed spheres still overlap after many steps that push them apart",
     "lower the packing fraction, or give your own start",
 )
-FAULTS = (
-    LIST_FULL,
-    CONTACTS_FULL,
-    SKIN_EXCEEDED,
-    STEP_TOO_LARGE,
-    NOT_FINITE,
-    STALLED,
-    TOO_FAST,
-    MAX_STEPS_REACHED,
-    OVERLAPPING,
-    BOX_MISMATCH,
-    BOX_TOO_SMALL,
-    ENERGY_DRIFT,
-    OUT_OF_RANGE,
-    UNSUPPORTED,
-    OVERLAPS_REMAIN,
-)
+FAULTS = tuple(x for x in [*globals().values()] if isinstance(x, Fault))
 
 
 def flag(fault: Fault, when: ArrayLike) -> Int[Array, "..."]:

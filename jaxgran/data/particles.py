@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxgran._utils.validation import no_type_check
+from jaxgran._utils.validation import checked_int, no_type_check
 from jaxgran.data.curve import Particles, import_extra
-from jaxgran.data.files import check_writable, checked_path, name_in_errors, read_bytes
+from jaxgran.data.files import MAX_COUNT, check_writable, checked_path, name_in_errors, read_bytes
 
 GSD = ".gsd"
 XYZ = ".xyz"
@@ -64,7 +64,7 @@ XYZ_VECTORS = {
 """Names of the columns of properties of an extended XYZ file."""
 
 EQUAL = {
-    **dict.fromkeys(("type", "element", "species", "Z")),
+    **dict.fromkeys(("type", "element", "species", "Z", "q", "shapex", "shapey", "shapez")),
     **dict.fromkeys(("diameter", "radius"), (1, 0)),
     **dict.fromkeys(("mass", "masses"), (0, 1)),
     "density": (-3, 1),
@@ -140,6 +140,7 @@ def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None =
     path = checked_path(path, "a LAMMPS dump or data file, extended XYZ, or GSD")
     if dimension not in (None, 2, 3):
         raise ValueError(f"dimension must be 2 or 3, or None, got {dimension!r}")
+    frame = checked_int("frame", frame, -MAX_COUNT)
     with name_in_errors(path):
         frames = open_frames(path)
         if not -len(frames) <= frame < len(frames):
@@ -161,7 +162,7 @@ def open_frames(path: Path) -> list[Callable[[int | None], Frame]]:
             raise FileNotFoundError
         with _import_gsd().open(str(path), "r") as file:
             return [partial(_read_gsd, path, k) for k in range(len(file))]
-    text = read_bytes(path).decode()
+    text = read_bytes(path).decode("utf-8-sig")
     if text.lstrip().startswith("ITEM:"):
         read, parts = _read_dump, _parts_of_dump(text)
     elif text.split(maxsplit=1)[:1] and text.split(maxsplit=1)[0].isdigit():

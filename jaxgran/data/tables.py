@@ -37,7 +37,11 @@ UNITS = {
 }
 """Unit of each column and header key; that of a standard error, x_err, is that of x."""
 
-ALIASES = {"time": "t"} | {quantity.field: quantity.column for quantity in QUANTITIES.values()}
+ALIASES = {
+    "time": "t",
+    **{quantity.field: quantity.column for quantity in QUANTITIES.values()},
+    **{name: name for name in ("id", "particle", "frame", "x", "y", "z")},
+}
 """Further names of columns, in any case."""
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "bars", " ": "blanks"}

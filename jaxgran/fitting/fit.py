@@ -33,6 +33,7 @@ from jaxgran.fitting.parameters import (
     guess_from_data,
     guess_from_drops,
     halving_time,
+    known_start_time,
     size_of,
     with_names_of_law,
 )
@@ -307,7 +308,11 @@ def _fit_deterministic(
             runs[label] or 1,
             use_displacement=START_TIME not in (*free, *prior_names),
         )
-        guesses[label] = guess_from_data(m.gas, m.curve, free)
+        clocks = (START_TIME,) if START_TIME in prior_names else ()
+        since = m.curve
+        if "temperature" in free:
+            since = replace(since, times=since.times - known_start_time(priors, label)[0])
+        guesses[label] = guess_from_data(m.gas, since, (*free, *clocks))
         if clock_is_free and not any_traced(measured, gas):
             accuracy = clock_accuracy(guesses[label], m, model, counts[label])
             m = replace(m, clock_accuracy=accuracy)

@@ -28,6 +28,7 @@ from jaxgran.fitting.parameters import (
     domain_of,
     guess_start_time,
     halving_time,
+    known_start_time,
 )
 from jaxgran.fitting.residuals import (
     CLOCK,
@@ -155,7 +156,8 @@ class Problem:
             if u.name == START_TIME:
                 names = tuple(v.name for v in self.unknowns if v.label in (None, label))
                 measurement: Any = by_label[label]
-                start = guess_start_time(gas, measurement.curve, names)
+                known = known_start_time(self.priors, label)
+                start = guess_start_time(gas, measurement.curve, names, known)
                 parts.append(xp.ravel(xp.asarray(start) / u.unit))
             elif u.name in gas.domains:
                 parts.append(xp.ravel(u.domain.to_free(xp.asarray(gas.value(u.name)))))

@@ -182,19 +182,33 @@ def _law_scales(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""]]:
 _scales = eqx.filter_jit(_law_scales)
 
 
-def guess_start_time(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Numbers:
+def known_start_time(priors: "dict[str, Priors]", label: str) -> tuple[Numbers, Numbers]:
+    """Return the t0 that priors give for a measurement and its error, s, or 0 and infinity."""
+    some = [priors.get(where, NO_PRIORS) for where in (SHARED, label)]
+    for part in some:
+        if START_TIME in part.names:
+            i = part.names.index(START_TIME)
+            return part.given[i], part.errors[i]
+    return 0.0, np.inf
+
+
+def guess_start_time(
+    gas: Gas, curve: CoolingCurve, free: tuple[str, ...], known: tuple[Numbers, Numbers]
+) -> Numbers:
     """Return the time, s, at which the line of `guess_from_data` gives the T_0 of a gas.
 
-    It is 0 if t0 is not free, or if T_0 is free too.
+    It is the known one if t0 is not free, or if T_0 is free too, and within 3 errors of it.
     """
+    t0, error = known
     if START_TIME not in free or "temperature" in free:
-        return 0.0
-    xp = array_module(gas, curve)
+        return t0
+    xp = array_module(gas, curve, known)
     times, T = xp.asarray(curve.times), xp.asarray(curve.temperature)
     power, line = _power_and_line(gas, curve)
     intercept, slope = _intercept_and_slope(times, line)
-    t0 = ((xp.asarray(gas.temperature) / T[0]) ** -power - intercept) / slope
-    return xp.clip(xp.where(slope > 0, t0, 0.0), -times[-1], 0.5 * times[-1])
+    guess = ((xp.asarray(gas.temperature) / T[0]) ** -power - intercept) / slope
+    guess = xp.clip(xp.where(slope > 0, guess, 0.0), -times[-1], 0.5 * times[-1])
+    return xp.clip(guess, t0 - 3 * error, t0 + 3 * error)
 
 
 def halving_time(curve: CoolingCurve) -> Numbers:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jaxgran._utils.tracing import is_known
 from jaxgran._utils.validation import FRACTION, Domain, number_named
 from jaxgran.scene.laws import ConstantRestitution, RestitutionLaw
-from jaxgran.scene.parameters import check_fields, domains_of
+from jaxgran.scene.parameters import ADVICE, Parameter, fields_of
 
 NUM_SPIN_COMPONENTS = {2: 1, 3: 3}
 """Number of components of the angular velocity, d_rot, by dimension."""
@@ -47,12 +47,28 @@ def _number_or_none(name: str) -> Callable[[Any], Array | None]:
     return convert
 
 
-def _domains_of_given(element: Any) -> dict[str, Domain]:
-    domains = domains_of(type(element).__name__)
-    return {name: x for name, x in domains.items() if getattr(element, name) is not None}
+class Element(eqx.Module):
+    """Base class of the elements, whose floats have ranges in `jaxgran.scene.parameters`."""
+
+    part: ClassVar[str] = ""
+    """End of the names of fields in messages, as " of the walls"."""
+
+    @property
+    def domains(self) -> dict[str, Domain]:
+        """Allowed range of each float that is given."""
+        return {name: p.domain for name, p in self._parameters.items()}
+
+    @property
+    def _parameters(self) -> dict[str, Parameter]:
+        known = fields_of(type(self).__name__)
+        return {name: p for name, p in known.items() if getattr(self, name) is not None}
+
+    def __check_init__(self):
+        for name, p in self._parameters.items():
+            p.domain.check(f"{name}{self.part}", getattr(self, name), ADVICE.get(p.name, ""))
 
 
-class Rough(eqx.Module):
+class Rough(Element):
     """Rough spheres, which rotate: the tangential velocity at contact is multiplied by -beta_t.
 
     The velocity at contact is ``u = v_i - v_j - (sigma/2) (w_i + w_j) x n`` with the unit vector n
@@ -100,16 +116,8 @@ class Rough(eqx.Module):
         converter=_number_or_none("friction"), default=None
     )
 
-    @property
-    def domains(self) -> dict[str, Domain]:
-        """Allowed range of each float."""
-        return _domains_of_given(self)
 
-    def __check_init__(self):
-        check_fields(self, "Rough")
-
-
-class Frictional(eqx.Module):
+class Frictional(Element):
     """Frictional spheres, which rotate: a viscous tangential force with Coulomb's upper limit.
 
     The slip velocity ``u_t`` is the tangential part of ``u = v_i - v_j - l (w_i + w_j) x n`` with
@@ -155,11 +163,6 @@ class Frictional(eqx.Module):
         converter=number_named("rotational_temperature"), default=0.0
     )
 
-    domains: ClassVar[dict[str, Domain]] = domains_of("Frictional")
-
-    def __check_init__(self):
-        check_fields(self, "Frictional")
-
 
 def _wall_law(law: UserWallLaw) -> RestitutionLaw:
     if isinstance(law, RestitutionLaw):
@@ -168,7 +171,7 @@ def _wall_law(law: UserWallLaw) -> RestitutionLaw:
     return ConstantRestitution(law)
 
 
-class Walls(eqx.Module):
+class Walls(Element):
     """Flat walls at rest around the gas: a cube (square), or a box of given sides.
 
     A wall reverses the normal velocity of a sphere and multiplies it by the restitution. A
@@ -205,8 +208,9 @@ class Walls(eqx.Module):
         converter=_number_or_none("friction of the walls"), default=None, kw_only=True
     )
 
+    part: ClassVar[str] = " of the walls"
+
     def __check_init__(self):
-        check_fields(self, "Walls", " of the walls")
         if (self.tangential_damping is None) != (self.friction is None):
             given, missing = "tangential_damping", "friction"
             if self.tangential_damping is None:
@@ -214,11 +218,6 @@ class Walls(eqx.Module):
             raise ValueError(
                 f"the walls have {given} but no {missing}. Give both, or leave {given} out."
             )
-
-    @property
-    def domains(self) -> dict[str, Domain]:
-        """Allowed range of each float of the walls, without those of their law."""
-        return _domains_of_given(self)
 
     def more_collisions(self, diameter: Array, dimension: int) -> Float[Array, ""]:
         """Ratio of the collision frequency to that without walls at the same mean density.
@@ -240,7 +239,7 @@ class Walls(eqx.Module):
         return room * (1 - jnp.sum(near) / 2 + 2 / (3 * pi) * pairs - jnp.prod(near) / (4 * pi))
 
 
-class StokesDrag(eqx.Module):
+class StokesDrag(Element):
     """Drag of a gas or liquid around the spheres, ``dv/dt = -gamma v``.
 
     Args:
@@ -261,13 +260,10 @@ class StokesDrag(eqx.Module):
         converter=number_named("rotational_rate of the drag"), default=0.0
     )
 
-    domains: ClassVar[dict[str, Domain]] = domains_of("StokesDrag")
-
-    def __check_init__(self):
-        check_fields(self, "StokesDrag", " of the drag")
+    part: ClassVar[str] = " of the drag"
 
 
-class WhiteNoise(eqx.Module):
+class WhiteNoise(Element):
     """A drive that heats the gas: Gaussian white noise on each component of each velocity.
 
     ``dv_i/dt = xi_i(t)`` with ``<xi_i(t) xi_j(t')> = strength delta_ij delta(t - t')``, independent
@@ -295,10 +291,7 @@ class WhiteNoise(eqx.Module):
 
     strength: Float[Array, ""] = eqx.field(converter=number_named("strength of the drive"))
 
-    domains: ClassVar[dict[str, Domain]] = domains_of("WhiteNoise")
-
-    def __check_init__(self):
-        check_fields(self, "WhiteNoise", " of the drive")
+    part: ClassVar[str] = " of the drive"
 
 
 def check_elements(gas: Any) -> None:

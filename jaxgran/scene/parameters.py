@@ -4,7 +4,7 @@ Elements, laws and `Gas` take the ranges of their fields from it, curve files th
 the command line the arguments of --free.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jaxgran._utils.validation import ANY, FRACTION, NON_NEGATIVE, POSITIVE, Domain
 
@@ -123,18 +123,3 @@ def fields_of(owner: str) -> dict[str, Parameter]:
 def domains_of(owner: str) -> dict[str, Domain]:
     """Return the allowed values of the fields of a class."""
     return {field: parameter.domain for field, parameter in fields_of(owner).items()}
-
-
-def check_fields(module: Any, owner: str, part: str = "") -> None:
-    """Raise ValueError for a field of a module outside its domain; None is allowed.
-
-    Args:
-        module: instance of the owner.
-        owner: name of its class in the table.
-        part: ends the name of the field in the message, as " of the walls".
-    """
-    for field, parameter in fields_of(owner).items():
-        value = getattr(module, field)
-        if value is not None:
-            advice = ADVICE.get(parameter.name, "")
-            parameter.domain.check(f"{field}{part}", value, advice)

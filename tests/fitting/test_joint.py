@@ -1,5 +1,7 @@
 """Several measurements of one material."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +39,19 @@ def test_a_drop_test_gives_its_constant(onto_plate):
     alone = jaxgran.fit(unknown, one)
     assert float(alone.standard_error[0]) == pytest.approx(2**0.5 * float(error), rel=0.05)
     assert jaxgran.diagnose(alone).grade == "determined"
+
+
+def test_a_restitution_that_is_flat_is_not_viscoelastic():
+    """As golf balls bounce: eps is .895 at all speeds from 1.9 to 4 m/s."""
+    speed = np.linspace(1.9, 4.0, 12)
+    noise = 0.002 * np.array(jax.random.normal(jax.random.key(3), (12,)))
+    test = jaxgran.DropTest(speed, 0.895 + noise, np.full(12, 0.002), onto_plate=True)
+    gas = glass_beads(0.15).replace(dissipative_constant=0.0)  # as files give it
+    fitted = jaxgran.fit(gas, test)
+    assert fitted.p_value < 1e-4 and fitted.value(A[0])[0] > 0
+    assert jaxgran.diagnose(fitted, test).grade == "not consistent"
+    constant = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.8))
+    assert jaxgran.fit(constant, test).p_value > 0.01
 
 
 def test_curves_and_drops_together():
