@@ -12,6 +12,7 @@ from scipy.linalg import hadamard
 import jaxgran
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.particles.soft.forces import SERIES_LIMIT, flight_time
+from jaxgran.scene.parameters import domains_of
 from tests.beads import glass_beads, soft_beads
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
@@ -309,7 +310,7 @@ def test_follows_lammps_with_friction_between_walls_particle_by_particle():
     gas = jaxgran.Gas(
         law,
         **{name: data[name] for name in ("diameter", "mass", "packing_fraction", "temperature")},
-        surface=jaxgran.Frictional(*(data[name] for name in jaxgran.Frictional.domains)),
+        surface=jaxgran.Frictional(*(data[name] for name in domains_of("Frictional"))),
         container=jaxgran.Walls(
             data["wall_side"],
             restitution=wall,
