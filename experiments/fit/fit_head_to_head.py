@@ -147,9 +147,9 @@ def with_derivatives(problem: Problem, count: int, most: int | None) -> list[np.
             key=jax.random.key(KEY),
             progress=False,
         )
-        guesses.append(np.log(np.asarray(fitted.estimate) / true))
-        if fitted.iterations < simulations or fitted.converged:
+        if fitted.iterations < simulations:
             break
+        guesses.append(np.log(np.asarray(fitted.estimate) / true))
     return guesses
 
 

@@ -193,7 +193,8 @@ def panel(axes: Axes, rows: list[dict]) -> None:
             (x,), (y,) = coordinates([row])
             axes.errorbar(x, y, 100 * row["standard_error"], **look)
             if not is_full:
-                axes.annotate(f" {steps_of(row)} steps", (x, y), fontsize=8, color=COLOURS[name])
+                look = {"fontsize": 8, "ha": "right" if k == len(usual) else "left", "va": "top"}
+                axes.annotate(f"  {steps_of(row)} steps  ", (x, y), color=COLOURS[name], **look)
         axes.plot(*coordinates(usual), color=COLOURS[name], lw=0.8, alpha=0.6)
     words = f"N = {sizes['soft spheres']}\nDSMC: {sizes['DSMC']}"
     axes.text(0.02, 0.03, words, transform=axes.transAxes, fontsize=8.5, color=INK)
