@@ -242,6 +242,4 @@ def test_curves_of_different_lengths_are_fitted_at_once():
 
     estimates, chi2 = jax.vmap(fitted)(batch)
     np.testing.assert_allclose(estimates, [SERIES.value("coefficients")] * 2, atol=1e-5)
-    alone = jaxgran.fit(guess, curves[1], free=("coefficients",))
-    np.testing.assert_allclose(estimates[1], alone.estimate, atol=1e-5)
-    np.testing.assert_allclose(chi2[1], alone.chi2, atol=1e-4)
+    np.testing.assert_allclose(chi2, 0.0, atol=1e-4)  # without noise

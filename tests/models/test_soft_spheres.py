@@ -100,7 +100,8 @@ def test_a_step_too_large_is_shortened():
     position = cold.position.at[0, 1].set(cold.position[0, 0] + jnp.array([1e-3, 0.0, 0.0]))
     start = cold._replace(position=jnp.mod(position, cold.box_side))
     model = SoftSpheres(64, start=start, steps_per_contact=10)
-    curve = jaxgran.cool(gas, [1e-6, 1e-4], model=model)
+    with pytest.warns(UserWarning, match="spheres of the start overlap: the energy of their"):
+        curve = jaxgran.cool(gas, [1e-6, 1e-4], model=model)
     total = energy(gas, curve)
     assert total[-1] > 10  # the energy was there
     np.testing.assert_allclose(total[0], total[-1], rtol=0.05)
