@@ -21,6 +21,7 @@ from jaxgran.fitting.optimise import Problem, search
 from jaxgran.fitting.parameters import START_TIME, domain_of
 from jaxgran.fitting.residuals import FLOOR, DropTestRows, Measurement, chi2_scale
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
+from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR, WALL_ERROR
 from jaxgran.models.kinetic_theory import KineticTheory
 
 ALLOWED_CHI2 = 3.84
@@ -45,11 +46,22 @@ ROUGHNESS = (0.02, 0.08, 0.25, 0.6, 1.0, 1.4, 1.75, 1.9)
 SLIDING = (0.3, 1.0, 2.5, 6.0, 15.0)
 """Values of 1/mu of rough spheres that slide."""
 
+FRICTION = (0.02, 0.06, 0.15, 0.4, 1.0)
+"""Values of mu of smooth spheres that become rough and slide."""
+
+STICKING_RESTITUTION = 0.44
+"""beta_t of these, where they stick: that of glass (.44) and acetate (.43) beads, Foerster et al.,
+Phys. Fluids 6, 1108 (1994)."""
+
 DELAYS = (0.003, 0.02, 0.1, 0.3)
 """Errors of the start of the clock, over the initial cooling time, of both signs."""
 
 NUM_REFINED = 2
-"""Number of amplitudes tried between the last allowed one and the first excluded one."""
+"""Number of amplitudes tried between the last allowed one and the first excluded one, and around
+each minimum."""
+
+MIN_SPACING = 0.05
+"""Least distance of the latter from those tried, over the distance of these."""
 
 WALL_RESTITUTION = 0.5
 """Restitution of the walls of an alternative; the side of the box is its amplitude."""
@@ -91,15 +103,19 @@ class Kind(NamedTuple):
 
     Attributes:
         name: in words.
-        parameter: the float, `START_TIME` or `FLOOR` that is its amplitude.
+        parameters: the floats, `START_TIME` or `FLOOR` that it adds, first its amplitude.
         amplitudes: values that are tried, in one or two increasing sequences from 0.
         values: values of parameters at an amplitude, given the label of the measurement.
+        rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.
+        one_minimum: False if amplitudes beyond excluded ones may be allowed.
     """
 
     name: str
-    parameter: str
+    parameters: tuple[str, ...]
     amplitudes: tuple[tuple[float, ...], ...]
     values: Callable[[float, str], dict[str, float]]
+    rate_error: Callable[[float], float] = lambda amplitude: 0.0
+    one_minimum: bool = True
 
 
 class Trial(NamedTuple):
@@ -170,7 +186,9 @@ def compare_alternatives(
     trials = {kind: [_profile(problem, kind, base, scale) for base in bases] for kind in kinds}
     everything = [t for valleys in trials.values() for valley in valleys for t in valley]
     scale, degrees = _scale(min([*bases, *everything], key=lambda t: t.chi2), result)
-    significant = scipy.stats.f.isf(SIGNIFICANCE / max(len(kinds), 1), 1, degrees)
+    chance = SIGNIFICANCE / max(len(kinds), 1)
+    # The quantile of the F distribution with 1 degree of freedom; scipy.stats takes .3 s to import.
+    significant = float(scipy.special.stdtrit(degrees, 1 - chance / 2) ** 2)
     # Errors that the trials, which have no noise, do not include.
     parts = [result.error_budget.get(part, 0.0) for part in ("simulation", "few particles")]
     noise = np.hypot(*map(np.asarray, parts))
@@ -202,7 +220,7 @@ def compare_alternatives(
         improvement, wider = float((bases[0].chi2 - best.chi2) / scale), 0.0
         if law is not None:
             wider = max(law.low[0] - low[0], high[0] - law.high[0]) / abs(law.estimate[0])
-        parameter = "" if kind is None else kind.parameter
+        parameter = "" if kind is None else kind.parameters[0]
         return Alternative(
             name="" if kind is None else kind.name,
             effect=next((name for name, x in DECLARABLE.items() if x[0] == parameter), ""),
@@ -401,30 +419,44 @@ def _kinds(result: Fit, problem: Problem, absent: tuple[str, ...]) -> list[Kind]
     def delay(share: float, label: str) -> dict[str, float]:
         return {START_TIME: -share / rates[label]}
 
+    beta_t, floor = "tangential_restitution", lambda x, label: {FLOOR: x * lowest[label]}
     possible = [
-        Kind("walls that dissipate energy", "wall_side", (SHARES,), walls),
-        Kind("linear drag, as in air", "drag_rate", (DRAG_SHARES,), drag),
-        Kind("a noise floor in T", FLOOR, (SHARES,), lambda x, label: {FLOOR: x * lowest[label]}),
+        Kind(
+            "walls that dissipate energy",
+            ("wall_side",),
+            (SHARES,),
+            walls,
+            lambda share: WALL_ERROR * share,
+        ),
+        Kind("linear drag, as in air", ("drag_rate",), (DRAG_SHARES,), drag),
+        Kind("a noise floor in T", (FLOOR,), (SHARES,), floor),
         Kind(
             "rough grains without initial rotation",
-            "tangential_restitution",
+            (beta_t,),
             (ROUGHNESS,),
-            lambda x, label: {"tangential_restitution": x - 1},
+            lambda x, label: {beta_t: x - 1},
+            lambda x: ROUGHNESS_ERROR * min(x, 1.0),
+        ),
+        Kind(
+            "rough grains that slide",
+            (beta_t, "friction"),
+            (FRICTION,),
+            lambda x, label: {beta_t: STICKING_RESTITUTION, "friction": x},
+            lambda x: SLIDING_ERROR * x,
+            one_minimum=False,
         ),
     ]
-    if all("tangential_restitution" in gas.domains for gas in scenes):
-        kind = Kind(
-            "grains that slide", "friction", (SLIDING,), lambda x, label: {"friction": 1 / x}
-        )
-        possible.append(kind)
+    if all(beta_t in gas.domains for gas in scenes):
+        sliding = lambda x, label: {"friction": 1 / x}  # noqa: E731
+        possible.append(Kind("grains that slide", ("friction",), (SLIDING,), sliding))
     known = {name.rpartition(": ")[2] for name in result.names}
     known |= {name for some in result.priors.values() for name in some.names}
     if not known & {START_TIME, "temperature"}:
         both = DELAYS, tuple(-x for x in DELAYS)
-        possible.append(Kind("an error of the start time or of T_0", START_TIME, both, delay))
+        possible.append(Kind("an error of the start time or of T_0", (START_TIME,), both, delay))
     known |= {DECLARABLE[name][0] for name in absent}
     known |= {name for gas in scenes for name in gas.domains}
-    return [kind for kind in possible if kind.parameter not in known and scenes]
+    return [kind for kind in possible if known.isdisjoint(kind.parameters) and scenes]
 
 
 def _initial_rate(m: Measurement, result: Fit) -> float:
@@ -489,7 +521,15 @@ def _profile(problem: Problem, kind: Kind, base: Trial, scale: float) -> list[Tr
 
     def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
         fixed = {m.label: kind.values(amplitude, m.label) for m in problem.curves}
-        return _trial(dataclasses.replace(problem, fixed=fixed), amplitude, first)
+        error = kind.rate_error(amplitude)
+        measurements = tuple(
+            dataclasses.replace(m, clock_accuracy=m.clock_accuracy + error)
+            if isinstance(m, Measurement)
+            else m
+            for m in problem.measurements
+        )
+        changed = dataclasses.replace(problem, fixed=fixed, measurements=measurements)
+        return _trial(changed, amplitude, first)
 
     trials, lowest = [base], base.chi2
     for sequence in kind.amplitudes:
@@ -508,9 +548,27 @@ def _profile(problem: Problem, kind: Kind, base: Trial, scale: float) -> list[Tr
             if trial.chi2 > lowest + ALLOWED_CHI2 * scale:
                 trials += _refined(fit_with, before, trial, lowest + ALLOWED_CHI2 * scale)
             previous, before = before, trial
-            if trial.chi2 > lowest + EXCLUDED_CHI2 * scale:
+            if kind.one_minimum and trial.chi2 > lowest + EXCLUDED_CHI2 * scale:
                 break
+    for _ in range(NUM_REFINED):
+        trials.sort(key=lambda trial: trial.amplitude)
+        threes = [trials[k - 1 : k + 2] for k in range(1, len(trials) - 1)]
+        lowest_of_three = [x for x in threes if x[1].chi2 < min(x[0].chi2, x[2].chi2)]
+        found = [_at_the_vertex(fit_with, three) for three in lowest_of_three]
+        trials += [trial for trial in found if trial is not None]
     return sorted(trials, key=lambda trial: trial.amplitude)
+
+
+def _at_the_vertex(
+    fit_with: Callable[[float, np.ndarray], Trial | None], three: list[Trial]
+) -> Trial | None:
+    """Return the fit at the vertex of the parabola through a minimum of chi^2, or on its side."""
+    x = np.array([trial.amplitude for trial in three])
+    curvature, slope, _ = np.polyfit(x - x[1], [trial.chi2 for trial in three], 2)
+    vertex = x[1] - slope / (2 * curvature)
+    if not np.min(np.abs(vertex - x)) > MIN_SPACING * (x[2] - x[0]):
+        vertex = (x[1] + (x[2] if vertex > x[1] else x[0])) / 2
+    return fit_with(vertex, three[1].flat)
 
 
 def _refined(

@@ -239,7 +239,7 @@ def _narrowing(
     best = max(x.improvement for x in (law, *alternatives))
     if not wide or max(x.improvement for x in others) < best - ALLOWED_CHI2:
         return ""
-    name, effects = result.names[0], sorted(x.effect for x in wide)
+    name, effects = result.names[0], sorted({x.effect for x in wide})
     low, high = (float(x[0]) for x in ranges_over_alternatives(result, others)[name])
     given = ", ".join(DECLARABLE[effect][1] for effect in effects)
     value = _format_range(low, high, float(np.asarray(result.estimate)[0]), unit_of(name))

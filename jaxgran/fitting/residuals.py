@@ -22,6 +22,14 @@ from jaxgran.scene.gas import Gas
 MAGNITUDES = 1e-30, 1e30
 """Smallest and largest allowed values of a measurement, SI."""
 
+TINY = 1e-30
+
+FEW_IMPACTS = 4.0
+"""Excess of the variance of T_rot over that of Gaussian spins, times collisions per particle.
+
+Measured: 100 runs of 250 spheres without initial rotation, beta_t = -.3: 5, 5, 4, 3 at .2, .7, 1.3,
+2.2 collisions; between walls, which spheres hit, too, 3, 2, 1 at .1, .5, 1."""
+
 MIN_ERROR = 1e-12
 """Smallest allowed relative error of a measurement."""
 
@@ -90,16 +98,27 @@ def with_errors_of_particles(
 ) -> CoolingCurve:
     """Return a curve with the errors that its T_rot needs, from the fluctuations of N particles.
 
-    Relative errors that the curve lacks are ``sqrt(2/(d N R))`` of T and ``sqrt(2/(d_rot N R))`` of
-    T_rot, with R replicas. Without N, T_rot or a surface the curve is returned unchanged.
+    Relative errors that the curve lacks are ``sqrt(2/(d N R))`` of T and, with R replicas and c
+    collisions per particle, ``sqrt((1 + `FEW_IMPACTS`/c) 2/(d_rot N R))`` of T_rot: at first few
+    spheres have hit another one and hold all rotation. Without N, T_rot or a surface the curve is
+    returned unchanged.
     """
     if num_particles is None or gas.surface is None or curve.rotational_temperature is None:
         return curve
-    total, errors = num_particles * replicas, {}
-    degrees = {"temperature": gas.dimension, "rotational_temperature": 2 * gas.dimension - 3}
-    for name, d in degrees.items():
-        if getattr(curve, f"{name}_error") is None:
-            errors[f"{name}_error"] = (2 / (d * total)) ** 0.5 * getattr(curve, name)
+    xp, d, errors = array_module(gas, curve), gas.dimension, {}
+    T, T_rot = xp.asarray(curve.temperature), xp.asarray(curve.rotational_temperature)
+    if curve.temperature_error is None:
+        errors["temperature_error"] = (2 / (d * num_particles * replicas)) ** 0.5 * T
+    if curve.rotational_temperature_error is None:
+        zero, T_0 = xp.zeros(1, T.dtype), xp.reshape(xp.asarray(gas.temperature), 1)
+        times = xp.concatenate([zero, xp.asarray(curve.times)])
+        speed = xp.sqrt(xp.concatenate([T_0, T]) / T_0)
+        steps = (speed[1:] + speed[:-1]) / 2 * (times[1:] - times[:-1])
+        collisions = xp.cumsum(steps) * xp.asarray(gas.collision_frequency)
+        before = xp.asarray(gas.surface.rotational_temperature) / xp.maximum(T_rot, TINY)
+        few = FEW_IMPACTS / xp.maximum(collisions, TINY) * xp.maximum(1 - before, 0.0)
+        variance = (1 + few) * 2 / ((2 * d - 3) * num_particles * replicas)
+        errors["rotational_temperature_error"] = xp.sqrt(variance) * T_rot
     return replace(curve, **errors) if errors else curve
 
 
@@ -210,7 +229,7 @@ class Measurement:
         if uses_rotation(gas, curve):
             name = "rotational_temperature"
             weights[name] = _weights(xp, getattr(curve, name), curve.rotational_temperature_error)
-            accuracies[name] = model.rotation_accuracy
+            accuracies[name] = model.rotation_accuracy(gas)
         # A measured <dr^2> starts at t = 0 of the curve, not at t0.
         has_errors = curve.displacement_error is not None or num_particles is not None
         accuracy = None

@@ -71,9 +71,6 @@ class AbstractModel(eqx.Module):
     has_positions: ClassVar[bool] = False
     """True if the model has positions, so that a run can write a trajectory."""
 
-    rotation_accuracy: ClassVar[float] = 0.07
-    """Relative accuracy of T_rot/T of rough spheres."""
-
     elements: ClassVar[tuple[str, ...]] = ()
     """Elements that the model supports in addition to smooth spheres in free flight: see
     `Gas.elements`."""
@@ -183,6 +180,10 @@ class AbstractModel(eqx.Module):
         Raises:
             ValueError: naming the floats that cannot be fitted, with the reason.
         """
+
+    def rotation_accuracy(self, gas: Gas) -> float:
+        """Relative accuracy of T_rot/T of rough spheres; 7 % by default."""
+        return 0.07
 
     def displacement_accuracy(self, gas: Gas) -> Float[Array, ""] | None:
         """Relative accuracy of <dr^2>; None (the default) if a fit should not use <dr^2>.

@@ -52,7 +52,7 @@ class LinearisedCurve(NamedTuple):
 def with_all_elements(gas: Gas, model: AbstractModel) -> Gas:
     """Return a gas with each element that the model supports; those added have no effect."""
     missing = {
-        "surface": lambda: Rough(-1.0),
+        "surface": lambda: Rough(-1.0, friction=STICKING),
         "container": lambda: Walls(REMOTE_WALLS, restitution=1.0),
         "drag": lambda: StokesDrag(0.0),
     }

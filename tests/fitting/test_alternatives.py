@@ -17,11 +17,13 @@ ELEMENTS = {
     "walls": {"container": jaxgran.Walls(0.1, restitution=0.8)},
     "drag": {"drag": jaxgran.StokesDrag(0.02)},
     "roughness": {"surface": jaxgran.Rough(-0.9)},
+    "friction": {"surface": jaxgran.Rough(0.44, friction=0.05)},
 }
 NAMES = {
     "walls": "walls that dissipate energy",
     "drag": "linear drag, as in air",
     "roughness": "rough grains without initial rotation",
+    "friction": "rough grains that slide",
 }
 
 

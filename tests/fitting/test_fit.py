@@ -222,6 +222,18 @@ def test_a_fit_is_shown_by_its_estimates():
     assert "converged" in shown._repr_html_()
 
 
+def test_T_rot_of_few_spheres_that_were_hit_fluctuates_more():
+    gas = dataclasses.replace(glass_beads(0.15), surface=jaxgran.Rough(-0.3))
+    times = jnp.array([0.3, 1.0, 3.0]) * gas.mean_free_time
+    curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(250, replicas=400), progress=False)
+    T_rot = curve.replicas.rotational_temperature
+    measured = jnp.std(T_rot, axis=0) / jnp.mean(T_rot, axis=0)
+    bare = jaxgran.CoolingCurve(times, curve.temperature, rotational_temperature=T_rot.mean(0))
+    error = with_errors_of_particles(gas, bare, 250, 1).rotational_temperature_error
+    np.testing.assert_allclose(error / bare.rotational_temperature, measured, rtol=0.4)
+    assert measured[0] > 3 * (2 / 750) ** 0.5  # the error of spins that all have
+
+
 def test_a_rotation_that_is_not_used_is_said():
     gas = glass_beads(0.15)
     rough = dataclasses.replace(gas, surface=jaxgran.Rough(0.0))
@@ -234,7 +246,8 @@ def test_a_rotation_that_is_not_used_is_said():
     )
     assert unused_rotation(rough, known) is None
     # With N the errors that lack are those of its fluctuations; those that are given stay.
-    of_250 = with_errors_of_particles(rough, bare, 250, 1)
+    spinning = rough.replace(rotational_temperature=0.01)
+    of_250 = with_errors_of_particles(spinning, bare, 250, 1)
     np.testing.assert_allclose(of_250.rotational_temperature_error, 0.1 * (2 / 750) ** 0.5 * T)
     assert unused_rotation(rough, of_250) is None
     assert with_errors_of_particles(rough, known, 250, 1) is known

@@ -119,7 +119,7 @@ def test_each_model_has_its_scene(beads):
     lossy = hard_gas(0.05, 0.01)  # far from Maxwellian, a_2 = 0.2, which kinetic theory follows
     choice = jaxgran.choose_model(lossy, over(lossy, 30), num_particles=None)
     assert isinstance(choice.model, jaxgran.KineticTheory)
-    rough = rough_gas()
+    rough = rough_gas(friction=0.3)  # kinetic theory is twice as exact without friction
     choice = jaxgran.choose_model(rough, over(rough, 30), 0.018, num_particles=None)
     assert isinstance(choice.model, jaxgran.DSMC) and choice.model.num_particles == 4000
     assert choice.candidates[3].error is None
@@ -166,10 +166,11 @@ def test_cool_chooses(beads):
     np.testing.assert_array_equal(chosen.temperature, jaxgran.cool(gas, times).temperature)
 
 
-def rough_gas():
+def rough_gas(**friction):
     """Spins and velocities are correlated, which kinetic theory leaves out."""
     gas = hard_gas(0.9, 0.01)
-    surface = jaxgran.Rough(-0.2, rotational_temperature=float(gas.temperature))
+    T_rot = float(gas.temperature)
+    surface = jaxgran.Rough(-0.2, rotational_temperature=T_rot, **friction)
     return dataclasses.replace(gas, surface=surface)
 
 
