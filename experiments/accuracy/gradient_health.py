@@ -34,7 +34,7 @@ import jaxgran
 from experiments.support.analysis import mean_and_error, over
 from experiments.support.plots import ELASTIC, GUIDE, HARD, INK, SOFT, THEORY, caption, panels
 from experiments.support.record import figures, run_parts
-from experiments.support.scenes import beads, cool, glass, times_of, with_A
+from experiments.support.scenes import beads, cool, glass, times_of
 
 COLLISIONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 INTERVALS = (0.03, 0.1, 0.3, 1.0)
@@ -63,7 +63,8 @@ class Slopes:
         self.truncation = self.differences(jaxgran.KineticTheory())[0] - self.theory
 
     def log_temperatures(self, shift, model, seed=0):
-        curve = cool(with_A(self.gas, shift), self.times, model, seed)
+        A = self.gas.value("dissipative_constant") * jnp.exp(shift)
+        curve = cool(self.gas.replace(dissipative_constant=A), self.times, model, seed)
         each = curve.temperature[None] if curve.replicas is None else curve.replicas.temperature
         return jnp.log(each), curve
 

@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import root_scalar
 
@@ -99,14 +98,9 @@ def times_of(
         points: number of these times.
     """
     trial = np.geomspace(1e-3 if model is None else 0.1, last, points) * float(gas.mean_free_time)
-    counts = jaxgran.cool(gas, jnp.asarray(trial), model=model, progress=False).collisions
+    counts = jaxgran.cool(gas, trial, model=model, progress=False).collisions
     x, y = np.append(0.0, np.asarray(counts)), np.append(0.0, trial)
     return np.interp(collisions, x, y)
-
-
-def with_A(gas: jaxgran.Gas, shift: Any) -> jaxgran.Gas:
-    """Return the gas with A times exp(shift)."""
-    return gas.replace(dissipative_constant=gas.value("dissipative_constant") * jnp.exp(shift))
 
 
 def cool(gas: jaxgran.Gas, times, model=None, seed: int = 0, **options: Any) -> Any:
