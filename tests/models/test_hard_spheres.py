@@ -237,7 +237,7 @@ def test_jit_flags_what_it_cannot_grow():
     cooled = jax.jit(lambda t: jaxgran.cool(gas, t, model=model))
     for end in (0.0, 1.0):
         curve = cooled(jnp.array([end]))
-        assert np.isnan(curve.temperature[0]) == (end > 0)
+        assert np.isnan(curve.temperature[0])
         assert "neighbour list is full" in jaxgran.explain_status(curve.status)
     with pytest.raises(ValueError, match="sized_for"):
         jax.jit(lambda gas: jaxgran.cool(gas, [1.0], model=HardSpheres(100)).temperature)(gas)
