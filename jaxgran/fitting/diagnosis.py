@@ -130,7 +130,7 @@ def diagnose(
         ValueError: if `result` is not a `Fit`, or for an unknown name in `absent`.
 
     >>> jaxgran.diagnose(result).grade
-    'determined'
+    'not determined'
     """
     if not isinstance(result, Fit) or not isinstance(data, CoolingCurve | DropTest | dict | None):
         raise ValueError(
