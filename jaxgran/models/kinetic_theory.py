@@ -18,7 +18,7 @@ from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced import reduced_scene
-from jaxgran.theory.equations import Density, Equations
+from jaxgran.theory.equations import Density, Equations, softness_factor
 from jaxgran.theory.solver import Integrator, moments_at, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
@@ -194,7 +194,10 @@ class KineticTheory(AbstractModel):
 
     def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
-        unit_time = gas.path_length / gas.impact_speed
+        unit_time, sound = gas.path_length / gas.impact_speed, jnp.asarray(True)
+        if self.softness:  # a search may try a T_0 at which spheres are too soft: no step is made
+            law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
+            sound = softness_factor(law, hottest, gas.dimension) > 0
         scene = reduced_scene(gas), Density.from_gas(gas, self.softness, self.correlations)
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
         integrator = Integrator(self.solver, rtol * tolerance, self.max_steps)
@@ -202,7 +205,10 @@ class KineticTheory(AbstractModel):
         equations = Equations(
             gas.dimension, order, not self.sonine, self.softness, self.initial_sonine
         )
-        state, fault = moments_at(scene, times / unit_time, equations, integrator)
+        state, fault = moments_at(
+            scene, jnp.where(sound, times, 0.0) / unit_time, equations, integrator
+        )
+        fault |= status.flag(status.UNSUPPORTED, ~sound)
         theta = jnp.exp(state.log_temperature)
         length = gas.path_length
         # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
