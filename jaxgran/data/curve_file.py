@@ -292,7 +292,8 @@ def read_gas(header: dict[str, str]) -> Gas:
     """
     _check_header(header)
     gas = _make_gas(header)
-    numbers = [key for key in header if key in BY_SYMBOL and header[key] != GUESS]
+    quantities = {*BY_SYMBOL, *PRIOR_KEYS}
+    numbers = [key for key in header if key in quantities and header[key] != GUESS]
     for question in ask_about_header({key: header_number(header, key) for key in numbers}):
         warnings.warn(question, stacklevel=2)
     known = dict.fromkeys((*REQUIRED, *BY_SYMBOL, *OPTIONAL_KEYS, *UNIT_KEYS))

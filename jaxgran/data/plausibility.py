@@ -68,6 +68,12 @@ def ask_about_header(values: dict[str, float]) -> Iterator[str]:
     for key, value in values.items():
         if not _is_usual(key, value):
             yield _unit_question(key, value, f"{key}: ")
+        error = values.get(f"{key}_err", 0.0)
+        if key in USUAL_RANGES and error > value > 0:
+            yield (
+                f"{key}_err is {error:.6g} {UNITS[key]}, more than {key}, {value:.6g}: a number "
+                f"without a unit has that of {key}. Is it in {UNITS[key]}? Then write it behind"
+            )
 
 
 def _unit_question(name: str, value: float, line: str) -> str:

@@ -126,6 +126,7 @@ FAULTS = {
     "a late clock, told": (text_of("t,T", (TIMES + 1000, T), t0=1000, t0_err=1), READ),
     "density in g/cm^3": (text_of(density=1.2), "density is 1.2 kg/m.3.* in g/cm.3.*density: 1200"),
     "diameter in mm": (text_of(diameter=3), "diameter is 3 m, .* is it in mm.*diameter: 0.003"),
+    "Y_err in Pa, Y in GPa": (text_of(Y="0.02 GPa", Y_err=1e6), "Y_err is 1e.15 Pa, more than Y"),
     "Y in GPa": (text_of(Y=70), "Y is 70 Pa.* is it in GPa.*Y: 7e.10"),
     "T0 in mm^2/s^2": (text_of(T0=2e4), "T0 is 20000 .* is it in mm.2/s.2"),
     "errors of other runs": (text_of(N=2e9), "T_err is at least .* larger .* N = 2e.09 particles"),
