@@ -72,7 +72,7 @@ def log_posterior(gas, curve, priors, result):
     along = 2 * (log_T - log_T[0]) / (log_T[-1] - log_T[0]) - 1
 
     def values(theta):
-        return jnp.exp(centre + width * theta[..., :3])
+        return jnp.exp(centre + width * theta[:3])
 
     def log_density(theta):
         A, phi, T_0 = values(theta)
@@ -108,7 +108,7 @@ def sample(log_density, values, options) -> tuple[np.ndarray, dict]:
     begin = time.perf_counter()
     theta, steps, divergent = jax.block_until_ready(chains(jax.random.split(keys[0], len(keys))))
     seconds = time.perf_counter() - begin
-    return np.asarray(values(theta)), {
+    return np.asarray(jax.vmap(jax.vmap(values))(theta)), {
         "samples_per_second": options.samples * options.chains / seconds,
         "seconds": seconds,
         "steps": float(jnp.mean(steps)),

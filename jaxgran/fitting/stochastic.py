@@ -169,7 +169,7 @@ def fit_stochastic(
     return dataclasses.replace(
         result,
         covariances=result.covariances | as_jax_arrays(covariances),
-        priors={None: priors} if priors.names else {},
+        priors={"": priors} if priors.names else {},
         minima=result.minima._replace(extrapolation=extrapolation),
     )
 
