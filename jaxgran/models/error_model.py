@@ -93,10 +93,10 @@ ROUGHNESS_ERROR, SLIDING_ERROR = 0.008, 0.01
 correlated; and of those that slide.
 
 Measured: T within .8 % of DSMC after 60 mean free times, beta_t = -.8 to .5; the mean rate of hard
-spheres, beta_t = -.3, until T has fallen to .03, is lower by .2 +- .3 %; fits of A, beta_t and T_rot
-to eight curves of DSMC, beta_t = 0, would be off by .9 standard errors of A in the mean with .5 %.
-With friction (mu = .05 to 1) T is within 1.5 % of DSMC, and the rate of hard spheres (mu = .2) .4 to
-.7 +- .4 % lower."""
+spheres, beta_t = -.3, until T has fallen to .03, is lower by .2 +- .3 %; A, fitted with beta_t and
+T_rot to eight curves of DSMC, beta_t = 0, is off by .9 standard errors in the mean with .5 %. With
+friction (mu = .05 to 1) T is within 1.5 % of DSMC, and the rate of hard spheres (mu = .2) .4 to .7
++- .4 % lower."""
 
 FLOW_NOISE = 0.8
 """Standard deviation of ln T over sqrt(min(1, |ln T/T_0|) / N): shot noise of first collisions.
