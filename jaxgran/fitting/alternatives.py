@@ -60,6 +60,13 @@ NUM_REFINED = 2
 """Number of amplitudes tried between the last allowed one and the first excluded one, and around
 each minimum."""
 
+MIN_DROP = 0.25
+"""Depth of a minimum among three amplitudes, and by their parabola below the least of them, over
+`ALLOWED_CHI2`, below which none is tried."""
+
+BARRIER = 5.0
+"""Factor of `EXCLUDED_CHI2` for alternatives whose chi^2 may have a second minimum."""
+
 MIN_SPACING = 0.05
 """Least distance of the latter from those tried, over the distance of these."""
 
@@ -548,23 +555,27 @@ def _profile(problem: Problem, kind: Kind, base: Trial, scale: float) -> list[Tr
             if trial.chi2 > lowest + ALLOWED_CHI2 * scale:
                 trials += _refined(fit_with, before, trial, lowest + ALLOWED_CHI2 * scale)
             previous, before = before, trial
-            if kind.one_minimum and trial.chi2 > lowest + EXCLUDED_CHI2 * scale:
+            excluded = EXCLUDED_CHI2 * (1.0 if kind.one_minimum else BARRIER)
+            if trial.chi2 > lowest + excluded * scale:
                 break
     for _ in range(NUM_REFINED):
         trials.sort(key=lambda trial: trial.amplitude)
         threes = [trials[k - 1 : k + 2] for k in range(1, len(trials) - 1)]
         lowest_of_three = [x for x in threes if x[1].chi2 < min(x[0].chi2, x[2].chi2)]
-        found = [_at_the_vertex(fit_with, three) for three in lowest_of_three]
+        least_drop = MIN_DROP * ALLOWED_CHI2 * scale
+        found = [_at_the_vertex(fit_with, three, least_drop) for three in lowest_of_three]
         trials += [trial for trial in found if trial is not None]
     return sorted(trials, key=lambda trial: trial.amplitude)
 
 
 def _at_the_vertex(
-    fit_with: Callable[[float, np.ndarray], Trial | None], three: list[Trial]
+    fit_with: Callable[[float, np.ndarray], Trial | None], three: list[Trial], least_drop: float
 ) -> Trial | None:
     """Return the fit at the vertex of the parabola through a minimum of chi^2, or on its side."""
-    x = np.array([trial.amplitude for trial in three])
-    curvature, slope, _ = np.polyfit(x - x[1], [trial.chi2 for trial in three], 2)
+    x, chi2 = (np.array([getattr(t, name) for t in three]) for name in ("amplitude", "chi2"))
+    curvature, slope, _ = np.polyfit(x - x[1], chi2, 2)
+    if max(np.min(np.delete(chi2, 1)) - chi2[1], slope**2 / (4 * curvature)) < least_drop:
+        return None
     vertex = x[1] - slope / (2 * curvature)
     if not np.min(np.abs(vertex - x)) > MIN_SPACING * (x[2] - x[0]):
         vertex = (x[1] + (x[2] if vertex > x[1] else x[0])) / 2

@@ -311,7 +311,9 @@ def _fit_deterministic(
         clocks = (START_TIME,) if START_TIME in prior_names else ()
         since = m.curve
         if "temperature" in free:
-            since = replace(since, times=since.times - known_start_time(priors, label)[0])
+            known = known_start_time(priors, label)[0]
+            xp = array_module(since, known)
+            since = replace(since, times=xp.asarray(since.times) - xp.asarray(known))
         guesses[label] = guess_from_data(m.gas, since, (*free, *clocks))
         if clock_is_free and not any_traced(measured, gas):
             accuracy = clock_accuracy(guesses[label], m, model, counts[label])
