@@ -170,7 +170,7 @@ def kinetic_theory(options: argparse.Namespace) -> dict:
 
 def command(folder: Path) -> dict[str, dict[str, float]]:
     """Measure `jaxgran fit` as a process: with an empty cache, with its cache, and without one."""
-    main, found = "import sys; from jaxgran.cli.main import main; sys.exit(main(sys.argv[1:]))", {}
+    main, found = "from jaxgran_command import main; raise SystemExit(main())", {}
     with tempfile.TemporaryDirectory() as out:
         arguments = ["-c", main, "fit", CURVE, "--free", "A", "T0", "--out", out, "--overwrite"]
         for name, more in (("cold", []), ("warm", []), ("no cache", ["--no-cache"])):

@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
@@ -32,6 +34,7 @@ from jaxgran.fitting.fit import free_by_default
 from jaxgran.fitting.residuals import unused_rotation
 from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE
 from jaxgran.models.choose import default_models
+from jaxgran.scene.laws import restitution_at
 from jaxgran.scene.parameters import BY_SYMBOL, MATERIAL, PARAMETERS, SCENE, symbol_of, unit_of
 
 JOINT_MODEL = MODELS[0]
@@ -227,18 +230,26 @@ def print_scene(label: str, gas: Any, curve: Any, header: dict[str, str]) -> Non
     print(f"         T falls to {T[-1] / T[0]:.3g} of its first value")
     if "T_from" in header:
         print(f"         {header['T_from']}")
+    scales = _scales(gas, T[-1], N or 1)
+    phi, tau, contact, beta, first, last, path, side = map(float, scales)
     print(
-        f"gas      phi = {float(gas.packing_fraction):.3g}, tau_c = "
-        f"{float(gas.mean_free_time):.3g} s, t_c/tau_c = {float(gas.contact_fraction):.2g}, "
-        f"beta_T0 = {float(gas.thermal_beta):.3g} (fitted)"
+        f"gas      phi = {phi:.3g}, tau_c = {tau:.3g} s, t_c/tau_c = {contact:.2g}, "
+        f"beta_T0 = {beta:.3g} (fitted)"
     )
-    first, last = (float(gas.restitution(np.sqrt(2 * x))) for x in (gas.temperature, T[-1]))
     print(f"impacts  eps = {first:.3g} at the thermal speed of t = 0, {last:.3g} at the last one;")
-    print(f"         mean free path {1e3 * float(gas.mean_free_path):.3g} mm", end="")
+    print(f"         mean free path {1e3 * path:.3g} mm", end="")
     if N is not None:
         shape = "cube" if gas.dimension == 3 else "square"
-        print(f", in a box of {1e3 * float(gas.box_side(N)):.3g} mm if it is a {shape}", end="")
+        print(f", in a box of {1e3 * side:.3g} mm if it is a {shape}", end="")
     print("\n         short contacts depend on A Y^(2/5) only: 10 % in Y is 4 % in A")
+
+
+@eqx.filter_jit
+def _scales(gas: jaxgran.Gas, last: Any, N: int) -> tuple[Any, ...]:
+    speeds = jnp.sqrt(2 * jnp.stack([gas.temperature, jnp.asarray(last)]))
+    first, last = restitution_at(gas.law, gas.diameter, gas.mass, speeds)
+    now = gas.packing_fraction, gas.mean_free_time, gas.contact_fraction, gas.thermal_beta
+    return *now, first, last, gas.mean_free_path, gas.box_side(N)
 
 
 def print_parameters(rows: list[dict]) -> None:

@@ -7,7 +7,9 @@ would make it usual; it is a warning, and the values are used as they are.
 from collections.abc import Iterator
 from math import sqrt
 
+import equinox as eqx
 import numpy as np
+from jax import Array
 
 from jaxgran.data.curve import QUANTITIES, CoolingCurve
 from jaxgran.data.tables import UNITS, unit_in
@@ -153,7 +155,7 @@ def _ask_about_start(
         )
     elif at_zero < 1 / (MAX_RATIO + chance + known):
         yield _scale_question(at_zero, gas, number)
-    loss = gas.dimension * slope / (0.6 * origin) / float(gas.collision_frequency)
+    loss = gas.dimension * slope / (0.6 * origin) / float(_collision_frequency(gas))
     if T[-1] < 0.8 * T[0] and not USUAL_LOSS[0] <= loss <= USUAL_LOSS[1]:
         units = [unit for unit in OTHER_UNITS["s"] if 1e-3 < loss / unit_in(unit, "s") < 1]
         question = "are t, eta, diameter and T0 in the units that the file says?"
@@ -165,6 +167,11 @@ def _ask_about_start(
             f"T falls to a half in {halving / float(gas.mean_free_time):.3g} mean free times of "
             f"the header's gas (eta, diameter, T0), and usual is .1 to 1e3: {question}"
         )
+
+
+@eqx.filter_jit
+def _collision_frequency(gas: Gas) -> Array:
+    return gas.collision_frequency
 
 
 def _scale_question(ratio: float, gas: Gas, number: float | None) -> str:

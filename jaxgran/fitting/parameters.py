@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.tracing import any_traced, array_module
-from jaxgran._utils.validation import POSITIVE, Domain, float_array
+from jaxgran._utils.validation import POSITIVE, Domain
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import DropTest
 from jaxgran.scene.gas import Gas, law_fields
@@ -69,15 +69,15 @@ def with_names_of_law(names: Any, gas: Gas) -> Any:
     return tuple(dict.fromkeys(name for part in parts for name in part))
 
 
-def with_floats(gas: Gas, values: dict[str, Any]) -> Gas:
-    """Return a gas with new values of some floats, whose ranges are not checked."""
+def with_floats(gas: Gas, values: dict[str, Any], xp: Any = jnp) -> Gas:
+    """Return a gas with new values of some floats, arrays of xp; ranges are not checked."""
     if not values:
         return gas
     fields = gas._float_fields
     return eqx.tree_at(
         lambda gas: [fields[name].get(gas) for name in values],
         gas,
-        [float_array(value) for value in values.values()],
+        [xp.asarray(value, jnp.result_type(float)) for value in values.values()],
     )
 
 

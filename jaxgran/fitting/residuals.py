@@ -1,5 +1,6 @@
 """Weighted residuals of a measured curve, their statistics, and the checks that all fits share."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -302,8 +303,8 @@ class Measurement:
         elapsed = (times - values.get(START_TIME, 0.0)) * clock
         around = START_TIME in values
         if linear:
-            gas = with_floats(self.gas, floats)
-            logs, computed = _log_curve(model, gas, elapsed, around, tolerance)
+            gas = with_floats(self.gas, floats, xp)
+            logs, computed = _log_curve(model, gas, elapsed, around, floats, tolerance)
         else:
             logs, computed = _log_values(model.simulate(self.scene, elapsed, Run()))
         if missing := ", ".join(name for name in self.weights if name not in logs):
@@ -340,7 +341,6 @@ class Measurement:
             slopes = {
                 key: xp.where(positive[:, None], factors[:, None] * slope, 0.0)
                 for key, slope in log.by_float.items()
-                if key in floats
             }
             slopes |= {key: -used[:, None] * column for key, column in extra.items()}
             by_clock = rate * elapsed
@@ -404,9 +404,14 @@ def _log_values(curve: CoolingCurve) -> tuple[dict[str, _LogQuantity], dict[str,
 
 
 def _log_curve(
-    model: AbstractModel, gas: Gas, times: Numbers, around: bool, tolerance: float
+    model: AbstractModel,
+    gas: Gas,
+    times: Numbers,
+    around: bool,
+    free: Iterable[str],
+    tolerance: float,
 ) -> tuple[dict[str, _LogQuantity], dict[str, Numbers]]:
-    """Return logarithms of the quantities of a curve with derivatives, and all its fields.
+    """Return logarithms of a curve's quantities, derivatives in free floats, and all its fields.
 
     If `around` is True, times may be negative. T is continued to t < 0 to first order in t,
     ``ln T(-t) = 2 ln T_0 - ln T(t)``, and so is T_rot, unless the spheres began without rotation.
@@ -428,7 +433,7 @@ def _log_curve(
         value = values[name]
         safe = xp.where(value > 0, value, 1.0)
         log = xp.where(value > 0, xp.log(safe), xp.where(value <= 0, -xp.inf, xp.nan))
-        by_float = {key: by[name][inverse] / safe[:, None] for key, by in linear.by_float.items()}
+        by_float = {key: linear.by_float[key][name][inverse] / safe[:, None] for key in free}
         if name in firsts:
             first = xp.asarray(firsts[name])
             log_first = xp.log(xp.where(first > 0, first, 1.0))
@@ -436,7 +441,8 @@ def _log_curve(
             log = xp.where(reflect, 2 * log_first - log, log)
             by_float = {k: xp.where(reflect[:, None], -x, x) for k, x in by_float.items()}
             added = xp.where(reflect, 2 / xp.where(first > 0, first, 1.0), 0.0)[:, None]
-            by_float[name] = by_float[name] + added  # the float has the name of the quantity
+            if name in by_float:  # the float has the name of the quantity
+                by_float[name] = by_float[name] + added
             values[name] = xp.exp(log)
         logs[name] = _LogQuantity(log, by_float, by_time[inverse] / safe)
     return logs, values

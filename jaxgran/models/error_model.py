@@ -8,7 +8,6 @@ bias of projected derivatives by it.
 from math import sqrt
 from typing import NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -305,7 +304,6 @@ def slope_bias(clock: A) -> A:
     return factor * clock * (1 + (clock / scale) ** 2)
 
 
-@jax.jit
 def slope_bias_of_run(
     times: Float[Array, "times"], flow_share: Float[Array, "times"]
 ) -> Float[Array, "times"]:

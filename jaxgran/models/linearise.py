@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import any_traced, as_jax_arrays, fast_compilation, grid_size, pad_to
@@ -79,10 +80,21 @@ def linearise(
     """
     size = times.shape[-1]
     if any_traced(gas, times):
-        return _linearised(model, gas, jnp.asarray(times), jnp.asarray(tolerance))
-    padded = pad_to(np.asarray(times), grid_size(size))
-    computed = _compiled(jax.default_backend())(model, gas, padded, np.asarray(tolerance))
-    return jax.tree.map(lambda x: np.asarray(x)[:size] if x.ndim else np.asarray(x), computed)
+        values, slopes, by_time = _linearised(
+            model, gas, jnp.asarray(times), jnp.asarray(tolerance)
+        )
+    else:
+        padded = pad_to(np.asarray(times), grid_size(size))
+        computed = _compiled(jax.default_backend())(model, gas, padded, np.asarray(tolerance))
+        values, slopes, by_time = jax.tree.map(
+            lambda x: np.asarray(x)[:size] if x.ndim else np.asarray(x), computed
+        )
+    by_float, begin = {}, 0
+    for name, value in gas.floats.items():
+        end = begin + np.size(value)
+        by_float[name] = {quantity: slope[:, begin:end] for quantity, slope in slopes.items()}
+        begin = end
+    return LinearisedCurve(values, by_float, by_time)
 
 
 def curve_of_program(
@@ -95,22 +107,24 @@ def curve_of_program(
     return CoolingCurve(**as_jax_arrays({"times": times} | values))
 
 
-def _linearised(model: AbstractModel, gas: Gas, times: Array, tolerance: Array) -> LinearisedCurve:
-    floats = {name: gas.value(name) for name in gas.domains}
+def _linearised(
+    model: AbstractModel, gas: Gas, times: Array, tolerance: Array
+) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array]]:
+    """Values, their derivatives in all floats in the order of `Gas.domains`, and in time."""
+    names, values = zip(*gas.floats.items(), strict=True)
+    flat, unravel = ravel_pytree(values)
 
-    def curve(floats: dict[str, Array], delay: Array) -> tuple[dict, dict]:
-        computed = model.curve_in_fit(gas.replace(**floats), times + delay, tolerance)
+    def curve(flat: Array, delay: Array) -> tuple[dict, dict]:
+        changed = gas.replace(**dict(zip(names, unravel(flat), strict=True)))
+        computed = model.curve_in_fit(changed, times + delay, tolerance)
         fields = {name: getattr(computed, name) for name in COMPUTED}
         known = {name: value for name, value in fields.items() if value is not None}
         return {name: known[name] for name in LINEARISED if name in known}, known
 
     delay = jnp.zeros((), times.dtype)
-    slopes, values = jax.jacfwd(curve, argnums=(0, 1), has_aux=True)(floats, delay)
-    by_float = {
-        name: {q: by[name].reshape(times.size, -1) for q, (by, _) in slopes.items()}
-        for name in floats
-    }
-    return LinearisedCurve(values, by_float, {q: rate for q, (_, rate) in slopes.items()})
+    slopes, values = jax.jacfwd(curve, argnums=(0, 1), has_aux=True)(flat, delay)
+    by_float, by_time = ({q: pair[i] for q, pair in slopes.items()} for i in (0, 1))
+    return values, by_float, by_time
 
 
 @cache

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -275,6 +276,7 @@ class AbstractSpheres(AbstractModel):
         )
         return snapshot.attach_saved(curve, save, out.records, particles, invalid[None])
 
+    @eqx.filter_jit
     def _bias(self, gas: Gas, times: Array, flow_share: Array | None) -> Array | None:
         """Estimate the bias of projected derivatives, 0 in a box below L_c, which has no flow."""
         if flow_share is None or self.differences is not None or not self.projected:

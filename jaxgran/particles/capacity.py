@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from math import ceil, log, pi
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Int
 
 from jaxgran._utils import status
+from jaxgran._utils.tracing import any_traced
 from jaxgran.particles.neighbours import unsorted_share
 from jaxgran.scene.geometry import contact_value, sphere_surface
 
@@ -122,7 +122,7 @@ class Neighbourhood(NamedTuple):
         in_contact = phi * 2 ** (dimension - 1)
         side = (per_volume * num_particles / in_contact) ** (1 / dimension)
         skin = float(skin_for_pairs(listed_more, num_particles, side, dimension))
-        at_contact = float(contact_value(phi, dimension))
+        at_contact = contact_value(phi, dimension)
         frequency = 2 * dimension * in_contact * at_contact / pi**0.5
         listed = in_contact * (1 + skin) ** dimension
         along_x = min((1 + skin) / side, 0.5)
@@ -158,7 +158,7 @@ def capacities(
 
 def skin_for_pairs(listed_more: float, num_particles: int, side: ArrayLike, dimension: int) -> Any:
     """Return the skin, in diameters, that adds `listed_more` listed pairs per particle."""
-    xp = jnp if isinstance(side, jax.Array) else np  # on the host nothing is compiled
+    xp, side = (jnp, side) if any_traced(side) else (np, np.asarray(side))  # nothing is compiled
     volume = num_particles * sphere_surface(dimension) / (2 * dimension)
     in_contact = volume / xp.asarray(side**dimension)
     return xp.minimum((1 + listed_more / in_contact) ** (1 / dimension) - 1, max_skin(side))

@@ -184,6 +184,11 @@ class Gas(eqx.Module):
         """Allowed range of every float, by name."""
         return {name: field.domain for name, field in self._float_fields.items()}
 
+    @property
+    def floats(self) -> dict[str, Float[Array, "..."]]:
+        """Value of every float, by name."""
+        return {name: field.get(self) for name, field in self._float_fields.items()}
+
     def value(self, name: str) -> Float[Array, "..."]:
         """Value of the float with this name.
 

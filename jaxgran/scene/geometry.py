@@ -63,7 +63,7 @@ def contact_value(packing_fraction: ArrayLike, dimension: int) -> Float[Array, "
     Returns:
         g_2, same shape.
     """
-    phi = jnp.asarray(packing_fraction)
+    phi = packing_fraction
     if dimension == 3:
         return (2 - phi) / (2 * (1 - phi) ** 3)
     return (1 - 7 * phi / 16) / (1 - phi) ** 2

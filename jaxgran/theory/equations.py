@@ -342,12 +342,9 @@ def element_rates(
         rate = collision_rate(sonine, dimension) * speed
         rates = [rate, rate]
         if surface.friction is not None:
-            sliding = partial(sliding_shares, surface, surface.eta, ratio, dimension)
-
-            def sticks(g: Array, k: int) -> Array:
-                return sliding((1 + scene.law.restitution(g * speed)) / 2 * g)[k]
-
-            rates = [rate * impact_average(partial(sticks, k=k), speed) for k in (0, 1)]
+            kick = mean_kick(scene.law, speed)
+            shares = sliding_shares(surface, surface.eta, ratio, dimension, kick)
+            rates = [rate * share for share in shares]
         total = _add(total, _friction_rates(surface.eta, surface.inertia, rates, ratio, dimension))
     if scene.walls is not None:
         rates = _wall_rates(scene.walls, scene.surface, speed, ratio, dimension)
@@ -392,9 +389,16 @@ def _friction_rates(
     )
 
 
-MAX_STICKING = 20.0
-"""Largest kick over eta times the typical slip, beyond which no sphere slides in double precision.
-"""
+MAX_STICKING = 1e6
+"""Largest friction over the slip at which some spheres slide in double precision."""
+
+TYPICAL_IMPACT = 2 * sqrt(2 / pi)
+"""Mean normal speed of impacts, weighted by itself, in units of sqrt(2 T)."""
+
+
+def mean_kick(law: ReducedLaw, speed: Float[Array, ""]) -> Float[Array, ""]:
+    """Return (1 + eps)/2 at the typical impact; within 2 % for sliding spheres of ice."""
+    return (1 + law.restitution(TYPICAL_IMPACT * speed)) / 2
 
 
 def sliding_shares(
@@ -402,34 +406,37 @@ def sliding_shares(
     eta: Float[Array, ""],
     ratio: Float[Array, ""] | float,
     dimension: int,
-    normal_kick: Float[Array, "..."],
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    kick: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the factors of the mean tangential impulse and of its square by Coulomb's limit.
 
     The slip u_t of Maxwellian velocities and spins has d - 1 Gaussian components of variance
-    ``s^2 = 2 (T + T_rot/q)``, and spheres stick where eta u_t is below mu times the normal kick w.
-    With ``y = mu w/(sqrt(2) eta s)`` the averages of u_t times the impulse and of its square, over
-    those without a limit, are ``1 - exp(-y^2) + (sqrt(pi)/2) y erfc(y)`` and ``1 - exp(-y^2)`` in
-    3D, ``erf(y)`` and ``erf(y) - (2/sqrt(pi)) y exp(-y^2) + 2 y^2 erfc(y)`` in 2D.
+    ``2 (T + T_rot/q)``, and spheres stick where eta u_t is below mu times the normal kick
+    ``(1 + eps)/2 g``. Averaged over the normal speeds g of impacts, of density
+    ``g exp(-g^2/2)``, u_t times the impulse and its square are, over those without a limit and
+    with ``m = mu (1 + eps)/2 / (eta sqrt(1 + T_rot/(q T)))``,
+
+    - 3D: ``(m^2/(1 + m^2) + m arccot m)/2`` and ``m^2/(1 + m^2)``;
+    - 2D: ``s`` and ``2 s^2/(1 + s)`` with ``s = m/sqrt(1 + m^2)``.
 
     Args:
         surface: with friction.
         eta: coefficient of `Rough`.
         ratio: T_rot/T.
         dimension: d.
-        normal_kick: w over sqrt(2 T), any shape.
+        kick: (1 + eps)/2, see `mean_kick`.
 
     Returns:
         Two factors, from 0 where all slide to 1 where all stick.
     """
     assert surface.friction is not None
-    slip = jnp.sqrt(2 * (1 + ratio / surface.inertia)) * jnp.maximum(eta, 1e-9)
-    y = jnp.minimum(surface.friction * normal_kick / slip, MAX_STICKING)
-    sticking, tail = -jnp.expm1(-(y**2)), jax.scipy.special.erfc(y)
+    slip = jnp.sqrt(1 + ratio / surface.inertia) * jnp.maximum(eta, 1e-9)
+    m = jnp.minimum(surface.friction * kick / slip, MAX_STICKING)
+    stick = m**2 / (1 + m**2)
     if dimension == 3:
-        return sticking + sqrt(pi) / 2 * y * tail, sticking
-    once = 1 - tail
-    return once, once - 2 / sqrt(pi) * y * jnp.exp(-(y**2)) + 2 * y**2 * tail
+        return (stick + m * jnp.arctan2(1.0, m)) / 2, stick
+    once = jnp.sqrt(stick)
+    return once, 2 * stick / (1 + once)
 
 
 def _wall_rates(
@@ -458,13 +465,9 @@ def _wall_rates(
         lost = impact_average(lambda g: share(g) * _wall_loss(walls, speed, g), speed)
         impacts = [frequency * impact_average(share, speed)] * 2
         if surface is not None and surface.friction is not None:
-            sliding = partial(sliding_shares, surface, eta, ratio, d)
-
-            def sticks(g: Array, k: int) -> Array:
-                kick = (1 + walls.law.restitution(g * speed / sqrt(2))) / 2 * g
-                return share(g) * sliding(kick)[k]
-
-            impacts = [frequency * impact_average(partial(sticks, k=k), speed) for k in (0, 1)]
+            kick = mean_kick(walls.law, speed / sqrt(2))
+            shares = sliding_shares(surface, eta, ratio, d, kick)
+            impacts = [impacts[0] * factor for factor in shares]
         # Energy lost over T, and numbers of impacts, per unit of time and sqrt(T/T_0).
         return frequency * lost, impacts
 
