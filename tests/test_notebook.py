@@ -1,6 +1,8 @@
-"""Curves as tables and pictures in a notebook."""
+"""Gases, curves and choices in a notebook: words, tables and pictures."""
 
+import copy
 import dataclasses
+import pickle
 import sys
 from typing import Any
 
@@ -12,6 +14,7 @@ from matplotlib import pyplot
 
 import jaxgran
 from jaxgran.data.curve import QUANTITIES
+from tests.beads import glass_beads
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +44,12 @@ def test_a_dataset_has_names_dimensions_and_units(curve):
 
 def test_a_dataset_has_saved_values(curve):
     each = jnp.arange(16.0).reshape(2, 4, 2)  # replicas, times, and an axis of the user's
-    data = curve.with_saved({"S": [each, each[..., 0]]}).to_xarray()
+    saved = curve.with_saved({"S": [each, each[..., 0]]})
+    data = saved.to_xarray()
+    again = jaxgran.CoolingCurve.from_xarray(data)
+    assert repr(again) == repr(saved)
+    np.testing.assert_array_equal(again.replicas.saved["S"][1], saved.replicas.saved["S"][1])
+    np.testing.assert_array_equal(again.replicas.temperature, saved.replicas.temperature)
     assert data["saved.S.0"].dims == ("time", "saved.S.0.axis0")
     assert data["saved_of_replicas.S.1"].dims == ("replica", "time")
     np.testing.assert_array_equal(data["saved.S.0"], each.mean(0))
@@ -94,6 +102,44 @@ def test_a_curve_is_drawn_in_given_axes(curve):
 
 
 def test_plot_functions_are_imported_on_first_use():
-    assert {"plot_curve", "plot_fit"} <= set(dir(jaxgran))
+    assert set(dir(jaxgran)) == {*jaxgran.__all__, "plot_curve", "plot_fit"}
     with pytest.raises(AttributeError, match="no attribute 'plot_nothing'"):
         _ = jaxgran.plot_nothing
+
+
+def test_repr_of_a_gas_has_units():
+    gas = glass_beads()
+    words = repr(gas)
+    assert "dissipative_constant" in words and "m^2/s^2" in words and "f64[]" not in words
+    assert f"{float(gas.mean_free_time):.4g} s" in words
+    assert gas._repr_html_().startswith("<table><caption>Gas of Viscoelastic spheres, d = 3")
+
+
+def test_repr_of_a_curve_lists_its_fields():
+    curve = jaxgran.CoolingCurve([0.0, 1.0, 2.0], [4.0, 2.0, 1.0], temperature_error=[1, 1, 1])
+    assert "3 times, t = 0 s to 2 s" in repr(curve) and "0.25" in repr(curve)
+    assert "temperature, temperature_error" in curve._repr_html_()
+
+
+def test_repr_of_a_choice_lists_its_reasons():
+    choice = jaxgran.choose_model(glass_beads(), [1e-3, 1.0])
+    assert repr(choice).startswith("Choice: kinetic theory, T within")
+    assert all(reason in repr(choice) for reason in choice.reasons)
+    assert "<th>1.</th>" in choice._repr_html_()
+
+
+def test_repr_marks_batches_and_traced_values():
+    gas, shown = glass_beads(), []
+    jax.jit(lambda gas: shown.append(repr(gas)) or gas.temperature)(gas)
+    assert "traced" in shown[0]
+    many = jax.vmap(lambda a: gas.replace(dissipative_constant=a))(jnp.ones(3))
+    assert "values of shape (3,)" in repr(many)
+
+
+def test_floats_of_parts_are_attributes_of_the_gas():
+    gas = glass_beads().replace(dissipative_constant=2e-6)
+    assert float(gas.dissipative_constant) == 2e-6
+    with pytest.raises(AttributeError, match="Gas has no attribute 'viscosity'"):
+        _ = gas.viscosity
+    for again in (copy.deepcopy(gas), pickle.loads(pickle.dumps(gas))):
+        np.testing.assert_array_equal(again.dissipative_constant, gas.dissipative_constant)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxgran._utils.validation import ANY, FRACTION, POSITIVE, Domain, checked_times, float_array
+from jaxgran._utils.validation import ANY, FRACTION, POSITIVE, Domain, float_array
 
 
 @pytest.mark.parametrize("value", ["steel", object(), [1.0, [2.0]]])
@@ -36,18 +36,3 @@ def test_free_values_return(fraction):
         assert jnp.isfinite(free)
         # The logarithm of a distance of 1e-2 loses two digits.
         np.testing.assert_allclose(domain.from_free(free), value, rtol=1e-12, atol=1e-13)
-
-
-@pytest.mark.parametrize(
-    "times, message",
-    [
-        ([1.0, -1.0], "times must be finite and not negative, got -1"),
-        ([0.0, np.inf], "times must be finite and not negative, got inf"),
-        ([0.0, 2.0, 2.0], "times must increase, got 2 after 2. Sort them"),
-        ([], r"times must be a list of numbers, got shape \(0,\)"),
-        ([[1.0]], r"times must be a list of numbers, got shape \(1, 1\)"),
-    ],
-)
-def test_bad_times_are_refused(times, message):
-    with pytest.raises(ValueError, match=message):
-        checked_times(times)

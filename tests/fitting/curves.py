@@ -2,38 +2,38 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import jaxgran
 from tests.data.test_curve import DATA
 
 RELATIVE_ERROR = 0.01
 
-TIMES = np.geomspace(0.1, 100, 40)
-TRUTH = np.array([0.3, -0.2])
-"""Times and parameters of `exact`."""
 
+def synthetic(
+    gas,
+    key=None,
+    num_points=40,
+    relative_error=RELATIVE_ERROR,
+    end=300.0,
+    model=None,
+    displacement=False,
+):
+    """A curve of a gas with its errors and, where a key is given, Gaussian noise in ln T.
 
-def exact(flat):
-    """ln T of a power law, whose parameters are logarithms of a rate and of T_0."""
-    return flat[1] - 5 / 3 * jnp.log1p(TIMES * jnp.exp(flat[0]))
-
-
-def synthetic(gas, key, num_points=40, relative_error=RELATIVE_ERROR, displacement=False):
-    """A curve of a gas with Gaussian noise in ln T."""
-    times = jnp.geomspace(0.3, 300.0, num_points) * gas.mean_free_time
-    exact = jaxgran.cool(gas, times)
-    noise = jax.random.normal(key, (2, num_points)) * relative_error
-    measured = exact.temperature * jnp.exp(noise[0])
-    assert exact.displacement is not None
-    msd = exact.displacement * jnp.exp(noise[1]) if displacement else None
-    return jaxgran.CoolingCurve(
-        times=times,
-        temperature=measured,
-        temperature_error=relative_error * exact.temperature,
-        displacement=msd,
-        displacement_error=relative_error * exact.displacement if displacement else None,
-    )
+    Rough spheres have T_rot, too.
+    """
+    times = jnp.geomspace(0.3, end, num_points) * gas.mean_free_time
+    run = {} if model is None else {"model": model, "key": jax.random.key(5)}
+    exact, fields = jaxgran.cool(gas, times, progress=False, **run), {}
+    names = ["temperature"]
+    names += ["displacement"] if displacement else []
+    names += ["rotational_temperature"] if gas.surface is not None else []
+    noise = jnp.zeros((3, num_points)) if key is None else jax.random.normal(key, (3, num_points))
+    for name, along in zip(names, noise, strict=False):
+        value = getattr(exact, name)
+        fields[name] = value * jnp.exp(along * relative_error)
+        fields[f"{name}_error"] = relative_error * value
+    return jaxgran.CoolingCurve(times, **fields)
 
 
 def measured(name):

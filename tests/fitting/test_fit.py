@@ -9,7 +9,7 @@ import pytest
 import jaxgran
 from jaxgran.fitting.parameters import guess_from_data
 from jaxgran.fitting.residuals import unused_rotation, with_errors_of_particles
-from tests.beads import glass_beads, hard_gas
+from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
 
 
@@ -79,7 +79,7 @@ def test_errors_from_the_scatter():
     curve = synthetic(gas, jax.random.key(5))
     free = ("dissipative_constant",)
     with_errors = jaxgran.fit(gas, curve, free=free)
-    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature)
+    bare = dataclasses.replace(curve, temperature_error=None)
     without = jaxgran.fit(gas, bare, free=free)
     np.testing.assert_allclose(without.estimate, with_errors.estimate, rtol=1e-3)
     found, expected = (fit.error_budget["measurement"] for fit in (without, with_errors))
@@ -94,78 +94,13 @@ def test_displacement_adds_information():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(6), relative_error=0.2, displacement=True)
     both = jaxgran.fit(gas, curve)
-    alone = jaxgran.fit(
-        gas,
-        jaxgran.CoolingCurve(
-            times=curve.times,
-            temperature=curve.temperature,
-            temperature_error=curve.temperature_error,
-        ),
-    )
+    alone = jaxgran.fit(gas, dataclasses.replace(curve, displacement=None))
     assert "displacement" in both.comparison.residuals
     assert "displacement" not in alone.comparison.residuals
     found, expected = (fit.error_budget["measurement"][0] for fit in (both, alone))
     assert found < 0.98 * expected
     truth = gas.value("dissipative_constant")
     assert abs(both.estimate[0] - truth) < 3 * both.standard_error[0]
-
-
-@pytest.mark.slow
-def test_series_coefficients_are_fitted_together():
-    law = jaxgran.RestitutionSeries([-0.2], [0.2])
-    gas = hard_gas(law)
-    start = gas.replace(coefficients=[-0.1])
-    curve = synthetic(gas, jax.random.key(8))
-    result = jaxgran.fit(gas, curve, free=("coefficients",), start=start)
-    assert abs(result.estimate[0] + 0.2) < 4 * result.standard_error[0]
-
-
-@pytest.mark.slow
-def test_parameters_that_cannot_be_told_apart_are_named():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(9))
-    free = ("dissipative_constant", "youngs_modulus")
-    hard = jaxgran.KineticTheory(softness=False)
-    for model in (hard, jaxgran.KineticTheory()):
-        with pytest.warns(UserWarning, match="does not determine A and Y"):
-            result = jaxgran.fit(gas, curve, free=free, model=model)
-    diagnosis = jaxgran.diagnose(result, curve)
-    assert any("does not determine" in reason for reason in diagnosis.reasons)
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"free": ("amplitude",)}, "no float 'amplitude'"),
-        ({"free": ()}, "free must be a tuple"),
-        ({"free": "temperature"}, "free must be a tuple"),
-        ({"free": ("temperature", "temperature")}, "different names"),
-        ({"solver": "simplex"}, "solver must be a least-squares solver or a minimiser"),
-        ({"max_steps": 0}, "max_steps must be a whole number >= 1, or None, got 0"),
-        ({"num_particles": -5}, "num_particles must be a whole number >= 1, or None, got -5"),
-    ],
-)
-def test_bad_requests_are_refused(options, message):
-    gas = glass_beads(0.15)
-    with pytest.raises(ValueError, match=message):
-        jaxgran.fit(gas, synthetic(gas, jax.random.key(0)), **options)
-
-
-@pytest.mark.slow
-def test_too_few_points_are_refused():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(0), num_points=3)
-    with pytest.raises(ValueError, match="3 points .* cannot determine 3 parameters; free fewer"):
-        jaxgran.fit(gas, curve, free=("dissipative_constant", "temperature", "packing_fraction"))
-    prepared = jaxgran.CoolingCurve(
-        times=curve.times.at[0].set(0.0),
-        temperature=curve.temperature,
-        temperature_error=curve.temperature_error.at[0].set(0.0),
-    )
-    with pytest.raises(ValueError, match="2 points .* cannot determine 2 parameters"):
-        jaxgran.fit(gas, prepared, free=("dissipative_constant", "temperature"))
-    with pytest.raises(ValueError, match="was not free; free were dissipative_constant"):
-        jaxgran.fit(gas, curve).value("temperature")
 
 
 @pytest.mark.slow
@@ -188,28 +123,12 @@ def test_wrong_error_bars_widen_the_error():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(11))
     honest = jaxgran.fit(gas, curve)
-    boast = jaxgran.CoolingCurve(
-        times=curve.times,
-        temperature=curve.temperature,
-        temperature_error=curve.temperature_error / 5,  # pyright: ignore
-    )
+    boast = dataclasses.replace(curve, temperature_error=curve.temperature_error / 5)
     result = jaxgran.fit(gas, boast)
     assert result.p_value < 0.01
     found, expected = (fit.error_budget["measurement"] for fit in (result, honest))
     np.testing.assert_allclose(found, expected, rtol=0.3)
     assert jaxgran.diagnose(result, boast).grade == "not consistent"
-
-
-def test_fit_under_vmap_over_a_float_of_the_gas():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(12))
-    packings = jnp.array([0.045, 0.05, 0.055])
-    batch = jax.vmap(lambda p: jaxgran.fit(gas.replace(packing_fraction=p), curve).estimate[0])(
-        packings
-    )
-    single = [jaxgran.fit(gas.replace(packing_fraction=p), curve).estimate[0] for p in packings]
-    np.testing.assert_allclose(batch, jnp.stack(single), rtol=1e-6)
-    assert jnp.all(jnp.diff(batch) < 0)  # a denser gas collides more: less A explains the same
 
 
 def test_a_fit_is_shown_by_its_estimates():
@@ -225,7 +144,7 @@ def test_a_fit_is_shown_by_its_estimates():
 def test_T_rot_of_few_spheres_that_were_hit_fluctuates_more():
     gas = dataclasses.replace(glass_beads(0.15), surface=jaxgran.Rough(-0.3))
     times = jnp.array([0.3, 1.0, 3.0]) * gas.mean_free_time
-    curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(250, replicas=400), progress=False)
+    curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(250, replicas=100), progress=False)
     T_rot = curve.replicas.rotational_temperature
     measured = jnp.std(T_rot, axis=0) / jnp.mean(T_rot, axis=0)
     bare = jaxgran.CoolingCurve(times, curve.temperature, rotational_temperature=T_rot.mean(0))

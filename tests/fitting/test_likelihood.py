@@ -1,4 +1,4 @@
-"""The likelihood that samplers follow."""
+"""The likelihood of a fit, and errors that come from the scatter of few replicas."""
 
 import jax
 import jax.numpy as jnp
@@ -6,12 +6,93 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.fitting.residuals import smooth_errors
+from jaxgran.fitting.result import goodness_of_fit
 from tests.beads import glass_beads
 from tests.fitting.curves import synthetic
 
+R, N = 3, 40
+SIGMA = 0.01 * np.exp(np.linspace(0.0, 1.5, N))
+"""Relative error of the mean of R replicas, growing along the curve."""
+
+
+def averaged(seed):
+    """A curve of T = 1 whose errors are the scatter of R replicas."""
+    noise = SIGMA * R**0.5 * np.random.default_rng(seed).standard_normal((R, N))
+    T = np.exp(noise)
+    return jaxgran.CoolingCurve(
+        times=np.arange(1.0, N + 1),
+        temperature=jnp.asarray(T.mean(axis=0)),
+        temperature_error=jnp.asarray(T.std(axis=0, ddof=1) / R**0.5),
+    )
+
+
+def test_errors_become_smooth():
+    curves = [averaged(seed) for seed in range(20)]
+    raw, smooth = (
+        np.array([c.temperature_error / c.temperature for c in each])
+        for each in (curves, [smooth_errors(c, R)[0] for c in curves])
+    )
+    # 40 points of 2 degrees: 80 for 3 coefficients, sqrt(3/160) = 14 % of an error, 25 % at ends.
+    off = [np.mean(np.abs(np.log(each / SIGMA))) for each in (smooth, raw)]
+    assert off[0] < 0.14 < 0.4 < off[1]
+    _, degrees = smooth_errors(curves[0], R)
+    # Neighbours are independent: what is found of a correlation is chance, 1/sqrt(40).
+    assert 0.55 * 2 * N < float(degrees["temperature"]) <= 2 * N
+
+
+def test_a_set_value_stays_without_weight_and_one_run_has_no_scatter():
+    curve = averaged(0)
+    error = curve.temperature_error.at[0].set(0.0)
+    curve = jaxgran.CoolingCurve(curve.times, curve.temperature, temperature_error=error)
+    smooth, _ = smooth_errors(curve, R)
+    assert smooth.temperature_error[0] == 0 and np.all(smooth.temperature_error[1:] > 0)
+    assert smooth_errors(curve, 1) == (curve, {})
+
+
+def p_values(smoothed):
+    """400 curves of the model that they are compared with."""
+    found = []
+    for seed in range(400):
+        curve = averaged(seed)
+        degrees = {}
+        if smoothed:
+            curve, degrees = smooth_errors(curve, R)
+        residuals = (curve.temperature - 1) / curve.temperature_error
+        tested = [(residuals, jnp.asarray(N), degrees.get("temperature"))]
+        found.append(float(goodness_of_fit(tested, jnp.asarray(N), errors_known=True).p_value))
+    return np.array(found)
+
+
+def test_p_values_are_those_of_students_t():
+    found = p_values(smoothed=True)
+    # Of 400: 5 +- 1.1 % and 1 +- .5 %, three of each; the F distribution is good to 1 %.
+    assert 0.015 < np.mean(found < 0.05) < 0.09 and np.mean(found < 0.01) < 0.035
+    assert 0.42 < np.mean(found) < 0.58
+    # Taken for exact the same errors refuse nearly every true curve.
+    assert np.mean(p_values(smoothed=False) < 0.01) > 0.8
+
 
 @pytest.mark.slow
-def test_is_the_chi2_of_the_fit():
+def test_fit_and_likelihood_use_them():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, jax.random.key(0))
+    chance = np.random.default_rng(0).chisquare(2, curve.times.size) / 2
+    ragged = jaxgran.CoolingCurve(
+        curve.times, curve.temperature, temperature_error=curve.temperature_error * chance**0.5
+    )
+    taken, few = (jaxgran.fit(gas, ragged, replicas=replicas) for replicas in (1, R))
+    assert float(taken.p_value) < 1e-4 < 0.01 < float(few.p_value)
+    # The weights are even: the errors were 1 % of T everywhere.
+    weights = few.comparison.weights["temperature"]
+    assert np.min(weights) / 100 > 0.6 and np.max(weights) / 100 < 1.7
+    expected = -0.5 * float(jnp.sum(few.residuals**2))
+    value = jaxgran.log_likelihood(few.gas, ragged, replicas=R)
+    assert float(value) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_likelihood_is_the_chi2_of_the_fit():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(0))
     result = jaxgran.fit(gas, curve, free=("dissipative_constant", "temperature"))
@@ -50,19 +131,3 @@ def test_a_clock_is_that_of_the_model():
     for clock in (0.9, jnp.full(40, 0.9)):
         assert float(jaxgran.log_likelihood(gas, curve, clock=clock)) == pytest.approx(0, abs=1e-6)
     assert float(jaxgran.log_likelihood(gas, curve)) < -10
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"model": jaxgran.DSMC(10)}, "a likelihood needs a model without noise, got DSMC"),
-        ({"model": "theory"}, "model"),
-        ({"clock": 0.0}, "clock must lie in"),
-        ({"curve": 3}, "curve must be a jaxgran.CoolingCurve"),
-    ],
-)
-def test_bad_requests_are_refused(change, message):
-    gas = glass_beads(0.15)
-    asked = {"curve": synthetic(gas, jax.random.key(0))} | change
-    with pytest.raises(ValueError, match=message):
-        jaxgran.log_likelihood(gas, asked.pop("curve"), **asked)
