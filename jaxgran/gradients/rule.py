@@ -59,22 +59,24 @@ class Outputs(NamedTuple):
     """Results of a run.
 
     Attributes:
-        position, velocity: of all particles at the last time.
-        records: by name, each of shape (times, replicas).
+        position, velocity: of all particles at the last time; None if they are not returned.
+        records: by name, each of shape (times, replicas); "saved" is a tree of arrays of shape
+            (times, replicas, ...).
         status: of the run, see `jaxgran._utils.status`.
         spin: of all particles at the last time; None for smooth spheres.
     """
 
-    position: Float[Array, "n d"]
-    velocity: Float[Array, "n d"]
-    records: dict[str, Array]
+    position: Any
+    velocity: Any
+    records: dict[str, Any]
     status: Int[Array, ""]
     spin: Float[Array, "n spins"] | None = None
 
 
 def differentiable(
     run: Callable[..., Outputs],
-    material: Callable[[Any], Any],
+    material: Callable[[Any], Any] = lambda scene: scene.material,
+    frequency: Callable[[Any], Any] = lambda scene: scene.collision_frequency,
     non_differentiable: Callable[[Any], Any] = lambda scene: (),
 ) -> Callable[[Inputs], Outputs]:
     """Return a run with projected derivatives: one linear rule for forward and reverse mode.
@@ -85,8 +87,10 @@ def differentiable(
     Args:
         run: a function of inputs, and of `directions` in the material: a pytree like the material,
             whose leaves hold the directions along a first axis. With directions the records of the
-            run are those of `with_tangents`.
+            run x are joined by their derivatives: "x.rate" in time and "x.along" in the directions,
+            as `with_tangents` returns them. Without both the derivatives of x are not known.
         material: the pytree of parameters of a scene, such as (alpha, A) or a reduced law.
+        frequency: the collision frequency of a scene; None if it is not part of the scene.
         non_differentiable: the parameters of a scene in which the derivative is not known.
 
     Returns:
@@ -122,32 +126,27 @@ def differentiable(
         out = run(inputs, directions=directions)
         # In a gas that is denser by some share everything happens earlier by this share.
         zero = jnp.zeros((), inputs.times.dtype)
-        frequency, times = change.scene.collision_frequency, change.times
-        density_change = (
-            frequency / inputs.scene.collision_frequency if _changes(frequency) else zero
-        )
+        rate, times = frequency(change.scene), change.times
+        density_change = rate / frequency(inputs.scene) if _changes(rate) else zero
         time_change = (times if _changes(times) else zero) + inputs.times * density_change
+        changes = amounts, density_change, time_change
         along, plain = {}, _plain(out.records)
         for name in [name for name in plain if f"{name}.rate" in out.records]:
             along[name] = out.records[f"{name}.rate"] * time_change[:, None]
             along[name] += _DENSITY_POWER.get(name, 0.0) * density_change * plain[name]
-            along[name] += jnp.einsum("tpr,p->tr", out.records[f"{name}.along"], amounts)
+            if (directional := out.records.get(f"{name}.along")) is None:
+                along[name] += nan_tangent(along[name].shape, *changes[:2])
+            else:
+                along[name] += jnp.einsum("tpr,p->tr", directional, amounts)
         if "dissipated_energy" in along:  # the energy balance holds in the tangents, too
             d = out.velocity.shape[1]
             inside = along.get("elastic_energy", 0.0)
             if "rotational_temperature" in along:
                 inside = inside + 0.5 * NUM_SPIN_COMPONENTS[d] * along["rotational_temperature"]
             along["dissipated_energy"] = -0.5 * d * along["temperature"] - inside
-        changes = amounts, density_change, time_change
-        for name in set(plain) - set(along) | _NON_DIFFERENTIABLE & set(plain):
-            along[name] = nan_tangent_like(plain[name], *changes)
-        return out._replace(records=plain), Outputs(
-            position=nan_tangent(out.position.shape, *changes),
-            velocity=nan_tangent(out.velocity.shape, *changes),
-            records=along,
-            status=np.zeros(out.status.shape, jax.dtypes.float0),  # type: ignore[arg-type]
-            spin=None if out.spin is None else nan_tangent(out.spin.shape, *changes),
-        )
+        out = out._replace(records=plain)
+        unknown = jax.tree.map(lambda x: nan_tangent_like(x, *changes), out)
+        return out, unknown._replace(records=unknown.records | along)
 
     return outputs
 
@@ -186,8 +185,8 @@ def _directions(
     return structure.unflatten(directions), amounts
 
 
-_NON_DIFFERENTIABLE = {"sonine", "flow_share"}
-"""Records whose derivatives are not known."""
+UNKNOWN = {"sonine", "flow_share"}
+"""Records whose derivatives `with_tangents` does not know."""
 
 _DENSITY_POWER = {"displacement": -2.0, "elastic_energy": 1.0}
 """Power of the collision frequency in a record at a fixed place in the sequence of collisions."""
@@ -199,7 +198,7 @@ def with_tangents(
     rates: dict[str, Array],
     clock: Float[Array, "p replicas"],
 ) -> dict[str, Array]:
-    """Return the records, and for each record x its derivatives "x.rate" and "x.along".
+    """Return the records, and for each record x but `UNKNOWN` ones "x.rate" and "x.along".
 
     The first is the derivative in time, the second the derivatives along the directions at a fixed
     time.
@@ -213,6 +212,8 @@ def with_tangents(
     """
     extended = dict(records)
     for name, values in records.items():
+        if name in UNKNOWN:
+            continue
         rate = rates.get(name, jnp.zeros(values.shape, clock.dtype))
         extended[f"{name}.rate"] = rate
         extended[f"{name}.along"] = along.get(name, 0.0) - rate[None] * clock

@@ -466,12 +466,32 @@ class ExchangeTangents(NamedTuple):
     are all sooner by some share are sooner by this share of their time.
 
     Attributes:
-        energies: of translation and rotation.
-        collisions: of their number.
+        directions: in the material, stacked along a first axis of each leaf.
+        energies: tangents of those of translation and rotation.
+        collisions: tangents of their number.
     """
 
+    directions: Any
     energies: Float[Array, "p 2 *replicas"]
     collisions: Float[Array, "p *replicas"]
+
+    @classmethod
+    def initial(
+        cls, directions: Any, material: Any, velocity: Float[Array, "n d"], replicas: int
+    ) -> "ExchangeTangents":
+        """Return the tangents at t = 0, where T is 1 and T_rot is that of the material."""
+        directions = jax.tree.map(
+            lambda x: jnp.concatenate([x, jnp.zeros_like(x, shape=(1, *x.shape[1:]))]), directions
+        )
+        if material.drag is not None:  # drag acts sooner, too
+            rates = jax.tree.map(lambda x, rate: x.at[-1].set(rate), directions.drag, material.drag)
+            directions = directions._replace(drag=rates)
+        (n, d), p = velocity.shape, len(jax.tree.leaves(directions)[0])
+        energies = jnp.zeros((p, 2, replicas), velocity.dtype)
+        if material.surface is not None:
+            rotational_energy = n // replicas * NUM_SPIN_COMPONENTS[d] / 2
+            energies = energies.at[:, 1].add(rotational_energy * directions.surface.ratio[:, None])
+        return cls(directions, energies, jnp.zeros((p, replicas), velocity.dtype))
 
     def after(
         self,
@@ -501,32 +521,6 @@ class ExchangeTangents(NamedTuple):
         first = ratio_or_zero(self.energies, before[None])
         half = ratio_or_zero(self.energies + growth(first) / 2, middle[None])
         new_collisions = sooner[:, 0] * collisions[None] + half[:, 0] / 2 * collisions[None]
-        return ExchangeTangents(self.energies + growth(half), self.collisions + new_collisions)
-
-    def of_records(
-        self,
-        values: dict[str, Array],
-        log_decay: Float[Array, "2"],
-        decay_along: Float[Array, "p 2"],
-        time: Float[Array, ""],
-        num_particles: int,
-        dimension: int,
-    ) -> tuple[dict[str, Array], dict[str, Array]]:
-        """Return the derivatives of T, T_rot and collisions along directions, and in time.
-
-        Args:
-            values: the records.
-            log_decay: logarithms of the decay of velocities and of spins by drag.
-            decay_along: their tangents.
-            time: at which the records are.
-            num_particles, dimension: N and d.
-        """
-        n, d, along = num_particles, dimension, {"collisions": 2 / num_particles * self.collisions}
-        for k, name in enumerate(("temperature", "rotational_temperature")):
-            if name in values:
-                size = n * (d, NUM_SPIN_COMPONENTS[d])[k] / 2
-                moved = jnp.exp(2 * log_decay[k]) * self.energies[:, k] / size
-                along[name] = moved + 2 * decay_along[:, k, None] * values[name][None]
-        elapsed = jnp.where(time > 0, time, 1.0)
-        rates = {name: x[-1] / elapsed for name, x in along.items()}
-        return {name: x[:-1] for name, x in along.items()}, rates
+        return self._replace(
+            energies=self.energies + growth(half), collisions=self.collisions + new_collisions
+        )

@@ -2,8 +2,8 @@
 
 - `cool`: the cooling curve of a gas by any model.
 - `base`: the interface of a model.
-- `kinetic_theory`, `dsmc`, `hard_spheres`, `soft_spheres`: the models, cheapest first; `spheres`
-  is the base of the last two.
+- `kinetic_theory`, `dsmc`, `hard_spheres`, `soft_spheres`: the models, cheapest first;
+  `particle_model` is the base of the last three, and `spheres` of the last two.
 - `linearise`: the program that fits, diagnoses and the choice of a model share.
 - `choose`: choice of a model, by the errors that `error_model` estimates.
 - `checks`: checks of arguments and scenes.

@@ -1,18 +1,13 @@
 """Direct simulation Monte Carlo (DSMC) of the velocities of a homogeneous gas."""
 
-import dataclasses
-from functools import partial
+from collections.abc import Callable
 from math import hypot
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Float
 
-from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import (
     Domain,
     UserFloat,
@@ -21,23 +16,15 @@ from jaxgran._utils.validation import (
     checked_int,
     python_int,
 )
-from jaxgran.data.checkpoint import describe_run
-from jaxgran.data.curve import DEFAULTS, QUANTITIES, CoolingCurve, Run, records_in_si
+from jaxgran.data.curve import Run
+from jaxgran.gradients.rule import Inputs, Outputs, differentiable
 from jaxgran.models import checks
-from jaxgran.models.base import AbstractModel, Limitation
+from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
-from jaxgran.particles import snapshot
+from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.particles.dsmc.collisions import DSMCDynamics, Scheme
-from jaxgran.particles.dsmc.run import differentiable_run, host_run_parts
-from jaxgran.particles.run import (
-    block_until_ready,
-    compiling,
-    join_records,
-    needs_compilation,
-    replica_devices,
-    run_replicas,
-    run_through_times,
-)
+from jaxgran.particles.dsmc.run import run_dsmc
+from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced import reduced_scene
@@ -46,7 +33,7 @@ MAX_STEP = 0.1
 """Largest number of collisions per particle and step: a step draws a particle at most twice."""
 
 
-class DSMC(AbstractModel):
+class DSMC(AbstractParticleModel):
     """Homogeneous gas of hard spheres by direct simulation Monte Carlo: velocities, no positions.
 
     Solves the Enskog-Boltzmann equation of the homogeneous gas with any law of restitution:
@@ -97,8 +84,6 @@ class DSMC(AbstractModel):
     replicas: UserInt = eqx.field(static=True, converter=python_int, default=1)
     step: UserFloat = eqx.field(static=True, default=0.05)
 
-    stochastic: ClassVar[bool] = True
-    saves: ClassVar[bool] = True
     elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
     derivative_accuracy: ClassVar[float] = 0.01
 
@@ -131,101 +116,23 @@ class DSMC(AbstractModel):
         contacts = checks.limitations_of_instant_impacts(gas)
         return contacts + checks.limitations_of_homogeneity(gas, num_particles)
 
-    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
-        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`.
+    def inputs(self, gas: Gas, times: Float[Array, "times"], run: Run) -> Inputs:
+        """Return the gas and the times in units of its path length and impact speed."""
+        scene, reduced = reduced_scene(gas), times * gas.impact_speed / gas.path_length
+        if scene.drag is not None:
+            reduced = transformed_times(scene.drag, reduced)
+        units = Units.of(gas, self.num_particles, gas.path_length, gas.impact_speed)
+        return Inputs(scene, reduced, None, run.key, units)
 
-        A run fails if too many pairs are faster than the ceiling of the collision rate.
+    def differentiable(self, outputs: Callable[..., Outputs], run: Run) -> Callable[..., Outputs]:
+        """Return runs with derivatives in all numbers of a scene; none of them is a frequency."""
+        return differentiable(outputs, lambda scene: scene, lambda scene: None)
+
+    def outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
+        """Return the records of a run.
+
+        It fails if too many pairs are faster than the ceiling of the collision rate.
         """
-        unreachable_times = checks.unreachable_with_drag(gas, times)
-        words = _key_words(run)
-        scheme = Scheme.of(gas.dimension, self.num_particles, self.step)
-        dynamics = DSMCDynamics(reduced_scene(gas), scheme)
-        reduced = times * gas.impact_speed / gas.path_length
-        if dynamics.scene.drag is not None:
-            reduced = transformed_times(dynamics.scene.drag, reduced)
-        units = snapshot.Units.of(gas, self.num_particles, gas.path_length, gas.impact_speed)
-        if any_traced(gas, times, words):
-            checks.refuse_files(self, run)
-            options = {"units": units, "save": snapshot.save_function(run.save)}
-            records = differentiable_run(
-                dynamics, reduced, words, replicas=self.replicas, **options
-            )
-        elif on := replica_devices(self.replicas):
-            single = dataclasses.replace(self, replicas=1)
-
-            def run_replica(k: int, run: Run) -> dict[str, Array]:
-                return single._run_on_host(dynamics, reduced, _key_words(run), units, run)
-
-            records = join_records(run_replicas(run_replica, self.replicas, run, on))
-        else:
-            records = self._run_on_host(dynamics, reduced, words, units, run)
-        curve, failed = _curve(gas, times, records, unreachable_times)
-        size = self.replicas, self.num_particles
-        rough = gas.surface is not None
-        like = snapshot.particle_shapes(units, size, gas.dimension, times.dtype, rough)
-        return snapshot.attach_saved(curve, run.save, records, like, failed)
-
-    def _run_on_host(
-        self,
-        dynamics: DSMCDynamics,
-        times: Float[Array, "times"],
-        words: UInt32[Array, "2"],
-        units: snapshot.Units,
-        run: Run,
-    ) -> dict[str, Array]:
-        """Run on the host, with progress and checkpoints, and return the records."""
-        new = needs_compilation((jax.tree.structure(dynamics), self.replicas, times.dtype))
-        with compiling(run.progress and new):
-            start, advance, observe = host_run_parts(
-                dynamics, words, replicas=self.replicas, donate=run.checkpoint is None
-            )
-            recorded = partial(observe, units=units, save=snapshot.save_function(run.save))
-            if new:  # compile with a call of zero steps; it may delete its state, so copy that
-                jax.block_until_ready(recorded(advance(jax.tree.map(jnp.copy, start), 0.0)))
-        description = {}
-        if run.checkpoint is not None:
-            fixed = {"dynamics": dynamics, "times": times, "key": words, "model": self}
-            description = describe_run(**fixed, save=run.save)
-        _, records, fault = run_through_times(
-            start,
-            np.asarray(times),
-            lambda state, end: block_until_ready(advance(state, end)),
-            recorded,
-            shown=observe,
-            scene=description,
-            progress=run.progress,
-            path=run.checkpoint,
-        )
-        records["fault"][np.isnan(records["temperature"])] |= fault  # a fault of the driver
-        return {name: jnp.asarray(value) for name, value in records.items()}
-
-
-def _key_words(run: Run) -> UInt32[Array, "2"]:
-    """Return two random words from a key of any kind."""
-    key = jax.random.key(0) if run.key is None else run.key
-    return jax.random.bits(key, (2,), jnp.uint32)
-
-
-def _curve(
-    gas: Gas,
-    times: Float[Array, "times"],
-    records: dict[str, Array],
-    unreachable_times: Bool[Array, "times"],
-) -> tuple[CoolingCurve, Bool[Array, "replicas times"]]:
-    """Return the curve in SI units and a mask of its nan values.
-
-    A replica is nan from its first fault on, and all replicas are nan at unreachable times.
-    """
-    fault = records["fault"] | status.flag(status.OUT_OF_RANGE, unreachable_times)[:, None]
-    failed = jnp.cumsum(fault != status.OK, axis=0) > 0
-    records = {name: x for name, x in records.items() if name in QUANTITIES}
-    if gas.container is not None:  # walls would limit <dr^2>
-        records.pop("displacement", None)
-    values = records_in_si(
-        {name: jnp.where(failed, jnp.nan, x) for name, x in records.items()},
-        length=gas.path_length,
-        temperature=gas.temperature,
-        mass=gas.mass,
-    )
-    status_of_all = jnp.bitwise_or.reduce(fault, axis=None)
-    return CoolingCurve.of_replicas(times, values, status=status_of_all), failed.T
+        scheme = Scheme.of(dimension, self.num_particles, self.step)
+        dynamics, settings = DSMCDynamics(inputs.scene, scheme), {"model": self}
+        return run_dsmc(dynamics, inputs, directions, self.replicas, run, settings)

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy  # which imports scipy.spatial at its first use
-from jaxtyping import Array, Bool, Float
 
 from jaxgran._utils.tracing import any_traced, concrete_array
 from jaxgran._utils.validation import POSITIVE, UserFloat, UserInt, checked_float, python_int
@@ -120,6 +119,7 @@ class SoftSpheres(AbstractSpheres):
 
     listed_by_skin: ClassVar[float] = 3.0
     elements: ClassVar[tuple[str, ...]] = ("friction", "container", "drag")
+    transforms_time: ClassVar[bool] = False
 
     def __check_init__(self):
         self.check_counts(steps_per_contact=10)
@@ -209,10 +209,6 @@ class SoftSpheres(AbstractSpheres):
             walls = ReducedWalls(ReducedContact.of(wall_law.of_wall(), gas), None, friction)
         material = ReducedScene(ReducedContact.of(law, gas), surface, walls)
         return sphere_scene(gas, self.num_particles, material)
-
-    def unreachable_times(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
-        """Return a mask without times: soft spheres do not transform time, and reach all."""
-        return jnp.zeros(times.shape, bool)
 
     def non_differentiable(self, scene: SphereScene) -> Any:
         """Return the lengths and the collision frequency between walls, otherwise nothing."""

@@ -12,18 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from equinox import AbstractClassVar, AbstractVar
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int, no_type_check
-from jaxgran.data.curve import DEFAULTS, CoolingCurve, Particles, Run, records_in_si
+from jaxgran.data.curve import DEFAULTS, CoolingCurve, Particles, Run
 from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable
 from jaxgran.models import checks
-from jaxgran.models.base import AbstractModel
 from jaxgran.models.error_model import ErrorModel, slope_bias_of_run
+from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.particles import neighbours, snapshot
-from jaxgran.particles import run as particle_run
 from jaxgran.particles.capacity import Capacity, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.run import Simulation, simulate_on_host, simulate_traced
@@ -62,12 +61,10 @@ class Plan(NamedTuple):
     equilibration_capacity: Capacity
 
 
-class AbstractSpheres(AbstractModel):
+class AbstractSpheres(AbstractParticleModel):
     """A model of spheres in periodic boxes.
 
     Attributes:
-        num_particles: N in each box.
-        replicas: number of independent boxes.
         start: positions and velocities given by a user; None for random ones.
         neighbours: the search for pairs.
         differences: step of derivatives by differences; None for projected ones.
@@ -75,16 +72,12 @@ class AbstractSpheres(AbstractModel):
         listed_by_skin: pairs per particle that the skin adds to a neighbour list.
     """
 
-    num_particles: AbstractVar[int]
-    replicas: AbstractVar[int]
     start: AbstractVar[Particles | None]
     neighbours: AbstractVar[str]
     differences: AbstractVar[float | None]
     plan: AbstractVar[Plan | None]
     listed_by_skin: AbstractClassVar[float]
 
-    stochastic: ClassVar[bool] = True
-    saves: ClassVar[bool] = True
     has_positions: ClassVar[bool] = True
     derivative_accuracy: ClassVar[float] = 0.02
 
@@ -117,9 +110,14 @@ class AbstractSpheres(AbstractModel):
         """Return the times of the run at reduced times."""
         return times
 
-    def unreachable_times(self, gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
-        """Return a mask of the times that the run cannot reach."""
-        return checks.unreachable_with_drag(gas, times)
+    def invalid_times(
+        self, gas: Gas, times: Float[Array, "times"]
+    ) -> tuple[Bool[Array, "times"], Int[Array, ""]]:
+        """Return a mask of the times that the run cannot reach, and the status for them."""
+        late, fault = super().invalid_times(gas, times)
+        # Traced values could not be checked before the run.
+        other_box = has_other_box(self.start, gas, self.num_particles)
+        return late | other_box, fault | status.flag(status.BOX_MISMATCH, other_box)
 
     def non_differentiable(self, scene: SphereScene) -> Any:
         """Return the numbers of a scene in which the derivative of a run is not known."""
@@ -159,10 +157,12 @@ class AbstractSpheres(AbstractModel):
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
-        unreachable_times = self.unreachable_times(gas, times)
-        gas = with_constant_temperature(self.start, gas)
+        return super().simulate(with_constant_temperature(self.start, gas), times, run)
+
+    def inputs(self, gas: Gas, times: Float[Array, "times"], run: Run) -> Inputs:
+        """Return the gas, the times and the start in units of the run."""
         scene, speed = self.scene(gas), jnp.sqrt(gas.temperature)
-        inputs = Inputs(
+        return Inputs(
             scene=scene,
             times=self.clock(scene, times * speed / gas.diameter),
             start=reduced_start(self.start, gas, differentiable=not self.projected),
@@ -170,36 +170,23 @@ class AbstractSpheres(AbstractModel):
             units=snapshot.Units.of(gas, self.num_particles, gas.diameter, speed),
         )
 
-        def outputs(inputs: Inputs, directions: Any = None, run: Run = run) -> Outputs:
-            return self._outputs(inputs, directions, gas.dimension, run)
-
-        differentiable_outputs: Callable[..., Outputs] = outputs
+    def differentiable(self, outputs: Callable[..., Outputs], run: Run) -> Callable[..., Outputs]:
+        """Return runs with projected derivatives, with differences of runs, or unchanged."""
+        if not self.projected:
+            return outputs
         if self.differences is not None:
             shifted = partial(outputs, run=Run(run.key, run.progress))  # these write no files
-            differentiable_outputs = by_differences(outputs, shifted, self.differences)
-        if self.projected:
-            differentiable_outputs = differentiable(
-                differentiable_outputs, lambda scene: scene.material, self.non_differentiable
-            )
-        out = differentiable_outputs(inputs)
-        return self._curve(gas, times, inputs.units, out, unreachable_times, run.save)
+            outputs = by_differences(outputs, shifted, self.differences)
+        return differentiable(outputs, non_differentiable=self.non_differentiable)
 
-    def _outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
-        """Run in reduced units: from the host if all numbers are known, otherwise compiled."""
-        if not any_traced(inputs) and (
-            on := particle_run.replica_devices(self.replicas, self.num_particles)
-        ):
-            single = dataclasses.replace(self, replicas=1, start=None, plan=None)
+    def single_replica(self: S) -> S:
+        """Return the model of one replica; the inputs of its run have its start."""
+        return dataclasses.replace(self, replicas=1, start=None, plan=None)
 
-            def run_replica(k: int, run: Run) -> Outputs:
-                part = particle_run.replica_inputs(inputs, k, self.num_particles, run)
-                return single._outputs(part, directions, dimension, run)
-
-            runs = particle_run.run_replicas(run_replica, self.replicas, run, on)
-            return particle_run.join_outputs(runs)
+    def outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
+        """Run all replicas in one array, from the host unless a number of the inputs is traced."""
         plan = self._known_plan(inputs.scene, dimension)
         side = inputs.scene.filled_side
-        skin = skin_for_pairs(self.listed_by_skin, self.num_particles, side, dimension)
         sim = Simulation(
             dynamics=self.dynamics(inputs.scene, plan),
             equilibration_capacity=plan.equilibration_capacity,
@@ -207,19 +194,13 @@ class AbstractSpheres(AbstractModel):
             directions=directions,
             num_particles=self.num_particles,
             dimension=dimension,
-            skin=skin,
+            skin=skin_for_pairs(self.listed_by_skin, self.num_particles, side, dimension),
             engine=self.neighbours,
             save=snapshot.save_function(run.save),
         )
         if not any_traced(inputs):
             model = dataclasses.replace(self, start=None, plan=None)
-            settings = {"model": model, "steps": plan.steps}
-            if directions is None:
-                return simulate_on_host(sim, run, settings)
-            # In a rule of differentiation operations on known numbers would be staged.
-            on_host = partial(simulate_on_host, sim, run, settings)
-            return particle_run.in_threads([on_host], [particle_run.chosen_device()])[0]
-        checks.refuse_files(self, run)
+            return simulate_on_host(sim, run, {"model": model, "steps": plan.steps})
         if self.neighbours == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap neighbours="jax-md" is not supported, since it sizes '
@@ -248,38 +229,10 @@ class AbstractSpheres(AbstractModel):
                 f"{name}(...).sized_for(gas), with a gas of known numbers and outside of jax.jit."
             ) from None
 
-    def _curve(
-        self,
-        gas: Gas,
-        times: Float[Array, "times"],
-        units: snapshot.Units,
-        out: Outputs,
-        unreachable_times: Bool[Array, "times"],
-        save: Any,
-    ) -> CoolingCurve:
-        """Return the curve in SI units from records in reduced units."""
-        values = records_in_si(
-            out.records, length=gas.diameter, temperature=gas.temperature, mass=gas.mass
-        )
-        # Traced values could not be checked before the run.
-        other_box = has_other_box(self.start, gas, self.num_particles)
-        invalid = other_box | unreachable_times
-        values = {name: jnp.where(invalid[None], jnp.nan, x) for name, x in values.items()}
-        particles = snapshot.particles(units, self.replicas, out.position, out.velocity, out.spin)
-        late = status.flag(status.OUT_OF_RANGE, jnp.any(unreachable_times))
-        curve = CoolingCurve.of_replicas(
-            times,
-            values,
-            particles=particles,
-            status=out.status | status.flag(status.BOX_MISMATCH, other_box) | late,
-            derivative_bias=self._bias(gas, times, values.get("flow_share")),
-        )
-        return snapshot.attach_saved(curve, save, out.records, particles, invalid[None])
-
     @eqx.filter_jit
-    def _bias(self, gas: Gas, times: Array, flow_share: Array | None) -> Array | None:
+    def derivative_bias(self, gas: Gas, times: Array, flow_share: Array) -> Array | None:
         """Estimate the bias of projected derivatives, 0 in a box below L_c, which has no flow."""
-        if flow_share is None or self.differences is not None or not self.projected:
+        if self.differences is not None or not self.projected:
             return None
         has_flow = gas.box_side(self.num_particles) > gas.critical_box
         return jnp.where(has_flow, slope_bias_of_run(times, jnp.mean(flow_share, axis=0)), 0.0)

@@ -235,15 +235,10 @@ def simulate_traced(sim: Simulation) -> Outputs:
     def record_at(carry, end):
         state, fault, _ = run_segments(dynamics, carry[0], end, engine, 0, None, carry[1])
         records, failed = sim.observe(state), fault != status.OK
-        return (state, fault), jax.tree.map(partial(_nan_if, failed), records)
+        return (state, fault), jax.tree.map(partial(snapshot.nan_where, failed), records)
 
     (state, fault), records = jax.lax.scan(record_at, (state, fault), inputs.times)
     return sim.outputs(state, records, fault)
-
-
-def _nan_if(failed: Array, x: Array) -> Array:
-    """Return nan after a failure; integers and booleans have no nan and stay as they are."""
-    return jnp.where(failed, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x
 
 
 def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
@@ -286,8 +281,7 @@ def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Out
         write=write,
         fault=fault,
     )
-    arrays = {name: jnp.asarray(value) for name, value in records.items()}
-    return sim.outputs(state, arrays, fault)
+    return sim.outputs(state, jax.tree.map(jnp.asarray, records), fault)
 
 
 def _equilibrate(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[State, int]:
@@ -400,8 +394,9 @@ def run_through_times(
         The last state; the records, whose first axis is that of the times, with nan (integers: 0)
         from a failure on; and the status.
     """
-    observed = {name: np.asarray(value) for name, value in observe(state).items()}
-    records = {name: np.zeros((len(times), *x.shape), x.dtype) for name, x in observed.items()}
+    records = jax.tree.map(
+        lambda x: np.zeros((len(times), *np.shape(x)), np.asarray(x).dtype), observe(state)
+    )
     num_done, last_save, num_stalled = 0, time.monotonic(), 0
     if path is not None and Path(path).exists():
         done, loaded, records = checkpoint.load(path, scene or {}, (0, state, records))
@@ -438,8 +433,8 @@ def run_through_times(
                     if time.monotonic() - last_save > CHECKPOINT_SECONDS:
                         save()
                         last_save = time.monotonic()
-                for name, value in observe(state).items():
-                    records[name][num_done] = value
+                for values, x in zip(*map(jax.tree.leaves, (records, observe(state))), strict=True):
+                    values[num_done] = x
                 write(num_done, state)
                 num_done += 1
             save()
@@ -448,7 +443,7 @@ def run_through_times(
             raise
         except RunFailure as failure:
             fault, state = failure.fault, failure.state or state
-            for values in records.values():
+            for values in jax.tree.leaves(records):
                 values[num_done:] = np.nan if np.issubdtype(values.dtype, np.inexact) else 0
     return state, records, fault
 
@@ -654,10 +649,12 @@ def join_records(runs: list[dict[str, Array]]) -> dict[str, Array]:
     Records have the shape (times, replicas, ...); in derivatives along directions replicas are the
     last axis.
     """
-    axes = {name: -1 if name.endswith(".along") else 1 for name in runs[0]}
     return {
-        name: _concatenate(*(records[name] for records in runs), axis=axis)
-        for name, axis in axes.items()
+        name: jax.tree.map(
+            partial(_concatenate, axis=-1 if name.endswith(".along") else 1),
+            *(records[name] for records in runs),
+        )
+        for name in runs[0]
     }
 
 

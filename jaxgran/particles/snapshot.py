@@ -10,11 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.data.curve import CoolingCurve, Particles
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import Gas
-
-PREFIX = "saved:"
-"""Prefix of the names of saved records, before the number of the leaf."""
 
 
 def box_side(gas: Gas, num_particles: int) -> Float[Array, "..."]:
@@ -62,15 +58,6 @@ def particles(
     )
 
 
-def particle_shapes(
-    units: Units, size: tuple[int, int], dimension: int, dtype: Any, rough: bool
-) -> Particles:
-    """Return the shapes of the particles, for `size` = (replicas, N), and their box."""
-    vectors = jax.ShapeDtypeStruct((*size, dimension), dtype)
-    spins = jax.ShapeDtypeStruct((*size, NUM_SPIN_COMPONENTS[dimension]), dtype) if rough else None
-    return Particles(vectors, vectors, units.box_side, spins)  # type: ignore[arg-type]
-
-
 def save_function(
     save: Callable[[Particles], Any] | str | None,
 ) -> Callable[[Particles], Any] | None:
@@ -83,25 +70,20 @@ def _without_box(particles: Particles) -> Particles:
 
 
 @partial(jax.jit, static_argnames="save")
-def saved_records(save: Callable[[Particles], Any], particles: Particles) -> dict[str, Array]:
-    """Return one record for each leaf of a user's function of the particles of each replica.
+def saved_records(save: Callable[[Particles], Any], particles: Particles) -> dict[str, Any]:
+    """Return the record "saved": a user's function of the particles of each replica.
 
     The particles of one replica have arrays of shape (N, d).
     """
-    leaves = jax.tree.leaves(_map_replicas(save, particles))
-    return {f"{PREFIX}{k}": jnp.asarray(leaf) for k, leaf in enumerate(leaves)}
 
-
-def _map_replicas(save: Callable[[Particles], Any], particles: Particles) -> Any:
     def saved(replica: Particles) -> Any:
         tree = save(replica)
         if not jax.tree.leaves(tree):
             raise ValueError(f"save must return arrays, in any tree, got {tree!r:.60} from it")
         return jax.tree.map(_as_array, tree)
 
-    spins = None if particles.angular_velocity is None else 0
-    axes: Any = Particles(0, 0, None, spins)  # type: ignore[arg-type]
-    return jax.vmap(saved, (axes,))(particles)
+    axes: Any = jax.tree.map(lambda _: 0, particles)._replace(box_side=None)
+    return {"saved": jax.vmap(saved, (axes,))(particles)}
 
 
 def _as_array(leaf: Any) -> Array:
@@ -114,36 +96,23 @@ def _as_array(leaf: Any) -> Array:
     return array
 
 
-def attach_saved(
-    curve: CoolingCurve,
-    save: Callable[[Particles], Any] | str | None,
-    records: dict[str, Array],
-    particles: Particles,
-    invalid: Bool[Array, "replicas_or_1 times"],
-) -> CoolingCurve:
-    """Add the saved records to a curve.
+def nan_where(failed: Bool[Array, "times replicas_or_1"], x: Array) -> Array:
+    """Return a record with nan where a run failed; integers have no nan and stay as they are."""
+    if not jnp.issubdtype(x.dtype, jnp.inexact):
+        return x
+    return jnp.where(failed.reshape(*failed.shape, *[1] * (x.ndim - failed.ndim)), jnp.nan, x)
+
+
+def attach_saved(curve: CoolingCurve, save: Any, saved: Any, box_side: Array) -> CoolingCurve:
+    """Add saved records, of shape (times, replicas, ...), to a curve.
 
     Args:
         curve: curve of the run.
         save: option of the run.
-        records: records of shape (times, replicas, ...).
-        particles: particles, or their shapes, with the box.
-        invalid: mask of the replicas and times at which records are replaced by nan.
+        saved: the records.
+        box_side: of the box, m.
     """
-    function = save_function(save)
-    if function is None:
-        return curve
-
-    def leaf(k: int) -> Array:
-        x = jnp.swapaxes(records[f"{PREFIX}{k}"], 0, 1)
-        if not jnp.issubdtype(x.dtype, jnp.inexact):
-            return x
-        return jnp.where(invalid.reshape(*invalid.shape, *[1] * (x.ndim - 2)), jnp.nan, x)
-
-    tree = jax.tree.structure(jax.eval_shape(partial(_map_replicas, function), particles))
-    by_replica = jax.tree.unflatten(tree, [leaf(k) for k in range(tree.num_leaves)])
     if save != "particles":
-        return curve.with_saved(by_replica)
-    side = jnp.broadcast_to(particles.box_side, (invalid.shape[1], *particles.box_side.shape))
-    by_time = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), by_replica)
-    return dataclasses.replace(curve, saved=by_time._replace(box_side=side))
+        return curve.with_saved(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), saved))
+    side = jnp.broadcast_to(box_side, (len(curve.times), *box_side.shape))
+    return dataclasses.replace(curve, saved=saved._replace(box_side=side))

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from jaxgran.gradients.tangents import PathTangents
+from jaxgran.gradients.tangents import ExchangeTangents, PathTangents
 from jaxgran.particles import observables
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.reduced import ReducedDrag, ReducedRough, SphereScene
@@ -212,8 +212,59 @@ def transformed_times(drag: ReducedDrag, times: Float[Array, "times"]) -> Float[
     return jnp.where(drag.rate > 0, -jnp.expm1(-drag.rate * times) / safe, times)
 
 
+def exchange_derivatives(
+    values: dict[str, Array],
+    tangents: ExchangeTangents,
+    drag: ReducedDrag | None,
+    drag_along: Any,
+    time: Float[Array, ""],
+    size: tuple[int, int],
+) -> dict[str, Array]:
+    """Return derivatives of T, T_rot and collisions for `jaxgran.gradients.rule.differentiable`.
+
+    Args:
+        values: the records, some of which are these three.
+        tangents: of the energies that the particles exchange.
+        drag: rates of drag; None without drag.
+        drag_along: directions in these rates, like `drag`.
+        time: transformed time of the records.
+        size: N and d.
+    """
+    (n, d), decay, decay_along = size, jnp.zeros(2), jnp.zeros((1, 2))
+    if drag is not None:
+
+        def logarithms(drag: ReducedDrag) -> Array:
+            left = drag_decay(drag, time)
+            return jnp.log(jnp.stack([left.velocity, left.true_spin]))
+
+        decay, linear = jax.linearize(logarithms, drag)
+        decay_along = jax.vmap(linear)(drag_along)
+    along = {"collisions": 2 / n * tangents.collisions}
+    for k, name in enumerate(("temperature", "rotational_temperature")):
+        if name in values:
+            energy = n * (d, NUM_SPIN_COMPONENTS[d])[k] / 2
+            moved = jnp.exp(2 * decay[k]) * tangents.energies[:, k] / energy
+            along[name] = moved + 2 * decay_along[:, k, None] * values[name][None]
+    elapsed = jnp.where(time > 0, time, 1.0)  # the last direction is that of time
+    rates = {f"{name}.rate": x[-1] / elapsed for name, x in along.items()}
+    return rates | {f"{name}.along": x[:-1] for name, x in along.items()}
+
+
 MAX_KICK = 0.05
 """Largest relative growth of T by the kicks of one step."""
+
+
+def kick_variance(
+    strength: Array, drag: ReducedDrag | None, start: Array, duration: Array, place: float
+) -> Array:
+    """Return the growth of T by half of the kicks of a step, at its begin (place 0) or end (1).
+
+    With drag a kick decays as a velocity does, and the start and the duration are transformed.
+    """
+    if drag is None:
+        return strength * jnp.maximum(duration, 0.0) / 2
+    time = true_duration(drag, start, duration)
+    return strength * time / 2 / drag_decay(drag, start + place * duration).velocity ** 2
 
 
 def threefry_key(words: Array) -> PRNGKeyArray:

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable
 from math import gamma, pi
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,7 +50,7 @@ def side_of_box(
     return (num_particles / number_density) ** (1 / dimension)
 
 
-def contact_value(packing_fraction: ArrayLike, dimension: int) -> Float[Array, "..."]:
+def contact_value(packing_fraction: ArrayLike, dimension: int) -> Any:
     """Equilibrium pair correlation function at contact, ``g_2(sigma)``.
 
     ``(2 - phi) / (2 (1 - phi)^3)`` in three dimensions (Carnahan & Starling 1969) and

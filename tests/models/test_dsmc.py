@@ -224,7 +224,7 @@ def test_keeps_no_checkpoint_in_compiled_code():
         return curve.temperature[0]
 
     with pytest.raises(ValueError, match="DSMC cannot write a checkpoint.*Set checkpoint=None"):
-        jax.grad(f)(0.6)
+        jax.jit(jax.grad(f))(0.6)
 
 
 def test_refuses_a_law_that_heats():

@@ -32,7 +32,7 @@ def test_impacts_follow_the_rule_of_rough_spheres(dimension, eps, beta):
         jnp.asarray(3.0),
         jnp.ones(()),
         scene,
-        False,
+        None,
         spin=jnp.asarray(spin.sum(0)),
     )
     kick, spin_change = np.asarray(out.kick), np.asarray(out.spin_change)

@@ -12,7 +12,6 @@ import pytest
 
 import jaxgran
 from jaxgran.data.curve import Run
-from jaxgran.models import dsmc
 from jaxgran.particles import run
 from jaxgran.particles.run import (
     MIN_SPHERES_PER_RUN,
@@ -28,8 +27,7 @@ MODELS = {"DSMC": 200, "HardSpheres": 20, "SoftSpheres": 20}
 @pytest.fixture
 def two_devices(monkeypatch):
     device = jax.devices()[0]
-    for module in (run, dsmc):
-        monkeypatch.setattr(module, "replica_devices", lambda n, *_: (device,) * 2 if n > 1 else ())
+    monkeypatch.setattr(run, "replica_devices", lambda n, *_: (device,) * 2 if n > 1 else ())
 
 
 def cool(gas, name, replicas, **options):

@@ -24,7 +24,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
 
 from jaxgran.gradients.tangents import ExchangeTangents
@@ -33,10 +32,10 @@ from jaxgran.particles.state import (
     MAX_KICK,
     DragDecay,
     drag_decay,
+    kick_variance,
     random_kicks,
     tangential_impulse,
     threefry_key,
-    true_duration,
 )
 from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.geometry import sphere_surface
@@ -91,7 +90,7 @@ class Scheme(NamedTuple):
 
 
 class DSMCTangents(NamedTuple):
-    """Tangents at a fixed scaled time s, ``ds = sqrt(T/T_0) dt``, in P parameters of the law.
+    """Tangents at a fixed scaled time s, ``ds = sqrt(T/T_0) dt``, along p directions in the law.
 
     The tangent of the velocities is c v / 2. That of <dr^2> follows from ``d<dr^2>/ds = 2 d M``,
     ``dM/ds = 1/2 - kappa M``, the equation of kinetic theory for ``M = D / sqrt(T/T_0)``. Here
@@ -99,18 +98,29 @@ class DSMCTangents(NamedTuple):
     collisions.
 
     Attributes:
+        directions: in the scene, stacked along a first axis of each leaf.
+        mobility: M.
         log_temperature: c = d ln T.
         clock: tangent of the time.
-        mobility: tangent of M.
+        mobility_along: tangent of M.
         displacement: tangent of <dr^2>.
         persistence: tangent of the logarithm of <v(0).v> / sqrt(T).
     """
 
-    log_temperature: Float[Array, "*replicas P"]
-    clock: Float[Array, "*replicas P"]
-    mobility: Float[Array, "*replicas P"]
-    displacement: Float[Array, "*replicas P"]
-    persistence: Float[Array, "*replicas P"]
+    directions: ReducedScene
+    mobility: Float[Array, "*replicas"]
+    log_temperature: Float[Array, "p *replicas"]
+    clock: Float[Array, "p *replicas"]
+    mobility_along: Float[Array, "p *replicas"]
+    displacement: Float[Array, "p *replicas"]
+    persistence: Float[Array, "p *replicas"]
+
+    @classmethod
+    def initial(cls, directions: ReducedScene, replicas: int, dtype: Any) -> "DSMCTangents":
+        """Return the tangents at t = 0."""
+        num_directions = max((len(leaf) for leaf in jax.tree.leaves(directions)), default=0)
+        along = jnp.zeros((num_directions, replicas), dtype)
+        return cls(directions, jnp.zeros(replicas, dtype), *[along] * 5)
 
 
 class DSMCState(NamedTuple):
@@ -126,8 +136,7 @@ class DSMCState(NamedTuple):
         collisions: number of pairs that collided.
         missed: number of collisions missed because of the `CEILING`.
         steps: number of steps.
-        mobility: M = D / sqrt(T/T_0), computed together with the tangents.
-        tangents: `DSMCTangents`, or `ExchangeTangents` of a scene with elements.
+        tangents: `DSMCTangents`, or `ExchangeTangents` of a scene with elements; None without them.
     """
 
     time: Float[Array, ""]
@@ -138,8 +147,7 @@ class DSMCState(NamedTuple):
     collisions: Float[Array, "*replicas"]
     missed: Float[Array, "*replicas"]
     steps: UInt32[Array, "*replicas"]
-    mobility: Float[Array, "*replicas"]
-    tangents: Any
+    tangents: Any = None
 
 
 @cache
@@ -185,7 +193,7 @@ class Outcome(NamedTuple):
         missed: number of collisions missed because of the ceiling of the collision rate.
         loss: decrease of sum v^2.
         relaxation: ``sum (1 + eps)^2 (g.n)^2 / 4``, by which D/sqrt(T) decays.
-        along: tangents of -loss and of relaxation in the parameters of the law.
+        along: tangents of -loss and of relaxation along the directions in the law.
         along_speed: their tangents in the logarithm of all speeds.
         rotational_gain: increase of q sum s^2 of rough spheres.
         spin_change: change of the spins of both particles of each pair; None for smooth spheres.
@@ -196,7 +204,7 @@ class Outcome(NamedTuple):
     missed: Float[Array, ""]
     loss: Float[Array, ""]
     relaxation: Float[Array, ""]
-    along: Float[Array, "2 P"]
+    along: Float[Array, "2 p"]
     along_speed: Float[Array, "..."]  # (2,)
     rotational_gain: Float[Array, ""] | float = 0.0
     spin_change: Float[Array, "pairs spins"] | None = None
@@ -208,7 +216,7 @@ def collide(
     ceiling: Float[Array, ""],
     share: Float[Array, ""],
     scene: ReducedScene,
-    tangents: bool,
+    directions: ReducedScene | None = None,
     spin: Float[Array, "pairs spins"] | None = None,
     drag_factor: Float[Array, ""] | None = None,
 ) -> Outcome:
@@ -220,7 +228,7 @@ def collide(
         ceiling: |g| at which a candidate collides with probability 1 in a whole step.
         share: fraction of the step to be done.
         scene: in reduced units.
-        tangents: True to compute the tangents.
+        directions: of the tangents; None for no tangents.
         spin: s_i + s_j of rough spheres.
         drag_factor: ratio of physical velocities to these; None for 1.
     """
@@ -239,7 +247,7 @@ def collide(
     sideways = _perpendicular(axis)
     normal_speed = jnp.where(hit, speed * cosine, ceiling)
     at_impact = normal_speed if drag_factor is None else normal_speed * drag_factor
-    eps, along, along_speed = _restitution(at_impact, hit, scene.law, tangents)
+    eps, along, along_speed = _restitution(at_impact, hit, scene.law, directions)
     square = jnp.where(hit, normal_speed**2, 0.0)
     push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
     normal = [
@@ -286,22 +294,26 @@ def _restitution(
     normal_speed: Float[Array, "pairs"],
     hit: Bool[Array, "pairs"],
     law: ReducedLaw,
-    tangents: bool,
-) -> tuple[Float[Array, "pairs"], Float[Array, "2 P"], Float[Array, "..."]]:
+    directions: ReducedScene | None,
+) -> tuple[Float[Array, "pairs"], Float[Array, "2 p"], Float[Array, "..."]]:
     """Return eps of each pair, and `Outcome.along` and `Outcome.along_speed` of the collisions."""
     zero, along = jnp.zeros((), normal_speed.dtype), jnp.zeros((2, 0), normal_speed.dtype)
 
     def restitution(law, log_scale):
         return law.restitution(normal_speed * jnp.exp(log_scale))
 
-    if not tangents:
+    if directions is None:
         return restitution(law, zero), along, zero
     eps, pull = jax.vjp(restitution, law, zero)
     weights = [jnp.where(hit, x * normal_speed**2, 0.0) for x in (eps, (1 + eps) / 2)]
     in_law, along_speed = jax.vmap(pull)(jnp.stack(weights))
-    if jax.tree.leaves(in_law):  # a law may have no floats
-        along = jax.vmap(lambda x: ravel_pytree(x)[0])(in_law)
-    return eps, along, along_speed
+    return eps, jax.vmap(slopes_along, (0, None))(in_law, directions.law), along_speed
+
+
+def slopes_along(gradient: Any, directions: Any) -> Float[Array, "p"]:
+    """Return the derivatives along some directions, from the derivatives in all numbers."""
+    products = jax.tree.map(lambda g, x: jnp.tensordot(x, g, g.ndim), gradient, directions)
+    return sum(jax.tree.leaves(products), start=jnp.zeros(()))  # a law may have no floats
 
 
 FASTEST_SPEED = 3.5
@@ -367,21 +379,6 @@ def change_subsets(
     return jax.lax.fori_loop(0, largest, change_one, (particles, zero))
 
 
-class WallImpacts(NamedTuple):
-    """Velocities and spins of some particles after impacts on walls.
-
-    Attributes:
-        velocity, spin: of each particle.
-        loss: decrease of sum v^2.
-        rotational_gain: increase of q sum s^2.
-    """
-
-    velocity: Float[Array, "N d"]
-    spin: Float[Array, "N spins"]
-    loss: Float[Array, ""]
-    rotational_gain: Float[Array, ""]
-
-
 SubsetCounts = tuple[Int[Array, "*replicas"] | None, Int[Array, "*replicas"] | None]
 """Numbers of subsets that a drive kicks in half of a step, and of those that may hit walls in the
 step; None without a drive or walls."""
@@ -391,8 +388,9 @@ CandidatePairs = tuple[Array, Array | None, Array]
 spheres) and random bits."""
 
 EnergyGains = tuple[Float[Array, "2"], Float[Array, "changes 2"]]
-"""Gains of sum v^2 and of q sum s^2 of the spins in the state, and their tangents: in the
-parameters of the scene, in time, and in the logarithms of all velocities and of all spins."""
+"""Gains of sum v^2 and of q sum s^2 of the spins in the state, and their tangents: along directions
+in the scene, of which the last is that of time, and in the logarithms of all velocities and of all
+spins."""
 
 
 class DSMCDynamics(eqx.Module):
@@ -419,11 +417,7 @@ class DSMCDynamics(eqx.Module):
 
         They come at its start (place 0) or end (1).
         """
-        strength, drag = self.scene.drive.strength, self.scene.drag
-        if drag is None:
-            return strength * jnp.maximum(ds, 0.0) / 2
-        time = true_duration(drag, start, ds)
-        return strength * time / 2 / drag_decay(drag, start + place * ds).velocity ** 2
+        return kick_variance(self.scene.drive.strength, self.scene.drag, start, ds, place)
 
     def max_wall_impacts(
         self, state: DSMCState, ds: Float[Array, "*replicas"]
@@ -471,19 +465,18 @@ class DSMCDynamics(eqx.Module):
         return kicks, walls
 
     def step(
-        self,
-        state: DSMCState,
-        key: UInt32[Array, "2"],
-        share: Float[Array, "replicas"],
-        tangents: bool,
+        self, state: DSMCState, key: UInt32[Array, "2"], share: Float[Array, "replicas"]
     ) -> DSMCState:
         """Do a share, 0 to 1, of the next step of each replica."""
         replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
         keys = jax.vmap(jax.random.fold_in, (None, 0))(threefry_key(key), replicas)
         subsets = self.subsets_per_step(state, share)
         largest = jax.tree.map(jnp.max, subsets)
-        step_replica = partial(self._step, largest=largest, tangents=tangents)
-        axes = jax.tree.map(lambda _: 0, state)._replace(time=None)
+        step_replica = partial(self._step, largest=largest)
+        axes = jax.tree.map(lambda _: 0, state._replace(tangents=None))._replace(time=None)
+        if state.tangents is not None:
+            along = jax.tree.map(lambda _: -1, state.tangents._replace(directions=None))
+            axes = axes._replace(tangents=along)
         state = jax.vmap(step_replica, (axes, 0, 0, 0), axes)(state, keys, subsets, share)
         due = state.steps % RECOUNT_INTERVAL == 0
 
@@ -502,7 +495,6 @@ class DSMCDynamics(eqx.Module):
         subsets: SubsetCounts,
         share: Float[Array, ""],
         largest: SubsetCounts,
-        tangents: bool,
     ) -> DSMCState:
         """Do a share, 0 to 1, of a step of one replica; random numbers do not depend on the share.
 
@@ -516,13 +508,12 @@ class DSMCDynamics(eqx.Module):
         kicks, walls = zip(subsets, largest, strict=True)
         kick = partial(self._kick, key=key, dt=dt, counts=kicks, clock=state.clock)
         state = kick(state, place=0)
-        exchanging = tangents and isinstance(state.tangents, ExchangeTangents)
-        particles, sums, pairs = self._collide(state, key, dt, share, tangents and not exchanging)
+        tangents = state.tangents
+        exchanging = isinstance(tangents, ExchangeTangents)
+        particles, sums, pairs = self._collide(state, key, dt, share)
         loss, wall_gains = sums.loss, None
         if self.scene.walls is not None:
-            particles, wall_loss, wall_gains = self._hit_walls(
-                state, key, dt, particles, walls, exchanging
-            )
+            particles, wall_loss, wall_gains = self._hit_walls(state, key, dt, particles, walls)
             loss = loss + wall_loss
         energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
         temperature = state.temperature - loss / energy
@@ -540,13 +531,13 @@ class DSMCDynamics(eqx.Module):
         new = kick(new, place=1)
         if exchanging:
             ceiling = CEILING * jnp.sqrt(state.temperature)
-            along = self._exchange_tangents(before, ceiling, share, dt, pairs, wall_gains, sums.num)
-            return new._replace(tangents=along)
-        if tangents:
+            tangents = self._exchange_tangents(
+                before, ceiling, share, dt, pairs, wall_gains, sums.num
+            )
+        elif tangents is not None:
             ds, after = share * scheme.scaled_step, energy * temperature
-            mobility, along = self._scaled_time_tangents(before, sums, dt, ds, after)
-            return new._replace(mobility=mobility, tangents=along)
-        return new
+            tangents = self._scaled_time_tangents(tangents, sums, dt, ds, after)
+        return new._replace(tangents=tangents)
 
     def _kick(
         self,
@@ -588,7 +579,6 @@ class DSMCDynamics(eqx.Module):
         key: PRNGKeyArray,
         dt: Float[Array, ""],
         share: Float[Array, ""],
-        tangents: bool,
     ) -> tuple[Float[Array, "N components"], Outcome, tuple[CandidatePairs, CandidatePairs]]:
         """Return the particles after the collisions of a step, sums over them, and candidates."""
         d, first, second = self.scheme.dimension, self.scheme.first, self.scheme.second
@@ -605,12 +595,13 @@ class DSMCDynamics(eqx.Module):
             drag_factor, spin_factor = decay.velocity, decay.spin
             spin = spin * spin_factor
 
+        scaled = isinstance(state.tangents, DSMCTangents)
         rule = partial(
             collide,
             ceiling=CEILING * jnp.sqrt(state.temperature),
             share=share,
             scene=self.scene,
-            tangents=tangents,
+            directions=state.tangents.directions if scaled else None,
             drag_factor=drag_factor,
         )
         rough = self.scene.surface is not None
@@ -644,7 +635,6 @@ class DSMCDynamics(eqx.Module):
         dt: Float[Array, ""],
         particles: Float[Array, "N components"],
         counts: tuple[Any, Any],
-        tangents: bool,
     ) -> tuple[Float[Array, "N components"], Float[Array, ""], EnergyGains | None]:
         """Let particles hit walls in a step, independent of their places.
 
@@ -665,9 +655,8 @@ class DSMCDynamics(eqx.Module):
             chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
             chance = jnp.where(belongs, chance, jnp.inf)
 
-            def hit(
-                scene: ReducedScene, decay: DragDecay, faster: Array, turning: Array
-            ) -> WallImpacts:
+            def hit(scene: ReducedScene, decay: DragDecay, faster: Array, turning: Array) -> tuple:
+                """Return velocities and spins after impacts, and the gains of both energies."""
                 velocity, spin = rows[:, :d] * faster, rows[:, 2 * d :] * turning
                 walls, surface = scene.walls, scene.surface
                 frequency = walls.frequency[axis]
@@ -692,17 +681,19 @@ class DSMCDynamics(eqx.Module):
                 inertia = 0.0 if surface is None else surface.inertia
                 loss = -jnp.sum(weight * kick * (2 * velocity + kick))
                 gain = inertia * jnp.sum(weight * spin_change * (2 * spin + spin_change))
-                return WallImpacts(velocity + kick, spin + spin_change, loss, gain)
+                gains = jnp.stack([-loss, gain / decay.spin**2])
+                return velocity + kick, spin + spin_change, gains
 
-            def gained(dynamics: DSMCDynamics, decay: DragDecay, *factors: Array) -> Array:
-                impacts = hit(dynamics.scene, decay, *factors)
-                return jnp.stack([-impacts.loss, impacts.rotational_gain / decay.spin**2])
+            def gained(dynamics: DSMCDynamics, *options: Any) -> Array:
+                return hit(dynamics.scene, *options)[2]
 
             decay = self.drag_decay(middle)
-            impacts = hit(self.scene, decay, one, decay.spin)
-            gains = self._energy_gains(gained, middle) if tangents else None
-            after = [impacts.velocity, rows[:, d : 2 * d], impacts.spin / decay.spin]
-            return jnp.concatenate(after, axis=-1), (impacts.loss, gains)
+            velocity, spin, gain = hit(self.scene, decay, one, decay.spin)
+            gains = None
+            if isinstance(state.tangents, ExchangeTangents):
+                gains = self._energy_gains(gained, middle, state.tangents.directions)
+            after = [velocity, rows[:, d : 2 * d], spin / decay.spin]
+            return jnp.concatenate(after, axis=-1), (-gain[0], gains)
 
         shapes = jax.eval_shape(hit_rows, jnp.int32(0), particles[:1], jnp.ones(1, bool))[1]
         zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
@@ -712,25 +703,27 @@ class DSMCDynamics(eqx.Module):
         return particles, loss, gains
 
     def _scaled_time_tangents(
-        self, before: DSMCState, sums: Outcome, dt: Array, ds: Array, energy: Array
-    ) -> tuple[Float[Array, ""], DSMCTangents]:
-        """Return M and the tangents after a step of a length in time and in scaled time.
+        self, old: DSMCTangents, sums: Outcome, dt: Array, ds: Array, energy: Array
+    ) -> DSMCTangents:
+        """Return the tangents after a step of a length in time and in scaled time.
 
         The energy is sum v^2 after the step.
         """
-        old, c, d = before.tangents, before.tangents.log_temperature, self.scheme.dimension
+        c, d = old.log_temperature, self.scheme.dimension
         # The tangent of the velocities is (c/2) v, and the law contributes at every collision.
         gain, fading = (sums.along + sums.along_speed[:, None] * (c / 2)[None]) / energy
         # dM/ds = 1/2 - kappa M and its tangent, by the implicit midpoint rule.
         half = sums.relaxation / energy / 2
-        mobility = ((1 - half) * before.mobility + ds / 2) / (1 + half)
-        along = (1 - half) * old.mobility - fading * (before.mobility + mobility) / 2
+        mobility = ((1 - half) * old.mobility + ds / 2) / (1 + half)
+        along = (1 - half) * old.mobility_along - fading * (old.mobility + mobility) / 2
         along = along / (1 + half)
-        return mobility, DSMCTangents(
+        return DSMCTangents(
+            directions=old.directions,
+            mobility=mobility,
             log_temperature=c + gain,
             clock=old.clock - c / 2 * dt,
-            mobility=along,
-            displacement=old.displacement + d * ds * (old.mobility + along),
+            mobility_along=along,
+            displacement=old.displacement + d * ds * (old.mobility_along + along),
             persistence=old.persistence - fading,
         )
 
@@ -745,7 +738,7 @@ class DSMCDynamics(eqx.Module):
         collisions: Float[Array, ""],
     ) -> ExchangeTangents:
         """Return the tangents after a step; see `collide` for its ceiling and share."""
-        d, start = self.scheme.dimension, before.clock
+        d, start, directions = self.scheme.dimension, before.clock, before.tangents.directions
 
         def by_collisions(
             dynamics: DSMCDynamics, decay: DragDecay, faster: Array, turning: Array
@@ -755,7 +748,7 @@ class DSMCDynamics(eqx.Module):
             for relative, spins, bits in candidates:
                 spins = None if spins is None else spins * turning
                 outcome = collide(
-                    relative * faster, bits, ceiling, share, scene, False, spins, drag_factor
+                    relative * faster, bits, ceiling, share, scene, None, spins, drag_factor
                 )
                 gain = outcome.rotational_gain / decay.spin**2
                 total = total + jnp.stack([-outcome.loss, gain])
@@ -765,9 +758,9 @@ class DSMCDynamics(eqx.Module):
             growth = sum(dynamics.kick_growth(start, ds, place) for place in (0.0, 1.0))
             return jnp.stack([self.scheme.num_particles * d / 2 * growth, jnp.zeros_like(ds)])
 
-        gains, along = self._energy_gains(by_collisions, start + ds / 2)
+        gains, along = self._energy_gains(by_collisions, start + ds / 2, directions)
         if self.scene.drive is not None:
-            kicks, along_kicks = self._energy_gains(by_drive, start + ds / 2)
+            kicks, along_kicks = self._energy_gains(by_drive, start + ds / 2, directions)
             # The rate of impacts depends on the speeds; kicks do not depend on them.
             gains, along = gains + kicks, along + along_kicks.at[-2].add(-kicks)
         if wall_gains is not None:
@@ -778,16 +771,18 @@ class DSMCDynamics(eqx.Module):
         return before.tangents.after(energies, gains, along, collisions)
 
     def _energy_gains(
-        self, gained: Callable[..., Float[Array, "2"]], middle: Float[Array, ""]
+        self,
+        gained: Callable[..., Float[Array, "2"]],
+        middle: Float[Array, ""],
+        directions: ReducedScene,
     ) -> EnergyGains:
         """Return the gains and tangents of a function at the middle of a step.
 
         It is a function of the dynamics, the decay by drag, and factors of velocities and spins.
         """
 
-        def gains(scene: ReducedScene, velocity: Array, spin: Array, time_scale: Array) -> Array:
-            drag = jax.tree.map(lambda rate: rate * (1 + time_scale), scene.drag)
-            dynamics = DSMCDynamics(scene._replace(drag=drag), self.scheme)
+        def gains(scene: ReducedScene, velocity: Array, spin: Array) -> Array:
+            dynamics = DSMCDynamics(scene, self.scheme)
             decay = dynamics.drag_decay(middle)
             faster, turning = jnp.exp(velocity), decay.spin * jnp.exp(spin)
             if scene.surface is not None:  # at a given energy a larger inertia has smaller spins
@@ -796,14 +791,13 @@ class DSMCDynamics(eqx.Module):
             return gained(dynamics, decay, faster, turning)
 
         zero = jnp.zeros_like(middle)
-        values, pull = jax.vjp(gains, self.scene, zero, zero, zero)
+        values, pull = jax.vjp(gains, self.scene, zero, zero)
 
         def row(weights):
             in_scene, *in_motion = pull(weights)
-            return jnp.concatenate([ravel_pytree(in_scene)[0], jnp.stack(in_motion)])
+            return jnp.concatenate([slopes_along(in_scene, directions), jnp.stack(in_motion)])
 
-        slopes = jax.vmap(row)(jnp.eye(2, dtype=zero.dtype)).T
-        return values, jnp.concatenate([slopes[:-3], slopes[-1:], slopes[-3:-1]])
+        return values, jax.vmap(row)(jnp.eye(2, dtype=zero.dtype)).T
 
 
 def advance(
@@ -812,7 +806,6 @@ def advance(
     end: Float[Array, ""],
     key: UInt32[Array, "2"],
     max_steps: Int[Array, ""],
-    tangents: bool = False,
 ) -> DSMCState:
     """Advance each replica by whole steps to the last one that ends before a time.
 
@@ -822,7 +815,6 @@ def advance(
         end: the time.
         key: two 32-bit words of a key of random numbers.
         max_steps: maximum number of steps; `time` of the result is the time that they reach.
-        tangents: True to compute tangents.
     """
     scene, length = dynamics.scene, dynamics.step_length
 
@@ -839,7 +831,7 @@ def advance(
         if scene.drive is not None or scene.walls is not None:
             share = share * length(state) * jnp.sqrt(state.temperature)
             share = share / dynamics.scheme.scaled_step
-        return dynamics.step(state, key, share, tangents), steps_left - 1
+        return dynamics.step(state, key, share), steps_left - 1
 
     state, _ = jax.lax.while_loop(unfinished, step_due, (state, max_steps))
     time = jnp.where(jnp.any(due(state)), jnp.min(state.clock), end)
@@ -851,7 +843,6 @@ def compiled_advance(donate: bool) -> Callable[..., DSMCState]:
     """Return `advance` for the host driver; with `donate` a call deletes its initial state."""
     return jax.jit(
         advance,
-        static_argnames="tangents",
         donate_argnames="state" if donate else (),
         compiler_options=cpu_compiler_options(),
     )

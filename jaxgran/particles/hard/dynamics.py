@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran._utils import status
 from jaxgran.gradients import rule
-from jaxgran.gradients.tangents import ImpactTangents, update_rates
+from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents, update_rates
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import (
@@ -26,12 +26,7 @@ from jaxgran.particles.dynamics import (
     initial_progress,
     repeat_until,
 )
-from jaxgran.particles.hard.impacts import (
-    MAX_ROUNDS,
-    HardTangents,
-    ImpactWork,
-    execute_impacts,
-)
+from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, execute_impacts
 from jaxgran.particles.hard.prediction import ImpactCandidates, select_impact_candidates
 from jaxgran.particles.neighbours import Pairs
 from jaxgran.particles.setup import min_distance, overlap_by_rounding
@@ -42,18 +37,19 @@ from jaxgran.particles.state import (
     common_records,
     derivatives_of_records,
     drag_decay,
+    exchange_derivatives,
     fastest,
     initial_spins,
+    kick_variance,
     kinetic_energy,
     random_kicks,
     temperature,
     threefry_key,
     time_left,
-    true_duration,
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.laws import ReducedLaw
-from jaxgran.scene.reduced import ReducedDrag, ReducedScene, SphereScene
+from jaxgran.scene.reduced import ReducedScene, SphereScene
 from jaxgran.theory import averages
 
 MIN_IMPACTS = 8
@@ -153,11 +149,11 @@ class HardDynamics(AbstractDynamics):
         return velocity * decay.velocity, None if spin is None else spin * decay.true_spin
 
     def with_tangents(self, state: State, directions: ReducedScene) -> State:
-        (n, d), replicas = state.velocity.shape, self.replicas
-        if self.scene.material.has_elements:
-            tangents = HardTangents.at_start(self.scene, directions, replicas, n // replicas, d)
+        material, velocity, replicas = self.scene.material, state.velocity, self.replicas
+        if material.has_elements:
+            tangents = ExchangeTangents.initial(directions, material, velocity, replicas)
         else:
-            tangents = ImpactTangents.initial(directions.law, replicas, state.velocity.dtype)
+            tangents = ImpactTangents.initial(directions.law, replicas, velocity.dtype)
         return state._replace(tangents=tangents)
 
     def observe(self, state: State) -> dict[str, Array]:
@@ -312,7 +308,7 @@ class HardDynamics(AbstractDynamics):
         counted_key, replicas = state.internal.key, self.replicas
         if self.scene.material.drive is None or counted_key is None:
             return state
-        variance = kick_variance(self.scene, state.time + state.time_rest, duration, place)
+        variance = drive_variance(self.scene, state.time + state.time_rest, duration, place)
         key = jax.random.fold_in(threefry_key(counted_key[:2]), counted_key[2])
         by_replica = state.velocity.reshape(replicas, -1, state.velocity.shape[-1])
         kicks = jax.vmap(random_kicks, (0, 0, None))(
@@ -327,7 +323,7 @@ class HardDynamics(AbstractDynamics):
         if self.scene.material.drive is None:
             return state.internal.window
         lowest, time = jnp.min(temperature(state.velocity, self.replicas)), state.time
-        growth = 2 * kick_variance(self.scene, time + state.time_rest, jnp.ones_like(lowest), 0.0)
+        growth = 2 * drive_variance(self.scene, time + state.time_rest, jnp.ones_like(lowest), 0.0)
         safe_growth = jnp.where(growth > 0, growth, 1.0)
         longest = jnp.where(growth > 0, MAX_KICK * lowest / safe_growth, jnp.inf)
         return jnp.minimum(state.internal.window, longest)
@@ -339,7 +335,7 @@ class HardDynamics(AbstractDynamics):
         candidates: ImpactCandidates,
         work: ImpactWork,
         duration: Array,
-    ) -> ImpactTangents | HardTangents:
+    ) -> ImpactTangents | ExchangeTangents:
         """Return the tangents after a window, from the states before and after it."""
         tangents, scene, replicas = old.tangents, self.scene, self.replicas
         n, d = len(new.velocity) // replicas, new.velocity.shape[1]
@@ -375,30 +371,23 @@ class HardDynamics(AbstractDynamics):
 
             def heating(material: ReducedScene) -> Array:
                 changed, start = scene.with_material(material), old.time + old.time_rest
-                halves = [kick_variance(changed, start, duration, place) for place in (0.0, 1.0)]
-                return n * d / 2 * (halves[0] + halves[1])
+                first, second = (drive_variance(changed, start, duration, k) for k in (0.0, 1.0))
+                return n * d / 2 * (first + second)
 
             heat, linear = jax.linearize(heating, scene.material)
             # Heating does not depend on the speeds, unlike the frequency of impacts.
             gains = gains.at[:-2, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
             gains = gains.at[-2, 0].add(-heat)
             gained = gained.at[0].add(heat)
-        after = tangents.exchange.after(before, gained, gains, impacts / 2)
-        return tangents._replace(exchange=after)
+        return tangents.after(before, gained, gains, impacts / 2)
 
 
-def kick_variance(
+def drive_variance(
     scene: SphereScene, start: Float[Array, ""], duration: ArrayLike, place: float
 ) -> Float[Array, ""]:
-    """Return the variance of half of the kicks of a window, at its begin (place 0) or end (1).
-
-    With drag a kick decays as a velocity does, and time is transformed.
-    """
-    strength, drag = scene.material.drive.strength * scene.collision_frequency, scene.drag_rates
-    if drag is None:
-        return strength * duration / 2
-    true_time = true_duration(drag, start, jnp.asarray(duration))
-    return strength * true_time / 2 / drag_decay(drag, start + place * duration).velocity ** 2
+    """Return the variance of half of the kicks of a window, at its begin (place 0) or end (1)."""
+    strength = scene.material.drive.strength * scene.collision_frequency
+    return kick_variance(strength, scene.drag_rates, start, jnp.asarray(duration), place)
 
 
 def cooling_trend(
@@ -442,8 +431,8 @@ def hard_records(state: State, scene: SphereScene, replicas: int) -> dict[str, A
             tangents.rates.collision(T),
         )
         return rule.with_tangents(values, derivatives, rates, tangents.clock)
-    velocity_factor = spin_factor = jnp.ones(())
-    if (drag := scene.drag_rates) is not None:
+    velocity_factor, spin_factor, drag = jnp.ones(()), jnp.ones(()), scene.drag_rates
+    if drag is not None:
         velocity_factor, _, spin_factor = drag_decay(drag, state.time + state.time_rest)
     initial = kinetic_energy(state.first_velocity, replicas) / n
     lost = initial - velocity_factor**2 * (initial - state.dissipated / n)
@@ -458,16 +447,6 @@ def hard_records(state: State, scene: SphereScene, replicas: int) -> dict[str, A
     values["dissipated_energy"] = lost
     if tangents is None:
         return values
-    time, decay, decay_along = state.time + state.time_rest, jnp.zeros(2), jnp.zeros((1, 2))
-    if material.drag is not None:
-
-        def logarithms(drag: ReducedDrag) -> Array:
-            changed = scene.with_material(material._replace(drag=drag))
-            left = drag_decay(changed.drag_rates, time)
-            return jnp.log(jnp.stack([left.velocity, left.true_spin]))
-
-        decay, linear = jax.linearize(logarithms, material.drag)
-        decay_along = jax.vmap(linear)(tangents.directions.drag)
-    along, rates = tangents.exchange.of_records(values, decay, decay_along, time, n, d)
-    derivatives = {f"{name}.along": x for name, x in along.items()}
-    return values | derivatives | {f"{name}.rate": x for name, x in rates.items()}
+    drag_along = jax.tree.map(lambda x: x * scene.collision_frequency, tangents.directions.drag)
+    time = state.time + state.time_rest
+    return values | exchange_derivatives(values, tangents, drag, drag_along, time, (n, d))

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
 from jaxgran.particles.hard.prediction import ImpactCandidates, Paths, first_impacts
 from jaxgran.particles.state import State, drag_decay, tangential_impulse, temperature
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
+from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.reduced import ReducedScene, SphereScene
 
 
@@ -118,73 +118,31 @@ def impact_effect(
     return ImpactEffect(kick, lost, spin_change, rotational_gain)
 
 
-class HardTangents(NamedTuple):
-    """Tangents of a state along p directions.
+def exchange_gains(
+    scene: SphereScene,
+    tangents: ExchangeTangents,
+    impact: ImpactEvents,
+    happens: Bool[Array, "rows"],
+    axis: Int[Array, "rows"] | None = None,
+) -> Float[Array, "changes 2 rows"]:
+    """Return the tangents of the gains of both energies, as `ExchangeTangents.after` takes them."""
 
-    Attributes:
-        directions: in the material, stacked along a first axis of each leaf; the last one is that
-            of time, in which everything is more frequent.
-        exchange: tangents of the energies of translation and of the (transformed) spins.
-    """
+    def energies(material: ReducedScene, velocity: Array, spin: Array) -> Array:
+        if material.surface is not None:
+            # At a given energy spins are smaller where the inertia is larger.
+            inertia = scene.material.surface.inertia
+            spin = spin - 0.5 * jnp.log(material.surface.inertia / inertia)
+        scaled = impact.scaled(velocity, spin)
+        _, lost, _, gain = impact_effect(scene.with_material(material), scaled, axis)
+        gain = jnp.zeros_like(lost) if gain is None else gain
+        return jnp.where(happens, jnp.stack([-lost, gain]), 0.0)
 
-    directions: Any
-    exchange: ExchangeTangents
-
-    @classmethod
-    def at_start(
-        cls,
-        scene: SphereScene,
-        directions: ReducedScene,
-        replicas: int,
-        num_particles: int,
-        dimension: int,
-    ) -> "HardTangents":
-        """Return the tangents at t = 0, where T is 1 and T_rot is that of the material."""
-        directions = jax.tree.map(
-            lambda x: jnp.concatenate([x, jnp.zeros_like(x, shape=(1, *x.shape[1:]))]), directions
-        )
-        if (drag := scene.material.drag) is not None:  # drag acts sooner, too
-            rates = jax.tree.map(lambda x, rate: x.at[-1].set(rate), directions.drag, drag)
-            directions = directions._replace(drag=rates)
-        p = len(jax.tree.leaves(directions)[0])
-        energies = jnp.zeros((p, 2, replicas), scene.collision_frequency.dtype)
-        if scene.material.surface is not None:
-            rotational_energy = num_particles * NUM_SPIN_COMPONENTS[dimension] / 2
-            energies = energies.at[:, 1].add(rotational_energy * directions.surface.ratio[:, None])
-        return cls(directions, ExchangeTangents(energies, jnp.zeros((p, replicas), energies.dtype)))
-
-    def gains(
-        self,
-        scene: SphereScene,
-        impact: ImpactEvents,
-        happens: Bool[Array, "rows"],
-        axis: Int[Array, "rows"] | None = None,
-    ) -> Float[Array, "changes 2 rows"]:
-        """Return the tangents of the gains of both energies in impacts, see
-        `ExchangeTangents.after`."""
-
-        def energies(material: ReducedScene, velocity: Array, spin: Array) -> Array:
-            if material.surface is not None:
-                # At a given energy spins are smaller where the inertia is larger.
-                inertia = scene.material.surface.inertia
-                spin = spin - 0.5 * jnp.log(material.surface.inertia / inertia)
-            scaled = impact.scaled(velocity, spin)
-            _, lost, _, gain = impact_effect(scene.with_material(material), scaled, axis)
-            gain = jnp.zeros_like(lost) if gain is None else gain
-            return jnp.where(happens, jnp.stack([-lost, gain]), 0.0)
-
-        zero, one = (jnp.full((), x, impact.speed.dtype) for x in (0.0, 1.0))
-        material = scene.material
-        _, linear = jax.linearize(energies, material, zero, zero)
-        no_direction = jax.tree.map(jnp.zeros_like, material)
-        by_direction = jax.vmap(lambda direction: linear(direction, zero, zero))(self.directions)
-        by_scale = jnp.stack([linear(no_direction, one, zero), linear(no_direction, zero, one)])
-        return jnp.concatenate([by_direction, by_scale])
-
-    @property
-    def num_changes(self) -> int:
-        """Number of rows of `gains`."""
-        return len(self.exchange.energies) + 2
+    zero, one = (jnp.full((), x, impact.speed.dtype) for x in (0.0, 1.0))
+    _, linear = jax.linearize(energies, scene.material, zero, zero)
+    no_direction = jax.tree.map(jnp.zeros_like, scene.material)
+    by_direction = jax.vmap(lambda direction: linear(direction, zero, zero))(tangents.directions)
+    by_scale = jnp.stack([linear(no_direction, one, zero), linear(no_direction, zero, one)])
+    return jnp.concatenate([by_direction, by_scale])
 
 
 MAX_ROUNDS = 100_000
@@ -207,7 +165,7 @@ class ImpactWork(NamedTuple):
         pending: whether the last round executed an impact.
         num_rounds: number of rounds.
         gains: tangents of the energy gained in impacts of pairs, along directions in the material,
-            see `ImpactTangents` and `HardTangents`; without tangents, no rows.
+            see `ImpactTangents` and `exchange_gains`; without tangents, no rows.
         wall_gains: the corresponding tangents of impacts on walls.
     """
 
@@ -289,8 +247,8 @@ def execute_impacts(
         events = ImpactEvents(start_time + s, -normal, next_impacts.w, speed, spin, elastic)
         effect = impact_effect(scene, events)
         gains = work.gains
-        if isinstance(tangents, HardTangents):  # each of two spheres loses half of the energy
-            gains = gains + 2 * tangents.gains(scene, events, executable)
+        if isinstance(tangents, ExchangeTangents):  # each of two loses half of the energy
+            gains = gains + 2 * exchange_gains(scene, tangents, events, executable)
         elif tangents is not None:  # the law's unit of speed is sqrt(2)
             more = 2 * tangents.gains(scene.material.law, events.speed * 0.5**0.5)
             gains = gains + jnp.where((executable & ~too_soon & ~all_elastic)[None], more, 0.0)
@@ -319,8 +277,8 @@ def execute_impacts(
                 start_time + wall_s, outwards, paths.v, speed, paths.spin, elastic
             )
             on_wall = impact_effect(scene, events, axis)
-            if isinstance(tangents, HardTangents):
-                wall_gains = wall_gains + tangents.gains(scene, events, at_wall, axis)
+            if isinstance(tangents, ExchangeTangents):
+                wall_gains = wall_gains + exchange_gains(scene, tangents, events, at_wall, axis)
             effect = jax.tree.map(partial(_where_rows, at_wall), on_wall, effect)
             s, hit = jnp.where(at_wall, wall_s, s), hit | at_wall
             after = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
@@ -357,8 +315,9 @@ def execute_impacts(
     if isinstance(tangents, ImpactTangents):
         shape = len(tangents.log_temperature) + 1, num_rows
     elif tangents is not None:
-        shape = tangents.num_changes, 2, num_rows
-        wall_shape = (0 if scene.container is None else tangents.num_changes), 2, len(slots)
+        num_changes = len(tangents.energies) + 2
+        shape = num_changes, 2, num_rows
+        wall_shape = (0 if scene.container is None else num_changes), 2, len(slots)
     work = ImpactWork(
         paths=paths,
         dissipated=zeros,

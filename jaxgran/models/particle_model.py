@@ -1,0 +1,117 @@
+"""Base of the models of particles: one run with its derivatives, or replicas side by side."""
+
+import dataclasses
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ClassVar, TypeVar
+
+import jax
+import jax.numpy as jnp
+from equinox import AbstractVar
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxgran._utils import status
+from jaxgran._utils.tracing import any_traced
+from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run, records_in_si
+from jaxgran.gradients.rule import Inputs, Outputs
+from jaxgran.models import checks
+from jaxgran.models.base import AbstractModel
+from jaxgran.particles import run as particle_run
+from jaxgran.particles import snapshot
+from jaxgran.scene.gas import Gas
+
+M = TypeVar("M", bound="AbstractParticleModel")
+
+
+class AbstractParticleModel(AbstractModel):
+    """A model of particles, whose runs are functions of `Inputs` and directions of derivatives.
+
+    Attributes:
+        num_particles: N of each replica.
+        replicas: number of independent gases.
+    """
+
+    num_particles: AbstractVar[int]
+    replicas: AbstractVar[int]
+
+    stochastic: ClassVar[bool] = True
+    saves: ClassVar[bool] = True
+    transforms_time: ClassVar[bool] = True
+    """True if drag is integrated in transformed time, which rounding limits."""
+
+    @abstractmethod
+    def inputs(self, gas: Gas, times: Float[Array, "times"], run: Run) -> Inputs:
+        """Return the gas and the times in the units of the run."""
+
+    @abstractmethod
+    def differentiable(self, outputs: Callable[..., Outputs], run: Run) -> Callable[..., Outputs]:
+        """Return `outputs`, a function of inputs, directions and a run, with derivatives."""
+
+    @abstractmethod
+    def outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
+        """Run all replicas in one array, from the host unless a number of the inputs is traced."""
+
+    def single_replica(self: M) -> M:
+        """Return the model of one replica."""
+        return dataclasses.replace(self, replicas=1)
+
+    def invalid_times(
+        self, gas: Gas, times: Float[Array, "times"]
+    ) -> tuple[Bool[Array, "times"], Int[Array, ""]]:
+        """Return a mask of the times that the run cannot reach, and the status for them."""
+        late = jnp.zeros(times.shape, bool)
+        if self.transforms_time:
+            late = checks.unreachable_with_drag(gas, times)
+        return late, status.flag(status.OUT_OF_RANGE, jnp.any(late))
+
+    def derivative_bias(self, gas: Gas, times: Array, flow_share: Array) -> Array | None:
+        """Estimate the bias of the derivatives of ln T from the flow in each replica."""
+        return None
+
+    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
+        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        invalid, fault = self.invalid_times(gas, times)
+        inputs = self.inputs(gas, times, run)
+
+        def outputs(inputs: Inputs, directions: Any = None, run: Run = run) -> Outputs:
+            return self._by_replica(inputs, directions, gas.dimension, run)
+
+        out = self.differentiable(outputs, run)(inputs)
+        units, others = inputs.units, {}
+        values = records_in_si(
+            out.records, length=units.length, temperature=gas.temperature, mass=gas.mass
+        )
+        values = {name: jnp.where(invalid[None], jnp.nan, x) for name, x in values.items()}
+        if out.position is not None:
+            arrays = out.position, out.velocity, out.spin
+            others["particles"] = snapshot.particles(units, self.replicas, *arrays)
+        if "flow_share" in values:
+            others["derivative_bias"] = self.derivative_bias(gas, times, values["flow_share"])
+        curve = CoolingCurve.of_replicas(times, values, status=out.status | fault, **others)
+        if run.save is None:
+            return curve
+        nan_if_invalid = partial(snapshot.nan_where, invalid[:, None])
+        saved = jax.tree.map(nan_if_invalid, out.records["saved"])
+        return snapshot.attach_saved(curve, run.save, saved, units.box_side)
+
+    def _by_replica(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
+        """Run on the host or compiled, and there replicas by themselves or all in one array."""
+        run_all = partial(self.outputs, inputs, directions, dimension, run)
+        if any_traced(inputs):
+            checks.refuse_files(self, run)
+            return run_all()
+        spheres = self.num_particles if self.has_positions else 0
+        if on := particle_run.replica_devices(self.replicas, spheres):
+            single = self.single_replica()
+
+            def run_replica(k: int, run: Run) -> Outputs:
+                part = particle_run.replica_inputs(inputs, k, self.num_particles, run)
+                return single._by_replica(part, directions, dimension, run)
+
+            runs = particle_run.run_replicas(run_replica, self.replicas, run, on)
+            return particle_run.join_outputs(runs)
+        if directions is None:
+            return run_all()
+        # In a rule of differentiation operations on known numbers would be staged.
+        return particle_run.in_threads([run_all], [particle_run.chosen_device()])[0]
