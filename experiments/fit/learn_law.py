@@ -2,14 +2,22 @@
 
     python experiments/fit/learn_law.py [--smoke] [--record] [--out DIR]
 
-Curves with an error of 1 % are made by direct simulation and by hard spheres with the viscoelastic
-law. `jaxgran.fit` fits a `RestitutionSpline` to each,
-through kinetic theory. Counts how often the band contains the true law at nine speeds that the gas
-visited, and reads off A.
+`jaxgran.fit` fits a `RestitutionSpline` to each curve, through kinetic theory. The worlds:
+
+- curves with an error of 1 %, made by direct simulation and by hard spheres, of viscoelastic beads,
+  of ice (eps = .34 (v/(1 cm/s))^-.234; Bridges, Hatzes & Lin 1984) and of a law with a yield speed,
+  .95 below it and falling as v^(-1/4) above;
+- curves measured in LAMMPS, of beads with known A;
+- a curve together with drop tests of single beads at speeds that the gas did not visit.
+
+Counts how often the band contains the true law at nine speeds that the gas visited, reads off A,
+and says whether the learnt law has the viscoelastic or the constant form (p > .01). The best
+viscoelastic law is wrong about eps by `bias`, the spline by `error`.
 """
 
 import argparse
 import dataclasses
+import time
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,19 +28,52 @@ import jaxgran
 from experiments.support.analysis import replicas_of
 from experiments.support.plots import DSMC, GUIDE, INK, THEORY, caption, panels
 from experiments.support.record import run_parts
-from experiments.support.scenes import cool
+from experiments.support.scenes import cool, of_lammps
 
 ERROR = 0.01
 NUM_KNOTS = 8
 BEADS: dict[str, Any] = {"diameter": 2e-3, "mass": 1e-5, "packing_fraction": 0.03}
+LAMMPS_CURVES = "dilute", "phi003", "phi003_large"
 
 
-def learn(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, num_particles: int) -> jaxgran.Fit:
+class Power(jaxgran.RestitutionLaw):
+    """``eps = (v/v_1)^-p``, and 1 below the speed v_1, m/s."""
+
+    speed: float
+    power: float
+
+    def restitution(self, normal_speed):
+        return jnp.maximum(normal_speed / self.speed, 1.0) ** -self.power
+
+
+class Yielding(jaxgran.RestitutionLaw):
+    """``eps = eps_0 (1 + (v/v_y)^2)^(-1/8)`` with the yield speed v_y, m/s."""
+
+    elastic: float
+    speed: float
+
+    def restitution(self, normal_speed):
+        return self.elastic * (1 + (normal_speed / self.speed) ** 2) ** -0.125
+
+
+TRUTHS: dict[str, tuple[Any, float]] = {  # and T_0, m^2/s^2
+    "viscoelastic": (jaxgran.Viscoelastic(5e7, 0.22, 5e-6), 0.01),
+    "ice": (Power(0.01 * 0.34 ** (1 / 0.234), 0.234), 4e-4),
+    "yield speed": (Yielding(0.95, 0.1), 0.04),
+}
+
+
+def learn(gas: jaxgran.Gas, data: Any, num_particles: int | dict) -> jaxgran.Fit:
     """The whole recipe: knots over the visited speeds, and a fit of all numbers of the law."""
-    speeds = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
-    law = jaxgran.RestitutionSpline(np.geomspace(*speeds, NUM_KNOTS))
-    learner = dataclasses.replace(gas, law=law)
-    return jaxgran.fit(learner, curve, free="law", num_particles=num_particles)
+    curve = data["gas"] if isinstance(data, dict) else data
+    low, high = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
+    if isinstance(data, dict):  # with drop tests
+        low = min(low, float(np.min(np.asarray(data["drops"].speed))))
+    law = jaxgran.RestitutionSpline(np.geomspace(low, high, NUM_KNOTS))
+    learner: Any = dataclasses.replace(gas, law=law)
+    if isinstance(data, dict):
+        learner = dict.fromkeys(data, learner)
+    return jaxgran.fit(learner, data, free="law", num_particles=num_particles)
 
 
 def curves_of(gas, model, taus, seed):
@@ -44,12 +85,13 @@ def curves_of(gas, model, taus, seed):
         yield jaxgran.CoolingCurve(times, jnp.asarray(T), temperature_error=jnp.asarray(ERROR * T))
 
 
-def judge(gas: jaxgran.Gas, result: jaxgran.Fit) -> dict:
-    """Compare a learnt law with the true one, and read off A."""
-    band = jaxgran.restitution_band(result)
+def judge(gas: jaxgran.Gas, result: jaxgran.Fit, speeds: Any = None) -> dict:
+    """Compare a learnt law with the true one, read off A, and test two forms."""
+    band = jaxgran.restitution_band(result, speeds)
     eps = np.asarray(gas.restitution(band.speeds))
     beads = dataclasses.replace(gas, law=jaxgran.Viscoelastic(5e7, 0.22, 1e-6))
-    fitted = band.compare(beads, "dissipative_constant")[2]
+    constant = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
+    chi2, p, fitted = band.compare(beads, "dissipative_constant")
     return {
         "speeds": band.speeds,
         "eps": band.restitution,
@@ -57,57 +99,104 @@ def judge(gas: jaxgran.Gas, result: jaxgran.Fit) -> dict:
         "true": eps,
         "held": (band.low <= eps) & (eps <= band.high),
         "A": float(fitted.value("dissipative_constant")),
+        "p": {"viscoelastic": p, "constant": band.compare(constant, "coefficient")[1]},
+        "error": float(np.max(np.abs(band.restitution - eps))),
+        "bias": float(np.max(np.abs(np.asarray(fitted.restitution(band.speeds)) - eps))),
     }
 
 
 def summary(rows: list[dict]) -> dict:
-    """Return how often the band contains the true law, in how many runs."""
+    """Return how often the band contains the true law, in how many runs, and its form."""
     held = np.array([row["held"] for row in rows])
+    forms = {form: sum(row["p"][form] > 0.01 for row in rows) for form in rows[0]["p"]}
     A = np.array([row["A"] for row in rows])
     return {
         "runs": len(rows),
         "held": float(held.mean()),  # at single speeds
         "held_at_all_speeds": int(held.all(1).sum()),
-        "A": [float(A.mean()), float(A.std(ddof=1))],
+        "A": [float(A.mean()), float(A.std(ddof=1)) if len(A) > 1 else None],
+        "forms": forms | {"neither": sum(max(row["p"].values()) <= 0.01 for row in rows)},
+        "error": float(np.median([row["error"] for row in rows])),
+        "bias": float(np.median([row["bias"] for row in rows])),
     }
 
 
 def learn_law(options: argparse.Namespace) -> dict:
     size, replicas = (200, 2) if options.smoke else (1000, 10)
     taus = np.geomspace(0.3, 100.0, 40)
-    beads = jaxgran.Gas(jaxgran.Viscoelastic(5e7, 0.22, 5e-6), **BEADS, temperature=0.01)
-    scenes = {
+    models = {
         "DSMC": jaxgran.DSMC(size, replicas=replicas),
         "hard spheres": jaxgran.HardSpheres(size, replicas=replicas),
     }
-    rows, results = [], []
-    for seed, (name, model) in enumerate(list(scenes.items())[: 1 if options.smoke else 2]):
-        for curve in curves_of(beads, model, taus, seed):
-            results.append(learn(beads, curve, size))
-            rows.append({"scene": name} | judge(beads, results[-1]))
-        print(name, summary([row for row in rows if row["scene"] == name]), flush=True)
-    true = float(beads.value("dissipative_constant"))
-    picture = draw(beads, results[0])
-    return {"beads": summary(rows), "rows": rows, "true_A": true, "picture": picture}
+    worlds, results, first_s = {}, {}, None
+    for truth, (law, T) in TRUTHS.items():
+        gas = jaxgran.Gas(law, **BEADS, temperature=T)
+        for seed, (name, model) in enumerate(list(models.items())[: 1 if options.smoke else 2]):
+            rows = []
+            for curve in curves_of(gas, model, taus, seed):
+                begin = time.perf_counter()
+                result = learn(gas, curve, size)
+                first_s = first_s or time.perf_counter() - begin
+                results.setdefault(truth, (gas, result))
+                rows.append(judge(gas, result))
+            worlds[f"{truth}, {name}"] = rows
+            print(truth, name, summary(rows), flush=True)
+        if truth == "viscoelastic":
+            worlds["viscoelastic, with drop tests"] = [with_drops(gas, curve, size)]
+    for name in LAMMPS_CURVES[: 1 if options.smoke else None]:
+        gas, curve, header = of_lammps(name)
+        after = np.asarray(curve.times) > 0
+        curve = jaxgran.CoolingCurve(
+            *(np.asarray(x)[after] for x in (curve.times, curve.temperature)),
+            temperature_error=np.asarray(curve.temperature_error)[after],
+        )
+        row = judge(gas, learn(gas, curve, int(header["N"])))
+        worlds[f"LAMMPS, {name}"] = [row | {"true_A": float(gas.value("dissipative_constant"))}]
+        print(name, summary(worlds[f"LAMMPS, {name}"]), flush=True)
+    beads = [row for name, rows in worlds.items() for row in rows if name in BEADS_WORLDS]
+    return {
+        "beads": summary(beads),
+        "worlds": {name: summary(rows) for name, rows in worlds.items()},
+        "rows": worlds,
+        "true_A": float(results["viscoelastic"][0].value("dissipative_constant")),
+        "first_fit_s": first_s,
+        "picture": draw(results),
+    }
 
 
-def draw(gas: jaxgran.Gas, result: jaxgran.Fit) -> Figure:
+BEADS_WORLDS = "viscoelastic, DSMC", "viscoelastic, hard spheres"
+
+
+def with_drops(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, size: int) -> dict:
+    """Learn from a curve and from 20 drops of single beads at a twentieth of its lowest speed."""
+    low = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)[0] / 20
+    speeds = np.geomspace(low, 3 * low, 20)
+    eps = np.asarray(gas.restitution(speeds))
+    noise = 0.002 * np.random.default_rng(0).normal(size=speeds.size)
+    drops = jaxgran.DropTest(speeds, eps + noise, np.full(speeds.size, 0.002))
+    result = learn(gas, {"gas": curve, "drops": drops}, {"gas": size})
+    return judge(gas, result, speeds[[0, -1]])
+
+
+def draw(results: dict[str, tuple[jaxgran.Gas, jaxgran.Fit]]) -> Figure:
     """Draw eps(v) with its band over the truth, and the speeds of impacts below."""
-    figure = panels(1, 2, size=(5.5, 2.5), sharex="col", height_ratios=[3, 1])
-    top, bottom = figure.axes
-    low, high = jaxgran.restitution_band(result).visited
-    v = np.geomspace(low / 3, 2 * high, 120)
-    band = jaxgran.restitution_band(result, v)
-    top.fill_between(v, band.low, band.high, color=THEORY, alpha=0.25, label="95 % band")
-    top.plot(v, band.restitution, color=THEORY, label="learnt from T(t)")
-    top.plot(v, gas.restitution(v), "--", color=INK, label="true law")
-    top.axvspan(low, high, color=GUIDE, alpha=0.12, label="visited speeds")
-    caption(top, "viscoelastic spheres", "lower left", xscale="log", ylabel="ε(v)")
-    # Impacts of a Maxwellian gas, per unit of ln v, over the whole curve.
-    T, count = np.asarray(result.curve.temperature), np.asarray(result.curve.collisions)
-    at = v[:, None] ** 2 / (2 * T[1:]) * np.exp(-(v[:, None] ** 2) / (4 * T[1:]))
-    bottom.fill_between(v, at @ np.diff(count) / (count[-1] - count[0]), color=DSMC)
-    caption(bottom, xlabel="normal speed of impacts (m/s)", ylabel="impacts", yticks=[])
+    num = len(results)
+    figure = panels(num, 2, size=(4.5, 2.5), sharex="col", height_ratios=[3, 1])
+    for i, (name, (gas, result)) in enumerate(results.items()):
+        top, bottom = figure.axes[i], figure.axes[num + i]
+        low, high = jaxgran.restitution_band(result).visited
+        v = np.geomspace(low / 3, 2 * high, 120)
+        band = jaxgran.restitution_band(result, v)
+        top.fill_between(v, band.low, band.high, color=THEORY, alpha=0.25, label="95 % band")
+        top.plot(v, band.restitution, color=THEORY, label="learnt from T(t)")
+        top.plot(v, gas.restitution(v), "--", color=INK, label="true law")
+        top.axvspan(low, high, color=GUIDE, alpha=0.12, label="visited speeds")
+        caption(top, name, "none" if i else "lower left", xscale="log", ylabel="" if i else "ε(v)")
+        # Impacts of a Maxwellian gas, per unit of ln v, over the whole curve.
+        T, count = np.asarray(result.curve.temperature), np.asarray(result.curve.collisions)
+        at = v[:, None] ** 2 / (2 * T[1:]) * np.exp(-(v[:, None] ** 2) / (4 * T[1:]))
+        bottom.fill_between(v, at @ np.diff(count) / (count[-1] - count[0]), color=DSMC)
+        caption(bottom, xlabel="normal speed of impacts (m/s)", ylabel="impacts", yticks=[])
     return figure
 
 

@@ -13,7 +13,7 @@ from jaxgran._utils.validation import POSITIVE, Domain
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import DropTest
 from jaxgran.scene.gas import Gas, law_fields
-from jaxgran.scene.laws import C1, ConstantRestitution, Viscoelastic
+from jaxgran.scene.laws import C1, ConstantRestitution, RestitutionSpline, Viscoelastic
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 START_TIME = "t0"
@@ -114,8 +114,9 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
 
     ``T^(-3/5)`` (``T^(-1/2)`` for constant restitution) of a cooling gas is a straight line in
     time. Its value at t = 0 gives T_0; its slope over that value is 1/tau_0, proportional to A (to
-    1 - e^2). The line is fitted by linear least squares. Floats of elements are guessed where they
-    are at an end of their range; all others keep the values of the gas.
+    1 - e^2); the drops of a `RestitutionSpline` are scaled to it. The line is fitted by least
+    squares. Floats of elements are guessed where they are at an end of their range; all others keep
+    the values of the gas.
 
     Args:
         gas: the scene.
@@ -158,11 +159,13 @@ def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> Gas:
 def _guess_law(gas: Gas, rate: Numbers, free: tuple[str, ...]) -> dict[str, Any]:
     xp = array_module(gas, rate)
     scales = _scales(gas) if not any_traced(gas) else _law_scales(gas)
-    mean_free_time, alpha = map(xp.asarray, scales)
+    mean_free_time, alpha, loss_now = map(xp.asarray, scales)
     rate = rate * mean_free_time
+    loss = xp.clip(2 * gas.dimension * rate, 1e-6, 0.99)
     if isinstance(gas.law, ConstantRestitution) and "coefficient" in free:
-        loss = xp.clip(2 * gas.dimension * rate, 1e-6, 0.99)
         return {"coefficient": xp.sqrt(1 - loss)}
+    if isinstance(gas.law, RestitutionSpline) and "drops" in free:
+        return {"drops": xp.asarray(gas.law.drops) * (-xp.log1p(-loss) / 2 / loss_now)}
     if isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free:
         delta = rate / COOLING_RATE[gas.dimension]
         # To the next order in delta the cooling rate is that of delta (1 - q delta / 2): invert it.
@@ -173,10 +176,17 @@ def _guess_law(gas: Gas, rate: Numbers, free: tuple[str, ...]) -> dict[str, Any]
     return {}
 
 
-def _law_scales(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Mean free time, and alpha of viscoelastic spheres."""
-    viscoelastic = isinstance(gas.law, Viscoelastic)
-    return gas.mean_free_time, gas.alpha if viscoelastic else jnp.ones_like(gas.mass)
+def _law_scales(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Mean free time, alpha of viscoelastic spheres, and -ln eps of a spline at a typical impact.
+
+    The typical impact has the root mean square of normal speeds, ``2 sqrt(T)``.
+    """
+    alpha = loss = jnp.ones_like(gas.mass)
+    if isinstance(gas.law, Viscoelastic):
+        alpha = gas.alpha
+    if isinstance(gas.law, RestitutionSpline):
+        loss = -jnp.log1p(-gas.law.loss(2 * jnp.sqrt(gas.temperature)))
+    return gas.mean_free_time, alpha, loss
 
 
 _scales = eqx.filter_jit(_law_scales)

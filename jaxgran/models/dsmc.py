@@ -27,7 +27,7 @@ from jaxgran.particles.dsmc.run import run_dsmc
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import reduced_scene
+from jaxgran.scene.reduced import mixed_path_length, reduced_scene
 
 MAX_STEP = 0.1
 """Largest number of collisions per particle and step: a step draws a particle at most twice."""
@@ -118,10 +118,11 @@ class DSMC(AbstractParticleModel):
 
     def inputs(self, gas: Gas, times: Float[Array, "times"], run: Run) -> Inputs:
         """Return the gas and the times in units of its path length and impact speed."""
-        scene, reduced = reduced_scene(gas), times * gas.impact_speed / gas.path_length
+        scene, length = reduced_scene(gas), mixed_path_length(gas)
+        reduced = times * gas.impact_speed / length
         if scene.drag is not None:
             reduced = transformed_times(scene.drag, reduced)
-        units = Units.of(gas, self.num_particles, gas.path_length, gas.impact_speed)
+        units = Units.of(gas, self.num_particles, length, gas.impact_speed)
         return Inputs(scene, reduced, None, run.key, units)
 
     def differentiable(self, outputs: Callable[..., Outputs], run: Run) -> Callable[..., Outputs]:

@@ -17,7 +17,7 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import reduced_scene
+from jaxgran.scene.reduced import mixed_path_length, reduced_scene
 from jaxgran.theory.equations import Density, Equations, softness_factor
 from jaxgran.theory.solver import Integrator, moments_at, padded_length
 
@@ -194,7 +194,7 @@ class KineticTheory(AbstractModel):
 
     def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
-        unit_time, sound = gas.path_length / gas.impact_speed, jnp.asarray(True)
+        length, sound = mixed_path_length(gas), jnp.asarray(True)
         if self.softness:  # a search may try a T_0 at which spheres are too soft: no step is made
             law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
             sound = softness_factor(law, hottest, gas.dimension) > 0
@@ -205,12 +205,10 @@ class KineticTheory(AbstractModel):
         equations = Equations(
             gas.dimension, order, not self.sonine, self.softness, self.initial_sonine
         )
-        state, fault = moments_at(
-            scene, jnp.where(sound, times, 0.0) / unit_time, equations, integrator
-        )
+        reduced = jnp.where(sound, times, 0.0) * gas.impact_speed / length
+        state, fault = moments_at(scene, reduced, equations, integrator)
         fault |= status.flag(status.UNSUPPORTED, ~sound)
         theta = jnp.exp(state.log_temperature)
-        length = gas.path_length
         # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
         nan_if_failed = jnp.where(fault == status.OK, 0.0, jnp.nan).astype(theta.dtype)
         temperature, optional = gas.temperature * theta + nan_if_failed, {}

@@ -603,8 +603,7 @@ class RestitutionSpline(RestitutionLaw):
         speeds: knots, normal approach speeds, m/s, > 0, increasing, two or more;
             `visited_speeds` gives the range that a measured curve determines.
         values: eps at the knots, in (0, 1), decreasing; by default that of L = 0.1 at the last
-            knot and p = 1/5. In fits this is the first guess: for grains as inelastic as ice
-            (eps = .3 to .8) a search from the default can end in a wrong minimum.
+            knot and p = 1/5. A fit begins with a multiple of this L that cools as the curve does.
         smoothness: standard deviation of p over a factor of ten in v, > 0.
 
     Raises:
