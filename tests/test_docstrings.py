@@ -32,7 +32,7 @@ def names():
 
 
 # Each compiles a fit of several curves, all alternatives, or a run of spheres.
-LONG = ("Diagnosis", "diagnose", "impact", "read_particles")
+LONG = ("DSMC", "Diagnosis", "diagnose", "impact", "read_particles", "sweep")
 NAMES = [
     pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in jaxgran.__all__
 ]

@@ -122,8 +122,8 @@ def test_repr_of_a_curve_lists_its_fields():
 
 
 def test_repr_of_a_choice_lists_its_reasons():
-    choice = jaxgran.choose_model(glass_beads(), [1e-3, 1.0])
-    assert repr(choice).startswith("Choice: kinetic theory, T within")
+    choice = jaxgran.Choice(jaxgran.KineticTheory(), ("is cheap", "is exact"), (), 0.012)
+    assert repr(choice).startswith("Choice: kinetic theory, T within 1.2 %")
     assert all(reason in repr(choice) for reason in choice.reasons)
     assert "<th>1.</th>" in choice._repr_html_()
 

@@ -233,7 +233,6 @@ TRACKS = {
     "clean": ({}, FREE, []),
     "clean, of a gas whose impacts the tracks do not show": ({}, GAS, [RATE]),
     "gaps, tracks that begin and end": ({"gaps": 0.2}, FREE, []),
-    "1 % wrong links": ({"wrong": 0.01}, FREE, [OUT]),
     "5 % wrong links": ({"wrong": 0.05}, FREE, [OUT]),
     "5 % wrong links and gaps": ({"wrong": 0.05, "gaps": 0.1}, FREE, [OUT]),
     "two swapped identities": ({"swaps": (7,)}, FREE, [OUT]),

@@ -108,6 +108,12 @@ def result():
     return jaxgran.fit(gas, curve), curve
 
 
+def test_few_particles_are_told(result):
+    of_ten = dataclasses.replace(result[0], model=jaxgran.DSMC(10, replicas=2))
+    reasons = jaxgran.diagnose(of_ten, result[1], quick=True).reasons
+    assert any("10 particles are too few for their noise to be known" in x for x in reasons)
+
+
 @pytest.mark.parametrize("too_large, said", [(1.0, False), (3.0, True)])
 def test_errors_that_are_too_large_are_named(too_large, said):
     # 40 residuals of a third of their errors: chi^2 is 4 of 39 degrees of freedom. As many points

@@ -86,11 +86,11 @@ def test_the_clock_is_that_of_the_scene():
     """A box of 297 diameters at phi = .2: the flow that grows there is no heat."""
     gas = glass_beads(0.18).replace(packing_fraction=0.2)
     n = round(297**3 * float(gas.number_density * gas.diameter**3))
-    times = jnp.geomspace(0.3, 300.0, 40) * gas.mean_free_time
-    exact = jaxgran.cool(gas, times).temperature
-    curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
+    curve = synthetic(gas)
     unknown, known = (jaxgran.fit(gas, curve, num_particles=x) for x in (None, n))
-    choice = jaxgran.choose_model(gas, times, num_particles=n, models=[jaxgran.KineticTheory()])
+    choice = jaxgran.choose_model(
+        gas, curve.times, num_particles=n, models=[jaxgran.KineticTheory()]
+    )
     assert relative(unknown, "model") < 0.04 < 0.09 < relative(known, "model") < 0.13
     # T errs by more than the clock: by |d ln T / d ln t|, at most 5/3 (the grids of times differ).
     clock_error = float(jnp.max(known.comparison.clock_error))
@@ -100,9 +100,7 @@ def test_the_clock_is_that_of_the_scene():
 @pytest.mark.slow
 def test_the_budget_of_a_particle_fit(beads):
     gas = beads(0.15)
-    times = jnp.geomspace(0.3, 30.0, 20) * gas.mean_free_time
-    exact = jaxgran.cool(gas, times).temperature
-    curve = jaxgran.CoolingCurve(times=times, temperature=exact, temperature_error=0.01 * exact)
+    curve = synthetic(gas, num_points=20, end=30.0)
     phi = float(gas.packing_fraction)
     priors = {"packing_fraction": (phi, 0.04 * phi)}
     options = {"priors": priors, "num_particles": 1000}

@@ -34,13 +34,10 @@ def within(result, gas, name):
     return abs(float(estimate) - float(gas.value(name))) < 2 * float(error)
 
 
-@pytest.mark.parametrize(
-    "model",
-    [
-        THEORY,
-        pytest.param(jaxgran.DSMC(10_000), marks=pytest.mark.slow),
-    ],
-)
+OF_PARTICLES = pytest.param(jaxgran.DSMC(10_000), marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("model", [THEORY, OF_PARTICLES])
 def test_roughness_and_A_are_found_together(model):
     gas = dataclasses.replace(glass_beads(), surface=ROUGH)
     curve = measured(gas, model)
@@ -109,14 +106,8 @@ def test_A_is_right_where_the_scene_is_known():
 
 def test_between_walls_few_particles_have_all_their_energy_in_T():
     # Without walls N particles of no momentum are hotter by N/(N - 1), and cool faster.
-    count = jnp.asarray(50.0)
-    assert float(finite_size_cooling_factor(glass_beads(), count)) == pytest.approx(
-        1 + 0.6 / 50, rel=2e-3
-    )
-    walls = jaxgran.Walls(0.05, restitution=0.9)
-    assert (
-        float(
-            finite_size_cooling_factor(dataclasses.replace(glass_beads(), container=walls), count)
-        )
-        == 1.0
-    )
+    gas, count = glass_beads(), jnp.asarray(50.0)
+    factor = float(finite_size_cooling_factor(gas, count))
+    assert factor == pytest.approx(1 + 0.6 / 50, rel=2e-3)
+    between = dataclasses.replace(gas, container=jaxgran.Walls(0.05, restitution=0.9))
+    assert float(finite_size_cooling_factor(between, count)) == 1.0

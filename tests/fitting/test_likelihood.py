@@ -1,5 +1,7 @@
 """The likelihood of a fit, and errors that come from the scatter of few replicas."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -78,9 +80,7 @@ def test_fit_and_likelihood_use_them():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(0))
     chance = np.random.default_rng(0).chisquare(2, curve.times.size) / 2
-    ragged = jaxgran.CoolingCurve(
-        curve.times, curve.temperature, temperature_error=curve.temperature_error * chance**0.5
-    )
+    ragged = dataclasses.replace(curve, temperature_error=curve.temperature_error * chance**0.5)
     taken, few = (jaxgran.fit(gas, ragged, replicas=replicas) for replicas in (1, R))
     assert float(taken.p_value) < 1e-4 < 0.01 < float(few.p_value)
     # The weights are even: the errors were 1 % of T everywhere.
@@ -117,7 +117,7 @@ def test_the_likelihood_is_the_chi2_of_the_fit():
 def test_without_errors_their_size_is_integrated_out():
     gas = glass_beads(0.15)
     curve = synthetic(gas, jax.random.key(1), num_points=20)
-    bare = jaxgran.CoolingCurve(times=curve.times, temperature=curve.temperature)
+    bare = dataclasses.replace(curve, temperature_error=None)
     off = np.log(curve.temperature / jaxgran.cool(gas, curve.times).temperature)
     expected = -0.5 * 20 * np.log(np.sum(off**2))
     assert float(jaxgran.log_likelihood(gas, bare)) == pytest.approx(expected, rel=1e-9)

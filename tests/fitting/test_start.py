@@ -1,5 +1,7 @@
 """An unknown start of the clock."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -13,11 +15,7 @@ A = "dissipative_constant"
 
 def shifted(curve, late):
     """The curve on a clock that was started earlier than the gas."""
-    return jaxgran.CoolingCurve(
-        times=curve.times + late,
-        temperature=curve.temperature,
-        temperature_error=curve.temperature_error,
-    )
+    return dataclasses.replace(curve, times=curve.times + late)
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +47,8 @@ def test_a_gas_begun_before_the_file_is_found(measured):
     """Times counted from a point that lies after the start: t0 is negative."""
     gas, _ = measured
     curve = synthetic(gas, jax.random.key(2), num_points=52)  # 40 are left, as in other tests
-    cut, first = slice(12, None), float(curve.times[12])
-    times, T, error = (x[cut] for x in (curve.times, curve.temperature, curve.temperature_error))
-    part = jaxgran.CoolingCurve(times=times - first, temperature=T, temperature_error=error)
+    first = float(curve.times[12])
+    part = shifted(jax.tree.map(lambda x: x[12:], curve), -first)
     result = jaxgran.fit(gas, part, free=(A, "t0"))
     t0, deviation = result.value("t0")
     assert abs(float(t0) + first) < 3 * float(deviation)

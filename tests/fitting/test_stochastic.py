@@ -38,9 +38,7 @@ def test_fit_through_soft_spheres_finds_what_made_the_curve():
     times = jnp.geomspace(0.3, 6.0, 12) * gas.mean_free_time
     model = jaxgran.SoftSpheres(200, replicas=3, steps_per_contact=20)
     curve = jaxgran.cool(gas, times, model=model, key=jax.random.key(7), progress=False)
-    curve = jaxgran.CoolingCurve(
-        times=times, temperature=curve.temperature, temperature_error=0.025 * curve.temperature
-    )
+    curve = jaxgran.CoolingCurve(times, T := curve.temperature, temperature_error=0.025 * T)
     result = jaxgran.fit(gas, curve, model=model, max_steps=5, progress=False)
     estimate, error = result.value("dissipative_constant")
     true = float(gas.value("dissipative_constant"))
