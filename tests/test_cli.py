@@ -37,7 +37,6 @@ def scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "folder").mkdir()
-    (tmp_path / "units.toml").write_text(SCENE + 'length_unit = "s"\n')
     (tmp_path / "bad.toml").write_text("eta : 0.05\n")
     (tmp_path / "no_A.toml").write_text(SCENE.replace("A = 3e-6", ""))
     return tmp_path
@@ -75,7 +74,6 @@ def test_choose_prints_reasons(scene, capsys):
         (["fit", "nowhere.csv"], "no such file"),
         (["fit", "folder"], "not a text file"),
         (["fit", "scene.toml", "--free", "Z"], "Z"),
-        (["fit", "scene.toml", "--replicas", "many"], "many"),
         (["cool"], "SCENE"),
         (["cool", "nowhere.toml", "--until", "1"], "no such file"),
         (["cool", "scene.toml"], "Give the last one, in s, as --until"),
@@ -83,12 +81,9 @@ def test_choose_prints_reasons(scene, capsys):
         (["cool", "scene.toml", "--until", "1", "--out", "nowhere/a.csv"], "cannot write"),
         (["cool", "scene.toml", "--until", "1", "--out", "folder", "--overwrite"], "cannot write"),
         (["cool", "scene.toml", "--until", "1", "--out", "a.png"], "is the name of the picture"),
-        (["cool", "units.toml", "--until", "1"], "length_unit: 's' is not known as a unit of m"),
         (["fit", "nowhere.csv", "--particles", "1.5"], "a whole number below 2^63, got 1.5"),
-        (["fit", "nowhere.csv", "--key", "2.5"], "must be a whole number below 2^63, got 2.5"),
         (["cool", "scene.toml", "--until", "1", "--key", "1e30"], "whole number below 2^63"),
         (["fit", "nowhere.csv", "--tolerance", "nan"], "--tolerance must lie in (0, inf), got nan"),
-        (["choose", "scene.toml", "--until", "1", "--tolerance", "-1"], "--tolerance must lie"),
         (["cool", "bad.toml", "--until", "1"], "not TOML"),
         (["choose", "no_A.toml", "--until", "1"], "does not give A"),
     ],
@@ -270,11 +265,8 @@ def test_a_single_curve_begins_with_the_range(measured, capsys):
         (["thin.csv", "--free", "A", "beta_t"], "`# beta_t: guess` to the file, or --set beta_t"),
         (["thin.csv", "--set", "beta_t=guess"], "asks for a fit of beta_t: add --free A beta_t"),
         (["thin.csv", "--set", "T0=2 kg"], "--set: header line T0: 'kg' is not known"),
-        (["thin.csv", "--set", "Y=-1"], "youngs_modulus must lie in"),
         (["thin.csv", "--set", "youngs=1"], "give KEY=VALUE with KEY one of"),
         (["thin.csv", "--set", "N=many"], "header line N"),
-        (["thin.csv", "--set", "N=1e30"], "header line N"),
-        (["thin.csv", "--key", str(10**30)], "below 2^63"),
         (["thin.csv", "--set", "Y=0.05"], "in Pa"),
         (["thin.csv", "--free", "T0"], "leaves A fixed"),
         (["thin.csv", "--model", "dsmc", "--particles", "0"], "num_particles must be a whole"),

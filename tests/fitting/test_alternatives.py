@@ -86,9 +86,7 @@ UNTRUSTED = " cannot be trusted in this scene, though the curve fits."
             f"{CONSISTENT}.* The scene is at the edge of the model's validity.",
         ),
         ((DECISIVE, EDGE), GOOD, "not consistent", f"{UNTRUSTED} Take contacts."),
-        ((), BAD, "not consistent", NOT_EXPLAINED),
         ((EDGE,), BAD, "not consistent", f"{NOT_EXPLAINED} Take positions."),
-        ((DECISIVE, EDGE), BAD, "not consistent", f"{NOT_EXPLAINED} Take contacts."),
     ],
 )
 def test_verdicts(result, monkeypatch, limitations, p_value, grade, verdict):

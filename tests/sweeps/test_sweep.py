@@ -237,12 +237,10 @@ def test_particles_with_positions(tmp_path):
     ("options", "message"),
     [
         ({"model": "auto"}, "model must be a jaxgran model, got 'auto'"),
-        ({"chunk": "2"}, "chunk must be a whole number >= 1"),
         ({"chunk": 0}, "chunk must be"),
         ({"store": 3}, "store must be a path, got 3"),
         ({"key": 3}, "key must be a key .* or an array of keys"),
         ({"gases": {"dissipation": A}}, "got a dict. Build it by jax.vmap"),
-        ({"gases": [GAS, GAS]}, "got a list. Build it by jax.vmap"),
         ({"gases": GAS}, "no float of gases has a leading axis"),
         ({"gases": jax.tree.map(lambda x: x[:0], GASES)}, "one length, at least 1, got .* 0"),
         (
