@@ -16,102 +16,61 @@ The examples in the docstrings use these definitions:
 from importlib import import_module
 from typing import Any
 
-from jaxgran._utils.status import explain as explain_status
-from jaxgran._utils.validation import Domain
-from jaxgran.data.curve import CoolingCurve, Particles, Run
-from jaxgran.data.curve_file import (
-    DropTest,
-    read_absent,
-    read_curve,
-    read_drop_test,
-    read_gas,
-    read_priors,
-    write_curve,
-)
-from jaxgran.data.particles import read_particles
-from jaxgran.fitting.diagnosis import Diagnosis, diagnose, log_likelihood
-from jaxgran.fitting.fit import fit
-from jaxgran.fitting.learnt_law import restitution_band
-from jaxgran.fitting.result import Fit
-from jaxgran.models.base import AbstractModel, Limitation
-from jaxgran.models.choose import Choice, choose_model
-from jaxgran.models.cool import cool
-from jaxgran.models.dsmc import DSMC
-from jaxgran.models.error_model import ErrorModel
-from jaxgran.models.hard_spheres import HardSpheres
-from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.soft_spheres import SoftSpheres
-from jaxgran.particles import observables
-from jaxgran.scene.contact import Impact, contact_force, elastic_constant, impact
-from jaxgran.scene.elements import Frictional, Rough, StokesDrag, Walls, WhiteNoise
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import sphere_mass
-from jaxgran.scene.laws import (
-    ConstantRestitution,
-    ReducedLaw,
-    RestitutionLaw,
-    RestitutionSeries,
-    RestitutionSpline,
-    Viscoelastic,
-    viscoelastic_restitution,
-)
-from jaxgran.sweep import sweep
-from jaxgran.theory.equations import SteadyState, steady_state
+from jaxgran._utils.status import explain as explain_status  # noqa: F401
+from jaxgran._utils.validation import Domain as Domain
+from jaxgran.data.curve import CoolingCurve as CoolingCurve
+from jaxgran.data.curve import Particles as Particles
+from jaxgran.data.curve import Run as Run
+from jaxgran.data.curve_file import DropTest as DropTest
+from jaxgran.data.curve_file import read_absent as read_absent
+from jaxgran.data.curve_file import read_curve as read_curve
+from jaxgran.data.curve_file import read_drop_test as read_drop_test
+from jaxgran.data.curve_file import read_gas as read_gas
+from jaxgran.data.curve_file import read_priors as read_priors
+from jaxgran.data.curve_file import write_curve as write_curve
+from jaxgran.data.particles import read_particles as read_particles
+from jaxgran.fitting.diagnosis import Diagnosis as Diagnosis
+from jaxgran.fitting.diagnosis import diagnose as diagnose
+from jaxgran.fitting.diagnosis import log_likelihood as log_likelihood
+from jaxgran.fitting.fit import fit as fit
+from jaxgran.fitting.learnt_law import restitution_band as restitution_band
+from jaxgran.fitting.result import Fit as Fit
+from jaxgran.models.base import AbstractModel as AbstractModel
+from jaxgran.models.base import Limitation as Limitation
+from jaxgran.models.choose import Choice as Choice
+from jaxgran.models.choose import choose_model as choose_model
+from jaxgran.models.cool import cool as cool
+from jaxgran.models.dsmc import DSMC as DSMC
+from jaxgran.models.error_model import ErrorModel as ErrorModel
+from jaxgran.models.hard_spheres import HardSpheres as HardSpheres
+from jaxgran.models.kinetic_theory import KineticTheory as KineticTheory
+from jaxgran.models.soft_spheres import SoftSpheres as SoftSpheres
+from jaxgran.particles import observables as observables
+from jaxgran.scene.contact import Impact as Impact
+from jaxgran.scene.contact import contact_force as contact_force
+from jaxgran.scene.contact import elastic_constant as elastic_constant
+from jaxgran.scene.contact import impact as impact
+from jaxgran.scene.elements import Frictional as Frictional
+from jaxgran.scene.elements import Rough as Rough
+from jaxgran.scene.elements import StokesDrag as StokesDrag
+from jaxgran.scene.elements import Walls as Walls
+from jaxgran.scene.elements import WhiteNoise as WhiteNoise
+from jaxgran.scene.gas import Gas as Gas
+from jaxgran.scene.geometry import sphere_mass as sphere_mass
+from jaxgran.scene.laws import ConstantRestitution as ConstantRestitution
+from jaxgran.scene.laws import ReducedLaw as ReducedLaw
+from jaxgran.scene.laws import RestitutionLaw as RestitutionLaw
+from jaxgran.scene.laws import RestitutionSeries as RestitutionSeries
+from jaxgran.scene.laws import RestitutionSpline as RestitutionSpline
+from jaxgran.scene.laws import Viscoelastic as Viscoelastic
+from jaxgran.scene.laws import viscoelastic_restitution as viscoelastic_restitution
+from jaxgran.sweep import sweep as sweep
+from jaxgran.theory.equations import SteadyState as SteadyState
+from jaxgran.theory.equations import steady_state as steady_state
 
-__all__ = [
-    "DSMC",
-    "AbstractModel",
-    "Choice",
-    "ConstantRestitution",
-    "CoolingCurve",
-    "Diagnosis",
-    "Domain",
-    "DropTest",
-    "ErrorModel",
-    "Fit",
-    "Frictional",
-    "Gas",
-    "HardSpheres",
-    "Impact",
-    "KineticTheory",
-    "Limitation",
-    "Particles",
-    "ReducedLaw",
-    "RestitutionLaw",
-    "RestitutionSeries",
-    "RestitutionSpline",
-    "Rough",
-    "Run",
-    "SoftSpheres",
-    "SteadyState",
-    "StokesDrag",
-    "Viscoelastic",
-    "Walls",
-    "WhiteNoise",
-    "choose_model",
-    "contact_force",
-    "cool",
-    "diagnose",
-    "elastic_constant",
-    "explain_status",
-    "fit",
-    "impact",
-    "log_likelihood",
-    "observables",
-    "read_absent",
-    "read_curve",
-    "read_drop_test",
-    "read_gas",
-    "read_particles",
-    "read_priors",
-    "restitution_band",
-    "sphere_mass",
-    "steady_state",
-    "sweep",
-    "viscoelastic_restitution",
-    "write_curve",
+__all__ = ["observables"] + [  # pyright: ignore[reportUnsupportedDunderAll]
+    name for name, x in globals().items() if getattr(x, "__module__", "").startswith("jaxgran.")
 ]
-
 
 _PLOT_FUNCTIONS = ("plot_curve", "plot_fit")
 """Functions of `jaxgran.plotting`, which is imported with matplotlib when one is first used."""

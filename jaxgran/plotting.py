@@ -10,17 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import CoolingCurve, import_extra
 from jaxgran.data.files import write_atomically
 from jaxgran.fitting.result import Fit
 
-try:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-except ModuleNotFoundError as error:  # pragma: no cover
-    raise ModuleNotFoundError(
-        'jaxgran.plotting needs matplotlib: pip install "jaxgran[notebook]"'
-    ) from error
+import_extra("matplotlib")
+from matplotlib.axes import Axes  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
 
 MAX_DRAWN = 1000
 """Largest number of points drawn; of a longer curve, points evenly spaced in log time are drawn."""
@@ -72,11 +68,7 @@ def plot_curve(curve: CoolingCurve, axes: Axes | None = None, **style: Any) -> A
     Raises:
         ValueError: for a batch of curves, as `jax.vmap` returns it.
     """
-    if np.ndim(curve.times) != 1:
-        raise ValueError(
-            f"the times of this curve have shape {np.shape(curve.times)}. Plot one curve at a "
-            "time, such as jax.tree.map(lambda x: x[0], curves)."
-        )
+    curve.check_single()
     if axes is None:
         from matplotlib import pyplot
 
@@ -224,13 +216,11 @@ def _draw_power_laws(axis, curve: CoolingCurve) -> None:
     top = 0.8 * float(T.max())
     if not T[-1] < 0.3 * top:
         return
-    for power, style, label, side in (
-        (-5 / 3, "--", r"$t^{-5/3}$", "right"),
-        (-2.0, ":", r"$t^{-2}$", "left"),
-    ):
+    laws = (-5 / 3, "--", r"$t^{-5/3}$", "right", -4), (-2.0, ":", r"$t^{-2}$", "left", 4)
+    for power, style, label, side, shift in laws:
         first = t[-1] * (T[-1] / top) ** (-1 / power)
         times = np.geomspace(first, t[-1], 50)
-        grey, shift = {"color": COLOURS["guide"]}, {"left": 4, "right": -4}[side]
+        grey = {"color": COLOURS["guide"]}
         axis.plot(times, T[-1] * (times / t[-1]) ** power, style, lw=1.2, zorder=1, **grey)
         place = {"xytext": (shift, 2), "textcoords": "offset points", "ha": side, "va": "center"}
         axis.annotate(label, (first, top), **place, **grey)

@@ -19,10 +19,10 @@ import jaxgran
 from jaxgran.cli.common import (
     MODELS,
     NO_CACHE_VARIABLE,
-    choose_or_make_model,
     models_by_name,
     use_compilation_cache,
 )
+from jaxgran.cli.fit import choose_or_make_model
 from jaxgran.cli.main import main
 from jaxgran.models.choose import default_models
 

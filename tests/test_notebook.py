@@ -112,20 +112,19 @@ def test_repr_of_a_gas_has_units():
     words = repr(gas)
     assert "dissipative_constant" in words and "m^2/s^2" in words and "f64[]" not in words
     assert f"{float(gas.mean_free_time):.4g} s" in words
-    assert gas._repr_html_().startswith("<table><caption>Gas of Viscoelastic spheres, d = 3")
+    assert words.startswith("Gas of Viscoelastic spheres, d = 3")
 
 
 def test_repr_of_a_curve_lists_its_fields():
     curve = jaxgran.CoolingCurve([0.0, 1.0, 2.0], [4.0, 2.0, 1.0], temperature_error=[1, 1, 1])
     assert "3 times, t = 0 s to 2 s" in repr(curve) and "0.25" in repr(curve)
-    assert "temperature, temperature_error" in curve._repr_html_()
+    assert "temperature, temperature_error" in repr(curve)
 
 
 def test_repr_of_a_choice_lists_its_reasons():
     choice = jaxgran.Choice(jaxgran.KineticTheory(), ("is cheap", "is exact"), (), 0.012)
     assert repr(choice).startswith("Choice: kinetic theory, T within 1.2 %")
     assert all(reason in repr(choice) for reason in choice.reasons)
-    assert "<th>1.</th>" in choice._repr_html_()
 
 
 def test_repr_marks_batches_and_traced_values():

@@ -1,14 +1,10 @@
-"""Short representations of objects, for a terminal and for a notebook."""
+"""Short representations of objects."""
 
 from collections.abc import Sequence
-from html import escape
 from typing import Any
 
 import numpy as np
 from jax.core import Tracer
-
-TableRows = Sequence[tuple[str, str]]
-"""Pairs of a name and its description."""
 
 
 def format_quantity(value: Any, unit: str = "") -> str:
@@ -21,13 +17,7 @@ def format_quantity(value: Any, unit: str = "") -> str:
     return f"{float(array):.4g} {unit}".rstrip()
 
 
-def text_table(title: str, rows: TableRows) -> str:
-    """Format a title and rows as plain text, one row a line."""
+def text_table(title: str, rows: Sequence[tuple[str, str]]) -> str:
+    """Format a title and rows, pairs of a name and its description, as one row a line."""
     width = max((len(name) for name, _ in rows), default=0)
     return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
-
-
-def html_table(title: str, rows: TableRows) -> str:
-    """Format a title and rows as an HTML table."""
-    lines = [f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in rows]
-    return f"<table><caption>{escape(title)}</caption>{''.join(lines)}</table>"

@@ -16,15 +16,17 @@ if TYPE_CHECKING:
     UserInt = int
     UserFloat = float
     UserBool = bool
-
-    def no_type_check(function: F) -> F:
-        """Mark a public function that checks its arguments itself and raises clearer errors."""
-        return function
 else:
     # With `Any` a run-time type checker accepts all values; the functions below report wrong types.
-    from typing import no_type_check  # noqa: F401
-
     UserNumber = UserInt = UserFloat = UserBool = Any
+
+
+def no_type_check(function: F) -> F:
+    """Mark a public function that checks its arguments itself and raises clearer errors.
+
+    `jaxtyping.install_import_hook` knows the decorator by this name.
+    """
+    return function
 
 
 class Domain(NamedTuple):
@@ -70,9 +72,7 @@ class Domain(NamedTuple):
             raise ValueError(
                 f"{name} must be a number in {self}, got {value!r}. {advice}"
             ) from None
-        above = numbers >= self.low if self.low_allowed else numbers > self.low
-        below = numbers <= self.high if self.high_allowed else numbers < self.high
-        wrong = ~(above & below & np.isfinite(numbers))
+        wrong = ~self._contains(numbers, np)
         if np.any(wrong):
             raise ValueError(f"{name} must lie in {self}, got {numbers[wrong].flat[0]:g}. {advice}")
 
@@ -81,10 +81,12 @@ class Domain(NamedTuple):
 
         The value may be traced.
         """
-        value = jnp.asarray(value)
+        return self._contains(jnp.asarray(value), jnp)
+
+    def _contains(self, value: Any, xp: Any) -> Any:
         above = value >= self.low if self.low_allowed else value > self.low
         below = value <= self.high if self.high_allowed else value < self.high
-        return above & below & jnp.isfinite(value)
+        return above & below & xp.isfinite(value)
 
     def to_free(self, value: Any) -> Any:
         """Map the interior of the interval one-to-one onto the whole real line.

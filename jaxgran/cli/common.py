@@ -1,25 +1,18 @@
-"""Parts shared by the commands: models by name, header values, output files, compilation cache."""
+"""Options of the commands, models by name, and the compilation cache."""
 
 import os
 import platform
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import jax
-import numpy as np
 from cyclopts import Parameter, Token
 from platformdirs import user_cache_path
 
-import jaxgran
 from jaxgran._utils.validation import POSITIVE
-from jaxgran.data.curve_file import GUESS, GUESSES, OPTIONAL_KEYS, PRIOR_KEYS
-from jaxgran.data.tables import header_in_si
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.choose import default_models
 from jaxgran.scene.parameters import BY_SYMBOL
 
 ModelName = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres"]
@@ -108,117 +101,9 @@ def models_by_name(models) -> dict[str, AbstractModel]:
     return {model.name.lower().replace(" ", "-"): model for model in models}
 
 
-def choose_or_make_model(options: Any, gas, curve, free, num_particles: int | None):
-    """Return the model, and the reasons for it if it was chosen automatically."""
-    size = num_particles if options.particles is None else options.particles
-    replicas = options.replicas
-    if options.model != "auto":
-        model = models_by_name(default_models(2 if size is None else size, replicas))[options.model]
-        if model.stochastic and size is None:
-            raise ValueError(f"{options.curve} does not give N. Add --particles.")
-        return model, ()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the diagnosis of the final fit repeats them
-        first = jaxgran.fit(gas, curve, free=free)
-    choice = jaxgran.choose_model(
-        first.gas,
-        curve.times,
-        options.tolerance,
-        size if num_particles is None else num_particles,
-        replicas=replicas,
-    )
-    if options.particles is None:
-        return choice.model, choice.reasons
-    # The choice is for the box of the file's N; the run has the number of particles given.
-    (name,) = models_by_name([choice.model])
-    return models_by_name(default_models(options.particles, replicas))[name], choice.reasons
-
-
-def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
-    """Return header values from KEY=VALUE arguments."""
-    known = (*BY_SYMBOL, *PRIOR_KEYS, *OPTIONAL_KEYS)
-    values = {}
-    for pair in pairs:
-        key, equals, value = pair.partition("=")
-        if not equals or key not in known:
-            raise ValueError(f"--set {pair}: give KEY=VALUE with KEY one of {', '.join(known)}")
-        values[key] = value
-    try:
-        return header_in_si(values)
-    except ValueError as error:
-        raise ValueError(f"--set: {error}") from None
-
-
 def check_tolerance(tolerance: float) -> None:
     """Raise ValueError unless a tolerance of --tolerance is positive."""
     POSITIVE.check("--tolerance", tolerance, "0.02 allows an error of T of 2 %.")
-
-
-def gas_of(header: dict[str, str], free: Sequence[str]) -> jaxgran.Gas:
-    """Return the gas of a header, with an element to start from for each free parameter.
-
-    Raises:
-        ValueError: for a free parameter that the header does not describe, or a guess that is not
-            fitted.
-    """
-    header = dict(header)
-    if "beta_t" in free and {"reduced_inertia", "T_rot_0"} & header.keys():
-        header.setdefault("beta_t", GUESS)
-    if guessed := [key for key in GUESSES if header.get(key) == GUESS and key not in free]:
-        raise ValueError(
-            f"the file asks for a fit of {guessed[0]}: add --free A {guessed[0]}, or give its value"
-        )
-    gas = jaxgran.read_gas(header)
-    for key in free:
-        if BY_SYMBOL[key].name not in (*gas.domains, "t0"):
-            start = f"`# {key}: {GUESS if key in GUESSES else 'VALUE'}` to the file"
-            raise ValueError(
-                f"--free {key}: the file gives no {key}. Add {start}, or --set "
-                f"{key}={f'{GUESSES[key]:g}' if key in GUESSES else 'VALUE'}"
-            )
-    return gas
-
-
-def output_files(options: Any) -> tuple[Path, Path]:
-    """Return the paths of the picture and the JSON file, by default in a new folder.
-
-    Raises:
-        ValueError: if the folder cannot be written to, or if a file exists and may not be replaced.
-    """
-    stem = f"{options.curve.stem}-{options.model}"
-    folder = options.out
-    if folder is None:
-        folder, i = Path("results") / stem, 2
-        while folder.exists():
-            folder, i = Path("results") / f"{stem}-{i}", i + 1
-    existing = next(part for part in (folder, *folder.absolute().parents) if part.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK):
-        raise ValueError(f"{existing} is not a writable folder. Name another one with --out.")
-    files = folder / f"{stem}.png", folder / f"{stem}.json"
-    for file in files:
-        if file.exists() and not options.overwrite:
-            raise ValueError(f"{file} exists. Name another --out, or add --overwrite.")
-    return files
-
-
-def environment() -> dict:
-    """Return versions and device."""
-    return {
-        "versions": {name: version(name) for name in ("jaxgran", "jax", "diffrax", "optimistix")},
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-    }
-
-
-def as_json(value: Any) -> Any:
-    """Return dictionaries and lists as JSON takes them: lists for arrays, None for nan and inf."""
-    if isinstance(value, dict):
-        return {key: as_json(part) for key, part in value.items()}
-    if isinstance(value, np.ndarray | np.generic | jax.Array):
-        value = np.asarray(value).tolist()
-    if isinstance(value, list | tuple):
-        return [as_json(part) for part in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 NO_CACHE_VARIABLE = "JAXGRAN_NO_CACHE"

@@ -4,9 +4,12 @@ Reads files, prints tables, and writes a picture and a JSON file.
 """
 
 import json
+import os
+import platform
 import time
 import warnings
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +20,10 @@ import numpy as np
 
 import jaxgran
 from jaxgran import plotting
-from jaxgran.cli.common import (
-    MODELS,
-    FitOptions,
-    as_json,
-    choose_or_make_model,
-    environment,
-    gas_of,
-    models_by_name,
-    output_files,
-    parse_settings,
-)
-from jaxgran.data.curve_file import GUESS, read_drops
+from jaxgran.cli.common import MODELS, FitOptions, models_by_name
+from jaxgran.data.curve_file import GUESS, GUESSES, OPTIONAL_KEYS, PRIOR_KEYS, read_drops
 from jaxgran.data.files import header_count, header_number, write_atomically
+from jaxgran.data.tables import header_in_si
 from jaxgran.fitting.fit import free_by_default
 from jaxgran.fitting.residuals import unused_rotation
 from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE
@@ -77,6 +71,8 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         else:
             data[label], header = jaxgran.read_curve(path)
         header |= parse_settings(options.set)
+        if options.absent:
+            header["absent"] = " ".join((header.get("absent", ""), *options.absent))
         gas = gas_of(header, free)
         free = free or tuple(map(symbol_of, free_by_default(gas, data[label])))
         gases[label], headers[label] = _with_A(gas, header, free), header
@@ -85,12 +81,7 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         for name, pair in jaxgran.read_priors(header).items():
             shared = name != "density" and PARAMETERS[name].belongs_to == MATERIAL
             priors.setdefault(f"{label}: {name}" if several and not shared else name, pair)
-    declared = [
-        jaxgran.read_absent(
-            header | {"absent": " ".join((header.get("absent", ""), *options.absent))}
-        )
-        for header in headers.values()
-    ]
+    declared = [jaxgran.read_absent(header) for header in headers.values()]
     arguments: dict[str, Any] = {
         "absent": tuple(x for x in declared[0] if all(x in others for others in declared)),
         "free": tuple(BY_SYMBOL[key].name for key in free),
@@ -144,7 +135,9 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         "weight": result.weights(),
         "chosen": reasons,
         "header": headers if several else headers[label],
-        **environment(),
+        "versions": {name: version(name) for name in ("jaxgran", "jax", "diffrax", "optimistix")},
+        "python": platform.python_version(),
+        "device": jax.devices()[0].device_kind,
     }
     picture.parent.mkdir(parents=True, exist_ok=True)
     title = f"{label.replace('_', ' ')}: {diagnosis.headline}"
@@ -175,6 +168,105 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     print("\n" + "\n".join(f"  - {reason}" for reason in diagnosis.reasons))
     print("\nwritten  " + "\n         ".join(map(str, (picture, record)[not paths :])) + "\n")
     print(json.dumps(summary, allow_nan=False))
+
+
+def choose_or_make_model(options: Any, gas, curve, free, num_particles: int | None):
+    """Return the model, and the reasons for it if it was chosen automatically."""
+    size = num_particles if options.particles is None else options.particles
+    replicas = options.replicas
+    if options.model != "auto":
+        model = models_by_name(default_models(2 if size is None else size, replicas))[options.model]
+        if model.stochastic and size is None:
+            raise ValueError(f"{options.curve} does not give N. Add --particles.")
+        return model, ()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the diagnosis of the final fit repeats them
+        first = jaxgran.fit(gas, curve, free=free)
+    choice = jaxgran.choose_model(
+        first.gas,
+        curve.times,
+        options.tolerance,
+        size if num_particles is None else num_particles,
+        replicas=replicas,
+    )
+    if options.particles is None:
+        return choice.model, choice.reasons
+    # The choice is for the box of the file's N; the run has the number of particles given.
+    (name,) = models_by_name([choice.model])
+    return models_by_name(default_models(options.particles, replicas))[name], choice.reasons
+
+
+def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
+    """Return header values from KEY=VALUE arguments."""
+    known = (*BY_SYMBOL, *PRIOR_KEYS, *OPTIONAL_KEYS)
+    values = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals or key not in known:
+            raise ValueError(f"--set {pair}: give KEY=VALUE with KEY one of {', '.join(known)}")
+        values[key] = value
+    try:
+        return header_in_si(values)
+    except ValueError as error:
+        raise ValueError(f"--set: {error}") from None
+
+
+def gas_of(header: dict[str, str], free: Sequence[str]) -> jaxgran.Gas:
+    """Return the gas of a header, with an element to start from for each free parameter.
+
+    Raises:
+        ValueError: for a free parameter that the header does not describe, or a guess that is not
+            fitted.
+    """
+    header = dict(header)
+    if "beta_t" in free and {"reduced_inertia", "T_rot_0"} & header.keys():
+        header.setdefault("beta_t", GUESS)
+    if guessed := [key for key in GUESSES if header.get(key) == GUESS and key not in free]:
+        raise ValueError(
+            f"the file asks for a fit of {guessed[0]}: add --free A {guessed[0]}, or give its value"
+        )
+    gas = jaxgran.read_gas(header)
+    for key in free:
+        if BY_SYMBOL[key].name not in (*gas.domains, "t0"):
+            start = f"`# {key}: {GUESS if key in GUESSES else 'VALUE'}` to the file"
+            raise ValueError(
+                f"--free {key}: the file gives no {key}. Add {start}, or --set "
+                f"{key}={f'{GUESSES[key]:g}' if key in GUESSES else 'VALUE'}"
+            )
+    return gas
+
+
+def output_files(options: Any) -> tuple[Path, Path]:
+    """Return the paths of the picture and the JSON file, by default in a new folder.
+
+    Raises:
+        ValueError: if the folder cannot be written to, or if a file exists and may not be replaced.
+    """
+    stem = f"{options.curve.stem}-{options.model}"
+    folder = options.out
+    if folder is None:
+        folder, i = Path("results") / stem, 2
+        while folder.exists():
+            folder, i = Path("results") / f"{stem}-{i}", i + 1
+    existing = next(part for part in (folder, *folder.absolute().parents) if part.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise ValueError(f"{existing} is not a writable folder. Name another one with --out.")
+    files = folder / f"{stem}.png", folder / f"{stem}.json"
+    for file in files:
+        if file.exists() and not options.overwrite:
+            raise ValueError(f"{file} exists. Name another --out, or add --overwrite.")
+    return files
+
+
+def as_json(value: Any) -> Any:
+    """Return dictionaries and lists as JSON takes them: lists for arrays, None for nan and inf."""
+    if isinstance(value, dict):
+        return {key: as_json(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        value = np.asarray(value).tolist()
+    if isinstance(value, list | tuple):
+        return [as_json(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _with_A(gas: Any, header: dict[str, str], free: Sequence[str]) -> Any:

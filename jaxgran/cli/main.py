@@ -194,17 +194,21 @@ def choose(
 
 def _read_scene(path: Path, until: float | None) -> SimpleNamespace:
     """Return the gas, the times, N (size) and the header of a scene."""
-    measured = None
+    times = None
     if path.suffix == ".toml":
-        header = _read_toml(path)
+        with name_in_errors(path):
+            try:
+                values = tomllib.loads(read_text(path, "eta, diameter, ..."))
+            except tomllib.TOMLDecodeError as error:
+                raise ValueError(f"not TOML ({error}). Write lines such as eta = 0.05.") from None
+            header = header_in_si({key: str(value) for key, value in values.items()})
     else:
         curve, header = jaxgran.read_curve(path)
-        measured = curve.times
+        times = curve.times
     if "A" not in header:
         raise ValueError(f"{path} does not give A, in s. Add it, or estimate it with jaxgran fit.")
     gas = jaxgran.read_gas(header)
     gas = gas.replace(dissipative_constant=header_number(header, "A"))
-    times = measured
     if until is not None:
         first = float(gas.mean_free_time) / 10
         if not first < until < float("inf"):
@@ -214,13 +218,3 @@ def _read_scene(path: Path, until: float | None) -> SimpleNamespace:
         raise ValueError(f"{path} has no times. Give the last one, in s, as --until.")
     size = header_count(header, "N")
     return SimpleNamespace(gas=gas, times=times, size=size, header=header)
-
-
-def _read_toml(path: Path) -> dict[str, str]:
-    """Return the keys of a TOML file as those of a header."""
-    with name_in_errors(path):
-        try:
-            values = tomllib.loads(read_text(path, "eta, diameter, ..."))
-        except tomllib.TOMLDecodeError as error:
-            raise ValueError(f"not TOML ({error}). Write lines such as eta = 0.05.") from None
-        return header_in_si({key: str(value) for key, value in values.items()})

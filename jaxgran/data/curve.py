@@ -19,7 +19,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxgran._utils.formatting import TableRows, format_quantity, html_table, text_table
+from jaxgran._utils.formatting import format_quantity, text_table
+from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import list_to_array
 
 
@@ -175,10 +176,19 @@ class CoolingCurve(eqx.Module):
     status: Int[Array, ""] | None = None
 
     def __repr__(self) -> str:
-        return text_table(*self._words)
-
-    def _repr_html_(self) -> str:
-        return html_table(*self._words)
+        first = last = ratio = ""
+        if not any_traced((self.times, self.temperature)):
+            first, last = (format_quantity(np.asarray(self.times)[..., i], "s") for i in (0, -1))
+            T = np.asarray(self.temperature)
+            ratio = format_quantity(T[..., -1] / T[..., 0])
+            first, last = f", t = {first}", f" to {last}"
+        known = [f.name for f in dataclasses.fields(self) if getattr(self, f.name) is not None]
+        rows = [("T over its first value", ratio or "traced")]
+        rows += [("known", ", ".join(name for name in known if name not in ("times", "status")))]
+        if self.status is not None:
+            rows.append(("status", format_quantity(self.status)))
+        title = f"CoolingCurve of {np.shape(self.times)[-1]} times{first}{last}"
+        return text_table(title, rows)
 
     def to_xarray(self) -> Any:
         """Return the curve as an `xarray.Dataset` with units; needs the extra `notebook`.
@@ -195,7 +205,7 @@ class CoolingCurve(eqx.Module):
             ModuleNotFoundError: without xarray.
         """
         xarray = import_extra("xarray")
-        self._check_single()
+        self.check_single()
         arrays = {name: np.asarray(x) for name, x in to_arrays(self).items()}
         attributes = {STATUS: int(arrays.pop(STATUS))} if STATUS in arrays else {}
         are_particles = isinstance(self.saved, Particles)
@@ -226,33 +236,18 @@ class CoolingCurve(eqx.Module):
         Raises: as `to_xarray`.
         """
         pandas = import_extra("pandas")
-        self._check_single()
+        self.check_single()
         known = {name: getattr(self, name) for name in QUANTITIES}
         columns = {name: np.asarray(x) for name, x in known.items() if x is not None}
         return pandas.DataFrame(columns).set_index("times")
 
-    def _check_single(self) -> None:
+    def check_single(self) -> None:
+        """Raise ValueError for several curves in one, as `jax.vmap` returns them."""
         if np.ndim(self.times) != 1:
             raise ValueError(
                 f"the times of this curve have shape {np.shape(self.times)}: take one curve, as in "
                 "jax.tree.map(lambda x: x[0], curves)"
             )
-
-    @property
-    def _words(self) -> tuple[str, TableRows]:
-        """Title and rows of a short account of the curve."""
-        first = last = ratio = ""
-        if not any(isinstance(x, Tracer) for x in (self.times, self.temperature)):
-            first, last = (format_quantity(np.asarray(self.times)[..., i], "s") for i in (0, -1))
-            T = np.asarray(self.temperature)
-            ratio = format_quantity(T[..., -1] / T[..., 0])
-            first, last = f", t = {first}", f" to {last}"
-        known = [f.name for f in dataclasses.fields(self) if getattr(self, f.name) is not None]
-        rows = [("T over its first value", ratio or "traced")]
-        rows += [("known", ", ".join(name for name in known if name not in ("times", "status")))]
-        if self.status is not None:
-            rows.append(("status", format_quantity(self.status)))
-        return f"CoolingCurve of {np.shape(self.times)[-1]} times{first}{last}", rows
 
     @classmethod
     def of_replicas(cls, times: Array, values: dict[str, Any], **others: Any) -> "CoolingCurve":

@@ -9,6 +9,7 @@ import json
 import re
 import warnings
 import zipfile
+from collections.abc import Callable
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -27,23 +28,10 @@ from jaxgran._utils.validation import (
     float_array,
     no_type_check,
 )
+from jaxgran.data import files, tracks
 from jaxgran.data.curve import MIN_POINTS, QUANTITIES, CoolingCurve, from_arrays, to_arrays
-from jaxgran.data.files import (
-    checked_path,
-    header_count,
-    header_number,
-    name_in_errors,
-    write_atomically,
-)
 from jaxgran.data.plausibility import ask_about_columns, ask_about_header
 from jaxgran.data.tables import UNIT_KEYS, Table, header_entry, read_table
-from jaxgran.data.tracks import (
-    TRACK_KEYS,
-    curve_of_tracks,
-    curve_of_trajectory,
-    is_trajectory,
-    track_columns,
-)
 from jaxgran.scene.elements import (
     VOLUME_TOLERANCE,
     Frictional,
@@ -63,7 +51,7 @@ WANTED = "t,T[,T_err][,msd][,msd_err]"
 
 CSV_FILE = f"a CSV file with the columns {WANTED}"
 
-OPTIONAL_KEYS = ("N", "dimension", "replicas", "absent", "T_from", *TRACK_KEYS)
+OPTIONAL_KEYS = ("N", "dimension", "replicas", "absent", "T_from", *tracks.TRACK_KEYS)
 """Further known header keys, neither of the gas nor of its elements."""
 
 PROVENANCE_KEYS = ("units", "points", "end_tau", "melt_tau", "steps_per_contact", "source")
@@ -99,16 +87,23 @@ ABSENT = {
 }
 """Effects that the header key ``absent`` may name, and the keys that describe them."""
 
-TEMPERATURE_COLUMNS = {
-    "mean_speed": "mean speed <|v|>",
-    "vx2": "mean square <v_x^2> of one component of the velocity",
-    "v2_xy": "mean square <v_x^2 + v_y^2> of two components, which a camera records",
-    "energy": "translational energy of a particle (m/2) <v^2>, in J",
+TEMPERATURE_COLUMNS: dict[str, tuple[int, Callable[..., np.ndarray], str]] = {
+    "mean_speed": (
+        2,
+        lambda v, d, m: (pi / 8 if d == 3 else 2 / pi) * v**2,
+        "(pi/8) <|v|>^2, in a plane (2/pi) <|v|>^2, for Maxwellian velocities",
+    ),
+    "vx2": (1, lambda x, d, m: x, "<v_x^2>, for isotropic velocities"),
+    "v2_xy": (1, lambda x, d, m: x / 2, "<v_x^2 + v_y^2>/2, for isotropic velocities"),
+    "energy": (1, lambda E, d, m: 2 * E / (d * m), "2 E/(d m), E in J per particle"),
 }
-"""Columns from which T = <v^2>/d is computed, and their meaning."""
+"""Columns from which T = <v^2>/d is computed: their power in T, T of values, d and m, words."""
 
 EXACT_DENSITY_ERROR = 1e-4
 """Relative error of the prior of a density without an error, where the diameter has one."""
+
+ANY_MATERIAL = {"density": "1", "Y": "1", "nu": "0", "T0": "1"}
+"""Header keys that the collision frequency over sqrt(T0) does not depend on."""
 
 _MIXTURE = "grains of a mixture have a temperature for each kind, and one T is too few"
 _STICKING = "grains that stick lose all of their speed below some speed, and grow"
@@ -168,19 +163,19 @@ def read_curve(
     >>> header, again.times.shape
     ({'eta': '0.05'}, (4,))
     """
-    path, given = checked_path(path, CSV_FILE), {} if header is None else header
+    path, given = files.checked_path(path, CSV_FILE), {} if header is None else header
     _check_header(given)
     questions: list[str] = []
-    with name_in_errors(path):
+    with files.name_in_errors(path):
         if path.suffix == ARCHIVE_SUFFIX:
             return _read_archive(path)
-        if is_trajectory(path):
-            return curve_of_trajectory(path, given)
+        if tracks.is_trajectory(path):
+            return tracks.curve_of_trajectory(path, given)
         table = read_table(path, WANTED, _columns_to_read)
         header = table.header | given
         if "x" in table.columns:
-            elements = read_elements(header)
-            curve, questions = curve_of_tracks(table.columns, header, table.lines, elements)
+            gas = _gas_or_none(ANY_MATERIAL | header)
+            curve, questions = tracks.curve_of_tracks(table.columns, header, table.lines, gas)
         else:
             columns = _with_temperature(table, header)
             fields = {quantity.column: quantity.field for quantity in QUANTITIES.values()}
@@ -195,7 +190,7 @@ def read_curve(
 def _columns_to_read(names: list[str]) -> list[str]:
     """Return the columns; raise ValueError if one is unknown, missing or repeated."""
     if "x" in names or "id" in names:
-        return track_columns(names)
+        return tracks.track_columns(names)
     if {"v", "eps"} <= {*names}:
         raise ValueError(
             f"the columns are {', '.join(names)}, those of a drop test: give it to read_drop_test, "
@@ -235,35 +230,28 @@ def _with_temperature(table: Table, header: dict[str, str]) -> dict[str, np.ndar
             f"{len(table.lines)} rows of numbers, at least {MIN_POINTS} are needed; measure the "
             "cooling at more times"
         )
-    columns, d = dict(table.columns), header_count(header, "dimension") or 3
+    columns, d, mass = dict(table.columns), files.header_count(header, "dimension") or 3, np.nan
     for name in TEMPERATURE_COLUMNS.keys() & columns.keys():
-        values, error, power = columns.pop(name), columns.pop(f"{name}_err", None), 1.0
+        values, error = columns.pop(name), columns.pop(f"{name}_err", None)
         if np.any(values <= 0):
             i = int(np.argmax(values <= 0))
             raise ValueError(
                 f"line {table.lines[i]}: {name} is {values[i]:g}, it must be a positive number; "
                 "correct or remove this row"
             )
-        if name == "mean_speed":
-            factor, words = (pi / 8, "pi/8") if d == 3 else (2 / pi, "2/pi")
-            T, power = factor * values**2, 2.0
-            header["T_from"] = f"T = ({words}) mean_speed^2, for Maxwellian velocities"
-        elif name == "energy":
+        if name == "energy":
             if not {"diameter", "density"} <= header.keys():
                 raise ValueError(
                     "a column energy needs the mass of a particle: add diameter and density to the "
                     "header, or give T = <v^2>/d itself"
                 )
-            size, density = (header_number(header, key) for key in ("diameter", "density"))
-            T = 2 * values / (d * float(sphere_mass(size, density)))
-            header["T_from"] = f"T = 2 energy / ({d} m), for energies in J per particle"
-        else:
-            T = values / (2 if name == "v2_xy" else 1)
-            what = "v2_xy / 2" if name == "v2_xy" else name
-            header["T_from"] = f"T = {what}, for isotropic velocities"
-        columns["T"] = T
+            size, density = (files.header_number(header, key) for key in ("diameter", "density"))
+            mass = float(sphere_mass(size, density))
+        power, temperature, words = TEMPERATURE_COLUMNS[name]
+        columns["T"] = temperature(values, d, mass)
+        header["T_from"] = f"T = {words}"
         if error is not None:
-            columns["T_err"] = power * T * error / values
+            columns["T_err"] = power * columns["T"] * error / values
     return columns
 
 
@@ -294,7 +282,7 @@ def read_gas(header: dict[str, str]) -> Gas:
     gas = _make_gas(header)
     quantities = {*BY_SYMBOL, *PRIOR_KEYS}
     numbers = [key for key in header if key in quantities and header[key] != GUESS]
-    for question in ask_about_header({key: header_number(header, key) for key in numbers}):
+    for question in ask_about_header({key: files.header_number(header, key) for key in numbers}):
         warnings.warn(question, stacklevel=2)
     known = dict.fromkeys((*REQUIRED, *BY_SYMBOL, *OPTIONAL_KEYS, *UNIT_KEYS))
     others = {*known, *PRIOR_KEYS, *PROVENANCE_KEYS, *UNSUPPORTED_KEYS}
@@ -326,18 +314,18 @@ def _gas_or_none(header: dict[str, str]) -> Gas | None:
 
 
 def _make_gas(header: dict[str, str]) -> Gas:
-    d = header_count(header, "dimension") or 3
+    d = files.header_count(header, "dimension") or 3
     if "eta" not in header and {"N", "container_side", "diameter"} <= header.keys():
-        size, side = (header_number(header, key) for key in ("diameter", "container_side"))
+        size, side = (files.header_number(header, key) for key in ("diameter", "container_side"))
         sphere = pi / 6 * size**3 if d == 3 else pi / 4 * size**2
-        header = header | {"eta": repr(header_number(header, "N") * sphere / side**d)}
+        header = header | {"eta": repr(files.header_number(header, "N") * sphere / side**d)}
     missing = [key for key in REQUIRED if key not in header]
     if missing:
         raise ValueError(
             f"the header lacks {', '.join(missing)}; add lines such as '# {missing[0]}: VALUE' "
             f"(needed: {', '.join(REQUIRED)}; in SI units, or with a unit behind the value)"
         )
-    values = {key: header_number(header, key) for key in REQUIRED}
+    values = {key: files.header_number(header, key) for key in REQUIRED}
     gas = Gas(
         Viscoelastic(values["Y"], values["nu"], 0.0),
         diameter=values["diameter"],
@@ -348,7 +336,7 @@ def _make_gas(header: dict[str, str]) -> Gas:
         **read_elements(header),
     )
     if gas.container is not None and "N" in header:
-        number, eta = header_number(header, "N"), float(gas.packing_fraction)
+        number, eta = files.header_number(header, "N"), float(gas.packing_fraction)
         ratio = container_volume_ratio(gas, number)
         if abs(ratio - 1) > VOLUME_TOLERANCE:
             raise ValueError(
@@ -376,41 +364,35 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
             that no model has: gravity, mixtures, rods, ellipsoids, cohesion and charges.
     """
     for key, (neutral, reason) in UNSUPPORTED_KEYS.items():
-        if key in header and (neutral is None or header_number(header, key) != neutral):
+        if key in header and (neutral is None or files.header_number(header, key) != neutral):
             advice = "" if neutral is None else f" or set it to {neutral:g}"
             raise ValueError(
                 f"the header gives {key}: {reason}. No model of jaxgran supports it; fit a curve "
                 f"of equal spheres without it, and leave {key} out{advice}"
             )
-    kinds = [kind for _, kind, _ in ELEMENTS]
-    symbols = {p.symbol for kind in kinds for p in fields_of(kind.__name__).values()}
-    values = {
-        key: GUESSES[key] if text == GUESS and key in GUESSES else header_number(header, key)
-        for key, text in header.items()
-        if key in symbols | {"wall_restitution"}
-    }
-    lasting, rough = "tangential_damping" in values, "beta_t" in values
+    lasting, rough = "tangential_damping" in header, "beta_t" in header
     if lasting and rough:
         raise ValueError(
             "the header gives both beta_t (instantaneous impacts) and tangential_damping (lasting "
             "contacts). Leave out beta_t for SoftSpheres(N), or tangential_damping for the other "
             "models"
         )
-    unused = Rough if lasting or ("friction" in values and not rough) else Frictional
+    unused = Rough if lasting or ("friction" in header and not rough) else Frictional
     elements = {}
     for name, kind, required in ELEMENTS:
         fields = {p.symbol: field for field, p in fields_of(kind.__name__).items()}
         fields |= {"wall_restitution": "restitution"} if kind is Walls else {}
-        given = [key for key in values if key in fields]
+        given = [key for key in header if key in fields]
         if not given or kind is unused:
             continue
-        if missing := [key for key in required if key not in values]:
+        if missing := [key for key in required if key not in header]:
             fitted = f", or the line '# {missing[0]}: guess' to fit it (--free {missing[0]})"
             raise ValueError(
                 f"the header gives {given[0]} without {missing[0]}; add {missing[0]}"
                 + (fitted if missing[0] in GUESSES else "")
             )
-        elements[name] = kind(**{fields[key]: values[key] for key in given})
+        values = header | {key: GUESSES[key] for key in GUESSES if header.get(key) == GUESS}
+        elements[name] = kind(**{fields[key]: files.header_number(values, key) for key in given})
     return elements
 
 
@@ -443,18 +425,17 @@ def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
         value_key = key.removesuffix("_err")
         if value_key not in header and value_key != "t0":
             raise ValueError(f"the header gives {key} without {value_key}; add the value itself")
-        error = header_number(header, key)
+        error = files.header_number(header, key)
         if error <= 0:
             raise ValueError(
                 f"header line {key}: must be a positive number, got {header[key]!r}; leave it out "
                 f"if {value_key} is known exactly"
             )
-        value = header_number({"t0": "0"} | header, value_key)
-        priors[name] = (value, error)
+        priors[name] = files.header_number({"t0": "0"} | header, value_key), error
     if "diameter" in priors and "density" not in priors:
         if "density" not in header:
             raise ValueError("the header gives diameter_err without density; add the density")
-        density = header_number(header, "density")
+        density = files.header_number(header, "density")
         priors["density"] = (density, EXACT_DENSITY_ERROR * density)
     return priors
 
@@ -508,7 +489,7 @@ def write_curve(
     >>> jaxgran.read_curve("all.npz")[1]["note"]
     'every array'
     """
-    path = checked_path(path, CSV_FILE)
+    path = files.checked_path(path, CSV_FILE)
     _check_header(header)
     check_bool(overwrite=overwrite)
     if not isinstance(curve, CoolingCurve):
@@ -518,7 +499,7 @@ def write_curve(
     if path.suffix == ARCHIVE_SUFFIX:
         arrays: dict[str, Any] = {name: np.asarray(x) for name, x in to_arrays(curve).items()}
         arrays[HEADER_ENTRY] = np.array(json.dumps(header))
-        return write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+        return files.write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
     fields = {q.column: getattr(curve, q.field) for q in QUANTITIES.values()}
     present = {name: np.asarray(v) for name, v in fields.items() if v is not None}
     lines = []
@@ -533,7 +514,7 @@ def write_curve(
     lines.append(",".join(present))
     lines += [",".join(f"{x:.17g}" for x in row) for row in zip(*present.values(), strict=True)]
     text = "\n".join(lines) + "\n"
-    write_atomically(path, lambda f: f.write(text.encode()))
+    files.write_atomically(path, lambda f: f.write(text.encode()))
 
 
 ARCHIVE_SUFFIX = ".npz"
@@ -647,8 +628,8 @@ def read_drops(path: str | Path, onto_plate: bool) -> tuple[DropTest, dict[str, 
             raise ValueError(f"the columns are {', '.join(names)}; name them {wanted}")
         return names
 
-    path = checked_path(path, f"a CSV file with the columns {wanted}")
-    with name_in_errors(path):
+    path = files.checked_path(path, f"a CSV file with the columns {wanted}")
+    with files.name_in_errors(path):
         header, columns, _ = read_table(path, wanted, columns_to_read)
         if not columns["v"].size:
             raise ValueError(f"no rows of numbers under {wanted}; add one row for each impact")

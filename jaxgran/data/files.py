@@ -3,11 +3,11 @@
 import errno
 import gzip
 import os
-import stat
-import tempfile
+import shutil
+import uuid
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -60,20 +60,18 @@ def write_atomically(path: str | Path, write: Callable[[Any], Any]) -> None:
     """
     path = Path(path)
     target = Path(os.path.realpath(path))
-    name = None
+    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex}")
     try:
-        with tempfile.NamedTemporaryFile(
-            dir=target.parent, prefix=f".{target.name}.", delete=False
-        ) as f:
-            name = f.name
-            write(f)
-            f.flush()
-            os.chmod(name, _permissions(target))
-            os.fsync(f.fileno())
-        os.replace(name, target)
+        with temporary.open("xb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        if target.exists():
+            shutil.copymode(target, temporary)
+        os.replace(temporary, target)
     except BaseException as error:
-        if name is not None:
-            Path(name).unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
         if not isinstance(error, OSError):
             raise
         raise OSError(
@@ -81,16 +79,6 @@ def write_atomically(path: str | Path, write: Callable[[Any], Any]) -> None:
             f"could not write ({error.strerror}); an existing file was not changed",
             str(path),
         ) from error
-
-
-def _permissions(path: Path) -> int:
-    """Return the permissions of a file, or those of a new one."""
-    try:
-        return stat.S_IMODE(path.stat().st_mode)
-    except OSError:
-        mask = os.umask(0)
-        os.umask(mask)
-        return 0o666 & ~mask
 
 
 def check_writable(path: str | Path) -> None:
@@ -116,7 +104,7 @@ MAX_COUNT = 10**12
 """Largest whole number in a header."""
 
 
-def header_number(header: dict[str, str], key: str) -> float:
+def header_number(header: Mapping[str, Any], key: str) -> float:
     """Return the value of a key in the header of a curve, as a number.
 
     Raises:

@@ -240,34 +240,23 @@ def _frame(
             is_equal = np.ptp(values) <= FLOAT32_TOLERANCE * np.max(np.abs(values))
         equal[name] = values
         different += [] if is_equal else [name]
-    is_periodic, still = all(periodic[:d]), not np.any(velocity[:, 2]) and np.any(velocity)
-    for wrong, message in (
-        (
-            different,
-            f"its particles differ in {', '.join(different)}, but gases of jaxgran consist of "
-            "equal spheres; give a file of one kind of particles",
-        ),
-        (
-            not all(np.all(np.isfinite(x)) for x in (position, velocity, sides)),
-            "some of its positions, velocities or sides are not finite numbers",
-        ),
-        (not np.all(sides > 0), f"its box has the sides {sides}, which must be positive"),
-        (
-            any(periodic[:d]) and not is_periodic,
-            "its box is periodic in some directions only; boxes of jaxgran are periodic, or have "
-            "walls, on all sides",
-        ),
-        (
-            not is_periodic and np.any((position < 0) | (position > sides)),
-            "some particles are outside of its box, which is not periodic",
-        ),
-        (
-            dimension is None and still and np.ptp(position[:, 2]) == 0,
-            "all its particles move in one plane: give dimension=2 for disks, or 3",
-        ),
-    ):
-        if wrong:
-            raise ValueError(message)
+    is_periodic, moving = all(periodic[:d]), np.any(velocity, axis=0)
+    finite = all(np.all(np.isfinite(x)) for x in (position, velocity, sides))
+    outside = np.any((position < 0) | (position > sides)) and not is_periodic
+    in_plane = d == 3 and any(moving) and not moving[2] and np.ptp(position[:, 2]) == 0
+    faults = {
+        f"its particles differ in {', '.join(different)}, but gases of jaxgran consist of equal "
+        "spheres; give a file of one kind of particles": different,
+        "some of its positions, velocities or sides are not finite numbers": not finite,
+        f"its box has the sides {sides}, which must be positive": np.any(sides <= 0),
+        "its box is periodic in some directions only; boxes of jaxgran are periodic, or have "
+        "walls, on all sides": any(periodic[:d]) and not is_periodic,
+        "some particles are outside of its box, which is not periodic": outside,
+        "all its particles move in one plane: give dimension=2 for disks, or 3": in_plane
+        and dimension is None,
+    }
+    if message := next((message for message, is_wrong in faults.items() if is_wrong), None):
+        raise ValueError(message)
     if is_periodic:
         position = np.mod(position, sides)
         position = np.where(position < sides, position, 0.0)  # rounding may give a side

@@ -25,6 +25,7 @@ UNIT_KEYS = {"length_unit": "m", "time_unit": "s", "speed_unit": "m/s"}
 """Header keys of units, and the units that they replace. speed_unit is also that of T, squared."""
 
 UNITS = {
+    **UNIT_KEYS,
     **{quantity.column: quantity.unit for quantity in QUANTITIES.values()},
     **{symbol: parameter.unit or "1" for symbol, parameter in BY_SYMBOL.items()},
     **dict.fromkeys(("x", "y", "z", "localisation_error", "box_side"), "m"),
@@ -51,7 +52,6 @@ _MARKS = (
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
-    (codecs.BOM_UTF8, "utf-8-sig"),
 )
 _BINARY = re.compile(r"[\x00-\x08\x0e-\x1f]")
 _NAME = re.compile(r"(?P<name>\w+)\s*(?:[(\[](?P<bracket>.*)[)\]]|/\s*(?P<slash>.+))?")
@@ -85,7 +85,7 @@ def read_text(path: Path, columns: str) -> str:
         OSError: if it cannot be read.
     """
     content = read_bytes(path)
-    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8")
+    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8-sig")
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:
@@ -138,7 +138,7 @@ def read_table(
         chosen = list(columns_to_read([name for name in bare_names if name]))
     except ValueError as error:
         raise ValueError(f"line {first}: {error}") from None
-    factors = [_factor_of(name, dict(told), units, "column") for name in bare_names]
+    factors = [_factor(name, dict(told), units, "column") for name in bare_names]
     at = [bare_names.index(name) for name in chosen]
     comma = _decimal_comma(rows, at, separator)
     values = []
@@ -244,9 +244,10 @@ def _base_unit(name: str) -> str | None:
 
 def _pop_units(header: dict[str, str]) -> dict[str, str]:
     """Remove the header keys of units; return the unit of numbers without one, by its SI unit."""
-    length, time, speed = (header.pop(key, unit) for key, unit in UNIT_KEYS.items())
-    for (key, base), unit in zip(UNIT_KEYS.items(), (length, time, speed), strict=True):
-        _factor(f"header line {key}", unit, base)
+    told = {key: header.pop(key, unit) for key, unit in UNIT_KEYS.items()}
+    for key in told:
+        _factor(key, told, {}, "header line")
+    length, time, speed = told.values()
     if speed == UNIT_KEYS["speed_unit"]:
         speed = f"{length}/{time}"
     return {
@@ -284,9 +285,10 @@ def _convert_header(header: dict[str, str], units: dict[str, str], comma: bool) 
     told = {key: unit.strip() for key, (_, _, unit) in parts.items()}
     converted = dict(header)
     for key, (number, _, unit) in parts.items():
-        number, is_known = _plain_number(number, comma), _base_unit(key) is not None
-        if _NUMBER.fullmatch(number) and "," not in number and (is_known or not unit):
-            factor = _factor_of(key, told, units, "header line") if is_known else 1.0
+        number = _plain_number(number, comma)
+        is_number = _NUMBER.fullmatch(number) and "," not in number
+        if is_number and (_base_unit(key) is not None or not unit):
+            factor = _factor(key, told, units, "header line")
             converted[key] = number if factor == 1 else repr(factor * float(number))
     return converted
 
@@ -303,7 +305,7 @@ def _name_and_unit(name: str) -> tuple[str, str]:
     return bare, match["bracket"] or match["slash"] or ""
 
 
-def _factor_of(name: str, told: dict[str, str], units: dict[str, str], kind: str) -> float:
+def _factor(name: str, told: dict[str, str], units: dict[str, str], kind: str) -> float:
     """Return the value in SI of the unit of a name.
 
     Args:
@@ -316,20 +318,17 @@ def _factor_of(name: str, told: dict[str, str], units: dict[str, str], kind: str
     if base is None:
         return 1.0
     unit = told[name] or told.get(name.removesuffix("_err")) or units.get(base, base)
-    return _factor(f"{kind} {name}", unit, base)
-
-
-def _factor(place: str, unit: str, base: str) -> float:
-    """Return the value of a unit in terms of an SI unit; `place` begins the message of an error."""
     if unit in (base, base.replace("m^2/s^2", "(m/s)^2")):
         return 1.0
-    advice = f"write a unit such as {base}, or leave it out"
-    if base == "m^2/s^2":
-        advice = "T is <v^2>/d, in m^2/s^2: convert it, or leave the unit out"
     try:
         return unit_in(unit, base)
     except Exception:  # pint raises errors of many types for text that is no unit
-        raise ValueError(f"{place}: {unit!r} is not known as a unit of {base}; {advice}") from None
+        advice = f"write a unit such as {base}, or leave it out"
+        if base == "m^2/s^2":
+            advice = "T is <v^2>/d, in m^2/s^2: convert it, or leave the unit out"
+        raise ValueError(
+            f"{kind} {name}: {unit!r} is not known as a unit of {base}; {advice}"
+        ) from None
 
 
 def unit_in(unit: str, base: str) -> float:

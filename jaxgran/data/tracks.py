@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from math import pi
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,6 @@ from jaxgran.data.files import header_count, header_number
 from jaxgran.data.particles import Frame, open_frames
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
-from jaxgran.scene.laws import ConstantRestitution
 
 COORDINATES = ("x", "y", "z")
 IDENTITIES = ("id", "particle")
@@ -88,20 +87,18 @@ class Step(NamedTuple):
         duration: s.
         ids: of the particles in both frames, increasing.
         displacement: m, shape (n, d), without those of wrong identities.
-        too_long: number of displacements left out as longer than the distribution allows.
-        folded: number of these that are usual but for the difference of the extreme positions.
-        swapped: number of further displacements left out, of exchanged identities.
-        spread: difference of the extreme positions, m, shape (d,).
+        left_out: numbers of displacements that are longer than the distribution allows, of those
+            among them that are usual but for the difference of the extreme positions, and of
+            further ones, of exchanged identities.
+        spread: largest difference of the extreme positions, m.
     """
 
     time: float
     duration: float
     ids: Int[np.ndarray, "n"]
     displacement: Float[np.ndarray, "n d"]
-    too_long: int = 0
-    folded: int = 0
-    swapped: int = 0
-    spread: Float[np.ndarray, "d"] = np.zeros(1)
+    left_out: tuple[int, int, int] = (0, 0, 0)
+    spread: float = 0.0
 
 
 def is_trajectory(path: Path) -> bool:
@@ -135,7 +132,7 @@ def curve_of_tracks(
     columns: Mapping[str, np.ndarray],
     header: dict[str, str],
     lines: list[int],
-    elements: dict[str, Any],
+    gas: Gas | None,
 ) -> tuple[CoolingCurve, list[str]]:
     """Return T(t) of particles whose positions are known in frames.
 
@@ -168,7 +165,7 @@ def curve_of_tracks(
         header: in SI; with ``frame_rate``, frames per second, for frames without times. It is
             changed: T_from says how T was computed, and the keys of tracks are removed.
         lines: line number of each row.
-        elements: those of the gas that the header describes, as arguments of `jaxgran.Gas`.
+        gas: a gas with the header's eta, diameter and elements, if the header gives these.
 
     Returns:
         The curve, and questions about its accuracy.
@@ -177,8 +174,7 @@ def curve_of_tracks(
         ValueError: for fewer than 3 particles or 4 frames, a particle twice in a frame, and
             positions that are wrapped into a box.
     """
-    steps = _steps(columns, header, lines)
-    left_out, questions = _wrong_identities(steps, header)
+    steps, notes, questions = _steps(columns, header, lines), [], []
     usable = [step for step in steps if len(step.ids) >= MIN_TRACKS]
     if len(usable) < MIN_POINTS:
         number = len(np.unique(columns["id" if "id" in columns else "particle"]))
@@ -188,21 +184,28 @@ def curve_of_tracks(
             "frames are needed to remove the drift and estimate errors"
         )
     n, d = max(len(step.ids) for step in usable), usable[0].displacement.shape[1]
-    factor, notes = _momentum_correction(n, d, header)
+    factor = _momentum_correction(n, d, header, notes)
     velocities = [step.displacement / step.duration for step in usable]
     T, error = np.transpose([_temperature_and_error(velocity) for velocity in velocities])
     difference, chance = _difference_from_median(T, velocities)
-    notes += [f"{100 * difference:+.2g} % from T by the median of the speeds", *left_out]
+    notes.append(f"{100 * difference:+.2g} % from T by the median of the speeds")
+    _ask_about_identities(steps, header, notes, questions)
     if abs(np.log1p(difference)) > 3 * chance + MAX_SONINE:
         questions.append(
             f"T by the mean square of the speeds is {100 * difference:+.2g} % from T by their "
             "median: identities may be wrong, or the gas may consist of unequal parts"
         )
     T, error = factor * T, factor * error
-    rate, fitted_notes, fitted_questions = _fit_memory(usable, T, header, elements)
-    notes, questions = notes + fitted_notes, questions + fitted_questions
+    rate = _fit_memory(usable, T, header, gas, notes, questions)
     duration = np.array([step.duration for step in usable])
-    shares = {}
+
+    def note_correction(note: str, share: float, words: str, advice: str) -> None:
+        percent = f"{100 * share:.2g} %"
+        notes.append(f"{note}, at most {percent} of T")
+        if share > MAX_CORRECTION:
+            words = words.format(percent)
+            questions.append(f"{words}, too much for an accurate correction: {advice}")
+
     if "localisation_error" in header:
         e = header_number(header, "localisation_error")
         added = 2 * (e / duration) ** 2
@@ -213,9 +216,8 @@ def curve_of_tracks(
                 f"localisation_error = {e:g} m; leave out this and later frames, or use frames "
                 "further apart"
             )
-        share = float(np.max(added / T))
-        shares["localisation_error adds up to {} to T", "leave out the last frames"] = share
-        notes.append(f"localisation_error removed, at most {100 * share:.2g} % of T")
+        words = "localisation_error adds up to {} to T", "leave out the last frames"
+        note_correction("localisation_error removed", np.max(added / T), *words)
         T = T - added
     else:
         notes.append("errors of positions not known (localisation_error)")
@@ -225,15 +227,8 @@ def curve_of_tracks(
     else:
         for _ in range(NUM_ITERATIONS):
             true = T / _displacement_factor(rate * duration * np.sqrt(true))
-        share = float(np.max(1 - T / true))
-        words = "impacts between frames take up to {} from T"
-        shares[words, "use frames closer together"] = share
-        notes.append(f"impacts between frames corrected, at most {100 * share:.2g} % of T")
-    questions += [
-        f"{words.format(f'{100 * share:.2g} %')}, too much for an accurate correction: {advice}"
-        for (words, advice), share in shares.items()
-        if share > MAX_CORRECTION
-    ]
+        words = "impacts between frames take up to {} from T", "use frames closer together"
+        note_correction("impacts between frames corrected", np.max(1 - T / true), *words)
     curve = CoolingCurve(
         times=jnp.asarray([step.time for step in usable]),
         temperature=jnp.asarray(true),
@@ -273,40 +268,33 @@ def _steps(
         )
     side = header_number(header, "box_side") if "box_side" in header else np.inf
     frames = np.split(order, np.flatnonzero(np.diff(t[order])) + 1)
-    steps = []
-    for before, after in zip(frames, frames[1:], strict=False):
-        shared, i, j = np.intersect1d(
-            ids[before], ids[after], assume_unique=True, return_indices=True
-        )
-        start, end = position[before[i]], position[after[j]]
-        if side < np.inf:
-            end = end - side * np.round((end - start) / side)
-        times = float(t[before[0]]), float(t[after[0]])
-        lost, new = np.delete(position[before], i, axis=0), np.delete(position[after], j, axis=0)
-        steps.append(_step(times, shared.astype(int), start, end, lost, new))
-    return steps
+    pairs = zip(frames, frames[1:], strict=False)
+    return [_step(before, after, ids, t, position, side) for before, after in pairs]
 
 
 def _step(
-    times: tuple[float, float],
+    before: np.ndarray,
+    after: np.ndarray,
     ids: np.ndarray,
-    start: np.ndarray,
-    end: np.ndarray,
-    lost: np.ndarray,
-    new: np.ndarray,
+    t: np.ndarray,
+    position: np.ndarray,
+    side: float,
 ) -> Step:
     """Return the displacements of particles without those of wrong identities.
 
     Args:
-        times: of the two frames, s.
-        ids: of the particles in both frames.
-        start: their positions in the first frame, m.
-        end: their positions in the second frame, m.
-        lost: positions of particles that are in the first frame only, m.
-        new: positions of particles that are in the second frame only, m.
+        before, after: rows of the two frames.
+        ids, t, position: columns.
+        side: of a box into which positions are wrapped, m; otherwise infinite.
     """
+    shared, i, j = np.intersect1d(ids[before], ids[after], assume_unique=True, return_indices=True)
+    start, end = position[before[i]], position[after[j]]
+    lost, new = np.delete(position[before], i, axis=0), np.delete(position[after], j, axis=0)
+    if side < np.inf:
+        end = end - side * np.round((end - start) / side)
+    first, last = float(t[before[0]]), float(t[after[0]])
+    step = Step((first + last) / 2, last - first, shared.astype(int), end - start)
     (n, d), chi2 = start.shape, scipy.stats.chi2
-    step = Step((times[0] + times[1]) / 2, times[1] - times[0], ids, end - start)
     drift = np.median(step.displacement, axis=0) if n else 0.0
     start = start + drift
     scale = np.median(np.sum((end - start) ** 2, axis=1)) / chi2.median(d) if n else 0.0
@@ -335,37 +323,35 @@ def _step(
                 other = scipy.spatial.KDTree(others).query(here)[0] ** 2 / scale
                 wrong |= own - other > MIN_GAIN
     return step._replace(
-        ids=ids[~wrong],
+        ids=step.ids[~wrong],
         displacement=step.displacement[~wrong],
-        too_long=int(np.sum(too_long)),
-        folded=int(np.sum(folded)),
-        swapped=int(np.sum(wrong & ~too_long)),
-        spread=spread,
+        left_out=(np.sum(too_long), np.sum(folded), np.sum(wrong & ~too_long)),
+        spread=np.max(spread),
     )
 
 
-def _wrong_identities(steps: list[Step], header: dict[str, str]) -> tuple[list[str], list[str]]:
-    """Return a note and a question on displacements that were left out; raise if wrapped."""
-    counts = [(step.too_long, step.folded, step.swapped, len(step.ids)) for step in steps]
+def _ask_about_identities(
+    steps: list[Step], header: dict[str, str], notes: list[str], questions: list[str]
+) -> None:
+    """Add a note and a question on displacements that were left out; raise if wrapped."""
+    counts = [(*step.left_out, len(step.ids)) for step in steps]
     too_long, folded, swapped, kept = np.sum(counts, axis=0, dtype=int, initial=0).tolist()
     if "box_side" not in header and 2 * folded > max(too_long, 4):
-        side = max(np.max(step.spread) for step in steps)
         raise ValueError(
             f"{folded} displacements are as long as the box: are the positions wrapped? Give its "
-            f"side, {side:.3g} m or slightly more, in the header as '# box_side: ...', or unwrap "
-            "them"
+            f"side, {max(step.spread for step in steps):.3g} m or slightly more, in the header as "
+            "'# box_side: ...', or unwrap them"
         )
     total = too_long + swapped + kept
     if not too_long + swapped:
-        return [], []
+        return
     words = f"{too_long + swapped} of {total} displacements left out as those of wrong identities"
-    if too_long <= 1 + MAX_TAIL * CHANCE * len(steps) and swapped <= MAX_SWAPPED * total:
-        return [words], []
-    question = (
-        f"{words}: {too_long} are longer than the distribution of speeds allows, and {swapped} "
-        "shorter if two particles exchange their identities; check the tracks"
-    )
-    return [words], [question]
+    notes.append(words)
+    if too_long > 1 + MAX_TAIL * CHANCE * len(steps) or swapped > MAX_SWAPPED * total:
+        questions.append(
+            f"{words}: {too_long} are longer than the distribution of speeds allows, and {swapped} "
+            "shorter if two particles exchange their identities; check the tracks"
+        )
 
 
 def _difference_from_median(T: np.ndarray, velocities: list[np.ndarray]) -> tuple[float, float]:
@@ -389,56 +375,51 @@ def _temperature_and_error(velocity: Float[np.ndarray, "n d"]) -> tuple[float, f
     return float(square.sum() / (d * (n - 1))), float(np.sqrt((n - 1) * np.var(left)))
 
 
-def _momentum_correction(n: int, d: int, header: dict[str, str]) -> tuple[float, list[str]]:
-    """Return (N - 1)/N, or 1 if N is unknown or walls change the momentum; and notes on both."""
+def _momentum_correction(n: int, d: int, header: dict[str, str], notes: list[str]) -> float:
+    """Return (N - 1)/N, or 1 if N is unknown or walls change the momentum; add notes on both."""
     dimension = header_count(header, "dimension") or 3
     if d > dimension:
         raise ValueError(
             f"a gas of dimension {dimension} has no tracks with {d} coordinates; correct the "
             "header or leave out z"
         )
-    projected = ["two of three coordinates, for isotropic velocities"] if d < dimension else []
     N = header_count(header, "N")
-    if N is None:
-        return 1.0, [f"drift of {n} particles removed", *projected]
-    if n > N:
+    if N is not None and n > N:
         raise ValueError(f"the header gives N = {N}, but {n} particles are tracked; correct N")
-    free = "container_side" not in header
-    return (N - 1) / N if free else 1.0, [f"drift of {n} of {N} particles removed", *projected]
+    notes.append(f"drift of {n}{'' if N is None else f' of {N}'} particles removed")
+    if d < dimension:
+        notes.append("two of three coordinates, for isotropic velocities")
+    return 1.0 if N is None or "container_side" in header else (N - 1) / N
 
 
 def _fit_memory(
-    steps: list[Step], T: np.ndarray, header: dict[str, str], elements: dict[str, Any]
-) -> tuple[float, list[str], list[str]]:
-    """Return nu_v/sqrt(T), 1/m, from the correlations of displacements; notes and questions.
+    steps: list[Step],
+    T: np.ndarray,
+    header: dict[str, str],
+    gas: Gas | None,
+    notes: list[str],
+    questions: list[str],
+) -> float:
+    """Return nu_v/sqrt(T), 1/m, from the correlations of displacements; add notes and questions.
 
     With the velocity autocorrelation ``exp(-nu_v t)`` and an error e of the positions
 
         <dx_k^2> = T f_k + 2 e^2,    <dx_k dx_l> = T h_k h_l exp(-nu_v gap) - e^2 (if they touch),
 
     where f and h are integrals over the intervals and gap is the time between these. Enskog's rate
-    of elastic spheres, if the header gives eta and diameter, is known with the error
-    `ENSKOG_ERROR`. An e that the header lacks and that is significant is added to the header.
+    of elastic spheres, if the gas is known, has the error `ENSKOG_ERROR`. An e that the header
+    lacks and that is significant is added to the header.
     """
     enskog = None
-    if {"eta", "diameter"} <= header.keys():
-        gas = Gas(
-            ConstantRestitution(1.0),
-            diameter=header_number(header, "diameter"),
-            mass=1.0,
-            packing_fraction=header_number(header, "eta"),
-            temperature=1.0,
-            dimension=header_count(header, "dimension") or 3,
-            **elements,
-        )
-        enskog = 2 / gas.dimension * float(gas.collision_frequency)
+    if gas is not None:
+        enskog = 2 / gas.dimension * float(gas.replace(temperature=1.0).collision_frequency)
     given = "localisation_error" in header
     e = header_number(header, "localisation_error") if given else 0.0
     if e < 0:
         raise ValueError(f"header line localisation_error: must be >= 0, got {e:g}")
     i, j, correlation, weight = _correlations(steps)
     if not (np.all(T > 0) and len(correlation)):
-        return enskog or 0.0, [], []
+        return enskog or 0.0
     time, duration = np.transpose([(step.time, step.duration) for step in steps])
     D = T * duration**2
     unit = float(np.median(D))
@@ -463,7 +444,6 @@ def _fit_memory(
         found = scipy.optimize.least_squares(residuals, start, bounds=bounds)
         return found.x, np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
 
-    notes, questions = [], []
     start = [prior or 0.1]
     found, error = fit(start)
     if not given:
@@ -472,16 +452,16 @@ def _fit_memory(
             found, error = both, errors
             e = float(np.sqrt(both[1] * unit))
             header["localisation_error"] = repr(e)
-            notes = [f"localisation_error not given, and estimated as {e:.2g} m"]
-            questions = [f"{notes[0]}; measure it and add it to the header"]
+            notes.append(f"localisation_error not given, and estimated as {e:.2g} m")
+            questions.append(f"{notes[-1]}; measure it and add it to the header")
     if prior is None and found[0] < MIN_SIGMAS * error[0]:
-        return 0.0, notes, questions
+        return 0.0
     if prior is not None and abs(found[0] / prior - 1) > MAX_RATE_ERROR:
         questions.append(
             f"velocities change {found[0] / prior:.2g} times as fast as impacts at this eta and "
             "diameter change them: check these and the tracks"
         )
-    return found[0] / unit**0.5, notes, questions
+    return found[0] / unit**0.5
 
 
 def _correlations(steps: list[Step]) -> tuple[np.ndarray, ...]:
@@ -546,10 +526,8 @@ def curve_of_trajectory(
             raise ValueError(f"frame {k}: {error}") from None
     if not rows:
         raise ValueError("it has no frames")
-    fields: Any = {
-        name: jnp.asarray([row[name] for row in rows if name in row]) for name in rows[0]
-    }
-    curve = CoolingCurve(**fields)
+    fields = {name: jnp.asarray([row[name] for row in rows if name in row]) for name in rows[0]}
+    curve = CoolingCurve(**fields)  # type: ignore[arg-type]
     curve.check("frame {}".format)
     if curve.times[0] == 0:
         header.setdefault("T0", repr(rows[0]["temperature"]))
@@ -596,15 +574,11 @@ def _time(k: int, frame: Frame, header: dict[str, str]) -> float:
 def _quantities(frame: Frame, header: dict[str, str]) -> dict[str, float]:
     """Return T and T_rot of a frame, and their errors, by the names of the fields of a curve."""
     velocity = frame.velocity - frame.velocity.mean(axis=0) * frame.periodic
-    values: dict[str, float] = {}
     energies = {"temperature": np.mean(velocity**2, axis=1)}
     if frame.spin is not None and "diameter" in header:
         inertia = header_number({"reduced_inertia": "0.4"} | header, "reduced_inertia")
         square = inertia * header_number(header, "diameter") ** 2 / 4
         energies["rotational_temperature"] = square * np.mean(frame.spin**2, axis=1)
-    for name, each in energies.items():
-        values |= {
-            name: float(np.mean(each)),
-            f"{name}_error": float(np.std(each, ddof=1) / len(each) ** 0.5),
-        }
-    return values
+    values = {name: float(np.mean(each)) for name, each in energies.items()}
+    scatter = {name: float(np.std(each, ddof=1)) for name, each in energies.items()}
+    return values | {f"{name}_error": x / len(velocity) ** 0.5 for name, x in scatter.items()}

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran._utils.formatting import TableRows, format_quantity, html_table, text_table
+from jaxgran._utils.formatting import format_quantity, text_table
 from jaxgran._utils.tracing import any_traced, array_module, as_jax_arrays, concrete_array
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.optimise import Problem, Trace
@@ -270,14 +270,7 @@ class Fit(eqx.Module):
         return {name: _deviations(part) for name, part in self.covariances.items()}
 
     def __repr__(self) -> str:
-        return text_table(*self._summary)
-
-    def _repr_html_(self) -> str:
-        return html_table(*self._summary)
-
-    @property
-    def _summary(self) -> tuple[str, TableRows]:
-        """Title and rows of a table of the estimates and the goodness of fit.
+        """Table of the estimates and the goodness of fit.
 
         The title is the headline of `jaxgran.diagnose`, which takes about a second: the first
         number is the one that readers copy, and the standard error alone is too small by factors
@@ -301,7 +294,7 @@ class Fit(eqx.Module):
         chi2 = f"{format_quantity(self.reduced_chi2)}, p = {format_quantity(self.p_value)}"
         trace = self.minima.trace
         converged = f"{self.converged}{f': {trace.reason}' if trace else ''}"
-        return title, [*rows, ("reduced chi^2", chi2), ("converged", converged)]
+        return text_table(title, [*rows, ("reduced chi^2", chi2), ("converged", converged)])
 
     def value(self, name: str) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return the estimate and the standard error of a parameter.

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils import status
-from jaxgran._utils.formatting import TableRows, html_table, text_table
+from jaxgran._utils.formatting import text_table
 from jaxgran._utils.tracing import grid_size, pad_to
 from jaxgran._utils.validation import POSITIVE, checked_float, checked_times, no_type_check
 from jaxgran.data.curve import CoolingCurve
@@ -70,14 +70,8 @@ class Choice(NamedTuple):
     error: float
 
     def __repr__(self) -> str:
-        return text_table(*self._words())
-
-    def _repr_html_(self) -> str:
-        return html_table(*self._words())
-
-    def _words(self) -> tuple[str, TableRows]:
         title = f"Choice: {self.model.name}, T within {100 * self.error:.2g} % by estimate"
-        return title, [(f"{i}.", reason) for i, reason in enumerate(self.reasons, start=1)]
+        return text_table(title, [(f"{i}.", x) for i, x in enumerate(self.reasons, start=1)])
 
 
 def default_models(num_particles: int, replicas: int = 1) -> tuple[AbstractModel, ...]:

@@ -153,17 +153,6 @@ def _rates(state, beta):
     return w, -2 * y * y * stress(y * y, w, beta), 2 * y
 
 
-# An impact is integrated until one of the next three functions of its state falls to 0.
-
-
-def _overlap_rate(state, beta):
-    return state[1]
-
-
-def _root_of_overlap(state, beta):
-    return state[0]
-
-
 def _scaled_stress(state, beta):
     # sqrt(xi) - sqrt(-beta w) has the same root as the stress xi + beta w, and always a simple one.
     y, w, _ = state
@@ -248,7 +237,7 @@ def impact(
     # Order of magnitude of the rebound speed; the absolute tolerance must be much smaller.
     smallest = (1 + jax.lax.stop_gradient(beta)) ** (-5 / 3 if clipped else -5)
     solve = partial(_integrate_to_zero, smallest=smallest, rtol=rtol, max_steps=max_steps)
-    y, _, half_time = solve(_overlap_rate, beta, (zero, one, zero))
-    separation = _scaled_stress if clipped else _root_of_overlap
+    y, _, half_time = solve(lambda state, beta: state[1], beta, (zero, one, zero))
+    separation = _scaled_stress if clipped else lambda state, beta: state[0]
     _, w, time = solve(separation, beta, (y, zero, half_time))
     return Impact(restitution=-w, duration=time, largest_overlap=y * y)

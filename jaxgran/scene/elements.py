@@ -21,6 +21,7 @@ from jaxgran.scene.parameters import ADVICE, Parameter, fields_of
 NUM_SPIN_COMPONENTS = {2: 1, 3: 3}
 """Number of components of the angular velocity, d_rot, by dimension."""
 
+
 if TYPE_CHECKING:
     UserWallLaw = RestitutionLaw | float
 else:
@@ -303,19 +304,16 @@ def check_elements(gas: Any) -> None:
                 "rotational_rate of the drag needs spheres that rotate, got a rate of "
                 f"{np.asarray(rate)} 1/s. Add surface=jaxgran.Rough(...), or leave it out."
             )
-    if gas.container is not None:
-        _check_walls(gas.container, gas.surface, gas.diameter, gas.dimension)
-
-
-def _check_walls(walls: Walls, surface: Any, diameter: Array, dimension: int) -> None:
-    """Raise ValueError for walls that do not suit the spheres of a gas."""
+    walls, surface, dimension = gas.container, gas.surface, gas.dimension
+    if walls is None:
+        return
     if np.ndim(walls.side) > 0 and np.shape(walls.side) != (dimension,):
         raise ValueError(
             f"side of the walls must be one number or {dimension} numbers, got shape "
             f"{np.shape(walls.side)}"
         )
     sides = Domain(low=2.1)
-    sides.check("side of the walls / diameter", walls.side / diameter, "Enlarge the box.")
+    sides.check("side of the walls / diameter", walls.side / gas.diameter, "Enlarge the box.")
     if walls.tangential_restitution is not None and not isinstance(surface, Rough):
         raise ValueError(
             "tangential_restitution of the walls needs rough spheres: add "

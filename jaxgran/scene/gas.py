@@ -1,9 +1,5 @@
-"""The scene: a homogeneous gas of equal spheres, and the physical scales that follow from it.
+"""The scene: a homogeneous gas of equal spheres, and the physical scales that follow from it."""
 
-`critical_length` is the length scale of the shear instability.
-"""
-
-from collections.abc import Iterator
 from math import gamma, pi
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxgran._utils.formatting import TableRows, format_quantity, html_table, text_table
+from jaxgran._utils.formatting import format_quantity, text_table
 from jaxgran._utils.validation import (
     ANY,
     POSITIVE,
@@ -25,29 +21,13 @@ from jaxgran._utils.validation import (
     float_array,
     number_named,
 )
-from jaxgran.scene import elements
+from jaxgran.scene import elements, laws
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
-from jaxgran.scene.elements import (
-    Frictional,
-    Rough,
-    StokesDrag,
-    Walls,
-    WhiteNoise,
-    optional_element,
-)
 from jaxgran.scene.geometry import (
     CLOSE_PACKING,
     contact_value,
     impact_average,
-    side_of_box,
     sphere_surface,
-)
-from jaxgran.scene.laws import (
-    ReducedLaw,
-    RestitutionLaw,
-    Viscoelastic,
-    check_reduced_units,
-    restitution_at,
 )
 from jaxgran.scene.parameters import ADVICE, FLOAT_UNITS, PREFIXES, domains_of, fields_of
 
@@ -66,7 +46,7 @@ class FloatField(NamedTuple):
 
 
 if TYPE_CHECKING:
-    UserLaw = RestitutionLaw
+    UserLaw = laws.RestitutionLaw
 else:
     # With `Any` a run-time type checker accepts all values; the converter reports wrong types.
     UserLaw = Any
@@ -75,12 +55,12 @@ else:
 _PACKING_DOMAINS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
 
 
-def _checked_law(law: UserLaw) -> RestitutionLaw:
-    if not isinstance(law, RestitutionLaw):
+def _checked_law(law: UserLaw) -> laws.RestitutionLaw:
+    if not isinstance(law, laws.RestitutionLaw):
         raise ValueError(f"law must be a restitution law such as jaxgran.Viscoelastic, got {law!r}")
     # Functions in a law, as those of a neural network, must not be leaves beside its arrays.
     law = jax.tree.map(_without_function_leaf, law)
-    check_reduced_units(law)
+    laws.check_reduced_units(law)
     return law
 
 
@@ -93,7 +73,7 @@ def _without_function_leaf(leaf: Any) -> Any:
     return jax.tree_util.Partial(leaf) if callable(leaf) else leaf
 
 
-def law_fields(law: RestitutionLaw) -> dict[str, FloatField]:
+def law_fields(law: laws.RestitutionLaw) -> dict[str, FloatField]:
     """Path and range of the floats of a law: those in its `domains`, then all further arrays.
 
     The name of an array in a part of the law is its path, "net.layers[0].weight".
@@ -106,6 +86,10 @@ def law_fields(law: RestitutionLaw) -> dict[str, FloatField]:
             path = [getattr(k, "name", item) for k, item in zip(keys, items, strict=True)]
             fields[name] = FloatField(tuple(path), ANY)
     return fields
+
+
+ELEMENTS = ("surface", "container", "drag", "drive")
+"""Fields of `Gas` that are elements."""
 
 
 class Gas(eqx.Module):
@@ -138,7 +122,7 @@ class Gas(eqx.Module):
     0.026
     """
 
-    law: RestitutionLaw = eqx.field(converter=_checked_law)
+    law: laws.RestitutionLaw = eqx.field(converter=_checked_law)
     diameter: Float[Array, ""] = eqx.field(converter=number_named("diameter"), kw_only=True)
     mass: Float[Array, ""] = eqx.field(converter=number_named("mass"), kw_only=True)
     packing_fraction: Float[Array, ""] = eqx.field(
@@ -146,10 +130,12 @@ class Gas(eqx.Module):
     )
     temperature: Float[Array, ""] = eqx.field(converter=number_named("temperature"), kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
-    surface: Rough | Frictional | None = optional_element(Rough, Frictional)
-    container: Walls | None = optional_element(Walls)
-    drag: StokesDrag | None = optional_element(StokesDrag)
-    drive: WhiteNoise | None = optional_element(WhiteNoise)
+    surface: elements.Rough | elements.Frictional | None = elements.optional_element(
+        elements.Rough, elements.Frictional
+    )
+    container: elements.Walls | None = elements.optional_element(elements.Walls)
+    drag: elements.StokesDrag | None = elements.optional_element(elements.StokesDrag)
+    drive: elements.WhiteNoise | None = elements.optional_element(elements.WhiteNoise)
 
     def __check_init__(self):
         if self.dimension not in CLOSE_PACKING or isinstance(self.dimension, bool | float):
@@ -167,12 +153,6 @@ class Gas(eqx.Module):
             check_not_subnormal(name, value)
         elements.check_elements(self)
 
-    def __repr__(self) -> str:
-        return text_table(*self._words)
-
-    def _repr_html_(self) -> str:
-        return html_table(*self._words)
-
     def __getattr__(self, name: str) -> Any:
         # Python calls this only for names that are not attributes, such as floats of parts.
         if not name.startswith("_") and "law" in vars(self) and name in self._float_fields:
@@ -185,8 +165,8 @@ class Gas(eqx.Module):
         return {name: field.domain for name, field in self._float_fields.items()}
 
     @property
-    def floats(self) -> dict[str, Float[Array, "..."]]:
-        """Value of every float, by name."""
+    def floats(self) -> dict[str, Any]:
+        """Value of every float, by name: arrays of JAX, in fits also of NumPy."""
         return {name: field.get(self) for name, field in self._float_fields.items()}
 
     def value(self, name: str) -> Float[Array, "..."]:
@@ -227,29 +207,20 @@ class Gas(eqx.Module):
         law = law_fields(self.law).items()
         fields = {name: FloatField(("law", *path), domain) for name, (path, domain) in law}
         fields |= {name: FloatField((name,), domain) for name, domain in gas_domains.items()}
-        for prefix, path, part in self._elements():
-            for name, domain in part.domains.items():
+        parts: list[tuple[Any, Any]] = [((name,), getattr(self, name)) for name in ELEMENTS]
+        if self.container is not None:
+            parts.insert(2, (("container", "restitution"), self.container.restitution))
+        for path, part in parts:
+            prefix = PREFIXES.get(type(getattr(self, path[0])).__name__, "")
+            for name, domain in ({} if part is None else part.domains).items():
                 fields[prefix + name] = FloatField((*path, name), domain)
         return fields
-
-    def _elements(self) -> Iterator[tuple[str, tuple[str, ...], Any]]:
-        """Yield for each element the prefix of its float names, its path and the element."""
-        if self.surface is not None:
-            yield "", ("surface",), self.surface
-        if self.container is not None:
-            yield PREFIXES["Walls"], ("container",), self.container
-            yield PREFIXES["Walls"], ("container", "restitution"), self.container.restitution
-        if self.drag is not None:
-            yield PREFIXES["StokesDrag"], ("drag",), self.drag
-        if self.drive is not None:
-            yield PREFIXES["WhiteNoise"], ("drive",), self.drive
 
     @property
     def elements(self) -> tuple[str, ...]:
         """Names of the elements of this gas; "friction" stands for a `Frictional` surface."""
-        names = ("surface", "container", "drag", "drive")
-        given = tuple(name for name in names if getattr(self, name) is not None)
-        return ("friction", *given[1:]) if isinstance(self.surface, Frictional) else given
+        given = tuple(name for name in ELEMENTS if getattr(self, name) is not None)
+        return ("friction", *given[1:]) if isinstance(self.surface, elements.Frictional) else given
 
     def check_single(self) -> None:
         """Check that this is one gas, not a batch of gases outside of `jax.vmap`.
@@ -271,21 +242,19 @@ class Gas(eqx.Module):
                     "`lists` of its class."
                 )
 
-    @property
-    def _words(self) -> tuple[str, TableRows]:
-        """Title and rows of a table: every float with its unit; of one untraced gas its scales."""
-        elements = "".join(f", with {name}" for name in self.elements)
-        title = f"Gas of {type(self.law).__name__} spheres, d = {self.dimension}{elements}"
+    def __repr__(self) -> str:
+        parts = "".join(f", with {name}" for name in self.elements)
+        title = f"Gas of {type(self.law).__name__} spheres, d = {self.dimension}{parts}"
         units = [(name, FLOAT_UNITS.get(name, "")) for name in self.domains]
         rows = [(name, format_quantity(self.value(name), unit)) for name, unit in units]
         leaves = jax.tree.leaves(self)
         if any(isinstance(leaf, Tracer) or np.ndim(leaf) > 0 for leaf in leaves):
-            return title, rows
+            return text_table(title, rows)
         rows.append(("mean free time", format_quantity(self.mean_free_time, "s")))
         if hasattr(self.law, "dissipative_constant"):
             rows.append(("beta", format_quantity(self.thermal_beta, "at v = sqrt(2 T_0)")))
             rows.append(("t_c/tau_c", format_quantity(self.contact_fraction)))
-        return title, rows
+        return text_table(title, rows)
 
     @property
     def number_density(self) -> Float[Array, ""]:
@@ -342,7 +311,7 @@ class Gas(eqx.Module):
         return 1 / self.collision_frequency
 
     @property
-    def reduced_law(self) -> ReducedLaw:
+    def reduced_law(self) -> laws.ReducedLaw:
         """The law of restitution in units of the diameter and of `impact_speed`."""
         return self.law.reduced(diameter=self.diameter, mass=self.mass, speed=self.impact_speed)
 
@@ -359,10 +328,10 @@ class Gas(eqx.Module):
             ValueError: for a speed that is not positive.
         """
         POSITIVE.check("normal_speed", normal_speed, "Give the normal approach speed in m/s.")
-        return restitution_at(self.law, self.diameter, self.mass, float_array(normal_speed))
+        return laws.restitution_at(self.law, self.diameter, self.mass, float_array(normal_speed))
 
-    def _viscoelastic(self, quantity: str) -> Viscoelastic:
-        if not isinstance(self.law, Viscoelastic):
+    def _viscoelastic(self, quantity: str) -> laws.Viscoelastic:
+        if not isinstance(self.law, laws.Viscoelastic):
             raise ValueError(
                 f"{quantity} belongs to the Viscoelastic law, but this gas has "
                 f"{type(self.law).__name__}. Make the gas with jaxgran.Viscoelastic."
@@ -422,16 +391,26 @@ class Gas(eqx.Module):
     def critical_box(self) -> Float[Array, ""]:
         """Critical length of the shear instability, ``L_c = 2 pi / k_c``, m, at t = 0.
 
+        The energy of a shear wave decays at the rate ``2 eta k^2/rho``, and the heat decays at the
+        cooling rate; the two rates are equal at k_c. It follows that
+        ``k_c sigma = n sigma^3 sqrt((32 pi/15) I f)`` (3D) or ``n sigma^2 sqrt(pi I f)`` (2D). Here
+        ``I = <1 - eps^2>`` is weighted by the energy of the normal motion, and the density factor
+        ``f = g_2^2/(1 + a_1 y + a_2 y^2)`` follows from Enskog's viscosity of elastic spheres in
+        the first Sonine approximation (see `SHEAR_VISCOSITY`).
+
         In a periodic box longer than L_c a flow grows relative to the thermal motion. Clusters form
         later, when the flow is strong enough to sweep the spheres together. In two-dimensional
         boxes of 8 to 10 L_c, T departs by 5 % from homogeneous cooling after 20 (phi = 0.245,
         eps = 0.9) and 5 (phi = 0.05, eps = 0.6) collisions per particle, and density fluctuations
         reach twice those of an elastic fluid after 55 and 7
         (``experiments/paper/paper_clustering.py``). In shorter boxes this happens later or never.
-        L_c is infinite for elastic spheres. See `jaxgran.scene.gas.critical_length`.
+        L_c is infinite for elastic spheres.
         """
-        reduced = critical_length(self.reduced_law, self.packing_fraction, self.dimension)
-        return self.diameter * reduced
+        loss = mean_loss(self.reduced_law, self.packing_fraction)
+        inelastic = loss > 0
+        wavenumber = scaled_critical_wavenumber(self.packing_fraction, self.dimension)
+        root = wavenumber * jnp.sqrt(jnp.where(inelastic, loss, 1.0))
+        return self.diameter * jnp.where(inelastic, 2 * pi / root, jnp.inf)
 
     def box_side(self, num_particles: int) -> Float[Array, ""]:
         """Side of the cube (of the square if d = 2) that contains N spheres of this gas, m.
@@ -443,7 +422,7 @@ class Gas(eqx.Module):
             ValueError: if N is not an integer >= 1.
         """
         num_particles = checked_int("num_particles", num_particles, 1)
-        return side_of_box(float_array(num_particles), self.number_density, self.dimension)
+        return (float_array(num_particles) / self.number_density) ** (1 / self.dimension)
 
 
 SHEAR_VISCOSITY = {2: (2.0, 1.0, 0.8729), 3: (4.0, 0.8, 0.7614)}
@@ -458,7 +437,7 @@ Reference: Gass 1971 (2D); Chapman & Cowling, Eq. 16.41.7 (3D).
 def scaled_critical_wavenumber(
     packing_fraction: Float[Array, ""], dimension: int
 ) -> Float[Array, ""]:
-    """Critical wavenumber ``k_c sigma/sqrt(I)``, with I = <1 - eps^2>; see `critical_length`."""
+    """Critical wavenumber ``k_c sigma/sqrt(I)``, with I = <1 - eps^2>; see `Gas.critical_box`."""
     g_2, phi = contact_value(packing_fraction, dimension), packing_fraction
     b, first, second = SHEAR_VISCOSITY[dimension]
     y = b * phi * g_2
@@ -467,7 +446,7 @@ def scaled_critical_wavenumber(
     return density * jnp.sqrt((32 * pi / 15 if dimension == 3 else pi) * dense)
 
 
-def mean_loss(law: ReducedLaw, like: Float[Array, ""]) -> Float[Array, ""]:
+def mean_loss(law: laws.ReducedLaw, like: Float[Array, ""]) -> Float[Array, ""]:
     """Mean loss ``I = <1 - eps^2>``, weighted by the energy of the normal motion.
 
     Args:
@@ -480,31 +459,3 @@ def mean_loss(law: ReducedLaw, like: Float[Array, ""]) -> Float[Array, ""]:
         return g**2 / 2 * loss * (2 - loss)
 
     return impact_average(weighted_loss, like)
-
-
-def critical_length(
-    law: ReducedLaw, packing_fraction: Float[Array, ""], dimension: int
-) -> Float[Array, ""]:
-    """Critical wavelength of the shear instability in diameters, ``L_c/sigma = 2 pi/(k_c sigma)``.
-
-    The energy of a shear wave decays at the rate ``2 eta k^2/rho``, and the heat decays at the
-    cooling rate; the two rates are equal at k_c. It follows that
-    ``k_c sigma = n sigma^3 sqrt((32 pi/15) I f)`` (3D) or ``n sigma^2 sqrt(pi I f)`` (2D). Here
-    ``I = <1 - eps^2>`` is weighted by the energy of the normal motion, and the density factor
-    ``f = g_2^2/(1 + a_1 y + a_2 y^2)`` follows from Enskog's viscosity of elastic spheres in the
-    first Sonine approximation (see `SHEAR_VISCOSITY`).
-
-    Args:
-        law: law of restitution with reference speed sqrt(2 T).
-        packing_fraction: phi.
-        dimension: d, 2 or 3.
-
-    Returns:
-        L_c/sigma; infinite for elastic spheres.
-    """
-    loss = mean_loss(law, packing_fraction)
-    inelastic = loss > 0
-    root = scaled_critical_wavenumber(packing_fraction, dimension) * jnp.sqrt(
-        jnp.where(inelastic, loss, 1.0)
-    )
-    return jnp.where(inelastic, 2 * pi / root, jnp.inf)

@@ -43,13 +43,6 @@ def sphere_mass(diameter: UserNumber, density: UserNumber) -> Float[Array, "..."
     return pi / 6 * float_array(density) * float_array(diameter) ** 3
 
 
-def side_of_box(
-    num_particles: Float[Array, ""], number_density: Float[Array, "..."], dimension: int
-) -> Float[Array, "..."]:
-    """Side of the cube (of the square if d = 2) that holds N particles at a number density."""
-    return (num_particles / number_density) ** (1 / dimension)
-
-
 def contact_value(packing_fraction: ArrayLike, dimension: int) -> Any:
     """Equilibrium pair correlation function at contact, ``g_2(sigma)``.
 
@@ -62,9 +55,9 @@ def contact_value(packing_fraction: ArrayLike, dimension: int) -> Any:
         dimension: d, 2 or 3.
 
     Returns:
-        g_2, same shape.
+        g_2, same shape; a float for a float, for which nothing is compiled.
     """
-    phi = packing_fraction
+    phi: Any = packing_fraction
     if dimension == 3:
         return (2 - phi) / (2 * (1 - phi) ** 3)
     return (1 - 7 * phi / 16) / (1 - phi) ** 2

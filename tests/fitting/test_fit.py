@@ -138,7 +138,7 @@ def test_a_fit_is_shown_by_its_estimates():
     title, *rows = repr(shown).splitlines()
     assert title == jaxgran.diagnose(shown).headline and "95 %" in title
     assert any(row.startswith("  if nothing else is there") for row in rows)
-    assert "converged" in shown._repr_html_()
+    assert "converged" in repr(shown)
 
 
 def test_T_rot_of_few_spheres_that_were_hit_fluctuates_more():
