@@ -26,7 +26,9 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas
-from jaxgran.theory.equations import softness_factor
+from jaxgran.scene.reduced import reduced_scene
+from jaxgran.theory.averages import impact_moments
+from jaxgran.theory.equations import element_rates, softness_factor
 
 NUM_PARTICLES = 4000
 """Particles of a particle model if the user gives no number."""
@@ -238,9 +240,22 @@ def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Arr
             "overlap": now.mean_overlap,
             "softness": 1 - factor,
             "critical_box": now.critical_box,
+            "impact_share": _impact_share(now, gas),
         }
 
     return jax.vmap(scales)(temperature)
+
+
+def _impact_share(now: Gas, first: Gas) -> Float[Array, ""]:
+    one, d = jnp.ones_like(now.temperature), now.dimension
+    if now.container is None and now.drag is None:
+        return one
+    scene, rough = reduced_scene(now), first.surface
+    ratio = 0.0 if rough is None else rough.rotational_temperature / first.temperature
+    impacts = 2 / d * impact_moments(scene.law, one, d)[0, 0]
+    alone = scene._replace(walls=None, drag=None, drive=None)
+    mine, rest = (element_rates(x, one, ratio, 0 * one, d).cooling for x in (alone, scene))
+    return (impacts + mine) / (impacts + rest)
 
 
 def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[str]:
