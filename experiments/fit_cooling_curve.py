@@ -15,19 +15,18 @@ JSON, and writes a picture and a JSON file.
 """
 
 import sys
-import time
 from pathlib import Path
 
 from jaxgran.cli.main import main as command
-
-started = time.perf_counter()
 
 DEFAULT_CURVE = Path(__file__).parent / "data" / "lammps_cooling_dilute.csv"
 
 
 def main() -> int:
     """Run `jaxgran fit` with the arguments of this script and a default curve."""
-    return command(["fit", *sys.argv[1:]], started=started, default_curve=DEFAULT_CURVE)
+    words = sys.argv[1:]
+    default = [] if any(Path(word).is_file() for word in words) else [str(DEFAULT_CURVE)]
+    return command(["fit", *default, *words])
 
 
 if __name__ == "__main__":

@@ -75,7 +75,14 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
             header["absent"] = " ".join((header.get("absent", ""), *options.absent))
         gas = gas_of(header, free)
         free = free or tuple(map(symbol_of, free_by_default(gas, data[label])))
-        gases[label], headers[label] = _with_A(gas, header, free), header
+        if "A" not in free:
+            if "A" not in header:
+                raise ValueError(
+                    f"--free {' '.join(free)} leaves A fixed, and the file does not give it. Add "
+                    "--set A=VALUE (in s), or free A too."
+                )
+            gas = gas.replace(dissipative_constant=header_number(header, "A"))
+        gases[label], headers[label] = gas, header
         if path in paths and "N" not in header and (unused := unused_rotation(gas, data[label])):
             warnings.warn(unused, stacklevel=2)
         for name, pair in jaxgran.read_priors(header).items():
@@ -267,18 +274,6 @@ def as_json(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [as_json(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _with_A(gas: Any, header: dict[str, str], free: Sequence[str]) -> Any:
-    """Return the gas with the header's A, if A is not free."""
-    if "A" in free:
-        return gas
-    if "A" in header:
-        return gas.replace(dissipative_constant=header_number(header, "A"))
-    raise ValueError(
-        f"--free {' '.join(free)} leaves A fixed, and the file does not give it. Add --set A=VALUE "
-        "(in s), or free A too."
-    )
 
 
 def _row(name: str, result: Any, diagnosis: Any, headers: dict[str, dict[str, str]]) -> dict:

@@ -15,14 +15,7 @@ import jax.numpy as jnp
 from cyclopts import App, CycloptsError, Parameter
 
 import jaxgran
-from jaxgran.cli.common import (
-    FitOptions,
-    ModelName,
-    WholeNumber,
-    check_tolerance,
-    models_by_name,
-    use_compilation_cache,
-)
+from jaxgran.cli import common
 from jaxgran.data.files import check_writable, header_count, header_number, name_in_errors
 from jaxgran.data.tables import header_in_si, read_text
 from jaxgran.models.choose import NUM_PARTICLES, default_models
@@ -31,30 +24,30 @@ NUM_POINTS = 50
 """Number of times of a curve that is computed for --until."""
 
 
-def main(
-    arguments: Sequence[str] | None = None,
-    *,
-    started: float | None = None,
-    default_curve: Path | None = None,
-) -> int:
+APP = App(
+    name="jaxgran",
+    help="Cooling granular gases: fit a measured curve, compute one, choose a model.",
+    default_parameter=Parameter(negative=()),
+    suppress_keyboard_interrupt=False,
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command. Invalid input gives one line on stderr and the exit code 2, Ctrl-C 130.
 
     Args:
         arguments: of the command line, by default those of this process.
-        started: start of the job on the clock `time.perf_counter`, for the seconds printed.
-        default_curve: the curve of `fit` if none is given.
 
     Returns:
         The exit code.
     """
-    app = _app(time.perf_counter() if started is None else started, default_curve)
     jax.config.update("jax_enable_x64", True)
     words = sys.argv[1:] if arguments is None else list(arguments)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = _print_warning
-            app(words, exit_on_error=False, print_error=False, result_action="return_value")
+            APP(words, exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -76,51 +69,39 @@ def _print_warning(message, category, filename, lineno, file=None, line=None) ->
     print(f"check: {message}", file=sys.stderr)
 
 
-def _app(started: float, default_curve: Path | None) -> App:
-    app = App(
-        name="jaxgran",
-        help="Cooling granular gases: fit a measured curve, compute one, choose a model.",
-        default_parameter=Parameter(negative=()),
-        suppress_keyboard_interrupt=False,
-    )
+@APP.command
+def fit(*curves: Path, options: common.FitOptions | None = None) -> None:
+    """Estimate the dissipative constant A from one measured cooling curve or several.
 
-    def fit(*curves: Path, options: FitOptions | None = None) -> None:
-        """Estimate the dissipative constant A from one measured cooling curve or several.
+    Prints a table and a line of JSON; writes a picture and a JSON file.
 
-        Prints a table and a line of JSON; writes a picture and a JSON file.
+    Args:
+        curves: CSV file: header lines `# key: value` (eta, diameter, density, Y, nu, T0; in SI or
+            with units), a line of column names, and rows t,T[,T_err]. Several files are fitted
+            jointly: they share the parameters of the material (A, Y, ...).
+    """
+    started = time.perf_counter()
+    options = common.FitOptions() if options is None else options
+    common.check_tolerance(options.tolerance)
+    if not options.no_cache:
+        common.use_compilation_cache()
+    from jaxgran.cli.fit import run_fit
 
-        Args:
-            curves: CSV file: header lines `# key: value` (eta, diameter, density, Y, nu, T0; in SI
-                or with units), a line of column names, and rows t,T[,T_err]. Several files are
-                fitted jointly: they share the parameters of the material (A, Y, ...).
-        """
-        options = FitOptions() if options is None else options
-        check_tolerance(options.tolerance)
-        if not options.no_cache:
-            use_compilation_cache()
-        from jaxgran.cli.fit import run_fit
-
-        if not (curves or options.drop_test) and default_curve is not None:
-            curves = (default_curve,)
-        if not (files := (*curves, *options.drop_test)):
-            raise ValueError("no curve is given. Name a file: jaxgran fit CURVE.csv.")
-        run_fit(curves, dataclasses.replace(options, curve=files[0]), started)
-
-    app.command(fit)
-    app.command(cool)
-    app.command(choose)
-    return app
+    if not (files := (*curves, *options.drop_test)):
+        raise ValueError("no curve is given. Name a file: jaxgran fit CURVE.csv.")
+    run_fit(curves, dataclasses.replace(options, curve=files[0]), started)
 
 
+@APP.command
 def cool(
     scene: Path,
     /,
     *,
     until: float | None = None,
-    model: ModelName = "kinetic-theory",
-    particles: WholeNumber | None = None,
-    replicas: WholeNumber = 1,
-    key: WholeNumber = 0,
+    model: common.ModelName = "kinetic-theory",
+    particles: common.WholeNumber | None = None,
+    replicas: common.WholeNumber = 1,
+    key: common.WholeNumber = 0,
     out: Path = Path("cooling.csv"),
     overwrite: bool = False,
     no_cache: bool = False,
@@ -141,7 +122,7 @@ def cool(
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
     if not no_cache:
-        use_compilation_cache()
+        common.use_compilation_cache()
     picture = out.with_suffix(".png")
     if picture == out:
         raise ValueError(f"--out {out} is the name of the picture. Give the CSV file another one.")
@@ -153,7 +134,7 @@ def cool(
     from jaxgran import plotting  # needs matplotlib, which `choose` does not need
 
     size = next(n for n in (particles, given.size, NUM_PARTICLES) if n is not None)
-    chosen = models_by_name(default_models(size, replicas))[model]
+    chosen = common.models_by_name(default_models(size, replicas))[model]
     curve = jaxgran.cool(given.gas, given.times, model=chosen, key=jax.random.key(key))
     header = given.header
     if chosen.stochastic:  # a later fit takes its error budget from them
@@ -166,6 +147,7 @@ def cool(
     print(f"written  {out}\n         {picture}")
 
 
+@APP.command
 def choose(
     scene: Path,
     /,
@@ -183,9 +165,9 @@ def choose(
         tolerance: Allowed relative error of T.
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
-    check_tolerance(tolerance)
+    common.check_tolerance(tolerance)
     if not no_cache:
-        use_compilation_cache()
+        common.use_compilation_cache()
     given = _read_scene(scene, until)
     choice = jaxgran.choose_model(given.gas, given.times, tolerance, given.size)
     for reason in choice.reasons:
