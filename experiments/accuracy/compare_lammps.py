@@ -1,6 +1,6 @@
 """Do soft spheres cool as in LAMMPS, with the same A and without fitted parameters?
 
-    python experiments/accuracy/compare_lammps.py [--replicas 4] [--smoke] [--record] [--out DIR]
+    python experiments/accuracy/compare_lammps.py [--smoke] [--record] [--out DIR]
 
 Simulates the gases of both LAMMPS curves. Finds the relative difference of T between soft spheres
 and LAMMPS at all times, with its standard error from the replicas of both, and the difference
@@ -17,7 +17,7 @@ from experiments.support.plots import INK, SOFT, THEORY, caption, panels
 from experiments.support.record import run_parts
 from experiments.support.scenes import cool, of_lammps
 
-STEPS_PER_CONTACT = 40
+SETTINGS = {"replicas": 4, "steps_per_contact": 40}
 
 
 def compare_lammps(options: argparse.Namespace) -> dict:
@@ -25,16 +25,14 @@ def compare_lammps(options: argparse.Namespace) -> dict:
     figure = panels(2, 2, title, (5, 3.2), sharex="col", height_ratios=[2, 1])
     columns = zip(("dilute", "dense"), figure.axes[:2], figure.axes[2:], strict=True)
     curves = {name: compare(name, options, *axes) for name, *axes in columns}
-    settings = {"replicas": options.replicas, "steps_per_contact": STEPS_PER_CONTACT}
-    return {"curves": curves, **settings, "picture": figure}
+    return {"curves": curves, **SETTINGS, "picture": figure}
 
 
 def compare(name: str, options: argparse.Namespace, top, bottom) -> dict:
     gas, measured, header = of_lammps(name)
     size, points = (200, 12) if options.smoke else (int(header["N"]), None)
     measured = jax.tree.map(lambda x: x[:points], measured)
-    settings = {"replicas": options.replicas, "steps_per_contact": STEPS_PER_CONTACT}
-    curve = cool(gas, measured.times, jaxgran.SoftSpheres(size, **settings))
+    curve = cool(gas, measured.times, jaxgran.SoftSpheres(size, **SETTINGS))
     theory = cool(gas, measured.times)
     t, lammps = np.asarray(measured.times), np.asarray(measured.temperature)
     miss, theory_miss = (np.asarray(each.temperature) / lammps - 1 for each in (curve, theory))
@@ -60,4 +58,4 @@ def compare(name: str, options: argparse.Namespace, top, bottom) -> dict:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"compare_lammps": compare_lammps}, replicas={"type": int, "default": 4})
+    run_parts(__doc__, {"compare_lammps": compare_lammps})

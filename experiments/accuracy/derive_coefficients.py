@@ -46,11 +46,7 @@ def samples(clipped: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_rational(
-    beta: np.ndarray,
-    target: np.ndarray,
-    slope: float,
-    powers_p: list[int],
-    powers_q: list[int],
+    beta: np.ndarray, target: np.ndarray, slope: float, powers_p: list[int], powers_q: list[int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the largest error, and the coefficients of P and Q without the constant ones."""
     z = np.sqrt(beta)[:, None]

@@ -70,9 +70,8 @@ class Slopes:
 
     def forward(self, model) -> tuple[np.ndarray, jaxgran.CoolingCurve]:
         """Return the derivatives in forward mode, and the curve."""
-        _, slopes, curve = jax.jvp(
-            lambda x: self.log_temperatures(x, model), (0.0,), (1.0,), has_aux=True
-        )
+        of = partial(self.log_temperatures, model=model)
+        _, slopes, curve = jax.jvp(of, (0.0,), (1.0,), has_aux=True)
         return np.asarray(slopes), curve
 
     def differences(self, model, seeds=(0,)) -> np.ndarray:
@@ -93,15 +92,8 @@ def soft_spheres(name: str, options: argparse.Namespace) -> dict:
     (phi, beta, contact, size, many, sets), few, most = SOFT_SPHERES[name], 4, 64
     collisions, intervals = COLLISIONS, INTERVALS
     if options.smoke:
-        collisions, intervals, size, many, sets, few, most = (
-            COLLISIONS[:2],
-            (0.03, 0.1),
-            50,
-            2,
-            1,
-            2,
-            4,
-        )
+        collisions, intervals = COLLISIONS[:2], INTERVALS[:2]
+        size, many, sets, few, most = 50, 2, 1, 2, 4
     gas = beads(phi, beta, contact)
     times = times_of(gas, collisions)
     if gas.box_side(size) > gas.critical_box:
@@ -128,9 +120,8 @@ def soft_spheres(name: str, options: argparse.Namespace) -> dict:
     models = {x: replace(model, replicas=few, projection=x) for x in intervals}
     by_interval = {x: mean_and_error(slopes.forward(own)[0]) for x, own in models.items()}
     # Reverse mode: the gradient of the mean ln T at the last time, compared with forward mode.
-    last = jax.grad(lambda x: jnp.mean(slopes.log_temperatures(x, models[intervals[1]])[0][:, -1]))(
-        0.0
-    )
+    model = models[intervals[1]]
+    last = jax.grad(lambda x: jnp.mean(slopes.log_temperatures(x, model)[0][:, -1]))(0.0)
     found = {
         "collisions": curve.collisions,
         "d_ln_T_d_ln_A": columns,

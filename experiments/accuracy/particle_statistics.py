@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 import jaxgran
 from experiments.support.analysis import mean_and_error
 from experiments.support.plots import INK, SOFT, THEORY, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import collected, run_parts
 from experiments.support.scenes import cool, glass, hard_beads
 from jaxgran import DSMC, HardSpheres
 from jaxgran.particles.dsmc.collisions import Scheme
@@ -74,9 +74,14 @@ def in_collisions(gas: jaxgran.Gas, first: float, last: float) -> np.ndarray:
 
 
 def sonine_coefficients(options: argparse.Namespace) -> dict:
-    size, replicas, states = (20_000, 4, []) if options.smoke else (100_000, 16, [])
+    states = collected(coefficients_of_states(options.smoke))
+    return {"states": states, "picture": draw_coefficients(states)}
+
+
+def coefficients_of_states(smoke: bool):
+    size, replicas = (20_000, 4) if smoke else (100_000, 16)
     for d in (3, 2):
-        for eps in (0.5, 1.0) if options.smoke else (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0):
+        for eps in (0.5, 1.0) if smoke else (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0):
             gas = hard_beads(0.01, eps, d)
             times = in_collisions(gas, 20.0, 60.0)
             theory = cool(gas, times, CHAOS)
@@ -88,9 +93,7 @@ def sonine_coefficients(options: argparse.Namespace) -> dict:
             unit = np.array([1.0, 1.0, float(D) / expected[2]])
             value, error = mean_and_error(numbers(each, each.saved) * unit)
             row = {"simulated": value, "off": expected * unit - value, "error": error}
-            states.append({"dimension": d, "eps": eps} | row)
-            print(states[-1], flush=True)
-    return {"states": states, "picture": draw_coefficients(states)}
+            yield {"dimension": d, "eps": eps} | row
 
 
 def numbers(curve: Any, a3: Any) -> np.ndarray:
@@ -102,19 +105,16 @@ def numbers(curve: Any, a3: Any) -> np.ndarray:
 def draw_coefficients(states: list[dict]) -> Figure:
     """Draw differences of theory in per cent."""
     figure = panels(2, size=(4.2, 3.6))
-    for axes, k, title in zip(
-        figure.axes, (0, 2), ("a₂ at constant ε", "D at constant ε"), strict=True
-    ):
+    shown = {"a₂ at constant ε": 0, "D at constant ε": 2}
+    for axes, (title, k) in zip(figure.axes, shown.items(), strict=True):
         for d, style, colour in ((3, "o-", THEORY), (2, "s--", SOFT)):
             some = [s for s in states if s["dimension"] == d]
             some = [s for s in some if k or (abs(s["simulated"][0]) > 0.01 and s["eps"] < 1)]
-            value, off, error = (
-                np.array([s[n][k] for s in some]) for n in ("simulated", "off", "error")
-            )
+            names = ("simulated", "off", "error")
+            value, off, error = (np.array([s[n][k] for s in some]) for n in names)
             scale, look = 100 / np.abs(value), {"fmt": style, "ms": 4, "color": colour}
-            axes.errorbar(
-                [s["eps"] for s in some], off * scale, error * scale, label=f"{d}D", **look
-            )
+            x = [s["eps"] for s in some]
+            axes.errorbar(x, off * scale, error * scale, label=f"{d}D", **look)
         axes.axhline(0, color=INK, lw=0.8)
         caption(axes, title, xlabel="ε", ylabel="theory − simulation (%)")
     return figure
@@ -177,11 +177,8 @@ def walls(smoke: bool):
         hard = cool(gas, times, HardSpheres(size, replicas=2 if smoke else max(2, 3200 // size)))
         dsmc = cool(gas, times, DSMC(1000 if smoke else 100_000))
         off = np.log(np.asarray(hard.temperature / dsmc.temperature))
-        yield {
-            "num_particles": size,
-            "off": off,
-            "error": hard.temperature_error / hard.temperature,
-        }
+        error = hard.temperature_error / hard.temperature
+        yield {"num_particles": size, "off": off, "error": error}
 
 
 def part(rows):

@@ -29,7 +29,7 @@ the true values. A simulation with tangents counts as one.
 
 import argparse
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ import optax
 import scipy.optimize
 
 import jaxgran
-from experiments.support.record import run_parts
+from experiments.support.record import collected, run_parts
 from experiments.support.scenes import cool, of_lammps
 
 PARAMETERS = ("dissipative_constant", "temperature")
@@ -90,12 +90,12 @@ def stochastic(options: argparse.Namespace) -> Problem:
 def soft_spheres(options: argparse.Namespace) -> Problem:
     gas, curve = dense()
     hottest = gas.replace(temperature=gas.temperature * np.exp(OFF[1] + REACH[1]))
-    model = jaxgran.SoftSpheres(1000, replicas=options.replicas, steps_per_contact=20)
+    model = jaxgran.SoftSpheres(1000, replicas=4, steps_per_contact=20)
     # One capacity for all parameters: nothing compiles again.
     return Problem(gas, curve, model.sized_for(hottest))
 
 
-def laws(smoke: bool) -> list[dict]:
+def laws(smoke: bool) -> Iterator[dict]:
     """Compare searches of laws with 1, 3, 10 and 30 parameters through hard spheres."""
     size, counts, most = (60, (1, 3), (4, 10)) if smoke else (1000, (1, 3, 10, 30), (60, 200))
     beads = jaxgran.Viscoelastic(5e7, 0.22, 5e-6)
@@ -106,7 +106,6 @@ def laws(smoke: bool) -> list[dict]:
     curve = jaxgran.CoolingCurve(times, made.temperature, temperature_error=made.temperature_error)
     measured = np.log(np.asarray(curve.temperature))
     sigma = 1.2 * np.asarray(curve.temperature_error / curve.temperature)  # and 1/8 of a run's
-    rows = []
     for count in counts:
         law, names = beads, ("dissipative_constant",)
         if count > 1:
@@ -132,16 +131,8 @@ def laws(smoke: bool) -> list[dict]:
 
         first = best + np.log(2.0)
         options = {"max_steps": most[0], "solver": optax.adam(0.1), "progress": False}
-        fitted = jaxgran.fit(
-            true,
-            curve,
-            model=model,
-            free=names,
-            start=at(first),
-            key=jax.random.key(KEY),
-            **options,
-        )
-        course = np.log(fitted.minima.trace.parameters)
+        options |= {"model": model, "free": names, "start": at(first), "key": jax.random.key(KEY)}
+        course = np.log(jaxgran.fit(true, curve, **options).minima.trace.parameters)
         guesses = {
             "jaxgran.fit, optax": [course[k // 2 : k + 1].mean(0) for k in range(len(course))]
         }
@@ -149,33 +140,40 @@ def laws(smoke: bool) -> list[dict]:
             guesses[name] = search(lambda x, f=residuals: f(x, model), first, most[1])
         for name, of_search in guesses.items():
             apart = [distance(guess) for guess in of_search]
-            outside = [k for k, x in enumerate(apart) if not x < 1.5]
-            last = outside[-1] + 1 if outside else 0
-            row = {
+            yield {
                 "search": name,
                 "parameters": count,
-                "simulations": last + 1 if last < len(apart) else None,
+                "simulations": needed([x < 1.5 for x in apart]),
                 "all_simulations": len(apart),
                 "distance": [apart[0], apart[-1]],
             }
-            rows.append(row)
-            print(row, flush=True)
-    return rows
+
+
+def needed(inside: list[bool]) -> int | None:
+    """Return the number of simulations after which a search stays inside; None for never."""
+    outside = [k for k, x in enumerate(inside) if not x]
+    first = outside[-1] + 1 if outside else 0
+    return first + 1 if first < len(inside) else None
+
+
+def recorded(function: Callable) -> tuple[Callable, list[np.ndarray]]:
+    """Return the function, and a list of its best point after each call."""
+    guesses, values = [], []
+
+    def chi2(point) -> float:
+        point = np.array(np.atleast_1d(point), float)
+        value = function(point)
+        guesses.append(point if not values or value < min(values) else guesses[-1])
+        values.append(value)
+        return value
+
+    return chi2, guesses
 
 
 def simplex(residuals: Callable, first: np.ndarray, most: int) -> list[np.ndarray]:
     """Return the best point of Nelder and Mead's search after each simulation."""
-    guesses, values = [], []
-
-    def chi2(flat: np.ndarray) -> float:
-        value = float(np.sum(residuals(flat) ** 2))
-        guesses.append(flat.copy() if not values or value < min(values) else guesses[-1])
-        values.append(value)
-        return value
-
-    start = np.vstack([first, first - 0.3 * np.eye(first.size)])
-    options = {"maxfev": most, "initial_simplex": start, "xatol": TOLERANCE, "fatol": 0.1}
-    scipy.optimize.minimize(chi2, first, method="Nelder-Mead", options=options)
+    chi2, guesses = recorded(lambda flat: float(np.sum(residuals(flat) ** 2)))
+    nelder_mead(chi2, first, None, most, -0.3 * np.ones(first.size))
     return guesses
 
 
@@ -198,18 +196,19 @@ PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
 
 
 def fit_head_to_head(options: argparse.Namespace) -> dict:
-    rows, of_laws = [], []
-    for scene in ["stochastic", "laws"] if options.smoke else options.scenes:
-        if scene == "laws":
-            of_laws = laws(options.smoke)
-            continue
-        problem = PROBLEMS[scene](options)
-        for count in (1, 2):
-            rows += compare(scene, problem, count, options.smoke)
-    return {"rows": rows, "laws": of_laws}
+    scenes = ["stochastic", "laws"] if options.smoke else options.scenes
+    problems = {scene: PROBLEMS[scene](options) for scene in scenes if scene != "laws"}
+    rows = (
+        row
+        for scene, problem in problems.items()
+        for count in (1, 2)
+        for row in compare(scene, problem, count, options.smoke)
+    )
+    of_laws = laws(options.smoke) if "laws" in scenes else ()
+    return {"rows": collected(rows), "laws": collected(of_laws)}
 
 
-def compare(scene: str, problem: Problem, count: int, smoke: bool) -> list[dict]:
+def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[dict]:
     # Measures the scatter of the replicas.
     warm, curve = problem.simulated(OFF[:count]), problem.curve
     scatter = np.asarray(warm.temperature_error / warm.temperature)[1:]
@@ -219,23 +218,17 @@ def compare(scene: str, problem: Problem, count: int, smoke: bool) -> list[dict]
     for name, search in WITHOUT.items():
         if count == 1 or search is not bounded:
             searches[name] = without(search, sigma)
-    rows = []
     for name, search in searches.items():
         guesses = search(problem, count, 3 if smoke else None)
-        outside = [k for k, guess in enumerate(guesses) if np.abs(guess).max() >= WITHIN]
-        first = outside[-1] + 1 if outside else 0  # from here on all guesses are within 2 %
-        row = {
+        yield {
             "scene": scene,
             "search": name,
             "free": PARAMETERS[:count],
-            "simulations": first + 1 if first < len(guesses) else None,
+            "simulations": needed([np.abs(guess).max() < WITHIN for guess in guesses]),
             "all_simulations": len(guesses),
             "last_error": np.exp(guesses[-1]) - 1,
             "guesses": np.exp(guesses),
         }
-        rows.append(row)
-        print(row, flush=True)
-    return rows
 
 
 def with_derivatives(problem: Problem, count: int, most: int | None) -> list[np.ndarray]:
@@ -263,18 +256,13 @@ def without(search: Callable, sigma: np.ndarray) -> Callable:
     """Return a function that runs a search by values of chi^2 only, as `with_derivatives`."""
 
     def run(problem: Problem, count: int, most: int | None) -> list[np.ndarray]:
-        guesses, values = [], []
         measured = np.log(np.asarray(problem.curve.temperature))[1:]
 
-        def chi2(point) -> float:
-            point = np.atleast_1d(np.asarray(point, float))
+        def misfit(point) -> float:
             computed = np.asarray(problem.simulated(point).temperature)
-            misfit = (measured - np.log(computed)[1:]) / sigma
-            value = float(misfit @ misfit)
-            guesses.append(point if not guesses or value < min(values) else guesses[-1])
-            values.append(value)
-            return value
+            return float(np.sum(((measured - np.log(computed)[1:]) / sigma) ** 2))
 
+        chi2, guesses = recorded(misfit)
         first, reach = OFF[:count], REACH[:count]
         bounds = list(zip(first - reach, first + reach, strict=True))
         search(chi2, first, bounds, most or MOST[count])
@@ -288,8 +276,8 @@ def bounded(chi2, first, bounds, most) -> None:
     scipy.optimize.minimize_scalar(chi2, bounds=bounds[0], method="bounded", options=options)
 
 
-def nelder_mead(chi2, first, bounds, most) -> None:
-    simplex = np.vstack([first, first + np.diag([0.3, 0.1][: len(first)])])
+def nelder_mead(chi2, first, bounds, most, steps=(0.3, 0.1)) -> None:
+    simplex = np.vstack([first, first + np.diag(steps[: len(first)])])
     options = {"xatol": TOLERANCE, "fatol": 0.1, "maxfev": most, "initial_simplex": simplex}
     scipy.optimize.minimize(chi2, first, method="Nelder-Mead", bounds=bounds, options=options)
 
@@ -308,9 +296,6 @@ WITHOUT = {
 
 
 if __name__ == "__main__":
-    run_parts(
-        __doc__,
-        {"fit_head_to_head": fit_head_to_head},
-        scenes={"nargs": "+", "choices": [*PROBLEMS, "laws"], "default": [*PROBLEMS, "laws"]},
-        replicas={"type": int, "default": 4, "help": "replicas of N = 1000 soft spheres"},
-    )
+    scenes = [*PROBLEMS, "laws"]
+    settings = {"nargs": "+", "choices": scenes, "default": scenes}
+    run_parts(__doc__, {"fit_head_to_head": fit_head_to_head}, scenes=settings)

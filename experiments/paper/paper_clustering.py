@@ -182,7 +182,7 @@ def analyse(runs: dict[str, dict], n_c: float) -> dict:
         found[law] |= {name: run[name].mean(axis=0) for name in names}
     one, other = (found[law]["departures"] for law in LAWS)
     return found | {
-        "viscoelastic_over_constant": {name: ratios(other[name], one[name]) for name in one},
+        "viscoelastic_over_constant": {name: ratios(other[name], one[name]) for name in one}
     }
 
 

@@ -38,15 +38,7 @@ from experiments.support.analysis import (
     slope,
 )
 from experiments.support.closed_forms import haff, paper_temperature
-from experiments.support.plots import (
-    CONSTANT,
-    ELASTIC,
-    GUIDE,
-    INK,
-    VISCOELASTIC,
-    caption,
-    panels,
-)
+from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
 from experiments.support.record import run_parts
 from experiments.support.scenes import beads, hard_beads, restitution_like
 from jaxgran._utils.validation import POSITIVE, Domain, float_array
@@ -149,12 +141,7 @@ def cooling(options: argparse.Namespace) -> dict:
     viscoelastic = beads(PACKING, config["beta"])
     e, delta = restitution_like(viscoelastic), float(viscoelastic.delta)
     gases = {
-        "viscoelastic": (
-            viscoelastic,
-            VISCOELASTIC,
-            -5 / 3,
-            f"viscoelastic, δ = {delta:.3f}",
-        ),
+        "viscoelastic": (viscoelastic, VISCOELASTIC, -5 / 3, f"viscoelastic, δ = {delta:.3f}"),
         "constant": (hard_beads(PACKING, e), CONSTANT, -2.0, f"constant ε = {e:.3f}"),
     }
     tau = np.geomspace(0.1, config["last_theory"], 133)

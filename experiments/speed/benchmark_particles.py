@@ -40,7 +40,7 @@ import numpy as np
 
 import jaxgran
 from experiments.support.lammps_library import granular_box, hertzian
-from experiments.support.record import run_parts, seconds
+from experiments.support.record import collected, run_parts, seconds
 from experiments.support.scenes import beads, cool, hard_beads, times_of
 
 PACKING, BETA = 0.1, 0.15
@@ -60,12 +60,8 @@ def soft_spheres(options: argparse.Namespace) -> dict:
     sizes, fractions, repeats = (1000, 4096, 32768), (0.01, 0.003), 3
     if options.smoke:
         sizes, fractions, repeats = (216,), (0.03,), 1
-    rows = []
-    for size in sizes:
-        for fraction in fractions:
-            rows.append(soft_row(size, fraction, repeats))
-            print(rows[-1], flush=True)
-    return {"rows": rows}
+    rows = (soft_row(size, fraction, repeats) for size in sizes for fraction in fractions)
+    return {"rows": collected(rows)}
 
 
 def soft_row(size: int, fraction: float, repeats: int) -> dict:
@@ -141,12 +137,8 @@ def lammps_worker(file: str) -> None:
 
 def hard_spheres(options: argparse.Namespace) -> dict:
     sizes, repeats = ((216,), 1) if options.smoke else ((1000, 4096, 16384, 50000), 7)
-    rows = []
-    for gas in (beads(PACKING, BETA, 0.01), hard_beads(0.2, 0.9, dimension=2)):
-        for size in sizes:
-            rows.append(hard_row(size, gas, repeats))
-            print(rows[-1], flush=True)
-    return {"rows": rows}
+    gases = beads(PACKING, BETA, 0.01), hard_beads(0.2, 0.9, dimension=2)
+    return {"rows": collected(hard_row(size, gas, repeats) for gas in gases for size in sizes)}
 
 
 def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:

@@ -1,8 +1,7 @@
 """What do two cores, two devices and a million particles bring and cost?
 
     python experiments/speed/benchmark_scale.py [--only replicas million] [--models hard-spheres
-        soft-spheres dsmc] [--size N] [--cases "two cores" clusters] [--smoke] [--record]
-        [--out DIR]
+        soft-spheres dsmc] [--smoke] [--record] [--out DIR]
 
 Every case runs in a separate process.
 
@@ -18,7 +17,7 @@ short runs, without compilation and set-up, from a disturbed lattice: the whole 
 on all cores, half of the gas on one core, and two replicas of half the gas on two CPU devices. In
 "clusters" the gas is equilibrated as hard disks and then simulated until the number of disks in
 cells of 20 varies twice as much as in an elastic fluid, which takes 7 to 10 collisions per disk.
-DSMC has no clusters. Models and cases that are not run keep their recorded rows. Each row contains
+DSMC has no clusters. Models that are not run keep their recorded rows. Each row contains
 its date and the load of the machine before the run.
 """
 
@@ -72,7 +71,7 @@ def apart(part: str, case: str, model: str, size: int, smoke: bool) -> dict:
 
 
 def replicas(options: argparse.Namespace) -> dict:
-    rows, size = [], 100 if options.smoke else options.size or 4096
+    rows, size = [], 100 if options.smoke else 4096
     for name in ["dsmc"] if options.smoke else options.models:
         row: dict = {"model": MODELS[name].__name__, "num_particles": size, "replicas": 2}
         row |= {x: apart("replicas", x, name, size, options.smoke) for x in REPLICAS}
@@ -83,14 +82,11 @@ def replicas(options: argparse.Namespace) -> dict:
 
 def million(options: argparse.Namespace) -> dict:
     known = figures("benchmark_million")["rows"] if options.record else []
-    rows, size = (
-        {row["model"]: row for row in known},
-        400 if options.smoke else options.size or 10**6,
-    )
+    rows, size = {row["model"]: row for row in known}, 400 if options.smoke else 10**6
     for model in ["hard-spheres"] if options.smoke else options.models:
         row = {"model": model, "size": size, "date": datetime.date.today().isoformat()}
         row["load"] = os.getloadavg()[0]
-        for case in options.cases or (*SCALING, CLUSTERS):
+        for case in (*SCALING, CLUSTERS):
             if case != CLUSTERS or model in UNTIL:
                 row[case] = apart("million", case, model, size, options.smoke)
         rows[model] = rows.get(model, {}) | row
@@ -222,11 +218,6 @@ if __name__ == "__main__":
         part, case, name, size, smoke = sys.argv[2:]
         print(json.dumps(measure(part, case, name, int(size), smoke == "1")))
     else:
-        run_parts(
-            __doc__,
-            {"replicas": replicas, "million": million},
-            "benchmark_",
-            models={"nargs": "+", "choices": list(MODELS), "default": list(MODELS)},
-            size={"type": int, "help": "particles (default: 4096 and a million)"},
-            cases={"nargs": "+", "choices": [*SCALING, CLUSTERS]},
-        )
+        models = {"nargs": "+", "choices": list(MODELS), "default": list(MODELS)}
+        parts = {"replicas": replicas, "million": million}
+        run_parts(__doc__, parts, "benchmark_", models=models)

@@ -16,7 +16,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -102,6 +102,15 @@ def rounded(found: Any) -> Any:
 
 def as_json(found: dict) -> str:
     return json.dumps(found, indent=1, default=lambda array: np.asarray(array).tolist()) + "\n"
+
+
+def collected(rows: Iterable[dict]) -> list[dict]:
+    """Return the rows, each of which is printed once it is there."""
+    found = []
+    for row in rows:
+        print(row, flush=True)
+        found.append(row)
+    return found
 
 
 def figures(name: str, default: Any = None) -> dict[str, Any]:

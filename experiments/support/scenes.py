@@ -1,5 +1,6 @@
 """Gases of several experiments, and their times."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -12,10 +13,7 @@ from jaxgran.data.files import header_number
 
 
 def beads(
-    packing_fraction: float,
-    beta: float,
-    contact_fraction: float | None = None,
-    dimension: int = 3,
+    packing_fraction: float, beta: float, contact_fraction: float | None = None, dimension: int = 3
 ) -> jaxgran.Gas:
     """Return viscoelastic beads of 2 mm with T = 0.01 m^2/s^2.
 
@@ -41,14 +39,8 @@ def beads(
 
 def hard_beads(packing_fraction: float, restitution: float, dimension: int = 3) -> jaxgran.Gas:
     """Return the beads of `beads`, with a constant coefficient of restitution."""
-    return jaxgran.Gas(
-        jaxgran.ConstantRestitution(restitution),
-        diameter=2e-3,
-        mass=jaxgran.sphere_mass(2e-3, 2500.0),
-        packing_fraction=packing_fraction,
-        temperature=0.01,
-        dimension=dimension,
-    )
+    gas = beads(packing_fraction, 0.1, dimension=dimension)
+    return dataclasses.replace(gas, law=jaxgran.ConstantRestitution(restitution))
 
 
 def glass(beta: float, packing_fraction: float = 0.05, dimension: int = 3) -> jaxgran.Gas:

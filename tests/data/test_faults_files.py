@@ -110,11 +110,7 @@ PARTICLES = {
     "walls": ("a.xyz", xyz(head='pbc="F F F"'), None),
     "walls in words": ("a.xyz", xyz(head='pbc="false false True"'), "in some directions only"),
     "walls elsewhere": ("a.xyz", xyz(head='pbc="F F F" Origin="1 0 0"'), "are outside of its box"),
-    "ASE's momenta": (
-        "a.xyz",
-        xyz(properties="species:S:1:pos:R:3:momenta:R:3"),
-        "not momenta",
-    ),
+    "ASE's momenta": ("a.xyz", xyz(properties="species:S:1:pos:R:3:momenta:R:3"), "not momenta"),
     "another suffix": ("a.extxyz", xyz(), None),
     "quoted properties": ("a.xyz", xyz(properties='"species:S:1:pos:R:3:velo:R:3"'), None),
     "compressed XYZ": ("a.xyz.gz", xyz(), None),
