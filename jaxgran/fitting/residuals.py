@@ -426,8 +426,8 @@ def _log_curve(
     linear = linearise(model, gas, distance[order], tolerance)
     values = {k: x[inverse] if x.ndim else x for k, x in linear.values.items()}
     firsts = {"temperature": gas.temperature} if around else {}
-    if around and "rotational_temperature" in gas.domains:
-        firsts["rotational_temperature"] = gas.value("rotational_temperature")
+    if around and gas.surface is not None:
+        firsts["rotational_temperature"] = gas.surface.rotational_temperature
     logs = {}
     for name, by_time in linear.by_time.items():
         value = values[name]
