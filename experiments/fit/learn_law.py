@@ -89,7 +89,8 @@ def judge(gas: jaxgran.Gas, result: jaxgran.Fit, speeds: Any = None) -> dict:
     """Compare a learnt law with the true one, read off A, and test two forms."""
     band = jaxgran.restitution_band(result, speeds)
     eps = np.asarray(gas.restitution(band.speeds))
-    beads = dataclasses.replace(gas, law=jaxgran.Viscoelastic(5e7, 0.22, 1e-6))
+    law = gas.law if isinstance(gas.law, jaxgran.Viscoelastic) else TRUTHS["viscoelastic"][0]
+    beads = dataclasses.replace(gas, law=law).replace(dissipative_constant=1e-6)
     constant = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
     chi2, p, fitted = band.compare(beads, "dissipative_constant")
     return {
