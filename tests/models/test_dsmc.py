@@ -1,5 +1,3 @@
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,44 +23,30 @@ def constant(eps, dimension=3) -> jaxgran.Gas:
     return hard_gas(eps, 0.1, dimension, diameter=2.0, temperature=3.0)
 
 
-TAUS = np.concatenate([[1.0, 10.0], np.arange(20.0, 101.0, 2.0)])
-
-
-def theory_and_dsmc(gas, n, **settings):
-    times = TAUS * float(gas.mean_free_time)
-    return tuple(jaxgran.cool(gas, times, model=m) for m in (THEORY, DSMC(n, **settings)))
-
-
-def compare_all_but_temperature(theory, curve, n, tolerance):
-    # D in the second Sonine order is within .5 %; another .5 % for the steps of early times.
-    excess = np.asarray(curve.displacement / theory.displacement - 1)
-    assert np.all(np.abs(excess) < 0.01 + 3 * MSD_SCATTER / n**0.5)
-    # a_2 forgets in some 2.5 mean free times: the mean over 80 errs by 1/4 of one value.
-    late = TAUS >= 20
-    a2, expected = np.mean(curve.sonine[late]), np.mean(theory.sonine[late])
-    # Theory's is within 3 %.
-    assert abs(a2 - expected) < 0.03 * abs(expected) + 3 * SONINE_SCATTER / n**0.5 / 4
-    # Collisions in the gas's own clock: as good as ln T.
-    assert np.all(np.abs(curve.collisions / theory.collisions - 1)[1:] < tolerance)
-
-
 @pytest.mark.parametrize(
     "beta, dimension", [(0.05, 3), pytest.param(0.15, 2, marks=pytest.mark.slow)]
 )
 def test_cools_and_spreads_as_kinetic_theory_says(beads, beta, dimension):
-    n = 10_000
-    theory, curve = theory_and_dsmc(beads(beta, dimension), n)
+    gas, n = beads(beta, dimension), 10_000
+    taus = np.concatenate([[1.0, 10.0], np.arange(20.0, 101.0, 2.0)])
+    times = taus * float(gas.mean_free_time)
+    theory, curve = (jaxgran.cool(gas, times, model=model) for model in (THEORY, DSMC(n)))
     tolerance = 0.002 + 3 * T_SCATTER / n**0.5
     assert np.all(np.abs(curve.temperature / theory.temperature - 1) < tolerance)
-    compare_all_but_temperature(theory, curve, n, tolerance)
+    # Collisions in the gas's own clock: as good as ln T.
+    assert np.all(np.abs(curve.collisions / theory.collisions - 1)[1:] < tolerance)
+    # D in the second Sonine order is within .5 %; another .5 % for the steps of early times.
+    excess = np.asarray(curve.displacement / theory.displacement - 1)
+    assert np.all(np.abs(excess) < 0.01 + 3 * MSD_SCATTER / n**0.5)
+    # a_2 forgets in some 2.5 mean free times: the mean over 80 errs by 1/4 of one value.
+    a2, expected = (np.mean(x.sonine[2:]) for x in (curve, theory))
+    # Theory's is within 3 %.
+    assert abs(a2 - expected) < 0.03 * abs(expected) + 3 * SONINE_SCATTER / n**0.5 / 4
 
 
-# Tables of stochastic simulation, with their errors.
-@pytest.mark.parametrize(
-    "eps, dimension, a2, error",
-    [(0.5, 3, 0.0476, 4e-4)],
-)
-def test_sonine_coefficient_of_constant_restitution(eps, dimension, a2, error):
+def test_sonine_coefficient_of_constant_restitution():
+    # a_2 and its error of a table of stochastic simulation.
+    eps, dimension, a2, error = 0.5, 3, 0.0476, 4e-4
     gas, n = constant(eps, dimension), 50_000
     cooling = (1 - eps**2) / dimension
     taus = np.arange(10.0, 50.0, 1.0)
@@ -93,7 +77,7 @@ def test_elastic_gas_keeps_its_energy_and_its_maxwellian():
     np.testing.assert_allclose(curve.collisions, [1, 10, 20], rtol=3 * 1.3 / n**0.5)
 
 
-@pytest.mark.parametrize("n", [2, 3, 64, 101, 1000])
+@pytest.mark.parametrize("n", [2, 64, 101])
 def test_every_pair_is_about_equally_likely(n):
     scheme = Scheme.of(3, n, 0.1)
 
@@ -102,10 +86,8 @@ def test_every_pair_is_about_equally_likely(n):
         one = jnp.stack([i, j])
         return jnp.concatenate([one, jnp.stack([i[: scheme.second], k])], axis=1)
 
-    draws = 4000 if n < 1000 else 20_000
-    i, j = np.moveaxis(
-        np.asarray(jax.vmap(drawn)(jax.random.split(jax.random.key(0), draws))), 1, 0
-    )
+    draws = jax.vmap(drawn)(jax.random.split(jax.random.key(0), 4000))
+    i, j = np.moveaxis(np.asarray(draws), 1, 0)
     for row_i, row_j in zip(i[:50], j[:50], strict=True):
         first = np.concatenate([row_i[: scheme.first], row_j])
         assert len(set(first)) == len(first)  # nobody twice, save the second pairs' first ones
@@ -113,7 +95,7 @@ def test_every_pair_is_about_equally_likely(n):
     np.add.at(pairs, (np.minimum(i, j), np.maximum(i, j)), 1)
     counts = pairs[np.triu_indices(n, 1)]
     assert counts.sum() == i.size
-    # Poisson counts: 5 standard deviations hold for the largest of half a million, and of few.
+    # Poisson counts: 6 standard deviations hold for the largest of thousands, and of few.
     mean = counts.mean()
     assert np.max(counts) < mean + 6 * mean**0.5 + 8 and np.min(counts) > mean - 6 * mean**0.5 - 1
     # What pairs scatter by beyond that: nothing for a prime N, else less than 20 %.
@@ -163,22 +145,19 @@ def test_cools_by_six_decades():
     assert np.all(np.abs(curve.temperature / theory.temperature - 1) < 0.02)
 
 
-NAMES = "dissipative_constant", "temperature", "packing_fraction"
-
-
-def logs(scale, gas, taus, model):
-    """Logarithms of T, <dr^2> and the collision count, of a gas with scaled floats."""
-    scaled = {name: gas.value(name) * jnp.exp(x) for name, x in zip(NAMES, scale, strict=True)}
-    times = jnp.asarray(taus) * gas.mean_free_time
-    curve = jaxgran.cool(gas.replace(**scaled), times, model=model)
-    return jnp.log(jnp.stack([curve.temperature, curve.displacement, curve.collisions]))
-
-
 @pytest.mark.slow
 def test_derivatives_are_those_of_kinetic_theory(beads):
-    gas, zero = beads(0.15), jnp.zeros(3)
+    gas, taus = beads(0.15), jnp.asarray(list(SENSITIVITY))
+
+    def logs(scales, model):
+        """Logarithms of T, <dr^2> and the collision count, of a gas with scaled floats."""
+        names = "dissipative_constant", "temperature", "packing_fraction"
+        scaled = {n: gas.value(n) * jnp.exp(x) for n, x in zip(names, scales, strict=True)}
+        curve = jaxgran.cool(gas.replace(**scaled), taus * gas.mean_free_time, model=model)
+        return jnp.log(jnp.stack([curve.temperature, curve.displacement, curve.collisions]))
+
     ours, theory = (
-        jax.jit(jax.jacfwd(lambda x, m=model: logs(x, gas, list(SENSITIVITY), m)))(zero)
+        jax.jit(jax.jacfwd(lambda x, model=model: logs(x, model)))(jnp.zeros(3))
         for model in (DSMC(20_000), THEORY)
     )
     # 1 % at N = 4e4; the clock's part is theory's, to a_2's noise.
@@ -206,10 +185,8 @@ def test_says_when_impacts_are_too_fast(beads, monkeypatch):
     "settings, message",
     [
         ({"num_particles": 1}, "num_particles must be a whole number >= 2, an int, got 1"),
-        ({"num_particles": 10.0}, "num_particles"),
         ({"num_particles": 10, "replicas": 0}, "replicas must be a whole number >= 1"),
-        ({"num_particles": 10, "step": 0.0}, r"step must lie in \(0, 0.1\]"),
-        ({"num_particles": 10, "step": 0.2}, "got 0.2"),
+        ({"num_particles": 10, "step": 0.2}, r"step must lie in \(0, 0.1\], got 0.2"),
         ({"num_particles": 10, "step": "fine"}, "got 'fine'"),
     ],
 )
@@ -225,19 +202,6 @@ def test_keeps_no_checkpoint_in_compiled_code():
 
     with pytest.raises(ValueError, match="DSMC cannot write a checkpoint.*Set checkpoint=None"):
         jax.jit(jax.grad(f))(0.6)
-
-
-def test_refuses_a_law_that_heats():
-    gas = dataclasses.replace(constant(0.9), law=jaxgran.RestitutionSeries([0.1], [0.2]))
-    with pytest.raises(ValueError, match="heat up"):
-        jaxgran.cool(gas, [1.0], model=DSMC(100))
-
-
-@pytest.mark.slow
-def test_few_particles():
-    gas, n = constant(0.9), 2
-    curve = jaxgran.cool(gas, [3 * float(gas.mean_free_time)], model=DSMC(n, replicas=20))
-    assert np.all(np.isfinite(curve.temperature)) and curve.temperature[0] < gas.temperature
 
 
 def test_each_of_a_few_particles_meets_the_others():

@@ -79,6 +79,7 @@ def test_derivatives_are_those_of_theory(kind):
         assert np.all(np.abs(found[k] - theory[k]) < allowed * largest + 0.01), name
 
 
+@pytest.mark.slow
 def test_what_is_not_known_is_nan():
     gas = scene("surface")
     times = jnp.array([0.5, 1.0]) * gas.mean_free_time

@@ -54,10 +54,13 @@ def serial(gas, start, end):
         just = pair
 
 
+LAW = jaxgran.Viscoelastic(5e7, 0.22, 1e-6)
+
+
 @pytest.mark.parametrize(
     "dimension, packing_fraction, law",
     [
-        (3, 0.02, jaxgran.Viscoelastic(5e7, 0.22, 1e-6)),
+        (3, 0.2, LAW),
         pytest.param(2, 0.6, 0.8, marks=pytest.mark.slow),
     ],
 )
@@ -90,23 +93,6 @@ def closest(particles) -> float:
     pairs = find_pairs(position, particles.box_side, 1.05, replicas=replicas, capacity=20 * n)
     apart = position[pairs.i] - position[pairs.j] - pairs.offset
     return float(np.min(np.linalg.norm(apart, axis=-1)[: int(pairs.count)]))
-
-
-@pytest.mark.slow
-def test_disks_stay_apart_and_the_ledger_closes():
-    gas = hard_gas(0.7, 0.6, 2)
-    start = None
-    for _ in range(2):
-        times = np.array([1.0, 5.0]) * float(gas.mean_free_time)
-        curve = jaxgran.cool(gas, times, model=HardSpheres(100, replicas=2, start=start))
-        assert closest(curve.particles) > 1 - 1e-9
-        before = 1.0 if start is None else np.mean(np.asarray(start.velocity) ** 2)
-        total = curve.temperature + curve.dissipated_energy
-        # Some hundred impacts, each with a round-off of 1e-16 of the energy.
-        np.testing.assert_allclose(total, before, rtol=1e-12)
-        momentum = np.mean(curve.particles.velocity, axis=1)
-        np.testing.assert_allclose(momentum, 0.0, atol=1e-13)
-        start = curve.particles
 
 
 @pytest.mark.slow
@@ -163,7 +149,7 @@ def test_a_dense_dissipative_cluster_does_not_stall():
 
 
 def test_a_fast_sphere_outruns_no_list():
-    gas = hard_gas(0.8, 0.3)
+    gas = hard_gas(LAW, 0.2)
     still = lattice(gas, 40)
     velocity = (1e-3 * still.velocity).at[0, 0, 0].set(10.0)
     start = still._replace(velocity=velocity)
@@ -246,11 +232,9 @@ def test_jit_flags_what_it_cannot_grow():
 def test_refuses_what_it_cannot_do():
     gas = hard_gas(0.8, 0.1)
     for settings, message in (
-        ({"num_particles": 1}, "num_particles must be a whole number >= 2"),
-        ({"num_particles": 10.0}, "num_particles"),
+        ({"num_particles": 10.0}, "num_particles must be a whole number >= 2"),
         ({"num_particles": 10, "replicas": 0}, "replicas"),
         ({"num_particles": 10, "contact_time": 1.0}, "contact_time must"),
-        ({"num_particles": 10, "contact_time": "short"}, "contact_time must"),
         ({"num_particles": 10, "neighbours": "best"}, "neighbours must be one of"),
     ):
         with pytest.raises(ValueError, match=message):

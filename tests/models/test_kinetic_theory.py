@@ -66,10 +66,9 @@ def test_sensitivity_table(beads, record):
     log_a = jnp.log(gas.value("dissipative_constant"))
     table = [-0.07813, -0.3193, -0.52054, -1.05837, -1.22284, -1.4631]
     # Asked: 1e-3. Reached: 5e-5, the last digit of the table.
-    for derivative in (jax.jacfwd, jax.jacrev):
-        found = derivative(log_temperature)(log_a)
-        np.testing.assert_allclose(found, table, rtol=1e-4)
-        record("derivative", error=float(np.max(np.abs(found / np.array(table) - 1))))
+    found = jax.jacfwd(log_temperature)(log_a)
+    np.testing.assert_allclose(found, table, rtol=1e-4)
+    record("derivative", error=float(np.max(np.abs(found / np.array(table) - 1))))
 
 
 def test_twelve_decades_of_cooling(beads):
@@ -160,26 +159,18 @@ def test_times_of_every_kind(beads):
     assert jaxgran.cool(gas, [0.0]).temperature[0] == gas.temperature
 
 
-def test_a_law_that_heats_is_refused():
-    hot = jaxgran.RestitutionSeries([0.1], [0.2])
-    gas = hard_gas(hot)
-    with pytest.raises(ValueError, match="makes this gas heat up"):
-        jaxgran.cool(gas, [1.0])
-
-
-def test_a_gas_as_soft_as_air_is_refused(beads):
+def test_what_is_refused(beads):
+    hot = hard_gas(jaxgran.RestitutionSeries([0.1], [0.2]))
+    for model in (KineticTheory(), jaxgran.DSMC(100)):
+        with pytest.raises(ValueError, match="makes this gas heat up"):
+            jaxgran.cool(hot, [1.0], model=model)
     gas = beads(0.1)
     gas = gas.replace(youngs_modulus=1e-9 * gas.value("youngs_modulus"))  # GPa taken for Pa
     with pytest.raises(ValueError, match="Check that youngs_modulus is in Pa"):
         jaxgran.cool(gas, [1.0])
     assert jaxgran.cool(gas, [1.0], model=KineticTheory(softness=False)).temperature[0] > 0
-
-
-def test_bad_options_are_refused():
     with pytest.raises(ValueError, match="order must be 2 or 3, got 4"):
         jaxgran.KineticTheory(order=4)
-    with pytest.raises(ValueError, match="gas must be a jaxgran.Gas, got float"):
-        jaxgran.cool(1.0, [1.0])  # pyright: ignore
 
 
 def test_another_number_of_times_compiles_nothing(beads, caplog):

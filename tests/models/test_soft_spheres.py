@@ -46,20 +46,6 @@ def test_follows_the_lammps_trajectory_particle_by_particle():
 
 
 @pytest.mark.slow
-def test_replicas_are_the_runs_they_stand_for():
-    gas = soft_beads(0.05, 0.2, packing_fraction=0.1)
-    tau = float(gas.mean_free_time)
-    both = lattice(gas, 64, replicas=2)
-    pair = jaxgran.cool(gas, [tau], model=SoftSpheres(64, replicas=2, start=both))
-    assert np.all(pair.temperature_error > 0)
-    for k in range(2):
-        start = jaxgran.Particles(both.position[k : k + 1], both.velocity[k : k + 1], both.box_side)
-        alone = jaxgran.cool(gas, [tau], model=SoftSpheres(64, start=start))
-        # Only the steps differ: they follow the hotter replica.
-        np.testing.assert_allclose(alone.temperature[0], pair.replicas.temperature[k], rtol=1e-3)
-
-
-@pytest.mark.slow
 def test_cools_as_kinetic_theory_with_softness_says():
     gas = soft_beads(0.02, 0.25, packing_fraction=0.04)
     n, replicas = 400, 3

@@ -38,6 +38,11 @@ def energy(gas, curve):
 
 
 FRICTIONAL_WALLS = {"tangential_damping": 0.8, "friction": 0.4}
+LAW = glass_beads().law
+
+
+def cooled(gas) -> jaxgran.CoolingCurve:
+    return jaxgran.cool(gas, [0.1], model=SoftSpheres(NUM))
 
 
 def with_all(num=NUM) -> jaxgran.Gas:
@@ -50,25 +55,6 @@ def with_all(num=NUM) -> jaxgran.Gas:
     return dataclasses.replace(gas, container=walls)
 
 
-@pytest.mark.slow
-def test_ledger_closes_and_all_stay_inside():
-    gas = with_all()
-    times = np.array([0.0, 1, 5, 20]) * float(gas.mean_free_time)
-    curve = jaxgran.cool(gas, times, model=SoftSpheres(NUM, steps_per_contact=30))
-    # As in the smooth gas: the onset of contacts leaves some 1e-4, falling as dt^(3/2).
-    np.testing.assert_allclose(energy(gas, curve), 1.0, atol=5e-4)
-    assert curve.temperature[-1] < 0.3 * gas.temperature
-    place, side = np.asarray(curve.particles.position), np.asarray(gas.container.side)
-    overlap = 0.05 * float(gas.diameter)  # elastic impacts at 5 sqrt(T) overlap by 4 %
-    edge = 0.5 * float(gas.diameter) - overlap
-    assert np.all(place > edge) and np.all(place < side - edge)
-    assert curve.displacement is None and curve.flow_share is None
-    np.testing.assert_allclose(curve.particles.box_side, side)
-    # Walls push: unlike in a periodic box the gas as a whole does not stay at rest.
-    momentum = np.abs(np.mean(curve.particles.velocity[0], axis=0))
-    assert np.max(momentum) > 1e-3 * np.sqrt(curve.temperature[-1])
-
-
 def two_spheres(gas, position, velocity, replicas=1):
     shape = replicas, 2, gas.dimension
     side = gas.box_side(2) if gas.container is None else gas.container.side
@@ -76,42 +62,94 @@ def two_spheres(gas, position, velocity, replicas=1):
     return jaxgran.Particles(place, speed, jnp.asarray(side))
 
 
+def after(gas, position, velocity, end):
+    """The curve of two spheres at 0 and at the end."""
+    start = two_spheres(gas, position, velocity)
+    return jaxgran.cool(gas, [0.0, end], model=SoftSpheres(2, start=start, steps_per_contact=100))
+
+
+def between_walls(fraction, beta, law, friction=0.0, tangential_damping=0.0) -> jaxgran.Gas:
+    """Two spheres without friction between walls of a law that may have some."""
+    surface = jaxgran.Frictional(0.0, 0.0, inertia=0.5)
+    gas = soft(fraction, beta, num=2, law=law, surface=surface)
+    walls = {"friction": friction, "tangential_damping": tangential_damping}
+    return dataclasses.replace(gas, container=dataclasses.replace(gas.container, **walls))
+
+
 def test_impact_on_a_wall_has_the_restitution_of_its_law():
     # Another material than that of the spheres, at the corner: three walls at once.
     law = jaxgran.Viscoelastic(2e9, 0.3, 4e-6)
-    gas = soft(1e-3, 0.0, num=2, law=law)
+    gas = between_walls(1e-3, 0.0, law)
     side, sigma = float(gas.container.side), float(gas.diameter)
     velocity = np.array([[0.3, -0.1, 0.2], [0.0, 0.0, 0.0]])
     gap = np.array([1e-4, 2e-4, 3e-4])
     corner = np.array([side - sigma / 2, sigma / 2, side - sigma / 2]) - np.sign(velocity[0]) * gap
-    opposite = side - corner
-    start = two_spheres(gas, np.array([corner, opposite]), velocity)
-    model = SoftSpheres(2, start=start, steps_per_contact=100)
-    curve = jaxgran.cool(gas, [0.006], model=model)
-    after = np.asarray(curve.particles.velocity[0, 0])
+    curve = after(gas, np.array([corner, side - corner]), velocity, 0.006)
+    final = np.asarray(curve.particles.velocity[0, 0])
     expected = law.on_wall(diameter=gas.diameter, mass=gas.mass, speed=1.0)
     eps = np.asarray(expected.restitution(jnp.abs(velocity[0])))
     # At 100 steps of a contact at the mean speed, here 1/2 to 1 times as long: 1e-4 by the onset.
-    np.testing.assert_allclose(-after / velocity[0], eps, atol=5e-4)
+    np.testing.assert_allclose(-final / velocity[0], eps, atol=5e-4)
     assert np.all(eps < 0.99)
     np.testing.assert_array_equal(curve.particles.velocity[0, 1], 0.0)
     assert float(curve.collisions[-1]) == 0.0
 
 
+def test_a_wall_on_which_a_sphere_slides_obeys_coulomb():
+    # The other sphere is at rest in the middle.
+    mu = 0.05
+    gas = between_walls(1e-5, 0.15, "own", friction=mu, tangential_damping=1e4)
+    side, sigma = float(gas.container.side), float(gas.diameter)
+    velocity = np.array([[0.2, 0.0, 0.15], [0.0, 0.0, 0.0]])
+    first = np.array([side - sigma / 2, 0.25 * side, 0.5 * side]) - 5e-5 * velocity[0]
+    curve = after(gas, [first, [0.3 * side, 0.75 * side, 0.5 * side]], velocity, 2e-4)
+    impulse = np.asarray(curve.particles.velocity[0, 0]) - velocity[0]
+    assert impulse[2] / impulse[0] == pytest.approx(mu, rel=1e-9)
+    assert impulse[1] == 0.0 and impulse[0] < -0.2
+    # The torque of the same force: I w = l n x F, with l = sigma/2 less the overlap, 2e-5 of it.
+    spin = np.asarray(curve.particles.angular_velocity[0, 0]) * sigma / 2
+    spin_expected = [0.0, -impulse[2] / gas.value("inertia"), 0.0]
+    np.testing.assert_allclose(spin, spin_expected, rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(energy(gas, curve), 1.0, atol=2e-5)
+
+
+def dragged(drag_rate=0.0, damping=0.0, friction=0.0) -> jaxgran.Gas:
+    """Two stiff spheres with friction, in a gas that drags."""
+    surface = jaxgran.Frictional(damping, friction, inertia=0.5)
+    return soft(1e-5, num=2, surface=surface, drag=jaxgran.StokesDrag(drag_rate))
+
+
 def test_flight_with_drag_is_exact():
-    rate = 3.0
-    gas = soft(1e-3, num=2, drag=jaxgran.StokesDrag(rate))
+    rate, time = 3e3, 2e-4
+    gas = dragged(rate)
     side = float(gas.box_side(2))
-    velocity = np.array([[0.01, 0.02, 0.0], [0.01, 0.02, 0.0]])  # side by side: they never meet
+    velocity = np.array([[0.1, 0.2, 0.0], [0.1, 0.2, 0.0]])  # side by side: they never meet
     place = np.array([[0.25 * side] * 3, [0.75 * side] * 3])
-    times = np.array([0.01, 0.1, 0.3])
-    model = SoftSpheres(2, start=two_spheres(gas, place, velocity))
-    end = jaxgran.cool(gas, times, model=model).particles
-    fraction = (1 - np.exp(-rate * times[-1])) / rate
+    end = after(gas, place, velocity, time).particles
     # Sums of some 1e3 blocks round to 1e-13.
-    np.testing.assert_allclose(end.velocity[0], velocity * np.exp(-rate * times[-1]), rtol=1e-11)
-    apart = end.position[0] - place - velocity * fraction
+    np.testing.assert_allclose(end.velocity[0], velocity * np.exp(-rate * time), rtol=1e-11)
+    apart = end.position[0] - place + velocity * np.expm1(-rate * time) / rate
     np.testing.assert_allclose(apart - side * np.round(apart / side), 0.0, atol=1e-12 * side)
+
+
+def test_sliding_impact_obeys_coulomb_and_conserves_momentum():
+    # So slippery that it slides to the end: the tangential impulse is mu times the normal one.
+    mu = 0.05
+    gas = dragged(damping=1e4, friction=mu)  # so stiff that the normal does not turn
+    side, sigma = float(gas.box_side(2)), float(gas.diameter)
+    normal = np.array([np.cos(0.6), np.sin(0.6), 0.0])
+    velocity = np.array([[0.2, 0.0, 0.05], [0.0, 0.0, 0.0]])
+    contact = side / 2 + np.array([-normal, normal]) * sigma / 2
+    curve = after(gas, contact - 5e-5 * velocity, velocity, 2e-4)  # they meet after 50 us
+    assert float(curve.collisions[-1]) == 1.0
+    final = np.asarray(curve.particles.velocity[0])
+    np.testing.assert_allclose(final.sum(0), velocity.sum(0), atol=1e-14)
+    impulse = final[0] - velocity[0]
+    along = impulse @ normal
+    sideways = np.linalg.norm(impulse - along * normal)
+    # The normal turns by 2e-5 during the contact.
+    assert sideways / abs(along) == pytest.approx(mu, rel=1e-3)
+    np.testing.assert_allclose(energy(gas, curve), 1.0, atol=2e-5)  # the onset at 100 steps
 
 
 @pytest.mark.parametrize("z", [0.0, 1e-9, 0.99 * SERIES_LIMIT, 1.01 * SERIES_LIMIT, 2.0])
@@ -122,57 +160,6 @@ def test_shortened_duration_and_its_derivative(z):
     derivative = small if z < 0.1 else 4 * (np.exp(-z) * (1 + z) - 1) / z**2
     assert float(value) == pytest.approx(exact, rel=1e-14)
     assert float(slope) == pytest.approx(derivative, rel=1e-9)
-
-
-def oblique(surface, **settings):
-    """Two spheres that meet obliquely, with what they had and what they have after the impact."""
-    gas = soft(1e-5, num=2, surface=surface)  # so stiff that the normal does not turn
-    side, sigma = float(gas.box_side(2)), float(gas.diameter)
-    angle = 0.6
-    normal = np.array([np.cos(angle), np.sin(angle), 0.0])
-    velocity = np.array([[0.2, 0.0, 0.05], [0.0, 0.0, 0.0]])  # they meet after 50 us
-    place = (
-        side / 2 + np.array([-normal, normal]) * sigma / 2 - 5e-5 * velocity
-    )  # they meet in 50 us
-    start = two_spheres(gas, place, velocity)
-    model = SoftSpheres(2, start=start, steps_per_contact=100, **settings)
-    curve = jaxgran.cool(gas, [0.0, 2e-4], model=model)
-    assert float(curve.collisions[-1]) == 1.0
-    return gas, curve, normal, velocity
-
-
-def test_sliding_impact_obeys_coulomb_and_conserves_momentum():
-    # So slippery that it slides to the end: the tangential impulse is mu times the normal one.
-    mu = 0.05
-    gas, curve, normal, velocity = oblique(jaxgran.Frictional(1e4, mu, inertia=0.5))
-    after = np.asarray(curve.particles.velocity[0])
-    impulse = after[0] - velocity[0]
-    np.testing.assert_allclose(after.sum(0), velocity.sum(0), atol=1e-14)
-    along = impulse @ normal
-    sideways = np.linalg.norm(impulse - along * normal)
-    # The normal turns by 2e-5 during the contact.
-    assert sideways / abs(along) == pytest.approx(mu, rel=1e-3)
-    np.testing.assert_allclose(energy(gas, curve), 1.0, atol=2e-5)  # the onset at 100 steps
-
-
-def test_a_wall_on_which_a_sphere_slides_obeys_coulomb():
-    # As above, on a wall alone; the other sphere is at rest in the middle.
-    mu, q = 0.05, 0.5
-    gas = soft(1e-5, num=2, law="own", surface=jaxgran.Frictional(0.0, 0.0, inertia=q))
-    walls = dataclasses.replace(gas.container, tangential_damping=1e4, friction=mu)
-    gas = dataclasses.replace(gas, container=walls)
-    side, sigma = float(walls.side), float(gas.diameter)
-    velocity = np.array([[0.2, 0.0, 0.15], [0.0, 0.0, 0.0]])
-    first = np.array([side - sigma / 2, 0.25 * side, 0.5 * side]) - 5e-5 * velocity[0]
-    start = two_spheres(gas, [first, [0.3 * side, 0.75 * side, 0.5 * side]], velocity)
-    curve = jaxgran.cool(gas, [0.0, 2e-4], model=SoftSpheres(2, start=start, steps_per_contact=100))
-    impulse = np.asarray(curve.particles.velocity[0, 0]) - velocity[0]
-    assert impulse[2] / impulse[0] == pytest.approx(mu, rel=1e-9)
-    assert impulse[1] == 0.0 and impulse[0] < -0.2
-    # The torque of the same force: I w = l n x F, with l = sigma/2 less the overlap, 2e-5 of it.
-    spin = np.asarray(curve.particles.angular_velocity[0, 0]) * sigma / 2
-    np.testing.assert_allclose(spin, [0.0, -impulse[2] / q, 0.0], rtol=1e-3, atol=1e-12)
-    np.testing.assert_allclose(energy(gas, curve), 1.0, atol=2e-5)
 
 
 @pytest.mark.slow
@@ -194,36 +181,40 @@ def test_steps_with_friction_are_of_second_order():
 
 
 @pytest.mark.parametrize(
-    "change, message",
+    "make, message",
     [
-        ({"law": 0.9}, "needs walls of the Viscoelastic law.*Use HardSpheres"),
-        ({"law": "own", "num": 120}, "spheres of packing_fraction 0.05 need a container 0.833"),
+        (lambda: jaxgran.Frictional(0.5, -0.1), "friction must lie in"),
+        (lambda: jaxgran.Frictional(-0.5, 0.1), "tangential_damping must lie in"),
+        (lambda: jaxgran.Walls(0.1, restitution=LAW, friction=0.1), "no tangential_damping.*Give"),
+        (
+            lambda: jaxgran.Walls(0.1, restitution=LAW, tangential_damping=0.5, friction=-0.1),
+            "friction of the walls must lie in",
+        ),
+        (
+            lambda: soft(container=jaxgran.Walls(0.1, restitution=LAW, **FRICTIONAL_WALLS)),
+            "friction of the walls needs frictional spheres",
+        ),
+        (
+            lambda: SoftSpheres(NUM).check(
+                soft(
+                    container=jaxgran.Walls(
+                        soft().box_side(NUM), restitution=LAW, tangential_restitution=0.5
+                    ),
+                    surface=jaxgran.Rough(0.1),
+                )
+            ),
+            "belongs to instantaneous impacts.*tangential_damping",
+        ),
+        (lambda: cooled(soft(law=0.9)), "needs walls of the Viscoelastic law.*Use HardSpheres"),
+        (
+            lambda: cooled(soft(law="own", num=120)),
+            "spheres of packing_fraction 0.05 need a container 0.833",
+        ),
     ],
 )
-def test_what_it_cannot_take_is_refused_in_words(change, message):
-    gas = soft(**change)
+def test_what_it_cannot_take_is_refused_in_words(make, message):
     with pytest.raises(ValueError, match=message):
-        jaxgran.cool(gas, [0.1], model=SoftSpheres(NUM))
-
-
-def test_walls_with_friction_need_a_tangential_damping():
-    law = glass_beads().law
-    with pytest.raises(ValueError, match="friction must lie in"):
-        jaxgran.Frictional(0.5, -0.1)
-    with pytest.raises(ValueError, match="tangential_damping must lie in"):
-        jaxgran.Frictional(-0.5, 0.1)
-    with pytest.raises(ValueError, match="have friction but no tangential_damping.*Give both"):
-        jaxgran.Walls(0.1, restitution=law, friction=0.1)
-    with pytest.raises(ValueError, match="friction of the walls must lie in"):
-        jaxgran.Walls(0.1, restitution=law, tangential_damping=0.5, friction=-0.1)
-    walls = jaxgran.Walls(0.1, restitution=law, **FRICTIONAL_WALLS)
-    for surface in (None, jaxgran.Rough(0.1)):
-        with pytest.raises(ValueError, match="friction of the walls needs frictional spheres"):
-            soft(container=walls, surface=surface)
-    walls = jaxgran.Walls(soft().box_side(NUM), restitution=law, tangential_restitution=0.5)
-    gas = soft(container=walls, surface=jaxgran.Rough(0.1))
-    with pytest.raises(ValueError, match="belongs to instantaneous impacts.*tangential_damping"):
-        SoftSpheres(NUM).check(gas)
+        make()
 
 
 def test_a_start_with_spins_is_refused():
@@ -233,21 +224,6 @@ def test_a_start_with_spins_is_refused():
     gas = soft(num=2, surface=jaxgran.Frictional(0.5, 0.3))
     with pytest.raises(ValueError, match="draws the angular velocities of a start"):
         jaxgran.cool(gas, [0.1], model=SoftSpheres(2, start=spinning))
-
-
-def test_the_model_for_friction_is_soft_spheres():
-    gas = soft(surface=jaxgran.Frictional(0.5, 0.3))
-    choice = jaxgran.choose_model(gas, np.array([1.0, 10.0]) * float(gas.mean_free_time))
-    assert isinstance(choice.model, SoftSpheres)
-    assert any("leave friction out" in reason for reason in choice.reasons)
-
-
-def log_temperatures(gas, model, times, names):
-    def logs(values):
-        changed = gas.replace(**dict(zip(names, jnp.exp(values), strict=True)))
-        return jnp.log(jaxgran.cool(changed, times, model=model).temperature)
-
-    return logs, jnp.log(jnp.stack([gas.value(name) for name in names]))
 
 
 FRICTION_FLOATS = [
@@ -264,39 +240,40 @@ FRICTION_FLOATS = [
 ]
 
 
-def both_temperatures(gas, model, times, names):
-    """ln T and ln T_rot as a function of the logarithms of some floats, and these."""
-
-    def logs(values):
-        changed = gas.replace(**dict(zip(names, jnp.exp(values), strict=True)))
-        curve = jaxgran.cool(changed, times, model=model)
-        return jnp.log(jnp.stack([curve.temperature, curve.rotational_temperature]))
-
-    return logs, jnp.log(jnp.stack([gas.value(name) for name in names]))
-
-
 def test_derivatives_with_friction_of_a_short_run_are_differences():
     h, gas = 1e-6, with_all()
     times = np.array([0.1, 0.2]) * float(gas.mean_free_time)  # before chaos
     model = SoftSpheres(NUM, projection=100.0, steps_per_contact=30)
-    logs, at = both_temperatures(gas, model, times, FRICTION_FLOATS)
-    found = np.asarray(jax.jacfwd(logs)(at))
-    # Along four directions in all floats, of mixed signs.
-    moves = hadamard(16)[:4, 1 : 1 + len(at)].T.astype(float)
-    each = [logs(at + h * move) - logs(at - h * move) for move in moves.T]
-    expected = np.stack(each, axis=-1) / (2 * h)
-    # The clock of a record takes the change of ln T for one that came evenly. It is off by t/4 of
-    # that change, and ln T_rot by its rate times this: .05 * .02 * .3 = 3e-4. From T the tangents
-    # leave out spheres in contact, of which there are many so soon.
-    np.testing.assert_allclose(found[1] @ moves, expected[1], atol=5e-4, rtol=0)
+
+    def logs(values):
+        changed = gas.replace(**dict(zip(FRICTION_FLOATS, jnp.exp(values), strict=True)))
+        curve = jaxgran.cool(changed, times, model=model)
+        return jnp.log(jnp.stack([curve.temperature, curve.rotational_temperature]))
+
+    # Values and derivatives by one program.
+    slopes_and_logs = jax.jacfwd(lambda values: (logs(values),) * 2, has_aux=True)
+    at = jnp.log(jnp.stack([gas.value(name) for name in FRICTION_FLOATS]))
+    found = np.asarray(slopes_and_logs(at)[0])
+    # Along three directions in all floats, of mixed signs.
+    for move in hadamard(16)[:3, 1 : 1 + len(at)].astype(float):
+        more, less = (slopes_and_logs(at + step * move)[1] for step in (h, -h))
+        # The clock of a record takes the change of ln T for one that came evenly. It is off by t/4
+        # of that change, and ln T_rot by its rate times this: .05 * .02 * .3 = 3e-4. From T the
+        # tangents leave out spheres in contact, of which there are many so soon.
+        expected = (more - less) / (2 * h)
+        np.testing.assert_allclose(found[1] @ move, expected[1], atol=5e-4, rtol=0)
     assert np.all(np.any(np.abs(found) > 1e-5, axis=(0, 1)))
 
 
 def test_derivatives_that_are_not_known_are_refused():
-    gas, times = soft(law="own"), [1e-3]
-    logs, at = log_temperatures(gas, SoftSpheres(NUM).sized_for(gas), times, ["wall_side"])
+    gas = soft(law="own")
+    model = SoftSpheres(NUM).sized_for(gas)
+
+    def curve(side):
+        return jaxgran.cool(gas.replace(wall_side=side), [1e-3], model=model)
+
     with pytest.raises(ValueError, match="side of a container.*not known.*KineticTheory"):
-        jax.eval_shape(jax.jacfwd(logs), at)
+        jax.eval_shape(jax.jacfwd(curve), gas.value("wall_side"))
 
 
 @pytest.mark.slow

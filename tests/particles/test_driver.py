@@ -78,36 +78,23 @@ def test_records_are_taken_at_the_times():
     assert records["count"].dtype == np.int32
 
 
-@pytest.mark.parametrize("at", [0, 1, 2, 4, 8, STEPS - 1])
-def test_an_interrupted_run_is_resumed(tmp_path, at):
-    path = tmp_path / "run.npz"
+@pytest.mark.parametrize(
+    "error, at", [(KeyboardInterrupt, 0), (KeyboardInterrupt, STEPS - 1), (MemoryError, 7)]
+)
+def test_a_run_that_ends_early_is_resumed_and_then_read_back(tmp_path, monkeypatch, error, at):
+    if error is MemoryError:  # the run cannot write a checkpoint as it dies
+        monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    saved = {"scene": {"name": "toy"}, "path": tmp_path / "run.npz"}
     whole = quiet(start(), TIMES, advance, observe)
-    with pytest.raises(KeyboardInterrupt):
-        quiet(start(), TIMES, Calls(at), observe, scene={"name": "toy"}, path=path)
-    assert path.exists()
+    with pytest.raises(error):
+        quiet(start(), TIMES, Calls(at, error), observe, **saved)
+    assert saved["path"].exists()
     rest = Calls()
-    resumed = quiet(start(), TIMES, rest, observe, scene={"name": "toy"}, path=path)
+    resumed = quiet(start(), TIMES, rest, observe, **saved)
     assert rest.number == STEPS - at
-    same(resumed, whole)
     assert all(isinstance(leaf, jax.Array) for leaf in resumed[0])
-
-
-def test_a_run_that_dies_loses_little(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
-    path = tmp_path / "run.npz"
-    whole = quiet(start(), TIMES, advance, observe)
-    with pytest.raises(MemoryError):
-        quiet(start(), TIMES, Calls(7, MemoryError), observe, scene={"name": "toy"}, path=path)
-    rest = Calls()
-    resumed = quiet(start(), TIMES, rest, observe, scene={"name": "toy"}, path=path)
-    assert rest.number == STEPS - 7
-    same(resumed, whole)
-
-
-def test_a_finished_run_is_read_back(tmp_path):
-    path = tmp_path / "run.npz"
-    whole = quiet(start(), TIMES, advance, observe, scene={"name": "toy"}, path=path)
-    same(quiet(start(), TIMES, Calls(0), observe, scene={"name": "toy"}, path=path), whole)
+    for found in (resumed, quiet(start(), TIMES, Calls(0), observe, **saved)):
+        same(found, whole)
 
 
 class Terminal(io.StringIO):
@@ -128,27 +115,21 @@ def shown(stream, capsys, **settings):
     return stream.getvalue()
 
 
-def test_the_bar_shows_the_temperature(eager, capsys):
+def test_the_bar_shows_the_temperature_on_a_terminal_alone(eager, capsys):
     last = shown(Terminal(), capsys).split("\r")[-1]
     # The mean of 1 and 4, cooled by exp(-2 x 2.5).
     assert last.startswith("toy: 100%") and "T/T_0 = 0.0168" in last and "left" in last
-
-
-def test_no_bar_without_a_terminal(eager, capsys):
     assert shown(io.StringIO(), capsys) == ""
 
 
-def test_compiling_is_said_until_the_program_runs():
+def test_compiling_is_said_until_the_program_runs_where_a_bar_would_be():
     with redirect_stderr(Terminal()) as stream, compiling(progress=True):
         assert stream.getvalue() == "\rcompiling ..."
     assert stream.getvalue().split("\r")[-2:] == [" " * 13, ""]  # removed, for the bar
-
-
-@pytest.mark.parametrize("stream, progress", [(Terminal(), False), (io.StringIO(), True)])
-def test_compiling_is_not_said_where_no_bar_would_be(stream, progress):
-    with redirect_stderr(stream), compiling(progress):
-        pass
-    assert stream.getvalue() == ""
+    for stream, progress in ((Terminal(), False), (io.StringIO(), True)):
+        with redirect_stderr(stream), compiling(progress):
+            pass
+        assert stream.getvalue() == ""
 
 
 def test_a_run_says_that_it_compiles_once():

@@ -1,68 +1,107 @@
+"""Random starts: places on the host and in compiled code, and velocities."""
+
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxgran._utils import status
 from jaxgran.particles.observables import sonine, temperature
 from jaxgran.particles.setup import (
-    _push_apart,
+    GAP,
     host_positions,
     maxwellian_velocities,
+    relaxed_positions,
+    uniform_points,
 )
+from jaxgran.scene.geometry import sphere_surface
 
-BALL = {2: np.pi / 4, 3: np.pi / 6}
-
-
-def box_side(packing, n, dimension):
-    return (n * BALL[dimension] / packing) ** (1 / dimension)
+N, REPLICAS, KEY = 60, 2, jax.random.key(1)
 
 
-def smallest_distance(x, side):
+def side_of(packing, dimension):
+    volume = N * sphere_surface(dimension) / dimension / 2**dimension / packing
+    return float(volume ** (1 / dimension))
+
+
+@partial(jax.jit, static_argnames=("size", "capacity"))
+def relaxed(key, side, size, region=None, capacity=(1000, 120), fault=status.OK):
+    return relaxed_positions(key, side, size, 0.4, capacity, region, fault)
+
+
+def on_host(side, size=(REPLICAS, N, 3), region=None):
+    return host_positions(KEY, side, *size, region)
+
+
+def compiled(side, size=(REPLICAS, N, 3), region=None):
+    x, fault = relaxed(KEY, side, size, region)
+    assert fault == status.OK
+    return x
+
+
+PLACES = pytest.mark.parametrize("place", [on_host, compiled])
+
+
+def closest(x, side, periodic=True):
     apart = x[:, None] - x[None]
-    apart = apart - side * np.round(apart / side)
-    return np.sqrt(np.min(np.sum(apart**2, axis=-1) + np.diag(np.full(len(x), np.inf))))
+    if periodic:
+        apart -= side * np.round(apart / side)
+    return np.min(np.linalg.norm(apart, axis=-1) + 9.0 * np.eye(len(x)))
 
 
-@pytest.mark.parametrize("dimension, packing", [(3, 0.1), (3, 0.45), (2, 0.6)])
-def test_spheres_do_not_overlap(dimension, packing):
-    n, replicas = 500, 2
-    side = box_side(packing, n, dimension)
-    x = np.asarray(host_positions(jax.random.key(1), side, replicas, n, dimension))
-    assert x.shape == (replicas * n, dimension)
-    assert np.all(x >= 0) and np.all(x < side)
-    boxes = x.reshape(replicas, n, dimension)
-    assert all(smallest_distance(box, side) > 1 for box in boxes)
-    assert not np.any(boxes[0] == boxes[1])
+@PLACES
+@pytest.mark.parametrize("dimension, packing", [(3, 0.02), (3, 0.47), (2, 0.64)])
+def test_no_spheres_overlap_and_boxes_differ(place, dimension, packing):
+    side, size = side_of(packing, dimension), (REPLICAS, N, dimension)
+    x = np.asarray(place(side, size))
+    assert x.shape == (REPLICAS * N, dimension) and np.all((x >= 0) & (x < side))
+    boxes = x.reshape(size)
+    # All are pushed to 1 + GAP, and taken as apart from half of the gap on.
+    assert all(closest(box, side) >= 1 + GAP / 2 for box in boxes)
+    assert np.max(np.abs(boxes[0] - boxes[1])) > 1
+    np.testing.assert_array_equal(place(side, size), x)
 
 
-def test_dilute_positions_fill_the_box_evenly():
-    n, side = 4000, 60.0
-    x = np.asarray(host_positions(jax.random.key(3), side, 1, n, 3))
-    counts = np.histogramdd(x, bins=3 * [np.linspace(0, side, 4)])[0]
-    # 27 cells; chi^2 of independent points is 26 +- 7, of spheres slightly less.
-    assert np.sum((counts - n / 27) ** 2) / (n / 27) < 26 + 5 * 7
+@PLACES
+def test_dilute_spheres_stay_at_their_uniform_points(place):
+    side = side_of(0.02, 3)
+    moved = np.abs(np.asarray(place(side)) - side * uniform_points(KEY, REPLICAS * N, 3))
+    assert np.mean(np.all(moved < 1e-12, axis=1)) > 0.7
+
+
+@PLACES
+def test_spheres_stay_within_their_room(place):
+    side, region = 8.0, jnp.array([3.0, 4.0, 5.5])
+    x = np.asarray(place(side, (1, 50, 3), region))
+    assert np.all((x >= 0) & (x <= region[None]))
+    assert closest(x, side, periodic=False) >= 1 + GAP / 2
 
 
 def test_two_spheres_in_the_smallest_box():
-    x = np.asarray(host_positions(jax.random.key(5), 2.0, 20, 2, 3))
-    assert np.all(x >= 0) and np.all(x < 2.0)
-    assert all(smallest_distance(pair, 2.0) > 1 for pair in x.reshape(20, 2, 3))
+    x = np.asarray(on_host(2.0, (20, 2, 3)))
+    assert np.all((x >= 0) & (x < 2.0))
+    assert all(closest(pair, 2.0) > 1 for pair in x.reshape(20, 2, 3))
 
 
-def test_coincident_points_are_parted():
-    x = _push_apart(np.full((3, 3), 4.0), 8.0, None)
-    assert smallest_distance(x, 8.0) > 1
+@PLACES
+def test_one_point_for_all_is_parted(place, monkeypatch):
+    monkeypatch.setattr("jaxgran.particles.setup.uniform_points", lambda *_: jnp.ones((3, 3)))
+    assert closest(np.asarray(place(8.0, (1, 3, 3))), 8.0) >= 1 + GAP / 2
 
 
-@pytest.mark.parametrize("dimension, packing", [(3, 0.8), (2, 0.95)])
-def test_too_dense_is_refused(dimension, packing, monkeypatch):
+def test_where_there_is_no_room_or_the_list_is_full_it_says_so(monkeypatch):
     monkeypatch.setattr("jaxgran.particles.setup.MAX_PUSHES", 50)
-    uniform, side = (
-        np.random.default_rng(0).random((60, dimension)),
-        box_side(packing, 60, dimension),
-    )
-    with pytest.raises(RuntimeError, match="60 spheres .* after 50 pushes. Lower the packing"):
-        _push_apart(side * uniform, side, None)
+    for dimension, packing in ((3, 0.8), (2, 0.95)):
+        with pytest.raises(RuntimeError, match="60 spheres .* after 50 pushes. Lower the packing"):
+            on_host(side_of(packing, dimension), (1, N, dimension))
+    _, fault = relaxed(KEY, side_of(0.8, 3), (1, N, 3), capacity=(2000, 60))
+    assert fault == status.OVERLAPS_REMAIN.bit
+    short = partial(relaxed, KEY, size=(1, N, 3), capacity=(20, 60))
+    assert short(side_of(0.4, 3))[1] == status.LIST_FULL.bit
+    x, fault = short(1.0, fault=1024)
+    assert fault == 1024 and np.all(np.isfinite(x))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -79,9 +118,5 @@ def test_velocities_are_maxwellian(dimension):
     covariance = jnp.einsum("pa,pb->ab", v, v) / len(v)
     # The same for products of two components.
     np.testing.assert_allclose(covariance, np.eye(dimension), atol=5 / np.sqrt(len(v)))
-
-
-@pytest.mark.parametrize("n", [-1, 0, 1])
-def test_too_few_particles_are_refused(n):
-    with pytest.raises(ValueError, match=f"num_particles must be at least 2, got {n}"):
-        maxwellian_velocities(jax.random.key(0), 1, n, 3)
+    with pytest.raises(ValueError, match="num_particles must be at least 2, got 1"):
+        maxwellian_velocities(KEY, 1, 1, dimension)

@@ -16,9 +16,6 @@ from jaxgran.particles.neighbours import (
 )
 from tests.pairs import find_pairs
 
-# In boxes of less than three cutoffs jax-md itself warns about its integers.
-jax_md_warns = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")
-
 
 def brute_force(position, side, cutoff, replicas=1):
     """Shortest x_i - x_j of every pair i < j closer than the cutoff."""
@@ -51,7 +48,14 @@ def awkward(dimension, replicas, side, n=30):
     return boxes.reshape(-1, dimension)
 
 
-def compare(dimension, replicas, side, cutoff, by):
+@pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")  # of jax-md's integers
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    "by, fraction",
+    [("scipy", 0.15), ("scipy", 0.4999), ("scipy", 0.5), ("sweep", 0.5), ("jax-md", 0.15)],
+)
+def test_pairs_are_those_of_brute_force(dimension, by, fraction):
+    side, replicas, cutoff = 3.7, 2, 3.7 * fraction
     position = awkward(dimension, replicas, side)
     expected = brute_force(position, side, cutoff, replicas)
     capacity = len(expected) + 7
@@ -73,39 +77,7 @@ def compare(dimension, replicas, side, cutoff, by):
     )
 
 
-WAYS = [("scipy", f) for f in (0.15, 1 / 3, 0.4999, 0.5)] + [("sweep", 0.5)]
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("replicas", [1, 3])
-@pytest.mark.parametrize("by, fraction", WAYS)
-def test_pairs_are_those_of_brute_force(dimension, replicas, fraction, by):
-    compare(dimension, replicas, 3.7, 3.7 * fraction, by)
-
-
-@jax_md_warns
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_jax_md_finds_what_brute_force_finds(dimension):
-    compare(dimension, 2, 3.7, 3.7 * 0.15, "jax-md")
-
-
 COMPILED = pytest.mark.parametrize("by", ["scipy", "sweep"])
-
-
-@COMPILED
-def test_coincident_particles_are_pairs(by):
-    position = jnp.stack([jnp.array([1.0, 2.0, 3.0])] * 3 + [jnp.array([3.0, 0.0, 1.0])])
-    pairs = find_pairs(position, 4.0, 1e-3, capacity=8, by=by)
-    assert sorted(listed(pairs)) == [(0, 1), (0, 2), (1, 2)]
-    assert not np.any(pairs.offset)
-
-
-@COMPILED
-def test_pairs_across_the_faces(by):
-    position = jnp.array([[0.1, 2.0], [3.9, 2.0], [0.0, 0.0], [3.95, 3.95]])
-    pairs = find_pairs(position, 4.0, 0.5, capacity=8, by=by)
-    offset = dict(zip(listed(pairs), np.asarray(pairs.offset).tolist(), strict=False))
-    assert offset == {(0, 1): [-4.0, 0.0], (2, 3): [-4.0, -4.0]}
 
 
 @COMPILED
@@ -175,9 +147,9 @@ def test_unknown_engines_are_refused():
         choose_engine("kd")
 
 
-@pytest.mark.parametrize("side, n", [(500.0, 20_000), (5000.0, 2000)])
-def test_wide_planes(side, n):
+def test_wide_planes():
     # Thousands of diameters across.
+    side, n = 5000.0, 2000
     position = np.random.default_rng(0).uniform(0, side, (n, 2))
     i, j, count = tree_search(position, side, 1.4, 1, 2 * n)
     found = np.sort(np.stack([i[:count], j[:count]], axis=1), axis=1)
@@ -210,18 +182,6 @@ def test_a_sweep_looks_as_far_as_it_must():
         assert told == ahead and enough == count
 
 
-def test_a_sweep_in_single_precision_misses_nothing():
-    rng = np.random.default_rng(7)
-    position = (30 * rng.random((4000, 3))).astype(np.float32)
-    i, j, count, _ = sweep(
-        jnp.asarray(position), 30.0, 1.5, replicas=1, capacity=20_000, ahead=4000
-    )
-    found = set(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
-    tree = KDTree(position.astype(float), boxsize=30.0)
-    # As documented: 10^-6 of the cutoff and of the side.
-    assert tree.query_pairs(1.5) <= found <= tree.query_pairs(1.5 + 3.2e-5)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_sweep_misses_no_pair_just_within_the_cutoff(dtype):
     # Far apart, so that a whole number of steps of the side is many of the cutoff's round-off.
@@ -241,6 +201,9 @@ def test_a_sweep_misses_no_pair_just_within_the_cutoff(dtype):
     )
     found = set(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
     assert {(k, k + n) for k in within.tolist()} <= found
+    # As documented: 1e-6 of the cutoff and of the side.
+    tree = KDTree(position.astype(float), boxsize=side)
+    assert tree.query_pairs(cutoff) <= found <= tree.query_pairs(cutoff + 1e-6 * (cutoff + side))
 
 
 @pytest.mark.parametrize("n", [2, 3])

@@ -111,54 +111,13 @@ def test_a_viscoelastic_wall_is_softer_by_the_root_of_two():
     assert float(wall.length) == pytest.approx(float(pair.length), rel=1e-12)
 
 
-ELEMENTS = {
-    "surface": jaxgran.Rough(0.3, rotational_temperature=1e-3),
-    "container": jaxgran.Walls(0.05, restitution=0.8, tangential_restitution=0.2),
-    "drag": jaxgran.StokesDrag(0.3, rotational_rate=0.5),
-}
-
-
-@pytest.mark.slow
-def test_derivatives_in_the_floats_of_elements_are_those_of_differences(beads):
-    gas = scene(beads(), **ELEMENTS)
-    times = jnp.asarray(TAUS) * gas.mean_free_time
-    names = [
-        "tangential_restitution",
-        "inertia",
-        "rotational_temperature",
-        "wall_side",
-        "wall_coefficient",
-        "wall_tangential_restitution",
-        "drag_rate",
-        "drag_rotational_rate",
-        "dissipative_constant",
-    ]
-
-    def both(values):
-        changed = gas.replace(**dict(zip(names, values, strict=True)))
-        curve = jaxgran.cool(changed, times, model=jaxgran.KineticTheory(rtol=1e-11))
-        return jnp.log(jnp.concatenate([curve.temperature, curve.rotational_temperature]))
-
-    at = jnp.stack([gas.value(name) for name in names])
-    forward, reverse = jax.jacfwd(both)(at), jax.jacrev(both)(at)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
-    step = 1e-4 * np.asarray(at)
-    for k in range(len(names)):
-        moved = np.zeros(len(names))
-        moved[k] = step[k]
-        difference = (both(at + moved) - both(at - moved)) / (2 * step[k])
-        # Their second order is 1e-8, and rounding 1e-10/1e-4 of ln T.
-        np.testing.assert_allclose(
-            forward[:, k] * at[k], difference * at[k], rtol=1e-4, atol=2e-6, err_msg=names[k]
-        )
-
-
 @pytest.mark.parametrize(
     "make, message",
     [
         (lambda: jaxgran.Rough(1.1), r"tangential_restitution must lie in \[-1, 1\], got 1.1"),
         (lambda: jaxgran.Rough(0.0, inertia=0.0), r"inertia must lie in \(0, 1\]"),
         (lambda: jaxgran.Rough(0.0, rotational_temperature=-1.0), "rotational_temperature"),
+        (lambda: jaxgran.Rough(0.5, friction=-0.1), "friction must lie in"),
         (lambda: jaxgran.StokesDrag(-1.0), r"rate of the drag must lie in \[0, inf\), got -1"),
         (lambda: jaxgran.Walls(0.0, restitution=0.9), "side of the walls must lie in"),
         (lambda: jaxgran.Walls(0.1, restitution=1.2), "restitution of the walls must lie in"),
@@ -193,69 +152,75 @@ def test_bad_elements_are_refused(make, message):
 
 HEADER = {"N": "200", "eta": "0.0067", "diameter": "0.002", "density": "2500", "Y": "5e7"}
 HEADER |= {"nu": "0.22", "T0": "0.01"}
-FRICTION = {"friction": "0.3", "tangential_damping": "0.5", "T_rot_0": "2e-3"}
+ROUGH = {
+    "beta_t": ("-0.2", "tangential_restitution"),
+    "friction": ("0.4", "friction"),
+    "T_rot_0": ("2e-3", "rotational_temperature"),
+    "container_side": ("0.05", "wall_side"),
+    "wall_restitution": ("0.9", "wall_coefficient"),
+    "wall_beta_t": ("0.1", "wall_tangential_restitution"),
+    "gamma": ("0.3", "drag_rate"),
+    "drive_strength": ("2.5e-4", "drive_strength"),
+}
+FRICTION = {
+    "friction": ("0.3", "friction"),
+    "tangential_damping": ("0.5", "tangential_damping"),
+    "T_rot_0": ("2e-3", "rotational_temperature"),
+}
+"""Keys of headers, their values, and the floats of the gas that they give."""
 
 
-def test_elements_are_read_from_a_header():
-    extra = {
-        "beta_t": "-0.2",
-        "T_rot_0": "2e-3",
-        "container_side": "0.05",
-        "wall_restitution": "0.9",
-        "wall_beta_t": "0.1",
-        "gamma": "0.3",
-    }
-    gas = jaxgran.read_gas(HEADER | extra)
-    assert gas.elements == ("surface", "container", "drag")
-    assert float(gas.value("inertia")) == 0.4
-    read = {name: float(gas.value(name)) for name in gas.domains}
-    assert read["tangential_restitution"] == -0.2 and read["rotational_temperature"] == 2e-3
-    assert read["wall_side"] == 0.05 and read["wall_coefficient"] == 0.9
-    assert read["wall_tangential_restitution"] == 0.1 and read["drag_rate"] == 0.3
-    for wrong, message in (
-        ({"T_rot_0": "1"}, "gives T_rot_0 without beta_t"),
-        ({"container_side": "0.05"}, "gives container_side without wall_restitution"),
-        ({"friction": "0.5"}, "gives friction without tangential_damping"),
-        (FRICTION | {"beta_t": "0"}, "both beta_t.*SoftSpheres"),
-        (FRICTION | {"friction": "-1"}, r"friction must lie in \[0, inf\)"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            jaxgran.read_gas(HEADER | wrong)
-    with pytest.warns(UserWarning, match="ignoring unknown header keys: mu.*are eta.*friction"):
-        jaxgran.read_gas(HEADER | {"mu": "0.5", "A comment of some words": "x"})
-    gas = jaxgran.read_gas(HEADER | FRICTION)
-    assert gas.elements == ("friction",)
-    found = [float(gas.value(name)) for name in ("tangential_damping", "friction", "inertia")]
-    assert found == [0.5, 0.3, 0.4] and float(gas.value("rotational_temperature")) == 2e-3
+def header(keys):
+    return HEADER | {key: text for key, (text, _) in keys.items()}
 
 
 @pytest.mark.parametrize(
-    "key, value, reason",
-    [
-        ("gravity", "9.81", "density and T change with height"),
-        ("diameter_2", "0.004", "a temperature for each kind"),
-        ("polydispersity", "0.1", "unequal temperatures"),
-        ("aspect_ratio", "3", "rods and ellipsoids"),
-        ("cohesion", "1e-6", "stick"),
-        ("charge", "1e-12", "deflected without touching"),
-    ],
+    "keys, elements",
+    [(ROUGH, ("surface", "container", "drag", "drive")), (FRICTION, ("friction",))],
 )
-def test_a_header_of_what_no_model_takes_is_refused_with_the_reason(key, value, reason):
-    with pytest.raises(ValueError, match=f"{key}: .*{reason}"):
-        jaxgran.read_gas(HEADER | {key: value})
+def test_elements_are_read_from_a_header(keys, elements):
+    gas = jaxgran.read_gas(header(keys))
+    assert gas.elements == elements and float(gas.value("inertia")) == 0.4
+    for text, name in keys.values():
+        assert float(gas.value(name)) == float(text)
 
 
 def test_a_header_may_say_that_there_is_nothing_of_it():
-    gas = jaxgran.read_gas(HEADER | {"gravity": "0", "aspect_ratio": "1"})
-    assert gas.elements == ()
+    assert jaxgran.read_gas(HEADER | {"gravity": "0", "aspect_ratio": "1"}).elements == ()
 
 
-def test_a_container_that_contradicts_N_and_eta_is_refused():
-    walls = {"wall_restitution": "0.9"}
-    with pytest.raises(ValueError, match="N, eta and container_side contradict.*eta = 0.0133"):
-        jaxgran.read_gas(HEADER | walls | {"container_side": "0.0397"})
-    fits = jaxgran.read_gas(HEADER | walls | {"container_side": "0.05"})
-    assert fits.container is not None
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"T_rot_0": "1"}, "gives T_rot_0 without beta_t"),
+        ({"container_side": "0.05"}, "gives container_side without wall_restitution"),
+        ({"friction": "0.5"}, "gives friction without tangential_damping"),
+        (header(FRICTION) | {"beta_t": "0"}, "both beta_t .* and tangential_damping.*SoftSpheres"),
+        (header(FRICTION) | {"friction": "-1"}, r"friction must lie in \[0, inf\)"),
+        ({"gravity": "9.81"}, "gravity: .*density and T change with height"),
+        ({"diameter_2": "0.004"}, "diameter_2: .*a temperature for each kind"),
+        ({"polydispersity": "0.1"}, "polydispersity: .*unequal temperatures"),
+        ({"aspect_ratio": "3"}, "aspect_ratio: .*rods and ellipsoids"),
+        ({"cohesion": "1e-6"}, "cohesion: .*stick"),
+        ({"charge": "1e-12"}, "charge: .*deflected without touching"),
+        (
+            {"wall_restitution": "0.9", "container_side": "0.0397"},
+            "N, eta and container_side contradict.*eta = 0.0133",
+        ),
+    ],
+)
+def test_what_a_header_cannot_say_is_refused_with_the_reason(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        jaxgran.read_gas(HEADER | wrong)
+
+
+def test_unknown_header_keys_are_told():
+    with pytest.warns(UserWarning, match="ignoring unknown header keys: mu.*are eta.*friction"):
+        jaxgran.read_gas(HEADER | {"mu": "0.5", "A comment of some words": "x"})
+
+
+def test_a_box_that_does_not_hold_other_spheres_is_refused_in_a_choice():
+    fits = jaxgran.read_gas(header(ROUGH))
     with pytest.raises(ValueError, match="100 spheres of packing_fraction 0.0067 need a container"):
         jaxgran.choose_model(fits, [1.0], num_particles=100)
 

@@ -9,7 +9,6 @@ import jaxgran
 from jaxgran.scene.laws import ReducedViscoelastic
 from jaxgran.theory import averages as kinetics
 from jaxgran.theory.averages import RateTable
-from tests.beads import hard_gas
 
 
 def test_averages_of_constant_restitution():
@@ -38,19 +37,6 @@ def test_averages_agree_with_sampled_impacts():
     )
     # 1e6 samples with a relative scatter of 1.2.
     np.testing.assert_allclose(rates.cooling, sampled, rtol=4e-3)
-
-
-# a_2 of the homogeneous cooling state, from stochastic simulation (errors 2e-4 to 4e-4).
-@pytest.mark.parametrize(
-    "d, e, a2",
-    [(3, 0.5, 0.0476), (3, 0.8, -0.0145), (3, 0.9, -0.0152), (2, 0.5, 0.0733), (2, 0.9, -0.0301)],
-)
-def test_stationary_kurtosis(d, e, a2):
-    gas = hard_gas(e, 0.01, d)
-    curve = jaxgran.cool(gas, jnp.array([300.0]) * gas.mean_free_time)
-    assert curve.sonine is not None
-    # The Sonine theory neglects a_3: at e = .5 it is 11 % (3D) and 15.4 % (2D) above simulation.
-    np.testing.assert_allclose(curve.sonine[0], a2, rtol=0.16)
 
 
 @pytest.mark.slow

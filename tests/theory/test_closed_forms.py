@@ -64,13 +64,6 @@ def test_expansion_is_right_to_its_order(beads):
         assert max(ratios) < 2.0, ratios
 
 
-def test_printed_expansion_breaks_the_initial_condition():
-    # The reason for the correction: at t = 0 the printed form is off by 2 q delta.
-    printed = paper_temperature(0.0, 0.1, corrected=False)
-    np.testing.assert_allclose(printed, 1 + 2 * COOLING_CORRECTION * 0.1, rtol=1e-12)
-    np.testing.assert_allclose(paper_temperature(0.0, 0.1), 1.0, rtol=1e-12)
-
-
 def test_paper_averages_are_the_first_two_terms(beads):
     gas = beads(0.002)
     law = gas.reduced_law
