@@ -230,12 +230,10 @@ def first_order_only(inputs: T) -> T:
         ValueError: if a derivative in these inputs is taken.
     """
     # Concrete values stay concrete, for runs that the host drives.
-    numbers, others = eqx.partition(inputs, _may_change)
+    numbers, others = eqx.partition(
+        inputs, lambda leaf: isinstance(leaf, Tracer) and eqx.is_inexact_array(leaf)
+    )
     return eqx.combine(_first_order_identity(numbers), others)
-
-
-def _may_change(leaf: Any) -> bool:
-    return isinstance(leaf, Tracer) and eqx.is_inexact_array(leaf)
 
 
 @jax.custom_jvp

@@ -3,18 +3,17 @@
 import dataclasses
 from collections.abc import Sequence
 from math import hypot
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils import status
 from jaxgran._utils.formatting import text_table
-from jaxgran._utils.tracing import grid_size, pad_to
+from jaxgran._utils.tracing import any_traced, grid_size, pad_to
 from jaxgran._utils.validation import POSITIVE, checked_float, checked_times, no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
@@ -123,7 +122,13 @@ def choose_model(
     >>> choice.reasons[0][:43]
     'Kinetic theory: the cheapest model whose es'
     """
-    _check_arguments(gas, times, tolerance)
+    checked_gas(gas)
+    if any_traced(gas, times):
+        raise ValueError(
+            "a model cannot be chosen for values traced by jax.jit, jax.grad or jax.vmap: "
+            "call choose_model outside, and pass its model to cool"
+        )
+    checked_float("tolerance", tolerance, POSITIVE, "0.02 allows T to err by 2 %.")
     tolerance = float(tolerance)
     if num_particles is not None:
         check_volume(gas, num_particles)
@@ -147,16 +152,6 @@ def choose_model(
         ),
     ]
     return Choice(best.model, tuple(reasons), candidates, error)
-
-
-def _check_arguments(gas: Any, times: Any, tolerance: Any) -> None:
-    checked_gas(gas)
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gas, times))):
-        raise ValueError(
-            "a model cannot be chosen for values traced by jax.jit, jax.grad or jax.vmap: "
-            "call choose_model outside, and pass its model to cool"
-        )
-    checked_float("tolerance", tolerance, POSITIVE, "0.02 allows T to err by 2 %.")
 
 
 def _candidate(model: AbstractModel, error_model: ErrorModel) -> Candidate:

@@ -107,10 +107,10 @@ def cool(
         )
     model = checks.checked_model(model)
     model.check_save(save)
-    if trajectory is not None:
-        _check_trajectory(trajectory, model)
+    _check_path("trajectory", trajectory, model, model.has_positions, "no positions to write")
+    _check_path("checkpoint", checkpoint, model, model.stochastic, "no run to be saved")
     if checkpoint is not None:
-        _check_checkpoint(checkpoint, model)
+        check_writable(os.fspath(checkpoint))
     model.check_scene(gas)
     gas, simulated, allowed = checks.valid_where_traced(gas, times)
     curve = model.simulate(gas, simulated, Run(key, progress, checkpoint, save, trajectory))
@@ -120,28 +120,14 @@ def cool(
     return curve
 
 
-def _check_path(name: str, path: Any) -> None:
-    if not isinstance(path, str | os.PathLike):
+def _check_path(name: str, path: Any, model: AbstractModel, supported: bool, lack: str) -> None:
+    if path is not None and not isinstance(path, str | os.PathLike):
         raise ValueError(f"{name} must be a path, got {path!r}")
-
-
-def _check_trajectory(trajectory: Any, model: AbstractModel) -> None:
-    _check_path("trajectory", trajectory)
-    if not model.has_positions:
+    if path is not None and not supported:
         raise ValueError(
-            f"{type(model).__name__} has no positions to write. Use HardSpheres or SoftSpheres, or "
-            "set trajectory=None."
+            f"{type(model).__name__} has {lack}, got {name}={str(path)!r}. Use HardSpheres or "
+            f"SoftSpheres, or set {name}=None."
         )
-
-
-def _check_checkpoint(checkpoint: Any, model: AbstractModel) -> None:
-    _check_path("checkpoint", checkpoint)
-    if not model.stochastic:
-        raise ValueError(
-            f"{type(model).__name__} has no run to be saved, got {str(checkpoint)!r}. Set "
-            "checkpoint=None."
-        )
-    check_writable(os.fspath(checkpoint))
 
 
 def _raise_if_failed(curve: CoolingCurve, gas: Gas) -> None:

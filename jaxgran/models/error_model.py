@@ -230,9 +230,8 @@ class ErrorModel(NamedTuple):
         The projection remembers T alone, and not how the flow depends on the material. The error
         is 0 in boxes below L_c.
         """
-        if self.num_particles is None:
-            return np.zeros(self.time.shape)
-        if float(self.gas.box_side(self.num_particles)) <= float(self.gas.critical_box):
+        gas, n = self.gas, self.num_particles
+        if n is None or float(gas.box_side(n)) <= float(gas.critical_box):
             return np.zeros(self.time.shape)
         return slope_bias(self.clock_error(MEASURED_FLOW * MISSING_HEAT * self.flow_share))
 

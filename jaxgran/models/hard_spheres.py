@@ -17,7 +17,7 @@ from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles import neighbours
-from jaxgran.particles.capacity import Neighbourhood, capacities
+from jaxgran.particles.capacity import capacities
 from jaxgran.particles.hard.dynamics import MIN_IMPACTS, SPEED_MARGIN, HardDynamics
 from jaxgran.particles.setup import min_distance, overlap_by_rounding
 from jaxgran.particles.state import transformed_times
@@ -122,11 +122,6 @@ class HardSpheres(AbstractSpheres):
         advice = "In mean free times; it only keeps clusters from collapsing, so leave it small."
         checked_float("contact_time", self.contact_time, CONTACT_TIMES, advice)
 
-    @property
-    def projected(self) -> bool:
-        """True: impacts have no plain derivatives."""
-        return True
-
     def check(self, gas: Gas) -> None:
         """Check that the model supports this law and scene.
 
@@ -194,8 +189,7 @@ class HardSpheres(AbstractSpheres):
         """Return static sizes; capacities were measured for phi = .001 to .4 (disks: .6) and
         N = 125 to 50 000."""
         d, n = dimension, self.replicas * self.num_particles
-        filled = float(scene.filled_side)
-        around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
+        around = self.neighbourhood(scene, d)
         share = max(WINDOW_SHARE, 2 * MIN_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         longest = share if share == WINDOW_SHARE else SKIN_GROWTH * share
@@ -206,8 +200,5 @@ class HardSpheres(AbstractSpheres):
         chosen = min((0.65 + 0.35 * near) * longest, around.listed)
         expected = around.listed, near, chosen, 1.25 * longest
         extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # random positions have more near pairs
-        ahead = around.lookahead
-        if scene.container is not None:  # the sweep runs along the first axis
-            ahead = min(ahead * max(1.0, filled / float(scene.container[0])), self.num_particles)
-        sizes = capacities(expected, ahead, spare or 1.15, extra, n)
+        sizes = capacities(expected, around.lookahead, spare or 1.15, extra, n)
         return Plan(self.replicas, None, share, *sizes)

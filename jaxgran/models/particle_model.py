@@ -93,7 +93,10 @@ class AbstractParticleModel(AbstractModel):
             return curve
         nan_if_invalid = partial(snapshot.nan_where, invalid[:, None])
         saved = jax.tree.map(nan_if_invalid, out.records["saved"])
-        return snapshot.attach_saved(curve, run.save, saved, units.box_side)
+        if run.save != "particles":
+            return curve.with_saved(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), saved))
+        box_side = jnp.broadcast_to(units.box_side, (len(times), *units.box_side.shape))
+        return dataclasses.replace(curve, saved=saved._replace(box_side=box_side))
 
     def _by_replica(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
         """Run on the host or compiled, and there replicas by themselves or all in one array."""
@@ -106,7 +109,9 @@ class AbstractParticleModel(AbstractModel):
             single = self.single_replica()
 
             def run_replica(k: int, run: Run) -> Outputs:
-                part = particle_run.replica_inputs(inputs, k, self.num_particles, run)
+                rows = slice(k * self.num_particles, (k + 1) * self.num_particles)
+                start = jax.tree.map(lambda x: x[rows], inputs.start)
+                part = inputs._replace(start=start, key=run.key)
                 return single._by_replica(part, directions, dimension, run)
 
             runs = particle_run.run_replicas(run_replica, self.replicas, run, on)

@@ -16,7 +16,7 @@ from jaxgran.data.curve import UserParticles
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.spheres import AbstractSpheres, Plan
-from jaxgran.particles.capacity import Grid, Neighbourhood, capacities
+from jaxgran.particles.capacity import Grid, capacities
 from jaxgran.particles.soft.dynamics import SoftDynamics
 from jaxgran.scene.contact import elastic_constant
 from jaxgran.scene.elements import Frictional
@@ -226,10 +226,7 @@ class SoftSpheres(AbstractSpheres):
         """Return static sizes; capacities were measured for phi = .01 to .4 (disks: .5) and
         t_c/tau_c = .003 to .3."""
         d, n = dimension, self.replicas * self.num_particles
-        filled, ahead = float(scene.filled_side), 1.0
-        around = Neighbourhood.of(filled, self.num_particles, self.replicas, d, self.listed_by_skin)
-        if scene.container is not None:  # the sweep runs along the first axis
-            ahead = max(1.0, filled / float(scene.container[0]))
+        around = self.neighbourhood(scene, d)
         duration = Grid.of(n).round_up(float(scene.contact_duration))
         # A block lasts at most a contact, less if spheres fly far in that time.
         contacts_flown = MAX_SPEED * float(scene.contact_duration) / BLOCK_FLIGHT
@@ -246,6 +243,5 @@ class SoftSpheres(AbstractSpheres):
         expected = around.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # At random positions the additional touching pairs are about those without correlation.
         extra = 1.3 * around.in_contact
-        lookahead = min(ahead * around.lookahead, self.num_particles)
-        sizes = capacities(expected, lookahead, spare or 1.2, extra, n)
+        sizes = capacities(expected, around.lookahead, spare or 1.2, extra, n)
         return Plan(self.replicas, self.steps_per_contact, steps, *sizes)

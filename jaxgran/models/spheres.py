@@ -23,7 +23,7 @@ from jaxgran.models import checks
 from jaxgran.models.error_model import ErrorModel, slope_bias_of_run
 from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.particles import neighbours, snapshot
-from jaxgran.particles.capacity import Capacity, skin_for_pairs
+from jaxgran.particles.capacity import Capacity, Neighbourhood, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.run import Simulation, simulate_on_host, simulate_traced
 from jaxgran.particles.setup import (
@@ -82,9 +82,18 @@ class AbstractSpheres(AbstractParticleModel):
     derivative_accuracy: ClassVar[float] = 0.02
 
     @property
-    @abstractmethod
     def projected(self) -> bool:
         """True if derivatives are projected or by differences, False if they are plain."""
+        return True
+
+    def neighbourhood(self, scene: SphereScene, dimension: int) -> Neighbourhood:
+        """Return the expected numbers of neighbours in a scene of known numbers."""
+        side, n = float(scene.filled_side), self.num_particles
+        around = Neighbourhood.of(side, n, self.replicas, dimension, self.listed_by_skin)
+        if scene.container is None:
+            return around
+        shorter = max(1.0, side / float(scene.container[0]))  # the sweep runs along the first axis
+        return around._replace(lookahead=min(around.lookahead * shorter, n))
 
     def derivative_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
         """Relative error of projected derivatives by a flow, or of differences by their noise."""

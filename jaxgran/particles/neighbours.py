@@ -342,6 +342,15 @@ def _tree_pairs(position, side, cutoff, replicas: int, capacity: int):
     return jax.pure_callback(host, shapes, position, side, cutoff, vmap_method="sequential")
 
 
+def close_pairs(points: Float[np.ndarray, "n d"], side: float, cutoff: float) -> np.ndarray:
+    """Return the indices of all pairs of points closer than a cutoff in a periodic box."""
+    from scipy.spatial import KDTree  # the import takes a tenth of a second
+
+    # Unbalanced trees give the same pairs and are built in half of the time.
+    tree = KDTree(points, boxsize=side, balanced_tree=False, compact_nodes=False)
+    return tree.query_pairs(cutoff, output_type="ndarray")
+
+
 def tree_search(
     position: Float[np.ndarray, "particles d"],
     side: float,
@@ -355,16 +364,12 @@ def tree_search(
 
     If any position is not finite, no pairs are returned.
     """
-    from scipy.spatial import KDTree  # the import takes a tenth of a second
-
     pairs, count = np.zeros((2, capacity), np.int32), 0
     if np.all(np.isfinite(position)):
         boxes = position.reshape(replicas, -1, position.shape[-1]).astype(np.float64)
         boxes = np.where(boxes >= side, 0.0, boxes)  # by rounding
         for first, points in zip(range(0, len(position), boxes.shape[1]), boxes, strict=True):
-            # Unbalanced trees give the same pairs and are built in half of the time.
-            tree = KDTree(points, boxsize=side, balanced_tree=False, compact_nodes=False)
-            in_box = tree.query_pairs(cutoff, output_type="ndarray")
+            in_box = close_pairs(points, side, cutoff)
             end = min(count + len(in_box), capacity)
             pairs[:, count:end] = in_box[: end - count].T + first
             count += len(in_box)

@@ -260,8 +260,7 @@ def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Out
 
     def advance(state: State, end: float) -> State:
         # An interruption saves the state before the current call, which then must not be donated.
-        donate = run.checkpoint is None
-        return _advance(state, end, dynamics, dynamics.capacity, engine, progress, donate)
+        return _advance(state, end, dynamics, engine, progress, donate=run.checkpoint is None)
 
     try:
         if fault == status.OK:  # counts the energy in contacts
@@ -291,8 +290,8 @@ def _equilibrate(sim: Simulation, state: State, engine: str, progress: bool) -> 
 
     def advance(state: State, end: float) -> State:
         crowded = float(state.time) < settled
-        capacity = sim.equilibration_capacity if crowded else elastic.capacity
-        return _advance(state, end, elastic, capacity, engine, progress, True)
+        dynamics = elastic.with_capacity(sim.equilibration_capacity) if crowded else elastic
+        return _advance(state, end, dynamics, engine, progress, donate=True)
 
     end = np.asarray([sim.equilibration_time])
     state, _, fault = run_through_times(
@@ -310,12 +309,11 @@ def _advance(
     state: State,
     end: float,
     dynamics: AbstractDynamics,
-    capacity: Capacity,
     engine: str,
     progress: bool,
     donate: bool,
 ) -> State:
-    """Run some segments towards an end; enlarge arrays, from a given capacity, where necessary.
+    """Run some segments towards an end; enlarge arrays where necessary.
 
     One compiled call runs several segments, or one segment if the host finds the pairs. With
     `donate` the given state may be deleted. A failure then holds the last good state.
@@ -323,14 +321,14 @@ def _advance(
     Raises:
         RunFailure: for any other failure.
     """
-    until = np.asarray(end, state.time.dtype)
+    until, capacity = np.asarray(end, state.time.dtype), dynamics.capacity
+    static = "engine", "min_segments", "max_segments"
     while True:
-        enlarged = _GROWN.get(capacity, capacity)
-        sized = dynamics if dynamics.capacity == enlarged else dynamics.with_capacity(enlarged)
+        sized = dynamics.with_capacity(enlarged := _GROWN.get(capacity, capacity))
         if engine == "sweep":
             program = state.position.shape, until.dtype, jax.tree.structure((sized, state))
             with compiling(progress and needs_compilation(program)):
-                result = compiled_segments(donate)(
+                result = compiled_for_host(run_segments, donate, static)(
                     sized, state, until, engine, min_segments=1, max_segments=SEGMENTS_PER_CALL
                 )
             state, fault, needed = block_until_ready(result)
@@ -449,14 +447,16 @@ def run_through_times(
 
 
 @cache
-def compiled_segments(donate: bool) -> Callable[..., tuple[State, Array, Array]]:
-    """Return `run_segments` for the host driver; with `donate` a call deletes its given state.
+def compiled_for_host(
+    function: Callable[..., T], donate: bool, static: tuple[str, ...] = ()
+) -> Callable[..., T]:
+    """Return a compiled function for the host driver; with `donate` it deletes the given `state`.
 
     That state must come from `copy_buffers` or from an earlier call.
     """
     return jax.jit(
-        run_segments,
-        static_argnames=("engine", "min_segments", "max_segments"),
+        function,
+        static_argnames=static,
         donate_argnames="state" if donate else (),
         compiler_options=cpu_compiler_options(),
     )
@@ -627,36 +627,23 @@ def run_replicas(
     return [by_device[k % len(devices)][k // len(devices)] for k in range(replicas)]
 
 
-def replica_inputs(inputs: Inputs, k: int, num_particles: int, run: Run) -> Inputs:
-    """Return the inputs of replica k alone, with the key of its run."""
-    rows = slice(k * num_particles, (k + 1) * num_particles)
-    return inputs._replace(start=jax.tree.map(lambda x: x[rows], inputs.start), key=run.key)
-
-
 def join_outputs(runs: list[Outputs]) -> Outputs:
-    """Join the results of runs with one replica each to those of one run."""
-    position, velocity, spin = jax.tree.map(
-        _concatenate, *((out.position, out.velocity, out.spin) for out in runs)
-    )
-    fault = np.bitwise_or.reduce([np.asarray(out.status) for out in runs])
-    records = join_records([out.records for out in runs])
-    return Outputs(position, velocity, records, concrete_array(fault), spin)
+    """Join the results of runs with one replica each to those of one run.
 
-
-def join_records(runs: list[dict[str, Array]]) -> dict[str, Array]:
-    """Join the records of runs with one replica each to those of one run.
-
-    Records have the shape (times, replicas, ...); in derivatives along directions replicas are the
-    last axis.
+    Particles are joined along the first axis. Records have the shape (times, replicas, ...); in
+    derivatives along directions replicas are the last axis.
     """
-    return {
+
+    def joined(axis: int, *parts: Array) -> Array:
+        return concrete_array(np.concatenate([np.asarray(part) for part in parts], axis))
+
+    records = {
         name: jax.tree.map(
-            partial(_concatenate, axis=-1 if name.endswith(".along") else 1),
-            *(records[name] for records in runs),
+            partial(joined, -1 if name.endswith(".along") else 1),
+            *(out.records[name] for out in runs),
         )
-        for name in runs[0]
+        for name in runs[0].records
     }
-
-
-def _concatenate(*parts: Array, axis: int = 0) -> Array:
-    return concrete_array(np.concatenate([np.asarray(part) for part in parts], axis))
+    fault = concrete_array(np.bitwise_or.reduce([np.asarray(out.status) for out in runs]))
+    none = (out._replace(records=None, status=None) for out in runs)
+    return jax.tree.map(partial(joined, 0), *none)._replace(records=records, status=fault)

@@ -16,7 +16,7 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, array_module, concrete_array
 from jaxgran.data.curve import Particles, UserParticles
 from jaxgran.particles import neighbours
-from jaxgran.particles.neighbours import Pairs, tree_search
+from jaxgran.particles.neighbours import Pairs
 from jaxgran.particles.snapshot import box_side
 from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
@@ -119,7 +119,7 @@ def _push_apart(
         moved = np.inf if built is None else np.sqrt(np.max(np.sum((x - built) ** 2, axis=1)))
         if 2 * moved > cutoff - 1 - 2 * GAP:
             # x stays unwrapped, so that the distance moved since then can be computed.
-            i, j = _close_pairs(_wrap_all(x, side), side, cutoff)
+            i, j = neighbours.close_pairs(_wrap_all(x, side), side, cutoff).T
             built = x.copy()
         separation = x[i] - x[j]
         separation -= side * np.round(separation / side)
@@ -156,17 +156,6 @@ def largest_extra_gap(n: int, d: int, volume: ArrayLike) -> Any:
 def _wrap_all(x: Float[np.ndarray, "n d"], side: float) -> Float[np.ndarray, "n d"]:
     inside = np.mod(x, side)
     return np.where(inside >= side, 0.0, inside)
-
-
-def _close_pairs(
-    inside: Float[np.ndarray, "n d"], side: float, cutoff: float
-) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-    capacity = 16 * len(inside)
-    while True:
-        i, j, count = tree_search(inside, side, cutoff, 1, capacity)
-        if count <= capacity:
-            return i[:count], j[:count]
-        capacity = int(1.5 * count)
 
 
 def relaxed_positions(

@@ -1,6 +1,5 @@
 """Particles in SI for the user, and records of the user's function of them."""
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.data.curve import CoolingCurve, Particles
+from jaxgran.data.curve import Particles
 from jaxgran.scene.gas import Gas
 
 
@@ -101,18 +100,3 @@ def nan_where(failed: Bool[Array, "times replicas_or_1"], x: Array) -> Array:
     if not jnp.issubdtype(x.dtype, jnp.inexact):
         return x
     return jnp.where(failed.reshape(*failed.shape, *[1] * (x.ndim - failed.ndim)), jnp.nan, x)
-
-
-def attach_saved(curve: CoolingCurve, save: Any, saved: Any, box_side: Array) -> CoolingCurve:
-    """Add saved records, of shape (times, replicas, ...), to a curve.
-
-    Args:
-        curve: curve of the run.
-        save: option of the run.
-        saved: the records.
-        box_side: of the box, m.
-    """
-    if save != "particles":
-        return curve.with_saved(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), saved))
-    side = jnp.broadcast_to(box_side, (len(curve.times), *box_side.shape))
-    return dataclasses.replace(curve, saved=saved._replace(box_side=side))

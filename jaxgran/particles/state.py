@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from jaxgran.gradients.tangents import ExchangeTangents, PathTangents
+from jaxgran.gradients.tangents import ContactTangents, ExchangeTangents, ImpactTangents
 from jaxgran.particles import observables
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.reduced import ReducedDrag, ReducedRough, SphereScene
@@ -85,6 +85,15 @@ def centred(values: Float[Array, "... d"], replicas: int) -> Float[Array, "repli
     return by_replica - jnp.mean(by_replica, axis=1, keepdims=True)
 
 
+def peculiar_velocity(
+    scene: SphereScene, velocity: Float[Array, "n d"], replicas: int
+) -> Float[Array, "replicas N d"]:
+    """Return velocities in the frame of each centre of mass, or in that of the walls."""
+    if scene.container is None:
+        return centred(velocity, replicas)
+    return velocity.reshape(replicas, -1, velocity.shape[-1])
+
+
 def temperature(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "replicas"]:
     """Return T of each replica."""
     return observables.temperature(centred(velocity, replicas))
@@ -108,11 +117,8 @@ def common_records(
     They are relative to the centre of mass, between walls relative to the walls. Walls bound
     displacements, and there are no periodic waves between them: these records are left out.
     """
-    walled, shape = scene.container is not None, (replicas, -1, state.velocity.shape[-1])
-    velocity, first = (
-        x.reshape(shape) if walled else centred(x, replicas)
-        for x in (state.velocity, state.first_velocity)
-    )
+    velocity = peculiar_velocity(scene, state.velocity, replicas)
+    first = peculiar_velocity(scene, state.first_velocity, replicas)
     displacement = centred(state.position - state.origin + scene.side * state.image, replicas)
     num_particles = velocity.shape[1]
     values = {
@@ -122,7 +128,7 @@ def common_records(
         "dissipated_energy": state.dissipated / num_particles,
         "collisions": 2 / num_particles * state.collisions,
     }
-    if not walled:
+    if scene.container is None:
         flow_share = jax.vmap(partial(observables.flow_share, side=scene.side))
         values["displacement"] = observables.mean_square_displacement(displacement)
         values["flow_share"] = flow_share(state.position.reshape(velocity.shape), velocity)
@@ -133,10 +139,8 @@ def derivatives_of_records(
     values: dict[str, Array],
     displacement: Float[Array, "replicas N d"],
     velocity: Float[Array, "replicas N d"],
-    log_temperature: Float[Array, "p replicas"],
-    paths: PathTangents,
+    tangents: ContactTangents | ImpactTangents,
     cooling_rate: Float[Array, "replicas"],
-    collision_rate: Float[Array, "replicas"],
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return derivatives of `common_records` for `jaxgran.gradients.rule.with_tangents`.
 
@@ -144,16 +148,15 @@ def derivatives_of_records(
 
     Args:
         values, displacement, velocity: results of `common_records`.
-        log_temperature: derivatives of ln T along p directions.
-        paths: tangents of the paths.
+        tangents: of the state.
         cooling_rate: ``-d ln T/dt``.
-        collision_rate: collisions per particle and time.
 
     Returns:
         The derivatives along the directions at a fixed place, and those with respect to time.
     """
-    c, d = log_temperature, velocity.shape[-1]
+    c, d, paths = tangents.log_temperature, velocity.shape[-1], tangents.paths
     T, C = values["temperature"], values["velocity_correlation"]
+    collision_rate = tangents.rates.collision(T)
     along = {
         "temperature": c * T[None],
         "velocity_correlation": (0.5 * c + paths.correlation_along) * C[None],

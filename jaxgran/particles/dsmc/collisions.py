@@ -27,7 +27,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
 
 from jaxgran.gradients.tangents import ExchangeTangents
-from jaxgran.particles.run import cpu_compiler_options
 from jaxgran.particles.state import (
     MAX_KICK,
     DragDecay,
@@ -218,7 +217,7 @@ def collide(
     scene: ReducedScene,
     directions: ReducedScene | None = None,
     spin: Float[Array, "pairs spins"] | None = None,
-    drag_factor: Float[Array, ""] | None = None,
+    drag_factor: Float[Array, ""] | float = 1.0,
 ) -> Outcome:
     """Let candidate pairs collide at a rate proportional to |g|, with normals weighted by g.n.
 
@@ -230,7 +229,7 @@ def collide(
         scene: in reduced units.
         directions: of the tangents; None for no tangents.
         spin: s_i + s_j of rough spheres.
-        drag_factor: ratio of physical velocities to these; None for 1.
+        drag_factor: ratio of physical velocities to these.
     """
     d, dtype = relative.shape[-1], relative.dtype
     g = [relative[:, k] for k in range(d)]
@@ -246,7 +245,7 @@ def collide(
     cosine = jnp.sqrt(jnp.where(in_disk, 1 - sine_square, 1.0))
     sideways = _perpendicular(axis)
     normal_speed = jnp.where(hit, speed * cosine, ceiling)
-    at_impact = normal_speed if drag_factor is None else normal_speed * drag_factor
+    at_impact = normal_speed * drag_factor
     eps, along, along_speed = _restitution(at_impact, hit, scene.law, directions)
     square = jnp.where(hit, normal_speed**2, 0.0)
     push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
@@ -587,14 +586,10 @@ class DSMCDynamics(eqx.Module):
         index = jnp.concatenate([i, j, k])
         options = {"mode": "promise_in_bounds", "unique_indices": True}
         old = state.particles.at[index].get(**options)
-        v, spin, drag_factor, spin_factor = old[:, :d], old[:, 2 * d :], None, 1.0
         # Collisions happen at the middle of the step, on average: x - v t changes by -kick t.
         middle = state.clock + dt / 2
-        if self.scene.drag is not None:
-            decay = drag_decay(self.scene.drag, middle)
-            drag_factor, spin_factor = decay.velocity, decay.spin
-            spin = spin * spin_factor
-
+        decay = self.drag_decay(middle)
+        v, spin, spin_factor = old[:, :d], old[:, 2 * d :] * decay.spin, decay.spin
         scaled = isinstance(state.tangents, DSMCTangents)
         rule = partial(
             collide,
@@ -602,7 +597,7 @@ class DSMCDynamics(eqx.Module):
             share=share,
             scene=self.scene,
             directions=state.tangents.directions if scaled else None,
-            drag_factor=drag_factor,
+            drag_factor=decay.velocity,
         )
         rough = self.scene.surface is not None
         firsts = v[:first] - v[first : 2 * first]
@@ -744,11 +739,10 @@ class DSMCDynamics(eqx.Module):
             dynamics: DSMCDynamics, decay: DragDecay, faster: Array, turning: Array
         ) -> Array:
             scene, total = dynamics.scene, jnp.zeros(2, ds.dtype)
-            drag_factor = None if scene.drag is None else decay.velocity
             for relative, spins, bits in candidates:
                 spins = None if spins is None else spins * turning
                 outcome = collide(
-                    relative * faster, bits, ceiling, share, scene, None, spins, drag_factor
+                    relative * faster, bits, ceiling, share, scene, None, spins, decay.velocity
                 )
                 gain = outcome.rotational_gain / decay.spin**2
                 total = total + jnp.stack([-outcome.loss, gain])
@@ -836,13 +830,3 @@ def advance(
     state, _ = jax.lax.while_loop(unfinished, step_due, (state, max_steps))
     time = jnp.where(jnp.any(due(state)), jnp.min(state.clock), end)
     return state._replace(time=jnp.maximum(time, state.time))
-
-
-@cache
-def compiled_advance(donate: bool) -> Callable[..., DSMCState]:
-    """Return `advance` for the host driver; with `donate` a call deletes its initial state."""
-    return jax.jit(
-        advance,
-        donate_argnames="state" if donate else (),
-        compiler_options=cpu_compiler_options(),
-    )

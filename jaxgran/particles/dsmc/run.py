@@ -26,10 +26,10 @@ from jaxgran.particles.dsmc.collisions import (
     DSMCState,
     DSMCTangents,
     advance,
-    compiled_advance,
 )
 from jaxgran.particles.run import (
     block_until_ready,
+    compiled_for_host,
     compiling,
     needs_compilation,
     run_through_times,
@@ -39,7 +39,6 @@ from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import (
     centred,
     copy_buffers,
-    drag_decay,
     exchange_derivatives,
     maxwellian_spins,
     threefry_key,
@@ -114,8 +113,8 @@ def dsmc_records(
         units, save: units of the particles, and a user's function of them.
     """
     scene, scheme, replicas = dynamics.scene, dynamics.scheme, len(state.clock)
-    left = (state.time - state.clock) - state.clock_rest
-    share = left * jnp.sqrt(state.temperature) / scheme.scaled_step
+    duration = (state.time - state.clock) - state.clock_rest
+    share = duration * jnp.sqrt(state.temperature) / scheme.scaled_step
     state = dynamics.step(state, key, jnp.clip(share, 0.0, 1.0))
     d = scheme.dimension
 
@@ -125,26 +124,25 @@ def dsmc_records(
     position = state.particles[..., d : 2 * d] + state.clock[:, None, None] * v
     displacement = centred(position, replicas)
     theta = 2 * observables.temperature(velocity)
+    left = dynamics.drag_decay(state.time)  # true over transformed velocities
+    correlation = 2 * observables.velocity_correlation(first, velocity) * left.velocity
     values = {
-        "temperature": theta,
+        "temperature": theta * left.velocity**2,
         "sonine": observables.sonine(velocity),
-        "velocity_correlation": 2 * observables.velocity_correlation(first, velocity),
+        "velocity_correlation": correlation,
         "collisions": 2 / scheme.num_particles * state.collisions,
     }
     if scene.walls is None:  # walls would limit <dr^2>
         values["displacement"] = observables.mean_square_displacement(displacement)
     if scene.surface is not None:
-        spin = jnp.mean(state.particles[..., 2 * d :] ** 2, axis=(1, 2))
-        values["rotational_temperature"] = 2 * scene.surface.inertia * spin
-    if scene.drag is not None:
-        left = drag_decay(scene.drag, state.time)  # true instead of transformed velocities
-        powers = {"temperature": left.velocity**2, "velocity_correlation": left.velocity}
-        powers["rotational_temperature"] = left.true_spin**2
-        values |= {name: powers[name] * values[name] for name in powers.keys() & values.keys()}
+        square = jnp.mean(state.particles[..., 2 * d :] ** 2, axis=(1, 2)) * left.true_spin**2
+        values["rotational_temperature"] = 2 * scene.surface.inertia * square
     fast = status.flag(status.TOO_FAST, state.missed > ALLOWED_MISSED * state.collisions + 1)
     values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
     if save is not None and units is not None:
-        values |= snapshot.saved_records(save, _to_particles(state, scene, d, units))
+        spin = None if scene.surface is None else state.particles[..., 2 * d :] * left.true_spin
+        arrays = jnp.full_like(v, jnp.nan), v * left.velocity, spin  # there are no positions
+        values |= snapshot.saved_records(save, snapshot.particles(units, replicas, *arrays))
     tangents = state.tangents
     if isinstance(tangents, ExchangeTangents):
         size, drag_along = (scheme.num_particles, d), tangents.directions.drag
@@ -152,23 +150,17 @@ def dsmc_records(
     elif tangents is not None:
         spreading = 2 * jnp.mean(jnp.sum(displacement * velocity, axis=-1), axis=-1)
         rates = _rates(values, scene.law, d) | {"displacement": spreading}
+        c = tangents.log_temperature
+        at_scaled_time = {
+            "temperature": theta[None] * c,
+            "velocity_correlation": correlation[None] * (c / 2 + tangents.persistence),
+            "displacement": tangents.displacement,
+            "collisions": jnp.zeros_like(c),
+        }
+        for name, along in at_scaled_time.items():
+            values[f"{name}.along"] = along - rates[name][None] * tangents.clock
         values |= {f"{name}.rate": rate for name, rate in rates.items()}
-        values |= _tangents_at_time(values, rates, tangents)
     return values
-
-
-def _to_particles(state: DSMCState, scene: ReducedScene, d: int, units: Units) -> Particles:
-    """Return particles in SI, with nan for positions, which do not exist."""
-    velocity, spin = state.particles[..., :d], state.particles[..., 2 * d :]
-    if scene.drag is not None:
-        left = drag_decay(scene.drag, state.time)
-        velocity, spin = velocity * left.velocity, spin * left.true_spin
-    return Particles(
-        position=jnp.full_like(velocity, jnp.nan),
-        velocity=velocity * units.velocity,
-        box_side=units.box_side,
-        angular_velocity=None if scene.surface is None else spin * units.spin,
-    )
 
 
 def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array]:
@@ -187,24 +179,6 @@ def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array
         "sonine": 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment * speed,
         "velocity_correlation": -rates.relaxation * speed * values["velocity_correlation"],
         "collisions": averages.collision_rate(a2, d) * speed,
-    }
-
-
-def _tangents_at_time(
-    values: dict[str, Array], rates: dict[str, Array], tangents: DSMCTangents
-) -> dict[str, Array]:
-    """Return tangents of the records at a fixed time, from those at a fixed scaled time."""
-    theta, c = values["temperature"], tangents.log_temperature
-    correlation = values["velocity_correlation"]
-    at_scaled_time = {
-        "temperature": theta[None] * c,
-        "velocity_correlation": correlation[None] * (c / 2 + tangents.persistence),
-        "displacement": tangents.displacement,
-        "collisions": jnp.zeros_like(c),
-    }
-    return {
-        f"{name}.along": along - rates[name][None] * tangents.clock
-        for name, along in at_scaled_time.items()
     }
 
 
@@ -278,24 +252,24 @@ def _run_on_host(
     scheme, dtype = dynamics.scheme, state.clock.dtype
     pairs = len(state.clock) * (scheme.first + scheme.second)
     max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
-    compiled = compiled_advance(donate=run.checkpoint is None)
+    compiled = compiled_for_host(advance, donate=run.checkpoint is None)
     observe = partial(dsmc_records, dynamics, first=state.particles[..., : scheme.dimension])
     observe = partial(observe, key=words)
     recorded = partial(observe, units=inputs.units, save=save)
     state = copy_buffers(state)
 
-    def advance(state: DSMCState, end: float) -> DSMCState:
+    def advance_towards(state: DSMCState, end: float) -> DSMCState:
         arguments = dynamics, state, jnp.asarray(end, dtype), words, max_steps
         return block_until_ready(compiled(*arguments))
 
     new = needs_compilation((jax.tree.structure((dynamics, state)), state.particles.shape, dtype))
     with compiling(run.progress and new):
         if new:  # compile with a call of zero steps, which may delete its state
-            jax.block_until_ready(recorded(advance(copy_buffers(state), 0.0)))
+            jax.block_until_ready(recorded(advance_towards(copy_buffers(state), 0.0)))
     _, records, fault = run_through_times(
         state,
         np.asarray(inputs.times),
-        advance,
+        advance_towards,
         recorded,
         shown=observe,
         scene=description,

@@ -422,13 +422,7 @@ def hard_records(state: State, scene: SphereScene, replicas: int) -> dict[str, A
         T = values["temperature"]
         cooling = tangents.rates.cooling(cooling_trend(material.law, T, d))
         derivatives, rates = derivatives_of_records(
-            values,
-            displacement,
-            velocity,
-            tangents.log_temperature,
-            tangents.paths,
-            cooling,
-            tangents.rates.collision(T),
+            values, displacement, velocity, tangents, cooling
         )
         return rule.with_tangents(values, derivatives, rates, tangents.clock)
     velocity_factor, spin_factor, drag = jnp.ones(()), jnp.ones(()), scene.drag_rates

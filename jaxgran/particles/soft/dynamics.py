@@ -56,6 +56,7 @@ from jaxgran.particles.state import (
     fastest,
     initial_spins,
     kinetic_energy,
+    peculiar_velocity,
     time_left,
 )
 from jaxgran.scene.reduced import ReducedContact, ReducedScene, SphereScene
@@ -254,7 +255,27 @@ class SoftDynamics(AbstractDynamics):
         too_far = block.max_square_move > reach**2
         repeat = too_far | jnp.any(block.unexpected)
         displacement = jnp.sqrt(jnp.max(jnp.sum((new.position - listed) ** 2, -1)))
-        new, fault = self._check_block(old, new, block, candidates, displacement)
+        before, after = (self._energy(state) for state in (old, new))
+        total = jnp.where(before > 0, before, 1.0)
+        error = (after - before + block.lost) / total
+        allowed = WORK_TOLERANCE * block.exchanged / total + ENERGY_TOLERANCE
+        settings = new.internal
+        num_good, drift = settings.num_good + 1, settings.drift + error
+        # The step is doubled again after enough good blocks.
+        recovers = (num_good >= RECOVERY_BLOCKS) & (settings.refinement > 1)
+        settings = settings._replace(
+            num_good=jnp.where(recovers, 0, num_good),
+            refinement=jnp.where(recovers, 0.5 * settings.refinement, settings.refinement),
+            drift=drift,
+        )
+        energy_wrong = jnp.any(jnp.abs(error) > allowed)
+        drifted = jnp.any(jnp.abs(drift) > DRIFT_TOLERANCE)
+        fault = status.flag(status.SKIN_EXCEEDED, displacement > 0.5 * old.skin)
+        fault |= status.flag(status.STEP_TOO_LARGE, energy_wrong)
+        fault |= status.flag(status.ENERGY_DRIFT, drifted & ~energy_wrong)
+        invalid = self.invalid_block(new, candidates.needed)
+        fault = jnp.where(invalid > 0, invalid, fault)
+        new = new._replace(internal=settings)
         accepted = (fault == status.OK) & ~repeat
         enlarged = jnp.where(too_far, 2 * internal.reach_factor, internal.reach_factor)
         return Progress(
@@ -382,43 +403,6 @@ class SoftDynamics(AbstractDynamics):
             unexpected=unexpected,
             max_square_move=jnp.max(jnp.sum(moved**2, -1)),
         )
-
-    def _check_block(
-        self,
-        old: State,
-        new: State,
-        block: Block,
-        candidates: ContactCandidates,
-        displacement: Array,
-    ) -> tuple[State, Int[Array, ""]]:
-        """Return the state with the energy error of a block, and its status.
-
-        The step is doubled again after enough good blocks.
-
-        Args:
-            old, new: the state before and after the block.
-            block, candidates: the block and its pairs.
-            displacement: largest distance that a sphere moved since the neighbour list was built.
-        """
-        before, after = (self._energy(state) for state in (old, new))
-        total = jnp.where(before > 0, before, 1.0)
-        error = (after - before + block.lost) / total
-        allowed = WORK_TOLERANCE * block.exchanged / total + ENERGY_TOLERANCE
-        internal = new.internal
-        num_good, drift = internal.num_good + 1, internal.drift + error
-        recovers = (num_good >= RECOVERY_BLOCKS) & (internal.refinement > 1)
-        internal = internal._replace(
-            num_good=jnp.where(recovers, 0, num_good),
-            refinement=jnp.where(recovers, 0.5 * internal.refinement, internal.refinement),
-            drift=drift,
-        )
-        energy_wrong = jnp.any(jnp.abs(error) > allowed)
-        drifted = jnp.any(jnp.abs(drift) > DRIFT_TOLERANCE)
-        fault = status.flag(status.SKIN_EXCEEDED, displacement > 0.5 * old.skin)
-        fault |= status.flag(status.STEP_TOO_LARGE, energy_wrong)
-        fault |= status.flag(status.ENERGY_DRIFT, drifted & ~energy_wrong)
-        invalid = self.invalid_block(new, candidates.needed)
-        return new._replace(internal=internal), jnp.where(invalid > 0, invalid, fault)
 
     def _energy(self, state: State) -> Float[Array, "replicas"]:
         energy = kinetic_energy(state.velocity, self.replicas)
@@ -556,15 +540,6 @@ def cooling_rate(
     return by_contacts if drag is None else by_contacts + 2 * drag.rate
 
 
-def peculiar_velocity(
-    scene: SphereScene, velocity: Float[Array, "n d"], replicas: int
-) -> Float[Array, "replicas N d"]:
-    """Return velocities in the frame of each centre of mass, or in that of the walls."""
-    if scene.container is None:
-        return centred(velocity, replicas)
-    return velocity.reshape(replicas, -1, velocity.shape[-1])
-
-
 def rotational_temperature(
     scene: SphereScene, spin: Float[Array, "n spins"], replicas: int
 ) -> Float[Array, "replicas"]:
@@ -590,10 +565,8 @@ def soft_records(state: State, scene: SphereScene, replicas: int) -> dict[str, A
     tangents, T, U = state.tangents, values["temperature"], values["elastic_energy"]
     cooling = cooling_rate(scene, tangents, T)
     projected = tangents.projected(velocity.reshape(state.velocity.shape), cooling)
-    c, collision_rate = projected.log_temperature, tangents.rates.collision(T)
-    along, rates = derivatives_of_records(
-        values, travelled, velocity, c, projected.paths, cooling, collision_rate
-    )
+    c = projected.log_temperature
+    along, rates = derivatives_of_records(values, travelled, velocity, projected, cooling)
     stiffer = (tangents.directions.law.alpha / scene.material.law.alpha)[:, None]
     along["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
     rates["elastic_energy"] = -1.4 * cooling * U

@@ -309,18 +309,9 @@ class ContactWork(NamedTuple):
     stored: Any = None
 
 
-class BlockWork(NamedTuple):
-    """Energies and contacts of a block.
-
-    Attributes:
-        pairs: of each pair.
-        walls: of each member at walls; None without walls.
-        lost_to_drag: energy that each member lost to drag; None without drag.
-    """
-
-    pairs: ContactWork
-    walls: ContactWork | None
-    lost_to_drag: Float[Array, "members"] | None
+BlockWork = tuple[ContactWork, ContactWork | None, Float[Array, "members"] | None]
+"""Energies and contacts of a block: of pairs; of each member at walls, None without walls; and the
+energy that each member lost to drag, None without drag."""
 
 
 def integrate(
@@ -414,7 +405,7 @@ def integrate(
             v, spin, lost = rub_pairs(v, spin, xi, -normal, force)
             pairs = pairs._replace(dissipated=pairs.dissipated + lost)
         spheres, lost = fly(scene, Spheres(x, v, spin), dt, material)
-        return spheres, BlockWork(pairs, walls, jax.tree.map(jnp.add, lost_to_drag, lost))
+        return spheres, (pairs, walls, jax.tree.map(jnp.add, lost_to_drag, lost))
 
     touching_at_start, zeros = overlap(members.x, a, b, offset)[2], jnp.zeros(len(a), dtype)
     num_begun = jnp.zeros(len(a), jnp.int32)
@@ -423,7 +414,7 @@ def integrate(
         zeros = jnp.zeros(len(members.x), dtype)
         walls = ContactWork(zeros, zeros, touched=wall_overlap(container, members.x)[2])
     members, lost = fly(scene, members, 0.5 * dt, material)
-    carry = members, BlockWork(pairs, walls, lost)
+    carry = members, (pairs, walls, lost)
     members, (pairs, walls, lost_to_drag) = jax.lax.fori_loop(0, num_steps, step, carry)
     members, lost = fly(scene, members, -0.5 * dt, material)
 
@@ -443,4 +434,4 @@ def integrate(
             touched=walls.touched | touching,
             stored=jnp.sum(elastic_energy(depth, wall_law, WALL), axis=-1),
         )
-    return members, BlockWork(pairs, walls, jax.tree.map(jnp.add, lost_to_drag, lost))
+    return members, (pairs, walls, jax.tree.map(jnp.add, lost_to_drag, lost))
