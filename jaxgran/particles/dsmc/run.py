@@ -135,8 +135,8 @@ def dsmc_records(
     if scene.walls is None:  # walls would limit <dr^2>
         values["displacement"] = observables.mean_square_displacement(displacement)
     if scene.surface is not None:
-        square = jnp.mean(state.particles[..., 2 * d :] ** 2, axis=(1, 2)) * left.true_spin**2
-        values["rotational_temperature"] = 2 * scene.surface.inertia * square
+        energy = 2 * scene.surface.inertia * jnp.mean(state.particles[..., 2 * d :] ** 2, (1, 2))
+        values["rotational_temperature"] = energy * left.true_spin**2
     fast = status.flag(status.TOO_FAST, state.missed > ALLOWED_MISSED * state.collisions + 1)
     values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
     if save is not None and units is not None:
