@@ -1,7 +1,7 @@
 """How many simulations does a fit need, with derivatives and without?
 
-    python experiments/fit/fit_head_to_head.py [--scenes stochastic soft-spheres]
-        [--smoke] [--record] [--out DIR]
+    python experiments/fit/fit_head_to_head.py [--only fit_head_to_head fit_laws]
+        [--scenes stochastic soft-spheres] [--smoke] [--record] [--out DIR]
 
 A, and then A and T_0 together, are estimated from a cooling curve: by `jaxgran.fit`, whose
 simulations compute tangents, and by searches without derivatives (SciPy's bounded scalar search,
@@ -19,7 +19,7 @@ the true values. A simulation with tangents counts as one.
 - soft-spheres: the curve measured in LAMMPS, up to 24 mean free times. According to the scatter of
   24 boxes of 1000 spheres, the noise of one simulation gives A an error of 3 %, that of the LAMMPS
   curve nearly 2 %. Whether one search with fixed random numbers ends within 2 % is partly chance.
-- laws: A, and then `RestitutionSpline` laws of 3, 10 and 30 knots, through hard spheres of a dense
+- laws (--only fit_laws): A, and then `RestitutionSpline` laws of 3, 10 and 30 knots, through hard spheres of a dense
   gas, from a law with twice the losses. `jaxgran.fit` descends by optax (reverse mode). The others
   are Nelder-Mead and Gauss-Newton steps by finite differences. Counted are the simulations until
   the distance from the true law stays below 1.5 times the statistical bound of Cramer and Rao: by
@@ -196,16 +196,19 @@ PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
 
 
 def fit_head_to_head(options: argparse.Namespace) -> dict:
-    scenes = ["stochastic", "laws"] if options.smoke else options.scenes
-    problems = {scene: PROBLEMS[scene](options) for scene in scenes if scene != "laws"}
+    scenes = ["stochastic"] if options.smoke else options.scenes
+    problems = {scene: PROBLEMS[scene](options) for scene in scenes}
     rows = (
         row
         for scene, problem in problems.items()
         for count in (1, 2)
         for row in compare(scene, problem, count, options.smoke)
     )
-    of_laws = laws(options.smoke) if "laws" in scenes else ()
-    return {"rows": collected(rows), "laws": collected(of_laws)}
+    return {"rows": collected(rows)}
+
+
+def fit_laws(options: argparse.Namespace) -> dict:
+    return {"rows": collected(laws(options.smoke))}
 
 
 def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[dict]:
@@ -296,6 +299,6 @@ WITHOUT = {
 
 
 if __name__ == "__main__":
-    scenes = [*PROBLEMS, "laws"]
-    settings = {"nargs": "+", "choices": scenes, "default": scenes}
-    run_parts(__doc__, {"fit_head_to_head": fit_head_to_head}, scenes=settings)
+    settings = {"nargs": "+", "choices": list(PROBLEMS), "default": list(PROBLEMS)}
+    parts = {"fit_head_to_head": fit_head_to_head, "fit_laws": fit_laws}
+    run_parts(__doc__, parts, scenes=settings)
