@@ -20,11 +20,11 @@ the true values. A simulation with tangents counts as one.
   24 boxes of 1000 spheres, the noise of one simulation gives A an error of 3 %, that of the LAMMPS
   curve nearly 2 %. Whether one search with fixed random numbers ends within 2 % is partly chance.
 - laws (--only fit_laws): A, and then `RestitutionSpline` laws of 3, 10 and 30 knots, through hard
-  spheres of a dense gas, from a law with twice the losses. `jaxgran.fit` descends by optax (reverse mode). The others
-  are Nelder-Mead and Gauss-Newton steps by finite differences. Counted are the simulations until
-  the distance from the true law stays below 1.5 times the statistical bound of Cramer and Rao: by
-  kinetic theory, ``sum(((ln T - ln T_true)/sigma)^2)``, with the prior, is p if an estimate of p
-  parameters is as good as the errors of the curve allow.
+  spheres of a dense gas, from a law with twice the losses. `jaxgran.fit` descends by optax (reverse
+  mode). The others are Nelder-Mead and Gauss-Newton steps by finite differences. Counted are the
+  simulations until the distance from the true law stays below 1.5 times the statistical bound of
+  Cramer and Rao: by kinetic theory, ``sum(((ln T - ln T_true)/sigma)^2)``, with the prior, is p if
+  an estimate of p parameters is as good as the errors of the curve allow.
 """
 
 import argparse
