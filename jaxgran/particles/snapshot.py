@@ -95,7 +95,7 @@ def _as_array(leaf: Any) -> Array:
     return array
 
 
-def nan_where(failed: Bool[Array, "times replicas_or_1"], x: Array) -> Array:
+def nan_where(failed: Bool[Array, "..."], x: Array) -> Array:
     """Return a record with nan where a run failed; integers have no nan and stay as they are."""
     if not jnp.issubdtype(x.dtype, jnp.inexact):
         return x
