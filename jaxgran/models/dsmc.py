@@ -1,10 +1,12 @@
 """Direct simulation Monte Carlo (DSMC) of the velocities of a homogeneous gas."""
 
+import dataclasses
 from collections.abc import Callable
 from math import hypot
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -16,7 +18,7 @@ from jaxgran._utils.validation import (
     checked_int,
     python_int,
 )
-from jaxgran.data.curve import Run
+from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
 from jaxgran.gradients.rule import Inputs, Outputs, differentiable
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
@@ -115,6 +117,19 @@ class DSMC(AbstractParticleModel):
         """Return limitations by contacts that last, correlated collisions, and a growing flow."""
         contacts = checks.limitations_of_instant_impacts(gas)
         return contacts + checks.limitations_of_homogeneity(gas, num_particles)
+
+    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
+        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        curve = super().simulate(gas, times, run)
+        if gas.container is None:
+            return curve
+        # Before walls impacts are weak, not few.
+        more = mixed_path_length(gas) / gas.path_length
+        curves = [x for x in (curve, curve.replicas) if x is not None]
+        curve, *replicas = (
+            dataclasses.replace(x, collisions=jnp.asarray(x.collisions) * more) for x in curves
+        )
+        return dataclasses.replace(curve, replicas=replicas[0] if replicas else None)
 
     def inputs(self, gas: Gas, times: Float[Array, "times"], run: Run) -> Inputs:
         """Return the gas and the times in units of its path length and impact speed."""

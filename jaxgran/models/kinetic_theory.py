@@ -221,7 +221,7 @@ class KineticTheory(AbstractModel):
             times=times,
             temperature=temperature,
             sonine=state.sonine + nan_if_failed,
-            collisions=state.collisions + nan_if_failed,
+            collisions=state.collisions * length / gas.path_length + nan_if_failed,
             diffusion=diffusion + nan_if_failed,
             displacement=state.displacement * length**2 + nan_if_failed,
             status=fault,

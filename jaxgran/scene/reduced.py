@@ -97,7 +97,7 @@ class ReducedScene(NamedTuple):
 
 
 SHIELDING = 4.5
-"""Factor of the share of impacts between spheres that walls prevent, see `mixed_path_length`.
+"""Factor of the share of losses between spheres that walls prevent, see `mixed_path_length`.
 
 Measured: hard spheres, N = 60 to 4000, phi = .03 and .1, eps = .8 to .95: 3.1 to 5."""
 
@@ -110,8 +110,8 @@ def mixed_path_length(gas: Gas) -> Float[Array, ""]:
 
     It is `Gas.path_length`, and longer between walls that dissipate energy. Before these the gas is
     denser and colder than elsewhere, but there spheres meet others on one side only. The share of
-    impacts that they lack is `SHIELDING` sigma/W e with the width W that the centres have and the
-    energy e, over 2 T, that an impact on a wall takes:
+    losses between spheres that is missing, in about as many impacts, is `SHIELDING` sigma/W e with
+    the width W that the centres have and the energy e, over 2 T, that an impact on a wall takes:
     ``(1 - eps^2)/2 + (d - 1) (eta - eta^2 (1 + T_rot/(q T)))``, where eta, half of
     `ReducedRough.eta_on_wall`, is 0 for smooth walls.
     """
