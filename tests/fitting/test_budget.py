@@ -1,5 +1,7 @@
 """The whole error of an estimate, part by part."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,9 @@ import pytest
 
 import jaxgran
 from experiments.support.scenes import beads as beads_of
+from jaxgran.fitting import alternatives
 from jaxgran.models.choose import error_model_of
+from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR, UNKNOWN_WALL_ERROR
 from tests.beads import glass_beads
 from tests.fitting.curves import measured, synthetic
 
@@ -135,3 +139,35 @@ def test_derivatives_through_a_flow_are_known_worse():
     assert float(gas.box_side(100)) < float(gas.critical_box)
     assert not np.any(jaxgran.SoftSpheres(100).derivative_error(small))
     assert jaxgran.DSMC(1000).derivative_error(error_model_of(gas, end, 1000)) == 0
+
+
+def test_between_walls_only_impacts_between_spheres_are_random():
+    gas = glass_beads(packing_fraction=0.03)
+    walled = dataclasses.replace(gas, container=jaxgran.Walls(gas.box_side(250), restitution=0.9))
+    elastic = walled.replace(wall_coefficient=1.0)
+    both = (error_model_of(x, end=0.1, num_particles=250) for x in (walled, elastic))
+    walled, elastic = both
+    rates = [-m.log_temperature[1] / m.time[1] for m in (walled, elastic)]
+    np.testing.assert_allclose(walled.impact_share[0], rates[1] / rates[0], rtol=0.04)
+    np.testing.assert_allclose(elastic.impact_share, 1.0, rtol=1e-12)
+    chance = [m.chance_of_clock(250)[-1] for m in (walled, elastic)]
+    assert 0.3 < chance[0] / chance[1] < 0.6
+    # The error of the rate is what was measured for such a box.
+    assert 0.003 < walled.mixing < 0.006 and elastic.mixing < 0.004
+    rough = dataclasses.replace(walled.gas.container, tangential_restitution=-0.3)
+    gas = dataclasses.replace(walled.gas, container=rough, surface=jaxgran.Rough(-0.3))
+    assert walled._replace(gas=gas).mixing == 0.02
+
+
+def test_alternatives_have_the_error_of_theory_with_what_they_add():
+    kinds = {kind.name: kind for kind in _kinds_of(glass_beads(0.15))}
+    errors = {name: kind.rate_error(0.5) for name, kind in kinds.items()}
+    assert errors["walls that dissipate energy"] == 0.5 * UNKNOWN_WALL_ERROR
+    assert errors["rough grains without initial rotation"] == 0.5 * ROUGHNESS_ERROR
+    assert errors["rough grains that slide"] == 0.5 * SLIDING_ERROR
+    assert errors["linear drag, as in air"] == 0.0
+
+
+def _kinds_of(gas):
+    result = jaxgran.fit(gas, synthetic(gas, jax.random.key(0)), free=BOTH, num_particles=500)
+    return alternatives._kinds(result, alternatives._problem(result)[0], ())

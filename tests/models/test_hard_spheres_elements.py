@@ -9,6 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran._utils import status
+from jaxgran.models import error_model
 from jaxgran.particles.hard.impacts import ImpactEvents, impact_effect
 from jaxgran.scene.reduced import ReducedDrag, ReducedRough, ReducedScene, SphereScene
 from tests.beads import SI, glass_beads, hard_gas
@@ -225,3 +226,20 @@ def test_walls_take_from_elastic_spheres_what_theory_says():
     slopes = np.diff((hard.temperature / gas.temperature) ** -0.5) / np.diff(times * rate)
     # Four standard errors of a slope, .8 sqrt(2/(N replicas)), and error_model.WALL_ERROR.
     assert np.all(np.abs(slopes - 1) < 4 * 0.8 * (2 / (500 * 8)) ** 0.5 + 0.04), slopes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beta", [None, -0.3])
+def test_beads_between_walls_cool_as_theory_says(beta):
+    gas = glass_beads(packing_fraction=0.03)
+    walls = jaxgran.Walls(gas.box_side(250), restitution=0.9, tangential_restitution=beta)
+    surface = None if beta is None else jaxgran.Rough(beta)
+    gas = dataclasses.replace(gas, container=walls, surface=surface)
+    times = jnp.array([8.0, 20.0, 40.0]) * gas.mean_free_time
+    theory = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False))
+    hard = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(250, replicas=24))
+    off = np.log(hard.temperature / theory.temperature)
+    # Three standard errors, and twice the measured error of the rate times d ln T/d ln t < 2.
+    error = 2 * 2 * (0.004 if beta is None else error_model.ROUGH_WALL_ERROR)
+    assert np.all(np.abs(off) < 3 * hard.temperature_error / hard.temperature + error), off
+    np.testing.assert_allclose(hard.collisions, theory.collisions, rtol=0.04)
