@@ -97,10 +97,10 @@ def soft_spheres(options: argparse.Namespace) -> Problem:
 
 def laws(smoke: bool) -> Iterator[dict]:
     """Compare searches of laws with 1, 3, 10 and 30 parameters through hard spheres."""
-    size, counts, most = (60, (1, 3), (4, 10)) if smoke else (1000, (1, 3, 10, 30), (60, 200))
+    size, counts, most = (60, (1, 3), (4, 10)) if smoke else (1000, (1, 3, 10, 30), (60, 100))
     beads = jaxgran.Viscoelastic(5e7, 0.22, 5e-6)
     gas = jaxgran.Gas(beads, diameter=2e-3, mass=1e-5, packing_fraction=0.25, temperature=0.01)
-    times = np.linspace(0.3, 12.0, 40) * float(gas.mean_free_time)
+    times = np.linspace(0.25, 8.0, 32) * float(gas.mean_free_time)
     model = jaxgran.HardSpheres(size, replicas=2)
     made = cool(gas, times, jaxgran.HardSpheres(size, replicas=8), KEY + 1)
     curve = jaxgran.CoolingCurve(times, made.temperature, temperature_error=made.temperature_error)
