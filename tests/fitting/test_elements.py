@@ -10,13 +10,27 @@ import pytest
 import jaxgran
 from jaxgran.fitting.residuals import finite_size_cooling_factor
 from tests.beads import glass_beads
-from tests.fitting.curves import synthetic
 
 THEORY = jaxgran.KineticTheory()
 
 
-def measured(gas, model=THEORY, error=0.02):
-    return synthetic(gas, jax.random.key(1), relative_error=error, end=80.0, model=model)
+def measured(gas, model=THEORY, error=0.02, end=80.0) -> jaxgran.CoolingCurve:
+    """A curve of a model with errors of T and, of rough spheres, of T_rot."""
+    times = np.geomspace(0.3, end, 40) * float(gas.mean_free_time)
+    exact = jaxgran.cool(gas, times, model=model, key=jax.random.key(5))
+    rng = np.random.default_rng(1)
+
+    def noisy(values):
+        return np.asarray(values) * np.exp(error * rng.normal(size=times.size))
+
+    T, fields = noisy(exact.temperature), {}
+    if gas.surface is not None:
+        T_rot = noisy(exact.rotational_temperature)
+        fields = {
+            "rotational_temperature": T_rot,
+            "rotational_temperature_error": error * T_rot,
+        }
+    return jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=error * T, **fields)
 
 
 ROUGH = jaxgran.Rough(0.0, rotational_temperature=3e-3)
