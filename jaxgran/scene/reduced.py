@@ -112,7 +112,7 @@ def mixed_path_length(gas: Gas) -> Float[Array, ""]:
     denser and colder than elsewhere, but there spheres meet others on one side only. The share of
     losses between spheres that is missing, in about as many impacts, is `SHIELDING` sigma/W e with
     the width W that the centres have and the energy e, over 2 T, that an impact on a wall takes:
-    ``(1 - eps^2)/2 + (d - 1) (eta - eta^2 (1 + T_rot/(q T)))``, where eta, half of
+    ``(1 - eps^2)/2 + (d - 1) (eta - eta^2)`` without rotation, where eta, half of
     `ReducedRough.eta_on_wall`, is 0 for smooth walls.
     """
     if gas.container is None:
@@ -123,7 +123,7 @@ def mixed_path_length(gas: Gas) -> Float[Array, ""]:
     energy = (1 - law.restitution(speed) ** 2) / 2
     if rough is not None and walls.tangential_restitution is not None:
         eta = rough.eta_on_wall(walls.tangential_restitution) / 2
-        energy = energy + (d - 1) * (eta - eta**2 * (1 + rough.ratio / rough.inertia))
+        energy = energy + (d - 1) * (eta - eta**2)
     near = jnp.mean(gas.diameter / (jnp.broadcast_to(walls.side, (d,)) - gas.diameter))
     return gas.path_length / (1 - jnp.minimum(SHIELDING * near * energy, 0.5))
 
