@@ -111,19 +111,15 @@ def mixed_path_length(gas: Gas) -> Float[Array, ""]:
     It is `Gas.path_length`, and longer between walls that dissipate energy. Before these the gas is
     denser and colder than elsewhere, but there spheres meet others on one side only. The share of
     losses between spheres that is missing, in about as many impacts, is `SHIELDING` sigma/W e with
-    the width W that the centres have and the energy e, over 2 T, that an impact on a wall takes:
-    ``(1 - eps^2)/2 + (d - 1) (eta - eta^2)`` without rotation, where eta, half of
-    `ReducedRough.eta_on_wall`, is 0 for smooth walls.
+    the width W that the centres have and the share ``e = (1 - eps^2)/2`` of 2 T that an impact on a
+    wall takes.
     """
     if gas.container is None:
         return gas.path_length
-    d, walls, rough = gas.dimension, gas.container, _rough(gas)
+    d, walls = gas.dimension, gas.container
     law = walls.restitution.on_wall(diameter=gas.diameter, mass=gas.mass, speed=gas.impact_speed)
     speed = jnp.full_like(gas.temperature, TYPICAL_IMPACT / sqrt(2))
     energy = (1 - law.restitution(speed) ** 2) / 2
-    if rough is not None and walls.tangential_restitution is not None:
-        eta = rough.eta_on_wall(walls.tangential_restitution) / 2
-        energy = energy + (d - 1) * (eta - eta**2)
     near = jnp.mean(gas.diameter / (jnp.broadcast_to(walls.side, (d,)) - gas.diameter))
     return gas.path_length / (1 - jnp.minimum(SHIELDING * near * energy, 0.5))
 
