@@ -112,9 +112,9 @@ def mixed_path_length(gas: Gas) -> Float[Array, ""]:
     denser and colder than elsewhere, but there spheres meet others on one side only. The share of
     losses between spheres that is missing, in about as many impacts, is `SHIELDING` sigma/W e with
     the width W that the centres have and the share ``e = (1 - eps^2)/2`` of 2 T that an impact on a
-    wall takes.
+    wall takes. Rough spheres are left as they were measured.
     """
-    if gas.container is None:
+    if gas.container is None or gas.surface is not None:
         return gas.path_length
     d, walls = gas.dimension, gas.container
     law = walls.restitution.on_wall(diameter=gas.diameter, mass=gas.mass, speed=gas.impact_speed)
@@ -145,7 +145,7 @@ def reduced_scene(gas: Gas) -> ReducedScene:
     if gas.container is not None:
         box = gas.container
         law = box.restitution.on_wall(diameter=gas.diameter, mass=gas.mass, speed=speed)
-        more = box.more_collisions(gas.diameter, d)
+        more = 1.0 if gas.surface is not None else box.more_collisions(gas.diameter, d)
         pressure = 1 + 2 ** (d - 1) * gas.packing_fraction * gas.contact_value * more
         widths = jnp.broadcast_to(box.side - gas.diameter, (d,))
         frequency = pressure * length / widths / pi**0.5
