@@ -21,7 +21,7 @@ from jaxgran.fitting.optimise import Problem, search
 from jaxgran.fitting.parameters import START_TIME, domain_of
 from jaxgran.fitting.residuals import FLOOR, DropTestRows, Measurement, chi2_scale
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
-from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR, UNKNOWN_WALL_ERROR
+from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR, WALL_ERROR
 from jaxgran.models.kinetic_theory import KineticTheory
 
 ALLOWED_CHI2 = 3.84
@@ -433,7 +433,7 @@ def _kinds(result: Fit, problem: Problem, absent: tuple[str, ...]) -> list[Kind]
             ("wall_side",),
             (SHARES,),
             walls,
-            lambda share: UNKNOWN_WALL_ERROR * share,
+            lambda share: WALL_ERROR * share,
         ),
         Kind("linear drag, as in air", ("drag_rate",), (DRAG_SHARES,), drag),
         Kind("a noise floor in T", (FLOOR,), (SHARES,), floor),

@@ -1,12 +1,10 @@
 """Direct simulation Monte Carlo (DSMC) of the velocities of a homogeneous gas."""
 
-import dataclasses
 from collections.abc import Callable
 from math import hypot
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -18,7 +16,7 @@ from jaxgran._utils.validation import (
     checked_int,
     python_int,
 )
-from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
+from jaxgran.data.curve import Run
 from jaxgran.gradients.rule import Inputs, Outputs, differentiable
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
@@ -29,7 +27,7 @@ from jaxgran.particles.dsmc.run import run_dsmc
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import mixed_path_length, reduced_scene
+from jaxgran.scene.reduced import reduced_scene
 
 MAX_STEP = 0.1
 """Largest number of collisions per particle and step: a step draws a particle at most twice."""
@@ -118,22 +116,9 @@ class DSMC(AbstractParticleModel):
         contacts = checks.limitations_of_instant_impacts(gas)
         return contacts + checks.limitations_of_homogeneity(gas, num_particles)
 
-    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
-        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
-        curve = super().simulate(gas, times, run)
-        if gas.container is None:
-            return curve
-        # Before walls impacts are weak, not few.
-        more = mixed_path_length(gas) / gas.path_length
-        curves = [x for x in (curve, curve.replicas) if x is not None]
-        curve, *replicas = (
-            dataclasses.replace(x, collisions=jnp.asarray(x.collisions) * more) for x in curves
-        )
-        return dataclasses.replace(curve, replicas=replicas[0] if replicas else None)
-
     def inputs(self, gas: Gas, times: Float[Array, "times"], run: Run) -> Inputs:
         """Return the gas and the times in units of its path length and impact speed."""
-        scene, length = reduced_scene(gas), mixed_path_length(gas)
+        scene, length = reduced_scene(gas), gas.path_length
         reduced = times * gas.impact_speed / length
         if scene.drag is not None:
             reduced = transformed_times(scene.drag, reduced)

@@ -69,16 +69,15 @@ Measured: kinetic theory against DSMC, 200000 particles, constant restitution: T
 +- .3 % after 80 mean free times at a_2 = .05, .12, .19, where |d ln T/d ln t| = 1.7.
 """
 
-WALL_ERROR = 0.0015, 0.1, 7.0
-"""a, b, c of the relative error ``a + b (1 - eps)^2 + c (sigma/W)^3`` of a cooling rate that
-assumes a mixed gas between smooth walls of restitution eps, with the width W that centres have.
+WALL_ERROR = 0.013
+"""Relative error of a cooling rate that assumes a mixed gas between walls, apart from the layer
+before them (`jaxgran.scene.elements`).
 
-Measured: the mean rate of hard spheres, 20000 in all replicas, until T has fallen to .5, .2 and
-.03, is lower than that of theory by .8, 1.2, 1.1 +- .2 % for N = 60, phi = .03, eps = .9, by -.8 to
-.4 % for N = 250 to 4000, eps = .8 to .95, phi = .03 and .1, and higher by up to 4, 2, 2 % for
-eps = .6; with elastic walls they agree within .5 %. In the first sound times, until T has fallen to
-.7, it is lower by 4 to 8 % for eps = .6, -1 to 2 % for .8. With elastic spheres, which walls alone
-cool, it is lower by .4 to .7 %, phi = .03, and by 1 to 2 %, phi = .1.
+Measured: the mean rate of hard spheres, 20000 in all replicas, phi = .03, until T has fallen to .5,
+.2 and .03, is lower than that of theory by 1.9, 2.0, 2.0 +- .2 % for N = 60 and eps_w = .9, by 1.0,
+1.2, 1.2 % for N = 250 and 1000, by .4, 1.4, 1.3 % for eps_w = .8, and higher by 2, 1, .5 % for
+eps_w = .6; with elastic walls they agree within .4 %. In the first sound times, until T has fallen
+to .7, it is lower by 8 % for eps_w = .6, 0 to 4 % for .8, 1 % for .9.
 """
 
 ROUGH_WALL_ERROR = 0.05
@@ -87,9 +86,6 @@ ROUGH_WALL_ERROR = 0.05
 Measured: the mean rate until T has fallen to .5, .2, .03 is lower by 4, 6, 7 % for N = 60, by 1 to
 3, 4 to 5, 5 to 6 % for N = 250 and by 2, 2, 3 % for N = 2000; T_rot/T is up to 11 % lower.
 """
-
-UNKNOWN_WALL_ERROR = 0.013
-"""The same for an explanation of a curve by walls of unknown restitution."""
 
 ROUGHNESS_ERROR, SLIDING_ERROR = 0.008, 0.01
 """Relative error of kinetic theory's cooling rate of rough spheres, whose spins and velocities are
@@ -250,14 +246,8 @@ class ErrorModel(NamedTuple):
         """Error of the cooling rate of models that assume a mixed gas between walls."""
         if self.gas.container is None:
             return 0.0
-        walls, (a, b, c) = self.gas.container, WALL_ERROR
-        if walls.tangential_restitution is not None:
-            return ROUGH_WALL_ERROR
-        eps = walls.restitution.on_wall(
-            diameter=self.gas.diameter, mass=self.gas.mass, speed=self.gas.impact_speed
-        ).restitution(jnp.ones(()))
-        near = np.max(np.asarray(self.gas.diameter / (walls.side - self.gas.diameter)))
-        return float(a + b * (1 - eps) ** 2 + c * near**3)
+        smooth = self.gas.container.tangential_restitution is None
+        return WALL_ERROR if smooth else ROUGH_WALL_ERROR
 
     @property
     def roughness(self) -> float:

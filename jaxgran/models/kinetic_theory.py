@@ -17,7 +17,7 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import mixed_path_length, reduced_scene
+from jaxgran.scene.reduced import reduced_scene
 from jaxgran.theory.equations import Density, Equations, softness_factor
 from jaxgran.theory.solver import Integrator, moments_at, padded_length
 
@@ -194,7 +194,7 @@ class KineticTheory(AbstractModel):
 
     def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
-        length, sound = mixed_path_length(gas), jnp.asarray(True)
+        length, sound = gas.path_length, jnp.asarray(True)
         if self.softness:  # a search may try a T_0 at which spheres are too soft: no step is made
             law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
             sound = softness_factor(law, hottest, gas.dimension) > 0
@@ -221,7 +221,7 @@ class KineticTheory(AbstractModel):
             times=times,
             temperature=temperature,
             sonine=state.sonine + nan_if_failed,
-            collisions=state.collisions * length / gas.path_length + nan_if_failed,
+            collisions=state.collisions + nan_if_failed,
             diffusion=diffusion + nan_if_failed,
             displacement=state.displacement * length**2 + nan_if_failed,
             status=fault,

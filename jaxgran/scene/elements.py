@@ -367,8 +367,8 @@ def wall_impact_ratio(
       ``q W/(6 kappa)`` below the mean. The ratio of the two is ``y = 1 - a sqrt(y)`` with
       ``a = (1 - eps) n W sqrt(2 T/pi) T/(6 kappa T)``.
 
-    The formula agrees with measurements within 2 % for eps from 0.7 to 0.95 and Kn from 0.04 to
-    0.3; see `jaxgran.models.error_model.WALL_ERROR`. The ratio is too large for Kn >> 1, where
+    The formula agrees with measurements within 3.5 % for eps from 0.6 to 0.9 and Kn from 0.09 to
+    1.2; see `jaxgran.models.error_model.WALL_ERROR`. The ratio is too large for Kn >> 1, where
     spheres meet only walls and there is no pressure to balance, and in the first sound times.
 
     Args:

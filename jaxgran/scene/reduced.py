@@ -1,12 +1,12 @@
 """A scene in reduced units.
 
 - `reduced_scene`, for kinetic theory and DSMC: speeds in `Gas.impact_speed`, lengths in
-  `mixed_path_length`.
+  `Gas.path_length`.
 - `sphere_scene`, for spheres in boxes: the diameter, the mass and the initial temperature are 1,
   and rates are per collision.
 """
 
-from math import pi, sqrt
+from math import pi
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -96,57 +96,23 @@ class ReducedScene(NamedTuple):
         return any(element is not None for element in self[1:])
 
 
-SHIELDING = 4.5
-"""Factor of the share of losses between spheres that walls prevent, see `mixed_path_length`.
-
-Measured: hard spheres, N = 60 to 4000, phi = .03 and .1, eps = .8 to .95: 3.1 to 5."""
-
-TYPICAL_IMPACT = 2 * sqrt(2 / pi)
-"""Mean normal speed of impacts, weighted by itself, in units of sqrt(2 T)."""
-
-
-def mixed_path_length(gas: Gas) -> Float[Array, ""]:
-    """Return the unit of length of theories of a mixed gas, m.
-
-    It is `Gas.path_length`, and longer between walls that dissipate energy. Before these the gas is
-    denser and colder than elsewhere, but there spheres meet others on one side only. The share of
-    losses between spheres that is missing, in about as many impacts, is `SHIELDING` sigma/W e with
-    the width W that the centres have and the share ``e = (1 - eps^2)/2`` of 2 T that an impact on a
-    wall takes. Rough spheres are left as they were measured.
-    """
-    if gas.container is None or gas.surface is not None:
-        return gas.path_length
-    d, walls = gas.dimension, gas.container
-    law = walls.restitution.on_wall(diameter=gas.diameter, mass=gas.mass, speed=gas.impact_speed)
-    speed = jnp.full_like(gas.temperature, TYPICAL_IMPACT / sqrt(2))
-    energy = (1 - law.restitution(speed) ** 2) / 2
-    near = jnp.mean(gas.diameter / (jnp.broadcast_to(walls.side, (d,)) - gas.diameter))
-    return gas.path_length / (1 - jnp.minimum(SHIELDING * near * energy, 0.5))
-
-
-def _rough(gas: Gas) -> ReducedRough | None:
-    rough = gas.surface
-    if not isinstance(rough, Rough):
-        return None
-    ratio = rough.rotational_temperature / gas.temperature
-    return ReducedRough(rough.tangential_restitution, rough.inertia, ratio, rough.friction)
-
-
 def reduced_scene(gas: Gas) -> ReducedScene:
-    """Return a gas of impacts in the unit of time `mixed_path_length` over `Gas.impact_speed`.
+    """Return a gas of impacts with rates in the unit of time `path_length` over `impact_speed`.
 
     The density of centres at a hard wall is Z times the mean density (contact theorem). Here
-    ``Z = 1 + 2^(d-1) phi g_2 M`` is the pressure of elastic spheres over that of a dilute gas, by
-    the virial theorem with M times as many collisions as without walls, `Walls.more_collisions`.
-    Hence a sphere hits the walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
+    ``Z = 1 + 2^(d-1) phi g_2`` is the pressure of elastic spheres over that of a dilute gas. Hence
+    a sphere hits the walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
     """
-    d, length, speed = gas.dimension, mixed_path_length(gas), gas.impact_speed
-    walls = drag = drive = None
+    d, length, speed = gas.dimension, gas.path_length, gas.impact_speed
+    surface = walls = drag = drive = None
+    if isinstance(gas.surface, Rough):
+        rough = gas.surface
+        ratio = rough.rotational_temperature / gas.temperature
+        surface = ReducedRough(rough.tangential_restitution, rough.inertia, ratio, rough.friction)
     if gas.container is not None:
         box = gas.container
         law = box.restitution.on_wall(diameter=gas.diameter, mass=gas.mass, speed=speed)
-        more = 1.0 if gas.surface is not None else box.more_collisions(gas.diameter, d)
-        pressure = 1 + 2 ** (d - 1) * gas.packing_fraction * gas.contact_value * more
+        pressure = 1 + 2 ** (d - 1) * gas.packing_fraction * gas.contact_value
         widths = jnp.broadcast_to(box.side - gas.diameter, (d,))
         frequency = pressure * length / widths / pi**0.5
         walls = ReducedWalls(law, frequency, box.tangential_restitution)
@@ -155,7 +121,7 @@ def reduced_scene(gas: Gas) -> ReducedScene:
         drag = ReducedDrag(gas.drag.rate * time, gas.drag.rotational_rate * time)
     if gas.drive is not None:
         drive = ReducedDrive(gas.drive.strength * (length / speed) / gas.temperature)
-    return ReducedScene(gas.reduced_law, _rough(gas), walls, drag, drive)
+    return ReducedScene(gas.reduced_law, surface, walls, drag, drive)
 
 
 class ReducedContact(eqx.Module):

@@ -27,7 +27,6 @@ from jaxgran.scene.gas import Gas, scaled_critical_wavenumber
 from jaxgran.scene.geometry import contact_value_slopes, impact_average, sphere_surface
 from jaxgran.scene.laws import C1, ReducedLaw
 from jaxgran.scene.reduced import (
-    TYPICAL_IMPACT,
     ReducedRough,
     ReducedScene,
     ReducedWalls,
@@ -397,6 +396,10 @@ def _friction_rates(
 
 MAX_STICKING = 1e6
 """Largest friction over the slip at which some spheres slide in double precision."""
+
+
+TYPICAL_IMPACT = 2 * sqrt(2 / pi)
+"""Mean normal speed of impacts, weighted by itself, in units of sqrt(2 T)."""
 
 
 def mean_kick(law: ReducedLaw, speed: Float[Array, ""]) -> Float[Array, ""]:

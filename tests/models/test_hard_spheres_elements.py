@@ -239,7 +239,7 @@ def test_beads_between_walls_cool_as_theory_says(beta):
     theory = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(softness=False))
     hard = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(250, replicas=24))
     off = np.log(hard.temperature / theory.temperature)
-    # Three standard errors, and twice the measured error of the rate times d ln T/d ln t < 2.
-    error = 2 * 2 * (0.004 if beta is None else error_model.ROUGH_WALL_ERROR)
+    # Three standard errors, and the measured error of the rate times d ln T/d ln t < 2.
+    error = 2 * (error_model.WALL_ERROR if beta is None else error_model.ROUGH_WALL_ERROR)
     assert np.all(np.abs(off) < 3 * hard.temperature_error / hard.temperature + error), off
     np.testing.assert_allclose(hard.collisions, theory.collisions, rtol=0.04)
