@@ -17,7 +17,13 @@ from jaxgran._utils.tracing import any_traced, grid_size, pad_to
 from jaxgran._utils.validation import POSITIVE, checked_float, checked_times, no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.checks import check_softness, check_volume, checked_gas, describe_walls
+from jaxgran.models.checks import (
+    check_softness,
+    check_volume,
+    checked_gas,
+    describe_walls,
+    first_cooling_rate,
+)
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.error_model import ErrorModel, flow_share
 from jaxgran.models.hard_spheres import HardSpheres
@@ -26,7 +32,6 @@ from jaxgran.models.linearise import curve_of_program
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced import reduced_scene
-from jaxgran.theory.averages import impact_moments
 from jaxgran.theory.equations import element_rates, softness_factor
 
 NUM_PARTICLES = 4000
@@ -247,7 +252,7 @@ def _impact_share(now: Gas, first: Gas) -> Float[Array, ""]:
         return one
     scene, rough = reduced_scene(now), first.surface
     ratio = 0.0 if rough is None else rough.rotational_temperature / first.temperature
-    impacts = 2 / d * impact_moments(scene.law, one, d)[0, 0]
+    impacts = first_cooling_rate(now)[0] * now.path_length / now.impact_speed
     alone = scene._replace(walls=None, drag=None, drive=None)
     mine, rest = (element_rates(x, one, ratio, 0 * one, d).cooling for x in (alone, scene))
     return (impacts + mine) / (impacts + rest)
