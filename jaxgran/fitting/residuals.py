@@ -56,7 +56,10 @@ def _check_magnitudes(curve: CoolingCurve) -> None:
             continue
         least, column, values = smallest, quantity.column, np.asarray(values)
         if name.endswith("_error"):
-            least = MIN_ERROR * np.asarray(getattr(curve, name.removesuffix("_error")))
+            of = getattr(curve, name.removesuffix("_error"))
+            if of is None:
+                raise ValueError(f"the curve has {name} without the values. Leave it out as well.")
+            least = MIN_ERROR * np.asarray(of)
         wrong = (values > 0) & ((values < least) | (values > largest))
         if np.any(wrong):
             i = int(np.argmax(wrong))

@@ -15,6 +15,7 @@ TIMES = np.geomspace(0.1, 100.0, 40)
 T = 0.01 / (1 + TIMES) ** (5 / 3)
 CURVE = jaxgran.CoolingCurve(TIMES, T, temperature_error=0.01 * T)
 FEW = jaxgran.CoolingCurve([0.0, 0.1, 0.2], [0.01, 0.009, 0.008], temperature_error=[0, 1e-4, 1e-4])
+NO_VALUES = jaxgran.CoolingCurve(TIMES, T, displacement_error=T)
 BARE = jaxgran.CoolingCurve([0.1, 0.2, 0.3], [0.01, 0.009, 0.008])
 DROPS = jaxgran.DropTest([0.1, 0.3], [0.92, 0.9], [0.01, 0.01])
 TWO = {"a": DROPS, "b": DROPS}
@@ -50,6 +51,7 @@ REFUSED = [
         {"data": FEW, "free": (A, "temperature", "packing_fraction")},
         "2 points .* cannot determine 3 parameters; free fewer",
     ),
+    ({"data": NO_VALUES}, "displacement_error without the values"),
     # priors
     ({"priors": [("packing_fraction", 0.05, 0.01)]}, "priors must be a dictionary of names"),
     ({"priors": {"phi": (0.05, 0.01)}}, "no float 'phi' in this gas; it has .*, and density"),
