@@ -238,7 +238,14 @@ def _checked_members(gases: Any, key: Any) -> tuple[Gas, Key[Array, "members"], 
         keys = jax.vmap(partial(jax.random.fold_in, keys))(jnp.arange(number))
     same = {name: gases.value(name) for name in gases.domains if name not in swept}
     repeated = {name: jnp.broadcast_to(x, (number, *x.shape)) for name, x in same.items()}
-    return gases.replace(**repeated), keys, swept
+    gases = gases.replace(**repeated)
+    if constants := gases.law.constants:  # lists, which jax.vmap has repeated already
+        gases = eqx.tree_at(
+            lambda gases: [getattr(gases.law, name) for name in constants],
+            gases,
+            replace_fn=lambda x: x if x.ndim > 1 else jnp.broadcast_to(x, (number, *x.shape)),
+        )
+    return gases, keys, swept
 
 
 def _swept_names(gases: Gas) -> list[str]:

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +68,7 @@ class RestitutionBand(NamedTuple):
 
         def residuals(flat: np.ndarray) -> np.ndarray:
             changed = with_floats(gas, {free: domain.from_free(flat[0])})
-            return whiten @ (np.asarray(_log_loss(changed, self.speeds)) - measured)
+            return whiten @ (np.asarray(_log_loss(changed, jnp.asarray(self.speeds))) - measured)
 
         first = np.ravel(domain.to_free(np.asarray(gas.value(free))))
         solution = scipy.optimize.least_squares(residuals, first)
@@ -91,7 +92,8 @@ def describe_unvisited_knots(result: Fit) -> str | None:
     if not isinstance(gas.law, RestitutionSpline) or "drops" not in result.names:
         return None
     low, high = visited_speeds(result)
-    outside = [v for v in gas.law.speeds if not low / KNOT_MARGIN < v < high * KNOT_MARGIN]
+    knots = np.asarray(gas.law.speeds)
+    outside = [v for v in knots if not low / KNOT_MARGIN < v < high * KNOT_MARGIN]
     if not outside:
         return None
     return (
@@ -131,7 +133,7 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
     grid = np.geomspace(*visited, NUM_COMPARED)
 
     def log_loss(values: dict[str, Array]) -> Array:
-        return _log_loss(with_floats(gas, values), np.append(v, grid))
+        return _log_loss(with_floats(gas, values), jnp.asarray(np.append(v, grid)))
 
     values = {name: gas.value(name) for name in own}
     slopes = jax.jacfwd(log_loss)(values)
@@ -151,6 +153,7 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
     return RestitutionBand(v, middle, low, high, visited, covariance[: v.size, : v.size])
 
 
-def _log_loss(gas: Gas, speeds: np.ndarray) -> Float[Array, "speeds"]:
-    eps = restitution_at(gas.law, gas.diameter, gas.mass, jnp.asarray(speeds))
+@eqx.filter_jit
+def _log_loss(gas: Gas, speeds: Float[Array, "speeds"]) -> Float[Array, "speeds"]:
+    eps = restitution_at(gas.law, gas.diameter, gas.mass, speeds)
     return jnp.log(-jnp.log(eps))

@@ -1,5 +1,6 @@
 """Parameters of a fit: their unconstrained scale, initial guesses from the data, and priors."""
 
+from math import prod
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -74,11 +75,11 @@ def with_floats(gas: Gas, values: dict[str, Any], xp: Any = jnp) -> Gas:
     if not values:
         return gas
     fields = gas._float_fields
-    return eqx.tree_at(
-        lambda gas: [fields[name].get(gas) for name in values],
-        gas,
-        [xp.asarray(value, jnp.result_type(float)) for value in values.values()],
-    )
+    leaves, structure = jax.tree.flatten(gas)
+    positions = structure.unflatten(range(len(leaves)))
+    for name, value in values.items():
+        leaves[fields[name].get(positions)] = xp.asarray(value, jnp.result_type(float))
+    return structure.unflatten(leaves)
 
 
 class Unknown(NamedTuple):
@@ -101,7 +102,7 @@ class Unknown(NamedTuple):
     @property
     def size(self) -> int:
         """Number of elements."""
-        return int(np.prod(self.shape))
+        return prod(self.shape)
 
     @property
     def title(self) -> str:

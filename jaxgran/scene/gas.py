@@ -81,7 +81,7 @@ def law_fields(law: laws.RestitutionLaw) -> dict[str, FloatField]:
     fields = {name: FloatField((name,), domain) for name, domain in law.domains.items()}
     for keys, leaf in jax.tree_util.tree_flatten_with_path(law)[0]:
         name = jax.tree_util.keystr(keys).removeprefix(".")
-        if name not in fields and eqx.is_inexact_array(leaf):
+        if name not in (*fields, *law.constants) and eqx.is_inexact_array(leaf):
             items = [(getattr(k, "idx", getattr(k, "key", None)),) for k in keys]
             path = [getattr(k, "name", item) for k, item in zip(keys, items, strict=True)]
             fields[name] = FloatField(tuple(path), ANY)

@@ -67,6 +67,9 @@ class RestitutionLaw(eqx.Module):
     lists: ClassVar[tuple[str, ...]] = ()
     """Names of the fields that hold more than one number."""
 
+    constants: ClassVar[tuple[str, ...]] = ()
+    """Names of the arrays that are no floats of a gas: fits and sweeps leave them as they are."""
+
     advice: ClassVar[dict[str, str]] = {}
     """Advice on a value outside its range, by name: a sentence that ends the error message."""
 
@@ -577,12 +580,13 @@ class RestitutionSpline(RestitutionLaw):
     '0.027 to 0.39 m/s'
     """
 
-    speeds: tuple[float, ...] = eqx.field(static=True)
+    speeds: Float[Array, "knots"]
     drops: Float[Array, "knots"]
     smoothness: float = eqx.field(static=True)
 
     domains: ClassVar[dict[str, Domain]] = {"drops": POSITIVE}
     lists: ClassVar[tuple[str, ...]] = ("drops",)
+    constants: ClassVar[tuple[str, ...]] = ("speeds",)
 
     def __init__(
         self,
@@ -590,10 +594,10 @@ class RestitutionSpline(RestitutionLaw):
         values: UserNumber | None = None,
         smoothness: UserFloat = 0.3,
     ):
-        knots = np.asarray(float_array(speeds, "speeds"), float)
+        self.speeds = float_array(speeds, "speeds")
+        knots = np.asarray(self.speeds, float)
         if knots.ndim != 1 or knots.size < 2 or np.any(np.diff(knots) <= 0) or knots[0] <= 0:
             raise ValueError(f"speeds must be two or more increasing numbers > 0, got {speeds!r}")
-        self.speeds = tuple(map(float, knots))
         self.smoothness = checked_float("smoothness", smoothness, POSITIVE)
         default = np.exp(-0.1 * (knots / knots[-1]) ** 0.2)
         eps = float_array(default if values is None else values, "values")
@@ -625,17 +629,17 @@ class RestitutionSpline(RestitutionLaw):
         return jnp.log(jnp.cumsum(self.drops))
 
     def prior_residuals(self) -> Float[Array, "residuals"]:
-        x = np.log(self.speeds)
+        x = jnp.log(self.speeds)
         decades = (x[2:] - x[:-2]) / (2 * np.log(10))
-        exponents = jnp.diff(self._log_L()) / np.diff(x)
-        return jnp.diff(exponents) / (self.smoothness * np.sqrt(decades))
+        exponents = jnp.diff(self._log_L()) / jnp.diff(x)
+        return jnp.diff(exponents) / (self.smoothness * jnp.sqrt(decades))
 
     def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         return 1 - self.loss(normal_speed)
 
     def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        x, y = np.log(self.speeds), self._log_L()
-        width = np.diff(x)
+        x, y = jnp.log(self.speeds), self._log_L()
+        width = jnp.diff(x)
         slope = jnp.diff(y) / width
         # Weighted harmonic means of the slopes on both sides.
         left, right = width[:-1] + 2 * width[1:], 2 * width[:-1] + width[1:]
@@ -643,9 +647,9 @@ class RestitutionSpline(RestitutionLaw):
         at_knots = jnp.concatenate([slope[:1], inner, slope[-1:]])
         log_speed = jnp.log(jnp.maximum(normal_speed, jnp.finfo(y.dtype).tiny))
         inside = jnp.clip(log_speed, x[0], x[-1])
-        i = jnp.searchsorted(jnp.asarray(x[1:-1]), inside)
-        h = jnp.asarray(width)[i]
-        t = (inside - jnp.asarray(x)[i]) / h
+        i = jnp.searchsorted(x[1:-1], inside)
+        h = width[i]
+        t = (inside - x[i]) / h
         first, last = at_knots[i], at_knots[i + 1]
         cubic = first + last - 2 * slope[i]
         log_L = y[i] + h * t * (first + t * (slope[i] - first - (1 - t) * cubic))

@@ -145,9 +145,14 @@ def test_spline():
     power = jaxgran.RestitutionSpline(speeds, np.exp(-(np.asarray(speeds) ** 0.3)))
     np.testing.assert_allclose(power.prior_residuals(), 0.0, atol=1e-10)
     np.testing.assert_allclose(power.restitution(v), jnp.exp(-(v**0.3)), rtol=1e-9)
+    # In a sweep all members have the knots of the law.
+    gas, drops = gas_of(law), jnp.stack([law.drops, 2 * law.drops])
+    members = jaxgran.sweep(jax.vmap(lambda x: gas.replace(drops=x))(drops), [0.1, 0.2])
+    alone = [jaxgran.cool(gas.replace(drops=x), [0.1, 0.2]).temperature for x in drops]
+    np.testing.assert_allclose(members.temperature, jnp.stack(alone), rtol=1e-9)
 
 
-def test_a_law_is_learnt_from_a_curve():
+def test_a_law_is_learnt_from_a_curve(caplog):
     true = glass_beads(0.15)
     curve = synthetic(true)
     learner = spline_gas(curve)
@@ -166,8 +171,10 @@ def test_a_law_is_learnt_from_a_curve():
     chi2, p, _ = band.compare(constant, "coefficient")
     assert chi2 > 10 and p < 1e-6
     wide = jaxgran.RestitutionSpline(np.geomspace(1e-4, 1.0, 8))
-    with pytest.warns(UserWarning, match=r"knots at 0.0001, .* outside the impact speeds 0.0095"):
+    words = r"knots at 0.0001, .* outside the impact speeds 0.0095"
+    with jax.log_compiles(), pytest.warns(UserWarning, match=words):
         jaxgran.fit(gas_of(wide), curve, free="law")
+    assert "Compiling" not in caplog.text  # other knots share the programs
     with pytest.raises(ValueError, match="no number of the law was free"):
         jaxgran.restitution_band(jaxgran.fit(true, curve, free=("temperature",)))
 
