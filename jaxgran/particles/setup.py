@@ -4,6 +4,7 @@ A random start has Maxwellian velocities and positions without overlap, which ar
 host or in compiled code. A start given by a user is checked and reduced to the units of the run.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -55,6 +56,7 @@ def maxwellian_velocities(
     return normalise_velocities(v.reshape(-1, dimension), replicas)
 
 
+@partial(jax.jit, static_argnums=1)
 def normalise_velocities(
     velocity: Float[Array, "particles d"], replicas: int
 ) -> Float[Array, "particles d"]:
