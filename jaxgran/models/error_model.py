@@ -80,6 +80,10 @@ eps_w = .6; with elastic walls they agree within .4 %. In the first sound times,
 to .7, it is lower by 8 % for eps_w = .6, 0 to 4 % for .8, 1 % for .9.
 """
 
+ELASTIC_WALL_ERROR, LOSS_WALL_ERROR, NARROW_BOX = 0.004, 0.07, 60.0
+"""a, b, c of the error of a given box, by the same measurements:
+``min(a + b (1 - eps_w), WALL_ERROR) + c (sigma/W)^4`` with the width W that centres have."""
+
 ROUGH_WALL_ERROR = 0.05
 """The same for rough walls, beta_t from -.3 to .5.
 
@@ -244,10 +248,18 @@ class ErrorModel(NamedTuple):
     @property
     def mixing(self) -> float:
         """Error of the cooling rate of models that assume a mixed gas between walls."""
-        if self.gas.container is None:
+        gas, walls = self.gas, self.gas.container
+        if walls is None:
             return 0.0
-        smooth = self.gas.container.tangential_restitution is None
-        return WALL_ERROR if smooth else ROUGH_WALL_ERROR
+        if walls.tangential_restitution is not None:
+            return ROUGH_WALL_ERROR
+        law = walls.restitution.on_wall(
+            diameter=gas.diameter, mass=gas.mass, speed=gas.impact_speed
+        )
+        loss = 1 - float(law.restitution(jnp.ones(())))
+        near = np.max(np.asarray(gas.diameter / (walls.side - gas.diameter)))
+        error = min(ELASTIC_WALL_ERROR + LOSS_WALL_ERROR * loss, WALL_ERROR)
+        return float(error + NARROW_BOX * near**4)
 
     @property
     def roughness(self) -> float:
