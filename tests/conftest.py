@@ -1,7 +1,9 @@
+import gc
 import os
 import shutil
 import tempfile
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,9 @@ import pytest
 PROGRAMS = "JAXGRAN_TEST_PROGRAMS"
 """An environment variable: the folder of programs compiled in this run of the tests."""
 
-FAST_BUILD = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
+FAST_BUILD = "--xla_backend_optimization_level=1"
+if tuple(map(int, version("jax").split(".")[:2])) < (0, 11):
+    FAST_BUILD += " --xla_cpu_use_fusion_emitters=false"
 """Flags of XLA. On a CPU its emitters of fusions take more than half of the time of a compilation:
 without them it compiles a fit in 1.9 s in place of 5.1 s (jaxlib 0.10.1)."""
 
@@ -20,6 +24,8 @@ each of thousands of compiled functions takes tens."""
 MAX_MAPS = 40_000
 """Memory maps above which a process clears its caches after each slow test: XLA crashes without a
 message if it gets no further map."""
+
+gc.set_threshold(100_000)  # tracing makes many objects that stay
 
 RESULTS: dict[str, list[dict]] = {}
 """Results of tests in this session, by the name of the file to record them in."""

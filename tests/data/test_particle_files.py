@@ -110,8 +110,12 @@ def test_a_run_writes_its_trajectory(beads, tmp_path, monkeypatch):
             np.testing.assert_array_equal(read.velocity[0], curve.saved.velocity[k, r])
     lines = (tmp_path / "run.0.xyz").read_text().splitlines()
     assert lines[0] == "30" and f"Time={float(t[0]):.17g}"[:20] in lines[1]
-    start = jaxgran.read_particles(tmp_path / "run.0.xyz")
-    onward = dataclasses.replace(model, replicas=1, start=start)
+    each = [jaxgran.read_particles(tmp_path / f"run.{r}.xyz") for r in range(2)]
+    start = each[0]._replace(
+        position=jnp.concatenate([read.position for read in each]),
+        velocity=jnp.concatenate([read.velocity for read in each]),
+    )
+    onward = dataclasses.replace(model, start=start)
     cooler = gas.replace(temperature=curve.temperature[-1])
     jaxgran.cool(cooler, t[:1], model=onward, progress=False)
     # It has ended: its checkpoint goes on with nothing, and its files stay.

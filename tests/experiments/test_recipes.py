@@ -17,8 +17,8 @@ WRITTEN = {
     "Snapshots, observables and a film": "film.gif",
     "Saving and loading everything": "run.npz",
 }
-ASKED = ("data", "law", "formula", "network", "sweep", "store", "film", "loading", "state")
-ASKED += ("cores", "GPU")
+ASKED = ("data", "law", "formula", "network", "drive", "sweep", "store", "film", "loading")
+ASKED += ("state", "cores", "GPU")
 SAID = {
     "Your own data: speeds in ms and mm": "Kinetic theory is consistent with this curve",
     "Your own law of restitution": "0.972",

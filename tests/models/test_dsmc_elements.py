@@ -58,14 +58,8 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize(
-    "name, dimension",
-    [
-        ("all", 3),
-        pytest.param("viscoelastic walls", 3, marks=pytest.mark.slow),
-        pytest.param("all", 2, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name, dimension", [("all", 3), ("viscoelastic walls", 3), ("all", 2)])
 def test_elements_cool_as_kinetic_theory_says(name, dimension):
     gas = dataclasses.replace(glass_beads(dimension=dimension), **SCENES[name])
     times = np.array([1.0, 5.0, 20.0]) * float(gas.mean_free_time)

@@ -240,6 +240,7 @@ FRICTION_FLOATS = [
 ]
 
 
+@pytest.mark.slow  # compiles derivatives in ten floats
 def test_derivatives_with_friction_of_a_short_run_are_differences():
     h, gas = 1e-6, with_all()
     times = np.array([0.1, 0.2]) * float(gas.mean_free_time)  # before chaos

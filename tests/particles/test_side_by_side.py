@@ -39,6 +39,7 @@ def fastest(particles):
     return jnp.sort(jnp.sum(particles.velocity**2, axis=1))[-2:]
 
 
+@pytest.mark.slow  # compiles for one replica, and for one on each device
 def test_a_replica_is_the_same_whatever_their_number(beads, two_devices, tmp_path):
     gas, key, name = beads(packing_fraction=0.1), jax.random.key(4), "HardSpheres"
     files = {"save": fastest, "trajectory": tmp_path / "run.xyz"}

@@ -190,6 +190,7 @@ def test_the_curve_tells_the_bias_where_the_gas_has_a_flow():
     assert gas.box_side(64) < gas.critical_box < gas.box_side(500)
     assert np.all(small.derivative_bias == 0)
     expected = slope_bias_of_run(times, jnp.mean(large.replicas.flow_share, axis=0))
-    np.testing.assert_array_equal(large.derivative_bias, expected)
+    # Compiled apart, the two differ by rounding.
+    np.testing.assert_allclose(large.derivative_bias, expected, rtol=1e-12)
     # Vortices hold .06 of the energy at last; heat alone scatters it by .005.
     assert large.flow_share[-1] > 0.03 and large.derivative_bias[-1] > 0.03

@@ -79,6 +79,7 @@ def test_constant_restitution_has_the_slopes_of_haff(constant):
     np.testing.assert_array_equal(slopes[:, 2], 0.0)
 
 
+@pytest.mark.slow  # compiles what is written between blocks
 def test_a_checkpoint_keeps_the_tangents(constant, tmp_path):
     f, at, _, slopes = constant
     kept = partial(f, checkpoint=tmp_path / "a.npz")
