@@ -123,7 +123,7 @@ def summary(rows: list[dict]) -> dict:
 
 
 def learn_law(options: argparse.Namespace) -> dict:
-    size, replicas = (200, 2) if options.smoke else (1000, 10)
+    size, replicas = (200, 2) if options.smoke else (1000, 20)
     taus = np.geomspace(0.3, 100.0, 40)
     models = {
         "DSMC": jaxgran.DSMC(size, replicas=replicas),
