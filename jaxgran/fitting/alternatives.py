@@ -46,7 +46,7 @@ ROUGHNESS = (0.02, 0.08, 0.25, 0.6, 1.0, 1.4, 1.75, 1.9)
 SLIDING = (0.3, 1.0, 2.5, 6.0, 15.0)
 """Values of 1/mu of rough spheres that slide."""
 
-FRICTION = (0.02, 0.06, 0.15, 0.4, 1.0)
+FRICTION = (0.02, 0.04, 0.06, 0.15, 0.4, 1.0)
 """Values of mu of smooth spheres that become rough and slide."""
 
 STICKING_RESTITUTION = 0.44
@@ -85,7 +85,7 @@ THEORY_TOLERANCE = 1e3
 SEARCH_TOLERANCE = 1e-4
 """Relative tolerance of a search where Gauss-Newton steps fail."""
 
-LINEAR_STEP = 3.0
+LINEAR_STEP = 5.0
 """Length of a Gauss-Newton step, in standard errors, that is the last one: after it chi^2 is known
 to some .02 without another curve."""
 
@@ -553,7 +553,7 @@ def _profile(problem: Problem, kind: Kind, base: Trial, scale: float) -> list[Tr
             trials.append(trial)
             lowest = min(lowest, trial.chi2)
             if trial.chi2 > lowest + ALLOWED_CHI2 * scale:
-                trials += _refined(fit_with, before, trial, lowest + ALLOWED_CHI2 * scale)
+                trials += _at_the_limit(fit_with, before, trial, lowest, ALLOWED_CHI2 * scale)
             previous, before = before, trial
             excluded = EXCLUDED_CHI2 * (1.0 if kind.one_minimum else BARRIER)
             if trial.chi2 > lowest + excluded * scale:
@@ -582,20 +582,27 @@ def _at_the_vertex(
     return fit_with(vertex, three[1].flat)
 
 
-def _refined(
-    fit_with: Callable[[float, np.ndarray], Trial | None], low: Trial, high: Trial, target: float
+def _at_the_limit(
+    fit_with: Callable[[float, np.ndarray], Trial | None],
+    low: Trial,
+    high: Trial,
+    least: float,
+    increase: float,
 ) -> list[Trial]:
-    """Return fits near the amplitude at which chi^2, about a parabola, exceeds a target."""
+    """Return fits near the amplitude at which chi^2, a parabola, exceeds its least value by so much.
+
+    The last one comes within a quarter of the increase, if `NUM_REFINED` are enough.
+    """
     trials = []
-    for _ in range(NUM_REFINED):
-        if not low.chi2 <= target < high.chi2:
-            break
-        share = np.sqrt((target - low.chi2) / (high.chi2 - low.chi2))
-        share = float(np.clip(share, 0.05, 0.95))
+    while low.chi2 <= least + increase < high.chi2 and len(trials) < NUM_REFINED:
+        at_low, at_high = np.sqrt(low.chi2 - least), np.sqrt(high.chi2 - least)
+        share = float(np.clip((np.sqrt(increase) - at_low) / (at_high - at_low), 0.05, 0.95))
         amplitude = low.amplitude + share * (high.amplitude - low.amplitude)
         trial = fit_with(amplitude, low.flat + share * (high.flat - low.flat))
         if trial is None:
             break
         trials.append(trial)
-        low, high = (trial, high) if trial.chi2 <= target else (low, trial)
+        if abs(trial.chi2 - least - increase) < increase / 4:
+            break
+        low, high = (trial, high) if trial.chi2 <= least + increase else (low, trial)
     return trials
