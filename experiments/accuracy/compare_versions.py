@@ -11,14 +11,13 @@ largest difference relative to the largest value of that array. The exit code is
 identical.
 """
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from experiments.support.record import DATA, EXPERIMENTS, process, run_parts
+from experiments.support.record import DATA, EXPERIMENTS, Options, process, run_parts
 
 # The scenes are written out because modules of other versions have other names.
 CASES = """
@@ -117,7 +116,7 @@ np.savez(sys.argv[2], **arrays)
 """
 
 
-def compare_versions(options: argparse.Namespace) -> dict:
+def compare_versions(options: Options) -> dict:
     before, now = (arrays_of(folder) for folder in (options.CHECKOUT, EXPERIMENTS.parent))
     rows = []
     for case in dict.fromkeys(key.partition("/")[0] for key in [*before, *now]):
@@ -158,6 +157,5 @@ def arrays_of(folder: Path) -> dict[str, np.ndarray]:
 
 if __name__ == "__main__":
     settings = {"type": Path, "help": "folder of the other version"}
-    parts = {"compare_versions": compare_versions}
-    found = run_parts(__doc__, parts, smoke=False, CHECKOUT=settings)
+    found = run_parts(__doc__, compare_versions, smoke=False, CHECKOUT=settings)
     sys.exit(any(row["difference"] for row in found["compare_versions"]["rows"]))

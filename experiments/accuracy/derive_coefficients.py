@@ -15,7 +15,6 @@ c/(d - 1) at some beta, the coefficients of `jaxgran.theory.equations` and the l
 error of the fit, and draws both.
 """
 
-import argparse
 from typing import Any
 
 import jax
@@ -26,7 +25,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
 from experiments.support.plots import GUIDE, INK, THEORY, VISCOELASTIC, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, viscoelastic_restitution
 from jaxgran.theory.equations import MEAN_OVERLAP, softness_coefficient
@@ -70,7 +69,7 @@ def fit_rational(
     return best
 
 
-def derive_restitution(_: argparse.Namespace) -> dict:
+def derive_restitution(_: Options) -> dict:
     # beta P and Q have the same degree, so that their ratio tends to a constant.
     shapes = {
         "clipped": (True, 0.7, 5 / 3, [2, *range(3, 9)], [2, *range(4, 11)]),
@@ -114,7 +113,7 @@ def soft_impact(beta: float) -> tuple[float, float]:
     return lost + 0.8 * y**5, more + 4 * y**4 * dy
 
 
-def derive_softness(_: argparse.Namespace) -> dict:
+def derive_softness(_: Options) -> dict:
     nodes = np.concatenate([[1e-4], np.geomspace(1e-3, 12, 70)])
     loss, slope = np.array([soft_impact(beta) for beta in nodes]).T
     loss, slope = (CubicSpline(np.sqrt(nodes), x / nodes) for x in (loss, slope))
@@ -152,7 +151,5 @@ def derive_softness(_: argparse.Namespace) -> dict:
     }
 
 
-PARTS = {"derive_restitution": derive_restitution, "derive_softness": derive_softness}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS, smoke=False)
+    run_parts(__doc__, derive_restitution, derive_softness, smoke=False)

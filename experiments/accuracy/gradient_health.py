@@ -20,7 +20,6 @@ and the estimate of their bias (`CoolingCurve.derivative_bias`), and derivatives
 one set (``differences=0.3``), with another key.
 """
 
-import argparse
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -33,7 +32,7 @@ from matplotlib.figure import Figure
 import jaxgran
 from experiments.support.analysis import mean_and_error, over
 from experiments.support.plots import ELASTIC, GUIDE, HARD, INK, SOFT, THEORY, caption, panels
-from experiments.support.record import figures, run_parts
+from experiments.support.record import Options, figures, run_parts
 from experiments.support.scenes import beads, cool, glass, times_of
 
 COLLISIONS = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -88,7 +87,7 @@ class Slopes:
         return Slopes(self.gas, self.times[:count])
 
 
-def soft_spheres(name: str, options: argparse.Namespace) -> dict:
+def soft_spheres(name: str, options: Options) -> dict:
     (phi, beta, contact, size, many, sets), few, most = SOFT_SPHERES[name], 4, 64
     collisions, intervals = COLLISIONS, INTERVALS
     if options.smoke:
@@ -139,7 +138,7 @@ def soft_spheres(name: str, options: argparse.Namespace) -> dict:
     return found | {"picture": {"gradient_health": draw(results)}}
 
 
-def hard_derivatives(options: argparse.Namespace) -> dict:
+def hard_derivatives(options: Options) -> dict:
     rows = []
     for phi, beta, replicas in ((0.02, 0.2, 32), (0.2, 0.1, 32), (0.2, 0.3, 96)):
         gas = glass(beta, phi)
@@ -152,7 +151,7 @@ def hard_derivatives(options: argparse.Namespace) -> dict:
     return {"rows": rows}
 
 
-def derivatives_in_flows(options: argparse.Namespace) -> dict:
+def derivatives_in_flows(options: Options) -> dict:
     scenes = {name: in_flow(name, options.smoke) for name in FLOWS}
     return {"step_of_ln_A": STEP, "scenes": scenes, "picture": draw_flows(scenes)}
 
@@ -268,10 +267,6 @@ def draw_derivatives(axes, name: str, result: dict) -> None:
     caption(axes, title, "lower left", xscale="log", ylim=(low, high), **labels)
 
 
-PARTS = {f"gradient_health_{name}": partial(soft_spheres, name) for name in SOFT_SPHERES} | {
-    "hard_derivatives": hard_derivatives,
-    "derivatives_in_flows": derivatives_in_flows,
-}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS)
+    soft = {f"gradient_health_{name}": partial(soft_spheres, name) for name in SOFT_SPHERES}
+    run_parts(__doc__, hard_derivatives, derivatives_in_flows, named=soft)

@@ -10,7 +10,6 @@ lammps_cooling_SCENE.csv, with --record to data/: the mean over replicas and its
 Draws all curves in data/ together with kinetic theory; ``--scenes`` without a name only draws.
 """
 
-import argparse
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,14 +19,14 @@ import jaxgran
 from experiments.support.analysis import mean_and_error
 from experiments.support.lammps_library import granular_box, hertzian
 from experiments.support.plots import INK, THEORY, caption, panels
-from experiments.support.record import DATA, run_parts
+from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import cool, of_lammps
 
 STEPS_PER_CONTACT = 40
 SCENES = ("phi003", "phi003_large", "phi010", "phi025")
 
 
-def make_lammps_curves(options: argparse.Namespace) -> dict:
+def make_lammps_curves(options: Options) -> dict:
     folder = DATA if options.record else options.out
     folder.mkdir(parents=True, exist_ok=True)
     for name in options.scenes:
@@ -105,4 +104,4 @@ def run(gas: jaxgran.Gas, start: Any, side: float, dt: float, steps: np.ndarray)
 
 if __name__ == "__main__":
     settings = {"nargs": "*", "choices": list(SCENES), "default": list(SCENES)}
-    run_parts(__doc__, {"make_lammps_curves": make_lammps_curves}, smoke=False, scenes=settings)
+    run_parts(__doc__, make_lammps_curves, smoke=False, scenes=settings)

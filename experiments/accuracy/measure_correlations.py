@@ -17,7 +17,6 @@ of the same length in L_c as those of eps = .7, and errors of some .15 %. (A box
 lacks waves that the theory of a large box counts.)
 """
 
-import argparse
 from functools import cache
 from typing import NamedTuple
 
@@ -29,7 +28,7 @@ from matplotlib.figure import Figure
 import jaxgran
 from experiments.support.analysis import mean_and_error, replicas_of
 from experiments.support.plots import DSMC, ELASTIC, HARD, INK, THEORY, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool, hard_beads, times_of
 from jaxgran.models.error_model import flow_share
 from jaxgran.theory.equations import correlation_build_up, correlation_slowdown
@@ -209,7 +208,7 @@ def draw(rows: list[dict]) -> Figure:
     return figure
 
 
-def measure_correlations(options: argparse.Namespace) -> dict:
+def measure_correlations(options: Options) -> dict:
     impacts = 2e4 if options.smoke else 1.6e6 if options.full else 7e5
     rows, elastic = [], {}
     for (d, phi), sizes in SIZES.items():
@@ -234,4 +233,4 @@ def measure_correlations(options: argparse.Namespace) -> dict:
 
 if __name__ == "__main__":
     settings = {"action": "store_true", "help": "the whole grid, errors below .15 %%"}
-    run_parts(__doc__, {"measure_correlations": measure_correlations}, full=settings)
+    run_parts(__doc__, measure_correlations, full=settings)

@@ -8,7 +8,6 @@ the time step at first touch; the energy balance of a cooling gas; the energy of
 Each has the order of the error: the slope of its logarithm over that of the time step.
 """
 
-import argparse
 import dataclasses
 
 import jax
@@ -20,7 +19,7 @@ from matplotlib.ticker import NullFormatter
 
 import jaxgran
 from experiments.support.plots import INK, SOFT, caption, panels
-from experiments.support.record import DATA, run_parts
+from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import beads, cool
 from jaxgran.particles.capacity import Capacity
 
@@ -37,7 +36,7 @@ CONTACT_FRACTION = 0.05  # of the mean free time, in both gases
 PACKING = 0.2
 
 
-def soft_sphere_accuracy(options: argparse.Namespace) -> dict:
+def soft_sphere_accuracy(options: Options) -> dict:
     num, finest, phases, ledger, elastic = None, FINEST, PHASES, LEDGER, ELASTIC
     if options.smoke:
         small = {"num_particles": 64, "collision_times": 2, "replicas": 2}
@@ -193,4 +192,4 @@ def line(axes: Axes, result: dict, name: str, style: str, colour: str, label: st
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"soft_sphere_accuracy": soft_sphere_accuracy})
+    run_parts(__doc__, soft_sphere_accuracy)

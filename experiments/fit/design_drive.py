@@ -7,7 +7,6 @@ the mean square of ln(T/T_wanted) over the logarithms of the strengths, along gr
 kinetic theory in reverse mode.
 """
 
-import argparse
 
 import jax
 import jax.numpy as jnp
@@ -16,14 +15,14 @@ import optax
 
 import jaxgran
 from experiments.support.plots import GUIDE, HARD, INK, THEORY, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 
 INTERVALS, POINTS = 12, 8
 LENGTH = 8.0  # of an interval, in mean free times
 BEADS = jaxgran.Viscoelastic(5e7, 0.22, 5e-6)
 
 
-def design_drive(options: argparse.Namespace) -> dict:
+def design_drive(options: Options) -> dict:
     gas = jaxgran.Gas(
         BEADS,
         diameter=2e-3,
@@ -74,4 +73,4 @@ def design_drive(options: argparse.Namespace) -> dict:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"design_drive": design_drive})
+    run_parts(__doc__, design_drive)

@@ -17,7 +17,6 @@ spheres between walls, adds errors of 5 % to T and T_rot, and fits each run twic
 theory: as smooth spheres without walls, and as rough spheres between walls with beta_t free.
 """
 
-import argparse
 import dataclasses
 
 import jax.numpy as jnp
@@ -28,7 +27,7 @@ from scipy.optimize import root_scalar
 import jaxgran
 from experiments.support.analysis import fit_quietly
 from experiments.support.plots import GUIDE, INK, THEORY, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool
 
 NUM_PARTICLES, DIAMETER, SIDE = 300, 6e-3, 0.1
@@ -90,7 +89,7 @@ def fitted(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> tuple[jaxgran.Fit, 
     return first, fit_quietly(unknown, curve, free=free, num_particles=NUM_PARTICLES)
 
 
-def drop_tower(options: argparse.Namespace) -> dict:
+def drop_tower(options: Options) -> dict:
     gas = scene()
     A = float(gas.value("dissipative_constant"))
     curves = [twin(gas, key) for key in range(options.runs)]
@@ -142,4 +141,4 @@ def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float) -> Figure:
 
 if __name__ == "__main__":
     settings = {"type": int, "default": 6, "help": "single runs (default: 6)"}
-    run_parts(__doc__, {"drop_tower": drop_tower}, smoke=False, runs=settings)
+    run_parts(__doc__, drop_tower, smoke=False, runs=settings)

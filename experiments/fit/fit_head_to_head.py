@@ -31,11 +31,8 @@ the true values. A simulation with tangents counts as one.
   between collisions and adjusted to the scatter of eight runs.
 """
 
-import argparse
 import dataclasses
-import json
 import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -46,7 +43,7 @@ import optax
 import scipy.optimize
 
 import jaxgran
-from experiments.support.record import alone, collected, run_parts, seconds
+from experiments.support.record import Options, alone, collected, run_parts, seconds
 from experiments.support.scenes import cool, of_lammps
 
 PARAMETERS = ("dissipative_constant", "temperature")
@@ -84,7 +81,7 @@ def dense() -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
     return gas, jax.tree.map(lambda x: x[keep], curve)
 
 
-def stochastic(options: argparse.Namespace) -> Problem:
+def stochastic(options: Options) -> Problem:
     gas, curve = dense()
     size = 1000 if options.smoke else 20_000
     model, other = (jaxgran.DSMC(size, replicas=replicas) for replicas in (2, 8))
@@ -95,7 +92,7 @@ def stochastic(options: argparse.Namespace) -> Problem:
     return Problem(gas, jaxgran.CoolingCurve(times, T, temperature_error=error), model)
 
 
-def soft_spheres(options: argparse.Namespace) -> Problem:
+def soft_spheres(options: Options) -> Problem:
     gas, curve = dense()
     hottest = gas.replace(temperature=gas.temperature * np.exp(OFF[1] + REACH[1]))
     model = jaxgran.SoftSpheres(1000, replicas=4, steps_per_contact=20)
@@ -103,7 +100,7 @@ def soft_spheres(options: argparse.Namespace) -> Problem:
     return Problem(gas, curve, model.sized_for(hottest))
 
 
-def law(count: int, number: int, size: int, most: Sequence[int]) -> dict:
+def search_law(count: int, number: int, size: int, *most: int) -> dict:
     """Search a law of some parameters for one curve; return distances after each simulation."""
     beads = jaxgran.Viscoelastic(5e7, 0.22, 5e-6)
     gas = jaxgran.Gas(beads, diameter=2e-3, mass=1e-5, packing_fraction=0.25, temperature=0.01)
@@ -207,13 +204,13 @@ def differences(residuals: Callable, first: np.ndarray, most: int) -> list[np.nd
     return [*guesses, flat]
 
 
-PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
+PROBLEMS: dict[str, Callable[[Options], Problem]] = {
     "stochastic": stochastic,
     "soft-spheres": soft_spheres,
 }
 
 
-def fit_head_to_head(options: argparse.Namespace) -> dict:
+def fit_head_to_head(options: Options) -> dict:
     scenes = ["stochastic"] if options.smoke else options.scenes
     problems = {scene: PROBLEMS[scene](options) for scene in scenes}
     rows = (
@@ -225,18 +222,13 @@ def fit_head_to_head(options: argparse.Namespace) -> dict:
     return {"rows": collected(rows)}
 
 
-def fit_laws(options: argparse.Namespace) -> dict:
+def fit_laws(options: Options) -> dict:
     counts, curves, rows = (3,) if options.smoke else (1, 3, 10, 30), range(4), []
     curves, *settings = (curves[:1], 60, 4, 10) if options.smoke else (curves, 1000, 60, 100)
     jobs = [(count, number) for count in counts for number in curves]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        found = dict(
-            zip(
-                jobs,
-                pool.map(lambda job: alone(__file__, "--law", *job, *settings), jobs),
-                strict=True,
-            )
-        )
+        each = pool.map(lambda job: alone(search_law, *job, *settings), jobs)
+        found = dict(zip(jobs, each, strict=True))
     for count in counts:
         each = [found[count, number] for number in curves]
         medians = {
@@ -341,11 +333,5 @@ WITHOUT = {
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--law"]:
-        jax.config.update("jax_enable_x64", True)
-        count, number, size, *most = map(int, sys.argv[2:])
-        print(json.dumps(law(count, number, size, most)))
-        raise SystemExit
     settings = {"nargs": "+", "choices": list(PROBLEMS), "default": list(PROBLEMS)}
-    parts = {"fit_head_to_head": fit_head_to_head, "fit_laws": fit_laws}
-    run_parts(__doc__, parts, scenes=settings)
+    run_parts(__doc__, fit_head_to_head, fit_laws, scenes=settings)

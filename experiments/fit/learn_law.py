@@ -15,7 +15,6 @@ and says whether the learnt law has the viscoelastic or the constant form (p > .
 viscoelastic law is wrong about eps by `bias`, the spline by `error`.
 """
 
-import argparse
 import dataclasses
 import time
 from typing import Any
@@ -27,7 +26,7 @@ from matplotlib.figure import Figure
 import jaxgran
 from experiments.support.analysis import replicas_of
 from experiments.support.plots import DSMC, GUIDE, INK, THEORY, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool, of_lammps
 
 ERROR = 0.01
@@ -122,7 +121,7 @@ def summary(rows: list[dict]) -> dict:
     }
 
 
-def learn_law(options: argparse.Namespace) -> dict:
+def learn_law(options: Options) -> dict:
     size, replicas = (200, 2) if options.smoke else (1000, 20)
     taus = np.geomspace(0.3, 100.0, 40)
     models = {
@@ -202,4 +201,4 @@ def draw(results: dict[str, tuple[jaxgran.Gas, jaxgran.Fit]]) -> Figure:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"learn_law": learn_law})
+    run_parts(__doc__, learn_law)

@@ -77,4 +77,4 @@ def own_model(_) -> dict:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"own_model": own_model}, smoke=False)
+    run_parts(__doc__, own_model, smoke=False)

@@ -20,11 +20,8 @@ and T is that of the mean square velocity (`unlike_spheres`). Contacts of hard s
 have no duration, so kinetic theory is used with `softness=False`.
 """
 
-import argparse
 import dataclasses
-import json
 import os
-import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -35,7 +32,7 @@ import numpy as np
 
 import jaxgran
 from experiments.support.analysis import fit_quietly
-from experiments.support.record import alone, figures, run_parts
+from experiments.support.record import Options, alone, figures, run_parts
 from experiments.support.scenes import cool, glass
 
 TRUE_A, NUM_PARTICLES, PHI = 3e-6, 250, 0.03
@@ -106,13 +103,13 @@ ROWS = (
 )
 
 
-def wrong_physics(options: argparse.Namespace) -> dict:
+def wrong_physics(options: Options) -> dict:
     """Compute each row in a process of its own, as many at a time as there are cores."""
     known = figures("wrong_physics")["rows"] if options.rows else []
     rows = {(row["name"], row["told"]): row for row in known}
     asked = [k for k, row in enumerate(ROWS) if options.rows in row.name]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        for found in pool.map(lambda k: alone(__file__, "--row", k, options.runs), asked):
+        for found in pool.map(lambda k: alone(of_row, k, options.runs), asked):
             print(found, flush=True)
             rows[found["name"], found["told"]] = found
     return {"rows": [rows[row.name, row.told] for row in ROWS if (row.name, row.told) in rows]}
@@ -230,12 +227,6 @@ def statistics(row: Row, times: Any, curve: jaxgran.CoolingCurve) -> dict[str, A
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--row"]:
-        jax.config.update("jax_enable_x64", True)
-        of_row = ROWS[int(sys.argv[2])]
-        print(json.dumps(statistics(of_row, *measured(of_row, int(sys.argv[3])))))
-    else:
-        runs = {"type": int, "default": 100, "help": "of each gas (default: 100)"}
-        some = {"default": "", "help": "only those whose name contains this"}
-        parts = {"wrong_physics": wrong_physics}
-        run_parts(__doc__, parts, smoke=False, runs=runs, rows=some)
+    number = {"type": int, "default": 100, "help": "of each gas (default: 100)"}
+    some = {"default": "", "help": "only those whose name contains this"}
+    run_parts(__doc__, wrong_physics, smoke=False, runs=number, rows=some)

@@ -300,4 +300,4 @@ def claims(found: dict, n: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"paper_claims": paper_claims}, smoke=False)
+    run_parts(__doc__, paper_claims, smoke=False)

@@ -20,7 +20,6 @@ clustering_film: density, structure factor and spectrum of the flow of disks of 
 restitution: the flow grows first, the clusters later.
 """
 
-import argparse
 from typing import Any
 
 import jax
@@ -36,7 +35,7 @@ from scipy.ndimage import gaussian_filter
 import jaxgran
 from experiments.support.analysis import crossing, mean_and_error, replicas_of
 from experiments.support.plots import CONSTANT, GUIDE, VISCOELASTIC, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool, hard_beads, viscoelastic_like
 from jaxgran import observables
 
@@ -143,7 +142,7 @@ def ratios(one: dict, other: dict) -> dict[str, list[float] | None]:
     return found
 
 
-def clustering(options: argparse.Namespace) -> dict:
+def paper_clustering(options: Options) -> dict:
     size, replicas, fields = 20_000, 3, (20.0, 60.0, 95.0, 128.0)
     scenes = {(0.245, 0.9): (2300.0, 3200.0), (0.05, 0.6): (600.0, 1800.0)}
     if options.smoke:
@@ -263,7 +262,7 @@ def nearest(run: dict, collisions: float) -> tuple[np.ndarray, str]:
     return run["position"][0, k], f"$N$ = {N:.0f},  $T/T_0$ = {T:.1e}"
 
 
-def dissolves(options: argparse.Namespace) -> dict:
+def paper_clustering_dissolves(options: Options) -> dict:
     size, replicas, until, fields = 2000, 6, (260.0, 4e6), (5.0, 50.0, 120.0, 400.0)
     if options.smoke:
         size, replicas, until, fields = 300, 2, (20.0, 800.0), (4.0, 60.0)
@@ -323,7 +322,7 @@ def draw_dissolution(run: dict, size: int, fields: tuple, found: dict) -> Figure
     return figure
 
 
-def clustering_film(options: argparse.Namespace) -> dict:
+def clustering_film(options: Options) -> dict:
     disks, frames, e = (500, 4, 0.85) if options.smoke else (20_000, 40, 0.85)
     gas, cells = hard_beads(0.245, e, dimension=2), max(4, int((disks / 9) ** 0.5))
     # Haff's law: collisions per particle N, T/T_0 = exp(-2 N/N_0), 1 + t/t_0 = exp(N/N_0).
@@ -383,11 +382,5 @@ def draw_growth(density: np.ndarray, results: dict) -> Figure:
     return figure
 
 
-PARTS = {
-    "paper_clustering": clustering,
-    "paper_clustering_dissolves": dissolves,
-    "clustering_film": clustering_film,
-}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS)
+    run_parts(__doc__, paper_clustering, paper_clustering_dissolves, clustering_film)

@@ -17,7 +17,6 @@ as measured by Bridges, Hatzes & Lin (Nature 309, 333, 1984), eps = min(1, 0.34 
 cm/s, is not such a power law: the exponent of its T(t) changes with time.
 """
 
-import argparse
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -39,7 +38,7 @@ from experiments.support.analysis import (
 )
 from experiments.support.closed_forms import haff, paper_temperature
 from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import beads, hard_beads, restitution_like
 from jaxgran._utils.validation import POSITIVE, Domain, float_array
 from jaxgran.scene.contact import impact
@@ -55,7 +54,7 @@ SHADES = ("#084594", "#2171b5", "#6baed6", "#bdc9e1")
 """Colours from the smallest gamma to the largest, from dark to light."""
 
 
-def restitution(options: argparse.Namespace) -> dict:
+def paper_restitution(options: Options) -> dict:
     config = {"rtol": 1e-13, "num_impacts": 60, "lowest": 1e-3, "highest": 2.0, "fit_top": 0.3}
     config["fit_degree"] = 16
     config |= {"num_impacts": 16, "fit_degree": 12} if options.smoke else {}
@@ -133,7 +132,7 @@ def recovered(config: dict) -> dict[str, list[float]]:
     return found
 
 
-def cooling(options: argparse.Namespace) -> dict:
+def paper_cooling(options: Options) -> dict:
     config = {"num_particles": 20_000, "replicas": 8, "last": 1e6, "points": 22}
     if options.smoke:
         config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9}
@@ -224,7 +223,7 @@ def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return at, np.interp(-np.log(at), -np.log(theta), gamma)
 
 
-def exponents(options: argparse.Namespace) -> dict:
+def paper_exponents(options: Options) -> dict:
     config = {"gammas": (0.0, 0.2, 0.5, 1.0), "num_particles": 5000, "last": 1e5, "points": 19}
     config |= {"loss": 0.15, "ice_speed": 0.01, "packing_fraction": PACKING, "replicas": 8}
     if options.smoke:
@@ -292,7 +291,5 @@ def draw_ice(axes, T: Compared, steepness: np.ndarray, speed: float) -> None:
     axes.plot(at, -2 / (1 + steepness[1:][old]), ":", color=GUIDE, label=label)
 
 
-PARTS = {"paper_restitution": restitution, "paper_cooling": cooling, "paper_exponents": exponents}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS)
+    run_parts(__doc__, paper_restitution, paper_cooling, paper_exponents)

@@ -19,7 +19,6 @@ exponent; and the range of times in which the paper expects its laws to hold, Eq
 with the range in which they do.
 """
 
-import argparse
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -46,7 +45,7 @@ from experiments.support.closed_forms import (
     paper_displacement,
 )
 from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, VISCOELASTIC, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import beads, cool, hard_beads, restitution_like
 from jaxgran.theory.averages import Rates, collision_rate, impact_moments
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
@@ -188,7 +187,7 @@ def printed_relaxation(gas: jaxgran.Gas) -> float:
     return float(2 / 3 * collision_rate(0.0, gas.dimension) / nu)
 
 
-def velocity_correlation(options: argparse.Namespace) -> dict:
+def paper_velocity_correlation(options: Options) -> dict:
     config = CORRELATION | (FEW if options.smoke else {})
     gases, e = gases_of(config["beta"])
     title = (
@@ -263,7 +262,7 @@ def relaxation_times(axes, config: dict) -> dict:
     return found
 
 
-def diffusion_coefficient(options: argparse.Namespace) -> dict:
+def paper_diffusion_coefficient(options: Options) -> dict:
     # The temperatures of the viscoelastic gas at t', over T_0; the last time in mean free times.
     config: dict[str, Any] = {"waits": (1.0, 0.1, 0.01, 0.001), "last": 3000.0, "points": 14}
     config |= {"waits": (1.0,), "last": 30.0, "points": 6} if options.smoke else {}
@@ -370,7 +369,7 @@ def by_models(axes, gases: dict, found: dict) -> None:
     caption(axes, title, xlabel="D / (T τ$_E$)", xlim=(0.95, 1.62))
 
 
-def diffusion(options: argparse.Namespace) -> dict:
+def paper_diffusion(options: Options) -> dict:
     config: dict[str, Any] = {"num_particles": 20_000, "last": 1e6, "points": 22, "replicas": 8}
     config |= {"last_theory": 1e14, "deltas": (0.1, 0.03, 0.01)}  # deltas of the ranges of times
     if options.smoke:
@@ -462,11 +461,5 @@ def cooling_window(delta: float, tau: np.ndarray) -> dict:
     }
 
 
-PARTS = {
-    "paper_velocity_correlation": velocity_correlation,
-    "paper_diffusion_coefficient": diffusion_coefficient,
-    "paper_diffusion": diffusion,
-}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS)
+    run_parts(__doc__, paper_velocity_correlation, paper_diffusion_coefficient, paper_diffusion)

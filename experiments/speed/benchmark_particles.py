@@ -23,7 +23,6 @@ per run). In a small box between walls, particles also collide with walls: `rati
 per collision with a particle or a wall, counted by the flux of a homogeneous gas.
 """
 
-import argparse
 import dataclasses
 import importlib.util
 import json
@@ -40,7 +39,7 @@ import numpy as np
 
 import jaxgran
 from experiments.support.lammps_library import granular_box, hertzian
-from experiments.support.record import collected, run_parts, seconds
+from experiments.support.record import Options, collected, run_parts, seconds
 from experiments.support.scenes import beads, cool, hard_beads, times_of
 
 PACKING, BETA = 0.1, 0.15
@@ -56,7 +55,7 @@ def timed(run) -> tuple[float, jaxgran.CoolingCurve]:
     return time.perf_counter() - begin, curve
 
 
-def soft_spheres(options: argparse.Namespace) -> dict:
+def particles(options: Options) -> dict:
     sizes, fractions, repeats = (1000, 4096, 32768), (0.01, 0.003), 3
     if options.smoke:
         sizes, fractions, repeats = (216,), (0.03,), 1
@@ -135,7 +134,7 @@ def lammps_worker(file: str) -> None:
         print(json.dumps({"seconds": min(medians), "temperature": temperature}))
 
 
-def hard_spheres(options: argparse.Namespace) -> dict:
+def hard_spheres(options: Options) -> dict:
     sizes, repeats = ((216,), 1) if options.smoke else ((1000, 4096, 16384, 50000), 7)
     gases = beads(PACKING, BETA, 0.01), hard_beads(0.2, 0.9, dimension=2)
     return {"rows": collected(hard_row(size, gas, repeats) for gas in gases for size in sizes)}
@@ -179,7 +178,7 @@ def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:
     }
 
 
-def dsmc(options: argparse.Namespace) -> dict:
+def dsmc(options: Options) -> dict:
     sizes, most, repeats = (10_000, 100_000, 1_000_000), 2e6, 3
     sizes, most, repeats = ((1000,), 1e4, 1) if options.smoke else (sizes, most, repeats)
     gas, rows = beads(PACKING, BETA), []
@@ -237,25 +236,18 @@ def elements_of(models: list, smoke: bool, size: int, contact_fraction: float | 
     return {"rows": rows}
 
 
-def elements(options: argparse.Namespace) -> dict:
+def elements(options: Options) -> dict:
     models = [jaxgran.KineticTheory(), jaxgran.DSMC(100_000), jaxgran.HardSpheres(4096)]
     return elements_of(models, options.smoke, 4096, None)
 
 
-def elements_soft(options: argparse.Namespace) -> dict:
+def elements_soft(options: Options) -> dict:
     return elements_of([jaxgran.SoftSpheres(2000)], options.smoke, 2000, 0.02)
 
-
-PARTS = {
-    "particles": soft_spheres,
-    "hard_spheres": hard_spheres,
-    "dsmc": dsmc,
-    "elements": elements,
-    "elements_soft": elements_soft,
-}
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--lammps-worker"]:
         lammps_worker(sys.argv[2])
     else:
-        run_parts(__doc__, PARTS, "benchmark_")
+        parts = particles, hard_spheres, dsmc, elements, elements_soft
+        run_parts(__doc__, *parts, prefix="benchmark_")

@@ -32,7 +32,6 @@ benchmark_versions: the same for medians of repeated runs of larger gases and of
 compiled before, by this version and by another one.
 """
 
-import argparse
 import json
 import statistics
 import tempfile
@@ -47,7 +46,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import jaxgran
-from experiments.support.record import DATA, EXPERIMENTS, process, run_parts, seconds
+from experiments.support.record import DATA, EXPERIMENTS, Options, process, run_parts, seconds
 from experiments.support.scenes import glass
 from jaxgran.scene.geometry import NODES, sphere_surface
 from jaxgran.scene.laws import _CLIPPED, C1
@@ -162,7 +161,7 @@ def derivative_cost(repeats: int) -> dict[str, float]:
     return row
 
 
-def kinetic_theory(options: argparse.Namespace) -> dict:
+def benchmark_kinetic_theory(options: Options) -> dict:
     times()  # made here, since they cannot be made under tracing
     sweep = sweep_against_scipy(*((20, 2) if options.smoke else (1000, 50)))
     return {"sweep": sweep, "derivative": derivative_cost(5 if options.smoke else 50)}
@@ -191,7 +190,7 @@ def task(name: str, num: int, folder: Path) -> dict[str, dict[str, float]]:
     return found["steps"]
 
 
-def measured(tasks: Sequence[str], options: argparse.Namespace, num: int) -> tuple[dict, dict]:
+def measured(tasks: Sequence[str], options: Options, num: int) -> tuple[dict, dict]:
     """Return the steps of this version and of the other one, if any, and this over the other."""
     folders = [EXPERIMENTS.parent, *([options.checkout] if options.checkout else [])]
     rounds = {folder: [] for folder in folders}
@@ -229,7 +228,7 @@ def tables(steps: dict[str, dict[str, float]]) -> dict[str, dict]:
     return {"rows": rows, "main_job": job, "steps": rest}
 
 
-def compilation(options: argparse.Namespace) -> dict:
+def benchmark_compilation(options: Options) -> dict:
     tasks, num = options.tasks, 500
     if options.smoke:
         tasks, num = ["reference", "DSMC"], 100
@@ -238,24 +237,20 @@ def compilation(options: argparse.Namespace) -> dict:
     return now | found | ({"compared": compared} if compared else {})
 
 
-def versions(options: argparse.Namespace) -> dict:
+def benchmark_versions(options: Options) -> dict:
     compared = measured(["speed"], options, 1 if options.smoke else 500)[1]
     speeds = {name: x for name, x in compared.items() if name.startswith("speed of ")}
     rows = [{"model": name.removeprefix("speed of "), **x} for name, x in speeds.items()]
     return {"rows": rows}
 
 
-PARTS = {
-    "benchmark_kinetic_theory": kinetic_theory,
-    "benchmark_compilation": compilation,
-    "benchmark_versions": versions,
-}
-
 if __name__ == "__main__":
     run_parts(
         __doc__,
-        PARTS,
-        default=list(PARTS)[:2],
+        benchmark_kinetic_theory,
+        benchmark_compilation,
+        benchmark_versions,
+        default=("benchmark_kinetic_theory", "benchmark_compilation"),
         tasks={"nargs": "+", "choices": TASKS, "default": TASKS},
         checkout={"type": Path, "help": "folder of another version"},
         rounds={"type": int, "default": 1},

@@ -9,7 +9,6 @@ per contact, in the largest box of the table and with three times the replicas. 
 twice, to separate compilation from run time. With --record, other scenes keep their recorded rows.
 """
 
-import argparse
 import datetime
 import re
 from dataclasses import replace
@@ -24,7 +23,7 @@ from tqdm import tqdm
 
 import jaxgran
 from experiments.support.plots import GUIDE, INK, caption, panels
-from experiments.support.record import figures, run_parts, seconds
+from experiments.support.record import Options, figures, run_parts, seconds
 from experiments.support.scenes import beads, cool, of_lammps
 from jaxgran.plotting import COLOURS
 
@@ -53,7 +52,7 @@ class Scene(NamedTuple):
     reference: str
 
 
-def speed_vs_error(options: argparse.Namespace) -> dict:
+def speed_vs_error(options: Options) -> dict:
     found = figures("speed_vs_error")["scenes"] if options.record else {}
     for name in ("dense",) if options.smoke else options.scenes:
         jax.clear_caches()  # so that every scene compiles separately
@@ -229,4 +228,4 @@ def steps_of(row: dict) -> int | None:
 
 if __name__ == "__main__":
     settings = {"nargs": "+", "choices": list(SIZES), "default": list(SIZES)}
-    run_parts(__doc__, {"speed_vs_error": speed_vs_error}, scenes=settings)
+    run_parts(__doc__, speed_vs_error, scenes=settings)
