@@ -7,7 +7,6 @@ and LAMMPS at all times, with its standard error from the replicas of both, and 
 between kinetic theory and LAMMPS.
 """
 
-
 import jax
 import numpy as np
 

@@ -7,7 +7,6 @@ the mean square of ln(T/T_wanted) over the logarithms of the strengths, along gr
 kinetic theory in reverse mode.
 """
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np

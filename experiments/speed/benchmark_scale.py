@@ -25,6 +25,7 @@ import datetime
 import os
 import resource
 import time
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -67,14 +68,13 @@ def apart(part: str, case: str, model: str, size: int, smoke: bool) -> dict:
     return found
 
 
-def replicas(options: Options) -> dict:
-    rows, size = [], 100 if options.smoke else 4096
+def replicas(options: Options) -> Iterator[dict]:
+    size = 100 if options.smoke else 4096
     for name in ["dsmc"] if options.smoke else options.models:
         row: dict = {"model": MODELS[name].__name__, "num_particles": size, "replicas": 2}
         row |= {x: apart("replicas", x, name, size, options.smoke) for x in REPLICAS}
         row["ratio"] = row[REPLICAS[2]]["collisions_per_s"] / row[REPLICAS[0]]["collisions_per_s"]
-        rows.append(row)
-    return {"rows": rows}
+        yield row
 
 
 def million(options: Options) -> dict:

@@ -208,3 +208,16 @@ def alone(function: Callable, *arguments: Any) -> dict:
         f"print(as_json({function.__name__}(*json.loads(sys.argv[1])), indent=None))"
     )
     return json.loads(process("-c", code, json.dumps(arguments)).stdout.splitlines()[-1])
+
+
+def of_version(folder: Path, task: str, curve: Path, num: int = 0) -> dict[str, Any]:
+    """Return what a task of `support/version.py` finds with the version in a folder.
+
+    Raises:
+        SystemExit: if it fails, or if another version is imported.
+    """
+    script = EXPERIMENTS / "support" / "version.py"
+    found = json.loads(process(script, task, curve, num, folder=folder).stdout.splitlines()[-1])
+    if not Path(found["package"]).is_relative_to(folder.resolve()):
+        raise SystemExit(f"the version in {folder} was not imported, but {found['package']}")
+    return found["steps"]
