@@ -20,8 +20,8 @@ SETTINGS = {"replicas": 4, "steps_per_contact": 40}
 
 def compare_lammps(options: Options) -> dict:
     title = "Temperature of two gases, without fitted parameters"
-    figure = panels(2, 2, title, (5, 3.2), sharex="col", height_ratios=[2, 1])
-    columns = zip(("dilute", "dense"), figure.axes[:2], figure.axes[2:], strict=True)
+    figure, places = panels(2, 2, title, (5, 3.2), sharex="col", height_ratios=[2, 1])
+    columns = zip(("dilute", "dense"), places[:2], places[2:], strict=True)
     curves = {name: compare(name, options, *axes) for name, *axes in columns}
     return {"curves": curves, **SETTINGS, "picture": figure}
 

@@ -55,8 +55,7 @@ def compare_lammps_elements(options: Options) -> dict:
         store()
         raise SystemExit
     rows = {name: compare(name, options.particles) for name in SCENES}
-    figure = panels(size=(7, 5.4))
-    (axes,) = figure.axes
+    figure, (axes,) = panels(size=(7, 5.4))
     for (name, row), mark in zip(rows.items(), "osD^vP", strict=True):
         axes.plot(TIMES, row["rms_velocity"], f"{mark}-", ms=4, label=name)
     labels = {"xlabel": "t, mean free times", "ylabel": "difference of velocities, rms, over √T₀"}

@@ -75,8 +75,7 @@ def derive_restitution(_: Options) -> dict:
         "clipped": (True, 0.7, 5 / 3, [2, *range(3, 9)], [2, *range(4, 11)]),
         "unclipped": (False, 0.7, 5.0, list(range(2, 21, 2)), list(range(2, 23, 2))),
     }
-    figure, largest = panels(2, size=(3.75, 3.2)), {}
-    left, right = figure.axes
+    (figure, (left, right)), largest = panels(2, size=(3.75, 3.2)), {}
     for (name, (clipped, kappa, decay, *powers)), style in zip(shapes.items(), "-:", strict=True):
         beta, restitution = samples(clipped)
         target = np.log(restitution) + decay * np.log1p(kappa * beta)
@@ -134,8 +133,8 @@ def derive_softness(_: Options) -> dict:
         return np.asarray(softness_coefficient(jnp.asarray(beta), 2))
 
     found = least_squares(lambda p: fit(p, BETAS) / c - 1, [0.5, 0.0, 1.0, 0.0]).x
-    figure, fine = panels(size=(5.5, 3.6)), np.geomspace(BETAS[0], BETAS[-1], 300)
-    (axes,) = figure.axes
+    figure, (axes,) = panels(size=(5.5, 3.6))
+    fine = np.geomspace(BETAS[0], BETAS[-1], 300)
     axes.plot(fine, in_package(fine), color=THEORY, label="the fit")
     axes.plot(BETAS, c, "o", color=INK, ms=3.5, label="average over simulated impacts")
     axes.axhline(MEAN_OVERLAP, color=GUIDE, ls="--", lw=1, label=r"$\beta\to 0$")

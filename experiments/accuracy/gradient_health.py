@@ -203,8 +203,8 @@ def in_flow(name: str, smoke: bool) -> dict:
 
 def draw_flows(scenes: dict) -> Figure:
     """Draw the derivatives of each gas by three methods, and without the estimated bias."""
-    figure = panels(len(scenes), size=(5, 4))
-    for axes, (name, found) in zip(figure.axes, scenes.items(), strict=True):
+    figure, places = panels(len(scenes), size=(5, 4))
+    for axes, (name, found) in zip(places, scenes.items(), strict=True):
         draw_derivatives(axes, found, LOOKS_IN_FLOWS)
         freed = np.array(found["d_ln_T_d_ln_A"]["projected"][0])
         freed = freed / (1 + np.array(found["derivative_bias"]))
@@ -217,8 +217,7 @@ def draw_flows(scenes: dict) -> Figure:
 
 def draw(results: dict) -> Figure:
     """Draw the derivatives of two gases, their errors, and the effect of the interval."""
-    figure = panels(2, 2, size=(5, 4))
-    left, right, errors, intervals = figure.axes
+    figure, (left, right, errors, intervals) = panels(2, 2, size=(5, 4))
     for axes, (name, found) in zip((left, right), results.items(), strict=False):
         draw_derivatives(axes, found, LOOKS, *SHOWN)
         theory = found["d_ln_T_d_ln_A"]["kinetic theory"][0]

@@ -38,8 +38,7 @@ def make_lammps_curves(options: Options) -> dict:
         curve = jaxgran.CoolingCurve(jnp.asarray(times), T, temperature_error=error)
         file = folder / f"lammps_cooling_{name}.csv"
         jaxgran.write_curve(file, curve, header, overwrite=True)
-    figure = panels(size=(5.5, 4.0))
-    (axes,) = figure.axes
+    figure, (axes,) = panels(size=(5.5, 4.0))
     for k, file in enumerate(sorted(DATA.glob("lammps_cooling_*.csv"))):
         gas, curve, header = of_lammps(file.stem.removeprefix("lammps_cooling_"))
         tau, theory = curve.times[1:] / gas.mean_free_time, cool(gas, curve.times)

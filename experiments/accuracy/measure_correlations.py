@@ -188,8 +188,8 @@ def build_up(rows: list[dict]) -> tuple[float, float]:
 
 def draw(rows: list[dict]) -> Figure:
     """Draw h against phi, and the rate against the number of collisions."""
-    figure = panels(2, size=(5, 4), sharey=True)
-    for axes, d in zip(figure.axes, (3, 2), strict=True):
+    figure, places = panels(2, size=(5, 4), sharey=True)
+    for axes, d in zip(places, (3, 2), strict=True):
         own = [r for r in rows if r["dimension"] == d and "h" in r]
         for k, eps in enumerate(sorted({r["restitution"] for r in own})):
             some = [r for r in own if r["restitution"] == eps]

@@ -104,9 +104,9 @@ def numbers(curve: Any, a3: Any) -> np.ndarray:
 
 def draw_coefficients(states: list[dict]) -> Figure:
     """Draw differences of theory in per cent."""
-    figure = panels(2, size=(4.2, 3.6))
+    figure, places = panels(2, size=(4.2, 3.6))
     shown = {"a₂ at constant ε": 0, "D at constant ε": 2}
-    for axes, (title, k) in zip(figure.axes, shown.items(), strict=True):
+    for axes, (title, k) in zip(places, shown.items(), strict=True):
         for d, style, colour in ((3, "o-", THEORY), (2, "s--", SOFT)):
             some = [s for s in states if s["dimension"] == d]
             some = [s for s in some if k or (abs(s["simulated"][0]) > 0.01 and s["eps"] < 1)]

@@ -155,8 +155,7 @@ def with_order(rows: list[dict]) -> dict:
 
 
 def draw(found: dict) -> Figure:
-    figure = panels(2, 2, size=(4.5, 3.5))
-    trajectory, impact, ledger, elastic = figure.axes
+    figure, (trajectory, impact, ledger, elastic) = panels(2, 2, size=(4.5, 3.5))
     line(trajectory, found["trajectory"], "lammps", "o-", SOFT, "to LAMMPS")
     finest = found["trajectory"]["finest"]
     line(trajectory, found["trajectory"], "own", "s--", INK, f"to {finest} steps")

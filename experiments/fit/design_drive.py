@@ -58,8 +58,7 @@ def design_drive(options: Options) -> dict:
         log_strengths, state, miss = step(log_strengths, state)
         misses.append(float(miss) ** 0.5)
     largest = float(jnp.max(jnp.abs(course(log_strengths) / wanted - 1)))
-    figure = panels(1, 2, size=(6, 2.25), sharex=True, height_ratios=[2, 1])
-    top, bottom = figure.axes
+    figure, (top, bottom) = panels(1, 2, size=(6, 2.25), sharex=True, height_ratios=[2, 1])
     top.plot(t, wanted, color=INK, linestyle="--", label="wanted")
     top.plot(t, course(first), color=GUIDE, label="first guess")
     top.plot(t, course(log_strengths), color=THEORY, label="with this drive")

@@ -118,8 +118,7 @@ def in_words(result: jaxgran.Fit, A: float) -> str:
 def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float) -> Figure:
     """Draw T and T_rot of a run, with both fits."""
     smooth, complete = fits
-    figure = panels(size=(7.0, 4.6))
-    (axes,) = figure.axes
+    figure, (axes,) = panels(size=(7.0, 4.6))
     for name, color, label in (
         ("temperature", INK, "$T$, one simulated run"),
         ("rotational_temperature", GUIDE, r"$T_\mathrm{rot}$, the same run"),

@@ -181,9 +181,9 @@ def with_drops(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, size: int) -> dict
 def draw(results: dict[str, tuple[jaxgran.Gas, jaxgran.Fit]]) -> Figure:
     """Draw eps(v) with its band over the truth, and the speeds of impacts below."""
     num = len(results)
-    figure = panels(num, 2, size=(4.5, 2.5), sharex="col", height_ratios=[3, 1])
+    figure, places = panels(num, 2, size=(4.5, 2.5), sharex="col", height_ratios=[3, 1])
     for i, (name, (gas, result)) in enumerate(results.items()):
-        top, bottom = figure.axes[i], figure.axes[num + i]
+        top, bottom = places[i], places[num + i]
         low, high = jaxgran.restitution_band(result).visited
         v = np.geomspace(low / 3, 2 * high, 120)
         band = jaxgran.restitution_band(result, v)

@@ -190,8 +190,7 @@ def draw_curves(runs: dict, found: dict) -> Figure:
 
     Colours show laws, line styles densities; each thin line is a replica.
     """
-    figure = panels(3, size=(4.4, 4.6))
-    cooling, by_number, by_clock = figure.axes
+    figure, (cooling, by_number, by_clock) = panels(3, size=(4.4, 4.6))
     marks: dict[str, Any] = {"color": CONSTANT, "mec": "k", "ls": "none"}
     for ((packing, e), laws), row, style in zip(
         runs.items(), found["scenes"].values(), ("-", "--"), strict=False
@@ -237,9 +236,9 @@ def draw_curves(runs: dict, found: dict) -> Figure:
 
 def draw_fields(runs: dict[str, dict], fields: tuple) -> Figure:
     """Draw the density of a scene, smoothed over 1.5 mean distances of disks."""
-    figure = panels(len(fields), 2, size=(2.8, 2.8), squeeze=False)
+    figure, places = panels(len(fields), 2, size=(2.8, 2.8), squeeze=False)
     shown = ScalarMappable(Normalize(0.0, 2.5), cmap=colormaps["magma"].resampled(25))
-    rows = figure.axes[: len(fields)], figure.axes[len(fields) :]
+    rows = places[: len(fields)], places[len(fields) :]
     for (law, run), row in zip(runs.items(), rows, strict=True):
         for mark, axes in zip(fields, row, strict=True):
             place, title = nearest(run, mark)
@@ -251,7 +250,7 @@ def draw_fields(runs: dict[str, dict], fields: tuple) -> Figure:
             axes.set(xticks=[], yticks=[])
             axes.set_title(title, fontsize=9)
         row[0].set_ylabel("constant $\\varepsilon$" if law == "constant" else "viscoelastic")
-    figure.colorbar(shown, ax=figure.axes, shrink=0.7, label="density / mean")
+    figure.colorbar(shown, ax=places, shrink=0.7, label="density / mean")
     return figure
 
 

@@ -71,8 +71,7 @@ def paper_restitution(options: Options) -> dict:
     }
     errors = {name: np.abs(error) for name, error in errors.items()}
     title = "The paper's two terms of ε hold to 1 % up to β = 0.25, for both ends of contact"
-    figure = panels(2, title=title)
-    left, right = figure.axes
+    figure, (left, right) = panels(2, title=title)
     for eps, style, color, label in (
         (clipped, "-", INK, "equation of motion, ends at F = 0"),
         (unclipped, "--", ELASTIC, "equation of motion, ends at ξ = 0 (paper)"),
@@ -148,8 +147,7 @@ def paper_cooling(options: Options) -> dict:
         "Viscoelastic spheres cool as t$^{-5/3}$, spheres of constant ε as t$^{-2}$:"
         " both of the paper's laws hold at late times"
     )
-    figure = panels(3, title=title)
-    left, middle, right = figure.axes
+    figure, (left, middle, right) = panels(3, title=title)
     found: dict[str, Any] = {"restitution": e}
     for name, (gas, color, power, label) in gases.items():
         theory = jaxgran.KineticTheory(softness=False, correlations=False)
@@ -231,8 +229,7 @@ def paper_exponents(options: Options) -> dict:
         config |= {"last": 100.0, "points": 7}
     config |= {"seed": 3, "last_theory": 1e8}
     title = "1 − ε ~ v$^γ$ cools as t$^{−2/(1+γ)}$; ice has no fixed exponent and becomes elastic"
-    figure = panels(3, title=title)
-    left, middle, right = figure.axes
+    figure, (left, middle, right) = panels(3, title=title)
     tau = np.geomspace(0.1, config["last_theory"], 181)
     scene, gases = beads(PACKING, 0.1), {}
     for gamma, color in zip(config["gammas"], SHADES, strict=False):

@@ -194,8 +194,7 @@ def paper_velocity_correlation(options: Options) -> dict:
         "Dissipation lengthens the paths: velocities decay nearly exponentially in collisions,"
         " more slowly in time"
     )
-    figure = panels(3, title=title)
-    decay, counted, times = figure.axes
+    figure, (decay, counted, times) = panels(3, title=title)
     found: dict[str, Any] = {"restitution": e}
     lags = np.linspace(0, config["longest"], 601)
     for name, (gas, color, label) in gases.items():
@@ -269,8 +268,7 @@ def paper_diffusion_coefficient(options: Options) -> dict:
     config["correlation"] = CORRELATION | (FEW if options.smoke else {"seed": 1})
     gases, e = gases_of(CORRELATION["beta"])
     title = "Three methods give the same D, and it is not T τ$_v$: the gas cools during τ$_v$"
-    figure = panels(3, title=title)
-    fall, ratio, kinds = figure.axes
+    figure, (fall, ratio, kinds) = panels(3, title=title)
     found: dict[str, Any] = {"restitution": e}
     for name, (gas, color, _) in gases.items():
         found[name] = routes(name, gas, color, config, fall, ratio)
@@ -382,8 +380,7 @@ def paper_diffusion(options: Options) -> dict:
         "Viscoelastic grains spread further: ⟨Δr²⟩ ~ t$^{1/6}$ instead of log t, but the exponent"
         " 1/6 is reached very late"
     )
-    figure = panels(2, 2, title)
-    in_time, exponent, in_collisions, forms = figure.axes
+    figure, (in_time, exponent, in_collisions, forms) = panels(2, 2, title)
     tau = np.geomspace(0.1, config["last_theory"], 400)
     found: dict[str, Any] = {"restitution": e, "delta": delta}
     for name in ("viscoelastic", "constant"):

@@ -158,8 +158,8 @@ def measure(scene: Scene, row: Run) -> dict:
 
 def draw(found: dict) -> Figure:
     """Draw the largest error over the run time; symbols grow with N."""
-    figure = panels(len(found), size=(5.0, 5.6), sharey=True)
-    for axes, (name, results) in zip(figure.axes, found.items(), strict=True):
+    figure, places = panels(len(found), size=(5.0, 5.6), sharey=True)
+    for axes, (name, results) in zip(places, found.items(), strict=True):
         panel(axes, results["rows"])
         title = f"{name} gas, against {results['reference'].split(', ')[0]}"
         labels = {
@@ -167,7 +167,7 @@ def draw(found: dict) -> Figure:
             "ylabel": "largest error of T(t) (%)",
         }
         caption(axes, title, "none", **labels)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
+    handles, labels = places[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
     return figure
 
