@@ -204,10 +204,7 @@ def differences(residuals: Callable, first: np.ndarray, most: int) -> list[np.nd
     return [*guesses, flat]
 
 
-PROBLEMS: dict[str, Callable[[Options], Problem]] = {
-    "stochastic": stochastic,
-    "soft-spheres": soft_spheres,
-}
+PROBLEMS = {"stochastic": stochastic, "soft-spheres": soft_spheres}
 
 
 def fit_head_to_head(options: Options) -> Iterator[dict]:
@@ -240,17 +237,27 @@ def fit_laws(options: Options) -> Iterator[dict]:
 
 
 def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[dict]:
+    first, reach, most = OFF[:count], REACH[:count], 3 if smoke else MOST[count]
     # Measures the scatter of the replicas.
-    warm, curve = problem.simulated(OFF[:count]), problem.curve
+    warm, curve = problem.simulated(first), problem.curve
     scatter = np.asarray(warm.temperature_error / warm.temperature)[1:]
     error = np.asarray(curve.temperature_error / curve.temperature)[1:]
     sigma = np.hypot(error, np.sqrt(np.mean(scatter**2)))
-    searches: dict[str, Callable] = {"jaxgran.fit": with_derivatives}
-    for name, search in WITHOUT.items():
-        if count == 1 or search is not bounded:
-            searches[name] = without(search, sigma)
+    measured = np.log(np.asarray(curve.temperature))[1:]
+
+    def misfit(point) -> float:
+        computed = np.asarray(problem.simulated(point).temperature)
+        return float(np.sum(((measured - np.log(computed)[1:]) / sigma) ** 2))
+
+    searches: dict[str, Callable | None] = {"jaxgran.fit": None}
+    searches |= {"bounded scalar": bounded} if count == 1 else {}
+    searches |= {"Nelder-Mead": nelder_mead, "differential evolution": differential_evolution}
     for name, search in searches.items():
-        guesses = search(problem, count, 3 if smoke else None)
+        if search is None:
+            guesses = with_derivatives(problem, count, most)
+        else:
+            chi2, guesses = recorded(misfit)
+            search(chi2, first, list(zip(first - reach, first + reach, strict=True)), most)
         yield {
             "scene": scene,
             "search": name,
@@ -262,44 +269,18 @@ def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[d
         }
 
 
-def with_derivatives(problem: Problem, count: int, most: int | None) -> list[np.ndarray]:
+def with_derivatives(problem: Problem, count: int, most: int) -> list[np.ndarray]:
     """Return the guess of `jaxgran.fit` after each simulation."""
     names, guesses = PARAMETERS[:count], []
     true = np.asarray([float(problem.gas.value(name)) for name in names])
-    for simulations in range(1, (most or MOST[count]) + 1):
-        fitted = jaxgran.fit(
-            problem.gas,
-            problem.curve,
-            model=problem.model,
-            free=names,
-            start=problem.at(OFF[:count]),
-            max_steps=simulations,
-            key=jax.random.key(KEY),
-            progress=False,
-        )
+    options = {"model": problem.model, "free": names, "start": problem.at(OFF[:count])}
+    options |= {"key": jax.random.key(KEY), "progress": False}
+    for simulations in range(1, most + 1):
+        fitted = jaxgran.fit(problem.gas, problem.curve, max_steps=simulations, **options)
         if fitted.iterations < simulations:
             break
         guesses.append(np.log(np.asarray(fitted.estimate) / true))
     return guesses
-
-
-def without(search: Callable, sigma: np.ndarray) -> Callable:
-    """Return a function that runs a search by values of chi^2 only, as `with_derivatives`."""
-
-    def run(problem: Problem, count: int, most: int | None) -> list[np.ndarray]:
-        measured = np.log(np.asarray(problem.curve.temperature))[1:]
-
-        def misfit(point) -> float:
-            computed = np.asarray(problem.simulated(point).temperature)
-            return float(np.sum(((measured - np.log(computed)[1:]) / sigma) ** 2))
-
-        chi2, guesses = recorded(misfit)
-        first, reach = OFF[:count], REACH[:count]
-        bounds = list(zip(first - reach, first + reach, strict=True))
-        search(chi2, first, bounds, most or MOST[count])
-        return guesses
-
-    return run
 
 
 def bounded(chi2, first, bounds, most) -> None:
@@ -317,13 +298,6 @@ def differential_evolution(chi2, first, bounds, most) -> None:
     generations = max(most // (FAMILY * len(first)) - 1, 0)
     options = {"popsize": FAMILY, "maxiter": generations, "polish": False, "rng": 0}
     scipy.optimize.differential_evolution(chi2, bounds, x0=first, **options)
-
-
-WITHOUT = {
-    "bounded scalar": bounded,
-    "Nelder-Mead": nelder_mead,
-    "differential evolution": differential_evolution,
-}
 
 
 if __name__ == "__main__":
