@@ -27,22 +27,12 @@ import jaxgran
 from experiments.support.analysis import replicas_of
 from experiments.support.plots import DSMC, GUIDE, INK, THEORY, caption, panels
 from experiments.support.record import Options, run_parts
-from experiments.support.scenes import cool, of_lammps
+from experiments.support.scenes import ICE, cool, of_lammps
 
 ERROR = 0.01
 NUM_KNOTS = 8
 BEADS: dict[str, Any] = {"diameter": 2e-3, "mass": 1e-5, "packing_fraction": 0.03}
 LAMMPS_CURVES = "dilute", "phi003", "phi003_large"
-
-
-class Power(jaxgran.RestitutionLaw):
-    """``eps = (v/v_1)^-p``, and 1 below the speed v_1, m/s."""
-
-    speed: float
-    power: float
-
-    def restitution(self, normal_speed):
-        return jnp.maximum(normal_speed / self.speed, 1.0) ** -self.power
 
 
 class Yielding(jaxgran.RestitutionLaw):
@@ -57,7 +47,7 @@ class Yielding(jaxgran.RestitutionLaw):
 
 TRUTHS: dict[str, tuple[Any, float]] = {  # and T_0, m^2/s^2
     "viscoelastic": (jaxgran.Viscoelastic(5e7, 0.22, 5e-6), 0.01),
-    "ice": (Power(0.01 * 0.34 ** (1 / 0.234), 0.234), 4e-4),
+    "ice": (ICE, 4e-4),
     "yield speed": (Yielding(0.95, 0.1), 0.04),
 }
 

@@ -17,13 +17,12 @@ as measured by Bridges, Hatzes & Lin (Nature 309, 333, 1984), eps = min(1, 0.34 
 cm/s, is not such a power law: the exponent of its T(t) changes with time.
 """
 
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from matplotlib.ticker import NullFormatter
 
 import jaxgran
@@ -39,8 +38,7 @@ from experiments.support.analysis import (
 from experiments.support.closed_forms import haff, paper_temperature
 from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
 from experiments.support.record import Options, run_parts
-from experiments.support.scenes import beads, hard_beads, restitution_like
-from jaxgran._utils.validation import POSITIVE, Domain, float_array
+from experiments.support.scenes import ICE, beads, hard_beads, restitution_like
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, C2, UNCLIPPED_SERIES, viscoelastic_restitution
 from jaxgran.theory.equations import COOLING_RATE
@@ -185,23 +183,6 @@ def paper_cooling(options: Options) -> dict:
     return {"config": config, "found": found, "picture": figure}
 
 
-class Ice(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
-    """``eps = min(1, (v/v_1)^(-p))``: elastic below v_1, decreasing with the speed above."""
-
-    threshold: Float[Array, ""] = eqx.field(
-        converter=float_array, default=0.01 * 0.34 ** (1 / 0.234)
-    )
-    exponent: Float[Array, ""] = eqx.field(converter=float_array, default=0.234)
-
-    domains: ClassVar[dict[str, Domain]] = {"threshold": POSITIVE, "exponent": POSITIVE}
-
-    def reduced(self, *, diameter, mass, speed) -> "Ice":
-        return Ice(self.threshold / speed, self.exponent)
-
-    def restitution(self, normal_speed):
-        return jnp.minimum(1.0, (normal_speed / self.threshold) ** -self.exponent)
-
-
 def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return T/T_0 of a Maxwellian gas of any law, and gamma = d ln <1 - eps^2> / d ln sqrt(T).
 
@@ -237,7 +218,7 @@ def paper_exponents(options: Options) -> dict:
         law = jaxgran.RestitutionSeries([coefficient], [gamma])
         gases[f"γ = {gamma:g}"] = eqx.tree_at(lambda gas: gas.law, scene, law), color, gamma
     frozen = jaxgran.Gas(
-        Ice(),
+        ICE,
         diameter=0.02,
         mass=jaxgran.sphere_mass(0.02, 900.0),
         packing_fraction=PACKING,
@@ -264,7 +245,7 @@ def paper_exponents(options: Options) -> dict:
             "last_exponent_of_theory": float(T.local[-1]),
             "last_displacement_exponent": float(slope(tau, np.asarray(of.displacement))[1][-1]),
         }
-    elastic = 100 * float(Ice().threshold)
+    elastic = 100 * ICE.speed
     logs = {"xlabel": TIME, "xscale": "log"}
     title = "Temperature: — theory, ● DSMC"
     caption(left, title, ylabel="T / T$_0$", yscale="log", **logs)
