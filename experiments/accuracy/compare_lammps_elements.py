@@ -12,7 +12,6 @@ writes a short trajectory of 64 spheres for the tests.
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -40,7 +39,7 @@ SCENES = {  # contact duration in mean free times, friction, walls
 def scene(name: str, num: int) -> jaxgran.Gas:
     duration, frictional, contained = SCENES[name]
     gas = beads(packing_fraction=0.15, beta=0.3, contact_fraction=duration)
-    elements: dict[str, Any] = {}
+    elements: dict = {}
     if frictional:
         elements["surface"] = jaxgran.Frictional(**FRICTION)
     if contained:
@@ -135,7 +134,7 @@ def store() -> None:
     lammps = trajectory(gas, start, times, 1000)
     first = {"first_position": start.position, "first_velocity": start.velocity}
     floats = {name: gas.value(name) for name in gas.domains}
-    content: dict[str, Any] = {"t": times} | first | lammps | floats
+    content: dict = {"t": times} | first | lammps | floats
     np.savez_compressed(DATA / "lammps_elements_n64.npz", **content)
 
 

@@ -15,8 +15,6 @@ c/(d - 1) at some beta, the coefficients of `jaxgran.theory.equations` and the l
 error of the fit, and draws both.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -106,7 +104,7 @@ def soft_impact(beta: float) -> tuple[float, float]:
         return z[0] - max(-beta * z[1], 0.0) ** 0.5
 
     apart.terminal, apart.direction = True, -1  # type: ignore[attr-defined]
-    options: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-14, "first_step": 1e-3, "max_step": 0.2}
+    options: dict = {"rtol": 1e-12, "atol": 1e-14, "first_step": 1e-3, "max_step": 0.2}
     found = solve_ivp(rates, (0, 400), [0, 1, 0, 0, 0, 0], "DOP853", events=apart, **options)
     y, _, lost, dy, _, more = found.y_events[0][0]  # type: ignore[index]
     return lost + 0.8 * y**5, more + 4 * y**4 * dy

@@ -23,12 +23,10 @@ one set (``differences=0.3``), with another key.
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.analysis import mean_and_error, over
@@ -201,7 +199,7 @@ def in_flow(name: str, smoke: bool) -> dict:
     }
 
 
-def draw_flows(scenes: dict) -> Figure:
+def draw_flows(scenes: dict):
     """Draw the derivatives of each gas by three methods, and without the estimated bias."""
     figure, places = panels(len(scenes), size=(5, 4))
     for axes, (name, found) in zip(places, scenes.items(), strict=True):
@@ -215,7 +213,7 @@ def draw_flows(scenes: dict) -> Figure:
     return figure
 
 
-def draw(results: dict) -> Figure:
+def draw(results: dict):
     """Draw the derivatives of two gases, their errors, and the effect of the interval."""
     figure, (left, right, errors, intervals) = panels(2, 2, size=(5, 4))
     for axes, (name, found) in zip((left, right), results.items(), strict=False):
@@ -228,7 +226,7 @@ def draw(results: dict) -> Figure:
     looks = ((INK, "o-"), (GUIDE, "s--"), (ELASTIC, "^:"))
     for (name, result), (colour, style) in zip(results.items(), looks, strict=False):
         bias, spread = (100 * np.asarray(x) for x in result["projected_over_differences"])
-        look: dict[str, Any] = {"fmt": style, "color": colour, "ms": 5, "label": name}
+        look: dict = {"fmt": style, "color": colour, "ms": 5, "label": name}
         errors.errorbar(np.asarray(result["collisions"])[: len(bias)], bias, spread, **look)
         if "by_interval" not in result:
             continue

@@ -10,8 +10,6 @@ lammps_cooling_SCENE.csv, with --record to data/: the mean over replicas and its
 Draws all curves in data/ together with kinetic theory; ``--scenes`` without a name only draws.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -72,7 +70,7 @@ def simulate(
     return np.append(0.0, steps * dt), np.asarray(curves)
 
 
-def run(gas: jaxgran.Gas, start: Any, side: float, dt: float, steps: np.ndarray) -> list[float]:
+def run(gas: jaxgran.Gas, start, side: float, dt: float, steps: np.ndarray) -> list[float]:
     """Return T of one replica at the start and after the given numbers of steps."""
     n, mass = len(start[0]), float(gas.mass)
     elastic = gas.replace(dissipative_constant=0.0)

@@ -23,7 +23,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.analysis import mean_and_error, replicas_of
@@ -186,7 +185,7 @@ def build_up(rows: list[dict]) -> tuple[float, float]:
     return float(trial[np.argmin(chi)]), float((near[-1] - near[0]) / 2)
 
 
-def draw(rows: list[dict]) -> Figure:
+def draw(rows: list[dict]):
     """Draw h against phi, and the rate against the number of collisions."""
     figure, places = panels(2, size=(5, 4), sharey=True)
     for axes, d in zip(places, (3, 2), strict=True):

@@ -17,12 +17,10 @@ Each part takes minutes, too long for a test, and writes a file of its own:
 """
 
 import dataclasses
-from typing import Any
 from unittest import mock
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.analysis import mean_and_error
@@ -96,13 +94,13 @@ def coefficients_of_states(smoke: bool):
             yield {"dimension": d, "eps": eps} | row
 
 
-def numbers(curve: Any, a3: Any) -> np.ndarray:
+def numbers(curve, a3) -> np.ndarray:
     """Return means over times of a_2, a_3 and of <dr^2> per collision, on the last axis."""
     spread = np.diff(curve.displacement) / np.diff(curve.collisions)
     return np.stack([np.mean(x, -1) for x in (curve.sonine, a3, spread)], -1)
 
 
-def draw_coefficients(states: list[dict]) -> Figure:
+def draw_coefficients(states: list[dict]):
     """Draw differences of theory in per cent."""
     figure, places = panels(2, size=(4.2, 3.6))
     shown = {"a₂ at constant ε": 0, "D at constant ε": 2}

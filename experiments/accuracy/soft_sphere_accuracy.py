@@ -13,8 +13,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 import jaxgran
@@ -154,7 +152,7 @@ def with_order(rows: list[dict]) -> dict:
     return {"rows": rows, "order": order}
 
 
-def draw(found: dict) -> Figure:
+def draw(found: dict):
     figure, (trajectory, impact, ledger, elastic) = panels(2, 2, size=(4.5, 3.5))
     line(trajectory, found["trajectory"], "lammps", "o-", SOFT, "to LAMMPS")
     finest = found["trajectory"]["finest"]
@@ -183,7 +181,7 @@ def draw(found: dict) -> Figure:
     return figure
 
 
-def line(axes: Axes, result: dict, name: str, style: str, colour: str, label: str) -> None:
+def line(axes, result: dict, name: str, style: str, colour: str, label: str) -> None:
     steps = [row["steps"] for row in result["rows"]]
     error = [abs(row[name]) for row in result["rows"]]
     label = f"{label} (order {result['order'][name]:.1f})"

@@ -21,7 +21,6 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.optimize import root_scalar
 
 import jaxgran
@@ -115,7 +114,7 @@ def in_words(result: jaxgran.Fit, A: float) -> str:
     return f"{result.estimate[0] / A:.2f} ± {result.standard_error[0] / A:.2f}"
 
 
-def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float) -> Figure:
+def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float):
     """Draw T and T_rot of a run, with both fits."""
     smooth, complete = fits
     figure, (axes,) = panels(size=(7.0, 4.6))

@@ -17,11 +17,9 @@ viscoelastic law is wrong about eps by `bias`, the spline by `error`.
 
 import dataclasses
 import time
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.analysis import replicas_of
@@ -31,7 +29,7 @@ from experiments.support.scenes import ICE, cool, of_lammps
 
 ERROR = 0.01
 NUM_KNOTS = 8
-BEADS: dict[str, Any] = {"diameter": 2e-3, "mass": 1e-5, "packing_fraction": 0.03}
+BEADS: dict = {"diameter": 2e-3, "mass": 1e-5, "packing_fraction": 0.03}
 LAMMPS_CURVES = "dilute", "phi003", "phi003_large"
 
 
@@ -45,21 +43,21 @@ class Yielding(jaxgran.RestitutionLaw):
         return self.elastic * (1 + (normal_speed / self.speed) ** 2) ** -0.125
 
 
-TRUTHS: dict[str, tuple[Any, float]] = {  # and T_0, m^2/s^2
+TRUTHS: dict[str, tuple] = {  # and T_0, m^2/s^2
     "viscoelastic": (jaxgran.Viscoelastic(5e7, 0.22, 5e-6), 0.01),
     "ice": (ICE, 4e-4),
     "yield speed": (Yielding(0.95, 0.1), 0.04),
 }
 
 
-def learn(gas: jaxgran.Gas, data: Any, num_particles: int | dict) -> jaxgran.Fit:
+def learn(gas: jaxgran.Gas, data, num_particles: int | dict) -> jaxgran.Fit:
     """The whole recipe: knots over the visited speeds, and a fit of all numbers of the law."""
     curve = data["gas"] if isinstance(data, dict) else data
     low, high = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
     if isinstance(data, dict):  # with drop tests
         low = min(low, float(np.min(np.asarray(data["drops"].speed))))
     law = jaxgran.RestitutionSpline(np.geomspace(low, high, NUM_KNOTS))
-    learner: Any = dataclasses.replace(gas, law=law)
+    learner = dataclasses.replace(gas, law=law)
     if isinstance(data, dict):
         learner = dict.fromkeys(data, learner)
     return jaxgran.fit(learner, data, free="law", num_particles=num_particles)
@@ -74,7 +72,7 @@ def curves_of(gas, model, taus, seed):
         yield jaxgran.CoolingCurve(times, jnp.asarray(T), temperature_error=jnp.asarray(ERROR * T))
 
 
-def judge(gas: jaxgran.Gas, result: jaxgran.Fit, speeds: Any = None) -> dict:
+def judge(gas: jaxgran.Gas, result: jaxgran.Fit, speeds=None) -> dict:
     """Compare a learnt law with the true one, read off A, and test two forms."""
     band = jaxgran.restitution_band(result, speeds)
     eps = np.asarray(gas.restitution(band.speeds))
@@ -168,7 +166,7 @@ def with_drops(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, size: int) -> dict
     return judge(gas, result, speeds[[0, -1]])
 
 
-def draw(results: dict[str, tuple[jaxgran.Gas, jaxgran.Fit]]) -> Figure:
+def draw(results: dict[str, tuple[jaxgran.Gas, jaxgran.Fit]]):
     """Draw eps(v) with its band over the truth, and the speeds of impacts below."""
     num = len(results)
     figure, places = panels(num, 2, size=(4.5, 2.5), sharex="col", height_ratios=[3, 1])

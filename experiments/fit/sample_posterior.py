@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 from corner import corner
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.plots import THEORY
@@ -117,7 +116,7 @@ def sample(log_density, values, options) -> tuple[np.ndarray, dict]:
     }
 
 
-def draw(result: jaxgran.Fit, samples: np.ndarray) -> Figure:
+def draw(result: jaxgran.Fit, samples: np.ndarray):
     """Draw a corner plot, with the Gaussian of the fit over the histograms of A and T_0."""
     figure = corner(samples, labels=LABELS, color="0.3", quantiles=(0.025, 0.975))
     axes = np.array(figure.axes).reshape(3, 3)

@@ -20,8 +20,6 @@ clustering_film: density, structure factor and spectrum of the flow of disks of 
 restitution: the flow grows first, the clusters later.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -147,7 +145,7 @@ def paper_clustering(options: Options) -> dict:
     scenes = {(0.245, 0.9): (2300.0, 3200.0), (0.05, 0.6): (600.0, 1800.0)}
     if options.smoke:
         size, replicas, scenes, fields = 500, 2, {(0.245, 0.6): (60.0, 60.0)}, (4.0, 12.0)
-    found: dict[str, Any] = {"config": {"num_particles": size, "replicas": replicas}, "scenes": {}}
+    found: dict = {"config": {"num_particles": size, "replicas": replicas}, "scenes": {}}
     runs = {}
     for scene, until in scenes.items():
         runs[scene] = runs_of(*scene, size, replicas, until)
@@ -164,7 +162,7 @@ def paper_clustering(options: Options) -> dict:
 def analyse(runs: dict[str, dict], n_c: float) -> dict:
     """Return means and errors over the replicas, and the ratios between the laws."""
     start = np.concatenate([run["unevenness"][:, 0] for run in runs.values()])
-    found: dict[str, Any] = {}
+    found: dict = {}
     for law, run in runs.items():
         number = range(len(run["tau"]))
         reached = [r for r in number if run["collisions"][r, -1] >= n_c]
@@ -185,13 +183,13 @@ def analyse(runs: dict[str, dict], n_c: float) -> dict:
     }
 
 
-def draw_curves(runs: dict, found: dict) -> Figure:
+def draw_curves(runs: dict, found: dict):
     """Draw T over N, and its ratio to that of kinetic theory over N and over T_0/T.
 
     Colours show laws, line styles densities; each thin line is a replica.
     """
     figure, (cooling, by_number, by_clock) = panels(3, size=(4.4, 4.6))
-    marks: dict[str, Any] = {"color": CONSTANT, "mec": "k", "ls": "none"}
+    marks: dict = {"color": CONSTANT, "mec": "k", "ls": "none"}
     for ((packing, e), laws), row, style in zip(
         runs.items(), found["scenes"].values(), ("-", "--"), strict=False
     ):
@@ -234,7 +232,7 @@ def draw_curves(runs: dict, found: dict) -> Figure:
     return figure
 
 
-def draw_fields(runs: dict[str, dict], fields: tuple) -> Figure:
+def draw_fields(runs: dict[str, dict], fields: tuple):
     """Draw the density of a scene, smoothed over 1.5 mean distances of disks."""
     figure, places = panels(len(fields), 2, size=(2.8, 2.8), squeeze=False)
     shown = ScalarMappable(Normalize(0.0, 2.5), cmap=colormaps["magma"].resampled(25))
@@ -267,7 +265,7 @@ def paper_clustering_dissolves(options: Options) -> dict:
         size, replicas, until, fields = 300, 2, (20.0, 800.0), (4.0, 60.0)
     runs = runs_of(0.05, 0.6, size, replicas, until)
     elastic = mean_and_error(np.concatenate([run["unevenness"][:, 0] for run in runs.values()]))
-    found: dict[str, Any] = {"config": {"num_particles": size, "replicas": replicas}}
+    found: dict = {"config": {"num_particles": size, "replicas": replicas}}
     for law, run in runs.items():
         grid = np.geomspace(1.0, run["collisions"][:, -1].min(), 60)
         found[law] = {"gamma_0": dissipation(run["gas"]), "collisions": grid}
@@ -293,7 +291,7 @@ def smooth(grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     )
 
 
-def draw_dissolution(run: dict, size: int, fields: tuple, found: dict) -> Figure:
+def draw_dissolution(run: dict, size: int, fields: tuple, found: dict):
     """Draw density fluctuations and flow over the collisions, and disks at some times."""
     figure, columns = Figure(figsize=(11, 7.2), layout="constrained"), len(fields)
     grid = figure.add_gridspec(2, 2 * columns, height_ratios=[1.15, 1])
@@ -352,7 +350,7 @@ def clustering_film(options: Options) -> dict:
     return results | {"picture": draw_growth(density, results)}
 
 
-def draw_growth(density: np.ndarray, results: dict) -> Figure:
+def draw_growth(density: np.ndarray, results: dict):
     """Draw four frames and, below, the growth of flow and clusters."""
     figure = Figure(figsize=(9, 6.2), layout="constrained")
     above, below = np.asarray(figure.subfigures(2, height_ratios=(1, 1.15)), dtype=object)

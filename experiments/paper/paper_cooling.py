@@ -17,8 +17,6 @@ as measured by Bridges, Hatzes & Lin (Nature 309, 333, 1984), eps = min(1, 0.34 
 cm/s, is not such a power law: the exponent of its T(t) changes with time.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,15 +24,7 @@ import numpy as np
 from matplotlib.ticker import NullFormatter
 
 import jaxgran
-from experiments.support.analysis import (
-    Compared,
-    at_powers,
-    compared,
-    draw_forms,
-    from_here,
-    interpolate,
-    slope,
-)
+from experiments.support import analysis
 from experiments.support.closed_forms import haff, paper_temperature
 from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
 from experiments.support.record import Options, run_parts
@@ -95,11 +85,11 @@ def paper_restitution(options: Options) -> dict:
     found = {
         "recovered": coefficients,
         "orders": {
-            name: float(np.mean(slope(betas[:10], errors[name][:10])[1]))
+            name: float(np.mean(analysis.slope(betas[:10], errors[name][:10])[1]))
             for name in ("two_terms_unclipped", "two_terms_clipped", "ramirez_four_terms")
         },
         "two_terms_good_to_one_per_cent": {
-            name: float(np.exp(interpolate(0.01, miss, np.log(betas))))
+            name: float(np.exp(analysis.interpolate(0.01, miss, np.log(betas))))
             for name, miss in relative.items()
         },
     }
@@ -146,21 +136,21 @@ def paper_cooling(options: Options) -> dict:
         " both of the paper's laws hold at late times"
     )
     figure, (left, middle, right) = panels(3, title=title)
-    found: dict[str, Any] = {"restitution": e}
+    found: dict = {"restitution": e}
     for name, (gas, color, power, label) in gases.items():
         theory = jaxgran.KineticTheory(softness=False, correlations=False)
-        T = compared(gas, "temperature", float(gas.temperature), tau, config, theory)[2]
+        T = analysis.compared(gas, "temperature", float(gas.temperature), tau, config, theory)[2]
         T.draw(left, middle, color, f"{label}: theory", f"{name}: theory")
         middle.axhline(power, color=color, ls=":", lw=1)
         found[name] = {
             "largest_difference_of_theory": float(np.abs(1 / (1 + T.miss) - 1).max()),
             "exponent": {f"{t:.3g}": x for t, x in zip(T.middle, T.exponent, strict=True)},
             "exponent_error": T.exponent_error,
-            "exponent_of_theory": at_powers(0, 10, T.where, T.local),
+            "exponent_of_theory": analysis.at_powers(0, 10, T.where, T.local),
         }
         if name == "viscoelastic":
             late = np.abs(T.local - power) < 0.01 * abs(power)
-            found["exponent_within_1_per_cent_from"] = from_here(late, T.where)
+            found["exponent_within_1_per_cent_from"] = analysis.from_here(late, T.where)
             u, t = 1 + COOLING_RATE[3] * delta * tau, jnp.asarray(tau)
             printed = paper_temperature(t, delta, corrected=False)
             forms = {
@@ -168,7 +158,7 @@ def paper_cooling(options: Options) -> dict:
                 "Eq. (38) as printed, to order δ": (printed, "--"),
                 "Eq. (38) corrected, to order δ$^2$": (paper_temperature(t, delta), "-"),
             }
-            found["closed_forms"] = draw_forms(right, T, forms, (-1, 11))
+            found["closed_forms"] = analysis.draw_forms(right, T, forms, (-1, 11))
         else:
             expected = np.asarray(haff(tau, e)) / T.theory - 1
             right.plot(tau, expected, color=color, label="Haff, Eq. (44)")
@@ -224,13 +214,13 @@ def paper_exponents(options: Options) -> dict:
         packing_fraction=PACKING,
         temperature=config["ice_speed"] ** 2 / 2,
     )
-    found: dict[str, Any] = {}
+    found: dict = {}
     for name, (gas, color, gamma) in {**gases, "ice": (frozen, INK, None)}.items():
         unit, theory = float(gas.temperature), jaxgran.KineticTheory()
-        of, _, T = compared(gas, "temperature", unit, tau, config, theory)
+        of, _, T = analysis.compared(gas, "temperature", unit, tau, config, theory)
         if gamma is None:
             theta, steepness = maxwellian(gas, tau)
-            T = Compared(tau, theta, T.at, T.each)
+            T = analysis.Compared(tau, theta, T.at, T.each)
             draw_ice(right, T, steepness, 100 * config["ice_speed"])
         label = name if gamma is None else f"{name}: −2/(1 + γ) = {-2 / (1 + gamma):.3g}"
         T.draw(left, None if gamma is None else middle, color, name, label)
@@ -243,7 +233,9 @@ def paper_exponents(options: Options) -> dict:
             "exponent_error": float(T.exponent_error[-1]),
             "exponent_of_theory": float(np.diff(ends)[0] / np.diff(np.log(T.at[-2:]))[0]),
             "last_exponent_of_theory": float(T.local[-1]),
-            "last_displacement_exponent": float(slope(tau, np.asarray(of.displacement))[1][-1]),
+            "last_displacement_exponent": float(
+                analysis.slope(tau, np.asarray(of.displacement))[1][-1]
+            ),
         }
     elastic = 100 * ICE.speed
     logs = {"xlabel": TIME, "xscale": "log"}
@@ -257,7 +249,7 @@ def paper_exponents(options: Options) -> dict:
     return {"config": config, "found": found, "picture": figure}
 
 
-def draw_ice(axes, T: Compared, steepness: np.ndarray, speed: float) -> None:
+def draw_ice(axes, T: analysis.Compared, steepness: np.ndarray, speed: float) -> None:
     """Draw the local exponents of ice over its thermal speed, past the initial transient."""
     aged, old = T.middle > 100, T.tau[1:] > 100
     at = speed * np.sqrt(T.theory[1:][old])

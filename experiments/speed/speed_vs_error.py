@@ -12,12 +12,10 @@ twice, to separate compilation from run time. With --record, other scenes keep t
 import datetime
 import re
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from tqdm import tqdm
 
@@ -102,7 +100,7 @@ class Run(NamedTuple):
 
 
 def all_runs(gas: jaxgran.Gas, sizes: tuple[int, ...]) -> list[Run]:
-    few: dict[str, Any] = {"replicas": REPLICAS}
+    few: dict = {"replicas": REPLICAS}
     middle, many = sizes[len(sizes) // 2], DSMC_SIZES[1]
     dsmc, hard = jaxgran.DSMC(many, **few), jaxgran.HardSpheres(middle, **few)
     soft = jaxgran.SoftSpheres(middle, **few)
@@ -156,7 +154,7 @@ def measure(scene: Scene, row: Run) -> dict:
     }
 
 
-def draw(found: dict) -> Figure:
+def draw(found: dict):
     """Draw the largest error over the run time; symbols grow with N."""
     figure, places = panels(len(found), size=(5.0, 5.6), sharey=True)
     for axes, (name, results) in zip(places, found.items(), strict=True):
@@ -172,7 +170,7 @@ def draw(found: dict) -> Figure:
     return figure
 
 
-def panel(axes: Axes, rows: list[dict]) -> None:
+def panel(axes, rows: list[dict]) -> None:
     """Draw a panel: full points grow with N; hollow points have the middle N and other steps.
 
     Rows of the table that differ in something else (float32, the tolerance, DSMC's step, softer

@@ -190,7 +190,7 @@ def numbers(gas: Any, curve: Any, _: int) -> None:
         arrays = [x for x in leaves if isinstance(x, jax.Array | np.ndarray | float | int)]
         STEPS[name] = []
         for x in arrays:
-            is_key = jax.dtypes.issubdtype(getattr(x, "dtype", None), jax.dtypes.prng_key)
+            is_key = jax.numpy.issubdtype(getattr(x, "dtype", None), jax.dtypes.prng_key)
             x = np.asarray(jax.random.key_data(x) if is_key else x)
             STEPS[name].append((x.tolist(), str(x.dtype)))
 
