@@ -118,8 +118,7 @@ def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray) -> dict:
     basis = np.stack([collisions[early], collisions[early] ** 2], axis=1)
     fits = np.linalg.lstsq(basis, -np.log(each[:, early]).T, rcond=None)[0][0]
     correlation, error = analysis.mean_and_error(each)
-    row = {"lags": lags, "collisions": collisions, "correlation": correlation, "error": error}
-    found: dict = {name: values for name, values in row.items()}
+    found = {"lags": lags, "collisions": collisions, "correlation": correlation, "error": error}
     integrals = np.asarray(simpson(each, x=lags, axis=1))
     for name, values in (("relaxation", 2 / 3 / fits), ("integral", integrals)):
         found[name], found[f"{name}_error"] = map(float, analysis.mean_and_error(values))
