@@ -257,11 +257,9 @@ def paper_clustering_dissolves(options: Options) -> dict:
                 [smooth(grid, x, y) for x, y in pairs]
             )
     run = runs["viscoelastic"]
-    gas, clocks = run["gas"], jnp.asarray(run["clock"])
-    lengths = jax.vmap(
-        jax.vmap(lambda x: gas.replace(temperature=gas.temperature / x).critical_box)
-    )
-    pairs = zip(run["collisions"], np.asarray(lengths(clocks) / gas.box_side(size)), strict=True)
+    T = run["gas"].temperature / jnp.asarray(run["clock"])
+    lengths = jax.vmap(jax.vmap(lambda T: run["gas"].replace(temperature=T).critical_box))(T)
+    pairs = zip(run["collisions"], np.asarray(lengths / run["gas"].box_side(size)), strict=True)
     found["critical_box_passes_at"] = [crossing(x, length, 1.0) for x, length in pairs]
     return found | {"picture": draw_dissolution(run, size, fields, found)}
 

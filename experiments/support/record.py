@@ -205,7 +205,7 @@ def alone(function: Callable, *arguments: Any) -> dict:
         "import json, sys, jax\n"
         "from experiments.support.record import as_json\n"
         "jax.config.update('jax_enable_x64', True)\n"
-        f"print(as_json({function.__name__}(*json.loads(sys.argv[1])), indent=None))"
+        f"print(as_json({function.__name__}(*json.loads(sys.argv[1])), indent=None), end='')"
     )
     return json.loads(process("-c", code, json.dumps(arguments)).stdout.splitlines()[-1])
 
