@@ -18,7 +18,6 @@ of each step, medians over the rounds. With CHECKOUT, the folder of another vers
 of seconds, now over before, and its standard error. The tasks are
 (`support/version.py`)
 
-    fit: fit and diagnosis of a curve with 60 points, then of one with 47, then with other `free`.
     command: `jaxgran fit` as a process, with an empty cache, and again.
     SoftSpheres, HardSpheres, DSMC: runs of one mean free time; the last one of the first two
         continues from the particles of the one before.
@@ -54,7 +53,7 @@ from jaxgran.scene.laws import _CLIPPED, C1
 from jaxgran.theory.averages import averaging_matrix
 
 CURVE = DATA / "lammps_cooling_dilute.csv"
-TASKS = "fit", "command", "SoftSpheres", "HardSpheres", "DSMC"
+TASKS = "command", "SoftSpheres", "HardSpheres", "DSMC"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
 SAME_EQUATIONS = {"order": 2, "softness": False, "correlations": False}
 """Options for which kinetic theory solves the equations that are written here for SciPy."""

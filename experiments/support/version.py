@@ -40,17 +40,6 @@ def step(name: str, call: Any, repeats: int = 1) -> Any:
     return result
 
 
-def fit(gas: Any, curve: Any, _: int) -> None:
-    """Fit and diagnose a curve of 60 points, one of 47, and with another free parameter."""
-    for points, words in ((60, "first"), (47, "47 points,")):
-        # Slices of arrays of JAX would compile for each length.
-        some = jax.tree.map(lambda x, n=points: jax.device_put(np.asarray(x)[1 : n + 1]), curve)
-        result = step(f"{words} fit", lambda c=some: jaxgran.fit(gas, c, free=BOTH))
-        step(f"{words} diagnose", lambda r=result, c=some: jaxgran.diagnose(r, c))
-    step("fit again", lambda: jaxgran.fit(gas, some, free=BOTH), repeats=5)
-    step("other free", lambda: jaxgran.fit(gas, some, free=BOTH[:1]))
-
-
 def first_run(name: str, gas: Any, num: int) -> None:
     """Run a particle model for one mean free time, and continue where it ended."""
     times = np.array([0.5, 1.0]) * float(gas.mean_free_time)
@@ -200,7 +189,7 @@ if __name__ == "__main__":
     task, file, number = sys.argv[1:]
     measured, header = jaxgran.read_curve(file)
     measured_gas = jaxgran.read_gas(header)
-    tasks = {"fit": fit, "speed": speed, "numbers": numbers}
+    tasks = {"speed": speed, "numbers": numbers}
     if task != "numbers":
         measured_gas = measured_gas.replace(dissipative_constant=3e-6)
     if task in tasks:
