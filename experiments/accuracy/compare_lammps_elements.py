@@ -139,11 +139,4 @@ def store() -> None:
 
 
 if __name__ == "__main__":
-    settings = {"action": "store_true", "help": "write the data of the tests"}
-    run_parts(
-        __doc__,
-        compare_lammps_elements,
-        smoke=False,
-        particles={"type": int, "default": 500},
-        store=settings,
-    )
+    run_parts(__doc__, compare_lammps_elements, smoke=False, particles=500, store=False)

@@ -45,6 +45,5 @@ def relative_difference(one: list, other: list) -> float:
 
 
 if __name__ == "__main__":
-    settings = {"type": Path, "help": "folder of the other version"}
-    found = run_parts(__doc__, compare_versions, smoke=False, CHECKOUT=settings)
+    found = run_parts(__doc__, compare_versions, smoke=False, CHECKOUT=Path)
     sys.exit(any(row["difference"] for row in found["compare_versions"]["rows"]))

@@ -100,5 +100,4 @@ def run(gas: jaxgran.Gas, start, side: float, dt: float, steps: np.ndarray) -> l
 
 
 if __name__ == "__main__":
-    settings = {"nargs": "*", "choices": list(SCENES), "default": list(SCENES)}
-    run_parts(__doc__, make_lammps_curves, smoke=False, scenes=settings)
+    run_parts(__doc__, make_lammps_curves, smoke=False, scenes=list(SCENES))

@@ -231,5 +231,4 @@ def measure_correlations(options: Options) -> dict:
 
 
 if __name__ == "__main__":
-    settings = {"action": "store_true", "help": "the whole grid, errors below .15 %%"}
-    run_parts(__doc__, measure_correlations, full=settings)
+    run_parts(__doc__, measure_correlations, full=False)

@@ -138,5 +138,4 @@ def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float):
 
 
 if __name__ == "__main__":
-    settings = {"type": int, "default": 6, "help": "single runs (default: 6)"}
-    run_parts(__doc__, drop_tower, smoke=False, runs=settings)
+    run_parts(__doc__, drop_tower, smoke=False, runs=6)

@@ -301,5 +301,4 @@ def differential_evolution(chi2, first, bounds, most) -> None:
 
 
 if __name__ == "__main__":
-    settings = {"nargs": "+", "choices": list(PROBLEMS), "default": list(PROBLEMS)}
-    run_parts(__doc__, fit_head_to_head, fit_laws, scenes=settings)
+    run_parts(__doc__, fit_head_to_head, fit_laws, scenes=list(PROBLEMS))

@@ -131,14 +131,6 @@ def measured() -> tuple[np.ndarray, np.ndarray]:
 
 
 if __name__ == "__main__":
-    run_parts(
-        __doc__,
-        interval_coverage,
-        coverage_in_clusters,
-        smoke=False,
-        runs={"type": int, "help": "runs of each gas (default: 600, 200 or 20)"},
-        models={"nargs": "+", "choices": list(KINDS), "default": list(KINDS)},
-        numbers={"nargs": "+", "type": int, "default": [100, 500]},
-        phis={"nargs": "+", "type": float, "default": [0.02, 0.05]},
-        measure={"action": "store_true", "help": "run LAMMPS again"},
-    )
+    scenes = {"models": list(KINDS), "numbers": [100, 500], "phis": [0.02, 0.05]}
+    parts = interval_coverage, coverage_in_clusters
+    run_parts(__doc__, *parts, smoke=False, runs=int, measure=False, **scenes)

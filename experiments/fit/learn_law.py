@@ -22,7 +22,7 @@ import jaxgran
 from experiments.support.analysis import replicas_of
 from experiments.support.plots import DSMC, GUIDE, INK, THEORY, caption, panels
 from experiments.support.record import Options, run_parts
-from experiments.support.scenes import ICE, cool
+from experiments.support.scenes import cool, ice
 
 ERROR = 0.01
 NUM_KNOTS = 8
@@ -41,7 +41,7 @@ class Yielding(jaxgran.RestitutionLaw):
 
 TRUTHS: dict[str, tuple] = {  # and T_0, m^2/s^2
     "viscoelastic": (jaxgran.Viscoelastic(5e7, 0.22, 5e-6), 0.01),
-    "ice": (ICE, 4e-4),
+    "ice": (ice(), 4e-4),
     "yield speed": (Yielding(0.95, 0.1), 0.04),
 }
 

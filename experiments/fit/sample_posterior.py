@@ -132,6 +132,4 @@ def draw(result: jaxgran.Fit, samples: np.ndarray):
 
 
 if __name__ == "__main__":
-    samples = {"type": int, "default": 1000, "help": "of a chain (default: 1000)"}
-    chains = {"type": int, "default": 4, "help": "parallel chains (default: 4)"}
-    run_parts(__doc__, sample_posterior, smoke=False, samples=samples, chains=chains)
+    run_parts(__doc__, sample_posterior, smoke=False, samples=1000, chains=4)

@@ -229,6 +229,4 @@ def statistics(number: int, runs: int) -> dict:
 
 
 if __name__ == "__main__":
-    number = {"type": int, "default": 100, "help": "of each gas (default: 100)"}
-    some = {"default": "", "help": "only those whose name contains this"}
-    run_parts(__doc__, wrong_physics, smoke=False, runs=number, rows=some)
+    run_parts(__doc__, wrong_physics, smoke=False, runs=100, rows="")

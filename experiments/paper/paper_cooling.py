@@ -28,7 +28,7 @@ from experiments.support import analysis
 from experiments.support.closed_forms import haff, paper_temperature
 from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
 from experiments.support.record import Options, run_parts
-from experiments.support.scenes import ICE, beads, hard_beads, restitution_like
+from experiments.support.scenes import beads, hard_beads, ice, restitution_like
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, C2, UNCLIPPED_SERIES, viscoelastic_restitution
 from jaxgran.theory.equations import COOLING_RATE
@@ -208,7 +208,7 @@ def paper_exponents(options: Options) -> dict:
         law = jaxgran.RestitutionSeries([coefficient], [gamma])
         gases[f"γ = {gamma:g}"] = eqx.tree_at(lambda gas: gas.law, scene, law), color, gamma
     frozen = jaxgran.Gas(
-        ICE,
+        ice(),
         diameter=0.02,
         mass=jaxgran.sphere_mass(0.02, 900.0),
         packing_fraction=PACKING,
@@ -237,7 +237,7 @@ def paper_exponents(options: Options) -> dict:
                 analysis.slope(tau, np.asarray(of.displacement))[1][-1]
             ),
         }
-    elastic = 100 * ICE.speed
+    elastic = 100 * float(ice().speed)
     logs = {"xlabel": TIME, "xscale": "log"}
     title = "Temperature: — theory, ● DSMC"
     caption(left, title, ylabel="T / T$_0$", yscale="log", **logs)

@@ -210,5 +210,4 @@ def to_clusters(gas: jaxgran.Gas, name: str, size: int) -> dict:
 
 
 if __name__ == "__main__":
-    settings = {"nargs": "+", "choices": list(MODELS), "default": list(MODELS)}
-    run_parts(__doc__, replicas, million, prefix="benchmark_", models=settings)
+    run_parts(__doc__, replicas, million, prefix="benchmark_", models=list(MODELS))

@@ -225,13 +225,6 @@ def benchmark_versions(options: Options) -> Iterator[dict]:
 
 
 if __name__ == "__main__":
-    run_parts(
-        __doc__,
-        benchmark_kinetic_theory,
-        benchmark_compilation,
-        benchmark_versions,
-        default=("benchmark_kinetic_theory", "benchmark_compilation"),
-        tasks={"nargs": "+", "choices": TASKS, "default": TASKS},
-        checkout={"type": Path, "help": "folder of another version"},
-        rounds={"type": int, "default": 1},
-    )
+    parts = benchmark_kinetic_theory, benchmark_compilation, benchmark_versions
+    usual = ("benchmark_kinetic_theory", "benchmark_compilation")
+    run_parts(__doc__, *parts, default=usual, tasks=list(TASKS), checkout=Path, rounds=1)

@@ -225,5 +225,4 @@ def steps_of(row: dict) -> int | None:
 
 
 if __name__ == "__main__":
-    settings = {"nargs": "+", "choices": list(SIZES), "default": list(SIZES)}
-    run_parts(__doc__, speed_vs_error, scenes=settings)
+    run_parts(__doc__, speed_vs_error, scenes=list(SIZES))

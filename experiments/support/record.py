@@ -46,7 +46,7 @@ def run_parts(
     prefix: str = "",
     smoke: bool = True,
     default: Sequence[str] = (),
-    **more: dict[str, Any],
+    **more: Any,
 ) -> dict[str, dict]:
     """Run the parts of a script that --only names, by default all, and write what they find.
 
@@ -60,7 +60,8 @@ def run_parts(
         prefix: before the names of parts in the names of files.
         smoke: whether there are small runs of some seconds (--smoke).
         default: parts that run without --only, if not all.
-        more: settings of further options; names in capitals are positional arguments.
+        more: defaults of further options: numbers, words, or lists of these (of words any may be
+            chosen); False for a flag; a type without a default. Names in capitals are positional.
 
     Returns:
         The results of the parts.
@@ -77,8 +78,8 @@ def run_parts(
         parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     if len(parts) > 1:
         parser.add_argument("--only", nargs="+", choices=list(parts))
-    for name, settings in more.items():
-        parser.add_argument(name if name.isupper() else f"--{name.replace('_', '-')}", **settings)
+    for name, default in more.items():
+        parser.add_argument(name if name.isupper() else f"--{name}", **settings_of(default))
     options = parser.parse_args()
     if options.record and options.smoke:
         parser.error("A smoke run is too small for the documents. Leave out --record.")
@@ -98,6 +99,17 @@ def run_parts(
                 figure.savefig(folder / f"{picture}.png", dpi=110)
         print(f"written to {options.out / name}.json; {time.perf_counter() - BEGAN:.0f} s")
     return results
+
+
+def settings_of(default: Any) -> dict[str, Any]:
+    """Return settings of an option of argparse: see `run_parts`."""
+    if default is False:
+        return {"action": "store_true"}
+    if isinstance(default, list):
+        words = {"choices": default} if isinstance(default[0], str) else {}
+        return {"nargs": "*", "type": type(default[0]), "default": default} | words
+    is_type = isinstance(default, type)
+    return {"type": default} if is_type else {"type": type(default), "default": default}
 
 
 def rounded(found: Any) -> Any:

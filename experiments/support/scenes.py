@@ -48,8 +48,9 @@ class Power(jaxgran.RestitutionLaw):
         return jnp.maximum(normal_speed / self.speed, 1.0) ** -self.power
 
 
-ICE = Power(0.01 * 0.34 ** (1 / 0.234), 0.234)
-"""Ice as measured by Bridges, Hatzes & Lin, Nature 309, 333 (1984)."""
+def ice() -> Power:
+    """Return the law of ice as measured by Bridges, Hatzes & Lin, Nature 309, 333 (1984)."""
+    return Power(0.01 * 0.34 ** (1 / 0.234), 0.234)
 
 
 def hard_beads(packing_fraction: float, restitution: float, dimension: int = 3) -> jaxgran.Gas:
