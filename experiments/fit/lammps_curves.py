@@ -28,7 +28,7 @@ CASES = {
     "dilute_soft_spheres": [DILUTE, *SOFT, "--replicas", "2"],
 }
 QUICK = (*NAMES, "dense_T0")
-SHOWN = ("dilute", "dense", "dense_soft_spheres")
+SHOWN = ("dilute", "dense_soft_spheres")
 """Cases whose picture is in the documents."""
 
 
