@@ -7,28 +7,26 @@ and LAMMPS at all times, with its standard error from the replicas of both, and 
 between kinetic theory and LAMMPS.
 """
 
-import argparse
-
 import jax
 import numpy as np
 
 import jaxgran
 from experiments.support.plots import INK, SOFT, THEORY, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool, of_lammps
 
 SETTINGS = {"replicas": 4, "steps_per_contact": 40}
 
 
-def compare_lammps(options: argparse.Namespace) -> dict:
+def compare_lammps(options: Options) -> dict:
     title = "Temperature of two gases, without fitted parameters"
-    figure = panels(2, 2, title, (5, 3.2), sharex="col", height_ratios=[2, 1])
-    columns = zip(("dilute", "dense"), figure.axes[:2], figure.axes[2:], strict=True)
+    figure, places = panels(2, 2, title, (5, 3.2), sharex="col", height_ratios=[2, 1])
+    columns = zip(("dilute", "dense"), places[:2], places[2:], strict=True)
     curves = {name: compare(name, options, *axes) for name, *axes in columns}
     return {"curves": curves, **SETTINGS, "picture": figure}
 
 
-def compare(name: str, options: argparse.Namespace, top, bottom) -> dict:
+def compare(name: str, options: Options, top, bottom) -> dict:
     gas, measured, header = of_lammps(name)
     size, points = (200, 12) if options.smoke else (int(header["N"]), None)
     measured = jax.tree.map(lambda x: x[:points], measured)
@@ -58,4 +56,4 @@ def compare(name: str, options: argparse.Namespace, top, bottom) -> dict:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"compare_lammps": compare_lammps})
+    run_parts(__doc__, compare_lammps)

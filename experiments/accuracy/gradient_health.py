@@ -20,20 +20,18 @@ and the estimate of their bias (`CoolingCurve.derivative_bias`), and derivatives
 one set (``differences=0.3``), with another key.
 """
 
-import argparse
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.analysis import mean_and_error, over
 from experiments.support.plots import ELASTIC, GUIDE, HARD, INK, SOFT, THEORY, caption, panels
-from experiments.support.record import figures, run_parts
+from experiments.support.record import Options, figures, run_parts
 from experiments.support.scenes import beads, cool, glass, times_of
 
 COLLISIONS = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -52,6 +50,20 @@ PLAIN_HORIZON = 3  # times at which the plain derivative is computed; at the las
 # packing fraction, beta_T0, dimension, particles in a box, replicas, sets of the reference
 FLOWS = {"hard": (0.2, 0.3, 3, 500, 32, 6), "disks": (0.25, 0.3, 2, 300, 32, 12)}
 WORDS = {"hard": "hard spheres", "disks": "hard disks"}
+
+# Marker, colour and label of the methods in the pictures.
+LOOKS = {
+    "differences": ("o", INK, "finite differences"),
+    "projected": ("^", SOFT, "projected"),
+    "plain": ("x", HARD, "plain forward mode"),
+}
+LOOKS_IN_FLOWS = {
+    "reference": ("o", INK, "differences of many runs"),
+    "projected": ("^", SOFT, "projected"),
+    "differences": ("s", HARD, "by differences"),
+}
+LABELS = {"xlabel": "collisions per particle", "ylabel": "d ln T / d ln A", "xscale": "log"}
+SHOWN = -2.2, 0.5  # range of the derivatives in the picture
 
 
 class Slopes:
@@ -88,7 +100,7 @@ class Slopes:
         return Slopes(self.gas, self.times[:count])
 
 
-def soft_spheres(name: str, options: argparse.Namespace) -> dict:
+def soft_spheres(name: str, options: Options) -> dict:
     (phi, beta, contact, size, many, sets), few, most = SOFT_SPHERES[name], 4, 64
     collisions, intervals = COLLISIONS, INTERVALS
     if options.smoke:
@@ -139,20 +151,18 @@ def soft_spheres(name: str, options: argparse.Namespace) -> dict:
     return found | {"picture": {"gradient_health": draw(results)}}
 
 
-def hard_derivatives(options: argparse.Namespace) -> dict:
-    rows = []
+def hard_derivatives(options: Options) -> Iterator[dict]:
     for phi, beta, replicas in ((0.02, 0.2, 32), (0.2, 0.1, 32), (0.2, 0.3, 96)):
         gas = glass(beta, phi)
         slopes = Slopes(gas, np.array([10.0, 30.0]) * float(gas.mean_free_time))
         model = jaxgran.HardSpheres(*((50, 2) if options.smoke else (500, replicas)))
         projected, curve = slopes.forward(model)
         off, error = over(mean_and_error(projected), mean_and_error(slopes.differences(model)))
-        row = {"off": off, "error": error, "told": curve.derivative_bias}
-        rows.append({"phi": phi, "beta": beta} | row)
-    return {"rows": rows}
+        row = {"phi": phi, "beta": beta, "off": off, "error": error}
+        yield row | {"told": curve.derivative_bias}
 
 
-def derivatives_in_flows(options: argparse.Namespace) -> dict:
+def derivatives_in_flows(options: Options) -> dict:
     scenes = {name: in_flow(name, options.smoke) for name in FLOWS}
     return {"step_of_ln_A": STEP, "scenes": scenes, "picture": draw_flows(scenes)}
 
@@ -189,41 +199,34 @@ def in_flow(name: str, smoke: bool) -> dict:
     }
 
 
-def draw_flows(scenes: dict) -> Figure:
+def draw_flows(scenes: dict):
     """Draw the derivatives of each gas by three methods, and without the estimated bias."""
-    figure = panels(len(scenes), size=(5, 4))
-    looks = {
-        "reference": ("o", INK, "differences of many runs"),
-        "projected": ("^", SOFT, "projected"),
-        "differences": ("s", HARD, "by differences"),
-    }
-    for axes, (name, found) in zip(figure.axes, scenes.items(), strict=True):
-        n = np.array(found["collisions"])
-        for shift, (kind, (marker, colour, label)) in enumerate(looks.items()):
-            mean, error = found["d_ln_T_d_ln_A"][kind]
-            fill = "none" if kind == "reference" else colour
-            look = {"fmt": marker, "color": colour, "mfc": fill, "ms": 6, "label": label}
-            axes.errorbar(n * 1.08 ** (shift - 1), mean, error, **look)
+    figure, places = panels(len(scenes), size=(5, 4))
+    for axes, (name, found) in zip(places, scenes.items(), strict=True):
+        draw_derivatives(axes, found, LOOKS_IN_FLOWS)
         freed = np.array(found["d_ln_T_d_ln_A"]["projected"][0])
         freed = freed / (1 + np.array(found["derivative_bias"]))
         label = "projected, minus its estimated bias"
-        axes.plot(n, freed, "--", color=SOFT, lw=1.2, label=label, zorder=0)
-        labels = {"xlabel": "collisions per particle", "ylabel": "d ln T / d ln A"}
+        axes.plot(found["collisions"], freed, "--", color=SOFT, lw=1.2, label=label, zorder=0)
         title = f"{WORDS[name]} in a box of {found['box_over_critical']:.1f} $L_c$"
-        caption(axes, title, "upper right", xscale="log", **labels)
+        caption(axes, title, "upper right", **LABELS)
     return figure
 
 
-def draw(results: dict) -> Figure:
+def draw(results: dict):
     """Draw the derivatives of two gases, their errors, and the effect of the interval."""
-    figure = panels(2, 2, size=(5, 4))
-    left, right, errors, intervals = figure.axes
-    for axes, name in zip((left, right), results, strict=False):
-        draw_derivatives(axes, name, results[name])
+    figure, (left, right, errors, intervals) = panels(2, 2, size=(5, 4))
+    for axes, (name, found) in zip((left, right), results.items(), strict=False):
+        draw_derivatives(axes, found, LOOKS, *SHOWN)
+        theory = found["d_ln_T_d_ln_A"]["kinetic theory"][0]
+        look = {"color": THEORY, "lw": 1.2, "label": "kinetic theory", "zorder": 0}
+        axes.plot(found["collisions"], theory, "--", **look)
+        title = f"{name} gas: d ln T / d ln A by four methods"
+        caption(axes, title, "lower left", ylim=SHOWN, **LABELS)
     looks = ((INK, "o-"), (GUIDE, "s--"), (ELASTIC, "^:"))
     for (name, result), (colour, style) in zip(results.items(), looks, strict=False):
         bias, spread = (100 * np.asarray(x) for x in result["projected_over_differences"])
-        look: dict[str, Any] = {"fmt": style, "color": colour, "ms": 5, "label": name}
+        look: dict = {"fmt": style, "color": colour, "ms": 5, "label": name}
         errors.errorbar(np.asarray(result["collisions"])[: len(bias)], bias, spread, **look)
         if "by_interval" not in result:
             continue
@@ -242,36 +245,20 @@ def draw(results: dict) -> Figure:
     return figure
 
 
-def draw_derivatives(axes, name: str, result: dict) -> None:
-    """Draw the derivatives of one gas; write plain derivatives beyond the panel as text."""
-    n = np.asarray(result["collisions"])
-    styles = {
-        "differences": ("o", INK, "finite differences"),
-        "projected": ("^", SOFT, "projected"),
-        "plain": ("x", HARD, "plain forward mode"),
-    }
-    low, high = -2.2, 0.5
-    for shift, (column, (marker, colour, label)) in enumerate(styles.items()):
-        mean, error = (np.asarray(x) for x in result["d_ln_T_d_ln_A"][column])
-        at = n[: len(mean)] * 1.08 ** (shift - 1)
+def draw_derivatives(axes, found: dict, looks: dict, low=-np.inf, high=np.inf) -> None:
+    """Draw the derivatives of one gas by each method; write those beyond the panel as text."""
+    for shift, (column, (marker, colour, label)) in enumerate(looks.items()):
+        mean, error = (np.asarray(x) for x in found["d_ln_T_d_ln_A"][column])
+        n = np.asarray(found["collisions"])[: len(mean)]
         inside = (mean - error > low) & (mean + error < high)
-        look = {"color": colour, "ms": 5.5, "mfc": "none" if marker == "o" else colour}
-        axes.errorbar(at[inside], mean[inside], error[inside], fmt=marker, label=label, **look)
-        outside = n[: len(mean)][~inside], mean[~inside], error[~inside]
-        for x, m, e in zip(*outside, strict=True):
-            words = f"plain after {x:.0f}:\n{m:.1g} ± {e:.1g}"
+        look = {"color": colour, "ms": 6, "mfc": "none" if marker == "o" else colour}
+        at = n[inside] * 1.08 ** (shift - 1)
+        axes.errorbar(at, mean[inside], error[inside], fmt=marker, label=label, **look)
+        for x, m, e in zip(n[~inside], mean[~inside], error[~inside], strict=True):
+            words = f"{column} after {x:.0f}:\n{m:.1g} ± {e:.1g}"
             axes.annotate(words, (x, high - 0.02), color=colour, fontsize=8, va="top")
-    theory = result["d_ln_T_d_ln_A"]["kinetic theory"][0]
-    axes.plot(n, theory, "--", color=THEORY, lw=1.2, label="kinetic theory", zorder=0)
-    labels = {"xlabel": "collisions per particle", "ylabel": "d ln T / d ln A"}
-    title = f"{name} gas: d ln T / d ln A by four methods"
-    caption(axes, title, "lower left", xscale="log", ylim=(low, high), **labels)
 
-
-PARTS = {f"gradient_health_{name}": partial(soft_spheres, name) for name in SOFT_SPHERES} | {
-    "hard_derivatives": hard_derivatives,
-    "derivatives_in_flows": derivatives_in_flows,
-}
 
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS)
+    soft = {f"gradient_health_{name}": partial(soft_spheres, name) for name in SOFT_SPHERES}
+    run_parts(__doc__, hard_derivatives, derivatives_in_flows, named=soft)

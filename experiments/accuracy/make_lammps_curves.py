@@ -10,9 +10,6 @@ lammps_cooling_SCENE.csv, with --record to data/: the mean over replicas and its
 Draws all curves in data/ together with kinetic theory; ``--scenes`` without a name only draws.
 """
 
-import argparse
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,14 +17,14 @@ import jaxgran
 from experiments.support.analysis import mean_and_error
 from experiments.support.lammps_library import granular_box, hertzian
 from experiments.support.plots import INK, THEORY, caption, panels
-from experiments.support.record import DATA, run_parts
+from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import cool, of_lammps
 
 STEPS_PER_CONTACT = 40
 SCENES = ("phi003", "phi003_large", "phi010", "phi025")
 
 
-def make_lammps_curves(options: argparse.Namespace) -> dict:
+def make_lammps_curves(options: Options) -> dict:
     folder = DATA if options.record else options.out
     folder.mkdir(parents=True, exist_ok=True)
     for name in options.scenes:
@@ -39,8 +36,7 @@ def make_lammps_curves(options: argparse.Namespace) -> dict:
         curve = jaxgran.CoolingCurve(jnp.asarray(times), T, temperature_error=error)
         file = folder / f"lammps_cooling_{name}.csv"
         jaxgran.write_curve(file, curve, header, overwrite=True)
-    figure = panels(size=(5.5, 4.0))
-    (axes,) = figure.axes
+    figure, (axes,) = panels(size=(5.5, 4.0))
     for k, file in enumerate(sorted(DATA.glob("lammps_cooling_*.csv"))):
         gas, curve, header = of_lammps(file.stem.removeprefix("lammps_cooling_"))
         tau, theory = curve.times[1:] / gas.mean_free_time, cool(gas, curve.times)
@@ -74,7 +70,7 @@ def simulate(
     return np.append(0.0, steps * dt), np.asarray(curves)
 
 
-def run(gas: jaxgran.Gas, start: Any, side: float, dt: float, steps: np.ndarray) -> list[float]:
+def run(gas: jaxgran.Gas, start, side: float, dt: float, steps: np.ndarray) -> list[float]:
     """Return T of one replica at the start and after the given numbers of steps."""
     n, mass = len(start[0]), float(gas.mass)
     elastic = gas.replace(dissipative_constant=0.0)
@@ -104,5 +100,4 @@ def run(gas: jaxgran.Gas, start: Any, side: float, dt: float, steps: np.ndarray)
 
 
 if __name__ == "__main__":
-    settings = {"nargs": "*", "choices": list(SCENES), "default": list(SCENES)}
-    run_parts(__doc__, {"make_lammps_curves": make_lammps_curves}, smoke=False, scenes=settings)
+    run_parts(__doc__, make_lammps_curves, smoke=False, scenes=list(SCENES))

@@ -17,19 +17,17 @@ of the same length in L_c as those of eps = .7, and errors of some .15 %. (A box
 lacks waves that the theory of a large box counts.)
 """
 
-import argparse
 from functools import cache
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.analysis import mean_and_error, replicas_of
 from experiments.support.plots import DSMC, ELASTIC, HARD, INK, THEORY, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool, hard_beads, times_of
 from jaxgran.models.error_model import flow_share
 from jaxgran.theory.equations import correlation_build_up, correlation_slowdown
@@ -187,10 +185,10 @@ def build_up(rows: list[dict]) -> tuple[float, float]:
     return float(trial[np.argmin(chi)]), float((near[-1] - near[0]) / 2)
 
 
-def draw(rows: list[dict]) -> Figure:
+def draw(rows: list[dict]):
     """Draw h against phi, and the rate against the number of collisions."""
-    figure = panels(2, size=(5, 4), sharey=True)
-    for axes, d in zip(figure.axes, (3, 2), strict=True):
+    figure, places = panels(2, size=(5, 4), sharey=True)
+    for axes, d in zip(places, (3, 2), strict=True):
         own = [r for r in rows if r["dimension"] == d and "h" in r]
         for k, eps in enumerate(sorted({r["restitution"] for r in own})):
             some = [r for r in own if r["restitution"] == eps]
@@ -209,7 +207,7 @@ def draw(rows: list[dict]) -> Figure:
     return figure
 
 
-def measure_correlations(options: argparse.Namespace) -> dict:
+def measure_correlations(options: Options) -> dict:
     impacts = 2e4 if options.smoke else 1.6e6 if options.full else 7e5
     rows, elastic = [], {}
     for (d, phi), sizes in SIZES.items():
@@ -233,5 +231,4 @@ def measure_correlations(options: argparse.Namespace) -> dict:
 
 
 if __name__ == "__main__":
-    settings = {"action": "store_true", "help": "the whole grid, errors below .15 %%"}
-    run_parts(__doc__, {"measure_correlations": measure_correlations}, full=settings)
+    run_parts(__doc__, measure_correlations, full=False)

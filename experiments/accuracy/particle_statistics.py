@@ -16,18 +16,16 @@ Each part takes minutes, too long for a test, and writes a file of its own:
 - walls: ln T of hard spheres between walls less that of DSMC, which assumes a homogeneous gas.
 """
 
-import argparse
 import dataclasses
-from typing import Any
+from unittest import mock
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.analysis import mean_and_error
 from experiments.support.plots import INK, SOFT, THEORY, caption, panels
-from experiments.support.record import collected, run_parts
+from experiments.support.record import Options, collected, run_parts
 from experiments.support.scenes import cool, glass, hard_beads
 from jaxgran import DSMC, HardSpheres
 from jaxgran.particles.dsmc.collisions import Scheme
@@ -36,8 +34,8 @@ from jaxgran.particles.observables import third_sonine
 CHAOS = jaxgran.KineticTheory(softness=False, correlations=False)
 
 
-def dsmc_million(smoke: bool):
-    size, replicas = (1000, 2) if smoke else (10**6, 12)
+def dsmc_million(options: Options):
+    size, replicas = (1000, 2) if options.smoke else (10**6, 12)
     for beta, dimension in ((0.05, 3), (0.15, 3), (0.15, 2)):
         gas = glass(beta, dimension=dimension)
         times = np.array([10.0, 50.0, 100.0]) * float(gas.mean_free_time)
@@ -57,8 +55,8 @@ TABLES = (
 """eps, dimension, a_2 and its error, by stochastic simulation."""
 
 
-def sonine(smoke: bool):
-    size, replicas = (1000, 2) if smoke else (100_000, 16)
+def sonine(options: Options):
+    size, replicas = (1000, 2) if options.smoke else (100_000, 16)
     for eps, dimension, known, error in TABLES:
         gas = hard_beads(0.1, eps, dimension)
         times = in_collisions(gas, 10.0, 50.0)
@@ -73,7 +71,7 @@ def in_collisions(gas: jaxgran.Gas, first: float, last: float) -> np.ndarray:
     return np.expm1(half * np.arange(first, last)) / half * float(gas.mean_free_time)
 
 
-def sonine_coefficients(options: argparse.Namespace) -> dict:
+def sonine_coefficients(options: Options) -> dict:
     states = collected(coefficients_of_states(options.smoke))
     return {"states": states, "picture": draw_coefficients(states)}
 
@@ -96,17 +94,17 @@ def coefficients_of_states(smoke: bool):
             yield {"dimension": d, "eps": eps} | row
 
 
-def numbers(curve: Any, a3: Any) -> np.ndarray:
+def numbers(curve, a3) -> np.ndarray:
     """Return means over times of a_2, a_3 and of <dr^2> per collision, on the last axis."""
     spread = np.diff(curve.displacement) / np.diff(curve.collisions)
     return np.stack([np.mean(x, -1) for x in (curve.sonine, a3, spread)], -1)
 
 
-def draw_coefficients(states: list[dict]) -> Figure:
+def draw_coefficients(states: list[dict]):
     """Draw differences of theory in per cent."""
-    figure = panels(2, size=(4.2, 3.6))
+    figure, places = panels(2, size=(4.2, 3.6))
     shown = {"a₂ at constant ε": 0, "D at constant ε": 2}
-    for axes, (title, k) in zip(figure.axes, shown.items(), strict=True):
+    for axes, (title, k) in zip(places, shown.items(), strict=True):
         for d, style, colour in ((3, "o-", THEORY), (2, "s--", SOFT)):
             some = [s for s in states if s["dimension"] == d]
             some = [s for s in some if k or (abs(s["simulated"][0]) > 0.01 and s["eps"] < 1)]
@@ -120,9 +118,9 @@ def draw_coefficients(states: list[dict]) -> Figure:
     return figure
 
 
-def dsmc_order(smoke: bool):
+def dsmc_order(options: Options):
     gas, of = hard_beads(0.1, 0.6), Scheme.of
-    size, replicas = (1000, 2) if smoke else (400_000, 16)
+    size, replicas = (1000, 2) if options.smoke else (400_000, 16)
     times = [float(gas.mean_free_time)]
 
     def memory(step, shared, seed):
@@ -131,9 +129,8 @@ def dsmc_order(smoke: bool):
             second = round(shared * made.second)
             return made._replace(first=made.first + made.second - second, second=second)
 
-        setattr(Scheme, "of", staticmethod(scheme))  # noqa: B010
-        each = cool(gas, times, DSMC(size, replicas=replicas, step=step), seed).replicas
-        setattr(Scheme, "of", staticmethod(of))  # noqa: B010
+        with mock.patch.object(Scheme, "of", scheme):
+            each = cool(gas, times, DSMC(size, replicas=replicas, step=step), seed).replicas
         return mean_and_error(np.log(each.velocity_correlation[:, 0] / gas.temperature))
 
     fine, its_error = memory(0.0125, 1.0, 0)
@@ -144,13 +141,13 @@ def dsmc_order(smoke: bool):
             yield {"shared": shared, "step": step} | off
 
 
-def diffusion_published(smoke: bool):
+def diffusion_published(options: Options):
     """Erpenbeck & Wood, Phys. Rev. A 43 (1991) 4254, whose coefficients were not checked.
 
     A periodic box lowers D by 2.84 T / (6 pi eta L) to first order in 1/L (Yeh & Hummer, J. Phys.
     Chem. B 108 (2004) 15873).
     """
-    size, replicas = (100, 2) if smoke else (4096, 16)
+    size, replicas = (100, 2) if options.smoke else (4096, 16)
     for phi in (0.1, 0.2, 0.3):
         gas = hard_beads(phi, 1.0)
         times = gas.mean_free_time * jnp.linspace(60, 100, 5)
@@ -166,7 +163,7 @@ def diffusion_published(smoke: bool):
         yield {"phi": phi, "off": (D + box) / infinite - 1, "error": error / infinite}
 
 
-def walls(smoke: bool):
+def walls(options: Options):
     for size, last in ((100, 0.006), (500, 0.04), (4000, 0.1)):
         phi = size * np.pi / 6 * (2e-3 / 0.05) ** 3
         container = jaxgran.Walls(0.05, restitution=0.8)
@@ -174,19 +171,15 @@ def walls(smoke: bool):
         theory = cool(gas, jnp.geomspace(1e-2, 1e3, 200))
         fallen = jnp.log(theory.temperature / gas.temperature)[::-1]
         times = jnp.interp(jnp.log(jnp.array([0.5, last])), fallen, theory.times[::-1])
-        hard = cool(gas, times, HardSpheres(size, replicas=2 if smoke else max(2, 3200 // size)))
-        dsmc = cool(gas, times, DSMC(1000 if smoke else 100_000))
+        hard = cool(
+            gas, times, HardSpheres(size, replicas=2 if options.smoke else max(2, 3200 // size))
+        )
+        dsmc = cool(gas, times, DSMC(1000 if options.smoke else 100_000))
         off = np.log(np.asarray(hard.temperature / dsmc.temperature))
         error = hard.temperature_error / hard.temperature
         yield {"num_particles": size, "off": off, "error": error}
 
 
-def part(rows):
-    return lambda options: {"rows": list(rows(options.smoke))}
-
-
-ROWS = (dsmc_million, sonine, dsmc_order, diffusion_published, walls)
-PARTS = {rows.__name__: part(rows) for rows in ROWS}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS | {"sonine_coefficients": sonine_coefficients})
+    tables = dsmc_million, sonine, dsmc_order, diffusion_published, walls
+    run_parts(__doc__, *tables, sonine_coefficients)

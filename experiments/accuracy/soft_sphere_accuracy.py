@@ -8,19 +8,16 @@ the time step at first touch; the energy balance of a cooling gas; the energy of
 Each has the order of the error: the slope of its logarithm over that of the time step.
 """
 
-import argparse
 import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 import jaxgran
 from experiments.support.plots import INK, SOFT, caption, panels
-from experiments.support.record import DATA, run_parts
+from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import beads, cool
 from jaxgran.particles.capacity import Capacity
 
@@ -37,7 +34,7 @@ CONTACT_FRACTION = 0.05  # of the mean free time, in both gases
 PACKING = 0.2
 
 
-def soft_sphere_accuracy(options: argparse.Namespace) -> dict:
+def soft_sphere_accuracy(options: Options) -> dict:
     num, finest, phases, ledger, elastic = None, FINEST, PHASES, LEDGER, ELASTIC
     if options.smoke:
         small = {"num_particles": 64, "collision_times": 2, "replicas": 2}
@@ -155,9 +152,8 @@ def with_order(rows: list[dict]) -> dict:
     return {"rows": rows, "order": order}
 
 
-def draw(found: dict) -> Figure:
-    figure = panels(2, 2, size=(4.5, 3.5))
-    trajectory, impact, ledger, elastic = figure.axes
+def draw(found: dict):
+    figure, (trajectory, impact, ledger, elastic) = panels(2, 2, size=(4.5, 3.5))
     line(trajectory, found["trajectory"], "lammps", "o-", SOFT, "to LAMMPS")
     finest = found["trajectory"]["finest"]
     line(trajectory, found["trajectory"], "own", "s--", INK, f"to {finest} steps")
@@ -185,7 +181,7 @@ def draw(found: dict) -> Figure:
     return figure
 
 
-def line(axes: Axes, result: dict, name: str, style: str, colour: str, label: str) -> None:
+def line(axes, result: dict, name: str, style: str, colour: str, label: str) -> None:
     steps = [row["steps"] for row in result["rows"]]
     error = [abs(row[name]) for row in result["rows"]]
     label = f"{label} (order {result['order'][name]:.1f})"
@@ -193,4 +189,4 @@ def line(axes: Axes, result: dict, name: str, style: str, colour: str, label: st
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"soft_sphere_accuracy": soft_sphere_accuracy})
+    run_parts(__doc__, soft_sphere_accuracy)

@@ -7,8 +7,6 @@ the mean square of ln(T/T_wanted) over the logarithms of the strengths, along gr
 kinetic theory in reverse mode.
 """
 
-import argparse
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,14 +14,14 @@ import optax
 
 import jaxgran
 from experiments.support.plots import GUIDE, HARD, INK, THEORY, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 
 INTERVALS, POINTS = 12, 8
 LENGTH = 8.0  # of an interval, in mean free times
 BEADS = jaxgran.Viscoelastic(5e7, 0.22, 5e-6)
 
 
-def design_drive(options: argparse.Namespace) -> dict:
+def design_drive(options: Options) -> dict:
     gas = jaxgran.Gas(
         BEADS,
         diameter=2e-3,
@@ -60,8 +58,7 @@ def design_drive(options: argparse.Namespace) -> dict:
         log_strengths, state, miss = step(log_strengths, state)
         misses.append(float(miss) ** 0.5)
     largest = float(jnp.max(jnp.abs(course(log_strengths) / wanted - 1)))
-    figure = panels(1, 2, size=(6, 2.25), sharex=True, height_ratios=[2, 1])
-    top, bottom = figure.axes
+    figure, (top, bottom) = panels(1, 2, size=(6, 2.25), sharex=True, height_ratios=[2, 1])
     top.plot(t, wanted, color=INK, linestyle="--", label="wanted")
     top.plot(t, course(first), color=GUIDE, label="first guess")
     top.plot(t, course(log_strengths), color=THEORY, label="with this drive")
@@ -74,4 +71,4 @@ def design_drive(options: argparse.Namespace) -> dict:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"design_drive": design_drive})
+    run_parts(__doc__, design_drive)

@@ -17,18 +17,16 @@ spheres between walls, adds errors of 5 % to T and T_rot, and fits each run twic
 theory: as smooth spheres without walls, and as rough spheres between walls with beta_t free.
 """
 
-import argparse
 import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.optimize import root_scalar
 
 import jaxgran
 from experiments.support.analysis import fit_quietly
 from experiments.support.plots import GUIDE, INK, THEORY, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool
 
 NUM_PARTICLES, DIAMETER, SIDE = 300, 6e-3, 0.1
@@ -90,7 +88,7 @@ def fitted(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> tuple[jaxgran.Fit, 
     return first, fit_quietly(unknown, curve, free=free, num_particles=NUM_PARTICLES)
 
 
-def drop_tower(options: argparse.Namespace) -> dict:
+def drop_tower(options: Options) -> dict:
     gas = scene()
     A = float(gas.value("dissipative_constant"))
     curves = [twin(gas, key) for key in range(options.runs)]
@@ -116,11 +114,10 @@ def in_words(result: jaxgran.Fit, A: float) -> str:
     return f"{result.estimate[0] / A:.2f} ± {result.standard_error[0] / A:.2f}"
 
 
-def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float) -> Figure:
+def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float):
     """Draw T and T_rot of a run, with both fits."""
     smooth, complete = fits
-    figure = panels(size=(7.0, 4.6))
-    (axes,) = figure.axes
+    figure, (axes,) = panels(size=(7.0, 4.6))
     for name, color, label in (
         ("temperature", INK, "$T$, one simulated run"),
         ("rotational_temperature", GUIDE, r"$T_\mathrm{rot}$, the same run"),
@@ -141,5 +138,4 @@ def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float) -> Figure:
 
 
 if __name__ == "__main__":
-    settings = {"type": int, "default": 6, "help": "single runs (default: 6)"}
-    run_parts(__doc__, {"drop_tower": drop_tower}, smoke=False, runs=settings)
+    run_parts(__doc__, drop_tower, smoke=False, runs=6)

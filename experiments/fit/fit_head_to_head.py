@@ -31,11 +31,8 @@ the true values. A simulation with tangents counts as one.
   between collisions and adjusted to the scatter of eight runs.
 """
 
-import argparse
 import dataclasses
-import json
 import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -46,7 +43,7 @@ import optax
 import scipy.optimize
 
 import jaxgran
-from experiments.support.record import alone, collected, run_parts, seconds
+from experiments.support.record import Options, alone, run_parts, seconds
 from experiments.support.scenes import cool, of_lammps
 
 PARAMETERS = ("dissipative_constant", "temperature")
@@ -84,7 +81,7 @@ def dense() -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
     return gas, jax.tree.map(lambda x: x[keep], curve)
 
 
-def stochastic(options: argparse.Namespace) -> Problem:
+def stochastic(options: Options) -> Problem:
     gas, curve = dense()
     size = 1000 if options.smoke else 20_000
     model, other = (jaxgran.DSMC(size, replicas=replicas) for replicas in (2, 8))
@@ -95,7 +92,7 @@ def stochastic(options: argparse.Namespace) -> Problem:
     return Problem(gas, jaxgran.CoolingCurve(times, T, temperature_error=error), model)
 
 
-def soft_spheres(options: argparse.Namespace) -> Problem:
+def soft_spheres(options: Options) -> Problem:
     gas, curve = dense()
     hottest = gas.replace(temperature=gas.temperature * np.exp(OFF[1] + REACH[1]))
     model = jaxgran.SoftSpheres(1000, replicas=4, steps_per_contact=20)
@@ -103,7 +100,7 @@ def soft_spheres(options: argparse.Namespace) -> Problem:
     return Problem(gas, curve, model.sized_for(hottest))
 
 
-def law(count: int, number: int, size: int, most: Sequence[int]) -> dict:
+def search_law(count: int, number: int, size: int, *most: int) -> dict:
     """Search a law of some parameters for one curve; return distances after each simulation."""
     beads = jaxgran.Viscoelastic(5e7, 0.22, 5e-6)
     gas = jaxgran.Gas(beads, diameter=2e-3, mass=1e-5, packing_fraction=0.25, temperature=0.01)
@@ -207,36 +204,24 @@ def differences(residuals: Callable, first: np.ndarray, most: int) -> list[np.nd
     return [*guesses, flat]
 
 
-PROBLEMS: dict[str, Callable[[argparse.Namespace], Problem]] = {
-    "stochastic": stochastic,
-    "soft-spheres": soft_spheres,
-}
+PROBLEMS = {"stochastic": stochastic, "soft-spheres": soft_spheres}
 
 
-def fit_head_to_head(options: argparse.Namespace) -> dict:
-    scenes = ["stochastic"] if options.smoke else options.scenes
-    problems = {scene: PROBLEMS[scene](options) for scene in scenes}
-    rows = (
-        row
-        for scene, problem in problems.items()
-        for count in (1, 2)
-        for row in compare(scene, problem, count, options.smoke)
-    )
-    return {"rows": collected(rows)}
+def fit_head_to_head(options: Options) -> Iterator[dict]:
+    for scene in ["stochastic"] if options.smoke else options.scenes:
+        problem = PROBLEMS[scene](options)
+        for count in (1, 2):
+            yield from compare(scene, problem, count, options.smoke)
 
 
-def fit_laws(options: argparse.Namespace) -> dict:
-    counts, curves, rows = (3,) if options.smoke else (1, 3, 10, 30), range(4), []
-    curves, *settings = (curves[:1], 60, 4, 10) if options.smoke else (curves, 1000, 60, 100)
+def fit_laws(options: Options) -> Iterator[dict]:
+    counts, curves, *settings = (1, 3, 10, 30), range(4), 1000, 60, 100
+    if options.smoke:
+        counts, curves, *settings = (3,), range(1), 60, 4, 10
     jobs = [(count, number) for count in counts for number in curves]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        found = dict(
-            zip(
-                jobs,
-                pool.map(lambda job: alone(__file__, "--law", *job, *settings), jobs),
-                strict=True,
-            )
-        )
+        each = pool.map(lambda job: alone(search_law, *job, *settings), jobs)
+        found = dict(zip(jobs, each, strict=True))
     for count in counts:
         each = [found[count, number] for number in curves]
         medians = {
@@ -248,23 +233,31 @@ def fit_laws(options: argparse.Namespace) -> dict:
             square = [np.square(x[search] + x[search][-1:] * (most - len(x[search]))) for x in each]
             distance = np.sqrt(np.mean(square, axis=0))
             row = {"search": search, "parameters": count, "simulations": needed(distance < 1.5)}
-            row |= {"all_simulations": most, "distance": distance[[0, -1]]} | medians
-            rows.append(row)
-    return {"rows": rows}
+            yield row | {"all_simulations": most, "distance": distance[[0, -1]]} | medians
 
 
 def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[dict]:
+    first, reach, most = OFF[:count], REACH[:count], 3 if smoke else MOST[count]
     # Measures the scatter of the replicas.
-    warm, curve = problem.simulated(OFF[:count]), problem.curve
+    warm, curve = problem.simulated(first), problem.curve
     scatter = np.asarray(warm.temperature_error / warm.temperature)[1:]
     error = np.asarray(curve.temperature_error / curve.temperature)[1:]
     sigma = np.hypot(error, np.sqrt(np.mean(scatter**2)))
-    searches: dict[str, Callable] = {"jaxgran.fit": with_derivatives}
-    for name, search in WITHOUT.items():
-        if count == 1 or search is not bounded:
-            searches[name] = without(search, sigma)
+    measured = np.log(np.asarray(curve.temperature))[1:]
+
+    def misfit(point) -> float:
+        computed = np.asarray(problem.simulated(point).temperature)
+        return float(np.sum(((measured - np.log(computed)[1:]) / sigma) ** 2))
+
+    searches: dict[str, Callable | None] = {"jaxgran.fit": None}
+    searches |= {"bounded scalar": bounded} if count == 1 else {}
+    searches |= {"Nelder-Mead": nelder_mead, "differential evolution": differential_evolution}
     for name, search in searches.items():
-        guesses = search(problem, count, 3 if smoke else None)
+        if search is None:
+            guesses = with_derivatives(problem, count, most)
+        else:
+            chi2, guesses = recorded(misfit)
+            search(chi2, first, list(zip(first - reach, first + reach, strict=True)), most)
         yield {
             "scene": scene,
             "search": name,
@@ -276,44 +269,18 @@ def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[d
         }
 
 
-def with_derivatives(problem: Problem, count: int, most: int | None) -> list[np.ndarray]:
+def with_derivatives(problem: Problem, count: int, most: int) -> list[np.ndarray]:
     """Return the guess of `jaxgran.fit` after each simulation."""
     names, guesses = PARAMETERS[:count], []
     true = np.asarray([float(problem.gas.value(name)) for name in names])
-    for simulations in range(1, (most or MOST[count]) + 1):
-        fitted = jaxgran.fit(
-            problem.gas,
-            problem.curve,
-            model=problem.model,
-            free=names,
-            start=problem.at(OFF[:count]),
-            max_steps=simulations,
-            key=jax.random.key(KEY),
-            progress=False,
-        )
+    options = {"model": problem.model, "free": names, "start": problem.at(OFF[:count])}
+    options |= {"key": jax.random.key(KEY), "progress": False}
+    for simulations in range(1, most + 1):
+        fitted = jaxgran.fit(problem.gas, problem.curve, max_steps=simulations, **options)
         if fitted.iterations < simulations:
             break
         guesses.append(np.log(np.asarray(fitted.estimate) / true))
     return guesses
-
-
-def without(search: Callable, sigma: np.ndarray) -> Callable:
-    """Return a function that runs a search by values of chi^2 only, as `with_derivatives`."""
-
-    def run(problem: Problem, count: int, most: int | None) -> list[np.ndarray]:
-        measured = np.log(np.asarray(problem.curve.temperature))[1:]
-
-        def misfit(point) -> float:
-            computed = np.asarray(problem.simulated(point).temperature)
-            return float(np.sum(((measured - np.log(computed)[1:]) / sigma) ** 2))
-
-        chi2, guesses = recorded(misfit)
-        first, reach = OFF[:count], REACH[:count]
-        bounds = list(zip(first - reach, first + reach, strict=True))
-        search(chi2, first, bounds, most or MOST[count])
-        return guesses
-
-    return run
 
 
 def bounded(chi2, first, bounds, most) -> None:
@@ -333,19 +300,5 @@ def differential_evolution(chi2, first, bounds, most) -> None:
     scipy.optimize.differential_evolution(chi2, bounds, x0=first, **options)
 
 
-WITHOUT = {
-    "bounded scalar": bounded,
-    "Nelder-Mead": nelder_mead,
-    "differential evolution": differential_evolution,
-}
-
-
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--law"]:
-        jax.config.update("jax_enable_x64", True)
-        count, number, size, *most = map(int, sys.argv[2:])
-        print(json.dumps(law(count, number, size, most)))
-        raise SystemExit
-    settings = {"nargs": "+", "choices": list(PROBLEMS), "default": list(PROBLEMS)}
-    parts = {"fit_head_to_head": fit_head_to_head, "fit_laws": fit_laws}
-    run_parts(__doc__, parts, scenes=settings)
+    run_parts(__doc__, fit_head_to_head, fit_laws, scenes=list(PROBLEMS))

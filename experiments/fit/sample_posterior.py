@@ -8,7 +8,6 @@ the error of kinetic theory's clock. Finds both results and the effective sample
 draws a corner plot.
 """
 
-import argparse
 import time
 from typing import Any
 
@@ -18,11 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 from corner import corner
-from matplotlib.figure import Figure
 
 import jaxgran
 from experiments.support.plots import THEORY
-from experiments.support.record import DATA, run_parts
+from experiments.support.record import DATA, Options, run_parts
 
 FREE = ("dissipative_constant", "temperature")
 PRIORS = {"packing_fraction": 0.04, "temperature": 0.01}
@@ -35,7 +33,7 @@ less time than at 1e-9."""
 LABELS = ("A (1e-6 s)", "phi", "T_0 (1e-2 m²/s²)")
 
 
-def sample_posterior(options: argparse.Namespace) -> dict:
+def sample_posterior(options: Options) -> dict:
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
     gas = jaxgran.read_gas(header)
     priors = {
@@ -118,7 +116,7 @@ def sample(log_density, values, options) -> tuple[np.ndarray, dict]:
     }
 
 
-def draw(result: jaxgran.Fit, samples: np.ndarray) -> Figure:
+def draw(result: jaxgran.Fit, samples: np.ndarray):
     """Draw a corner plot, with the Gaussian of the fit over the histograms of A and T_0."""
     figure = corner(samples, labels=LABELS, color="0.3", quantiles=(0.025, 0.975))
     axes = np.array(figure.axes).reshape(3, 3)
@@ -134,7 +132,4 @@ def draw(result: jaxgran.Fit, samples: np.ndarray) -> Figure:
 
 
 if __name__ == "__main__":
-    samples = {"type": int, "default": 1000, "help": "of a chain (default: 1000)"}
-    chains = {"type": int, "default": 4, "help": "parallel chains (default: 4)"}
-    parts = {"sample_posterior": sample_posterior}
-    run_parts(__doc__, parts, smoke=False, samples=samples, chains=chains)
+    run_parts(__doc__, sample_posterior, smoke=False, samples=1000, chains=4)

@@ -20,14 +20,11 @@ and T is that of the mean square velocity (`unlike_spheres`). Contacts of hard s
 have no duration, so kinetic theory is used with `softness=False`.
 """
 
-import argparse
 import dataclasses
-import json
 import os
-import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +32,7 @@ import numpy as np
 
 import jaxgran
 from experiments.support.analysis import fit_quietly
-from experiments.support.record import alone, figures, run_parts
+from experiments.support.record import Options, alone, figures, run_parts
 from experiments.support.scenes import cool, glass
 
 TRUE_A, NUM_PARTICLES, PHI = 3e-6, 250, 0.03
@@ -47,7 +44,7 @@ SEEN = 2.2
 THEORY = jaxgran.KineticTheory(softness=False)
 
 
-def beads(**elements: Any) -> jaxgran.Gas:
+def beads(**elements) -> jaxgran.Gas:
     gas = glass(0.1, PHI).replace(dissipative_constant=TRUE_A)
     return dataclasses.replace(gas, **elements)
 
@@ -77,9 +74,9 @@ class Row(NamedTuple):
     """
 
     name: str
-    gas: dict[str, Any]
+    gas: dict
     told: str
-    fitted: dict[str, Any]
+    fitted: dict
     free: tuple[str, ...] = ()
     floor: float = 0.0
     seen: float | None = None
@@ -106,19 +103,19 @@ ROWS = (
 )
 
 
-def wrong_physics(options: argparse.Namespace) -> dict:
+def wrong_physics(options: Options) -> dict:
     """Compute each row in a process of its own, as many at a time as there are cores."""
     known = figures("wrong_physics")["rows"] if options.rows else []
     rows = {(row["name"], row["told"]): row for row in known}
     asked = [k for k, row in enumerate(ROWS) if options.rows in row.name]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        for found in pool.map(lambda k: alone(__file__, "--row", k, options.runs), asked):
+        for found in pool.map(lambda k: alone(statistics, k, options.runs), asked):
             print(found, flush=True)
             rows[found["name"], found["told"]] = found
     return {"rows": [rows[row.name, row.told] for row in ROWS if (row.name, row.told) in rows]}
 
 
-def measured(row: Row, runs: int) -> tuple[Any, jaxgran.CoolingCurve]:
+def measured(row: Row, runs: int) -> tuple:
     """Return times until T has fallen to its last share, and the curves of all runs."""
     gas = beads(**row.gas)
     trial = jnp.geomspace(1e-2, 1e4, 400) * gas.mean_free_time
@@ -132,7 +129,7 @@ def measured(row: Row, runs: int) -> tuple[Any, jaxgran.CoolingCurve]:
     return times, cool(gas, times, model, save=save)
 
 
-def unlike_spheres(gas: jaxgran.Gas, spread: float, times: Any, runs: int) -> jaxgran.CoolingCurve:
+def unlike_spheres(gas: jaxgran.Gas, spread: float, times, runs: int) -> jaxgran.CoolingCurve:
     """Return T of spheres of different sizes; a serial event-driven code."""
     largest = float(gas.diameter) * (1 + spread)
     apart = gas.replace(diameter=largest, packing_fraction=PHI * (1 + spread) ** 3)
@@ -187,15 +184,17 @@ def unlike_spheres(gas: jaxgran.Gas, spread: float, times: Any, runs: int) -> ja
     return jaxgran.CoolingCurve(jnp.asarray(times), T.mean(axis=0), replicas=replicas)
 
 
-def seen(particles: Any) -> Any:
+def seen(particles):
     """Return T of the spheres whose speed is below `SEEN`."""
     square = jnp.sum(particles.velocity**2, axis=-1)
     near = square < SEEN**2 * 2 * jnp.mean(square) / 3
     return jnp.sum(jnp.where(near, square, 0.0)) / (3 * jnp.sum(near))
 
 
-def statistics(row: Row, times: Any, curve: jaxgran.CoolingCurve) -> dict[str, Any]:
-    """Fit each run, and return statistics."""
+def statistics(number: int, runs: int) -> dict:
+    """Simulate a row, fit each run, and return statistics."""
+    row = ROWS[number]
+    times, curve = measured(row, runs)
     each = curve.replicas.temperature if row.seen is None else curve.replicas.saved
     rotation = None if not row.free else curve.replicas.rotational_temperature
     gas, found = beads(**row.fitted), []
@@ -212,7 +211,7 @@ def statistics(row: Row, times: Any, curve: jaxgran.CoolingCurve) -> dict[str, A
         ends = diagnosis.ranges.get("dissipative_constant", (np.nan, np.nan))
         found.append((A, error, *(float(np.squeeze(x)) / TRUE_A for x in ends), diagnosis.grade))
     A, error, low, high = np.array([one[:4] for one in found]).T
-    known, runs = np.isfinite(low), len(found)
+    known = np.isfinite(low)
     return {
         "name": row.name,
         "told": row.told,
@@ -230,12 +229,4 @@ def statistics(row: Row, times: Any, curve: jaxgran.CoolingCurve) -> dict[str, A
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--row"]:
-        jax.config.update("jax_enable_x64", True)
-        of_row = ROWS[int(sys.argv[2])]
-        print(json.dumps(statistics(of_row, *measured(of_row, int(sys.argv[3])))))
-    else:
-        runs = {"type": int, "default": 100, "help": "of each gas (default: 100)"}
-        some = {"default": "", "help": "only those whose name contains this"}
-        parts = {"wrong_physics": wrong_physics}
-        run_parts(__doc__, parts, smoke=False, runs=runs, rows=some)
+    run_parts(__doc__, wrong_physics, smoke=False, runs=100, rows="")

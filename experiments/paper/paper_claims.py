@@ -8,20 +8,13 @@ contradict it. The table, `templates/paper_claims.md`, quotes these numbers and 
 """
 
 from math import gamma, pi
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.closed_forms import (
-    RELAXATION_CORRECTION,
-    SONINE_COEFFICIENT,
-    paper_averages,
-    paper_displacement,
-    paper_temperature,
-)
+from experiments.support import closed_forms
 from experiments.support.record import figures, run_parts
 from experiments.support.scenes import beads, hard_beads, of_lammps
 from jaxgran.scene.contact import impact
@@ -53,7 +46,7 @@ def paper_claims(_) -> dict:
     return {"numbers": numbers, "rows": rows}
 
 
-def check(name: str, verdict: str, value, expected, tolerance, *compared: tuple) -> dict[str, Any]:
+def check(name: str, verdict: str, value, expected, tolerance, *compared: tuple) -> dict:
     """Return a verdict, which holds if a value is within a tolerance of the expected one.
 
     `compared` are labels, measured and printed values, and errors of the measured ones, of which
@@ -79,21 +72,22 @@ def cooled(delta: float, u) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
 def averages(delta: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the rates of cooling and of relaxation, exact and by the paper's two terms."""
     law, one = beads(0.05, 1.5 * 2**0.1 * delta).reduced_law, jnp.ones(())
-    both = (f(law, one, 3) for f in (impact_moments, paper_averages))
+    both = (f(law, one, 3) for f in (impact_moments, closed_forms.paper_averages))
     exact, paper = (np.asarray(moments)[np.array([0, 2]), 0] for moments in both)
     return exact, paper
 
 
 def expansions() -> dict[str, float]:
     """Return the coefficients of the expansions in delta, of the paper and by theory."""
-    q, c, s = COOLING_CORRECTION, RELAXATION_CORRECTION, SONINE_COEFFICIENT
+    q, c = COOLING_CORRECTION, closed_forms.RELAXATION_CORRECTION
+    s = closed_forms.SONINE_COEFFICIENT
     (cooling, relaxation), (paper_cooling, _) = averages(SMALL)
     gas, curve = cooled(SMALL, [1.0001, 10.0, 1e4, 1e6])
     u, late = np.array([1e4, 1e6]), slice(2, None)
     d_0 = 1.5 * float(gas.temperature * gas.mean_free_time)
     a_3 = (np.asarray(curve.diffusion)[late] / d_0 - u ** (-5 / 6)) * u / SMALL
     exact = np.asarray(curve.displacement)[late] / float(gas.temperature * gas.mean_free_time**2)
-    formula = np.asarray(paper_displacement((u - 1) / (RATE * SMALL), SMALL))
+    formula = np.asarray(closed_forms.paper_displacement((u - 1) / (RATE * SMALL), SMALL))
     rate = jax.grad(
         lambda x: jnp.log(jaxgran.KineticTheory().cooling_rate(gas.replace(temperature=x)))
     )
@@ -123,11 +117,11 @@ def expansions() -> dict[str, float]:
     }
 
 
-def laws() -> dict[str, Any]:
+def laws() -> dict:
     """Return the accuracy of closed forms at delta = .093, and of theory for a LAMMPS curve."""
     u = np.geomspace(1.01, 1e9, 50)
     gas, curve = cooled(0.093, u)
-    formula = paper_temperature((u - 1) / (RATE * 0.093), 0.093) * gas.temperature
+    formula = closed_forms.paper_temperature((u - 1) / (RATE * 0.093), 0.093) * gas.temperature
     gas, late = cooled(0.093, [1e2, 1e6, 1e12])
     theta = np.asarray(late.temperature / gas.temperature)
     leading = 54 / (RATE * 0.093) * (theta**-0.1 - 1)
@@ -137,7 +131,7 @@ def laws() -> dict[str, Any]:
     theory = jaxgran.cool(gas, measured.times)
     far = theory.displacement[1:] / measured.displacement[1:] - 1
     return {
-        "first_temperature": float(paper_temperature(0.0, 0.093, corrected=False)),
+        "first_temperature": float(closed_forms.paper_temperature(0.0, 0.093, corrected=False)),
         "temperature_off": float(jnp.abs(formula / curve.temperature - 1).max()),
         "leading": (leading / np.asarray(late.displacement)).tolist(),
         "power_of_N": float(np.log(theta[2] / theta[1]) / np.log(collisions[2] / collisions[1])),
@@ -158,7 +152,7 @@ def relaxation_of_cooling_state(eps: float) -> float:
     return float(sum(terms) / moments[0] - 1)
 
 
-def curves(found: dict) -> dict[str, Any]:
+def curves(found: dict) -> dict:
     """Return what follows from the recorded simulations of cooling and diffusion."""
     run, routes = found["velocity_correlation"], found["diffusion_coefficient"]["constant"]
     dsmc, e = run["constant"]["dsmc"], run["restitution"]
@@ -181,7 +175,7 @@ def curves(found: dict) -> dict[str, Any]:
     }
 
 
-def clusters(found: dict) -> dict[str, Any]:
+def clusters(found: dict) -> dict:
     """Return the departures from Haff's law, and their distance from the paper's numbers."""
     scenes = list(found["scenes"].values())
     left = [scene["constant"]["departures"] for scene in scenes]
@@ -213,7 +207,7 @@ def clusters(found: dict) -> dict[str, Any]:
     }
 
 
-def claims(found: dict, n: dict[str, Any]) -> list[dict[str, Any]]:
+def claims(found: dict, n: dict) -> list[dict]:
     """Return the verdict of each claim, with what it is compared with."""
     run, spread, routes = found["cooling"], found["diffusion"], found["diffusion_coefficient"]
     visco, even = run["viscoelastic"], run["constant"]
@@ -300,4 +294,4 @@ def claims(found: dict, n: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, {"paper_claims": paper_claims}, smoke=False)
+    run_parts(__doc__, paper_claims, smoke=False)

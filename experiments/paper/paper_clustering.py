@@ -20,9 +20,6 @@ clustering_film: density, structure factor and spectrum of the flow of disks of 
 restitution: the flow grows first, the clusters later.
 """
 
-import argparse
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,9 +31,9 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 import jaxgran
-from experiments.support.analysis import crossing, mean_and_error, replicas_of
+from experiments.support.analysis import crossing, mean_and_error, ratio, replicas_of
 from experiments.support.plots import CONSTANT, GUIDE, VISCOELASTIC, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool, hard_beads, viscoelastic_like
 from jaxgran import observables
 
@@ -105,10 +102,10 @@ def dissipation(gas: jaxgran.Gas) -> float:
     return float(jaxgran.KineticTheory().cooling_rate(gas) / gas.collision_frequency) / 2
 
 
-def departures(run: dict, elastic: float) -> dict[str, dict[str, list[float] | None]]:
+def departures(run: dict, elastic: float) -> dict[str, dict[str, tuple]]:
     """Return N, T/T_0 and nu_0 t of the departure from kinetic theory, by each definition.
 
-    Each is a mean and its standard error, or None if not every replica departed.
+    Each is a mean and its standard error, nan if not every replica departed.
     """
     kinds = {f"T over theory's of N by {c:g}": ("excess", np.log(c)) for c in FACTORS}
     kinds |= {f"T over theory's of t by {c:g}": ("excess_in_time", np.log(c)) for c in FACTORS}
@@ -116,39 +113,31 @@ def departures(run: dict, elastic: float) -> dict[str, dict[str, list[float] | N
     found = {}
     for name, (quantity, level) in kinds.items():
         N = [crossing(x, y, level) for x, y in zip(run["collisions"], run[quantity], strict=True)]
-        T = [1 / at(run, "clock", r, n) for r, n in enumerate(N)]
-        tau = [at(run, "tau", r, n) for r, n in enumerate(N)]
-        found[name] = {"N": in_all(N), "T": in_all(T), "tau": in_all(tau)}
+        T, tau = 1 / at(run, "clock", N), at(run, "tau", N)
+        found[name] = {"N": mean_and_error(N), "T": mean_and_error(T), "tau": mean_and_error(tau)}
     return found
 
 
-def at(run: dict, name: str, replica: int, collisions: float) -> float:
-    """Return a positive quantity of a replica at a number of collisions per particle."""
-    x, y = run["collisions"][replica, 1:], np.log(run[name][replica, 1:])
-    return float(np.exp(np.interp(collisions, x, y))) if np.isfinite(collisions) else np.nan
+def at(run: dict, name: str, collisions: list[float]) -> np.ndarray:
+    """Return a positive quantity of each replica at a number of collisions per particle."""
+    columns = zip(collisions, run["collisions"][:, 1:], np.log(run[name][:, 1:]), strict=True)
+    return np.exp([np.interp(n, x, y, right=np.nan) for n, x, y in columns])
 
 
-def in_all(values: list[float]) -> list[float] | None:
-    """Return mean and standard error, or None if not every replica has a value."""
-    return [float(x) for x in mean_and_error(values)] if np.all(np.isfinite(values)) else None
+def ratios(one: dict, other: dict) -> dict[str, dict[str, tuple]]:
+    """Return the ratio of two departures by each definition in each clock, with its error."""
+    return {
+        name: {clock: ratio(each[clock], other[name][clock]) for clock in each}
+        for name, each in one.items()
+    }
 
 
-def ratios(one: dict, other: dict) -> dict[str, list[float] | None]:
-    """Return the ratio of two departures in each clock, with its error; None if one is missing."""
-    found: dict[str, list[float] | None] = dict.fromkeys(one)
-    for clock in one:
-        if one[clock] is not None and other[clock] is not None:
-            (a, a_error), (b, b_error) = one[clock], other[clock]
-            found[clock] = [a / b, a / b * float(np.hypot(a_error / a, b_error / b))]
-    return found
-
-
-def clustering(options: argparse.Namespace) -> dict:
+def paper_clustering(options: Options) -> dict:
     size, replicas, fields = 20_000, 3, (20.0, 60.0, 95.0, 128.0)
     scenes = {(0.245, 0.9): (2300.0, 3200.0), (0.05, 0.6): (600.0, 1800.0)}
     if options.smoke:
         size, replicas, scenes, fields = 500, 2, {(0.245, 0.6): (60.0, 60.0)}, (4.0, 12.0)
-    found: dict[str, Any] = {"config": {"num_particles": size, "replicas": replicas}, "scenes": {}}
+    found: dict = {"config": {"num_particles": size, "replicas": replicas}, "scenes": {}}
     runs = {}
     for scene, until in scenes.items():
         runs[scene] = runs_of(*scene, size, replicas, until)
@@ -156,7 +145,7 @@ def clustering(options: argparse.Namespace) -> dict:
         found["scenes"][name] = analyse(runs[scene], PAPER.get(scene, PAPER[0.245, 0.9])[0])
     if len(scenes) == 2:
         one, other = (scene["constant"]["departures"] for scene in found["scenes"].values())
-        found["first_scene_over_second"] = {name: ratios(one[name], other[name]) for name in one}
+        found["first_scene_over_second"] = ratios(one, other)
     pictures = {"paper_clustering": draw_curves(runs, found)}
     pictures["paper_clustering_fields"] = draw_fields(next(iter(runs.values())), fields)
     return found | {"picture": pictures}
@@ -165,35 +154,25 @@ def clustering(options: argparse.Namespace) -> dict:
 def analyse(runs: dict[str, dict], n_c: float) -> dict:
     """Return means and errors over the replicas, and the ratios between the laws."""
     start = np.concatenate([run["unevenness"][:, 0] for run in runs.values()])
-    found: dict[str, Any] = {}
+    found: dict = {}
     for law, run in runs.items():
-        number = range(len(run["tau"]))
-        reached = [r for r in number if run["collisions"][r, -1] >= n_c]
         found[law] = {
             "gamma_0": dissipation(run["gas"]),
             "departures": departures(run, float(np.mean(start))),
-            "T_at_the_papers_N": in_all([1 / at(run, "clock", r, n_c) for r in reached])
-            if len(reached) > 1
-            else None,
+            "T_at_the_papers_N": mean_and_error(1 / at(run, "clock", [n_c] * len(run["tau"]))),
             "last_flow": mean_and_error(run["flow"][:, -1]),
-            "tau": run["tau"][0],
         }
-        names = ("collisions", "clock", "excess", "unevenness", "flow")
-        found[law] |= {name: run[name].mean(axis=0) for name in names}
     one, other = (found[law]["departures"] for law in LAWS)
-    return found | {
-        "viscoelastic_over_constant": {name: ratios(other[name], one[name]) for name in one}
-    }
+    return found | {"viscoelastic_over_constant": ratios(other, one)}
 
 
-def draw_curves(runs: dict, found: dict) -> Figure:
+def draw_curves(runs: dict, found: dict):
     """Draw T over N, and its ratio to that of kinetic theory over N and over T_0/T.
 
     Colours show laws, line styles densities; each thin line is a replica.
     """
-    figure = panels(3, size=(4.4, 4.6))
-    cooling, by_number, by_clock = figure.axes
-    marks: dict[str, Any] = {"color": CONSTANT, "mec": "k", "ls": "none"}
+    figure, (cooling, by_number, by_clock) = panels(3, size=(4.4, 4.6))
+    marks: dict = {"color": CONSTANT, "mec": "k", "ls": "none"}
     for ((packing, e), laws), row, style in zip(
         runs.items(), found["scenes"].values(), ("-", "--"), strict=False
     ):
@@ -210,8 +189,7 @@ def draw_curves(runs: dict, found: dict) -> Figure:
             cooling.plot(x, 1 / excess / clock, color=LAWS[law], ls=":", lw=1)
         left = row["constant"]["departures"][f"T over theory's of N by {FACTORS[-1]:g}"]
         label = f"T is {FACTORS[-1]:g} times that of theory" if style == "-" else None
-        point = [left[clock][0] if left[clock] else np.nan for clock in ("N", "T")]
-        cooling.plot(*point, "o", ms=7, zorder=5, label=label, **marks)
+        cooling.plot(left["N"][0], left["T"][0], "o", ms=7, zorder=5, label=label, **marks)
         if (packing, e) in PAPER:
             label = "the paper's $N_c$, $T_c$" if style == "-" else None
             cooling.plot(*PAPER[packing, e], "*", ms=13, zorder=4, label=label, **marks)
@@ -236,11 +214,11 @@ def draw_curves(runs: dict, found: dict) -> Figure:
     return figure
 
 
-def draw_fields(runs: dict[str, dict], fields: tuple) -> Figure:
+def draw_fields(runs: dict[str, dict], fields: tuple):
     """Draw the density of a scene, smoothed over 1.5 mean distances of disks."""
-    figure = panels(len(fields), 2, size=(2.8, 2.8), squeeze=False)
+    figure, places = panels(len(fields), 2, size=(2.8, 2.8), squeeze=False)
     shown = ScalarMappable(Normalize(0.0, 2.5), cmap=colormaps["magma"].resampled(25))
-    rows = figure.axes[: len(fields)], figure.axes[len(fields) :]
+    rows = places[: len(fields)], places[len(fields) :]
     for (law, run), row in zip(runs.items(), rows, strict=True):
         for mark, axes in zip(fields, row, strict=True):
             place, title = nearest(run, mark)
@@ -252,7 +230,7 @@ def draw_fields(runs: dict[str, dict], fields: tuple) -> Figure:
             axes.set(xticks=[], yticks=[])
             axes.set_title(title, fontsize=9)
         row[0].set_ylabel("constant $\\varepsilon$" if law == "constant" else "viscoelastic")
-    figure.colorbar(shown, ax=figure.axes, shrink=0.7, label="density / mean")
+    figure.colorbar(shown, ax=places, shrink=0.7, label="density / mean")
     return figure
 
 
@@ -263,13 +241,13 @@ def nearest(run: dict, collisions: float) -> tuple[np.ndarray, str]:
     return run["position"][0, k], f"$N$ = {N:.0f},  $T/T_0$ = {T:.1e}"
 
 
-def dissolves(options: argparse.Namespace) -> dict:
+def paper_clustering_dissolves(options: Options) -> dict:
     size, replicas, until, fields = 2000, 6, (260.0, 4e6), (5.0, 50.0, 120.0, 400.0)
     if options.smoke:
         size, replicas, until, fields = 300, 2, (20.0, 800.0), (4.0, 60.0)
     runs = runs_of(0.05, 0.6, size, replicas, until)
     elastic = mean_and_error(np.concatenate([run["unevenness"][:, 0] for run in runs.values()]))
-    found: dict[str, Any] = {"config": {"num_particles": size, "replicas": replicas}}
+    found: dict = {"config": {"num_particles": size, "replicas": replicas}}
     for law, run in runs.items():
         grid = np.geomspace(1.0, run["collisions"][:, -1].min(), 60)
         found[law] = {"gamma_0": dissipation(run["gas"]), "collisions": grid}
@@ -278,13 +256,12 @@ def dissolves(options: argparse.Namespace) -> dict:
             found[law][name], found[law][f"{name}_error"] = mean_and_error(
                 [smooth(grid, x, y) for x, y in pairs]
             )
-    gas, passes = runs["viscoelastic"]["gas"], []
-    length = jax.vmap(lambda clock: gas.replace(temperature=gas.temperature / clock).critical_box)
-    for x, clock in zip(*(runs["viscoelastic"][k] for k in ("collisions", "clock")), strict=True):
-        beyond = np.flatnonzero(length(clock) > gas.box_side(size))
-        passes.append(float(x[beyond[0]]) if beyond.size else None)  # None: not reached
-    found["critical_box_passes_at"] = passes
-    return found | {"picture": draw_dissolution(runs["viscoelastic"], size, fields, found)}
+    run = runs["viscoelastic"]
+    T = run["gas"].temperature / jnp.asarray(run["clock"])
+    lengths = jax.vmap(jax.vmap(lambda T: run["gas"].replace(temperature=T).critical_box))(T)
+    pairs = zip(run["collisions"], np.asarray(lengths / run["gas"].box_side(size)), strict=True)
+    found["critical_box_passes_at"] = [crossing(x, length, 1.0) for x, length in pairs]
+    return found | {"picture": draw_dissolution(run, size, fields, found)}
 
 
 def smooth(grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -295,7 +272,7 @@ def smooth(grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     )
 
 
-def draw_dissolution(run: dict, size: int, fields: tuple, found: dict) -> Figure:
+def draw_dissolution(run: dict, size: int, fields: tuple, found: dict):
     """Draw density fluctuations and flow over the collisions, and disks at some times."""
     figure, columns = Figure(figsize=(11, 7.2), layout="constrained"), len(fields)
     grid = figure.add_gridspec(2, 2 * columns, height_ratios=[1.15, 1])
@@ -306,9 +283,8 @@ def draw_dissolution(run: dict, size: int, fields: tuple, found: dict) -> Figure
             x, y, error = (found[law][key] for key in ("collisions", name, f"{name}_error"))
             axes.plot(x, y, color=colour, lw=1.6, label=law)
             axes.fill_between(x, y - error, y + error, color=colour, alpha=0.25, lw=0)
-        if None not in found["critical_box_passes_at"]:
-            mean = np.mean(found["critical_box_passes_at"])
-            axes.axvline(mean, color="0.5", ls="--", lw=1, label="$L_c$ exceeds the box")
+        mean = np.mean(found["critical_box_passes_at"])
+        axes.axvline(mean, color="0.5", ls="--", lw=1, label="$L_c$ exceeds the box")
         if i == 0:
             axes.axhline(1, color="0.7", lw=0.8)
         caption(axes, xscale="log", xlabel="collisions per particle N", ylabel=label)
@@ -323,7 +299,7 @@ def draw_dissolution(run: dict, size: int, fields: tuple, found: dict) -> Figure
     return figure
 
 
-def clustering_film(options: argparse.Namespace) -> dict:
+def clustering_film(options: Options) -> dict:
     disks, frames, e = (500, 4, 0.85) if options.smoke else (20_000, 40, 0.85)
     gas, cells = hard_beads(0.245, e, dimension=2), max(4, int((disks / 9) ** 0.5))
     # Haff's law: collisions per particle N, T/T_0 = exp(-2 N/N_0), 1 + t/t_0 = exp(N/N_0).
@@ -354,7 +330,7 @@ def clustering_film(options: argparse.Namespace) -> dict:
     return results | {"picture": draw_growth(density, results)}
 
 
-def draw_growth(density: np.ndarray, results: dict) -> Figure:
+def draw_growth(density: np.ndarray, results: dict):
     """Draw four frames and, below, the growth of flow and clusters."""
     figure = Figure(figsize=(9, 6.2), layout="constrained")
     above, below = np.asarray(figure.subfigures(2, height_ratios=(1, 1.15)), dtype=object)
@@ -383,11 +359,5 @@ def draw_growth(density: np.ndarray, results: dict) -> Figure:
     return figure
 
 
-PARTS = {
-    "paper_clustering": clustering,
-    "paper_clustering_dissolves": dissolves,
-    "clustering_film": clustering_film,
-}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS)
+    run_parts(__doc__, paper_clustering, paper_clustering_dissolves, clustering_film)

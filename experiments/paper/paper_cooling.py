@@ -17,31 +17,18 @@ as measured by Bridges, Hatzes & Lin (Nature 309, 333, 1984), eps = min(1, 0.34 
 cm/s, is not such a power law: the exponent of its T(t) changes with time.
 """
 
-import argparse
-from typing import Any, ClassVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from matplotlib.ticker import NullFormatter
 
 import jaxgran
-from experiments.support.analysis import (
-    Compared,
-    at_powers,
-    compared,
-    draw_forms,
-    from_here,
-    interpolate,
-    slope,
-)
+from experiments.support import analysis
 from experiments.support.closed_forms import haff, paper_temperature
 from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
-from experiments.support.record import run_parts
-from experiments.support.scenes import beads, hard_beads, restitution_like
-from jaxgran._utils.validation import POSITIVE, Domain, float_array
+from experiments.support.record import Options, run_parts
+from experiments.support.scenes import beads, hard_beads, ice, restitution_like
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, C2, UNCLIPPED_SERIES, viscoelastic_restitution
 from jaxgran.theory.equations import COOLING_RATE
@@ -55,7 +42,7 @@ SHADES = ("#084594", "#2171b5", "#6baed6", "#bdc9e1")
 """Colours from the smallest gamma to the largest, from dark to light."""
 
 
-def restitution(options: argparse.Namespace) -> dict:
+def paper_restitution(options: Options) -> dict:
     config = {"rtol": 1e-13, "num_impacts": 60, "lowest": 1e-3, "highest": 2.0, "fit_top": 0.3}
     config["fit_degree"] = 16
     config |= {"num_impacts": 16, "fit_degree": 12} if options.smoke else {}
@@ -72,8 +59,7 @@ def restitution(options: argparse.Namespace) -> dict:
     }
     errors = {name: np.abs(error) for name, error in errors.items()}
     title = "The paper's two terms of ε hold to 1 % up to β = 0.25, for both ends of contact"
-    figure = panels(2, title=title)
-    left, right = figure.axes
+    figure, (left, right) = panels(2, title=title)
     for eps, style, color, label in (
         (clipped, "-", INK, "equation of motion, ends at F = 0"),
         (unclipped, "--", ELASTIC, "equation of motion, ends at ξ = 0 (paper)"),
@@ -99,11 +85,11 @@ def restitution(options: argparse.Namespace) -> dict:
     found = {
         "recovered": coefficients,
         "orders": {
-            name: float(np.mean(slope(betas[:10], errors[name][:10])[1]))
+            name: float(np.mean(analysis.slope(betas[:10], errors[name][:10])[1]))
             for name in ("two_terms_unclipped", "two_terms_clipped", "ramirez_four_terms")
         },
         "two_terms_good_to_one_per_cent": {
-            name: float(np.exp(interpolate(0.01, miss, np.log(betas))))
+            name: float(np.exp(analysis.interpolate(0.01, miss, np.log(betas))))
             for name, miss in relative.items()
         },
     }
@@ -133,7 +119,7 @@ def recovered(config: dict) -> dict[str, list[float]]:
     return found
 
 
-def cooling(options: argparse.Namespace) -> dict:
+def paper_cooling(options: Options) -> dict:
     config = {"num_particles": 20_000, "replicas": 8, "last": 1e6, "points": 22}
     if options.smoke:
         config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9}
@@ -149,23 +135,22 @@ def cooling(options: argparse.Namespace) -> dict:
         "Viscoelastic spheres cool as t$^{-5/3}$, spheres of constant ε as t$^{-2}$:"
         " both of the paper's laws hold at late times"
     )
-    figure = panels(3, title=title)
-    left, middle, right = figure.axes
-    found: dict[str, Any] = {"restitution": e}
+    figure, (left, middle, right) = panels(3, title=title)
+    found: dict = {"restitution": e}
     for name, (gas, color, power, label) in gases.items():
         theory = jaxgran.KineticTheory(softness=False, correlations=False)
-        T = compared(gas, "temperature", float(gas.temperature), tau, config, theory)[2]
+        T = analysis.compared(gas, "temperature", float(gas.temperature), tau, config, theory)[2]
         T.draw(left, middle, color, f"{label}: theory", f"{name}: theory")
         middle.axhline(power, color=color, ls=":", lw=1)
         found[name] = {
             "largest_difference_of_theory": float(np.abs(1 / (1 + T.miss) - 1).max()),
             "exponent": {f"{t:.3g}": x for t, x in zip(T.middle, T.exponent, strict=True)},
             "exponent_error": T.exponent_error,
-            "exponent_of_theory": at_powers(0, 10, T.where, T.local),
+            "exponent_of_theory": analysis.at_powers(0, 10, T.where, T.local),
         }
         if name == "viscoelastic":
             late = np.abs(T.local - power) < 0.01 * abs(power)
-            found["exponent_within_1_per_cent_from"] = from_here(late, T.where)
+            found["exponent_within_1_per_cent_from"] = analysis.from_here(late, T.where)
             u, t = 1 + COOLING_RATE[3] * delta * tau, jnp.asarray(tau)
             printed = paper_temperature(t, delta, corrected=False)
             forms = {
@@ -173,7 +158,7 @@ def cooling(options: argparse.Namespace) -> dict:
                 "Eq. (38) as printed, to order δ": (printed, "--"),
                 "Eq. (38) corrected, to order δ$^2$": (paper_temperature(t, delta), "-"),
             }
-            found["closed_forms"] = draw_forms(right, T, forms, (-1, 11))
+            found["closed_forms"] = analysis.draw_forms(right, T, forms, (-1, 11))
         else:
             expected = np.asarray(haff(tau, e)) / T.theory - 1
             right.plot(tau, expected, color=color, label="Haff, Eq. (44)")
@@ -186,23 +171,6 @@ def cooling(options: argparse.Namespace) -> dict:
     title = "Closed forms: difference from kinetic theory"
     caption(right, title, ylabel="T$_{formula}$ / T − 1", ylim=(-0.42, 0.62), **logs)
     return {"config": config, "found": found, "picture": figure}
-
-
-class Ice(jaxgran.RestitutionLaw, jaxgran.ReducedLaw):
-    """``eps = min(1, (v/v_1)^(-p))``: elastic below v_1, decreasing with the speed above."""
-
-    threshold: Float[Array, ""] = eqx.field(
-        converter=float_array, default=0.01 * 0.34 ** (1 / 0.234)
-    )
-    exponent: Float[Array, ""] = eqx.field(converter=float_array, default=0.234)
-
-    domains: ClassVar[dict[str, Domain]] = {"threshold": POSITIVE, "exponent": POSITIVE}
-
-    def reduced(self, *, diameter, mass, speed) -> "Ice":
-        return Ice(self.threshold / speed, self.exponent)
-
-    def restitution(self, normal_speed):
-        return jnp.minimum(1.0, (normal_speed / self.threshold) ** -self.exponent)
 
 
 def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -224,7 +192,7 @@ def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return at, np.interp(-np.log(at), -np.log(theta), gamma)
 
 
-def exponents(options: argparse.Namespace) -> dict:
+def paper_exponents(options: Options) -> dict:
     config = {"gammas": (0.0, 0.2, 0.5, 1.0), "num_particles": 5000, "last": 1e5, "points": 19}
     config |= {"loss": 0.15, "ice_speed": 0.01, "packing_fraction": PACKING, "replicas": 8}
     if options.smoke:
@@ -232,8 +200,7 @@ def exponents(options: argparse.Namespace) -> dict:
         config |= {"last": 100.0, "points": 7}
     config |= {"seed": 3, "last_theory": 1e8}
     title = "1 − ε ~ v$^γ$ cools as t$^{−2/(1+γ)}$; ice has no fixed exponent and becomes elastic"
-    figure = panels(3, title=title)
-    left, middle, right = figure.axes
+    figure, (left, middle, right) = panels(3, title=title)
     tau = np.geomspace(0.1, config["last_theory"], 181)
     scene, gases = beads(PACKING, 0.1), {}
     for gamma, color in zip(config["gammas"], SHADES, strict=False):
@@ -241,19 +208,19 @@ def exponents(options: argparse.Namespace) -> dict:
         law = jaxgran.RestitutionSeries([coefficient], [gamma])
         gases[f"γ = {gamma:g}"] = eqx.tree_at(lambda gas: gas.law, scene, law), color, gamma
     frozen = jaxgran.Gas(
-        Ice(),
+        ice(),
         diameter=0.02,
         mass=jaxgran.sphere_mass(0.02, 900.0),
         packing_fraction=PACKING,
         temperature=config["ice_speed"] ** 2 / 2,
     )
-    found: dict[str, Any] = {}
+    found: dict = {}
     for name, (gas, color, gamma) in {**gases, "ice": (frozen, INK, None)}.items():
         unit, theory = float(gas.temperature), jaxgran.KineticTheory()
-        of, _, T = compared(gas, "temperature", unit, tau, config, theory)
+        of, _, T = analysis.compared(gas, "temperature", unit, tau, config, theory)
         if gamma is None:
             theta, steepness = maxwellian(gas, tau)
-            T = Compared(tau, theta, T.at, T.each)
+            T = analysis.Compared(tau, theta, T.at, T.each)
             draw_ice(right, T, steepness, 100 * config["ice_speed"])
         label = name if gamma is None else f"{name}: −2/(1 + γ) = {-2 / (1 + gamma):.3g}"
         T.draw(left, None if gamma is None else middle, color, name, label)
@@ -266,9 +233,11 @@ def exponents(options: argparse.Namespace) -> dict:
             "exponent_error": float(T.exponent_error[-1]),
             "exponent_of_theory": float(np.diff(ends)[0] / np.diff(np.log(T.at[-2:]))[0]),
             "last_exponent_of_theory": float(T.local[-1]),
-            "last_displacement_exponent": float(slope(tau, np.asarray(of.displacement))[1][-1]),
+            "last_displacement_exponent": float(
+                analysis.slope(tau, np.asarray(of.displacement))[1][-1]
+            ),
         }
-    elastic = 100 * float(Ice().threshold)
+    elastic = 100 * float(ice().speed)
     logs = {"xlabel": TIME, "xscale": "log"}
     title = "Temperature: — theory, ● DSMC"
     caption(left, title, ylabel="T / T$_0$", yscale="log", **logs)
@@ -280,7 +249,7 @@ def exponents(options: argparse.Namespace) -> dict:
     return {"config": config, "found": found, "picture": figure}
 
 
-def draw_ice(axes, T: Compared, steepness: np.ndarray, speed: float) -> None:
+def draw_ice(axes, T: analysis.Compared, steepness: np.ndarray, speed: float) -> None:
     """Draw the local exponents of ice over its thermal speed, past the initial transient."""
     aged, old = T.middle > 100, T.tau[1:] > 100
     at = speed * np.sqrt(T.theory[1:][old])
@@ -292,7 +261,5 @@ def draw_ice(axes, T: Compared, steepness: np.ndarray, speed: float) -> None:
     axes.plot(at, -2 / (1 + steepness[1:][old]), ":", color=GUIDE, label=label)
 
 
-PARTS = {"paper_restitution": restitution, "paper_cooling": cooling, "paper_exponents": exponents}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS)
+    run_parts(__doc__, paper_restitution, paper_cooling, paper_exponents)

@@ -19,10 +19,8 @@ exponent; and the range of times in which the paper expects its laws to hold, Eq
 with the range in which they do.
 """
 
-import argparse
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,23 +28,9 @@ import numpy as np
 from scipy.integrate import simpson
 
 import jaxgran
-from experiments.support.analysis import (
-    at_powers,
-    compared,
-    draw_forms,
-    from_here,
-    interpolate,
-    mean_and_error,
-    replicas_of,
-    slope,
-)
-from experiments.support.closed_forms import (
-    RELAXATION_CORRECTION,
-    paper_averages,
-    paper_displacement,
-)
+from experiments.support import analysis, closed_forms
 from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, VISCOELASTIC, caption, panels
-from experiments.support.record import run_parts
+from experiments.support.record import Options, run_parts
 from experiments.support.scenes import beads, cool, hard_beads, restitution_like
 from jaxgran.theory.averages import Rates, collision_rate, impact_moments
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
@@ -126,19 +110,18 @@ def stochastic(gas: jaxgran.Gas, config: dict) -> dict:
 
 def summary(curve: jaxgran.CoolingCurve, lags: np.ndarray) -> dict:
     """Return means and standard errors over the replicas, as lists and numbers for JSON."""
-    each = replicas_of(curve, "velocity_correlation")
+    each = analysis.replicas_of(curve, "velocity_correlation")
     each = each / each[:, :1]
-    collisions = replicas_of(curve, "collisions").mean(axis=0)
+    collisions = analysis.replicas_of(curve, "collisions").mean(axis=0)
     early = (collisions > 0) & (collisions < 2.5)
     # Early -ln C = r N + s N^2: the relaxation time is 1/r collisions, and tau_E is 3/2 collisions.
     basis = np.stack([collisions[early], collisions[early] ** 2], axis=1)
     fits = np.linalg.lstsq(basis, -np.log(each[:, early]).T, rcond=None)[0][0]
-    correlation, error = mean_and_error(each)
-    row = {"lags": lags, "collisions": collisions, "correlation": correlation, "error": error}
-    found: dict[str, Any] = {name: values for name, values in row.items()}
+    correlation, error = analysis.mean_and_error(each)
+    found = {"lags": lags, "collisions": collisions, "correlation": correlation, "error": error}
     integrals = np.asarray(simpson(each, x=lags, axis=1))
     for name, values in (("relaxation", 2 / 3 / fits), ("integral", integrals)):
-        found[name], found[f"{name}_error"] = map(float, mean_and_error(values))
+        found[name], found[f"{name}_error"] = map(float, analysis.mean_and_error(values))
     return found
 
 
@@ -168,10 +151,10 @@ def diffusion_of(
     curve: jaxgran.CoolingCurve, gas: jaxgran.Gas, which: slice
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return d<dr^2>/(6 T tau_E dt) between times, where T tau_E dt ~ sqrt(T) dt ~ dN."""
-    spread = replicas_of(curve, "displacement")[:, which]
-    collisions = replicas_of(curve, "collisions")[:, which]
+    spread = analysis.replicas_of(curve, "displacement")[:, which]
+    collisions = analysis.replicas_of(curve, "collisions")[:, which]
     unit = 9 * float(gas.temperature * gas.mean_free_time**2)
-    return mean_and_error(np.diff(spread) / np.diff(collisions) / unit)
+    return analysis.mean_and_error(np.diff(spread) / np.diff(collisions) / unit)
 
 
 def exact_relaxation(gas: jaxgran.Gas) -> float:
@@ -184,24 +167,23 @@ def printed_relaxation(gas: jaxgran.Gas) -> float:
     """Return tau_v/tau_E by Eq. (31), or by the two terms of Eq. (32)."""
     if isinstance(gas.law, jaxgran.ConstantRestitution):
         return float(2 / (1 + gas.law.coefficient))
-    nu = paper_averages(gas.reduced_law, jnp.ones(()), gas.dimension)[2, 0]
+    nu = closed_forms.paper_averages(gas.reduced_law, jnp.ones(()), gas.dimension)[2, 0]
     return float(2 / 3 * collision_rate(0.0, gas.dimension) / nu)
 
 
-def velocity_correlation(options: argparse.Namespace) -> dict:
+def paper_velocity_correlation(options: Options) -> dict:
     config = CORRELATION | (FEW if options.smoke else {})
     gases, e = gases_of(config["beta"])
     title = (
         "Dissipation lengthens the paths: velocities decay nearly exponentially in collisions,"
         " more slowly in time"
     )
-    figure = panels(3, title=title)
-    decay, counted, times = figure.axes
-    found: dict[str, Any] = {"restitution": e}
+    figure, (decay, counted, times) = panels(3, title=title)
+    found: dict = {"restitution": e}
     lags = np.linspace(0, config["longest"], 601)
     for name, (gas, color, label) in gases.items():
         expected, collisions = decay_of_theory(gas, lags)
-        row: dict[str, Any] = {"dsmc": stochastic(gas, config)}
+        row: dict = {"dsmc": stochastic(gas, config)}
         row["paper_relaxation"] = printed_relaxation(gas)
         row["exact_relaxation"] = exact_relaxation(gas)
         row |= in_boxes(gas, config, ages=name != "elastic")
@@ -263,22 +245,21 @@ def relaxation_times(axes, config: dict) -> dict:
     return found
 
 
-def diffusion_coefficient(options: argparse.Namespace) -> dict:
+def paper_diffusion_coefficient(options: Options) -> dict:
     # The temperatures of the viscoelastic gas at t', over T_0; the last time in mean free times.
-    config: dict[str, Any] = {"waits": (1.0, 0.1, 0.01, 0.001), "last": 3000.0, "points": 14}
+    config: dict = {"waits": (1.0, 0.1, 0.01, 0.001), "last": 3000.0, "points": 14}
     config |= {"waits": (1.0,), "last": 30.0, "points": 6} if options.smoke else {}
     config["correlation"] = CORRELATION | (FEW if options.smoke else {"seed": 1})
     gases, e = gases_of(CORRELATION["beta"])
     title = "Three methods give the same D, and it is not T τ$_v$: the gas cools during τ$_v$"
-    figure = panels(3, title=title)
-    fall, ratio, kinds = figure.axes
-    found: dict[str, Any] = {"restitution": e}
+    figure, (fall, ratio, kinds) = panels(3, title=title)
+    found: dict = {"restitution": e}
     for name, (gas, color, _) in gases.items():
         found[name] = routes(name, gas, color, config, fall, ratio)
     delta = float(gases["viscoelastic"][0].delta)
     tau = np.geomspace(0.3, config["last"], 200)
     u = 1 + COOLING_RATE[3] * delta * tau
-    printed = u ** (-5 / 6) + (COOLING_CORRECTION + RELAXATION_CORRECTION) * delta / u
+    printed = u ** (-5 / 6) + (COOLING_CORRECTION + closed_forms.RELAXATION_CORRECTION) * delta / u
     fall.plot(tau, printed, "--", lw=1, color=VISCOELASTIC, label="Eq. (40), to order δ")
     title = f"viscoelastic (β = {CORRELATION['beta']}) and constant ε = {e:.3f}"
     labels = {"xlabel": "time t / τ$_c$(0)", "ylabel": "D / D$_0$,  D$_0$ = T$_0$ τ$_E$(0)"}
@@ -310,7 +291,7 @@ def routes(name: str, gas: jaxgran.Gas, color: str, config: dict, fall, ratio) -
 
     def expected(quantity: str) -> np.ndarray:
         values = np.log(np.asarray(getattr(of, quantity)))
-        return np.diff(np.exp(interpolate(tau, fine, values)))
+        return np.diff(np.exp(analysis.interpolate(tau, fine, values)))
 
     def printed(shares) -> list[float]:
         return [printed_relaxation(gas.replace(temperature=start * x)) for x in shares]
@@ -370,8 +351,8 @@ def by_models(axes, gases: dict, found: dict) -> None:
     caption(axes, title, xlabel="D / (T τ$_E$)", xlim=(0.95, 1.62))
 
 
-def diffusion(options: argparse.Namespace) -> dict:
-    config: dict[str, Any] = {"num_particles": 20_000, "last": 1e6, "points": 22, "replicas": 8}
+def paper_diffusion(options: Options) -> dict:
+    config: dict = {"num_particles": 20_000, "last": 1e6, "points": 22, "replicas": 8}
     config |= {"last_theory": 1e14, "deltas": (0.1, 0.03, 0.01)}  # deltas of the ranges of times
     if options.smoke:
         config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9}
@@ -383,14 +364,13 @@ def diffusion(options: argparse.Namespace) -> dict:
         "Viscoelastic grains spread further: ⟨Δr²⟩ ~ t$^{1/6}$ instead of log t, but the exponent"
         " 1/6 is reached very late"
     )
-    figure = panels(2, 2, title)
-    in_time, exponent, in_collisions, forms = figure.axes
+    figure, (in_time, exponent, in_collisions, forms) = panels(2, 2, title)
     tau = np.geomspace(0.1, config["last_theory"], 400)
-    found: dict[str, Any] = {"restitution": e, "delta": delta}
+    found: dict = {"restitution": e, "delta": delta}
     for name in ("viscoelastic", "constant"):
         gas, color, label = gases[name]
         unit = float(gas.temperature * gas.mean_free_time**2)
-        theory, dsmc, spread = compared(gas, "displacement", unit, tau, config, THEORY)
+        theory, dsmc, spread = analysis.compared(gas, "displacement", unit, tau, config, THEORY)
         label = f"viscoelastic, δ = {delta:.3f}" if name == "viscoelastic" else label
         spread.draw(in_time, exponent, color, f"{label}: theory", f"{name}: theory")
         shown = {"fmt": "o", "ms": 3.5, "color": color}
@@ -406,19 +386,22 @@ def diffusion(options: argparse.Namespace) -> dict:
             "dsmc_from_theory": spread.miss,
             "exponent": spread.exponent,
             "exponent_error": spread.exponent_error,
-            "exponent_of_theory": at_powers(0, 14, spread.where, spread.local),
+            "exponent_of_theory": analysis.at_powers(0, 14, spread.where, spread.local),
             "linear_in_collisions_within": float(np.ptp(steps) / steps.mean()),
         }
         if name == "viscoelastic":
             near = np.abs(spread.local - 1 / 6) < 1 / 60
-            found["exponent_within_10_per_cent_from"] = from_here(near, spread.where)
+            found["exponent_within_10_per_cent_from"] = analysis.from_here(near, spread.where)
             rate, t = COOLING_RATE[3] * delta, jnp.asarray(tau)
             of = {
                 "leading: u$^{1/6}$ − 1": (54 / rate * ((1 + rate * tau) ** (1 / 6) - 1), ":"),
-                "Eq. (40) integrated": (paper_displacement(t, delta, corrected=False), "--"),
-                "corrected, to order δ": (paper_displacement(t, delta), "-"),
+                "Eq. (40) integrated": (
+                    closed_forms.paper_displacement(t, delta, corrected=False),
+                    "--",
+                ),
+                "corrected, to order δ": (closed_forms.paper_displacement(t, delta), "-"),
             }
-            found["closed_forms"] = draw_forms(forms, spread, of, (1, 15))
+            found["closed_forms"] = analysis.draw_forms(forms, spread, of, (1, 15))
     # At small delta the solver's steps cover few collisions; longer times would take minutes.
     found["windows"] = [cooling_window(x, tau[tau < 1e12]) for x in config["deltas"]]
     for axes in (in_time, exponent, in_collisions):
@@ -445,28 +428,22 @@ def cooling_window(delta: float, tau: np.ndarray) -> dict:
     gas = beads(PACKING, 1.5 * 2**0.1 * delta)
     curve = cool(gas, tau * gas.mean_free_time, THEORY)
     theta = np.asarray(curve.temperature / gas.temperature)
-    middle, local = slope(tau, np.asarray(curve.displacement))
+    middle, local = analysis.slope(tau, np.asarray(curve.displacement))
     # tau_c |dT/dt| / T is the share of T lost in a collision, -d ln T/dN.
     lost = -np.diff(np.log(theta)) / np.diff(curve.collisions)
     relaxed = np.asarray(curve.diffusion / (1.5 * gas.temperature * gas.mean_free_time))
-    averages = jax.vmap(lambda x: paper_averages(gas.reduced_law, x, 3)[2, 0])
+    averages = jax.vmap(lambda x: closed_forms.paper_averages(gas.reduced_law, x, 3)[2, 0])
     slowing = np.asarray(averages(jnp.sqrt(jnp.asarray(theta))))
     off = np.abs(np.sqrt(theta) * float(np.sqrt(32 * np.pi) / 3) / slowing / relaxed - 1)
     last = delta ** (-11 / 5)
     return {
         "delta": delta,
-        "exponent_at_paper_to": float(interpolate(last, middle, local)),
+        "exponent_at_paper_to": float(analysis.interpolate(last, middle, local)),
         "lost_per_collision_at_start": float(lost[0]),
-        "lost_per_collision_at_paper_to": float(interpolate(last, middle, lost)),
-        "t_tau_v_within_5_per_cent_from": from_here(off < 0.05, tau),
+        "lost_per_collision_at_paper_to": float(analysis.interpolate(last, middle, lost)),
+        "t_tau_v_within_5_per_cent_from": analysis.from_here(off < 0.05, tau),
     }
 
 
-PARTS = {
-    "paper_velocity_correlation": velocity_correlation,
-    "paper_diffusion_coefficient": diffusion_coefficient,
-    "paper_diffusion": diffusion,
-}
-
 if __name__ == "__main__":
-    run_parts(__doc__, PARTS)
+    run_parts(__doc__, paper_velocity_correlation, paper_diffusion_coefficient, paper_diffusion)

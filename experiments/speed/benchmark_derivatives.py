@@ -13,10 +13,7 @@ process that has already compiled it, for runs of increasing length, beside the 
 storing the state after every block would need (Linux only).
 """
 
-import argparse
 import dataclasses
-import json
-import sys
 import time
 from pathlib import Path
 
@@ -25,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.record import alone, run_parts
+from experiments.support.record import Options, alone, run_parts
 from experiments.support.scenes import beads, cool
 
 PACKING, BETA, STEPS_PER_CONTACT = 0.1, 0.15, 30
@@ -33,7 +30,7 @@ FREE_TIMES = 3.0  # length of a run, in mean free times at T_0
 STATUS = Path("/proc/self/status")
 
 
-def benchmark_derivatives(options: argparse.Namespace) -> dict:
+def benchmark_derivatives(options: Options) -> dict:
     fractions, repeats, blocks = (0.01, 0.1), 5, (1, 10, 100, 1000)
     soft, stochastic = 4096, 100_000
     if options.smoke:
@@ -104,14 +101,13 @@ def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict 
     if not STATUS.exists():
         print("no /proc here: peak memory is not measured")
         return None
-    rows = [{"blocks": n, **alone(__file__, "--memory", fraction, size, n)} for n in blocks]
+    rows = [{"blocks": n, **alone(memory_of_reverse, fraction, size, n)} for n in blocks]
     state = 2 * 3 * size * 8 / 2**20  # positions and velocities
     return {"num_particles": size, "state_MiB": state, "rows": rows}
 
 
-def memory_of_reverse(fraction: float, size: int, blocks: float) -> None:
-    """Print the memory of this process before and during a run of some blocks."""
-    jax.config.update("jax_enable_x64", True)
+def memory_of_reverse(fraction: float, size: int, blocks: float) -> dict:
+    """Return the memory of this process before and during a run of some blocks."""
     gas = beads(PACKING, BETA, fraction)
     model = equilibrated(gas, size)
     at = gas.value("dissipative_constant"), gas.value("youngs_modulus")
@@ -124,7 +120,7 @@ def memory_of_reverse(fraction: float, size: int, blocks: float) -> None:
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = memory("VmRSS")
     reverse(blocks)
-    print(json.dumps({"before_MiB": before, "peak_MiB": memory("VmHWM")}))
+    return {"before_MiB": before, "peak_MiB": memory("VmHWM")}
 
 
 def memory(name: str) -> float:
@@ -134,7 +130,4 @@ def memory(name: str) -> float:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--memory"]:
-        memory_of_reverse(float(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4]))
-    else:
-        run_parts(__doc__, {"benchmark_derivatives": benchmark_derivatives})
+    run_parts(__doc__, benchmark_derivatives)

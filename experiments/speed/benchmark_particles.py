@@ -23,9 +23,9 @@ per run). In a small box between walls, particles also collide with walls: `rati
 per collision with a particle or a wall, counted by the flux of a homogeneous gas.
 """
 
-import argparse
 import dataclasses
 import importlib.util
+import itertools
 import json
 import shutil
 import statistics
@@ -33,6 +33,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -40,7 +41,7 @@ import numpy as np
 
 import jaxgran
 from experiments.support.lammps_library import granular_box, hertzian
-from experiments.support.record import collected, run_parts, seconds
+from experiments.support.record import Options, run_parts, seconds
 from experiments.support.scenes import beads, cool, hard_beads, times_of
 
 PACKING, BETA = 0.1, 0.15
@@ -56,12 +57,12 @@ def timed(run) -> tuple[float, jaxgran.CoolingCurve]:
     return time.perf_counter() - begin, curve
 
 
-def soft_spheres(options: argparse.Namespace) -> dict:
+def particles(options: Options) -> Iterator[dict]:
     sizes, fractions, repeats = (1000, 4096, 32768), (0.01, 0.003), 3
     if options.smoke:
         sizes, fractions, repeats = (216,), (0.03,), 1
-    rows = (soft_row(size, fraction, repeats) for size in sizes for fraction in fractions)
-    return {"rows": collected(rows)}
+    for size, fraction in itertools.product(sizes, fractions):
+        yield soft_row(size, fraction, repeats)
 
 
 def soft_row(size: int, fraction: float, repeats: int) -> dict:
@@ -135,26 +136,23 @@ def lammps_worker(file: str) -> None:
         print(json.dumps({"seconds": min(medians), "temperature": temperature}))
 
 
-def hard_spheres(options: argparse.Namespace) -> dict:
+def hard_spheres(options: Options) -> Iterator[dict]:
     sizes, repeats = ((216,), 1) if options.smoke else ((1000, 4096, 16384, 50000), 7)
     gases = beads(PACKING, BETA, 0.01), hard_beads(0.2, 0.9, dimension=2)
-    return {"rows": collected(hard_row(size, gas, repeats) for gas in gases for size in sizes)}
+    for gas, size in itertools.product(gases, sizes):
+        yield hard_row(size, gas, repeats)
 
 
 def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:
-    begin = time.perf_counter()
     start = cool(gas, [0.0], jaxgran.HardSpheres(size)).particles
     model, end = jaxgran.HardSpheres(size, start=start), 4.0 * float(gas.mean_free_time)
     curve = cool(gas, [end], model)
-    first = time.perf_counter() - begin
     in_a_row = -(-10_000 // size)  # one timing covers runs of at least this many particles in all
     took, lammps_s = {0.0: [], end: []}, []
     for _ in range(repeats):
         for until, each in took.items():
-            begin = time.perf_counter()
-            for _ in range(in_a_row):
-                _, curve = timed(lambda u=until: cool(gas, [u], model))
-            each.append((time.perf_counter() - begin) / in_a_row)
+            runs = [timed(lambda u=until: cool(gas, [u], model)) for _ in range(in_a_row)]
+            each.append(sum(run_s for run_s, _ in runs) / in_a_row)
         if gas.dimension == 3 and lammps_ranks():
             # The faster of two skins in every repeat, which slightly favours LAMMPS.
             lammps_s.append(time_lammps(gas, start, end, 1, 1)[0])
@@ -163,14 +161,10 @@ def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:
     lammps = {}
     if lammps_s:
         ratios = [a / (b - set_up) for a, b in zip(lammps_s, took[end], strict=True)]
-        middle = statistics.median(lammps_s)
-        lammps = {"run_s": middle, "collisions_per_s": collisions / middle}
-        lammps |= {"ratio": statistics.median(ratios), "ratios": ratios}
+        lammps = {"ratio": statistics.median(ratios), "ratios": ratios}
     return {
         "dimension": gas.dimension,
-        "packing_fraction": float(gas.packing_fraction),
         "num_particles": size,
-        "first_s": first,
         "run_s": run,
         "set_up_s": set_up,
         "collisions_per_s": collisions / (run - set_up),
@@ -179,22 +173,27 @@ def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:
     }
 
 
-def dsmc(options: argparse.Namespace) -> dict:
+def dsmc(options: Options) -> Iterator[dict]:
     sizes, most, repeats = (10_000, 100_000, 1_000_000), 2e6, 3
-    sizes, most, repeats = ((1000,), 1e4, 1) if options.smoke else (sizes, most, repeats)
-    gas, rows = beads(PACKING, BETA), []
+    if options.smoke:
+        sizes, most, repeats = (1000,), 1e4, 1
+    gas = beads(PACKING, BETA)
     for size in sizes:
         times, model = times_of(gas, [max(2 * most / size, 2.0)]), jaxgran.DSMC(size)
         compile_s, run_s = seconds(lambda t=times, m=model: cool(gas, t, m), repeats)
-        curve, row = cool(gas, times, model), {"num_particles": size}
-        row |= {"compile_s": compile_s, "run_s": run_s}
-        row["collisions_per_s"] = float(curve.collisions[-1]) * size / 2 / run_s
-        row["temperature_ratio"] = float(curve.temperature[-1] / gas.temperature)
-        rows.append(row)
-    return {"rows": rows, "dimension": 3}
+        curve = cool(gas, times, model)
+        yield {
+            "num_particles": size,
+            "compile_s": compile_s,
+            "run_s": run_s,
+            "collisions_per_s": float(curve.collisions[-1]) * size / 2 / run_s,
+            "temperature_ratio": float(curve.temperature[-1] / gas.temperature),
+        }
 
 
-def elements_of(models: list, smoke: bool, size: int, contact_fraction: float | None) -> dict:
+def elements_of(
+    models: list, smoke: bool, size: int, contact_fraction: float | None
+) -> Iterator[dict]:
     """Measure a row for each scene that a model supports; the scenes of a model run alternately."""
     smooth = beads(0.05, BETA, contact_fraction)
     side = float(smooth.box_side(size))
@@ -217,7 +216,7 @@ def elements_of(models: list, smoke: bool, size: int, contact_fraction: float | 
     times = np.linspace(0, 1.0 if smoke else 10.0, 6)[1:] * float(smooth.mean_free_time)
     # Wall collisions per collision of a pair: 2 tau_c sum_i 2/(L - sigma) sqrt(T/(2 pi)).
     flux = 6 / (side - float(smooth.diameter)) * (float(smooth.temperature) / (2 * np.pi)) ** 0.5
-    hits, rows = float(2 * smooth.mean_free_time * flux), []
+    hits = float(2 * smooth.mean_free_time * flux)
     for model in models:
         gases = {name: gas for name, gas in scenes.items() if {*gas.elements} <= {*model.elements}}
         took, made = {name: [] for name in gases}, {}
@@ -232,30 +231,21 @@ def elements_of(models: list, smoke: bool, size: int, contact_fraction: float | 
             row = {"model": model.name, "scene": name, "first_s": took[name][0]}
             row |= {"run_s": run[name], "ratio": cost[name] / cost["smooth"]}
             hit = gas.container is not None and model.stochastic
-            row["ratio_of_contacts"] = row["ratio"] / (1 + hits) if hit else row["ratio"]
-            rows.append(row)
-    return {"rows": rows}
+            yield row | {"ratio_of_contacts": row["ratio"] / (1 + hits if hit else 1)}
 
 
-def elements(options: argparse.Namespace) -> dict:
+def elements(options: Options) -> Iterator[dict]:
     models = [jaxgran.KineticTheory(), jaxgran.DSMC(100_000), jaxgran.HardSpheres(4096)]
     return elements_of(models, options.smoke, 4096, None)
 
 
-def elements_soft(options: argparse.Namespace) -> dict:
+def elements_soft(options: Options) -> Iterator[dict]:
     return elements_of([jaxgran.SoftSpheres(2000)], options.smoke, 2000, 0.02)
 
-
-PARTS = {
-    "particles": soft_spheres,
-    "hard_spheres": hard_spheres,
-    "dsmc": dsmc,
-    "elements": elements,
-    "elements_soft": elements_soft,
-}
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--lammps-worker"]:
         lammps_worker(sys.argv[2])
     else:
-        run_parts(__doc__, PARTS, "benchmark_")
+        parts = particles, hard_spheres, dsmc, elements, elements_soft
+        run_parts(__doc__, *parts, prefix="benchmark_")

@@ -21,13 +21,11 @@ DSMC has no clusters. Models that are not run keep their recorded rows. Each row
 its date and the load of the machine before the run.
 """
 
-import argparse
 import datetime
-import json
 import os
 import resource
-import sys
 import time
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +33,7 @@ import numpy as np
 
 import jaxgran
 from experiments.support.analysis import crossing
-from experiments.support.record import alone, figures, run_parts, seconds
+from experiments.support.record import Options, alone, figures, run_parts, seconds
 from experiments.support.scenes import beads, cool, hard_beads, times_of, viscoelastic_like
 
 MODELS = {
@@ -65,22 +63,21 @@ DEVICES_GB = (16, 80, 141)
 
 def apart(part: str, case: str, model: str, size: int, smoke: bool) -> dict:
     """Return what `measure` finds in a separate process."""
-    found = alone(__file__, "--measure", part, case, model, size, int(smoke))
+    found = alone(measure, part, case, model, size, smoke)
     print(part, case, model, found, flush=True)
     return found
 
 
-def replicas(options: argparse.Namespace) -> dict:
-    rows, size = [], 100 if options.smoke else 4096
+def replicas(options: Options) -> Iterator[dict]:
+    size = 100 if options.smoke else 4096
     for name in ["dsmc"] if options.smoke else options.models:
         row: dict = {"model": MODELS[name].__name__, "num_particles": size, "replicas": 2}
         row |= {x: apart("replicas", x, name, size, options.smoke) for x in REPLICAS}
         row["ratio"] = row[REPLICAS[2]]["collisions_per_s"] / row[REPLICAS[0]]["collisions_per_s"]
-        rows.append(row)
-    return {"rows": rows}
+        yield row
 
 
-def million(options: argparse.Namespace) -> dict:
+def million(options: Options) -> dict:
     known = figures("benchmark_million")["rows"] if options.record else []
     rows, size = {row["model"]: row for row in known}, 400 if options.smoke else 10**6
     for model in ["hard-spheres"] if options.smoke else options.models:
@@ -122,7 +119,6 @@ def measure(part: str, case: str, name: str, size: int, smoke: bool) -> dict:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     if case == "two devices":
         jax.config.update("jax_num_cpu_devices", 2)
-    jax.config.update("jax_enable_x64", True)
     if part == "replicas":
         return two_replicas(name, size, 1 if smoke else 3)
     gas = hard_beads(0.05, 0.6, 2)
@@ -214,10 +210,4 @@ def to_clusters(gas: jaxgran.Gas, name: str, size: int) -> dict:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--measure"]:
-        part, case, name, size, smoke = sys.argv[2:]
-        print(json.dumps(measure(part, case, name, int(size), smoke == "1")))
-    else:
-        models = {"nargs": "+", "choices": list(MODELS), "default": list(MODELS)}
-        parts = {"replicas": replicas, "million": million}
-        run_parts(__doc__, parts, "benchmark_", models=models)
+    run_parts(__doc__, replicas, million, prefix="benchmark_", models=list(MODELS))

@@ -13,18 +13,12 @@ in reverse mode, compared with one solution without it. Run times are medians of
 compilation, which is given separately.
 
 benchmark_compilation: tasks, each in a new process without a cache of compiled programs: seconds
-of each step, those of XLA's compiler, the number of programs compiled, and the ratio of the seconds
-to the reference, the first call of `jax.jit(jax.jacfwd(...))` of ln T of kinetic theory in A and
-T_0 in the same round. Seconds and ratios are medians over the rounds. With CHECKOUT, the folder of
-another version (``git worktree add --detach CHECKOUT COMMIT``), both versions run in turn, and are
-compared: ratio of seconds, now over before, and its standard error. The tasks are
-(`support/time_version.py`)
+of each step, medians over the rounds. With CHECKOUT, the folder of another version
+(``git worktree add --detach CHECKOUT COMMIT``), both versions run in turn, and are compared: ratio
+of seconds, now over before, and its standard error. The tasks are
+(`support/version.py`)
 
-    reference: the import, the Jacobian and the curve, their run times, and the numbers of
-        equations of their jaxprs.
-    fit: fit and diagnosis of a curve with 61 points, then of one with 47, then with other `free`.
-    lengths: fit and diagnosis of 20 curves of 20 lengths.
-    command: `jaxgran fit` as a process, with an empty cache, again, and without a cache.
+    command: `jaxgran fit` as a process, with an empty cache, and again.
     SoftSpheres, HardSpheres, DSMC: runs of one mean free time; the last one of the first two
         continues from the particles of the one before.
 
@@ -32,12 +26,9 @@ benchmark_versions: the same for medians of repeated runs of larger gases and of
 compiled before, by this version and by another one.
 """
 
-import argparse
-import json
-import statistics
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -47,16 +38,22 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import jaxgran
-from experiments.support.record import DATA, EXPERIMENTS, process, run_parts, seconds
+from experiments.support.record import (
+    DATA,
+    EXPERIMENTS,
+    Options,
+    of_version,
+    process,
+    run_parts,
+    seconds,
+)
 from experiments.support.scenes import glass
 from jaxgran.scene.geometry import NODES, sphere_surface
 from jaxgran.scene.laws import _CLIPPED, C1
 from jaxgran.theory.averages import averaging_matrix
 
 CURVE = DATA / "lammps_cooling_dilute.csv"
-MODELS = "SoftSpheres", "HardSpheres", "DSMC"
-TASKS = "reference", "fit", "lengths", "command", *MODELS
-REFERENCE = "first Jacobian"
+TASKS = "command", "SoftSpheres", "HardSpheres", "DSMC"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
 SAME_EQUATIONS = {"order": 2, "softness": False, "correlations": False}
 """Options for which kinetic theory solves the equations that are written here for SciPy."""
@@ -162,101 +159,72 @@ def derivative_cost(repeats: int) -> dict[str, float]:
     return row
 
 
-def kinetic_theory(options: argparse.Namespace) -> dict:
+def benchmark_kinetic_theory(options: Options) -> dict:
     times()  # made here, since they cannot be made under tracing
     sweep = sweep_against_scipy(*((20, 2) if options.smoke else (1000, 50)))
     return {"sweep": sweep, "derivative": derivative_cost(5 if options.smoke else 50)}
 
 
-def command(folder: Path) -> dict[str, dict[str, float]]:
-    """Measure `jaxgran fit` as a process: with an empty cache, with its cache, and without one."""
+def command(folder: Path) -> dict[str, float]:
+    """Measure `jaxgran fit` as a process: with an empty cache, and with its cache."""
     main, found = "from jaxgran_command import main; raise SystemExit(main())", {}
     with tempfile.TemporaryDirectory() as out:
         arguments = ["-c", main, "fit", CURVE, "--free", "A", "T0", "--out", out, "--overwrite"]
-        for name, more in (("cold", []), ("warm", []), ("no cache", ["--no-cache"])):
+        for name in ("jaxgran fit", "jaxgran fit again"):
             begin = time.perf_counter()
-            process(*arguments, *more, folder=folder, XDG_CACHE_HOME=out)
-            found[f"jaxgran fit, {name}"] = {"s": time.perf_counter() - begin}
+            process(*arguments, folder=folder, XDG_CACHE_HOME=out)
+            found[name] = time.perf_counter() - begin
     return found
 
 
-def task(name: str, num: int, folder: Path) -> dict[str, dict[str, float]]:
-    """Return the steps of a task of the version in a folder."""
-    if name == "command":
-        return command(folder)
-    script = EXPERIMENTS / "support" / "time_version.py"
-    found = json.loads(process(script, name, CURVE, num, folder=folder).stdout.splitlines()[-1])
-    if not Path(found["package"]).is_relative_to(folder.resolve()):
-        raise SystemExit(f"not the version in {folder} was imported, but {found['package']}")
-    return found["steps"]
-
-
-def measured(tasks: Sequence[str], options: argparse.Namespace, num: int) -> tuple[dict, dict]:
-    """Return the steps of this version and of the other one, if any, and this over the other."""
+def measured(tasks: Sequence[str], options: Options, num: int) -> list[dict[str, np.ndarray]]:
+    """Return the seconds of each step in each round, of this version and of the other, if any."""
     folders = [EXPERIMENTS.parent, *([options.checkout] if options.checkout else [])]
     rounds = {folder: [] for folder in folders}
     for k in range(options.rounds):
         for folder in folders[:: 1 - 2 * (k % 2)]:
-            steps = {step: row for name in tasks for step, row in task(name, num, folder).items()}
-            for row in steps.values():
-                if "s" in row and REFERENCE in steps:
-                    row["ratio"] = row["s"] / steps[REFERENCE]["s"]
+            steps = {}
+            for task in tasks:
+                is_command = task == "command"
+                steps |= command(folder) if is_command else of_version(folder, task, CURVE, num)
             rounds[folder].append(steps)
-    medians = [
-        {
-            name: {key: statistics.median(steps[name][key] for steps in each) for key in row}
-            for name, row in each[0].items()
-        }
+    return [
+        {name: np.array([steps[name] for steps in each]) for name in each[0]}
         for each in rounds.values()
     ]
-    compared = {}
-    for name in medians[0] if options.checkout else ():
-        key = next(iter(medians[0][name]))
-        now, before = (np.array([steps[name][key] for steps in rounds[x]]) for x in folders)
-        error = np.std(now / before, ddof=1) / len(now) ** 0.5 if len(now) > 1 else np.nan
-        compared[name] = {"ratio": statistics.median(now / before), "error": error}
-    return dict(zip(("now", "before"), map(tables, medians), strict=False)), compared
 
 
-def tables(steps: dict[str, dict[str, float]]) -> dict[str, dict]:
-    """Return the runs of the particle models, the command, and all other steps."""
-    rest, rows = dict(steps), {}
-    for name in [name for name in steps if name.startswith(MODELS) and f"{name} again" in steps]:
-        row = rest.pop(name)
-        rows[name] = {"first_s": row.pop("s"), "again_s": rest.pop(f"{name} again")["s"], **row}
-    names = {"first_s": "jaxgran fit, cold", "again_s": "jaxgran fit, warm"}
-    job = {key: steps[name]["s"] for key, name in names.items() if name in steps}
-    return {"rows": rows, "main_job": job, "steps": rest}
+def compared(now: dict[str, np.ndarray], before: dict[str, np.ndarray]) -> Iterator[dict]:
+    for name, ratio in ((name, now[name] / before[name]) for name in now):
+        error = np.std(ratio, ddof=1) / len(ratio) ** 0.5 if len(ratio) > 1 else np.nan
+        yield {"model": name.removeprefix("speed of "), "ratio": np.median(ratio), "error": error}
 
 
-def compilation(options: argparse.Namespace) -> dict:
-    tasks, num = options.tasks, 500
-    if options.smoke:
-        tasks, num = ["reference", "DSMC"], 100
-    found, compared = measured(tasks, options, num)
-    now = {"num_particles": num, "rounds": options.rounds, **found.pop("now")}
-    return now | found | ({"compared": compared} if compared else {})
+def benchmark_compilation(options: Options) -> dict:
+    tasks, num = (["DSMC"], 100) if options.smoke else (options.tasks, 500)
+    versions = measured(tasks, options, num)
+    steps = {name: np.median(each) for name, each in versions[0].items()}
+    rows = {
+        name: {"first_s": steps[name], "again_s": steps[f"{name} again"]}
+        for name in steps
+        if f"{name} again" in steps
+    }
+    return {
+        "num_particles": num,
+        "rounds": options.rounds,
+        "main_job": rows.pop("jaxgran fit", {}),
+        "rows": rows,
+        "steps": {name: {"s": each} for name, each in steps.items()},
+        "compared": list(compared(*versions)) if options.checkout else [],
+    }
 
 
-def versions(options: argparse.Namespace) -> dict:
-    compared = measured(["speed"], options, 1 if options.smoke else 500)[1]
-    speeds = {name: x for name, x in compared.items() if name.startswith("speed of ")}
-    rows = [{"model": name.removeprefix("speed of "), **x} for name, x in speeds.items()]
-    return {"rows": rows}
+def benchmark_versions(options: Options) -> Iterator[dict]:
+    versions = measured(["speed"], options, 1 if options.smoke else 500)
+    return (row for row in compared(*versions) if row["model"] != "import")
 
-
-PARTS = {
-    "benchmark_kinetic_theory": kinetic_theory,
-    "benchmark_compilation": compilation,
-    "benchmark_versions": versions,
-}
 
 if __name__ == "__main__":
-    run_parts(
-        __doc__,
-        PARTS,
-        default=list(PARTS)[:2],
-        tasks={"nargs": "+", "choices": TASKS, "default": TASKS},
-        checkout={"type": Path, "help": "folder of another version"},
-        rounds={"type": int, "default": 1},
-    )
+    parts = benchmark_kinetic_theory, benchmark_compilation, benchmark_versions
+    usual = ("benchmark_kinetic_theory", "benchmark_compilation")
+    run_parts(__doc__, *parts, default=usual, tasks=list(TASKS), checkout=Path, rounds=1)

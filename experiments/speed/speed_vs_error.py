@@ -9,22 +9,19 @@ per contact, in the largest box of the table and with three times the replicas. 
 twice, to separate compilation from run time. With --record, other scenes keep their recorded rows.
 """
 
-import argparse
 import datetime
 import re
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from tqdm import tqdm
 
 import jaxgran
 from experiments.support.plots import GUIDE, INK, caption, panels
-from experiments.support.record import figures, run_parts, seconds
+from experiments.support.record import Options, figures, run_parts, seconds
 from experiments.support.scenes import beads, cool, of_lammps
 from jaxgran.plotting import COLOURS
 
@@ -53,7 +50,7 @@ class Scene(NamedTuple):
     reference: str
 
 
-def speed_vs_error(options: argparse.Namespace) -> dict:
+def speed_vs_error(options: Options) -> dict:
     found = figures("speed_vs_error")["scenes"] if options.record else {}
     for name in ("dense",) if options.smoke else options.scenes:
         jax.clear_caches()  # so that every scene compiles separately
@@ -103,7 +100,7 @@ class Run(NamedTuple):
 
 
 def all_runs(gas: jaxgran.Gas, sizes: tuple[int, ...]) -> list[Run]:
-    few: dict[str, Any] = {"replicas": REPLICAS}
+    few: dict = {"replicas": REPLICAS}
     middle, many = sizes[len(sizes) // 2], DSMC_SIZES[1]
     dsmc, hard = jaxgran.DSMC(many, **few), jaxgran.HardSpheres(middle, **few)
     soft = jaxgran.SoftSpheres(middle, **few)
@@ -157,10 +154,10 @@ def measure(scene: Scene, row: Run) -> dict:
     }
 
 
-def draw(found: dict) -> Figure:
+def draw(found: dict):
     """Draw the largest error over the run time; symbols grow with N."""
-    figure = panels(len(found), size=(5.0, 5.6), sharey=True)
-    for axes, (name, results) in zip(figure.axes, found.items(), strict=True):
+    figure, places = panels(len(found), size=(5.0, 5.6), sharey=True)
+    for axes, (name, results) in zip(places, found.items(), strict=True):
         panel(axes, results["rows"])
         title = f"{name} gas, against {results['reference'].split(', ')[0]}"
         labels = {
@@ -168,12 +165,12 @@ def draw(found: dict) -> Figure:
             "ylabel": "largest error of T(t) (%)",
         }
         caption(axes, title, "none", **labels)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
+    handles, labels = places[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
     return figure
 
 
-def panel(axes: Axes, rows: list[dict]) -> None:
+def panel(axes, rows: list[dict]) -> None:
     """Draw a panel: full points grow with N; hollow points have the middle N and other steps.
 
     Rows of the table that differ in something else (float32, the tolerance, DSMC's step, softer
@@ -228,5 +225,4 @@ def steps_of(row: dict) -> int | None:
 
 
 if __name__ == "__main__":
-    settings = {"nargs": "+", "choices": list(SIZES), "default": list(SIZES)}
-    run_parts(__doc__, {"speed_vs_error": speed_vs_error}, scenes=settings)
+    run_parts(__doc__, speed_vs_error, scenes=list(SIZES))

@@ -23,10 +23,16 @@ def mean_and_error(each: Any) -> tuple[np.ndarray, np.ndarray]:
     return each.mean(axis=0), each.std(axis=0, ddof=1) / len(each) ** 0.5
 
 
+def ratio(one: tuple, other: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ratio of two values with errors, and its error."""
+    (a, a_error), (b, b_error) = one, other
+    return a / b, np.hypot(a_error, a / b * b_error) / np.abs(b)
+
+
 def over(one: tuple, other: tuple) -> tuple[np.ndarray, np.ndarray]:
     """Return the ratio of two values with errors, less 1, and its error."""
-    (a, a_error), (b, b_error) = one, other
-    return a / b - 1, np.hypot(a_error, a / b * b_error) / np.abs(b)
+    value, error = ratio(one, other)
+    return value - 1, error
 
 
 def interpolate(x: Any, where: np.ndarray, values: np.ndarray) -> Any:

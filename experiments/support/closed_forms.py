@@ -100,52 +100,6 @@ def haff(tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3) -> Float[Ar
     return (1 + loss * jnp.asarray(tau)) ** -2.0
 
 
-def haff_collisions(
-    tau: ArrayLike, coefficient: ArrayLike, dimension: int = 3
-) -> Float[Array, "..."]:
-    """Return the collisions per particle under Haff's law, ``N = ln(1 + gamma_0 tau) / gamma_0``.
-
-    Args:
-        tau: ``nu_0 t``, >= 0, any shape.
-        coefficient: e, in [0, 1).
-        dimension: d.
-
-    Returns:
-        N, same shape as tau.
-
-    Valid as `haff`.
-    """
-    loss = (1 - jnp.asarray(coefficient) ** 2) / (2 * dimension)
-    return jnp.log1p(loss * jnp.asarray(tau)) / loss
-
-
-def constant_displacement(
-    collisions: ArrayLike, coefficient: ArrayLike, dimension: int = 3
-) -> Float[Array, "..."]:
-    """Return the mean square displacement of a gas of constant restitution.
-
-    ``<dr^2> = (2 d / k) (N - (1 - exp(-k N)) / k)`` with ``k = (1 + e)^2 / (2 d)``: at first
-    ballistic, then linear in the collisions per particle and hence logarithmic in time. It solves
-    ``dD/dt = T - D/tau_v`` with ``1/tau_v = nu (1 + e)/d``.
-
-    Args:
-        collisions: N per particle, any shape; see `haff_collisions`.
-        coefficient: e, in [0, 1].
-        dimension: d.
-
-    Returns:
-        <dr^2> in units of ``T_0 tau_c(0)^2``, same shape.
-
-    Valid for Maxwellian velocities, in the first Sonine approximation of D.
-
-    Reference: Brilliantov & Poeschel, Eqs. (45) and (46), which give the asymptotic growth; their
-    ``D = T tau_v``, Eq. (34), neglects the cooling during tau_v and has ``k = (1 + e) / d``.
-    """
-    k = (1 + jnp.asarray(coefficient)) ** 2 / (2 * dimension)
-    n = jnp.asarray(collisions)
-    return 2 * dimension / k * (n + jnp.expm1(-k * n) / k)
-
-
 def paper_temperature(
     tau: ArrayLike, delta: ArrayLike, *, corrected: bool = True, clipped: bool = True
 ) -> Float[Array, "..."]:

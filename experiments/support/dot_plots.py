@@ -3,11 +3,13 @@
 ``python experiments/documents.py --pictures`` draws them all; the entries of the gallery show them.
 """
 
+import re
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.support.plots import caption
 from jaxgran.plotting import COLOURS, INK, colour_of
 
 
@@ -48,27 +50,16 @@ class DotPlot(NamedTuple):
     kinds: tuple[str, str] = ("", "")
 
 
-NAMES = {"hard-spheres": "hard spheres", "HardSpheres": "hard spheres"} | {
-    "soft-spheres": "soft spheres",
-    "SoftSpheres": "soft spheres",
-    "Soft spheres": "soft spheres",
-    "dsmc": "DSMC",
-    "KineticTheory": "kinetic theory",
-}
-"""Names of models in the pictures, by those in the figures."""
-
-
 def named(model: str) -> str:
-    return NAMES.get(model, model)
+    """Return the name of a model in the pictures, from that in the figures."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])|-", " ", model).lower()
+    return {"dsmc": "DSMC"}.get(words, words if words in COLOURS else model)
 
 
 def dots_of(rows: list[dict], label: str, value: str, model: str = "") -> list[Dot]:
     """Return a dot for each row: label and model are formats of the fields of the row."""
-    words = [{key: named(x) if isinstance(x, str) else x for key, x in row.items()} for row in rows]
-    return [
-        Dot(label.format(**word), row[value], model=named(model.format(**row)))
-        for row, word in zip(rows, words, strict=True)
-    ]
+    rows = [{key: named(x) if isinstance(x, str) else x for key, x in row.items()} for row in rows]
+    return [Dot(label.format(**row), row[value], model=model.format(**row)) for row in rows]
 
 
 def drawn(plot: DotPlot) -> Figure:
@@ -91,11 +82,8 @@ def drawn(plot: DotPlot) -> Figure:
         axes.set_xscale("log")
     axes.set_yticks(range(len(labels)), labels, fontsize=8)
     axes.set_ylim(len(labels) - 0.4, -0.6)
-    axes.set_xlabel(plot.axis, fontsize=9)
     axes.tick_params(axis="x", labelsize=8)
-    axes.grid(axis="x", color="#e6e6e6", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    caption(axes, legend="none", xlabel=plot.axis)
     if any(plot.kinds):
         for words, marker, face in zip(plot.kinds, "os", (INK, "white"), strict=True):
             axes.plot([], [], marker, color=INK, mfc=face, ms=6, label=words)
@@ -103,9 +91,9 @@ def drawn(plot: DotPlot) -> Figure:
     return figure
 
 
-def of_rows(found: dict, label: str, value: str, axis: str, model: str = "", **plot) -> DotPlot:
+def of_rows(rows: list, label: str, value: str, axis: str, model: str = "", **plot) -> DotPlot:
     """Return a picture with a dot for each row."""
-    return DotPlot(dots_of(found["rows"], label, value, model), axis, **plot)
+    return DotPlot(dots_of(rows, label, value, model), axis, **plot)
 
 
 def wrong_physics(found: dict) -> DotPlot:
@@ -121,19 +109,15 @@ def interval_coverage(found: dict) -> DotPlot:
     rows = [row | {"percent": 100 * row["coverage"]} for row in found["rows"]]
     dots = dots_of(rows, "{model}, N = {num_particles}, φ = {phi:g}", "percent", "{model}")
     for k, row in enumerate(rows):
-        x, error = row["percent"], (row["coverage"] * (1 - row["coverage"]) / row["runs"]) ** 0.5
-        dots[k] = dots[k]._replace(low=x - 100 * error, high=x + 100 * error)
+        error = 100 * (row["coverage"] * (1 - row["coverage"]) / row["runs"]) ** 0.5
+        dots[k] = dots[k]._replace(low=dots[k].value - error, high=dots[k].value + error)
     return DotPlot(dots, "runs whose 95 % interval contains A, %", (95.0, "95 %"))
 
 
 def fit_head_to_head(found: dict) -> DotPlot:
-    rows = [
-        row
-        | {"scene": row["scene"].replace("stochastic", "dsmc")}
-        | {"free": "A" if len(row["free"]) == 1 else "A and T₀"}
-        for row in found["rows"]
-        if row["simulations"]
-    ]
+    rows = [row | {"scene": row["scene"].replace("stochastic", "dsmc")} for row in found["rows"]]
+    rows = [row | {"free": ("A", "A and T₀")[len(row["free"]) - 1]} for row in rows]
+    rows = [row for row in rows if row["simulations"]]
     dots = dots_of(rows, "{scene}, {free}: {search}", "simulations", "{scene}")
     dots = [dot._replace(hollow="jaxgran" not in dot.label) for dot in dots]
     axis = "simulations until A is known to 2 %"
@@ -166,7 +150,7 @@ def benchmark_kinetic_theory(found: dict) -> DotPlot:
 
 def benchmark_replicas(found: dict) -> DotPlot:
     axis = "collisions per second on two CPU devices, over one core"
-    return of_rows(found, "{model}", "ratio", axis, "{model}", reference=(1.0, "one core"))
+    return of_rows(found["rows"], "{model}", "ratio", axis, "{model}", reference=(1.0, "one core"))
 
 
 def benchmark_million(found: dict) -> DotPlot:
@@ -178,7 +162,7 @@ def benchmark_million(found: dict) -> DotPlot:
         if case in row
     ]
     axis = "microseconds per collision, 10⁶ disks (or half of them)"
-    return of_rows({"rows": rows}, "{model}, {case}", "x", axis, "{model}", logarithmic=True)
+    return of_rows(rows, "{model}, {case}", "x", axis, "{model}", logarithmic=True)
 
 
 def benchmark_compilation(found: dict) -> DotPlot:
@@ -194,16 +178,14 @@ def benchmark_compilation(found: dict) -> DotPlot:
 
 
 def benchmark_dsmc(found: dict) -> DotPlot:
-    axis = "collisions per second"
-    return of_rows(found, "N = {num_particles}", "collisions_per_s", axis, "DSMC", logarithmic=True)
+    columns = "N = {num_particles}", "collisions_per_s", "collisions per second", "DSMC"
+    return of_rows(found["rows"], *columns, logarithmic=True)
 
 
 def over_lammps(rows: list[dict], label: str, model: str) -> DotPlot:
     axis = "collisions per second, over those of LAMMPS on one core"
     reference = (1.0, "LAMMPS")
-    return of_rows(
-        {"rows": rows}, label, "over", axis, model, reference=reference, logarithmic=True
-    )
+    return of_rows(rows, label, "over", axis, model, reference=reference, logarithmic=True)
 
 
 def benchmark_hard_spheres(found: dict) -> DotPlot:
@@ -227,7 +209,7 @@ def benchmark_derivatives(found: dict) -> DotPlot:
             if way != "plain"
         ]
     axis, reference = "time over that of the plain run", (1.0, "plain run")
-    return of_rows({"rows": rows}, "{model}, {way}", "ratio", axis, "{model}", reference=reference)
+    return of_rows(rows, "{model}, {way}", "ratio", axis, "{model}", reference=reference)
 
 
 def benchmark_elements(found: dict) -> DotPlot:

@@ -16,8 +16,8 @@ THEORY, DSMC, HARD, SOFT = (
 
 def panels(
     columns: int = 1, rows: int = 1, title: str = "", size=(4.6, 4.0), **shared: Any
-) -> Figure:
-    """Return a figure with a title and panels; `Figure.axes` are the panels, row by row.
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a title, and its panels, row by row.
 
     Args:
         size: width and height of a panel, inches.
@@ -27,7 +27,7 @@ def panels(
     figure = Figure(figsize=(columns * size[0], height), layout="constrained")
     figure.suptitle(title, color=INK)
     figure.subplots(rows, columns, **shared)
-    return figure
+    return figure, figure.axes
 
 
 def caption(axes: Axes, title: str = "", legend: Any = "best", **settings: Any) -> None:

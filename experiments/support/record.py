@@ -7,6 +7,7 @@ generated from these files only (``python experiments/documents.py``).
 
 import argparse
 import datetime
+import inspect
 import json
 import os
 import platform
@@ -17,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -34,29 +35,38 @@ PACKAGES = ("jaxgran", "jax", "jax-md", "diffrax", "optimistix", "numpy", "scipy
 COUNTS = {1: "one", 2: "two", 4: "four", 8: "eight", 16: "sixteen"}
 BEGAN = time.perf_counter()
 
+Options = argparse.Namespace
+"""Options of a script, which each of its parts takes."""
+
 
 def run_parts(
     doc: str | None,
-    parts: Mapping[str, Callable[[argparse.Namespace], dict]],
+    *functions: Callable[[Options], Any],
+    named: Mapping[str, Callable[[Options], Any]] | None = None,
     prefix: str = "",
     smoke: bool = True,
     default: Sequence[str] = (),
-    **more: dict[str, Any],
+    **more: Any,
 ) -> dict[str, dict]:
     """Run the parts of a script that --only names, by default all, and write what they find.
 
     Args:
         doc: docstring of the script, its help.
-        parts: functions by name. Each takes the options and returns its results. "picture" among
-            them is a figure, or figures by name. Results are written to ``prefix + name`` in the
-            folder --out, by default ``results/SCRIPT``, and with --record to ``figures/``, too.
+        functions: the parts. Each takes the options and returns its results, or yields the rows
+            of a table, which are printed as they come. "picture" among the results is a figure, or
+            figures by name. Results are written to ``prefix + name`` in the folder --out, by
+            default ``results/SCRIPT``, and with --record to ``figures/``, too.
+        named: further parts by name.
+        prefix: before the names of parts in the names of files.
         smoke: whether there are small runs of some seconds (--smoke).
         default: parts that run without --only, if not all.
-        more: settings of further options; names in capitals are positional arguments.
+        more: defaults of further options: numbers, words, or lists of these (of words any may be
+            chosen); False for a flag; a type without a default. Names in capitals are positional.
 
     Returns:
         The results of the parts.
     """
+    parts = {function.__name__: function for function in functions} | dict(named or {})
     script = Path(sys.argv[0]).stem
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -68,26 +78,38 @@ def run_parts(
         parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
     if len(parts) > 1:
         parser.add_argument("--only", nargs="+", choices=list(parts))
-    for name, settings in more.items():
-        parser.add_argument(name if name.isupper() else f"--{name.replace('_', '-')}", **settings)
+    for name, default in more.items():
+        parser.add_argument(name if name.isupper() else f"--{name}", **settings_of(default))
     options = parser.parse_args()
     if options.record and options.smoke:
         parser.error("A smoke run is too small for the documents. Leave out --record.")
     jax.config.update("jax_enable_x64", True)
     results = {}
     for part in options.only:
-        results[part] = found = parts[part](options)
+        found = parts[part](options)
+        results[part] = found if isinstance(found, dict) else {"rows": collected(found)}
         name = prefix + part
-        pictures = found.pop("picture", {})
+        pictures = results[part].pop("picture", {})
         pictures = pictures if isinstance(pictures, dict) else {name: pictures}
-        pprint.pp(rounded(json.loads(as_json(found))), width=100, compact=True)
+        pprint.pp(rounded(json.loads(as_json(results[part]))), width=100, compact=True)
         for path in (options.out / f"{name}.json", FIGURES / f"{name}.json")[: 1 + options.record]:
-            save(path, **found)
+            save(path, **results[part])
         for folder in (options.out, PICTURES)[: 1 + options.record]:
             for picture, figure in pictures.items():
                 figure.savefig(folder / f"{picture}.png", dpi=110)
         print(f"written to {options.out / name}.json; {time.perf_counter() - BEGAN:.0f} s")
     return results
+
+
+def settings_of(default: Any) -> dict[str, Any]:
+    """Return settings of an option of argparse: see `run_parts`."""
+    if default is False:
+        return {"action": "store_true"}
+    if isinstance(default, list):
+        words = {"choices": default} if isinstance(default[0], str) else {}
+        return {"nargs": "*", "type": type(default[0]), "default": default} | words
+    is_type = isinstance(default, type)
+    return {"type": default} if is_type else {"type": type(default), "default": default}
 
 
 def rounded(found: Any) -> Any:
@@ -100,8 +122,9 @@ def rounded(found: Any) -> Any:
     return float(f"{found:.4g}") if isinstance(found, float) else found
 
 
-def as_json(found: dict) -> str:
-    return json.dumps(found, indent=1, default=lambda array: np.asarray(array).tolist()) + "\n"
+def as_json(found: dict, indent: int | None = 1) -> str:
+    text = json.dumps(found, indent=indent, default=lambda array: np.asarray(array).tolist())
+    return text + "\n"
 
 
 def collected(rows: Iterable[dict]) -> list[dict]:
@@ -149,15 +172,8 @@ def made_by() -> dict[str, Any]:
         "precision": "float64" if jax.config.read("jax_enable_x64") else "float32",
         "seconds": round(time.perf_counter() - BEGAN, 1),
         "python": platform.python_version(),
-        "packages": {name: found for name in PACKAGES if (found := _version(name))},
+        "packages": {name: version(name) for name in PACKAGES},
     }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
@@ -193,6 +209,27 @@ def process(
     return done
 
 
-def alone(script: str, *arguments: Any) -> dict:
-    """Run a script in a separate process and return its last printed line, which is JSON."""
-    return json.loads(process(script, *arguments).stdout.splitlines()[-1])
+def alone(function: Callable, *arguments: Any) -> dict:
+    """Return what a function of a script returns in a separate process; all are JSON."""
+    script = Path(inspect.getfile(function)).resolve().relative_to(EXPERIMENTS.parent)
+    code = (
+        f"from {'.'.join(script.with_suffix('').parts)} import {function.__name__}\n"
+        "import json, sys, jax\n"
+        "from experiments.support.record import as_json\n"
+        "jax.config.update('jax_enable_x64', True)\n"
+        f"print(as_json({function.__name__}(*json.loads(sys.argv[1])), indent=None), end='')"
+    )
+    return json.loads(process("-c", code, json.dumps(arguments)).stdout.splitlines()[-1])
+
+
+def of_version(folder: Path, task: str, curve: Path, num: int = 0) -> dict[str, Any]:
+    """Return what a task of `support/version.py` finds with the version in a folder.
+
+    Raises:
+        SystemExit: if it fails, or if another version is imported.
+    """
+    script = EXPERIMENTS / "support" / "version.py"
+    found = json.loads(process(script, task, curve, num, folder=folder).stdout.splitlines()[-1])
+    if not Path(found["package"]).is_relative_to(folder.resolve()):
+        raise SystemExit(f"the version in {folder} was not imported, but {found['package']}")
+    return found["steps"]

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import root_scalar
 
@@ -35,6 +36,21 @@ def beads(
         stiffer = (float(gas.contact_fraction) / contact_fraction) ** 2.5
         gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
     return gas.replace(dissipative_constant=1e-6 * beta / float(gas.thermal_beta))
+
+
+class Power(jaxgran.RestitutionLaw):
+    """``eps = (v/v_1)^-p``, and 1 below the speed v_1, m/s."""
+
+    speed: float
+    power: float
+
+    def restitution(self, normal_speed):
+        return jnp.maximum(normal_speed / self.speed, 1.0) ** -self.power
+
+
+def ice() -> Power:
+    """Return the law of ice as measured by Bridges, Hatzes & Lin, Nature 309, 333 (1984)."""
+    return Power(0.01 * 0.34 ** (1 / 0.234), 0.234)
 
 
 def hard_beads(packing_fraction: float, restitution: float, dimension: int = 3) -> jaxgran.Gas:

@@ -11,9 +11,7 @@ from experiments.support.closed_forms import (
     EXPANSION_P,
     EXPANSION_R,
     SONINE_COEFFICIENT,
-    constant_displacement,
     haff,
-    haff_collisions,
     paper_averages,
     paper_displacement,
     paper_temperature,
@@ -83,8 +81,11 @@ def test_displacement_of_constant_restitution():
         tau = jnp.geomspace(0.01, 1e6, 50)
         model = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-9)
         curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
-        collisions = haff_collisions(tau, e, d)
-        formula = constant_displacement(collisions, e, d) * gas.mean_free_time**2
+        # Brilliantov & Poeschel, Eqs. (45), (46); of dD/dt = T - D/tau_v, 1/tau_v = nu (1 + e)/d,
+        # follows <dr^2> = (2 d/k) (N - (1 - exp(-k N))/k) with k = (1 + e)^2/(2 d).
+        loss, k = (1 - e**2) / (2 * d), (1 + e) ** 2 / (2 * d)
+        collisions = jnp.log1p(loss * tau) / loss
+        formula = 2 * d / k * (collisions + jnp.expm1(-k * collisions) / k) * gas.mean_free_time**2
         # The solver's atol is its rtol, too: of the ballistic start it sees less.
         np.testing.assert_allclose(curve.collisions, collisions, rtol=1e-7)
         np.testing.assert_allclose(curve.displacement, formula, rtol=1e-6)
