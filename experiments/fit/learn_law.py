@@ -2,11 +2,13 @@
 
     python experiments/fit/learn_law.py [--smoke] [--record] [--out DIR]
 
-`jaxgran.fit` fits a `RestitutionSpline` to each curve, through kinetic theory. The worlds are
-curves with an error of 1 %, made by direct simulation and by hard spheres, of viscoelastic beads,
-of ice (eps = .34 (v/(1 cm/s))^-.234; Bridges, Hatzes & Lin 1984) and of a law with a yield speed,
-.95 below it and falling as v^(-1/4) above. (`tutorials/5_learn_a_law.py` learns that of a curve
-simulated in LAMMPS.)
+`jaxgran.fit` fits a `RestitutionSpline` to each curve, through kinetic theory. The worlds:
+
+- curves with an error of 1 %, made by direct simulation and by hard spheres, of viscoelastic beads,
+  of ice (eps = .34 (v/(1 cm/s))^-.234; Bridges, Hatzes & Lin 1984) and of a law with a yield speed,
+  .95 below it and falling as v^(-1/4) above;
+- curves measured in LAMMPS, of beads with known A;
+- a curve together with drop tests of single beads at speeds that the gas did not visit.
 
 Counts how often the band contains the true law at nine speeds that the gas visited, reads off A,
 and says whether the learnt law has the viscoelastic or the constant form (p > .01). The best
@@ -14,6 +16,7 @@ viscoelastic law is wrong about eps by `bias`, the spline by `error`.
 """
 
 import dataclasses
+import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,11 +25,12 @@ import jaxgran
 from experiments.support.analysis import replicas_of
 from experiments.support.plots import DSMC, GUIDE, INK, THEORY, caption, panels
 from experiments.support.record import Options, run_parts
-from experiments.support.scenes import cool, ice
+from experiments.support.scenes import cool, ice, of_lammps
 
 ERROR = 0.01
 NUM_KNOTS = 8
 BEADS: dict = {"diameter": 2e-3, "mass": 1e-5, "packing_fraction": 0.03}
+LAMMPS_CURVES = "dilute", "phi003", "phi003_large"
 
 
 class Yielding(jaxgran.RestitutionLaw):
@@ -46,11 +50,17 @@ TRUTHS: dict[str, tuple] = {  # and T_0, m^2/s^2
 }
 
 
-def learn(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, num_particles: int) -> jaxgran.Fit:
+def learn(gas: jaxgran.Gas, data, num_particles: int | dict) -> jaxgran.Fit:
     """The whole recipe: knots over the visited speeds, and a fit of all numbers of the law."""
-    speeds = np.geomspace(*jaxgran.RestitutionSpline.visited_speeds(curve.temperature), NUM_KNOTS)
-    learner = dataclasses.replace(gas, law=jaxgran.RestitutionSpline(speeds))
-    return jaxgran.fit(learner, curve, free="law", num_particles=num_particles)
+    curve = data["gas"] if isinstance(data, dict) else data
+    low, high = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
+    if isinstance(data, dict):  # with drop tests
+        low = min(low, float(np.min(np.asarray(data["drops"].speed))))
+    law = jaxgran.RestitutionSpline(np.geomspace(low, high, NUM_KNOTS))
+    learner = dataclasses.replace(gas, law=law)
+    if isinstance(data, dict):
+        learner = dict.fromkeys(data, learner)
+    return jaxgran.fit(learner, data, free="law", num_particles=num_particles)
 
 
 def curves_of(gas, model, taus, seed):
@@ -62,9 +72,9 @@ def curves_of(gas, model, taus, seed):
         yield jaxgran.CoolingCurve(times, jnp.asarray(T), temperature_error=jnp.asarray(ERROR * T))
 
 
-def judge(gas: jaxgran.Gas, result: jaxgran.Fit) -> dict:
+def judge(gas: jaxgran.Gas, result: jaxgran.Fit, speeds=None) -> dict:
     """Compare a learnt law with the true one, read off A, and test two forms."""
-    band = jaxgran.restitution_band(result)
+    band = jaxgran.restitution_band(result, speeds)
     eps = np.asarray(gas.restitution(band.speeds))
     law = gas.law if isinstance(gas.law, jaxgran.Viscoelastic) else TRUTHS["viscoelastic"][0]
     beads = dataclasses.replace(gas, law=law).replace(dissipative_constant=1e-6)
@@ -102,22 +112,58 @@ def summary(rows: list[dict]) -> dict:
 def learn_law(options: Options) -> dict:
     size, replicas = (200, 2) if options.smoke else (1000, 20)
     taus = np.geomspace(0.3, 100.0, 40)
-    models = [jaxgran.DSMC(size, replicas=replicas), jaxgran.HardSpheres(size, replicas=replicas)]
-    worlds, results = {}, {}
+    models = {
+        "DSMC": jaxgran.DSMC(size, replicas=replicas),
+        "hard spheres": jaxgran.HardSpheres(size, replicas=replicas),
+    }
+    worlds, results, first_s = {}, {}, None
     for truth, (law, T) in TRUTHS.items():
         gas = jaxgran.Gas(law, **BEADS, temperature=T)
-        for seed, model in enumerate(models[: 1 if options.smoke else 2]):
-            fits = [learn(gas, curve, size) for curve in curves_of(gas, model, taus, seed)]
-            results.setdefault(truth, (gas, fits[0]))
-            rows = worlds[f"{truth}, {model.name}"] = [judge(gas, result) for result in fits]
-            print(truth, model.name, summary(rows), flush=True)
-    beads = [row for name, rows in worlds.items() for row in rows if "viscoelastic" in name]
+        for seed, (name, model) in enumerate(list(models.items())[: 1 if options.smoke else 2]):
+            rows = []
+            for curve in curves_of(gas, model, taus, seed):
+                begin = time.perf_counter()
+                result = learn(gas, curve, size)
+                first_s = first_s or time.perf_counter() - begin
+                results.setdefault(truth, (gas, result))
+                rows.append(judge(gas, result))
+            worlds[f"{truth}, {name}"] = rows
+            print(truth, name, summary(rows), flush=True)
+        if truth == "viscoelastic":
+            worlds["viscoelastic, with drop tests"] = [with_drops(gas, curve, size)]
+    for name in LAMMPS_CURVES[: 1 if options.smoke else None]:
+        gas, curve, header = of_lammps(name)
+        after = np.asarray(curve.times) > 0
+        curve = jaxgran.CoolingCurve(
+            *(np.asarray(x)[after] for x in (curve.times, curve.temperature)),
+            temperature_error=np.asarray(curve.temperature_error)[after],
+        )
+        row = judge(gas, learn(gas, curve, int(header["N"])))
+        worlds[f"LAMMPS, {name}"] = [row | {"true_A": float(gas.value("dissipative_constant"))}]
+        print(name, summary(worlds[f"LAMMPS, {name}"]), flush=True)
+    beads = [row for name, rows in worlds.items() for row in rows if name in BEADS_WORLDS]
     return {
         "beads": summary(beads),
         "worlds": {name: summary(rows) for name, rows in worlds.items()},
         "rows": worlds,
+        "true_A": float(results["viscoelastic"][0].value("dissipative_constant")),
+        "first_fit_s": first_s,
         "picture": draw(results),
     }
+
+
+BEADS_WORLDS = "viscoelastic, DSMC", "viscoelastic, hard spheres"
+
+
+def with_drops(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, size: int) -> dict:
+    """Learn from a curve and from 20 drops of single beads at a twentieth of its lowest speed."""
+    low = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)[0] / 20
+    speeds = np.geomspace(low, 3 * low, 20)
+    eps = np.asarray(gas.restitution(speeds))
+    noise = 0.002 * np.random.default_rng(0).normal(size=speeds.size)
+    drops = jaxgran.DropTest(speeds, eps + noise, np.full(speeds.size, 0.002))
+    result = learn(gas, {"gas": curve, "drops": drops}, {"gas": size})
+    return judge(gas, result, speeds[[0, -1]])
 
 
 def draw(results: dict[str, tuple[jaxgran.Gas, jaxgran.Fit]]):

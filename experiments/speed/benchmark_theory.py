@@ -13,12 +13,17 @@ in reverse mode, compared with one solution without it. Run times are medians of
 compilation, which is given separately.
 
 benchmark_compilation: tasks, each in a new process without a cache of compiled programs: seconds
-of each step, medians over the rounds. With CHECKOUT, the folder of another version
+of each step, those of XLA's compiler, the number of programs compiled, and the ratio of the seconds
+to the reference, the first call of `jax.jit(jax.jacfwd(...))` of ln T of kinetic theory in A and
+T_0 in the same round; medians over the rounds. With CHECKOUT, the folder of another version
 (``git worktree add --detach CHECKOUT COMMIT``), both versions run in turn, and are compared: ratio
-of seconds, now over before, and its standard error. The tasks are
-(`support/version.py`)
+of seconds, now over before, and its standard error. The tasks are (`support/version.py`)
 
-    command: `jaxgran fit` as a process, with an empty cache, and again.
+    reference: the import, the Jacobian and the curve, their run times, and the numbers of
+        equations of their jaxprs.
+    fit: fit and diagnosis of a curve with 61 points, then of one with 47, then with other `free`.
+    lengths: fit and diagnosis of 20 curves of 20 lengths.
+    command: `jaxgran fit` as a process, with an empty cache, again, and without a cache.
     SoftSpheres, HardSpheres, DSMC: runs of one mean free time; the last one of the first two
         continues from the particles of the one before.
 
@@ -53,7 +58,8 @@ from jaxgran.scene.laws import _CLIPPED, C1
 from jaxgran.theory.averages import averaging_matrix
 
 CURVE = DATA / "lammps_cooling_dilute.csv"
-TASKS = "command", "SoftSpheres", "HardSpheres", "DSMC"
+TASKS = "reference", "fit", "lengths", "command", "SoftSpheres", "HardSpheres", "DSMC"
+REFERENCE = "first Jacobian"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
 SAME_EQUATIONS = {"order": 2, "softness": False, "correlations": False}
 """Options for which kinetic theory solves the equations that are written here for SciPy."""
@@ -165,20 +171,24 @@ def benchmark_kinetic_theory(options: Options) -> dict:
     return {"sweep": sweep, "derivative": derivative_cost(5 if options.smoke else 50)}
 
 
-def command(folder: Path) -> dict[str, float]:
-    """Measure `jaxgran fit` as a process: with an empty cache, and with its cache."""
+def command(folder: Path) -> dict[str, dict[str, float]]:
+    """Measure `jaxgran fit` as a process: with an empty cache, with its cache, and without."""
     main, found = "from jaxgran_command import main; raise SystemExit(main())", {}
     with tempfile.TemporaryDirectory() as out:
         arguments = ["-c", main, "fit", CURVE, "--free", "A", "T0", "--out", out, "--overwrite"]
-        for name in ("jaxgran fit", "jaxgran fit again"):
+        without = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+        for name, more in (("", {}), (" again", {}), (", no cache", without)):
             begin = time.perf_counter()
-            process(*arguments, folder=folder, XDG_CACHE_HOME=out)
-            found[name] = time.perf_counter() - begin
+            process(*arguments, folder=folder, XDG_CACHE_HOME=out, **more)
+            found[f"jaxgran fit{name}"] = {"s": time.perf_counter() - begin}
     return found
 
 
-def measured(tasks: Sequence[str], options: Options, num: int) -> list[dict[str, np.ndarray]]:
-    """Return the seconds of each step in each round, of this version and of the other, if any."""
+Steps = dict[str, dict[str, np.ndarray]]
+
+
+def measured(tasks: Sequence[str], options: Options, num: int) -> list[Steps]:
+    """Return the figures of each step in each round, of this version and of the other, if any."""
     folders = [EXPERIMENTS.parent, *([options.checkout] if options.checkout else [])]
     rounds = {folder: [] for folder in folders}
     for k in range(options.rounds):
@@ -187,34 +197,43 @@ def measured(tasks: Sequence[str], options: Options, num: int) -> list[dict[str,
             for task in tasks:
                 is_command = task == "command"
                 steps |= command(folder) if is_command else of_version(folder, task, CURVE, num)
+            for row in steps.values():
+                if "s" in row and REFERENCE in steps:
+                    row["ratio"] = row["s"] / steps[REFERENCE]["s"]
             rounds[folder].append(steps)
     return [
-        {name: np.array([steps[name] for steps in each]) for name in each[0]}
+        {
+            name: {key: np.array([steps[name][key] for steps in each]) for key in row}
+            for name, row in each[0].items()
+        }
         for each in rounds.values()
     ]
 
 
-def compared(now: dict[str, np.ndarray], before: dict[str, np.ndarray]) -> Iterator[dict]:
-    for name, ratio in ((name, now[name] / before[name]) for name in now):
+def compared(now: Steps, before: Steps) -> Iterator[dict]:
+    for name in (name for name, row in now.items() if "s" in row):
+        ratio = now[name]["s"] / before[name]["s"]
         error = np.std(ratio, ddof=1) / len(ratio) ** 0.5 if len(ratio) > 1 else np.nan
         yield {"model": name.removeprefix("speed of "), "ratio": np.median(ratio), "error": error}
 
 
 def benchmark_compilation(options: Options) -> dict:
-    tasks, num = (["DSMC"], 100) if options.smoke else (options.tasks, 500)
+    tasks, num = (["reference", "DSMC"], 100) if options.smoke else (options.tasks, 500)
     versions = measured(tasks, options, num)
-    steps = {name: np.median(each) for name, each in versions[0].items()}
-    rows = {
-        name: {"first_s": steps[name], "again_s": steps[f"{name} again"]}
-        for name in steps
-        if f"{name} again" in steps
+    steps = {
+        name: {key: np.median(each) for key, each in row.items()}
+        for name, row in versions[0].items()
     }
+    rows = {}
+    for name in [name for name in steps if f"{name} again" in steps]:
+        row = steps.pop(name)
+        rows[name] = {"first_s": row.pop("s"), "again_s": steps.pop(f"{name} again")["s"], **row}
     return {
         "num_particles": num,
         "rounds": options.rounds,
         "main_job": rows.pop("jaxgran fit", {}),
         "rows": rows,
-        "steps": {name: {"s": each} for name, each in steps.items()},
+        "steps": steps,
         "compared": list(compared(*versions)) if options.checkout else [],
     }
 

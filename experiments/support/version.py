@@ -3,8 +3,9 @@
     python version.py TASK CURVE NUM_PARTICLES
 
 `experiments.support.record.of_version` runs a task in a separate process, with any version:
-nothing else of this repository is imported here. Prints JSON: the seconds of each step, or, for the
-task numbers, the arrays of each case.
+nothing else of this repository is imported here. Prints JSON: the seconds of each step, those of
+XLA's compiler, and the number of programs compiled; or, for the task numbers, the arrays of each
+case.
 """
 
 import json
@@ -22,22 +23,88 @@ BEGAN = time.perf_counter()
 
 import jaxgran  # noqa: E402
 
-STEPS: dict[str, Any] = {"import": time.perf_counter() - BEGAN}
+STEPS: dict[str, Any] = {"import": {"s": time.perf_counter() - BEGAN}}
+COMPILED: list[float] = []
 
 A, BOTH = "dissipative_constant", ("dissipative_constant", "temperature")
+LENGTHS = range(40, 60)
 SPEED = {"DSMC": 100_000, "HardSpheres": 4096, "SoftSpheres": 2000}
 """Numbers of particles of the task speed, for 500 or more."""
 
 
+def hear(event: str, duration_secs: float, **_: str | int) -> None:
+    if event == "/jax/core/compile/backend_compile_duration":
+        COMPILED.append(duration_secs)
+
+
 def step(name: str, call: Any, repeats: int = 1) -> Any:
     """Record the median seconds of a call, and return its result."""
+    COMPILED.clear()
     took, result = [], None
     for _ in range(repeats):
         begin = time.perf_counter()
         result = jax.block_until_ready(call())
         took.append(time.perf_counter() - begin)
-    STEPS[name] = statistics.median(took)
+    STEPS[name] = {"s": statistics.median(took), "xla_s": sum(COMPILED), "programs": len(COMPILED)}
     return result
+
+
+def with_points(curve: Any, count: int) -> Any:
+    """Return the curve interpolated to a number of points, without that at t = 0."""
+    of = curve.times, curve.temperature, curve.temperature_error
+    t, T, error = (np.asarray(x)[1:] for x in of)
+    times = np.geomspace(t[0], t[-1], count)
+    columns = times, np.interp(times, t, T), np.interp(times, t, error)
+    times, T, error = map(jax.device_put, columns)  # jnp.asarray compiles for each length
+    return jaxgran.CoolingCurve(times, T, temperature_error=error)
+
+
+def reference(gas: Any, curve: Any, _: int) -> None:
+    """The Jacobian and the curve of kinetic theory, and the sizes of their jaxprs."""
+
+    def log_temperature(constant, temperature):
+        now = gas.replace(dissipative_constant=constant, temperature=temperature)
+        return jax.numpy.log(jaxgran.cool(now, curve.times[1:]).temperature)
+
+    ways = {"Jacobian": jax.jacfwd(log_temperature, argnums=(0, 1)), "curve": log_temperature}
+    for name, way in ways.items():
+        compiled = jax.jit(way)
+        step(f"first {name}", lambda call=compiled: call(3e-6, 0.01))
+        step(f"{name} again", lambda call=compiled: call(3e-6, 0.01), repeats=100)
+        jaxpr = jax.make_jaxpr(way)(3e-6, 0.01).jaxpr
+        STEPS[f"{name}, jaxpr"] = {"equations": equations(jaxpr)}
+
+
+def equations(jaxpr: Any) -> int:
+    """Return the number of equations of a jaxpr and of those inside it."""
+    values = [value for equation in jaxpr.eqns for value in equation.params.values()]
+    parts = [x for value in values for x in (value if isinstance(value, tuple | list) else [value])]
+    inner = [getattr(part, "jaxpr", part) for part in parts]
+    return len(jaxpr.eqns) + sum(equations(part) for part in inner if hasattr(part, "eqns"))
+
+
+def fit(gas: Any, curve: Any, _: int) -> None:
+    """Fit and diagnose a curve of 61 points, one of 47, and with another free parameter."""
+
+    def both(some):
+        result = jaxgran.fit(gas, some, free=BOTH)
+        return result, jaxgran.diagnose(result)
+
+    for points, words in ((61, "first"), (47, "47 points,")):
+        some = with_points(curve, points)
+        step(f"{words} fit and diagnose", lambda some=some: both(some))
+    step("fit again", lambda: jaxgran.fit(gas, some, free=BOTH), repeats=5)
+    step("other free", lambda: jaxgran.fit(gas, some, free=BOTH[:1]))
+
+
+def lengths(gas: Any, curve: Any, _: int) -> None:
+    """Fit and diagnose curves of 20 lengths."""
+
+    def all_of_them():
+        for points in LENGTHS:
+            jaxgran.diagnose(jaxgran.fit(gas, with_points(curve, points), free=BOTH))
+
+    step(f"{len(LENGTHS)} lengths, fit and diagnose", all_of_them)
 
 
 def first_run(name: str, gas: Any, num: int) -> None:
@@ -186,10 +253,12 @@ def numbers(gas: Any, curve: Any, _: int) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
+    jax.monitoring.register_event_duration_secs_listener(hear)
     task, file, number = sys.argv[1:]
     measured, header = jaxgran.read_curve(file)
     measured_gas = jaxgran.read_gas(header)
-    tasks = {"speed": speed, "numbers": numbers}
+    tasks = {"reference": reference, "fit": fit, "lengths": lengths}
+    tasks |= {"speed": speed, "numbers": numbers}
     if task != "numbers":
         measured_gas = measured_gas.replace(dissipative_constant=3e-6)
     if task in tasks:

@@ -87,7 +87,7 @@ SEARCH_TOLERANCE = 1e-4
 
 LINEAR_STEP = 5.0
 """Length of a Gauss-Newton step, in standard errors, that is the last one: after it chi^2 is known
-to some .02 without another curve."""
+to .01 without another curve."""
 
 MAX_CHANGE = 1.0
 """Largest change of an unconstrained parameter by a Gauss-Newton step: a factor e of A."""
@@ -589,7 +589,7 @@ def _at_the_limit(
     least: float,
     increase: float,
 ) -> list[Trial]:
-    """Return fits near the amplitude at which chi^2, a parabola, exceeds its least value by so much.
+    """Return fits near the amplitude at which chi^2, a parabola, exceeds its least value by this.
 
     The last one comes within a quarter of the increase, if `NUM_REFINED` are enough.
     """
