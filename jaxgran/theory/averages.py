@@ -51,18 +51,9 @@ DSMC.
 """
 
 
-class Terms(NamedTuple):
-    """Powers of a_2 and a_3 of the columns of a matrix of averages."""
-
-    sonine: tuple[int, ...]
-    third_sonine: tuple[int, ...]
-
-
-TERMS = {
-    2: Terms((0, 1, 2), (0, 0, 0)),
-    3: Terms((0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)),
-}
-"""Terms by order: 1, a_2, a_2^2 at order 2; 1, a_2, a_3, a_2^2, a_2 a_3, a_3^2 at order 3."""
+TERMS = {2: ((0, 1, 2), (0, 0, 0)), 3: ((0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2))}
+"""Powers of a_2 and of a_3 of the columns of a matrix of averages, by order: 1, a_2, a_2^2 at order
+2; 1, a_2, a_3, a_2^2, a_2 a_3, a_3^2 at order 3."""
 
 
 class _ImpactNodes(NamedTuple):
@@ -297,12 +288,12 @@ class RateTable(eqx.Module):
         coefficients: of the Chebyshev polynomials, shape (nodes, rows, terms), or (nodes, ...,
             rows, terms) for several such functions over the same range.
         lowest: lower end of the series in ln(T/T_0). The series must not be evaluated outside.
-        highest: upper end of a gas that is heated; None means 0.
+        highest: upper end, 0 unless the gas is heated.
     """
 
     coefficients: Float[Array, "nodes ... rows terms"]
     lowest: Float[Array, ""]
-    highest: Float[Array, ""] | None = None
+    highest: Float[Array, ""]
 
     @classmethod
     def from_function(
@@ -324,13 +315,12 @@ class RateTable(eqx.Module):
         """
         lowest = _lowest_log_temperature(averages, duration, dimension, bounds)
         nodes, to_coefficients = (jnp.asarray(x, lowest.dtype) for x in _chebyshev(num_nodes))
-        if bounds.heating is None:
-            highest, speeds = None, jnp.exp(lowest * (1 - nodes) / 4)
-        else:
+        highest = jnp.zeros_like(lowest)
+        if bounds.heating is not None:
             highest = _highest_log_temperature(
                 averages, duration, dimension, bounds.heating, bounds.rotation
             )
-            speeds = jnp.exp(highest / 2 + (lowest - highest) * (1 - nodes) / 4)
+        speeds = jnp.exp(highest / 2 + (lowest - highest) * (1 - nodes) / 4)
         values = jax.vmap(averages)(speeds)
         return cls(jnp.tensordot(to_coefficients, values, 1), lowest, highest)
 
@@ -340,10 +330,7 @@ class RateTable(eqx.Module):
         Args:
             log_theta: ln(T/T_0), from `lowest` to `highest`.
         """
-        if self.highest is None:
-            x = 2 * (1 - log_theta / self.lowest) - 1
-        else:
-            x = 2 * (log_theta - self.lowest) / (self.highest - self.lowest) - 1
+        x = 2 * (1 - (log_theta - self.highest) / (self.lowest - self.highest)) - 1
         if self.coefficients.ndim > 3:  # a matrix product is faster for many functions
             polynomials = [jnp.ones_like(x), x]
             for _ in range(2, len(self.coefficients)):
@@ -366,7 +353,7 @@ class RateTable(eqx.Module):
             derivative in ln(T/T_0), and those given.
         """
         derivative = jnp.asarray(_derivative_matrix(len(self.coefficients)), self.lowest.dtype)
-        width = -self.lowest if self.highest is None else self.highest - self.lowest
+        width = self.highest - self.lowest
         slope = jnp.tensordot(derivative, self.coefficients, 1) * 2 / width
         both = jnp.stack([self.coefficients, slope], axis=1)
         derivatives = jnp.moveaxis(along, 0, 1)
