@@ -367,9 +367,11 @@ def _wall_rates(
     between spheres, with half the eta of a wall. Walls reverse velocities: displacements are not
     those of a free gas.
     """
-    beta: Any = walls.surface
-    rough = None if beta is None else surface
-    eta: Any = None if rough is None else rough.eta_on_wall(beta) / 2
+    eta: Any = None
+    if surface is None or walls.surface is None:
+        surface = None
+    else:
+        eta = surface.eta_on_wall(walls.surface) / 2
 
     def axis_rates(frequency: Array) -> tuple[Array, list[Array]]:
         def share(g: Array) -> Array:
@@ -383,9 +385,9 @@ def _wall_rates(
 
         lost = impact_average(lambda g: share(g) * energy(g), speed)
         impacts = [frequency * impact_average(share, speed)] * 2
-        if rough is not None and rough.friction is not None:
+        if surface is not None and surface.friction is not None:
             kick = mean_kick(walls.law, speed / sqrt(2))
-            shares = sliding_shares(rough, eta, ratio, d, kick)
+            shares = sliding_shares(surface, eta, ratio, d, kick)
             impacts = [impacts[0] * factor for factor in shares]
         # Energy lost over T, and numbers of impacts, per unit of time and sqrt(T/T_0).
         return frequency * lost, impacts
@@ -393,9 +395,9 @@ def _wall_rates(
     by_axis = jax.vmap(axis_rates)(walls.frequency)
     lost, impacts = jax.tree.map(lambda x: speed * jnp.sum(x), by_axis)
     cooling = 2 / d * lost
-    if rough is None:
+    if surface is None:
         return ElementRates(cooling)
-    friction = _friction_rates(eta, rough.inertia, [2 * rate for rate in impacts], ratio, d)
+    friction = _friction_rates(eta, surface.inertia, [2 * rate for rate in impacts], ratio, d)
     return friction._replace(cooling=cooling + friction.cooling)
 
 
