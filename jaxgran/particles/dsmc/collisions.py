@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
 
-from jaxgran.gradients.tangents import ExchangeTangents
+from jaxgran.gradients.tangents import ExchangeTangents, PathTangents
 from jaxgran.particles.state import (
     MAX_KICK,
     DragDecay,
@@ -91,35 +91,26 @@ class Scheme(NamedTuple):
 class DSMCTangents(NamedTuple):
     """Tangents at a fixed scaled time s, ``ds = sqrt(T/T_0) dt``, along p directions in the law.
 
-    The tangent of the velocities is c v / 2. That of <dr^2> follows from ``d<dr^2>/ds = 2 d M``,
-    ``dM/ds = 1/2 - kappa M``, the equation of kinetic theory for ``M = D / sqrt(T/T_0)``. Here
-    kappa is the rate of velocity relaxation less half the cooling rate, and is measured on the
-    collisions.
+    The tangent of the velocities is c v / 2. The rate of velocity relaxation, which `PathTangents`
+    takes, is measured on the collisions.
 
     Attributes:
         directions: in the scene, stacked along a first axis of each leaf.
-        mobility: M.
         log_temperature: c = d ln T.
         clock: tangent of the time.
-        mobility_along: tangent of M.
-        displacement: tangent of <dr^2>.
-        persistence: tangent of the logarithm of <v(0).v> / sqrt(T).
+        paths: tangents of the paths of the particles.
     """
 
     directions: ReducedScene
-    mobility: Float[Array, "*replicas"]
     log_temperature: Float[Array, "p *replicas"]
     clock: Float[Array, "p *replicas"]
-    mobility_along: Float[Array, "p *replicas"]
-    displacement: Float[Array, "p *replicas"]
-    persistence: Float[Array, "p *replicas"]
+    paths: PathTangents
 
     @classmethod
     def initial(cls, directions: ReducedScene, replicas: int, dtype: Any) -> "DSMCTangents":
         """Return the tangents at t = 0."""
-        num_directions = max((len(leaf) for leaf in jax.tree.leaves(directions)), default=0)
-        along = jnp.zeros((num_directions, replicas), dtype)
-        return cls(directions, jnp.zeros(replicas, dtype), *[along] * 5)
+        paths = PathTangents.initial(directions, replicas, dtype)
+        return cls(directions, paths.correlation_along, paths.correlation_along, paths)
 
 
 class DSMCState(NamedTuple):
@@ -707,20 +698,9 @@ class DSMCDynamics(eqx.Module):
         c, d = old.log_temperature, self.scheme.dimension
         # The tangent of the velocities is (c/2) v, and the law contributes at every collision.
         gain, fading = (sums.along + sums.along_speed[:, None] * (c / 2)[None]) / energy
-        # dM/ds = 1/2 - kappa M and its tangent, by the implicit midpoint rule.
-        half = sums.relaxation / energy / 2
-        mobility = ((1 - half) * old.mobility + ds / 2) / (1 + half)
-        along = (1 - half) * old.mobility_along - fading * (old.mobility + mobility) / 2
-        along = along / (1 + half)
-        return DSMCTangents(
-            directions=old.directions,
-            mobility=mobility,
-            log_temperature=c + gain,
-            clock=old.clock - c / 2 * dt,
-            mobility_along=along,
-            displacement=old.displacement + d * ds * (old.mobility_along + along),
-            persistence=old.persistence - fading,
-        )
+        # In the units of a run T is half of T/T_0.
+        paths = old.paths.after(ds / sqrt(2), sums.relaxation / energy, fading, d)
+        return DSMCTangents(old.directions, c + gain, old.clock - c / 2 * dt, paths)
 
     def _exchange_tangents(
         self,

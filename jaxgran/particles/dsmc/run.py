@@ -18,7 +18,7 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import Particles, Run
-from jaxgran.gradients.rule import Inputs, Outputs
+from jaxgran.gradients.rule import Inputs, Outputs, with_tangents
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import observables, snapshot
 from jaxgran.particles.dsmc.collisions import (
@@ -153,13 +153,13 @@ def dsmc_records(
         c = tangents.log_temperature
         at_scaled_time = {
             "temperature": theta[None] * c,
-            "velocity_correlation": correlation[None] * (c / 2 + tangents.persistence),
-            "displacement": tangents.displacement,
+            "velocity_correlation": correlation[None] * (c / 2 + tangents.paths.correlation_along),
+            "displacement": tangents.paths.displacement_along,
             "collisions": jnp.zeros_like(c),
         }
-        for name, along in at_scaled_time.items():
-            values[f"{name}.along"] = along - rates[name][None] * tangents.clock
-        values |= {f"{name}.rate": rate for name, rate in rates.items()}
+        known = {name: values[name] for name in at_scaled_time}
+        values |= with_tangents(known, at_scaled_time, rates, tangents.clock)
+        values["sonine.rate"] = rates["sonine"]
     return values
 
 

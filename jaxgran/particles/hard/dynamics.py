@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran._utils import status
 from jaxgran.gradients import rule
-from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents, update_rates
+from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import (
@@ -347,8 +347,7 @@ class HardDynamics(AbstractDynamics):
         if isinstance(tangents, ImpactTangents):
             T = temperature(new.velocity, replicas)
             energy, trend = 0.5 * d * n * T, cooling_trend(scene.material.law, T, d)
-            rates = update_rates(
-                tangents.rates,
+            rates = tangents.rates.after(
                 lost=lost,
                 collisions=impacts / n,
                 energy=energy,

@@ -21,7 +21,6 @@ from jaxgran.gradients.tangents import (
     ContactTangents,
     component_along,
     ratio_or_zero,
-    update_rates,
 )
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.capacity import Capacity, max_skin
@@ -432,8 +431,7 @@ class SoftDynamics(AbstractDynamics):
             gain_ratio = gain_ratio.after(passed, gain, energy * passed, ratio)
         tangents = tangents._replace(
             free=block.free,
-            rates=update_rates(
-                tangents.rates,
+            rates=tangents.rates.after(
                 lost=lost,
                 collisions=2 * replicas / len(new.position) * block.begun,
                 energy=energy + new.internal.elastic,
