@@ -183,7 +183,7 @@ class Equations(NamedTuple):
         # Of the terms that cool the gas, only impacts change the shape of the velocity
         # distribution.
         net_growth = cooling / 2 - relaxing
-        diffusing = _diffusion_rates(moments, a2, a3, relaxation, speed, impacts, shape_decay, d)
+        diffusing = _diffusion_rates(moments, a3, relaxation, impacts, shape_decay, d)
         diffusion, *shape = [rate + net_growth * q for rate, q in diffusing]
         rate = [
             -cooling,
@@ -197,14 +197,7 @@ class Equations(NamedTuple):
 
 
 def _diffusion_rates(
-    moments: Moments,
-    a2: Array,
-    a3: Array,
-    relaxation: Array,
-    speed: Array,
-    impacts: Array,
-    shape_decay: Array,
-    d: int,
+    moments: Moments, a3: Array, relaxation: Array, impacts: Array, shape_decay: Array, d: int
 ) -> list[tuple[Array, Array]]:
     """Rates of change of the diffusion moments, without the growth that cooling adds to all, each
     with its moment.
@@ -215,7 +208,7 @@ def _diffusion_rates(
     ``dq_j/dt = n_j0/2 - sum_k nu_jk b_k/2 + zeta (j q_j - j (j + h) q_(j-1)) + zeta/2 q_j`` with
     the cooling rate zeta. The last term is the growth by cooling.
     """
-    half = d / 2
+    half, a2, speed = d / 2, moments.sonine, jnp.exp(moments.log_temperature / 2)
     if moments.diffusion_shape is None:
         return [(speed / 2 - relaxation[0, 0] * speed * moments.diffusion, moments.diffusion)]
     q0, q1 = moments.diffusion, moments.diffusion_shape

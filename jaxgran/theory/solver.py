@@ -70,7 +70,26 @@ def integrate_at(
     term = diffrax.ODETerm(lambda t, y, args: vector_field(t, y))
     if isinstance(solver, diffrax.AbstractERK):
         return _integrate_with_loop(term, start, times, solver, controller, max_steps)
-    return _integrate_with_diffrax(term, start, times, solver, controller, max_steps)
+    if isinstance(solver, diffrax.AbstractImplicitSolver):
+        # Their dense output is only of third order: step to every requested time instead.
+        controller = diffrax.ClipStepSizeController(controller, step_ts=times)
+    solution = diffrax.diffeqsolve(
+        term,
+        solver,
+        t0=jnp.zeros((), times.dtype),
+        t1=times[-1],
+        dt0=None,
+        y0=start,
+        saveat=diffrax.SaveAt(ts=times),
+        stepsize_controller=controller,
+        adjoint=diffrax.ForwardMode(),
+        max_steps=max_steps,
+        throw=False,  # one member of a batch must not end the others
+    )
+    assert solution.ys is not None
+    reached = solution.result != diffrax.RESULTS.max_steps_reached
+    failed = reached & (solution.result != diffrax.RESULTS.successful)
+    return jnp.where(failed, jnp.nan, solution.ys), reached
 
 
 class _Progress(NamedTuple):
@@ -158,36 +177,6 @@ def _fill_values(
         return values, begin + jnp.sum(t <= reached)
 
     return jax.lax.while_loop(some_left, fill, (values, known))
-
-
-def _integrate_with_diffrax(
-    term: diffrax.ODETerm,
-    start: Array,
-    times: Array,
-    solver: diffrax.AbstractSolver,
-    controller: diffrax.AbstractAdaptiveStepSizeController,
-    max_steps: int,
-) -> tuple[Array, Array]:
-    if isinstance(solver, diffrax.AbstractImplicitSolver):
-        # Their dense output is only of third order: step to every requested time instead.
-        controller = diffrax.ClipStepSizeController(controller, step_ts=times)
-    solution = diffrax.diffeqsolve(
-        term,
-        solver,
-        t0=jnp.zeros((), times.dtype),
-        t1=times[-1],
-        dt0=None,
-        y0=start,
-        saveat=diffrax.SaveAt(ts=times),
-        stepsize_controller=controller,
-        adjoint=diffrax.ForwardMode(),
-        max_steps=max_steps,
-        throw=False,  # one member of a batch must not end the others
-    )
-    assert solution.ys is not None
-    reached = solution.result != diffrax.RESULTS.max_steps_reached
-    failed = reached & (solution.result != diffrax.RESULTS.successful)
-    return jnp.where(failed, jnp.nan, solution.ys), reached
 
 
 def moments_at(
