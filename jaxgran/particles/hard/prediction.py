@@ -57,10 +57,6 @@ class RelativeMotion(NamedTuple):
     rw: Float[Array, "rows"]
     ww: Float[Array, "rows"]
 
-    @classmethod
-    def from_vectors(cls, r: Float[Array, "rows d"], w: Float[Array, "rows d"]) -> "RelativeMotion":
-        return cls(jnp.sum(r * r, -1), jnp.sum(r * w, -1), jnp.sum(w * w, -1))
-
     def gap(self, s: ArrayLike) -> Float[Array, "rows"]:
         """Return the distance between the surfaces at s."""
         return jnp.sqrt(jnp.maximum(self.rr + (2 * self.rw + self.ww * s) * s, 0.0)) - 1
@@ -125,7 +121,7 @@ def first_impacts(
     """Return the next impact of each pair and of each particle before `end`."""
     a, b = rows.a, rows.b
     r, w = paths.x[a] - paths.x[b] - rows.offset, paths.v[a] - paths.v[b]
-    motion = RelativeMotion.from_vectors(r, w)
+    motion = RelativeMotion(jnp.sum(r * r, -1), jnp.sum(r * w, -1), jnp.sum(w * w, -1))
     last = paths.last[a], paths.last[b]
     times = motion.impact_time(jnp.maximum(jnp.maximum(*last), 0.0))
     times = jnp.where(rows.real & (times < end), times, jnp.inf)
@@ -134,26 +130,11 @@ def first_impacts(
     if container is not None:
         wall_times, wall_axis = next_wall_impacts(container, paths, end)
         first = jnp.minimum(first, wall_times)
-    final = _final_times(paths, rows, motion, first, end)
-    return FirstImpacts(r, w, motion, times, wall_times, wall_axis, first, final)
 
-
-def _final_times(
-    paths: Paths,
-    rows: PairRows,
-    motion: RelativeMotion,
-    first: Float[Array, "slots"],
-    end: ArrayLike,
-) -> Float[Array, "slots"]:
-    """Return a lower bound on the time until which each path is final, for times before `end`.
-
-    The path of a particle changes at its first impact, or when it is hit by a particle whose path
-    has changed earlier. Such a particle moves no faster than the bound on all speeds, which gives
-    the earliest time at which it can arrive. These times depend on each other from pair to pair;
-    starting from `first` they are lowered until they are consistent.
-    """
-    a, b = rows.a, rows.b
-    last = paths.last[a], paths.last[b]
+    # The path of a particle changes at its first impact, or when it is hit by a particle whose path
+    # has changed earlier. Such a particle moves no faster than the bound on all speeds, which gives
+    # the earliest time at which it can arrive. These times depend on each other from pair to pair;
+    # starting from `first` they are lowered until they are consistent.
     speed = jnp.sqrt(jnp.sum(paths.v**2, -1))
     closing = rows.bound + speed[a], rows.bound + speed[b]
 
@@ -171,7 +152,8 @@ def _final_times(
         new = new.at[a].min(arrival(new[b], last[0], closing[0]))
         return new, jnp.any(new < jnp.minimum(final, end))  # times after `end` do not matter
 
-    return jax.lax.while_loop(lambda carry: carry[1], lower, (first, jnp.array(True)))[0]
+    final, _ = jax.lax.while_loop(lambda carry: carry[1], lower, (first, jnp.array(True)))
+    return FirstImpacts(r, w, motion, times, wall_times, wall_axis, first, final)
 
 
 class ImpactCandidates(NamedTuple):
