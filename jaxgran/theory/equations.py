@@ -176,7 +176,7 @@ class Equations(NamedTuple):
             cooling, relaxing = cooling + changes.cooling, changes.relaxation
             a2_rate = a2_rate + changes.sonine
             if gas.drive is not None:
-                shape_decay = gas.drive.strength / speed**2
+                shape_decay = gas.drive / speed**2
                 a3_rate = a3_rate - 3 * shape_decay * a3
             if gas.surface is not None:
                 rotating = [changes.rotation + cooling * ratio]
@@ -270,7 +270,7 @@ def element_rates(
     if (drag := scene.drag) is not None:
         parts.append(ElementRates(2 * drag.rate, -2 * drag.rotational_rate * ratio, drag.rate))
     if scene.drive is not None:
-        heating = scene.drive.strength / speed**2
+        heating = scene.drive / speed**2
         parts.append(ElementRates(-heating, sonine=-2 * sonine * heating))
     return ElementRates(*map(sum, zip(*parts, strict=True)))
 
@@ -420,7 +420,7 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
     if scene.drag is not None:
         constant = 2 * scene.drag.rate
     if scene.drive is not None:
-        heating = scene.drive.strength
+        heating = scene.drive
     return ElementBounds(by_speed, constant, heating, rotation)
 
 
@@ -647,7 +647,7 @@ def _solve_steady(gas: Gas) -> tuple[Array, Array, Array, Array]:
     tolerance = jnp.finfo(start.dtype).eps ** 0.75
     solver = optx.Newton(rtol=float(tolerance), atol=float(tolerance))
     x = optx.root_find(balance, solver, start, scene, throw=False, max_steps=32).value
-    heating = scene.drive.strength / jnp.exp(1.5 * x[0])
+    heating = scene.drive / jnp.exp(1.5 * x[0])
     imbalance = jnp.abs(balance(x, scene)[0]) / heating
     return x[0], x[1], _steady_ratio(jnp.exp(x[0] / 2), x[1], scene, d), imbalance
 

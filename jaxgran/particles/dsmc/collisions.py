@@ -408,7 +408,7 @@ class DSMCDynamics(eqx.Module):
 
         They come at its start (place 0) or end (1).
         """
-        return kick_variance(self.scene.drive.strength, self.scene.drag, start, ds, place)
+        return kick_variance(self.scene.drive, self.scene.drag, start, ds, place)
 
     def max_wall_impacts(
         self, state: DSMCState, ds: Float[Array, "*replicas"]
@@ -428,7 +428,7 @@ class DSMCDynamics(eqx.Module):
             ds = ds / jnp.maximum(self.max_wall_impacts(state, ds), 1.0)
         if self.scene.drive is None:
             return ds
-        growth = self.scene.drive.strength / self.drag_decay(state.clock).velocity ** 3
+        growth = self.scene.drive / self.drag_decay(state.clock).velocity ** 3
         safe = jnp.where(growth > 0, growth, 1.0)
         return jnp.where(growth > 0, jnp.minimum(ds, MAX_KICK * state.temperature / safe), ds)
 

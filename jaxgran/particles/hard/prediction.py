@@ -12,9 +12,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.neighbours import Pairs, rows_where, select_members
-
 
 class PairRows(NamedTuple):
     """Pairs of particles that may touch.
@@ -171,44 +168,3 @@ class ImpactCandidates(NamedTuple):
     rows: PairRows
     replica: Int[Array, "members"]
     needed: Int[Array, "kinds"]
-
-
-def select_impact_candidates(
-    x: Float[Array, "n d"],
-    v: Float[Array, "n d"],
-    pairs: Pairs,
-    duration: ArrayLike,
-    bound: Float[Array, "replicas"],
-    capacity: Capacity,
-    container: Float[Array, "d"] | None = None,
-) -> ImpactCandidates:
-    """Select the pairs that touch in free flight, and all that may touch once paths have changed.
-
-    Args:
-        x, v: positions and velocities of all particles of all replicas.
-        pairs: a neighbour list, with all pairs that may touch.
-        duration: of the window.
-        bound: an upper bound on the speeds in each replica during the window.
-        capacity: sizes of the arrays.
-        container: its sides; particles that reach its walls are members, too.
-    """
-    n, size = len(x), len(x) // len(bound)
-    # The listed pairs that can touch at the largest speeds are a small part of the list.
-    displacement = x[pairs.i] - x[pairs.j] - pairs.offset
-    gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
-    gap = jnp.where(jnp.arange(gap.size) < pairs.count, gap, jnp.inf)
-    near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, capacity.near)
-    real = jnp.arange(capacity.near) < num_near
-    near = jnp.where(real, near, 0)
-    i, j, offset = pairs.i[near], pairs.j[near], pairs.offset[near]
-    rows = PairRows(i, j, offset, bound[i // size], real)
-
-    free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, container)
-    disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
-    closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
-    selected = rows.real & (jnp.isfinite(free.times) | closer)
-    at_walls = jnp.zeros(n, bool) if free.wall_times is None else jnp.isfinite(free.wall_times)
-    picked, real, members, (a, b), counts = select_members(selected, i, j, at_walls, capacity[3:])
-    rows = PairRows(a, b, offset[picked], rows.bound[picked], real)
-    needed = jnp.stack([pairs.count, pairs.lookahead, num_near, *counts])
-    return ImpactCandidates(members, rows, members // size, needed)
