@@ -201,9 +201,7 @@ class KineticTheory(AbstractModel):
         scene = reduced_scene(gas), Density.from_gas(gas, self.softness, self.correlations)
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
         order = self.order if self.sonine else 2
-        equations = Equations(
-            gas.dimension, order, not self.sonine, self.softness, self.initial_sonine
-        )
+        equations = Equations(gas.dimension, order, not self.sonine, self.initial_sonine)
         reduced = jnp.where(sound, times, 0.0) * gas.impact_speed / length
         state, fault = moments_at(
             scene, reduced, equations, self.solver, rtol * tolerance, self.max_steps

@@ -121,14 +121,14 @@ def _push_apart(
         moved = np.inf if built is None else np.sqrt(np.max(np.sum((x - built) ** 2, axis=1)))
         if 2 * moved > cutoff - 1 - 2 * GAP:
             # x stays unwrapped, so that the distance moved since then can be computed.
-            i, j = neighbours.close_pairs(_wrap_all(x, side), side, cutoff).T
+            i, j = neighbours.close_pairs(neighbours.wrap(side, x), side, cutoff).T
             built = x.copy()
         separation = x[i] - x[j]
         separation -= side * np.round(separation / side)
         distance = np.sqrt(np.sum(separation**2, axis=1))
         close = distance < 1 + GAP / 2
         if not close.any():
-            return _wrap_all(x, side)
+            return neighbours.wrap(side, x)
         separation, distance = separation[close], distance[close]
         # Coincident points are separated along the first axis.
         separation[distance == 0, 0] = distance[distance == 0] = COINCIDENT
@@ -153,11 +153,6 @@ def largest_extra_gap(n: int, d: int, volume: ArrayLike) -> Any:
     xp = array_module(volume)
     packing_fraction = n / xp.asarray(volume) * {2: np.pi / 4, 3: np.pi / 6}[d]
     return 0.1 * xp.maximum(0.0, 1 - 1.5 * packing_fraction / PACKING_LIMIT[d])
-
-
-def _wrap_all(x: Float[np.ndarray, "n d"], side: float) -> Float[np.ndarray, "n d"]:
-    inside = np.mod(x, side)
-    return np.where(inside >= side, 0.0, inside)
 
 
 def relaxed_positions(
@@ -290,13 +285,6 @@ def has_other_box(start: Particles | None, gas: Gas, num_particles: int) -> Bool
         return jnp.array(False)
     ratio = jax.lax.stop_gradient(start.box_side / box_side(gas, num_particles))
     return ~jnp.all(jnp.abs(ratio - 1) < SAME_BOX + 10 * jnp.finfo(ratio.dtype).eps)
-
-
-def with_constant_temperature(start: Particles | None, gas: Gas) -> Gas:
-    """Return the gas for derivatives: with a start, T_0 is a constant unit of speed."""
-    if start is None:
-        return gas
-    return gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
 
 
 def reduced_start(

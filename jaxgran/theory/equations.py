@@ -70,10 +70,11 @@ class Moments(NamedTuple):
 
 
 class Density(NamedTuple):
-    """Effects of finite density on the cooling rate; None leaves an effect out.
+    """Effects of softness and density on the cooling rate; None leaves an effect out.
 
     Attributes:
-        crowding: k in ``1/(1 + k X_T/sigma)``, see `crowding_coefficient`.
+        crowding: k in ``(1 - c X_T/sigma)/(1 + k X_T/sigma)``, by which soft contacts slow the
+            cooling, see `softness_factor` and `crowding_coefficient`.
         packing_fraction: phi, for correlated velocities, see `correlation_slowdown`.
     """
 
@@ -108,14 +109,12 @@ class Equations(NamedTuple):
         dimension: d.
         order: of the Sonine expansion: 2 has a_2, 3 also a_3.
         maxwellian: if True, a_2 stays 0.
-        softness: if True, soft contacts slow the cooling.
         initial_sonine: a_2 at t = 0.
     """
 
     dimension: int
     order: int
     maxwellian: bool
-    softness: bool
     initial_sonine: float = 0.0
 
     def initial(self, scene: SceneAndDensity, like: Array) -> Float[Array, "moments"]:
@@ -161,9 +160,8 @@ class Equations(NamedTuple):
             sixth = 8 / (d * (d + 2) * (d + 4)) * losses[2]
             a3_rate = 3 * a2_rate - 3 * impacts * (1 + 3 * a2 - a3) + sixth
         cooling = impacts
-        if self.softness:
-            cooling = cooling * softness_factor(gas.law, speed, d)
         if density.crowding is not None:
+            cooling = cooling * softness_factor(gas.law, speed, d)
             cooling = cooling / (1 + density.crowding * gas.law.impact_length(speed))
         if density.packing_fraction is not None:
             inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
@@ -661,7 +659,7 @@ def _balance_log_temperature(scene: ReducedScene, like: Array, d: int) -> Float[
     def bisect(_, ends):
         middle = (ends[0] + ends[1]) / 2
         maxwellian = jnp.stack([middle, jnp.zeros_like(middle)])
-        heats = _steady_rates(maxwellian, scene, Density(), d, softness=False)[0] > 0
+        heats = _steady_rates(maxwellian, scene, Density(), d)[0] > 0
         return jnp.where(heats, middle, ends[0]), jnp.where(heats, ends[1], middle)
 
     bound = jnp.full((), MAX_LOG_TEMPERATURE, like.dtype)
@@ -681,11 +679,7 @@ def max_thermal_speed(gas: Gas) -> Float[Array, ""]:
 
 
 def _steady_rates(
-    x: Float[Array, "variables"],
-    scene: ReducedScene,
-    density: Density,
-    d: int,
-    softness: bool = True,
+    x: Float[Array, "variables"], scene: ReducedScene, density: Density, d: int
 ) -> Float[Array, "variables"]:
     """Rates of change of ln T, a_2 and at order 3 of a_3, where T_rot/T is steady.
 
@@ -697,7 +691,7 @@ def _steady_rates(
         moments += [x[2], zero]
     if scene.surface is not None:
         moments.append(_steady_ratio(speed, x[1], scene, d))
-    equations = Equations(d, order, maxwellian=False, softness=softness)
+    equations = Equations(d, order, maxwellian=False)
     rates = impact_moments(scene.law, speed, d, order)
     change = equations.derivative(jnp.stack(moments), rates, (scene, density))
     return jnp.stack([change[k] for k in (0, 1, 5)[:order]])

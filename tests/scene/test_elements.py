@@ -231,7 +231,7 @@ def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
     model = jaxgran.KineticTheory(order=2, softness=False, correlations=False)
     curve = jaxgran.cool(gas, times, model=model)
     assert float(curve.temperature[2]) > 2 * float(gas.temperature)
-    reduced, equations = reduced_scene(gas), Equations(3, 2, maxwellian=False, softness=False)
+    reduced, equations = reduced_scene(gas), Equations(3, 2, maxwellian=False)
 
     @jax.jit
     def rate(state):
