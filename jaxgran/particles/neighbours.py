@@ -306,13 +306,8 @@ def search_pairs(
         capacity: capacity of the list, in pairs, and of a sweep's look-ahead, in particles.
         engine: "scipy", "sweep" or "jax-md". All return the same pairs, but may differ in pairs
             within rounding error of the cutoff.
-
-    Raises:
-        ValueError: for any other engine.
     """
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
-    if engine not in ENGINES[1:]:
-        raise ValueError(f"engine must be one of {', '.join(ENGINES[1:])}, got {engine!r}")
     max_pairs, ahead = capacity
     if engine == "sweep":
         return sweep(position, side, cutoff, replicas=replicas, capacity=max_pairs, ahead=ahead)

@@ -35,6 +35,9 @@ MAX_PUSHES = 20_000
 COINCIDENT = 1e-9
 """Distance, in diameters, that is assumed between points at the same place."""
 
+ALLOWED_OVERLAP = 1e-9
+"""Overlap in diameters that is allowed in a given start of hard spheres."""
+
 SAME_BOX = 1e-6
 """Relative difference up to which the box of a start counts as that of the gas."""
 
@@ -327,8 +330,7 @@ def min_distance(
     return jnp.sqrt(jnp.min(square, initial=1.0))
 
 
-def overlap_by_rounding(
-    position: Float[Array, "n d"], side: ArrayLike, least: float
-) -> Float[Array, ""]:
-    """Return the overlap of spheres in contact by rounding of positions, but at least `least`."""
-    return jnp.maximum(least, 10 * side * jnp.finfo(position.dtype).eps)
+def allowed_overlap(position: Float[Array, "n d"], side: ArrayLike) -> Float[Array, ""]:
+    """Return the overlap up to which spheres of a start count as hard, at least that of spheres in
+    contact by rounding of positions."""
+    return jnp.maximum(ALLOWED_OVERLAP, 10 * side * jnp.finfo(position.dtype).eps)

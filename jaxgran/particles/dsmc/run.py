@@ -31,7 +31,6 @@ from jaxgran.particles.run import (
     block_until_ready,
     compiled_for_host,
     compiling,
-    needs_compilation,
     run_through_times,
 )
 from jaxgran.particles.setup import maxwellian_velocities
@@ -223,8 +222,7 @@ def run_dsmc(
             return block_until_ready(compiled(*arguments))
 
         program = jax.tree.structure((dynamics, state)), state.particles.shape, dtype
-        new = needs_compilation(program)
-        with compiling(run.progress and new):
+        with compiling(program, run.progress) as new:
             if new:  # compile with a call of zero steps, which may delete its state
                 jax.block_until_ready(recorded(advance_towards(copy_buffers(state), 0.0)))
         given = inputs._asdict() | settings | {"directions": directions, "save": run.save}

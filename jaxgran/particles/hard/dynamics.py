@@ -34,7 +34,7 @@ from jaxgran.particles.hard.prediction import (
     first_impacts,
 )
 from jaxgran.particles.neighbours import Pairs, rows_where, select_members
-from jaxgran.particles.setup import min_distance, overlap_by_rounding
+from jaxgran.particles.setup import allowed_overlap, min_distance
 from jaxgran.particles.state import (
     MAX_KICK,
     State,
@@ -105,8 +105,6 @@ class HardDynamics(AbstractDynamics):
         contact_time: in mean free times; the impact of a sphere within this time of its last one is
             elastic.
         all_elastic: whether all impacts are elastic and smooth.
-        overlap: largest overlap of positions given by a user that are accepted as those of hard
-            spheres.
     """
 
     scene: SphereScene
@@ -115,7 +113,6 @@ class HardDynamics(AbstractDynamics):
     share: float = eqx.field(static=True)
     contact_time: Float[Array, ""]
     all_elastic: Bool[Array, ""]
-    overlap: float = eqx.field(static=True, default=1e-9)
 
     def initial_internal(self, num_rows, dtype) -> HardState:
         # The first window is short: at random positions many spheres are near contact.
@@ -167,11 +164,10 @@ class HardDynamics(AbstractDynamics):
     def check_start(self, state: State) -> Int[Array, ""]:
         x, side = state.position, self.scene.side
         closest = min_distance(x, side, self.replicas, self.capacity[:2], "sweep")
-        tolerance = overlap_by_rounding(x, side, self.overlap)
         if (container := self.scene.container) is not None:  # a sphere and its image beyond a wall
             image = 2 * jnp.min(jnp.minimum(x, container[None] - x))
             closest = jnp.minimum(closest, image)
-        return status.flag(status.OVERLAPPING, closest < 1 - tolerance)
+        return status.flag(status.OVERLAPPING, closest < 1 - allowed_overlap(x, side))
 
     @jax.jit
     def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, Array]:
