@@ -41,6 +41,46 @@ def padded_length(size: int) -> int:
     return WINDOW * 2 ** max(0, (size - 1) // WINDOW).bit_length()
 
 
+class _Progress(NamedTuple):
+    # The next step, the state before it, the states of solver and controller, the values at output
+    # times, how many of these are known, and the number of steps made.
+    t: Float[Array, ""]
+    end: Float[Array, ""]
+    y: Array
+    solver: Any
+    control: Any
+    values: Array
+    known: Int[Array, ""]
+    steps: Int[Array, ""]
+
+
+def _fill_values(
+    evaluate: Callable[[Array], Array], times: Array, reached: Array, values: Array, known: Array
+) -> tuple[Array, Int[Array, ""]]:
+    """Values with those up to a reached time filled in, and the number of known ones."""
+
+    window = min(WINDOW, times.size)
+
+    def next_time(known):
+        return times[jnp.minimum(known, times.size - 1)]
+
+    def some_left(at):
+        return (at[1] < times.size) & (next_time(at[1]) <= reached)
+
+    def fill(at):
+        values, known = at
+        begin = jnp.minimum(known, times.size - window)
+        t = jax.lax.dynamic_slice_in_dim(times, begin, window)
+        old = jax.lax.dynamic_slice_in_dim(values, begin, window)
+        inside = (begin + jnp.arange(window) >= known) & (t <= reached)
+        inside = jnp.expand_dims(inside, tuple(range(1, old.ndim)))
+        new = jnp.where(inside, jax.vmap(evaluate)(t), old)
+        values = jax.lax.dynamic_update_slice_in_dim(values, new, begin, 0)
+        return values, begin + jnp.sum(t <= reached)
+
+    return jax.lax.while_loop(some_left, fill, (values, known))
+
+
 def integrate_at(
     vector_field: Callable[[Any, Array], Array],
     start: Array,
@@ -68,51 +108,28 @@ def integrate_at(
         steps; nan where the solver failed otherwise.
     """
     term = diffrax.ODETerm(lambda t, y, args: vector_field(t, y))
-    if isinstance(solver, diffrax.AbstractERK):
-        return _integrate_with_loop(term, start, times, solver, controller, max_steps)
-    if isinstance(solver, diffrax.AbstractImplicitSolver):
-        # Their dense output is only of third order: step to every requested time instead.
-        controller = diffrax.ClipStepSizeController(controller, step_ts=times)
-    solution = diffrax.diffeqsolve(
-        term,
-        solver,
-        t0=jnp.zeros((), times.dtype),
-        t1=times[-1],
-        dt0=None,
-        y0=start,
-        saveat=diffrax.SaveAt(ts=times),
-        stepsize_controller=controller,
-        adjoint=diffrax.ForwardMode(),
-        max_steps=max_steps,
-        throw=False,  # one member of a batch must not end the others
-    )
-    assert solution.ys is not None
-    reached = solution.result != diffrax.RESULTS.max_steps_reached
-    failed = reached & (solution.result != diffrax.RESULTS.successful)
-    return jnp.where(failed, jnp.nan, solution.ys), reached
+    if not isinstance(solver, diffrax.AbstractERK):
+        if isinstance(solver, diffrax.AbstractImplicitSolver):
+            # Their dense output is only of third order: step to every requested time instead.
+            controller = diffrax.ClipStepSizeController(controller, step_ts=times)
+        solution = diffrax.diffeqsolve(
+            term,
+            solver,
+            t0=jnp.zeros((), times.dtype),
+            t1=times[-1],
+            dt0=None,
+            y0=start,
+            saveat=diffrax.SaveAt(ts=times),
+            stepsize_controller=controller,
+            adjoint=diffrax.ForwardMode(),
+            max_steps=max_steps,
+            throw=False,  # one member of a batch must not end the others
+        )
+        assert solution.ys is not None
+        reached = solution.result != diffrax.RESULTS.max_steps_reached
+        failed = reached & (solution.result != diffrax.RESULTS.successful)
+        return jnp.where(failed, jnp.nan, solution.ys), reached
 
-
-class _Progress(NamedTuple):
-    # The next step, the state before it, the states of solver and controller, the values at output
-    # times, how many of these are known, and the number of steps made.
-    t: Float[Array, ""]
-    end: Float[Array, ""]
-    y: Array
-    solver: Any
-    control: Any
-    values: Array
-    known: Int[Array, ""]
-    steps: Int[Array, ""]
-
-
-def _integrate_with_loop(
-    term: diffrax.ODETerm,
-    start: Array,
-    times: Array,
-    solver: diffrax.AbstractERK,
-    controller: diffrax.AbstractAdaptiveStepSizeController,
-    max_steps: int,
-) -> tuple[Array, Array]:
     last = times[-1]
     order: Any = solver.error_order(term)
     zero, first = jnp.zeros((), times.dtype), jnp.asarray(FIRST_STEP, times.dtype)
@@ -150,33 +167,6 @@ def _integrate_with_loop(
 
     done = jax.lax.while_loop(unfinished, step, progress)
     return done.values, done.t >= last
-
-
-def _fill_values(
-    evaluate: Callable[[Array], Array], times: Array, reached: Array, values: Array, known: Array
-) -> tuple[Array, Int[Array, ""]]:
-    """Values with those up to a reached time filled in, and the number of known ones."""
-
-    window = min(WINDOW, times.size)
-
-    def next_time(known):
-        return times[jnp.minimum(known, times.size - 1)]
-
-    def some_left(at):
-        return (at[1] < times.size) & (next_time(at[1]) <= reached)
-
-    def fill(at):
-        values, known = at
-        begin = jnp.minimum(known, times.size - window)
-        t = jax.lax.dynamic_slice_in_dim(times, begin, window)
-        old = jax.lax.dynamic_slice_in_dim(values, begin, window)
-        inside = (begin + jnp.arange(window) >= known) & (t <= reached)
-        inside = jnp.expand_dims(inside, tuple(range(1, old.ndim)))
-        new = jnp.where(inside, jax.vmap(evaluate)(t), old)
-        values = jax.lax.dynamic_update_slice_in_dim(values, new, begin, 0)
-        return values, begin + jnp.sum(t <= reached)
-
-    return jax.lax.while_loop(some_left, fill, (values, known))
 
 
 def moments_at(

@@ -24,7 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt, UInt32
 
 from jaxgran.gradients.tangents import ExchangeTangents, PathTangents
 from jaxgran.particles.state import (
@@ -38,7 +38,6 @@ from jaxgran.particles.state import (
 )
 from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.geometry import sphere_surface
-from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory.averages import collision_rate
 
@@ -236,8 +235,18 @@ def collide(
     cosine = jnp.sqrt(jnp.where(in_disk, 1 - sine_square, 1.0))
     sideways = _perpendicular(axis)
     normal_speed = jnp.where(hit, speed * cosine, ceiling)
-    at_impact = normal_speed * drag_factor
-    eps, along, along_speed = _restitution(at_impact, hit, scene.law, directions)
+    at_impact, zero = normal_speed * drag_factor, jnp.zeros((), dtype)
+
+    def restitution(law, log_scale):
+        return law.restitution(at_impact * jnp.exp(log_scale))
+
+    if directions is None:
+        eps, along, along_speed = restitution(scene.law, zero), jnp.zeros((2, 0), dtype), zero
+    else:
+        eps, pull = jax.vjp(restitution, scene.law, zero)
+        weights = [jnp.where(hit, x * at_impact**2, 0.0) for x in (eps, (1 + eps) / 2)]
+        in_law, along_speed = jax.vmap(pull)(jnp.stack(weights))
+        along = jax.vmap(slopes_along, (0, None))(in_law, directions.law)
     square = jnp.where(hit, normal_speed**2, 0.0)
     push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
     normal = [
@@ -280,26 +289,6 @@ def _perpendicular(axis: list[Float[Array, "pairs"]]) -> list[list[Float[Array, 
         [1 + sign * x * x * a, sign * x * y * a, -sign * x],
         [x * y * a, sign + y * y * a, -y],
     ]
-
-
-def _restitution(
-    normal_speed: Float[Array, "pairs"],
-    hit: Bool[Array, "pairs"],
-    law: ReducedLaw,
-    directions: ReducedScene | None,
-) -> tuple[Float[Array, "pairs"], Float[Array, "2 p"], Float[Array, "..."]]:
-    """Return eps of each pair, and `Outcome.along` and `Outcome.along_speed` of the collisions."""
-    zero, along = jnp.zeros((), normal_speed.dtype), jnp.zeros((2, 0), normal_speed.dtype)
-
-    def restitution(law, log_scale):
-        return law.restitution(normal_speed * jnp.exp(log_scale))
-
-    if directions is None:
-        return restitution(law, zero), along, zero
-    eps, pull = jax.vjp(restitution, law, zero)
-    weights = [jnp.where(hit, x * normal_speed**2, 0.0) for x in (eps, (1 + eps) / 2)]
-    in_law, along_speed = jax.vmap(pull)(jnp.stack(weights))
-    return eps, jax.vmap(slopes_along, (0, None))(in_law, directions.law), along_speed
 
 
 def slopes_along(gradient: Any, directions: Any) -> Float[Array, "p"]:
