@@ -135,7 +135,7 @@ def differentiable(
             along[name] = out.records[f"{name}.rate"] * time_change[:, None]
             along[name] += _DENSITY_POWER.get(name, 0.0) * density_change * plain[name]
             if (directional := out.records.get(f"{name}.along")) is None:
-                along[name] += nan_tangent(along[name].shape, *changes[:2])
+                along[name] += nan_tangent(along[name], *changes[:2])
             else:
                 along[name] += jnp.einsum("tpr,p->tr", directional, amounts)
         if "dissipated_energy" in along:  # the energy balance holds in the tangents, too
@@ -145,7 +145,7 @@ def differentiable(
                 inside = inside + 0.5 * NUM_SPIN_COMPONENTS[d] * along["rotational_temperature"]
             along["dissipated_energy"] = -0.5 * d * along["temperature"] - inside
         out = out._replace(records=plain)
-        unknown = jax.tree.map(lambda x: nan_tangent_like(x, *changes), out)
+        unknown = jax.tree.map(lambda x: nan_tangent(x, *changes), out)
         return out, unknown._replace(records=unknown.records | along)
 
     return outputs
@@ -253,26 +253,21 @@ def _first_order_identity_jvp(primals, tangents):
     return numbers, jax.tree.map(jnp.zeros_like, numbers)
 
 
-def nan_tangent(shape: tuple[int, ...], *changes: Float[Array, "..."]) -> Float[Array, "..."]:
+def nan_tangent(result: Array, *changes: Float[Array, "..."]) -> Any:
     """Return the tangent of a result whose derivative is not known: nan, or 0 if nothing changes.
 
     In reverse mode the changes are nan where the result has a cotangent, and 0 where it has none,
     so that results that a function does not use leave its gradient finite.
 
     Args:
-        shape: of the result.
+        result: of any type: integers have no tangent.
         changes: tangents of all that the result depends on.
     """
+    if not jnp.issubdtype(result.dtype, jnp.inexact):
+        return np.zeros(result.shape, jax.dtypes.float0)
     dtype = jnp.result_type(*changes)
     total = sum((jnp.sum(_nan_unless_zero(x)) for x in changes), start=jnp.zeros((), dtype))
-    return _nan_unless_zero(jnp.broadcast_to(total, shape))
-
-
-def nan_tangent_like(result: Array, *changes: Float[Array, "..."]) -> Any:
-    """Return the `nan_tangent` of a result of any type: integers have no tangent."""
-    if jnp.issubdtype(result.dtype, jnp.inexact):
-        return nan_tangent(result.shape, *changes).astype(result.dtype)
-    return np.zeros(result.shape, jax.dtypes.float0)
+    return _nan_unless_zero(jnp.broadcast_to(total, result.shape)).astype(result.dtype)
 
 
 def _nan_unless_zero(x: Float[Array, "..."]) -> Float[Array, "..."]:

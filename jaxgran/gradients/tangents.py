@@ -37,11 +37,6 @@ AVERAGING_TIME = 5.0
 """Mean free times over which the rates of cooling and of collision are averaged."""
 
 
-def decay_factor(passed: Any) -> Array:
-    """Return the factor by which a further time, in mean free times, reduces sums over the past."""
-    return jnp.exp(-passed / AVERAGING_TIME)
-
-
 def ratio_or_zero(above: Array, below: Array) -> Array:
     """Return the ratio, or 0 where the denominator is 0."""
     return jnp.where(below != 0, above / jnp.where(below != 0, below, 1.0), 0.0)
@@ -75,37 +70,30 @@ class RateSums(NamedTuple):
         """Return the collisions per particle and time, which are proportional to ``T^(1/2)``."""
         return ratio_or_zero(self.collisions, self.trend_collisions) * temperature**0.5
 
+    def after(
+        self,
+        lost: Float[Array, "replicas"],
+        collisions: Float[Array, "replicas"],
+        energy: Float[Array, "replicas"],
+        temperature: Float[Array, "replicas"],
+        trend: Float[Array, "replicas"],
+        duration: Any,
+        collision_frequency: Any,
+    ) -> "RateSums":
+        """Return the sums after a further time.
 
-def update_rates(
-    rates: RateSums,
-    lost: Float[Array, "replicas"],
-    collisions: Float[Array, "replicas"],
-    energy: Float[Array, "replicas"],
-    temperature: Float[Array, "replicas"],
-    trend: Float[Array, "replicas"],
-    duration: ArrayLike,
-    collision_frequency: ArrayLike,
-) -> RateSums:
-    """Return the exponentially weighted sums after a further time.
-
-    Args:
-        rates: the sums before.
-        lost: energy lost in this time.
-        collisions: per particle, those that began in it.
-        energy: of the gas.
-        temperature: of the gas.
-        trend: the dependence of the cooling rate on T, at this temperature.
-        duration: of this time.
-        collision_frequency: at T = 1.
-    """
-    passed = duration * jnp.sqrt(temperature)
-    decay = decay_factor(passed * collision_frequency)
-    return RateSums(
-        lost=decay * rates.lost + lost,
-        trend_loss=decay * rates.trend_loss + energy * trend * duration,
-        collisions=decay * rates.collisions + collisions,
-        trend_collisions=decay * rates.trend_collisions + passed,
-    )
+        Args:
+            lost: energy lost in this time.
+            collisions: per particle, those that began in it.
+            energy: of the gas.
+            temperature: of the gas.
+            trend: the dependence of the cooling rate on T, at this temperature.
+            duration: of this time.
+            collision_frequency: at T = 1.
+        """
+        passed = duration * jnp.sqrt(temperature)
+        new = RateSums(lost, energy * trend * duration, collisions, passed)
+        return _add_decayed(self, new, passed * collision_frequency)
 
 
 class LinearRatio(NamedTuple):
@@ -128,8 +116,7 @@ class LinearRatio(NamedTuple):
     def after(self, passed: Array, above: Array, below: Array, x: Array) -> "LinearRatio":
         """Return the sums after a further time `passed`, in mean free times."""
         new = LinearRatio(below, x * below, x**2 * below, above, x * above)
-        decay = decay_factor(passed)
-        return LinearRatio(*(decay * old + more for old, more in zip(self, new, strict=True)))
+        return _add_decayed(self, new, passed)
 
     def at(self, x: Float[Array, "replicas"]) -> Float[Array, "replicas"]:
         """Return the ratio at x, or 0 where there is no data."""
@@ -139,6 +126,12 @@ class LinearRatio(NamedTuple):
         known = square > 1e-12 * self.below_square
         slope = ratio_or_zero(self.above_x - centre * self.above, jnp.where(known, square, 0.0))
         return mean + slope * (x - centre)
+
+
+def _add_decayed(old: Any, new: Any, passed: Any) -> Any:
+    """Return sums that forget the past, `passed` mean free times ago, plus new ones."""
+    decay = jnp.exp(-passed / AVERAGING_TIME)
+    return jax.tree.map(lambda old, new: decay * old + new, old, new)
 
 
 MIN_RESTITUTION = 0.3
@@ -177,12 +170,13 @@ class PathTangents(NamedTuple):
     correlation_along: Float[Array, "p replicas"]
 
     @classmethod
-    def initial(cls, num_directions: int, replicas: int, dtype: DTypeLike) -> "PathTangents":
-        """Return the tangents of an initial state."""
+    def initial(cls, directions: Any, replicas: int, dtype: DTypeLike) -> "PathTangents":
+        """Return the tangents of an initial state, with directions along the first axis."""
+        num_directions = max((len(leaf) for leaf in jax.tree.leaves(directions)), default=0)
         zeros, along = jnp.zeros(replicas, dtype), jnp.zeros((num_directions, replicas), dtype)
         return cls(zeros, zeros, along, along, along)
 
-    def after(
+    def after_impacts(
         self,
         thermal_time: Float[Array, "replicas"],
         gain: Float[Array, "p replicas"],
@@ -190,7 +184,7 @@ class PathTangents(NamedTuple):
         cooling: Float[Array, "replicas"],
         dimension: int,
     ) -> "PathTangents":
-        """Return the tangents after a time, by the implicit midpoint rule.
+        """Return the tangents after a time with given rates.
 
         Args:
             thermal_time: increase of s.
@@ -202,11 +196,26 @@ class PathTangents(NamedTuple):
         d = dimension
         square = 1 - d * cooling / jnp.maximum(collision_rate, jnp.finfo(collision_rate.dtype).tiny)
         eps = jnp.sqrt(jnp.clip(square, MIN_RESTITUTION**2, 1.0))
-        ratio = (1 + eps) / (2 * eps)
-        half = 0.5 * collision_rate * (1 + eps) ** 2 / (2 * d) * thermal_time
-        old = self.mobility
+        relaxed = collision_rate * (1 + eps) ** 2 / (2 * d) * thermal_time
+        return self.after(thermal_time, relaxed, ((1 + eps) / (2 * eps))[None] * gain, d)
+
+    def after(
+        self,
+        thermal_time: Float[Array, "*replicas"],
+        relaxed: Float[Array, "*replicas"],
+        relaxation_gain: Float[Array, "p *replicas"],
+        dimension: int,
+    ) -> "PathTangents":
+        """Return the tangents after a time, by the implicit midpoint rule.
+
+        Args:
+            thermal_time: increase of s.
+            relaxed: the integral of kappa over it.
+            relaxation_gain: tangents of this integral.
+            dimension: d.
+        """
+        d, half, old = dimension, 0.5 * relaxed, self.mobility
         new = ((1 - half) * old + thermal_time) / (1 + half)
-        relaxation_gain = ratio[None] * gain
         decay, mean = ((1 - half) / (1 + half))[None], (0.5 * (old + new) / (1 + half))[None]
         along = decay * self.mobility_along - mean * relaxation_gain
         return PathTangents(
@@ -299,9 +308,10 @@ class ContactTangents(NamedTuple):
             replicas: number of boxes.
             spin: tangents of the spins; None for smooth spheres.
         """
-        p, dtype = len(jax.tree.leaves(directions)[0]), velocity.dtype
-        zeros, by_replica = jnp.zeros((p, replicas), dtype), jnp.zeros(replicas, dtype)
-        particle_zeros = jnp.zeros((p, *velocity.shape), dtype)
+        dtype, by_replica = velocity.dtype, jnp.zeros(replicas, velocity.dtype)
+        paths = PathTangents.initial(directions, replicas, dtype)
+        zeros = paths.correlation_along
+        particle_zeros = jnp.zeros((len(zeros), *velocity.shape), dtype)
         return cls(
             directions=directions,
             log_temperature=zeros,
@@ -312,7 +322,7 @@ class ContactTangents(NamedTuple):
             elapsed=jnp.zeros((), dtype),
             thermal_elapsed=by_replica,
             rates=RateSums.zero(replicas, dtype),
-            paths=PathTangents.initial(p, replicas, dtype),
+            paths=paths,
             spin=spin,
             rotational_gain=None if spin is None else LinearRatio(*[by_replica] * 5),
         )
@@ -353,7 +363,7 @@ class ContactTangents(NamedTuple):
             velocity=jnp.where(free[None], 0.0, rest),
             elapsed=jnp.zeros_like(self.elapsed),
             thermal_elapsed=jnp.zeros_like(self.thermal_elapsed),
-            paths=self.paths.after(
+            paths=self.paths.after_impacts(
                 self.thermal_elapsed,
                 gain,
                 collision_rate=self.rates.collision(jnp.ones_like(temperature)),
@@ -388,9 +398,8 @@ class ImpactTangents(NamedTuple):
     @classmethod
     def initial(cls, law: ReducedLaw, replicas: int, dtype: DTypeLike) -> "ImpactTangents":
         """Return the tangents of an initial state, which does not depend on the law."""
-        num_directions = max((len(leaf) for leaf in jax.tree.leaves(law)), default=0)
-        zeros = jnp.zeros((num_directions, replicas), dtype)
-        paths = PathTangents.initial(num_directions, replicas, dtype)
+        paths = PathTangents.initial(law, replicas, dtype)
+        zeros = paths.correlation_along
         return cls(law, zeros, zeros, RateSums.zero(replicas, dtype), paths)
 
     def gains(
@@ -432,7 +441,7 @@ class ImpactTangents(NamedTuple):
         half = gains[-1:] / (4 * energy[None])
         new = ((1 + half) * c + gains[:-1] / energy[None]) / (1 - half)
         speed = jnp.sqrt(temperature)
-        paths = self.paths.after(
+        paths = self.paths.after_impacts(
             speed * duration,
             new - c,
             collision_rate=rates.collision(jnp.ones_like(speed)),

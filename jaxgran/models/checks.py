@@ -137,11 +137,6 @@ def check_softness(gas: Gas, factor: ArrayLike, hottest: ArrayLike = 1.0) -> Non
         )
 
 
-def max_drag_exponent(dtype: Any) -> float:
-    """Return the largest gamma t of particle models with drag; beyond it ``1 - gamma s`` is 0."""
-    return float(-0.5 * np.log(np.finfo(dtype).eps))
-
-
 def unreachable_with_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
     """Return a mask of the times that particle models with drag cannot reach.
 
@@ -150,7 +145,7 @@ def unreachable_with_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array,
     """
     if gas.drag is None:
         return jnp.zeros(times.shape, bool)
-    limit = max_drag_exponent(times.dtype)
+    limit = float(-0.5 * np.log(np.finfo(times.dtype).eps))  # beyond it 1 - gamma s is 0
     too_late = gas.drag.rate * times > limit
     if is_known(too_late) and np.any(np.asarray(too_late)):
         raise ValueError(

@@ -19,7 +19,7 @@ from jaxgran.models.spheres import AbstractSpheres, Plan
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import capacities
 from jaxgran.particles.hard.dynamics import MIN_IMPACTS, SPEED_MARGIN, HardDynamics
-from jaxgran.particles.setup import min_distance, overlap_by_rounding
+from jaxgran.particles.setup import ALLOWED_OVERLAP, allowed_overlap, min_distance
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced import SphereScene, reduced_scene, sphere_scene
@@ -32,9 +32,6 @@ SKIN_GROWTH = 1.5
 """Factor by which windows of `MIN_IMPACTS` grow too long: (8/2)^0.3 after a window of two."""
 
 CONTACT_TIMES = Domain(0.0, 0.1, low_allowed=True, high_allowed=True)
-
-ALLOWED_OVERLAP = 1e-9
-"""Overlap in diameters that is allowed in a given start."""
 
 
 class HardSpheres(AbstractSpheres):
@@ -140,7 +137,7 @@ class HardSpheres(AbstractSpheres):
         start, side = self.start, self.scene(gas).side
         position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
         closest = float(min_distance(position, side, self.replicas, (8 * len(position), 0)))
-        if closest < 1 - overlap_by_rounding(position, side, ALLOWED_OVERLAP):
+        if closest < 1 - allowed_overlap(position, side):
             raise ValueError(
                 f"two spheres of the start are {closest:.9g} diameters apart, hard spheres must "
                 "not overlap. Move them apart, or leave start out for a random one."
@@ -169,16 +166,8 @@ class HardSpheres(AbstractSpheres):
 
     def dynamics(self, scene: SphereScene, plan: Plan) -> HardDynamics:
         """Return the equations of motion of the spheres."""
-        contact_time = jnp.asarray(self.contact_time, scene.side.dtype)
-        return HardDynamics(
-            scene,
-            plan.replicas,
-            plan.capacity,
-            plan.steps,
-            contact_time,
-            jnp.zeros((), bool),
-            ALLOWED_OVERLAP,
-        )
+        numbers = jnp.asarray(self.contact_time, scene.side.dtype), jnp.zeros((), bool)
+        return HardDynamics(scene, plan.replicas, plan.capacity, plan.steps, *numbers)
 
     def clock(self, scene: SphereScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
         """Return the transformed times of a gas with drag, otherwise the times."""

@@ -19,7 +19,7 @@ from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced import reduced_scene
 from jaxgran.theory.equations import Density, Equations, softness_factor
-from jaxgran.theory.solver import Integrator, moments_at, padded_length
+from jaxgran.theory.solver import moments_at, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
@@ -200,13 +200,12 @@ class KineticTheory(AbstractModel):
             sound = softness_factor(law, hottest, gas.dimension) > 0
         scene = reduced_scene(gas), Density.from_gas(gas, self.softness, self.correlations)
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
-        integrator = Integrator(self.solver, rtol * tolerance, self.max_steps)
         order = self.order if self.sonine else 2
-        equations = Equations(
-            gas.dimension, order, not self.sonine, self.softness, self.initial_sonine
-        )
+        equations = Equations(gas.dimension, order, not self.sonine, self.initial_sonine)
         reduced = jnp.where(sound, times, 0.0) * gas.impact_speed / length
-        state, fault = moments_at(scene, reduced, equations, integrator)
+        state, fault = moments_at(
+            scene, reduced, equations, self.solver, rtol * tolerance, self.max_steps
+        )
         fault |= status.flag(status.UNSUPPORTED, ~sound)
         theta = jnp.exp(state.log_temperature)
         # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).

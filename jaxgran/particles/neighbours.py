@@ -245,10 +245,11 @@ class Pairs(NamedTuple):
     lookahead: Int[Array, ""]
 
 
-def wrap(side: ArrayLike, position: Float[Array, "... d"]) -> Float[Array, "... d"]:
-    """Move positions by multiples of the side into [0, side)."""
-    inside = jnp.mod(position, side)
-    return jnp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
+def wrap(side: ArrayLike, position: Any) -> Any:
+    """Move positions, arrays of JAX or NumPy, by multiples of the side into [0, side)."""
+    xp = np if isinstance(position, np.ndarray) else jnp
+    inside = xp.mod(position, side)
+    return xp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
 
 
 def choose_engine(name: str, ahead: int = 0, traced: bool = False) -> str:
@@ -305,13 +306,8 @@ def search_pairs(
         capacity: capacity of the list, in pairs, and of a sweep's look-ahead, in particles.
         engine: "scipy", "sweep" or "jax-md". All return the same pairs, but may differ in pairs
             within rounding error of the cutoff.
-
-    Raises:
-        ValueError: for any other engine.
     """
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
-    if engine not in ENGINES[1:]:
-        raise ValueError(f"engine must be one of {', '.join(ENGINES[1:])}, got {engine!r}")
     max_pairs, ahead = capacity
     if engine == "sweep":
         return sweep(position, side, cutoff, replicas=replicas, capacity=max_pairs, ahead=ahead)

@@ -329,7 +329,7 @@ def _advance(
         sized = dynamics.with_capacity(enlarged := _GROWN.get(capacity, capacity))
         if engine == "sweep":
             program = state.position.shape, until.dtype, jax.tree.structure((sized, state))
-            with compiling(progress and needs_compilation(program)):
+            with compiling(program, progress):
                 result = compiled_for_host(run_segments, donate, static, short)(
                     sized, state, until, engine, min_segments=1, max_segments=SEGMENTS_PER_CALL
                 )
@@ -482,21 +482,20 @@ def cpu_compiler_options() -> dict[str, Any]:
 _COMPILED: set[Hashable] = set()
 
 
-def needs_compilation(program: Hashable) -> bool:
-    """Return whether this is the first call for a program in this process."""
-    new = program not in _COMPILED
-    _COMPILED.add(program)
-    return new
-
-
 @contextmanager
-def compiling(progress: bool) -> Iterator[None]:
-    """Show "compiling ..." on a terminal during the block; the progress bar follows."""
-    shown, text = progress and sys.stderr.isatty(), "compiling ..."
+def compiling(program: Hashable, progress: bool) -> Iterator[bool]:
+    """Tell whether the block is the first call for a program in this process.
+
+    If so, and with `progress`, show "compiling ..." on a terminal during it; the progress bar
+    follows.
+    """
+    new, text = program not in _COMPILED, "compiling ..."
+    _COMPILED.add(program)
+    shown = new and progress and sys.stderr.isatty()
     if shown:
         print(f"\r{text}", end="", file=sys.stderr, flush=True)
     try:
-        yield
+        yield new
     finally:
         if shown:
             print(f"\r{' ' * len(text)}\r", end="", file=sys.stderr, flush=True)

@@ -35,6 +35,9 @@ MAX_PUSHES = 20_000
 COINCIDENT = 1e-9
 """Distance, in diameters, that is assumed between points at the same place."""
 
+ALLOWED_OVERLAP = 1e-9
+"""Overlap in diameters that is allowed in a given start of hard spheres."""
+
 SAME_BOX = 1e-6
 """Relative difference up to which the box of a start counts as that of the gas."""
 
@@ -121,14 +124,14 @@ def _push_apart(
         moved = np.inf if built is None else np.sqrt(np.max(np.sum((x - built) ** 2, axis=1)))
         if 2 * moved > cutoff - 1 - 2 * GAP:
             # x stays unwrapped, so that the distance moved since then can be computed.
-            i, j = neighbours.close_pairs(_wrap_all(x, side), side, cutoff).T
+            i, j = neighbours.close_pairs(neighbours.wrap(side, x), side, cutoff).T
             built = x.copy()
         separation = x[i] - x[j]
         separation -= side * np.round(separation / side)
         distance = np.sqrt(np.sum(separation**2, axis=1))
         close = distance < 1 + GAP / 2
         if not close.any():
-            return _wrap_all(x, side)
+            return neighbours.wrap(side, x)
         separation, distance = separation[close], distance[close]
         # Coincident points are separated along the first axis.
         separation[distance == 0, 0] = distance[distance == 0] = COINCIDENT
@@ -153,11 +156,6 @@ def largest_extra_gap(n: int, d: int, volume: ArrayLike) -> Any:
     xp = array_module(volume)
     packing_fraction = n / xp.asarray(volume) * {2: np.pi / 4, 3: np.pi / 6}[d]
     return 0.1 * xp.maximum(0.0, 1 - 1.5 * packing_fraction / PACKING_LIMIT[d])
-
-
-def _wrap_all(x: Float[np.ndarray, "n d"], side: float) -> Float[np.ndarray, "n d"]:
-    inside = np.mod(x, side)
-    return np.where(inside >= side, 0.0, inside)
 
 
 def relaxed_positions(
@@ -292,13 +290,6 @@ def has_other_box(start: Particles | None, gas: Gas, num_particles: int) -> Bool
     return ~jnp.all(jnp.abs(ratio - 1) < SAME_BOX + 10 * jnp.finfo(ratio.dtype).eps)
 
 
-def with_constant_temperature(start: Particles | None, gas: Gas) -> Gas:
-    """Return the gas for derivatives: with a start, T_0 is a constant unit of speed."""
-    if start is None:
-        return gas
-    return gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
-
-
 def reduced_start(
     start: Particles | None, gas: Gas, *, differentiable: bool = False
 ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]] | None:
@@ -339,8 +330,7 @@ def min_distance(
     return jnp.sqrt(jnp.min(square, initial=1.0))
 
 
-def overlap_by_rounding(
-    position: Float[Array, "n d"], side: ArrayLike, least: float
-) -> Float[Array, ""]:
-    """Return the overlap of spheres in contact by rounding of positions, but at least `least`."""
-    return jnp.maximum(least, 10 * side * jnp.finfo(position.dtype).eps)
+def allowed_overlap(position: Float[Array, "n d"], side: ArrayLike) -> Float[Array, ""]:
+    """Return the overlap up to which spheres of a start count as hard, at least that of spheres in
+    contact by rounding of positions."""
+    return jnp.maximum(ALLOWED_OVERLAP, 10 * side * jnp.finfo(position.dtype).eps)

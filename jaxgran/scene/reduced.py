@@ -69,19 +69,14 @@ class ReducedDrag(NamedTuple):
     rotational_rate: Any
 
 
-class ReducedDrive(NamedTuple):
-    """`WhiteNoise` in reduced units: the growth rate of T/T_0 that it causes."""
-
-    strength: Float[Array, ""]
-
-
 class ReducedScene(NamedTuple):
     """The law and the elements of a gas in reduced units; None for each missing element.
 
     Attributes:
         law: of restitution, for speeds in units of `Gas.impact_speed`, or a `ReducedContact`.
         surface: `ReducedRough`, or `ReducedFriction` of contacts.
-        walls, drag, drive: `ReducedWalls`, `ReducedDrag`, `ReducedDrive`.
+        walls, drag: `ReducedWalls`, `ReducedDrag`.
+        drive: of `WhiteNoise`, the growth rate of T/T_0 that it causes.
     """
 
     law: Any
@@ -120,7 +115,7 @@ def reduced_scene(gas: Gas) -> ReducedScene:
         time = length / speed
         drag = ReducedDrag(gas.drag.rate * time, gas.drag.rotational_rate * time)
     if gas.drive is not None:
-        drive = ReducedDrive(gas.drive.strength * (length / speed) / gas.temperature)
+        drive = gas.drive.strength * (length / speed) / gas.temperature
     return ReducedScene(gas.reduced_law, surface, walls, drag, drive)
 
 
@@ -229,7 +224,7 @@ def sphere_scene(gas: Gas, num_particles: int, material: ReducedScene) -> Sphere
         rotational = None if gas.surface is None else gas.drag.rotational_rate / nu
         drag = ReducedDrag(gas.drag.rate / nu, rotational)
     if gas.drive is not None:
-        drive = ReducedDrive(gas.drive.strength / (nu * gas.temperature))
+        drive = gas.drive.strength / (nu * gas.temperature)
     # It does not depend on T_0, and between walls of soft spheres its derivative is refused.
     fixed = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
     unit_time = fixed.diameter / jnp.sqrt(fixed.temperature)

@@ -51,18 +51,9 @@ DSMC.
 """
 
 
-class Terms(NamedTuple):
-    """Powers of a_2 and a_3 of the columns of a matrix of averages."""
-
-    sonine: tuple[int, ...]
-    third_sonine: tuple[int, ...]
-
-
-TERMS = {
-    2: Terms((0, 1, 2), (0, 0, 0)),
-    3: Terms((0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)),
-}
-"""Terms by order: 1, a_2, a_2^2 at order 2; 1, a_2, a_3, a_2^2, a_2 a_3, a_3^2 at order 3."""
+TERMS = {2: ((0, 1, 2), (0, 0, 0)), 3: ((0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2))}
+"""Powers of a_2 and of a_3 of the columns of a matrix of averages, by order: 1, a_2, a_2^2 at order
+2; 1, a_2, a_3, a_2^2, a_2 a_3, a_3^2 at order 3."""
 
 
 class _ImpactNodes(NamedTuple):
@@ -297,12 +288,12 @@ class RateTable(eqx.Module):
         coefficients: of the Chebyshev polynomials, shape (nodes, rows, terms), or (nodes, ...,
             rows, terms) for several such functions over the same range.
         lowest: lower end of the series in ln(T/T_0). The series must not be evaluated outside.
-        highest: upper end of a gas that is heated; None means 0.
+        highest: upper end, 0 unless the gas is heated.
     """
 
     coefficients: Float[Array, "nodes ... rows terms"]
     lowest: Float[Array, ""]
-    highest: Float[Array, ""] | None = None
+    highest: Float[Array, ""]
 
     @classmethod
     def from_function(
@@ -322,15 +313,9 @@ class RateTable(eqx.Module):
             num_nodes: number of terms; see `ReducedLaw.num_nodes`.
             bounds: of the effects of the elements of the scene on T.
         """
-        lowest = _lowest_log_temperature(averages, duration, dimension, bounds)
+        lowest, highest = _log_temperature_range(averages, duration, dimension, bounds)
         nodes, to_coefficients = (jnp.asarray(x, lowest.dtype) for x in _chebyshev(num_nodes))
-        if bounds.heating is None:
-            highest, speeds = None, jnp.exp(lowest * (1 - nodes) / 4)
-        else:
-            highest = _highest_log_temperature(
-                averages, duration, dimension, bounds.heating, bounds.rotation
-            )
-            speeds = jnp.exp(highest / 2 + (lowest - highest) * (1 - nodes) / 4)
+        speeds = jnp.exp(highest / 2 + (lowest - highest) * (1 - nodes) / 4)
         values = jax.vmap(averages)(speeds)
         return cls(jnp.tensordot(to_coefficients, values, 1), lowest, highest)
 
@@ -340,10 +325,7 @@ class RateTable(eqx.Module):
         Args:
             log_theta: ln(T/T_0), from `lowest` to `highest`.
         """
-        if self.highest is None:
-            x = 2 * (1 - log_theta / self.lowest) - 1
-        else:
-            x = 2 * (log_theta - self.lowest) / (self.highest - self.lowest) - 1
+        x = 2 * (1 - (log_theta - self.highest) / (self.lowest - self.highest)) - 1
         if self.coefficients.ndim > 3:  # a matrix product is faster for many functions
             polynomials = [jnp.ones_like(x), x]
             for _ in range(2, len(self.coefficients)):
@@ -366,7 +348,7 @@ class RateTable(eqx.Module):
             derivative in ln(T/T_0), and those given.
         """
         derivative = jnp.asarray(_derivative_matrix(len(self.coefficients)), self.lowest.dtype)
-        width = -self.lowest if self.highest is None else self.highest - self.lowest
+        width = self.highest - self.lowest
         slope = jnp.tensordot(derivative, self.coefficients, 1) * 2 / width
         both = jnp.stack([self.coefficients, slope], axis=1)
         derivatives = jnp.moveaxis(along, 0, 1)
@@ -388,58 +370,50 @@ def _derivative_matrix(num_nodes: int) -> np.ndarray:
     return np.pad(np.polynomial.chebyshev.chebder(np.eye(num_nodes)), ((0, 1), (0, 0)))
 
 
-def _lowest_log_temperature(
+def _log_temperature_range(
     averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
     duration: Float[Array, ""],
     dimension: int,
     bounds: ElementBounds,
-) -> Float[Array, ""]:
-    """Lower bound of ln(T/T_0) after a reduced time, negative and not far below the true value.
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Bounds of ln(T/T_0) within a reduced time, the lower one negative and not far below the true
+    value, the upper one 0, or positive where the gas is heated.
 
-    The first bound is Haff's law for e = 0 with 10 % added to the rate. A law with small losses at
-    low speed cools much less; a series over the whole range would lose digits. Therefore the time
-    to cool is bounded from below by integrating the law's rate, with 10 % added, over
+    The first lower bound is Haff's law for e = 0 with 10 % added to the rate. A law with small
+    losses at low speed cools much less; a series over the whole range would lose digits. Therefore
+    the time to cool is bounded from below by integrating the law's rate, with 10 % added, over
     `_SCAN_POINTS` temperatures, and the range is cut off one point below the temperature reached.
-    """
-    duration, bounds = jax.lax.stop_gradient((duration, bounds))
-    by_speed, constant = bounds.by_speed, bounds.constant
-    collisions = sphere_surface(dimension) / sqrt(2 * pi)
-    haff = 1.1 * collisions / (2 * dimension) + by_speed / 2
-    bound = -2 * jnp.log1p(haff * duration) - constant * duration
-    scan = bound * jnp.linspace(0, 1, _SCAN_POINTS, dtype=bound.dtype)
-    speeds = jnp.exp(scan / 2)
-    loss = jax.lax.stop_gradient(jax.vmap(averages)(speeds)[:, 0, 0])
-    rate = 2.2 / dimension * loss * speeds + by_speed * speeds + constant
-    if bounds.heating is not None:
-        rate = rate - bounds.heating / speeds**2
-    rate = jnp.maximum(rate, jnp.finfo(bound.dtype).tiny)
-    earliest = jnp.cumsum(-jnp.diff(scan) / jnp.maximum(rate[1:], rate[:-1]))
-    reached = jnp.min(jnp.where(earliest < duration, scan[1:], 0.0))
-    lowest = reached + scan[1]
-    return jnp.minimum(jnp.maximum(lowest, bound), -1e-3)
 
-
-def _highest_log_temperature(
-    averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
-    duration: Float[Array, ""],
-    dimension: int,
-    heating: ArrayLike,
-    rotation: ArrayLike | None,
-) -> Float[Array, ""]:
-    """Upper bound of ln(T/T_0) of a driven gas within a reduced time, positive.
-
-    The first bound has no losses, ``T_0 + xi_0^2 t`` and the whole energy of rotation. Smooth
+    The first upper bound has no losses, ``T_0 + xi_0^2 t`` and the whole energy of rotation. Smooth
     spheres do not heat up beyond the temperature at which their impacts take the power of the
     drive, with half of the losses to spare for a_2 and soft contacts; the range is cut off one of
     `_SCAN_POINTS` temperatures above it.
     """
-    duration, heating, rotation = jax.lax.stop_gradient((duration, heating, rotation))
-    bound = jnp.log1p(heating * duration + (0.0 if rotation is None else rotation))
-    if rotation is None:
+    duration, bounds = jax.lax.stop_gradient((duration, bounds))
+    by_speed, constant, heating, rotation = bounds
+
+    def scan_to(bound: Array) -> tuple[Array, Array, Array]:
         scan = bound * jnp.linspace(0, 1, _SCAN_POINTS, dtype=bound.dtype)
         speeds = jnp.exp(scan / 2)
-        loss = jax.lax.stop_gradient(jax.vmap(averages)(speeds)[:, 0, 0])
+        return scan, speeds, jax.lax.stop_gradient(jax.vmap(averages)(speeds)[:, 0, 0])
+
+    collisions = sphere_surface(dimension) / sqrt(2 * pi)
+    haff = 1.1 * collisions / (2 * dimension) + by_speed / 2
+    bound = -2 * jnp.log1p(haff * duration) - constant * duration
+    scan, speeds, loss = scan_to(bound)
+    rate = 2.2 / dimension * loss * speeds + by_speed * speeds + constant
+    if heating is not None:
+        rate = rate - heating / speeds**2
+    rate = jnp.maximum(rate, jnp.finfo(bound.dtype).tiny)
+    earliest = jnp.cumsum(-jnp.diff(scan) / jnp.maximum(rate[1:], rate[:-1]))
+    reached = jnp.min(jnp.where(earliest < duration, scan[1:], 0.0))
+    lowest = jnp.minimum(jnp.maximum(reached + scan[1], bound), -1e-3)
+    if heating is None:
+        return lowest, jnp.zeros_like(lowest)
+    bound = jnp.log1p(heating * duration + (0.0 if rotation is None else rotation))
+    if rotation is None:
+        scan, speeds, loss = scan_to(bound)
         balanced = loss / dimension * speeds >= heating / speeds**2
         stop = jnp.min(jnp.where(balanced, scan, bound))
         bound = jnp.minimum(bound, stop + scan[1])
-    return jnp.maximum(bound, 1e-3)
+    return lowest, jnp.maximum(bound, 1e-3)

@@ -68,20 +68,13 @@ class Moments(NamedTuple):
             named |= {"third_sonine": values[5], "diffusion_shape": values[6]}
         return cls(**named, rotation=values[-1] if has_rotation else None)
 
-    @classmethod
-    def initial(cls, scene: ReducedScene, like: Array, order: int) -> Float[Array, "moments"]:
-        """Return the state at t = 0 as one array, of the dtype of `like`."""
-        start = [jnp.zeros((), like.dtype)] * (5 if order == 2 else 7)
-        if scene.surface is not None:
-            start.append(scene.surface.ratio.astype(like.dtype))
-        return jnp.stack(start)
-
 
 class Density(NamedTuple):
-    """Effects of finite density on the cooling rate; None leaves an effect out.
+    """Effects of softness and density on the cooling rate; None leaves an effect out.
 
     Attributes:
-        crowding: k in ``1/(1 + k X_T/sigma)``, see `crowding_coefficient`.
+        crowding: k in ``(1 - c X_T/sigma)/(1 + k X_T/sigma)``, by which soft contacts slow the
+            cooling, see `softness_factor` and `crowding_coefficient`.
         packing_fraction: phi, for correlated velocities, see `correlation_slowdown`.
     """
 
@@ -116,20 +109,21 @@ class Equations(NamedTuple):
         dimension: d.
         order: of the Sonine expansion: 2 has a_2, 3 also a_3.
         maxwellian: if True, a_2 stays 0.
-        softness: if True, soft contacts slow the cooling.
         initial_sonine: a_2 at t = 0.
     """
 
     dimension: int
     order: int
     maxwellian: bool
-    softness: bool
     initial_sonine: float = 0.0
 
     def initial(self, scene: SceneAndDensity, like: Array) -> Float[Array, "moments"]:
         """Return the `Moments` at t = 0 as one array, of the dtype of `like`."""
-        first = Moments.initial(scene[0], like, self.order)
-        return first.at[1].set(self.initial_sonine) if self.initial_sonine else first
+        start = [jnp.zeros((), like.dtype)] * (5 if self.order == 2 else 7)
+        start[1] += self.initial_sonine
+        if scene[0].surface is not None:
+            start.append(scene[0].surface.ratio.astype(like.dtype))
+        return jnp.stack(start)
 
     def table(self, scene: SceneAndDensity, duration: Array) -> RateTable:
         """Return the averages at all temperatures that the gas reaches in a time."""
@@ -144,149 +138,67 @@ class Equations(NamedTuple):
         rates: Float[Array, "rows terms"],
         scene: SceneAndDensity,
     ) -> Float[Array, "moments"]:
-        """Return the time derivative of the moments at given averages over impacts."""
-        return moment_rates(
-            state,
-            rates,
-            *scene,
-            self.dimension,
-            order=self.order,
-            softness=self.softness,
-            maxwellian=self.maxwellian,
-        )
+        """Return the time derivative of the moments.
 
-
-def moment_rates(
-    state: Float[Array, "moments"],
-    rates: Float[Array, "rows terms"],
-    scene: ReducedScene,
-    density: Density,
-    dimension: int,
-    *,
-    order: int,
-    softness: bool,
-    maxwellian: bool,
-) -> Float[Array, "moments"]:
-    """Return the time derivative of the moments.
-
-    Args:
-        state: the `Moments` as one array.
-        rates: from `jaxgran.theory.averages.impact_moments` at this temperature.
-        scene: in reduced units.
-        density: its effects on the cooling rate.
-        dimension: d.
-        order: of the Sonine expansion, 2 or 3.
-        softness: if True, soft contacts slow the cooling by impacts.
-        maxwellian: if True, a_2 stays 0.
-    """
-    moments, d = Moments.from_array(state, order), dimension
-    a2 = moments.sonine
-    a3 = jnp.zeros_like(a2) if moments.third_sonine is None else moments.third_sonine
-    speed = jnp.exp(moments.log_temperature / 2)
-    losses, relaxation = _impact_rates(rates, a2, a3, order)
-    losses = [loss * speed for loss in losses]
-    impacts = 2 / d * losses[0]
-    a2_rate, a3_rate = _sonine_rates(losses, impacts, a2, a3, d)
-    cooling = _impact_cooling(moments, impacts, rates, scene, density, d, softness)
-    relaxing, rotating = jnp.zeros_like(speed), []
-    shape_decay = jnp.zeros_like(speed)
-    if any(element is not None for element in scene[1:5]):
-        ratio = 0.0 if moments.rotation is None else moments.rotation
-        changes = element_rates(scene, speed, ratio, a2, d)
-        cooling, relaxing = cooling + changes.cooling, changes.relaxation
-        a2_rate = a2_rate + changes.sonine
-        if scene.drive is not None:
-            shape_decay = scene.drive.strength / speed**2
-            a3_rate = a3_rate - 3 * shape_decay * a3
-        if scene.surface is not None:
-            rotating = [changes.rotation + cooling * ratio]
-    # Of the terms that cool the gas, only impacts change the shape of the velocity distribution.
-    net_growth = cooling / 2 - relaxing
-    diffusing = _diffusion_rates(moments, a2, a3, relaxation, speed, impacts, shape_decay, d)
-    diffusion, *shape = [
-        rate + net_growth * q
-        for rate, q in zip(diffusing, _diffusion_moments(moments), strict=True)
-    ]
-    rate = [
-        -cooling,
-        jnp.zeros_like(speed) if maxwellian else a2_rate,
-        diffusion,
-        2 * d * speed * moments.diffusion,
-        collision_rate(a2, d, a3) * speed,
-    ]
-    third = [] if order == 2 else [a3_rate, *shape]
-    return jnp.stack(rate + third + rotating)
-
-
-def _impact_rates(
-    rates: Float[Array, "rows terms"], a2: Array, a3: Array, order: int
-) -> tuple[list[Array], list[list[Array]]]:
-    """The losses mu_2, mu_4, ... and the matrix nu_jk at given a_2 and a_3."""
-    powers = zip(*TERMS[order], strict=True)
-    ones = jnp.ones_like(a2)
-    products = jnp.stack([_power_product(ones, a2, i, a3, j) for i, j in powers])
-    values = list(rates @ products)
-    losses, flat = values[:order], values[order:]
-    size = order - 1
-    return losses, [flat[j * size : (j + 1) * size] for j in range(size)]
-
-
-def _power_product(ones: Array, a2: Array, i: int, a3: Array, j: int) -> Array:
-    product = ones
-    for factor in [a2] * i + [a3] * j:
-        product = product * factor
-    return product
-
-
-def _sonine_rates(
-    losses: list[Array], impacts: Array, a2: Array, a3: Array, d: int
-) -> tuple[Array, Array]:
-    a2_rate = 2 * impacts * (1 + a2) - 4 / (d * (d + 2)) * losses[1]
-    if len(losses) == 2:
-        return a2_rate, jnp.zeros_like(a2_rate)
-    sixth = 8 / (d * (d + 2) * (d + 4)) * losses[2]
-    return a2_rate, 3 * a2_rate - 3 * impacts * (1 + 3 * a2 - a3) + sixth
-
-
-def _impact_cooling(
-    moments: Moments,
-    impacts: Array,
-    rates: Array,
-    scene: ReducedScene,
-    density: Density,
-    d: int,
-    softness: bool,
-) -> Array:
-    """Cooling rate by soft, correlated impacts, from that of hard, uncorrelated ones."""
-    speed = jnp.exp(moments.log_temperature / 2)
-    if softness:
-        impacts = impacts * softness_factor(scene.law, speed, d)
-    if density.crowding is not None:
-        impacts = impacts / (1 + density.crowding * scene.law.impact_length(speed))
-    if density.packing_fraction is not None:
-        inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
-        lost = correlation_slowdown(
-            density.packing_fraction, inelasticity, d
-        ) * correlation_build_up(moments.collisions)
-        impacts = impacts * (1 - lost)
-    return impacts
-
-
-def _diffusion_moments(moments: Moments) -> list[Array]:
-    return [q for q in (moments.diffusion, moments.diffusion_shape) if q is not None]
+        Args:
+            state: the `Moments` as one array.
+            rates: from `jaxgran.theory.averages.impact_moments` at this temperature.
+            scene: the gas.
+        """
+        moments, d, order = Moments.from_array(state, self.order), self.dimension, self.order
+        gas, density = scene
+        a2, speed = moments.sonine, jnp.exp(moments.log_temperature / 2)
+        zero = jnp.zeros_like(speed)
+        a3 = zero if moments.third_sonine is None else moments.third_sonine
+        # The losses mu_2, mu_4, ..., and the matrix nu_jk row by row.
+        values = rates @ jnp.stack([a2**i * a3**j for i, j in zip(*TERMS[order], strict=True)])
+        losses, relaxation = values[:order] * speed, values[order:].reshape(order - 1, -1)
+        impacts = 2 / d * losses[0]
+        a2_rate = 2 * impacts * (1 + a2) - 4 / (d * (d + 2)) * losses[1]
+        a3_rate = shape_decay = zero
+        if order > 2:
+            sixth = 8 / (d * (d + 2) * (d + 4)) * losses[2]
+            a3_rate = 3 * a2_rate - 3 * impacts * (1 + 3 * a2 - a3) + sixth
+        cooling = impacts
+        if density.crowding is not None:
+            cooling = cooling * softness_factor(gas.law, speed, d)
+            cooling = cooling / (1 + density.crowding * gas.law.impact_length(speed))
+        if density.packing_fraction is not None:
+            inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
+            slowdown = correlation_slowdown(density.packing_fraction, inelasticity, d)
+            cooling = cooling * (1 - slowdown * correlation_build_up(moments.collisions))
+        relaxing, rotating = zero, []
+        if gas.has_elements:
+            ratio = 0.0 if moments.rotation is None else moments.rotation
+            changes = element_rates(gas, speed, ratio, a2, d)
+            cooling, relaxing = cooling + changes.cooling, changes.relaxation
+            a2_rate = a2_rate + changes.sonine
+            if gas.drive is not None:
+                shape_decay = gas.drive / speed**2
+                a3_rate = a3_rate - 3 * shape_decay * a3
+            if gas.surface is not None:
+                rotating = [changes.rotation + cooling * ratio]
+        # Of the terms that cool the gas, only impacts change the shape of the velocity
+        # distribution.
+        net_growth = cooling / 2 - relaxing
+        diffusing = _diffusion_rates(moments, a3, relaxation, impacts, shape_decay, d)
+        diffusion, *shape = [rate + net_growth * q for rate, q in diffusing]
+        rate = [
+            -cooling,
+            zero if self.maxwellian else a2_rate,
+            diffusion,
+            2 * d * speed * moments.diffusion,
+            collision_rate(a2, d, a3) * speed,
+        ]
+        third = [] if order == 2 else [a3_rate, *shape]
+        return jnp.stack(rate + third + rotating)
 
 
 def _diffusion_rates(
-    moments: Moments,
-    a2: Array,
-    a3: Array,
-    relaxation: list[list[Array]],
-    speed: Array,
-    impacts: Array,
-    shape_decay: Array,
-    d: int,
-) -> list[Array]:
-    """Rates of change of the diffusion moments, without the growth that cooling adds to all.
+    moments: Moments, a3: Array, relaxation: Array, impacts: Array, shape_decay: Array, d: int
+) -> list[tuple[Array, Array]]:
+    """Rates of change of the diffusion moments, without the growth that cooling adds to all, each
+    with its moment.
 
     The mean displacement of labelled spheres at velocity c is ``f(c) c (b_0 + b_1 S_1(c^2))``. Its
     moments ``q_j = <S_j c.dr>/d = sum_k n_jk b_k/2`` with ``n_00 = 1``, ``n_01 = -(h + 1) a_2``,
@@ -294,22 +206,22 @@ def _diffusion_rates(
     ``dq_j/dt = n_j0/2 - sum_k nu_jk b_k/2 + zeta (j q_j - j (j + h) q_(j-1)) + zeta/2 q_j`` with
     the cooling rate zeta. The last term is the growth by cooling.
     """
-    half = d / 2
+    half, a2, speed = d / 2, moments.sonine, jnp.exp(moments.log_temperature / 2)
     if moments.diffusion_shape is None:
-        return [speed / 2 - relaxation[0][0] * speed * moments.diffusion]
+        return [(speed / 2 - relaxation[0, 0] * speed * moments.diffusion, moments.diffusion)]
     q0, q1 = moments.diffusion, moments.diffusion_shape
     mixed = -(half + 1) * a2
     square = (half + 1) * (1 + (half + 4) * a2 - (half + 2) * a3)
     b1 = (q1 - mixed * q0) / (square - mixed**2)
     b0 = q0 - mixed * b1  # half of b_0 and b_1 above
-    first = speed * (0.5 - relaxation[0][0] * b0 - relaxation[0][1] * b1)
-    second = speed * (mixed / 2 - relaxation[1][0] * b0 - relaxation[1][1] * b1)
+    first = speed * (0.5 - relaxation[0, 0] * b0 - relaxation[0, 1] * b1)
+    second = speed * (mixed / 2 - relaxation[1, 0] * b0 - relaxation[1, 1] * b1)
     coupling = impacts * (q1 - (half + 1) * q0) - shape_decay * q1
-    return [first, second + coupling]
+    return [(first, q0), (second + coupling, q1)]
 
 
 class ElementRates(NamedTuple):
-    """Rates of change by the elements of a scene.
+    """Rates of change by the elements of a scene, or by one of them.
 
     Attributes:
         cooling: part of ``-d ln T/dt``.
@@ -318,10 +230,10 @@ class ElementRates(NamedTuple):
         sonine: part of ``da_2/dt``.
     """
 
-    cooling: Float[Array, ""]
-    rotation: Float[Array, ""]
-    relaxation: Float[Array, ""]
-    sonine: Float[Array, ""]
+    cooling: Any
+    rotation: Any = 0.0
+    relaxation: Any = 0.0
+    sonine: Any = 0.0
 
 
 def element_rates(
@@ -342,7 +254,7 @@ def element_rates(
         sonine: a_2, on which the collision rate depends.
         dimension: d.
     """
-    total = ElementRates(*[jnp.zeros_like(speed)] * 4)
+    parts = [ElementRates(*[jnp.zeros_like(speed)] * 4)]
     if (surface := scene.surface) is not None:
         rate = collision_rate(sonine, dimension) * speed
         rates = [rate, rate]
@@ -350,24 +262,15 @@ def element_rates(
             kick = mean_kick(scene.law, speed)
             shares = sliding_shares(surface, surface.eta, ratio, dimension, kick)
             rates = [rate * share for share in shares]
-        total = _add(total, _friction_rates(surface.eta, surface.inertia, rates, ratio, dimension))
+        parts.append(_friction_rates(surface.eta, surface.inertia, rates, ratio, dimension))
     if scene.walls is not None:
-        rates = _wall_rates(scene.walls, scene.surface, speed, ratio, dimension)
-        total = _add(total, rates)
-    if scene.drag is not None:
-        drag = scene.drag
-        zero = jnp.zeros_like(speed)
-        rates = ElementRates(2 * drag.rate, -2 * drag.rotational_rate * ratio, drag.rate, zero)
-        total = _add(total, rates)
+        parts.append(_wall_rates(scene.walls, scene.surface, speed, ratio, dimension))
+    if (drag := scene.drag) is not None:
+        parts.append(ElementRates(2 * drag.rate, -2 * drag.rotational_rate * ratio, drag.rate))
     if scene.drive is not None:
-        heating = scene.drive.strength / speed**2
-        zero = jnp.zeros_like(speed)
-        total = _add(total, ElementRates(-heating, zero, zero, -2 * sonine * heating))
-    return total
-
-
-def _add(a: ElementRates, b: ElementRates) -> ElementRates:
-    return ElementRates(*(x + y for x, y in zip(a, b, strict=True)))
+        heating = scene.drive / speed**2
+        parts.append(ElementRates(-heating, sonine=-2 * sonine * heating))
+    return ElementRates(*map(sum, zip(*parts, strict=True)))
 
 
 def _friction_rates(
@@ -390,7 +293,6 @@ def _friction_rates(
         cooling=(once - twice * square) / d,
         rotation=-(once * ratio - twice * square) / (NUM_SPIN_COMPONENTS[d] * inertia),
         relaxation=once / (2 * d),
-        sonine=jnp.zeros_like(eta),
     )
 
 
@@ -456,11 +358,10 @@ def _wall_rates(
     between spheres, with half the eta of a wall. Walls reverse velocities: displacements are not
     those of a free gas.
     """
-
-    eta = jnp.zeros_like(speed)
-    if walls.surface is None:
+    eta: Any = None
+    if surface is None or walls.surface is None:
         surface = None
-    if surface is not None and walls.surface is not None:
+    else:
         eta = surface.eta_on_wall(walls.surface) / 2
 
     def axis_rates(frequency: Array) -> tuple[Array, list[Array]]:
@@ -468,7 +369,12 @@ def _wall_rates(
             eps = walls.law.restitution(g * speed / sqrt(2))
             return wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
 
-        lost = impact_average(lambda g: share(g) * _wall_loss(walls, speed, g), speed)
+        def energy(g: Array) -> Array:
+            """Energy over T that the wall takes in an impact at the normal speed g sqrt(T)."""
+            lost = walls.law.loss(g * speed / sqrt(2))
+            return lost * (2 - lost) * g**2 / 2
+
+        lost = impact_average(lambda g: share(g) * energy(g), speed)
         impacts = [frequency * impact_average(share, speed)] * 2
         if surface is not None and surface.friction is not None:
             kick = mean_kick(walls.law, speed / sqrt(2))
@@ -479,18 +385,11 @@ def _wall_rates(
 
     by_axis = jax.vmap(axis_rates)(walls.frequency)
     lost, impacts = jax.tree.map(lambda x: speed * jnp.sum(x), by_axis)
-    zero = jnp.zeros_like(speed)
-    total = ElementRates(2 / d * lost, zero, zero, zero)
+    cooling = 2 / d * lost
     if surface is None:
-        return total
-    rates = [2 * rate for rate in impacts]
-    return _add(total, _friction_rates(eta, surface.inertia, rates, ratio, d))
-
-
-def _wall_loss(walls: ReducedWalls, speed: Array, g: Array) -> Array:
-    """Energy over T that a wall takes in an impact at the normal speed g sqrt(T)."""
-    lost = walls.law.loss(g * speed / sqrt(2))
-    return lost * (2 - lost) * g**2 / 2
+        return ElementRates(cooling)
+    friction = _friction_rates(eta, surface.inertia, [2 * rate for rate in impacts], ratio, d)
+    return friction._replace(cooling=cooling + friction.cooling)
 
 
 def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
@@ -499,39 +398,28 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
     The bound of the cooling is that of spheres that do not rotate and that stop at walls. The
     rotation heats at most by the initial energy of the spins.
     """
-    by_speed, constant = 0.0, 0.0
-    if scene.surface is not None:
-        rate = collision_rate(0.0, dimension)
-        surface, both = scene.surface, (rate, rate)
-        friction = _friction_rates(surface.eta, surface.inertia, both, 0.0, dimension)
-        by_speed = by_speed + friction.cooling
-    if scene.walls is not None:
-        by_speed = by_speed + _wall_cooling_bound(scene.walls, scene.surface, dimension)
+    by_speed, constant, heating, rotation = 0.0, 0.0, None, None
+    surface, walls, d, rate = scene.surface, scene.walls, dimension, collision_rate(0.0, dimension)
+
+    def friction(surface: ReducedRough, eta: Array, rate: Array) -> Array:
+        return _friction_rates(eta, surface.inertia, (rate, rate), 0.0, d).cooling
+
+    if surface is not None:
+        by_speed = by_speed + friction(surface, surface.eta, rate)
+        heating, rotation = jnp.zeros(()), NUM_SPIN_COMPONENTS[d] / d * surface.ratio
+    if walls is not None:
+        frequency = walls.frequency / rate
+        share = wall_impact_ratio(jnp.zeros_like(frequency), frequency, d)
+        bound = 2 / d * jnp.sum(walls.frequency * share)
+        if surface is not None and walls.surface is not None:
+            most = 2 * MAX_WALL_IMPACT_RATIO * jnp.sum(walls.frequency)
+            bound += friction(surface, surface.eta_on_wall(walls.surface) / 2, most)
+        by_speed = by_speed + bound
     if scene.drag is not None:
         constant = 2 * scene.drag.rate
-    if scene.drive is None and scene.surface is None:
-        return ElementBounds(by_speed, constant)
-    heating = jnp.zeros(()) if scene.drive is None else scene.drive.strength
-    rotation = None
-    if scene.surface is not None:
-        rotation = NUM_SPIN_COMPONENTS[dimension] / dimension * scene.surface.ratio
+    if scene.drive is not None:
+        heating = scene.drive
     return ElementBounds(by_speed, constant, heating, rotation)
-
-
-def _wall_cooling_bound(
-    walls: ReducedWalls, surface: ReducedRough | None, d: int
-) -> Float[Array, ""]:
-    """Upper bound of the cooling by walls: the rate of walls at which all spheres stop."""
-    frequency = walls.frequency / collision_rate(0.0, d)
-    share = wall_impact_ratio(jnp.zeros_like(frequency), frequency, d)
-    bound = 2 / d * jnp.sum(walls.frequency * share)
-    if surface is None or walls.surface is None:
-        return bound
-    eta, rate = (
-        surface.eta_on_wall(walls.surface) / 2,
-        MAX_WALL_IMPACT_RATIO * jnp.sum(walls.frequency),
-    )
-    return bound + _friction_rates(eta, surface.inertia, (2 * rate, 2 * rate), 0.0, d).cooling
 
 
 MAX_WAVENUMBER = {2: (0.181, 3.10), 3: (0.926, 2.19)}
@@ -757,7 +645,7 @@ def _solve_steady(gas: Gas) -> tuple[Array, Array, Array, Array]:
     tolerance = jnp.finfo(start.dtype).eps ** 0.75
     solver = optx.Newton(rtol=float(tolerance), atol=float(tolerance))
     x = optx.root_find(balance, solver, start, scene, throw=False, max_steps=32).value
-    heating = scene.drive.strength / jnp.exp(1.5 * x[0])
+    heating = scene.drive / jnp.exp(1.5 * x[0])
     imbalance = jnp.abs(balance(x, scene)[0]) / heating
     return x[0], x[1], _steady_ratio(jnp.exp(x[0] / 2), x[1], scene, d), imbalance
 
@@ -771,7 +659,7 @@ def _balance_log_temperature(scene: ReducedScene, like: Array, d: int) -> Float[
     def bisect(_, ends):
         middle = (ends[0] + ends[1]) / 2
         maxwellian = jnp.stack([middle, jnp.zeros_like(middle)])
-        heats = _steady_rates(maxwellian, scene, Density(), d, softness=False)[0] > 0
+        heats = _steady_rates(maxwellian, scene, Density(), d)[0] > 0
         return jnp.where(heats, middle, ends[0]), jnp.where(heats, ends[1], middle)
 
     bound = jnp.full((), MAX_LOG_TEMPERATURE, like.dtype)
@@ -791,33 +679,22 @@ def max_thermal_speed(gas: Gas) -> Float[Array, ""]:
 
 
 def _steady_rates(
-    x: Float[Array, "variables"],
-    scene: ReducedScene,
-    density: Density,
-    d: int,
-    softness: bool = True,
+    x: Float[Array, "variables"], scene: ReducedScene, density: Density, d: int
 ) -> Float[Array, "variables"]:
     """Rates of change of ln T, a_2 and at order 3 of a_3, where T_rot/T is steady.
 
     All correlations have built up.
     """
-    order = len(x)
-    speed, zero = jnp.exp(x[0] / 2), jnp.zeros_like(x[0])
-    rotation = None if scene.surface is None else _steady_ratio(speed, x[1], scene, d)
-    variables: dict[str, Array] = dict(
-        zip(("log_temperature", "sonine", "third_sonine"), x, strict=False)
-    )
+    order, speed, zero = len(x), jnp.exp(x[0] / 2), jnp.zeros_like(x[0])
+    moments = [x[0], x[1], zero, zero, jnp.full_like(x[0], jnp.inf)]
     if order > 2:
-        variables["diffusion_shape"] = zero
-    endless = jnp.full_like(x[0], jnp.inf)
-    moments = Moments(
-        **variables, diffusion=zero, displacement=zero, collisions=endless, rotation=rotation
-    )
-    state = jnp.stack([value for value in moments if value is not None])
+        moments += [x[2], zero]
+    if scene.surface is not None:
+        moments.append(_steady_ratio(speed, x[1], scene, d))
+    equations = Equations(d, order, maxwellian=False)
     rates = impact_moments(scene.law, speed, d, order)
-    options = {"order": order, "softness": softness, "maxwellian": False}
-    change = Moments.from_array(moment_rates(state, rates, scene, density, d, **options), order)
-    return jnp.stack([getattr(change, name) for name in list(variables)[:order]])
+    change = equations.derivative(jnp.stack(moments), rates, (scene, density))
+    return jnp.stack([change[k] for k in (0, 1, 5)[:order]])
 
 
 def _steady_ratio(speed: Array, sonine: Array, scene: ReducedScene, d: int) -> Array:

@@ -41,6 +41,46 @@ def padded_length(size: int) -> int:
     return WINDOW * 2 ** max(0, (size - 1) // WINDOW).bit_length()
 
 
+class _Progress(NamedTuple):
+    # The next step, the state before it, the states of solver and controller, the values at output
+    # times, how many of these are known, and the number of steps made.
+    t: Float[Array, ""]
+    end: Float[Array, ""]
+    y: Array
+    solver: Any
+    control: Any
+    values: Array
+    known: Int[Array, ""]
+    steps: Int[Array, ""]
+
+
+def _fill_values(
+    evaluate: Callable[[Array], Array], times: Array, reached: Array, values: Array, known: Array
+) -> tuple[Array, Int[Array, ""]]:
+    """Values with those up to a reached time filled in, and the number of known ones."""
+
+    window = min(WINDOW, times.size)
+
+    def next_time(known):
+        return times[jnp.minimum(known, times.size - 1)]
+
+    def some_left(at):
+        return (at[1] < times.size) & (next_time(at[1]) <= reached)
+
+    def fill(at):
+        values, known = at
+        begin = jnp.minimum(known, times.size - window)
+        t = jax.lax.dynamic_slice_in_dim(times, begin, window)
+        old = jax.lax.dynamic_slice_in_dim(values, begin, window)
+        inside = (begin + jnp.arange(window) >= known) & (t <= reached)
+        inside = jnp.expand_dims(inside, tuple(range(1, old.ndim)))
+        new = jnp.where(inside, jax.vmap(evaluate)(t), old)
+        values = jax.lax.dynamic_update_slice_in_dim(values, new, begin, 0)
+        return values, begin + jnp.sum(t <= reached)
+
+    return jax.lax.while_loop(some_left, fill, (values, known))
+
+
 def integrate_at(
     vector_field: Callable[[Any, Array], Array],
     start: Array,
@@ -68,32 +108,28 @@ def integrate_at(
         steps; nan where the solver failed otherwise.
     """
     term = diffrax.ODETerm(lambda t, y, args: vector_field(t, y))
-    if isinstance(solver, diffrax.AbstractERK):
-        return _integrate_with_loop(term, start, times, solver, controller, max_steps)
-    return _integrate_with_diffrax(term, start, times, solver, controller, max_steps)
+    if not isinstance(solver, diffrax.AbstractERK):
+        if isinstance(solver, diffrax.AbstractImplicitSolver):
+            # Their dense output is only of third order: step to every requested time instead.
+            controller = diffrax.ClipStepSizeController(controller, step_ts=times)
+        solution = diffrax.diffeqsolve(
+            term,
+            solver,
+            t0=jnp.zeros((), times.dtype),
+            t1=times[-1],
+            dt0=None,
+            y0=start,
+            saveat=diffrax.SaveAt(ts=times),
+            stepsize_controller=controller,
+            adjoint=diffrax.ForwardMode(),
+            max_steps=max_steps,
+            throw=False,  # one member of a batch must not end the others
+        )
+        assert solution.ys is not None
+        reached = solution.result != diffrax.RESULTS.max_steps_reached
+        failed = reached & (solution.result != diffrax.RESULTS.successful)
+        return jnp.where(failed, jnp.nan, solution.ys), reached
 
-
-class _Progress(NamedTuple):
-    # The next step, the state before it, the states of solver and controller, the values at output
-    # times, how many of these are known, and the number of steps made.
-    t: Float[Array, ""]
-    end: Float[Array, ""]
-    y: Array
-    solver: Any
-    control: Any
-    values: Array
-    known: Int[Array, ""]
-    steps: Int[Array, ""]
-
-
-def _integrate_with_loop(
-    term: diffrax.ODETerm,
-    start: Array,
-    times: Array,
-    solver: diffrax.AbstractERK,
-    controller: diffrax.AbstractAdaptiveStepSizeController,
-    max_steps: int,
-) -> tuple[Array, Array]:
     last = times[-1]
     order: Any = solver.error_order(term)
     zero, first = jnp.zeros((), times.dtype), jnp.asarray(FIRST_STEP, times.dtype)
@@ -133,82 +169,13 @@ def _integrate_with_loop(
     return done.values, done.t >= last
 
 
-def _fill_values(
-    evaluate: Callable[[Array], Array], times: Array, reached: Array, values: Array, known: Array
-) -> tuple[Array, Int[Array, ""]]:
-    """Values with those up to a reached time filled in, and the number of known ones."""
-
-    window = min(WINDOW, times.size)
-
-    def next_time(known):
-        return times[jnp.minimum(known, times.size - 1)]
-
-    def some_left(at):
-        return (at[1] < times.size) & (next_time(at[1]) <= reached)
-
-    def fill(at):
-        values, known = at
-        begin = jnp.minimum(known, times.size - window)
-        t = jax.lax.dynamic_slice_in_dim(times, begin, window)
-        old = jax.lax.dynamic_slice_in_dim(values, begin, window)
-        inside = (begin + jnp.arange(window) >= known) & (t <= reached)
-        inside = jnp.expand_dims(inside, tuple(range(1, old.ndim)))
-        new = jnp.where(inside, jax.vmap(evaluate)(t), old)
-        values = jax.lax.dynamic_update_slice_in_dim(values, new, begin, 0)
-        return values, begin + jnp.sum(t <= reached)
-
-    return jax.lax.while_loop(some_left, fill, (values, known))
-
-
-def _integrate_with_diffrax(
-    term: diffrax.ODETerm,
-    start: Array,
-    times: Array,
-    solver: diffrax.AbstractSolver,
-    controller: diffrax.AbstractAdaptiveStepSizeController,
-    max_steps: int,
-) -> tuple[Array, Array]:
-    if isinstance(solver, diffrax.AbstractImplicitSolver):
-        # Their dense output is only of third order: step to every requested time instead.
-        controller = diffrax.ClipStepSizeController(controller, step_ts=times)
-    solution = diffrax.diffeqsolve(
-        term,
-        solver,
-        t0=jnp.zeros((), times.dtype),
-        t1=times[-1],
-        dt0=None,
-        y0=start,
-        saveat=diffrax.SaveAt(ts=times),
-        stepsize_controller=controller,
-        adjoint=diffrax.ForwardMode(),
-        max_steps=max_steps,
-        throw=False,  # one member of a batch must not end the others
-    )
-    assert solution.ys is not None
-    reached = solution.result != diffrax.RESULTS.max_steps_reached
-    failed = reached & (solution.result != diffrax.RESULTS.successful)
-    return jnp.where(failed, jnp.nan, solution.ys), reached
-
-
-class Integrator(NamedTuple):
-    """Settings of the integration of equations.
-
-    Attributes:
-        solver: of diffrax.
-        rtol: relative tolerance; may be traced.
-        max_steps: largest number of steps of one curve.
-    """
-
-    solver: diffrax.AbstractSolver
-    rtol: Any
-    max_steps: int
-
-
 def moments_at(
     scene: SceneAndDensity,
     times: Float[Array, "times"],
     equations: Equations,
-    integrator: Integrator,
+    solver: diffrax.AbstractSolver,
+    rtol: Any,
+    max_steps: int,
 ) -> tuple[Moments, Int[Array, ""]]:
     """Return the moments of a gas at some reduced times, and a status.
 
@@ -216,36 +183,97 @@ def moments_at(
         scene: its floats can be differentiated.
         times: not decreasing, >= 0.
         equations: of the moments.
-        integrator: of the equations.
+        solver: of diffrax.
+        rtol: relative tolerance; may be traced.
+        max_steps: largest number of steps.
 
     Returns:
         The moments, each of shape (times,), nan unless the status is ok; and the status.
     """
+    dtype, order = times.dtype, equations.order
     leaves, structure = jax.tree.flatten(scene)
-    leaves = [jnp.asarray(x, times.dtype) for x in leaves]
+    leaves = [jnp.asarray(x, dtype) for x in leaves]
     _, unravel = ravel_pytree(structure.unflatten(leaves))
 
+    def integrate(
+        derivative: Callable, first: Array, parameters: Array, times: Array
+    ) -> tuple[Array, Int[Array, ""]]:
+        """Return the rows at the given times, shape (times, rows, states), and a status."""
+        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
+        # With nan parameters the state stays constant, so that the solver does not shorten its
+        # steps.
+        times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=dtype))
+        # The state alone controls the steps: its tangents are then those of the discrete solution.
+        controller = diffrax.PIDController(
+            rtol=rtol, atol=rtol, norm=lambda rows: optx.rms_norm(rows[0][:5])
+        )
+        rows, completed = integrate_at(
+            # s = ln(1 + t): a power law of time takes the same number of steps each decade.
+            lambda s, rows: jnp.where(known, derivative(rows) * jnp.exp(s), 0.0),
+            jnp.where(known, first, 0.0),
+            jnp.log1p(times),
+            solver=solver,
+            controller=controller,
+            max_steps=max_steps,
+        )
+        finite = known & jnp.all(jnp.isfinite(rows))
+        fault = status.flag(status.MAX_STEPS_REACHED, ~completed)
+        fault |= status.flag(status.NOT_FINITE, completed & ~finite)
+        return jnp.where(fault == status.OK, rows, jnp.nan), fault
+
     @jax.custom_jvp
-    def solve(leaves, times):
-        return _solve(_ravel(leaves, times.dtype), unravel, times, equations, integrator)
+    def solve(leaves: list[Array], times: Array) -> tuple[Moments, Int[Array, ""]]:
+        parameters = _ravel(leaves, dtype)
+        scene = unravel(parameters)
+        table, start = equations.table(scene, times[-1]), equations.initial(scene, times)
+
+        def derivative(row):
+            return equations.derivative(row, table(row[0]), scene)
+
+        rows, fault = integrate(jax.vmap(derivative), start[None], parameters, times)
+        return Moments.from_array(rows[:, 0].T, order), fault
 
     @partial(solve.defjvp, symbolic_zeros=True)
     def solve_jvp(primals, tangents):
         (leaves, times), (along, times_along) = primals, tangents
-        parameters = _ravel(leaves, times.dtype)
+        parameters = _ravel(leaves, dtype)
         changing = [np.full(x.size, not _is_zero(x)) for x in along]
         units = np.eye(parameters.size)[np.concatenate([np.zeros(0, bool), *changing])]
-        directions = jnp.asarray(units, times.dtype)
-        solution = _solve_with_tangents(
-            parameters, unravel, times, directions, equations, integrator
+        directions = jnp.asarray(units, dtype)
+        amounts = _ravel([x for x in along if not _is_zero(x)], dtype)
+        table, table_along = jax.linearize(
+            lambda parameters: equations.table(unravel(parameters), times[-1]), parameters
         )
-        state, rate, jacobian, fault = solution
-        amounts = _ravel([x for x in along if not _is_zero(x)], times.dtype)
-        changes = jax.tree.map(lambda j: amounts @ j, jacobian)
+        table = table.with_slopes(jax.vmap(lambda x: table_along(x).coefficients)(directions))
+
+        @jax.jit  # traced once
+        def derivative(state, rates, parameters):
+            return equations.derivative(state, rates, unravel(parameters))
+
+        @jax.jit  # traced once
+        def rows_derivative(rows):
+            # Row 0 is the state; the others, its tangents, obey the linearised equation.
+            rates, slope, *_ = at = table(rows[0, 0])
+            rate, linear = jax.linearize(derivative, rows[0], rates, parameters)
+
+            def along(tangent, rates_along, direction):
+                return linear(tangent, rates_along + slope * tangent[0], direction)
+
+            return jnp.concatenate([rate[None], jax.vmap(along)(rows[1:], at[2:], directions)])
+
+        start, start_along = jax.linearize(
+            lambda parameters: equations.initial(unravel(parameters), times), parameters
+        )
+        first = jnp.concatenate([start[None], jax.vmap(start_along)(directions)])
+        rows, fault = integrate(rows_derivative, first, parameters, times)
+        states, jacobian = rows[:, 0], rows[:, 1:].T
+        changes = jax.tree.map(lambda j: amounts @ j, Moments.from_array(jacobian, order))
         if not _is_zero(times_along):
-            changes = jax.tree.map(lambda m, v: m + v * times_along, changes, rate)
+            rates = jax.vmap(lambda x: derivative(x, table(x[0])[0], parameters))(states)
+            rates = Moments.from_array(rates.T, order)
+            changes = jax.tree.map(lambda m, v: m + v * times_along, changes, rates)
         no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of an integer
-        return (state, fault), (changes, no_tangent)
+        return (Moments.from_array(states.T, order), fault), (changes, no_tangent)
 
     return solve(leaves, times)
 
@@ -256,93 +284,3 @@ def _ravel(leaves: list[Array], dtype: Any) -> Float[Array, "parameters"]:
 
 def _is_zero(tangent: Any) -> bool:
     return isinstance(tangent, SymbolicZero)
-
-
-def _solve(
-    parameters: Array,
-    unravel: Callable[[Array], SceneAndDensity],
-    times: Array,
-    equations: Equations,
-    integrator: Integrator,
-) -> tuple[Moments, Int[Array, ""]]:
-    """The moments, nan unless the status is ok, and the status."""
-    scene = unravel(parameters)
-    table = equations.table(scene, times[-1])
-
-    def derivative(row):
-        return equations.derivative(row, table(row[0]), scene)
-
-    start = equations.initial(scene, times)
-    rows, fault = _integrate_rows(jax.vmap(derivative), start[None], parameters, times, integrator)
-    return Moments.from_array(rows[:, 0].T, equations.order), fault
-
-
-def _solve_with_tangents(
-    parameters: Array,
-    unravel: Callable[[Array], SceneAndDensity],
-    times: Array,
-    directions: Float[Array, "directions parameters"],
-    equations: Equations,
-    integrator: Integrator,
-) -> tuple[Moments, Moments, Moments, Int[Array, ""]]:
-    """The moments, their time derivatives, their derivatives along directions, and a status.
-
-    The directions are those of the parameters. All are nan unless the status is ok.
-    """
-    order = equations.order
-    table, table_along = jax.linearize(
-        lambda parameters: equations.table(unravel(parameters), times[-1]), parameters
-    )
-    table = table.with_slopes(jax.vmap(lambda x: table_along(x).coefficients)(directions))
-
-    @jax.jit  # traced once
-    def derivative(state, rates, parameters):
-        return equations.derivative(state, rates, unravel(parameters))
-
-    @jax.jit  # traced once
-    def rows_derivative(rows):
-        # Row 0 is the state; the others, its tangents, obey the linearised equation.
-        rates, slope, *_ = at = table(rows[0, 0])
-        rate, linear = jax.linearize(derivative, rows[0], rates, parameters)
-
-        def along(tangent, rates_along, direction):
-            return linear(tangent, rates_along + slope * tangent[0], direction)
-
-        return jnp.concatenate([rate[None], jax.vmap(along)(rows[1:], at[2:], directions)])
-
-    start, start_along = jax.linearize(
-        lambda parameters: equations.initial(unravel(parameters), times), parameters
-    )
-    first = jnp.concatenate([start[None], jax.vmap(start_along)(directions)])
-    rows, fault = _integrate_rows(rows_derivative, first, parameters, times, integrator)
-    states, jacobian = rows[:, 0], jnp.moveaxis(rows[:, 1:], 2, 0)
-    state_rates = jax.vmap(lambda x: derivative(x, table(x[0])[0], parameters))(states)
-    jacobian = jnp.swapaxes(jacobian, 1, 2)
-    state, rate, slope = (Moments.from_array(x, order) for x in (states.T, state_rates.T, jacobian))
-    return state, rate, slope, fault
-
-
-def _integrate_rows(
-    derivative: Callable, first: Array, parameters: Array, times: Array, integrator: Integrator
-) -> tuple[Array, Int[Array, ""]]:
-    """The rows at the given reduced times, shape (times, rows, states), and a status."""
-    known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
-    # With nan parameters the state stays constant, so that the solver does not shorten its steps.
-    times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=times.dtype))
-    # The state alone controls the steps: its tangents are then those of the discrete solution.
-    controller = diffrax.PIDController(
-        rtol=integrator.rtol, atol=integrator.rtol, norm=lambda rows: optx.rms_norm(rows[0][:5])
-    )
-    rows, completed = integrate_at(
-        # s = ln(1 + t): a power law of time takes the same number of steps each decade.
-        lambda s, rows: jnp.where(known, derivative(rows) * jnp.exp(s), 0.0),
-        jnp.where(known, first, 0.0),
-        jnp.log1p(times),
-        solver=integrator.solver,
-        controller=controller,
-        max_steps=integrator.max_steps,
-    )
-    finite = known & jnp.all(jnp.isfinite(rows))
-    fault = status.flag(status.MAX_STEPS_REACHED, ~completed)
-    fault |= status.flag(status.NOT_FINITE, completed & ~finite)
-    return jnp.where(fault == status.OK, rows, jnp.nan), fault

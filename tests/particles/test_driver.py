@@ -123,11 +123,11 @@ def test_the_bar_shows_the_temperature_on_a_terminal_alone(eager, capsys):
 
 
 def test_compiling_is_said_until_the_program_runs_where_a_bar_would_be():
-    with redirect_stderr(Terminal()) as stream, compiling(progress=True):
+    with redirect_stderr(Terminal()) as stream, compiling(object(), progress=True):
         assert stream.getvalue() == "\rcompiling ..."
     assert stream.getvalue().split("\r")[-2:] == [" " * 13, ""]  # removed, for the bar
     for stream, progress in ((Terminal(), False), (io.StringIO(), True)):
-        with redirect_stderr(stream), compiling(progress):
+        with redirect_stderr(stream), compiling(object(), progress):
             pass
         assert stream.getvalue() == ""
 

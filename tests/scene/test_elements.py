@@ -10,7 +10,7 @@ import jaxgran
 from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, wall_impact_ratio
 from jaxgran.scene.reduced import reduced_scene
 from jaxgran.theory.averages import impact_moments
-from jaxgran.theory.equations import Density, Moments, moment_rates
+from jaxgran.theory.equations import Density, Equations
 from tests.beads import SI, hard_gas
 
 TAUS = np.geomspace(1.0, 300.0, 8)
@@ -231,19 +231,18 @@ def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
     model = jaxgran.KineticTheory(order=2, softness=False, correlations=False)
     curve = jaxgran.cool(gas, times, model=model)
     assert float(curve.temperature[2]) > 2 * float(gas.temperature)
-    reduced = reduced_scene(gas)
+    reduced, equations = reduced_scene(gas), Equations(3, 2, maxwellian=False)
 
     @jax.jit
     def rate(state):
         rates = impact_moments(reduced.law, jnp.exp(state[0] / 2), 3, 2)
-        options = {"order": 2, "softness": False, "maxwellian": False}
-        return moment_rates(state, rates, reduced, Density(), 3, **options)
+        return equations.derivative(state, rates, (reduced, Density()))
 
     def rates(t, state):
         return np.asarray(rate(jnp.asarray(state)))
 
     ends = times * float(gas.impact_speed / gas.path_length)
-    first = np.asarray(Moments.initial(reduced, jnp.zeros(()), order=2))
+    first = np.asarray(equations.initial((reduced, Density()), jnp.zeros(())))
     found = solve_ivp(rates, (0, ends[-1]), first, t_eval=ends, rtol=1e-10, atol=1e-12)
     T = float(gas.temperature) * np.exp(found.y[0])
     np.testing.assert_allclose(curve.temperature, T, rtol=1e-7)  # the table's 1e-9, the solvers'

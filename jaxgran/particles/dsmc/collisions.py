@@ -24,9 +24,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt, UInt32
 
-from jaxgran.gradients.tangents import ExchangeTangents
+from jaxgran.gradients.tangents import ExchangeTangents, PathTangents
 from jaxgran.particles.state import (
     MAX_KICK,
     DragDecay,
@@ -38,7 +38,6 @@ from jaxgran.particles.state import (
 )
 from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.geometry import sphere_surface
-from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory.averages import collision_rate
 
@@ -91,35 +90,26 @@ class Scheme(NamedTuple):
 class DSMCTangents(NamedTuple):
     """Tangents at a fixed scaled time s, ``ds = sqrt(T/T_0) dt``, along p directions in the law.
 
-    The tangent of the velocities is c v / 2. That of <dr^2> follows from ``d<dr^2>/ds = 2 d M``,
-    ``dM/ds = 1/2 - kappa M``, the equation of kinetic theory for ``M = D / sqrt(T/T_0)``. Here
-    kappa is the rate of velocity relaxation less half the cooling rate, and is measured on the
-    collisions.
+    The tangent of the velocities is c v / 2. The rate of velocity relaxation, which `PathTangents`
+    takes, is measured on the collisions.
 
     Attributes:
         directions: in the scene, stacked along a first axis of each leaf.
-        mobility: M.
         log_temperature: c = d ln T.
         clock: tangent of the time.
-        mobility_along: tangent of M.
-        displacement: tangent of <dr^2>.
-        persistence: tangent of the logarithm of <v(0).v> / sqrt(T).
+        paths: tangents of the paths of the particles.
     """
 
     directions: ReducedScene
-    mobility: Float[Array, "*replicas"]
     log_temperature: Float[Array, "p *replicas"]
     clock: Float[Array, "p *replicas"]
-    mobility_along: Float[Array, "p *replicas"]
-    displacement: Float[Array, "p *replicas"]
-    persistence: Float[Array, "p *replicas"]
+    paths: PathTangents
 
     @classmethod
     def initial(cls, directions: ReducedScene, replicas: int, dtype: Any) -> "DSMCTangents":
         """Return the tangents at t = 0."""
-        num_directions = max((len(leaf) for leaf in jax.tree.leaves(directions)), default=0)
-        along = jnp.zeros((num_directions, replicas), dtype)
-        return cls(directions, jnp.zeros(replicas, dtype), *[along] * 5)
+        paths = PathTangents.initial(directions, replicas, dtype)
+        return cls(directions, paths.correlation_along, paths.correlation_along, paths)
 
 
 class DSMCState(NamedTuple):
@@ -195,7 +185,7 @@ class Outcome(NamedTuple):
         along: tangents of -loss and of relaxation along the directions in the law.
         along_speed: their tangents in the logarithm of all speeds.
         rotational_gain: increase of q sum s^2 of rough spheres.
-        spin_change: change of the spins of both particles of each pair; None for smooth spheres.
+        spin_change: change of the spins of both particles of each pair.
     """
 
     kick: Float[Array, "pairs d"]
@@ -205,8 +195,8 @@ class Outcome(NamedTuple):
     relaxation: Float[Array, ""]
     along: Float[Array, "2 p"]
     along_speed: Float[Array, "..."]  # (2,)
-    rotational_gain: Float[Array, ""] | float = 0.0
-    spin_change: Float[Array, "pairs spins"] | None = None
+    rotational_gain: Float[Array, ""] | float
+    spin_change: Float[Array, "pairs spins"]
 
 
 def collide(
@@ -215,8 +205,8 @@ def collide(
     ceiling: Float[Array, ""],
     share: Float[Array, ""],
     scene: ReducedScene,
-    directions: ReducedScene | None = None,
-    spin: Float[Array, "pairs spins"] | None = None,
+    directions: ReducedScene | None,
+    spin: Float[Array, "pairs spins"],
     drag_factor: Float[Array, ""] | float = 1.0,
 ) -> Outcome:
     """Let candidate pairs collide at a rate proportional to |g|, with normals weighted by g.n.
@@ -228,7 +218,7 @@ def collide(
         share: fraction of the step to be done.
         scene: in reduced units.
         directions: of the tangents; None for no tangents.
-        spin: s_i + s_j of rough spheres.
+        spin: s_i + s_j; smooth spheres have no components.
         drag_factor: ratio of physical velocities to these.
     """
     d, dtype = relative.shape[-1], relative.dtype
@@ -245,8 +235,18 @@ def collide(
     cosine = jnp.sqrt(jnp.where(in_disk, 1 - sine_square, 1.0))
     sideways = _perpendicular(axis)
     normal_speed = jnp.where(hit, speed * cosine, ceiling)
-    at_impact = normal_speed * drag_factor
-    eps, along, along_speed = _restitution(at_impact, hit, scene.law, directions)
+    at_impact, zero = normal_speed * drag_factor, jnp.zeros((), dtype)
+
+    def restitution(law, log_scale):
+        return law.restitution(at_impact * jnp.exp(log_scale))
+
+    if directions is None:
+        eps, along, along_speed = restitution(scene.law, zero), jnp.zeros((2, 0), dtype), zero
+    else:
+        eps, pull = jax.vjp(restitution, scene.law, zero)
+        weights = [jnp.where(hit, x * at_impact**2, 0.0) for x in (eps, (1 + eps) / 2)]
+        in_law, along_speed = jax.vmap(pull)(jnp.stack(weights))
+        along = jax.vmap(slopes_along, (0, None))(in_law, directions.law)
     square = jnp.where(hit, normal_speed**2, 0.0)
     push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
     normal = [
@@ -261,8 +261,10 @@ def collide(
         relaxation=jnp.sum((1 + eps) ** 2 / 4 * square),
         along=along,
         along_speed=along_speed,
+        rotational_gain=0.0,
+        spin_change=spin,
     )
-    if (surface := scene.surface) is None or spin is None:
+    if (surface := scene.surface) is None:
         return outcome
     normal = jnp.stack(normal, axis=-1)
     tangential = tangential_impulse(relative, spin, normal, hit, surface.eta, surface, push)
@@ -287,26 +289,6 @@ def _perpendicular(axis: list[Float[Array, "pairs"]]) -> list[list[Float[Array, 
         [1 + sign * x * x * a, sign * x * y * a, -sign * x],
         [x * y * a, sign + y * y * a, -y],
     ]
-
-
-def _restitution(
-    normal_speed: Float[Array, "pairs"],
-    hit: Bool[Array, "pairs"],
-    law: ReducedLaw,
-    directions: ReducedScene | None,
-) -> tuple[Float[Array, "pairs"], Float[Array, "2 p"], Float[Array, "..."]]:
-    """Return eps of each pair, and `Outcome.along` and `Outcome.along_speed` of the collisions."""
-    zero, along = jnp.zeros((), normal_speed.dtype), jnp.zeros((2, 0), normal_speed.dtype)
-
-    def restitution(law, log_scale):
-        return law.restitution(normal_speed * jnp.exp(log_scale))
-
-    if directions is None:
-        return restitution(law, zero), along, zero
-    eps, pull = jax.vjp(restitution, law, zero)
-    weights = [jnp.where(hit, x * normal_speed**2, 0.0) for x in (eps, (1 + eps) / 2)]
-    in_law, along_speed = jax.vmap(pull)(jnp.stack(weights))
-    return eps, jax.vmap(slopes_along, (0, None))(in_law, directions.law), along_speed
 
 
 def slopes_along(gradient: Any, directions: Any) -> Float[Array, "p"]:
@@ -382,9 +364,8 @@ SubsetCounts = tuple[Int[Array, "*replicas"] | None, Int[Array, "*replicas"] | N
 """Numbers of subsets that a drive kicks in half of a step, and of those that may hit walls in the
 step; None without a drive or walls."""
 
-CandidatePairs = tuple[Array, Array | None, Array]
-"""Candidate pairs of a step: relative velocities, sums of the spins in the state (None for smooth
-spheres) and random bits."""
+CandidatePairs = tuple[Array, Array, Array]
+"""Candidate pairs of a step: relative velocities, sums of the spins in the state, random bits."""
 
 EnergyGains = tuple[Float[Array, "2"], Float[Array, "changes 2"]]
 """Gains of sum v^2 and of q sum s^2 of the spins in the state, and their tangents: along directions
@@ -416,7 +397,7 @@ class DSMCDynamics(eqx.Module):
 
         They come at its start (place 0) or end (1).
         """
-        return kick_variance(self.scene.drive.strength, self.scene.drag, start, ds, place)
+        return kick_variance(self.scene.drive, self.scene.drag, start, ds, place)
 
     def max_wall_impacts(
         self, state: DSMCState, ds: Float[Array, "*replicas"]
@@ -436,7 +417,7 @@ class DSMCDynamics(eqx.Module):
             ds = ds / jnp.maximum(self.max_wall_impacts(state, ds), 1.0)
         if self.scene.drive is None:
             return ds
-        growth = self.scene.drive.strength / self.drag_decay(state.clock).velocity ** 3
+        growth = self.scene.drive / self.drag_decay(state.clock).velocity ** 3
         safe = jnp.where(growth > 0, growth, 1.0)
         return jnp.where(growth > 0, jnp.minimum(ds, MAX_KICK * state.temperature / safe), ds)
 
@@ -501,14 +482,12 @@ class DSMCDynamics(eqx.Module):
         a step is as accurate as at its end. `largest` are the largest numbers of subsets of all
         replicas.
         """
-        scheme, before = self.scheme, state
+        scheme, before, tangents = self.scheme, state, state.tangents
         key = jax.random.fold_in(key, state.steps)
         dt = share * scheme.scaled_step / jnp.sqrt(state.temperature)
         kicks, walls = zip(subsets, largest, strict=True)
         kick = partial(self._kick, key=key, dt=dt, counts=kicks, clock=state.clock)
         state = kick(state, place=0)
-        tangents = state.tangents
-        exchanging = isinstance(tangents, ExchangeTangents)
         particles, sums, pairs = self._collide(state, key, dt, share)
         loss, wall_gains = sums.loss, None
         if self.scene.walls is not None:
@@ -528,14 +507,23 @@ class DSMCDynamics(eqx.Module):
             steps=state.steps + (share > 0).astype(state.steps.dtype),
         )
         new = kick(new, place=1)
-        if exchanging:
+        if isinstance(tangents, ExchangeTangents):
             ceiling = CEILING * jnp.sqrt(state.temperature)
             tangents = self._exchange_tangents(
                 before, ceiling, share, dt, pairs, wall_gains, sums.num
             )
         elif tangents is not None:
-            ds, after = share * scheme.scaled_step, energy * temperature
-            tangents = self._scaled_time_tangents(tangents, sums, dt, ds, after)
+            # The tangent of the velocities is (c/2) v, and the law contributes at every collision.
+            c, after = tangents.log_temperature, energy * temperature
+            along = sums.along + sums.along_speed[:, None] * (c / 2)[None]
+            gain, fading = along / after
+            # In the units of a run T is half of T/T_0.
+            thermal_time, relaxed = share * scheme.scaled_step / sqrt(2), sums.relaxation / after
+            tangents = tangents._replace(
+                log_temperature=c + gain,
+                clock=tangents.clock - c / 2 * dt,
+                paths=tangents.paths.after(thermal_time, relaxed, fading, scheme.dimension),
+            )
         return new._replace(tangents=tangents)
 
     def _kick(
@@ -599,28 +587,22 @@ class DSMCDynamics(eqx.Module):
             directions=state.tangents.directions if scaled else None,
             drag_factor=decay.velocity,
         )
-        rough = self.scene.surface is not None
         firsts = v[:first] - v[first : 2 * first]
-        first_spins = spin[:first] + spin[first : 2 * first] if rough else None
+        first_spins = spin[:first] + spin[first : 2 * first]
         one = rule(firsts, bits[:, :first], spin=first_spins)
-        kick_before, second_spins = one.kick[:second], one.spin_change
-        if second_spins is not None:
-            second_spins = spin[:second] + second_spins[:second] + spin[2 * first :]
-        seconds = v[:second] + kick_before - v[2 * first :]
+        kick, turn = one.kick, one.spin_change
+        seconds = v[:second] + kick[:second] - v[2 * first :]
+        second_spins = spin[:second] + turn[:second] + spin[2 * first :]
         two = rule(seconds, bits[:, first:-2], spin=second_spins)
-        kicks = jnp.concatenate([kick_before + two.kick, one.kick[second:], -one.kick, -two.kick])
-        changes = [kicks, -middle * kicks]
-        if one.spin_change is not None and two.spin_change is not None:
-            both = one.spin_change[:second] + two.spin_change
-            changes.append(
-                jnp.concatenate([both, one.spin_change[second:], one.spin_change, two.spin_change])
-                / spin_factor
-            )
-        sums = jax.tree.map(jnp.add, *(x._replace(kick=0.0, spin_change=None) for x in (one, two)))
+        kicks = jnp.concatenate([kick[:second] + two.kick, kick[second:], -kick, -two.kick])
+        turns = [turn[:second] + two.spin_change, turn[second:], turn, two.spin_change]
+        changes = [kicks, -middle * kicks, jnp.concatenate(turns) / spin_factor]
+        sums = jax.tree.map(jnp.add, *(x._replace(kick=0.0, spin_change=0.0) for x in (one, two)))
         new = old + jnp.concatenate(changes, axis=-1)
-        first_spins = None if first_spins is None else first_spins / spin_factor
-        second_spins = None if second_spins is None else second_spins / spin_factor
-        pairs = (firsts, first_spins, bits[:, :first]), (seconds, second_spins, bits[:, first:-2])
+        pairs = (
+            (firsts, first_spins / spin_factor, bits[:, :first]),
+            (seconds, second_spins / spin_factor, bits[:, first:-2]),
+        )
         return state.particles.at[index].set(new, **options), sums, pairs
 
     def _hit_walls(
@@ -697,31 +679,6 @@ class DSMCDynamics(eqx.Module):
         particles, (loss, gains) = change_subsets(particles, first, drawn, largest, hit_rows, zero)
         return particles, loss, gains
 
-    def _scaled_time_tangents(
-        self, old: DSMCTangents, sums: Outcome, dt: Array, ds: Array, energy: Array
-    ) -> DSMCTangents:
-        """Return the tangents after a step of a length in time and in scaled time.
-
-        The energy is sum v^2 after the step.
-        """
-        c, d = old.log_temperature, self.scheme.dimension
-        # The tangent of the velocities is (c/2) v, and the law contributes at every collision.
-        gain, fading = (sums.along + sums.along_speed[:, None] * (c / 2)[None]) / energy
-        # dM/ds = 1/2 - kappa M and its tangent, by the implicit midpoint rule.
-        half = sums.relaxation / energy / 2
-        mobility = ((1 - half) * old.mobility + ds / 2) / (1 + half)
-        along = (1 - half) * old.mobility_along - fading * (old.mobility + mobility) / 2
-        along = along / (1 + half)
-        return DSMCTangents(
-            directions=old.directions,
-            mobility=mobility,
-            log_temperature=c + gain,
-            clock=old.clock - c / 2 * dt,
-            mobility_along=along,
-            displacement=old.displacement + d * ds * (old.mobility_along + along),
-            persistence=old.persistence - fading,
-        )
-
     def _exchange_tangents(
         self,
         before: DSMCState,
@@ -740,9 +697,9 @@ class DSMCDynamics(eqx.Module):
         ) -> Array:
             scene, total = dynamics.scene, jnp.zeros(2, ds.dtype)
             for relative, spins, bits in candidates:
-                spins = None if spins is None else spins * turning
+                relative, spins = relative * faster, spins * turning
                 outcome = collide(
-                    relative * faster, bits, ceiling, share, scene, None, spins, decay.velocity
+                    relative, bits, ceiling, share, scene, None, spins, decay.velocity
                 )
                 gain = outcome.rotational_gain / decay.spin**2
                 total = total + jnp.stack([-outcome.loss, gain])

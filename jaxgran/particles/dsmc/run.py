@@ -18,7 +18,7 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import Particles, Run
-from jaxgran.gradients.rule import Inputs, Outputs
+from jaxgran.gradients.rule import Inputs, Outputs, with_tangents
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import observables, snapshot
 from jaxgran.particles.dsmc.collisions import (
@@ -31,7 +31,6 @@ from jaxgran.particles.run import (
     block_until_ready,
     compiled_for_host,
     compiling,
-    needs_compilation,
     run_through_times,
 )
 from jaxgran.particles.setup import maxwellian_velocities
@@ -153,13 +152,13 @@ def dsmc_records(
         c = tangents.log_temperature
         at_scaled_time = {
             "temperature": theta[None] * c,
-            "velocity_correlation": correlation[None] * (c / 2 + tangents.persistence),
-            "displacement": tangents.displacement,
+            "velocity_correlation": correlation[None] * (c / 2 + tangents.paths.correlation_along),
+            "displacement": tangents.paths.displacement_along,
             "collisions": jnp.zeros_like(c),
         }
-        for name, along in at_scaled_time.items():
-            values[f"{name}.along"] = along - rates[name][None] * tangents.clock
-        values |= {f"{name}.rate": rate for name, rate in rates.items()}
+        known = {name: values[name] for name in at_scaled_time}
+        values |= with_tangents(known, at_scaled_time, rates, tangents.clock)
+        values["sonine.rate"] = rates["sonine"]
     return values
 
 
@@ -209,11 +208,35 @@ def run_dsmc(
         records = _run_traced(dynamics, inputs.times, state, words, units=inputs.units, save=save)
         fault = status.OK
     else:
-        description = {}
-        if run.checkpoint is not None:
-            given = inputs._asdict() | settings | {"directions": directions, "save": run.save}
-            description = describe_run(**given)
-        records, fault = _run_on_host(dynamics, inputs, state, words, save, run, description)
+        scheme, dtype = dynamics.scheme, state.clock.dtype
+        pairs = replicas * (scheme.first + scheme.second)
+        max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
+        compiled = compiled_for_host(advance, donate=run.checkpoint is None)
+        first = state.particles[..., : scheme.dimension]
+        observe = partial(dsmc_records, dynamics, first=first, key=words)
+        recorded = partial(observe, units=inputs.units, save=save)
+        state = copy_buffers(state)
+
+        def advance_towards(state: DSMCState, end: float) -> DSMCState:
+            arguments = dynamics, state, jnp.asarray(end, dtype), words, max_steps
+            return block_until_ready(compiled(*arguments))
+
+        program = jax.tree.structure((dynamics, state)), state.particles.shape, dtype
+        with compiling(program, run.progress) as new:
+            if new:  # compile with a call of zero steps, which may delete its state
+                jax.block_until_ready(recorded(advance_towards(copy_buffers(state), 0.0)))
+        given = inputs._asdict() | settings | {"directions": directions, "save": run.save}
+        _, records, fault = run_through_times(
+            state,
+            np.asarray(inputs.times),
+            advance_towards,
+            recorded,
+            shown=observe,
+            scene={} if run.checkpoint is None else describe_run(**given),
+            progress=run.progress,
+            path=run.checkpoint,
+        )
+        records = jax.tree.map(jnp.asarray, records)
     faults = records.pop("fault")
     failed = jnp.cumsum(faults != status.OK, axis=0) > 0
     records |= {
@@ -237,43 +260,3 @@ def _run_traced(
         return state, dsmc_records(dynamics, state, first, words, **options)
 
     return jax.lax.scan(advance_to, state, times)[1]
-
-
-def _run_on_host(
-    dynamics: DSMCDynamics,
-    inputs: Inputs,
-    state: DSMCState,
-    words: Array,
-    save: Callable[[Particles], Any] | None,
-    run: Run,
-    description: dict[str, str],
-) -> tuple[dict[str, Any], int]:
-    """Run with progress and checkpoints; return the records and the status of the driver."""
-    scheme, dtype = dynamics.scheme, state.clock.dtype
-    pairs = len(state.clock) * (scheme.first + scheme.second)
-    max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
-    compiled = compiled_for_host(advance, donate=run.checkpoint is None)
-    observe = partial(dsmc_records, dynamics, first=state.particles[..., : scheme.dimension])
-    observe = partial(observe, key=words)
-    recorded = partial(observe, units=inputs.units, save=save)
-    state = copy_buffers(state)
-
-    def advance_towards(state: DSMCState, end: float) -> DSMCState:
-        arguments = dynamics, state, jnp.asarray(end, dtype), words, max_steps
-        return block_until_ready(compiled(*arguments))
-
-    new = needs_compilation((jax.tree.structure((dynamics, state)), state.particles.shape, dtype))
-    with compiling(run.progress and new):
-        if new:  # compile with a call of zero steps, which may delete its state
-            jax.block_until_ready(recorded(advance_towards(copy_buffers(state), 0.0)))
-    _, records, fault = run_through_times(
-        state,
-        np.asarray(inputs.times),
-        advance_towards,
-        recorded,
-        shown=observe,
-        scene=description,
-        progress=run.progress,
-        path=run.checkpoint,
-    )
-    return jax.tree.map(jnp.asarray, records), fault

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran._utils import status
 from jaxgran.gradients import rule
-from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents, update_rates
+from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import (
@@ -27,9 +27,14 @@ from jaxgran.particles.dynamics import (
     repeat_until,
 )
 from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, execute_impacts
-from jaxgran.particles.hard.prediction import ImpactCandidates, select_impact_candidates
-from jaxgran.particles.neighbours import Pairs
-from jaxgran.particles.setup import min_distance, overlap_by_rounding
+from jaxgran.particles.hard.prediction import (
+    ImpactCandidates,
+    PairRows,
+    Paths,
+    first_impacts,
+)
+from jaxgran.particles.neighbours import Pairs, rows_where, select_members
+from jaxgran.particles.setup import allowed_overlap, min_distance
 from jaxgran.particles.state import (
     MAX_KICK,
     State,
@@ -100,8 +105,6 @@ class HardDynamics(AbstractDynamics):
         contact_time: in mean free times; the impact of a sphere within this time of its last one is
             elastic.
         all_elastic: whether all impacts are elastic and smooth.
-        overlap: largest overlap of positions given by a user that are accepted as those of hard
-            spheres.
     """
 
     scene: SphereScene
@@ -110,7 +113,6 @@ class HardDynamics(AbstractDynamics):
     share: float = eqx.field(static=True)
     contact_time: Float[Array, ""]
     all_elastic: Bool[Array, ""]
-    overlap: float = eqx.field(static=True, default=1e-9)
 
     def initial_internal(self, num_rows, dtype) -> HardState:
         # The first window is short: at random positions many spheres are near contact.
@@ -162,11 +164,10 @@ class HardDynamics(AbstractDynamics):
     def check_start(self, state: State) -> Int[Array, ""]:
         x, side = state.position, self.scene.side
         closest = min_distance(x, side, self.replicas, self.capacity[:2], "sweep")
-        tolerance = overlap_by_rounding(x, side, self.overlap)
         if (container := self.scene.container) is not None:  # a sphere and its image beyond a wall
             image = 2 * jnp.min(jnp.minimum(x, container[None] - x))
             closest = jnp.minimum(closest, image)
-        return status.flag(status.OVERLAPPING, closest < 1 - tolerance)
+        return status.flag(status.OVERLAPPING, closest < 1 - allowed_overlap(x, side))
 
     @jax.jit
     def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, Array]:
@@ -209,9 +210,7 @@ class HardDynamics(AbstractDynamics):
         duration = time_until_end / num_left
         kicked = self._apply_drive(old, duration, 0.0)
         bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
-        candidates = select_impact_candidates(
-            old.position, kicked.velocity, pairs, duration, bound, self.capacity, scene.container
-        )
+        candidates = self._select_candidates(kicked, pairs, duration, bound)
         work = execute_impacts(
             kicked, listed, candidates, scene, duration, self.contact_time, self.all_elastic
         )
@@ -239,6 +238,42 @@ class HardDynamics(AbstractDynamics):
             needed=jnp.maximum(now.needed, candidates.needed),
             internal=jnp.where(repeat, 1.3 * bound_factor, 1.0),
         )
+
+    def _select_candidates(
+        self, state: State, pairs: Pairs, duration: Array, bound: Float[Array, "replicas"]
+    ) -> ImpactCandidates:
+        """Select the pairs that touch in free flight, and all that may touch once paths have
+        changed. Particles that reach a wall are members, too.
+
+        Args:
+            state: at the beginning of the window.
+            pairs: a neighbour list, with all pairs that may touch.
+            duration: of the window.
+            bound: an upper bound on the speeds in each replica during the window.
+        """
+        x, v, container = state.position, state.velocity, self.scene.container
+        n, size = len(x), len(x) // len(bound)
+        # The listed pairs that can touch at the largest speeds are a small part of the list.
+        displacement = x[pairs.i] - x[pairs.j] - pairs.offset
+        gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
+        gap = jnp.where(jnp.arange(gap.size) < pairs.count, gap, jnp.inf)
+        near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, self.capacity.near)
+        real = jnp.arange(self.capacity.near) < num_near
+        near = jnp.where(real, near, 0)
+        i, j, offset = pairs.i[near], pairs.j[near], pairs.offset[near]
+        rows = PairRows(i, j, offset, bound[i // size], real)
+
+        free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, container)
+        disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
+        closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
+        selected = rows.real & (jnp.isfinite(free.times) | closer)
+        at_walls = jnp.zeros(n, bool) if free.wall_times is None else jnp.isfinite(free.wall_times)
+        picked, real, members, (a, b), counts = select_members(
+            selected, i, j, at_walls, self.capacity[3:]
+        )
+        rows = PairRows(a, b, offset[picked], rows.bound[picked], real)
+        needed = jnp.stack([pairs.count, pairs.lookahead, num_near, *counts])
+        return ImpactCandidates(members, rows, members // size, needed)
 
     def _state_after_window(
         self, state: State, candidates: ImpactCandidates, work: ImpactWork, duration: Array
@@ -347,8 +382,7 @@ class HardDynamics(AbstractDynamics):
         if isinstance(tangents, ImpactTangents):
             T = temperature(new.velocity, replicas)
             energy, trend = 0.5 * d * n * T, cooling_trend(scene.material.law, T, d)
-            rates = update_rates(
-                tangents.rates,
+            rates = tangents.rates.after(
                 lost=lost,
                 collisions=impacts / n,
                 energy=energy,
@@ -386,7 +420,7 @@ def drive_variance(
     scene: SphereScene, start: Float[Array, ""], duration: ArrayLike, place: float
 ) -> Float[Array, ""]:
     """Return the variance of half of the kicks of a window, at its begin (place 0) or end (1)."""
-    strength = scene.material.drive.strength * scene.collision_frequency
+    strength = scene.material.drive * scene.collision_frequency
     return kick_variance(strength, scene.drag_rates, start, jnp.asarray(duration), place)
 
 

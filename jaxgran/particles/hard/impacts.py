@@ -44,15 +44,6 @@ class ImpactEvents(NamedTuple):
     spin: Float[Array, "rows spins"] | None
     elastic: Bool[Array, "rows"]
 
-    def scaled(self, velocity: Float[Array, ""], spin: Float[Array, ""]) -> "ImpactEvents":
-        """Return the impacts with all velocities and all spins multiplied by exp(...)."""
-        factor = jnp.exp(velocity)
-        return self._replace(
-            relative=self.relative * factor,
-            speed=self.speed * factor,
-            spin=None if self.spin is None else self.spin * jnp.exp(spin),
-        )
-
 
 class ImpactEffect(NamedTuple):
     """Effect of impacts on the first sphere.
@@ -128,11 +119,17 @@ def exchange_gains(
     """Return the tangents of the gains of both energies, as `ExchangeTangents.after` takes them."""
 
     def energies(material: ReducedScene, velocity: Array, spin: Array) -> Array:
+        # All velocities and all spins are multiplied by exp(...).
         if material.surface is not None:
             # At a given energy spins are smaller where the inertia is larger.
             inertia = scene.material.surface.inertia
             spin = spin - 0.5 * jnp.log(material.surface.inertia / inertia)
-        scaled = impact.scaled(velocity, spin)
+        factor = jnp.exp(velocity)
+        scaled = impact._replace(
+            relative=impact.relative * factor,
+            speed=impact.speed * factor,
+            spin=None if impact.spin is None else impact.spin * jnp.exp(spin),
+        )
         _, lost, _, gain = impact_effect(scene.with_material(material), scaled, axis)
         gain = jnp.zeros_like(lost) if gain is None else gain
         return jnp.where(happens, jnp.stack([-lost, gain]), 0.0)

@@ -12,9 +12,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.neighbours import Pairs, rows_where, select_members
-
 
 class PairRows(NamedTuple):
     """Pairs of particles that may touch.
@@ -56,10 +53,6 @@ class RelativeMotion(NamedTuple):
     rr: Float[Array, "rows"]
     rw: Float[Array, "rows"]
     ww: Float[Array, "rows"]
-
-    @classmethod
-    def from_vectors(cls, r: Float[Array, "rows d"], w: Float[Array, "rows d"]) -> "RelativeMotion":
-        return cls(jnp.sum(r * r, -1), jnp.sum(r * w, -1), jnp.sum(w * w, -1))
 
     def gap(self, s: ArrayLike) -> Float[Array, "rows"]:
         """Return the distance between the surfaces at s."""
@@ -125,7 +118,7 @@ def first_impacts(
     """Return the next impact of each pair and of each particle before `end`."""
     a, b = rows.a, rows.b
     r, w = paths.x[a] - paths.x[b] - rows.offset, paths.v[a] - paths.v[b]
-    motion = RelativeMotion.from_vectors(r, w)
+    motion = RelativeMotion(jnp.sum(r * r, -1), jnp.sum(r * w, -1), jnp.sum(w * w, -1))
     last = paths.last[a], paths.last[b]
     times = motion.impact_time(jnp.maximum(jnp.maximum(*last), 0.0))
     times = jnp.where(rows.real & (times < end), times, jnp.inf)
@@ -134,26 +127,11 @@ def first_impacts(
     if container is not None:
         wall_times, wall_axis = next_wall_impacts(container, paths, end)
         first = jnp.minimum(first, wall_times)
-    final = _final_times(paths, rows, motion, first, end)
-    return FirstImpacts(r, w, motion, times, wall_times, wall_axis, first, final)
 
-
-def _final_times(
-    paths: Paths,
-    rows: PairRows,
-    motion: RelativeMotion,
-    first: Float[Array, "slots"],
-    end: ArrayLike,
-) -> Float[Array, "slots"]:
-    """Return a lower bound on the time until which each path is final, for times before `end`.
-
-    The path of a particle changes at its first impact, or when it is hit by a particle whose path
-    has changed earlier. Such a particle moves no faster than the bound on all speeds, which gives
-    the earliest time at which it can arrive. These times depend on each other from pair to pair;
-    starting from `first` they are lowered until they are consistent.
-    """
-    a, b = rows.a, rows.b
-    last = paths.last[a], paths.last[b]
+    # The path of a particle changes at its first impact, or when it is hit by a particle whose path
+    # has changed earlier. Such a particle moves no faster than the bound on all speeds, which gives
+    # the earliest time at which it can arrive. These times depend on each other from pair to pair;
+    # starting from `first` they are lowered until they are consistent.
     speed = jnp.sqrt(jnp.sum(paths.v**2, -1))
     closing = rows.bound + speed[a], rows.bound + speed[b]
 
@@ -171,7 +149,8 @@ def _final_times(
         new = new.at[a].min(arrival(new[b], last[0], closing[0]))
         return new, jnp.any(new < jnp.minimum(final, end))  # times after `end` do not matter
 
-    return jax.lax.while_loop(lambda carry: carry[1], lower, (first, jnp.array(True)))[0]
+    final, _ = jax.lax.while_loop(lambda carry: carry[1], lower, (first, jnp.array(True)))
+    return FirstImpacts(r, w, motion, times, wall_times, wall_axis, first, final)
 
 
 class ImpactCandidates(NamedTuple):
@@ -189,44 +168,3 @@ class ImpactCandidates(NamedTuple):
     rows: PairRows
     replica: Int[Array, "members"]
     needed: Int[Array, "kinds"]
-
-
-def select_impact_candidates(
-    x: Float[Array, "n d"],
-    v: Float[Array, "n d"],
-    pairs: Pairs,
-    duration: ArrayLike,
-    bound: Float[Array, "replicas"],
-    capacity: Capacity,
-    container: Float[Array, "d"] | None = None,
-) -> ImpactCandidates:
-    """Select the pairs that touch in free flight, and all that may touch once paths have changed.
-
-    Args:
-        x, v: positions and velocities of all particles of all replicas.
-        pairs: a neighbour list, with all pairs that may touch.
-        duration: of the window.
-        bound: an upper bound on the speeds in each replica during the window.
-        capacity: sizes of the arrays.
-        container: its sides; particles that reach its walls are members, too.
-    """
-    n, size = len(x), len(x) // len(bound)
-    # The listed pairs that can touch at the largest speeds are a small part of the list.
-    displacement = x[pairs.i] - x[pairs.j] - pairs.offset
-    gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
-    gap = jnp.where(jnp.arange(gap.size) < pairs.count, gap, jnp.inf)
-    near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, capacity.near)
-    real = jnp.arange(capacity.near) < num_near
-    near = jnp.where(real, near, 0)
-    i, j, offset = pairs.i[near], pairs.j[near], pairs.offset[near]
-    rows = PairRows(i, j, offset, bound[i // size], real)
-
-    free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, container)
-    disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
-    closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
-    selected = rows.real & (jnp.isfinite(free.times) | closer)
-    at_walls = jnp.zeros(n, bool) if free.wall_times is None else jnp.isfinite(free.wall_times)
-    picked, real, members, (a, b), counts = select_members(selected, i, j, at_walls, capacity[3:])
-    rows = PairRows(a, b, offset[picked], rows.bound[picked], real)
-    needed = jnp.stack([pairs.count, pairs.lookahead, num_near, *counts])
-    return ImpactCandidates(members, rows, members // size, needed)

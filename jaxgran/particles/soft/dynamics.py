@@ -21,7 +21,6 @@ from jaxgran.gradients.tangents import (
     ContactTangents,
     component_along,
     ratio_or_zero,
-    update_rates,
 )
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.capacity import Capacity, max_skin
@@ -33,7 +32,7 @@ from jaxgran.particles.dynamics import (
     initial_progress,
     repeat_until,
 )
-from jaxgran.particles.neighbours import Pairs
+from jaxgran.particles.neighbours import Pairs, rows_where, select_members
 from jaxgran.particles.soft.forces import (
     PAIR,
     WALL,
@@ -44,7 +43,6 @@ from jaxgran.particles.soft.forces import (
     fly,
     integrate,
     overlap,
-    select_contact_candidates,
     wall_overlap,
 )
 from jaxgran.particles.state import (
@@ -112,31 +110,6 @@ class SoftProgress(NamedTuple):
 
     extra: Bool[Array, "n"]
     reach_factor: Float[Array, ""]
-
-
-class Block(NamedTuple):
-    """Result of one block, not yet accepted.
-
-    Attributes:
-        state: after the block, at its old time, with tangents that are not yet projected.
-        lost_in_contacts: energy lost in contacts, of pairs and at walls.
-        lost: energy lost in contacts and to drag.
-        exchanged: work of the elastic forces, with all its parts counted as positive.
-        begun: number of contacts of pairs that began.
-        free: True for particles without contact.
-        unexpected: particles that touched another one or a wall although not all of their
-            neighbours belong to the candidates.
-        max_square_move: square of the largest distance that a member moved.
-    """
-
-    state: State
-    lost_in_contacts: Float[Array, "replicas"]
-    lost: Float[Array, "replicas"]
-    exchanged: Float[Array, "replicas"]
-    begun: Int[Array, "replicas"]
-    free: Bool[Array, "n"]
-    unexpected: Bool[Array, "n"]
-    max_square_move: Float[Array, ""]
 
 
 class SoftDynamics(AbstractDynamics):
@@ -235,30 +208,20 @@ class SoftDynamics(AbstractDynamics):
         from_contacts = (internal.reach_factor - 1) * jnp.sqrt(hottest)
         reach = REACH_MARGIN * speed * internal.reach_factor + from_contacts
         reach = reach * duration
-        candidates = select_contact_candidates(
-            old.position,
-            old.velocity,
-            pairs,
-            duration,
-            2 * reach,
-            internal.extra,
-            self.replicas,
-            self.capacity[2:],
-            self.scene.container,
+        candidates = self._select_candidates(old, pairs, duration, 2 * reach, internal.extra)
+        new, lost, exchanged, unexpected, max_square_move = self._integrate_block(
+            old, candidates, duration
         )
-        block = self._integrate_block(old, candidates, duration)
-        new = advance_time(block.state, duration, end, num_left <= 1)
-        if old.tangents is not None:
-            new = new._replace(tangents=self._project_if_due(old, new, block, duration))
+        new = advance_time(new, duration, end, num_left <= 1)
 
         # A sphere outside the candidates was hit, or one went farther than the reach.
-        too_far = block.max_square_move > reach**2
-        repeat = too_far | jnp.any(block.unexpected)
+        too_far = max_square_move > reach**2
+        repeat = too_far | jnp.any(unexpected)
         displacement = jnp.sqrt(jnp.max(jnp.sum((new.position - listed) ** 2, -1)))
         before, after = (self._energy(state) for state in (old, new))
         total = jnp.where(before > 0, before, 1.0)
-        error = (after - before + block.lost) / total
-        allowed = WORK_TOLERANCE * block.exchanged / total + ENERGY_TOLERANCE
+        error = (after - before + lost) / total
+        allowed = WORK_TOLERANCE * exchanged / total + ENERGY_TOLERANCE
         settings = new.internal
         num_good, drift = settings.num_good + 1, settings.drift + error
         # The step is doubled again after enough good blocks.
@@ -284,9 +247,67 @@ class SoftDynamics(AbstractDynamics):
             status=fault,
             needed=jnp.maximum(now.needed, candidates.needed),
             internal=SoftProgress(
-                extra=jnp.where(accepted, False, internal.extra | block.unexpected),
+                extra=jnp.where(accepted, False, internal.extra | unexpected),
                 reach_factor=jnp.where(accepted, 1.0, enlarged),
             ),
+        )
+
+    def _select_candidates(
+        self, state: State, pairs: Pairs, duration: Array, margin: Array, extra: Bool[Array, "n"]
+    ) -> ContactCandidates:
+        """Select the pairs that would touch in free flight, and the pairs near those.
+
+        Particles that touch a wall before or after free flight are members even without a pair.
+
+        Args:
+            state: at the beginning of the block.
+            pairs: a neighbour list, with all pairs closer than 1 + margin.
+            duration: of the block.
+            margin: largest change of a pair's distance during the block.
+            extra: further particles that are known to touch another one.
+        """
+        position, velocity, container = state.position, state.velocity, self.scene.container
+        n, max_near = len(position), self.capacity.near
+        displacement = position[pairs.i] - position[pairs.j] - pairs.offset
+        near = jnp.sum(displacement * displacement, -1) < (1 + margin) ** 2
+        near &= jnp.arange(near.size) < pairs.count
+        rows, num_near = rows_where(near, max_near)
+        real = jnp.arange(max_near) < num_near
+        i, j, offset = pairs.i[rows], pairs.j[rows], pairs.offset[rows]
+        displacement = displacement[rows]
+
+        # Which of them come closer than a diameter in free flight.
+        relative = velocity[i] - velocity[j]
+        approach, speed2 = jnp.sum(displacement * relative, -1), jnp.sum(relative * relative, -1)
+        closest = jnp.clip(-approach / jnp.where(speed2 > 0, speed2, 1.0), 0.0, duration)
+        distance2 = jnp.sum(displacement * displacement, -1)
+        touching = real & (distance2 + (2 * approach + speed2 * closest) * closest < 1.0)
+
+        def mark_ends(active, mask):
+            ends = jnp.where(mask[None], jnp.stack([i, j]), n)
+            return active.at[ends].set(True, mode="drop")
+
+        # The particles that would touch, those near them, and all pairs near these.
+        alone = jnp.zeros(n, bool)
+        if container is not None:
+            before, after = position, position + velocity * duration
+            alone = extra | wall_overlap(container, before)[2] | wall_overlap(container, after)[2]
+        active = mark_ends(extra | alone, touching)
+        active = mark_ends(active, real & (active[i] | active[j]))
+        selected = real & (active[i] | active[j])
+        rows, real, members, (a, b), counts = select_members(
+            selected, i, j, alone, self.capacity[3:]
+        )
+        i, j, offset = i[rows], j[rows], offset[rows]
+        return ContactCandidates(
+            members=members,
+            a=a,
+            b=b,
+            offset=jnp.where(real[:, None], offset, 2.0),  # an empty row is a pair out of reach
+            replica=i // (n // self.replicas),
+            expected=active[i] & active[j],
+            expected_at_walls=active.at[members].get(mode="fill", fill_value=True),
+            needed=jnp.stack([pairs.count, pairs.lookahead, num_near, *counts]),
         )
 
     def _block_duration(self, state: State, end: ArrayLike) -> tuple[Array, Array, Array]:
@@ -314,7 +335,14 @@ class SoftDynamics(AbstractDynamics):
 
     def _integrate_block(
         self, state: State, candidates: ContactCandidates, duration: Array
-    ) -> Block:
+    ) -> tuple[State, Array, Array, Bool[Array, "n"], Array]:
+        """Return the state after a block, at its old time, and what decides whether it is accepted.
+
+        That is, by replica, the energy lost in contacts and to drag, and the work of the elastic
+        forces, with all its parts counted as positive; the particles that touched another one or a
+        wall although not all of their neighbours belong to the candidates; and the square of the
+        largest distance that a member moved.
+        """
         scene, replicas, members = self.scene, self.replicas, candidates.members
         n = len(state.position)
         replica_of_particle = jnp.arange(n) // (n // replicas)
@@ -386,23 +414,18 @@ class SoftDynamics(AbstractDynamics):
             lost_with_drag = lost + sum_members(member_loss, lost_to_drag)
         begun = sum_pairs(pairs.begun)
         moved = ends[1].x - block_members(scene, spheres, members).x
-        return Block(
-            state=state._replace(
-                position=x,
-                velocity=v,
-                dissipated=state.dissipated + lost_with_drag,
-                collisions=state.collisions + begun,
-                internal=state.internal._replace(elastic=stored, spin=spin),
-                tangents=tangents,
-            ),
-            lost_in_contacts=lost,
-            lost=lost_with_drag,
-            exchanged=exchanged,
-            begun=begun,
-            free=~touching,
-            unexpected=unexpected,
-            max_square_move=jnp.max(jnp.sum(moved**2, -1)),
+        new = state._replace(
+            position=x,
+            velocity=v,
+            dissipated=state.dissipated + lost_with_drag,
+            collisions=state.collisions + begun,
+            internal=state.internal._replace(elastic=stored, spin=spin),
         )
+        if tangents is not None:
+            tangents = tangents._replace(free=~touching)
+            tangents = self._project_if_due(tangents, state, new, lost, begun, duration)
+            new = new._replace(tangents=tangents)
+        return new, lost_with_drag, exchanged, unexpected, jnp.max(jnp.sum(moved**2, -1))
 
     def _energy(self, state: State) -> Float[Array, "replicas"]:
         energy = kinetic_energy(state.velocity, self.replicas)
@@ -412,15 +435,26 @@ class SoftDynamics(AbstractDynamics):
         return energy + state.internal.elastic
 
     def _project_if_due(
-        self, old: State, new: State, block: Block, duration: ArrayLike
+        self,
+        tangents: ContactTangents,
+        old: State,
+        new: State,
+        lost: Array,
+        begun: Array,
+        duration: Array,
     ) -> ContactTangents:
-        """Return the tangents after a block, projected if a projection is due."""
-        tangents, scene, replicas = new.tangents, self.scene, self.replicas
+        """Return the tangents after a block, projected if a projection is due.
+
+        `lost` and `begun` are the energy lost in contacts, and the number of those that began.
+        """
+        scene, replicas = self.scene, self.replicas
         velocity = peculiar_velocity(scene, new.velocity, replicas)
         T, velocity = observables.temperature(velocity), velocity.reshape(new.velocity.shape)
         energy = kinetic_energy(velocity, replicas)
-        lost, gain_ratio, spin = block.lost_in_contacts, tangents.rotational_gain, new.internal.spin
-        if spin is not None:  # in contacts rotation gained its change less that by drag
+        spin, gain_ratio = new.internal.spin, tangents.rotational_gain
+        if (
+            spin is not None and gain_ratio is not None
+        ):  # in contacts rotation gained its change less that by drag
             first, last = (kinetic_energy(s, replicas) for s in (old.internal.spin, spin))
             gain = last - first
             if (drag := scene.drag_rates) is not None:
@@ -431,11 +465,9 @@ class SoftDynamics(AbstractDynamics):
             ratio = ratio_or_zero(rotational_temperature(scene, spin, replicas), T)
             gain_ratio = gain_ratio.after(passed, gain, energy * passed, ratio)
         tangents = tangents._replace(
-            free=block.free,
-            rates=update_rates(
-                tangents.rates,
+            rates=tangents.rates.after(
                 lost=lost,
-                collisions=2 * replicas / len(new.position) * block.begun,
+                collisions=2 * replicas / len(new.position) * begun,
                 energy=energy + new.internal.elastic,
                 temperature=T,
                 trend=cooling_trend(scene, T),

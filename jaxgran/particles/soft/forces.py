@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.particles.neighbours import Pairs, rows_where, select_members
 from jaxgran.particles.state import surface_direction, torque
 from jaxgran.scene.contact import contact_force, midpoint_rate
 from jaxgran.scene.reduced import (
@@ -47,72 +46,6 @@ class ContactCandidates(NamedTuple):
     expected: Bool[Array, "contacts"]
     expected_at_walls: Bool[Array, "members"]
     needed: Int[Array, "kinds"]
-
-
-def select_contact_candidates(
-    position: Float[Array, "n d"],
-    velocity: Float[Array, "n d"],
-    pairs: Pairs,
-    duration: ArrayLike,
-    margin: ArrayLike,
-    extra: Bool[Array, "n"],
-    replicas: int,
-    capacities: tuple[int, int, int],
-    container: Float[Array, "d"] | None = None,
-) -> ContactCandidates:
-    """Select the pairs that would touch in free flight, and the pairs near those.
-
-    Args:
-        position, velocity: of all particles.
-        pairs: a neighbour list, with all pairs closer than 1 + margin.
-        duration: of the block.
-        margin: largest change of a pair's distance during the block.
-        extra: further particles that are known to touch another one.
-        replicas: number of boxes, whose particles follow one another.
-        capacities: for the near pairs, the contacts and the members.
-        container: its sides. Particles that touch a wall before or after free flight are members
-            even without a pair.
-    """
-    n, max_near = len(position), capacities[0]
-    displacement = position[pairs.i] - position[pairs.j] - pairs.offset
-    near = jnp.sum(displacement * displacement, -1) < (1 + margin) ** 2
-    near &= jnp.arange(near.size) < pairs.count
-    rows, num_near = rows_where(near, max_near)
-    real = jnp.arange(max_near) < num_near
-    i, j, offset = pairs.i[rows], pairs.j[rows], pairs.offset[rows]
-    displacement = displacement[rows]
-
-    # Which of them come closer than a diameter in free flight.
-    relative = velocity[i] - velocity[j]
-    approach, speed2 = jnp.sum(displacement * relative, -1), jnp.sum(relative * relative, -1)
-    closest = jnp.clip(-approach / jnp.where(speed2 > 0, speed2, 1.0), 0.0, duration)
-    distance2 = jnp.sum(displacement * displacement, -1)
-    touching = real & (distance2 + (2 * approach + speed2 * closest) * closest < 1.0)
-
-    def mark_ends(active, mask):
-        ends = jnp.where(mask[None], jnp.stack([i, j]), n)
-        return active.at[ends].set(True, mode="drop")
-
-    # The particles that would touch, those near them, and all pairs near these.
-    alone = jnp.zeros(n, bool)
-    if container is not None:
-        before, after = position, position + velocity * duration
-        alone = extra | wall_overlap(container, before)[2] | wall_overlap(container, after)[2]
-    active = mark_ends(extra | alone, touching)
-    active = mark_ends(active, real & (active[i] | active[j]))
-    selected = real & (active[i] | active[j])
-    rows, real, members, (a, b), counts = select_members(selected, i, j, alone, capacities[1:])
-    i, j, offset = i[rows], j[rows], offset[rows]
-    return ContactCandidates(
-        members=members,
-        a=a,
-        b=b,
-        offset=jnp.where(real[:, None], offset, 2.0),  # an empty row is a pair out of reach
-        replica=i // (n // replicas),
-        expected=active[i] & active[j],
-        expected_at_walls=active.at[members].get(mode="fill", fill_value=True),
-        needed=jnp.stack([pairs.count, pairs.lookahead, num_near, *counts]),
-    )
 
 
 class Spheres(NamedTuple):
