@@ -23,7 +23,6 @@ from jaxgran.fitting.error_budget import clock_accuracy, with_scene_errors
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.optimise import Problem, best_of_starts, is_transformation, search
 from jaxgran.fitting.parameters import (
-    LAW,
     NO_PRIORS,
     SHARED,
     SMOOTHNESS,
@@ -113,8 +112,8 @@ def fit(
             needs two or more replicas.
         free: names of the free parameters: floats of the gas or its law, such as "temperature"
             (T_0), or "t0", the time at which the gas had T_0 and began to cool, if the clock was
-            not started then; "law" stands for all numbers and arrays of the law. By default A (or a
-            constant restitution) and, if T has no errors, T_0.
+            not started then; "law" stands for all numbers and arrays of the law. A single name
+            needs no tuple. By default A (or a constant restitution) and, if T has no errors, T_0.
             A cooling gas forgets its initial temperature: a free T_0 compensates for any start of
             the clock, and a curve does not determine both T_0 and t0; if both are free, t0 is
             constrained to 0 within the time in which T halves. If t0 is free, <dr^2> is not used.
@@ -189,7 +188,7 @@ def fit(
     names = free
     if free is None:
         names = tuple(x for x in free_by_default(scenes[first], data[first]) if x not in separate)
-    names = with_names_of_law((names,) if names == LAW else names, next(iter(scenes.values())))
+    names = with_names_of_law(names, next(iter(scenes.values())))
     _check_request(scenes, data, names, separate, max_steps)
     absent = checked_absent(absent)
     names, separate, key = tuple(names), tuple(separate), checked_key(key)

@@ -58,6 +58,7 @@ def size_of(gas: Gas, name: str) -> int:
 
 def with_names_of_law(names: Any, gas: Gas) -> Any:
     """Return names of free parameters with those of all floats of the law in place of `LAW`."""
+    names = (names,) if isinstance(names, str) else names
     if not isinstance(names, tuple | list) or LAW not in names:
         return names
     own = tuple(law_fields(gas.law))
