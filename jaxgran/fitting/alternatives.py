@@ -602,6 +602,7 @@ def _at_the_limit(
         if trial is None:
             break
         trials.append(trial)
+        least = min(least, trial.chi2)
         if abs(trial.chi2 - least - increase) < increase / 4:
             break
         low, high = (trial, high) if trial.chi2 <= least + increase else (low, trial)
