@@ -37,7 +37,7 @@ def with_law(law):
 
 
 REFUSED = [
-    ({"free": ("amplitude",)}, "no float 'amplitude'"),
+    ({"free": "amplitude"}, "no float 'amplitude'"),
     ({"free": ()}, "free must be a tuple"),
     ({"free": ("temperature", "temperature")}, "different names"),
     ({"free": "law", "gas": with_law(fixed())}, 'free="law", but the law Fixed has no floats'),
