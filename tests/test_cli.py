@@ -181,6 +181,7 @@ def test_late_clocks_of_headers_are_priors_of_joint_fits(measured, capsys, free)
     assert answer["agree"]
 
 
+@pytest.mark.slow
 def test_curves_with_one_floor_of_noise_are_misfits_not_contradictions(measured, capsys):
     for name in ("thin.csv", "dense.csv"):
         rewrite(name, lambda x: dataclasses.replace(x, temperature=x.temperature + 2e-5))

@@ -191,6 +191,7 @@ def test_a_checkpoint_that_cannot_be_written_is_told_before_the_run(tmp_path):
         cool(model=SOFT, checkpoint=tmp_path)
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_out_of_range_say_so():
     phi, A = (float(GAS.value(name)) for name in ("packing_fraction", "dissipative_constant"))
     many = jax.vmap(lambda p, a: cool(GAS.replace(packing_fraction=p, dissipative_constant=a)))

@@ -241,12 +241,13 @@ def corrupted_curves():
 BOTH, DOUBLE, SINGLE = ("float64", "float32"), ("float64",), ("float32",)
 CASES = {
     speeds: DOUBLE,
-    angles: BOTH,
+    angles: DOUBLE,
     own_image: BOTH,
     weak_dissipation: SINGLE,
     si_units: SINGLE,
 }
 SLOW_CASES = {
+    angles: SINGLE,
     order_flips: BOTH,
     four_bodies: DOUBLE,
     thin_and_dense: DOUBLE,

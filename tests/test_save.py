@@ -30,6 +30,7 @@ def times(gas):
     return gas.mean_free_time * jnp.array([0.0, 1.0, 3.0])
 
 
+@pytest.mark.slow
 def test_is_of_the_particles_at_each_time(gas):
     t, model = times(gas), HARD
     curve = jaxgran.cool(gas, t, model=model, save=save, progress=False)

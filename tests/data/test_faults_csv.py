@@ -148,7 +148,13 @@ def test_units_of_speeds_are_those_of_T(tmp_path):
     assert float(gas.temperature) == pytest.approx(0.02)
 
 
-@pytest.mark.parametrize("error", [0.01 * T, None], ids=["with errors", "without"])
+@pytest.mark.parametrize(
+    "error",
+    [
+        pytest.param(0.01 * T, marks=pytest.mark.slow, id="with errors"),
+        pytest.param(None, id="without"),
+    ],
+)
 def test_an_outlier_is_named_with_its_row_and_left_out_for_comparison(error):
     outlier = T * np.where(np.arange(25) == 12, 3.0, 1.0)
     curve = jaxgran.CoolingCurve(TIMES, outlier, temperature_error=error)

@@ -32,7 +32,9 @@ def gas_of(law):
     return dataclasses.replace(glass_beads(), law=law)
 
 
-@pytest.mark.parametrize("model", [jaxgran.KineticTheory(), jaxgran.DSMC(200)])
+@pytest.mark.parametrize(
+    "model", [jaxgran.KineticTheory(), pytest.param(jaxgran.DSMC(200), marks=pytest.mark.slow)]
+)
 def test_networks_are_laws(model):
     gas = gas_of(NETWORK)
     times = jnp.array([0.5, 2.0]) * gas.mean_free_time
@@ -65,6 +67,7 @@ def test_names_of_the_arrays_of_a_law():
         jaxgran.cool(gas, [1.0], model=jaxgran.SoftSpheres(64))
 
 
+@pytest.mark.slow
 def test_vectors_are_fitted():
     law = jaxgran.RestitutionSeries([-0.2, 0.03], [0.2, 0.4])
     gas = gas_of(law)

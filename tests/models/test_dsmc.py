@@ -44,6 +44,7 @@ def test_cools_and_spreads_as_kinetic_theory_says(beads, beta, dimension):
     assert abs(a2 - expected) < 0.03 * abs(expected) + 3 * SONINE_SCATTER / n**0.5 / 4
 
 
+@pytest.mark.slow
 def test_sonine_coefficient_of_constant_restitution():
     # a_2 and its error of a table of stochastic simulation.
     eps, dimension, a2, error = 0.5, 3, 0.0476, 4e-4

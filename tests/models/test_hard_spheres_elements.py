@@ -146,6 +146,7 @@ def cooled(gas, times, start=None) -> jaxgran.CoolingCurve:
     return jaxgran.cool(gas, jnp.asarray(times), model=model, save="particles")
 
 
+@pytest.mark.slow
 def test_viscoelastic_walls_bounce_by_their_own_law():
     # Elastic spheres: what is lost, is lost to the walls, at the eps of their speeds.
     gas = boxed(0.0)
