@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.particles.state import tangential_impulse
-from jaxgran.scene.reduced import ReducedRough
+from jaxgran.scene.gas import ReducedRough
 from jaxgran.theory.equations import sliding_shares
 from tests.beads import hard_gas
 

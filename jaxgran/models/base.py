@@ -13,15 +13,6 @@ from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas
 
-SUPPORTED_BY = {
-    "surface": "KineticTheory, DSMC or HardSpheres",
-    "friction": "SoftSpheres, or surface=Rough(...) for instantaneous impacts",
-    "container": "KineticTheory, DSMC, HardSpheres or SoftSpheres",
-    "drag": "KineticTheory, DSMC, HardSpheres or SoftSpheres",
-    "drive": "KineticTheory, DSMC or HardSpheres",
-}
-"""Models that support each element of a scene (see `Gas.elements`)."""
-
 
 class Limitation(NamedTuple):
     """An effect that a scene contains and a model leaves out.
@@ -83,11 +74,13 @@ class AbstractModel(eqx.Module):
         """
         for name in gas.elements:
             if name not in self.elements:
-                field = "surface" if name in ("surface", "friction") else name
-                given = {"surface": "surface=Rough", "friction": "surface=Frictional"}
+                field = "surface" if name == "friction" else name
+                given = type(getattr(gas, field)).__name__
+                models = " or ".join(_models_with(name))
+                instead = ", or surface=Rough(...) for impacts" if name == "friction" else ""
                 raise ValueError(
-                    f"{type(self).__name__} does not support `{given.get(name, name)}`. "
-                    f"Use {SUPPORTED_BY[name]}, or set {field}=None."
+                    f"{type(self).__name__} does not support `{field}={given}`. Use {models}"
+                    f"{instead}, or set {field}=None."
                 )
         self.check(gas)
 
@@ -197,3 +190,13 @@ class AbstractModel(eqx.Module):
         """Name of the model in a sentence: "soft spheres" for `SoftSpheres`."""
         words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(self).__name__).split()
         return " ".join(word if word.isupper() else word.lower() for word in words)
+
+
+def _models_with(element: str) -> list[str]:
+    """Return the names of the models of this package that support an element."""
+
+    def below(cls: type[AbstractModel]) -> list[type[AbstractModel]]:
+        return [x for sub in cls.__subclasses__() for x in (sub, *below(sub))]
+
+    known = [x for x in below(AbstractModel) if x.__module__.startswith("jaxgran.")]
+    return sorted({x.__name__ for x in known if element in x.elements})

@@ -30,8 +30,7 @@ from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program
 from jaxgran.models.soft_spheres import SoftSpheres
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import reduced_scene
+from jaxgran.scene.gas import Gas, reduced_scene
 from jaxgran.theory.equations import element_rates, softness_factor
 
 NUM_PARTICLES = 4000

@@ -26,8 +26,7 @@ from jaxgran.particles.dsmc.collisions import DSMCDynamics, Scheme
 from jaxgran.particles.dsmc.run import run_dsmc
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import transformed_times
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import reduced_scene
+from jaxgran.scene.gas import Gas, reduced_scene
 
 MAX_STEP = 0.1
 """Largest number of collisions per particle and step: a step draws a particle at most twice."""

@@ -21,8 +21,7 @@ from jaxgran.particles.capacity import capacities
 from jaxgran.particles.hard.dynamics import MIN_IMPACTS, SPEED_MARGIN, HardDynamics
 from jaxgran.particles.setup import ALLOWED_OVERLAP, allowed_overlap, min_distance
 from jaxgran.particles.state import transformed_times
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import SphereScene, reduced_scene, sphere_scene
+from jaxgran.scene.gas import Gas, SphereScene, reduced_scene, sphere_scene
 from jaxgran.theory.averages import collision_rate
 
 WINDOW_SHARE = 0.05

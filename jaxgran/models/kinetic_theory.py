@@ -16,9 +16,8 @@ from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import reduced_scene
-from jaxgran.theory.equations import Density, Equations, softness_factor
+from jaxgran.scene.gas import Gas, reduced_scene
+from jaxgran.theory.equations import SUPPORTED, Density, Equations, softness_factor
 from jaxgran.theory.solver import moments_at, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
@@ -114,7 +113,7 @@ class KineticTheory(AbstractModel):
         validation.checked_int("max_steps", self.max_steps, 1, "Leave it out for 200000.")
 
     stochastic: ClassVar[bool] = False
-    elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
+    elements: ClassVar[tuple[str, ...]] = SUPPORTED
     derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs
 
     def rotation_accuracy(self, gas: Gas) -> float:

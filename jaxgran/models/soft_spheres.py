@@ -20,9 +20,8 @@ from jaxgran.particles.capacity import Grid, capacities
 from jaxgran.particles.soft.dynamics import SoftDynamics
 from jaxgran.scene.contact import elastic_constant
 from jaxgran.scene.elements import Frictional
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.laws import Viscoelastic
-from jaxgran.scene.reduced import (
+from jaxgran.scene.gas import (
+    Gas,
     ReducedContact,
     ReducedFriction,
     ReducedScene,
@@ -30,6 +29,7 @@ from jaxgran.scene.reduced import (
     SphereScene,
     sphere_scene,
 )
+from jaxgran.scene.laws import Viscoelastic
 
 PROJECTION = 0.1
 """Mean free times between thermal projections of a derivative."""

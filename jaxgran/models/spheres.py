@@ -32,8 +32,7 @@ from jaxgran.particles.setup import (
     has_other_box,
     reduced_start,
 )
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.reduced import SphereScene
+from jaxgran.scene.gas import Gas, SphereScene
 
 DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
 """Allowed steps of differences: the lower value of alpha must stay positive."""

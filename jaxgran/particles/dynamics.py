@@ -21,7 +21,7 @@ from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.neighbours import ListedPairs, Pairs
 from jaxgran.particles.state import State
-from jaxgran.scene.reduced import SphereScene
+from jaxgran.scene.gas import SphereScene
 
 MAX_STALLED = 1000
 """Largest number of blocks or segments in a row that do not advance the time."""

@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from jaxgran.gradients.tangents import ContactTangents, ExchangeTangents, ImpactTangents
 from jaxgran.particles import observables
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
-from jaxgran.scene.reduced import ReducedDrag, ReducedRough, SphereScene
+from jaxgran.scene.gas import ReducedDrag, ReducedRough, SphereScene
 
 S = TypeVar("S")
 

@@ -29,18 +29,6 @@ else:
     UserWallLaw = Any
 
 
-def optional_element(*classes: type) -> Any:
-    """Return an optional field of `Gas` that accepts only None and instances of the classes."""
-
-    def check_class(value: Any) -> Any:
-        if value is None or isinstance(value, classes):
-            return value
-        allowed = ", ".join(f"a jaxgran.{cls.__name__}" for cls in classes)
-        raise ValueError(f"expected {allowed} or None, got {value!r}")
-
-    return eqx.field(converter=check_class, default=None, kw_only=True)
-
-
 def _number_or_none(name: str) -> Callable[[Any], Array | None]:
     def convert(value: Any) -> Array | None:
         return None if value is None else number_named(name)(value)

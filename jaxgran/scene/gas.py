@@ -1,4 +1,10 @@
-"""The scene: a homogeneous gas of equal spheres, and the physical scales that follow from it."""
+"""The scene: a homogeneous gas of equal spheres, its physical scales, and its reduced units.
+
+- `reduced_scene`, for kinetic theory and DSMC: speeds in `Gas.impact_speed`, lengths in
+  `Gas.path_length`.
+- `sphere_scene`, for spheres in boxes: the diameter, the mass and the initial temperature are 1,
+  and rates are per collision.
+"""
 
 from math import gamma, pi
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -88,8 +94,26 @@ def law_fields(law: laws.RestitutionLaw) -> dict[str, FloatField]:
     return fields
 
 
-ELEMENTS = ("surface", "container", "drag", "drive")
-"""Fields of `Gas` that are elements."""
+ELEMENTS: dict[str, tuple[type, ...]] = {
+    "surface": (elements.Rough, elements.Frictional),
+    "container": (elements.Walls,),
+    "drag": (elements.StokesDrag,),
+    "drive": (elements.WhiteNoise,),
+}
+"""Fields of `Gas` that are elements, with their classes."""
+
+
+def optional_element(name: str) -> Any:
+    """Return the field of an element, which accepts only None and instances of its classes."""
+    classes = ELEMENTS[name]
+
+    def check_class(value: Any) -> Any:
+        if value is None or isinstance(value, classes):
+            return value
+        allowed = ", ".join(f"a jaxgran.{cls.__name__}" for cls in classes)
+        raise ValueError(f"expected {allowed} or None, got {value!r}")
+
+    return eqx.field(converter=check_class, default=None, kw_only=True)
 
 
 class Gas(eqx.Module):
@@ -130,12 +154,10 @@ class Gas(eqx.Module):
     )
     temperature: Float[Array, ""] = eqx.field(converter=number_named("temperature"), kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
-    surface: elements.Rough | elements.Frictional | None = elements.optional_element(
-        elements.Rough, elements.Frictional
-    )
-    container: elements.Walls | None = elements.optional_element(elements.Walls)
-    drag: elements.StokesDrag | None = elements.optional_element(elements.StokesDrag)
-    drive: elements.WhiteNoise | None = elements.optional_element(elements.WhiteNoise)
+    surface: elements.Rough | elements.Frictional | None = optional_element("surface")
+    container: elements.Walls | None = optional_element("container")
+    drag: elements.StokesDrag | None = optional_element("drag")
+    drive: elements.WhiteNoise | None = optional_element("drive")
 
     def __check_init__(self):
         if self.dimension not in CLOSE_PACKING or isinstance(self.dimension, bool | float):
@@ -459,3 +481,221 @@ def mean_loss(law: laws.ReducedLaw, like: Float[Array, ""]) -> Float[Array, ""]:
         return g**2 / 2 * loss * (2 - loss)
 
     return impact_average(weighted_loss, like)
+
+
+class ReducedRough(NamedTuple):
+    """`Rough` in reduced units.
+
+    Attributes:
+        beta: tangential restitution beta_t.
+        inertia: q.
+        ratio: T_rot/T at t = 0.
+        friction: mu; None without Coulomb's limit.
+    """
+
+    beta: Float[Array, ""]
+    inertia: Float[Array, ""]
+    ratio: Float[Array, ""]
+    friction: Float[Array, ""] | None = None
+
+    @property
+    def eta(self) -> Float[Array, ""]:
+        """Coefficient eta of `Rough`, ``q (1 + beta_t) / (2 (1 + q))``."""
+        return self.eta_on_wall(self.beta) / 2
+
+    def eta_on_wall(self, beta: Float[Array, ""]) -> Float[Array, ""]:
+        """Coefficient eta for a wall at rest with beta_w, ``q (1 + beta_w) / (1 + q)``."""
+        return self.inertia * (1 + beta) / (1 + self.inertia)
+
+
+class ReducedWalls(NamedTuple):
+    """`Walls` in reduced units.
+
+    Attributes:
+        law: of impacts on them, as in `ReducedScene`.
+        frequency: impacts on the two walls across each axis per particle and unit of time, divided
+            by sqrt(T/T_0); None where spheres resolve their contacts.
+        surface: beta_t of the walls, or their `ReducedFriction`; None if they are smooth.
+    """
+
+    law: Any
+    frequency: Any
+    surface: Any
+
+
+class ReducedDrag(NamedTuple):
+    """`StokesDrag` in reduced units: the rates of velocities and of angular velocities.
+
+    The second is None in a `SphereScene` of smooth spheres.
+    """
+
+    rate: Float[Array, ""]
+    rotational_rate: Any
+
+
+class ReducedScene(NamedTuple):
+    """The law and the elements of a gas in reduced units; None for each missing element.
+
+    Attributes:
+        law: of restitution, for speeds in units of `Gas.impact_speed`, or a `ReducedContact`.
+        surface: `ReducedRough`, or `ReducedFriction` of contacts.
+        walls, drag: `ReducedWalls`, `ReducedDrag`.
+        drive: of `WhiteNoise`, the growth rate of T/T_0 that it causes.
+    """
+
+    law: Any
+    surface: Any = None
+    walls: Any = None
+    drag: Any = None
+    drive: Any = None
+
+    @property
+    def has_elements(self) -> bool:
+        """True unless there are only smooth spheres in free flight."""
+        return any(element is not None for element in self[1:])
+
+
+def reduced_scene(gas: Gas) -> ReducedScene:
+    """Return a gas of impacts with rates in the unit of time `path_length` over `impact_speed`.
+
+    The density of centres at a hard wall is Z times the mean density (contact theorem). Here
+    ``Z = 1 + 2^(d-1) phi g_2`` is the pressure of elastic spheres over that of a dilute gas. Hence
+    a sphere hits the walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
+    """
+    d, length, speed = gas.dimension, gas.path_length, gas.impact_speed
+    surface = walls = drag = drive = None
+    if isinstance(gas.surface, elements.Rough):
+        rough = gas.surface
+        ratio = rough.rotational_temperature / gas.temperature
+        surface = ReducedRough(rough.tangential_restitution, rough.inertia, ratio, rough.friction)
+    if gas.container is not None:
+        box = gas.container
+        law = box.restitution.on_wall(diameter=gas.diameter, mass=gas.mass, speed=speed)
+        pressure = 1 + 2 ** (d - 1) * gas.packing_fraction * gas.contact_value
+        widths = jnp.broadcast_to(box.side - gas.diameter, (d,))
+        frequency = pressure * length / widths / pi**0.5
+        walls = ReducedWalls(law, frequency, box.tangential_restitution)
+    if gas.drag is not None:
+        time = length / speed
+        drag = ReducedDrag(gas.drag.rate * time, gas.drag.rotational_rate * time)
+    if gas.drive is not None:
+        drive = gas.drive.strength * (length / speed) / gas.temperature
+    return ReducedScene(gas.reduced_law, surface, walls, drag, drive)
+
+
+class ReducedContact(eqx.Module):
+    """Contacts of `Viscoelastic` spheres, or of a sphere and a wall, in units of `sphere_scene`.
+
+    Attributes:
+        alpha: elastic constant over effective mass.
+        dissipative_constant: A.
+        clipped: whether a contact ends where the force vanishes; otherwise it ends where the
+            overlap does.
+    """
+
+    alpha: Float[Array, "..."]
+    dissipative_constant: Float[Array, "..."]
+    clipped: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, law: laws.Viscoelastic, gas: Gas) -> "ReducedContact":
+        """Return the contacts of two spheres of a gas with a law."""
+        time = gas.diameter / jnp.sqrt(gas.temperature)
+        alpha = law.alpha(diameter=gas.diameter, mass=gas.mass) * gas.diameter**0.5 * time**2
+        return cls(alpha, law.dissipative_constant / time, law.clipped)
+
+
+class ReducedFriction(NamedTuple):
+    """Friction of contacts: `Frictional` in units of `sphere_scene`, or that of walls.
+
+    Attributes:
+        damping: x_t.
+        friction: mu.
+        inertia: q; None for walls.
+        ratio: T_rot/T at t = 0; None for walls.
+    """
+
+    damping: Float[Array, ""]
+    friction: Float[Array, ""]
+    inertia: Any = None
+    ratio: Any = None
+
+
+class SphereScene(NamedTuple):
+    """Spheres in a box, in units of their diameter, their mass and the initial temperature.
+
+    In a container positions are coordinates from a corner, and the centre of a sphere that touches
+    no wall lies between 1/2 and the container's side less 1/2. The periodic box is a cube longer
+    than the container by a diameter, so that no sphere meets another one through its boundary.
+
+    Attributes:
+        side: of the periodic box.
+        container: sides of the container; None without walls.
+        collision_frequency: collisions per particle and time at T = 1.
+        contact_duration: mean duration of an elastic contact at T = 1.
+        material: the numbers in which derivatives are taken. All rates are per collision, so that
+            in a denser gas the same happens sooner.
+    """
+
+    side: Float[Array, ""]
+    container: Float[Array, "d"] | None
+    collision_frequency: Float[Array, ""]
+    contact_duration: Float[Array, ""]
+    material: ReducedScene
+
+    @property
+    def galilean_invariant(self) -> bool:
+        """True if any frame at constant velocity will do: there are no walls and no drag."""
+        return self.container is None and self.material.drag is None
+
+    @property
+    def filled_side(self) -> Float[Array, ""]:
+        """Side of a cube (square) with the volume that is open to the spheres."""
+        if self.container is None:
+            return self.side
+        return jnp.prod(self.container) ** (1 / len(self.container))
+
+    @property
+    def drag_rates(self) -> Any:
+        """`ReducedDrag` in the unit of time of the scene; None without drag."""
+        return jax.tree.map(lambda rate: rate * self.collision_frequency, self.material.drag)
+
+    def with_material(self, material: ReducedScene) -> "SphereScene":
+        """Return this scene with other numbers of its material."""
+        return self._replace(material=material)
+
+    def log_loss(self, material: ReducedScene) -> Float[Array, ""]:
+        """Return ln of an impact's loss up to a constant.
+
+        It is ``A alpha^(2/5)`` of contacts, and otherwise ``I/(1 - I)`` with the share I of normal
+        energy that impacts dissipate.
+        """
+        law = material.law
+        if isinstance(law, ReducedContact):
+            return jnp.log(law.dissipative_constant) + 0.4 * jnp.log(law.alpha)
+        lost = mean_loss(law, self.side)
+        return jnp.log(lost) - jnp.log1p(-lost)
+
+
+def sphere_scene(gas: Gas, num_particles: int, material: ReducedScene) -> SphereScene:
+    """Return N spheres in a box, with the law, the surface and the walls of a material."""
+    side, container, nu = gas.box_side(num_particles) / gas.diameter, None, gas.collision_frequency
+    if gas.container is not None:
+        container = jnp.broadcast_to(gas.container.side, (gas.dimension,)) / gas.diameter
+        side = jnp.max(container) + 1
+    drag = drive = None
+    if gas.drag is not None:
+        rotational = None if gas.surface is None else gas.drag.rotational_rate / nu
+        drag = ReducedDrag(gas.drag.rate / nu, rotational)
+    if gas.drive is not None:
+        drive = gas.drive.strength / (nu * gas.temperature)
+    # It does not depend on T_0, and between walls of soft spheres its derivative is refused.
+    fixed = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
+    unit_time = fixed.diameter / jnp.sqrt(fixed.temperature)
+    return SphereScene(
+        side=side,
+        container=container,
+        collision_frequency=fixed.collision_frequency * unit_time,
+        contact_duration=gas.contact_duration / (gas.diameter / jnp.sqrt(gas.temperature)),
+        material=material._replace(drag=drag, drive=drive),
+    )

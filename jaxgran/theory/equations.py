@@ -23,16 +23,20 @@ from jaxtyping import Array, Float
 
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME
 from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, NUM_SPIN_COMPONENTS, wall_impact_ratio
-from jaxgran.scene.gas import Gas, scaled_critical_wavenumber
-from jaxgran.scene.geometry import contact_value_slopes, impact_average, sphere_surface
-from jaxgran.scene.laws import C1, ReducedLaw
-from jaxgran.scene.reduced import (
+from jaxgran.scene.gas import (
+    Gas,
     ReducedRough,
     ReducedScene,
     ReducedWalls,
     reduced_scene,
+    scaled_critical_wavenumber,
 )
+from jaxgran.scene.geometry import contact_value_slopes, impact_average, sphere_surface
+from jaxgran.scene.laws import C1, ReducedLaw
 from jaxgran.theory.averages import TERMS, ElementBounds, RateTable, collision_rate, impact_moments
+
+SUPPORTED = ("surface", "container", "drag", "drive")
+"""Elements of a scene that the equations contain, see `Gas.elements`."""
 
 
 class Moments(NamedTuple):

@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.particles.dsmc.collisions import MIN_SUBSET_SIZE, change_subsets, collide, num_subsets
-from jaxgran.scene.reduced import ReducedRough, ReducedScene
+from jaxgran.scene.gas import ReducedRough, ReducedScene
 from tests.beads import SI, glass_beads, hard_gas
 
 

@@ -11,7 +11,7 @@ import jaxgran
 from jaxgran._utils import status
 from jaxgran.models import error_model
 from jaxgran.particles.hard.impacts import ImpactEvents, impact_effect
-from jaxgran.scene.reduced import ReducedDrag, ReducedRough, ReducedScene, SphereScene
+from jaxgran.scene.gas import ReducedDrag, ReducedRough, ReducedScene, SphereScene
 from tests.beads import SI, glass_beads, hard_gas
 
 

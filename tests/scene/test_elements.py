@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import jaxgran
 from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, wall_impact_ratio
-from jaxgran.scene.reduced import reduced_scene
+from jaxgran.scene.gas import reduced_scene
 from jaxgran.theory.averages import impact_moments
 from jaxgran.theory.equations import Density, Equations
 from tests.beads import SI, hard_gas

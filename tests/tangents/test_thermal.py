@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.models.soft_spheres import SoftSpheres
-from jaxgran.scene.reduced import ReducedContact
+from jaxgran.scene.gas import ReducedContact
 from tests.beads import lattice, soft_beads
 
 

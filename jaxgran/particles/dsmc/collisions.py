@@ -37,8 +37,8 @@ from jaxgran.particles.state import (
     threefry_key,
 )
 from jaxgran.scene.elements import wall_impact_ratio
+from jaxgran.scene.gas import ReducedScene
 from jaxgran.scene.geometry import sphere_surface
-from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory.averages import collision_rate
 
 CEILING = 5.0

@@ -43,8 +43,8 @@ from jaxgran.particles.state import (
     threefry_key,
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
+from jaxgran.scene.gas import ReducedScene
 from jaxgran.scene.laws import ReducedLaw
-from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory import averages
 
 

@@ -53,8 +53,8 @@ from jaxgran.particles.state import (
     time_left,
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
+from jaxgran.scene.gas import ReducedScene, SphereScene
 from jaxgran.scene.laws import ReducedLaw
-from jaxgran.scene.reduced import ReducedScene, SphereScene
 from jaxgran.theory import averages
 
 MIN_IMPACTS = 8

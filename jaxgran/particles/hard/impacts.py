@@ -21,7 +21,7 @@ from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
 from jaxgran.particles.hard.prediction import ImpactCandidates, Paths, first_impacts
 from jaxgran.particles.state import State, drag_decay, tangential_impulse, temperature
 from jaxgran.scene.elements import wall_impact_ratio
-from jaxgran.scene.reduced import ReducedScene, SphereScene
+from jaxgran.scene.gas import ReducedScene, SphereScene
 
 
 class ImpactEvents(NamedTuple):

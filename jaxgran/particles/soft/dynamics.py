@@ -57,7 +57,7 @@ from jaxgran.particles.state import (
     peculiar_velocity,
     time_left,
 )
-from jaxgran.scene.reduced import ReducedContact, ReducedScene, SphereScene
+from jaxgran.scene.gas import ReducedContact, ReducedScene, SphereScene
 from jaxgran.theory.equations import COOLING_CORRECTION
 
 WORK_TOLERANCE = 0.1
