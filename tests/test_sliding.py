@@ -100,9 +100,10 @@ def test_shares_are_averages_over_slips_and_normal_speeds(dimension, mu):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dimension, mu", [(2, 0.3), (3, 0.05)])
-def test_theory_beside_dsmc(dimension, mu):
+@pytest.mark.parametrize("dimension, mu, T_rot", [(2, 0.3, 0.0), (3, 0.05, 0.0), (3, 0.1, 1.0)])
+def test_theory_beside_dsmc(dimension, mu, T_rot):
     gas = sliding(mu, dimension)
+    gas = gas.replace(rotational_temperature=T_rot * float(gas.temperature))
     times = np.array([3.0, 10.0, 30.0]) * float(gas.mean_free_time)
     theory = jaxgran.cool(gas, times, model=jaxgran.KineticTheory(correlations=False))
     model = jaxgran.DSMC(20_000, 2)

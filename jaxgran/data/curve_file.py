@@ -4,6 +4,7 @@ A CSV file holds a measured curve, or tracks of particles, under header lines th
 an npz file holds every array of a curve. `jaxgran.data.tables` reads the tables.
 """
 
+import dataclasses
 import io
 import json
 import re
@@ -36,12 +37,10 @@ from jaxgran.scene.elements import (
     VOLUME_TOLERANCE,
     Frictional,
     Rough,
-    StokesDrag,
     Walls,
-    WhiteNoise,
     container_volume_ratio,
 )
-from jaxgran.scene.gas import Gas
+from jaxgran.scene.gas import ELEMENTS, Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.laws import Viscoelastic
 from jaxgran.scene.parameters import BY_SYMBOL, REQUIRED, fields_of
@@ -69,15 +68,6 @@ GUESSES = {
     "wall_beta_t": 0.0,
 }
 """Header keys whose value may be "guess", and the values from which a fit then starts."""
-
-ELEMENTS: tuple[tuple[str, Any, tuple[str, ...]], ...] = (
-    ("surface", Rough, ("beta_t",)),
-    ("surface", Frictional, ("tangential_damping", "friction")),
-    ("container", Walls, ("container_side", "wall_restitution")),
-    ("drag", StokesDrag, ("gamma",)),
-    ("drive", WhiteNoise, ("drive_strength",)),
-)
-"""Field of `Gas`, class, and header keys that it needs, of each element."""
 
 ABSENT = {
     "walls": ("container_side", "wall_restitution"),
@@ -379,13 +369,15 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
         )
     unused = Rough if lasting or ("friction" in header and not rough) else Frictional
     elements = {}
-    for name, kind, required in ELEMENTS:
-        fields = {p.symbol: field for field, p in fields_of(kind.__name__).items()}
-        fields |= {"wall_restitution": "restitution"} if kind is Walls else {}
+    for name, kind in ((name, kind) for name, kinds in ELEMENTS.items() for kind in kinds):
+        symbols = {field: p.symbol for field, p in fields_of(kind.__name__).items() if p.symbol}
+        symbols |= {"restitution": "wall_restitution"} if kind is Walls else {}
+        fields = {symbol: field for field, symbol in symbols.items()}
         given = [key for key in header if key in fields]
         if not given or kind is unused:
             continue
-        if missing := [key for key in required if key not in header]:
+        required = (x.name for x in dataclasses.fields(kind) if x.default is dataclasses.MISSING)
+        if missing := [symbols[x] for x in required if symbols[x] not in header]:
             fitted = f", or the line '# {missing[0]}: guess' to fit it (--free {missing[0]})"
             raise ValueError(
                 f"the header gives {given[0]} without {missing[0]}; add {missing[0]}"
