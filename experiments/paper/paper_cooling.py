@@ -17,18 +17,23 @@ as measured by Bridges, Hatzes & Lin (Nature 309, 333, 1984), eps = min(1, 0.34 
 cm/s, is not such a power law: the exponent of its T(t) changes with time.
 """
 
-import equinox as eqx
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.ticker import NullFormatter
+from numpy.polynomial.chebyshev import chebpts1
+from numpy.polynomial.polynomial import polyfit
+from scipy.integrate import cumulative_trapezoid
 
 import jaxgran
 from experiments.support import analysis
+from experiments.support.analysis import PACKING
 from experiments.support.closed_forms import haff, paper_temperature
-from experiments.support.plots import CONSTANT, ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
+from experiments.support.plots import ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
 from experiments.support.record import Options, run_parts
-from experiments.support.scenes import beads, hard_beads, ice, restitution_like
+from experiments.support.scenes import beads, ice
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, C2, UNCLIPPED_SERIES, viscoelastic_restitution
 from jaxgran.theory.equations import COOLING_RATE
@@ -36,19 +41,16 @@ from jaxgran.theory.equations import COOLING_RATE
 RAMIREZ = (0.48358, 0.28528)
 """Third and fourth coefficients of Ramirez et al., PRE 60, 4465 (1999), as often quoted."""
 
-PACKING = 0.05
-TIME, RATE = "time t / τ$_c$(0)", "d ln T / d ln t"
+TIME, RATE = {"xlabel": "time t / τ$_c$(0)", "xscale": "log"}, "d ln T / d ln t"
 SHADES = ("#084594", "#2171b5", "#6baed6", "#bdc9e1")
 """Colours from the smallest gamma to the largest, from dark to light."""
 
 
 def paper_restitution(options: Options) -> dict:
     config = {"rtol": 1e-13, "num_impacts": 60, "lowest": 1e-3, "highest": 2.0, "fit_top": 0.3}
-    config["fit_degree"] = 16
-    config |= {"num_impacts": 16, "fit_degree": 12} if options.smoke else {}
+    config |= {"num_impacts": 16, "fit_degree": 12} if options.smoke else {"fit_degree": 16}
     betas = np.geomspace(config["lowest"], config["highest"], config["num_impacts"])
     clipped, unclipped = (restitutions(betas, end, config["rtol"]) for end in (True, False))
-    coefficients = recovered(config)
     two, five = series(betas, (-C1, C2)), series(betas, UNCLIPPED_SERIES)
     errors = {
         "two_terms_unclipped": two - unclipped,
@@ -59,7 +61,8 @@ def paper_restitution(options: Options) -> dict:
     }
     errors = {name: np.abs(error) for name, error in errors.items()}
     title = "The paper's two terms of ε hold to 1 % up to β = 0.25, for both ends of contact"
-    figure, (left, right) = panels(2, title=title)
+    axis = {"xlabel": "dissipation  β = (3/2) A α$^{2/5}$ v$^{1/5}$", "xscale": "log"}
+    figure, (left, right) = panels(2, title=title, subplot_kw=axis)
     for eps, style, color, label in (
         (clipped, "-", INK, "equation of motion, ends at F = 0"),
         (unclipped, "--", ELASTIC, "equation of motion, ends at ξ = 0 (paper)"),
@@ -67,8 +70,7 @@ def paper_restitution(options: Options) -> dict:
         (five, ":", INK, "five terms"),
     ):
         left.plot(betas, eps, style, color=color, label=label)
-    labels = {"xlabel": "dissipation  β = (3/2) A α$^{2/5}$ v$^{1/5}$", "xscale": "log"}
-    caption(left, "One impact", ylabel="restitution  ε", ylim=(-0.02, 1.02), **labels)
+    caption(left, "One impact", ylabel="restitution  ε", ylim=(-0.02, 1.02))
     looks = (
         ("two terms, from ε that ends at ξ = 0", VISCOELASTIC, "-"),
         ("two terms, from ε that ends at F = 0", VISCOELASTIC, ":"),
@@ -79,18 +81,17 @@ def paper_restitution(options: Options) -> dict:
     for error, (label, color, style) in zip(errors.values(), looks, strict=True):
         seen = error > 1e-13
         right.plot(betas[seen], error[seen], style, color=color, label=label)
-    labels |= {"ylabel": "error of ε", "yscale": "log", "ylim": (1e-13, 30)}
+    labels = {"ylabel": "error of ε", "yscale": "log", "ylim": (1e-13, 30)}
     caption(right, "Difference from the equation of motion", **labels)
     relative = {"F = 0": np.abs(two / clipped - 1), "xi = 0": np.abs(two / unclipped - 1)}
     found = {
-        "recovered": coefficients,
+        "recovered": recovered(config),
         "orders": {
-            name: float(np.mean(analysis.slope(betas[:10], errors[name][:10])[1]))
+            name: np.mean(analysis.slope(betas[:10], errors[name][:10])[1])
             for name in ("two_terms_unclipped", "two_terms_clipped", "ramirez_four_terms")
         },
         "two_terms_good_to_one_per_cent": {
-            name: float(np.exp(analysis.interpolate(0.01, miss, np.log(betas))))
-            for name, miss in relative.items()
+            name: analysis.interpolate_logs(0.01, miss, betas) for name, miss in relative.items()
         },
     }
     return {"config": config, "found": found, "picture": figure}
@@ -108,14 +109,12 @@ def series(betas: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
 def recovered(config: dict) -> dict[str, list[float]]:
     """Fit coefficients of beta^(1/2), beta, ... (clipped) or beta, beta^2, ... to impacts."""
     # A least-squares fit on Chebyshev nodes, twice as many as coefficients.
-    degree, top = config["fit_degree"], config["fit_top"]
-    nodes = (1 - np.cos((np.arange(2 * degree) + 0.5) / degree * np.pi / 2)) / 2
-    powers, found = np.arange(1, degree + 1), {}
-    for clipped in (True, False):
-        x = nodes * (top**0.5 if clipped else top)
-        lost = restitutions(x**2 if clipped else x, clipped, config["rtol"]) - 1
-        fitted = np.linalg.lstsq((x / x.max())[:, None] ** powers, lost, rcond=None)[0]
-        found["clipped" if clipped else "unclipped"] = (fitted / x.max() ** powers)[:6]
+    degree, found = config["fit_degree"], {}
+    nodes = config["fit_top"] * (1 + chebpts1(2 * degree)) / 2
+    for name, power in (("clipped", 2), ("unclipped", 1)):
+        x = nodes * config["fit_top"] ** (1 / power - 1)
+        lost = restitutions(x**power, name == "clipped", config["rtol"]) - 1
+        found[name] = polyfit(x, lost, range(1, degree + 1))[1:7]
     return found
 
 
@@ -124,52 +123,42 @@ def paper_cooling(options: Options) -> dict:
     if options.smoke:
         config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9}
     config |= {"packing_fraction": PACKING, "beta": 0.15, "seed": 0, "last_theory": 1e10}
-    viscoelastic = beads(PACKING, config["beta"])
-    e, delta = restitution_like(viscoelastic), float(viscoelastic.delta)
-    gases = {
-        "viscoelastic": (viscoelastic, VISCOELASTIC, -5 / 3, f"viscoelastic, δ = {delta:.3f}"),
-        "constant": (hard_beads(PACKING, e), CONSTANT, -2.0, f"constant ε = {e:.3f}"),
-    }
-    tau = np.geomspace(0.1, config["last_theory"], 133)
-    title = (
-        "Viscoelastic spheres cool as t$^{-5/3}$, spheres of constant ε as t$^{-2}$:"
-        " both of the paper's laws hold at late times"
-    )
-    figure, (left, middle, right) = panels(3, title=title)
+    gases, tau = analysis.gases_of(config["beta"]), np.geomspace(0.1, config["last_theory"], 133)
+    gas, e = gases["viscoelastic"][0], gases["constant"][0].coefficient
+    title = "Late viscoelastic gases cool as t$^{-5/3}$, those of constant ε as t$^{-2}$"
+    figure, (left, middle, right) = panels(3, title=title, subplot_kw=TIME)
     found: dict = {"restitution": e}
-    for name, (gas, color, power, label) in gases.items():
-        theory = jaxgran.KineticTheory(softness=False, correlations=False)
-        T = analysis.compared(gas, "temperature", float(gas.temperature), tau, config, theory)[2]
+    for name, power in (("viscoelastic", -5 / 3), ("constant", -2.0)):
+        gas, color, label = gases[name]
+        T = analysis.compared(gas, "temperature", tau, config)[2]
         T.draw(left, middle, color, f"{label}: theory", f"{name}: theory")
         middle.axhline(power, color=color, ls=":", lw=1)
         found[name] = {
-            "largest_difference_of_theory": float(np.abs(1 / (1 + T.miss) - 1).max()),
+            "largest_difference_of_theory": np.abs(1 / (1 + T.miss) - 1).max(),
             "exponent": {f"{t:.3g}": x for t, x in zip(T.middle, T.exponent, strict=True)},
             "exponent_error": T.exponent_error,
-            "exponent_of_theory": analysis.at_powers(0, 10, T.where, T.local),
         }
         if name == "viscoelastic":
             late = np.abs(T.local - power) < 0.01 * abs(power)
             found["exponent_within_1_per_cent_from"] = analysis.from_here(late, T.where)
-            u, t = 1 + COOLING_RATE[3] * delta * tau, jnp.asarray(tau)
-            printed = paper_temperature(t, delta, corrected=False)
+            delta = float(gas.delta)
+            u = 1 + COOLING_RATE[3] * delta * tau
+            printed = paper_temperature(tau, delta, corrected=False)
             forms = {
                 "Eq. (10): u$^{-5/3}$": (u ** (-5 / 3), ":"),
                 "Eq. (38) as printed, to order δ": (printed, "--"),
-                "Eq. (38) corrected, to order δ$^2$": (paper_temperature(t, delta), "-"),
+                "Eq. (38) corrected, to order δ$^2$": (paper_temperature(tau, delta), "-"),
             }
             found["closed_forms"] = analysis.draw_forms(right, T, forms, (-1, 11))
         else:
             expected = np.asarray(haff(tau, e)) / T.theory - 1
             right.plot(tau, expected, color=color, label="Haff, Eq. (44)")
             found["haff"] = expected[::12]
-    logs = {"xlabel": TIME, "xscale": "log"}
     title = "Temperature: — theory, ● DSMC"
-    caption(left, title, ylabel="T / T$_0$", yscale="log", ylim=(1e-16, 3), **logs)
-    title = "Local exponent; dotted: the paper's −5/3 and −2"
-    caption(middle, title, ylabel=RATE, ylim=(-2.1, 0.05), **logs)
+    caption(left, title, ylabel="T / T$_0$", yscale="log", ylim=(1e-16, 3))
+    caption(middle, "Local exponent; dotted: the paper's", ylabel=RATE, ylim=(-2.1, 0.05))
     title = "Closed forms: difference from kinetic theory"
-    caption(right, title, ylabel="T$_{formula}$ / T − 1", ylim=(-0.42, 0.62), **logs)
+    caption(right, title, ylabel="T$_{formula}$ / T − 1", ylim=(-0.42, 0.62))
     return {"config": config, "found": found, "picture": figure}
 
 
@@ -185,9 +174,9 @@ def maxwellian(gas: jaxgran.Gas, tau: np.ndarray) -> tuple[np.ndarray, np.ndarra
     weight = g**3 * np.exp(-(g**2) / 2)
     eps = np.asarray(gas.reduced_law.restitution(jnp.asarray(g * np.sqrt(theta)[:, None])))
     lost = np.maximum((1 - eps**2) @ weight / weight.sum(), 1e-300)
-    pace = 3 / (lost * np.sqrt(theta))
-    passed = np.cumsum((pace[1:] + pace[:-1]) / 2 * -np.diff(np.log(theta)))
-    at = np.exp(np.interp(tau, np.concatenate([[0.0], passed]), np.log(theta)))
+    # The times at which T has these values.
+    passed = cumulative_trapezoid(3 / (lost * np.sqrt(theta)), -np.log(theta), initial=0)
+    at = np.exp(np.interp(tau, passed, np.log(theta)))
     gamma = 2 * np.gradient(np.log(lost), np.log(theta))
     return at, np.interp(-np.log(at), -np.log(theta), gamma)
 
@@ -200,51 +189,40 @@ def paper_exponents(options: Options) -> dict:
         config |= {"last": 100.0, "points": 7}
     config |= {"seed": 3, "last_theory": 1e8}
     title = "1 − ε ~ v$^γ$ cools as t$^{−2/(1+γ)}$; ice has no fixed exponent and becomes elastic"
-    figure, (left, middle, right) = panels(3, title=title)
+    figure, (left, middle, right) = panels(3, title=title, subplot_kw={"xscale": "log"})
     tau = np.geomspace(0.1, config["last_theory"], 181)
     scene, gases = beads(PACKING, 0.1), {}
     for gamma, color in zip(config["gammas"], SHADES, strict=False):
         coefficient = -config["loss"] / float(scene.impact_speed) ** gamma
         law = jaxgran.RestitutionSeries([coefficient], [gamma])
-        gases[f"γ = {gamma:g}"] = eqx.tree_at(lambda gas: gas.law, scene, law), color, gamma
-    frozen = jaxgran.Gas(
-        ice(),
-        diameter=0.02,
-        mass=jaxgran.sphere_mass(0.02, 900.0),
-        packing_fraction=PACKING,
-        temperature=config["ice_speed"] ** 2 / 2,
-    )
+        gases[f"γ = {gamma:g}"] = replace(scene, law=law), color, -2 / (1 + gamma)
+    size = {"diameter": 0.02, "mass": jaxgran.sphere_mass(0.02, 900.0)}
+    frozen = replace(scene, law=ice(), temperature=config["ice_speed"] ** 2 / 2, **size)
     found: dict = {}
-    for name, (gas, color, gamma) in {**gases, "ice": (frozen, INK, None)}.items():
-        unit, theory = float(gas.temperature), jaxgran.KineticTheory()
-        of, _, T = analysis.compared(gas, "temperature", unit, tau, config, theory)
-        if gamma is None:
+    for name, (gas, color, power) in {**gases, "ice": (frozen, INK, None)}.items():
+        theory = jaxgran.KineticTheory()
+        of, _, T = analysis.compared(gas, "temperature", tau, config, theory)
+        if power is None:
             theta, steepness = maxwellian(gas, tau)
             T = analysis.Compared(tau, theta, T.at, T.each)
+            T.draw(left, None, color, name, "")
             draw_ice(right, T, steepness, 100 * config["ice_speed"])
-        label = name if gamma is None else f"{name}: −2/(1 + γ) = {-2 / (1 + gamma):.3g}"
-        T.draw(left, None if gamma is None else middle, color, name, label)
-        if gamma is not None:
-            middle.axhline(-2 / (1 + gamma), color=color, ls=":", lw=1)
-        ends = np.log(np.interp(T.at[-2:], tau, T.theory))
+        else:
+            T.draw(left, middle, color, name, f"{name}: −2/(1 + γ) = {power:.3g}")
+            middle.axhline(power, color=color, ls=":", lw=1)
+        last = T.at[-2:]
         found[name] = {
-            "paper_exponent": None if gamma is None else -2 / (1 + gamma),
-            "exponent": float(T.exponent[-1]),
-            "exponent_error": float(T.exponent_error[-1]),
-            "exponent_of_theory": float(np.diff(ends)[0] / np.diff(np.log(T.at[-2:]))[0]),
-            "last_exponent_of_theory": float(T.local[-1]),
-            "last_displacement_exponent": float(
-                analysis.slope(tau, np.asarray(of.displacement))[1][-1]
-            ),
+            "paper_exponent": power,
+            "exponent": T.exponent[-1],
+            "exponent_error": T.exponent_error[-1],
+            "exponent_of_theory": analysis.slope(last, np.interp(last, tau, T.theory))[1][0],
+            "last_exponent_of_theory": T.local[-1],
+            "last_displacement_exponent": analysis.slope(tau, of.displacement)[1][-1],
         }
-    elastic = 100 * float(ice().speed)
-    logs = {"xlabel": TIME, "xscale": "log"}
-    title = "Temperature: — theory, ● DSMC"
-    caption(left, title, ylabel="T / T$_0$", yscale="log", **logs)
-    caption(middle, "Local exponents; dotted: −2/(1 + γ)", ylabel=RATE, **logs)
-    title = f"Ice: elastic below {elastic:.3f} cm/s; time runs to the left"
-    labels = {"xlabel": "thermal speed (2T)$^{1/2}$, cm/s", "ylabel": RATE}
-    caption(right, title, xscale="log", ylim=(-2.1, 0.05), **labels)
+    caption(left, "Temperature: — theory, ● DSMC", ylabel="T / T$_0$", yscale="log", **TIME)
+    caption(middle, "Local exponents; dotted: −2/(1 + γ)", ylabel=RATE, **TIME)
+    title = f"Ice: elastic below {100 * float(ice().speed):.3f} cm/s; time runs to the left"
+    caption(right, title, xlabel="thermal speed (2T)$^{1/2}$, cm/s", ylabel=RATE, ylim=(-2.1, 0.05))
     right.xaxis.set_minor_formatter(NullFormatter())
     return {"config": config, "found": found, "picture": figure}
 

@@ -8,8 +8,13 @@ import numpy as np
 from matplotlib.axes import Axes
 
 import jaxgran
-from experiments.support.plots import VISCOELASTIC
-from experiments.support.scenes import cool
+from experiments.support.plots import CONSTANT, ELASTIC, VISCOELASTIC
+from experiments.support.scenes import beads, cool, hard_beads, restitution_like
+
+PACKING = 0.05
+"""Packing fraction of the gases of `gases_of`."""
+
+ENSKOG = jaxgran.KineticTheory(softness=False, correlations=False)
 
 
 def replicas_of(curve: jaxgran.CoolingCurve, name: str) -> np.ndarray:
@@ -38,6 +43,11 @@ def over(one: tuple, other: tuple) -> tuple[np.ndarray, np.ndarray]:
 def interpolate(x: Any, where: np.ndarray, values: np.ndarray) -> Any:
     """Interpolate linearly in ln x."""
     return np.interp(np.log(x), np.log(where), values)
+
+
+def interpolate_logs(x: Any, where: np.ndarray, values: Any) -> Any:
+    """Interpolate ln y linearly in ln x."""
+    return np.exp(interpolate(x, where, np.log(values)))
 
 
 def at_powers(first: int, last: int, where: np.ndarray, values: np.ndarray) -> dict[str, float]:
@@ -74,10 +84,22 @@ def fit_quietly(*measured: Any, **options: Any) -> jaxgran.Fit:
         return jaxgran.fit(*measured, **options)
 
 
+def gases_of(beta: float) -> dict[str, tuple[jaxgran.Gas, str, str]]:
+    """Return gases, the last two with one initial cooling rate, with their colour and label."""
+    viscoelastic = beads(PACKING, beta)
+    e, delta = restitution_like(viscoelastic), float(viscoelastic.delta)
+    return {
+        "elastic": (hard_beads(PACKING, 1.0), ELASTIC, "elastic"),
+        "constant": (hard_beads(PACKING, e), CONSTANT, f"constant ε = {e:.3f}"),
+        "viscoelastic": (viscoelastic, VISCOELASTIC, f"viscoelastic, δ = {delta:.3f}"),
+    }
+
+
 def compared(
-    gas: jaxgran.Gas, quantity: str, unit: float, tau: np.ndarray, config: dict, theory: Any
+    gas: jaxgran.Gas, quantity: str, tau: np.ndarray, config: dict, theory: Any = ENSKOG
 ) -> tuple[jaxgran.CoolingCurve, jaxgran.CoolingCurve, "Compared"]:
-    """Return the curves of theory and of DSMC, and a quantity of both in some unit."""
+    """Return the curves of theory and of DSMC, and T/T_0 or <dr^2>/(T_0 tau_c(0)^2) of both."""
+    unit = float(gas.temperature * (gas.mean_free_time**2 if quantity == "displacement" else 1))
     of = cool(gas, tau * float(gas.mean_free_time), theory)
     at = np.geomspace(0.1, config["last"], config["points"])
     model = jaxgran.DSMC(config["num_particles"], config["replicas"])
@@ -112,7 +134,7 @@ class Compared:
     @property
     def miss(self) -> np.ndarray:
         """Return DSMC over theory, minus 1."""
-        return self.mean / np.exp(interpolate(self.at, self.tau, np.log(self.theory))) - 1
+        return self.mean / interpolate_logs(self.at, self.tau, self.theory) - 1
 
     def draw(
         self, values: Axes, exponents: Axes | None, color: str, label: str, of_exponents: str
