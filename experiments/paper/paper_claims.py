@@ -206,10 +206,10 @@ def clusters(found: dict) -> dict:
 def claims(found: dict, n: dict) -> list[dict]:
     """Return the verdict of each claim, with what it is compared with."""
     spread, routes = found["diffusion"], found["diffusion_coefficient"]
-    (visco, visco_error), (even, even_error) = (
-        (list(one["exponent"].values())[-1], one["exponent_error"][-1])
-        for one in (found["cooling"]["viscoelastic"], found["cooling"]["constant"])
-    )
+    cooling, laws = found["cooling"], ("viscoelastic", "constant")
+    visco, even = (list(cooling[law]["exponent"].values())[-1] for law in laws)
+    visco_error, even_error = (cooling[law]["exponent_error"][-1] for law in laws)
+    bend = [spread[law]["linear_in_collisions_within"] for law in laws]
     elastic, constant, eps = routes["elastic"], routes["constant"], routes["restitution"]
     error = np.hypot(elastic["by_slope_error"][-1], elastic["by_integral_error"][0])
     D, D_error, D_theory = (constant[f"by_slope{key}"][-1] for key in ("", "_error", "_theory"))
@@ -217,7 +217,6 @@ def claims(found: dict, n: dict) -> list[dict]:
     tau_v, tau_v_error = (slow[key][-1] / slow["paper"][-1] for key in ("measured", "error"))
     decay, decay_error = n["correlation"]
     far, far_error = (spread["viscoelastic"][key][-1] for key in ("exponent", "exponent_error"))
-    bend = [spread[name]["linear_in_collisions_within"] for name in ("constant", "viscoelastic")]
     powers = [
         (f"exponent of T(t), {name}", one["last_exponent_of_theory"], one["paper_exponent"])
         for name, one in found["exponents"].items()
@@ -264,7 +263,7 @@ def claims(found: dict, n: dict) -> list[dict]:
         check("42", CORRECTED, n["displacement_off"], 0, 1e-4, power_of_t),
         check("44", AGREE, even, -2, 0.01, ("exponent of T(t), constant ε", even_error)),
         check("45", AGREE, n["logarithm_off"], 0, 0.03),
-        check("46", AGREE, max(bend[0] / 0.01, bend[1] / 0.3), 0, 1),
+        check("46", AGREE, max(bend[0] / 0.3, bend[1] / 0.01), 0, 1),
         check("47", AGREE, n["leading"][-1], 1, 0.1),
         check("—", CORRECTED, n["a2_of_theory"] / -n["a2"], 1, 0.02),
         check("text, clocks of the gas", AGREE, n["power_of_N"], -10, 3, ("exponent of T(N)",)),

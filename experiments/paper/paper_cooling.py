@@ -29,9 +29,9 @@ from scipy.integrate import cumulative_trapezoid
 
 import jaxgran
 from experiments.support import analysis
-from experiments.support.analysis import PACKING
+from experiments.support.analysis import PACKING, interpolate_logs, slope
 from experiments.support.closed_forms import haff, paper_temperature
-from experiments.support.plots import ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
+from experiments.support.plots import DOTS, ELASTIC, GUIDE, INK, VISCOELASTIC, caption, panels
 from experiments.support.record import Options, run_parts
 from experiments.support.scenes import beads, ice
 from jaxgran.scene.contact import impact
@@ -84,14 +84,12 @@ def paper_restitution(options: Options) -> dict:
     labels = {"ylabel": "error of ε", "yscale": "log", "ylim": (1e-13, 30)}
     caption(right, "Difference from the equation of motion", **labels)
     relative = {"F = 0": np.abs(two / clipped - 1), "xi = 0": np.abs(two / unclipped - 1)}
+    measured = "two_terms_unclipped", "two_terms_clipped", "ramirez_four_terms"
     found = {
         "recovered": recovered(config),
-        "orders": {
-            name: np.mean(analysis.slope(betas[:10], errors[name][:10])[1])
-            for name in ("two_terms_unclipped", "two_terms_clipped", "ramirez_four_terms")
-        },
+        "orders": {name: np.mean(slope(betas[:10], errors[name][:10])[1]) for name in measured},
         "two_terms_good_to_one_per_cent": {
-            name: analysis.interpolate_logs(0.01, miss, betas) for name, miss in relative.items()
+            name: interpolate_logs(0.01, miss, betas) for name, miss in relative.items()
         },
     }
     return {"config": config, "found": found, "picture": figure}
@@ -131,8 +129,7 @@ def paper_cooling(options: Options) -> dict:
     for name, power in (("viscoelastic", -5 / 3), ("constant", -2.0)):
         gas, color, label = gases[name]
         T = analysis.compared(gas, "temperature", tau, config)[2]
-        T.draw(left, middle, color, f"{label}: theory", f"{name}: theory")
-        middle.axhline(power, color=color, ls=":", lw=1)
+        T.draw(left, middle, color, label, power)
         found[name] = {
             "largest_difference_of_theory": np.abs(1 / (1 + T.miss) - 1).max(),
             "exponent": {f"{t:.3g}": x for t, x in zip(T.middle, T.exponent, strict=True)},
@@ -142,21 +139,17 @@ def paper_cooling(options: Options) -> dict:
             late = np.abs(T.local - power) < 0.01 * abs(power)
             found["exponent_within_1_per_cent_from"] = analysis.from_here(late, T.where)
             delta = float(gas.delta)
-            u = 1 + COOLING_RATE[3] * delta * tau
-            printed = paper_temperature(tau, delta, corrected=False)
-            forms = {
-                "Eq. (10): u$^{-5/3}$": (u ** (-5 / 3), ":"),
-                "Eq. (38) as printed, to order δ": (printed, "--"),
-                "Eq. (38) corrected, to order δ$^2$": (paper_temperature(tau, delta), "-"),
-            }
-            found["closed_forms"] = analysis.draw_forms(right, T, forms, (-1, 11))
+            labels = "Eq. (10): u$^{-5/3}$", "Eq. (38) as printed, to order δ"
+            labels += ("Eq. (38) corrected, to order δ$^2$",)
+            forms = (1 + COOLING_RATE[3] * delta * tau) ** power, paper_temperature, range(-1, 11)
+            found["closed_forms"] = analysis.draw_forms(right, T, delta, labels, *forms)
         else:
             expected = np.asarray(haff(tau, e)) / T.theory - 1
             right.plot(tau, expected, color=color, label="Haff, Eq. (44)")
             found["haff"] = expected[::12]
     title = "Temperature: — theory, ● DSMC"
     caption(left, title, ylabel="T / T$_0$", yscale="log", ylim=(1e-16, 3))
-    caption(middle, "Local exponent; dotted: the paper's", ylabel=RATE, ylim=(-2.1, 0.05))
+    caption(middle, "Local exponent; dotted: −5/3 and −2", ylabel=RATE, ylim=(-2.1, 0.05))
     title = "Closed forms: difference from kinetic theory"
     caption(right, title, ylabel="T$_{formula}$ / T − 1", ylim=(-0.42, 0.62))
     return {"config": config, "found": found, "picture": figure}
@@ -185,8 +178,7 @@ def paper_exponents(options: Options) -> dict:
     config = {"gammas": (0.0, 0.2, 0.5, 1.0), "num_particles": 5000, "last": 1e5, "points": 19}
     config |= {"loss": 0.15, "ice_speed": 0.01, "packing_fraction": PACKING, "replicas": 8}
     if options.smoke:
-        config |= {"gammas": (0.0, 1.0), "num_particles": 1000, "replicas": 2}
-        config |= {"last": 100.0, "points": 7}
+        config |= {"gammas": (0, 1), "num_particles": 1000, "replicas": 2, "last": 100, "points": 7}
     config |= {"seed": 3, "last_theory": 1e8}
     title = "1 − ε ~ v$^γ$ cools as t$^{−2/(1+γ)}$; ice has no fixed exponent and becomes elastic"
     figure, (left, middle, right) = panels(3, title=title, subplot_kw={"xscale": "log"})
@@ -205,19 +197,23 @@ def paper_exponents(options: Options) -> dict:
         if power is None:
             theta, steepness = maxwellian(gas, tau)
             T = analysis.Compared(tau, theta, T.at, T.each)
-            T.draw(left, None, color, name, "")
-            draw_ice(right, T, steepness, 100 * config["ice_speed"])
-        else:
-            T.draw(left, middle, color, name, f"{name}: −2/(1 + γ) = {power:.3g}")
-            middle.axhline(power, color=color, ls=":", lw=1)
+            speed, aged, old = 100 * config["ice_speed"], T.middle > 100, tau[1:] > 100
+            at = speed * np.sqrt(theta[1:][old])
+            right.plot(at, T.local[old], color=INK, label="theory, Maxwellian")
+            seen = speed * np.sqrt(np.sqrt(T.mean[1:] * T.mean[:-1]))[aged]
+            errors = T.exponent_error[aged]
+            right.errorbar(seen, T.exponent[aged], errors, color=INK, label="DSMC", **DOTS)
+            label = "−2/(1 + γ), γ = d ln⟨1 − ε²⟩ / d ln T$^{1/2}$"
+            right.plot(at, -2 / (1 + steepness[1:][old]), ":", color=GUIDE, label=label)
+        T.draw(left, None if power is None else middle, color, name, power)
         last = T.at[-2:]
         found[name] = {
             "paper_exponent": power,
             "exponent": T.exponent[-1],
             "exponent_error": T.exponent_error[-1],
-            "exponent_of_theory": analysis.slope(last, np.interp(last, tau, T.theory))[1][0],
+            "exponent_of_theory": slope(last, np.interp(last, tau, T.theory))[1][0],
             "last_exponent_of_theory": T.local[-1],
-            "last_displacement_exponent": analysis.slope(tau, of.displacement)[1][-1],
+            "last_displacement_exponent": slope(tau, of.displacement)[1][-1],
         }
     caption(left, "Temperature: — theory, ● DSMC", ylabel="T / T$_0$", yscale="log", **TIME)
     caption(middle, "Local exponents; dotted: −2/(1 + γ)", ylabel=RATE, **TIME)
@@ -225,18 +221,6 @@ def paper_exponents(options: Options) -> dict:
     caption(right, title, xlabel="thermal speed (2T)$^{1/2}$, cm/s", ylabel=RATE, ylim=(-2.1, 0.05))
     right.xaxis.set_minor_formatter(NullFormatter())
     return {"config": config, "found": found, "picture": figure}
-
-
-def draw_ice(axes, T: analysis.Compared, steepness: np.ndarray, speed: float) -> None:
-    """Draw the local exponents of ice over its thermal speed, past the initial transient."""
-    aged, old = T.middle > 100, T.tau[1:] > 100
-    at = speed * np.sqrt(T.theory[1:][old])
-    axes.plot(at, T.local[old], color=INK, label="theory, Maxwellian")
-    seen = speed * np.sqrt(np.sqrt(T.mean[1:] * T.mean[:-1]))[aged]
-    dots = {"fmt": "o", "ms": 3.5, "color": INK, "label": "DSMC"}
-    axes.errorbar(seen, T.exponent[aged], T.exponent_error[aged], **dots)
-    label = "−2/(1 + γ), γ = d ln⟨1 − ε²⟩ / d ln T$^{1/2}$"
-    axes.plot(at, -2 / (1 + steepness[1:][old]), ":", color=GUIDE, label=label)
 
 
 if __name__ == "__main__":

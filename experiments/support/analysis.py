@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 import jaxgran
-from experiments.support.plots import CONSTANT, ELASTIC, VISCOELASTIC
+from experiments.support.plots import CONSTANT, DOTS, ELASTIC, VISCOELASTIC
 from experiments.support.scenes import beads, cool, hard_beads, restitution_like
 
 PACKING = 0.05
@@ -28,6 +28,12 @@ def mean_and_error(each: Any) -> tuple[np.ndarray, np.ndarray]:
     return each.mean(axis=0), each.std(axis=0, ddof=1) / len(each) ** 0.5
 
 
+def with_error(name: str, each: Any) -> dict[str, np.ndarray]:
+    """Return the mean over the replicas and its standard error, by name."""
+    mean, error = mean_and_error(each)
+    return {name: mean, f"{name}_error": error}
+
+
 def ratio(one: tuple, other: tuple) -> tuple[np.ndarray, np.ndarray]:
     """Return the ratio of two values with errors, and its error."""
     (a, a_error), (b, b_error) = one, other
@@ -45,14 +51,9 @@ def interpolate(x: Any, where: np.ndarray, values: np.ndarray) -> Any:
     return np.interp(np.log(x), np.log(where), values)
 
 
-def interpolate_logs(x: Any, where: np.ndarray, values: Any) -> Any:
+def interpolate_logs(x: Any, where: np.ndarray, values: Any) -> np.ndarray:
     """Interpolate ln y linearly in ln x."""
-    return np.exp(interpolate(x, where, np.log(values)))
-
-
-def at_powers(first: int, last: int, where: np.ndarray, values: np.ndarray) -> dict[str, float]:
-    """Return the values at powers of ten, from the first to before the last."""
-    return {f"{10.0**k:g}": float(interpolate(10.0**k, where, values)) for k in range(first, last)}
+    return np.asarray(np.exp(interpolate(x, where, np.log(values))))
 
 
 def from_here(inside: np.ndarray, x: np.ndarray) -> float:
@@ -136,28 +137,29 @@ class Compared:
         """Return DSMC over theory, minus 1."""
         return self.mean / interpolate_logs(self.at, self.tau, self.theory) - 1
 
-    def draw(
-        self, values: Axes, exponents: Axes | None, color: str, label: str, of_exponents: str
-    ) -> None:
-        """Draw theory as a line and DSMC as points, and their local exponents."""
-        style = {"fmt": "o", "ms": 3.5, "color": color}
+    def draw(self, values: Axes, exponents: Axes | None, color: str, label: str, power=None):
+        """Draw theory as a line and DSMC as points, their local exponents, and the paper's."""
         values.plot(self.tau, self.theory, color=color, label=label)
-        values.errorbar(self.at, self.mean, self.error, **style)
+        values.errorbar(self.at, self.mean, self.error, color=color, **DOTS)
         if exponents is not None:
-            exponents.plot(self.where, self.local, color=color, label=of_exponents)
-            exponents.errorbar(self.middle, self.exponent, self.exponent_error, **style)
+            exponents.plot(self.where, self.local, color=color, label=label)
+            exponents.errorbar(self.middle, self.exponent, self.exponent_error, color=color, **DOTS)
+            if power is not None:
+                exponents.axhline(power, color=color, ls=":", lw=1)
 
 
-def draw_forms(axes: Axes, of: Compared, forms: dict[str, tuple], powers: tuple[int, int]) -> dict:
+def draw_forms(
+    axes: Axes, of: Compared, delta: float, labels: tuple, leading: Any, formula: Any, powers: range
+) -> dict:
     """Draw relative errors of closed forms, and return them at powers of ten, by the short label.
 
-    Args:
-        forms: values at the times of the theory, and line styles, by label.
-        powers: the first power of ten, and the one after the last.
+    The forms are the leading term, and the formula at (tau, delta), as printed and corrected.
     """
-    rows = {}
-    for label, (values, style) in forms.items():
+    rows, printed = {}, formula(of.tau, delta, corrected=False)
+    forms = ((leading, ":"), (printed, "--"), (formula(of.tau, delta), "-"))
+    for label, (values, style) in zip(labels, forms, strict=True):
         miss = np.asarray(values) / of.theory - 1
         axes.plot(of.tau, miss, style, color=VISCOELASTIC, label=label)
-        rows[label.split(":")[0].replace("$^2$", "^2")] = at_powers(*powers, of.tau, miss)
+        short = label.split(":")[0].replace("$^2$", "^2")
+        rows[short] = {f"{10.0**k:g}": interpolate(10.0**k, of.tau, miss) for k in powers}
     return rows

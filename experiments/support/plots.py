@@ -13,6 +13,9 @@ THEORY, DSMC, HARD, SOFT = (
     COLOURS[name] for name in ("kinetic theory", "DSMC", "hard spheres", "soft spheres")
 )
 
+DOTS = {"fmt": "o", "ms": 3.5}
+"""Points with error bars."""
+
 
 def panels(
     columns: int = 1, rows: int = 1, title: str = "", size=(4.6, 4.0), **shared: Any
