@@ -20,18 +20,17 @@ clustering_film: density, structure factor and spectrum of the flow of disks of 
 restitution: the flow grows first, the clusters later.
 """
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.cm import ScalarMappable
 from matplotlib.collections import EllipseCollection
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 import jaxgran
-from experiments.support.analysis import crossing, mean_and_error, ratio, replicas_of
+from experiments.support.analysis import crossing, mean_and_error, ratio, replicas_of, with_error
 from experiments.support.plots import CONSTANT, GUIDE, VISCOELASTIC, caption, panels
 from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool, hard_beads, viscoelastic_like
@@ -79,27 +78,34 @@ def runs_of(packing: float, e: float, size: int, replicas: int, until: tuple) ->
     constant, runs = hard_beads(packing, e, dimension=2), {}
     gases = constant, viscoelastic_like(constant)
     for law, gas, last in zip(LAWS, gases, until, strict=True):
-        gamma = dissipation(gas)
+        gamma, model = dissipation(gas), jaxgran.HardSpheres(size, replicas=replicas)
         tau = np.expm1(np.linspace(0.0, np.log1p(gamma * last), TIMES)) / gamma
-        model = jaxgran.HardSpheres(size, replicas=replicas)
         curve = cool(gas, tau * float(gas.mean_free_time), model, save=measures)
-        run = {"gas": gas, "tau": np.broadcast_to(tau, (replicas, TIMES))}
-        run |= {"collisions": replicas_of(curve, "collisions")}
-        run |= {name: np.asarray(x) for name, x in curve.replicas.saved.items()}
         log_T = np.log(replicas_of(curve, "temperature") / float(gas.temperature))
+        collisions = replicas_of(curve, "collisions")
         trial = np.append(0.0, np.geomspace(1e-2, 1e13, 800))
         theory = cool(gas, trial * float(gas.mean_free_time))
         of_theory = np.log(np.asarray(theory.temperature / gas.temperature))
-        at_N = np.interp(run["collisions"], np.asarray(theory.collisions), of_theory)
-        at_t = np.interp(np.log1p(run["tau"]), np.log1p(trial), of_theory)
-        runs[law] = run | {"clock": np.exp(-log_T), "excess": log_T - at_N}
-        runs[law]["excess_in_time"] = log_T - at_t
+        runs[law] = {
+            "gas": gas,
+            "tau": np.broadcast_to(tau, log_T.shape),
+            "collisions": collisions,
+            "T": np.exp(log_T),
+            "excess": log_T - np.interp(collisions, np.asarray(theory.collisions), of_theory),
+            "excess_in_time": log_T - np.interp(np.log1p(tau), np.log1p(trial), of_theory),
+            **jax.tree.map(np.asarray, curve.replicas.saved),
+        }
     return runs
 
 
 def dissipation(gas: jaxgran.Gas) -> float:
     """Return gamma_0, half of the initial decrease of ln T per collision per particle."""
     return float(jaxgran.KineticTheory().cooling_rate(gas) / gas.collision_frequency) / 2
+
+
+def crossings(run: dict, quantity: str, level: float) -> list[float]:
+    """Return the collisions per particle at which each replica reaches a level; nan if never."""
+    return [crossing(N, y, level) for N, y in zip(run["collisions"], run[quantity], strict=True)]
 
 
 def departures(run: dict, elastic: float) -> dict[str, dict[str, tuple]]:
@@ -111,10 +117,10 @@ def departures(run: dict, elastic: float) -> dict[str, dict[str, tuple]]:
     kinds |= {f"T over theory's of t by {c:g}": ("excess_in_time", np.log(c)) for c in FACTORS}
     kinds["unevenness over elastic by 2"] = ("unevenness", 2 * elastic)
     found = {}
-    for name, (quantity, level) in kinds.items():
-        N = [crossing(x, y, level) for x, y in zip(run["collisions"], run[quantity], strict=True)]
-        T, tau = 1 / at(run, "clock", N), at(run, "tau", N)
-        found[name] = {"N": mean_and_error(N), "T": mean_and_error(T), "tau": mean_and_error(tau)}
+    for name, kind in kinds.items():
+        N = crossings(run, *kind)
+        there = {"N": N, "T": at(run, "T", N), "tau": at(run, "tau", N)}
+        found[name] = {clock: mean_and_error(each) for clock, each in there.items()}
     return found
 
 
@@ -154,14 +160,15 @@ def paper_clustering(options: Options) -> dict:
 def analyse(runs: dict[str, dict], n_c: float) -> dict:
     """Return means and errors over the replicas, and the ratios between the laws."""
     start = np.concatenate([run["unevenness"][:, 0] for run in runs.values()])
-    found: dict = {}
-    for law, run in runs.items():
-        found[law] = {
+    found = {
+        law: {
             "gamma_0": dissipation(run["gas"]),
             "departures": departures(run, float(np.mean(start))),
-            "T_at_the_papers_N": mean_and_error(1 / at(run, "clock", [n_c] * len(run["tau"]))),
+            "T_at_the_papers_N": mean_and_error(at(run, "T", [n_c] * len(run["tau"]))),
             "last_flow": mean_and_error(run["flow"][:, -1]),
         }
+        for law, run in runs.items()
+    }
     one, other = (found[law]["departures"] for law in LAWS)
     return found | {"viscoelastic_over_constant": ratios(other, one)}
 
@@ -172,72 +179,66 @@ def draw_curves(runs: dict, found: dict):
     Colours show laws, line styles densities; each thin line is a replica.
     """
     figure, (cooling, by_number, by_clock) = panels(3, size=(4.4, 4.6))
-    marks: dict = {"color": CONSTANT, "mec": "k", "ls": "none"}
-    for ((packing, e), laws), row, style in zip(
-        runs.items(), found["scenes"].values(), ("-", "--"), strict=False
-    ):
+    for (scene, laws), style in zip(runs.items(), ("-", "--"), strict=False):
         for law, run in laws.items():
-            name = f"ε = {e:g}" if law == "constant" else "viscoelastic"
-            for k, (x, clock, excess) in enumerate(
-                zip(run["collisions"], run["clock"], np.exp(run["excess"]), strict=True)
-            ):
-                label = f"φ = {packing:g}, {name}" if k == 0 else None
-                look = {"color": LAWS[law], "ls": style, "lw": 1.1, "label": label}
-                cooling.plot(x, 1 / clock, **look)
-                by_number.plot(x, excess, **look)
-                by_clock.plot(clock, excess, **look)
-            cooling.plot(x, 1 / excess / clock, color=LAWS[law], ls=":", lw=1)
-        left = row["constant"]["departures"][f"T over theory's of N by {FACTORS[-1]:g}"]
-        label = f"T is {FACTORS[-1]:g} times that of theory" if style == "-" else None
-        cooling.plot(left["N"][0], left["T"][0], "o", ms=7, zorder=5, label=label, **marks)
-        if (packing, e) in PAPER:
-            label = "the paper's $N_c$, $T_c$" if style == "-" else None
-            cooling.plot(*PAPER[packing, e], "*", ms=13, zorder=4, label=label, **marks)
+            name = f"ε = {scene[1]:g}" if law == "constant" else "viscoelastic"
+            N, T, excess = run["collisions"].T, run["T"].T, np.exp(run["excess"]).T
+            look = {"color": LAWS[law], "ls": style, "lw": 1.1}
+            lines = cooling.plot(N, T, **look)
+            lines[0].set_label(f"φ = {scene[0]:g}, {name}")
+            by_number.plot(N, excess, **look)
+            by_clock.plot(1 / T, excess, **look)
+            cooling.plot(N[:, 0], (T / excess)[:, 0], color=LAWS[law], ls=":", lw=1)
+    name = f"T over theory's of N by {FACTORS[-1]:g}"
+    left = [scene["constant"]["departures"][name] for scene in found["scenes"].values()]
+    N, T = ([one[clock][0] for one in left] for clock in "NT")
+    marks: dict = {"color": CONSTANT, "mec": "k", "zorder": 5}
+    cooling.plot(N, T, "o", ms=7, label="T is twice that of theory", **marks)
+    N, T = np.transpose(list(PAPER.values()))
+    cooling.plot(N, T, "*", ms=13, label="the paper's $N_c$, $T_c$", **marks)
     cooling.plot([], [], ":", color=GUIDE, label="kinetic theory of the same gas")
-    low = min(float(np.min(1 / run["clock"])) for laws in runs.values() for run in laws.values())
-    titles = (
-        "Disks cool more slowly than kinetic theory",
-        "... after different numbers of collisions",
-        "... but below nearly the same temperature",
-    )
-    for axes, title in zip(figure.axes, titles, strict=True):
-        labels = {"xlabel": "collisions per particle N", "ylabel": "T / T of theory at the same N"}
-        caption(axes, title, "none", yscale="log", ylim=(0.9, 20), **labels)
-    cooling.set(ylabel="$T/T_0$", ylim=(low / 8, 1.5))
+    number = {"xlabel": "collisions per particle N"}
+    labels = {"ylabel": "$T/T_0$", "yscale": "log", "ylim": (2e-5, 1.5)}
+    caption(cooling, "Disks cool more slowly than kinetic theory", "none", **labels, **number)
+    labels |= {"ylabel": "T / T of theory at the same N", "ylim": (0.9, 20)}
+    caption(by_number, "... after different numbers of collisions", **labels, **number)
+    labels |= {"xlabel": "$T_0/T$", "xscale": "log"}
+    caption(by_clock, "... but below nearly the same temperature", **labels)
     for axes in (by_number, by_clock):
         axes.axhline(FACTORS[-1], color=GUIDE, lw=0.8, zorder=0)
         axes.set_yticks([1, 2, 5, 10, 20], ["1", "2", "5", "10", "20"])
         axes.set_yticks([], minor=True)
-    by_clock.set(xscale="log", xlabel="$T_0/T$")
-    handles, labels = cooling.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
+
+
+def draw_density(axes, density: np.ndarray, title: str):
+    """Draw the density over its mean as an image."""
+    image = axes.imshow(density.T, origin="lower", cmap="magma", vmin=0.0, vmax=2.5)
+    axes.set(xticks=[], yticks=[])
+    axes.set_title(title, fontsize=9)
+    return image
 
 
 def draw_fields(runs: dict[str, dict], fields: tuple):
     """Draw the density of a scene, smoothed over 1.5 mean distances of disks."""
-    figure, places = panels(len(fields), 2, size=(2.8, 2.8), squeeze=False)
-    shown = ScalarMappable(Normalize(0.0, 2.5), cmap=colormaps["magma"].resampled(25))
-    rows = places[: len(fields)], places[len(fields) :]
-    for (law, run), row in zip(runs.items(), rows, strict=True):
-        for mark, axes in zip(fields, row, strict=True):
-            place, title = nearest(run, mark)
-            pixels = int(len(place) ** 0.5)  # as large as the mean distance of disks
-            number = np.histogram2d(*place.T, bins=pixels, range=[[0, 1], [0, 1]])[0]
-            density = gaussian_filter(number, 1.5, mode="wrap") / number.mean()
-            look = {"norm": shown.norm, "cmap": shown.cmap, "origin": "lower"}
-            axes.imshow(density.T, interpolation="nearest", **look)
-            axes.set(xticks=[], yticks=[])
-            axes.set_title(title, fontsize=9)
-        row[0].set_ylabel("constant $\\varepsilon$" if law == "constant" else "viscoelastic")
-    figure.colorbar(shown, ax=places, shrink=0.7, label="density / mean")
+    figure, places = panels(len(fields), 2, size=(2.8, 2.8))
+    for axes, ((law, run), mark) in zip(places, product(runs.items(), fields), strict=True):
+        place, title = nearest(run, mark)
+        pixels = int(len(place) ** 0.5)  # as large as the mean distance of disks
+        number = np.histogram2d(*place.T, bins=pixels, range=[[0, 1], [0, 1]])[0]
+        density = gaussian_filter(number, 1.5, mode="wrap") / number.mean()
+        image = draw_density(axes, density, title)
+        if mark == fields[0]:
+            axes.set_ylabel(f"{law} ε")
+    figure.colorbar(image, ax=places, shrink=0.7, label="density / mean")
     return figure
 
 
 def nearest(run: dict, collisions: float) -> tuple[np.ndarray, str]:
     """Return the positions of a replica next to a number of collisions, and a title."""
     k = int(np.argmin(np.abs(run["collisions"][0] - collisions)))
-    N, T = run["collisions"][0, k], 1 / run["clock"][0, k]
+    N, T = run["collisions"][0, k], run["T"][0, k]
     return run["position"][0, k], f"$N$ = {N:.0f},  $T/T_0$ = {T:.1e}"
 
 
@@ -246,50 +247,45 @@ def paper_clustering_dissolves(options: Options) -> dict:
     if options.smoke:
         size, replicas, until, fields = 300, 2, (20.0, 800.0), (4.0, 60.0)
     runs = runs_of(0.05, 0.6, size, replicas, until)
-    elastic = mean_and_error(np.concatenate([run["unevenness"][:, 0] for run in runs.values()]))
+    elastic = np.mean([run["unevenness"][:, 0] for run in runs.values()])
     found: dict = {"config": {"num_particles": size, "replicas": replicas}}
     for law, run in runs.items():
         grid = np.geomspace(1.0, run["collisions"][:, -1].min(), 60)
         found[law] = {"gamma_0": dissipation(run["gas"]), "collisions": grid}
-        for name, unit in (("unevenness", elastic[0]), ("flow", 1.0), ("excess", 1.0)):
+        for name, unit in (("unevenness", elastic), ("flow", 1.0), ("excess", 1.0)):
             pairs = zip(run["collisions"], run[name] / unit, strict=True)
-            found[law][name], found[law][f"{name}_error"] = mean_and_error(
-                [smooth(grid, x, y) for x, y in pairs]
-            )
+            found[law] |= with_error(name, [smooth(grid, x, y) for x, y in pairs])
     run = runs["viscoelastic"]
-    T = run["gas"].temperature / jnp.asarray(run["clock"])
-    lengths = jax.vmap(jax.vmap(lambda T: run["gas"].replace(temperature=T).critical_box))(T)
-    pairs = zip(run["collisions"], np.asarray(lengths / run["gas"].box_side(size)), strict=True)
-    found["critical_box_passes_at"] = [crossing(x, length, 1.0) for x, length in pairs]
+    gas = run["gas"]
+    lengths = jnp.vectorize(lambda T: gas.replace(temperature=T * gas.temperature).critical_box)
+    run["critical_box"] = np.asarray(lengths(run["T"]) / gas.box_side(size))
+    found["critical_box_passes_at"] = crossings(run, "critical_box", 1.0)
     return found | {"picture": draw_dissolution(run, size, fields, found)}
 
 
 def smooth(grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Average y over points within 10 % of each grid point; interpolate if there are none."""
-    near = [np.abs(np.log(np.maximum(x, 1e-9) / at)) < 0.1 for at in grid]
-    return np.array(
-        [y[i].mean() if i.any() else np.interp(at, x, y) for i, at in zip(near, grid, strict=True)]
-    )
+    near = np.abs(np.log(np.maximum(x, 1e-9) / grid[:, None])) < 0.1
+    means = near @ y / np.maximum(near.sum(axis=1), 1)
+    return np.where(near.any(axis=1), means, np.interp(grid, x, y))
 
 
 def draw_dissolution(run: dict, size: int, fields: tuple, found: dict):
     """Draw density fluctuations and flow over the collisions, and disks at some times."""
-    figure, columns = Figure(figsize=(11, 7.2), layout="constrained"), len(fields)
-    grid = figure.add_gridspec(2, 2 * columns, height_ratios=[1.15, 1])
+    figure = Figure(figsize=(11, 7.2), layout="constrained")
+    above, below = np.asarray(figure.subfigures(2, height_ratios=(1.15, 1)), dtype=object)
     labels = "density fluctuations / elastic", "share of the energy in the flow"
-    for i, (name, label) in enumerate(zip(("unevenness", "flow"), labels, strict=True)):
-        axes = figure.add_subplot(grid[0, i * columns : (i + 1) * columns])
+    for axes, name, label in zip(above.subplots(1, 2), ("unevenness", "flow"), labels, strict=True):
         for law, colour in LAWS.items():
             x, y, error = (found[law][key] for key in ("collisions", name, f"{name}_error"))
             axes.plot(x, y, color=colour, lw=1.6, label=law)
             axes.fill_between(x, y - error, y + error, color=colour, alpha=0.25, lw=0)
         mean = np.mean(found["critical_box_passes_at"])
         axes.axvline(mean, color="0.5", ls="--", lw=1, label="$L_c$ exceeds the box")
-        if i == 0:
-            axes.axhline(1, color="0.7", lw=0.8)
         caption(axes, xscale="log", xlabel="collisions per particle N", ylabel=label)
-    for i, mark in enumerate(fields):
-        axes, (place, title) = figure.add_subplot(grid[1, 2 * i : 2 * i + 2]), nearest(run, mark)
+    above.axes[0].axhline(1, color="0.7", lw=0.8)
+    for mark, axes in zip(fields, below.subplots(1, len(fields)), strict=True):
+        place, title = nearest(run, mark)
         width = np.full(len(place), float(run["gas"].diameter / run["gas"].box_side(size)))
         where = {"units": "xy", "offsets": place, "offset_transform": axes.transData}
         disks = EllipseCollection(width, width, 0 * width, color=VISCOELASTIC, lw=0, **where)
@@ -307,24 +303,23 @@ def clustering_film(options: Options) -> dict:
     times = N_0 * jnp.expm1(jnp.linspace(0.0, 100.0, frames) / N_0) * gas.mean_free_time
 
     def spectra(particles: jaxgran.Particles) -> dict:
-        where = particles.position, particles.box_side
-        k, across, along = observables.flow_spectrum(where[0], particles.velocity, where[1], 8)
-        T = observables.temperature(particles.velocity)
-        S = observables.structure_factor(*where, 8)[1]
-        density = observables.cell_density(*where, cells)
-        waves = {"k": k * gas.diameter, "S": S, "across": across / T, "along": along / T}
-        return waves | {"density": density}
+        x, v, side = particles.position, particles.velocity, particles.box_side
+        k, across, along = observables.flow_spectrum(x, v, side, 8)
+        T = observables.temperature(v)
+        waves = {"k": k * gas.diameter, "across": across / T, "along": along / T}
+        waves["S"] = observables.structure_factor(x, side, 8)[1]
+        return waves | {"density": observables.cell_density(x, side, cells)}
 
     curve = cool(gas, times, jaxgran.HardSpheres(disks), save=spectra)
-    saved = {name: np.asarray(values) for name, values in curve.saved.items()}
+    saved = jax.tree.map(np.asarray, curve.saved)
     density = saved.pop("density")
     results = {
         "disks": disks,
         "restitution": e,
         "collisions": np.asarray(curve.collisions),
-        "temperature": np.asarray(curve.temperature / gas.temperature),
+        "temperature": curve.temperature / gas.temperature,
         "critical_box": float(gas.critical_box / gas.diameter),
-        "box": float(gas.box_side(disks) / gas.diameter),
+        "box": gas.box_side(disks) / gas.diameter,
         **saved,
     }
     return results | {"picture": draw_growth(density, results)}
@@ -337,16 +332,11 @@ def draw_growth(density: np.ndarray, results: dict):
     frames, x = above.subplots(1, 4), results["collisions"]
     for axes, share in zip(frames, (0.0, 0.2, 0.5, 1.0), strict=True):
         k = int(np.argmin(np.abs(x - share * x[-1])))
-        image = axes.imshow(density[k].T, origin="lower", cmap="cividis", vmin=0.0, vmax=3.0)
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(f"{x[k]:.0f} collisions per disk", fontsize=10)
+        image = draw_density(axes, density[k], f"{x[k]:.0f} collisions per disk")
     above.colorbar(image, ax=frames, label="density over its mean", shrink=0.8)
     growth, spectrum = below.subplots(1, 2)
-    for name, label, style in (
-        ("across", "flow, transverse", "-"),
-        ("along", "flow, longitudinal", "--"),
-        ("S", "density, S(k)", ":"),
-    ):
+    styles = {"flow, transverse": ("across", "-"), "flow, longitudinal": ("along", "--")}
+    for label, (name, style) in (styles | {"density, S(k)": ("S", ":")}).items():
         growth.plot(x, results[name][:, :3].mean(axis=1), style, color="black", label=label)
         spectrum.plot(results["k"][0], results[name][-1], style, color="black", marker=".")
     label = "mean of the three longest waves"
@@ -354,8 +344,7 @@ def draw_growth(density: np.ndarray, results: dict):
     place = 2 * np.pi / results["critical_box"]
     spectrum.axvline(place, color="0.6", linewidth=1)
     spectrum.annotate("2π/L_c ", (place, 0.95), xycoords=("data", "axes fraction"), ha="right")
-    label = "at the last frame"
-    caption(spectrum, xlabel="wavenumber, diameter k", ylabel=label, yscale="log")
+    caption(spectrum, xlabel="wavenumber, diameter k", ylabel="at the last frame", yscale="log")
     return figure
 
 

@@ -122,7 +122,7 @@ def paper_cooling(options: Options) -> dict:
         config |= {"num_particles": 1000, "replicas": 2, "last": 1e3, "points": 9}
     config |= {"packing_fraction": PACKING, "beta": 0.15, "seed": 0, "last_theory": 1e10}
     gases, tau = analysis.gases_of(config["beta"]), np.geomspace(0.1, config["last_theory"], 133)
-    gas, e = gases["viscoelastic"][0], gases["constant"][0].coefficient
+    e = gases["constant"][0].coefficient
     title = "Late viscoelastic gases cool as t$^{-5/3}$, those of constant ε as t$^{-2}$"
     figure, (left, middle, right) = panels(3, title=title, subplot_kw=TIME)
     found: dict = {"restitution": e}
@@ -141,8 +141,9 @@ def paper_cooling(options: Options) -> dict:
             delta = float(gas.delta)
             labels = "Eq. (10): u$^{-5/3}$", "Eq. (38) as printed, to order δ"
             labels += ("Eq. (38) corrected, to order δ$^2$",)
-            forms = (1 + COOLING_RATE[3] * delta * tau) ** power, paper_temperature, range(-1, 11)
-            found["closed_forms"] = analysis.draw_forms(right, T, delta, labels, *forms)
+            leading = (1 + COOLING_RATE[3] * delta * tau) ** power
+            of = labels, leading, paper_temperature, range(-1, 11)
+            found["closed_forms"] = analysis.draw_forms(right, T, delta, *of)
         else:
             expected = np.asarray(haff(tau, e)) / T.theory - 1
             right.plot(tau, expected, color=color, label="Haff, Eq. (44)")

@@ -338,9 +338,9 @@ def paper_diffusion(options: Options) -> dict:
             found["exponent_within_10_per_cent_from"] = analysis.from_here(near, spread.where)
             rate = COOLING_RATE[3] * delta
             leading = 54 / rate * ((1 + rate * tau) ** (1 / 6) - 1)
-            of = leading, closed_forms.paper_displacement, range(1, 15)
             labels = "leading: u$^{1/6}$ − 1", "Eq. (40) integrated", "corrected, to order δ"
-            found["closed_forms"] = analysis.draw_forms(forms, spread, delta, labels, *of)
+            of = labels, leading, closed_forms.paper_displacement, range(1, 15)
+            found["closed_forms"] = analysis.draw_forms(forms, spread, delta, *of)
     # At small delta the solver's steps cover few collisions; longer times would take minutes.
     found["windows"] = [cooling_window(x, tau[tau < 1e12]) for x in config["deltas"]]
     length = "⟨Δr²⟩ / (T$_0$ τ$_c$(0)²)"
