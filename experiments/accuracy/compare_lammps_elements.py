@@ -16,7 +16,7 @@ import dataclasses
 import numpy as np
 
 import jaxgran
-from experiments.support.lammps_library import granular_box, hertzian
+from experiments.support.lammps_library import granular_box
 from experiments.support.plots import caption, panels
 from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import beads, cool
@@ -39,14 +39,10 @@ SCENES = {  # contact duration in mean free times, friction, walls
 def scene(name: str, num: int) -> jaxgran.Gas:
     duration, frictional, contained = SCENES[name]
     gas = beads(packing_fraction=0.15, beta=0.3, contact_fraction=duration)
-    elements: dict = {}
-    if frictional:
-        elements["surface"] = jaxgran.Frictional(**FRICTION)
-    if contained:
-        friction_material = OF_WALLS if frictional else {}
-        walls = jaxgran.Walls(gas.box_side(num), restitution=gas.law, **friction_material)
-        elements["container"] = walls
-    return dataclasses.replace(gas, **elements)
+    surface = jaxgran.Frictional(**FRICTION) if frictional else None
+    of_walls = OF_WALLS if frictional else {}
+    walls = jaxgran.Walls(gas.box_side(num), restitution=gas.law, **of_walls) if contained else None
+    return dataclasses.replace(gas, surface=surface, container=walls)
 
 
 def compare_lammps_elements(options: Options) -> dict:
@@ -66,30 +62,25 @@ def compare_lammps_elements(options: Options) -> dict:
 
 def compare(name: str, num: int) -> dict:
     gas = scene(name, num)
-    start = initial(gas, num)
-    times = TIMES * float(gas.mean_free_time)
+    start, times = initial(gas, num), TIMES * float(gas.mean_free_time)
     lammps = trajectory(gas, start, times, STEPS)
     model = jaxgran.SoftSpheres(num, steps_per_contact=STEPS, start=start)
-    curves = [cool(gas, times[:i], model) for i in range(1, len(times) + 1)]
-    ours, last = [curve.particles for curve in curves], curves[-1]
-    speed, sigma = float(gas.temperature) ** 0.5, float(gas.diameter)
-    velocity = np.array([each.velocity[0] for each in ours]) - lammps["velocity"]
+    curve = cool(gas, times, model, save="particles")
+    ours, speed, sigma = curve.saved, float(gas.temperature) ** 0.5, float(gas.diameter)
+    velocity = ours.velocity[:, 0] - lammps["velocity"]
 
-    def rms(x: np.ndarray) -> np.ndarray:
+    def rms(x) -> np.ndarray:
         return np.sqrt(np.mean(x**2, axis=(1, 2)))
 
     found = {
         "rms_velocity": rms(velocity) / speed,
-        "largest_velocity": np.abs(velocity).max(axis=(1, 2)) / speed,
-        "temperature": float(last.temperature[-1] / np.mean(lammps["velocity"][-1] ** 2) - 1),
-        "collisions": float(last.collisions[-1]),
-        "mean_overlap": float(gas.mean_overlap),
+        "temperature": float(curve.temperature[-1] / np.mean(lammps["velocity"][-1] ** 2) - 1),
     }
     if gas.surface is not None:
-        spin = np.array([each.angular_velocity[0] for each in ours]) - lammps["omega"]
         T_rot = 0.4 * sigma**2 / 4 * np.mean(lammps["omega"][-1] ** 2)
+        spin = ours.angular_velocity[:, 0] - lammps["omega"]
         found["rms_spin"] = rms(spin) * sigma / 2 / speed
-        found["rotational_temperature"] = float(last.rotational_temperature[-1] / T_rot - 1)
+        found["rotational_temperature"] = float(curve.rotational_temperature[-1] / T_rot - 1)
     print(name, found, flush=True)
     return found
 
@@ -103,38 +94,25 @@ def initial(gas: jaxgran.Gas, num: int) -> jaxgran.Particles:
 
 def trajectory(gas: jaxgran.Gas, start, times: np.ndarray, steps: int) -> dict[str, np.ndarray]:
     """Return positions, velocities and angular velocities in LAMMPS at the given times."""
-    walls, n, side = gas.container, start.position.shape[1], float(start.box_side)
-    law = hertzian(gas, gas.law, tangential(gas, FRICTION))
-    lmp = granular_box(gas, start.position[0], start.velocity[0], side, law, 0.3, "nve/sphere")
-    if walls is not None:
-        law = hertzian(gas, walls.restitution, tangential(gas, OF_WALLS), wall=True)
-        for axis in "xyz":
-            lmp.command(f"fix {axis} all wall/gran granular {law} {axis}plane 0 {side!r}")
-    found: dict[str, list] = {"position": [], "velocity": [], "omega": []}
+    lmp = granular_box(gas, start, 0.3, "nve/sphere")
+    names = {"position": "x", "velocity": "v", "omega": "omega"}
+    found: dict[str, list] = {name: [] for name in names}
     for duration in np.diff(times, prepend=0.0):
         count = int(np.ceil(duration * steps / float(gas.contact_duration)))
-        lmp.command(f"timestep {float(duration) / count!r}")
-        lmp.command(f"run {count}")
-        order = np.argsort(lmp.numpy.extract_atom("id")[:n])
-        for name, key in (("position", "x"), ("velocity", "v"), ("omega", "omega")):
-            found[name].append(np.array(lmp.numpy.extract_atom(key)[:n], float)[order])
+        lmp.commands_list([f"timestep {float(duration) / count!r}", f"run {count}"])
+        for name, key in names.items():
+            found[name].append(np.reshape(lmp.gather_atoms(key, 1, 3), (-1, 3)))
     lmp.close()
     return {name: np.array(rows) for name, rows in found.items()}
-
-
-def tangential(gas: jaxgran.Gas, values: dict[str, float]) -> str:
-    return "0 0" if gas.surface is None else " ".join(str(value) for value in values.values())
 
 
 def store() -> None:
     """Write a trajectory of 64 spheres with friction between walls, for the tests."""
     gas = scene("walls and friction", 64)
-    start = initial(gas, 64)
-    times = np.array([0.25, 0.5]) * float(gas.mean_free_time)
-    lammps = trajectory(gas, start, times, 1000)
+    start, times = initial(gas, 64), np.array([0.25, 0.5]) * float(gas.mean_free_time)
     first = {"first_position": start.position, "first_velocity": start.velocity}
-    floats = {name: gas.value(name) for name in gas.domains}
-    content: dict = {"t": times} | first | lammps | floats
+    content = {"t": times} | first | trajectory(gas, start, times, 1000)
+    content |= {name: gas.value(name) for name in gas.domains}
     np.savez_compressed(DATA / "lammps_elements_n64.npz", **content)
 
 

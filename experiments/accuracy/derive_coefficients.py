@@ -52,8 +52,7 @@ def fit_rational(
     best = (np.inf, np.array([]), np.array([]))
     for _ in range(ROUNDS):
         weight = (lawson / denominator)[:, None]
-        matrix = np.concatenate([beta[:, None] * basis_p, -target[:, None] * basis_q], axis=1)
-        matrix = matrix * weight
+        matrix = weight * np.hstack([beta[:, None] * basis_p, -target[:, None] * basis_q])
         scale = np.abs(matrix).max(axis=0)
         right = (target - beta * slope) * weight[:, 0]
         x = np.linalg.lstsq(matrix / scale, right, rcond=1e-15)[0] / scale

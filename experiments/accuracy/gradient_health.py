@@ -8,9 +8,8 @@ kinetic theory corrects the truncation error of the step), compared with derivat
 errors are over replicas. Relative errors mean little at times when ln T hardly depends on A.
 
 gradient_health_dilute, _dense, _clustering: soft spheres after 1, 3, 10, 30 and 100 collisions per
-particle, by forward mode without projection ("plain"), thermally projected forward and reverse
-mode, and kinetic theory; and the dependence of the projected derivative on the interval between
-projections.
+particle, by forward mode without projection ("plain"), thermally projected, and by kinetic theory;
+and the dependence of the projected derivative on the interval between projections.
 
 hard_derivatives: hard spheres after 10 and 30 mean free times, below L_c and in a box of 1.1 L_c.
 
@@ -88,16 +87,11 @@ class Slopes:
 
     def differences(self, model, seeds=(0,)) -> np.ndarray:
         """Return finite differences, corrected by kinetic theory."""
-        ends = [
-            [np.asarray(self.log_temperatures(x * STEP, model, seed)[0]) for x in (1, -1)]
-            for seed in seeds
-        ]
-        slopes = [(right - left) / (2 * STEP) for right, left in ends]
+        slopes = []
+        for seed in seeds:
+            right, left = (self.log_temperatures(x * STEP, model, seed)[0] for x in (1, -1))
+            slopes.append((right - left) / (2 * STEP))
         return np.concatenate(slopes) - self.truncation
-
-    def until(self, count: int) -> "Slopes":
-        """Return the same for the first times."""
-        return Slopes(self.gas, self.times[:count])
 
 
 def soft_spheres(name: str, options: Options) -> dict:
@@ -112,38 +106,31 @@ def soft_spheres(name: str, options: Options) -> dict:
         rough = jaxgran.SoftSpheres(size, steps_per_contact=10)
         times = times_of(gas, collisions, rough, times[-1] / float(gas.mean_free_time), 60)
     model = jaxgran.SoftSpheres(size, replicas=many, steps_per_contact=STEPS_PER_CONTACT)
-    slopes = Slopes(gas, times)
-    early, early_model = slopes.until(EARLY), replace(model, replicas=most)
-    late = slopes.differences(model, range(sets))
+    slopes, early, first = (Slopes(gas, times[:n]) for n in (None, EARLY, PLAIN_HORIZON))
+    early_model = replace(model, replicas=most)
     projected, curve = slopes.forward(model)
 
     def joined(first, rest):
-        pairs = zip(mean_and_error(first), mean_and_error(rest), strict=True)
-        return [np.concatenate([a, b[EARLY:]]) for a, b in pairs]
+        return np.hstack([mean_and_error(first), np.array(mean_and_error(rest))[:, EARLY:]])
 
     # A plain derivative is computed under tracing, where arrays cannot be enlarged.
     plain = replace(model, replicas=few, projection=None).sized_for(gas)
+    late = slopes.differences(model, range(sets))
     columns = {
         "kinetic theory": [slopes.theory, 0 * slopes.theory],
         "differences": joined(early.differences(early_model), late),
         "projected": joined(early.forward(early_model)[0], projected),
-        "plain": mean_and_error(slopes.until(PLAIN_HORIZON).forward(plain)[0]),
+        "plain": mean_and_error(first.forward(plain)[0]),
     }
-    models = {x: replace(model, replicas=few, projection=x) for x in intervals}
-    by_interval = {x: mean_and_error(slopes.forward(own)[0]) for x, own in models.items()}
-    # Reverse mode: the gradient of the mean ln T at the last time, compared with forward mode.
-    model = models[intervals[1]]
-    last = jax.grad(lambda x: jnp.mean(slopes.log_temperatures(x, model)[0][:, -1]))(0.0)
+    models = {str(x): replace(model, replicas=few, projection=x) for x in intervals}
     found = {
         "collisions": curve.collisions,
         "d_ln_T_d_ln_A": columns,
         "projected_over_differences": over(columns["projected"], columns["differences"]),
-        "reverse_minus_forward": abs(float(last) - by_interval[intervals[1]][0][-1]),
-        "by_interval": {str(x): values for x, values in by_interval.items()},
+        "by_interval": {x: mean_and_error(slopes.forward(own)[0]) for x, own in models.items()},
         "num_particles": size,
         "replicas": many,
         "early_replicas": most,
-        "late_differences": late,  # of each replica
         "step_of_ln_A": STEP,
         "steps_per_contact": STEPS_PER_CONTACT,
     }
@@ -172,8 +159,8 @@ def in_flow(name: str, smoke: bool) -> dict:
     if smoke:
         collisions, size, replicas, sets = COLLISIONS[1:3], 60, 2, 1
     gas, model = beads(phi, beta, 0.01, dimension), jaxgran.HardSpheres(size, replicas=replicas)
-    last = 60 * collisions[-1]
-    end = times_of(gas, collisions[-1], replace(model, replicas=2), last, 40)
+    few = replace(model, replicas=2)
+    end = times_of(gas, collisions[-1], few, 60 * collisions[-1], 40)
     # The bias follows from the flow at all times.
     slopes = Slopes(gas, np.geomspace(0.3 * float(gas.mean_free_time), end, 40))
     projected, curve = slopes.forward(model)
@@ -192,7 +179,6 @@ def in_flow(name: str, smoke: bool) -> dict:
         "sets": sets,
         "collisions": counts[at],
         "d_ln_T_d_ln_A": columns,
-        "flow_share": np.asarray(curve.flow_share)[at],
         "bias": over(columns["projected"], columns["reference"]),
         "bias_of_differences": over(columns["differences"], columns["reference"]),
         "derivative_bias": np.asarray(curve.derivative_bias)[at],
@@ -232,9 +218,9 @@ def draw(results: dict):
             continue
         reference = np.asarray(result["d_ln_T_d_ln_A"]["differences"][0])
         at = min(3, len(reference) - 1)  # 30 collisions
-        y, e = (np.array([v[k][at] for v in result["by_interval"].values()]) for k in (0, 1))
-        x, ratio = [float(k) for k in result["by_interval"]], 100 * (y / reference[at] - 1)
-        intervals.errorbar(x, ratio, 100 * np.abs(e / reference[at]), **look)
+        y, e = 100 * np.array(list(result["by_interval"].values()))[:, :, at].T / reference[at]
+        x = [float(interval) for interval in result["by_interval"]]
+        intervals.errorbar(x, y - 100, np.abs(e), **look)
     labels = {"xscale": "log", "ylabel": "projected over differences − 1 (%)"}
     for axes in (errors, intervals):
         axes.axhspan(-5, 5, color="0.92", zorder=0)

@@ -15,7 +15,7 @@ import numpy as np
 
 import jaxgran
 from experiments.support.analysis import mean_and_error
-from experiments.support.lammps_library import granular_box, hertzian
+from experiments.support.lammps_library import granular_box, hertzian, temperature
 from experiments.support.plots import INK, THEORY, caption, panels
 from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import cool, of_lammps
@@ -34,8 +34,7 @@ def make_lammps_curves(options: Options) -> dict:
         T, error = map(jnp.asarray, mean_and_error(each))
         error = error.at[0].set(0.0)  # all replicas start at T_0
         curve = jaxgran.CoolingCurve(jnp.asarray(times), T, temperature_error=error)
-        file = folder / f"lammps_cooling_{name}.csv"
-        jaxgran.write_curve(file, curve, header, overwrite=True)
+        jaxgran.write_curve(folder / f"lammps_cooling_{name}.csv", curve, header, overwrite=True)
     figure, (axes,) = panels(size=(5.5, 4.0))
     for k, file in enumerate(sorted(DATA.glob("lammps_cooling_*.csv"))):
         gas, curve, header = of_lammps(file.stem.removeprefix("lammps_cooling_"))
@@ -45,8 +44,7 @@ def make_lammps_curves(options: Options) -> dict:
         look = {"color": INK, "mfc": "white", "ms": 4, "label": words}
         axes.plot(tau, curve.temperature[1:] / gas.temperature, "osD^vP"[k], **look)
     axes.plot([], [], color=THEORY, lw=1, label="kinetic theory")
-    labels = {"xlabel": r"$t/\tau_c$", "ylabel": r"$T/T_0$"}
-    caption(axes, xscale="log", yscale="log", **labels)
+    caption(axes, xlabel=r"$t/\tau_c$", ylabel=r"$T/T_0$", xscale="log", yscale="log")
     return {"picture": figure}
 
 
@@ -59,44 +57,29 @@ def simulate(
     points: int = 40,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return times, s, and T of each replica, m^2/s^2, shape (replicas, times)."""
-    elastic = gas.replace(dissipative_constant=0.0)
+    elastic, tau = gas.replace(dissipative_constant=0.0), float(gas.mean_free_time)
     model = jaxgran.HardSpheres(num_particles, replicas=replicas)
-    fluid = cool(elastic, [1e-3 * float(gas.mean_free_time)], model).particles
-    tau = np.geomspace(1.0, end, points - 1)
+    fluid = cool(elastic, [1e-3 * tau], model).particles
     dt = float(gas.contact_duration) / steps_per_contact
-    steps = np.unique(np.rint(tau * float(gas.mean_free_time) / dt).astype(int))
-    starts = zip(np.asarray(fluid.position), np.asarray(fluid.velocity), strict=True)
-    curves = [run(gas, start, float(fluid.box_side), dt, steps) for start in starts]
-    return np.append(0.0, steps * dt), np.asarray(curves)
+    steps = np.unique(np.rint(np.geomspace(1.0, end, points - 1) * tau / dt).astype(int))
+    skin = 0.15 if num_particles * float(gas.packing_fraction) > 60 else 0.3
 
+    def run(replica: int) -> list[float]:
+        lmp = granular_box(elastic, fluid, skin, replica=replica)
+        melt = f"run {int(5 * tau / dt)}"
+        lmp.commands_list([f"timestep {dt}", melt, "velocity all zero linear", "run 0"])
+        factor = (float(gas.temperature) / temperature(lmp, gas)) ** 0.5
+        lmp.commands_list([f"variable v{axis} atom v{axis}*{factor}" for axis in "xyz"])
+        lmp.command("velocity all set v_vx v_vy v_vz")
+        lmp.command(f"pair_coeff * * {hertzian(gas)}")
+        found = []
+        for more in np.diff(steps, prepend=[0, 0]):
+            lmp.command(f"run {more}")
+            found.append(temperature(lmp, gas))
+        lmp.close()
+        return found
 
-def run(gas: jaxgran.Gas, start, side: float, dt: float, steps: np.ndarray) -> list[float]:
-    """Return T of one replica at the start and after the given numbers of steps."""
-    n, mass = len(start[0]), float(gas.mass)
-    elastic = gas.replace(dissipative_constant=0.0)
-    skin = 0.15 if n * float(gas.packing_fraction) > 60 else 0.3
-    law = hertzian(elastic, elastic.law)
-    lmp = granular_box(gas, start[0], start[1], side, law, skin, "nve")
-    lmp.command(f"timestep {dt}")
-    lmp.command(f"run {int(5 * float(gas.mean_free_time) / dt)}")
-
-    def temperature() -> float:
-        return 2 / 3 * (lmp.get_thermo("ke") or 0.0) / (mass * n)
-
-    lmp.command("velocity all zero linear")
-    lmp.command("run 0")
-    factor = (float(gas.temperature) / temperature()) ** 0.5
-    for axis in "xyz":
-        lmp.command(f"variable v{axis} atom v{axis}*{factor}")
-    lmp.command("velocity all set v_vx v_vy v_vz")
-    lmp.command(f"pair_coeff * * {hertzian(gas, gas.law)}")
-    lmp.command("run 0")
-    found = [temperature()]
-    for more in np.diff(steps, prepend=0):
-        lmp.command(f"run {more}")
-        found.append(temperature())
-    lmp.close()
-    return found
+    return np.append(0.0, steps * dt), np.array([run(replica) for replica in range(replicas)])
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import curve_fit
 
 import jaxgran
 from experiments.support.analysis import mean_and_error, replicas_of
@@ -39,21 +40,10 @@ PLATEAU = 5
 """Index of the first mark at which correlations have reached their plateau."""
 
 SIZES = {
-    (3, 0.05): (1000,),
-    (3, 0.1): (400,),
-    (3, 0.2): (140, 1200),
-    (3, 0.3): (110,),
-    (2, 0.05): (200,),
-    (2, 0.1): (100, 420),
-    (2, 0.2): (50,),
-    (2, 0.3): (36,),
+    3: {0.05: (1000,), 0.1: (400,), 0.2: (140, 1200), 0.3: (110,)},
+    2: {0.05: (200,), 0.1: (100, 420), 0.2: (50,), 0.3: (36,)},
 }
 """N by dimension and phi: boxes of .6 to .8 L_c at eps = .7, and two of .9 L_c at eps = .9."""
-
-
-def as_long(num_particles: int, restitution: float, dimension: int) -> int:
-    """Return N of a box with the length in L_c that N spheres have at eps = .7."""
-    return round(num_particles * (0.51 / (1 - restitution**2)) ** (dimension / 2))
 
 
 TOGETHER = 6000
@@ -80,11 +70,9 @@ def enskog(point: Point) -> jaxgran.CoolingCurve:
     return cool(point.gas, times_of(point.gas, MARKS[1:], model, 4e3, 600), model)
 
 
-def root(point: Point, temperature) -> np.ndarray:
-    """Return T^(-1/2) from the start on, on the last axis."""
-    first = np.asarray(point.gas.temperature)
-    T = np.concatenate([np.broadcast_to(first, (*temperature.shape[:-1], 1)), temperature], -1)
-    return T**-0.5
+def slowing(point: Point, temperature) -> np.ndarray:
+    """Return the growth of T^(-1/2) up to each mark from the one before, on the last axis."""
+    return np.diff(np.asarray(temperature) ** -0.5, prepend=float(point.gas.temperature) ** -0.5)
 
 
 def simulated(point: Point, impacts: float, seed: int) -> np.ndarray:
@@ -100,18 +88,18 @@ def simulated(point: Point, impacts: float, seed: int) -> np.ndarray:
             counts = replicas_of(curve, "collisions")
             found.append(np.diff(counts, axis=1, prepend=0) / np.diff(MARKS))
         else:
-            steps = np.diff(root(point, replicas_of(curve, "temperature")))
-            found.append(steps / np.diff(root(point, theory.temperature)))
+            growth = slowing(point, replicas_of(curve, "temperature"))
+            found.append(growth / slowing(point, theory.temperature))
     loss = 1 - point.restitution**2
     few = (1 / 2 - 3 / (4 * d) + 3 * loss / d if loss else -1 / 2 + 1 / (4 * d)) / n
     return np.concatenate(found) / (1 + few)
 
 
 def weighted(values: np.ndarray, first: int, point: Point) -> np.ndarray:
-    """Return the mean over the marks from the first on, weighted by the observed growth."""
-    # Weighted by collisions, not by T^(-1/2), whose last values would dominate.
-    growth = np.log(root(point, enskog(point).temperature))
-    weights = np.diff(MARKS if point.restitution == 1 else growth)[first:]
+    """Return the mean over the marks from the first on, weighted by the change of ln T."""
+    # By T^(-1/2) the last values would dominate. T of elastic spheres is constant.
+    log_t = np.log(np.append(point.gas.temperature, enskog(point).temperature))
+    weights = np.diff(MARKS if point.restitution == 1 else log_t)[first:]
     return values[..., first:] @ (weights / weights.sum())
 
 
@@ -119,9 +107,9 @@ def measured(point: Point, impacts: float, seed: int) -> dict:
     """Measure the rates of one gas over Enskog's, on the plateau and as they build up."""
     each = simulated(point, impacts, seed)
     late = weighted(each, 0 if point.restitution == 1 else PLATEAU, point)
-    row = dict(zip(("rate", "error"), map(float, mean_and_error(late)), strict=True))
-    row |= dict(zip(("course", "course_error"), mean_and_error(each), strict=True))
-    return point._asdict() | {"boxes": len(each)} | row
+    (rate, error), (course, course_error) = mean_and_error(late), mean_and_error(each)
+    row = {"rate": float(rate), "error": float(error), "boxes": len(each)}
+    return point._asdict() | row | {"course": course, "course_error": course_error}
 
 
 def strength(phi: float, eps: float, d: int) -> float:
@@ -172,17 +160,15 @@ def compared(row: dict, elastic: dict) -> dict:
 def build_up(rows: list[dict]) -> tuple[float, float]:
     """Fit a common N_0 of ``1 - exp(-N/N_0)``, net of the flow; return it with its error."""
     middle = (MARKS[1:] + MARKS[:-1]) / 2
-    trial, lowest = np.geomspace(0.7, 20, 300), []
-    for n_0 in trial:
-        shape, total = -np.expm1(-middle / n_0), 0.0
-        for row in rows:
-            y, w = 1 - row["course_flow"] - row["course"], row["course_error"] ** -2.0
-            a = np.sum(w * y * shape) / np.sum(w * shape**2)
-            total += np.sum(w * (y - a * shape) ** 2)
-        lowest.append(total)
-    chi = np.array(lowest) - min(lowest)
-    near = trial[chi < 1]
-    return float(trial[np.argmin(chi)]), float((near[-1] - near[0]) / 2)
+    slower = np.array([1 - row["course_flow"] - row["course"] for row in rows])
+    errors = np.array([row["course_error"] for row in rows])
+
+    def courses(_, n_0, *plateaus):
+        return np.outer(plateaus, -np.expm1(-middle / n_0)).ravel()
+
+    data = {"ydata": slower.ravel(), "sigma": errors.ravel(), "absolute_sigma": True}
+    best, covariance = curve_fit(courses, None, p0=(5.0, *slower[:, -1]), **data)
+    return float(best[0]), float(covariance[0, 0] ** 0.5)
 
 
 def draw(rows: list[dict]):
@@ -201,33 +187,29 @@ def draw(rows: list[dict]):
             h = [strength(p, eps, d) for p in phi]
             axes.plot(phi, h, line, color=THEORY, label=f"kinetic theory, ε = {eps:g}")
         axes.axhline(0, color=INK, lw=0.8)
-        label = "h, loss of rate over 1 − ε²" if d == 3 else ""
-        title = "spheres" if d == 3 else "disks"
+        title, label = ("spheres", "h, loss of rate over 1 − ε²") if d == 3 else ("disks", "")
         caption(axes, title, "upper left", xlabel="packing fraction φ", ylabel=label)
     return figure
 
 
 def measure_correlations(options: Options) -> dict:
     impacts = 2e4 if options.smoke else 1.6e6 if options.full else 7e5
+    gases = [(d, phi, sizes) for d in SIZES for phi, sizes in SIZES[d].items()]
     rows, elastic = [], {}
-    for (d, phi), sizes in SIZES.items():
-        if options.smoke and (d, phi) != (3, 0.2):
-            continue
+    for d, phi, sizes in gases[2:3] if options.smoke else gases:
         series = [(n, (0.7, 0.9) if k == 0 else (0.9,)) for k, n in enumerate(sizes)]
         if options.full:
-            series += [(as_long(sizes[0], eps, d), (eps,)) for eps in (0.8, 0.95)]
+            # Boxes of the length in L_c that those of eps = .7 have.
+            shares = {eps: (0.51 / (1 - eps**2)) ** (d / 2) for eps in (0.8, 0.95)}
+            series += [(round(sizes[0] * share), (eps,)) for eps, share in shares.items()]
         for n, epsilons in series:
             for eps in (1.0, *epsilons):
                 row = measured(Point(d, phi, eps, n), impacts, seed=len(rows))
-                if eps == 1:
-                    elastic = row
-                else:
-                    row = compared(row, elastic)
-                rows.append(row)
-                print(row, flush=True)
-    cooled = [r for r in rows if "h" in r]
-    found = {"rows": rows, "marks": MARKS, "build_up": build_up(cooled)}
-    return found | {"picture": draw(rows)}
+                elastic = row if eps == 1 else elastic
+                rows.append(row if eps == 1 else compared(row, elastic))
+                print(rows[-1], flush=True)
+    n_0 = build_up([row for row in rows if "h" in row])
+    return {"rows": rows, "marks": MARKS, "build_up": n_0, "picture": draw(rows)}
 
 
 if __name__ == "__main__":

@@ -171,9 +171,8 @@ def walls(options: Options):
         theory = cool(gas, jnp.geomspace(1e-2, 1e3, 200))
         fallen = jnp.log(theory.temperature / gas.temperature)[::-1]
         times = jnp.interp(jnp.log(jnp.array([0.5, last])), fallen, theory.times[::-1])
-        hard = cool(
-            gas, times, HardSpheres(size, replicas=2 if options.smoke else max(2, 3200 // size))
-        )
+        replicas = 2 if options.smoke else max(2, 3200 // size)
+        hard = cool(gas, times, HardSpheres(size, replicas=replicas))
         dsmc = cool(gas, times, DSMC(1000 if options.smoke else 100_000))
         off = np.log(np.asarray(hard.temperature / dsmc.temperature))
         error = hard.temperature_error / hard.temperature

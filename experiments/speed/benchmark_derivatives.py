@@ -14,7 +14,7 @@ storing the state after every block would need (Linux only).
 """
 
 import dataclasses
-import time
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support.record import Options, alone, run_parts
+from experiments.support.record import Options, alone, alternately, run_parts
 from experiments.support.scenes import beads, cool
 
 PACKING, BETA, STEPS_PER_CONTACT = 0.1, 0.15, 30
@@ -39,9 +39,9 @@ def benchmark_derivatives(options: Options) -> dict:
     for fraction in fractions:
         gas = beads(PACKING, BETA, fraction)
         title = f"SoftSpheres, N={soft}, t_c/tau_c={fraction:g}"
-        rows.append(measure(title, gas, equilibrated(gas, soft), repeats, compiled=False))
+        rows.append(measure(title, gas, equilibrated(gas, soft), repeats))
     gas, model = beads(PACKING, BETA, fractions[0]), jaxgran.DSMC(stochastic)
-    rows.append(measure(f"DSMC, N={stochastic}", gas, model, repeats, compiled=True))
+    rows.append(measure(f"DSMC, N={stochastic}", gas, model, repeats))
     return {"rows": rows, "memory": measure_memory(fractions[0], soft, blocks)}
 
 
@@ -55,45 +55,38 @@ def equilibrated(gas: jaxgran.Gas, size: int) -> jaxgran.SoftSpheres:
 
 def log_temperature(gas: jaxgran.Gas, model, t: float):
     """Return ln T at the time t, as a function of A and Y."""
-    times = jnp.asarray([t])
 
     def function(constant, modulus):
         changed = gas.replace(dissipative_constant=constant, youngs_modulus=modulus)
-        return jnp.log(cool(changed, times, model).temperature[-1])
+        return jnp.log(cool(changed, [t], model).temperature[-1])
 
     return function
 
 
-def measure(title: str, gas: jaxgran.Gas, model, repeats: int, compiled: bool) -> dict:
-    """Measure run times of each way; with `compiled` the whole run is one program (DSMC).
+def measure(title: str, gas: jaxgran.Gas, model, repeats: int) -> dict:
+    """Measure run times of each way.
 
-    Soft spheres are run by the host driver, which calls compiled functions.
+    DSMC is one compiled program. Soft spheres are run by the host, which calls compiled functions.
     """
     function = log_temperature(gas, model, FREE_TIMES * float(gas.mean_free_time))
     at = gas.value("dissipative_constant"), gas.value("youngs_modulus")
-    one = jnp.ones(())
     ways = {
         "plain": function,
-        "forward, A": lambda a, y: jax.jvp(lambda x: function(x, y), (a,), (one,)),
+        "forward, A": lambda a, y: jax.jvp(lambda x: function(x, y), (a,), (jnp.ones(()),)),
         "reverse, A": jax.value_and_grad(function),
         "forward, A and Y": jax.jacfwd(function, argnums=(0, 1)),
     }
-    if compiled:
+    if isinstance(model, jaxgran.DSMC):
         ways = {name: jax.jit(way) for name, way in ways.items()}
     jax.clear_caches()
-    took = {name: [] for name in ways}
-    for _ in range(1 + repeats):
-        for name, way in ways.items():
-            begin = time.perf_counter()
-            jax.block_until_ready(way(*at))
-            took[name].append(time.perf_counter() - begin)
+    took = alternately({name: partial(way, *at) for name, way in ways.items()}, 1 + repeats)
     median = {name: float(np.median(each[1:])) for name, each in took.items()}
-    row = {"title": title, "ways": {}}
-    for name, run_s in median.items():
-        ratio = run_s / median["plain"]
-        row["ways"][name] = {"compile_s": took[name][0] - run_s, "run_s": run_s, "ratio": ratio}
+    costs = {
+        name: {"compile_s": took[name][0] - s, "run_s": s, "ratio": s / median["plain"]}
+        for name, s in median.items()
+    }
     forward, reverse = (ways[name](*at)[1] for name in ("forward, A", "reverse, A"))
-    return row | {"reverse_over_forward": float(reverse / forward)}
+    return {"title": title, "ways": costs, "reverse_over_forward": float(reverse / forward)}
 
 
 def measure_memory(fraction: float, size: int, blocks: tuple[int, ...]) -> dict | None:

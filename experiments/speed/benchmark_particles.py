@@ -26,22 +26,21 @@ per collision with a particle or a wall, counted by the flux of a homogeneous ga
 import dataclasses
 import importlib.util
 import itertools
-import json
+import pickle
 import shutil
-import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import jax
 import numpy as np
 
 import jaxgran
-from experiments.support.lammps_library import granular_box, hertzian
-from experiments.support.record import Options, run_parts, seconds
+from experiments.speed.benchmark_derivatives import equilibrated
+from experiments.support.lammps_library import granular_box, temperature
+from experiments.support.record import Options, alone, alternately, run_parts, seconds
 from experiments.support.scenes import beads, cool, hard_beads, times_of
 
 PACKING, BETA = 0.1, 0.15
@@ -49,12 +48,14 @@ STEPS_PER_CONTACT = 30
 SKINS = (0.3, 0.6)  # skins of LAMMPS, in diameters; the faster run counts
 
 
-def timed(run) -> tuple[float, jaxgran.CoolingCurve]:
-    """Return wall seconds of a run, and its curve."""
-    begin = time.perf_counter()
-    curve = run()
-    jax.block_until_ready(curve.temperature)
-    return time.perf_counter() - begin, curve
+def rates(gas: jaxgran.Gas, size: int, curve, run_s: float, last=None) -> dict:
+    """Return what a run takes, and its last T, by default that of the curve, over the first."""
+    last = curve.temperature[-1] if last is None else last
+    return {
+        "run_s": run_s,
+        "collisions_per_s": float(curve.collisions[-1]) * size / 2 / run_s,
+        "temperature_ratio": float(last / gas.temperature),
+    }
 
 
 def particles(options: Options) -> Iterator[dict]:
@@ -67,25 +68,15 @@ def particles(options: Options) -> Iterator[dict]:
 
 def soft_row(size: int, fraction: float, repeats: int) -> dict:
     gas = beads(PACKING, BETA, fraction)
-    tau = float(gas.mean_free_time)
-    model = jaxgran.SoftSpheres(size, steps_per_contact=STEPS_PER_CONTACT)
-    elastic = gas.replace(dissipative_constant=0.0)
-    start = cool(elastic, [0.5 * tau], model).particles
-    model = dataclasses.replace(model, start=start)
+    end, model = 2.0 * float(gas.mean_free_time), equilibrated(gas, size)
     jax.clear_caches()  # so that the first run compiles
-    compile_s, run_s = seconds(lambda: cool(gas, [2.0 * tau], model), repeats)
-    curve = cool(gas, [2.0 * tau], model)
-    collisions = float(curve.collisions[-1]) * size / 2
-
-    def rates(took: float, temperature) -> dict:
-        ratio = float(temperature / gas.temperature)
-        return {"run_s": took, "collisions_per_s": collisions / took, "temperature_ratio": ratio}
-
-    row = {"num_particles": size, "contact_fraction": fraction, "compile_s": compile_s}
-    row |= rates(run_s, curve.temperature[-1]) | {"lammps": {}}
+    run = partial(cool, gas, [end], model)
+    (compile_s, run_s), curve = seconds(run, repeats), run()
+    row: dict = {"num_particles": size, "contact_fraction": fraction, "compile_s": compile_s}
+    row |= rates(gas, size, curve, run_s) | {"lammps": {}}
     for ranks in lammps_ranks():
-        took, temperature = time_lammps(gas, start, 2.0 * tau, repeats, ranks)
-        row["lammps"][ranks] = rates(took, temperature) | {"ratio": took / run_s}
+        took, last = time_lammps(gas, model.start, end, repeats, ranks)
+        row["lammps"][ranks] = rates(gas, size, curve, took, last) | {"ratio": took / run_s}
     return row
 
 
@@ -98,42 +89,26 @@ def lammps_ranks() -> list[int]:
 def time_lammps(gas, start, end: float, repeats: int, ranks: int) -> tuple[float, float]:
     """Return seconds of the run with the faster skin, and the final temperature."""
     dt = float(gas.contact_duration) / STEPS_PER_CONTACT
-    task = {name: gas.value(name) for name in gas.domains} | {"side": start.box_side}
-    task |= {"position": start.position[0], "velocity": start.velocity[0]}
-    task |= {"dt": dt, "steps": round(end / dt), "repeats": repeats}
+    launch = (Path(sys.executable).parent / "mpiexec", "-n", ranks) if ranks > 1 else ()
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "task.npz"
-        np.savez(file, **task)
-        launch = [Path(sys.executable).parent / "mpiexec", "-n", str(ranks)] if ranks > 1 else []
-        command = [*launch, sys.executable, __file__, "--lammps-worker", str(file)]
-        out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    result = json.loads(out.strip().splitlines()[-1])
-    return result["seconds"], result["temperature"]
+        file = Path(folder) / "start"
+        file.write_bytes(pickle.dumps((gas, start)))
+        return alone(in_lammps, str(file), dt, round(end / dt), repeats, launch=launch)
 
 
-def lammps_worker(file: str) -> None:
-    jax.config.update("jax_enable_x64", True)
-    task = {name: x.item() if x.ndim == 0 else x for name, x in np.load(file).items()}
-    gas = beads(PACKING, BETA)
-    gas = gas.replace(**{name: task[name] for name in gas.domains})
-    medians, temperature, rank = [], 0.0, 0
+def in_lammps(file: str, dt: float, steps: int, repeats: int) -> tuple[float, float]:
+    gas, start = pickle.loads(Path(file).read_bytes())
+    medians, last = [], 0.0
     for skin in SKINS:
         took = []
-        for _ in range(task["repeats"]):
-            scene = task["position"], task["velocity"], task["side"]
-            lmp = granular_box(gas, *scene, hertzian(gas, gas.law), skin, "nve")
-            lmp.command(f"timestep {task['dt']}")
-            lmp.command("run 0")
-            begin = time.perf_counter()
-            lmp.command(f"run {task['steps']}")
-            took.append(time.perf_counter() - begin)
-            energy = lmp.get_thermo("ke") or 0.0
-            temperature = 2 / 3 * energy / (float(gas.mass) * len(task["position"]))
-            rank = lmp.extract_setting("world_rank")
+        for _ in range(repeats):
+            lmp = granular_box(gas, start, skin)
+            lmp.commands_list([f"timestep {dt}", "run 0"])
+            took += alternately({"": partial(lmp.command, f"run {steps}")}, 1)[""]
+            last = temperature(lmp, gas)
             lmp.close()
-        medians.append(statistics.median(took))
-    if rank == 0:
-        print(json.dumps({"seconds": min(medians), "temperature": temperature}))
+        medians.append(float(np.median(took)))
+    return min(medians), last
 
 
 def hard_spheres(options: Options) -> Iterator[dict]:
@@ -148,29 +123,24 @@ def hard_row(size: int, gas: jaxgran.Gas, repeats: int) -> dict:
     model, end = jaxgran.HardSpheres(size, start=start), 4.0 * float(gas.mean_free_time)
     curve = cool(gas, [end], model)
     in_a_row = -(-10_000 // size)  # one timing covers runs of at least this many particles in all
-    took, lammps_s = {0.0: [], end: []}, []
+
+    def several(until: float) -> None:
+        for _ in range(in_a_row):
+            jax.block_until_ready(cool(gas, [until], model))
+
+    runs = {name: partial(several, until) for name, until in (("set-up", 0.0), ("run", end))}
+    took, lammps_s = [], []
     for _ in range(repeats):
-        for until, each in took.items():
-            runs = [timed(lambda u=until: cool(gas, [u], model)) for _ in range(in_a_row)]
-            each.append(sum(run_s for run_s, _ in runs) / in_a_row)
+        took.append([each / in_a_row for (each,) in alternately(runs, 1).values()])
         if gas.dimension == 3 and lammps_ranks():
             # The faster of two skins in every repeat, which slightly favours LAMMPS.
             lammps_s.append(time_lammps(gas, start, end, 1, 1)[0])
-    set_up, run = (statistics.median(each) for each in took.values())
-    collisions = float(curve.collisions[-1]) * size / 2  # pyright: ignore
-    lammps = {}
-    if lammps_s:
-        ratios = [a / (b - set_up) for a, b in zip(lammps_s, took[end], strict=True)]
-        lammps = {"ratio": statistics.median(ratios), "ratios": ratios}
-    return {
-        "dimension": gas.dimension,
-        "num_particles": size,
-        "run_s": run,
-        "set_up_s": set_up,
-        "collisions_per_s": collisions / (run - set_up),
-        "temperature_ratio": float(curve.temperature[-1] / gas.temperature),
-        "lammps": lammps,
-    }
+    took = np.array(took)
+    set_up_s, run_s = map(float, np.median(took, axis=0))
+    ratios = lammps_s / (took[: len(lammps_s), 1] - set_up_s)
+    row = {"dimension": gas.dimension, "num_particles": size, "set_up_s": set_up_s}
+    row |= rates(gas, size, curve, run_s - set_up_s) | {"run_s": run_s}
+    return row | {"lammps": {"ratio": np.median(ratios), "ratios": ratios} if lammps_s else {}}
 
 
 def dsmc(options: Options) -> Iterator[dict]:
@@ -179,16 +149,10 @@ def dsmc(options: Options) -> Iterator[dict]:
         sizes, most, repeats = (1000,), 1e4, 1
     gas = beads(PACKING, BETA)
     for size in sizes:
-        times, model = times_of(gas, [max(2 * most / size, 2.0)]), jaxgran.DSMC(size)
-        compile_s, run_s = seconds(lambda t=times, m=model: cool(gas, t, m), repeats)
-        curve = cool(gas, times, model)
-        yield {
-            "num_particles": size,
-            "compile_s": compile_s,
-            "run_s": run_s,
-            "collisions_per_s": float(curve.collisions[-1]) * size / 2 / run_s,
-            "temperature_ratio": float(curve.temperature[-1] / gas.temperature),
-        }
+        run = partial(cool, gas, times_of(gas, [max(2 * most / size, 2.0)]), jaxgran.DSMC(size))
+        compile_s, run_s = seconds(run, repeats)
+        row = {"num_particles": size, "compile_s": compile_s}
+        yield row | rates(gas, size, run(), run_s)
 
 
 def elements_of(
@@ -219,17 +183,16 @@ def elements_of(
     hits = float(2 * smooth.mean_free_time * flux)
     for model in models:
         gases = {name: gas for name, gas in scenes.items() if {*gas.elements} <= {*model.elements}}
-        took, made = {name: [] for name in gases}, {}
-        for _ in range(2 if smoke else 8):
-            for name, gas in gases.items():
-                run_s, curve = timed(lambda g=gas, m=model: cool(g, times, m))
-                took[name].append(run_s)
-                made[name] = float(curve.collisions[-1]) if model.stochastic else 1.0  # type: ignore
-        run = {name: statistics.median(runs[1:]) for name, runs in took.items()}
-        cost = {name: run[name] / made[name] for name in gases}
+        runs = {name: partial(cool, gas, times, model) for name, gas in gases.items()}
+        took = alternately(runs, 2 if smoke else 8)
+        run_s = {name: float(np.median(each[1:])) for name, each in took.items()}
+        made = dict.fromkeys(runs, 1.0)
+        if model.stochastic:
+            made = {name: float(run().collisions[-1]) for name, run in runs.items()}
+        cost = {name: run_s[name] / made[name] for name in runs}
         for name, gas in gases.items():
             row = {"model": model.name, "scene": name, "first_s": took[name][0]}
-            row |= {"run_s": run[name], "ratio": cost[name] / cost["smooth"]}
+            row |= {"run_s": run_s[name], "ratio": cost[name] / cost["smooth"]}
             hit = gas.container is not None and model.stochastic
             yield row | {"ratio_of_contacts": row["ratio"] / (1 + hits if hit else 1)}
 
@@ -244,8 +207,4 @@ def elements_soft(options: Options) -> Iterator[dict]:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--lammps-worker"]:
-        lammps_worker(sys.argv[2])
-    else:
-        parts = particles, hard_spheres, dsmc, elements, elements_soft
-        run_parts(__doc__, *parts, prefix="benchmark_")
+    run_parts(__doc__, particles, hard_spheres, dsmc, elements, elements_soft, prefix="benchmark_")

@@ -13,7 +13,7 @@ counts as 10 collisions per particle.
 
 million: disks of phi = .05, of constant restitution .6 (hard), or viscoelastic with the same first
 cooling rate and contacts of .01 mean free times (soft), cool in one periodic box. Four cases are
-short runs, without compilation and set-up, from a disturbed lattice: the whole gas on one core and
+short runs, without compilation and set-up, from random places: the whole gas on one core and
 on all cores, half of the gas on one core, and two replicas of half the gas on two CPU devices. In
 "clusters" the gas is equilibrated as hard disks and then simulated until the number of disks in
 cells of 20 varies twice as much as in an elastic fluid, which takes 7 to 10 collisions per disk.
@@ -26,6 +26,7 @@ import os
 import resource
 import time
 from collections.abc import Iterator
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -33,14 +34,12 @@ import numpy as np
 
 import jaxgran
 from experiments.support.analysis import crossing
-from experiments.support.record import Options, alone, figures, run_parts, seconds
+from experiments.support.record import Options, alone, alternately, figures, run_parts, seconds
 from experiments.support.scenes import beads, cool, hard_beads, times_of, viscoelastic_like
+from jaxgran import DSMC, HardSpheres, SoftSpheres
+from jaxgran.particles.setup import host_positions, maxwellian_velocities
 
-MODELS = {
-    "hard-spheres": jaxgran.HardSpheres,
-    "soft-spheres": jaxgran.SoftSpheres,
-    "dsmc": jaxgran.DSMC,
-}
+MODELS = {"hard-spheres": HardSpheres, "soft-spheres": SoftSpheres, "dsmc": DSMC}
 COOLING = {"soft-spheres": 25.0, "hard-spheres": 100.0, "dsmc": 500.0}
 """Mean free times of cooling of two replicas."""
 
@@ -93,20 +92,16 @@ def million(options: Options) -> dict:
 
 def derived(row: dict) -> dict:
     """Return ratios of rates, and memory per particle."""
-    rate = {case: 1 / row[case]["s_per_collision"] for case in SCALING if case in row}
-    found = {}
-    for name, case, base in (
-        ("strong", "two cores", "one core"),
-        ("weak", "two cores", "half on one core"),
-        ("replicas", "two devices", "half on one core"),
-    ):
-        if {case, base} <= set(rate):
-            found[name] = rate[case] / rate[base]
-    if "two cores" in row:
-        taken = row["two cores"]["peak_GiB"] - row["two cores"]["before_GiB"]
-        each = found["bytes_per_particle"] = taken * 2**30 / row["size"]
-        found["largest"] = {str(gb): gb * 1e9 / each for gb in DEVICES_GB}
-    return found
+    rate = {case: 1 / row[case]["s_per_collision"] for case in SCALING}
+    taken = row["two cores"]["peak_GiB"] - row["two cores"]["before_GiB"]
+    each = taken * 2**30 / row["size"]
+    return {
+        "strong": rate["two cores"] / rate["one core"],
+        "weak": rate["two cores"] / rate["half on one core"],
+        "replicas": rate["two devices"] / rate["half on one core"],
+        "bytes_per_particle": each,
+        "largest": {str(gb): gb * 1e9 / each for gb in DEVICES_GB},
+    }
 
 
 def peak_memory() -> float:
@@ -137,49 +132,35 @@ def two_replicas(name: str, size: int, repeats: int) -> dict:
     gas = beads(0.1, 0.01 if name == "dsmc" else 0.15, contact_fraction=0.01)
     model, times = MODELS[name](size, replicas=2), [COOLING[name] * float(gas.mean_free_time)]
 
-    def cooled():
-        return cool(gas, times, model).collisions
-
-    compile_s, run_s = seconds(cooled, repeats)
-    collisions = float(np.asarray(cooled())[-1]) + (0 if name == "dsmc" else 10)
+    run = partial(cool, gas, times, model)
+    compile_s, run_s = seconds(run, repeats)
+    collisions = float(run().collisions[-1]) + (0 if name == "dsmc" else 10)
     rate = collisions * size / run_s
     return {"compile_s": compile_s, "run_s": run_s, "collisions_per_s": rate}
 
 
-def disturbed_lattice(gas: jaxgran.Gas, size: int, replicas: int) -> jaxgran.Particles:
-    """Return disks at random places in the cells of a square lattice, with random velocities."""
-    rng, side = np.random.default_rng(0), float(gas.box_side(size))
-    per_side = int(np.ceil(size**0.5))
-    spacing = side / per_side
-    place = np.stack(np.divmod(rng.permuted(np.arange(per_side**2))[:size], per_side), -1)
-    shift = (spacing - 1.001 * float(gas.diameter)) * rng.random((replicas, size, 2))
-    velocity = float(gas.temperature) ** 0.5 * rng.standard_normal((replicas, size, 2))
-    velocity -= velocity.mean(axis=1, keepdims=True)
-    position = jnp.asarray(spacing * place[None] + shift)
-    return jaxgran.Particles(position, jnp.asarray(velocity), gas.box_side(size))
+def random_start(gas: jaxgran.Gas, size: int, replicas: int) -> jaxgran.Particles:
+    """Return disks at random places that do not overlap, not equilibrated."""
+    side, shape = gas.box_side(size), (replicas, size, 2)
+    places = host_positions(jax.random.key(0), side / gas.diameter, *shape)
+    velocity = maxwellian_velocities(jax.random.key(1), *shape) * jnp.sqrt(gas.temperature)
+    position = places * gas.diameter
+    return jaxgran.Particles(position.reshape(shape), velocity.reshape(shape), side)
 
 
 def short(gas: jaxgran.Gas, name: str, size: int, replicas: int) -> dict:
     """Return seconds per collision of a short run, without compilation and set-up."""
-    start = {} if name == "dsmc" else {"start": disturbed_lattice(gas, size, replicas)}
+    start = {} if name == "dsmc" else {"start": random_start(gas, size, replicas)}
     model = MODELS[name](size, replicas=replicas, **start)
 
-    def cooled(collisions: float) -> tuple[float, float]:
-        times = times_of(gas, [collisions])
-        begin = time.perf_counter()
-        made = float(np.asarray(cool(gas, times, model).collisions)[-1])
-        return time.perf_counter() - begin, made
-
-    first_s, _ = cooled(SHORT[name])  # also finds the capacities, which may take compilations
-    set_up_s, _ = cooled(0.0)
-    run_s, made = cooled(SHORT[name])
-    return {
-        "first_s": first_s,
-        "set_up_s": set_up_s,
-        "run_s": run_s,
-        "collisions_per_particle": made,
-        "s_per_collision": (run_s - set_up_s) / (made * size * replicas / 2),
-    }
+    run = partial(cool, gas, times_of(gas, [SHORT[name]]), model)
+    # The first run also finds the capacities, which may take compilations.
+    runs = {"first_s": run, "set_up_s": partial(cool, gas, [0.0], model)}
+    took = alternately(runs | {"run_s": run}, 1)
+    row = {name: each for name, (each,) in took.items()}
+    made = float(run().collisions[-1])
+    each = (row["run_s"] - row["set_up_s"]) / (made * size * replicas / 2)
+    return row | {"collisions_per_particle": made, "s_per_collision": each}
 
 
 def to_clusters(gas: jaxgran.Gas, name: str, size: int) -> dict:
@@ -191,21 +172,21 @@ def to_clusters(gas: jaxgran.Gas, name: str, size: int) -> dict:
         return jaxgran.observables.number_fluctuation(*where, cells)
 
     begin = time.perf_counter()
-    start = cool(gas, [0.0], jaxgran.HardSpheres(size)).particles
+    start = cool(gas, [0.0], HardSpheres(size)).particles
     equilibrated = time.perf_counter()
     times = times_of(gas, np.linspace(0.0, UNTIL[name], 14))
     model = MODELS[name](size, start=start)
     curve = cool(gas, times, model, save=unevenness)
-    collisions, uneven = np.asarray(curve.collisions), np.asarray(curve.saved)
+    collisions, uneven = np.asarray(curve.collisions), curve.saved
     run_s = time.perf_counter() - equilibrated
     return {
         "melt_s": equilibrated - begin,
         "run_s": run_s,
         "s_per_collision": run_s / (float(collisions[-1]) * size / 2),
         "clusters_at": crossing(collisions, uneven, 2 * FLUID),
-        "collisions": collisions.tolist(),
-        "unevenness": uneven.tolist(),
-        "temperature": np.asarray(curve.temperature / gas.temperature).tolist(),
+        "collisions": collisions,
+        "unevenness": uneven,
+        "temperature": curve.temperature / gas.temperature,
     }
 
 

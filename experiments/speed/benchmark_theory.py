@@ -13,16 +13,12 @@ in reverse mode, compared with one solution without it. Run times are medians of
 compilation, which is given separately.
 
 benchmark_compilation: tasks, each in a new process without a cache of compiled programs: seconds
-of each step, those of XLA's compiler, the number of programs compiled, and the ratio of the seconds
-to the reference, the first call of `jax.jit(jax.jacfwd(...))` of ln T of kinetic theory in A and
-T_0 in the same round; medians over the rounds. With CHECKOUT, the folder of another version
-(``git worktree add --detach CHECKOUT COMMIT``), both versions run in turn, and are compared: ratio
-of seconds, now over before, and its standard error. The tasks are (`support/version.py`)
+of each step, those of XLA's compiler, and the number of programs compiled; medians over the rounds.
+With CHECKOUT, the folder of another version (``git worktree add --detach CHECKOUT COMMIT``), both
+versions run in turn, and are compared: ratio of seconds, now over before, and its standard error.
+The tasks, of which each begins with the import, are (`support/version.py`)
 
-    reference: the import, the Jacobian and the curve, their run times, and the numbers of
-        equations of their jaxprs.
-    fit: fit and diagnosis of a curve with 61 points, then of one with 47, then with other `free`.
-    lengths: fit and diagnosis of 20 curves of 20 lengths.
+    fit: fit and diagnosis of a curve with 60 points, then of one with 47, then with other `free`.
     command: `jaxgran fit` as a process, with an empty cache, again, and without a cache.
     SoftSpheres, HardSpheres, DSMC: runs of one mean free time; the last one of the first two
         continues from the particles of the one before.
@@ -34,7 +30,7 @@ compiled before, by this version and by another one.
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -47,6 +43,7 @@ from experiments.support.record import (
     DATA,
     EXPERIMENTS,
     Options,
+    alternately,
     of_version,
     process,
     run_parts,
@@ -58,8 +55,7 @@ from jaxgran.scene.laws import _CLIPPED, C1
 from jaxgran.theory.averages import averaging_matrix
 
 CURVE = DATA / "lammps_cooling_dilute.csv"
-TASKS = "reference", "fit", "lengths", "command", "SoftSpheres", "HardSpheres", "DSMC"
-REFERENCE = "first Jacobian"
+TASKS = "fit", "command", "SoftSpheres", "HardSpheres", "DSMC"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
 SAME_EQUATIONS = {"order": 2, "softness": False, "correlations": False}
 """Options for which kinetic theory solves the equations that are written here for SciPy."""
@@ -153,15 +149,15 @@ def derivative_cost(repeats: int) -> dict[str, float]:
         "forward": jax.jit(jax.jacfwd(log_temperature)),
         "reverse": jax.jit(jax.grad(lambda a: jnp.sum(log_temperature(a)))),
     }
-    many, row, batches = jnp.geomspace(3e-7, 3e-5, 100), {}, {}
+    row, batch_s = {}, {}
     for name, run in runs.items():
-        compiled, took = seconds(lambda run=run: run(jnp.asarray(3e-6)), repeats)
-        row[f"{name}_compile_s"], row[f"{name}_ms"] = compiled, 1e3 * took
-        batch = jax.jit(jax.vmap(run))
-        batches[name] = seconds(lambda batch=batch: batch(many), 5)[1]
+        row[f"{name}_compile_s"], run_s = seconds(partial(run, jnp.asarray(3e-6)), repeats)
+        row[f"{name}_ms"] = 1e3 * run_s
+        batch = partial(jax.jit(jax.vmap(run)), jnp.geomspace(3e-7, 3e-5, 100))
+        batch_s[name] = seconds(batch, 5)[1]
     row["ratio_forward"] = row["forward_ms"] / row["solve_ms"]
     row["ratio_reverse"] = row["reverse_ms"] / row["solve_ms"]
-    row["ratio_forward_in_batches_of_100"] = batches["forward"] / batches["solve"]
+    row["ratio_forward_in_batches_of_100"] = batch_s["forward"] / batch_s["solve"]
     return row
 
 
@@ -173,15 +169,13 @@ def benchmark_kinetic_theory(options: Options) -> dict:
 
 def command(folder: Path) -> dict[str, dict[str, float]]:
     """Measure `jaxgran fit` as a process: with an empty cache, with its cache, and without."""
-    main, found = "from jaxgran_command import main; raise SystemExit(main())", {}
+    main = "from jaxgran_command import main; raise SystemExit(main())"
     with tempfile.TemporaryDirectory() as out:
         arguments = ["-c", main, "fit", CURVE, "--free", "A", "T0", "--out", out, "--overwrite"]
-        without = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-        for name, more in (("", {}), (" again", {}), (", no cache", without)):
-            begin = time.perf_counter()
-            process(*arguments, folder=folder, XDG_CACHE_HOME=out, **more)
-            found[f"jaxgran fit{name}"] = {"s": time.perf_counter() - begin}
-    return found
+        run = partial(process, *arguments, folder=folder, XDG_CACHE_HOME=out)
+        without = partial(run, JAX_ENABLE_COMPILATION_CACHE="false")
+        runs = {"jaxgran fit": run, "jaxgran fit again": run, "jaxgran fit, no cache": without}
+        return {name: {"s": s} for name, (s,) in alternately(runs, 1).items()}
 
 
 Steps = dict[str, dict[str, np.ndarray]]
@@ -193,38 +187,25 @@ def measured(tasks: Sequence[str], options: Options, num: int) -> list[Steps]:
     rounds = {folder: [] for folder in folders}
     for k in range(options.rounds):
         for folder in folders[:: 1 - 2 * (k % 2)]:
-            steps = {}
+            rounds[folder].append({})
             for task in tasks:
                 is_command = task == "command"
-                steps |= command(folder) if is_command else of_version(folder, task, CURVE, num)
-            for row in steps.values():
-                if "s" in row and REFERENCE in steps:
-                    row["ratio"] = row["s"] / steps[REFERENCE]["s"]
-            rounds[folder].append(steps)
-    return [
-        {
-            name: {key: np.array([steps[name][key] for steps in each]) for key in row}
-            for name, row in each[0].items()
-        }
-        for each in rounds.values()
-    ]
+                found = command(folder) if is_command else of_version(folder, task, CURVE, num)
+                rounds[folder][-1] |= found
+    return [jax.tree.map(lambda *x: np.array(x), *each) for each in rounds.values()]
 
 
 def compared(now: Steps, before: Steps) -> Iterator[dict]:
-    for name in (name for name, row in now.items() if "s" in row):
-        ratio = now[name]["s"] / before[name]["s"]
+    for name, row in now.items():
+        ratio = row["s"] / before[name]["s"]
         error = np.std(ratio, ddof=1) / len(ratio) ** 0.5 if len(ratio) > 1 else np.nan
         yield {"model": name.removeprefix("speed of "), "ratio": np.median(ratio), "error": error}
 
 
 def benchmark_compilation(options: Options) -> dict:
-    tasks, num = (["reference", "DSMC"], 100) if options.smoke else (options.tasks, 500)
+    tasks, num = (["DSMC"], 100) if options.smoke else (options.tasks, 500)
     versions = measured(tasks, options, num)
-    steps = {
-        name: {key: np.median(each) for key, each in row.items()}
-        for name, row in versions[0].items()
-    }
-    rows = {}
+    steps, rows = jax.tree.map(np.median, versions[0]), {}
     for name in [name for name in steps if f"{name} again" in steps]:
         row = steps.pop(name)
         rows[name] = {"first_s": row.pop("s"), "again_s": steps.pop(f"{name} again")["s"], **row}

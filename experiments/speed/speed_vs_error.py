@@ -72,11 +72,10 @@ def speed_vs_error(options: Options) -> dict:
 def measured(name: str, smoke: bool) -> Scene:
     """Return a gas whose curve was simulated in LAMMPS."""
     gas, curve, header = of_lammps(name)
-    used = slice(1, 6 if smoke else None)  # at t = 0 nothing is measured
-    columns = curve.times, curve.temperature, curve.temperature_error
+    last = 6 if smoke else None
+    curve = jax.tree.map(lambda x: np.asarray(x)[1:last], curve)  # at t = 0 nothing is measured
     label = f"LAMMPS, N = {header['N']}, {header['replicas']} replicas"
-    times, T, error = (np.asarray(x)[used] for x in columns)
-    return Scene(gas, times, T, error, label)
+    return Scene(gas, curve.times, curve.temperature, curve.temperature_error, label)
 
 
 def clustering() -> Scene:
@@ -160,11 +159,8 @@ def draw(found: dict):
     for axes, (name, results) in zip(places, found.items(), strict=True):
         panel(axes, results["rows"])
         title = f"{name} gas, against {results['reference'].split(', ')[0]}"
-        labels = {
-            "xlabel": "run time without compilation (s)",
-            "ylabel": "largest error of T(t) (%)",
-        }
-        caption(axes, title, "none", **labels)
+        axes.set(xlabel="run time without compilation (s)", ylabel="largest error of T(t) (%)")
+        caption(axes, title, "none")
     handles, labels = places[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
     return figure
@@ -179,7 +175,7 @@ def panel(axes, rows: list[dict]) -> None:
     sizes = {}
     for name, marker in MARKERS.items():
         mine = [row for row in rows if row["model"] == name]
-        usual = [row for row in mine if is_usual(row)]
+        usual = [row for row in mine if steps_of(row) == 40]
         sizes[name] = ", ".join(row["knob"].split(",")[0].removeprefix("N ") for row in usual)
         others = [row for row in mine if steps_of(row) not in (None, 40)]
         for k, row in enumerate([*usual, *others]):
@@ -195,14 +191,10 @@ def panel(axes, rows: list[dict]) -> None:
         axes.plot(*coordinates(usual), color=COLOURS[name], lw=0.8, alpha=0.6)
     words = f"N = {sizes['soft spheres']}\nDSMC: {sizes['DSMC']}"
     axes.text(0.02, 0.03, words, transform=axes.transAxes, fontsize=8.5, color=INK)
-    # The Pareto front: rows for which no other is both faster and more accurate.
-    front, best = [], np.inf
-    for row in sorted(rows, key=lambda row: row["run_s"]):
-        if row["error"] < best:
-            best = row["error"]
-            front.append(row)
+    # The Pareto front: the smallest error of the rows that are not slower.
+    run_s, error = coordinates(sorted(rows, key=lambda row: row["run_s"]))
     look = {"color": GUIDE, "lw": 1, "zorder": 0, "label": "Pareto front"}
-    axes.step(*coordinates(front), where="post", **look)
+    axes.step(run_s, np.minimum.accumulate(error), where="post", **look)
     axes.set(xscale="log", yscale="log", ylim=(0.2, 60))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
@@ -211,17 +203,10 @@ def coordinates(rows: list[dict]) -> tuple[list[float], list[float]]:
     return [row["run_s"] for row in rows], [100 * row["error"] for row in rows]
 
 
-def is_usual(row: dict) -> bool:
-    """Return whether a row has default settings apart from N."""
-    return (
-        row["float64"] and re.fullmatch(r"(N \d+(, 40 steps)?|rtol 1e-06)", row["knob"]) is not None
-    )
-
-
 def steps_of(row: dict) -> int | None:
-    """Return the steps per contact of a row with otherwise default settings."""
-    found = re.fullmatch(r"N \d+, (\d+) steps", row["knob"])
-    return int(found[1]) if found else None
+    """Return the steps per contact, 40 without contacts; None if more than N and they differ."""
+    found = re.fullmatch(r"(N \d+(, (\d+) steps)?|rtol 1e-06)", row["knob"])
+    return int(found[3] or 40) if found and row["float64"] else None
 
 
 if __name__ == "__main__":

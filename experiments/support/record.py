@@ -13,7 +13,6 @@ import os
 import platform
 import pprint
 import shlex
-import statistics
 import subprocess
 import sys
 import time
@@ -176,23 +175,30 @@ def made_by() -> dict[str, Any]:
     }
 
 
+def alternately(runs: Mapping[str, Callable], repeats: int) -> dict[str, list[float]]:
+    """Return seconds of each call; the runs take turns, since the speed of a machine varies."""
+    took = {name: [] for name in runs}
+    for _ in range(repeats):
+        for name, run in runs.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(run())
+            took[name].append(time.perf_counter() - begin)
+    return took
+
+
 def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
     """Return seconds of compilation (first call less a later one) and the median of later calls."""
-    took = []
-    for _ in range(repeats + 1):
-        begin = time.perf_counter()
-        jax.block_until_ready(run())
-        took.append(time.perf_counter() - begin)
-    run_time = statistics.median(took[1:])
-    return max(took[0] - run_time, 0.0), run_time
+    first, *later = alternately({"": run}, repeats + 1)[""]
+    run_time = float(np.median(later))
+    return max(first - run_time, 0.0), run_time
 
 
 def process(
-    *arguments: Any, folder: Path = EXPERIMENTS.parent, **variables: str
-) -> subprocess.CompletedProcess:
-    """Run Python in a separate process, with the version of jaxgran in a folder.
+    *arguments: Any, folder: Path = EXPERIMENTS.parent, launch: Sequence = (), **variables: str
+) -> str:
+    """Return what Python prints in a separate process, with the version of jaxgran in a folder.
 
-    Settings of JAX and of its caches are left out.
+    Settings of JAX and of its caches are left out. The words of `launch` come before the command.
 
     Raises:
         SystemExit: with its messages, if it fails.
@@ -200,16 +206,14 @@ def process(
     bare = {key: x for key, x in os.environ.items() if not key.startswith(("JAX", "XLA"))}
     path = os.pathsep.join(filter(None, [str(folder.resolve()), os.environ.get("PYTHONPATH")]))
     bare |= {"PYTHONPATH": path} | variables
-    command = [sys.executable, *map(str, arguments)]
-    done = subprocess.run(
-        command, env=bare, cwd=folder, capture_output=True, text=True, check=False
-    )
+    command = [*map(str, launch), sys.executable, *map(str, arguments)]
+    done = subprocess.run(command, env=bare, cwd=folder, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"the version in {folder} does not run:\n{done.stderr}")
-    return done
+    return done.stdout
 
 
-def alone(function: Callable, *arguments: Any) -> dict:
+def alone(function: Callable, *arguments: Any, launch: Sequence = ()) -> Any:
     """Return what a function of a script returns in a separate process; all are JSON."""
     script = Path(inspect.getfile(function)).resolve().relative_to(EXPERIMENTS.parent)
     code = (
@@ -219,7 +223,7 @@ def alone(function: Callable, *arguments: Any) -> dict:
         "jax.config.update('jax_enable_x64', True)\n"
         f"print(as_json({function.__name__}(*json.loads(sys.argv[1])), indent=None), end='')"
     )
-    return json.loads(process("-c", code, json.dumps(arguments)).stdout.splitlines()[-1])
+    return json.loads(process("-c", code, json.dumps(arguments), launch=launch).splitlines()[-1])
 
 
 def of_version(folder: Path, task: str, curve: Path, num: int = 0) -> dict[str, Any]:
@@ -229,7 +233,7 @@ def of_version(folder: Path, task: str, curve: Path, num: int = 0) -> dict[str, 
         SystemExit: if it fails, or if another version is imported.
     """
     script = EXPERIMENTS / "support" / "version.py"
-    found = json.loads(process(script, task, curve, num, folder=folder).stdout.splitlines()[-1])
+    found = json.loads(process(script, task, curve, num, folder=folder).splitlines()[-1])
     if not Path(found["package"]).is_relative_to(folder.resolve()):
         raise SystemExit(f"the version in {folder} was not imported, but {found['package']}")
     return found["steps"]
