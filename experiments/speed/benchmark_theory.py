@@ -13,12 +13,15 @@ in reverse mode, compared with one solution without it. Run times are medians of
 compilation, which is given separately.
 
 benchmark_compilation: tasks, each in a new process without a cache of compiled programs: seconds
-of each step, those of XLA's compiler, and the number of programs compiled; medians over the rounds.
-With CHECKOUT, the folder of another version (``git worktree add --detach CHECKOUT COMMIT``), both
-versions run in turn, and are compared: ratio of seconds, now over before, and its standard error.
-The tasks, of which each begins with the import, are (`support/version.py`)
+of each step, those of XLA's compiler, the number of programs compiled, and the ratio of the seconds
+to the reference in the same round; medians over the rounds. With CHECKOUT, the folder of another
+version (``git worktree add --detach CHECKOUT COMMIT``), both versions run in turn and are compared:
+ratio of seconds, now over before, and its standard error. The tasks, of which each begins with the
+import, are (`support/version.py`)
 
+    reference: the first call of `jax.jit(jax.jacfwd(...))` of ln T of kinetic theory in A and T_0.
     fit: fit and diagnosis of a curve with 60 points, then of one with 47, then with other `free`.
+    lengths: fit and diagnosis of 20 curves of 20 lengths.
     command: `jaxgran fit` as a process, with an empty cache, again, and without a cache.
     SoftSpheres, HardSpheres, DSMC: runs of one mean free time; the last one of the first two
         continues from the particles of the one before.
@@ -55,8 +58,9 @@ from jaxgran.scene.laws import _CLIPPED, C1
 from jaxgran.theory.averages import averaging_matrix
 
 CURVE = DATA / "lammps_cooling_dilute.csv"
-TASKS = "fit", "command", "SoftSpheres", "HardSpheres", "DSMC"
+TASKS = "reference", "fit", "lengths", "command", "SoftSpheres", "HardSpheres", "DSMC"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
+REFERENCE = "first Jacobian"
 SAME_EQUATIONS = {"order": 2, "softness": False, "correlations": False}
 """Options for which kinetic theory solves the equations that are written here for SciPy."""
 
@@ -187,11 +191,13 @@ def measured(tasks: Sequence[str], options: Options, num: int) -> list[Steps]:
     rounds = {folder: [] for folder in folders}
     for k in range(options.rounds):
         for folder in folders[:: 1 - 2 * (k % 2)]:
-            rounds[folder].append({})
+            steps: dict[str, dict[str, float]] = {}
             for task in tasks:
                 is_command = task == "command"
-                found = command(folder) if is_command else of_version(folder, task, CURVE, num)
-                rounds[folder][-1] |= found
+                steps |= command(folder) if is_command else of_version(folder, task, CURVE, num)
+            for row in steps.values() if REFERENCE in steps else ():
+                row["ratio"] = row["s"] / steps[REFERENCE]["s"]
+            rounds[folder].append(steps)
     return [jax.tree.map(lambda *x: np.array(x), *each) for each in rounds.values()]
 
 
@@ -203,7 +209,7 @@ def compared(now: Steps, before: Steps) -> Iterator[dict]:
 
 
 def benchmark_compilation(options: Options) -> dict:
-    tasks, num = (["DSMC"], 100) if options.smoke else (options.tasks, 500)
+    tasks, num = (["reference", "DSMC"], 100) if options.smoke else (options.tasks, 500)
     versions = measured(tasks, options, num)
     steps, rows = jax.tree.map(np.median, versions[0]), {}
     for name in [name for name in steps if f"{name} again" in steps]:

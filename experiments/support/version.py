@@ -60,6 +60,24 @@ def of_points(curve: Any, count: int) -> Any:
     return jaxgran.CoolingCurve(times, T, temperature_error=error)
 
 
+def reference(gas: Any, curve: Any, _: int) -> None:
+    """The first and a later call of the Jacobian of kinetic theory."""
+
+    def log_temperature(constant, temperature):
+        now = gas.replace(dissipative_constant=constant, temperature=temperature)
+        return jax.numpy.log(jaxgran.cool(now, curve.times[1:]).temperature)
+
+    jacobian = partial(jax.jit(jax.jacfwd(log_temperature, argnums=(0, 1))), 3e-6, 0.01)
+    step("first Jacobian", jacobian)
+    step("Jacobian again", jacobian, repeats=100)
+
+
+def lengths(gas: Any, curve: Any, _: int) -> None:
+    """Fit and diagnose curves of 20 lengths."""
+    curves = [of_points(curve, count) for count in range(40, 60)]
+    step("20 lengths, fit and diagnose", lambda: [fitted_by_theory(gas, x) for x in curves])
+
+
 def fit(gas: Any, curve: Any, _: int) -> None:
     """Fit and diagnose a curve of 60 points, one of 47, and with another free parameter."""
     for points, words in ((60, "first"), (47, "47 points,")):
@@ -195,7 +213,8 @@ if __name__ == "__main__":
     task, file, number = sys.argv[1:]
     measured, header = jaxgran.read_curve(file)
     measured_gas = jaxgran.read_gas(header)
-    tasks: dict[str, Any] = {"fit": fit, "speed": speed, "numbers": numbers}
+    tasks: dict[str, Any] = {"reference": reference, "fit": fit, "lengths": lengths}
+    tasks |= {"speed": speed, "numbers": numbers}
     tasks |= {name: partial(first_run, name) for name in SPEED}
     if task != "numbers":
         measured_gas = measured_gas.replace(dissipative_constant=3e-6)
