@@ -26,7 +26,7 @@ from tests.beads import glass_beads, hard_gas
 GAS = glass_beads(0.3, packing_fraction=0.1)
 TAU = float(GAS.mean_free_time)
 CURVE = jaxgran.CoolingCurve(times=[0.1, 0.2, 0.3, 0.4], temperature=[4e-3, 3e-3, 2e-3, 1e-3])
-SOFT = jaxgran.SoftSpheres(20)
+SOFT, DSMC = jaxgran.SoftSpheres(20), jaxgran.DSMC(50)
 TESTS = Path(__file__).parent
 MASKED = np.ma.masked_all(1)
 
@@ -124,6 +124,10 @@ REFUSED = [
     ("no particles", lambda: jaxgran.read_particles(None), "must be the name of a file, got None"),
     ("a list for a header", lambda: jaxgran.read_curve("a.csv", [1]), "must be a dictionary"),
     ("None in a header", lambda: jaxgran.read_gas({"eta": None}), "dictionary of texts"),
+    ("four dimensions", lambda: jaxgran.read_particles("a.gsd", dimension=4), "must be 2 or 3"),
+    ("no positions", lambda: cool(model=DSMC, trajectory="a.gsd"), "DSMC has no positions"),
+    ("a suffix", lambda: cool(model=SOFT, trajectory="a.dcd"), "ends in .gsd or .xyz, got 'a.dcd'"),
+    ("a number for a trajectory", lambda: cool(model=SOFT, trajectory=3), "must be a path, got 3"),
     ("a law that is not reduced", lambda: hard_gas(NotReduced()), "must return a .*ReducedLaw"),
 ]
 
@@ -177,7 +181,7 @@ def test_whole_numbers_of_numpy_are_taken():
     assert type(model.num_particles) is int and model == jaxgran.DSMC(50, replicas=2)
 
 
-@pytest.mark.parametrize("model", [jaxgran.KineticTheory(), jaxgran.DSMC(50), SOFT])
+@pytest.mark.parametrize("model", [jaxgran.KineticTheory(), DSMC, SOFT])
 def test_every_model_can_be_sized(model):
     sized = model.sized_for(GAS)
     assert type(sized) is type(model)
