@@ -21,10 +21,10 @@ VELOCITY = RNG.normal(size=(FRAMES, N, 3)) * 0.1 / np.arange(1, FRAMES + 1)[:, N
 def rows(*columns, frame=-1):
     """Rows of text: whole numbers and words before the positions and velocities of a frame."""
     numbers = np.concatenate([POSITION[frame], VELOCITY[frame]], axis=1)
-    return [
-        " ".join([*map(str, words), *(f"{x:.17g}" for x in row)])
+    return "".join(
+        " ".join([*map(str, words), *(f"{x:.17g}" for x in row)]) + "\n"
         for *words, row in zip(*columns, numbers, strict=True)
-    ]
+    )
 
 
 IDS, ONES = range(1, N + 1), [1] * N
@@ -38,8 +38,7 @@ def dump(
     return "".join(
         f"{head.format(k=k)}ITEM: TIMESTEP\n{1000 * k}\nITEM: NUMBER OF ATOMS\n{N}\n"
         f"ITEM: BOX BOUNDS {flags}\n{bounds}ITEM: ATOMS {names}\n"
-        + "\n".join(rows(*columns, frame=k))
-        + "\n"
+        f"{rows(*columns, frame=k)}"
         for k in range(FRAMES)
     )
 
@@ -48,9 +47,7 @@ def xyz(*, head="", properties="species:S:1:pos:R:3:velo:R:3", between="", speci
     """An extended XYZ file of all frames; {k} in its head is the index of a frame."""
     lattice = f'Lattice="{SIDE} 0 0 0 {SIDE} 0 0 0 {SIDE}"'
     return between.join(
-        f"{N}\n{lattice} Properties={properties} {head.format(k=k)}\n"
-        + "\n".join(rows(species, frame=k))
-        + "\n"
+        f"{N}\n{lattice} Properties={properties} {head.format(k=k)}\n{rows(species, frame=k)}"
         for k in range(FRAMES)
     )
 
@@ -226,10 +223,10 @@ def test_disks_in_space_are_asked_about(tmp_path):
     assert jaxgran.read_particles(path, dimension=2).velocity.shape == (1, N, 2)
 
 
-def tracks(
-    *, wrong=0.0, gaps=0.0, noise=0.0, wrapped=False, swaps=(), n=400, frames=15, step=0.15, d=3
-):
-    """Columns of particles in free flight whose speeds fall, their T, and the side of the box.
+def tracks(*, wrong=0.0, gaps=0.0, noise=0.0, wrapped=False, swaps=(), d=3):
+    """Columns of 400 particles in free flight whose speeds fall, their T, and the side of the box.
+
+    The thermal displacement between the first two of 15 frames is .15 of the mean distance.
 
     Args:
         wrong: share of the identities that are exchanged with a neighbour before each frame.
@@ -237,11 +234,9 @@ def tracks(
         noise: standard error of a position, in units of the displacement.
         wrapped: whether positions are wrapped into the box.
         swaps: frames before which two particles anywhere exchange their identities.
-        n: number of particles.
-        frames: number of frames.
-        step: thermal displacement between the first two frames, over the mean distance.
         d: dimension.
     """
+    n, frames, step = 400, 15, 0.15
     rng = np.random.default_rng(1)
     side = 0.003 * (n * np.pi / 6 / 0.04) ** (1 / d)
     velocity = rng.normal(size=(n, d))
