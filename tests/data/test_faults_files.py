@@ -152,13 +152,15 @@ PARTICLES = {
     "no GSD": ("a.gsd", "no GSD", ""),
     **{name: (name, lambda path: None, "no such file") for name in ("no.gsd", "no.xyz", "no.dump")},
 }
+ATOMIC = DATA.replace("# sphere", "# atomic").replace(" 0.002 2500", "")
+ATOMIC = ATOMIC.replace("3 0 0 1\n2 4 5 6 0 0 2", "3\n2 4 5 6")  # no spins
 CHANGES = [
     (DUMP, "xu yu zu", "a b c", "it has no columns xu yu zu or x y z or"),
     (DUMP, "vx vy vz", "fx fy fz", "it has no velocities in this frame"),
     (DUMP, "BOUNDS", "BOUNDS xy xz yz", "its box is slanted"),
     (DUMP, "2.5 1 1 1", "nan 1 1 1", "positions, velocities or sides are not finite"),
     (DUMP, "2.5 1 1 1", "x 1 1 1", "could not convert string"),
-    (DATA, "version 2 Aug 2023", "units = lj", "'lj', without a size"),
+    (ATOMIC, "version 2 Aug 2023", "units = lj", "'lj', without a size"),
     (DATA, "# sphere", "", "must name its style, atomic or sphere"),
     (DATA, "Velocities", "Bodies", "it has no section Velocities"),
     (DATA, "2 4 5 6 0 0 2", "3 4 5 6 0 0 2", "have different ids"),
