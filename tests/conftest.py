@@ -103,6 +103,22 @@ def beads():
     return glass_beads
 
 
+@pytest.fixture(scope="module")
+def read(tmp_path_factory):
+    """A function that reads the curve of a file of given text or bytes, and rows of numbers."""
+    import jaxgran
+
+    path = tmp_path_factory.mktemp("file") / "curve.csv"
+
+    def read(content, *columns):
+        for row in zip(*columns, strict=True):
+            content += ",".join(f"{x:.17g}" for x in row) + "\n"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return jaxgran.read_curve(path)
+
+    return read
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled_code():
     yield

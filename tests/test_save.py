@@ -32,9 +32,8 @@ def times(gas):
 
 @pytest.mark.slow
 def test_is_of_the_particles_at_each_time(gas):
-    t, model = times(gas), HARD
-    curve = jaxgran.cool(gas, t, model=model, save=save, progress=False)
-    plain = jaxgran.cool(gas, t, model=model, progress=False)
+    curve = jaxgran.cool(gas, times(gas), model=HARD, save=save, progress=False)
+    plain = jaxgran.cool(gas, times(gas), model=HARD, progress=False)
     for name in ("temperature", "sonine", "collisions", "displacement", "status"):
         np.testing.assert_array_equal(getattr(curve, name), getattr(plain, name))
     # Round-off of the units; each replica is at rest.
@@ -54,9 +53,8 @@ def test_is_of_the_particles_at_each_time(gas):
 
 @pytest.mark.slow
 def test_spins_of_rough_spheres(gas):
-    rough = dataclasses.replace(
-        gas, surface=jaxgran.Rough(tangential_restitution=-0.5, rotational_temperature=0.002)
-    )
+    surface = jaxgran.Rough(tangential_restitution=-0.5, rotational_temperature=0.002)
+    rough = dataclasses.replace(gas, surface=surface)
 
     def rotation(particles):
         inertia = 0.4 * (gas.diameter / 2) ** 2  # over the mass
@@ -72,8 +70,7 @@ def test_a_file_keeps_what_was_saved(gas, tmp_path):
     jaxgran.write_curve(tmp_path / "curve.npz", curve, {})
     same, _ = jaxgran.read_curve(tmp_path / "curve.npz")
     assert jax.tree.structure(same) == jax.tree.structure(curve)
-    for a, b in zip(jax.tree.leaves(curve), jax.tree.leaves(same), strict=True):
-        np.testing.assert_array_equal(a, b)
+    jax.tree.map(np.testing.assert_array_equal, same, curve)
     whole = jaxgran.Particles(*(jnp.ones((3, 2, 9, 3)) for _ in range(2)), 2 * jnp.ones(3))
     jaxgran.write_curve(tmp_path / "particles.npz", dataclasses.replace(curve, saved=whole), {})
     same, _ = jaxgran.read_curve(tmp_path / "particles.npz")

@@ -46,6 +46,11 @@ def path(tmp_path):
     return tmp_path / "run.eqx"
 
 
+def assert_refused(path, words, scene=ABC, like=None):
+    with pytest.raises(ValueError, match=words):
+        load(path, scene, state() if like is None else like)
+
+
 def test_round_trip_bit_for_bit(path):
     for scene in ({}, ABC):
         save(path, scene, state())
@@ -57,17 +62,14 @@ def test_round_trip_bit_for_bit(path):
 
 def test_other_runs_are_refused(path, monkeypatch):
     save(path, ABC, state())
-    other = {"name": "abd", "N": "3"}
-    with pytest.raises(ValueError, match="run.eqx .* name was abc and is abd; N was absent and is"):
-        load(path, other, state())
+    words = "run.eqx .* name was abc and is abd; N was absent and is"
+    assert_refused(path, words, scene={"name": "abd", "N": "3"})
     for like in (state(), jnp.zeros(3)), jnp.zeros(3):
-        with pytest.raises(ValueError, match="run.eqx belongs to another run"):
-            load(path, ABC, like)
+        assert_refused(path, "run.eqx belongs to another run", like=like)
     save(path, ABC, np.ones((3, 2)))
     # Another shape of as many numbers, another type, another structure.
     for like in np.zeros((2, 3)), np.zeros((3, 2), np.float32), [np.zeros((3, 2)), 0]:
-        with pytest.raises(ValueError, match="run.eqx belongs to another run"):
-            load(path, ABC, like)
+        assert_refused(path, "run.eqx belongs to another run", like=like)
     same_bits(load(path, ABC, np.zeros((3, 2))), np.ones((3, 2)))
     for name, value, words in (
         ("FORMAT", "7", "format was 7 and is 5"),
@@ -76,8 +78,7 @@ def test_other_runs_are_refused(path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(checkpoint, name, value)
             save(path, ABC, state())
-        with pytest.raises(ValueError, match=f"run.eqx belongs to another run: {words}"):
-            load(path, ABC, state())
+        assert_refused(path, f"run.eqx belongs to another run: {words}")
 
 
 def test_damaged_files_are_told_or_harmless(path):
@@ -85,8 +86,7 @@ def test_damaged_files_are_told_or_harmless(path):
     data = path.read_bytes()
     for part in (0.0, 0.001, 0.3, 0.9, 0.999):
         path.write_bytes(data[: int(part * len(data))])
-        with pytest.raises(ValueError, match="run.eqx is (damaged|no checkpoint of jaxgran)"):
-            load(path, ABC, state())
+        assert_refused(path, "run.eqx is (damaged|no checkpoint of jaxgran)")
     rng, told = np.random.default_rng(0), 0
     for _ in range(300):
         damaged = bytearray(data)
@@ -103,18 +103,15 @@ def test_damaged_files_are_told_or_harmless(path):
 
 
 def test_files_of_others_are_refused(path):
-    with pytest.raises(ValueError, match="run.eqx is no checkpoint .* No such file"):
-        load(path, ABC, state())
-    with pytest.raises(ValueError, match=f"{path.parent.name} is no checkpoint"):
-        load(path.parent, ABC, state())
+    assert_refused(path, "run.eqx is no checkpoint .* No such file")
+    assert_refused(path.parent, f"{path.parent.name} is no checkpoint")
     archive = io.BytesIO()
     np.savez(archive, leaf_0=np.zeros(3))
     headers = (b"3", b"[]", b"{}", b'{"format": 2}', b"[" * 100_000)
     contents = (b"t,T\n0,1\n", b"\x89PNG\r\n\x1a\n", b"\x00" * 100, archive.getvalue())
     for content in (*contents, *(header + b"\n" for header in headers)):
         path.write_bytes(content)
-        with pytest.raises(ValueError, match="run.eqx is no checkpoint"):
-            load(path, ABC, state())
+        assert_refused(path, "run.eqx is no checkpoint")
 
 
 def test_nothing_is_unpickled(path):
@@ -124,8 +121,7 @@ def test_nothing_is_unpickled(path):
     np.save(body, np.array([{}]), allow_pickle=True)
     header["digest"] = hashlib.sha256(body.getvalue()).hexdigest()
     path.write_bytes(json.dumps(header).encode() + b"\n" + body.getvalue())
-    with pytest.raises(ValueError, match="run.eqx is damaged"):
-        load(path, ABC, np.zeros(1))
+    assert_refused(path, "run.eqx is damaged", like=np.zeros(1))
 
 
 def test_folders_that_are_not_there(tmp_path):
@@ -203,15 +199,16 @@ def recursive():
     return again
 
 
+def described(function):
+    return describe_run(save=function)
+
+
 def test_descriptions_of_functions_hold_what_they_keep():
-    assert describe_run(save=observable(3)) == describe_run(save=observable(3))
-    (words,) = differences(describe_run(save=observable(3)), describe_run(save=observable(4)))
-    assert words == "save.number was 3 and is 4"
-    assert differences(describe_run(save=observable(3)), describe_run(save=observable(3, 2.0)))
-    assert "save.default 0" in describe_run(save=observable(3))
+    three = described(observable(3))
+    assert three == described(observable(3)) and "save.default 0" in three
+    assert differences(three, described(observable(4))) == ["save.number was 3 and is 4"]
+    assert differences(three, described(observable(3, 2.0)))
     # What jax.jit has wrapped is the function.
-    assert describe_run(save=jax.jit(observable(3))) == describe_run(save=observable(3))
-    assert differences(
-        describe_run(save=jax.jit(observable(3))), describe_run(save=jax.jit(recursive()))
-    )
-    assert describe_run(save=recursive()) == describe_run(save=recursive())
+    assert described(jax.jit(observable(3))) == three
+    assert differences(described(jax.jit(observable(3))), described(jax.jit(recursive())))
+    assert described(recursive()) == described(recursive())

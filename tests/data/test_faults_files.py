@@ -21,10 +21,10 @@ VELOCITY = RNG.normal(size=(FRAMES, N, 3)) * 0.1 / np.arange(1, FRAMES + 1)[:, N
 def rows(*columns, frame=-1):
     """Rows of text: whole numbers and words before the positions and velocities of a frame."""
     numbers = np.concatenate([POSITION[frame], VELOCITY[frame]], axis=1)
-    return [
-        " ".join([*map(str, words), *(f"{x:.17g}" for x in row)])
+    return "".join(
+        " ".join([*map(str, words), *(f"{x:.17g}" for x in row)]) + "\n"
         for *words, row in zip(*columns, numbers, strict=True)
-    ]
+    )
 
 
 IDS, ONES = range(1, N + 1), [1] * N
@@ -38,8 +38,7 @@ def dump(
     return "".join(
         f"{head.format(k=k)}ITEM: TIMESTEP\n{1000 * k}\nITEM: NUMBER OF ATOMS\n{N}\n"
         f"ITEM: BOX BOUNDS {flags}\n{bounds}ITEM: ATOMS {names}\n"
-        + "\n".join(rows(*columns, frame=k))
-        + "\n"
+        f"{rows(*columns, frame=k)}"
         for k in range(FRAMES)
     )
 
@@ -48,9 +47,7 @@ def xyz(*, head="", properties="species:S:1:pos:R:3:velo:R:3", between="", speci
     """An extended XYZ file of all frames; {k} in its head is the index of a frame."""
     lattice = f'Lattice="{SIDE} 0 0 0 {SIDE} 0 0 0 {SIDE}"'
     return between.join(
-        f"{N}\n{lattice} Properties={properties} {head.format(k=k)}\n"
-        + "\n".join(rows(species, frame=k))
-        + "\n"
+        f"{N}\n{lattice} Properties={properties} {head.format(k=k)}\n{rows(species, frame=k)}"
         for k in range(FRAMES)
     )
 
@@ -76,6 +73,46 @@ def gsd(*, velocities=range(FRAMES), types=0, diameter=1.0):
     return write
 
 
+FRAME = """ITEM: TIMESTEP
+0
+ITEM: NUMBER OF ATOMS
+2
+ITEM: BOX BOUNDS pp pp pp
+-1 3
+0 4
+0 4
+ITEM: ATOMS id """
+
+DUMP = f"""{FRAME}x y z vx vy vz
+1 0 0 0 1 2 3
+2 0 0 0 1 2 3
+{FRAME.replace("0", "100", 1)}type xu yu zu vx vy vz omegax omegay omegaz
+2 1 0.5 1 -1 4 5 6 0 0 2
+1 1 2.5 1 1 1 2 3 0 0 1
+"""
+
+DATA = """LAMMPS data file via write_data, version 2 Aug 2023
+
+2 atoms
+1 atom types
+
+-1 3 xlo xhi
+0 4 ylo yhi
+0 4 zlo zhi
+
+Atoms # sphere
+
+2 1 0.002 2500 0.5 1 3 0 0 -1
+1 1 0.002 2500 2.5 1 1 0 0 0
+
+Velocities
+
+1 1 2 3 0 0 1
+2 4 5 6 0 0 2
+"""
+
+
+TWO = [1, 2] * (N // 2)
 PARTICLES = {
     # 6: velocities of this very frame
     "velocities in the first frame only": ("a.gsd", gsd(velocities=(0,)), "no velocities in this"),
@@ -85,26 +122,11 @@ PARTICLES = {
     "units si": ("a.dump", dump().replace("ITEM", "ITEM: UNITS\nsi\nITEM", 1), None),
     "units lj": ("a.dump", dump().replace("ITEM", "ITEM: UNITS\nlj\nITEM", 1), "'lj', without a"),
     "time of each frame": ("a.dump", dump(head="ITEM: TIME\n0.5\n"), None),
-    "units of a data file": (
-        "a.data",
-        "LAMMPS data file via write_data, units = lj\n\n1 atoms\n"
-        "0 1 xlo xhi\n0 1 ylo yhi\n0 1 zlo zhi\n\nAtoms # atomic\n\n1 1 0 0 0\n\n"
-        "Velocities\n\n1 1 1 1\n",
-        "'lj', without a size",
-    ),
     "another unit of XYZ": ("a.xyz", xyz(head="length_unit=mm"), "gives length_unit: write units="),
     # 8: equal spheres
-    "two types": ("a.dump", dump(columns=(IDS, [1, 2] * (N // 2))), "differ in type"),
-    "two radii": (
-        "a.dump",
-        dump(names="id radius x y z vx vy vz", columns=(IDS, [1e-3, 2e-3] * (N // 2))),
-        "differ in radius",
-    ),
-    "two masses": (
-        "a.xyz",
-        xyz(properties="mass:R:1:pos:R:3:velo:R:3", species=[1.0, 1.5] * (N // 2)),
-        "differ in mass",
-    ),
+    "two types": ("a.dump", dump(columns=(IDS, TWO)), "differ in type"),
+    "two radii": ("a.dump", dump(columns=(IDS, TWO)).replace("type", "radius"), "differ in radius"),
+    "two masses": ("a.xyz", xyz(species=TWO).replace("species:S", "mass:R"), "differ in mass"),
     "equal sizes in float32": ("a.gsd", gsd(diameter=0.1), None),
     # 9: extended XYZ of others
     "walls": ("a.xyz", xyz(head='pbc="F F F"'), None),
@@ -126,7 +148,26 @@ PARTICLES = {
     "an id twice": ("a.dump", dump(columns=([1, 1, *IDS[2:]], ONES)), "has an id twice"),
     "a box around the particles": ("a.dump", dump(flags="ss ss ss"), "boundary s or m"),
     "walls of a dump": ("a.dump", dump(flags="ff ff ff"), None),
+    "a curve": ("a.csv", "t,T\n1,2\n", "no file of particles: give a LAMMPS dump"),
+    "no GSD": ("a.gsd", "no GSD", ""),
+    **{name: (name, lambda path: None, "no such file") for name in ("no.gsd", "no.xyz", "no.dump")},
 }
+ATOMIC = DATA.replace("# sphere", "# atomic").replace(" 0.002 2500", "")
+ATOMIC = ATOMIC.replace("3 0 0 1\n2 4 5 6 0 0 2", "3\n2 4 5 6")  # no spins
+CHANGES = [
+    (DUMP, "xu yu zu", "a b c", "it has no columns xu yu zu or x y z or"),
+    (DUMP, "vx vy vz", "fx fy fz", "it has no velocities in this frame"),
+    (DUMP, "BOUNDS", "BOUNDS xy xz yz", "its box is slanted"),
+    (DUMP, "2.5 1 1 1", "nan 1 1 1", "positions, velocities or sides are not finite"),
+    (DUMP, "2.5 1 1 1", "x 1 1 1", "could not convert string"),
+    (ATOMIC, "version 2 Aug 2023", "units = lj", "'lj', without a size"),
+    (DATA, "# sphere", "", "must name its style, atomic or sphere"),
+    (DATA, "Velocities", "Bodies", "it has no section Velocities"),
+    (DATA, "2 4 5 6 0 0 2", "3 4 5 6 0 0 2", "have different ids"),
+    (DATA, "-1 3 xlo xhi", "3 -1 xlo xhi", "which must be positive"),
+]
+for text, old, new, words in CHANGES:
+    PARTICLES[words] = ("state.lammps", new.join(text.rsplit(old, 1)), words)
 
 
 def write(path, content):
@@ -153,6 +194,19 @@ def test_particles(tmp_path, name, content, words):
     assert read.box_side == pytest.approx(SIDE, rel=digits)
 
 
+@pytest.mark.parametrize("text", [DUMP, DATA], ids=["dump", "data"])
+def test_files_of_lammps(tmp_path, text):
+    path = write(tmp_path / "state.lammps", text)
+    read = jaxgran.read_particles(path)
+    np.testing.assert_array_equal(read.position, [[[3.5, 1, 1], [1.5, 1, 3]]])
+    np.testing.assert_array_equal(read.velocity, [[[1, 2, 3], [4, 5, 6]]])
+    np.testing.assert_array_equal(read.angular_velocity, [[[0, 0, 1], [0, 0, 2]]])
+    assert read.box_side == 4.0
+    disks = jaxgran.read_particles(path, dimension=2)
+    assert disks.position.shape == (1, 2, 2)
+    np.testing.assert_array_equal(disks.angular_velocity, [[[1], [2]]])
+
+
 @pytest.mark.parametrize(
     "units, length, speed", [("cgs", 1e-2, 1e-2), ("micro", 1e-6, 1.0), ("metal", 1e-10, 100.0)]
 )
@@ -164,21 +218,17 @@ def test_units_of_lammps(tmp_path, units, length, speed):
 
 
 def test_disks_in_space_are_asked_about(tmp_path):
-    lines = [
-        " ".join([*words[:4], "0", *words[5:7], "0"]) if len(words) == 8 else line
-        for line in dump().splitlines()
-        if (words := line.split())
-    ]
-    path = write(tmp_path / "a.dump", "\n".join(lines) + "\n")
+    flat = dump(names="id z vz x y a vx vy b", columns=(IDS, [0] * N, [0] * N))
+    path = write(tmp_path / "a.dump", flat)
     with pytest.raises(ValueError, match="move in one plane: give dimension=2"):
         jaxgran.read_particles(path)
     assert jaxgran.read_particles(path, dimension=2).velocity.shape == (1, N, 2)
 
 
-def tracks(
-    *, wrong=0.0, gaps=0.0, noise=0.0, wrapped=False, swaps=(), n=400, frames=15, step=0.15, d=3
-):
-    """Positions of particles in free flight whose speeds fall, their T, and the side of the box.
+def tracks(*, wrong=0.0, gaps=0.0, noise=0.0, wrapped=False, swaps=(), d=3):
+    """Columns of 400 particles in free flight whose speeds fall, their T, and the side of the box.
+
+    The thermal displacement between the first two of 15 frames is .15 of the mean distance.
 
     Args:
         wrong: share of the identities that are exchanged with a neighbour before each frame.
@@ -186,11 +236,9 @@ def tracks(
         noise: standard error of a position, in units of the displacement.
         wrapped: whether positions are wrapped into the box.
         swaps: frames before which two particles anywhere exchange their identities.
-        n: number of particles.
-        frames: number of frames.
-        step: thermal displacement between the first two frames, over the mean distance.
         d: dimension.
     """
+    n, frames, step = 400, 15, 0.15
     rng = np.random.default_rng(1)
     side = 0.003 * (n * np.pi / 6 / 0.04) ** (1 / d)
     velocity = rng.normal(size=(n, d))
@@ -200,7 +248,7 @@ def tracks(
     position = side * rng.random((n, d)) + velocity * clock[:, None, None]
     T = np.mean(velocity**2) * (np.diff(clock) / dt) ** 2
     position += noise * step * side / n ** (1 / d) * rng.normal(size=position.shape)
-    ids, lines = np.arange(n), []
+    ids, rows = np.arange(n), []
     for k, frame in enumerate(position):
         distance = np.linalg.norm(frame[:, None] - frame, axis=2) + 10 * side * np.eye(n)
         for i in rng.choice(n, round(wrong * n / 2), replace=False) if k else ():
@@ -210,10 +258,8 @@ def tracks(
             ids[[0, n // 2]] = ids[[n // 2, 0]]
         frame = frame % side if wrapped else frame
         there = np.flatnonzero(rng.random(n) >= gaps)
-        lines += [
-            ",".join(map(repr, [int(ids[i]), float(k * dt), *frame[i].tolist()])) for i in there
-        ]
-    return lines, T, side
+        rows.append([ids[there], np.full(there.size, k * dt), *frame[there].T])
+    return np.concatenate(rows, axis=1), T, side
 
 
 OUT = "displacements left out as those of wrong identities"
@@ -235,19 +281,18 @@ TRACKS = {
 
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("faults, header, words", TRACKS.values(), ids=TRACKS)
-def test_tracks(tmp_path, faults, header, words, d):
-    lines, T, side = tracks(**faults, d=d)
+def test_tracks(read, faults, header, words, d):
+    columns, T, side = tracks(**faults, d=d)
     header = header | {"dimension": d}
     if "box_side" in header:
         header["box_side"] = side
     if "localisation_error" in header:
         header["localisation_error"] *= 0.15 * side / 400 ** (1 / d)
-    head = [f"# {key}: {value}" for key, value in header.items()]
+    head = "".join(f"# {key}: {value}\n" for key, value in header.items())
     names = "id,t,x,y,z"[: 4 + 2 * d]
-    path = write(tmp_path / "t.csv.gz", "\n".join([*head, names, *lines]) + "\n")
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        curve, found = jaxgran.read_curve(path)
+        curve, found = read(f"{head}{names}\n", *columns)
     assert len(told) == len(words)
     for word, warning in zip(words, told, strict=True):
         assert re.search(word, str(warning.message))
@@ -258,24 +303,10 @@ def test_tracks(tmp_path, faults, header, words, d):
     assert np.mean(np.asarray(curve.temperature) / T) == pytest.approx(1.0, abs=0.03)
 
 
-def test_few_particles_are_all_kept(tmp_path):
-    """The scatter of five displacements says too little on the longest of them."""
-    times = 0.01 * np.arange(30)
-    position = RNG.normal(size=(5, 3)) * times[:, None, None]
-    lines = [
-        ",".join(map(repr, [i, float(t), *x]))
-        for t, frame in zip(times, position.tolist(), strict=True)
-        for i, x in enumerate(frame)
-    ]
-    path = write(tmp_path / "t.csv", "\n".join(["id,t,x,y,z", *lines]) + "\n")
-    assert OUT not in jaxgran.read_curve(path)[1]["T_from"]
-
-
-def test_wrapped_tracks_are_refused(tmp_path):
-    lines, _, side = tracks(wrapped=True, swaps=(7,))
-    path = write(tmp_path / "t.csv", "\n".join(["id,t,x,y,z", *lines]) + "\n")
+def test_wrapped_tracks_are_refused(read):
+    columns, _, side = tracks(wrapped=True, swaps=(7,))
     with pytest.raises(ValueError, match="as long as the box.*'# box_side: ...'") as error:
-        jaxgran.read_curve(path)
+        read("id,t,x,y,z\n", *columns)
     suggested = float(re.search(r"side, ([\d.]+) m", str(error.value))[1])
     assert suggested == pytest.approx(side, rel=0.02)
 
@@ -287,19 +318,9 @@ TRAJECTORIES = {
     "steps without their length": ("a.dump", dump(), {}, r"frame 0: it has no time.*timestep"),
     "XYZ without times": ("a.xyz", xyz(), {"frame_rate": "1"}, None),
     "GSD": ("a.gsd", gsd(), STEP, None),
-    "GSD without velocities": (
-        "a.gsd",
-        gsd(velocities=(0, 1, 3)),
-        STEP,
-        "frame 2: .*no velocities",
-    ),
+    "GSD, no velocities": ("a.gsd", gsd(velocities=(0, 1, 3)), STEP, "frame 2: .*no velocities"),
     "another N": ("a.dump", dump(), STEP | {"N": "31"}, "N is 30, but 31 in the header"),
-    "another diameter": (
-        "a.gsd",
-        gsd(diameter=0.002),
-        STEP | {"diameter": "0.003"},
-        "diameter is 0.002, but 0.003",
-    ),
+    "another size": ("a.gsd", gsd(diameter=2.0), STEP | {"diameter": "3"}, "diameter is 2, but 3"),
 }
 
 

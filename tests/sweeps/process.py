@@ -18,12 +18,10 @@ CHUNK = 2
 def members(number):
     import jax.numpy as jnp
 
-    import jaxgran
+    from tests.beads import glass_beads
 
-    law = jaxgran.Viscoelastic(5e7, 0.22, 1e-6)
-    gas = jaxgran.Gas(law, diameter=2e-3, mass=1e-5, packing_fraction=0.05, temperature=0.01)
     values = jnp.geomspace(1e-6, 1e-5, number)
-    return jax.vmap(lambda a: gas.replace(dissipative_constant=a))(values)
+    return jax.vmap(lambda a: glass_beads().replace(dissipative_constant=a))(values)
 
 
 def main(port, index, processes, store, number, die_at=-1):

@@ -11,12 +11,11 @@ import pytest
 import jaxgran
 from jaxgran import observables
 from jaxgran._utils import status
+from tests.beads import glass_beads
+from tests.sweeps.process import TIMES, members
 
-TIMES = (0.1, 1.0, 10.0)
-A = jnp.geomspace(1e-6, 1e-5, 5)
-LAW = jaxgran.Viscoelastic(5e7, 0.22, 1e-6)
-GAS = jaxgran.Gas(LAW, diameter=2e-3, mass=1e-5, packing_fraction=0.05, temperature=0.01)
-GASES = jax.vmap(lambda a: GAS.replace(dissipative_constant=a))(A)
+GAS, GASES = glass_beads(), members(5)
+A = GASES.value("dissipative_constant")
 DSMC = jaxgran.DSMC(50, replicas=2)
 
 
@@ -233,6 +232,9 @@ def test_particles_with_positions(tmp_path):
     equal(sweep(**options), curves)
 
 
+TWO_LENGTHS = GAS.replace(temperature=jnp.ones(3), diameter=jnp.ones(2))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -243,10 +245,7 @@ def test_particles_with_positions(tmp_path):
         ({"gases": {"dissipation": A}}, "got a dict. Build it by jax.vmap"),
         ({"gases": GAS}, "no float of gases has a leading axis"),
         ({"gases": jax.tree.map(lambda x: x[:0], GASES)}, "one length, at least 1, got .* 0"),
-        (
-            {"gases": GAS.replace(temperature=jnp.ones(3), diameter=jnp.ones(2))},
-            "one length, at least 1, got .*diameter 2.* temperature 3",
-        ),
+        ({"gases": TWO_LENGTHS}, "one length, at least 1, got .*diameter 2.* temperature 3"),
         ({"key": jax.random.split(jax.random.key(0))}, "key 2, .*dissipative_constant 5"),
         ({"gases": GAS.replace(temperature=jnp.ones((2, 2)))}, r"has shape \(2, 2\).*ravel"),
         ({"gases": dense(2.0, 3.0)}, "supports no member .*; member 0: packing_fraction"),
