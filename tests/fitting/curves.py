@@ -1,5 +1,7 @@
 """Curves that tests of fits share, and how far a fit is from what made its curve."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
@@ -39,6 +41,11 @@ def cooled_beads(seed=0, **options):
     """Glass beads and a curve of theirs with noise."""
     gas = glass_beads(0.15)
     return gas, synthetic(gas, jax.random.key(seed), **options)
+
+
+def rough_beads(tangential_restitution=0.0):
+    surface = jaxgran.Rough(tangential_restitution, rotational_temperature=3e-3)
+    return dataclasses.replace(glass_beads(), surface=surface)
 
 
 def measured(name):
