@@ -23,7 +23,8 @@ def constant(eps, dimension=3, **elements) -> jaxgran.Gas:
 @pytest.mark.parametrize("dimension, spins", [(3, 3), (2, 1)])
 def test_perfectly_rough_elastic_spheres_keep_their_energy(dimension, spins):
     surface = jaxgran.Rough(1.0, rotational_temperature=2e-3)
-    curve = theory_curve(constant(1.0, dimension, surface=surface), TAUS, sonine=False)
+    gas = constant(1.0, dimension, surface=surface)
+    curve = theory_curve(gas, TAUS, sonine=False, correlations=False)
     energy = dimension * curve.temperature + spins * curve.rotational_temperature
     np.testing.assert_allclose(energy, dimension * 0.01 + spins * 2e-3, rtol=1e-8)
     # In the end each of the d + d_rot squares of the energy has the same share.
