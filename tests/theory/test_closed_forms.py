@@ -18,7 +18,7 @@ from experiments.support.closed_forms import (
 )
 from jaxgran.theory import averages as kinetics
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
-from tests.beads import hard_gas
+from tests.beads import hard_gas, theory_curve
 
 
 def test_constants_of_the_expansion():
@@ -34,8 +34,7 @@ def test_constants_of_the_expansion():
 def test_haff(e, record):
     gas = hard_gas(e)
     tau = jnp.geomspace(1e-3, 1e8, 100)
-    model = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-9)
-    curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
+    curve = theory_curve(gas, tau, sonine=False, correlations=False, rtol=1e-9)
     # Asked: 1e-8. The solver's rtol is 1e-9 and its error adds up over eleven decades.
     exact = haff(tau, e)
     np.testing.assert_allclose(curve.temperature, exact, rtol=1e-8)
@@ -49,22 +48,18 @@ def test_expansion_is_right_to_its_order(beads):
         ratios = []
         for delta in (1e-3, 1e-2):
             gas = beads(0.15)
-            scale = delta / gas.delta
-            law = jaxgran.Viscoelastic(
-                5e7, 0.22, gas.value("dissipative_constant") * scale, clipped
-            )
-            gas = dataclasses.replace(gas, law=law)
+            A = gas.value("dissipative_constant") * delta / gas.delta
+            gas = dataclasses.replace(gas, law=jaxgran.Viscoelastic(5e7, 0.22, A, clipped))
             tau = jnp.geomspace(0.01, 1e4, 40) / delta
-            model = jaxgran.KineticTheory(sonine=False, softness=False, correlations=False)
-            theta = jaxgran.cool(gas, tau * gas.mean_free_time, model=model).temperature / 0.01
+            curve = theory_curve(gas, tau, sonine=False, softness=False, correlations=False)
+            theta = curve.temperature / 0.01
             formula = paper_temperature(tau, delta, clipped=clipped)
             ratios.append(float(jnp.max(jnp.abs(formula / theta - 1))) / delta**2.5)
         assert max(ratios) < 2.0, ratios
 
 
 def test_paper_averages_are_the_first_two_terms(beads):
-    gas = beads(0.002)
-    law = gas.reduced_law
+    law = beads(0.002).reduced_law
     exact = kinetics.impact_moments(law, jnp.ones(()), 3)[:, 0]
     paper = paper_averages(law, jnp.ones(()), 3)[:, 0]
     # The next term of 1 - eps^2 is O(beta^(3/2)) relative to the first: 0.23 * 9e-5.
@@ -79,8 +74,7 @@ def test_displacement_of_constant_restitution():
     for d, e in ((3, 0.6), (2, 0.9)):
         gas = hard_gas(e, dimension=d)
         tau = jnp.geomspace(0.01, 1e6, 50)
-        model = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-9)
-        curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
+        curve = theory_curve(gas, tau, sonine=False, correlations=False, rtol=1e-9)
         # Brilliantov & Poeschel, Eqs. (45), (46); of dD/dt = T - D/tau_v, 1/tau_v = nu (1 + e)/d,
         # follows <dr^2> = (2 d/k) (N - (1 - exp(-k N))/k) with k = (1 + e)^2/(2 d).
         loss, k = (1 - e**2) / (2 * d), (1 + e) ** 2 / (2 * d)
@@ -98,8 +92,8 @@ def test_first_order_of_viscoelastic_gas(beads):
     for delta in (1e-4, 1e-3):
         gas = beads(1.5 * 2**0.1 * delta)
         tau = (u - 1) / (COOLING_RATE[3] * delta)
-        model = jaxgran.KineticTheory(softness=False, order=2, correlations=False, rtol=1e-11)
-        curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
+        options = {"softness": False, "order": 2, "correlations": False}
+        curve = theory_curve(gas, tau, rtol=1e-11, **options)
         leading = 54 / (COOLING_RATE[3] * delta) * (u ** (1 / 6) - 1)
         unit = gas.temperature * gas.mean_free_time**2
         exact = curve.displacement / unit - leading
