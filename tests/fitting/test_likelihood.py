@@ -29,15 +29,17 @@ def averaged(seed):
     )
 
 
+def away(curves):
+    """Mean of how far relative errors lie from the true ones, in their logarithm."""
+    errors = np.array([curve.temperature_error / curve.temperature for curve in curves])
+    return np.mean(np.abs(np.log(errors / SIGMA)))
+
+
 def test_errors_become_smooth():
     curves = [averaged(seed) for seed in range(20)]
-    raw, smooth = (
-        np.array([c.temperature_error / c.temperature for c in each])
-        for each in (curves, [smooth_errors(c, R)[0] for c in curves])
-    )
+    smooth = [smooth_errors(curve, R)[0] for curve in curves]
     # 40 points of 2 degrees: 80 for 3 coefficients, sqrt(3/160) = 14 % of an error, 25 % at ends.
-    off = [np.mean(np.abs(np.log(each / SIGMA))) for each in (smooth, raw)]
-    assert off[0] < 0.14 < 0.4 < off[1]
+    assert away(smooth) < 0.14 < 0.4 < away(curves)
     _, degrees = smooth_errors(curves[0], R)
     # Neighbours are independent: what is found of a correlation is chance, 1/sqrt(40).
     assert 0.55 * 2 * N < float(degrees["temperature"]) <= 2 * N
@@ -52,26 +54,21 @@ def test_a_set_value_stays_without_weight_and_one_run_has_no_scatter():
     assert smooth_errors(curve, 1) == (curve, {})
 
 
-def p_values(smoothed):
-    """400 curves of the model that they are compared with."""
-    found = []
-    for seed in range(400):
-        curve, degrees = averaged(seed), {}
-        if smoothed:
-            curve, degrees = smooth_errors(curve, R)
-        residuals = (curve.temperature - 1) / curve.temperature_error
-        tested = [(residuals, jnp.asarray(N), degrees.get("temperature"))]
-        found.append(float(goodness_of_fit(tested, jnp.asarray(N), errors_known=True).p_value))
-    return np.array(found)
+def p_value(curve, degrees):
+    """That of a curve against the model T = 1, which it is of."""
+    residuals = (curve.temperature - 1) / curve.temperature_error
+    tested = [(residuals, jnp.asarray(N), degrees.get("temperature"))]
+    return float(goodness_of_fit(tested, jnp.asarray(N), errors_known=True).p_value)
 
 
 def test_p_values_are_those_of_students_t():
-    found = p_values(smoothed=True)
+    curves = [averaged(seed) for seed in range(400)]
+    found = np.array([p_value(*smooth_errors(curve, R)) for curve in curves])
     # Of 400: 5 +- 1.1 % and 1 +- .5 %, three of each; the F distribution is good to 1 %.
     assert 0.015 < np.mean(found < 0.05) < 0.09 and np.mean(found < 0.01) < 0.035
     assert 0.42 < np.mean(found) < 0.58
     # Taken for exact the same errors refuse nearly every true curve.
-    assert np.mean(p_values(smoothed=False) < 0.01) > 0.8
+    assert np.mean([p_value(curve, {}) < 0.01 for curve in curves]) > 0.8
 
 
 @pytest.mark.slow
