@@ -33,6 +33,12 @@ def hard_gas(law=0.9, packing_fraction=0.05, dimension=3, **values) -> jaxgran.G
     return jaxgran.Gas(law, packing_fraction=packing_fraction, dimension=dimension, **values)
 
 
+def theory_curve(gas, taus, **settings) -> jaxgran.CoolingCurve:
+    """The curve of kinetic theory at times in mean free times."""
+    times = taus * gas.mean_free_time
+    return jaxgran.cool(gas, times, model=jaxgran.KineticTheory(**settings))
+
+
 def lattice(gas, n, replicas=1) -> jaxgran.Particles:
     """Spheres near the sites of a cubic lattice, at T: a start that needs no equilibration."""
     rng, d, side = np.random.default_rng(0), gas.dimension, float(gas.box_side(n))

@@ -33,9 +33,7 @@ def names():
 
 # Each compiles a fit of several curves, all alternatives, or a run of spheres.
 LONG = ("DSMC", "Diagnosis", "diagnose", "impact", "read_particles", "sweep")
-NAMES = [
-    pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in jaxgran.__all__
-]
+NAMES = [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in jaxgran.__all__]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -59,11 +57,9 @@ def test_api_pages_are_made_without_a_warning(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "Warn" not in done.stderr and "Warn" not in done.stdout, done.stderr
-    observables = "jaxgran/particles/observables"
-    for page, names in (
-        ("jaxgran", set(jaxgran.__all__) - {"observables"}),
-        (observables, jaxgran.observables.__all__),
-    ):
+    pages = {"jaxgran": {*jaxgran.__all__} - {"observables"}}
+    pages["jaxgran/particles/observables"] = jaxgran.observables.__all__
+    for page, names in pages.items():
         text = (tmp_path / f"{page}.html").read_text(encoding="utf-8")
         for name in names:
             assert f'id="{name}"' in text, f"{name} is not on the page {page}"

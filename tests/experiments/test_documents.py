@@ -14,6 +14,7 @@ from experiments.support.record import figures
 ROOT = Path(__file__).parents[2]
 EXPERIMENTS = ROOT / "experiments"
 DOCUMENTS = [ROOT / "README.md", ROOT / "jaxgran" / "README.md", *EXPERIMENTS.glob("*.md")]
+RECORDS = sorted(EXPERIMENTS.glob("figures/**/*.json"))
 ENTRY = r"^\| (.*?) ?\| (.*)<br>\[`(.*)`\]\(.*\) \| (.*?)(?: \(\[table\].*)? \| (.*) \|$"
 GALLERY = re.findall(ENTRY, (EXPERIMENTS / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
 
@@ -39,9 +40,7 @@ def test_a_missing_figure_is_an_error():
         documents.documents(found)
 
 
-@pytest.mark.parametrize(
-    "path", sorted(EXPERIMENTS.glob("figures/**/*.json")), ids=lambda p: p.stem
-)
+@pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
 def test_figures_say_what_made_them(path):
     made = json.loads(path.read_text(encoding="utf-8"))["made_by"]
     assert re.fullmatch(r"\d{4}-\d\d-\d\d|before dates were recorded", made["date"])
@@ -57,6 +56,12 @@ def test_entries_of_the_gallery_are_short(entry):
     assert picture or script.endswith(("compare_versions.py", "particle_statistics.py"))
 
 
+def markers(axes):
+    """The markers of a plot that are drawn, without those of its legend."""
+    found = [line for line in axes.lines if line.get_marker() in "os"]
+    return [np.asarray(line.get_xydata())[0] for line in found if np.size(line.get_xdata())]
+
+
 @pytest.mark.parametrize("name", PLOTS)
 def test_recorded_figures_can_be_drawn(name):
     plot = PLOTS[name](figures(name))
@@ -64,27 +69,22 @@ def test_recorded_figures_can_be_drawn(name):
     labels = [tick.get_text() for tick in axes.get_yticklabels()]
     assert labels == list(dict.fromkeys(dot.label for dot in plot.dots))
     # One marker for each dot, at its value.
-    markers = [line for line in axes.lines if line.get_marker() in "os"]
-    shown = [np.asarray(line.get_xdata())[0] for line in markers if np.size(line.get_xdata())]
-    assert sorted(shown) == sorted(dot.value for dot in plot.dots)
+    assert sorted(x for x, _ in markers(axes)) == sorted(dot.value for dot in plot.dots)
 
 
 def test_dots_of_one_label_share_a_line_and_bars_span_their_range():
     plot = DotPlot([Dot("a", 2.0, 1.0, 3.0), Dot("a", 4.0, hollow=True), Dot("b", 5.0)], "x")
     axes = drawn(plot).axes[0]
-    markers = [line for line in axes.lines if line.get_marker() in "os"]
-    assert [np.asarray(line.get_ydata())[0] for line in markers] == [0, 0, 1]
+    assert [y for _, y in markers(axes)] == [0, 0, 1]
     (bar,) = [line for line in axes.lines if np.size(line.get_xdata()) == 2]
     assert list(np.asarray(bar.get_xdata())) == [1.0, 3.0]
 
 
 def test_every_script_is_in_the_gallery():
     assert all((EXPERIMENTS / entry[2]).exists() for entry in GALLERY)
-    groups = ("fit", "accuracy", "speed", "paper")
-    scripts = {
-        str(p.relative_to(EXPERIMENTS)) for g in groups for p in EXPERIMENTS.glob(f"{g}/*.py")
-    }
-    assert scripts == {entry[2] for entry in GALLERY if entry[2].split("/")[0] in groups}
+    shown = {EXPERIMENTS / entry[2] for entry in GALLERY}
+    for group in ("fit", "accuracy", "speed", "paper"):
+        assert {*EXPERIMENTS.glob(f"{group}/*.py")} <= shown
 
 
 def test_every_picture_is_made_by_a_script():
@@ -116,20 +116,16 @@ def test_the_first_page_is_short():
 @pytest.mark.parametrize("name", ["accuracy.md", "speed.md"])
 def test_commands_of_the_tables_are_there(name):
     text = (EXPERIMENTS / name).read_text(encoding="utf-8")
-    for file in re.findall(
-        r"\S+\.(?:py|csv)", " ".join(re.findall(r"`(python .*?|pytest .*?)`", text))
-    ):
+    commands = " ".join(re.findall(r"`(python .*?|pytest .*?)`", text))
+    for file in re.findall(r"\S+\.(?:py|csv)", commands):
         assert (ROOT / file).exists(), f"{name}: no {file}"
-
-
-def _blocks(path):
-    return re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
 
 
 @pytest.mark.slow
 def test_python_of_the_documents_runs():
-    names = {}
-    for block in _blocks(ROOT / "README.md") + _blocks(ROOT / "experiments" / "guide.md"):
+    names, pages = {}, (ROOT / "README.md", EXPERIMENTS / "guide.md")
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(block, names)
     assert names["sweep"].shape == (1000, 50) and names["slope"].shape == (50,)
     assert names["curve"].rotational_temperature.shape == (50,)

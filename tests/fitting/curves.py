@@ -1,39 +1,51 @@
-"""Curves that tests of fits share."""
+"""Curves that tests of fits share, and how far a fit is from what made its curve."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 
 import jaxgran
+from tests.beads import glass_beads
 from tests.data.test_curve import DATA
 
-RELATIVE_ERROR = 0.01
+A = "dissipative_constant"
+BOTH = (A, "temperature")
 
 
 def synthetic(
     gas,
     key=None,
     num_points=40,
-    relative_error=RELATIVE_ERROR,
+    relative_error=0.01,
     end=300.0,
     model=None,
-    displacement=False,
+    quantities=("temperature", "rotational_temperature"),
 ):
     """A curve of a gas with its errors and, where a key is given, Gaussian noise in ln T.
 
-    Rough spheres have T_rot, too.
+    It holds those of the quantities that the gas has.
     """
     times = jnp.geomspace(0.3, end, num_points) * gas.mean_free_time
     run = {} if model is None else {"model": model, "key": jax.random.key(5)}
     exact, fields = jaxgran.cool(gas, times, progress=False, **run), {}
-    names = ["temperature"]
-    names += ["displacement"] if displacement else []
-    names += ["rotational_temperature"] if gas.surface is not None else []
     noise = jnp.zeros((3, num_points)) if key is None else jax.random.normal(key, (3, num_points))
-    for name, along in zip(names, noise, strict=False):
-        value = getattr(exact, name)
-        fields[name] = value * jnp.exp(along * relative_error)
-        fields[f"{name}_error"] = relative_error * value
+    for name, along in zip(quantities, noise, strict=False):
+        if (value := getattr(exact, name)) is not None:
+            fields[name] = value * jnp.exp(along * relative_error)
+            fields[f"{name}_error"] = relative_error * value
     return jaxgran.CoolingCurve(times, **fields)
+
+
+def cooled_beads(seed=0, **options):
+    """Glass beads and a curve of theirs with noise."""
+    gas = glass_beads(0.15)
+    return gas, synthetic(gas, jax.random.key(seed), **options)
+
+
+def rough_beads(tangential_restitution=0.0):
+    surface = jaxgran.Rough(tangential_restitution, rotational_temperature=3e-3)
+    return dataclasses.replace(glass_beads(), surface=surface)
 
 
 def measured(name):
@@ -41,3 +53,15 @@ def measured(name):
     curve, header = jaxgran.read_curve(DATA / f"lammps_cooling_{name}.csv")
     gas = jaxgran.read_gas(header)
     return gas, curve, float(header["A"]), int(header["N"]), int(header["replicas"])
+
+
+def deviation(result, gas, name=A):
+    """How many standard errors an estimate lies from the gas."""
+    estimate, error = result.value(name)
+    return abs(float(estimate) - float(gas.value(name))) / float(error)
+
+
+def in_range(diagnosis, truth, name=A):
+    """Whether a truth lies in the range that a diagnosis gives."""
+    low, high = diagnosis.ranges[name]
+    return float(low[0]) < float(truth) < float(high[0])

@@ -14,7 +14,7 @@ from jaxgran.fitting.optimise import Problem, search
 from jaxgran.models.base import Limitation
 from jaxgran.models.choose import default_models
 from tests.beads import glass_beads
-from tests.fitting.curves import measured, synthetic
+from tests.fitting.curves import BOTH, A, cooled_beads, deviation, in_range, measured, synthetic
 
 
 @pytest.mark.slow
@@ -63,32 +63,20 @@ def test_every_model_has_limitations_in_a_dense_scene():
 
 EDGE = Limitation("the gas is dense", False, "Take positions.")
 DECISIVE = Limitation("contacts last", True, "Take contacts.")
-GOOD, BAD = 0.5, 0.001
 CONSISTENT = " is consistent with this curve"
+AT_EDGE = ".* The scene is at the edge of the model's validity."
 NOT_EXPLAINED = " is not consistent with this curve: do not trust the estimates."
 UNTRUSTED = " cannot be trusted in this scene, though the curve fits."
+VERDICTS = [
+    # The clock is known to .5 %: no alternative changes A by more than its error.
+    ((), 0.5, "determined", CONSISTENT + r", which determines A: A is between \S+ and \S+ s\."),
+    ((EDGE,), 0.5, "determined", CONSISTENT + AT_EDGE),
+    ((DECISIVE, EDGE), 0.5, "not consistent", UNTRUSTED + " Take contacts."),
+    ((EDGE,), 0.001, "not consistent", NOT_EXPLAINED + " Take positions."),
+]
 
 
-@pytest.mark.parametrize(
-    "limitations, p_value, grade, verdict",
-    [
-        # The clock is known to .5 %: no alternative changes A by more than its error.
-        (
-            (),
-            GOOD,
-            "determined",
-            rf"{CONSISTENT}, which determines A: A is between \S+ and \S+ s\.",
-        ),
-        (
-            (EDGE,),
-            GOOD,
-            "determined",
-            f"{CONSISTENT}.* The scene is at the edge of the model's validity.",
-        ),
-        ((DECISIVE, EDGE), GOOD, "not consistent", f"{UNTRUSTED} Take contacts."),
-        ((EDGE,), BAD, "not consistent", f"{NOT_EXPLAINED} Take positions."),
-    ],
-)
+@pytest.mark.parametrize("limitations, p_value, grade, verdict", VERDICTS)
 def test_verdicts(result, monkeypatch, limitations, p_value, grade, verdict):
     fitted, curve = result
     monkeypatch.setattr(jaxgran.KineticTheory, "limitations", lambda *_, **__: limitations)
@@ -101,8 +89,7 @@ def test_verdicts(result, monkeypatch, limitations, p_value, grade, verdict):
 
 @pytest.fixture(scope="module")
 def result():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(1))
+    gas, curve = cooled_beads(1)
     return jaxgran.fit(gas, curve), curve
 
 
@@ -114,15 +101,10 @@ def test_few_particles_are_told(result):
 
 @pytest.mark.parametrize("too_large, said", [(1.0, False), (3.0, True)])
 def test_errors_that_are_too_large_are_named(too_large, said):
-    # 40 residuals of a third of their errors: chi^2 is 4 of 39 degrees of freedom. As many points
-    # as `result` has, so that one program fits both.
-    gas = glass_beads()
-    curve = jaxgran.cool(gas, jnp.geomspace(0.1, 10.0, 40))
-    noise = 0.02 * np.random.default_rng(3).normal(size=40)
-    T = curve.temperature * jnp.exp(noise)
-    error = 0.02 * too_large * T
-    measured = jaxgran.CoolingCurve(curve.times, T, temperature_error=error)
-    found = jaxgran.diagnose(jaxgran.fit(gas, measured), num_particles=4000, quick=True)
+    # 40 residuals of a third of their errors: chi^2 is 4 of 39 degrees of freedom.
+    gas, curve = cooled_beads(3, relative_error=0.02)
+    curve = dataclasses.replace(curve, temperature_error=too_large * curve.temperature_error)
+    found = jaxgran.diagnose(jaxgran.fit(gas, curve), num_particles=4000, quick=True)
     assert found.grade != "not consistent"
     assert any("errors are too large" in reason for reason in found.reasons) == said
     assert any("give T_err = 0.013 T, or leave" in reason for reason in found.reasons) == said
@@ -130,56 +112,45 @@ def test_errors_that_are_too_large_are_named(too_large, said):
 
 # --- elements that the fit is not told of
 
-A = "dissipative_constant"
-ELEMENTS = {
-    "walls": {"container": jaxgran.Walls(0.1, restitution=0.8)},
-    "drag": {"drag": jaxgran.StokesDrag(0.02)},
-    "roughness": {"surface": jaxgran.Rough(-0.9)},
-    "friction": {"surface": jaxgran.Rough(0.44, friction=0.05)},
-}
-NAMES = {
-    "walls": "walls that dissipate energy",
-    "drag": "linear drag, as in air",
-    "roughness": "rough grains without initial rotation",
-    "friction": "rough grains that slide",
-}
+# Declared absent as, what it is, and what an alternative is called.
+ELEMENTS = [
+    ("walls", {"container": jaxgran.Walls(0.1, restitution=0.8)}, "walls that dissipate energy"),
+    ("drag", {"drag": jaxgran.StokesDrag(0.02)}, "linear drag, as in air"),
+    ("roughness", {"surface": jaxgran.Rough(-0.9)}, "rough grains without initial rotation"),
+    ("friction", {"surface": jaxgran.Rough(0.44, friction=0.05)}, "rough grains that slide"),
+]
 
 
-def exact_to(gas, key=None, error=0.003):
+def exact_to(gas, seed=None, error=0.003):
     """A curve of T alone: what is not known of a gas is not measured either."""
-    times = jnp.geomspace(0.2, 300.0, 48) * gas.mean_free_time
-    T = jaxgran.cool(gas, times).temperature
-    T = T * (1 + (0.0 if key is None else error * jax.random.normal(key, T.shape)))
-    return jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=error * T)
+    key = None if seed is None else jax.random.key(seed)
+    return synthetic(gas, key, relative_error=error, quantities=("temperature",))
 
 
-@pytest.mark.parametrize("element", ELEMENTS)
-def test_the_range_holds_A_where_an_element_is_not_told(element):
+@pytest.mark.parametrize("absent, element, name", ELEMENTS)
+def test_the_range_holds_A_where_an_element_is_not_told(absent, element, name):
     gas = glass_beads(0.1)
-    truth = float(gas.value(A))
-    curve = exact_to(dataclasses.replace(gas, **ELEMENTS[element]), jax.random.key(0))
+    curve = exact_to(dataclasses.replace(gas, **element), 0)
     result = jaxgran.fit(gas, curve)
-    assert abs(float(result.estimate[0]) - truth) > 3 * float(result.standard_error[0])
+    assert deviation(result, gas) > 3
     diagnosis = jaxgran.diagnose(result)
-    low, high = (float(x[0]) for x in diagnosis.ranges[A])
-    assert low < truth < high
-    found = next(a for a in diagnosis.alternatives if a.name == NAMES[element])
-    assert found.low[0] < truth < found.high[0]
+    assert in_range(diagnosis, gas.value(A))
+    found = next(a for a in diagnosis.alternatives if a.name == name)
+    assert found.low[0] < gas.value(A) < found.high[0]
     best = diagnosis.alternatives[0].improvement
     assert found.improvement > best - 3.84 and found.preferred
     assert diagnosis.grade != "determined"
     # Declared absent, the element is no longer an alternative.
-    told = jaxgran.diagnose(jaxgran.fit(gas, curve, absent=(element,)))
-    assert NAMES[element] not in {a.name for a in told.alternatives}
-    assert f"known to be absent: {element}" in told.reasons
+    told = jaxgran.diagnose(jaxgran.fit(gas, curve, absent=(absent,)))
+    assert name not in {a.name for a in told.alternatives}
+    assert f"known to be absent: {absent}" in told.reasons
 
 
 def test_no_alternative_is_preferred_where_all_is_told():
     gas = glass_beads(0.1)
     for seed in range(5):
-        diagnosis = jaxgran.diagnose(jaxgran.fit(gas, exact_to(gas, jax.random.key(seed))))
-        low, high = (float(x[0]) for x in diagnosis.ranges[A])
-        assert diagnosis.grade != "not consistent" and low < float(gas.value(A)) < high
+        diagnosis = jaxgran.diagnose(jaxgran.fit(gas, exact_to(gas, seed)))
+        assert diagnosis.grade != "not consistent" and in_range(diagnosis, gas.value(A))
         assert not any(a.preferred for a in diagnosis.alternatives)
         drag = next(a for a in diagnosis.alternatives if "drag" in a.name)
         assert drag.distinguishable and drag.allowed[1] < 0.02
@@ -196,7 +167,7 @@ def test_more_exact_data_narrow_the_range():
 
 def test_the_last_step_of_a_trial_needs_no_further_curve(monkeypatch):
     gas = glass_beads(0.1)
-    result = jaxgran.fit(gas, exact_to(gas, jax.random.key(0)), free=(A, "temperature"))
+    result = jaxgran.fit(gas, exact_to(gas, 0), free=BOTH)
     problem, starts = alternatives._problem(result)
     first = alternatives._first(problem, result, starts)
     flat, *_ = search(problem, first, 100)  # to its own tolerance, 1e-8

@@ -11,7 +11,7 @@ import jaxgran
 from jaxgran.fitting.residuals import smooth_errors
 from jaxgran.fitting.result import goodness_of_fit
 from tests.beads import glass_beads
-from tests.fitting.curves import synthetic
+from tests.fitting.curves import BOTH, cooled_beads, synthetic
 
 R, N = 3, 40
 SIGMA = 0.01 * np.exp(np.linspace(0.0, 1.5, N))
@@ -29,15 +29,17 @@ def averaged(seed):
     )
 
 
+def away(curves):
+    """Mean of how far relative errors lie from the true ones, in their logarithm."""
+    errors = np.array([curve.temperature_error / curve.temperature for curve in curves])
+    return np.mean(np.abs(np.log(errors / SIGMA)))
+
+
 def test_errors_become_smooth():
     curves = [averaged(seed) for seed in range(20)]
-    raw, smooth = (
-        np.array([c.temperature_error / c.temperature for c in each])
-        for each in (curves, [smooth_errors(c, R)[0] for c in curves])
-    )
+    smooth = [smooth_errors(curve, R)[0] for curve in curves]
     # 40 points of 2 degrees: 80 for 3 coefficients, sqrt(3/160) = 14 % of an error, 25 % at ends.
-    off = [np.mean(np.abs(np.log(each / SIGMA))) for each in (smooth, raw)]
-    assert off[0] < 0.14 < 0.4 < off[1]
+    assert away(smooth) < 0.14 < 0.4 < away(curves)
     _, degrees = smooth_errors(curves[0], R)
     # Neighbours are independent: what is found of a correlation is chance, 1/sqrt(40).
     assert 0.55 * 2 * N < float(degrees["temperature"]) <= 2 * N
@@ -46,39 +48,32 @@ def test_errors_become_smooth():
 def test_a_set_value_stays_without_weight_and_one_run_has_no_scatter():
     curve = averaged(0)
     error = curve.temperature_error.at[0].set(0.0)
-    curve = jaxgran.CoolingCurve(curve.times, curve.temperature, temperature_error=error)
+    curve = dataclasses.replace(curve, temperature_error=error)
     smooth, _ = smooth_errors(curve, R)
     assert smooth.temperature_error[0] == 0 and np.all(smooth.temperature_error[1:] > 0)
     assert smooth_errors(curve, 1) == (curve, {})
 
 
-def p_values(smoothed):
-    """400 curves of the model that they are compared with."""
-    found = []
-    for seed in range(400):
-        curve = averaged(seed)
-        degrees = {}
-        if smoothed:
-            curve, degrees = smooth_errors(curve, R)
-        residuals = (curve.temperature - 1) / curve.temperature_error
-        tested = [(residuals, jnp.asarray(N), degrees.get("temperature"))]
-        found.append(float(goodness_of_fit(tested, jnp.asarray(N), errors_known=True).p_value))
-    return np.array(found)
+def p_value(curve, degrees):
+    """That of a curve against the model T = 1, which it is of."""
+    residuals = (curve.temperature - 1) / curve.temperature_error
+    tested = [(residuals, jnp.asarray(N), degrees.get("temperature"))]
+    return float(goodness_of_fit(tested, jnp.asarray(N), errors_known=True).p_value)
 
 
 def test_p_values_are_those_of_students_t():
-    found = p_values(smoothed=True)
+    curves = [averaged(seed) for seed in range(400)]
+    found = np.array([p_value(*smooth_errors(curve, R)) for curve in curves])
     # Of 400: 5 +- 1.1 % and 1 +- .5 %, three of each; the F distribution is good to 1 %.
     assert 0.015 < np.mean(found < 0.05) < 0.09 and np.mean(found < 0.01) < 0.035
     assert 0.42 < np.mean(found) < 0.58
     # Taken for exact the same errors refuse nearly every true curve.
-    assert np.mean(p_values(smoothed=False) < 0.01) > 0.8
+    assert np.mean([p_value(curve, {}) < 0.01 for curve in curves]) > 0.8
 
 
 @pytest.mark.slow
 def test_fit_and_likelihood_use_them():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(0))
+    gas, curve = cooled_beads()
     chance = np.random.default_rng(0).chisquare(2, curve.times.size) / 2
     ragged = dataclasses.replace(curve, temperature_error=curve.temperature_error * chance**0.5)
     taken, few = (jaxgran.fit(gas, ragged, replicas=replicas) for replicas in (1, R))
@@ -93,9 +88,8 @@ def test_fit_and_likelihood_use_them():
 
 @pytest.mark.slow
 def test_the_likelihood_is_the_chi2_of_the_fit():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(0))
-    result = jaxgran.fit(gas, curve, free=("dissipative_constant", "temperature"))
+    gas, curve = cooled_beads()
+    result = jaxgran.fit(gas, curve, free=BOTH)
     likelihood = jax.jit(lambda gas: jaxgran.log_likelihood(gas, curve))
     assert float(likelihood(result.gas)) == pytest.approx(-0.5 * float(result.chi2), rel=1e-6)
 
@@ -110,13 +104,11 @@ def test_the_likelihood_is_the_chi2_of_the_fit():
     curvature = float(moved(step) - 2 * moved(0.0) + moved(-step)) / step**2
     alone = jaxgran.fit(gas.replace(temperature=result.estimate[1]), curve)
     found = alone.comparison.gain[0] / alone.estimate[0]
-    variance = float(jnp.sum((found * 0.01) ** 2))
-    assert curvature == pytest.approx(-1 / variance, rel=0.02)
+    assert curvature == pytest.approx(-1 / float(jnp.sum((found * 0.01) ** 2)), rel=0.02)
 
 
 def test_without_errors_their_size_is_integrated_out():
-    gas = glass_beads(0.15)
-    curve = synthetic(gas, jax.random.key(1), num_points=20)
+    gas, curve = cooled_beads(1, num_points=20)
     bare = dataclasses.replace(curve, temperature_error=None)
     off = np.log(curve.temperature / jaxgran.cool(gas, curve.times).temperature)
     expected = -0.5 * 20 * np.log(np.sum(off**2))
@@ -125,9 +117,8 @@ def test_without_errors_their_size_is_integrated_out():
 
 def test_a_clock_is_that_of_the_model():
     gas = glass_beads(0.15)
-    times = jnp.geomspace(0.3, 300.0, 40) * gas.mean_free_time
-    slow = jaxgran.cool(gas, 0.9 * times).temperature
-    curve = jaxgran.CoolingCurve(times=times, temperature=slow, temperature_error=0.01 * slow)
+    curve = synthetic(gas)
+    curve = dataclasses.replace(curve, times=curve.times / 0.9)
     for clock in (0.9, jnp.full(40, 0.9)):
         assert float(jaxgran.log_likelihood(gas, curve, clock=clock)) == pytest.approx(0, abs=1e-6)
     assert float(jaxgran.log_likelihood(gas, curve)) < -10

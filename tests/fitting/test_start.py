@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.beads import glass_beads
-from tests.fitting.curves import synthetic
-
-A = "dissipative_constant"
+from tests.fitting.curves import A, cooled_beads
 
 
 def shifted(curve, late):
@@ -18,19 +15,11 @@ def shifted(curve, late):
     return dataclasses.replace(curve, times=curve.times + late)
 
 
-@pytest.fixture(scope="module")
-def measured():
-    gas = glass_beads(0.15)
-    return gas, synthetic(gas, jax.random.key(0))
-
-
-def test_t0_takes_up_a_late_clock(measured):
+def test_t0_takes_up_a_late_clock():
     """A curve on two clocks has one A, and the values of t0 differ by the offset."""
-    gas, curve = measured
+    gas, curve = cooled_beads()
     late = 10.0 * float(curve.times[0])
-    early, later = (
-        jaxgran.fit(gas, shifted(curve, shift), free=(A, "t0")) for shift in (0.0, late)
-    )
+    early, later = (jaxgran.fit(gas, shifted(curve, x), free=(A, "t0")) for x in (0.0, late))
     assert bool(early.converged) and bool(later.converged)
     # Two searches, each to 1e-2 of a standard error.
     np.testing.assert_allclose(later.estimate[0], early.estimate[0], rtol=1e-4)
@@ -43,10 +32,9 @@ def test_t0_takes_up_a_late_clock(measured):
     assert float(jaxgran.fit(gas, shifted(curve, late)).p_value) < 1e-6
 
 
-def test_a_gas_begun_before_the_file_is_found(measured):
+def test_a_gas_begun_before_the_file_is_found():
     """Times counted from a point that lies after the start: t0 is negative."""
-    gas, _ = measured
-    curve = synthetic(gas, jax.random.key(2), num_points=52)  # 40 are left, as in other tests
+    gas, curve = cooled_beads(2, num_points=52)  # 40 are left, as in other tests
     first = float(curve.times[12])
     part = shifted(jax.tree.map(lambda x: x[12:], curve), -first)
     result = jaxgran.fit(gas, part, free=(A, "t0"))
@@ -54,8 +42,8 @@ def test_a_gas_begun_before_the_file_is_found(measured):
     assert abs(float(t0) + first) < 3 * float(deviation)
 
 
-def test_t0_and_the_first_temperature_are_not_found_together(measured):
-    gas, curve = measured
+def test_t0_and_the_first_temperature_are_not_found_together():
+    gas, curve = cooled_beads()
     with pytest.warns(UserWarning, match="T0 and t0: .*a cooling gas forgets its initial"):
         both = jaxgran.fit(gas, curve, free=(A, "temperature", "t0"))
     assert both.undetermined() == ("temperature", "t0") and bool(both.converged)
@@ -69,8 +57,8 @@ def test_t0_and_the_first_temperature_are_not_found_together(measured):
     assert any("does not determine T0 and t0" in x for x in diagnosis.reasons)
 
 
-def test_curves_of_one_material_have_their_own_clocks(measured):
-    gas, curve = measured
+def test_curves_of_one_material_have_their_own_clocks():
+    gas, curve = cooled_beads()
     late = 20.0 * float(curve.times[0])
     data = {"prompt": shifted(curve, 0.0), "late": shifted(curve, late)}
     found = jaxgran.fit(gas, data, separate=("t0",))

@@ -2,7 +2,6 @@ import jax
 import numpy as np
 import pytest
 
-import jaxgran
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
 
 
@@ -28,9 +27,3 @@ def test_contact_value_of_a_dilute_gas(dimension, second_virial):
     slope = jax.grad(lambda phi: contact_value(phi, dimension))(0.0)
     # Henderson's formula has 25/16 for 1.5640.
     np.testing.assert_allclose(slope, third * second_virial * per_packing, rtol=2e-3)
-
-
-@pytest.mark.parametrize("value, message", [(-1.0, "diameter"), ("wide", "diameter")])
-def test_sphere_mass_refuses(value, message):
-    with pytest.raises(ValueError, match=message):
-        jaxgran.sphere_mass(value, 2500.0)

@@ -7,26 +7,18 @@ import numpy as np
 import pytest
 
 import jaxgran
-from experiments.support.closed_forms import (
-    EXPANSION_P,
-    EXPANSION_R,
-    SONINE_COEFFICIENT,
-    haff,
-    paper_averages,
-    paper_displacement,
-    paper_temperature,
-)
+from experiments.support import closed_forms as forms
 from jaxgran.theory import averages as kinetics
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
-from tests.beads import hard_gas
+from tests.beads import hard_gas, theory_curve
 
 
 def test_constants_of_the_expansion():
     # Checked values of the corrected expansion; the third series coefficient has nine digits.
     np.testing.assert_allclose(COOLING_RATE[3], 0.831934150151502, rtol=1e-14)
     np.testing.assert_allclose(COOLING_CORRECTION, 2.301752786151829, rtol=1e-14)
-    np.testing.assert_allclose(EXPANSION_P, 0.5661271900235634, rtol=1e-14)
-    np.testing.assert_allclose(EXPANSION_R, 4.142724172222288, rtol=1e-9)
+    np.testing.assert_allclose(forms.EXPANSION_P, 0.5661271900235634, rtol=1e-14)
+    np.testing.assert_allclose(forms.EXPANSION_R, 4.142724172222288, rtol=1e-9)
 
 
 @pytest.mark.parametrize("e", [0.99, 0.9, 0.5, 0.0])
@@ -34,10 +26,9 @@ def test_constants_of_the_expansion():
 def test_haff(e, record):
     gas = hard_gas(e)
     tau = jnp.geomspace(1e-3, 1e8, 100)
-    model = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-9)
-    curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
+    curve = theory_curve(gas, tau, sonine=False, correlations=False, rtol=1e-9)
     # Asked: 1e-8. The solver's rtol is 1e-9 and its error adds up over eleven decades.
-    exact = haff(tau, e)
+    exact = forms.haff(tau, e)
     np.testing.assert_allclose(curve.temperature, exact, rtol=1e-8)
     record("haff", eps=e, error=float(jnp.max(jnp.abs(curve.temperature / exact - 1))))
 
@@ -49,29 +40,25 @@ def test_expansion_is_right_to_its_order(beads):
         ratios = []
         for delta in (1e-3, 1e-2):
             gas = beads(0.15)
-            scale = delta / gas.delta
-            law = jaxgran.Viscoelastic(
-                5e7, 0.22, gas.value("dissipative_constant") * scale, clipped
-            )
-            gas = dataclasses.replace(gas, law=law)
+            A = gas.value("dissipative_constant") * delta / gas.delta
+            gas = dataclasses.replace(gas, law=jaxgran.Viscoelastic(5e7, 0.22, A, clipped))
             tau = jnp.geomspace(0.01, 1e4, 40) / delta
-            model = jaxgran.KineticTheory(sonine=False, softness=False, correlations=False)
-            theta = jaxgran.cool(gas, tau * gas.mean_free_time, model=model).temperature / 0.01
-            formula = paper_temperature(tau, delta, clipped=clipped)
+            curve = theory_curve(gas, tau, sonine=False, softness=False, correlations=False)
+            theta = curve.temperature / 0.01
+            formula = forms.paper_temperature(tau, delta, clipped=clipped)
             ratios.append(float(jnp.max(jnp.abs(formula / theta - 1))) / delta**2.5)
         assert max(ratios) < 2.0, ratios
 
 
 def test_paper_averages_are_the_first_two_terms(beads):
-    gas = beads(0.002)
-    law = gas.reduced_law
+    law = beads(0.002).reduced_law
     exact = kinetics.impact_moments(law, jnp.ones(()), 3)[:, 0]
-    paper = paper_averages(law, jnp.ones(()), 3)[:, 0]
+    paper = forms.paper_averages(law, jnp.ones(()), 3)[:, 0]
     # The next term of 1 - eps^2 is O(beta^(3/2)) relative to the first: 0.23 * 9e-5.
     np.testing.assert_allclose(paper[0], exact[0], rtol=5e-5)
     np.testing.assert_allclose(paper[2], exact[2], rtol=1e-7)
     with pytest.raises(ValueError, match="Viscoelastic law, got ConstantRestitution"):
-        paper_averages(jaxgran.ConstantRestitution(0.9), jnp.ones(()), 3)
+        forms.paper_averages(jaxgran.ConstantRestitution(0.9), jnp.ones(()), 3)
 
 
 @pytest.mark.slow
@@ -79,8 +66,7 @@ def test_displacement_of_constant_restitution():
     for d, e in ((3, 0.6), (2, 0.9)):
         gas = hard_gas(e, dimension=d)
         tau = jnp.geomspace(0.01, 1e6, 50)
-        model = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-9)
-        curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
+        curve = theory_curve(gas, tau, sonine=False, correlations=False, rtol=1e-9)
         # Brilliantov & Poeschel, Eqs. (45), (46); of dD/dt = T - D/tau_v, 1/tau_v = nu (1 + e)/d,
         # follows <dr^2> = (2 d/k) (N - (1 - exp(-k N))/k) with k = (1 + e)^2/(2 d).
         loss, k = (1 - e**2) / (2 * d), (1 + e) ** 2 / (2 * d)
@@ -98,14 +84,14 @@ def test_first_order_of_viscoelastic_gas(beads):
     for delta in (1e-4, 1e-3):
         gas = beads(1.5 * 2**0.1 * delta)
         tau = (u - 1) / (COOLING_RATE[3] * delta)
-        model = jaxgran.KineticTheory(softness=False, order=2, correlations=False, rtol=1e-11)
-        curve = jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
+        options = {"softness": False, "order": 2, "correlations": False}
+        curve = theory_curve(gas, tau, rtol=1e-11, **options)
         leading = 54 / (COOLING_RATE[3] * delta) * (u ** (1 / 6) - 1)
         unit = gas.temperature * gas.mean_free_time**2
         exact = curve.displacement / unit - leading
-        formula = paper_displacement(tau, delta) - leading
+        formula = forms.paper_displacement(tau, delta) - leading
         np.testing.assert_allclose(exact, formula, rtol=0.3 * delta**0.5)
-        kurtosis = -SONINE_COEFFICIENT * delta * (curve.temperature / gas.temperature) ** 0.1
+        kurtosis = -forms.SONINE_COEFFICIENT * delta * (curve.temperature / gas.temperature) ** 0.1
         np.testing.assert_allclose(curve.sonine, kurtosis, rtol=2 * delta**0.5)
-        printed = paper_displacement(tau, delta, corrected=False) - leading
+        printed = forms.paper_displacement(tau, delta, corrected=False) - leading
         assert jnp.all(jnp.abs(printed / exact - 1) > 0.1)

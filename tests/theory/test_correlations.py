@@ -18,16 +18,14 @@ def test_slowing_is_the_integral_over_the_modes(dimension, phi, eps):
     k_c = 2 * pi / float(gas.critical_box)
     a, b = MAX_WAVENUMBER[dimension]
     shell = {2: 2 * pi, 3: 4 * pi}[dimension]
+
     # d - 1 shear modes a wave; d N kinetic degrees of freedom; the rate goes as T^(3/2) of heat.
     # The leading term up to K, what a mode holds beyond it over all waves.
+    def beyond(k):
+        return shell * k ** (dimension - 1) * (1 / ((k / k_c) ** 2 - 1) - (k_c / k) ** 2)
+
     leading, _ = quad(lambda k: shell * k ** (dimension - 3) * k_c**2, 2 * k_c, a + b * phi)
-    beyond, _ = quad(
-        lambda k: shell * k ** (dimension - 1) * (1 / ((k / k_c) ** 2 - 1) - (k_c / k) ** 2),
-        2 * k_c,
-        np.inf,
-    )
-    energy = leading + beyond
-    n = float(gas.number_density)
+    energy, n = leading + quad(beyond, 2 * k_c, np.inf)[0], float(gas.number_density)
     expected = 1.5 * (dimension - 1) / (dimension * n) * energy / (2 * pi) ** dimension
     found = correlation_slowdown(jnp.asarray(phi), jnp.asarray(1 - eps**2), dimension)
     np.testing.assert_allclose(found, expected, rtol=1e-6)  # of the quadrature

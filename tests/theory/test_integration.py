@@ -15,28 +15,19 @@ TIMES = np.linspace(0.0, 5.0, 64)
 
 @partial(jax.jit, static_argnums=0, static_argnames="max_steps")
 def solved(velocity, start, times, rtol=1e-9, max_steps=1000):
-    return integrate_at(
-        velocity,
-        jnp.asarray(start),
-        jnp.asarray(times),
-        solver=diffrax.Tsit5(scan_kind="lax"),
-        controller=diffrax.PIDController(rtol=rtol, atol=rtol),
-        max_steps=max_steps,
-    )
+    controller = diffrax.PIDController(rtol=rtol, atol=rtol)
+    options = {"solver": diffrax.Tsit5(scan_kind="lax"), "controller": controller}
+    start, times = jnp.asarray(start), jnp.asarray(times)
+    return integrate_at(velocity, start, times, max_steps=max_steps, **options)
 
 
 @jax.jit
 def solved_by_diffrax(rtol):
-    return diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: rotation(t, y)),
-        diffrax.Tsit5(),
-        t0=0.0,
-        t1=5.0,
-        dt0=FIRST_STEP,
-        y0=jnp.array([1.0, 0.0]),
-        saveat=diffrax.SaveAt(ts=TIMES),
-        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
-    )
+    controller = diffrax.PIDController(rtol=rtol, atol=rtol)
+    options = {"saveat": diffrax.SaveAt(ts=TIMES), "stepsize_controller": controller}
+    term = diffrax.ODETerm(lambda t, y, args: rotation(t, y))
+    start = jnp.array([1.0, 0.0])
+    return diffrax.diffeqsolve(term, diffrax.Tsit5(), 0.0, 5.0, FIRST_STEP, start, **options)
 
 
 def rotation(t, y):

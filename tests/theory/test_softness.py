@@ -16,9 +16,8 @@ def loss_and_slope(beta):
         y, w, _, dy, dw, _ = z
         stress = y * y + beta * w
         slower = -4 * y * dy * stress - 2 * y * y * (2 * y * dy + beta * dw) - 2 * y
-        return [w, -2 * y * y * stress, 4 * beta * (y * w) ** 2, dw, slower] + [
-            8 * beta * y * w * (dy * w + y * dw)
-        ]
+        lost = 4 * beta * (y * w) ** 2
+        return [w, -2 * y * y * stress, lost, dw, slower, 8 * beta * y * w * (dy * w + y * dw)]
 
     def apart(s, z):
         return z[0] - max(-beta * z[1], 0.0) ** 0.5
@@ -55,16 +54,12 @@ def test_softness_of_a_weakly_dissipating_contact():
     np.testing.assert_allclose(found, [1.84, 1.71, 1.60, 1.42], atol=8e-3)
 
 
-@pytest.mark.parametrize(
-    "dimension, of_diameter, of_distance", [(3, 7.5, 4.5), (2, 25 / 8, 53 / 24)]
-)
-def test_slopes_of_a_dilute_gas_are_those_of_the_excluded_volume(
-    dimension, of_diameter, of_distance
-):
+@pytest.mark.parametrize("dimension, expected", [(3, [7.5, 4.5]), (2, [25 / 8, 53 / 24])])
+def test_slopes_of_a_dilute_gas_are_those_of_the_excluded_volume(dimension, expected):
     # Their sum over phi is the slope in d of the volume that two spheres of radius d exclude both:
     # 2 pi n = 12 phi for spheres, (4 pi/3) n = (16/3) phi for disks.
     slopes = contact_value_slopes(jnp.asarray(1e-7), dimension)
-    np.testing.assert_allclose(np.array(slopes) / 1e-7, [of_diameter, of_distance], rtol=1e-5)
+    np.testing.assert_allclose(np.array(slopes) / 1e-7, expected, rtol=1e-5)
     np.testing.assert_allclose(sum(slopes) / 1e-7, {3: 12, 2: 16 / 3}[dimension], rtol=1e-5)
 
 
