@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import jaxgran
 from jaxgran.data.curve import Run
@@ -24,20 +25,15 @@ from tests.beads import hard_gas, lattice
 )
 def test_gains_are_slopes_of_the_loss(law):
     g = jnp.array([0.03, 0.5, 2.0])
-    leaves, structure = jax.tree.flatten(law)
-    flat = jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
-    ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
+    flat, unravel = ravel_pytree(law)
 
     def eps(flat, log_scale=0.0):
-        parts = zip(jnp.split(flat, ends), leaves, strict=True)
-        law = structure.unflatten([part.reshape(leaf.shape) for part, leaf in parts])
-        return law.restitution(g * jnp.exp(log_scale))
+        return unravel(flat).restitution(g * jnp.exp(log_scale))
 
     def energy(eps):  # of relative motion, with the reduced mass 1/2
         return eps**2 * g**2 / 4
 
-    parts = zip(jnp.split(jnp.eye(flat.size), ends, axis=1), leaves, strict=True)
-    directions = structure.unflatten([p.reshape(-1, *leaf.shape) for p, leaf in parts])
+    directions = jax.vmap(unravel)(jnp.eye(flat.size))
     along = ImpactTangents.initial(directions, 1, g.dtype)
     h = 1e-5
     steps = h * jnp.eye(flat.size)
