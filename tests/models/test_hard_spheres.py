@@ -129,18 +129,16 @@ def test_a_fast_sphere_outruns_no_list():
 @pytest.mark.slow
 def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     gas = hard_gas(0.8, 0.2)
-    times = np.array([0.3, 1.0]) * float(gas.mean_free_time)
-    model = HardSpheres(100)
-    reference = jaxgran.cool(gas, times, model=model)
-    plan = model.sized_for(gas).plan
+    plan = HardSpheres(100).sized_for(gas).plan
     tiny = plan._replace(capacity=Capacity(*(rows // 3 for rows in plan.capacity)))
-    small = jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
+    small_model = HardSpheres(100, plan=tiny)
+    reference, small = curves_of(gas, [0.3, 1.0], HardSpheres(100), small_model)
     # In another order sums are rounded differently, and that grows in the ten impacts of the
     # equilibration; rows are only added at the end, so the order is the same.
     np.testing.assert_array_equal(small.temperature, reference.temperature)
     np.testing.assert_array_equal(small.particles.position, reference.particles.position)
     monkeypatch.setattr(Capacity, "grown", lambda *args: pytest.fail("arrays had to grow again"))
-    jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
+    curves_of(gas, [0.3, 1.0], small_model)
 
 
 @pytest.mark.slow
@@ -234,13 +232,12 @@ def test_drag_takes_energy_of_perfectly_rough_spheres_at_its_rate_alone(dimensio
         container=jaxgran.Walls(sides, restitution=1.0, tangential_restitution=1.0),
         drag=jaxgran.StokesDrag(rate, rotational_rate=rate),
     )
-    times = jnp.array([0.0, 2.0, 10.0]) * gas.mean_free_time
-    curve = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(n, replicas=2))
+    (curve,) = curves_of(gas, [0.0, 2.0, 10.0], HardSpheres(n, replicas=2))
     assert float(curve.times[-1]) * rate > 0.5
     kept = total_energy(gas, dataclasses.replace(curve, dissipated_energy=0.0))
     at_start = 0.5e-5 * (dimension * 0.01 + {2: 1, 3: 3}[dimension] * 4e-3)
     # Sums of 300 numbers, some 1000 impacts.
-    np.testing.assert_allclose(kept * np.exp(2 * rate * times), at_start, rtol=1e-12)
+    np.testing.assert_allclose(kept * np.exp(2 * rate * curve.times), at_start, rtol=1e-12)
     np.testing.assert_allclose(total_energy(gas, curve), at_start, rtol=1e-12)
     final = curve.particles
     places = np.asarray(final.position)
@@ -261,7 +258,7 @@ def contained(law, sides=1.0) -> jaxgran.Gas:
 
 
 def cooled(gas, times, start=None) -> jaxgran.CoolingCurve:
-    model = jaxgran.HardSpheres(50, start=start)
+    model = HardSpheres(50, start=start)
     return jaxgran.cool(gas, times, model=model, save="particles")
 
 
@@ -300,7 +297,7 @@ def test_what_does_not_stand_between_the_walls_is_refused():
 @pytest.mark.slow
 def test_a_start_beyond_a_wall_has_a_status_where_it_cannot_be_looked_at():
     gas, middle = contained(1.0), SIDE / 4
-    model = jaxgran.HardSpheres(50).sized_for(gas)
+    model = HardSpheres(50).sized_for(gas)
 
     @jax.jit
     def faults(start):
@@ -319,7 +316,7 @@ def test_walls_take_from_elastic_spheres_what_theory_says():
     theory = jaxgran.cool(gas, jnp.array([20.0]) * gas.mean_free_time)
     rate = ((theory.temperature[0] / gas.temperature) ** -0.5 - 1) / theory.times[0]
     times = jnp.array([0.5, 1.0, 2.5, 4.0]) / rate
-    hard = jaxgran.cool(gas, times, model=jaxgran.HardSpheres(500, replicas=8))
+    hard = jaxgran.cool(gas, times, model=HardSpheres(500, replicas=8))
     slopes = np.diff((hard.temperature / gas.temperature) ** -0.5) / np.diff(times * rate)
     # Four standard errors of a slope, .8 sqrt(2/(N replicas)), and error_model.WALL_ERROR.
     assert np.all(np.abs(slopes - 1) < 4 * 0.8 * (2 / (500 * 8)) ** 0.5 + 0.04), slopes

@@ -13,7 +13,7 @@ import jaxgran
 from jaxgran.data.curve import Run
 from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable, with_tangents
 from jaxgran.models.error_model import slope_bias, slope_bias_of_run
-from tests.beads import glass_beads, soft_beads
+from tests.beads import curves_of, glass_beads, soft_beads
 
 TIMES = jnp.array([0.0, 1e-3, 0.3, 2.0, 50.0])
 
@@ -164,13 +164,11 @@ def test_the_bias_follows_from_the_energy_of_the_flow():
 def test_the_curve_tells_the_bias_where_the_gas_has_a_flow():
     """0 in a box below L_c; above it, from the flow of the run itself."""
     gas = glass_beads(0.5, packing_fraction=0.2)
-    times = jnp.geomspace(0.3, 30.0, 12) * gas.mean_free_time
-    small, large = (
-        jaxgran.cool(gas, times, model=jaxgran.HardSpheres(n, replicas=2)) for n in (64, 500)
-    )
+    models = (jaxgran.HardSpheres(n, replicas=2) for n in (64, 500))
+    small, large = curves_of(gas, np.geomspace(0.3, 30.0, 12), *models)
     assert gas.box_side(64) < gas.critical_box < gas.box_side(500)
     assert np.all(small.derivative_bias == 0)
-    expected = slope_bias_of_run(times, jnp.mean(large.replicas.flow_share, axis=0))
+    expected = slope_bias_of_run(large.times, jnp.mean(large.replicas.flow_share, axis=0))
     # Compiled apart, the two differ by rounding.
     np.testing.assert_allclose(large.derivative_bias, expected, rtol=1e-12)
     # Vortices hold .06 of the energy at last; heat alone scatters it by .005.
