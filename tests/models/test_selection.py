@@ -126,9 +126,8 @@ def test_each_model_has_its_scene(beads):
     choice = choose(hard_gas(0.9, 0.01, surface=surface), 30, 0.018)
     assert isinstance(choice.model, jaxgran.DSMC) and choice.model.num_particles == 4000
     assert choice.candidates[3].error is None
-    assert choice.reasons[-1].startswith(
-        "Soft spheres: SoftSpheres does not support `surface=Rough`"
-    )
+    refused = "Soft spheres: SoftSpheres does not support `surface=Rough`"
+    assert choice.reasons[-1].startswith(refused)
 
     choice = choose(soft_beads(1e-3, 0.6, packing_fraction=0.2), 40, num_particles=4000)
     assert isinstance(choice.model, jaxgran.HardSpheres)

@@ -10,7 +10,7 @@ import pytest
 import jaxgran
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import ReducedContact
-from tests.beads import lattice, soft_beads
+from tests.beads import lattice, soft_beads, spheres
 
 
 def slope(f, at=0.0):
@@ -105,22 +105,19 @@ def test_touching_two_and_three_bodies_have_finite_slopes():
     middle = np.full(3, side / 2)
     e = np.eye(3)
     # The middle one is exactly touched, and struck from two sides at nearly the same moment.
-    starts = np.stack([middle - e[0], middle, middle + e[1] * (1 + 1e-9)])[None] % side
-    velocity = np.stack([e[0], 0 * e[0], -e[1]])[None]
-    velocity = velocity - velocity.mean(axis=1, keepdims=True)
-    velocity /= np.sqrt(np.mean(velocity**2))
-    position = jnp.asarray(starts) * gas.diameter
-    start = jaxgran.Particles(
-        position, jnp.asarray(velocity) * jnp.sqrt(gas.temperature), side * gas.diameter
-    )
+    position = np.stack([middle - e[0], middle, middle + e[1] * (1 + 1e-9)]) % side
+    velocity = np.stack([e[0], 0 * e[0], -e[1]])
+    velocity -= velocity.mean(axis=0)
+    velocity *= float(gas.temperature) ** 0.5 / np.sqrt(np.mean(velocity**2))
+    sigma = float(gas.diameter)
+    start = spheres(position * sigma, velocity, side * sigma)
     end = float(gas.contact_duration) * 8
 
     def f(log_scale, interval):
         a = gas.value("dissipative_constant") * jnp.exp(log_scale)
         model = SoftSpheres(3, start=start, projection=interval, steps_per_contact=200)
-        return jnp.log(
-            jaxgran.cool(gas.replace(dissipative_constant=a), [end], model=model).temperature
-        )[0]
+        curve = jaxgran.cool(gas.replace(dissipative_constant=a), [end], model=model)
+        return jnp.log(curve.temperature[0])
 
     plain = slope(partial(f, interval=None))
     h = 1e-3
