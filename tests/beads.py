@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
+from experiments.support import scenes
 
 SI = {"diameter": 2e-3, "mass": 1e-5, "temperature": 0.01}
 
@@ -16,13 +17,9 @@ def glass_beads(beta: float = 0.15, dimension: int = 3, **values) -> jaxgran.Gas
     return gas.replace(dissipative_constant=1e-6 * beta / gas.thermal_beta).replace(**values)
 
 
-def soft_beads(fraction=0.02, beta=0.15, dimension=3, **values) -> jaxgran.Gas:
+def soft_beads(fraction=0.02, beta=0.15, dimension=3, packing_fraction=0.05) -> jaxgran.Gas:
     """Glass beads whose contacts last a given part of the mean free time."""
-    gas = glass_beads(beta, dimension, **values)
-    stiffer = (float(gas.contact_fraction) / fraction) ** 2.5
-    gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
-    scale = beta / gas.thermal_beta if beta else 0.0
-    return gas.replace(dissipative_constant=gas.value("dissipative_constant") * scale)
+    return scenes.beads(packing_fraction, beta, fraction, dimension)
 
 
 def hard_gas(law=0.9, packing_fraction=0.05, dimension=3, **values) -> jaxgran.Gas:
@@ -50,3 +47,24 @@ def lattice(gas, n, replicas=1) -> jaxgran.Particles:
     velocity -= velocity.mean(axis=1, keepdims=True)
     velocity *= np.sqrt(gas.temperature / np.mean(velocity**2, axis=(1, 2), keepdims=True))
     return jaxgran.Particles(jnp.asarray(position), jnp.asarray(velocity), gas.box_side(n))
+
+
+def spheres(position, velocity, side) -> jaxgran.Particles:
+    """Given spheres as a start with one replica."""
+    x, v = (jnp.asarray(np.asarray(x, float)[None]) for x in (position, velocity))
+    return jaxgran.Particles(x, v, jnp.asarray(float(side)))
+
+
+def curves_of(gas, taus, *models, **options) -> list[jaxgran.CoolingCurve]:
+    """Curves of some models, at times in mean free times."""
+    times = np.asarray(taus, float) * float(gas.mean_free_time)
+    return [jaxgran.cool(gas, times, model=model, progress=False, **options) for model in models]
+
+
+def total_energy(gas, curve):
+    """Energy per particle, J, with what was dissipated; soft contacts hold some of it."""
+    twice = gas.dimension * curve.temperature
+    if curve.rotational_temperature is not None:
+        twice = twice + {2: 1, 3: 3}[gas.dimension] * curve.rotational_temperature
+    parts = [curve.elastic_energy, curve.dissipated_energy]
+    return np.asarray(0.5 * gas.mass * twice + sum(x for x in parts if x is not None))

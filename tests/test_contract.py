@@ -36,7 +36,7 @@ import jaxgran
 from experiments.fit.own_model import HaffLaw
 from experiments.support.scenes import hard_beads
 from jaxgran import Rough, StokesDrag, Walls, WhiteNoise
-from tests.beads import glass_beads
+from tests.beads import glass_beads, total_energy
 
 N, REPLICAS = 64, 2
 TAUS = np.array([0.0, 0.02, 0.5, 2.0])
@@ -45,6 +45,7 @@ SHORT = 2
 
 BEADS = glass_beads(0.3, packing_fraction=0.2)
 ALL = ("surface", "container", "drag", "drive")
+OF_SOFT_SPHERES = ("friction", "container", "drag")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,9 +110,7 @@ CASES = {
     "own model": Case(HaffLaw(), (), hard_beads(0.2, 0.9), "coefficient", 1.0),
     "DSMC": Case(jaxgran.DSMC(N, replicas=REPLICAS), ALL),
     "hard spheres": Case(jaxgran.HardSpheres(N, replicas=REPLICAS), ALL),
-    "soft spheres": Case(
-        jaxgran.SoftSpheres(N, replicas=REPLICAS), ("friction", "container", "drag")
-    ),
+    "soft spheres": Case(jaxgran.SoftSpheres(N, replicas=REPLICAS), OF_SOFT_SPHERES),
 }
 RATE = 0.3 / float(BEADS.mean_free_time)
 TIMES = np.array([0.0, 0.5, 1.0]) * float(BEADS.mean_free_time)
@@ -140,15 +139,6 @@ CURVE_UNITS = {
     "elastic_energy": (2, -2, 1),
     "dissipated_energy": (2, -2, 1),
 }
-
-
-def total_energy(gas, curve):
-    """Energy per particle, J, with what was dissipated; soft contacts hold some of it."""
-    twice = gas.dimension * curve.temperature
-    if curve.rotational_temperature is not None:
-        twice = twice + 3 * curve.rotational_temperature
-    parts = [curve.elastic_energy, curve.dissipated_energy]
-    return 0.5 * gas.mass * twice + sum(x for x in parts if x is not None)
 
 
 def known(curve, scales=(1.0, 1.0, 1.0)):
@@ -204,7 +194,7 @@ def given_elements(case, **elements):
 
     All scenes of a model have the same structure, and thereby the same compiled program.
     """
-    if case.model.elements == ("friction", "container", "drag"):
+    if case.model.elements == OF_SOFT_SPHERES:
         walls = Walls(SIDE, restitution=elastic_law(), tangential_damping=0.0, friction=0.0)
         idle = {"surface": jaxgran.Frictional(0.0, 0.0)}
         gas = BEADS
@@ -218,15 +208,6 @@ def given_elements(case, **elements):
 
 def elastic_law(A=0.0):
     return jaxgran.Viscoelastic(5e7, 0.22, A)
-
-
-ELEMENTS = {
-    "surface": Rough(0.2, rotational_temperature=4e-3),
-    "friction": jaxgran.Frictional(0.5, 0.3, rotational_temperature=4e-3),
-    "container": Walls(SIDE, restitution=0.8),
-    "drag": StokesDrag(RATE),
-    "drive": WhiteNoise(0.01 * RATE),
-}
 
 
 def cooled_with(case, **elements):
@@ -318,13 +299,14 @@ def check_drive(case):
         np.testing.assert_allclose(curve.dissipated_energy, 0.0, atol=1e-20)
 
 
-CHECKS = {
-    "surface": check_surface,
-    "friction": check_friction,
-    "container": check_container,
-    "drag": check_drag,
-    "drive": check_drive,
+ELEMENTS = {
+    "surface": (check_surface, Rough(0.2, rotational_temperature=4e-3)),
+    "friction": (check_friction, jaxgran.Frictional(0.5, 0.3, rotational_temperature=4e-3)),
+    "container": (check_container, Walls(SIDE, restitution=0.8)),
+    "drag": (check_drag, StokesDrag(RATE)),
+    "drive": (check_drive, WhiteNoise(0.01 * RATE)),
 }
+"""A check of each element, and one that models without it refuse."""
 
 
 def of_models(which=lambda case: True):
@@ -419,13 +401,9 @@ class TestContract:
     def test_units_do_not_matter(self, case):
         scales = 37.0, 0.013, 8.1
         gas, start = case.gas, case.start
-        gas = gas.replace(
-            **{
-                name: gas.value(name) * np.prod(np.power(scales, powers))
-                for name, powers in UNITS.items()
-                if name in gas.domains
-            }
-        )
+        factors = {name: np.prod(np.power(scales, powers)) for name, powers in UNITS.items()}
+        names = UNITS.keys() & gas.domains.keys()
+        gas = gas.replace(**{name: gas.value(name) * factors[name] for name in names})
         if start is not None:
             start = start._replace(
                 position=start.position * scales[0],
@@ -444,14 +422,13 @@ class TestContract:
         found = case.curve_and_slope(start=start)
         check_same(found, case.reference)
         if change is boosted:
-            momentum = np.mean(found[0].saved.velocity, axis=2)
+            velocity = found[0].saved.velocity
+            momentum = np.mean(velocity, axis=2)
             speed = float(np.max(np.abs(momentum)))
             np.testing.assert_allclose(momentum, momentum[:1] + 0 * momentum, atol=1e-13 * speed)
             drift = start.velocity[:1, :1] - case.start.velocity[:1, :1]
             before = case.reference[0].saved.velocity
-            np.testing.assert_allclose(
-                found[0].saved.velocity, before + drift[None], atol=1e-9 * speed
-            )
+            np.testing.assert_allclose(velocity, before + drift[None], atol=1e-9 * speed)
 
     @of_models()
     def test_vmap_and_jit_are_a_loop(self, case):
@@ -598,15 +575,40 @@ class TestContract:
             with pytest.raises(ValueError, match=words):
                 case.run(**arguments)
 
+    @pytest.mark.parametrize(
+        "kind, settings, words",
+        [
+            ("KineticTheory", {"order": 4}, "order must be 2 or 3, got 4"),
+            ("DSMC", {"num_particles": 1}, "num_particles must be a whole number >= 2, an int"),
+            ("DSMC", {"step": 0.2}, r"step must lie in \(0, 0.1\], got 0.2"),
+            ("DSMC", {"step": "fine"}, "got 'fine'"),
+            ("DSMC", {"replicas": 0}, "replicas must be a whole number >= 1"),
+            ("HardSpheres", {"replicas": 0}, "replicas"),
+            ("HardSpheres", {"num_particles": 10.0}, "num_particles must be a whole number >= 2"),
+            ("HardSpheres", {"contact_time": 1.0}, "contact_time must"),
+            ("HardSpheres", {"neighbours": "best"}, "neighbours must be one of"),
+            ("HardSpheres", {"differences": 0.6}, r"differences must lie in \(0, 0.5\]"),
+            ("SoftSpheres", {"differences": 0.0}, r"differences must lie in \(0, 0.5\]"),
+            ("SoftSpheres", {"differences": 0.3, "projection": None}, "two kinds of derivative"),
+            ("SoftSpheres", {"projection": 0.0}, "projection must"),
+            ("SoftSpheres", {"steps_per_contact": 5}, "steps_per_contact"),
+        ],
+    )
+    def test_wrong_settings_are_refused(self, kind, settings, words):
+        size = {} if kind == "KineticTheory" else {"num_particles": 10}
+        with pytest.raises(ValueError, match=words):
+            getattr(jaxgran, kind)(**size | settings)
+
     @pytest.mark.parametrize("element", ELEMENTS)
     @of_models()
     def test_element_keeps_the_ledger_or_is_refused(self, case, element):
         assert (element in case.model.elements) == (element in case.elements)
+        check, refused = ELEMENTS[element]
         if element in case.elements:
-            CHECKS[element](case)
+            check(case)
             return
         field = "surface" if element == "friction" else element
-        gas = dataclasses.replace(case.gas, **{field: ELEMENTS[element]})
+        gas = dataclasses.replace(case.gas, **{field: refused})
         supporting = [x.model for x in CASES.values() if element in x.model.elements]
         kinds = "|".join(type(model).__name__ for model in supporting)
         with pytest.raises(ValueError, match=f"does not support `{field}.*Use .*({kinds})"):

@@ -1,4 +1,7 @@
+"""Hard spheres: impacts, clusters, what compiled runs flag, drag, and walls."""
+
 import dataclasses
+import itertools
 from functools import partial
 from pathlib import Path
 
@@ -8,10 +11,12 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran._utils import status
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.particles.capacity import Capacity
-from tests.beads import hard_gas, lattice
-from tests.pairs import find_pairs
+from jaxgran.particles.setup import min_distance
+from jaxgran.scene.geometry import sphere_surface
+from tests.beads import SI, curves_of, glass_beads, hard_gas, lattice, spheres, total_energy
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 
@@ -22,12 +27,10 @@ def serial(gas, start, end):
     Returns positions, velocities and how often each particle collided.
     """
     x, v = np.array(start.position[0]), np.array(start.velocity[0])
-    side, now = float(start.box_side), 0.0
+    side, now, just = float(start.box_side), 0.0, None
     i, j = np.triu_indices(len(x), 1)
-    images = np.stack(np.meshgrid(*[[-1, 0, 1]] * x.shape[1], indexing="ij"), -1)
-    images = side * images.reshape(-1, x.shape[1])
+    images = side * np.array(list(itertools.product((-1, 0, 1), repeat=x.shape[1])))
     counts, loss = np.zeros(len(x), int), 0.0
-    just = None
     while True:
         r = (x[i] - x[j])[:, None] - side * np.round((x[i] - x[j]) / side)[:, None] + images
         w = (v[i] - v[j])[:, None]
@@ -59,10 +62,7 @@ LAW = jaxgran.Viscoelastic(5e7, 0.22, 1e-6)
 
 @pytest.mark.parametrize(
     "dimension, packing_fraction, law",
-    [
-        (3, 0.2, LAW),
-        pytest.param(2, 0.6, 0.8, marks=pytest.mark.slow),
-    ],
+    [(3, 0.2, LAW), pytest.param(2, 0.6, 0.8, marks=pytest.mark.slow)],
 )
 def test_impacts_are_those_of_a_serial_code(dimension, packing_fraction, law):
     gas = hard_gas(law, packing_fraction, dimension)
@@ -86,39 +86,11 @@ def test_impacts_are_those_of_a_serial_code(dimension, packing_fraction, law):
     assert num_impacts > 100
 
 
-def closest(particles) -> float:
-    """The least distance between two spheres, in a gas of diameter 1."""
-    replicas, n, d = particles.position.shape
-    position = particles.position.reshape(-1, d)
-    pairs = find_pairs(position, particles.box_side, 1.05, replicas=replicas, capacity=20 * n)
-    apart = position[pairs.i] - position[pairs.j] - pairs.offset
-    return float(np.min(np.linalg.norm(apart, axis=-1)[: int(pairs.count)]))
-
-
-@pytest.mark.slow
-def test_impacts_come_as_often_as_enskog_says():
-    gas = hard_gas(1.0, 0.2)
-    times = [25 * float(gas.mean_free_time)]
-    rate = float(jaxgran.cool(gas, times, model=HardSpheres(500, replicas=2)).collisions[-1]) / 25
-    # 12 500 impacts scatter by 0.9 % at most: they are less random than independent ones.
-    assert rate == pytest.approx(1.0, abs=0.02)
-
-
-@pytest.mark.slow
-def test_cools_as_kinetic_theory_says(beads):
-    # Box below L_c, so that the gas stays homogeneous.
-    gas, n, replicas = beads(0.15, packing_fraction=0.02), 1000, 3
-    assert gas.box_side(n) < 1.5 * gas.critical_box
-    times = np.array([1.0, 5.0, 20.0]) * float(gas.mean_free_time)
-    theory = jaxgran.cool(gas, times)
-    curve = jaxgran.cool(gas, times, model=HardSpheres(n, replicas=replicas))
-    miss = np.abs(curve.temperature / theory.temperature - 1)
-    assert np.all(miss < 0.01 + 2 * curve.temperature_error / curve.temperature)
-    # The first Sonine order leaves out 2 %, and 3000 spheres' <dr^2> scatters by 3 %.
-    assert np.all(np.abs(curve.displacement / theory.displacement - 1) < 0.1)
-    scatter = 1 / np.sqrt(curve.collisions * n * replicas / 2)
-    assert np.all(np.abs(curve.collisions / theory.collisions - 1) < 0.02 + 2 * scatter)
-    assert np.all(np.abs(curve.sonine - theory.sonine) < 0.1)
+def least_distance(particles) -> float:
+    """The least distance between two spheres of a gas of diameter 1, or 1."""
+    position = particles.position[0]
+    capacity = 20 * len(position), len(position)
+    return float(min_distance(position, particles.box_side, 1, capacity))
 
 
 @pytest.mark.slow
@@ -126,26 +98,21 @@ def test_three_spheres_in_a_row_do_not_collapse():
     # eps below 7 - 4 sqrt(3) = 0.072: infinitely many impacts in a finite time (McNamara & Young,
     # Phys. Fluids A 4, 496 (1992)).
     gas = hard_gas(0.05, 3 * np.pi / 6 / 10.0**3)
-    x = np.array([[[2.0, 5.0, 5.0], [5.0, 5.0, 5.0], [8.5, 5.0, 5.0]]])
-    v = np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]])
-    start = jaxgran.Particles(*map(jnp.asarray, (x, v, 10.0)))
+    x = [[2.0, 5.0, 5.0], [5.0, 5.0, 5.0], [8.5, 5.0, 5.0]]
+    start = spheres(x, [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], 10.0)
     curve = jaxgran.cool(gas, [8.0], model=HardSpheres(3, start=start))
     assert curve.regularised[-1] > 0
     assert curve.collisions[-1] < 100
-    assert closest_in_row(curve.particles) > 1 - 1e-9
-
-
-def closest_in_row(particles) -> float:
-    return float(np.min(np.diff(np.sort(particles.position[0, :, 0]))))
+    assert least_distance(curve.particles) > 1 - 1e-9
 
 
 @pytest.mark.slow
 def test_a_dense_dissipative_cluster_does_not_stall():
     gas = hard_gas(0.3, 0.4, 2)
-    curve = jaxgran.cool(gas, [20 * float(gas.mean_free_time)], model=HardSpheres(300))
+    (curve,) = curves_of(gas, [20], HardSpheres(300))
     assert curve.temperature[-1] < 0.2  # clusters cool more slowly than Haff says, to 0.03
     assert curve.regularised[-1] < 0.5 * curve.collisions[-1]
-    assert closest(curve.particles) > 1 - 1e-9
+    assert least_distance(curve.particles) > 1 - 1e-9
 
 
 def test_a_fast_sphere_outruns_no_list():
@@ -162,35 +129,16 @@ def test_a_fast_sphere_outruns_no_list():
 @pytest.mark.slow
 def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     gas = hard_gas(0.8, 0.2)
-    times = np.array([0.3, 1.0]) * float(gas.mean_free_time)
-    model = HardSpheres(100)
-    reference = jaxgran.cool(gas, times, model=model)
-    plan = model.sized_for(gas).plan
+    plan = HardSpheres(100).sized_for(gas).plan
     tiny = plan._replace(capacity=Capacity(*(rows // 3 for rows in plan.capacity)))
-    small = jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
+    small_model = HardSpheres(100, plan=tiny)
+    reference, small = curves_of(gas, [0.3, 1.0], HardSpheres(100), small_model)
     # In another order sums are rounded differently, and that grows in the ten impacts of the
     # equilibration; rows are only added at the end, so the order is the same.
     np.testing.assert_array_equal(small.temperature, reference.temperature)
     np.testing.assert_array_equal(small.particles.position, reference.particles.position)
     monkeypatch.setattr(Capacity, "grown", lambda *args: pytest.fail("arrays had to grow again"))
-    jaxgran.cool(gas, times, model=HardSpheres(100, plan=tiny))
-
-
-@pytest.mark.slow
-def test_a_random_start_melts_under_jit():
-    """Many spheres begin near contact there; the capacity of a run would not do."""
-    gas = hard_gas(0.8, 0.6, 2)
-    model = HardSpheres(200).sized_for(gas)
-    times = [float(gas.mean_free_time)]
-
-    def cooled(key):
-        return jaxgran.cool(gas, times, model=HardSpheres(200, plan=model.plan), key=key)
-
-    curve = jax.jit(cooled)(jax.random.key(1))
-    assert curve.status == 0
-    theory = jaxgran.cool(gas, times)
-    # T has fallen by 11 to 16 %; that of one box scatters by 2 %.
-    np.testing.assert_allclose(curve.temperature, theory.temperature, rtol=0.05)
+    curves_of(gas, [0.3, 1.0], small_model)
 
 
 @pytest.mark.slow
@@ -231,31 +179,19 @@ def test_jit_flags_what_it_cannot_grow():
 
 def test_refuses_what_it_cannot_do():
     gas = hard_gas(0.8, 0.1)
-    for settings, message in (
-        ({"num_particles": 10.0}, "num_particles must be a whole number >= 2"),
-        ({"num_particles": 10, "replicas": 0}, "replicas"),
-        ({"num_particles": 10, "contact_time": 1.0}, "contact_time must"),
-        ({"num_particles": 10, "neighbours": "best"}, "neighbours must be one of"),
+    touching, apart = (
+        spheres([[1.0, 1.0, 1.0], [x, 1.0, 1.0]], np.zeros((2, 3)), gas.box_side(2))
+        for x in (1.5, 2.1)
+    )
+    for density, model, words in (
+        (0.3, HardSpheres(4), "Use more particles"),
+        (0.6, HardSpheres(500), "too dense for a fluid"),
+        (0.1, HardSpheres(2, start=touching), "0.5 diameters apart, hard spheres must not overlap"),
+        (0.1, HardSpheres(3, start=touching), "start.position has shape"),
+        (0.09, HardSpheres(2, start=touching), "start.box_side"),
     ):
-        with pytest.raises(ValueError, match=message):
-            HardSpheres(**settings)
-    more = dataclasses.replace(HardSpheres(100).sized_for(gas), replicas=3)
-    with pytest.raises(ValueError, match="sized for replicas = 1, and now has 3"):
-        jaxgran.cool(gas, [1.0], model=more)
-    with pytest.raises(ValueError, match="Use more particles"):
-        jaxgran.cool(gas.replace(packing_fraction=0.3), [1.0], model=HardSpheres(4))
-    with pytest.raises(ValueError, match="too dense for a fluid"):
-        jaxgran.cool(gas.replace(packing_fraction=0.6), [1.0], model=HardSpheres(500))
-    side = float(gas.box_side(2))
-    touching = jnp.array([[[1.0, 1.0, 1.0], [1.5, 1.0, 1.0]]])
-    start = jaxgran.Particles(touching, jnp.zeros_like(touching), jnp.asarray(side))
-    with pytest.raises(ValueError, match="0.5 diameters apart, hard spheres must not overlap"):
-        jaxgran.cool(gas, [1.0], model=HardSpheres(2, start=start))
-    with pytest.raises(ValueError, match="start.position has shape"):
-        jaxgran.cool(gas, [1.0], model=HardSpheres(3, start=start))
-    with pytest.raises(ValueError, match="start.box_side"):
-        jaxgran.cool(gas.replace(packing_fraction=0.09), [1.0], model=HardSpheres(2, start=start))
-    apart = start._replace(position=start.position.at[0, 1, 0].set(2.1))
+        with pytest.raises(ValueError, match=words):
+            jaxgran.cool(gas.replace(packing_fraction=density), [1.0], model=model)
     fit = partial(jaxgran.fit, gas, jaxgran.cool(gas, np.linspace(1, 9, 9)))
     with pytest.raises(ValueError, match="temperature cannot be fitted from a given start"):
         given = HardSpheres(2, replicas=2, start=apart)
@@ -276,3 +212,111 @@ def test_lammps_curve():
     error = np.hypot(ours.temperature_error, curve.temperature_error) / curve.temperature
     # Errors of three and four replicas are themselves uncertain by half.
     assert np.all(miss < 0.005 + 3 * error)
+
+
+SIDE = 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension, n", [(2, 20), (3, 150)])
+def test_drag_takes_energy_of_perfectly_rough_spheres_at_its_rate_alone(dimension, n):
+    # In a box of unequal sides: impacts, on walls too, keep the energy, drag takes exp(-2 gamma t).
+    sides, rate = np.array([0.02, 0.03, 0.05])[:dimension], 1.5
+    volume = sphere_surface(dimension) / dimension * 1e-3**dimension
+    gas = hard_gas(
+        1.0,
+        n * volume / sides.prod(),
+        dimension,
+        **SI,
+        surface=jaxgran.Rough(1.0, rotational_temperature=4e-3),
+        container=jaxgran.Walls(sides, restitution=1.0, tangential_restitution=1.0),
+        drag=jaxgran.StokesDrag(rate, rotational_rate=rate),
+    )
+    (curve,) = curves_of(gas, [0.0, 2.0, 10.0], HardSpheres(n, replicas=2))
+    assert float(curve.times[-1]) * rate > 0.5
+    kept = total_energy(gas, dataclasses.replace(curve, dissipated_energy=0.0))
+    at_start = 0.5e-5 * (dimension * 0.01 + {2: 1, 3: 3}[dimension] * 4e-3)
+    # Sums of 300 numbers, some 1000 impacts.
+    np.testing.assert_allclose(kept * np.exp(2 * rate * curve.times), at_start, rtol=1e-12)
+    np.testing.assert_allclose(total_energy(gas, curve), at_start, rtol=1e-12)
+    final = curve.particles
+    places = np.asarray(final.position)
+    assert np.all(places >= 1e-3 * (1 - 1e-9))
+    assert np.all(places <= (sides - 1e-3) * (1 + 1e-9))
+    assert np.all(places.max(axis=(0, 1)) > 0.85 * sides)  # all of the box is in use
+    T_rot = 0.4 * 1e-6 * jnp.mean(final.angular_velocity**2)
+    assert float(T_rot) == pytest.approx(float(curve.rotational_temperature[-1]), rel=1e-12)
+    T = jnp.mean(final.velocity**2)
+    assert float(T) == pytest.approx(float(curve.temperature[-1]), rel=1e-12)
+
+
+def contained(law, sides=1.0) -> jaxgran.Gas:
+    """A gas of 50 spheres in a cube of 50 mm, or in a box of the same volume."""
+    gas = glass_beads(packing_fraction=50 * np.pi / 6 * 8e-9 / SIDE**3)
+    walls = jaxgran.Walls(SIDE * np.asarray(sides), restitution=law)
+    return dataclasses.replace(gas, container=walls)
+
+
+def cooled(gas, times, start=None) -> jaxgran.CoolingCurve:
+    model = HardSpheres(50, start=start)
+    return jaxgran.cool(gas, times, model=model, save="particles")
+
+
+def test_a_run_goes_on_from_its_own_particles():
+    gas = contained(jaxgran.Viscoelastic(5e7, 0.22, 3e-5), sides=(1.0, 0.8, 1.25))
+    whole = cooled(gas, [0.1, 0.2])  # some bounces, and few impacts that would let paths part
+    middle = jax.tree.map(lambda x: x[0], whole.saved)
+    curve = cooled(gas.replace(temperature=whole.temperature[0]), [0.05, 0.1], middle)
+    assert float(whole.temperature[1]) < 0.99 * float(whole.temperature[0])
+    np.testing.assert_allclose(curve.temperature[-1], whole.temperature[1], rtol=1e-6)
+    last = curve.particles
+    np.testing.assert_allclose(last.position, whole.particles.position, atol=1e-6 * SIDE)
+
+
+def at_rest(place=None, side=SIDE, **more):
+    """50 spheres at rest on a lattice with 12.5 mm between them, off the walls, but for one."""
+    position = (np.argwhere(np.ones((4, 4, 4)))[None, :50] + 0.5) * SIDE / 4
+    if place is not None:
+        position[0, 7] = place
+    return jaxgran.Particles(position, np.zeros_like(position), side, **more)
+
+
+def test_what_does_not_stand_between_the_walls_is_refused():
+    gas, middle = contained(1.0), SIDE / 4
+    cooled(gas, [1e-3], at_rest([middle, SIDE - 1e-3, middle]))  # it touches the wall
+    for start, words in (
+        (at_rest([-1e-4, middle, middle]), "sphere 7 of replica 0 .* outside of the walls.* 0.05"),
+        (at_rest([middle, SIDE - 0.9e-3, middle]), "less than its radius, 0.001 m, from a wall"),
+        (at_rest(side=1.1 * SIDE), "start.box_side is .* diameters, that of the gas"),
+        (at_rest(angular_velocity=np.ones((1, 50, 3))), "HardSpheres draws the angular velocities"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            cooled(gas, [1e-3], start)
+
+
+@pytest.mark.slow
+def test_a_start_beyond_a_wall_has_a_status_where_it_cannot_be_looked_at():
+    gas, middle = contained(1.0), SIDE / 4
+    model = HardSpheres(50).sized_for(gas)
+
+    @jax.jit
+    def faults(start):
+        return jaxgran.cool(gas, [1e-3], model=dataclasses.replace(model, start=start)).status
+
+    assert faults(at_rest()) == 0
+    assert faults(at_rest([middle, 0.9e-3, middle])) == status.OVERLAPPING.bit
+
+
+@pytest.mark.slow
+def test_walls_take_from_elastic_spheres_what_theory_says():
+    # Haff's law: T^(-1/2) grows linearly. The slope after the first sound times, to 1/5 of T^(1/2).
+    gas = hard_gas(1.0, 0.02, **SI)
+    walls = jaxgran.Walls(gas.box_side(500), restitution=0.6)
+    gas = dataclasses.replace(gas, container=walls)
+    theory = jaxgran.cool(gas, jnp.array([20.0]) * gas.mean_free_time)
+    rate = ((theory.temperature[0] / gas.temperature) ** -0.5 - 1) / theory.times[0]
+    times = jnp.array([0.5, 1.0, 2.5, 4.0]) / rate
+    hard = jaxgran.cool(gas, times, model=HardSpheres(500, replicas=8))
+    slopes = np.diff((hard.temperature / gas.temperature) ** -0.5) / np.diff(times * rate)
+    # Four standard errors of a slope, .8 sqrt(2/(N replicas)), and error_model.WALL_ERROR.
+    assert np.all(np.abs(slopes - 1) < 4 * 0.8 * (2 / (500 * 8)) ** 0.5 + 0.04), slopes

@@ -9,8 +9,8 @@ import pytest
 
 import jaxgran
 from experiments.fit.own_model import HaffLaw
-from experiments.support.closed_forms import haff
 from tests.beads import SI, hard_gas
+from tests.fitting.curves import synthetic
 
 MEMBERS = sorted(
     jaxgran.AbstractModel.__abstractmethods__ | jaxgran.AbstractModel.__abstractclassvars__
@@ -21,24 +21,14 @@ def gas_of(coefficient=0.9):
     return hard_gas(coefficient, 0.02, **SI)
 
 
-def times_of(gas, num=40):
-    return jnp.geomspace(0.3, 300.0, num) * gas.mean_free_time
-
-
-def measured(gas, key=None):
-    """A curve by Haff's law with errors of 1 %, and noise of that size where a key is given."""
-    times = times_of(gas)
-    T = gas.temperature * haff(gas.collision_frequency * times, gas.value("coefficient"))
-    noise = 0.0 if key is None else 0.01 * jax.random.normal(key, times.shape)
-    return jaxgran.CoolingCurve(
-        times=times, temperature=T * jnp.exp(noise), temperature_error=0.01 * T
-    )
+def times_of(gas):
+    return jnp.geomspace(0.3, 300.0, 40) * gas.mean_free_time
 
 
 @pytest.mark.slow
 def test_fit_finds_what_made_the_curve():
     gas = gas_of()
-    curve = measured(gas, jax.random.key(0))
+    curve = synthetic(gas, model=HaffLaw(), key=jax.random.key(0))
     free = ("coefficient", "temperature")
     unknown = gas.replace(coefficient=0.5, temperature=1.0)
     result = jaxgran.fit(unknown, curve, model=HaffLaw(), free=free)
@@ -59,12 +49,11 @@ def test_fit_finds_what_made_the_curve():
 @pytest.mark.slow
 def test_diagnosis_asks_the_model():
     gas = gas_of(0.6)
-    curve = measured(gas, jax.random.key(2))
+    curve = synthetic(gas, model=HaffLaw(), key=jax.random.key(2))
     result = jaxgran.fit(gas, curve, model=HaffLaw(), free=("coefficient",))
     diagnosis = jaxgran.diagnose(result, curve)
-    assert (
-        diagnosis.grade == "not consistent" and "velocities are not Maxwellian" in diagnosis.reasons
-    )
+    assert diagnosis.grade == "not consistent"
+    assert "velocities are not Maxwellian" in diagnosis.reasons
     assert diagnosis.verdict == (
         "Haff law cannot be trusted in this scene, though the curve fits. "
         "This scene needs kinetic theory, which includes a_2."
@@ -108,7 +97,7 @@ class NoisyHaffLaw(HaffLaw):
 @pytest.mark.slow
 def test_a_stochastic_model_is_fitted_through_its_replicas():
     gas, free = gas_of(), ("coefficient", "temperature")
-    curve = measured(gas, jax.random.key(3))
+    curve = synthetic(gas, model=HaffLaw(), key=jax.random.key(3))
     options = {"free": free, "progress": False, "key": jax.random.key(1)}
     result = jaxgran.fit(gas.replace(coefficient=0.8), curve, model=NoisyHaffLaw(), **options)
     assert bool(result.converged)

@@ -1,4 +1,4 @@
-import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,14 +11,17 @@ from tests.beads import hard_gas, soft_beads
 from tests.fitting.curves import measured
 
 
-def errors(*request, **options):
-    """Estimated errors by the names of the models that can take a scene."""
-    candidates = jaxgran.choose_model(*request, **options).candidates
-    return {c.model.name: c.error for c in candidates if c.error is not None}
-
-
 def over(gas, collision_times):
     return np.geomspace(0.1, 1, 8) * collision_times * float(gas.mean_free_time)
+
+
+def choose(gas, collision_times, *tolerance, **options):
+    return jaxgran.choose_model(gas, over(gas, collision_times), *tolerance, **options)
+
+
+def errors(choice):
+    """Estimated errors by the names of the models that can take a scene."""
+    return {c.model.name: c.error for c in choice.candidates if c.error is not None}
 
 
 @pytest.mark.parametrize(
@@ -38,7 +41,7 @@ def test_measured_curves(name, model, fitted):
     gas = gas.replace(dissipative_constant=a_true)
     theory = jaxgran.cool(gas, curve.times).temperature
     error = float(jnp.max(jnp.abs(jnp.log(curve.temperature / theory))))
-    estimate = errors(gas, curve.times, **options)["kinetic theory"]
+    estimate = errors(jaxgran.choose_model(gas, curve.times, **options))["kinetic theory"]
     assert error - 0.005 < estimate < 2 * error
 
 
@@ -63,7 +66,7 @@ MEASURED = {
 def test_estimates_bound_what_was_measured(scene):
     phi, contact, dimension, n, beta, duration, deviation, error = MEASURED[scene]
     gas = soft_beads(contact, beta, dimension, packing_fraction=phi)
-    estimate = errors(gas, over(gas, duration), num_particles=n)["kinetic theory"]
+    estimate = errors(choose(gas, duration, num_particles=n))["kinetic theory"]
     # Estimates are sums of magnitudes of what is known to within some ten per cent: they must not
     # be too low by more than a fifth, nor too high by more than a factor of two and a half.
     assert deviation - 2 * error < 1.2 * estimate
@@ -90,7 +93,8 @@ def test_noise_is_that_of_runs(phi, beta, n, duration, scatter):
     times = [duration * float(gas.mean_free_time)]
 
     def noise(replicas):
-        estimate = errors(gas, times, num_particles=n, replicas=replicas)
+        options = {"num_particles": n, "replicas": replicas}
+        estimate = errors(jaxgran.choose_model(gas, times, **options))
         return (estimate["soft spheres"] ** 2 - INTEGRATION_ERROR**2) ** 0.5
 
     # So many runs tell it to 10 % (N = 1000) and 18 %; shot noise differs by as much.
@@ -101,61 +105,51 @@ def test_noise_is_that_of_runs(phi, beta, n, duration, scatter):
 def test_only_a_flow_makes_noise_besides():
     still, flowing = hard_gas(0.9), hard_gas(0.6, 0.3)
     for gas, more in ((still, False), (flowing, True)):
-        request = gas, over(gas, 30)
-        choice = jaxgran.choose_model(*request, num_particles=4000)
-        assert ("random amplitudes" in " ".join(choice.reasons)) is more
-        assert "random amplitudes" not in " ".join(jaxgran.choose_model(*request).reasons)
+        in_box, unknown = (choose(gas, 30, num_particles=n) for n in (4000, None))
+        assert ("random amplitudes" in " ".join(in_box.reasons)) is more
+        assert "random amplitudes" not in " ".join(unknown.reasons)
         # Where a flow grows its noise is more than that of shots alone, and the larger part.
-        noise, shots = (errors(*request, num_particles=n)["hard spheres"] for n in (4000, None))
+        noise, shots = (errors(choice)["hard spheres"] for choice in (in_box, unknown))
         assert (noise > 1.5 * shots) is more
 
 
 def test_each_model_has_its_scene(beads):
-    dilute = beads(0.15)
-    choice = jaxgran.choose_model(dilute, over(dilute, 10))
+    choice = choose(beads(0.15), 10)
     assert isinstance(choice.model, jaxgran.KineticTheory) and choice.error < 0.02
     assert "the box is unknown" in " ".join(choice.reasons)
 
     lossy = hard_gas(0.05, 0.01)  # far from Maxwellian, a_2 = 0.2, which kinetic theory follows
-    choice = jaxgran.choose_model(lossy, over(lossy, 30), num_particles=None)
-    assert isinstance(choice.model, jaxgran.KineticTheory)
-    rough = rough_gas(friction=0.3)  # kinetic theory is twice as exact without friction
-    choice = jaxgran.choose_model(rough, over(rough, 30), 0.018, num_particles=None)
+    assert isinstance(choose(lossy, 30).model, jaxgran.KineticTheory)
+    # Spins and velocities are correlated, which kinetic theory leaves out: it is twice as exact
+    # without friction.
+    surface = jaxgran.Rough(-0.2, rotational_temperature=1.0, friction=0.3)
+    choice = choose(hard_gas(0.9, 0.01, surface=surface), 30, 0.018)
     assert isinstance(choice.model, jaxgran.DSMC) and choice.model.num_particles == 4000
     assert choice.candidates[3].error is None
-    assert choice.reasons[-1].startswith(
-        "Soft spheres: SoftSpheres does not support `surface=Rough`"
-    )
+    refused = "Soft spheres: SoftSpheres does not support `surface=Rough`"
+    assert choice.reasons[-1].startswith(refused)
 
-    clustering = soft_beads(1e-3, 0.6, packing_fraction=0.2)
-    request = clustering, over(clustering, 40)
-    choice = jaxgran.choose_model(*request, num_particles=4000)
+    choice = choose(soft_beads(1e-3, 0.6, packing_fraction=0.2), 40, num_particles=4000)
     assert isinstance(choice.model, jaxgran.HardSpheres)
     assert "L_c" in " ".join(choice.reasons)
-
-    soft = soft_beads(0.2, 0.6, packing_fraction=0.2)
-    choice = jaxgran.choose_model(soft, over(soft, 40), num_particles=4000)
+    choice = choose(soft_beads(0.2, 0.6, packing_fraction=0.2), 40, num_particles=4000)
     assert isinstance(choice.model, jaxgran.SoftSpheres)
 
 
 def test_nothing_accurate_enough_is_said():
-    gas = hard_gas(0.7, 0.3)
-    choice = jaxgran.choose_model(gas, over(gas, 30), 1e-6, num_particles=1000)
-    known = [c.error for c in choice.candidates if c.error is not None]
-    assert choice.error == min(known) > 1e-6
+    choice = choose(hard_gas(0.7, 0.3), 30, 1e-6, num_particles=1000)
+    assert choice.error == min(errors(choice).values()) > 1e-6
     assert "no model is within 0.0001 %" in choice.reasons[0]
     with pytest.warns(UserWarning, match="no model is within"):
         jaxgran.cool(hard_gas(0.7), [1.0], model="auto", tolerance=1e-9)
 
 
 def test_scenes_that_particles_cannot_run_are_left_to_the_others():
-    crowded = hard_gas(0.9, 0.6)
-    choice = jaxgran.choose_model(crowded, over(crowded, 10), num_particles=100)
+    choice = choose(hard_gas(0.9, 0.6), 10, num_particles=100)
     able = [c.model.name for c in choice.candidates if c.refusal is None]
     assert able == ["kinetic theory", "DSMC"]
     assert "too dense for a fluid start" in " ".join(choice.reasons)
-    few = hard_gas(0.9, 0.4)
-    choice = jaxgran.choose_model(few, over(few, 10), num_particles=5)
+    choice = choose(hard_gas(0.9, 0.4), 10, num_particles=5)
     assert "at least 2.1 are needed" in " ".join(choice.reasons)
 
 
@@ -166,32 +160,20 @@ def test_cool_chooses(beads):
     np.testing.assert_array_equal(chosen.temperature, jaxgran.cool(gas, times).temperature)
 
 
-def rough_gas(**friction):
-    """Spins and velocities are correlated, which kinetic theory leaves out."""
-    gas = hard_gas(0.9, 0.01)
-    T_rot = float(gas.temperature)
-    surface = jaxgran.Rough(-0.2, rotational_temperature=T_rot, **friction)
-    return dataclasses.replace(gas, surface=surface)
-
-
 def test_bad_requests_are_refused(beads):
-    gas = beads(0.15)
-    for tolerance in (0, -0.1, float("nan"), "2 %"):
-        with pytest.raises(ValueError, match="tolerance must"):
-            jaxgran.choose_model(gas, [1.0], tolerance)
-    jaxgran.choose_model(gas, [1.0], np.float32(0.02), 1000)
-    with pytest.raises(ValueError, match="num_particles must be a whole number >= 2, an int"):
-        jaxgran.choose_model(gas, [1.0], num_particles=1)
-    with pytest.raises(ValueError, match="times must increase"):
-        jaxgran.choose_model(gas, [2.0, 1.0])
-    with pytest.raises(ValueError, match="gas must be a jaxgran.Gas"):
-        jaxgran.choose_model("gas", [1.0])
-    with pytest.raises(ValueError, match='go with model="auto"'):
-        jaxgran.cool(gas, [1.0], tolerance=0.1)
-    with pytest.raises(ValueError, match="model must be a jaxgran model, got 'best'"):
-        jaxgran.cool(gas, [1.0], model="best")
-    with pytest.raises(ValueError, match="call choose_model outside"):
-        jax.jit(lambda g: jaxgran.cool(g, [1.0], model="auto").temperature)(gas)
-    curve = jaxgran.cool(gas, over(gas, 10))
-    with pytest.raises(ValueError, match="model must be a jaxgran model, got .auto"):
-        jaxgran.fit(gas, curve, model="auto")
+    gas, times, cool = beads(0.15), [1.0], jaxgran.cool
+    choose = partial(jaxgran.choose_model, gas)
+    choose(times, np.float32(0.02), 1000)
+    curve = cool(gas, over(gas, 10))
+    for call, words in (
+        *((partial(choose, times, x), "tolerance must") for x in (0, -0.1, float("nan"), "2 %")),
+        (lambda: choose(times, num_particles=1), "num_particles must be a whole number >= 2, an"),
+        (lambda: choose([2.0, 1.0]), "times must increase"),
+        (lambda: jaxgran.choose_model("gas", times), "gas must be a jaxgran.Gas"),
+        (lambda: cool(gas, times, tolerance=0.1), 'go with model="auto"'),
+        (lambda: cool(gas, times, model="best"), "model must be a jaxgran model, got 'best'"),
+        (lambda: jax.jit(partial(cool, times=times, model="auto"))(gas), "choose_model outside"),
+        (lambda: jaxgran.fit(gas, curve, model="auto"), "must be a jaxgran model, got .auto"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()

@@ -8,14 +8,9 @@ import numpy as np
 import pytest
 
 from jaxgran._utils import status
+from jaxgran.particles import setup
 from jaxgran.particles.observables import sonine, temperature
-from jaxgran.particles.setup import (
-    GAP,
-    host_positions,
-    maxwellian_velocities,
-    relaxed_positions,
-    uniform_points,
-)
+from jaxgran.particles.setup import GAP, host_positions, maxwellian_velocities
 from jaxgran.scene.geometry import sphere_surface
 
 N, REPLICAS, KEY = 60, 2, jax.random.key(1)
@@ -28,7 +23,7 @@ def side_of(packing, dimension):
 
 @partial(jax.jit, static_argnames=("size", "capacity"))
 def relaxed(key, side, size, region=None, capacity=(1000, 120), fault=status.OK):
-    return relaxed_positions(key, side, size, 0.4, capacity, region, fault)
+    return setup.relaxed_positions(key, side, size, 0.4, capacity, region, fault)
 
 
 def on_host(side, size=(REPLICAS, N, 3), region=None):
@@ -67,7 +62,7 @@ def test_no_spheres_overlap_and_boxes_differ(place, dimension, packing):
 @PLACES
 def test_dilute_spheres_stay_at_their_uniform_points(place):
     side = side_of(0.02, 3)
-    moved = np.abs(np.asarray(place(side)) - side * uniform_points(KEY, REPLICAS * N, 3))
+    moved = np.abs(np.asarray(place(side)) - side * setup.uniform_points(KEY, REPLICAS * N, 3))
     assert np.mean(np.all(moved < 1e-12, axis=1)) > 0.7
 
 
@@ -87,12 +82,12 @@ def test_two_spheres_in_the_smallest_box():
 
 @PLACES
 def test_one_point_for_all_is_parted(place, monkeypatch):
-    monkeypatch.setattr("jaxgran.particles.setup.uniform_points", lambda *_: jnp.ones((3, 3)))
+    monkeypatch.setattr(setup, "uniform_points", lambda *_: jnp.ones((3, 3)))
     assert closest(np.asarray(place(8.0, (1, 3, 3))), 8.0) >= 1 + GAP / 2
 
 
 def test_where_there_is_no_room_or_the_list_is_full_it_says_so(monkeypatch):
-    monkeypatch.setattr("jaxgran.particles.setup.MAX_PUSHES", 50)
+    monkeypatch.setattr(setup, "MAX_PUSHES", 50)
     for dimension, packing in ((3, 0.8), (2, 0.95)):
         with pytest.raises(RuntimeError, match="60 spheres .* after 50 pushes. Lower the packing"):
             on_host(side_of(packing, dimension), (1, N, dimension))

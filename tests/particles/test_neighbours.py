@@ -10,29 +10,33 @@ from scipy.spatial import KDTree
 from jaxgran.particles.neighbours import (
     MAX_LOOKAHEAD,
     choose_engine,
+    search_pairs,
     sweep,
-    tree_search,
+    with_offsets,
     wrap,
 )
-from tests.pairs import find_pairs
 
 
-def brute_force(position, side, cutoff, replicas=1):
+def find_pairs(position, side, cutoff, *, replicas=1, capacity, by="scipy"):
+    """All pairs with their offsets; a sweep may look ahead over all particles of a replica."""
+    capacities = capacity, len(position) // replicas
+    return with_offsets(
+        position, side, search_pairs(position, side, cutoff, replicas, capacities, by)
+    )
+
+
+def brute_force(position, side, cutoff, replicas):
     """Shortest x_i - x_j of every pair i < j closer than the cutoff."""
-    found = {}
+    i, j = np.triu_indices(len(position), 1)
+    apart = position[i] - position[j]
+    apart -= side * np.round(apart / side)
     n = len(position) // replicas
-    for first in range(0, len(position), n):
-        for i, j in itertools.combinations(range(first, first + n), 2):
-            apart = position[i] - position[j]
-            apart = apart - side * np.round(apart / side)
-            if np.sqrt(np.sum(apart**2)) < cutoff:
-                found[i, j] = apart
-    return found
+    near = (i // n == j // n) & (np.linalg.norm(apart, axis=1) < cutoff)
+    return dict(zip(zip(i[near].tolist(), j[near].tolist(), strict=True), apart[near], strict=True))
 
 
-def listed(pairs):
-    count = int(pairs.count)
-    return list(zip(pairs.i[:count].tolist(), pairs.j[:count].tolist(), strict=True))
+def listed(i, j, count):
+    return list(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
 
 
 def awkward(dimension, replicas, side, n=30):
@@ -61,7 +65,7 @@ def test_pairs_are_those_of_brute_force(dimension, by, fraction):
     capacity = len(expected) + 7
     search = partial(find_pairs, replicas=replicas, capacity=capacity, by=by)
     pairs = search(jnp.asarray(position), side, cutoff)
-    found = listed(pairs)
+    found = listed(pairs.i, pairs.j, int(pairs.count))
     assert int(pairs.count) == len(expected)  # each once
     assert set(found) == set(expected)  # and with i < j
     assert pairs.i.dtype == pairs.j.dtype == jnp.int32 and pairs.i.shape == (capacity,)
@@ -131,6 +135,8 @@ def test_wrap_lands_inside(side):
 
 
 def test_engine_follows_the_device_and_the_gas(monkeypatch):
+    with pytest.raises(ValueError, match="must be one of auto, sweep, scipy, jax-md, got 'kd'"):
+        choose_engine("kd")
     assert choose_engine("scipy", 1) == "scipy" and choose_engine("sweep", 10**6) == "sweep"
     assert choose_engine("jax-md") == "jax-md"
     for device, dense in (("cpu", "scipy"), ("gpu", "jax-md")):
@@ -141,22 +147,14 @@ def test_engine_follows_the_device_and_the_gas(monkeypatch):
         assert choose_engine("auto", 10 * MAX_LOOKAHEAD, traced=True) == "sweep"
 
 
-def test_unknown_engines_are_refused():
-    message = "neighbours must be one of auto, sweep, scipy, jax-md, got 'kd'"
-    with pytest.raises(ValueError, match=message):
-        choose_engine("kd")
-
-
 def test_wide_planes():
     # Thousands of diameters across.
     side, n = 5000.0, 2000
     position = np.random.default_rng(0).uniform(0, side, (n, 2))
-    i, j, count = tree_search(position, side, 1.4, 1, 2 * n)
-    found = np.sort(np.stack([i[:count], j[:count]], axis=1), axis=1)
     expected = KDTree(position, boxsize=side).query_pairs(1.4)
-    assert set(map(tuple, found.tolist())) == expected
-    pairs = find_pairs(jnp.asarray(position), side, 1.4, capacity=2 * n, by="sweep")
-    assert set(listed(pairs)) == expected
+    for by in ("scipy", "sweep"):
+        pairs = find_pairs(jnp.asarray(position), side, 1.4, capacity=2 * n, by=by)
+        assert {(min(p), max(p)) for p in listed(pairs.i, pairs.j, pairs.count)} == expected
 
 
 @pytest.mark.slow
@@ -172,7 +170,7 @@ def test_a_sweep_looks_as_far_as_it_must():
         flat = jnp.asarray(position.reshape(-1, 3))
         look = partial(sweep, flat, side, 1.0, replicas=2, capacity=len(expected) + 9)
         i, j, count, ahead = look(ahead=n)
-        found = list(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
+        found = listed(i, j, count)
         assert set(found) == expected and len(found) == len(expected)
         # Within .1 of the box, evenly: 100, and up to five standard errors more.
         assert min(100 * crowd, n - 1) <= ahead <= min(150 * crowd + 32, n - 1)
@@ -196,10 +194,8 @@ def test_a_sweep_misses_no_pair_just_within_the_cutoff(dtype):
     apart -= side * np.round(apart / side)
     within = np.flatnonzero(np.sum(apart**2, axis=1) < cutoff**2)
     assert 0.3 * n < len(within) < 0.7 * n
-    i, j, count, _ = sweep(
-        jnp.asarray(position), side, cutoff, replicas=1, capacity=3 * n, ahead=200
-    )
-    found = set(zip(i[:count].tolist(), j[:count].tolist(), strict=True))
+    look = partial(sweep, replicas=1, capacity=3 * n, ahead=200)
+    found = set(listed(*look(jnp.asarray(position), side, cutoff)[:3]))
     assert {(k, k + n) for k in within.tolist()} <= found
     # As documented: 1e-6 of the cutoff and of the side.
     tree = KDTree(position.astype(float), boxsize=side)

@@ -7,18 +7,10 @@ import pytest
 from scipy.special import j1
 from scipy.stats import chi2
 
-from jaxgran.particles.observables import (
-    cell_density,
-    cell_velocity,
-    flow_share,
-    flow_spectrum,
-    number_fluctuation,
-    pair_correlation,
-    sonine,
-    structure_factor,
-    third_sonine,
-    velocity_distribution,
-)
+from jaxgran import observables as obs
+
+BALL = {2: np.pi, 3: 4 / 3 * np.pi}
+"""Volume of a ball of radius 1."""
 
 
 def lattice(per_side, dimension):
@@ -26,31 +18,27 @@ def lattice(per_side, dimension):
     return np.array(list(points), float)
 
 
-def random_directions(n, dimension):
-    v = np.random.default_rng(dimension).normal(size=(n, dimension))
-    return v / np.linalg.norm(v, axis=1, keepdims=True)
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_sonine_coefficients_of_known_distributions(dimension):
     d = dimension
-    one_speed = random_directions(1000, d)
+    one_speed = np.random.default_rng(d).normal(size=(1000, d))
+    one_speed /= np.linalg.norm(one_speed, axis=1, keepdims=True)
     two_speeds = one_speed * np.repeat([1.0, 3.0], 500)[:, None]
     cube = np.array(list(itertools.product([-2.0, 0.0, 2.0], repeat=d)))  # <x^2> = 8/3, <x^4> = 6 x
     fourth = d * 32 / 3 + d * (d - 1) * 64 / 9
     a2 = -2 / (d + 2)
-    batch = sonine(jnp.stack([one_speed, 5 * two_speeds]))
+    batch = obs.sonine(jnp.stack([one_speed, 5 * two_speeds]))
     # Round-off of sums of 1000.
     np.testing.assert_allclose(batch, [a2, d / (d + 2) * 41 / 25 - 1], rtol=1e-12)
     exact = d / (d + 2) * fourth / (d * 8 / 3) ** 2 - 1
-    assert sonine(jnp.asarray(cube)) == pytest.approx(exact, rel=1e-12)
+    assert obs.sonine(jnp.asarray(cube)) == pytest.approx(exact, rel=1e-12)
     # All of one speed: <v^6> = <v^2>^3, and the definition by <c^6>.
     exact = 1 + 3 * a2 - d**2 / ((d + 2) * (d + 4))
-    assert third_sonine(jnp.asarray(one_speed)) == pytest.approx(exact, rel=1e-12)
+    assert obs.third_sonine(jnp.asarray(one_speed)) == pytest.approx(exact, rel=1e-12)
     # Errors sqrt(1 / (norm n)); S_2 has the norm d (d + 2) / 8, S_3 d (d + 2) (d + 4) / 48.
     maxwell = jax.random.normal(jax.random.key(0), (200_000, d))
-    assert abs(sonine(maxwell)) < 4 * np.sqrt(8 / (d * (d + 2) * 200_000))
-    assert abs(third_sonine(maxwell)) < 4 * np.sqrt(48 / (d * (d + 2) * (d + 4) * 200_000))
+    assert abs(obs.sonine(maxwell)) < 4 * np.sqrt(8 / (d * (d + 2) * 200_000))
+    assert abs(obs.third_sonine(maxwell)) < 4 * np.sqrt(48 / (d * (d + 2) * (d + 4) * 200_000))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -58,8 +46,8 @@ def test_ideal_gas_has_no_pair_correlation(dimension):
     n, side = 1500, 3.7
     rng = np.random.default_rng(0)
     edges = np.linspace(0, side / 2, 9)
-    g = pair_correlation(jnp.asarray(side * rng.random((n, dimension))), side, edges)
-    ball = {2: np.pi, 3: 4 / 3 * np.pi}[dimension] * (edges / side) ** dimension
+    g = obs.pair_correlation(jnp.asarray(side * rng.random((n, dimension))), side, edges)
+    ball = BALL[dimension] * (edges / side) ** dimension
     error = 1 / np.sqrt(n**2 / 2 * np.diff(ball))
     miss = (g - (1 - 1 / n)) / error  # a particle is no neighbour of itself
     assert np.all(np.abs(miss) < 4)
@@ -72,9 +60,8 @@ def test_ideal_gas_has_no_pair_correlation(dimension):
 )
 def test_shells_of_a_lattice(dimension, shells):
     edges = np.array([0.9, 1.1, 1.3, 1.5])
-    ball = {2: np.pi, 3: 4 / 3 * np.pi}[dimension] * edges**dimension
-    spacing = 0.5
-    g = pair_correlation(jnp.asarray(spacing * lattice(4, dimension)), 4 * spacing, spacing * edges)
+    ball = BALL[dimension] * edges**dimension
+    g = obs.pair_correlation(jnp.asarray(lattice(4, dimension) / 2), 2.0, edges / 2)
     np.testing.assert_allclose(g, shells / np.diff(ball), rtol=1e-12)  # round-off
 
 
@@ -87,7 +74,7 @@ def test_pairs_of_a_clump_are_all_counted():
     counts = np.histogram(distances[np.triu_indices(120, 1)], edges)[0]
     assert counts.sum() == 120 * 119 // 2
     expected = 120**2 / 2 / side**3 * 4 / 3 * np.pi * np.diff(edges**3)
-    g = pair_correlation(jnp.asarray(position), side, edges)
+    g = obs.pair_correlation(jnp.asarray(position), side, edges)
     np.testing.assert_allclose(g, counts / expected, rtol=1e-12)  # round-off
 
 
@@ -97,7 +84,8 @@ def test_spectra_of_an_ideal_gas(dimension):
         x, v = jax.random.split(key)
         position = 3.7 * jax.random.uniform(x, (50, dimension))
         velocity = 2.0 * jax.random.normal(v, (50, dimension))
-        return structure_factor(position, 3.7)[1], *flow_spectrum(position, velocity, 3.7)[1:]
+        flow = obs.flow_spectrum(position, velocity, 3.7)[1:]
+        return obs.structure_factor(position, 3.7)[1], *flow
 
     runs = 400
     shape, across, along = jax.vmap(spectra)(jax.random.split(jax.random.key(0), runs))
@@ -110,23 +98,22 @@ def test_spectra_of_an_ideal_gas(dimension):
 @pytest.mark.parametrize("dimension, squares", [(2, (1, 2, 4, 5, 8)), (3, (1, 2, 3, 4, 5))])
 def test_shells_of_wave_vectors(dimension, squares):
     points = np.ones((7, dimension))
-    k, shape = structure_factor(points, 3.7, num_shells=5)
+    k, shape = obs.structure_factor(points, 3.7, num_shells=5)
     np.testing.assert_allclose(k, 2 * np.pi / 3.7 * np.sqrt(squares), rtol=1e-15)
     np.testing.assert_allclose(shape, 7.0, rtol=1e-14)  # all in one place: N
-    k, shape = structure_factor(points, 3.7)
+    k, shape = obs.structure_factor(points, 3.7)
     assert k.shape == shape.shape == (4,)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_structure_factor_of_layers_and_waves(dimension):
-    per_side = 8
-    points = lattice(per_side, dimension)
-    n, side = len(points), float(per_side)
-    _, shape = structure_factor(points, side)
+    points, side = lattice(8, dimension), 8.0
+    n = len(points)
+    _, shape = obs.structure_factor(points, side)
     np.testing.assert_allclose(shape, 0.0, atol=1e-25)  # squares of round-off
     # Particles on one plane: N for the waves across it, none for those along it.
     layer = points * np.array([0.0] + [1.0] * (dimension - 1))
-    _, shape = structure_factor(layer, side)
+    _, shape = obs.structure_factor(layer, side)
     np.testing.assert_allclose(shape[0], n / dimension, rtol=1e-12)
     np.testing.assert_allclose(shape[1], 0.0, atol=1e-25)
     # A density wave along x: |sum exp(i k x)| / N is the Bessel function J_1 of its strength,
@@ -135,7 +122,7 @@ def test_structure_factor_of_layers_and_waves(dimension):
     wave = points.copy()
     phase = 2 * np.pi * points[:, 0] / side
     wave[:, 0] += strength * side / (2 * np.pi) * np.sin(phase)
-    _, shape = structure_factor(wave, side)
+    _, shape = obs.structure_factor(wave, side)
     np.testing.assert_allclose(shape[0], n * j1(strength) ** 2 / dimension, rtol=1e-6)
 
 
@@ -143,28 +130,26 @@ def test_structure_factor_of_layers_and_waves(dimension):
 def test_velocity_distribution_of_a_maxwellian_gas(dimension):
     n, edges = 200_000, np.linspace(0, 2.5, 11)
     v = 0.3 * jax.random.normal(jax.random.key(dimension), (n, dimension)) + 5.0
-    f = jax.jit(lambda v: velocity_distribution(v, edges))(v)
+    f = jax.jit(lambda v: obs.velocity_distribution(v, edges))(v)
     # Exact shares of the bins, of c^2, whose double is chi^2 of d degrees of freedom.
     share = np.diff(chi2.cdf(2 * edges**2, dimension))
-    volume = {2: np.pi, 3: 4 / 3 * np.pi}[dimension] * np.diff(edges**dimension)
+    volume = BALL[dimension] * np.diff(edges**dimension)
     miss = (np.asarray(f) * volume - share) / np.sqrt(share / n)
     assert np.sum(miss**2) < 10 + 4 * np.sqrt(20)  # chi^2 of ten bins
 
 
 def test_flow_spectrum_of_a_wave():
     # A shear wave v_y = sin(k x) on a lattice: all of it is transverse, in the first shell, where
-    # it is two of the 2 d wave vectors; |j|^2 = N/4 for each of these.
+    # it is two of the 2 d wave vectors; |j|^2 = N/4 for each of these. A sound wave v_x likewise.
     points = lattice(8, 3) + 0.3
-    k, across, along = flow_spectrum(
-        jnp.asarray(points), jnp.asarray(np.sin(np.pi / 4 * points[:, :1]) * [[0.0, 1.0, 0.0]]), 8.0
-    )
-    np.testing.assert_allclose(k, np.pi / 4 * np.sqrt([1, 2, 3, 4]), rtol=1e-14)
-    np.testing.assert_allclose(across, [512 / 4 / 3 / 2, 0, 0, 0], rtol=1e-12, atol=1e-25)
-    np.testing.assert_allclose(along, 0.0, atol=1e-25)  # squares of round-off
-    sound = jnp.asarray(np.sin(np.pi / 4 * points[:, :1]) * [[1.0, 0.0, 0.0]])
-    _, across, along = flow_spectrum(jnp.asarray(points), sound, 8.0)
-    np.testing.assert_allclose(along, [512 / 4 / 3, 0, 0, 0], rtol=1e-12, atol=1e-25)
-    np.testing.assert_allclose(across, 0.0, atol=1e-25)
+    wave = np.sin(np.pi / 4 * points[:, :1])
+    for shear in (True, False):
+        velocity = wave * np.array([[0.0, 1.0, 0.0] if shear else [1.0, 0.0, 0.0]])
+        k, across, along = obs.flow_spectrum(jnp.asarray(points), jnp.asarray(velocity), 8.0)
+        found, none = (2 * across, along) if shear else (along, across)
+        np.testing.assert_allclose(k, np.pi / 4 * np.sqrt([1, 2, 3, 4]), rtol=1e-14)
+        np.testing.assert_allclose(found, [512 / 4 / 3, 0, 0, 0], rtol=1e-12, atol=1e-25)
+        np.testing.assert_allclose(none, 0.0, atol=1e-25)  # squares of round-off
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -174,15 +159,15 @@ def test_flow_share(dimension):
     points = jnp.asarray(lattice(8, dimension) + 0.3)
     wave = jnp.zeros(points.shape).at[:, 1].set(jnp.sin(jnp.pi / 4 * points[:, 0]))
     even = 2 * waves / n  # by equipartition
-    assert float(flow_share(points, wave, 8.0)) == pytest.approx(1 - even, abs=1e-12)
+    assert float(obs.flow_share(points, wave, 8.0)) == pytest.approx(1 - even, abs=1e-12)
     short = jnp.zeros(points.shape).at[:, 1].set(jnp.sin(jnp.pi / 2 * points[:, 0]))
-    assert float(flow_share(points, short, 8.0)) == pytest.approx(-even, abs=1e-12)
-    assert float(flow_share(points, 0 * wave, 8.0)) == pytest.approx(-even, abs=1e-12)
+    for nothing in (short, 0 * wave):
+        assert float(obs.flow_share(points, nothing, 8.0)) == pytest.approx(-even, abs=1e-12)
 
     def of_heat(key):
         x, v = jax.random.split(key)
         position, heat = jax.random.uniform(x, points.shape), jax.random.normal(v, points.shape)
-        return flow_share(position, heat, 1.0)
+        return obs.flow_share(position, heat, 1.0)
 
     runs = 400
     found = jax.vmap(of_heat)(jax.random.split(jax.random.key(0), runs))
@@ -195,25 +180,25 @@ def test_flow_share(dimension):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_cells(dimension):
     points = jnp.asarray(lattice(4, dimension) + 0.5) / 2
-    density = cell_density(points, 2.0, 2)
+    density = obs.cell_density(points, 2.0, 2)
     assert density.shape == (2,) * dimension
     np.testing.assert_array_equal(density, 1.0)
-    assert number_fluctuation(points, 2.0, 2) == 0
-    np.testing.assert_array_equal(cell_density(points - 6.0, 2.0, 2), 1.0)  # an image
+    assert obs.number_fluctuation(points, 2.0, 2) == 0
+    np.testing.assert_array_equal(obs.cell_density(points - 6.0, 2.0, 2), 1.0)  # an image
     shear = jnp.where(points[:, :1] < 1, 1.0, -1.0) * jnp.eye(dimension)[-1][None]
-    flow = cell_velocity(points, shear + 7.0, 2.0, 2)
+    flow = obs.cell_velocity(points, shear + 7.0, 2.0, 2)
     sign = jnp.array([1.0, -1.0]).reshape((2,) + (1,) * (dimension - 1))
     np.testing.assert_allclose(flow[..., -1], jnp.broadcast_to(sign, density.shape), rtol=1e-13)
     np.testing.assert_allclose(flow[..., 0], 0.0, atol=1e-13)
     one = points.at[:].set(0.1)  # all in the first cell, the others empty
     clumped = (2**dimension - 1) * 2**dimension  # variance of the density, times the mean number
-    assert number_fluctuation(one, 2.0, 2) == pytest.approx(clumped, rel=1e-13)
-    assert jnp.sum(jnp.isnan(cell_velocity(one, shear, 2.0, 2)[..., 0])) == 2**dimension - 1
+    assert obs.number_fluctuation(one, 2.0, 2) == pytest.approx(clumped, rel=1e-13)
+    assert jnp.sum(jnp.isnan(obs.cell_velocity(one, shear, 2.0, 2)[..., 0])) == 2**dimension - 1
 
 
 def test_number_fluctuation_of_independent_particles():
     position = jax.random.uniform(jax.random.key(0), (400, 1000, 3))
-    found = jax.vmap(lambda x: number_fluctuation(x, 1.0, 4))(position)
+    found = jax.vmap(lambda x: obs.number_fluctuation(x, 1.0, 4))(position)
     # 1 - 1/64 by the fixed sum; chi^2 of 63 degrees of freedom each.
     assert jnp.mean(found) == pytest.approx(1 - 1 / 64, abs=4 * np.sqrt(2 / 63 / 400))
 
@@ -223,28 +208,28 @@ def test_observables_compile_and_have_batches():
     edges = np.linspace(0.1, 0.5, 5)
 
     def all_of(x, v, side):
-        g = pair_correlation(x, side, edges, centres=50)
-        return g, structure_factor(x, side), flow_spectrum(x, v, side), cell_density(x, side, 3)
+        spectra = obs.structure_factor(x, side), obs.flow_spectrum(x, v, side)
+        return spectra, obs.pair_correlation(x, side, edges, 50), obs.cell_density(x, side, 3)
 
     both = jax.jit(jax.vmap(all_of, (0, 0, None)))(position, velocity, 1.0)
     one = all_of(position[1], velocity[1], 1.0)
     for batch, single in zip(jax.tree.leaves(both), jax.tree.leaves(one), strict=True):
         np.testing.assert_allclose(batch[1], single, rtol=1e-12)  # round-off
     # Beyond half of a side that could not be checked before.
-    assert jnp.isnan(jax.jit(lambda s: pair_correlation(position[0], s, edges))(0.9)[-1])
+    assert jnp.isnan(jax.jit(lambda s: obs.pair_correlation(position[0], s, edges))(0.9)[-1])
 
 
 @pytest.mark.parametrize(
-    "call, message",
+    "function, arguments, message",
     [
-        (lambda x: pair_correlation(x, 1.0, [0.2, 0.1]), "increasing numbers >= 0, got"),
-        (lambda x: pair_correlation(x, 1.0, [0.0, 0.25, 0.51]), r"the last edge.* 0.5, got 0.51"),
-        (lambda x: pair_correlation(x, 1.0, [0.1, 0.2], centres=11), "from 1 to 10, got 11"),
-        (lambda x: structure_factor(x, 1.0, 0), "num_shells must be a whole number >= 1, got 0"),
-        (lambda x: cell_density(x, 1.0, 0), "cells must be a whole number >= 1, got 0"),
-        (lambda x: velocity_distribution(x, [0.1]), "at least two increasing numbers"),
+        (obs.pair_correlation, (1.0, [0.2, 0.1]), "increasing numbers >= 0, got"),
+        (obs.pair_correlation, (1.0, [0.0, 0.25, 0.51]), r"the last edge.* 0.5, got 0.51"),
+        (obs.pair_correlation, (1.0, [0.1, 0.2], 11), "from 1 to 10, got 11"),
+        (obs.structure_factor, (1.0, 0), "num_shells must be a whole number >= 1, got 0"),
+        (obs.cell_density, (1.0, 0), "cells must be a whole number >= 1, got 0"),
+        (obs.velocity_distribution, ([0.1],), "at least two increasing numbers"),
     ],
 )
-def test_bad_requests_are_refused(call, message):
+def test_bad_requests_are_refused(function, arguments, message):
     with pytest.raises(ValueError, match=message):
-        call(jnp.ones((10, 3)))
+        function(jnp.ones((10, 3)), *arguments)

@@ -1,9 +1,9 @@
-"""Replicas as runs of their own. One device stands for two, but for one test in another process."""
+"""Replicas as runs of their own."""
 
+import os
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,19 +13,19 @@ import pytest
 import jaxgran
 from jaxgran.data.curve import Run
 from jaxgran.particles import run
-from jaxgran.particles.run import (
-    MIN_SPHERES_PER_RUN,
-    block_until_ready,
-    replica_devices,
-    run_replicas,
-)
+from jaxgran.particles.run import block_until_ready, replica_devices, run_replicas
 
+DEVICES = "JAX_NUM_CPU_DEVICES"
 TIMES = jnp.array([0.01, 0.03])
 MODELS = {"DSMC": 200, "HardSpheres": 20, "SoftSpheres": 20}
 
 
 @pytest.fixture
 def two_devices(monkeypatch):
+    """One device stands for two, where there are not two."""
+    if DEVICES in os.environ:
+        assert jax.device_count() == 2
+        return
     device = jax.devices()[0]
     monkeypatch.setattr(run, "replica_devices", lambda n, *_: (device,) * 2 if n > 1 else ())
 
@@ -53,6 +53,7 @@ def test_a_replica_is_the_same_whatever_their_number(beads, two_devices, tmp_pat
     np.testing.assert_array_equal(two.replicas.saved[1], alone.replicas.saved[0])
     np.testing.assert_array_equal(two.particles.velocity, three.particles.velocity[:2])
     np.testing.assert_array_equal(two.particles.position[1], alone.particles.position[0])
+    assert not np.array_equal(*two.replicas.temperature)
     assert two.temperature_error.shape == TIMES.shape
     assert two.saved.shape == (2, 2)  # times, and the two numbers of `fastest`
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.0.xyz", "run.1.xyz"]
@@ -62,9 +63,8 @@ def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
     gas, path = beads(packing_fraction=0.1), tmp_path / "run.ckpt"
     curve = cool(gas, "DSMC", 2, checkpoint=path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.ckpt.0", "run.ckpt.1"]
-    np.testing.assert_array_equal(
-        cool(gas, "DSMC", 2, checkpoint=path).temperature, curve.temperature
-    )
+    again = cool(gas, "DSMC", 2, checkpoint=path)
+    np.testing.assert_array_equal(again.temperature, curve.temperature)
     path.touch()
     with pytest.raises(ValueError, match="written by replicas in one array"):
         cool(gas, "DSMC", 2, checkpoint=path)
@@ -86,7 +86,7 @@ def test_an_error_of_one_ends_the_others_and_is_raised():
 
 def test_replicas_stand_in_one_array_where_there_is_one_device_or_a_chosen_one():
     assert replica_devices(1) == () and replica_devices(2) == ()
-    many = MIN_SPHERES_PER_RUN
+    many = run.MIN_SPHERES_PER_RUN
     assert replica_devices(2, many - 1) == replica_devices(1, many) == ()
     assert replica_devices(2, many) == tuple(jax.devices())
     with jax.default_device(jax.devices()[0]):
@@ -106,7 +106,8 @@ def test_large_replicas_on_one_device_run_in_turn(name, beads, monkeypatch):
 
 @pytest.mark.slow  # two devices need a process of their own, which compiles for each
 def test_two_real_devices():
-    command = [sys.executable, "-m", "tests.particles.two_devices", "HardSpheres"]
-    root = Path(__file__).parents[2]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
-    assert "independent on 2 devices" in done.stdout, done.stderr
+    test = f"{__file__}::{test_a_replica_is_the_same_whatever_their_number.__name__}"
+    command = [sys.executable, "-m", "pytest", "-n0", "-m", "slow", "-p", "no:cacheprovider", test]
+    with_two = os.environ | {DEVICES: "2"}
+    done = subprocess.run(command, env=with_two, capture_output=True, text=True, check=False)
+    assert "1 passed" in done.stdout, done.stdout
