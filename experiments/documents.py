@@ -20,7 +20,7 @@ from typing import Any
 
 import jinja2
 
-from experiments.support.dot_plots import PLOTS, drawn
+from experiments.support.dot_plots import PLOTS
 from experiments.support.record import EXPERIMENTS, FIGURES, PICTURES, figures
 
 ROOT = EXPERIMENTS.parent
@@ -39,12 +39,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--pictures", action="store_true", help="draw pictures from the figures, too"
-    )
+    parser.add_argument("--pictures", action="store_true", help="draw pictures of the figures, too")
     if parser.parse_args().pictures:
-        for name, plot in PLOTS.items():
-            drawn(plot(figures(name))).savefig(PICTURES / f"{Path(name).name}.png", dpi=110)
+        for name, (dots, draw) in PLOTS.items():
+            draw(dots(figures(name))).savefig(PICTURES / f"{Path(name).name}.png", dpi=110)
     for path, text in documents(recorded()).items():
         path.write_text(text, encoding="utf-8")
 

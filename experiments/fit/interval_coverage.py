@@ -28,7 +28,7 @@ import numpy as np
 import jaxgran
 from experiments.accuracy.make_lammps_curves import simulate
 from experiments.support.analysis import fit_quietly, replicas_of
-from experiments.support.dot_plots import Dot, DotPlot, drawn
+from experiments.support.dot_plots import Dot, drawn
 from experiments.support.record import DATA, Options, figures, run_parts
 from experiments.support.scenes import beads, cool
 
@@ -113,7 +113,7 @@ def coverage_in_clusters(options: Options) -> dict:
         ratio, half = fits[-1]["ratio"], NORMAL * fits[-1]["error"]
         dots.append(Dot(f"run {number}", ratio, ratio - half, ratio + half, "soft spheres"))
     found = {"box_over_critical": float(gas.box_side(SIZE) / gas.critical_box)}
-    picture = drawn(DotPlot(dots, "A over the true A", (1.0, "true A")))
+    picture = drawn(dots, "A over the true A", (1.0, "true A"))
     return found | statistics(fits) | {"fits": fits, "picture": picture}
 
 
