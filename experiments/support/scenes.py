@@ -91,6 +91,12 @@ def of_lammps(name: str) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve, dict[str, s
     return gas.replace(dissipative_constant=header_number(header, "A")), curve, header
 
 
+def temperature_only(curve: jaxgran.CoolingCurve) -> jaxgran.CoolingCurve:
+    """Return the curve without what was measured besides T."""
+    error = curve.temperature_error
+    return jaxgran.CoolingCurve(curve.times, curve.temperature, temperature_error=error)
+
+
 def times_of(
     gas: jaxgran.Gas,
     collisions: Any,
