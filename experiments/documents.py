@@ -32,9 +32,8 @@ RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def main() -> None:
     """Write all documents."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    as_written = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=as_written)
     parser.add_argument("--pictures", action="store_true", help="draw pictures of the figures, too")
     if parser.parse_args().pictures:
         for name, (dots, draw) in PLOTS.items():

@@ -13,7 +13,6 @@ import os
 import platform
 import pprint
 import shlex
-import statistics
 import subprocess
 import sys
 import time
@@ -69,9 +68,8 @@ def run_parts(
     """
     parts = {function.__name__: function for function in functions} | dict(named or {})
     script = Path(sys.argv[0]).stem
-    parser = argparse.ArgumentParser(
-        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    as_written = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=doc, formatter_class=as_written)
     parser.set_defaults(smoke=False, only=list(default or parts))
     parser.add_argument("--out", type=Path, default=Path("results") / script)
     parser.add_argument("--record", action="store_true", help="write figures of the documents")
@@ -184,14 +182,12 @@ def seconds(run: Callable, repeats: int = 3) -> tuple[float, float]:
         begin = time.perf_counter()
         jax.block_until_ready(run())
         took.append(time.perf_counter() - begin)
-    run_time = statistics.median(took[1:])
+    run_time = float(np.median(took[1:]))
     return max(took[0] - run_time, 0.0), run_time
 
 
-def process(
-    *arguments: Any, folder: Path = EXPERIMENTS.parent, **variables: str
-) -> subprocess.CompletedProcess:
-    """Run Python in a separate process, with the version of jaxgran in a folder.
+def process(*arguments: Any, folder: Path = EXPERIMENTS.parent, **variables: str) -> str:
+    """Return what Python prints in a separate process, with the version of jaxgran in a folder.
 
     Settings of JAX and of its caches are left out.
 
@@ -202,12 +198,10 @@ def process(
     path = os.pathsep.join(filter(None, [str(folder.resolve()), os.environ.get("PYTHONPATH")]))
     bare |= {"PYTHONPATH": path} | variables
     command = [sys.executable, *map(str, arguments)]
-    done = subprocess.run(
-        command, env=bare, cwd=folder, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(command, env=bare, cwd=folder, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"the version in {folder} does not run:\n{done.stderr}")
-    return done
+    return done.stdout
 
 
 def alone(function: Callable, *arguments: Any) -> dict:
@@ -220,7 +214,7 @@ def alone(function: Callable, *arguments: Any) -> dict:
         "jax.config.update('jax_enable_x64', True)\n"
         f"print(as_json({function.__name__}(*json.loads(sys.argv[1])), indent=None), end='')"
     )
-    return json.loads(process("-c", code, json.dumps(arguments)).stdout.splitlines()[-1])
+    return json.loads(process("-c", code, json.dumps(arguments)).splitlines()[-1])
 
 
 def each_alone(function: Callable, jobs: Iterable[Sequence]) -> Iterator[dict]:
@@ -236,7 +230,7 @@ def of_version(folder: Path, task: str, curve: Path, num: int = 0) -> dict[str, 
         SystemExit: if it fails, or if another version is imported.
     """
     script = EXPERIMENTS / "support" / "version.py"
-    found = json.loads(process(script, task, curve, num, folder=folder).stdout.splitlines()[-1])
+    found = json.loads(process(script, task, curve, num, folder=folder).splitlines()[-1])
     if not Path(found["package"]).is_relative_to(folder.resolve()):
         raise SystemExit(f"the version in {folder} was not imported, but {found['package']}")
     return found["steps"]

@@ -98,11 +98,7 @@ def temperature_only(curve: jaxgran.CoolingCurve) -> jaxgran.CoolingCurve:
 
 
 def times_of(
-    gas: jaxgran.Gas,
-    collisions: Any,
-    model: jaxgran.AbstractModel | None = None,
-    last: float = 1e6,
-    points: int = 400,
+    gas: jaxgran.Gas, collisions: Any, model: Any = None, last: float = 1e6, points: int = 400
 ) -> np.ndarray:
     """Return times at which a particle has made these numbers of collisions on average.
 
