@@ -62,10 +62,8 @@ def twin(gas: jaxgran.Gas, key: int) -> jaxgran.CoolingCurve:
     exact = cool(gas, times, jaxgran.HardSpheres(NUM_PARTICLES), key)
     noise = np.exp(ERROR * np.random.default_rng(key).standard_normal((2, POINTS)))
     T, T_rot = exact.temperature * noise[0], exact.rotational_temperature * noise[1]
-    curve = jaxgran.CoolingCurve(times, T, temperature_error=ERROR * T)
-    return dataclasses.replace(
-        curve, rotational_temperature=T_rot, rotational_temperature_error=ERROR * T_rot
-    )
+    rotation = {"rotational_temperature": T_rot, "rotational_temperature_error": ERROR * T_rot}
+    return jaxgran.CoolingCurve(times, T, temperature_error=ERROR * T, **rotation)
 
 
 def fitted(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> tuple[jaxgran.Fit, jaxgran.Fit]:
