@@ -50,8 +50,8 @@ def scene() -> jaxgran.Gas:
         now = gas.replace(dissipative_constant=np.exp(log_A))
         return float(now.restitution(gas.impact_speed)) - EPS
 
-    found = root_scalar(excess, bracket=(np.log(1e-9), np.log(1e-2)), xtol=1e-14)
-    return gas.replace(dissipative_constant=np.exp(found.root))
+    log_A = root_scalar(excess, bracket=(np.log(1e-9), np.log(1e-2)), xtol=1e-14).root
+    return gas.replace(dissipative_constant=np.exp(log_A))
 
 
 def twin(gas: jaxgran.Gas, key: int) -> jaxgran.CoolingCurve:

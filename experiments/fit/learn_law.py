@@ -122,8 +122,8 @@ def learn_law(options: Options) -> dict:
         gas, curve, header = of_lammps(name)
         after = jax.tree.map(lambda x: x[1:], temperature_only(curve))  # the start
         worlds[f"LAMMPS, {name}"] = [judge(gas, learn(gas, after, int(header["N"])))]
-    found = {"worlds": {name: summary(rows) for name, rows in worlds.items()}}
-    return found | {"beads": summary(beads), "picture": draw(shown)}
+    found = {name: summary(rows) for name, rows in worlds.items()}
+    return {"worlds": found, "beads": summary(beads), "picture": draw(shown)}
 
 
 def with_drops(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, size: int) -> dict:

@@ -67,11 +67,10 @@ def run_parts(
         The results of the parts.
     """
     parts = {function.__name__: function for function in functions} | dict(named or {})
-    script = Path(sys.argv[0]).stem
     as_written = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=doc, formatter_class=as_written)
     parser.set_defaults(smoke=False, only=list(default or parts))
-    parser.add_argument("--out", type=Path, default=Path("results") / script)
+    parser.add_argument("--out", type=Path, default=Path("results") / Path(sys.argv[0]).stem)
     parser.add_argument("--record", action="store_true", help="write figures of the documents")
     if smoke:
         parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
