@@ -12,7 +12,6 @@ the output of this script. With --pictures the pictures that show only recorded 
 """
 
 import argparse
-import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,57 +19,42 @@ from typing import Any
 
 import jinja2
 
-from experiments.support.dot_plots import PLOTS, drawn
+from experiments.support.dot_plots import PLOTS
 from experiments.support.record import EXPERIMENTS, FIGURES, PICTURES, figures
 
 ROOT = EXPERIMENTS.parent
 TEMPLATES = EXPERIMENTS / "templates"
-BLOCKS = {
-    "models": ROOT / "README.md",
-    "dilute": ROOT / "README.md",
-    "gallery": EXPERIMENTS / "README.md",
-}
+FRONT = ROOT / "README.md"
+BLOCKS = {"models": FRONT, "dilute": FRONT, "gallery": EXPERIMENTS / "README.md"}
 USUAL = {"version": "0.1.0", "machine": "two-core CPU", "precision": "float64"}
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def main() -> None:
     """Write all documents."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--pictures", action="store_true", help="draw pictures from the figures, too"
-    )
+    as_written = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=as_written)
+    parser.add_argument("--pictures", action="store_true", help="draw pictures of the figures, too")
     if parser.parse_args().pictures:
-        for name, plot in PLOTS.items():
-            drawn(plot(figures(name))).savefig(PICTURES / f"{Path(name).name}.png", dpi=110)
+        for name, (dots, draw) in PLOTS.items():
+            draw(dots(figures(name))).savefig(PICTURES / f"{Path(name).name}.png", dpi=110)
     for path, text in documents(recorded()).items():
         path.write_text(text, encoding="utf-8")
 
 
 def recorded() -> dict[str, Any]:
     """Return all recorded figures, by the name of their file; those of tests in "tests"."""
-
-    def read(folder: Path) -> dict[str, Any]:
-        paths = folder.glob("*.json")
-        return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
-
-    return read(FIGURES) | {"tests": read(FIGURES / "tests")}
+    of_tests = {path.stem: figures(f"tests/{path.stem}") for path in FIGURES.glob("tests/*.json")}
+    return {path.stem: figures(path.stem) for path in FIGURES.glob("*.json")} | {"tests": of_tests}
 
 
 def documents(found: dict[str, Any]) -> dict[Path, str]:
     """Return the text of each generated document, by its path."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {
-        f.__name__: f for f in (each, errors, made, measured, of, pick, power, span)
-    }
+    blanks = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
+    loader = jinja2.FileSystemLoader(TEMPLATES)
+    environment = jinja2.Environment(loader=loader, undefined=jinja2.StrictUndefined, **blanks)
+    filters = each, errors, made, measured, of, pick, power, span
+    environment.filters |= {f.__name__: f for f in filters}
     written: dict[Path, str] = {}
     for template in sorted(TEMPLATES.glob("*.md")):
         name, text = template.stem, environment.get_template(template.name).render(found)

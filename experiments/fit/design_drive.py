@@ -18,20 +18,14 @@ from experiments.support.record import Options, run_parts
 
 INTERVALS, POINTS = 12, 8
 LENGTH = 8.0  # of an interval, in mean free times
-BEADS = jaxgran.Viscoelastic(5e7, 0.22, 5e-6)
 
 
 def design_drive(options: Options) -> dict:
-    gas = jaxgran.Gas(
-        BEADS,
-        diameter=2e-3,
-        mass=1e-5,
-        packing_fraction=0.05,
-        temperature=0.01,
-        drive=jaxgran.WhiteNoise(0.01),
-    )
-    within = LENGTH * gas.mean_free_time * jnp.arange(1, POINTS + 1) / POINTS
-    t = within[-1] * jnp.arange(1, INTERVALS * POINTS + 1) / (INTERVALS * POINTS) * INTERVALS
+    law, size = jaxgran.Viscoelastic(5e7, 0.22, 5e-6), {"diameter": 2e-3, "mass": 1e-5}
+    drive = jaxgran.WhiteNoise(0.01)
+    gas = jaxgran.Gas(law, **size, packing_fraction=0.05, temperature=0.01, drive=drive)
+    t = LENGTH * gas.mean_free_time * jnp.arange(1, INTERVALS * POINTS + 1) / POINTS
+    within = t[:POINTS]
     wanted = gas.temperature * (1 + jnp.sin(2 * jnp.pi * t / t[-1]) ** 2)
 
     def course(log_strengths):
@@ -42,32 +36,28 @@ def design_drive(options: Options) -> dict:
 
         return jnp.ravel(jax.lax.scan(interval, gas.temperature, log_strengths)[1])
 
-    @jax.jit
-    def step(log_strengths, state):
-        def miss(x):
-            return jnp.mean(jnp.log(course(x) / wanted) ** 2)
+    def square(log_strengths):
+        return jnp.mean(jnp.log(course(log_strengths) / wanted) ** 2)
 
-        value, gradient = jax.value_and_grad(miss)(log_strengths)
+    def step(carry, _):
+        log_strengths, state = carry
+        value, gradient = jax.value_and_grad(square)(log_strengths)
         updates, state = solver.update(gradient, state)
-        return optax.apply_updates(log_strengths, updates), state, value
+        return (optax.apply_updates(log_strengths, updates), state), jnp.sqrt(value)
 
-    solver = optax.adam(0.1)
-    log_strengths = jnp.full(INTERVALS, jnp.log(gas.temperature / t[-1]))
-    first, state, misses = log_strengths, solver.init(log_strengths), []
-    for _ in range(10 if options.smoke else 200):
-        log_strengths, state, miss = step(log_strengths, state)
-        misses.append(float(miss) ** 0.5)
+    solver, first = optax.adam(0.1), jnp.full(INTERVALS, jnp.log(gas.temperature / t[-1]))
+    start, steps = (first, solver.init(first)), 10 if options.smoke else 200
+    (log_strengths, _), misses = jax.lax.scan(step, start, length=steps)
     largest = float(jnp.max(jnp.abs(course(log_strengths) / wanted - 1)))
     figure, (top, bottom) = panels(1, 2, size=(6, 2.25), sharex=True, height_ratios=[2, 1])
     top.plot(t, wanted, color=INK, linestyle="--", label="wanted")
     top.plot(t, course(first), color=GUIDE, label="first guess")
     top.plot(t, course(log_strengths), color=THEORY, label="with this drive")
     caption(top, ylabel="T (m²/s²)")
-    edges = float(within[-1]) * np.arange(INTERVALS + 1)
-    bottom.stairs(np.exp(log_strengths), edges, fill=True, color=HARD)
+    strengths, edges = jnp.exp(log_strengths), np.append(0.0, t[POINTS - 1 :: POINTS])
+    bottom.stairs(strengths, edges, fill=True, color=HARD)
     caption(bottom, xlabel="t (s)", ylabel="drive (m²/s³)")
-    found = {"misses": misses, "largest": largest, "strengths": np.exp(log_strengths)}
-    return found | {"picture": figure}
+    return {"misses": misses, "largest": largest, "strengths": strengths, "picture": figure}
 
 
 if __name__ == "__main__":

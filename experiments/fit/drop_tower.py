@@ -27,7 +27,7 @@ import jaxgran
 from experiments.support.analysis import fit_quietly
 from experiments.support.plots import GUIDE, INK, THEORY, caption, panels
 from experiments.support.record import Options, run_parts
-from experiments.support.scenes import cool
+from experiments.support.scenes import cool, temperature_only
 
 NUM_PARTICLES, DIAMETER, SIDE = 300, 6e-3, 0.1
 EPS, BETA_T, RATIO = 0.85, 0.0, 2 / 3
@@ -50,40 +50,28 @@ def scene() -> jaxgran.Gas:
         now = gas.replace(dissipative_constant=np.exp(log_A))
         return float(now.restitution(gas.impact_speed)) - EPS
 
-    found = root_scalar(excess, bracket=(np.log(1e-9), np.log(1e-2)), xtol=1e-14)
-    return gas.replace(dissipative_constant=np.exp(found.root))
+    log_A = root_scalar(excess, bracket=(np.log(1e-9), np.log(1e-2)), xtol=1e-14).root
+    return gas.replace(dissipative_constant=np.exp(log_A))
 
 
 def twin(gas: jaxgran.Gas, key: int) -> jaxgran.CoolingCurve:
     """Simulate a single run of hard spheres, with errors of T and T_rot."""
     theory = cool(gas, np.geomspace(0.01, 100.0, 400))
-    fallen = np.asarray(theory.temperature) < 0.05 * float(gas.temperature)
-    end = float(theory.times[np.argmax(fallen)])
+    end = float(theory.times[jnp.argmax(theory.temperature < 0.05 * gas.temperature)])
     times = np.linspace(end / POINTS, end, POINTS)
     exact = cool(gas, times, jaxgran.HardSpheres(NUM_PARTICLES), key)
-    rng = np.random.default_rng(key)
-    T, T_rot = (
-        jnp.asarray(x) * np.exp(ERROR * rng.standard_normal(POINTS))
-        for x in (exact.temperature, exact.rotational_temperature)
-    )
-    return jaxgran.CoolingCurve(
-        times=jnp.asarray(times),
-        temperature=T,
-        temperature_error=ERROR * T,
-        rotational_temperature=T_rot,
-        rotational_temperature_error=ERROR * T_rot,
-    )
+    noise = np.exp(ERROR * np.random.default_rng(key).standard_normal((2, POINTS)))
+    T, T_rot = exact.temperature * noise[0], exact.rotational_temperature * noise[1]
+    rotation = {"rotational_temperature": T_rot, "rotational_temperature_error": ERROR * T_rot}
+    return jaxgran.CoolingCurve(times, T, temperature_error=ERROR * T, **rotation)
 
 
 def fitted(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> tuple[jaxgran.Fit, jaxgran.Fit]:
     """Fit a run as smooth spheres without walls, and with the complete scene."""
     unknown = gas.replace(dissipative_constant=0.0, tangential_restitution=0.0)
     smooth = dataclasses.replace(unknown, surface=None, container=None)
-    alone = dataclasses.replace(
-        curve, rotational_temperature=None, rotational_temperature_error=None
-    )
     free = ("dissipative_constant", "temperature")
-    first = fit_quietly(smooth, alone, free=free, num_particles=NUM_PARTICLES)
+    first = fit_quietly(smooth, temperature_only(curve), free=free, num_particles=NUM_PARTICLES)
     free = ("dissipative_constant", "tangential_restitution", "rotational_temperature")
     return first, fit_quietly(unknown, curve, free=free, num_particles=NUM_PARTICLES)
 
@@ -92,18 +80,18 @@ def drop_tower(options: Options) -> dict:
     gas = scene()
     A = float(gas.value("dissipative_constant"))
     curves = [twin(gas, key) for key in range(options.runs)]
-    rows = [fitted(gas, curve) for curve in curves]
-    right = [float(complete.estimate[0]) / A for _, complete in rows]
-    errors = [float(complete.standard_error[0]) / A for _, complete in rows]
-    found = [float(s.estimate[0]) / A for s, _ in rows if not s.undetermined()]
+    smooth, complete = zip(*(fitted(gas, curve) for curve in curves), strict=True)
+    right = [float(fit.estimate[0]) / A for fit in complete]
+    errors = [float(fit.standard_error[0]) / A for fit in complete]
+    found = [float(fit.estimate[0]) / A for fit in smooth if not fit.undetermined()]
     return {
         "A_over_true": right,
         "error_over_true": errors,
         "held": sum(abs(x - 1) < 1.96 * error for x, error in zip(right, errors, strict=True)),
-        "runs": len(rows),
-        "smooth_undetermined": len(rows) - len(found),
+        "runs": options.runs,
+        "smooth_undetermined": options.runs - len(found),
         "smooth_over_true": found,
-        "picture": draw(curves[0], rows[0], A),
+        "picture": draw(curves[0], smooth[0], complete[0], A),
     }
 
 
@@ -114,25 +102,20 @@ def in_words(result: jaxgran.Fit, A: float) -> str:
     return f"{result.estimate[0] / A:.2f} ± {result.standard_error[0] / A:.2f}"
 
 
-def draw(curve: jaxgran.CoolingCurve, fits: tuple, A: float):
+def draw(curve: jaxgran.CoolingCurve, smooth: jaxgran.Fit, complete: jaxgran.Fit, A: float):
     """Draw T and T_rot of a run, with both fits."""
-    smooth, complete = fits
     figure, (axes,) = panels(size=(7.0, 4.6))
     for name, color, label in (
         ("temperature", INK, "$T$, one simulated run"),
         ("rotational_temperature", GUIDE, r"$T_\mathrm{rot}$, the same run"),
     ):
-        style = {"fmt": "o", "markersize": 4, "capsize": 2, "color": color, "label": label}
-        values, error = getattr(curve, name), getattr(curve, f"{name}_error")
-        axes.errorbar(curve.times, values, error, **style)
+        T, style = getattr(curve, name), {"fmt": "o", "markersize": 4, "capsize": 2}
+        axes.errorbar(curve.times, T, ERROR * T, color=color, label=label, **style)
     told = f"rough spheres between walls: A over the true A {in_words(complete, A)}"
     untold = f"smooth spheres, no walls: A over the true A {in_words(smooth, A)}"
-    for values, style, label in (
-        (complete.curve.temperature, "-", told),
-        (complete.curve.rotational_temperature, ":", None),
-        (smooth.curve.temperature, "--", untold),
-    ):
-        axes.plot(curve.times, values, style, color=THEORY, label=label)
+    axes.plot(curve.times, complete.curve.temperature, color=THEORY, label=told)
+    axes.plot(curve.times, complete.curve.rotational_temperature, ":", color=THEORY)
+    axes.plot(curve.times, smooth.curve.temperature, "--", color=THEORY, label=untold)
     caption(axes, yscale="log", xlabel="t (s)", ylabel="temperature (m²/s²)")
     return figure
 

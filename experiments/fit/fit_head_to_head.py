@@ -32,9 +32,7 @@ the true values. A simulation with tangents counts as one.
 """
 
 import dataclasses
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -43,8 +41,9 @@ import optax
 import scipy.optimize
 
 import jaxgran
-from experiments.support.record import Options, alone, run_parts, seconds
-from experiments.support.scenes import cool, of_lammps
+from experiments.support.analysis import from_here
+from experiments.support.record import Options, each_alone, run_parts, seconds
+from experiments.support.scenes import cool, of_lammps, temperature_only
 
 PARAMETERS = ("dissipative_constant", "temperature")
 OFF = np.log([0.5, 1.2])  # the first guess over the true values, in logarithms
@@ -84,12 +83,10 @@ def dense() -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
 def stochastic(options: Options) -> Problem:
     gas, curve = dense()
     size = 1000 if options.smoke else 20_000
-    model, other = (jaxgran.DSMC(size, replicas=replicas) for replicas in (2, 8))
-    made = cool(gas, curve.times, other, KEY + 1)
-    columns = made.times, made.temperature, made.temperature_error
+    made = cool(gas, curve.times, jaxgran.DSMC(size, replicas=8), KEY + 1)
     # All replicas start from the same temperature.
-    times, T, error = (x[made.times > 0] for x in columns if x is not None)
-    return Problem(gas, jaxgran.CoolingCurve(times, T, temperature_error=error), model)
+    later = jax.tree.map(lambda x: x[1:], temperature_only(made))
+    return Problem(gas, later, jaxgran.DSMC(size, replicas=2))
 
 
 def soft_spheres(options: Options) -> Problem:
@@ -134,41 +131,40 @@ def search_law(count: int, number: int, size: int, *most: int) -> dict:
         weighted = apart / (np.sqrt(1.5) * error / T)
         return np.append(weighted, at(flat).law.prior_residuals())
 
-    def of_theory(flat: np.ndarray) -> np.ndarray:
+    def of_theory(flat) -> jax.Array:
         """Return steps of the clock, in standard errors, and the prior."""
-        steps_of_clock = np.diff(np.asarray(log_T(flat)) / slope, prepend=0.0)
-        return np.append(steps_of_clock / np.sqrt(share * steps), at(flat).law.prior_residuals())
+        steps_of_clock = jnp.diff(log_T(flat) / slope, prepend=0.0)
+        return jnp.append(steps_of_clock / np.sqrt(share * steps), at(flat).law.prior_residuals())
 
-    ends = [best + x for x in 0.01 * np.concatenate([np.eye(count), -np.eye(count)])]
-    columns = np.stack([of_theory(x) for x in ends], axis=1)
-    jacobian = (columns[:, :count] - columns[:, count:]) / 0.02
+    jacobian = np.asarray(jax.jacfwd(of_theory)(jnp.asarray(best)))
     by_data = jacobian[: times.size].T @ jacobian[: times.size]
     determined = float(np.trace(np.linalg.solve(jacobian.T @ jacobian, by_data)))
     gradient = jax.value_and_grad(lambda x: jnp.sum(log_T(x, model) ** 2))
-    run_s = seconds(lambda: log_T(best, model), 3)[1]
-    gradient_s = seconds(lambda: gradient(best), 3)[1]
+    slower = seconds(lambda: gradient(best))[1] / seconds(lambda: log_T(best, model))[1]
     first = best + np.log(2.0)
     options = {"max_steps": most[0], "solver": optax.adam(0.1), "progress": False}
     options |= {"model": model, "free": (name,), "start": at(first), "key": jax.random.key(KEY)}
     course = np.log(jaxgran.fit(true, curve, **options).minima.trace.parameters)
+    chi2, of_simplex = recorded(lambda flat: float(np.sum(residuals(flat) ** 2)))
+    nelder_mead(chi2, first, None, most[1], -0.3 * np.ones(count))
     guesses = {
         "jaxgran.fit, optax": [course[k // 2 : k + 1].mean(0) for k in range(len(course))],
-        "Nelder-Mead": simplex(residuals, first, most[1]),
+        "Nelder-Mead": of_simplex,
         "finite differences": differences(residuals, first, most[1]),
     }
     exact = of_theory(best)
-    distances = {
-        search: [float(np.linalg.norm(of_theory(x) - exact)) / determined**0.5 for x in of_search]
-        for search, of_search in guesses.items()
-    }
-    return {"determined": determined, "gradient_over_run": gradient_s / run_s} | distances
+
+    def distance(flat) -> float:
+        return float(np.linalg.norm(of_theory(flat) - exact)) / determined**0.5
+
+    found = {search: list(map(distance, course)) for search, course in guesses.items()}
+    return {"gradient_over_run": slower} | found
 
 
-def needed(inside: Sequence[bool]) -> int | None:
+def needed(inside: np.ndarray) -> int | None:
     """Return the number of simulations after which a search stays inside; None for never."""
-    outside = [k for k, x in enumerate(inside) if not x]
-    first = outside[-1] + 1 if outside else 0
-    return first + 1 if first < len(inside) else None
+    first = from_here(inside, np.arange(1, inside.size + 1))
+    return None if np.isnan(first) else int(first)
 
 
 def recorded(function: Callable) -> tuple[Callable, list[np.ndarray]]:
@@ -183,13 +179,6 @@ def recorded(function: Callable) -> tuple[Callable, list[np.ndarray]]:
         return value
 
     return chi2, guesses
-
-
-def simplex(residuals: Callable, first: np.ndarray, most: int) -> list[np.ndarray]:
-    """Return the best point of Nelder and Mead's search after each simulation."""
-    chi2, guesses = recorded(lambda flat: float(np.sum(residuals(flat) ** 2)))
-    nelder_mead(chi2, first, None, most, -0.3 * np.ones(first.size))
-    return guesses
 
 
 def differences(residuals: Callable, first: np.ndarray, most: int) -> list[np.ndarray]:
@@ -218,55 +207,41 @@ def fit_laws(options: Options) -> Iterator[dict]:
     counts, curves, *settings = (1, 3, 10, 30), range(4), 1000, 60, 100
     if options.smoke:
         counts, curves, *settings = (3,), range(1), 60, 4, 10
-    jobs = [(count, number) for count in counts for number in curves]
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        each = pool.map(lambda job: alone(search_law, *job, *settings), jobs)
-        found = dict(zip(jobs, each, strict=True))
     for count in counts:
-        each = [found[count, number] for number in curves]
-        medians = {
-            name: float(np.median([x.pop(name) for x in each]))
-            for name in ("determined", "gradient_over_run")
-        }
+        each = list(each_alone(search_law, [(count, number, *settings) for number in curves]))
+        gradient_over_run = float(np.median([x.pop("gradient_over_run") for x in each]))
         for search in each[0]:
             most = max(len(x[search]) for x in each)
             square = [np.square(x[search] + x[search][-1:] * (most - len(x[search]))) for x in each]
             distance = np.sqrt(np.mean(square, axis=0))
             row = {"search": search, "parameters": count, "simulations": needed(distance < 1.5)}
-            yield row | {"all_simulations": most, "distance": distance[[0, -1]]} | medians
+            row |= {"all_simulations": most, "distance": distance[[0, -1]]}
+            yield row | {"gradient_over_run": gradient_over_run}
 
 
 def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[dict]:
     first, reach, most = OFF[:count], REACH[:count], 3 if smoke else MOST[count]
-    # Measures the scatter of the replicas.
-    warm, curve = problem.simulated(first), problem.curve
-    scatter = np.asarray(warm.temperature_error / warm.temperature)[1:]
-    error = np.asarray(curve.temperature_error / curve.temperature)[1:]
+    # The simulation measures the scatter of the replicas.
+    both = problem.simulated(first), problem.curve
+    scatter, error = (np.asarray(x.temperature_error / x.temperature)[1:] for x in both)
     sigma = np.hypot(error, np.sqrt(np.mean(scatter**2)))
-    measured = np.log(np.asarray(curve.temperature))[1:]
+    measured = np.log(np.asarray(problem.curve.temperature))[1:]
 
     def misfit(point) -> float:
         computed = np.asarray(problem.simulated(point).temperature)
         return float(np.sum(((measured - np.log(computed)[1:]) / sigma) ** 2))
 
-    searches: dict[str, Callable | None] = {"jaxgran.fit": None}
-    searches |= {"bounded scalar": bounded} if count == 1 else {}
+    searches = {"bounded scalar": bounded} if count == 1 else {}
     searches |= {"Nelder-Mead": nelder_mead, "differential evolution": differential_evolution}
+    found = {"jaxgran.fit": with_derivatives(problem, count, most)}
     for name, search in searches.items():
-        if search is None:
-            guesses = with_derivatives(problem, count, most)
-        else:
-            chi2, guesses = recorded(misfit)
-            search(chi2, first, list(zip(first - reach, first + reach, strict=True)), most)
-        yield {
-            "scene": scene,
-            "search": name,
-            "free": PARAMETERS[:count],
-            "simulations": needed([np.abs(guess).max() < WITHIN for guess in guesses]),
-            "all_simulations": len(guesses),
-            "last_error": np.exp(guesses[-1]) - 1,
-            "guesses": np.exp(guesses),
-        }
+        chi2, found[name] = recorded(misfit)
+        search(chi2, first, list(zip(first - reach, first + reach, strict=True)), most)
+    for name, guesses in found.items():
+        row = {"scene": scene, "search": name, "free": PARAMETERS[:count]}
+        row["simulations"] = needed(np.abs(guesses).max(axis=1) < WITHIN)
+        row |= {"all_simulations": len(guesses), "last_error": np.exp(guesses[-1]) - 1}
+        yield row | {"guesses": np.exp(guesses)}
 
 
 def with_derivatives(problem: Problem, count: int, most: int) -> list[np.ndarray]:

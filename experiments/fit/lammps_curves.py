@@ -16,16 +16,13 @@ from experiments.support.record import DATA, PICTURES, Options, run_parts
 from jaxgran.cli.main import main as command
 
 NAMES = ("dilute", "dense", "phi003", "phi003_large", "phi010", "phi025")
-DILUTE, DENSE, *OTHERS = (str(DATA / f"lammps_cooling_{name}.csv") for name in NAMES)
-SOFT = ["--model", "soft-spheres"]
-CASES = {
-    "dilute": [DILUTE],
-    "dense": [DENSE],
-    "dense_T0": [DENSE, "--free", "A", "T0"],
-    **{name: [curve] for name, curve in zip(NAMES[2:], OTHERS, strict=True)},
-    "dense_soft_spheres": [DENSE, *SOFT],
-    "dense_soft_spheres_T0": [DENSE, *SOFT, "--free", "A", "T0"],
-    "dilute_soft_spheres": [DILUTE, *SOFT, "--replicas", "2"],
+CURVES = {name: str(DATA / f"lammps_cooling_{name}.csv") for name in NAMES}
+SOFT, T_0 = ["--model", "soft-spheres"], ["--free", "A", "T0"]
+CASES = {name: [curve] for name, curve in CURVES.items()} | {
+    "dense_T0": [CURVES["dense"], *T_0],
+    "dense_soft_spheres": [CURVES["dense"], *SOFT],
+    "dense_soft_spheres_T0": [CURVES["dense"], *SOFT, *T_0],
+    "dilute_soft_spheres": [CURVES["dilute"], *SOFT, "--replicas", "2"],
 }
 QUICK = (*NAMES, "dense_T0")
 SHOWN = ("dilute", "dense_soft_spheres")
@@ -33,6 +30,7 @@ SHOWN = ("dilute", "dense_soft_spheres")
 
 
 def fit_case(case: str, options: Options) -> dict:
+    """Fit a curve; return estimates, true values, the verdict, and lines of the printed table."""
     folder, said = options.out / case, io.StringIO()
     with contextlib.redirect_stdout(said):
         code = command(["fit", *CASES[case], "--out", str(folder), "--overwrite"])
@@ -42,21 +40,12 @@ def fit_case(case: str, options: Options) -> dict:
     (record,), (picture,) = folder.glob("*.json"), folder.glob("*.png")
     if options.record and case in SHOWN:
         (PICTURES / f"fit_{case}.png").write_bytes(picture.read_bytes())
-    return results(json.loads(record.read_text(encoding="utf-8")), said.getvalue())
-
-
-def results(found: dict, said: str) -> dict:
-    """Return the figures of the documents: estimates, true values, verdict, lines of the table."""
+    found, lines = json.loads(record.read_text(encoding="utf-8")), said.getvalue().splitlines()
     rows = found["parameters"]
-    lines = said.splitlines()
     first = next(i for i, line in enumerate(lines) if line.split()[:1] == ["95"])
     budget = next(line for line in lines if line.startswith(f"error of {rows[0]['parameter']}"))
     return {
-        "parameters": [
-            {key: row[key] for key in ("parameter", "unit", "estimate", "std_err", "low", "high")}
-            | {"true": row["header"]}
-            for row in rows
-        ],
+        "parameters": [row | {"true": row["header"]} for row in rows],
         "verdict": found["verdict"],
         "reduced_chi2": found["reduced_chi2"],
         "printed": [lines[0], "", *lines[first : first + 1 + len(rows)], budget],

@@ -16,8 +16,8 @@ viscoelastic law is wrong about eps by `bias`, the spline by `error`.
 """
 
 import dataclasses
-import time
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -25,7 +25,7 @@ import jaxgran
 from experiments.support.analysis import replicas_of
 from experiments.support.plots import DSMC, GUIDE, INK, THEORY, caption, panels
 from experiments.support.record import Options, run_parts
-from experiments.support.scenes import cool, ice, of_lammps
+from experiments.support.scenes import cool, ice, of_lammps, temperature_only
 
 ERROR = 0.01
 NUM_KNOTS = 8
@@ -34,33 +34,29 @@ LAMMPS_CURVES = "dilute", "phi003", "phi003_large"
 
 
 class Yielding(jaxgran.RestitutionLaw):
-    """``eps = eps_0 (1 + (v/v_y)^2)^(-1/8)`` with the yield speed v_y, m/s."""
-
-    elastic: float
-    speed: float
+    """``eps = .95 (1 + (v/v_y)^2)^(-1/8)`` with the yield speed v_y = .1 m/s."""
 
     def restitution(self, normal_speed):
-        return self.elastic * (1 + (normal_speed / self.speed) ** 2) ** -0.125
+        return 0.95 * (1 + (normal_speed / 0.1) ** 2) ** -0.125
 
 
 TRUTHS: dict[str, tuple] = {  # and T_0, m^2/s^2
     "viscoelastic": (jaxgran.Viscoelastic(5e7, 0.22, 5e-6), 0.01),
     "ice": (ice(), 4e-4),
-    "yield speed": (Yielding(0.95, 0.1), 0.04),
+    "yield speed": (Yielding(), 0.04),
 }
 
 
-def learn(gas: jaxgran.Gas, data, num_particles: int | dict) -> jaxgran.Fit:
-    """The whole recipe: knots over the visited speeds, and a fit of all numbers of the law."""
-    curve = data["gas"] if isinstance(data, dict) else data
-    low, high = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
-    if isinstance(data, dict):  # with drop tests
-        low = min(low, float(np.min(np.asarray(data["drops"].speed))))
+def with_spline(gas: jaxgran.Gas, low: float, high: float) -> jaxgran.Gas:
+    """Return the gas with an unknown law, whose knots span these speeds."""
     law = jaxgran.RestitutionSpline(np.geomspace(low, high, NUM_KNOTS))
-    learner = dataclasses.replace(gas, law=law)
-    if isinstance(data, dict):
-        learner = dict.fromkeys(data, learner)
-    return jaxgran.fit(learner, data, free="law", num_particles=num_particles)
+    return dataclasses.replace(gas, law=law)
+
+
+def learn(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, num_particles: int) -> jaxgran.Fit:
+    """The whole recipe: knots over the visited speeds, and a fit of all numbers of the law."""
+    learner = with_spline(gas, *jaxgran.RestitutionSpline.visited_speeds(curve.temperature))
+    return jaxgran.fit(learner, curve, free="law", num_particles=num_particles)
 
 
 def curves_of(gas, model, taus, seed):
@@ -69,7 +65,7 @@ def curves_of(gas, model, taus, seed):
     each = replicas_of(cool(gas, times, model, seed), "temperature")
     noise = np.random.default_rng(seed).normal(size=each.shape)
     for T in each * np.exp(ERROR * noise):
-        yield jaxgran.CoolingCurve(times, jnp.asarray(T), temperature_error=jnp.asarray(ERROR * T))
+        yield jaxgran.CoolingCurve(times, T, temperature_error=ERROR * T)
 
 
 def judge(gas: jaxgran.Gas, result: jaxgran.Fit, speeds=None) -> dict:
@@ -81,10 +77,7 @@ def judge(gas: jaxgran.Gas, result: jaxgran.Fit, speeds=None) -> dict:
     constant = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
     chi2, p, fitted = band.compare(beads, "dissipative_constant")
     return {
-        "speeds": band.speeds,
-        "eps": band.restitution,
-        "band": [band.low, band.high],
-        "true": eps,
+        "true_A": getattr(gas.law, "dissipative_constant", None),
         "held": (band.low <= eps) & (eps <= band.high),
         "A": float(fitted.value("dissipative_constant")),
         "p": {"viscoelastic": p, "constant": band.compare(constant, "coefficient")[1]},
@@ -95,74 +88,53 @@ def judge(gas: jaxgran.Gas, result: jaxgran.Fit, speeds=None) -> dict:
 
 def summary(rows: list[dict]) -> dict:
     """Return how often the band contains the true law, in how many runs, and its form."""
-    held = np.array([row["held"] for row in rows])
+    names = "held", "A", "error", "bias"
+    held, A, error, bias = (np.array([row[name] for row in rows]) for name in names)
     forms = {form: sum(row["p"][form] > 0.01 for row in rows) for form in rows[0]["p"]}
-    A = np.array([row["A"] for row in rows])
     return {
         "runs": len(rows),
+        "true_A": rows[0]["true_A"],
         "held": float(held.mean()),  # at single speeds
         "held_at_all_speeds": int(held.all(1).sum()),
         "A": [float(A.mean()), float(A.std(ddof=1)) if len(A) > 1 else None],
         "forms": forms | {"neither": sum(max(row["p"].values()) <= 0.01 for row in rows)},
-        "error": float(np.median([row["error"] for row in rows])),
-        "bias": float(np.median([row["bias"] for row in rows])),
+        "error": float(np.median(error)),
+        "bias": float(np.median(bias)),
     }
 
 
 def learn_law(options: Options) -> dict:
     size, replicas = (200, 2) if options.smoke else (1000, 20)
-    taus = np.geomspace(0.3, 100.0, 40)
-    models = {
-        "DSMC": jaxgran.DSMC(size, replicas=replicas),
-        "hard spheres": jaxgran.HardSpheres(size, replicas=replicas),
-    }
-    worlds, results, first_s = {}, {}, None
+    models = [jaxgran.DSMC(size, replicas=replicas), jaxgran.HardSpheres(size, replicas=replicas)]
+    taus, few = np.geomspace(0.3, 100.0, 40), 1 if options.smoke else None
+    worlds, shown, beads = {}, {}, []
     for truth, (law, T) in TRUTHS.items():
         gas = jaxgran.Gas(law, **BEADS, temperature=T)
-        for seed, (name, model) in enumerate(list(models.items())[: 1 if options.smoke else 2]):
-            rows = []
-            for curve in curves_of(gas, model, taus, seed):
-                begin = time.perf_counter()
-                result = learn(gas, curve, size)
-                first_s = first_s or time.perf_counter() - begin
-                results.setdefault(truth, (gas, result))
-                rows.append(judge(gas, result))
-            worlds[f"{truth}, {name}"] = rows
-            print(truth, name, summary(rows), flush=True)
+        for seed, model in enumerate(models[:few]):
+            curves = list(curves_of(gas, model, taus, seed))
+            fits = [learn(gas, curve, size) for curve in curves]
+            worlds[f"{truth}, {model.name}"] = [judge(gas, fit) for fit in fits]
+            shown.setdefault(truth, (gas, fits[0]))
         if truth == "viscoelastic":
-            worlds["viscoelastic, with drop tests"] = [with_drops(gas, curve, size)]
-    for name in LAMMPS_CURVES[: 1 if options.smoke else None]:
+            beads = [row for rows in worlds.values() for row in rows]
+            worlds["viscoelastic, with drop tests"] = [with_drops(gas, curves[-1], size)]
+    for name in LAMMPS_CURVES[:few]:
         gas, curve, header = of_lammps(name)
-        after = np.asarray(curve.times) > 0
-        curve = jaxgran.CoolingCurve(
-            *(np.asarray(x)[after] for x in (curve.times, curve.temperature)),
-            temperature_error=np.asarray(curve.temperature_error)[after],
-        )
-        row = judge(gas, learn(gas, curve, int(header["N"])))
-        worlds[f"LAMMPS, {name}"] = [row | {"true_A": float(gas.value("dissipative_constant"))}]
-        print(name, summary(worlds[f"LAMMPS, {name}"]), flush=True)
-    beads = [row for name, rows in worlds.items() for row in rows if name in BEADS_WORLDS]
-    return {
-        "beads": summary(beads),
-        "worlds": {name: summary(rows) for name, rows in worlds.items()},
-        "rows": worlds,
-        "true_A": float(results["viscoelastic"][0].value("dissipative_constant")),
-        "first_fit_s": first_s,
-        "picture": draw(results),
-    }
-
-
-BEADS_WORLDS = "viscoelastic, DSMC", "viscoelastic, hard spheres"
+        after = jax.tree.map(lambda x: x[1:], temperature_only(curve))  # the start
+        worlds[f"LAMMPS, {name}"] = [judge(gas, learn(gas, after, int(header["N"])))]
+    found = {name: summary(rows) for name, rows in worlds.items()}
+    return {"worlds": found, "beads": summary(beads), "picture": draw(shown)}
 
 
 def with_drops(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, size: int) -> dict:
     """Learn from a curve and from 20 drops of single beads at a twentieth of its lowest speed."""
-    low = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)[0] / 20
-    speeds = np.geomspace(low, 3 * low, 20)
-    eps = np.asarray(gas.restitution(speeds))
+    low, high = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
+    speeds = np.geomspace(low / 20, 3 * low / 20, 20)
     noise = 0.002 * np.random.default_rng(0).normal(size=speeds.size)
-    drops = jaxgran.DropTest(speeds, eps + noise, np.full(speeds.size, 0.002))
-    result = learn(gas, {"gas": curve, "drops": drops}, {"gas": size})
+    drops = jaxgran.DropTest(speeds, gas.restitution(speeds) + noise, np.full(20, 0.002))
+    data = {"gas": curve, "drops": drops}
+    learners = dict.fromkeys(data, with_spline(gas, speeds[0], high))
+    result = jaxgran.fit(learners, data, free="law", num_particles={"gas": size})
     return judge(gas, result, speeds[[0, -1]])
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 import jaxgran
 from experiments.support.closed_forms import haff
-from experiments.support.plots import panels
 from experiments.support.record import run_parts
 from experiments.support.scenes import hard_beads
 
@@ -37,9 +36,8 @@ class HaffLaw(jaxgran.AbstractModel):
 
     def estimated_error(self, error_model):
         # a_2 changes the cooling rate by a fraction 3 a_2 / 16.
-        return error_model.error_of_temperature(
-            error_model.homogeneous + 3 / 16 * np.abs(error_model.sonine)
-        )
+        of_rate = error_model.homogeneous + 3 / 16 * np.abs(error_model.sonine)
+        return error_model.error_of_temperature(of_rate)
 
     def limitations(self, gas, num_particles=None):
         if float(gas.value("coefficient")) > 0.7:
@@ -51,28 +49,23 @@ class HaffLaw(jaxgran.AbstractModel):
 def own_model(_) -> dict:
     gas = hard_beads(packing_fraction=0.02, restitution=0.9)
     times = jnp.geomspace(1, 300, 9) * gas.mean_free_time
-    theory = jaxgran.cool(gas, times)
-    own = jaxgran.cool(gas, times, model=HaffLaw())
     models = (HaffLaw(), jaxgran.KineticTheory())
+    own, theory = (jaxgran.cool(gas, times, model=model).temperature for model in models)
     choice = jaxgran.choose_model(gas, times, 0.05, models=models)
 
     times = jnp.geomspace(0.3, 300, 40) * gas.mean_free_time
     exact = jaxgran.cool(gas, times).temperature
     noise = 0.01 * jax.random.normal(jax.random.key(0), times.shape)
-    curve = jaxgran.CoolingCurve(
-        times=times, temperature=exact * jnp.exp(noise), temperature_error=0.01 * exact
-    )
+    curve = jaxgran.CoolingCurve(times, exact * jnp.exp(noise), temperature_error=0.01 * exact)
     free = ("coefficient", "temperature")
     result = jaxgran.fit(gas.replace(coefficient=0.5), curve, model=HaffLaw(), free=free)
     print(result)
-    figure, places = panels(1, 2, size=(6.0, 2.75), sharex=True, height_ratios=[3, 1])
-    jaxgran.plot_fit(result, curve, np.array(places))
     return {
-        "T_over_theory": own.temperature / theory.temperature,
+        "T_over_theory": own / theory,
         "choice": choice.reasons[0],
         "fitted": {name: result.value(name) for name in free},
         "verdict": jaxgran.diagnose(result, curve).verdict,
-        "picture": figure,
+        "picture": jaxgran.plot_fit(result, curve)[0].figure,
     }
 
 

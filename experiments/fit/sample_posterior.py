@@ -16,11 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
+from blackjax.util import run_inference_algorithm
 from corner import corner
 
 import jaxgran
 from experiments.support.plots import THEORY
 from experiments.support.record import DATA, Options, run_parts
+from experiments.support.scenes import temperature_only
 
 FREE = ("dissipative_constant", "temperature")
 PRIORS = {"packing_fraction": 0.04, "temperature": 0.01}
@@ -35,22 +37,17 @@ LABELS = ("A (1e-6 s)", "phi", "T_0 (1e-2 m²/s²)")
 
 def sample_posterior(options: Options) -> dict:
     curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
-    gas = jaxgran.read_gas(header)
-    priors = {
-        name: (float(gas.value(name)), e * float(gas.value(name))) for name, e in PRIORS.items()
-    }
     # T only: the factor of <dr^2> in the fit is a parameter that the likelihood integrates out.
-    curve = jaxgran.CoolingCurve(
-        times=curve.times, temperature=curve.temperature, temperature_error=curve.temperature_error
-    )
+    gas, curve = jaxgran.read_gas(header), temperature_only(curve)
+    values = {name: float(gas.value(name)) for name in PRIORS}
+    priors = {name: (x, PRIORS[name] * x) for name, x in values.items()}
     result = jaxgran.fit(gas, curve, free=FREE, priors=priors)
     samples, facts = sample(*log_posterior(gas, curve, priors, result), options)
     A, phi, T_0 = samples.reshape(-1, 3).T
-    for name, values in (("dissipative_constant", A), ("temperature", T_0)):
+    for name, values in zip(FREE, (A, T_0), strict=True):
         estimate, error = (float(x) for x in result.value(name))
-        facts[name] = {"mean": float(values.mean()), "std": float(values.std())}
-        facts[name] |= {"fit": estimate, "fit_std": error}
-    facts["correlation_of_A_and_phi"] = float(np.corrcoef(A, phi)[0, 1])
+        of_values = {"mean": float(values.mean()), "std": float(values.std())}
+        facts[name] = of_values | {"fit": estimate, "fit_std": error}
     return facts | {"picture": draw(result, np.stack([A * 1e6, phi, T_0 * 100], axis=1))}
 
 
@@ -84,32 +81,25 @@ def log_posterior(gas, curve, priors, result):
 
 
 def sample(log_density, values, options) -> tuple[np.ndarray, dict]:
-    """Return samples (chains, samples, 3) of SI values, and seconds and diagnostics of the run."""
+    """Return samples (chains, samples, 3) of SI values, and speed and diagnostics of the run."""
     warm_key, key = jax.random.split(jax.random.key(0))
-    adapt: Any = blackjax.window_adaptation(
-        blackjax.nuts, log_density, is_mass_matrix_diagonal=False
-    )
+    full = {"is_mass_matrix_diagonal": False}
+    adapt: Any = blackjax.window_adaptation(blackjax.nuts, log_density, **full)
     (state, tuned), _ = adapt.run(warm_key, jnp.zeros(5), 600)
     nuts: Any = blackjax.nuts(log_density, **tuned)
 
-    @jax.jit
     def chain(key):
-        def step(state, key):
-            state, info = nuts.step(key, state)
-            return state, (state.position, info.num_integration_steps, info.is_divergent)
-
-        return jax.lax.scan(step, state, jax.random.split(key, options.samples))[1]
+        kept = {"transform": lambda state, info: (state.position, info.is_divergent)}
+        return run_inference_algorithm(key, nuts, options.samples, initial_state=state, **kept)[1]
 
     chains = jax.jit(jax.vmap(chain))
     keys = jax.random.split(key, options.chains)
     jax.block_until_ready(chains(keys))  # compiles
     begin = time.perf_counter()
-    theta, steps, divergent = jax.block_until_ready(chains(jax.random.split(keys[0], len(keys))))
+    theta, divergent = jax.block_until_ready(chains(jax.random.split(keys[0], len(keys))))
     seconds = time.perf_counter() - begin
     return np.asarray(jax.vmap(jax.vmap(values))(theta)), {
         "samples_per_second": options.samples * options.chains / seconds,
-        "seconds": seconds,
-        "steps": float(jnp.mean(steps)),
         "divergent": int(jnp.sum(divergent)),
         "effective": float(jnp.min(effective_sample_size(theta))),
         "r_hat": float(jnp.max(potential_scale_reduction(theta))),
@@ -122,10 +112,9 @@ def draw(result: jaxgran.Fit, samples: np.ndarray):
     axes = np.array(figure.axes).reshape(3, 3)
     for i, name, unit in ((0, FREE[0], 1e6), (2, FREE[1], 100.0)):
         estimate, error = (float(x) * unit for x in result.value(name))
-        left, right = axes[i, i].get_xlim()
+        (left, right), (_, top) = axes[i, i].get_xlim(), axes[i, i].get_ylim()
         x = np.linspace(left, right, 200)
-        normal = np.exp(-0.5 * ((x - estimate) / error) ** 2)
-        top = axes[i, i].get_ylim()[1] * 0.95
+        normal = 0.95 * np.exp(-0.5 * ((x - estimate) / error) ** 2)
         axes[i, i].plot(x, normal * top, color=THEORY, lw=2)
     axes[0, 2].text(0.0, 0.8, "grey: NUTS\nblue: fit, with its budget", fontsize=12)
     return figure

@@ -21,9 +21,8 @@ have no duration, so kinetic theory is used with `softness=False`.
 """
 
 import dataclasses
-import os
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -32,7 +31,7 @@ import numpy as np
 
 import jaxgran
 from experiments.support.analysis import fit_quietly
-from experiments.support.record import Options, alone, figures, run_parts
+from experiments.support.record import Options, collected, each_alone, figures, run_parts
 from experiments.support.scenes import cool, glass
 
 TRUE_A, NUM_PARTICLES, PHI = 3e-6, 250, 0.03
@@ -51,12 +50,18 @@ def beads(**elements) -> jaxgran.Gas:
 
 SIDE = float(beads().box_side(NUM_PARTICLES))
 WALLS = {"container": jaxgran.Walls(SIDE, restitution=0.9)}
-ROUGH_WALLS = {
-    "container": jaxgran.Walls(SIDE, restitution=0.9, tangential_restitution=-0.3),
-    "surface": jaxgran.Rough(-0.3),
-}
+ROUGH, GUESS = {"surface": jaxgran.Rough(-0.3)}, {"surface": jaxgran.Rough(0.0)}
+BETA_WALLS = jaxgran.Walls(SIDE, restitution=0.9, tangential_restitution=-0.3)
+ROUGH_WALLS = ROUGH | {"container": BETA_WALLS}
 SLIDING = {"surface": jaxgran.Rough(0.5, friction=0.2)}
 DRAG = {"drag": jaxgran.StokesDrag(0.015 * float(THEORY.cooling_rate(beads())))}
+
+
+def seen(particles):
+    """Return T of the spheres whose speed is below `SEEN`."""
+    square = jnp.sum(particles.velocity**2, axis=-1)
+    near = square < SEEN**2 * 2 * jnp.mean(square) / 3
+    return jnp.sum(jnp.where(near, square, 0.0)) / (3 * jnp.sum(near))
 
 
 class Row(NamedTuple):
@@ -69,7 +74,7 @@ class Row(NamedTuple):
         fitted: elements of the gas of the fit.
         free: free parameters besides A and T_0; with beta_t, T_rot is measured.
         floor: noise floor over T_0.
-        seen: largest speed that is seen, in sqrt(2 T).
+        save: what is measured instead of T; see `jaxgran.cool`.
         sizes: largest deviation of diameters from their mean, over it.
     """
 
@@ -79,12 +84,11 @@ class Row(NamedTuple):
     fitted: dict
     free: tuple[str, ...] = ()
     floor: float = 0.0
-    seen: float | None = None
+    save: Callable | None = None
     sizes: float = 0.0
 
 
 BETA = ("tangential_restitution",)
-ROUGH, GUESS = {"surface": jaxgran.Rough(-0.3)}, {"surface": jaxgran.Rough(0.0)}
 ROWS = (
     Row("smooth, periodic", {}, "all", {}),
     Row("walls, eps_w = .9", WALLS, "all", WALLS),
@@ -98,7 +102,7 @@ ROWS = (
     Row("sliding, mu = .2, beta_0 = .5", SLIDING, "nothing", {}),
     Row("drag, 3 % of the first losses", DRAG, "nothing", {}),
     Row("a noise floor of 1 % of T_0", {}, "nothing", {}, floor=0.01),
-    Row("fast grains lost", {}, "nothing", {}, seen=SEEN),
+    Row("fast grains lost", {}, "nothing", {}, save=seen),
     Row("sizes, +-10 %", {}, "nothing", {}, sizes=0.1),
 )
 
@@ -108,35 +112,32 @@ def wrong_physics(options: Options) -> dict:
     known = figures("wrong_physics")["rows"] if options.rows else []
     rows = {(row["name"], row["told"]): row for row in known}
     asked = [k for k, row in enumerate(ROWS) if options.rows in row.name]
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        for found in pool.map(lambda k: alone(statistics, k, options.runs), asked):
-            print(found, flush=True)
-            rows[found["name"], found["told"]] = found
+    for found in collected(each_alone(statistics, [(k, options.runs) for k in asked])):
+        rows[found["name"], found["told"]] = found
     return {"rows": [rows[row.name, row.told] for row in ROWS if (row.name, row.told) in rows]}
 
 
 def measured(row: Row, runs: int) -> tuple:
-    """Return times until T has fallen to its last share, and the curves of all runs."""
+    """Return times until T has fallen to its last share, and T and T_rot of each run."""
     gas = beads(**row.gas)
     trial = jnp.geomspace(1e-2, 1e4, 400) * gas.mean_free_time
     T = cool(gas, trial, THEORY).temperature / gas.temperature
     end = float(jnp.interp(-np.log(LAST), -jnp.log(T), trial))
-    model = jaxgran.HardSpheres(NUM_PARTICLES, replicas=runs)
-    save = None if row.seen is None else seen
     times = np.geomspace(end / 300, end, NUM_POINTS)
     if row.sizes:
-        return times, unlike_spheres(gas, row.sizes, times, runs)
-    return times, cool(gas, times, model, save=save)
+        return times, unlike_spheres(gas, row.sizes, times, runs), None
+    model = jaxgran.HardSpheres(NUM_PARTICLES, replicas=runs)
+    each = cool(gas, times, model, save=row.save).replicas
+    return times, each.saved if row.save else each.temperature, each.rotational_temperature
 
 
-def unlike_spheres(gas: jaxgran.Gas, spread: float, times, runs: int) -> jaxgran.CoolingCurve:
-    """Return T of spheres of different sizes; a serial event-driven code."""
+def unlike_spheres(gas: jaxgran.Gas, spread: float, times, runs: int) -> jax.Array:
+    """Return T in each run of spheres of different sizes; a serial event-driven code."""
     largest = float(gas.diameter) * (1 + spread)
     apart = gas.replace(diameter=largest, packing_fraction=PHI * (1 + spread) ** 3)
     start = cool(apart, [0.0], jaxgran.HardSpheres(NUM_PARTICLES, replicas=runs)).particles
     side, sizes = start.box_side, jnp.linspace(1 - spread, 1 + spread, NUM_PARTICLES)
-    diameter = (sizes[:, None] + sizes) / 2 * gas.diameter
-    mass = sizes**3
+    diameter, mass = (sizes[:, None] + sizes) / 2 * gas.diameter, sizes**3
     images = side * jnp.stack(jnp.meshgrid(*[jnp.arange(-1.0, 2.0)] * 3), -1).reshape(-1, 3)
 
     def impacts(now, x, v, i):
@@ -179,43 +180,27 @@ def unlike_spheres(gas: jaxgran.Gas, spread: float, times, runs: int) -> jaxgran
         first = jax.vmap(lambda i: impacts(0.0, x, v, i))(jnp.arange(NUM_PARTICLES))
         return jax.lax.scan(until, (jnp.zeros(()), x, v, first), jnp.asarray(times))[1]
 
-    T = jnp.stack([run(x, v) for x, v in zip(start.position, start.velocity, strict=True)])
-    replicas = jaxgran.CoolingCurve(jnp.asarray(times), T)
-    return jaxgran.CoolingCurve(jnp.asarray(times), T.mean(axis=0), replicas=replicas)
-
-
-def seen(particles):
-    """Return T of the spheres whose speed is below `SEEN`."""
-    square = jnp.sum(particles.velocity**2, axis=-1)
-    near = square < SEEN**2 * 2 * jnp.mean(square) / 3
-    return jnp.sum(jnp.where(near, square, 0.0)) / (3 * jnp.sum(near))
+    return jnp.stack([run(x, v) for x, v in zip(start.position, start.velocity, strict=True)])
 
 
 def statistics(number: int, runs: int) -> dict:
     """Simulate a row, fit each run, and return statistics."""
     row = ROWS[number]
-    times, curve = measured(row, runs)
-    each = curve.replicas.temperature if row.seen is None else curve.replicas.saved
-    rotation = None if not row.free else curve.replicas.rotational_temperature
+    times, each, rotation = measured(row, runs)
     gas, found = beads(**row.fitted), []
+    free = "dissipative_constant", "temperature", *row.free
     for run, T in enumerate(np.asarray(each) + row.floor * float(gas.temperature)):
-        one = jaxgran.CoolingCurve(
-            times=jnp.asarray(times),
-            temperature=jnp.asarray(T),
-            rotational_temperature=None if rotation is None else rotation[run],
-        )
-        free = "dissipative_constant", "temperature", *row.free
+        T_rot = rotation[run] if row.free else None
+        one = jaxgran.CoolingCurve(times, T, rotational_temperature=T_rot)
         result = fit_quietly(gas, one, model=THEORY, free=free, num_particles=NUM_PARTICLES)
         diagnosis = jaxgran.diagnose(result)
-        A, error = (float(x) / TRUE_A for x in result.value("dissipative_constant"))
         ends = diagnosis.ranges.get("dissipative_constant", (np.nan, np.nan))
-        found.append((A, error, *(float(np.squeeze(x)) / TRUE_A for x in ends), diagnosis.grade))
-    A, error, low, high = np.array([one[:4] for one in found]).T
+        numbers = *result.value("dissipative_constant"), *ends
+        found.append((*(float(np.squeeze(x)) / TRUE_A for x in numbers), diagnosis.grade))
+    *numbers, grades = zip(*found, strict=True)
+    A, error, low, high = np.array(numbers)
     known = np.isfinite(low)
-    return {
-        "name": row.name,
-        "told": row.told,
-        "runs": runs,
+    return {"name": row.name, "told": row.told, "runs": runs} | {
         "A": float(np.median(A)),
         "scatter": float(np.std(np.log(A), ddof=1)) if runs > 1 else None,
         "off": float(np.sqrt(np.mean(np.log(A) ** 2))),
@@ -224,7 +209,7 @@ def statistics(number: int, runs: int) -> dict:
         "inside": int(np.sum((low <= 1) & (high >= 1))),
         "computed": int(np.sum(known)),
         "range": [float(np.median(x[known])) if known.any() else None for x in (low, high)],
-        "grades": dict(Counter(one[4] for one in found)),
+        "grades": dict(Counter(grades)),
     }
 
 

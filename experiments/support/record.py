@@ -16,7 +16,8 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -66,12 +67,10 @@ def run_parts(
         The results of the parts.
     """
     parts = {function.__name__: function for function in functions} | dict(named or {})
-    script = Path(sys.argv[0]).stem
-    parser = argparse.ArgumentParser(
-        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    as_written = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=doc, formatter_class=as_written)
     parser.set_defaults(smoke=False, only=list(default or parts))
-    parser.add_argument("--out", type=Path, default=Path("results") / script)
+    parser.add_argument("--out", type=Path, default=Path("results") / Path(sys.argv[0]).stem)
     parser.add_argument("--record", action="store_true", help="write figures of the documents")
     if smoke:
         parser.add_argument("--smoke", action="store_true", help="a small run of some seconds")
@@ -91,11 +90,11 @@ def run_parts(
         pictures = results[part].pop("picture", {})
         pictures = pictures if isinstance(pictures, dict) else {name: pictures}
         pprint.pp(rounded(json.loads(as_json(results[part]))), width=100, compact=True)
-        for path in (options.out / f"{name}.json", FIGURES / f"{name}.json")[: 1 + options.record]:
-            save(path, **results[part])
-        for folder in (options.out, PICTURES)[: 1 + options.record]:
+        folders = (options.out, options.out), (FIGURES, PICTURES)
+        for of_figures, of_pictures in folders[: 1 + options.record]:
+            save(of_figures / f"{name}.json", **results[part])
             for picture, figure in pictures.items():
-                figure.savefig(folder / f"{picture}.png", dpi=110)
+                figure.savefig(of_pictures / f"{picture}.png", dpi=110)
         print(f"written to {options.out / name}.json; {time.perf_counter() - BEGAN:.0f} s")
     return results
 
@@ -224,6 +223,12 @@ def alone(function: Callable, *arguments: Any, launch: Sequence = ()) -> Any:
         f"print(as_json({function.__name__}(*json.loads(sys.argv[1])), indent=None), end='')"
     )
     return json.loads(process("-c", code, json.dumps(arguments), launch=launch).splitlines()[-1])
+
+
+def each_alone(function: Callable, jobs: Iterable[Sequence]) -> Iterator[dict]:
+    """Return what a function returns for each job, in processes as many as there are cores."""
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        yield from pool.map(lambda arguments: alone(function, *arguments), jobs)
 
 
 def of_version(folder: Path, task: str, curve: Path, num: int = 0) -> dict[str, Any]:

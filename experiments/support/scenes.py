@@ -91,12 +91,14 @@ def of_lammps(name: str) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve, dict[str, s
     return gas.replace(dissipative_constant=header_number(header, "A")), curve, header
 
 
+def temperature_only(curve: jaxgran.CoolingCurve) -> jaxgran.CoolingCurve:
+    """Return the curve without what was measured besides T."""
+    error = curve.temperature_error
+    return jaxgran.CoolingCurve(curve.times, curve.temperature, temperature_error=error)
+
+
 def times_of(
-    gas: jaxgran.Gas,
-    collisions: Any,
-    model: jaxgran.AbstractModel | None = None,
-    last: float = 1e6,
-    points: int = 400,
+    gas: jaxgran.Gas, collisions: Any, model: Any = None, last: float = 1e6, points: int = 400
 ) -> np.ndarray:
     """Return times at which a particle has made these numbers of collisions on average.
 

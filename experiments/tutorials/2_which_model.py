@@ -42,13 +42,8 @@ print(*choice.reasons, sep="\n")
 # Now all four, with 500 particles (DSMC: 5000). A second call is timed, as the first one compiles.
 
 # %%
-few = {"replicas": 2}
-models = [
-    jaxgran.KineticTheory(),
-    jaxgran.DSMC(5000, **few),
-    jaxgran.HardSpheres(500, **few),
-    jaxgran.SoftSpheres(500, **few),
-]
+spheres = jaxgran.HardSpheres(500, replicas=2), jaxgran.SoftSpheres(500, replicas=2)
+models = jaxgran.KineticTheory(), jaxgran.DSMC(5000, replicas=2), *spheres
 found, seconds = {}, {}
 for model in models:
     for _ in range(2):

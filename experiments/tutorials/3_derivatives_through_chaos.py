@@ -31,17 +31,15 @@ def positions(particles):
     return particles.position
 
 
-starts = []
-for k in range(4):
-    key = jax.random.key(k)
-    first = jaxgran.cool(gas, times[:1], model=model, key=key, progress=False)
-    starts.append(first.particles)
+quiet = {"progress": False}
+keys = [jax.random.key(k) for k in range(4)]
+starts = [jaxgran.cool(gas, times[:1], model=model, key=k, **quiet).particles for k in keys]
 
 
 def run(factor, start=starts[0]):
     changed = gas.replace(dissipative_constant=2e-5 * factor)
     model = jaxgran.HardSpheres(500, start=start)
-    return jaxgran.cool(changed, times, model=model, save=positions, progress=False)
+    return jaxgran.cool(changed, times, model=model, save=positions, **quiet)
 
 
 def distance(a, b):
@@ -69,14 +67,13 @@ axes.set(xlabel="collisions per sphere", ylabel="distance of the two runs / diam
 
 
 # %%
-def log_temperature(log_constant):
+def log_temperature(log_constant, model=None):
     changed = gas.replace(dissipative_constant=jnp.exp(log_constant))
-    model = jaxgran.HardSpheres(500, start=starts[0])
-    return jnp.log(jaxgran.cool(changed, times, model=model, progress=False).temperature)
+    return jnp.log(jaxgran.cool(changed, times, model=model, **quiet).temperature)
 
 
-at = jnp.log(2e-5)
-_, slope = jax.jvp(log_temperature, (at,), (1.0,))
+at, model = jnp.log(2e-5), jaxgran.HardSpheres(500, start=starts[0])
+_, slope = jax.jvp(lambda x: log_temperature(x, model), (at,), (1.0,))
 
 # %% [markdown]
 # Compare with differences of runs whose $A$ differ by 40 %, from four initial states, and with the
@@ -89,18 +86,12 @@ pairs = [(run(np.exp(h), start), run(np.exp(-h), start)) for start in starts]
 slopes = np.array([np.log(a.temperature / b.temperature) for a, b in pairs]) / (2 * h)
 difference, noise = slopes.mean(axis=0), slopes.std(axis=0, ddof=1) / len(pairs) ** 0.5
 
-
-def theory(log_constant):
-    changed = gas.replace(dissipative_constant=jnp.exp(log_constant))
-    return jnp.log(jaxgran.cool(changed, times).temperature)
-
-
 # %%
 fig, axes = plt.subplots(figsize=(6, 4), layout="constrained")
 x = times / gas.mean_free_time
 axes.errorbar(x, difference, noise, fmt="o", color="#222222", label="differences of 8 runs")
 axes.plot(x, slope, color="#e69f00", label="tangent, one run")
-axes.plot(x, jax.jacfwd(theory)(at), "--", color="#0072b2", label="kinetic theory")
+axes.plot(x, jax.jacfwd(log_temperature)(at), "--", color="#0072b2", label="kinetic theory")
 axes.set(xlabel="time / mean free time", ylabel="d ln T / d ln A")
 axes.legend(frameon=False)
 plt.show()

@@ -45,20 +45,15 @@ rough = scenes["rough spheres"]
 run = jaxgran.cool(rough, times, model=jaxgran.DSMC(3000), progress=False)
 noise = jnp.exp(0.02 * jax.random.normal(jax.random.key(1), (2, times.size)))
 T, T_rot = run.temperature * noise[0], run.rotational_temperature * noise[1]
-curve = jaxgran.CoolingCurve(
-    times=times,
-    temperature=T,
-    temperature_error=0.02 * T,
-    rotational_temperature=T_rot,
-    rotational_temperature_error=0.02 * T_rot,
-)
+only_T = jaxgran.CoolingCurve(times, T, temperature_error=0.02 * T)
+rotation = {"rotational_temperature": T_rot, "rotational_temperature_error": 0.02 * T_rot}
+curve = dataclasses.replace(only_T, **rotation)
 
 # %% [markdown]
 # We fit twice: as if the grains were smooth, with $T$ alone, and as they are, with the tangential
 # restitution $\beta_t$ free in addition, which $T_\mathrm{rot}$ determines.
 
 # %%
-only_T = jaxgran.CoolingCurve(times=times, temperature=T, temperature_error=0.02 * T)
 wrong = jaxgran.fit(smooth, only_T, free=("dissipative_constant", "temperature"))
 guess = rough.replace(tangential_restitution=-0.3)
 right = jaxgran.fit(guess, curve, free=("dissipative_constant", "tangential_restitution"))

@@ -56,9 +56,8 @@ print(f"constant restitution: {chi2:.2g}")
 v = jnp.geomspace(low / 3, 2 * high, 100)
 band = jaxgran.restitution_band(result, v)
 true = grains.replace(dissipative_constant=float(header["A"])).restitution(v)
-fig, (top, bottom) = plt.subplots(
-    2, sharex=True, figsize=(6, 5), height_ratios=[3, 1], layout="constrained"
-)
+shape = {"figsize": (6, 5), "height_ratios": [3, 1], "layout": "constrained"}
+fig, (top, bottom) = plt.subplots(2, sharex=True, **shape)
 top.axvspan(low, high, color="#999999", alpha=0.12)
 top.fill_between(v, band.low, band.high, color="#0072b2", alpha=0.2)
 top.semilogx(v, band.restitution, color="#0072b2", label="learnt from T(t)")

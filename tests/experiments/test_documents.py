@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import experiments.documents as documents
-from experiments.support.dot_plots import PLOTS, Dot, DotPlot, drawn
+from experiments.support.dot_plots import PLOTS, Dot, drawn
 from experiments.support.record import figures
 
 ROOT = Path(__file__).parents[2]
@@ -64,17 +64,18 @@ def markers(axes):
 
 @pytest.mark.parametrize("name", PLOTS)
 def test_recorded_figures_can_be_drawn(name):
-    plot = PLOTS[name](figures(name))
-    axes = drawn(plot).axes[0]
+    dots_of, draw = PLOTS[name]
+    dots = list(dots_of(figures(name)))
+    axes = draw(dots).axes[0]
     labels = [tick.get_text() for tick in axes.get_yticklabels()]
-    assert labels == list(dict.fromkeys(dot.label for dot in plot.dots))
+    assert labels == list(dict.fromkeys(dot.label for dot in dots))
     # One marker for each dot, at its value.
-    assert sorted(x for x, _ in markers(axes)) == sorted(dot.value for dot in plot.dots)
+    assert sorted(x for x, _ in markers(axes)) == sorted(dot.value for dot in dots)
 
 
 def test_dots_of_one_label_share_a_line_and_bars_span_their_range():
-    plot = DotPlot([Dot("a", 2.0, 1.0, 3.0), Dot("a", 4.0, hollow=True), Dot("b", 5.0)], "x")
-    axes = drawn(plot).axes[0]
+    dots = [Dot("a", 2.0, 1.0, 3.0), Dot("a", 4.0, hollow=True), Dot("b", 5.0)]
+    axes = drawn(dots, "x").axes[0]
     assert [y for _, y in markers(axes)] == [0, 0, 1]
     (bar,) = [line for line in axes.lines if np.size(line.get_xdata()) == 2]
     assert list(np.asarray(bar.get_xdata())) == [1.0, 3.0]

@@ -262,8 +262,24 @@ def cooled(gas, times, start=None) -> jaxgran.CoolingCurve:
     return jaxgran.cool(gas, times, model=model, save="particles")
 
 
+def between_viscoelastic_walls() -> jaxgran.Gas:
+    return contained(jaxgran.Viscoelastic(5e7, 0.22, 3e-5), sides=(1.0, 0.8, 1.25))
+
+
+@pytest.mark.slow
+def test_viscoelastic_walls_bounce_by_their_own_law():
+    # Elastic spheres: what is lost, is lost to the walls, at the eps of their speeds.
+    gas = between_viscoelastic_walls().replace(dissipative_constant=0.0)
+    curve = cooled(gas, [0.0, 1.0])
+    np.testing.assert_allclose(
+        total_energy(gas, curve), 1.5 * gas.mass * gas.temperature, rtol=1e-12
+    )
+    # Some 5 bounces across each axis in a second, of 1 - eps^2 = .2 to .3 at 1 to 10 cm/s.
+    assert 0.05 < float(curve.temperature[-1] / gas.temperature) < 0.7
+
+
 def test_a_run_goes_on_from_its_own_particles():
-    gas = contained(jaxgran.Viscoelastic(5e7, 0.22, 3e-5), sides=(1.0, 0.8, 1.25))
+    gas = between_viscoelastic_walls()
     whole = cooled(gas, [0.1, 0.2])  # some bounces, and few impacts that would let paths part
     middle = jax.tree.map(lambda x: x[0], whole.saved)
     curve = cooled(gas.replace(temperature=whole.temperature[0]), [0.05, 0.1], middle)

@@ -53,14 +53,6 @@ COOLING = {
         (8, 20, 40),
         {"temperature": (2 * ROUGH_WALL_ERROR, 3), "collisions": (0.04, 0)},
     ),
-    # Elastic spheres: what is lost, is lost to the walls, at the eps of their speeds. In the first
-    # sound times T falls by 6 % more than theory says, which has the layer at the walls at once.
-    "walls of another law": (
-        between_walls(jaxgran.Viscoelastic(5e7, 0.22, 3e-5), 0.0),
-        HardSpheres(250, replicas=8),
-        (8, 20, 40),
-        {"temperature": (0.08, 2)},
-    ),
 }
 """A gas, its model, mean free times; of each quantity a relative error, with standard errors."""
 
