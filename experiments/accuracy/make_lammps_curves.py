@@ -66,8 +66,8 @@ def simulate(
 
     def run(replica: int) -> list[float]:
         lmp = granular_box(elastic, fluid, skin, replica=replica)
-        melt = f"run {int(5 * tau / dt)}"
-        lmp.commands_list([f"timestep {dt}", melt, "velocity all zero linear", "run 0"])
+        settle = f"run {int(5 * tau / dt)}"
+        lmp.commands_list([f"timestep {dt}", settle, "velocity all zero linear", "run 0"])
         factor = (float(gas.temperature) / temperature(lmp, gas)) ** 0.5
         lmp.commands_list([f"variable v{axis} atom v{axis}*{factor}" for axis in "xyz"])
         lmp.command("velocity all set v_vx v_vy v_vz")
