@@ -81,6 +81,7 @@ def test_all_floats_of_a_law_are_free():
 SERIES = gas_of(jaxgran.RestitutionSeries([-0.2, 0.03], [0.2, 0.4]))
 
 
+@pytest.mark.slow
 def test_vectors_are_fitted_by_least_squares_and_by_gradient_descent():
     curve, guess = synthetic(SERIES), SERIES.replace(coefficients=[-0.15, 0.0])
     options = {"free": ("coefficients",), "progress": False}
@@ -118,8 +119,11 @@ def spline_gas(curve, num_knots=8):
     return gas_of(jaxgran.RestitutionSpline(np.geomspace(*speeds, num_knots)))
 
 
+SPEEDS, VALUES = [1e-3, 1e-2, 3e-2, 1e-1], [0.97, 0.95, 0.9, 0.85]
+
+
 def test_spline():
-    speeds, values = [1e-3, 1e-2, 3e-2, 1e-1], [0.97, 0.95, 0.9, 0.85]
+    speeds, values = SPEEDS, VALUES
     law = jaxgran.RestitutionSpline(speeds, values)
     np.testing.assert_allclose(law.restitution(jnp.asarray(speeds)), values, rtol=1e-12)
     inside, pchip = np.geomspace(1e-2, 3e-2, 5), scipy.interpolate.PchipInterpolator
@@ -135,7 +139,11 @@ def test_spline():
     power = jaxgran.RestitutionSpline(speeds, np.exp(-(np.asarray(speeds) ** 0.3)))
     np.testing.assert_allclose(power.prior_residuals(), 0.0, atol=1e-10)
     np.testing.assert_allclose(power.restitution(v), jnp.exp(-(v**0.3)), rtol=1e-9)
-    # In a sweep all members have the knots of the law.
+
+
+@pytest.mark.slow
+def test_members_of_a_sweep_have_the_knots_of_the_law():
+    law = jaxgran.RestitutionSpline(SPEEDS, VALUES)
     gas, drops = gas_of(law), jnp.stack([law.drops, 2 * law.drops])
     members = jaxgran.sweep(jax.vmap(lambda x: gas.replace(drops=x))(drops), [0.1, 0.2])
     alone = [jaxgran.cool(gas.replace(drops=x), [0.1, 0.2]).temperature for x in drops]

@@ -93,9 +93,8 @@ def test_replicas_stand_in_one_array_where_there_is_one_device_or_a_chosen_one()
         assert replica_devices(2, many) == ()
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("HardSpheres", marks=pytest.mark.slow), "SoftSpheres"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["HardSpheres", "SoftSpheres"])
 def test_large_replicas_on_one_device_run_in_turn(name, beads, monkeypatch):
     monkeypatch.setattr(run, "MIN_SPHERES_PER_RUN", MODELS[name])
     gas, key = beads(packing_fraction=0.1), jax.random.key(4)
