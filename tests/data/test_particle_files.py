@@ -92,6 +92,7 @@ def test_half_a_frame_is_cut_off(tmp_path):
     assert path.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_a_run_writes_its_trajectory(beads, tmp_path, monkeypatch):
     gas, path = beads(0.15, dimension=2), tmp_path / "run.xyz"
     t = gas.mean_free_time * jnp.array([0.5, 1.0, 1.5])

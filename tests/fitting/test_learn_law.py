@@ -64,6 +64,7 @@ def test_names_of_the_arrays_of_a_law():
         jaxgran.cool(gas, [1.0], model=jaxgran.SoftSpheres(64))
 
 
+@pytest.mark.slow
 def test_all_floats_of_a_law_are_free():
     class Power(jaxgran.RestitutionLaw):
         loss_at_one: float

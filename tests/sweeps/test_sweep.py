@@ -78,6 +78,7 @@ def test_members_are_the_curves_of_cool():
     np.testing.assert_allclose(two.temperature[1], alone.temperature, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_keys_of_members_do_not_depend_on_their_number():
     same, key = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), GASES), jax.random.key(1)
     curves = sweep(same, key=key, **SAVED)

@@ -45,7 +45,8 @@ def cooling_state(dimension, eps):
     return jax.vmap(one)(jnp.asarray(eps))
 
 
-@pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_cooling_state_agrees_with_direct_simulation(dimension):
     _, eps, a2, a3, diffusion = ROWS[ROWS[:, 0] == dimension].T
     found = cooling_state(dimension, eps)
