@@ -16,7 +16,7 @@ Deliberate faults in the package, and the tests here that found each:
 8. random numbers: replicas of DSMC begin with the velocities of the first: replicas and keys.
 9. status: soft spheres that are nan are no failure: a start that is not finite.
 10. checkpoint: a run resumes at its first time: an interrupted run.
-11. frame: the drift of a start stays in the run: the frame, boosted.
+11. frame: the drift of a start stays in the run, or out of the positions: the frame, boosted.
 12. sign: second part of the energy that soft contacts dissipate: energy.
 13. factor: the force of soft spheres with half the mass: energy.
 14. factor: drag at half its rate in kinetic theory: the element drag.
@@ -427,8 +427,11 @@ class TestContract:
             speed = float(np.max(np.abs(momentum)))
             np.testing.assert_allclose(momentum, momentum[:1] + 0 * momentum, atol=1e-13 * speed)
             drift = start.velocity[:1, :1] - case.start.velocity[:1, :1]
-            before = case.reference[0].saved.velocity
-            np.testing.assert_allclose(velocity, before + drift[None], atol=1e-9 * speed)
+            before, side = case.reference[0].saved, start.box_side
+            np.testing.assert_allclose(velocity, before.velocity + drift[None], atol=1e-9 * speed)
+            moved = found[0].saved.position - before.position
+            moved = moved - drift[None] * found[0].times[:, None, None, None]
+            np.testing.assert_allclose(moved, side * np.round(moved / side), atol=1e-9 * side)
 
     @of_models()
     def test_vmap_and_jit_are_a_loop(self, case):
