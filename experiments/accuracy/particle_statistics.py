@@ -13,6 +13,7 @@ Each part takes minutes, too long for a test, and writes a file of its own:
 - dsmc_order: the memory of the first velocity by steps of .1 and .05 less that by steps of .0125,
   with all pairs that may share a particle, half of them, or none;
 - diffusion_published: D of elastic hard spheres;
+- spins: T_rot/T and T of kinetic theory over those of DSMC for rough spheres;
 - walls: ln T of hard spheres between walls less that of DSMC, which assumes a homogeneous gas.
 """
 
@@ -163,6 +164,40 @@ def diffusion_published(options: Options):
         yield {"phi": phi, "off": (D + box) / infinite - 1, "error": error / infinite}
 
 
+ROUGH = (
+    (None, 0.5, 0.7, 1.0),
+    (None, 0.0, 0.7, 0.0),
+    (0.05, 0.5, 0.9, 0.0),
+    (0.05, 0.5, 0.9, 1.0),
+    (0.1, 0.0, 0.9, 1.0),
+    (0.2, 0.0, 0.8, 1.0),
+    (0.2, 1.0, 0.7, 0.0),
+    (1.0, 0.5, 0.8, 0.0),
+)
+"""mu, beta_t, eps, and T_rot/T at t = 0."""
+
+
+def spins(options: Options):
+    size, replicas = (1000, 2) if options.smoke else (50_000, 4)
+    for dimension in (3, 2):
+        for mu, beta, eps, ratio in ROUGH:
+            gas = hard_beads(0.02, eps, dimension)
+            T_rot = ratio * float(gas.temperature)
+            surface = jaxgran.Rough(beta, rotational_temperature=T_rot, friction=mu)
+            gas = dataclasses.replace(gas, surface=surface)
+            times = np.array([1.0, 3.0, 10.0, 30.0, 100.0]) * float(gas.mean_free_time)
+            simulated = cool(gas, times, DSMC(size, replicas=replicas))
+            row = {"dimension": dimension, "mu": mu, "beta": beta, "eps": eps, "ratio": ratio}
+            for name, cumulants in (("off", True), ("gaussian", False)):
+                model = dataclasses.replace(CHAOS, spin_cumulants=cumulants)
+                theory = cool(gas, times, model)
+                T = theory.temperature / simulated.temperature
+                row[f"T_{name}"] = T - 1
+                ratios = theory.rotational_temperature / simulated.rotational_temperature / T
+                row[name] = ratios - 1
+            yield row
+
+
 def walls(options: Options):
     for size, last in ((100, 0.006), (500, 0.04), (4000, 0.1)):
         phi = size * np.pi / 6 * (2e-3 / 0.05) ** 3
@@ -180,5 +215,5 @@ def walls(options: Options):
 
 
 if __name__ == "__main__":
-    tables = dsmc_million, sonine, dsmc_order, diffusion_published, walls
+    tables = dsmc_million, sonine, dsmc_order, diffusion_published, spins, walls
     run_parts(__doc__, *tables, sonine_coefficients)

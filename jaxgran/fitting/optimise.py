@@ -7,6 +7,7 @@ optimistix.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -38,6 +39,7 @@ from jaxgran.fitting.residuals import (
     Rows,
 )
 from jaxgran.models.base import AbstractModel
+from jaxgran.models.linearise import model_for_fits
 from jaxgran.scene.gas import Gas
 
 CONVERGED_STEP = 0.01
@@ -134,6 +136,10 @@ class Problem:
             unknowns += [Unknown(name, m.label, (), Domain()) for name in names]
         return cls(measurements, model, tuple(unknowns), num_free, priors, {})
 
+    @cached_property
+    def _compiled_model(self) -> AbstractModel:
+        return model_for_fits(self.model, *(m.scene for m in self.measurements))
+
     @property
     def curves(self) -> tuple[Measurement, ...]:
         """The measured curves."""
@@ -211,8 +217,9 @@ class Problem:
 
     def _evaluate(self, flat: Numbers) -> tuple[list[Rows], Numbers, Numbers, dict]:
         values, rows, computed = self.values(flat), [], {}
+        model = self._compiled_model
         for m in self.measurements:
-            more, curve = m.evaluate(self.model, values[m.label], tolerance=self.tolerance)
+            more, curve = m.evaluate(model, values[m.label], tolerance=self.tolerance)
             rows += more
             if curve is not None:
                 computed[m.label] = curve

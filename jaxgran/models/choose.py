@@ -31,7 +31,7 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas, reduced_scene
-from jaxgran.theory.equations import element_rates, softness_factor
+from jaxgran.theory.equations import Spins, element_rates, softness_factor
 
 NUM_PARTICLES = 4000
 """Particles of a particle model if the user gives no number."""
@@ -253,7 +253,8 @@ def _impact_share(now: Gas, first: Gas) -> Float[Array, ""]:
     ratio = 0.0 if rough is None else rough.rotational_temperature / first.temperature
     impacts = first_cooling_rate(now)[0] * now.path_length / now.impact_speed
     alone = scene._replace(walls=None, drag=None, drive=None)
-    mine, rest = (element_rates(x, one, ratio, 0 * one, d).cooling for x in (alone, scene))
+    spins = Spins.gaussian(ratio * one)
+    mine, rest = (element_rates(x, one, spins, 0 * one, d, True).cooling for x in (alone, scene))
     return (impacts + mine) / (impacts + rest)
 
 

@@ -29,6 +29,7 @@ import numpy as np
 import scipy  # imports scipy.special at its first use
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.geometry import NODES, WEIGHTS, sphere_surface
 from jaxgran.scene.laws import ReducedLaw
 
@@ -252,6 +253,122 @@ def collision_rate(
     """
     factor = 1 - jnp.asarray(sonine) / 16 - jnp.asarray(third_sonine) / 64
     return sphere_surface(dimension) / sqrt(2 * pi) * factor
+
+
+_STEEP = 5.0
+"""m from which on a series in 1/m^2 is used in `slip_moments`."""
+
+_STEEP_SERIES = [2 * (-1) ** n * (n + 1) / (2 * n + 3) for n in range(9, -1, -1)]
+"""``m^2 (m arccot m - m^2/(1 + m^2))`` in powers of 1/m^2, the highest first."""
+
+
+def slip_moments(m: Float[Array, "..."] | None, d: int) -> list[Float[Array, "..."]]:
+    """Return means of a slip y and an impulse ``z = min(y, m x)`` at the normal speed x of impacts.
+
+    y has d - 1 Gaussian components of variance 1, and x the density ``x exp(-x^2/2)``.
+
+    Args:
+        m: any shape; None where all spheres stick, m = infinity.
+        d: dimension.
+
+    Returns:
+        The means of y z, z^2, y^2 z^2, y^3 z, z^4, y z^3, x^2 y z and x^2 z^2, each of the shape
+        of m. With ``c = m/sqrt(1 + m^2)`` the first two are ``c^2 + m arccot m`` and ``2 c^2`` in
+        3D, and ``c`` and ``2 c^2/(1 + c)`` in 2D.
+    """
+    c = jnp.ones(()) if m is None else m / jnp.sqrt(1 + m**2)
+    if d == 2:
+        w = c**2 / (1 + c)
+        return [
+            c,
+            2 * w,
+            2 * (w + c**3),
+            2 * c + c**3,
+            4 * w**2 * (2 + c),
+            3 * c**3,
+            3 * c - c**3,
+            2 * w * (4 - c - c**2),
+        ]
+    x, g, h = c**2, jnp.ones(()), 2 / 3
+    if m is not None:
+        g = m * jnp.arctan2(1.0, m)
+        series = jnp.polyval(jnp.asarray(_STEEP_SERIES, c.dtype), jnp.maximum(m, _STEEP) ** -2)
+        h = jnp.where(m < _STEEP, jnp.minimum(m, _STEEP) ** 2 * (g - x), series)
+    return [
+        g + x,
+        2 * x,
+        4 * x * (1 + x),
+        3 * (g + x) + 2 * x**2,
+        8 * x**2,
+        3 * h + 6 * x**2,
+        3 * (g + x) - 2 * x**2,
+        4 * x * (2 - x),
+    ]
+
+
+def rough_impact_means(
+    T: Float[Array, "spheres n"],
+    a: Float[Array, "spheres n"],
+    S: Float[Array, "1 n"],
+    V: Float[Array, "1 n"],
+    m: Float[Array, "1 n"] | None,
+    kick: Float[Array, ""],
+    eta: Float[Array, ""],
+    inertia: Float[Array, ""],
+    d: int,
+) -> list[Float[Array, "spheres n"]]:
+    """Return mean changes of a sphere in an impact, times the rate of impacts over that at T = 1.
+
+    The components of velocities v and of ``s = (sigma/2) w`` are Gaussian. Given the slip u and the
+    normal speed g, those of v and s along the slip are Gaussian around ``(T/V) u`` and ``(a/V) u``.
+    The impulse along the slip is the smaller one of eta u and Coulomb's limit.
+
+    Args:
+        T: variances of the components of v of both spheres.
+        a: those of the components of s.
+        S: variance of the components of the relative velocity, the sum of the two T.
+        V: variance of those of the slip, S and the sum of the two a.
+        m: see `slip_moments`, with ``m = mu (1 + eps)/2 / eta sqrt(S/V)``; None without a limit.
+        kick: (1 + eps)/2.
+        eta: coefficient of `Rough`.
+        inertia: q.
+        d: dimension.
+
+    Returns:
+        The changes of v^2 by the tangential and by the normal part, of s^2, v^2 s^2 and s^4, and
+        the impulse times the slip over V.
+    """
+    N, r = NUM_SPIN_COMPONENTS[d], 1 / inertia
+    per_S, per_V = 1 / S, 1 / V
+    uJ, JJ, uuJJ, uuuJ, J4, uJ3, gguJ, ggJJ = slip_moments(m, d)
+    z = eta * r
+    both, rest = T * a, a + r * T
+    along_n = T * T * per_S
+    normal = kick * (kick * S - 2 * T)
+    pushed = along_n + normal
+    of_v = eta * (eta * V * JJ - 2 * T * uJ)
+    of_s = z * (z * V * JJ - 2 * a * uJ)
+    of_vs = (
+        2 * N * a * normal
+        + eta * (2 * both * (((d + 1) * rest) * per_V - (N + r * d)) + 2 * r * a * along_n) * uJ
+        - 2 * eta * both * rest * per_V * uuuJ
+        + eta**2 * (N * a * V - (d - 1) * (a**2) - 4 * r * both) * JJ
+        + z**2 * (d * T * V - (d - 1) * T**2 - along_n * V) * JJ
+        + eta**2 * (rest**2 + 2 * r * both) * uuJJ
+        + z**2 * eta**2 * V**2 * J4
+        - 2 * z * eta**2 * V * rest * uJ3
+        + z * pushed * (z * V * ggJJ - 2 * a * gguJ)
+    )
+    spin = a * ((N + 2) * V - (d + 1) * a)
+    of_ss = (
+        -4 * z * a * per_V * (spin * uJ + a**2 * uuuJ)
+        + 2 * z**2 * (spin * JJ + 3 * a**2 * uuJJ)
+        + z**4 * V**2 * J4
+        - 4 * z**3 * a * V * uJ3
+    )
+    rate = jnp.sqrt(S / 2)
+    slipping = jnp.broadcast_to(eta * uJ, T.shape)
+    return [rate * x for x in (of_v, 2 * normal, of_s, of_vs, of_ss, slipping)]
 
 
 _SCAN_POINTS = 16

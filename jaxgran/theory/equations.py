@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Float
@@ -33,7 +34,14 @@ from jaxgran.scene.gas import (
 )
 from jaxgran.scene.geometry import contact_value_slopes, impact_average, sphere_surface
 from jaxgran.scene.laws import C1, ReducedLaw
-from jaxgran.theory.averages import TERMS, ElementBounds, RateTable, collision_rate, impact_moments
+from jaxgran.theory.averages import (
+    TERMS,
+    ElementBounds,
+    RateTable,
+    collision_rate,
+    impact_moments,
+    rough_impact_means,
+)
 
 SUPPORTED = ("surface", "container", "drag", "drive")
 """Elements of a scene that the equations contain, see `Gas.elements`."""
@@ -52,6 +60,10 @@ class Moments(NamedTuple):
         diffusion_shape: ``<S_1(c^2) v.dr>/d`` over sqrt(T/T_0), S_1 = d/2 + 1 - c^2; None at
             order 2.
         rotation: T_rot/T of rough spheres; None for smooth spheres.
+        spin_correlation: T_rot/T times ``a_11 = <v^2 w^2>/(<v^2> <w^2>) - 1``; None for smooth
+            spheres and Gaussian spins.
+        spin_kurtosis: (T_rot/T)^2 times ``a_02 = d_rot/(d_rot + 2) <w^4>/<w^2>^2 - 1``. Both
+            products stay finite where the spins begin at 0.
     """
 
     log_temperature: Float[Array, "..."]
@@ -62,15 +74,40 @@ class Moments(NamedTuple):
     third_sonine: Float[Array, "..."] | None = None
     diffusion_shape: Float[Array, "..."] | None = None
     rotation: Float[Array, "..."] | None = None
+    spin_correlation: Float[Array, "..."] | None = None
+    spin_kurtosis: Float[Array, "..."] | None = None
 
     @classmethod
     def from_array(cls, values: Float[Array, "moments ..."], order: int) -> "Moments":
         """Return the moments held by the rows of an array."""
-        has_rotation = len(values) > 5 + 2 * (order > 2)
-        named = dict(zip(cls._fields, values[:5], strict=False))
-        if order > 2:
-            named |= {"third_sonine": values[5], "diffusion_shape": values[6]}
-        return cls(**named, rotation=values[-1] if has_rotation else None)
+        names = [*cls._fields[: 5 if order == 2 else 7], *cls._fields[7:]]
+        return cls(**dict(zip(names, values, strict=False)))
+
+    @property
+    def spins(self) -> "Spins | None":
+        """T_rot/T and the moments of the spins, 0 where they are Gaussian; None if smooth."""
+        if self.rotation is None:
+            return None
+        if self.spin_correlation is None or self.spin_kurtosis is None:
+            return Spins.gaussian(self.rotation)
+        return Spins(self.rotation, self.spin_correlation, self.spin_kurtosis)
+
+
+class Spins(NamedTuple):
+    """Moments of the spins of rough spheres, or their rates of change: see `Moments`."""
+
+    rotation: Any
+    correlation: Any
+    kurtosis: Any
+
+    @classmethod
+    def gaussian(cls, rotation: Array) -> "Spins":
+        """Return the moments of Gaussian spins."""
+        return cls(rotation, jnp.zeros_like(rotation), jnp.zeros_like(rotation))
+
+    def damped(self, rate: Any) -> "Spins":
+        """Return the rates of change where T_rot decays at a rate."""
+        return Spins(-rate * self.rotation, -rate * self.correlation, -2 * rate * self.kurtosis)
 
 
 class Density(NamedTuple):
@@ -114,19 +151,22 @@ class Equations(NamedTuple):
         order: of the Sonine expansion: 2 has a_2, 3 also a_3.
         maxwellian: if True, a_2 stays 0.
         initial_sonine: a_2 at t = 0.
+        gaussian_spins: if True, a_11 and a_02 stay 0.
     """
 
     dimension: int
     order: int
     maxwellian: bool
     initial_sonine: float = 0.0
+    gaussian_spins: bool = False
 
     def initial(self, scene: SceneAndDensity, like: Array) -> Float[Array, "moments"]:
         """Return the `Moments` at t = 0 as one array, of the dtype of `like`."""
         start = [jnp.zeros((), like.dtype)] * (5 if self.order == 2 else 7)
         start[1] += self.initial_sonine
         if scene[0].surface is not None:
-            start.append(scene[0].surface.ratio.astype(like.dtype))
+            spins = Spins.gaussian(scene[0].surface.ratio.astype(like.dtype))
+            start += spins[: 1 if self.gaussian_spins else 3]
         return jnp.stack(start)
 
     def table(self, scene: SceneAndDensity, duration: Array) -> RateTable:
@@ -173,15 +213,16 @@ class Equations(NamedTuple):
             cooling = cooling * (1 - slowdown * correlation_build_up(moments.collisions))
         relaxing, rotating = zero, []
         if gas.has_elements:
-            ratio = 0.0 if moments.rotation is None else moments.rotation
-            changes = element_rates(gas, speed, ratio, a2, d)
+            changes = element_rates(gas, speed, moments.spins, a2, d, self.gaussian_spins)
             cooling, relaxing = cooling + changes.cooling, changes.relaxation
             a2_rate = a2_rate + changes.sonine
             if gas.drive is not None:
                 shape_decay = gas.drive / speed**2
                 a3_rate = a3_rate - 3 * shape_decay * a3
-            if gas.surface is not None:
-                rotating = [changes.rotation + cooling * ratio]
+            if (spins := moments.spins) is not None:  # over powers of T, which falls
+                growth = zip(changes.spins, spins, (1, 1, 2), strict=True)
+                rotating = [change + power * cooling * x for change, x, power in growth]
+                rotating = rotating[: 1 if self.gaussian_spins else 3]
         # Of the terms that cool the gas, only impacts change the shape of the velocity
         # distribution.
         net_growth = cooling / 2 - relaxing
@@ -229,13 +270,13 @@ class ElementRates(NamedTuple):
 
     Attributes:
         cooling: part of ``-d ln T/dt``.
-        rotation: ``dT_rot/dt`` over T.
+        spins: of `Spins` at constant T.
         relaxation: part of the relaxation rate of the velocity autocorrelation function.
         sonine: part of ``da_2/dt``.
     """
 
     cooling: Any
-    rotation: Any = 0.0
+    spins: Spins = Spins(0.0, 0.0, 0.0)  # type: ignore[arg-type]
     relaxation: Any = 0.0
     sonine: Any = 0.0
 
@@ -243,65 +284,46 @@ class ElementRates(NamedTuple):
 def element_rates(
     scene: ReducedScene,
     speed: Float[Array, ""],
-    ratio: Float[Array, ""] | float,
+    spins: Spins | None,
     sonine: Float[Array, ""],
     dimension: int,
+    gaussian_spins: bool = False,
 ) -> ElementRates:
     """Return the sum of the rates of change by all elements of a scene.
-
-    Velocities and angular velocities are taken to be Maxwellian.
 
     Args:
         scene: in reduced units.
         speed: sqrt(T/T_0).
-        ratio: T_rot/T; ignored where the spheres are smooth.
-        sonine: a_2, on which the collision rate depends.
+        spins: of rough spheres; None where the spheres are smooth.
+        sonine: a_2.
         dimension: d.
+        gaussian_spins: take spins and velocities of rough spheres to be independent and Gaussian.
     """
-    parts = [ElementRates(*[jnp.zeros_like(speed)] * 4)]
+    zero = jnp.zeros_like(speed)
+    spins = spins or Spins.gaussian(zero)
+    parts = [ElementRates(zero)]
     if (surface := scene.surface) is not None:
-        rate = collision_rate(sonine, dimension) * speed
-        rates = [rate, rate]
-        if surface.friction is not None:
-            kick = mean_kick(scene.law, speed)
-            shares = sliding_shares(surface, surface.eta, ratio, dimension, kick)
-            rates = [rate * share for share in shares]
-        parts.append(_friction_rates(surface.eta, surface.inertia, rates, ratio, dimension))
+        kick = mean_kick(scene.law, speed)
+        changes = rough_impact_rates(
+            surface, surface.eta, kick, spins, sonine, dimension, gaussian_spins
+        )
+        # The means over spins that are not Gaussian contain the effect of a_2.
+        rate = collision_rate(sonine if gaussian_spins else 0.0, dimension) * speed
+        parts.append(jax.tree.map(lambda change: rate * change, changes))
     if scene.walls is not None:
-        parts.append(_wall_rates(scene.walls, scene.surface, speed, ratio, dimension))
+        on_walls = _wall_rates(scene.walls, surface, speed, spins, dimension)
+        if surface is not None:  # spins lose their share of the slip, and gain Gaussian ones
+            damping = 2 * dimension / (NUM_SPIN_COMPONENTS[dimension] * surface.inertia)
+            lost = spins._replace(rotation=zero).damped(damping * on_walls.relaxation)
+            parts.append(ElementRates(zero, lost))
+        parts.append(on_walls)
     if (drag := scene.drag) is not None:
-        parts.append(ElementRates(2 * drag.rate, -2 * drag.rotational_rate * ratio, drag.rate))
+        parts.append(ElementRates(2 * drag.rate, spins.damped(2 * drag.rotational_rate), drag.rate))
     if scene.drive is not None:
         heating = scene.drive / speed**2
-        parts.append(ElementRates(-heating, sonine=-2 * sonine * heating))
-    return ElementRates(*map(sum, zip(*parts, strict=True)))
-
-
-def _friction_rates(
-    eta: Array, inertia: Array, rates: Any, ratio: Array | float, d: int
-) -> ElementRates:
-    """Rates of change by the tangential part of impacts between spheres.
-
-    With nu impacts per particle and unit of time
-    ``dT/dt = -(2 (d-1)/d) nu (eta T - eta^2 (T + T_rot/q))`` and
-    ``dT_rot/dt = -(2 (d-1)/(q d_rot)) nu (eta T_rot - eta^2 (T + T_rot/q))``: the mean squared
-    tangential velocity of two colliding spheres is 2 (d-1) T for their centres and 2 (d-1) T_rot/q
-    for their surfaces. Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997).
-
-    The two `rates` are nu in the terms with eta and with eta^2, smaller where spheres slide, see
-    `sliding_shares`.
-    """
-    once, twice = (2 * (d - 1) * rate * x for rate, x in zip(rates, (eta, eta**2), strict=True))
-    square = 1 + ratio / inertia
-    return ElementRates(
-        cooling=(once - twice * square) / d,
-        rotation=-(once * ratio - twice * square) / (NUM_SPIN_COMPONENTS[d] * inertia),
-        relaxation=once / (2 * d),
-    )
-
-
-MAX_STICKING = 1e6
-"""Largest friction over the slip at which some spheres slide in double precision."""
+        heated = Spins(zero, -heating * spins.correlation, zero)
+        parts.append(ElementRates(-heating, heated, sonine=-2 * sonine * heating))
+    return jax.tree.map(lambda *rates: sum(rates), *parts)
 
 
 TYPICAL_IMPACT = 2 * sqrt(2 / pi)
@@ -313,46 +335,93 @@ def mean_kick(law: ReducedLaw, speed: Float[Array, ""]) -> Float[Array, ""]:
     return (1 + law.restitution(TYPICAL_IMPACT * speed)) / 2
 
 
-def sliding_shares(
+MAX_STICKING = 1e6
+"""Largest friction over the slip at which some spheres slide in double precision."""
+
+_STEP = 0.04
+"""Steps of variances over S and V: second derivatives are then right to 1e-3."""
+
+A12 = 3.0
+"""``a_12/(a_11 a_02)``: 2 to 3 in DSMC with a_02 from .3 to .9. Without a_12 spins of inelastic
+spheres (eps = .6, beta_t = -.3) have no cooling state."""
+
+_STENCIL = np.array(
+    [
+        [0, 0, 0, 1, -1, 1, -1, 1, -1],
+        [0, 1, -1, 1, -1, -1, 1, 0, 0],
+        [-2, 0, 0, 0, 0, 0, 0, 1, 1],
+        [0, 0, 0, 0.25, 0.25, -0.25, -0.25, 0, 0],
+        [-2, 1, 1, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 0.5, -0.5, 0.5, -0.5, -1, 1],
+    ]
+)[:, None]
+"""Steps in T and a, and weights of the differences d_TT, d_Ta, d_aa and d_Taa."""
+
+
+def rough_impact_rates(
     surface: ReducedRough,
     eta: Float[Array, ""],
-    ratio: Float[Array, ""] | float,
-    dimension: int,
     kick: Float[Array, ""],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the factors of the mean tangential impulse and of its square by Coulomb's limit.
+    spins: Spins,
+    sonine: Float[Array, ""],
+    d: int,
+    gaussian: bool = True,
+) -> ElementRates:
+    """Return the rates of change in impacts of rough spheres, per impact of a sphere.
 
-    The slip u_t of Maxwellian velocities and spins has d - 1 Gaussian components of variance
-    ``2 (T + T_rot/q)``, and spheres stick where eta u_t is below mu times the normal kick
-    ``(1 + eps)/2 g``. Averaged over the normal speeds g of impacts, of density
-    ``g exp(-g^2/2)``, u_t times the impulse and its square are, over those without a limit and
-    with ``m = mu (1 + eps)/2 / (eta sqrt(1 + T_rot/(q T)))``,
+    The cooling is that by roughness. With the cumulants a_20 = a_2, a_11, a_02 and a_12 = 3 a_11
+    a_02 the distribution of a sphere is ``(1 + a_20 T^2/2 d_TT + a_11 T a d_Ta + a_02 a^2/2 d_aa +
+    a_12 T a^2/2 d_Taa) f`` with the Gaussian f of the variances T and a of the components of v and
+    s = (sigma/2) w, so that means are those of `rough_impact_means` and their derivatives, here by
+    differences. Products of cumulants of two spheres are left out, and directions of v and s are
+    taken to be independent.
 
-    - 3D: ``(m^2/(1 + m^2) + m arccot m)/2`` and ``m^2/(1 + m^2)``;
-    - 2D: ``s`` and ``2 s^2/(1 + s)`` with ``s = m/sqrt(1 + m^2)``.
+    Spheres stick where eta times the slip is below mu times the normal kick ``(1 + eps)/2 g``.
+
+    References: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997), for Gaussian spins; Santos,
+    Kremer & dos Santos, Phys. Fluids 23, 030604 (2011), for cumulants, named as there, of spheres
+    that do not slide.
 
     Args:
-        surface: with friction.
+        surface: in reduced units.
         eta: coefficient of `Rough`.
-        ratio: T_rot/T.
-        dimension: d.
         kick: (1 + eps)/2, see `mean_kick`.
-
-    Returns:
-        Two factors, from 0 where all slide to 1 where all stick.
+        spins: moments of the spins.
+        sonine: a_2.
+        d: dimension.
+        gaussian: take v and s to be Gaussian.
     """
-    assert surface.friction is not None
-    slip = jnp.sqrt(1 + ratio / surface.inertia) * jnp.maximum(eta, 1e-9)
-    m = jnp.minimum(surface.friction * kick / slip, MAX_STICKING)
-    stick = m**2 / (1 + m**2)
-    if dimension == 3:
-        return (stick + m * jnp.arctan2(1.0, m)) / 2, stick
-    once = jnp.sqrt(stick)
-    return once, 2 * stick / (1 + once)
+    q, num_spins = surface.inertia, NUM_SPIN_COMPONENTS[d]
+    a, correlation, kurtosis = spins.rotation / q, spins.correlation / q, spins.kurtosis / q**2
+    # A pair of spheres at each step of the first: sums over both.
+    stencil = jnp.asarray(_STENCIL[:, :, : 1 if gaussian else None], a.dtype)
+    step_T, step_a, of_TT, of_Ta, of_aa, of_Taa = stencil
+    size_T, size_a = 2 * _STEP, 2 * _STEP * (1 + a)
+    T1, a1 = 1 + size_T * step_T, a + size_a * step_a
+    T, of_spin = (jnp.concatenate([x, jnp.full_like(x, y)]) for x, y in ((T1, 1.0), (a1, a)))
+    S, V, m = 1 + T1, 1 + T1 + a + a1, None
+    if surface.friction is not None:
+        slip = jnp.sqrt(V / S) * jnp.maximum(eta, 1e-9)
+        m = jnp.minimum(surface.friction * kick / slip, MAX_STICKING)
+    means = rough_impact_means(T, of_spin, S, V, m, kick, eta, q, d)
+    weights = jnp.zeros_like(T1).at[0, 0].set(0.5)
+    if not gaussian:
+        weights += sonine / (2 * size_T**2) * of_TT + correlation / (size_T * size_a) * of_Ta
+        weights += kurtosis / (2 * size_a**2) * of_aa
+        third = A12 * correlation * kurtosis * a / jnp.maximum(a**2, 1e-12)
+        weights += third / (2 * size_T * size_a**2) * of_Taa
+    of_v, by_normal, of_s, of_vs, of_ss, slipping = (jnp.sum(x * weights) for x in means)
+    spinning, zero = of_s / num_spins, jnp.zeros_like(of_s)
+    turned = spreading = zero
+    if not gaussian:
+        cooling = -(of_v + by_normal) / d
+        turned = of_vs / (d * num_spins) - spinning + (a + correlation) * cooling
+        spreading = of_ss / (num_spins * (num_spins + 2)) - 2 * a * spinning
+    return ElementRates(-of_v / d, Spins(q * spinning, q * turned, q**2 * spreading), slipping / d)
 
 
 def _wall_rates(
-    walls: ReducedWalls, surface: ReducedRough | None, speed: Array, ratio: Array | float, d: int
+    walls: ReducedWalls, surface: ReducedRough | None, speed: Array, spins: Spins, d: int
 ) -> ElementRates:
     """Rates of change by impacts on walls, in a well-mixed gas (see `wall_impact_ratio`).
 
@@ -363,12 +432,13 @@ def _wall_rates(
     those of a free gas.
     """
     eta: Any = None
+    zero = jnp.zeros_like(speed)
     if surface is None or walls.surface is None:
         surface = None
     else:
         eta = surface.eta_on_wall(walls.surface) / 2
 
-    def axis_rates(frequency: Array) -> tuple[Array, list[Array]]:
+    def axis_rates(frequency: Array) -> ElementRates:
         def share(g: Array) -> Array:
             eps = walls.law.restitution(g * speed / sqrt(2))
             return wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
@@ -378,22 +448,17 @@ def _wall_rates(
             lost = walls.law.loss(g * speed / sqrt(2))
             return lost * (2 - lost) * g**2 / 2
 
-        lost = impact_average(lambda g: share(g) * energy(g), speed)
-        impacts = [frequency * impact_average(share, speed)] * 2
-        if surface is not None and surface.friction is not None:
-            kick = mean_kick(walls.law, speed / sqrt(2))
-            shares = sliding_shares(surface, eta, ratio, d, kick)
-            impacts = [impacts[0] * factor for factor in shares]
-        # Energy lost over T, and numbers of impacts, per unit of time and sqrt(T/T_0).
-        return frequency * lost, impacts
+        cooling = 2 / d * frequency * impact_average(lambda g: share(g) * energy(g), speed)
+        if surface is None:
+            return ElementRates(cooling)
+        kick = mean_kick(walls.law, speed / sqrt(2))
+        changes = rough_impact_rates(surface, eta, kick, spins, zero, d)
+        impacts = 2 * frequency * impact_average(share, speed)
+        changes = jax.tree.map(lambda change: impacts * change, changes)
+        return changes._replace(cooling=cooling + changes.cooling)
 
     by_axis = jax.vmap(axis_rates)(walls.frequency)
-    lost, impacts = jax.tree.map(lambda x: speed * jnp.sum(x), by_axis)
-    cooling = 2 / d * lost
-    if surface is None:
-        return ElementRates(cooling)
-    friction = _friction_rates(eta, surface.inertia, [2 * rate for rate in impacts], ratio, d)
-    return friction._replace(cooling=cooling + friction.cooling)
+    return jax.tree.map(lambda x: speed * jnp.sum(x), by_axis)
 
 
 def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
@@ -406,7 +471,7 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
     surface, walls, d, rate = scene.surface, scene.walls, dimension, collision_rate(0.0, dimension)
 
     def friction(surface: ReducedRough, eta: Array, rate: Array) -> Array:
-        return _friction_rates(eta, surface.inertia, (rate, rate), 0.0, d).cooling
+        return rate * 2 * (d - 1) / d * (eta - eta**2)
 
     if surface is not None:
         by_speed = by_speed + friction(surface, surface.eta, rate)
@@ -580,7 +645,7 @@ MAX_LOG_TEMPERATURE = 60.0
 """Largest |ln T/T_0| of a steady state."""
 
 _NEWTON_STEPS = 8
-"""Newton steps to a steady T_rot/T of spheres that slide, exact to rounding."""
+"""Newton steps to steady spins, exact to rounding."""
 
 
 class SteadyState(NamedTuple):
@@ -651,7 +716,8 @@ def _solve_steady(gas: Gas) -> tuple[Array, Array, Array, Array]:
     x = optx.root_find(balance, solver, start, scene, throw=False, max_steps=32).value
     heating = scene.drive / jnp.exp(1.5 * x[0])
     imbalance = jnp.abs(balance(x, scene)[0]) / heating
-    return x[0], x[1], _steady_ratio(jnp.exp(x[0] / 2), x[1], scene, d), imbalance
+    spins = _steady_spins(jnp.exp(x[0] / 2), x[1], scene, d, gaussian=False)
+    return x[0], x[1], jnp.zeros_like(guess) if spins is None else spins.rotation, imbalance
 
 
 def _balance_log_temperature(scene: ReducedScene, like: Array, d: int) -> Float[Array, ""]:
@@ -663,7 +729,7 @@ def _balance_log_temperature(scene: ReducedScene, like: Array, d: int) -> Float[
     def bisect(_, ends):
         middle = (ends[0] + ends[1]) / 2
         maxwellian = jnp.stack([middle, jnp.zeros_like(middle)])
-        heats = _steady_rates(maxwellian, scene, Density(), d)[0] > 0
+        heats = _steady_rates(maxwellian, scene, Density(), d, gaussian_spins=True)[0] > 0
         return jnp.where(heats, middle, ends[0]), jnp.where(heats, ends[1], middle)
 
     bound = jnp.full((), MAX_LOG_TEMPERATURE, like.dtype)
@@ -683,7 +749,11 @@ def max_thermal_speed(gas: Gas) -> Float[Array, ""]:
 
 
 def _steady_rates(
-    x: Float[Array, "variables"], scene: ReducedScene, density: Density, d: int
+    x: Float[Array, "variables"],
+    scene: ReducedScene,
+    density: Density,
+    d: int,
+    gaussian_spins: bool = False,
 ) -> Float[Array, "variables"]:
     """Rates of change of ln T, a_2 and at order 3 of a_3, where T_rot/T is steady.
 
@@ -693,24 +763,30 @@ def _steady_rates(
     moments = [x[0], x[1], zero, zero, jnp.full_like(x[0], jnp.inf)]
     if order > 2:
         moments += [x[2], zero]
-    if scene.surface is not None:
-        moments.append(_steady_ratio(speed, x[1], scene, d))
-    equations = Equations(d, order, maxwellian=False)
+    if (spins := _steady_spins(speed, x[1], scene, d, gaussian_spins)) is not None:
+        moments += spins[: 1 if gaussian_spins else 3]
+    equations = Equations(d, order, maxwellian=False, gaussian_spins=gaussian_spins)
     rates = impact_moments(scene.law, speed, d, order)
     change = equations.derivative(jnp.stack(moments), rates, (scene, density))
     return jnp.stack([change[k] for k in (0, 1, 5)[:order]])
 
 
-def _steady_ratio(speed: Array, sonine: Array, scene: ReducedScene, d: int) -> Array:
-    """T_rot/T at which ``dT_rot/dt`` is 0, which is linear in it without friction; 0 if smooth."""
-    ratio = jnp.zeros_like(speed)
+def _steady_spins(
+    speed: Array, sonine: Array, scene: ReducedScene, d: int, gaussian: bool
+) -> Spins | None:
+    """Moments of the spins that do not change at a given T; None for smooth spheres."""
     if scene.surface is None:
-        return ratio
-    for _ in range(1 if scene.surface.friction is None else _NEWTON_STEPS):
-        gain, slope = jax.jvp(
-            lambda r: element_rates(scene, speed, r, sonine, d).rotation,
-            (ratio,),
-            (jnp.ones_like(ratio),),
-        )
-        ratio = jnp.where(slope < 0, ratio - gain / jnp.where(slope < 0, slope, -1.0), 0.0)
-    return ratio
+        return None
+
+    def rates(x):
+        spins = Spins.gaussian(x[0]) if gaussian else Spins(*x)
+        changes = element_rates(scene, speed, spins, sonine, d, gaussian)
+        return jnp.stack(changes.spins[: x.size])
+
+    def step(x, _):
+        x = x - jnp.linalg.solve(jax.jacfwd(rates)(x), rates(x))
+        return x.at[0].max(0.0), None
+
+    start = jnp.zeros(1 if gaussian else 3, speed.dtype)
+    x, _ = jax.lax.scan(step, start, length=_NEWTON_STEPS)
+    return Spins.gaussian(x[0]) if gaussian else Spins(*x)
