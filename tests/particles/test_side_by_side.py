@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.curve import Run
 from jaxgran.particles import run
 from jaxgran.particles.run import block_until_ready, replica_devices, run_replicas
 
@@ -81,7 +80,7 @@ def test_an_error_of_one_ends_the_others_and_is_raised():
             block_until_ready(jnp.zeros(()))
 
     with pytest.raises(RuntimeError, match="of the first"):
-        run_replicas(one, 2, Run(), devices)
+        run_replicas(one, 2, jaxgran.Run(), devices)
 
 
 def test_replicas_stand_in_one_array_where_there_is_one_device_or_a_chosen_one():

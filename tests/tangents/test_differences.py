@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.curve import Run
 from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable, with_tangents
 from jaxgran.models.error_model import slope_bias, slope_bias_of_run
 from tests.beads import curves_of, glass_beads, soft_beads
@@ -118,7 +117,7 @@ def test_soft_spheres_have_the_difference_of_two_runs():
         changed = gas.replace(
             dissipative_constant=gas.value("dissipative_constant") * jnp.exp(log_scale)
         )
-        return model.simulate(changed, times, Run()).replicas.temperature / gas.temperature
+        return model.simulate(changed, times, jaxgran.Run()).replicas.temperature / gas.temperature
 
     f = partial(ratios, differences=0.3)
     value, slope = jax.jvp(f, (0.0,), (1.0,))
@@ -141,7 +140,7 @@ def test_what_differences_do_not_know_is_refused():
 
     def temperature(A):
         changed = gas.replace(dissipative_constant=A)
-        return model.simulate(changed, jnp.array([1e-3]), Run()).temperature
+        return model.simulate(changed, jnp.array([1e-3]), jaxgran.Run()).temperature
 
     with pytest.raises(ValueError, match="this gas has no loss"):
         jax.jvp(temperature, (0.0,), (1.0,))

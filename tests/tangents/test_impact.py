@@ -9,7 +9,6 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxgran
-from jaxgran.data.curve import Run
 from jaxgran.gradients.tangents import ImpactTangents
 from jaxgran.scene.laws import ConstantRestitution, ReducedViscoelastic, RestitutionSeries
 from tests.beads import hard_gas, lattice
@@ -56,7 +55,7 @@ def constant():
 
     def f(x, checkpoint=None):
         changed = gas.replace(coefficient=x[0], temperature=jnp.exp(x[2]))
-        run = Run(checkpoint=checkpoint)
+        run = jaxgran.Run(checkpoint=checkpoint)
         return jnp.log(model.simulate(changed, times * jnp.exp(x[1]), run).temperature)
 
     at = jnp.array([COEFFICIENT, 0.0, 0.0])
