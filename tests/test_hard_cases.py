@@ -120,7 +120,7 @@ def four_bodies():
     velocity = -corner / sigma * np.array([[1.0], [1.3], [0.8], [1.1]]) * speed
     place, end = 1.0001 * corner + side / 2, 3 * float(gas.contact_duration)
     youngs, poisson, a = (gas.value(x) for x in ("youngs_modulus", "poisson_ratio", FREE))
-    rho = jaxgran.scene.contact.elastic_constant(youngs, poisson, sigma)
+    rho = jaxgran.elastic_constant(youngs, poisson, sigma)
 
     def rates(_, state):
         x, v = state.reshape(2, 4, 3)

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.capacity import Neighbourhood
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_neighbourhood_is_that_of_the_gas(beads, dimension):
     gas = beads(packing_fraction=0.1, dimension=dimension)
-    side = float(gas.box_side(1000) / gas.diameter)
-    around = Neighbourhood.of(side, 1000, 1, dimension, listed_more=3.0)
+    model = jaxgran.SoftSpheres(1000)
+    around = model.neighbourhood(model.scene(gas), dimension)
     rate = float(gas.collision_frequency * gas.diameter / jnp.sqrt(gas.temperature))
     # The density is rounded up by 20 % at most; the pair correlation and the rate follow it.
     for rounded, exact in (
@@ -20,7 +19,7 @@ def test_the_neighbourhood_is_that_of_the_gas(beads, dimension):
         (around.contact_value, float(gas.contact_value)),
     ):
         assert exact * (1 - 1e-9) <= rounded < 1.5 * exact
-    assert around.listed == pytest.approx(around.in_contact + 3.0)
+    assert around.listed == pytest.approx(around.in_contact + model.listed_by_skin)
 
 
 @pytest.mark.slow

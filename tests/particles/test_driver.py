@@ -9,7 +9,6 @@ import pytest
 from tqdm import tqdm
 
 import jaxgran
-from jaxgran._utils import status
 from jaxgran.particles import run
 from jaxgran.particles.run import RunFailure, compiling, run_through_times
 from tests.beads import glass_beads
@@ -55,7 +54,7 @@ class Calls:
 def quiet(*args, **options):
     """The last state and the records of a run that does not fail."""
     *found, fault = run_through_times(*args, progress=False, **options)
-    assert fault == status.OK
+    assert fault == 0
     return tuple(found)
 
 
@@ -152,9 +151,9 @@ def test_the_bar_goes_on_where_the_run_was(tmp_path, eager, capsys):
 def test_a_failure_leaves_nan_and_a_status():
     def fails(state, until):
         if state.time >= 1.0:
-            raise RunFailure(status.NOT_FINITE.bit)
+            raise RunFailure(16)
         return advance(state, until)
 
     state, records, fault = run_through_times(start(), TIMES, fails, observe, progress=False)
-    assert fault == status.NOT_FINITE.bit and state.time == 1.0
+    assert "not a finite number" in jaxgran.explain_status(fault) and state.time == 1.0
     assert np.all(np.isfinite(records["total"][:3])) and np.all(np.isnan(records["total"][3:]))

@@ -1,9 +1,11 @@
 """Replicas as runs of their own."""
 
 import os
+import re
 import subprocess
 import sys
-import threading
+import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +13,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.curve import Run
-from jaxgran.particles import run
-from jaxgran.particles.run import block_until_ready, replica_devices, run_replicas
+from tests.beads import lattice
 
 DEVICES = "JAX_NUM_CPU_DEVICES"
 TIMES = jnp.array([0.01, 0.03])
@@ -26,8 +26,7 @@ def two_devices(monkeypatch):
     if DEVICES in os.environ:
         assert jax.device_count() == 2
         return
-    device = jax.devices()[0]
-    monkeypatch.setattr(run, "replica_devices", lambda n, *_: (device,) * 2 if n > 1 else ())
+    monkeypatch.setattr(jax, "local_devices", lambda: jax.devices()[:1] * 2)
 
 
 def cool(gas, name, replicas, **options):
@@ -70,37 +69,51 @@ def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
         cool(gas, "DSMC", 2, checkpoint=path)
 
 
-def test_an_error_of_one_ends_the_others_and_is_raised():
-    begun, devices = threading.Barrier(2), (jax.devices()[0],) * 2
-
-    def one(k, run):
-        begun.wait(timeout=20)
-        if k == 0:
-            raise RuntimeError("of the first")
-        while True:  # until it is told to stop
-            block_until_ready(jnp.zeros(()))
-
-    with pytest.raises(RuntimeError, match="of the first"):
-        run_replicas(one, 2, Run(), devices)
+def test_an_error_of_one_ends_the_others_and_is_raised(beads, two_devices, tmp_path):
+    gas = beads(packing_fraction=0.1, dissipative_constant=0.0)
+    times, model = [3e5 * gas.mean_free_time], jaxgran.DSMC(200, replicas=2)  # a minute
+    (tmp_path / "run.ckpt.0").touch()
+    began = time.monotonic()
+    with pytest.raises(ValueError, match="run.ckpt.0 is no checkpoint"):
+        jaxgran.cool(gas, times, model=model, progress=False, checkpoint=tmp_path / "run.ckpt")
+    assert time.monotonic() - began < 30
 
 
-def test_replicas_stand_in_one_array_where_there_is_one_device_or_a_chosen_one():
-    assert replica_devices(1) == () and replica_devices(2) == ()
-    many = run.MIN_SPHERES_PER_RUN
-    assert replica_devices(2, many - 1) == replica_devices(1, many) == ()
-    assert replica_devices(2, many) == tuple(jax.devices())
+def run_apart(gas, spheres, replicas, folder):
+    """Whether replicas have a run each, seen by what is refused first."""
+    model = jaxgran.HardSpheres(spheres, replicas=replicas)
+    files = {"checkpoint": folder / "run.ckpt", "trajectory": folder / "none" / "run.xyz"}
+    files["checkpoint"].touch()
+    with pytest.raises((ValueError, OSError)) as error:
+        jaxgran.cool(gas, TIMES, model=model, progress=False, **files)
+    assert re.search("written by replicas in one array|cannot write", str(error.value))
+    return error.type is ValueError
+
+
+MANY = 8192
+"""Spheres of a replica from which on one array saves no time."""
+
+
+def test_replicas_stand_in_one_array_on_one_device_or_a_chosen_one(beads, tmp_path, request):
+    apart = partial(run_apart, beads(packing_fraction=0.1), folder=tmp_path)
+    assert not apart(20, 2) and not apart(MANY - 1, 2) and not apart(MANY, 1)
+    assert apart(MANY, 2)
+    request.getfixturevalue("two_devices")
+    assert apart(20, 2) and not apart(20, 1)
     with jax.default_device(jax.devices()[0]):
-        assert replica_devices(2, many) == ()
+        assert not apart(20, 2) and not apart(MANY, 2)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["HardSpheres", "SoftSpheres"])
-def test_large_replicas_on_one_device_run_in_turn(name, beads, monkeypatch):
-    monkeypatch.setattr(run, "MIN_SPHERES_PER_RUN", MODELS[name])
-    gas, key = beads(packing_fraction=0.1), jax.random.key(4)
-    two = cool(gas, name, 2, key=key)
-    alone = cool(gas, name, 1, key=jax.random.fold_in(key, 1))
+@pytest.mark.parametrize("kind", [jaxgran.HardSpheres, jaxgran.SoftSpheres])
+def test_large_replicas_on_one_device_run_in_turn(kind, beads):
+    gas = beads(packing_fraction=0.1)
+    start, times = lattice(gas, MANY, replicas=2), [0.1 * gas.mean_free_time]
+    second = start._replace(position=start.position[1:], velocity=start.velocity[1:])
+    two = jaxgran.cool(gas, times, model=kind(MANY, replicas=2, start=start))
+    alone = jaxgran.cool(gas, times, model=kind(MANY, start=second))
     np.testing.assert_array_equal(two.replicas.temperature[1], alone.temperature)
+    np.testing.assert_array_equal(two.particles.velocity[1], alone.particles.velocity[0])
 
 
 @pytest.mark.slow  # two devices need a process of their own, which compiles for each

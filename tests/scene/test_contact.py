@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.scene.contact import contact_force, impact
+from jaxgran import contact_force, impact
 
 # beta, eps unclipped, eps clipped, contact time in X/v clipped: high-precision solutions of the
 # impact equation, to the digits given.

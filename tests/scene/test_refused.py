@@ -5,7 +5,6 @@ import dataclasses
 import pytest
 
 import jaxgran
-from jaxgran.scene.contact import impact
 from tests.beads import SI, glass_beads, hard_gas
 
 NAN, INF = float("nan"), float("inf")
@@ -36,7 +35,7 @@ class Open(jaxgran.RestitutionLaw):
 
 
 REFUSED = [
-    (lambda: impact(-0.1), r"beta must lie in \[0, inf\), got -0.1"),
+    (lambda: jaxgran.impact(-0.1), r"beta must lie in \[0, inf\), got -0.1"),
     # gases
     (lambda: gas_with(packing_fraction=0.0), r"packing_fraction .* \(0, 0.74048\), got 0"),
     (lambda: gas_with(packing_fraction=0.75), "close packing"),

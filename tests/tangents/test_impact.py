@@ -9,18 +9,16 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxgran
-from jaxgran.data.curve import Run
 from jaxgran.gradients.tangents import ImpactTangents
-from jaxgran.scene.laws import ConstantRestitution, ReducedViscoelastic, RestitutionSeries
-from tests.beads import hard_gas, lattice
+from tests.beads import glass_beads, hard_gas, lattice
 
 
 @pytest.mark.parametrize(
     "law",
     [
-        ReducedViscoelastic(jnp.array(0.4), jnp.array(0.01), True),
-        ConstantRestitution(0.7),
-        RestitutionSeries([-0.2, 0.03], [0.2, 0.4]),
+        glass_beads(0.4).reduced_law,
+        jaxgran.ConstantRestitution(0.7),
+        jaxgran.RestitutionSeries([-0.2, 0.03], [0.2, 0.4]),
     ],
 )
 def test_gains_are_slopes_of_the_loss(law):
@@ -56,7 +54,7 @@ def constant():
 
     def f(x, checkpoint=None):
         changed = gas.replace(coefficient=x[0], temperature=jnp.exp(x[2]))
-        run = Run(checkpoint=checkpoint)
+        run = jaxgran.Run(checkpoint=checkpoint)
         return jnp.log(model.simulate(changed, times * jnp.exp(x[1]), run).temperature)
 
     at = jnp.array([COEFFICIENT, 0.0, 0.0])

@@ -1,5 +1,6 @@
 """Derivatives through particles: exact between projections, right on average across them."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -8,8 +9,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.models.soft_spheres import SoftSpheres
-from jaxgran.scene.gas import ReducedContact
+from jaxgran import SoftSpheres
 from tests.beads import lattice, soft_beads, spheres
 
 
@@ -24,7 +24,8 @@ def followed(gas, position, velocity, replicas, end, interval):
     scene = model.scene(gas)
     dynamics = model.dynamics(scene, model.plan)
     state = dynamics.begin(jnp.asarray(position), jnp.asarray(velocity), 0.4)
-    law = ReducedContact(jnp.zeros(1), jnp.ones(1), scene.material.law.clipped)
+    along = {"alpha": jnp.zeros(1), "dissipative_constant": jnp.ones(1)}
+    law = dataclasses.replace(scene.material.law, **along)
     state = dynamics.with_tangents(state, scene.material._replace(law=law))
     while float(state.time) < end:
         now = dynamics.run_segment(state, end, "sweep")

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,28 +10,65 @@ import pytest
 import jaxgran
 from experiments.support import closed_forms as forms
 from jaxgran.theory import averages as kinetics
-from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 from tests.beads import hard_gas, theory_curve
 
+RATE = 0.831934150151502
+"""Initial cooling rate of viscoelastic spheres, 1/tau_0 in units of delta/tau_c: checked value."""
 
-def test_constants_of_the_expansion():
+
+def test_constants_of_the_expansion(beads):
     # Checked values of the corrected expansion; the third series coefficient has nine digits.
-    np.testing.assert_allclose(COOLING_RATE[3], 0.831934150151502, rtol=1e-14)
-    np.testing.assert_allclose(COOLING_CORRECTION, 2.301752786151829, rtol=1e-14)
-    np.testing.assert_allclose(forms.EXPANSION_P, 0.5661271900235634, rtol=1e-14)
-    np.testing.assert_allclose(forms.EXPANSION_R, 4.142724172222288, rtol=1e-9)
+    q, p, r = 2.301752786151829, 0.5661271900235634, 4.142724172222288
+    np.testing.assert_allclose(forms.EXPANSION_P, p, rtol=1e-14)
+    np.testing.assert_allclose(forms.EXPANSION_R, r, rtol=1e-9)
+    delta = 1e-3
+    expected = -5 / 3 * RATE * delta * (1 - q * delta - p * delta**1.5 + r * delta**2)
+    slope = jax.grad(forms.paper_temperature)(0.0, delta)
+    np.testing.assert_allclose(slope, expected, rtol=1e-13)
+    gas = beads(1.5 * 2**0.1 * delta)
+    rate = jaxgran.KineticTheory().cooling_rate(gas) * gas.mean_free_time
+    np.testing.assert_allclose(rate, -expected, rtol=1e-5)  # 1 - eps = 2e-3 is off by 4e-9
+
+
+TAUS = np.geomspace(1e-3, 1e8, 100)
+HAFF = {"sonine": False, "correlations": False, "rtol": 1e-9}
+"""Settings of kinetic theory with which constant restitution obeys Haff's law."""
 
 
 @pytest.mark.parametrize("e", [0.99, 0.9, 0.5, 0.0])
 @pytest.mark.figures
 def test_haff(e, record):
-    gas = hard_gas(e)
-    tau = jnp.geomspace(1e-3, 1e8, 100)
-    curve = theory_curve(gas, tau, sonine=False, correlations=False, rtol=1e-9)
+    curve = theory_curve(hard_gas(e), TAUS, **HAFF)
     # Asked: 1e-8. The solver's rtol is 1e-9 and its error adds up over eleven decades.
-    exact = forms.haff(tau, e)
+    exact = forms.haff(TAUS, e)
     np.testing.assert_allclose(curve.temperature, exact, rtol=1e-8)
     record("haff", eps=e, error=float(jnp.max(jnp.abs(curve.temperature / exact - 1))))
+
+
+@pytest.mark.parametrize(
+    "taus",
+    [
+        np.zeros(1),  # the start alone
+        np.array([1e-12, 2.0]),  # padded
+        np.linspace(1.0, 1.01, 100),  # more than a window in one step
+    ],
+)
+def test_times_of_every_kind(taus):
+    curve = theory_curve(hard_gas(0.5), taus, **HAFF)
+    np.testing.assert_allclose(curve.temperature, forms.haff(taus, 0.5), rtol=1e-8)
+
+
+def test_members_of_a_batch_keep_their_own_steps():
+    model, eps = jaxgran.KineticTheory(**HAFF), jnp.array([0.99, 0.5, 0.0])
+    gas, some = hard_gas(0.5), slice(4, None, 5)
+
+    def one(e):  # as in a fit: the number of times, 20, is not rounded up to a multiple of 16
+        times = TAUS[some] * gas.mean_free_time
+        return model.curve_in_fit(gas.replace(coefficient=e), times, 1.0).temperature
+
+    for e, found in zip(eps, jax.jit(jax.vmap(one))(eps), strict=True):
+        alone = theory_curve(gas.replace(coefficient=e), TAUS, **HAFF)
+        np.testing.assert_allclose(found, alone.temperature[some], rtol=1e-13)  # of rounding
 
 
 @pytest.mark.slow
@@ -83,10 +121,10 @@ def test_first_order_of_viscoelastic_gas(beads):
     u = jnp.asarray([10.0, 1e2, 1e4, 1e6])
     for delta in (1e-4, 1e-3):
         gas = beads(1.5 * 2**0.1 * delta)
-        tau = (u - 1) / (COOLING_RATE[3] * delta)
+        tau = (u - 1) / (RATE * delta)
         options = {"softness": False, "order": 2, "correlations": False}
         curve = theory_curve(gas, tau, rtol=1e-11, **options)
-        leading = 54 / (COOLING_RATE[3] * delta) * (u ** (1 / 6) - 1)
+        leading = 54 / (RATE * delta) * (u ** (1 / 6) - 1)
         unit = gas.temperature * gas.mean_free_time**2
         exact = curve.displacement / unit - leading
         formula = forms.paper_displacement(tau, delta) - leading

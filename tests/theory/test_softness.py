@@ -1,12 +1,41 @@
 """Contacts that last, by quadratures of their own."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from jaxgran.scene.geometry import contact_value_slopes
-from jaxgran.theory.equations import DIAMETER_REDUCTION, crowding_coefficient, softness_coefficient
+import jaxgran
+from tests.beads import hard_gas
+
+LENGTH = 0.2
+"""X_T of the gases, the length scale of overlaps at sqrt(2 T_0), in diameters."""
+
+DILUTE = 1e-12
+"""A packing fraction at which spheres meet two at a time."""
+
+
+def soft_gas(beta, phi, dimension):
+    alpha = 2 * LENGTH**-2.5
+    A = beta / (1.5 * alpha**0.4 * 2**0.1)
+    return hard_gas(jaxgran.Viscoelastic(1.5 * alpha, 0.0, A), phi, dimension)
+
+
+def slowing(gas):
+    """Cooling rate at T_0 over that of instantaneous impacts, (1 - c X_T)/(1 + k X_T)."""
+    theory = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-12)
+    short = 1e-3 * np.array([0.25, 0.5, 0.75, 1.0])
+    T = jaxgran.cool(gas, short / theory.cooling_rate(gas), model=theory).temperature
+    return np.polyfit(short, -np.log(T) / short, 3)[-1]  # at t = 0
+
+
+def softness(beta, dimension=3):
+    """c of a gas in which k is 0."""
+    return (1 - slowing(soft_gas(beta, DILUTE, dimension))) / LENGTH
+
+
+def mean(power):
+    """Of the overlap in X_T."""
+    return quad(lambda x: x**power * np.exp(-0.4 * x**2.5), 0, 8)[0]
 
 
 def loss_and_slope(beta):
@@ -37,37 +66,40 @@ def test_softness_is_the_average_over_oblique_impacts(beta):
     loss, slope = np.array([loss_and_slope(beta * v**0.2) for v in g]).T
     expected = -2 * np.sum(weights * g**1.8 * slope) / np.sum(weights * g**3 * loss)
     # The fit is good to 5e-4, twelve nodes to 3e-4.
-    np.testing.assert_allclose(softness_coefficient(jnp.asarray(beta), 3), expected, rtol=1e-3)
+    np.testing.assert_allclose(softness(beta), expected, rtol=1e-3)
 
 
-def test_softness_of_a_weakly_dissipating_contact():
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_softness_of_a_weakly_dissipating_contact(dimension):
     # Velocities are then independent of positions: the loss is the mean of sqrt(xi) (1 - xi)^(d-1).
-    def mean(power):
-        return quad(lambda x: x**power * np.exp(-0.4 * x**2.5), 0, 8)[0]
+    expected = (dimension - 1) * mean(1.5) / mean(0.5)
+    betas = 1e-4 * np.array([1.0, 2.0, 3.0])
+    found = np.polyfit(betas, [softness(beta, dimension) for beta in betas], 2)[-1]  # at beta = 0
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
 
-    for d in (2, 3):
-        expected = (d - 1) * mean(1.5) / mean(0.5)
-        np.testing.assert_allclose(softness_coefficient(jnp.zeros(()), d), expected, rtol=1e-8)
-    np.testing.assert_allclose(DIAMETER_REDUCTION, mean(0.0), rtol=1e-8)
-    # 0.96878 (d - 1), and in 3D 1.84, 1.71, 1.60, 1.42: oblique impacts, integrated apart.
-    found = softness_coefficient(jnp.asarray([0.1, 0.3, 0.5, 1.0]), 3)
+
+def test_softness_of_dissipating_contacts():
+    # Oblique impacts, integrated apart; 1.938 without dissipation.
+    found = [softness(beta) for beta in (0.1, 0.3, 0.5, 1.0)]
     np.testing.assert_allclose(found, [1.84, 1.71, 1.60, 1.42], atol=8e-3)
 
 
-@pytest.mark.parametrize("dimension, expected", [(3, [7.5, 4.5]), (2, [25 / 8, 53 / 24])])
-def test_slopes_of_a_dilute_gas_are_those_of_the_excluded_volume(dimension, expected):
-    # Their sum over phi is the slope in d of the volume that two spheres of radius d exclude both:
-    # 2 pi n = 12 phi for spheres, (4 pi/3) n = (16/3) phi for disks.
-    slopes = contact_value_slopes(jnp.asarray(1e-7), dimension)
-    np.testing.assert_allclose(np.array(slopes) / 1e-7, expected, rtol=1e-5)
-    np.testing.assert_allclose(sum(slopes) / 1e-7, {3: 12, 2: 16 / 3}[dimension], rtol=1e-5)
-
-
-def test_crowding_is_the_loss_of_the_equilibrium_fluid(beads):
-    gas = beads(0.1, packing_fraction=0.2)
-    # 1.2801 (1.9170) + .3113 (1.2003) + .56/3 t_c/tau_c sigma/X_T, worked out by hand.
-    length = gas.reduced_law.impact_length(jnp.ones(()))
-    held = 0.56 / 3 * gas.contact_fraction / length
-    expected = 1.28011 * 1.91667 + 0.31133 * 1.2 + held
-    np.testing.assert_allclose(crowding_coefficient(gas), expected, rtol=1e-3)
-    assert crowding_coefficient(beads(0.1, packing_fraction=1e-6)) < 2e-5
+@pytest.mark.parametrize(
+    "dimension, phi, by_diameter, by_distance",
+    [
+        # d times 5/2 and 25/16, of the third virial coefficient. Both are together the slope in d
+        # of the volume that two spheres of radius d exclude both: 2 pi n = 12 phi for spheres,
+        # (4 pi/3) n = (16/3) phi for disks.
+        (3, 1e-6, 7.5, 4.5),
+        (2, 1e-6, 25 / 8, 53 / 24),
+        (3, 0.2, 1.91667 / 0.2, 1.2 / 0.2),  # by hand
+    ],
+)
+def test_crowding_is_the_loss_of_the_equilibrium_fluid(dimension, phi, by_diameter, by_distance):
+    gas, dilute = soft_gas(0.1, phi, dimension), soft_gas(0.1, DILUTE, dimension)
+    # The diameter that excludes the same volume, the mean overlap, and the energy of contacts.
+    reduction, overlap = mean(0.0), mean(1.5) / mean(0.5)
+    expected = phi * (reduction * by_diameter + (reduction - overlap) * by_distance)
+    expected += 0.56 / dimension * gas.contact_fraction / LENGTH
+    found = (slowing(dilute) / slowing(gas) - 1) / LENGTH
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
