@@ -190,13 +190,25 @@ def test_a_box_that_does_not_hold_other_spheres_is_refused_in_a_choice():
         jaxgran.choose_model(fits, [1.0], num_particles=100)
 
 
+def test_rejected_steps_leave_no_values():
+    # The first step, .01 mean free times, is far too long for D of spheres that drag stops sooner.
+    gas = constant(1.0, drag=jaxgran.StokesDrag(1.0))
+    taus, rate = np.array([1e-5, 1e-4, 1e-3]), 3e3
+    gas = gas.replace(drag_rate=rate / float(gas.mean_free_time))
+    curve = theory_curve(gas, taus, correlations=False)
+    left = np.exp(-rate * taus)
+    expected = float(gas.temperature / gas.value("drag_rate")) * left * (1 - left)
+    np.testing.assert_allclose(curve.diffusion, expected, rtol=2e-3)  # collisions: 1e-3
+
+
 def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
     # T rises to 2 T_0 by the spins, far beyond a table that ends at T_0: beside the equations of
     # Huthmann & Zippelius without a table, integrated by another library.
     q, beta = 0.4, 0.5
     surface = jaxgran.Rough(beta, inertia=q, rotational_temperature=0.1)
     gas, taus = dataclasses.replace(beads(0.02), surface=surface), np.array([0.3, 1.0, 3.0])
-    curve = theory_curve(gas, taus, sonine=False, softness=False, correlations=False)
+    options = {"sonine": False, "softness": False, "correlations": False}
+    curve = theory_curve(gas, taus, spin_cumulants=False, **options)
     assert float(curve.temperature[2]) > 2 * float(gas.temperature)
     eta = q * (1 + beta) / (2 * (1 + q))
 
