@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,20 +15,12 @@ TAU = float(BEADS.mean_free_time)
 
 
 def spheres_of(case, gas, end, key=0):
-    """Velocities and spins s = sigma w/2 at the start and at the end, and the positions at first.
-
-    Replicas follow each other.
-    """
+    """Velocities, spins s = sigma w/2 and places of all replicas, at the start and at the end."""
     times = np.linspace(0.0, end, 3)
     saved = case.run(gas, times, save="particles", key=jax.random.key(key)).saved
-    saved = jax.tree.map(lambda x: x[jnp.array([0, -1])], saved)
-    if saved.angular_velocity is not None:
-        saved = saved._replace(angular_velocity=saved.angular_velocity * gas.diameter / 2)
-    velocity, spin, position = (
-        None if x is None else np.asarray(x).reshape(2, -1, x.shape[-1])
-        for x in (saved.velocity, saved.angular_velocity, saved.position)
-    )
-    return velocity, spin, None if position is None else position[0]
+    parts = [saved.velocity, 0.5 * gas.diameter * saved.angular_velocity]
+    parts += [saved.position] if case.model.has_positions else []
+    return [np.reshape(np.asarray(x), (3, -1, x.shape[-1]))[::2] for x in parts]
 
 
 def pairs_of(*kicks):
@@ -47,18 +38,14 @@ def pairs_of(*kicks):
 def test_impacts_keep_angular_momentum_and_follow_the_rule(model, dimension, loss, beta):
     # Unit masses, I = q/4. In 2D as in a plane.
     case, q = CASES[model], 0.4
-    if dimension == 3:
-        gas = given_elements(case, surface=jaxgran.Rough(beta, rotational_temperature=T_ROT))
-    else:
-        gas = glass_beads(0.3, 2, packing_fraction=0.2)
-        surface = jaxgran.Rough(beta, rotational_temperature=T_ROT)
-        gas = dataclasses.replace(gas, surface=surface)
+    gas = given_elements(case) if dimension == 3 else glass_beads(0.3, 2, packing_fraction=0.2)
+    gas = dataclasses.replace(gas, surface=jaxgran.Rough(beta, rotational_temperature=T_ROT))
     gas = gas.replace(dissipative_constant=loss * BEADS.value("dissipative_constant"))
     # Smooth spheres show the normals.
     smooth, end = gas.replace(tangential_restitution=-1.0), 0.4 * float(gas.mean_free_time)
     number = 0
     for key in range(3):
-        velocity, spin, _ = spheres_of(case, gas, end, key)
+        velocity, spin, *_ = spheres_of(case, gas, end, key)
         alone = spheres_of(case, smooth, end, key)[0]
         kick, changed, along = velocity[1] - velocity[0], spin[1] - spin[0], alone[1] - alone[0]
         i, j = pairs_of(along, kick)
@@ -91,7 +78,7 @@ def test_laws_see_the_speeds_that_drag_has_left():
     case, gamma = CASES["hard spheres"], 1.0 / TAU
     gas, end = given_elements(case, drag=jaxgran.StokesDrag(gamma)), 0.5 * TAU
     gas = gas.replace(dissipative_constant=BEADS.value("dissipative_constant"))
-    velocity, _, place = spheres_of(case, gas, end)
+    velocity, _, (place, _) = spheres_of(case, gas, end)
     kick = velocity[1] * np.exp(gamma * end) - velocity[0]
     i, j = pairs_of(kick)
     assert len(i) > 5
