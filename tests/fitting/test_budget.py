@@ -1,7 +1,6 @@
 """The whole error of an estimate, part by part."""
 
 import dataclasses
-from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -113,19 +112,17 @@ def test_the_budget_of_a_particle_fit(beads):
     assert relative(result, "model") > 0.005  # DSMC has Enskog's rate too
 
 
-class Listener(jaxgran.KineticTheory):
-    """A model that keeps the error models that it is asked about."""
-
-    heard: ClassVar[list[jaxgran.ErrorModel]] = []
-
-    def estimated_error(self, error_model):
-        self.heard.append(error_model)
-        return 0.0
-
-
 def error_model_of(gas, end, num_particles):
+    """The error model that models are asked about."""
+    asked = []
+
+    class Listener(jaxgran.KineticTheory):
+        def estimated_error(self, error_model):
+            asked.append(error_model)
+            return 0.0
+
     jaxgran.choose_model(gas, [end], num_particles=num_particles, models=[Listener()])
-    return Listener.heard.pop()
+    return asked[0]
 
 
 def test_derivatives_through_a_flow_are_known_worse():
