@@ -1,6 +1,5 @@
 """The command line, run in this process."""
 
-import argparse
 import dataclasses
 import json
 import os
@@ -17,10 +16,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.cli.common import MODELS, NO_CACHE_VARIABLE, models_by_name, use_compilation_cache
-from jaxgran.cli.fit import choose_or_make_model
 from jaxgran.cli.main import main
-from jaxgran.models.choose import default_models
+from tests.beads import glass_beads
 
 PNG = b"\x89PNG\r\n\x1a\n"
 """The first bytes of a PNG file."""
@@ -315,17 +312,26 @@ BY_NAME = {
 
 
 @pytest.mark.parametrize("name, model", BY_NAME.items())
-def test_models_are_found_by_their_names(name, model):
-    options = argparse.Namespace(model=name, particles=100, replicas=3, curve="curve.csv")
-    assert choose_or_make_model(options, None, None, (), None) == (model, ())
-    options.particles = None
-    if model.stochastic:
-        with pytest.raises(ValueError, match="curve.csv does not give N. Add --particles"):
-            choose_or_make_model(options, None, None, (), None)
+def test_models_are_found_by_their_names(measured, run, monkeypatch, name, model):
+    fitted = []
+
+    def fit(*measured, model, **options):
+        fitted.append(model)
+        raise RuntimeError("no fit")
+
+    monkeypatch.setattr("jaxgran.fit", fit)
+    run("fit", "thin.csv", "--model", name, "--particles", 100)
+    assert fitted == [model]
+    *_, error = run("fit", "thin.csv", "--model", name)
+    assert ("thin.csv does not give N. Add --particles." in error) == model.stochastic
 
 
-def test_model_names_are_complete():
-    assert (*models_by_name(default_models(2)), "auto") == MODELS == (*BY_NAME, "auto")
+def test_model_names_are_complete(run):
+    candidates = jaxgran.choose_model(glass_beads(), [1.0]).candidates
+    assert [c.model.name.lower().replace(" ", "-") for c in candidates] == [*BY_NAME]
+    names = ", ".join(f'"{name}"' for name in BY_NAME)
+    assert f"Choose from: {names}." in run("cool", "scene.toml", "--model", "best")[2]
+    assert f'Choose from: {names}, "auto".' in run("fit", "thin.csv", "--model", "best")[2]
 
 
 @pytest.mark.parametrize("command", ["fit thin.csv", "cool scene.toml --until 1"])
@@ -344,34 +350,39 @@ def test_a_terminal_without_colours_gets_no_escape_codes(capsys, monkeypatch, va
 
 
 @pytest.fixture
-def no_cache_yet(monkeypatch):
-    """Set JAX up as in a new process, and restore its settings after the test."""
-    monkeypatch.delenv(NO_CACHE_VARIABLE, raising=False)
+def cache_of(monkeypatch):
+    """A function that runs a command as in a new process; it returns the folder of its programs."""
+    monkeypatch.delenv("JAXGRAN_NO_CACHE", raising=False)
     monkeypatch.setenv("XLA_FLAGS", "")
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", None)
-    yield
+
+    def cache_of(folder):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
+        assert main(["choose", "none.toml", "--until", "1"]) == 2
+        return jax.config.values["jax_compilation_cache_dir"]
+
+    yield cache_of
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def test_the_compilation_cache_is_used_if_possible(tmp_path, monkeypatch, no_cache_yet):
+def test_the_compilation_cache_is_used_if_possible(tmp_path, monkeypatch, cache_of):
     (tmp_path / "file").write_text("")
-    assert not use_compilation_cache(tmp_path / "file" / "programs")
-    assert jax.config.values["jax_compilation_cache_dir"] is None
-    monkeypatch.setenv(NO_CACHE_VARIABLE, "1")
-    assert not use_compilation_cache(tmp_path / "programs")
-    monkeypatch.setenv(NO_CACHE_VARIABLE, "0")
-    assert use_compilation_cache(tmp_path / "programs")
-    assert (tmp_path / "programs").stat().st_mode & 0o777 == 0o700
-    assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path / "programs")
-    assert not use_compilation_cache(tmp_path / "others")  # one is set already
+    assert cache_of(tmp_path / "file") is None
+    monkeypatch.setenv("JAXGRAN_NO_CACHE", "1")
+    assert cache_of(tmp_path) is None
+    monkeypatch.setenv("JAXGRAN_NO_CACHE", "0")
+    programs = tmp_path / "jaxgran" / "compiled"
+    assert cache_of(tmp_path) == str(programs)
+    assert programs.stat().st_mode & 0o777 == 0o700
+    assert cache_of(tmp_path / "others") == str(programs)  # one is set already
 
 
-def test_a_cache_folder_that_others_can_write_is_not_used(tmp_path, no_cache_yet):
-    (tmp_path / "shared").mkdir()
-    (tmp_path / "shared").chmod(0o777)
-    assert not use_compilation_cache(tmp_path / "shared")
-    assert jax.config.values["jax_compilation_cache_dir"] is None
+def test_a_cache_folder_that_others_can_write_is_not_used(tmp_path, cache_of):
+    shared = tmp_path / "jaxgran" / "compiled"
+    shared.mkdir(parents=True)
+    shared.chmod(0o777)
+    assert cache_of(tmp_path) is None
 
 
 @pytest.mark.slow

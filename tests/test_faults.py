@@ -15,12 +15,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran._utils import status
-from jaxgran._utils.validation import ANY
-from jaxgran.data.curve import Run
+from jaxgran import ReducedLaw, RestitutionLaw, Run
 from jaxgran.particles import dynamics as moving
 from jaxgran.particles.run import block_until_ready, in_thread, run_through_times
-from jaxgran.scene.laws import ReducedLaw, RestitutionLaw
 from tests.beads import glass_beads, hard_gas
 
 GAS = glass_beads(0.3, packing_fraction=0.1)
@@ -53,7 +50,7 @@ class OfMass(NotReduced, ReducedLaw):
     """A law with a float called like one of the gas."""
 
     mass: float = 1.0
-    domains = {"mass": ANY}
+    domains = {"mass": jaxgran.Domain()}
 
     def restitution(self, normal_speed):
         return 0.9 * jnp.ones_like(normal_speed)
@@ -159,10 +156,9 @@ def test_the_table_of_faults_names_tests_that_exist():
 
 def test_statuses_are_explained():
     assert jaxgran.explain_status(None) == jaxgran.explain_status(jnp.zeros(3, int)) == "ok"
-    several = np.array([0, status.STALLED.bit, status.STALLED.bit | status.LIST_FULL.bit])
-    words = jaxgran.explain_status(several)
+    words = jaxgran.explain_status(np.array([0, 32, 32 | 1]))
     assert "2 of 3 curves: the simulated time" in words and "1 of 3 curves: the neigh" in words
-    for wrong in (-1, 1.5, "x", 2 * status.FAULTS[-1].bit):
+    for wrong in (-1, 1.5, "x", 2**15):
         with pytest.raises(ValueError, match="status must be that of a curve"):
             jaxgran.explain_status(wrong)
 
@@ -195,8 +191,8 @@ def test_members_of_a_batch_out_of_range_say_so():
     phi, A = (float(GAS.value(name)) for name in ("packing_fraction", "dissipative_constant"))
     many = jax.vmap(lambda p, a: cool(GAS.replace(packing_fraction=p, dissipative_constant=a)))
     curve = many(jnp.array([phi, 0.9, phi]), jnp.array([A, A, -1.0]))
-    assert curve.status[0] == status.OK and np.isfinite(curve.temperature[0])
-    assert np.all(curve.status[1:] == status.OUT_OF_RANGE.bit)
+    assert curve.status[0] == 0 and np.isfinite(curve.temperature[0])
+    assert "2 of 2 curves: a float of the gas" in jaxgran.explain_status(curve.status[1:])
     assert np.all(np.isnan(curve.temperature[1:]))
 
 
@@ -230,7 +226,8 @@ def test_a_run_that_stands_still_ends():
     state, records, fault = run_through_times(
         Standing(), np.ones(1), lambda s, end: s, lambda s: {"temperature": jnp.ones(())}
     )
-    assert fault == status.STALLED.bit and np.isnan(records["temperature"])
+    assert "no longer advances" in jaxgran.explain_status(fault)
+    assert np.isnan(records["temperature"])
 
 
 @pytest.mark.slow
@@ -243,7 +240,8 @@ def test_blocks_that_stand_still_end(kind, x64, monkeypatch):
         jax.clear_caches()
         curve = kind(20).simulate(gas, jnp.array([TAU]), Run())
         jax.clear_caches()
-    assert int(curve.status) & status.STALLED.bit and np.isnan(curve.temperature[0])
+    assert "no longer advances" in jaxgran.explain_status(curve.status)
+    assert np.isnan(curve.temperature[0])
 
 
 @jax.jit
@@ -346,7 +344,7 @@ def test_heavily_damped_impacts_end():
 
 OWN_LAW = """
 import sys, jax, jax.numpy as jnp, jaxgran
-from jaxgran.scene.laws import ReducedLaw, RestitutionLaw
+from jaxgran import ReducedLaw, RestitutionLaw
 jax.config.update("jax_enable_x64", True)
 def slow(v): return FACTOR * jnp.ones_like(v)
 class Own(RestitutionLaw, ReducedLaw):

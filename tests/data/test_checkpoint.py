@@ -1,37 +1,35 @@
+"""Checkpoints of runs, and files that are written whole or not at all."""
+
 import errno
 import hashlib
 import io
 import json
-from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data import checkpoint, files
-from jaxgran.data.checkpoint import describe_run, differences, load, save
-from jaxgran.data.files import write_atomically
+from jaxgran.data.checkpoint import describe_run, differences
+from tests.test_contract import CASES
 
-ABC = {"name": "abc"}
+ODD = {
+    "odd": np.array([np.nan, -0.0, np.inf, 5e-324, 1 / 3]),
+    "empty": np.zeros((0, 3)),
+    "single": np.linspace(0, 1, 6, dtype=np.float32).reshape(2, 3),
+    "whole": np.arange(-2, 3, dtype=np.int32),
+    "truth": (np.array([True, False]), np.uint8(200)),
+    "nothing": None,
+}
 
 
-class State(NamedTuple):
-    time: jax.Array
-    rest: dict
+def odd(particles):
+    return ODD
 
 
-def state():
-    rest = {
-        "odd": np.array([np.nan, -0.0, np.inf, 5e-324, 1 / 3]),
-        "empty": np.zeros((0, 3)),
-        "single": jnp.linspace(0, 1, 6, dtype=jnp.float32).reshape(2, 3),
-        "whole": jnp.arange(-2, 3, dtype=jnp.int32),
-        "truth": (np.array([True, False]), np.uint8(200)),
-        "nothing": None,
-    }
-    return State(jnp.asarray(0.1), rest)
+def resumed(path):
+    """The curve of a run that saves odd numbers of all types."""
+    return CASES["DSMC"].run(checkpoint=path, save=odd)
 
 
 def same_bits(a, b):
@@ -41,122 +39,121 @@ def same_bits(a, b):
         assert x.tobytes() == np.asarray(y).tobytes()
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run that has ended, and the content of its checkpoint."""
+    path = tmp_path_factory.mktemp("run") / "run.eqx"
+    curve = resumed(path)
+    assert [file.name for file in path.parent.iterdir()] == ["run.eqx"]
+    return curve, path.read_bytes()
+
+
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "run.eqx"
 
 
-def assert_refused(path, words, scene=ABC, like=None):
+def assert_refused(path, content, words):
+    path.write_bytes(content)
     with pytest.raises(ValueError, match=words):
-        load(path, scene, state() if like is None else like)
+        resumed(path)
 
 
-def test_round_trip_bit_for_bit(path):
-    for scene in ({}, ABC):
-        save(path, scene, state())
-        same_bits(load(path, scene, state()), state())
-    save(str(path), ABC, jnp.ones(3))  # written over
-    same_bits(load(str(path), ABC, jnp.zeros(3)), jnp.ones(3))
-    assert [file.name for file in path.parent.iterdir()] == ["run.eqx"]
+def test_round_trip_bit_for_bit(finished, path):
+    curve, data = finished
+    path.write_bytes(data)
+    for name in (path, str(path)):
+        same_bits(resumed(name), curve)
+    saved = jax.tree.map(lambda x: np.asarray(x)[0, 0], curve.replicas.saved)
+    same_bits(saved, jax.tree.map(np.asarray, ODD))
 
 
-def test_other_runs_are_refused(path, monkeypatch):
-    save(path, ABC, state())
-    words = "run.eqx .* name was abc and is abd; N was absent and is"
-    assert_refused(path, words, scene={"name": "abd", "N": "3"})
-    for like in (state(), jnp.zeros(3)), jnp.zeros(3):
-        assert_refused(path, "run.eqx belongs to another run", like=like)
-    save(path, ABC, np.ones((3, 2)))
-    # Another shape of as many numbers, another type, another structure.
-    for like in np.zeros((2, 3)), np.zeros((3, 2), np.float32), [np.zeros((3, 2)), 0]:
-        assert_refused(path, "run.eqx belongs to another run", like=like)
-    same_bits(load(path, ABC, np.zeros((3, 2))), np.ones((3, 2)))
-    for name, value, words in (
-        ("FORMAT", "7", "format was 7 and is 5"),
-        ("version", lambda package: "0.0.7", "version of jaxgran was 0.0.7 and is"),
+def test_other_runs_are_refused(finished, path):
+    line, _, body = finished[1].partition(b"\n")
+    for name, value in (
+        ("format", "7"),
+        ("version of jaxgran", "0.0.7"),
+        ("times", "absent"),
+        ("types and shapes of the state", "float64"),
     ):
-        with monkeypatch.context() as patch:
-            patch.setattr(checkpoint, name, value)
-            save(path, ABC, state())
-        assert_refused(path, f"run.eqx belongs to another run: {words}")
+        header = json.loads(line)
+        header["scene"][name] = value
+        changed = json.dumps(header).encode() + b"\n" + body
+        words = f"run.eqx belongs to another run: {name} was {value} and is"
+        assert_refused(path, changed, words)
 
 
-def test_damaged_files_are_told_or_harmless(path):
-    save(path, ABC, state())
-    data = path.read_bytes()
+def test_damaged_files_are_told_or_harmless(finished, path):
+    curve, data = finished
     for part in (0.0, 0.001, 0.3, 0.9, 0.999):
-        path.write_bytes(data[: int(part * len(data))])
-        assert_refused(path, "run.eqx is (damaged|no checkpoint of jaxgran)")
+        words = "run.eqx is (damaged|no checkpoint of jaxgran)"
+        assert_refused(path, data[: int(part * len(data))], words)
     rng, told = np.random.default_rng(0), 0
-    for _ in range(300):
+    for end in 50 * [data.index(b"\n"), len(data)]:  # half of them in the header
         damaged = bytearray(data)
-        damaged[rng.integers(len(data))] ^= rng.integers(1, 256)
+        damaged[rng.integers(end)] ^= rng.integers(1, 256)
         path.write_bytes(damaged)
         try:
-            loaded = load(path, ABC, state())
+            loaded = resumed(path)
         except ValueError as error:
             assert str(path) in str(error)
             told += 1
         else:  # white space of the header
-            same_bits(loaded, state())
-    assert told > 280
+            same_bits(loaded, curve)
+    assert told > 93
 
 
 def test_files_of_others_are_refused(path):
-    assert_refused(path, "run.eqx is no checkpoint .* No such file")
-    assert_refused(path.parent, f"{path.parent.name} is no checkpoint")
     archive = io.BytesIO()
     np.savez(archive, leaf_0=np.zeros(3))
     headers = (b"3", b"[]", b"{}", b'{"format": 2}', b"[" * 100_000)
     contents = (b"t,T\n0,1\n", b"\x89PNG\r\n\x1a\n", b"\x00" * 100, archive.getvalue())
     for content in (*contents, *(header + b"\n" for header in headers)):
-        path.write_bytes(content)
-        assert_refused(path, "run.eqx is no checkpoint")
+        assert_refused(path, content, "run.eqx is no checkpoint")
 
 
-def test_nothing_is_unpickled(path):
-    save(path, ABC, np.zeros(1))
-    header = json.loads(path.read_bytes().split(b"\n")[0])
+def test_nothing_is_unpickled(finished, path):
+    header = json.loads(finished[1].partition(b"\n")[0])
     body = io.BytesIO()
     np.save(body, np.array([{}]), allow_pickle=True)
     header["digest"] = hashlib.sha256(body.getvalue()).hexdigest()
-    path.write_bytes(json.dumps(header).encode() + b"\n" + body.getvalue())
-    assert_refused(path, "run.eqx is damaged", like=np.zeros(1))
+    content = json.dumps(header).encode() + b"\n" + body.getvalue()
+    assert_refused(path, content, "run.eqx is damaged")
+
+
+CURVE = jaxgran.CoolingCurve(times=[0.1, 0.2, 0.3], temperature=[3e-3, 2e-3, 1e-3])
 
 
 def test_folders_that_are_not_there(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder").mkdir()
-    for name in ("none/run.eqx", "file/run.eqx", "folder"):
+    for name in ("none/curve.csv", "file/curve.npz", "folder"):
         path = tmp_path / name
         with pytest.raises(OSError, match="could not write") as error:
-            save(path, ABC, state())
+            jaxgran.write_curve(path, CURVE, {}, overwrite=True)
         assert str(path) in str(error.value) and error.value.filename == str(path)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["file", "folder"]
 
 
-@pytest.mark.parametrize("stage", ["write", "fsync", "replace"])
+@pytest.mark.parametrize("stage", ["numpy.savez_compressed", "os.fsync", "os.replace"])
 @pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
-def test_whatever_ends_the_writing_the_old_file_stays(path, monkeypatch, stage, fault):
-    save(path, ABC, state())
+def test_whatever_ends_the_writing_the_old_file_stays(tmp_path, monkeypatch, stage, fault):
+    path = tmp_path / "curve.npz"
+    jaxgran.write_curve(path, CURVE, {})
     before = path.read_bytes()
 
-    def fail(*args):
+    def fail(file, *args, **arrays):
+        if stage == "numpy.savez_compressed":
+            file.write(b"half")
         raise fault
 
-    def write(file):
-        file.write(b"half")
-        if stage == "write":
-            fail()
-
-    if stage != "write":
-        monkeypatch.setattr(files.os, stage, fail)
+    monkeypatch.setattr(stage, fail)
     with pytest.raises(type(fault)) as error:
-        write_atomically(path, write)
+        jaxgran.write_curve(path, CURVE, {"N": "3"}, overwrite=True)
     if isinstance(fault, OSError):
         assert error.value.errno == errno.ENOSPC and str(path) in str(error.value)
     assert path.read_bytes() == before
-    assert [file.name for file in path.parent.iterdir()] == ["run.eqx"]
+    assert [file.name for file in path.parent.iterdir()] == ["curve.npz"]
 
 
 def test_descriptions_tell_everything_apart():

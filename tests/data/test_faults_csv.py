@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 import jaxgran
 from jaxgran import read_curve, read_gas, read_priors, write_curve
-from jaxgran.data.files import header_count
 
 KEYS = {"N": 2000, "eta": 0.04, "diameter": 0.003, "density": 1200, "Y": 2e7, "nu": 0.3, "T0": 0.02}
 
@@ -304,7 +303,7 @@ CALLS = [
         lambda: jaxgran.read_absent({"absent": "walls", "container_side": "1"}),
         "declares walls absent and gives container_side",
     ),
-    *((lambda n=n: header_count({"N": n}, "N"), "header line N") for n in NO_COUNTS),
+    *((lambda n=n: gas_of(dimension=n), "header line dimension") for n in NO_COUNTS),
 ]
 
 

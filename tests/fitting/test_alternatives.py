@@ -11,8 +11,6 @@ import pytest
 import jaxgran
 from jaxgran.fitting import alternatives
 from jaxgran.fitting.optimise import Problem, search
-from jaxgran.models.base import Limitation
-from jaxgran.models.choose import default_models
 from tests.beads import glass_beads
 from tests.fitting.curves import BOTH, A, cooled_beads, deviation, in_range, measured, synthetic
 
@@ -43,10 +41,15 @@ def test_dense_measured_curve_is_not_explained():
         assert word in text
 
 
+def models_of(n):
+    particles = jaxgran.DSMC(n), jaxgran.HardSpheres(n), jaxgran.SoftSpheres(n)
+    return jaxgran.KineticTheory(), *particles
+
+
 def test_a_valid_scene_has_no_limitations():
     gas = glass_beads(0.09)
     between_walls = dataclasses.replace(gas, container=jaxgran.Walls(0.1, restitution=0.9))
-    for model in default_models(4000):
+    for model in models_of(4000):
         assert model.limitations(gas, 4000) == ()
         assert model.limitations(between_walls, None) == ()
 
@@ -54,15 +57,15 @@ def test_a_valid_scene_has_no_limitations():
 def test_every_model_has_limitations_in_a_dense_scene():
     gas, _, a, n, _ = measured("dense")
     gas = gas.replace(dissipative_constant=a)
-    theory, dsmc, hard, soft = (model.limitations(gas, n) for model in default_models(n))
+    theory, dsmc, hard, soft = (model.limitations(gas, n) for model in models_of(n))
     assert [limitation.decisive for limitation in theory] == [True, True, False]
     assert "softness correction" in theory[1].words and "above L_c" in theory[2].words
     assert dsmc[2] == theory[2] and "instantaneous impacts leave out" in dsmc[1].words
     assert hard == dsmc[:2] and soft == ()
 
 
-EDGE = Limitation("the gas is dense", False, "Take positions.")
-DECISIVE = Limitation("contacts last", True, "Take contacts.")
+EDGE = jaxgran.Limitation("the gas is dense", False, "Take positions.")
+DECISIVE = jaxgran.Limitation("contacts last", True, "Take contacts.")
 CONSISTENT = " is consistent with this curve"
 AT_EDGE = ".* The scene is at the edge of the model's validity."
 NOT_EXPLAINED = " is not consistent with this curve: do not trust the estimates."

@@ -7,10 +7,17 @@ import optimistix as optx
 import pytest
 
 import jaxgran
-from jaxgran.fitting.parameters import guess_from_data
-from jaxgran.fitting.residuals import unused_rotation, with_errors_of_particles
 from tests.beads import glass_beads
-from tests.fitting.curves import BOTH, A, cooled_beads, deviation, in_range, measured, synthetic
+from tests.fitting.curves import (
+    BOTH,
+    A,
+    cooled_beads,
+    deviation,
+    in_range,
+    measured,
+    rough_beads,
+    synthetic,
+)
 
 
 def test_exact_data_give_exact_parameters():
@@ -34,11 +41,8 @@ def test_quasi_newton_ends_where_least_squares_do():
 
 def test_guess_uses_the_data_not_the_gas():
     gas, curve = cooled_beads(2)
-    values = {
-        float(guess_from_data(gas.replace(dissipative_constant=a), curve, (A,)).value(A))
-        for a in (0.0, 1e-9, 1e-2)
-    }
-    (value,) = values
+    gases = [gas.replace(dissipative_constant=a) for a in (0.0, 1e-9, 1e-2)]
+    (value,) = {float(jaxgran.fit(x, curve).minima.first[0]) for x in gases}
     assert 0.7 < value / gas.value(A) < 1.4
 
 
@@ -118,35 +122,29 @@ def test_a_fit_is_shown_by_its_estimates():
 
 def test_T_rot_of_few_spheres_that_were_hit_fluctuates_more():
     gas = dataclasses.replace(glass_beads(0.15), surface=jaxgran.Rough(-0.3))
-    times = jnp.array([0.3, 1.0, 3.0]) * gas.mean_free_time
+    times = jnp.geomspace(0.3, 3.0, 40) * gas.mean_free_time
     curve = jaxgran.cool(gas, times, model=jaxgran.DSMC(250, replicas=100), progress=False)
     T_rot = curve.replicas.rotational_temperature
     measured = jnp.std(T_rot, axis=0) / jnp.mean(T_rot, axis=0)
     bare = jaxgran.CoolingCurve(times, curve.temperature, rotational_temperature=T_rot.mean(0))
-    error = with_errors_of_particles(gas, bare, 250, 1).rotational_temperature_error
-    np.testing.assert_allclose(error / bare.rotational_temperature, measured, rtol=0.4)
+    weights = jaxgran.fit(gas, bare, num_particles=250).comparison.weights
+    np.testing.assert_allclose(1 / weights["rotational_temperature"], measured, rtol=0.4)
     assert measured[0] > 3 * (2 / 750) ** 0.5  # the error of spins that all have
 
 
 def test_a_rotation_that_is_not_used_is_said():
-    gas = glass_beads(0.15)
-    rough = dataclasses.replace(gas, surface=jaxgran.Rough(0.0))
-    T = jnp.geomspace(0.01, 0.001, 8)
-    bare = jaxgran.CoolingCurve(jnp.arange(1.0, 9.0), T, rotational_temperature=0.1 * T)
-    assert "no surface" in str(unused_rotation(gas, bare))
-    assert "its weights need T_err and T_rot_err, or N" in str(unused_rotation(rough, bare))
-    errors = {"temperature_error": 0.1 * T, "rotational_temperature_error": 0.1 * T}
-    known = dataclasses.replace(bare, **errors)
-    assert unused_rotation(rough, known) is None
+    gas = rough_beads().replace(rotational_temperature=0.01)
+    known, smooth = synthetic(gas, relative_error=0.02), dataclasses.replace(gas, surface=None)
+    bare = dataclasses.replace(known, temperature_error=None, rotational_temperature_error=None)
+    for scene, words in ((smooth, "no surface"), (gas, "its weights need T_err and T_rot_err")):
+        # Said before a long search.
+        with pytest.warns(UserWarning, match=words), pytest.raises(ValueError):
+            jaxgran.fit(scene, bare, solver="none")
     # With N the errors that lack are those of its fluctuations; those that are given stay.
-    spinning = rough.replace(rotational_temperature=0.01)
-    of_250 = with_errors_of_particles(spinning, bare, 250, 1)
-    np.testing.assert_allclose(of_250.rotational_temperature_error, 0.1 * (2 / 750) ** 0.5 * T)
-    assert unused_rotation(rough, of_250) is None
-    assert with_errors_of_particles(rough, known, 250, 1) is known
-    # Said before a long search.
-    with pytest.warns(UserWarning, match="its weights need T_err"), pytest.raises(ValueError):
-        jaxgran.fit(rough, bare, solver="none")
+    for curve, error in ((bare, (2 / 750) ** 0.5), (known, 0.02)):
+        found = jaxgran.fit(gas, curve, num_particles=250).comparison.weights
+        np.testing.assert_allclose(1 / found["temperature"], error)
+        np.testing.assert_allclose(1 / found["rotational_temperature"], error)
 
 
 def test_a_search_through_gases_too_soft_for_the_theory_ends():

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import jaxgran
-from jaxgran.fitting.residuals import smooth_errors
-from jaxgran.fitting.result import goodness_of_fit
-from tests.beads import glass_beads
+from experiments.fit.own_model import HaffLaw
+from tests.beads import glass_beads, hard_gas
 from tests.fitting.curves import BOTH, cooled_beads, synthetic
 
 R, N = 3, 40
@@ -29,46 +29,55 @@ def averaged(seed):
     )
 
 
-def away(curves):
+ELASTIC = hard_gas(1.0)
+"""A gas whose T is 1."""
+
+
+def fitted(curve, replicas=R):
+    options = {"model": HaffLaw(), "free": ("temperature",), "replicas": replicas}
+    return jaxgran.fit(ELASTIC, curve, **options)
+
+
+def away(fits):
     """Mean of how far relative errors lie from the true ones, in their logarithm."""
-    errors = np.array([curve.temperature_error / curve.temperature for curve in curves])
-    return np.mean(np.abs(np.log(errors / SIGMA)))
+    weights = np.array([fit.comparison.weights["temperature"] for fit in fits])
+    return np.mean(np.abs(np.log(weights * SIGMA[None])))
 
 
 def test_errors_become_smooth():
     curves = [averaged(seed) for seed in range(20)]
-    smooth = [smooth_errors(curve, R)[0] for curve in curves]
+    smooth, taken = ([fitted(curve, n) for curve in curves] for n in (R, 1))
     # 40 points of 2 degrees: 80 for 3 coefficients, sqrt(3/160) = 14 % of an error, 25 % at ends.
-    assert away(smooth) < 0.14 < 0.4 < away(curves)
-    _, degrees = smooth_errors(curves[0], R)
+    assert away(smooth) < 0.14 < 0.4 < away(taken)
+    # Taken for exact the same errors refuse nearly every true curve.
+    assert np.mean([fit.p_value < 0.01 for fit in taken]) > 0.8
     # Neighbours are independent: what is found of a correlation is chance, 1/sqrt(40).
-    assert 0.55 * 2 * N < float(degrees["temperature"]) <= 2 * N
+    for fit in smooth:
+        degrees = np.array([0.55, 1.0]) * 2 * N
+        least, most = np.sort(scipy.stats.f.sf(fit.chi2 / (N - 1), N - 1, degrees))
+        assert least * (1 - 1e-9) < fit.p_value < most * (1 + 1e-9)
 
 
 def test_a_set_value_stays_without_weight_and_one_run_has_no_scatter():
     curve = averaged(0)
     error = curve.temperature_error.at[0].set(0.0)
-    curve = dataclasses.replace(curve, temperature_error=error)
-    smooth, _ = smooth_errors(curve, R)
-    assert smooth.temperature_error[0] == 0 and np.all(smooth.temperature_error[1:] > 0)
-    assert smooth_errors(curve, 1) == (curve, {})
+    curve = dataclasses.replace(curve, times=curve.times - 1, temperature_error=error)
+    smooth, taken = (fitted(curve, n).comparison.weights["temperature"] for n in (R, 1))
+    assert smooth[0] == taken[0] == 0 and np.all(smooth[1:] > 0)
+    np.testing.assert_allclose(1 / taken[1:], (error / curve.temperature)[1:], rtol=1e-12)
 
 
-def p_value(curve, degrees):
-    """That of a curve against the model T = 1, which it is of."""
-    residuals = (curve.temperature - 1) / curve.temperature_error
-    tested = [(residuals, jnp.asarray(N), degrees.get("temperature"))]
-    return float(goodness_of_fit(tested, jnp.asarray(N), errors_known=True).p_value)
+def test_chi2_of_smooth_errors_has_the_F_distribution():
+    @jax.jit
+    @jax.vmap
+    def chi2(curve):
+        return -2 * jaxgran.log_likelihood(ELASTIC, curve, model=HaffLaw(), replicas=R)
 
-
-def test_p_values_are_those_of_students_t():
     curves = [averaged(seed) for seed in range(400)]
-    found = np.array([p_value(*smooth_errors(curve, R)) for curve in curves])
+    found = scipy.stats.f.sf(chi2(jax.tree.map(lambda *x: jnp.stack(x), *curves)) / N, N, 2 * N)
     # Of 400: 5 +- 1.1 % and 1 +- .5 %, three of each; the F distribution is good to 1 %.
     assert 0.015 < np.mean(found < 0.05) < 0.09 and np.mean(found < 0.01) < 0.035
     assert 0.42 < np.mean(found) < 0.58
-    # Taken for exact the same errors refuse nearly every true curve.
-    assert np.mean([p_value(curve, {}) < 0.01 for curve in curves]) > 0.8
 
 
 @pytest.mark.slow

@@ -1,98 +1,94 @@
-"""Single impacts of hard spheres and of DSMC: the rule of rough spheres, and drag."""
+"""Single impacts in runs of hard spheres and of DSMC: the rule of rough spheres, and drag."""
+
+import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.dsmc.collisions import collide
-from jaxgran.particles.hard.impacts import ImpactEvents, impact_effect
-from jaxgran.scene.gas import ReducedDrag, ReducedRough, ReducedScene, SphereScene
 from tests.beads import glass_beads
+from tests.test_contract import BEADS, CASES, given_elements
 
-ZERO = jnp.zeros(())
-
-
-def of_dsmc(relative, spin, material):
-    """Normals that are drawn, changes of velocities and spins, energy lost and gain of the spins.
-
-    The energies are those of both spheres of all pairs, in unit masses.
-    """
-    bits = jax.random.bits(jax.random.key(0), (2, len(relative)), jnp.uint32)
-    smooth, rough = (
-        collide(relative, bits, jnp.asarray(3.0), jnp.ones(()), scene, None, spin)
-        for scene in (material._replace(surface=None), material)
-    )
-    size = jnp.linalg.norm(smooth.kick, axis=1, keepdims=True)
-    normal = -smooth.kick / jnp.where(size > 0, size, 1.0)
-    return normal, rough.kick, rough.spin_change, rough.loss / 2, rough.rotational_gain / 2
+T_ROT = 0.4 * float(BEADS.temperature)
+TAU = float(BEADS.mean_free_time)
 
 
-def of_hard_spheres(relative, spin, material):
-    """The same at given normals."""
-    normal = np.random.default_rng(1).normal(size=relative.shape)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    speed = np.sum(relative * normal, -1)
-    normal = jnp.asarray(np.sign(speed)[:, None] * normal)  # they approach
-    n = len(relative)
-    impact = ImpactEvents(jnp.zeros(n), normal, relative, jnp.abs(speed), spin, jnp.zeros(n, bool))
-    effect = impact_effect(SphereScene(ZERO, None, ZERO, ZERO, material), impact)
-    lost, gained = (2 * jnp.sum(x) for x in (effect.lost, effect.rotational_gain))
-    return normal, effect.kick, effect.spin_change, lost, gained
+def spheres_of(case, gas, end, key=0):
+    """Velocities, spins s = sigma w/2 and places of all replicas, at the start and at the end."""
+    times = np.linspace(0.0, end, 3)
+    saved = case.run(gas, times, save="particles", key=jax.random.key(key)).saved
+    parts = [saved.velocity, 0.5 * gas.diameter * saved.angular_velocity]
+    parts += [saved.position] if case.model.has_positions else []
+    return [np.reshape(np.asarray(x), (3, -1, x.shape[-1]))[::2] for x in parts]
 
 
-@pytest.mark.parametrize("eps, beta", [(0.8, 0.3), (0.8, -1.0), (1.0, 1.0)])
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("impacts", [of_dsmc, of_hard_spheres])
-def test_impacts_keep_angular_momentum_and_follow_the_rule(impacts, dimension, eps, beta):
-    # Unit masses and diameters, I = q/4, spins s = w/2, of both spheres. In 2D as in a plane.
-    q, n, rng = 0.4, 400, np.random.default_rng(0)
-    relative = jnp.asarray(rng.normal(size=(n, dimension)))
-    spin = jnp.asarray(rng.normal(size=(n, 3 if dimension == 3 else 1)))
-    surface = ReducedRough(jnp.asarray(beta), jnp.asarray(q), ZERO)
-    material = ReducedScene(jaxgran.ConstantRestitution(eps), surface)
-    normal, kick, spin_change, lost, gained = impacts(relative, spin, material)
-    hit = np.any(normal != 0, axis=1)
-    assert 50 < hit.sum() < n or impacts is of_hard_spheres and np.all(hit)
-    assert not np.any(kick[~hit]) and not np.any(spin_change[~hit])
+def pairs_of(*kicks):
+    """Indices of pairs that had one impact, that of each other: opposite kicks in all runs."""
+    alone = True
+    for kick in kicks:
+        size, apart = np.linalg.norm(kick, axis=1), np.linalg.norm(kick[:, None] + kick, axis=2)
+        alone = alone & (apart < 1e-9 * size.max()) & (size > 1e-3 * size.max())
+    return np.nonzero(np.triu(alone, 1))
 
-    def vectors(x):
-        return np.pad(x[hit], ((0, 0), (0, 3 - x.shape[1])))
 
-    def spins(x):
-        return np.pad(x[hit], ((0, 0), (3 - x.shape[1], 0)))
+@pytest.mark.parametrize("loss, beta", [(1.0, 0.3), (1.0, -1.0), (0.0, 1.0)])
+@pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("model", ["DSMC", "hard spheres"])
+def test_impacts_keep_angular_momentum_and_follow_the_rule(model, dimension, loss, beta):
+    # Unit masses, I = q/4. In 2D as in a plane.
+    case, q = CASES[model], 0.4
+    gas = given_elements(case) if dimension == 3 else glass_beads(0.3, 2, packing_fraction=0.2)
+    gas = dataclasses.replace(gas, surface=jaxgran.Rough(beta, rotational_temperature=T_ROT))
+    gas = gas.replace(dissipative_constant=loss * BEADS.value("dissipative_constant"))
+    # Smooth spheres show the normals.
+    smooth, end = gas.replace(tangential_restitution=-1.0), 0.4 * float(gas.mean_free_time)
+    number = 0
+    for key in range(3):
+        velocity, spin, *_ = spheres_of(case, gas, end, key)
+        alone = spheres_of(case, smooth, end, key)[0]
+        kick, changed, along = velocity[1] - velocity[0], spin[1] - spin[0], alone[1] - alone[0]
+        i, j = pairs_of(along, kick)
+        number += len(i)
+        normal = np.pad(along[j], ((0, 0), (0, 3 - dimension)))
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
 
-    relative, normal, kick = map(vectors, (relative, normal, kick))
-    spin, spin_change = map(spins, (spin, spin_change))
+        def slip_and_approach(v, s, i=i, j=j, normal=normal):
+            relative = np.pad(v[i] - v[j], ((0, 0), (0, 3 - v.shape[1])))
+            both = np.pad(s[i] + s[j], ((0, 0), (3 - s.shape[1], 0)))
+            at_contact = relative + np.cross(both, normal)
+            approach = np.sum(at_contact * normal, -1)
+            return at_contact - approach[:, None] * normal, approach
 
-    def slip_and_approach(relative, spin):
-        at_contact = relative + np.cross(spin, normal)
-        along = np.sum(at_contact * normal, -1, keepdims=True) * normal
-        return at_contact - along, along
-
-    before = slip_and_approach(relative, spin)
-    after = slip_and_approach(relative + 2 * kick, spin + 2 * spin_change)
-    np.testing.assert_allclose(after[0], -beta * before[0], atol=1e-12)
-    np.testing.assert_allclose(after[1], -eps * before[1], atol=1e-12)
-    # Angular momentum of each sphere about the point of contact.
-    np.testing.assert_allclose(np.cross(normal, kick), q * spin_change, atol=1e-12)
-    assert float(lost) == pytest.approx(-np.sum((relative + kick) * kick), rel=1e-10)
-    rotation = q * np.sum((spin + spin_change) * spin_change)
-    assert float(gained) == pytest.approx(rotation, rel=1e-10, abs=1e-10)
-    slip, approach = (np.sum(x**2) for x in before)
-    expected = (1 - eps**2) / 4 * approach + q / (1 + q) * (1 - beta**2) / 4 * slip
-    assert float(lost - gained) == pytest.approx(expected, rel=1e-10, abs=1e-10)
+        before, after = map(slip_and_approach, velocity, spin)
+        assert np.all(before[1] > 0)
+        heat = float(gas.temperature) ** 0.5
+        np.testing.assert_allclose(after[0], -beta * before[0], atol=1e-9 * heat)
+        eps = np.asarray(gas.restitution(before[1]))
+        np.testing.assert_allclose(after[1], -eps * before[1], atol=1e-9 * heat)
+        # Angular momentum of each sphere about the point of contact.
+        kick = np.pad(kick[i], ((0, 0), (0, 3 - dimension)))
+        for k in (i, j):
+            change = np.pad(changed[k], ((0, 0), (3 - changed.shape[1], 0)))
+            np.testing.assert_allclose(np.cross(normal, kick), q * change, atol=1e-9 * heat)
+    assert number > 20
 
 
 def test_laws_see_the_speeds_that_drag_has_left():
-    n, gamma = 20, 0.3
-    speed, time = jnp.linspace(0.1, 2.0, n), jnp.linspace(0.0, 2.5, n)
-    law = glass_beads(0.5).reduced_law
-    material = ReducedScene(law, drag=ReducedDrag(jnp.asarray(gamma / 2), None))
-    scene = SphereScene(ZERO, None, jnp.asarray(2.0), ZERO, material)
-    normal = jnp.tile(jnp.array([1.0, 0.0, 0.0]), (n, 1))
-    impact = ImpactEvents(time, normal, speed[:, None] * normal, speed, None, jnp.zeros(n, bool))
-    eps = law.restitution(speed * (1 - gamma * time) / 2**0.5)
-    lost = impact_effect(scene, impact).lost
-    np.testing.assert_allclose(lost, (1 - eps**2) * speed**2 / 8, rtol=1e-9)
+    case, gamma = CASES["hard spheres"], 1.0 / TAU
+    gas, end = given_elements(case, drag=jaxgran.StokesDrag(gamma)), 0.5 * TAU
+    gas = gas.replace(dissipative_constant=BEADS.value("dissipative_constant"))
+    velocity, _, (place, _) = spheres_of(case, gas, end)
+    kick = velocity[1] * np.exp(gamma * end) - velocity[0]
+    i, j = pairs_of(kick)
+    assert len(i) > 5
+    # They meet where drag has left a share of their speeds and of the way without it.
+    g, r, sigma = velocity[0][i] - velocity[0][j], place[i] - place[j], float(gas.diameter)
+    b, square = np.sum(r * g, -1), np.sum(g**2, -1)
+    way = (-b - np.sqrt(b**2 - square * (np.sum(r**2, -1) - sigma**2))) / square
+    normal = (r + g * way[:, None]) / sigma
+    approach, left = -np.sum(g * normal, -1), 1 - gamma * way
+    assert np.min(left) < 0.7
+    eps = np.asarray(gas.restitution(left * approach))
+    expected = ((1 + eps) / 2 * approach)[:, None] * normal
+    np.testing.assert_allclose(kick[i], expected, atol=1e-9 * float(gas.temperature) ** 0.5)

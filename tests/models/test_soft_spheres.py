@@ -11,9 +11,8 @@ from scipy.linalg import hadamard
 
 import jaxgran
 from experiments.support.scenes import hard_beads
-from jaxgran.models.soft_spheres import SoftSpheres
-from jaxgran.particles.soft.forces import SERIES_LIMIT, flight_time
-from jaxgran.scene.parameters import domains_of
+from jaxgran import SoftSpheres
+from jaxgran.particles.soft.forces import flight_time
 from tests.beads import curves_of, glass_beads, lattice, soft_beads, spheres, total_energy
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
@@ -203,7 +202,7 @@ def test_flight_with_drag_is_exact():
     np.testing.assert_allclose(apart - side * np.round(apart / side), 0.0, atol=1e-12 * side)
 
 
-@pytest.mark.parametrize("z", [0.0, 1e-9, 0.99 * SERIES_LIMIT, 1.01 * SERIES_LIMIT, 2.0])
+@pytest.mark.parametrize("z", [0.0, 3.3e-9, 0.0099, 0.0101, 2.0])
 def test_shortened_duration_and_its_derivative(z):
     value, slope = jax.value_and_grad(lambda rate: flight_time(rate, 2.0))(z / 2)
     exact = 2 * (-np.expm1(-z) / z if z else 1.0)
@@ -326,7 +325,7 @@ def test_follows_lammps_with_friction_between_walls_particle_by_particle():
     gas = jaxgran.Gas(
         law,
         **{name: data[name] for name in ("diameter", "mass", "packing_fraction", "temperature")},
-        surface=jaxgran.Frictional(*(data[name] for name in domains_of("Frictional"))),
+        surface=jaxgran.Frictional(*(data[x.name] for x in dataclasses.fields(jaxgran.Frictional))),
         container=jaxgran.Walls(
             data["wall_side"],
             restitution=wall,
