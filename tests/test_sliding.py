@@ -8,8 +8,6 @@ from scipy.integrate import quad
 from scipy.special import gamma
 
 import jaxgran
-from jaxgran.particles.state import tangential_impulse
-from jaxgran.scene.gas import ReducedRough
 from jaxgran.theory.averages import slip_moments
 from tests.beads import hard_gas, theory_curve
 from tests.fitting.curves import synthetic
@@ -18,29 +16,6 @@ from tests.fitting.curves import synthetic
 def sliding(friction, dimension=3, beta=0.5, T_rot=0.0, **elements) -> jaxgran.Gas:
     surface = jaxgran.Rough(beta, rotational_temperature=T_rot, friction=friction)
     return hard_gas(0.9, 0.02, dimension, surface=surface, **elements)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_impulse_sticks_below_the_limit_and_slides_at_it(dimension):
-    n, mu, q, eps = 2000, 0.2, 0.4, 0.9
-    rng = np.random.default_rng(0)
-    normal = rng.normal(size=(n, dimension))
-    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    relative = rng.normal(size=(n, dimension))
-    spin = rng.normal(size=(n, 1 if dimension == 2 else 3))
-    push = (1 + eps) / 2 * np.abs(np.sum(relative * normal, axis=1))
-    arrays = [jnp.asarray(x) for x in (relative, spin, normal, np.ones(n, bool))]
-    rough = [ReducedRough(*map(jnp.asarray, (0.5, q, 0.0, f))) for f in (mu, 1e9)]
-    limited, free = (tangential_impulse(*arrays, x.eta, x, jnp.asarray(push)) for x in rough)
-    size, most = np.linalg.norm(free.kick, axis=1), mu * push
-    slides = size > most
-    assert 0.2 < slides.mean() < 0.9
-    np.testing.assert_array_equal(limited.kick[~slides], free.kick[~slides])
-    expected = free.kick * (most / size)[:, None]
-    np.testing.assert_allclose(limited.kick[slides], expected[slides], rtol=1e-12)
-    # Angular momentum: the torque on either sphere is that of the kick.
-    torque, kick = (np.linalg.norm(x, axis=1) for x in (limited.spin_change, limited.kick))
-    np.testing.assert_allclose(torque * q, kick, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -32,18 +32,21 @@ def pairs_of(*kicks):
     return np.nonzero(np.triu(alone, 1))
 
 
-@pytest.mark.parametrize("loss, beta", [(1.0, 0.3), (1.0, -1.0), (0.0, 1.0)])
+@pytest.mark.parametrize(
+    "loss, beta, friction", [(1.0, 0.3, 1e9), (1.0, -1.0, 1e9), (0.0, 1.0, 1e9), (1.0, 0.3, 0.2)]
+)
 @pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("model", ["DSMC", "hard spheres"])
-def test_impacts_keep_angular_momentum_and_follow_the_rule(model, dimension, loss, beta):
+def test_impacts_keep_angular_momentum_and_follow_the_rule(model, dimension, loss, beta, friction):
     # Unit masses, I = q/4. In 2D as in a plane.
     case, q = CASES[model], 0.4
     gas = given_elements(case) if dimension == 3 else glass_beads(0.3, 2, packing_fraction=0.2)
-    gas = dataclasses.replace(gas, surface=jaxgran.Rough(beta, rotational_temperature=T_ROT))
+    surface = jaxgran.Rough(beta, rotational_temperature=T_ROT, friction=friction)
+    gas, eta = dataclasses.replace(gas, surface=surface), q * (1 + beta) / (2 * (1 + q))
     gas = gas.replace(dissipative_constant=loss * BEADS.value("dissipative_constant"))
     # Smooth spheres show the normals.
     smooth, end = gas.replace(tangential_restitution=-1.0), 0.4 * float(gas.mean_free_time)
-    number = 0
+    number = slides = 0
     for key in range(3):
         velocity, spin, *_ = spheres_of(case, gas, end, key)
         alone = spheres_of(case, smooth, end, key)[0]
@@ -63,8 +66,11 @@ def test_impacts_keep_angular_momentum_and_follow_the_rule(model, dimension, los
         before, after = map(slip_and_approach, velocity, spin)
         assert np.all(before[1] > 0)
         heat = float(gas.temperature) ** 0.5
-        np.testing.assert_allclose(after[0], -beta * before[0], atol=1e-9 * heat)
         eps = np.asarray(gas.restitution(before[1]))
+        limit = friction * (1 + eps) / 2 * before[1] / np.linalg.norm(before[0], axis=1)
+        change = (1 + beta) * np.minimum(limit / max(eta, 1e-9), 1.0)[:, None]
+        slides += np.sum(limit < eta)
+        np.testing.assert_allclose(after[0], (1 - change) * before[0], atol=1e-9 * heat)
         np.testing.assert_allclose(after[1], -eps * before[1], atol=1e-9 * heat)
         # Angular momentum of each sphere about the point of contact.
         kick = np.pad(kick[i], ((0, 0), (0, 3 - dimension)))
@@ -72,6 +78,7 @@ def test_impacts_keep_angular_momentum_and_follow_the_rule(model, dimension, los
             change = np.pad(changed[k], ((0, 0), (3 - changed.shape[1], 0)))
             np.testing.assert_allclose(np.cross(normal, kick), q * change, atol=1e-9 * heat)
     assert number > 20
+    assert slides == 0 if friction == 1e9 else 0.2 < slides / number < 0.9
 
 
 def test_laws_see_the_speeds_that_drag_has_left():
