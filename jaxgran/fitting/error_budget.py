@@ -17,7 +17,7 @@ from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import error_model_along
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.linearise import curve_of_program, linearise, model_for_fits, with_all_elements
+from jaxgran.models.linearise import curve_of_program, linearise, with_all_elements
 from jaxgran.scene.gas import Gas
 
 MIN_REPORTED_BIAS = 0.05
@@ -208,7 +208,7 @@ def parameter_effects(
     model, varied, times = KineticTheory(), priors.extra_parameters(()), np.asarray(computed.times)
     smooth = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
     complete = with_all_elements(smooth, model)
-    linear = linearise(model_for_fits(model, smooth), complete, times)
+    linear = linearise(model.for_fits(smooth), complete, times)
     names = ["temperature"]
     if rotation and "friction" not in gas.elements:
         names.append("rotational_temperature")

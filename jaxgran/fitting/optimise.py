@@ -39,7 +39,6 @@ from jaxgran.fitting.residuals import (
     Rows,
 )
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.linearise import model_for_fits
 from jaxgran.scene.gas import Gas
 
 CONVERGED_STEP = 0.01
@@ -138,7 +137,7 @@ class Problem:
 
     @cached_property
     def _compiled_model(self) -> AbstractModel:
-        return model_for_fits(self.model, *(m.scene for m in self.measurements))
+        return self.model.for_fits(*(m.scene for m in self.measurements))
 
     @property
     def curves(self) -> tuple[Measurement, ...]:

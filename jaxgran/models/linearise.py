@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 from jaxgran._utils.tracing import any_traced, as_jax_arrays, fast_compilation, grid_size, pad_to
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.elements import Rough, StokesDrag, Walls
 from jaxgran.scene.gas import Gas
 
@@ -68,17 +67,6 @@ def with_all_elements(gas: Gas, model: AbstractModel) -> Gas:
     return dataclasses.replace(gas, **added)
 
 
-def model_for_fits(model: AbstractModel, *gases: Gas) -> AbstractModel:
-    """Return a model with Gaussian spins if the spheres of all gases are smooth.
-
-    Only alternative explanations of their curves rotate. Those change T by up to 2 %, which is
-    within the error of the theory there, and the program compiles in two thirds of the time.
-    """
-    if isinstance(model, KineticTheory) and all(gas.surface is None for gas in gases):
-        return dataclasses.replace(model, spin_cumulants=False)
-    return model
-
-
 def linearise(
     model: AbstractModel, gas: Gas, times: Any, tolerance: float = 1.0
 ) -> LinearisedCurve:
@@ -114,7 +102,7 @@ def curve_of_program(
 ) -> CoolingCurve:
     """Return the curve of a gas without <dr^2>, by the program that fits share."""
     complete = with_all_elements(gas, model)
-    values = dict(linearise(model_for_fits(model, gas), complete, times).values)
+    values = dict(linearise(model.for_fits(gas), complete, times).values)
     for name in ("displacement", "diffusion"):
         values.pop(name, None)
     return CoolingCurve(**as_jax_arrays({"times": times} | values))
