@@ -36,7 +36,7 @@ def pairs_of(*kicks):
     "loss, beta, friction", [(1.0, 0.3, 1e9), (1.0, -1.0, 1e9), (0.0, 1.0, 1e9), (1.0, 0.3, 0.2)]
 )
 @pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
-@pytest.mark.parametrize("model", ["DSMC", "hard spheres"])
+@pytest.mark.parametrize("model", ["DSMC", pytest.param("hard spheres", marks=pytest.mark.slow)])
 def test_impacts_keep_angular_momentum_and_follow_the_rule(model, dimension, loss, beta, friction):
     # Unit masses, I = q/4. In 2D as in a plane.
     case, q = CASES[model], 0.4
@@ -81,6 +81,7 @@ def test_impacts_keep_angular_momentum_and_follow_the_rule(model, dimension, los
     assert slides == 0 if friction == 1e9 else 0.2 < slides / number < 0.9
 
 
+@pytest.mark.slow
 def test_laws_see_the_speeds_that_drag_has_left():
     case, gamma = CASES["hard spheres"], 1.0 / TAU
     gas, end = given_elements(case, drag=jaxgran.StokesDrag(gamma)), 0.5 * TAU

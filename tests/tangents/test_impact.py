@@ -62,6 +62,7 @@ def constant():
     return f, at, values, slopes
 
 
+@pytest.mark.slow
 def test_constant_restitution_has_the_slopes_of_haff(constant):
     _, _, log_temperature, slopes = constant
     e, cooled = COEFFICIENT, 1 - jnp.exp(log_temperature / 2)
