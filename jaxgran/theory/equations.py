@@ -311,7 +311,7 @@ def element_rates(
         rate = collision_rate(sonine if gaussian_spins else 0.0, dimension) * speed
         parts.append(jax.tree.map(lambda change: rate * change, changes))
     if scene.walls is not None:
-        on_walls = _wall_rates(scene.walls, surface, speed, spins, dimension)
+        on_walls = _wall_rates(scene.walls, surface, speed, spins, sonine, dimension)
         if surface is not None:  # spins lose their share of the slip, and gain Gaussian ones
             damping = 2 * dimension / (NUM_SPIN_COMPONENTS[dimension] * surface.inertia)
             lost = spins._replace(rotation=zero).damped(damping * on_walls.relaxation)
@@ -421,11 +421,19 @@ def rough_impact_rates(
 
 
 def _wall_rates(
-    walls: ReducedWalls, surface: ReducedRough | None, speed: Array, spins: Spins, d: int
+    walls: ReducedWalls,
+    surface: ReducedRough | None,
+    speed: Array,
+    spins: Spins,
+    sonine: Array,
+    d: int,
 ) -> ElementRates:
     """Rates of change by impacts on walls, in a well-mixed gas (see `wall_impact_ratio`).
 
     A wall takes ``(1 - eps^2) v_n^2/2`` in an impact, on average ``(1 - eps^2) T`` at constant eps.
+    It takes more from fast spheres, which come more often, and so changes a_2, at constant eps and
+    Z impacts by ``(4/d) Z (1 - eps^2) (a_2 - (2 eps^2 - 1)/(d + 2))``. A mean power k of the speeds
+    is that of a Maxwellian gas times ``1 + k (k - 2) a_2/8``.
     Friction at a wall takes from one sphere what friction between two spheres takes from both, each
     of which has half of the mean squared relative velocity. So walls count as twice as many impacts
     between spheres, with half the eta of a wall. Walls reverse velocities: displacements are not
@@ -443,22 +451,37 @@ def _wall_rates(
             eps = walls.law.restitution(g * speed / sqrt(2))
             return wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
 
-        def energy(g: Array) -> Array:
-            """Energy over T that the wall takes in an impact at the normal speed g sqrt(T)."""
-            lost = walls.law.loss(g * speed / sqrt(2))
-            return lost * (2 - lost) * g**2 / 2
+        def lost(g: Array) -> Array:
+            """Loss of v^2 over T in an impact at the normal speed g sqrt(T)."""
+            loss = walls.law.loss(g * speed / sqrt(2))
+            return loss * (2 - loss) * g**2
 
-        cooling = 2 / d * frequency * impact_average(lambda g: share(g) * energy(g), speed)
+        def lost_fourth(g: Array) -> Array:
+            """Loss of v^4 over T^2."""
+            return lost(g) * (2 * (g**2 + d - 1) - lost(g))
+
+        squares, fourths = (
+            (1 + k * (k - 2) * sonine / 8)
+            * frequency
+            * impact_average(lambda g, of=of: share(g) * of(g), speed)
+            for k, of in ((3, lost), (5, lost_fourth))
+        )
+        cooling = squares / d
+        a2_rate = 2 * (1 + sonine) * cooling - fourths / (d * (d + 2))
         if surface is None:
-            return ElementRates(cooling)
+            return ElementRates(cooling, sonine=a2_rate)
         kick = mean_kick(walls.law, speed / sqrt(2))
         changes = rough_impact_rates(surface, eta, kick, spins, zero, d)
         impacts = 2 * frequency * impact_average(share, speed)
         changes = jax.tree.map(lambda change: impacts * change, changes)
-        return changes._replace(cooling=cooling + changes.cooling)
+        return changes._replace(cooling=cooling + changes.cooling, sonine=a2_rate)
 
     by_axis = jax.vmap(axis_rates)(walls.frequency)
     return jax.tree.map(lambda x: speed * jnp.sum(x), by_axis)
+
+
+MAX_SPEED_FACTOR = 1.2
+"""Bound of ``1 + 3 a_2/8``, the factor of losses at walls."""
 
 
 def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
@@ -479,7 +502,7 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
     if walls is not None:
         frequency = walls.frequency / rate
         share = wall_impact_ratio(jnp.zeros_like(frequency), frequency, d)
-        bound = 2 / d * jnp.sum(walls.frequency * share)
+        bound = 2 / d * MAX_SPEED_FACTOR * jnp.sum(walls.frequency * share)
         if surface is not None and walls.surface is not None:
             most = 2 * MAX_WALL_IMPACT_RATIO * jnp.sum(walls.frequency)
             bound += friction(surface, surface.eta_on_wall(walls.surface) / 2, most)

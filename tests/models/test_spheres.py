@@ -39,13 +39,13 @@ COOLING = {
         (0.5, 2, 8),
         {"temperature": (0.015, 2), "displacement": (0.09, 2), "collisions": (0.03, 2)},
     ),
-    # The error of the rate, measured by runs of 20 000 spheres, times d ln T/d ln t < 2: 1.3 %
+    # The error of the rate, measured by runs of 24 000 spheres, times d ln T/d ln t < 2: .7 %
     # between smooth walls, 5 % between rough ones.
     "walls": (
         between_walls(0.9),
         MANY,
         (8, 20, 40),
-        {"temperature": (2 * 0.013, 3), "collisions": (0.04, 0)},
+        {"temperature": (2 * 0.007, 3), "collisions": (0.04, 0)},
     ),
     "rough walls": (
         between_walls(0.9, wall_beta=-0.3),

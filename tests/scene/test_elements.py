@@ -59,7 +59,7 @@ def test_walls_take_energy_as_haff_has_it():
     # layer before the wall brings 2/(1 + e) of the impacts, warmer by the heat that flows to it
     # (.8634/5), and colder by its conduction over the width.
     gas = constant(1.0, container=jaxgran.Walls(0.05, restitution=0.8))
-    curve = theory_curve(gas, TAUS)
+    curve = theory_curve(gas, TAUS, sonine=False)
     phi = 0.02
     pressure = 1 + 4 * phi * (1 - phi / 2) / (1 - phi) ** 3
     assert float(gas.mean_free_path) < float(constant(1.0).mean_free_path)
@@ -73,6 +73,15 @@ def test_walls_take_energy_as_haff_has_it():
     assert curve.displacement is None and curve.diffusion is None
 
 
+def test_walls_take_more_from_fast_spheres():
+    # DSMC of 800 000 spheres: T has an error of .1 %, a_2 of .003. Without walls a_2 is -.015.
+    gas = constant(0.9, container=jaxgran.Walls(0.05, restitution=0.8))
+    curve = theory_curve(gas, np.array([1.0, 3.0, 10.0]), correlations=False)
+    T = curve.temperature / gas.temperature
+    np.testing.assert_allclose(T, [0.85653, 0.64930, 0.30791], rtol=2e-3)
+    np.testing.assert_allclose(curve.sonine, [-0.0119, -0.0293, -0.0383], atol=0.01)
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_elastic_walls_are_met_by_a_gas_everywhere_alike(dimension):
     free = hard_gas(1.0, 0.02, dimension)
@@ -84,7 +93,8 @@ def test_elastic_walls_are_met_by_a_gas_everywhere_alike(dimension):
         gas = hard_gas(1.0, 0.02, dimension, container=jaxgran.Walls(width + 1, restitution=eps))
         # d pairs of walls; each impact takes (1 - eps^2) T of the energy d T/2.
         alike = 4 * (1 - eps**2) * pressure / width / np.sqrt(2 * np.pi)
-        T = jaxgran.cool(gas, [0.02 / alike]).temperature[0]
+        maxwellian = jaxgran.KineticTheory(sonine=False)
+        T = jaxgran.cool(gas, [0.02 / alike], model=maxwellian).temperature[0]
         return 100 * (float(T) ** -0.5 - 1)  # T = (1 + rate t/2)^-2
 
     widths = 70, 7, 0.5  # in mean free paths
