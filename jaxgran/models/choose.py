@@ -253,8 +253,10 @@ def _impact_share(now: Gas, first: Gas) -> Float[Array, ""]:
     ratio = 0.0 if rough is None else rough.rotational_temperature / first.temperature
     impacts = first_cooling_rate(now)[0] * now.path_length / now.impact_speed
     alone = scene._replace(walls=None, drag=None, drive=None)
-    spins = Spins.gaussian(ratio * one)
-    mine, rest = (element_rates(x, one, spins, 0 * one, d, True).cooling for x in (alone, scene))
+    state = Spins.gaussian(ratio * one), 0 * one, d
+    mine, rest = (
+        element_rates(x, one, *state, gaussian_spins=True).cooling for x in (alone, scene)
+    )
     return (impacts + mine) / (impacts + rest)
 
 

@@ -305,17 +305,13 @@ def element_rates(
     if (surface := scene.surface) is not None:
         kick = mean_kick(scene.law, speed)
         changes = rough_impact_rates(
-            surface, surface.eta, kick, spins, sonine, dimension, gaussian_spins
+            surface, surface.eta, kick, spins, sonine, dimension, gaussian=gaussian_spins
         )
         # The means over spins that are not Gaussian contain the effect of a_2.
         rate = collision_rate(sonine if gaussian_spins else 0.0, dimension) * speed
         parts.append(jax.tree.map(lambda change: rate * change, changes))
     if scene.walls is not None:
         on_walls = _wall_rates(scene.walls, surface, speed, spins, sonine, dimension)
-        if surface is not None:  # spins lose their share of the slip, and gain Gaussian ones
-            damping = 2 * dimension / (NUM_SPIN_COMPONENTS[dimension] * surface.inertia)
-            lost = spins._replace(rotation=zero).damped(damping * on_walls.relaxation)
-            parts.append(ElementRates(zero, lost))
         parts.append(on_walls)
     if (drag := scene.drag) is not None:
         parts.append(ElementRates(2 * drag.rate, spins.damped(2 * drag.rotational_rate), drag.rate))
@@ -365,7 +361,8 @@ def rough_impact_rates(
     spins: Spins,
     sonine: Float[Array, ""],
     d: int,
-    gaussian: bool = True,
+    *,
+    gaussian: bool,
 ) -> ElementRates:
     """Return the rates of change in impacts of rough spheres, per impact of a sphere.
 
@@ -440,7 +437,6 @@ def _wall_rates(
     those of a free gas.
     """
     eta: Any = None
-    zero = jnp.zeros_like(speed)
     if surface is None or walls.surface is None:
         surface = None
     else:
@@ -471,7 +467,7 @@ def _wall_rates(
         if surface is None:
             return ElementRates(cooling, sonine=a2_rate)
         kick = mean_kick(walls.law, speed / sqrt(2))
-        changes = rough_impact_rates(surface, eta, kick, spins, zero, d)
+        changes = rough_impact_rates(surface, eta, kick, spins, sonine, d, gaussian=True)
         impacts = 2 * frequency * impact_average(share, speed)
         changes = jax.tree.map(lambda change: impacts * change, changes)
         return changes._replace(cooling=cooling + changes.cooling, sonine=a2_rate)
@@ -668,7 +664,7 @@ MAX_LOG_TEMPERATURE = 60.0
 """Largest |ln T/T_0| of a steady state."""
 
 _NEWTON_STEPS = 8
-"""Newton steps to steady spins, exact to rounding."""
+"""Newton steps to a steady T_rot/T of spheres that slide, exact to rounding."""
 
 
 class SteadyState(NamedTuple):
@@ -733,14 +729,17 @@ def _solve_steady(gas: Gas) -> tuple[Array, Array, Array, Array]:
         return _steady_rates(x, scene, density, d) / jnp.exp(x[0] / 2)
 
     guess = _balance_log_temperature(scene, gas.temperature, d)
-    start = jnp.stack([guess, jnp.zeros_like(guess), jnp.zeros_like(guess)])
+    start = [guess, jnp.zeros_like(guess), jnp.zeros_like(guess)]
+    if scene.surface is not None:
+        start += Spins.gaussian(_gaussian_ratio(jnp.exp(guess / 2), scene, d))
+    start = jnp.stack(start)
     tolerance = jnp.finfo(start.dtype).eps ** 0.75
     solver = optx.Newton(rtol=float(tolerance), atol=float(tolerance))
     x = optx.root_find(balance, solver, start, scene, throw=False, max_steps=32).value
     heating = scene.drive / jnp.exp(1.5 * x[0])
     imbalance = jnp.abs(balance(x, scene)[0]) / heating
-    spins = _steady_spins(jnp.exp(x[0] / 2), x[1], scene, d, gaussian=False)
-    return x[0], x[1], jnp.zeros_like(guess) if spins is None else spins.rotation, imbalance
+    ratio = jnp.zeros_like(guess) if scene.surface is None else x[3]
+    return x[0], x[1], ratio, imbalance
 
 
 def _balance_log_temperature(scene: ReducedScene, like: Array, d: int) -> Float[Array, ""]:
@@ -751,8 +750,13 @@ def _balance_log_temperature(scene: ReducedScene, like: Array, d: int) -> Float[
 
     def bisect(_, ends):
         middle = (ends[0] + ends[1]) / 2
-        maxwellian = jnp.stack([middle, jnp.zeros_like(middle)])
-        heats = _steady_rates(maxwellian, scene, Density(), d, gaussian_spins=True)[0] > 0
+        speed, zero = jnp.exp(middle / 2), jnp.zeros_like(middle)
+        moments = [middle, zero, zero, zero, jnp.full_like(middle, jnp.inf)]
+        if scene.surface is not None:
+            moments.append(_gaussian_ratio(speed, scene, d))
+        equations = Equations(d, 2, maxwellian=True, gaussian_spins=True)
+        rates = impact_moments(scene.law, speed, d, 2)
+        heats = equations.derivative(jnp.stack(moments), rates, (scene, Density()))[0] > 0
         return jnp.where(heats, middle, ends[0]), jnp.where(heats, ends[1], middle)
 
     bound = jnp.full((), MAX_LOG_TEMPERATURE, like.dtype)
@@ -772,44 +776,33 @@ def max_thermal_speed(gas: Gas) -> Float[Array, ""]:
 
 
 def _steady_rates(
-    x: Float[Array, "variables"],
-    scene: ReducedScene,
-    density: Density,
-    d: int,
-    gaussian_spins: bool = False,
+    x: Float[Array, "variables"], scene: ReducedScene, density: Density, d: int
 ) -> Float[Array, "variables"]:
-    """Rates of change of ln T, a_2 and at order 3 of a_3, where T_rot/T is steady.
-
-    All correlations have built up.
-    """
-    order, speed, zero = len(x), jnp.exp(x[0] / 2), jnp.zeros_like(x[0])
-    moments = [x[0], x[1], zero, zero, jnp.full_like(x[0], jnp.inf)]
-    if order > 2:
-        moments += [x[2], zero]
-    if (spins := _steady_spins(speed, x[1], scene, d, gaussian_spins)) is not None:
-        moments += spins[: 1 if gaussian_spins else 3]
-    equations = Equations(d, order, maxwellian=False, gaussian_spins=gaussian_spins)
-    rates = impact_moments(scene.law, speed, d, order)
-    change = equations.derivative(jnp.stack(moments), rates, (scene, density))
-    return jnp.stack([change[k] for k in (0, 1, 5)[:order]])
+    """Rates of change of ln T, a_2, a_3 and the spins where all correlations have built up."""
+    zero = jnp.zeros_like(x[:1])
+    moments = jnp.concatenate([x[:2], zero, zero, zero + jnp.inf, x[2:3], zero, x[3:]])
+    rates = impact_moments(scene.law, jnp.exp(x[0] / 2), d, 3)
+    change = Equations(d, 3, maxwellian=False).derivative(moments, rates, (scene, density))
+    # Spins of smooth spheres, beta_t = -1, do not change: they are 0.
+    return jnp.concatenate([change[:2], change[5:6], change[7:] - 1e-30 * x[3:]])
 
 
-def _steady_spins(
-    speed: Array, sonine: Array, scene: ReducedScene, d: int, gaussian: bool
-) -> Spins | None:
-    """Moments of the spins that do not change at a given T; None for smooth spheres."""
-    if scene.surface is None:
-        return None
+def _gaussian_ratio(speed: Array, scene: ReducedScene, d: int) -> Array:
+    """T_rot/T at which that of Gaussian spins is steady, linear in it without friction."""
 
-    def rates(x):
-        spins = Spins.gaussian(x[0]) if gaussian else Spins(*x)
-        changes = element_rates(scene, speed, spins, sonine, d, gaussian)
-        return jnp.stack(changes.spins[: x.size])
+    def step(ratio, _):
+        gain, slope = jax.jvp(
+            lambda r: (
+                element_rates(
+                    scene, speed, Spins.gaussian(r), jnp.zeros_like(r), d, gaussian_spins=True
+                ).spins.rotation
+            ),
+            (ratio,),
+            (jnp.ones_like(ratio),),
+        )
+        # Without a slope, at beta_t = -1, nothing turns the spheres.
+        return jnp.where(slope < 0, ratio - gain / jnp.where(slope < 0, slope, -1.0), 0.0), None
 
-    def step(x, _):
-        x = x - jnp.linalg.solve(jax.jacfwd(rates)(x), rates(x))
-        return x.at[0].max(0.0), None
-
-    start = jnp.zeros(1 if gaussian else 3, speed.dtype)
-    x, _ = jax.lax.scan(step, start, length=_NEWTON_STEPS)
-    return Spins.gaussian(x[0]) if gaussian else Spins(*x)
+    assert scene.surface is not None
+    steps = 1 if scene.surface.friction is None else _NEWTON_STEPS
+    return jax.lax.scan(step, jnp.zeros_like(speed), length=steps)[0]

@@ -60,6 +60,18 @@ def test_the_steady_state_is_where_theory_comes_to_rest():
     assert float(slope(strength) * strength / steady.temperature) == pytest.approx(2 / 3, rel=1e-8)
 
 
+@pytest.mark.parametrize("beta", [-1.0, 0.3])
+def test_the_steady_spins_are_where_theory_comes_to_rest(beta):
+    surface = jaxgran.Rough(beta, rotational_temperature=0.0, friction=0.3)
+    gas = dataclasses.replace(constant(0.8), surface=surface)
+    steady, curve = jaxgran.steady_state(gas), theory_curve(gas, LATE, rtol=1e-10)
+    np.testing.assert_allclose(steady.temperature, curve.temperature[1], rtol=1e-7)
+    # That of the solver adds up over thousands of collisions; 0 if nothing turns them.
+    rotation = steady.rotational_temperature
+    np.testing.assert_allclose(rotation, curve.rotational_temperature[1], rtol=1e-6)
+    assert rotation == 0.0 if beta == -1.0 else rotation > 0.0
+
+
 def test_theory_begins_with_a_given_sonine():
     gas = constant(0.5)
     steady = jaxgran.steady_state(gas)
