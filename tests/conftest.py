@@ -65,6 +65,8 @@ def pytest_configure(config):
         raise pytest.UsageError("--record needs all tests in one process: add -n 0")
     if not worker:
         os.environ["MPLBACKEND"] = "agg"  # no window
+        for name in ("JAX_COMPILATION_CACHE_DIR", "JAXGRAN_NO_CACHE"):
+            os.environ.pop(name, None)
         os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxgran-tests-")
         config.add_cleanup(partial(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True))
         if config.option.markexpr == "not slow":
