@@ -30,6 +30,22 @@ def is_known(value: Any) -> bool:
     return not isinstance(value, Tracer)
 
 
+def in_compiled_code(*trees: Any) -> bool:
+    """Tell whether any leaf is traced by `jax.jit`, and not only differentiated or batched."""
+
+    def compiled(value):
+        while isinstance(value, Tracer):
+            if hasattr(value, "primal"):
+                value = value.primal
+            elif hasattr(value, "batch_dim"):
+                value = value.val
+            else:
+                return True
+        return False
+
+    return any(compiled(leaf) for leaf in jax.tree.leaves(trees))
+
+
 def pad_to(values: Any, size: int) -> Array:
     """Pad an array to `size` rows by repeating its last row."""
     missing = size - len(values)

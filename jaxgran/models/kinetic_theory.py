@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils import status, validation
-from jaxgran._utils.tracing import any_traced, array_module, pad_to, truncate_to
+from jaxgran._utils.tracing import any_traced, array_module, in_compiled_code, pad_to, truncate_to
 from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
@@ -214,7 +214,7 @@ class KineticTheory(AbstractModel):
         size = times.size
         padded = pad_to(times, padded_length(size))
         # Traced twice if it were compiled within another program.
-        computed = self.curve_in_fit if any_traced(gas, times) else self._compiled_curve
+        computed = self.curve_in_fit if in_compiled_code(gas, times) else self._compiled_curve
         curve = computed(gas, padded, 1.0)
         if gas.container is not None:  # walls would limit <dr^2>
             curve = dataclasses.replace(curve, diffusion=None, displacement=None)

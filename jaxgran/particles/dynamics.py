@@ -233,7 +233,7 @@ def run_segments(
     state: State,
     end: ArrayLike,
     engine: str,
-    min_segments: int,
+    min_segments: ArrayLike,
     max_segments: int | None = None,
     fault: ArrayLike = status.OK,
 ) -> tuple[State, Array, Array]:

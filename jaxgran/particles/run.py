@@ -33,6 +33,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -213,6 +214,7 @@ class Simulation(NamedTuple):
         return self.dynamics.with_tangents(state, self.directions)
 
 
+@eqx.filter_jit
 def simulate_traced(sim: Simulation) -> Outputs:
     """Equilibrate and cool inside JAX transformations, with records at the times of the inputs."""
     dynamics, inputs = sim.dynamics, sim.inputs
@@ -228,16 +230,19 @@ def simulate_traced(sim: Simulation) -> Outputs:
         )
     else:
         fault |= dynamics.check_start(state)
-    # One segment until t = 0 counts the energy in contacts.
-    state = sim.cooling_state(state)
-    state, fault, _ = run_segments(dynamics, state, jnp.zeros_like(state.time), engine, 1, 1, fault)
 
-    def record_at(carry, end):
-        state, fault, _ = run_segments(dynamics, carry[0], end, engine, 0, None, carry[1])
+    def record_at(carry, x):
+        state, fault, _ = run_segments(dynamics, carry[0], x[0], engine, x[1], None, carry[1])
         records, failed = sim.observe(state), fault != status.OK
         return (state, fault), jax.tree.map(partial(snapshot.nan_where, failed), records)
 
-    (state, fault), records = jax.lax.scan(record_at, (state, fault), inputs.times)
+    # One segment until t = 0 counts the energy in contacts. With it in the loop over the times a
+    # program has the segments once.
+    ends = jnp.concatenate([jnp.zeros_like(state.time)[None], inputs.times])
+    least = jnp.zeros(len(ends), jnp.int32).at[0].set(1)
+    carry = sim.cooling_state(state), fault
+    (state, fault), records = jax.lax.scan(record_at, carry, (ends, least))
+    records = jax.tree.map(lambda x: x[1:], records)
     return sim.outputs(state, records, fault)
 
 

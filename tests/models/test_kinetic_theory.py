@@ -155,6 +155,19 @@ def test_another_number_of_times_compiles_nothing(beads, caplog):
     assert half.temperature.shape == half.displacement.shape == (16,)
 
 
+def test_derivatives_and_batches_outside_of_jit_are_compiled_once(beads, caplog):
+    gas = beads(0.15)
+
+    def final(T):
+        return jaxgran.cool(gas.replace(temperature=T), [1.0]).temperature[-1]
+
+    batch = jax.vmap(jax.grad(final))
+    batch(jnp.array([0.01, 0.02]))
+    with jax.log_compiles():
+        batch(jnp.array([0.02, 0.03]))
+    assert not caplog.records
+
+
 def test_displacement_accuracy_covers_dense_hard_spheres(beads):
     # Speedy's D over Enskog's first Sonine order, evaluated apart; rounded, so 15 % of the excess.
     for phi, excess in ((0.05, 0.0407), (0.1, 0.0844), (0.2, 0.1883)):
