@@ -2,7 +2,6 @@ import gc
 import os
 import shutil
 import tempfile
-from contextlib import nullcontext
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -79,27 +78,20 @@ def pytest_configure(config):
 def pytest_sessionstart(session):
     config = session.config
     if hasattr(config, "workerinput") or getattr(config.option, "dist", "no") == "no":
-        # Not where workers do it, who wait until then.
-        _import(nullcontext() if config.option.markexpr == "slow" else _checked_annotations())
+        _import()  # not where workers do it, who wait until then
 
 
-def _checked_annotations():
-    """A block in which jaxgran is imported so that the types and shapes of annotations are checked.
+def _import():
+    """Import jaxgran so that the types and shapes of all annotations are checked.
 
-    Under jax.vmap and in pytrees of tracers annotations hold for one member. The checks take a
-    tenth of the time of the tests.
+    Under jax.vmap and in pytrees of tracers annotations hold for one member.
     """
-    from jaxtyping import install_import_hook
-
-    return install_import_hook("jaxgran", "beartype.beartype")
-
-
-def _import(block):
     import jax
+    from jaxtyping import install_import_hook
 
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_rank_promotion", "raise")
-    with block:
+    with install_import_hook("jaxgran", "beartype.beartype"):
         import jaxgran  # noqa: F401
         from jaxgran.cli.common import use_compilation_cache
 

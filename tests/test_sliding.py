@@ -92,12 +92,14 @@ def test_drag_and_a_drive_leave_the_shape_of_spins(element, expected):
 
 
 def test_rough_spheres_spread_nearly_as_far_as_theory_says():
-    # <dr^2> of DSMC, 50 000 spheres, known to 1 %; with the correlation of v and s it is smaller.
+    # <dr^2> of DSMC, 50 000 spheres, known to 1 %. That of theory is larger, 7 % at the last time,
+    # as it leaves out the correlation of v and s in D.
     gas = hard_gas(0.8, 0.02, surface=jaxgran.Rough(0.5))
     gas = gas.replace(rotational_temperature=gas.temperature)
     curve = theory_curve(gas, np.array([3.0, 10.0, 30.0]))
+    accuracy = jaxgran.KineticTheory().displacement_accuracy(gas)
     found = curve.displacement / gas.path_length**2
-    np.testing.assert_allclose(found, [0.24890, 0.96667, 2.17824], rtol=0.08)
+    np.testing.assert_allclose(found, [0.24890, 0.96667, 2.17824], rtol=accuracy)
 
 
 def test_T_rot_is_less_accurate_where_sliding_slows_spins_down():

@@ -231,8 +231,9 @@ def simulate_traced(sim: Simulation) -> Outputs:
     else:
         fault |= dynamics.check_start(state)
 
-    def record_at(carry, x):
-        state, fault, _ = run_segments(dynamics, carry[0], x[0], engine, x[1], None, carry[1])
+    def record_at(carry, target):
+        (state, fault), (end, least) = carry, target
+        state, fault, _ = run_segments(dynamics, state, end, engine, least, None, fault)
         records, failed = sim.observe(state), fault != status.OK
         return (state, fault), jax.tree.map(partial(snapshot.nan_where, failed), records)
 
