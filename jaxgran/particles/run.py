@@ -265,8 +265,7 @@ def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Out
     state = copy_buffers(sim.cooling_state(state))
 
     def advance(state: State, end: float) -> State:
-        # An interruption saves the state before the current call, which then must not be donated.
-        return _advance(state, end, dynamics, engine, progress, donate=run.checkpoint is None)
+        return _advance(state, end, dynamics, engine, progress)
 
     try:
         if fault == status.OK:  # counts the energy in contacts
@@ -298,7 +297,7 @@ def _equilibrate(sim: Simulation, state: State, engine: str, progress: bool) -> 
         crowded = float(state.time) < settled
         dynamics = elastic.with_capacity(sim.equilibration_capacity) if crowded else elastic
         short = dynamics.capacity != elastic.capacity  # no other part of the run has this program
-        return _advance(state, end, dynamics, engine, progress, donate=True, short=short)
+        return _advance(state, end, dynamics, engine, progress, short)
 
     end = np.asarray([sim.equilibration_time])
     state, _, fault = run_through_times(
@@ -318,13 +317,12 @@ def _advance(
     dynamics: AbstractDynamics,
     engine: str,
     progress: bool,
-    donate: bool,
     short: bool = False,
 ) -> State:
     """Run some segments towards an end; enlarge arrays where necessary.
 
-    One compiled call runs several segments, or one segment if the host finds the pairs. With
-    `donate` the given state may be deleted. A failure then holds the last good state.
+    One compiled call runs several segments, or one segment if the host finds the pairs. The given
+    state may be deleted; a failure holds the last good one.
 
     Raises:
         RunFailure: for any other failure.
@@ -336,7 +334,7 @@ def _advance(
         if engine == "sweep":
             program = state.position.shape, until.dtype, jax.tree.structure((sized, state))
             with compiling(program, progress):
-                result = compiled_for_host(run_segments, donate, static, short)(
+                result = compiled_for_host(run_segments, static, short)(
                     sized, state, until, engine, min_segments=1, max_segments=SEGMENTS_PER_CALL
                 )
             state, fault, needed = block_until_ready(result)
@@ -384,8 +382,8 @@ def run_through_times(
     Args:
         state: pytree with a field `time`, at the beginning of the run.
         times: increasing times, not before that of the state.
-        advance: function that advances a state towards a time, but not beyond it. It raises
-            `RunFailure` if it cannot.
+        advance: function that advances a state towards a time, but not beyond it. It may delete the
+            given state, and raises `RunFailure` if it cannot.
         observe: function that returns the records, a dictionary of arrays.
         write: function of the number of a time and the state there.
         shown: function whose result "temperature" the progress bar shows; `observe` by default.
@@ -428,7 +426,9 @@ def run_through_times(
                 raise RunFailure(fault)
             while num_done < len(times):
                 while (now := float(state.time)) < times[num_done]:
-                    state = advance(state, float(times[num_done]))
+                    # An interruption saves the state before the current call.
+                    given = state if path is None else copy_buffers(state)
+                    state = advance(given, float(times[num_done]))
                     num_stalled = num_stalled + 1 if float(state.time) <= now else 0
                     if num_stalled >= MAX_STALLED:
                         raise RunFailure(status.STALLED.bit)
@@ -456,9 +456,9 @@ def run_through_times(
 
 @cache
 def compiled_for_host(
-    function: Callable[..., T], donate: bool, static: tuple[str, ...] = (), short: bool = False
+    function: Callable[..., T], static: tuple[str, ...] = (), short: bool = False
 ) -> Callable[..., T]:
-    """Return a compiled function for the host driver; with `donate` it deletes the given `state`.
+    """Return a compiled function for the host driver, which deletes the given `state`.
 
     That state must come from `copy_buffers` or from an earlier call. If the program runs for a
     `short` time, it is compiled in three fifths of the time, and runs 5 to 40 % slower.
@@ -466,7 +466,7 @@ def compiled_for_host(
     return jax.jit(
         function,
         static_argnames=static,
-        donate_argnames="state" if donate else (),
+        donate_argnames="state",
         compiler_options=(fast_compilation(jax.default_backend()) if short else {})
         | cpu_compiler_options(),
     )

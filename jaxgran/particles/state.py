@@ -59,6 +59,7 @@ class State(NamedTuple):
     tangents: Any = None
 
 
+@jax.jit
 def copy_buffers(state: S) -> S:
     """Copy every array of a state to a new buffer, which may then be donated."""
     return jax.tree.map(jnp.copy, state)

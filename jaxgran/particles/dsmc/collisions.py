@@ -24,7 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt, UInt32
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
 
 from jaxgran.gradients.tangents import ExchangeTangents, PathTangents
 from jaxgran.particles.state import (
@@ -757,32 +757,42 @@ def advance(
     end: Float[Array, ""],
     key: UInt32[Array, "2"],
     max_steps: Int[Array, ""],
+    in_part: Bool[Array, ""],
 ) -> DSMCState:
     """Advance each replica by whole steps to the last one that ends before a time.
+
+    Or do one step in part, exactly up to this time, which whole steps have reached: both are one
+    program, because the step takes nearly all of the time of its compilation.
 
     Args:
         dynamics: of the gas.
         state: the initial state.
         end: the time.
         key: two 32-bit words of a key of random numbers.
-        max_steps: maximum number of steps; `time` of the result is the time that they reach.
+        max_steps: maximum number of whole steps; `time` of the result is the time that they reach.
+        in_part: whether to do the step in part.
     """
     scene, length = dynamics.scene, dynamics.step_length
+    scaled_step = dynamics.scheme.scaled_step
+    max_steps = jnp.where(in_part, 1, max_steps)
+
+    def left(state):
+        return (end - state.clock) - state.clock_rest
 
     def due(state):
-        return length(state) <= (end - state.clock) - state.clock_rest
+        return length(state) <= left(state)
 
     def unfinished(carry):
         state, steps_left = carry
-        return jnp.any(due(state)) & (steps_left > 0)
+        return (in_part | jnp.any(due(state))) & (steps_left > 0)
 
     def step_due(carry):
         state, steps_left = carry
         share = due(state).astype(state.clock.dtype)
         if scene.drive is not None or scene.walls is not None:
-            share = share * length(state) * jnp.sqrt(state.temperature)
-            share = share / dynamics.scheme.scaled_step
-        return dynamics.step(state, key, share), steps_left - 1
+            share = share * length(state) * jnp.sqrt(state.temperature) / scaled_step
+        part = jnp.clip(left(state) * jnp.sqrt(state.temperature) / scaled_step, 0.0, 1.0)
+        return dynamics.step(state, key, jnp.where(in_part, part, share)), steps_left - 1
 
     state, _ = jax.lax.while_loop(unfinished, step_due, (state, max_steps))
     time = jnp.where(jnp.any(due(state)), jnp.min(state.clock), end)

@@ -95,28 +95,23 @@ def dsmc_records(
     dynamics: DSMCDynamics,
     state: DSMCState,
     first: Float[Array, "replicas N d"],
-    key: UInt32[Array, "2"],
     *,
     units: Units | None = None,
     save: Callable[[Particles], Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the records of each replica at the time of a state, with their status as "fault".
+    """Return the records of each replica, with their status as "fault".
 
-    The next step of each replica is done in part, up to this time, and then discarded. If the state
-    has tangents, there are also the derivatives that `jaxgran.gradients.rule.differentiable` takes.
+    If the state has tangents, there are also the derivatives that
+    `jaxgran.gradients.rule.differentiable` takes.
 
     Args:
-        dynamics, key: of the run.
-        state: the state of the gas.
+        dynamics: of the run.
+        state: the gas, whose clocks have reached the time.
         first: velocities at t = 0.
         units, save: units of the particles, and a user's function of them.
     """
     scene, scheme, replicas = dynamics.scene, dynamics.scheme, len(state.clock)
-    duration = (state.time - state.clock) - state.clock_rest
-    share = duration * jnp.sqrt(state.temperature) / scheme.scaled_step
-    state = dynamics.step(state, key, jnp.clip(share, 0.0, 1.0))
     d = scheme.dimension
-
     velocity = v = state.particles[..., :d]
     if scene.walls is None:  # walls stop the gas as a whole
         velocity = centred(v, replicas)
@@ -211,15 +206,19 @@ def run_dsmc(
         scheme, dtype = dynamics.scheme, state.clock.dtype
         pairs = replicas * (scheme.first + scheme.second)
         max_steps = jnp.asarray(max(CHUNK // pairs, 16), jnp.int32)
-        compiled = compiled_for_host(advance, donate=run.checkpoint is None)
+        compiled = compiled_for_host(advance)
         first = state.particles[..., : scheme.dimension]
-        observe = partial(dsmc_records, dynamics, first=first, key=words)
-        recorded = partial(observe, units=inputs.units, save=save)
         state = copy_buffers(state)
 
         def advance_towards(state: DSMCState, end: float) -> DSMCState:
-            arguments = dynamics, state, jnp.asarray(end, dtype), words, max_steps
-            return block_until_ready(compiled(*arguments))
+            arguments = dynamics, state, np.asarray(end, dtype), words, max_steps
+            return block_until_ready(compiled(*arguments, False))
+
+        def observe(state: DSMCState, **options: Any) -> dict[str, Any]:
+            arguments = dynamics, copy_buffers(state), state.time, words, max_steps
+            return dsmc_records(dynamics, compiled(*arguments, True), first, **options)
+
+        recorded = partial(observe, units=inputs.units, save=save)
 
         program = jax.tree.structure((dynamics, state)), state.particles.shape, dtype
         with compiling(program, run.progress) as new:
@@ -253,10 +252,14 @@ def _run_traced(
     dynamics: DSMCDynamics, times: Array, state: DSMCState, words: Array, **options: Any
 ) -> dict[str, Any]:
     first = state.particles[..., : dynamics.scheme.dimension]
-    max_steps = jnp.asarray(2**31 - 1, jnp.int32)
+    max_steps, in_parts = jnp.asarray(2**31 - 1, jnp.int32), jnp.array([False, True])
 
-    def advance_to(state, end):
-        state = advance(dynamics, state, end, words, max_steps)
-        return state, dsmc_records(dynamics, state, first, words, **options)
+    def record_at(state, end):
+        def advance_to(states, in_part):
+            after = advance(dynamics, states[0], end, words, max_steps, in_part)
+            return jax.tree.map(partial(jnp.where, in_part), (states[0], after), (after, after)), None
 
-    return jax.lax.scan(advance_to, state, times)[1]
+        (state, ahead), _ = jax.lax.scan(advance_to, (state, state), in_parts)
+        return state, dsmc_records(dynamics, ahead, first, **options)
+
+    return jax.lax.scan(record_at, state, times)[1]
