@@ -15,6 +15,7 @@ of distances, and Fourier modes of the density and of the flow.
 import itertools
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +42,7 @@ __all__ = [
 ]
 
 
+@jax.jit
 def temperature(velocity: Float[Array, "... particles d"]) -> Float[Array, "..."]:
     """Return the temperature ``T = <v^2>/d`` for mass 1.
 
@@ -50,6 +52,7 @@ def temperature(velocity: Float[Array, "... particles d"]) -> Float[Array, "..."
     return jnp.mean(velocity**2, axis=(-2, -1))
 
 
+@jax.jit
 def sonine(velocity: Float[Array, "... particles d"]) -> Float[Array, "..."]:
     """Return the Sonine coefficient ``a_2 = d <v^4> / ((d + 2) <v^2>^2) - 1``.
 
@@ -63,6 +66,7 @@ def sonine(velocity: Float[Array, "... particles d"]) -> Float[Array, "..."]:
     return d / (d + 2) * jnp.mean(square**2, axis=-1) / jnp.mean(square, axis=-1) ** 2 - 1
 
 
+@jax.jit
 def third_sonine(velocity: Float[Array, "... particles d"]) -> Float[Array, "..."]:
     """Return the Sonine coefficient ``a_3 = 1 + 3 a_2 - d^2 <v^6> / ((d + 2)(d + 4) <v^2>^3)``.
 
@@ -77,6 +81,7 @@ def third_sonine(velocity: Float[Array, "... particles d"]) -> Float[Array, "...
     return 1 + 3 * sonine(velocity) - d**2 / ((d + 2) * (d + 4)) * sixth
 
 
+@jax.jit
 def mean_square_displacement(
     displacement: Float[Array, "... particles d"],
 ) -> Float[Array, "..."]:
@@ -88,6 +93,7 @@ def mean_square_displacement(
     return jnp.mean(jnp.sum(displacement**2, axis=-1), axis=-1)
 
 
+@jax.jit
 def velocity_correlation(
     first: Float[Array, "... particles d"], velocity: Float[Array, "... particles d"]
 ) -> Float[Array, "..."]:
@@ -95,11 +101,13 @@ def velocity_correlation(
     return jnp.mean(first * velocity, axis=(-2, -1))
 
 
+@jax.jit
 def centred(velocity: Float[Array, "n d"]) -> Float[Array, "n d"]:
     """Return velocities relative to their mean."""
     return velocity - jnp.mean(velocity, axis=0, keepdims=True)
 
 
+@partial(jax.jit, static_argnames="cells")
 def cell_density(
     position: Float[Array, "particles d"], side: ArrayLike, cells: int
 ) -> Float[Array, "*grid"]:
@@ -121,6 +129,7 @@ def cell_density(
     return (number * (cells**d / n)).reshape((cells,) * d)
 
 
+@partial(jax.jit, static_argnames="cells")
 def cell_velocity(
     position: Float[Array, "particles d"],
     velocity: Float[Array, "particles d"],
@@ -147,6 +156,7 @@ def cell_velocity(
     return (total / number[:, None]).reshape((cells,) * d + (d,))  # 0/0 is nan
 
 
+@partial(jax.jit, static_argnames="cells")
 def number_fluctuation(
     position: Float[Array, "particles d"], side: ArrayLike, cells: int
 ) -> Float[Array, ""]:
@@ -197,8 +207,12 @@ def velocity_distribution(
     >>> bool(abs(f[1] * jnp.pi**1.5 - 0.977) < 0.1)
     True
     """
+    return _speed_distribution(velocity, checked_edges(edges))
+
+
+@jax.jit
+def _speed_distribution(velocity: Float[Array, "n d"], edges: Float[Array, "e"]) -> Array:
     n, d = velocity.shape
-    edges = checked_edges(edges)
     v = centred(velocity)
     c = jnp.sqrt(jnp.sum(v**2, axis=-1) / (2 * temperature(v)))
     return histogram(c, edges) / (n * shell_volumes(edges, d))
@@ -237,7 +251,7 @@ def pair_correlation(
             f"position must have the shape (N, d) of one replica, got {position.shape}: take "
             "particles.position[0], or average over replicas by jax.vmap"
         )
-    n, d = position.shape
+    n = len(position)
     edges = checked_edges(edges)
     centres = n if centres is None else centres
     if not (isinstance(centres, int) and 1 <= centres <= n):
@@ -247,6 +261,14 @@ def pair_correlation(
             f"the last edge of g(r) must be at most half a box side, {np.asarray(side) / 2:g}, got "
             f"{float(edges[-1]):g}. Use smaller distances, or more particles for a larger box."
         )
+    return _pair_correlation(position, side, edges, centres)
+
+
+@partial(jax.jit, static_argnames="centres")
+def _pair_correlation(
+    position: Float[Array, "n d"], side: Float[Array, ""], edges: Float[Array, "e"], centres: int
+) -> Float[Array, "bins"]:
+    n, d = position.shape
 
     def around(i: Array) -> Float[Array, "bins"]:
         apart = position - position[i][None]
@@ -290,6 +312,7 @@ NUM_FLOW_SHELLS = 2
 """Number of lengths of wave vectors that count as flow: k = 2 pi / side, and sqrt(2) times that."""
 
 
+@partial(jax.jit, static_argnames="num_shells")
 def structure_factor(
     position: Float[Array | np.ndarray, "particles d"], side: ArrayLike, num_shells: int = 4
 ) -> tuple[Float[Array, "shells"], Float[Array, "shells"]]:
@@ -313,6 +336,7 @@ def structure_factor(
     return _wave_numbers(waves, shells, side), _shell_means(jnp.abs(amplitude) ** 2, shells)
 
 
+@partial(jax.jit, static_argnames="num_shells")
 def flow_spectrum(
     position: Float[Array, "particles d"],
     velocity: Float[Array, "particles d"],
@@ -343,12 +367,14 @@ def flow_spectrum(
     v = centred(velocity)
     current = jax.vmap(lambda x: _amplitudes(position, x, waves, side), 1, 1)(v)
     unit = waves / np.sqrt(np.sum(waves**2, axis=1, keepdims=True))
-    along = jnp.abs(jnp.sum(current * unit, axis=1)) ** 2
-    across = (jnp.sum(jnp.abs(current) ** 2, axis=1) - along) / (d - 1)
+    amplitude = jnp.sum(current * unit, axis=1, keepdims=True)
+    along = jnp.abs(amplitude[:, 0]) ** 2
+    across = jnp.sum(jnp.abs(current - amplitude * unit) ** 2, axis=1) / (d - 1)
     k = _wave_numbers(waves, shells, side)
     return k, _shell_means(across, shells), _shell_means(along, shells)
 
 
+@partial(jax.jit, static_argnames="num_shells")
 def flow_share(
     position: Float[Array, "particles d"],
     velocity: Float[Array, "particles d"],
