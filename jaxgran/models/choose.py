@@ -218,8 +218,10 @@ def error_model_along(
         "collisions": zero if curve.collisions is None else curve.collisions,
         "sonine": zero if curve.sonine is None else curve.sonine,
     }
-    size = temperature.size
-    scales = _scales(gas, pad_to(temperature, grid_size(size)))
+    size, rotation = temperature.size, curve.rotational_temperature
+    if rotation is None:
+        rotation = gas.value("rotational_temperature") + zero if gas.surface is not None else zero
+    scales = _scales(gas, *(pad_to(x, grid_size(size)) for x in (temperature, rotation)))
     scales = {name: np.asarray(value)[:size] for name, value in scales.items()}
     values = {name: np.asarray(value, float) for name, value in (values | scales).items()}
     critical, flow = values.pop("critical_box"), np.zeros_like(values["time"])
@@ -230,34 +232,37 @@ def error_model_along(
 
 
 @eqx.filter_jit
-def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Array, "times"]]:
-    def scales(temperature):
+def _scales(
+    gas: Gas, temperature: Float[Array, "times"], rotation: Float[Array, "times"]
+) -> dict[str, Float[Array, "times"]]:
+    def scales(temperature, rotation):
         now = gas.replace(temperature=temperature)
+        shares = _shares_of_losses(now, rotation / temperature)
         factor = softness_factor(now.reduced_law, jnp.ones_like(temperature), now.dimension)
-        return {
+        scales = {
             "contact_fraction": now.contact_fraction,
             "overlap": now.mean_overlap,
             "softness": 1 - factor,
             "critical_box": now.critical_box,
-            "impact_share": _impact_share(now, gas),
         }
+        return scales | dict(zip(("impact_share", "normal_share"), shares, strict=True))
 
-    return jax.vmap(scales)(temperature)
+    return jax.vmap(scales)(temperature, rotation)
 
 
-def _impact_share(now: Gas, first: Gas) -> Float[Array, ""]:
-    one, d = jnp.ones_like(now.temperature), now.dimension
-    if now.container is None and now.drag is None:
-        return one
-    scene, rough = reduced_scene(now), first.surface
-    ratio = 0.0 if rough is None else rough.rotational_temperature / first.temperature
-    impacts = first_cooling_rate(now)[0] * now.path_length / now.impact_speed
+def _shares_of_losses(now: Gas, ratio: Float[Array, ""]) -> tuple[Array, Array]:
+    """Return the shares of impacts in all losses, and of normal losses in those of impacts."""
+    one = jnp.ones_like(now.temperature)
+    if now.container is None and now.drag is None and now.surface is None:
+        return one, one
+    scene, state = reduced_scene(now), (Spins.gaussian(ratio), 0 * one, now.dimension)
+    normal = first_cooling_rate(now)[0] * now.path_length / now.impact_speed
     alone = scene._replace(walls=None, drag=None, drive=None)
-    state = Spins.gaussian(ratio * one), 0 * one, d
-    mine, rest = (
+    tangential, rest = (
         element_rates(x, one, *state, gaussian_spins=True).cooling for x in (alone, scene)
     )
-    return (impacts + mine) / (impacts + rest)
+    impacts = normal + tangential
+    return impacts / (normal + rest), normal / impacts
 
 
 def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[str]:

@@ -157,6 +157,7 @@ class ErrorModel(NamedTuple):
         overlap: mean largest overlap, in diameters.
         softness: c X_T/sigma, by which soft contacts slow the cooling.
         impact_share: share of the losses in impacts between spheres, the rest by walls and drag.
+        normal_share: share of these by the normal velocity; rough spheres lose the rest by slip.
         flow_share: mean share of the kinetic energy in the flow, 0 where the box is unknown.
         flow_scatter: standard deviation of this share between realisations.
 
@@ -176,6 +177,7 @@ class ErrorModel(NamedTuple):
     overlap: Float[np.ndarray, "times"]
     softness: Float[np.ndarray, "times"]
     impact_share: Float[np.ndarray, "times"]
+    normal_share: Float[np.ndarray, "times"]
     flow_share: Float[np.ndarray, "times"]
     flow_scatter: Float[np.ndarray, "times"]
 
@@ -218,11 +220,17 @@ class ErrorModel(NamedTuple):
         Collisions are a Poisson process of rate N nu/2. The energy lost in each is proportional to
         the square of the normal speed, which is distributed exponentially: its mean square is twice
         the square of its mean. A clock that reads the loss then has the variance
-        ``int 4 dt / (N nu)`` (4.4 instead of 4 if ``1 - eps^2`` grows as v^(1/5)). The factor of
-        losses by walls and drag is `CHANCE_OF_OTHERS`.
+        ``int 4 dt / (N nu)`` (4.4 instead of 4 if ``1 - eps^2`` grows as v^(1/5)). Rough spheres
+        lose a share 1 - n by the slip, whose square has the variance ``2/(d - 1)`` relative to its
+        squared mean and is independent of the normal speed: 2 becomes
+        ``1 + n^2 + 2 (1 - n)^2/(d - 1)``. The factor of losses by walls and drag is
+        `CHANCE_OF_OTHERS`.
         """
         frequency = float(self.gas.collision_frequency) * np.exp(self.log_temperature / 2)
-        share = self.impact_share**2 + CHANCE_OF_OTHERS * (1 - self.impact_share) ** 2
+        normal, slip = self.normal_share, 1 - self.normal_share
+        spread = 1 + normal**2 + 2 / (self.gas.dimension - 1) * slip**2
+        share = spread / 2 * self.impact_share**2
+        share = share + CHANCE_OF_OTHERS * (1 - self.impact_share) ** 2
         return self._integral(4 * share / (num_particles * frequency))
 
     def slope_error(self) -> Float[np.ndarray, "times"]:

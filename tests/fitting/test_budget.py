@@ -155,6 +155,17 @@ def test_between_walls_only_impacts_between_spheres_are_random():
     assert 0.007 < walled.mixing < 0.008 and 0.004 < elastic.mixing < 0.005
 
 
+def test_slip_makes_the_losses_of_rough_spheres_more_regular():
+    gas = glass_beads(packing_fraction=0.03)
+    rough = dataclasses.replace(gas, surface=jaxgran.Rough(-0.3))
+    smooth, rough = (error_model_of(x, 0.001, num_particles=250) for x in (gas, rough))
+    n = smooth.log_temperature[1] / rough.log_temperature[1]
+    np.testing.assert_allclose(rough.normal_share[0], n, rtol=0.02)
+    ratio = rough.chance_of_clock(250)[1] / smooth.chance_of_clock(250)[1]
+    # Mean squares of a sum of two independent exponential losses, n and 1 - n, and of one.
+    assert ratio == pytest.approx((1 + n**2 + (1 - n) ** 2) / 2, rel=0.02)
+
+
 def test_alternatives_have_the_error_of_theory_with_what_they_add():
     gas, curve = cooled_beads()
     result = jaxgran.fit(gas, curve, free=BOTH, num_particles=500)

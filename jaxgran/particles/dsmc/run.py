@@ -257,7 +257,9 @@ def _run_traced(
     def record_at(state, end):
         def advance_to(states, in_part):
             after = advance(dynamics, states[0], end, words, max_steps, in_part)
-            return jax.tree.map(partial(jnp.where, in_part), (states[0], after), (after, after)), None
+            return jax.tree.map(
+                partial(jnp.where, in_part), (states[0], after), (after, after)
+            ), None
 
         (state, ahead), _ = jax.lax.scan(advance_to, (state, state), in_parts)
         return state, dsmc_records(dynamics, ahead, first, **options)
