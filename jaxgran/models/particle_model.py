@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from equinox import AbstractVar
@@ -78,7 +79,21 @@ class AbstractParticleModel(AbstractModel):
             return self._by_replica(inputs, directions, gas.dimension, run)
 
         out = self.differentiable(outputs, run)(inputs)
-        units, others = inputs.units, {}
+        return self._curve(gas, times, inputs.units, out, invalid, fault, run.save == "particles")
+
+    @eqx.filter_jit
+    def _curve(
+        self,
+        gas: Gas,
+        times: Float[Array, "times"],
+        units: snapshot.Units,
+        out: Outputs,
+        invalid: Bool[Array, "times"],
+        fault: Int[Array, ""],
+        saves_particles: bool,
+    ) -> CoolingCurve:
+        """Return the curve of a run in SI, with nan at invalid times."""
+        others = {}
         values = records_in_si(
             out.records, length=units.length, temperature=gas.temperature, mass=gas.mass
         )
@@ -89,11 +104,11 @@ class AbstractParticleModel(AbstractModel):
         if "flow_share" in values:
             others["derivative_bias"] = self.derivative_bias(gas, times, values["flow_share"])
         curve = CoolingCurve.of_replicas(times, values, status=out.status | fault, **others)
-        if run.save is None:
+        if "saved" not in out.records:
             return curve
         nan_if_invalid = partial(snapshot.nan_where, invalid[:, None])
         saved = jax.tree.map(nan_if_invalid, out.records["saved"])
-        if run.save != "particles":
+        if not saves_particles:
             return curve.with_saved(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), saved))
         box_side = jnp.broadcast_to(units.box_side, (len(times), *units.box_side.shape))
         return dataclasses.replace(curve, saved=saved._replace(box_side=box_side))

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Float, Int, UInt32
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
@@ -236,6 +236,12 @@ def run_dsmc(
             path=run.checkpoint,
         )
         records = jax.tree.map(jnp.asarray, records)
+    return _nan_from_faults(records, jnp.asarray(fault, jnp.int32))
+
+
+@jax.jit
+def _nan_from_faults(records: dict[str, Any], fault: Int[Array, ""]) -> Outputs:
+    """Return the results of a run, with nan in a replica from its first fault on."""
     faults = records.pop("fault")
     failed = jnp.cumsum(faults != status.OK, axis=0) > 0
     records |= {
