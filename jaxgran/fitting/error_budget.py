@@ -102,6 +102,9 @@ def _error_model(curve: CoolingCurve, gas: Gas, comparison: Comparison) -> Error
         temperature=with_start(curve.temperature, gas.temperature),
         sonine=None if curve.sonine is None else with_start(curve.sonine),
         collisions=None if curve.collisions is None else with_start(curve.collisions),
+        rotational_temperature=None
+        if curve.rotational_temperature is None
+        else with_start(curve.rotational_temperature, gas.value("rotational_temperature")),
     )
     return error_model_along(gas, curve_from_start, comparison.num_particles)
 
