@@ -61,21 +61,13 @@ def test_ideal_gas_has_no_pair_correlation(dimension):
 def test_shells_of_a_lattice(dimension, shells):
     edges = np.array([0.9, 1.1, 1.3, 1.5])
     ball = BALL[dimension] * edges**dimension
-    g = obs.pair_correlation(jnp.asarray(lattice(4, dimension) / 2), 2.0, edges / 2)
-    np.testing.assert_allclose(g, shells / np.diff(ball), rtol=1e-12)  # round-off
-
-
-def test_pairs_of_a_clump_are_all_counted():
-    # Far more pairs than the mean density lets expect.
-    rng = np.random.default_rng(1)
-    position, side = rng.random((120, 3)), 100.0
-    edges = np.linspace(0, 2, 5)
-    distances = np.linalg.norm(position[:, None] - position[None], axis=-1)
-    counts = np.histogram(distances[np.triu_indices(120, 1)], edges)[0]
-    assert counts.sum() == 120 * 119 // 2
-    expected = 120**2 / 2 / side**3 * 4 / 3 * np.pi * np.diff(edges**3)
-    g = obs.pair_correlation(jnp.asarray(position), side, edges)
-    np.testing.assert_allclose(g, counts / expected, rtol=1e-12)  # round-off
+    points = jnp.asarray(lattice(4, dimension) / 2)
+    # A few centres see what all do.
+    found = jax.jit(lambda side: obs.pair_correlation(points, side, edges / 2, 5))
+    for g in (obs.pair_correlation(points, 2.0, edges / 2), found(2.0)):
+        np.testing.assert_allclose(g, shells / np.diff(ball), rtol=1e-12)  # round-off
+    # Beyond half of a side that could not be checked before.
+    assert jnp.isnan(found(1.4)[-1])
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -88,7 +80,7 @@ def test_spectra_of_an_ideal_gas(dimension):
         return obs.structure_factor(position, 3.7)[1], *flow
 
     runs = 400
-    shape, across, along = jax.vmap(spectra)(jax.random.split(jax.random.key(0), runs))
+    shape, across, along = jax.jit(jax.vmap(spectra))(jax.random.split(jax.random.key(0), runs))
     # S = 1; T = 4 less what the mean velocity takes, 1/50. A mode is exponential; k and -k are one.
     T = 4 * (1 - 1 / 50)
     for found, modes in ((shape, 2), (across / T, (dimension - 1) * 2), (along / T, 2)):
@@ -156,11 +148,11 @@ def test_flow_spectrum_of_a_wave():
 def test_flow_share(dimension):
     """All of a wave, a part of a wave that is added to heat, nothing of heat alone."""
     n, waves = 8**dimension, {2: 4, 3: 9}[dimension]
-    points = jnp.asarray(lattice(8, dimension) + 0.3)
-    wave = jnp.zeros(points.shape).at[:, 1].set(jnp.sin(jnp.pi / 4 * points[:, 0]))
+    points = lattice(8, dimension) + 0.3
+    along = np.eye(dimension)[1]
+    wave, short = (np.sin(k * points[:, :1]) * along for k in (np.pi / 4, np.pi / 2))
     even = 2 * waves / n  # by equipartition
     assert float(obs.flow_share(points, wave, 8.0)) == pytest.approx(1 - even, abs=1e-12)
-    short = jnp.zeros(points.shape).at[:, 1].set(jnp.sin(jnp.pi / 2 * points[:, 0]))
     for nothing in (short, 0 * wave):
         assert float(obs.flow_share(points, nothing, 8.0)) == pytest.approx(-even, abs=1e-12)
 
@@ -170,7 +162,7 @@ def test_flow_share(dimension):
         return obs.flow_share(position, heat, 1.0)
 
     runs = 400
-    found = jax.vmap(of_heat)(jax.random.split(jax.random.key(0), runs))
+    found = jax.jit(jax.vmap(of_heat))(jax.random.split(jax.random.key(0), runs))
     spread = 2 * np.sqrt(waves / dimension) / n
     assert float(jnp.std(found)) == pytest.approx(spread, rel=4 / np.sqrt(2 * runs) + 2 / n)
     # The mean velocity takes 1/n of the energy, not of the waves.
@@ -179,44 +171,26 @@ def test_flow_share(dimension):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_cells(dimension):
-    points = jnp.asarray(lattice(4, dimension) + 0.5) / 2
-    density = obs.cell_density(points, 2.0, 2)
+    points = (lattice(4, dimension) + 0.5) / 2
+    shear = np.where(points[:, :1] < 1, 1.0, -1.0) * np.eye(dimension)[-1]
+
+    @jax.jit
+    def found(points):
+        flow = obs.cell_velocity(points, shear + 7.0, 2.0, 2)
+        return obs.cell_density(points, 2.0, 2), flow, obs.number_fluctuation(points, 2.0, 2)
+
+    density, flow, fluctuation = found(points)
     assert density.shape == (2,) * dimension
     np.testing.assert_array_equal(density, 1.0)
-    assert obs.number_fluctuation(points, 2.0, 2) == 0
-    np.testing.assert_array_equal(obs.cell_density(points - 6.0, 2.0, 2), 1.0)  # an image
-    shear = jnp.where(points[:, :1] < 1, 1.0, -1.0) * jnp.eye(dimension)[-1][None]
-    flow = obs.cell_velocity(points, shear + 7.0, 2.0, 2)
-    sign = jnp.array([1.0, -1.0]).reshape((2,) + (1,) * (dimension - 1))
-    np.testing.assert_allclose(flow[..., -1], jnp.broadcast_to(sign, density.shape), rtol=1e-13)
+    assert fluctuation == 0
+    np.testing.assert_array_equal(found(points - 6.0)[0], 1.0)  # an image
+    sign = np.array([1.0, -1.0]).reshape((2,) + (1,) * (dimension - 1))
+    np.testing.assert_allclose(flow[..., -1], np.broadcast_to(sign, density.shape), rtol=1e-13)
     np.testing.assert_allclose(flow[..., 0], 0.0, atol=1e-13)
-    one = points.at[:].set(0.1)  # all in the first cell, the others empty
+    _, flow, fluctuation = found(np.full(points.shape, 0.1))  # all in the first cell
     clumped = (2**dimension - 1) * 2**dimension  # variance of the density, times the mean number
-    assert obs.number_fluctuation(one, 2.0, 2) == pytest.approx(clumped, rel=1e-13)
-    assert jnp.sum(jnp.isnan(obs.cell_velocity(one, shear, 2.0, 2)[..., 0])) == 2**dimension - 1
-
-
-def test_number_fluctuation_of_independent_particles():
-    position = jax.random.uniform(jax.random.key(0), (400, 1000, 3))
-    found = jax.vmap(lambda x: obs.number_fluctuation(x, 1.0, 4))(position)
-    # 1 - 1/64 by the fixed sum; chi^2 of 63 degrees of freedom each.
-    assert jnp.mean(found) == pytest.approx(1 - 1 / 64, abs=4 * np.sqrt(2 / 63 / 400))
-
-
-def test_observables_compile_and_have_batches():
-    position, velocity = jax.random.uniform(jax.random.key(0), (2, 3, 100, 3))
-    edges = np.linspace(0.1, 0.5, 5)
-
-    def all_of(x, v, side):
-        spectra = obs.structure_factor(x, side), obs.flow_spectrum(x, v, side)
-        return spectra, obs.pair_correlation(x, side, edges, 50), obs.cell_density(x, side, 3)
-
-    both = jax.jit(jax.vmap(all_of, (0, 0, None)))(position, velocity, 1.0)
-    one = all_of(position[1], velocity[1], 1.0)
-    for batch, single in zip(jax.tree.leaves(both), jax.tree.leaves(one), strict=True):
-        np.testing.assert_allclose(batch[1], single, rtol=1e-12)  # round-off
-    # Beyond half of a side that could not be checked before.
-    assert jnp.isnan(jax.jit(lambda s: obs.pair_correlation(position[0], s, edges))(0.9)[-1])
+    assert fluctuation == pytest.approx(clumped, rel=1e-13)
+    assert np.sum(np.isnan(flow[..., 0])) == 2**dimension - 1
 
 
 @pytest.mark.parametrize(
