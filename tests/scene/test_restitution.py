@@ -44,24 +44,10 @@ def test_fast_law_at_zero():
     assert viscoelastic_restitution(0.0) == 1.0
     for clipped in (True, False):
         law = partial(viscoelastic_restitution, clipped=clipped)
-        np.testing.assert_allclose(jax.grad(law)(0.0), -C1, rtol=1e-12)
+        np.testing.assert_allclose(jax.jit(jax.grad(law))(0.0), -C1, rtol=1e-12)
         # The fits fix the slope at 0, the curvature only to their own accuracy.
-        np.testing.assert_allclose(jax.grad(jax.grad(law))(0.0), 2 * C2, rtol=2e-3)
-
-
-def test_fast_law_series():
-    # The terms of the clipped contact begin with (4/15) beta^(5/2).
-    beta = 0.01
-    difference = viscoelastic_restitution(beta) - viscoelastic_restitution(beta, clipped=False)
-    # Next term .0614 relative: (.461 - 0) beta^(1/2) / (4/15); measured .0829.
-    np.testing.assert_allclose(difference, 4 / 15 * beta**2.5, rtol=0.2)
-
-
-def test_laws_at_a_speed(beads):
-    beta, _, clipped, _ = REFERENCE[4]
-    gas = beads(beta)
-    np.testing.assert_allclose(gas.restitution(gas.impact_speed), clipped, rtol=1e-9)
-    np.testing.assert_allclose(hard_gas(0.9).restitution(jnp.ones(3)), 0.9)
+        curvature = jax.jit(jax.grad(jax.grad(law)))(0.0)
+        np.testing.assert_allclose(curvature, 2 * C2, rtol=2e-3)
 
 
 def test_series_of_viscoelastic_spheres(beads):
@@ -115,7 +101,7 @@ def test_a_law_may_give_one_number_for_all_speeds():
 
 
 @given(st.floats(0, 1e6))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_restitution_is_a_fraction(beta):
     for clipped in (True, False):
         eps = float(viscoelastic_restitution(beta, clipped=clipped))

@@ -78,12 +78,6 @@ def test_softness_of_a_weakly_dissipating_contact(dimension):
     np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
-def test_softness_of_dissipating_contacts():
-    # Oblique impacts, integrated apart; 1.938 without dissipation.
-    found = [softness(beta) for beta in (0.1, 0.3, 0.5, 1.0)]
-    np.testing.assert_allclose(found, [1.84, 1.71, 1.60, 1.42], atol=8e-3)
-
-
 @pytest.mark.parametrize(
     "dimension, phi, by_diameter, by_distance",
     [
