@@ -55,6 +55,13 @@ def spheres(position, velocity, side) -> jaxgran.Particles:
     return jaxgran.Particles(x, v, jnp.asarray(float(side)))
 
 
+def least_distance(x, side) -> float:
+    """The least distance between two of some points in a periodic box."""
+    i, j = np.triu_indices(len(x), 1)
+    apart = np.asarray(x[i] - x[j])
+    return np.min(np.linalg.norm(apart - side * np.round(apart / side), axis=1))
+
+
 def curves_of(gas, taus, *models, **options) -> list[jaxgran.CoolingCurve]:
     """Curves of some models, at times in mean free times."""
     times = np.asarray(taus, float) * float(gas.mean_free_time)

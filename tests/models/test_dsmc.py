@@ -91,7 +91,7 @@ def test_every_pair_is_about_equally_likely(n):
         one = jnp.stack([i, j])
         return jnp.concatenate([one, jnp.stack([i[: scheme.second], k])], axis=1)
 
-    draws = jax.vmap(drawn)(jax.random.split(jax.random.key(0), 4000))
+    draws = jax.jit(jax.vmap(drawn))(jax.random.split(jax.random.key(0), 4000))
     i, j = np.moveaxis(np.asarray(draws), 1, 0)
     for row_i, row_j in zip(i[:50], j[:50], strict=True):
         first = np.concatenate([row_i[: scheme.first], row_j])

@@ -52,7 +52,7 @@ GASES = {
         glass_beads(),
         jaxgran.DSMC(20_000),
         jaxgran.KineticTheory(softness=False, correlations=False),
-        (1, 5, 10, 50, 100),
+        (1, 5, 10, 50),
         ("dissipative_constant", "temperature", "packing_fraction"),
         {"temperature": (0.03, 0.003), "collisions": (0.03, 0.003), "displacement": (0.06, 0.015)},
     ),

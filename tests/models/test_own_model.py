@@ -1,6 +1,5 @@
 """A model of a user's own works wherever one of this package does."""
 
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -78,36 +77,6 @@ def test_choice(beads):
     viscous = beads(0.1)
     own, _ = jaxgran.choose_model(viscous, times_of(viscous), models=models).candidates
     assert own.error is None and "HaffLaw needs ConstantRestitution" in own.refusal
-
-
-class NoisyHaffLaw(HaffLaw):
-    """Haff's law with the noise of a particle model."""
-
-    num: int = 3
-    stochastic: ClassVar[bool] = True
-
-    def simulate(self, gas, times, run):
-        exact = super().simulate(gas, times, run).temperature
-        noise = 0.01 * jax.random.normal(run.key, (self.num, times.size))
-        each = jaxgran.CoolingCurve(times=times, temperature=exact[None] * jnp.exp(noise))
-        mean = jnp.mean(each.temperature, axis=0)
-        return jaxgran.CoolingCurve(times=times, temperature=mean, replicas=each)
-
-
-@pytest.mark.slow
-def test_a_stochastic_model_is_fitted_through_its_replicas():
-    gas, free = gas_of(), ("coefficient", "temperature")
-    curve = synthetic(gas, model=HaffLaw(), key=jax.random.key(3))
-    options = {"free": free, "progress": False, "key": jax.random.key(1)}
-    result = jaxgran.fit(gas.replace(coefficient=0.8), curve, model=NoisyHaffLaw(), **options)
-    assert bool(result.converged)
-    for i, name in enumerate(free):
-        estimate, error = result.value(name)
-        # Errors of the measurement and, with kinetic theory's guess close by, of two or three runs.
-        assert abs(estimate - gas.value(name)) < 3 * error
-        assert 0.1 < result.error_budget["simulation"][i] / error < 0.8
-    with pytest.raises(ValueError, match="NoisyHaffLaw needs curves with at least two replicas"):
-        jaxgran.fit(gas, curve, model=NoisyHaffLaw(num=1), **options)
 
 
 def test_a_missing_member_is_named():

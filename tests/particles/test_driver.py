@@ -64,19 +64,6 @@ def same(a, b):
     assert kinds[0] == kinds[1]
 
 
-def test_records_are_taken_at_the_times():
-    calls = Calls()
-    state, records = quiet(start(), TIMES, calls, observe)
-    assert isinstance(state, State) and state.time == 2.5 and calls.number == STEPS
-    assert records["temperature"].shape == (5, 2) and records["total"].shape == (5,)
-    # Products of up to twelve rounded factors.
-    decay = np.exp(-TIMES)
-    np.testing.assert_allclose(records["total"], 3 * decay, rtol=1e-14)
-    np.testing.assert_allclose(records["temperature"], np.outer(decay**2, [1.0, 4.0]), rtol=1e-14)
-    np.testing.assert_array_equal(records["count"], [0, 2, 5, 6, 12])
-    assert records["count"].dtype == np.int32
-
-
 @pytest.mark.parametrize(
     "error, at", [(KeyboardInterrupt, 0), (KeyboardInterrupt, STEPS - 1), (MemoryError, 7)]
 )
@@ -131,8 +118,9 @@ def test_compiling_is_said_until_the_program_runs_where_a_bar_would_be():
         assert stream.getvalue() == ""
 
 
-def test_a_run_says_that_it_compiles_once():
-    said, model = [], jaxgran.DSMC(23)
+def test_a_run_says_that_it_compiles_once(monkeypatch):
+    monkeypatch.setattr(run, "_COMPILED", set())
+    said, model = [], jaxgran.DSMC(64, replicas=2)
     for _ in range(2):
         with redirect_stderr(Terminal()) as stream:
             jaxgran.cool(glass_beads(), [1e-3], model=model)

@@ -17,7 +17,7 @@ from tests.beads import lattice
 
 DEVICES = "JAX_NUM_CPU_DEVICES"
 TIMES = jnp.array([0.01, 0.03])
-MODELS = {"DSMC": 200, "HardSpheres": 20, "SoftSpheres": 20}
+MODELS = {"DSMC": 200, "HardSpheres": 20}
 
 
 @pytest.fixture
@@ -58,6 +58,7 @@ def test_a_replica_is_the_same_whatever_their_number(beads, two_devices, tmp_pat
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.0.xyz", "run.1.xyz"]
 
 
+@pytest.mark.slow  # compiles for one replica
 def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
     gas, path = beads(packing_fraction=0.1), tmp_path / "run.ckpt"
     curve = cool(gas, "DSMC", 2, checkpoint=path)

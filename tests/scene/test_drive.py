@@ -39,6 +39,7 @@ def test_the_steady_state_is_that_of_van_noije_and_ernst(eps, dimension):
     np.testing.assert_allclose(curve.temperature[1], curve.temperature[2], rtol=1e-8)
 
 
+@pytest.mark.slow  # compiles the choice of a driven gas
 def test_the_choice_of_a_model_tells_the_error_of_a_steady_state():
     gas = constant(0.9, rate=0.1)
     choice = jaxgran.choose_model(gas, [1000 * float(gas.mean_free_time)])

@@ -21,7 +21,7 @@ def constant(eps, dimension=3, **elements) -> jaxgran.Gas:
 def test_perfectly_rough_elastic_spheres_keep_their_energy(dimension, spins):
     surface = jaxgran.Rough(1.0, rotational_temperature=2e-3)
     gas = constant(1.0, dimension, surface=surface)
-    curve = theory_curve(gas, TAUS, sonine=False, correlations=False)
+    curve = theory_curve(gas, TAUS, correlations=False)
     energy = dimension * curve.temperature + spins * curve.rotational_temperature
     np.testing.assert_allclose(energy, dimension * 0.01 + spins * 2e-3, rtol=1e-8)
     # In the end each of the d + d_rot squares of the energy has the same share.

@@ -69,14 +69,15 @@ AT = jnp.array([3.0, 0.2])
 
 @pytest.mark.parametrize("step", [0.1, 0.5])
 def test_a_gas_of_haff_has_its_derivative_for_any_step(step):
-    slopes = jax.jacfwd(of_haff(step))(AT)
-    expected = jax.jacfwd(lambda x: temperature(*x, TIMES))(AT)
+    slopes = jax.jit(jax.jacfwd(of_haff(step)))(AT)
+    expected = jax.jit(jax.jacfwd(lambda x: temperature(*x, TIMES)))(AT)
     found = np.asarray(slopes["temperature"])
     # g loses digits where T is near 1.
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-11, atol=1e-14)
     # In the time, too, which the run itself knows.
-    in_time = jax.jvp(lambda t: of_haff(step)(AT, t), (TIMES,), (jnp.ones_like(TIMES),))[1]
-    by_theory = jax.vmap(jax.grad(temperature, 2), (None, None, 0))(*AT, TIMES)
+    along = jax.jit(lambda t: jax.jvp(partial(of_haff(step), AT), (t,), (jnp.ones_like(t),)))
+    _, in_time = along(TIMES)
+    by_theory = jax.jit(jax.vmap(jax.grad(temperature, 2), (None, None, 0)))(*AT, TIMES)
     np.testing.assert_allclose(in_time["temperature"][:, 0], by_theory, rtol=1e-12)
     # Other records are differences in ln A, that of a logarithm too large by its third derivative.
     exact = 0.2 * TIMES / (1 + 0.2 * TIMES)
@@ -90,8 +91,8 @@ def test_reverse_mode_and_jit_of_it_agree_with_forward_mode():
     def total(x):
         return jnp.sum(f(x)["temperature"] * jnp.arange(1.0, 6.0)[:, None])
 
-    forward = jax.jacfwd(total)(AT)
-    for derivative in (jax.grad(total), jax.jit(jax.grad(total)), jax.jit(jax.jacfwd(total))):
+    forward = jax.jit(jax.jacfwd(total))(AT)
+    for derivative in (jax.grad(total), jax.jit(jax.grad(total))):
         np.testing.assert_allclose(derivative(AT), forward, rtol=1e-12)
 
 
