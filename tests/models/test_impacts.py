@@ -8,7 +8,7 @@ import pytest
 
 import jaxgran
 from tests.beads import glass_beads
-from tests.test_contract import BEADS, CASES, given_elements
+from tests.test_contract import BEADS, CASES, NO_LIMIT, given_elements
 
 T_ROT = 0.4 * float(BEADS.temperature)
 TAU = float(BEADS.mean_free_time)
@@ -33,7 +33,8 @@ def pairs_of(*kicks):
 
 
 @pytest.mark.parametrize(
-    "loss, beta, friction", [(1.0, 0.3, 1e9), (1.0, -1.0, 1e9), (0.0, 1.0, 1e9), (1.0, 0.3, 0.2)]
+    "loss, beta, friction",
+    [(1.0, 0.3, NO_LIMIT), (1.0, -1.0, NO_LIMIT), (0.0, 1.0, NO_LIMIT), (1.0, 0.3, 0.2)],
 )
 @pytest.mark.parametrize("dimension", [pytest.param(2, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("model", ["DSMC", pytest.param("hard spheres", marks=pytest.mark.slow)])
@@ -78,7 +79,7 @@ def test_impacts_keep_angular_momentum_and_follow_the_rule(model, dimension, los
             change = np.pad(changed[k], ((0, 0), (3 - changed.shape[1], 0)))
             np.testing.assert_allclose(np.cross(normal, kick), q * change, atol=1e-9 * heat)
     assert number > 20
-    assert slides == 0 if friction == 1e9 else 0.2 < slides / number < 0.9
+    assert slides == 0 if friction == NO_LIMIT else 0.2 < slides / number < 0.9
 
 
 @pytest.mark.slow

@@ -103,7 +103,7 @@ def test_noise_is_that_of_runs(phi, beta, n, duration, scatter):
 
 
 def test_only_a_flow_makes_noise_besides():
-    still, flowing = hard_gas(0.9), hard_gas(0.6, 0.3)
+    still, flowing = soft_beads(1e-4), soft_beads(1e-4, 0.5, packing_fraction=0.3)
     for gas, more in ((still, False), (flowing, True)):
         in_box, unknown = (choose(gas, 30, num_particles=n) for n in (4000, None))
         assert ("random amplitudes" in " ".join(in_box.reasons)) is more
@@ -118,7 +118,8 @@ def test_each_model_has_its_scene(beads):
     assert isinstance(choice.model, jaxgran.KineticTheory) and choice.error < 0.02
     assert "the box is unknown" in " ".join(choice.reasons)
 
-    lossy = hard_gas(0.05, 0.01)  # far from Maxwellian, a_2 = 0.2, which kinetic theory follows
+    # Far from Maxwellian, which kinetic theory follows: eps = 0.07.
+    lossy = soft_beads(1e-4, 5.0, packing_fraction=0.01)
     assert isinstance(choose(lossy, 30).model, jaxgran.KineticTheory)
     # Directions of spins and velocities are correlated, which kinetic theory leaves out.
     surface = jaxgran.Rough(-0.2, rotational_temperature=1.0, friction=0.3)
@@ -136,19 +137,20 @@ def test_each_model_has_its_scene(beads):
 
 
 def test_nothing_accurate_enough_is_said():
-    choice = choose(hard_gas(0.7, 0.3), 30, 1e-6, num_particles=1000)
+    gas = soft_beads(1e-4, 0.35, packing_fraction=0.3)
+    choice = choose(gas, 30, 1e-6, num_particles=1000)
     assert choice.error == min(errors(choice).values()) > 1e-6
     assert "no model is within 0.0001 %" in choice.reasons[0]
     with pytest.warns(UserWarning, match="no model is within"):
-        jaxgran.cool(hard_gas(0.7), [1.0], model="auto", tolerance=1e-9)
+        jaxgran.cool(gas, [1e-3], model="auto", tolerance=1e-9)
 
 
 def test_scenes_that_particles_cannot_run_are_left_to_the_others():
-    choice = choose(hard_gas(0.9, 0.6), 10, num_particles=100)
+    choice = choose(soft_beads(1e-4, packing_fraction=0.6), 10, num_particles=100)
     able = [c.model.name for c in choice.candidates if c.refusal is None]
     assert able == ["kinetic theory", "DSMC"]
     assert "too dense for a fluid start" in " ".join(choice.reasons)
-    choice = choose(hard_gas(0.9, 0.4), 10, num_particles=5)
+    choice = choose(soft_beads(1e-4, packing_fraction=0.4), 10, num_particles=5)
     assert "at least 2.1 are needed" in " ".join(choice.reasons)
 
 
