@@ -1,6 +1,5 @@
 """A model of a user's own works wherever one of this package does."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np
