@@ -41,9 +41,13 @@ def test_a_dataset_has_names_dimensions_and_units(curve):
     assert data.attrs["status"] == 0 and "sonine" not in data
 
 
-def test_a_dataset_has_saved_values(curve):
+def test_a_dataset_has_saved_values(curve, tmp_path):
     each = jnp.arange(16.0).reshape(2, 4, 2)  # replicas, times, and an axis of the user's
-    saved = curve.with_saved({"S": [each, each[..., 0]]})
+    saved = curve.with_saved({"S": (each, each[..., 0])})
+    jaxgran.write_curve(tmp_path / "saved.npz", saved, {})
+    same, _ = jaxgran.read_curve(tmp_path / "saved.npz")
+    assert jax.tree.structure(same) == jax.tree.structure(saved)
+    jax.tree.map(np.testing.assert_array_equal, same, saved)
     data = saved.to_xarray()
     again = jaxgran.CoolingCurve.from_xarray(data)
     assert repr(again) == repr(saved)
@@ -56,7 +60,12 @@ def test_a_dataset_has_saved_values(curve):
     with pytest.raises(ValueError, match="the key 'a.b': keys name arrays"):
         curve.with_saved({"a.b": each}).to_xarray()
     whole = jaxgran.Particles(*(jnp.ones((4, 2, 3, 3)) for _ in range(2)), 2 * jnp.ones(4))
-    data = dataclasses.replace(curve, saved=whole).to_xarray()
+    saved = dataclasses.replace(curve, saved=whole)
+    jaxgran.write_curve(tmp_path / "particles.npz", saved, {})
+    same, _ = jaxgran.read_curve(tmp_path / "particles.npz")
+    assert isinstance(same.saved, jaxgran.Particles)
+    np.testing.assert_array_equal(same.saved.velocity, whole.velocity)
+    data = saved.to_xarray()
     assert data["saved.position"].dims == ("time", "replica", "particle", "axis")
     assert data["saved.velocity"].attrs["units"] == "m/s"
 
@@ -116,13 +125,10 @@ def test_repr_of_a_gas_has_units():
     assert words.startswith("Gas of Viscoelastic spheres, d = 3")
 
 
-def test_repr_of_a_curve_lists_its_fields():
+def test_repr_of_a_curve_and_of_a_choice():
     curve = jaxgran.CoolingCurve([0.0, 1.0, 2.0], [4.0, 2.0, 1.0], temperature_error=[1, 1, 1])
     assert "3 times, t = 0 s to 2 s" in repr(curve) and "0.25" in repr(curve)
     assert "temperature, temperature_error" in repr(curve)
-
-
-def test_repr_of_a_choice_lists_its_reasons():
     choice = jaxgran.Choice(jaxgran.KineticTheory(), ("is cheap", "is exact"), (), 0.012)
     assert repr(choice).startswith("Choice: kinetic theory, T within 1.2 %")
     assert all(reason in repr(choice) for reason in choice.reasons)

@@ -1,6 +1,6 @@
 """Does the error bar of a fit agree with the posterior? NUTS on (A, phi, T_0, clock).
 
-    python experiments/fit/sample_posterior.py [--samples 1000] [--chains 4] [--out DIR]
+    python experiments/fit/sample_posterior.py [--samples 1000] [--chains 4] [--warmup 600] [--out DIR]
 
 The curve is the dilute LAMMPS curve, with phi known within 4 % and T_0 within 1 %. The sampler uses
 `jaxgran.log_likelihood` and the priors of the fit: of phi, of T_0, and of the mean and the trend of
@@ -85,18 +85,18 @@ def sample(log_density, values, options) -> tuple[np.ndarray, dict]:
     warm_key, key = jax.random.split(jax.random.key(0))
     full = {"is_mass_matrix_diagonal": False}
     adapt: Any = blackjax.window_adaptation(blackjax.nuts, log_density, **full)
-    (state, tuned), _ = adapt.run(warm_key, jnp.zeros(5), 600)
+    (state, tuned), _ = adapt.run(warm_key, jnp.zeros(5), options.warmup)
     nuts: Any = blackjax.nuts(log_density, **tuned)
 
     def chain(key):
         kept = {"transform": lambda state, info: (state.position, info.is_divergent)}
         return run_inference_algorithm(key, nuts, options.samples, initial_state=state, **kept)[1]
 
-    chains = jax.jit(jax.vmap(chain))
     keys = jax.random.split(key, options.chains)
-    jax.block_until_ready(chains(keys))  # compiles
+    keys = jax.random.split(keys[0], len(keys))
+    chains = jax.jit(jax.vmap(chain)).lower(keys).compile()
     begin = time.perf_counter()
-    theta, divergent = jax.block_until_ready(chains(jax.random.split(keys[0], len(keys))))
+    theta, divergent = jax.block_until_ready(chains(keys))
     seconds = time.perf_counter() - begin
     return np.asarray(jax.vmap(jax.vmap(values))(theta)), {
         "samples_per_second": options.samples * options.chains / seconds,
@@ -121,4 +121,4 @@ def draw(result: jaxgran.Fit, samples: np.ndarray):
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, sample_posterior, smoke=False, samples=1000, chains=4)
+    run_parts(__doc__, sample_posterior, smoke=False, samples=1000, chains=4, warmup=600)
