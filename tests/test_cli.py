@@ -246,7 +246,6 @@ BAD_INPUT = {
     "fit nowhere.csv --tolerance nan": "--tolerance must lie in (0, inf), got nan",
     "cool bad.toml --until 1": "not TOML",
     "choose no_A.toml --until 1": "does not give A",
-    "fit thin.csv --absent gravity": "'gravity' is not known; give some of walls",
     "fit thin.csv thin.csv": "given twice",
     "fit thin.csv dense.csv --model dsmc": "fitted with kinetic-theory",
     "fit thin.csv dense.csv --free T0 --set A=3e-6": "share none of these",

@@ -584,52 +584,6 @@ class TestContract:
         curve = case.run(model=model, throw=False)
         assert int(curve.status) != 0 and np.all(np.isnan(curve.temperature))
 
-    @of_models()
-    def test_wrong_arguments_are_refused(self, case, tmp_path):
-        two = jnp.stack([case.gas.temperature] * 2)
-        refused = [
-            ({"times": [2.0, 1.0]}, "must increase"),
-            ({"times": [-1.0, 1.0]}, "not negative, got -1"),
-            ({"times": [np.nan]}, "finite .*got nan"),
-            ({"gas": case.gas.replace(temperature=two)}, "shape .2,.*vmap"),
-            ({"gas": 3}, "must be a jaxgran.Gas"),
-            ({"model": type(case.model)}, "got the class"),
-            ({"key": 5}, "key must be"),
-        ]
-        if not case.model.saves:
-            refused.append(({"save": "particles"}, "no particles to save"))
-        if not case.model.has_positions:
-            refused.append(({"trajectory": tmp_path / "run.xyz"}, "no positions to write"))
-        if not case.model.stochastic:
-            refused.append(({"checkpoint": tmp_path / "run.ckpt"}, "no run to be saved"))
-        for arguments, words in refused:
-            with pytest.raises(ValueError, match=words):
-                case.run(**arguments)
-
-    @pytest.mark.parametrize(
-        "kind, settings, words",
-        [
-            ("KineticTheory", {"order": 4}, "order must be 2 or 3, got 4"),
-            ("DSMC", {"num_particles": 1}, "num_particles must be a whole number >= 2, an int"),
-            ("DSMC", {"step": 0.2}, r"step must lie in \(0, 0.1\], got 0.2"),
-            ("DSMC", {"step": "fine"}, "got 'fine'"),
-            ("DSMC", {"replicas": 0}, "replicas must be a whole number >= 1"),
-            ("HardSpheres", {"replicas": 0}, "replicas"),
-            ("HardSpheres", {"num_particles": 10.0}, "num_particles must be a whole number >= 2"),
-            ("HardSpheres", {"contact_time": 1.0}, "contact_time must"),
-            ("HardSpheres", {"neighbours": "best"}, "neighbours must be one of"),
-            ("HardSpheres", {"differences": 0.6}, r"differences must lie in \(0, 0.5\]"),
-            ("SoftSpheres", {"differences": 0.0}, r"differences must lie in \(0, 0.5\]"),
-            ("SoftSpheres", {"differences": 0.3, "projection": None}, "two kinds of derivative"),
-            ("SoftSpheres", {"projection": 0.0}, "projection must"),
-            ("SoftSpheres", {"steps_per_contact": 5}, "steps_per_contact"),
-        ],
-    )
-    def test_wrong_settings_are_refused(self, kind, settings, words):
-        size = {} if kind == "KineticTheory" else {"num_particles": 10}
-        with pytest.raises(ValueError, match=words):
-            getattr(jaxgran, kind)(**size | settings)
-
     @pytest.mark.parametrize("element", ELEMENTS)
     @of_models()
     def test_element_keeps_the_ledger_or_is_refused(self, case, element):
