@@ -1,6 +1,7 @@
 """Does the error bar of a fit agree with the posterior? NUTS on (A, phi, T_0, clock).
 
-    python experiments/fit/sample_posterior.py [--samples 1000] [--chains 4] [--warmup 600] [--out DIR]
+    python experiments/fit/sample_posterior.py [--samples 1000] [--chains 4] [--warmup 600]
+        [--out DIR]
 
 The curve is the dilute LAMMPS curve, with phi known within 4 % and T_0 within 1 %. The sampler uses
 `jaxgran.log_likelihood` and the priors of the fit: of phi, of T_0, and of the mean and the trend of

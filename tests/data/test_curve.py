@@ -67,7 +67,7 @@ number = st.floats(allow_nan=True, allow_infinity=True) | st.floats(1e-6, 1e6)
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # questions about unusual values
 @given(st.lists(st.tuples(number, number, number), max_size=6))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_any_rows_are_read_or_refused_with_a_reason(read, rows):
     text = "t,T,T_err\n" + "".join(f"{t!r},{x!r},{e!r}\n" for t, x, e in rows)
     good = len(rows) >= 3 and bool(np.all(np.isfinite(rows)))
@@ -85,7 +85,7 @@ def test_any_rows_are_read_or_refused_with_a_reason(read, rows):
 
 
 @given(st.binary(max_size=200))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_any_bytes_are_read_or_refused(read, data):
     try:
         read(data)
@@ -133,14 +133,8 @@ def test_what_stands_in_for_the_temperature(read, dimension):
 
 def test_units_of_the_header(read, tmp_path):
     """mm and ms: velocities are as in SI, lengths and times are not."""
-    msd = np.array([0.0, 1e-6, 2e-6, 3e-6])
     errors = "# diameter_err: 0.02\n# A: 3e-3\n"
-    columns = TIMES * 1e3, T, msd * 1e6, 0.1 * msd * 1e6
-    curve, header = read(f"{IN_MM}{UNITS}{errors}t,T,msd,msd_err\n", *columns)
-    np.testing.assert_allclose(curve.times, TIMES, rtol=1e-12)
-    np.testing.assert_allclose(curve.temperature, T, rtol=1e-12)
-    np.testing.assert_allclose(curve.displacement, msd, rtol=1e-12)
-    np.testing.assert_allclose(curve.displacement_error, 0.1 * msd, rtol=1e-12)
+    curve, header = read(f"{IN_MM}{UNITS}{errors}t,T\n", TIMES * 1e3, T)
     assert float(jaxgran.read_gas(header).diameter) == pytest.approx(2e-3)
     assert jaxgran.read_priors(header)["diameter"] == pytest.approx((2e-3, 2e-5))
     assert float(header["A"]) == pytest.approx(3e-6)
@@ -148,11 +142,6 @@ def test_units_of_the_header(read, tmp_path):
     jaxgran.write_curve(tmp_path / "copy.csv", curve, header)
     copy, again = jaxgran.read_curve(tmp_path / "copy.csv")
     np.testing.assert_array_equal(copy.times, curve.times)
-    assert again == header
-    # Centimetres and seconds: T is in cm^2/s^2.
-    head = IN_MM.replace("diameter: 2", "diameter: 0.2").replace("T0: 0.01", "T0: 100")
-    head += "# length_unit: cm\n# force_unit: N\n"
-    curve, header = read(f"{head}t,T\n", TIMES, T * 1e4)
-    np.testing.assert_allclose(curve.temperature, T, rtol=1e-12)
-    assert float(header["T0"]) == pytest.approx(0.01)
-    assert header["force_unit"] == "N" and "length_unit" not in header
+    assert again == header and "length_unit" not in header
+    _, header = read(f"{IN_MM}{UNITS}# force_unit: N\nt,T\n", TIMES * 1e3, T)
+    assert header["force_unit"] == "N"

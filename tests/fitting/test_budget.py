@@ -8,7 +8,6 @@ import pytest
 
 import jaxgran
 from experiments.support.scenes import beads as beads_of
-from jaxgran.fitting import alternatives
 from tests.beads import glass_beads
 from tests.fitting.curves import BOTH, cooled_beads, in_range, measured, synthetic
 
@@ -164,16 +163,3 @@ def test_slip_makes_the_losses_of_rough_spheres_more_regular():
     ratio = rough.chance_of_clock(250)[1] / smooth.chance_of_clock(250)[1]
     # Mean squares of a sum of two independent exponential losses, n and 1 - n, and of one.
     assert ratio == pytest.approx((1 + n**2 + (1 - n) ** 2) / 2, rel=0.02)
-
-
-def test_alternatives_have_the_error_of_theory_with_what_they_add():
-    gas, curve = cooled_beads()
-    result = jaxgran.fit(gas, curve, free=BOTH, num_particles=500)
-    kinds = alternatives._kinds(result, alternatives._problem(result)[0], ())
-    expected = {
-        "walls that dissipate energy": 0.5 * 0.007,
-        "rough grains without initial rotation": 0.5 * 0.008,
-        "rough grains that slide": 0.5 * 0.01,
-        "linear drag, as in air": 0.0,
-    }
-    assert expected.items() <= {kind.name: kind.rate_error(0.5) for kind in kinds}.items()

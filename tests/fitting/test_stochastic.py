@@ -108,6 +108,18 @@ def test_a_biased_slope_does_not_move_the_answer(bias):
     assert quiet.converged and quiet.iterations <= 8
 
 
+class OneRun(StandIn):
+    """A model whose curves do not tell their noise."""
+
+    def simulate(self, gas, times, run):
+        return dataclasses.replace(super().simulate(gas, times, run), replicas=None)
+
+
+def test_curves_without_replicas_are_refused():
+    with pytest.raises(ValueError, match="OneRun needs curves with at least two replicas"):
+        fitted(OneRun())
+
+
 def test_more_runs_make_it_quieter():
     model = StandIn(noise=0.06, replicas=16)
     found, once = (fitted(model, first=(0.25, -0.2), max_steps=steps) for steps in (8, 1))

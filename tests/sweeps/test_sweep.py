@@ -17,7 +17,7 @@ from tests.sweeps.process import TIMES, members
 
 GAS, GASES = glass_beads(), members(5)
 A = GASES.value("dissipative_constant")
-DSMC = jaxgran.DSMC(50, replicas=2)
+DSMC = jaxgran.DSMC(64, replicas=2)
 
 
 def sweep(gases=GASES, times=TIMES, **options):
@@ -30,7 +30,7 @@ def dense(*packing):
 
 def forward(particles):
     v = particles.velocity
-    assert v.shape == (50, 3)
+    assert v.shape == (64, 3)
     edges = jnp.linspace(0.0, 3.0, 8)
     f = observables.velocity_distribution(v, edges)
     return {"T": observables.temperature(v), "num": jnp.sum(v[:, 0] > 0), "f": [edges[1:], f]}
