@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import itertools
 import runpy
 import sys
 import warnings
@@ -19,7 +18,6 @@ def run(path, *arguments, folder, warning="default"):
         contextlib.chdir(folder),
         contextlib.redirect_stdout(printed),
         mock.patch.object(sys, "argv", [str(path), *map(str, arguments)]),
-        mock.patch("experiments.support.record.each_alone", itertools.starmap),
         warnings.catch_warnings(),
     ):
         warnings.simplefilter(warning)

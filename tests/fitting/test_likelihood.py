@@ -81,7 +81,7 @@ def test_chi2_of_smooth_errors_has_the_F_distribution():
 
 
 @pytest.mark.slow
-def test_fit_and_likelihood_use_them():
+def test_fits_use_them():
     gas, curve = cooled_beads()
     chance = np.random.default_rng(0).chisquare(2, curve.times.size) / 2
     ragged = dataclasses.replace(curve, temperature_error=curve.temperature_error * chance**0.5)
@@ -90,9 +90,6 @@ def test_fit_and_likelihood_use_them():
     # The weights are even: the errors were 1 % of T everywhere.
     weights = few.comparison.weights["temperature"]
     assert np.min(weights) / 100 > 0.6 and np.max(weights) / 100 < 1.7
-    expected = -0.5 * float(jnp.sum(few.residuals**2))
-    value = jaxgran.log_likelihood(few.gas, ragged, replicas=R)
-    assert float(value) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.slow
