@@ -266,10 +266,8 @@ def _shares_of_losses(now: Gas, ratio: Float[Array, ""]) -> tuple[Array, Array]:
 
 
 def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[str]:
-    hard = error_model.error_of_temperature(error_model.lasting_contacts + error_model.softness)
-    corrected = error_model.error_of_temperature(
-        error_model.crowded_contacts + error_model.second_order_softness
-    )
+    hard = error_model.error_of_temperature(error_model.instant_contacts)
+    corrected = error_model.error_of_temperature(error_model.corrected_contacts)
     lowest, end = np.exp([error_model.log_temperature.min(), error_model.log_temperature[-1]])
     heated = error_model.gas.drive is not None and end > 1
     frictional = "friction" in error_model.gas.elements

@@ -103,12 +103,7 @@ class DSMC(AbstractParticleModel):
 
     def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
         """Relative error of Enskog's rate, by contacts that last and are soft, and by walls."""
-        return (
-            error_model.homogeneous
-            + error_model.lasting_contacts
-            + error_model.softness
-            + error_model.mixing
-        )
+        return error_model.homogeneous + error_model.instant_contacts + error_model.mixing
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Return limitations by contacts that last, correlated collisions, and a growing flow."""

@@ -294,19 +294,14 @@ class ErrorModel(NamedTuple):
         return by_density + MISSING_HEAT * self.flow_share
 
     @property
-    def lasting_contacts(self) -> Float[np.ndarray, "times"]:
-        """Error of the cooling rate of a model of binary impacts."""
-        return CONTACT_ERROR * self.contact_fraction
+    def instant_contacts(self) -> Float[np.ndarray, "times"]:
+        """Error of the cooling rate of a model of binary impacts without duration."""
+        return CONTACT_ERROR * self.contact_fraction + self.softness
 
     @property
-    def crowded_contacts(self) -> Float[np.ndarray, "times"]:
-        """Error of the cooling rate with the first-order correction for contacts that last."""
-        return CROWDED_ERROR * self.contact_fraction
-
-    @property
-    def second_order_softness(self) -> Float[np.ndarray, "times"]:
-        """Error of the cooling rate with the first-order softness correction."""
-        return SOFTNESS_SQUARED * self.softness**2
+    def corrected_contacts(self) -> Float[np.ndarray, "times"]:
+        """Error of the cooling rate with the first-order corrections for contacts that last."""
+        return CROWDED_ERROR * self.contact_fraction + SOFTNESS_SQUARED * self.softness**2
 
     def truncation(self, order: int) -> Float[np.ndarray, "times"]:
         """Error of the cooling rate by the Sonine terms beyond a_2 or a_3."""

@@ -149,7 +149,7 @@ class HardSpheres(AbstractSpheres):
 
     def rate_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
         """Relative error of the cooling rate by contacts that last and overlap."""
-        return error_model.lasting_contacts + error_model.softness
+        return error_model.instant_contacts
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Return limitations by contacts that last and overlap."""

@@ -187,12 +187,9 @@ class KineticTheory(AbstractModel):
         beyond a_3.
         """
         rate = error_model.correlated if self.correlations else error_model.homogeneous
-        if self.softness:
-            rate = rate + error_model.crowded_contacts + error_model.second_order_softness
-        else:
-            rate = rate + error_model.lasting_contacts + error_model.softness
+        contacts = error_model.corrected_contacts if self.softness else error_model.instant_contacts
         elements = error_model.mixing + error_model.roughness
-        return rate + error_model.truncation(self.order) + elements
+        return rate + contacts + error_model.truncation(self.order) + elements
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Return limitations by contacts that last, correlated collisions, and a growing flow."""
