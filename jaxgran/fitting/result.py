@@ -414,19 +414,12 @@ def search_starts(problem: Problem, first: Numbers) -> Numbers:
         first: the first guess of its unknowns.
     """
     xp = array_module(first)
-    if MULTIMODAL_PARAMETER not in {u.name for u in problem.unknowns}:
+    domains = [u.domain for u in problem.unknowns if u.name == MULTIMODAL_PARAMETER]
+    if not domains:
         return first[None]
-    starts = [first]
-    for beta in MULTIMODAL_STARTS:
-        parts, begin = [], 0
-        for u in problem.unknowns:
-            part = first[begin : begin + u.size]
-            begin += u.size
-            if u.name == MULTIMODAL_PARAMETER:
-                part = xp.full_like(part, u.domain.to_free(np.asarray(beta)))
-            parts.append(part)
-        starts.append(xp.concatenate(parts))
-    return xp.stack(starts)
+    varied = [np.full(u.size, u.name == MULTIMODAL_PARAMETER) for u in problem.unknowns]
+    starts = domains[0].to_free(np.asarray(MULTIMODAL_STARTS)).astype(first.dtype)
+    return xp.stack([first, *(xp.where(np.concatenate(varied), x, first) for x in starts)])
 
 
 def goodness_of_fit(
