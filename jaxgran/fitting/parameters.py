@@ -1,5 +1,6 @@
 """Parameters of a fit: their unconstrained scale, initial guesses from the data, and priors."""
 
+from collections.abc import Callable
 from math import prod
 from typing import Any, NamedTuple
 
@@ -348,9 +349,8 @@ class Priors(eqx.Module):
         for name, given, error in zip(self.names, self.given, self.errors, strict=True):
             if name == SMOOTHNESS:
                 floats = {n: jnp.asarray(values[n]) for n in law_fields(gas.law) if n in values}
-                row, slopes = _law_prior(gas, floats)
-                by_name = {n: xp.asarray(x).reshape(row.size, -1) for n, x in slopes.items()}
-                rows[name] = xp.asarray(row), by_name
+                row = residuals_and_slopes(_law_prior, gas, floats)
+                rows[name] = jax.tree.map(xp.asarray, row)
                 continue
             domain, given, error = _prior_domain(gas, name), xp.asarray(given), xp.asarray(error)
             width = error / domain.slope(given)
@@ -375,14 +375,22 @@ class Priors(eqx.Module):
         return rows
 
 
-@eqx.filter_jit
-def _law_prior(gas: Gas, floats: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
-    def residuals(floats: dict[str, Array]) -> tuple[Array, Array]:
-        row = with_floats(gas, floats).law.prior_residuals()
-        return row, row
+def _law_prior(gas: Gas) -> Array:
+    return gas.law.prior_residuals()
 
-    slopes, row = jax.jacfwd(residuals, has_aux=True)(floats)
-    return row, slopes
+
+@eqx.filter_jit
+def residuals_and_slopes(
+    residuals_of: Callable[[Gas], Array], gas: Gas, floats: dict[str, Array]
+) -> tuple[Array, dict[str, Array]]:
+    """Return residuals of a gas, and their derivatives in some floats, shape (n, size), by name."""
+
+    def residuals(floats: dict[str, Array]) -> tuple[Array, Array]:
+        values = residuals_of(with_floats(gas, floats))
+        return values, values
+
+    slopes, values = jax.jacfwd(residuals, has_aux=True)(floats)
+    return values, {name: slope.reshape(values.size, -1) for name, slope in slopes.items()}
 
 
 NO_PRIORS = Priors((), (), ())

@@ -14,7 +14,7 @@ from jaxgran._utils.tracing import any_traced, array_module, as_jax_arrays
 from jaxgran._utils.validation import float_array, no_type_check
 from jaxgran.data.curve import QUANTITIES, WITH_ERRORS, CoolingCurve, Run
 from jaxgran.data.curve_file import DropTest
-from jaxgran.fitting.parameters import START_TIME, Numbers, with_floats
+from jaxgran.fitting.parameters import START_TIME, Numbers, residuals_and_slopes, with_floats
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_model
 from jaxgran.models.linearise import COMPUTED, LINEARISED, linearise, with_all_elements
@@ -484,20 +484,8 @@ class DropTestRows(NamedTuple):
         """Return the residuals of the impacts, with derivatives."""
         xp = array_module(self.gas, values)
         floats = {n: jnp.asarray(x) for n, x in values.items() if n in self.gas.domains}
-        residuals, slopes = _drop_test_residuals(self.gas, floats, self.data)
-        size = residuals.shape[0]
-        slopes = {name: xp.asarray(x).reshape(size, -1) for name, x in slopes.items()}
-        return [Rows("drop test", self.label, xp.asarray(residuals), slopes)], None
-
-
-@eqx.filter_jit
-def _drop_test_residuals(gas: Gas, floats: dict[str, Array], test: DropTest) -> tuple[Array, dict]:
-    def residuals(floats: dict[str, Array]) -> tuple[Array, Array]:
-        values = test.residuals(with_floats(gas, floats))
-        return values, values
-
-    slopes, values = jax.jacfwd(residuals, has_aux=True)(floats)
-    return values, slopes
+        row = residuals_and_slopes(self.data.residuals, self.gas, floats)
+        return [Rows("drop test", self.label, *jax.tree.map(xp.asarray, row))], None
 
 
 def finite_size_cooling_factor(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:
