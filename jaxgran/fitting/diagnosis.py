@@ -24,12 +24,11 @@ from jaxgran.fitting.error_budget import curve_and_gas, describe_derivative_bias
 from jaxgran.fitting.residuals import (
     Measurement,
     check_curve,
-    check_deterministic,
     neighbour_correlation,
 )
 from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE, Comparison, Fit, describe_minima
 from jaxgran.models.base import AbstractModel, Limitation
-from jaxgran.models.checks import describe_walls
+from jaxgran.models.checks import checked_model, describe_walls
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of, unit_of
@@ -537,7 +536,14 @@ def log_likelihood(
     True
     """
     model = KineticTheory() if model is None else model
-    _check_likelihood(gas, curve, model, clock)
+    check_curve(gas, curve)
+    POSITIVE.check("clock", clock, "1 leaves the times of the model unchanged.")
+    if checked_model(model).stochastic:
+        raise ValueError(
+            f"a likelihood needs a model without noise, got {type(model).__name__}, which is "
+            "stochastic. Use jaxgran.KineticTheory()"
+        )
+    model.check_scene(gas)
     m = Measurement.of("", gas, curve, model, num_particles, replicas, use_displacement=True)
     m = replace(m, faster=m.faster * jnp.asarray(clock))
     rows, _ = m.evaluate(model, dict.fromkeys(m.nuisances, jnp.zeros(())), linear=False)
@@ -558,13 +564,3 @@ def log_likelihood(
     else:
         value = -0.5 * chi2
     return jnp.where(jnp.isnan(value), -jnp.inf, value)
-
-
-@no_type_check
-def _check_likelihood(
-    gas: Gas, curve: CoolingCurve, model: AbstractModel, clock: ArrayLike
-) -> None:
-    check_curve(gas, curve)
-    POSITIVE.check("clock", clock, "1 leaves the times of the model unchanged.")
-    check_deterministic(model, "a likelihood")
-    model.check_scene(gas)

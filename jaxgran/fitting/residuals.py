@@ -16,7 +16,7 @@ from jaxgran.data.curve import QUANTITIES, WITH_ERRORS, CoolingCurve, Run
 from jaxgran.data.curve_file import DropTest
 from jaxgran.fitting.parameters import START_TIME, Numbers, residuals_and_slopes, with_floats
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.checks import checked_gas, checked_model
+from jaxgran.models.checks import checked_gas
 from jaxgran.models.linearise import COMPUTED, LINEARISED, linearise, with_all_elements
 from jaxgran.scene.gas import Gas
 
@@ -68,17 +68,6 @@ def _check_magnitudes(curve: CoolingCurve) -> None:
                 f"{smallest:g} to {largest:g} in SI units, and errors above {MIN_ERROR:g} of the "
                 "value: correct or remove the point"
             )
-
-
-@no_type_check
-def check_deterministic(model: AbstractModel, user: str) -> None:
-    """Raise ValueError for a stochastic model; `user` names what does not support it."""
-    checked_model(model)
-    if model.stochastic:
-        raise ValueError(
-            f"{user} needs a model without noise, got {type(model).__name__}, which is stochastic. "
-            "Use jaxgran.KineticTheory()"
-        )
 
 
 def unused_rotation(gas: Gas, curve: CoolingCurve) -> str | None:
