@@ -91,7 +91,9 @@ def clock_accuracy(
 
 def _error_model(curve: CoolingCurve, gas: Gas, comparison: Comparison) -> ErrorModel:
     """Return the error model of the fitted gas, at its start and at the measured times."""
-    times = _times_since_start(curve, comparison)
+    times = np.asarray(curve.times)
+    # Points before t0 have the state at t0.
+    times = np.maximum(times - np.asarray(comparison.start_time, times.dtype), 0.0)
     before = np.zeros(int(times[0] > 0), times.dtype)
 
     def with_start(values: ArrayLike, first: Any = 0.0) -> Array:
@@ -107,12 +109,6 @@ def _error_model(curve: CoolingCurve, gas: Gas, comparison: Comparison) -> Error
         else with_start(curve.rotational_temperature, gas.value("rotational_temperature")),
     )
     return error_model_along(gas, curve_from_start, comparison.num_particles)
-
-
-def _times_since_start(curve: CoolingCurve, comparison: Comparison) -> np.ndarray:
-    """Return the measured times minus t0, or 0 if they are earlier."""
-    times = np.asarray(curve.times)
-    return np.maximum(times - np.asarray(comparison.start_time, times.dtype), 0.0)
 
 
 def _collision_noise_covariance(

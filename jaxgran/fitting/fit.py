@@ -383,10 +383,10 @@ def with_values_of(gas: Gas, other: Gas, names: tuple[str, ...]) -> Gas:
 def _by_label(gas: Any, data: Any) -> tuple[dict[str, Gas], dict[str, Data]]:
     """Return scenes and measurements by label; the label of a single measurement is ""."""
     if not isinstance(data, dict):
-        checked_gas(gas)
         if isinstance(data, DropTest):
-            return {"": gas}, {"": data}
-        check_curve(gas, data)
+            checked_gas(gas)
+        else:
+            check_curve(gas, data)
         return {"": gas}, {"": data}
     if not data:
         raise ValueError("data is empty: give one measurement or more, as {'first': curve}")
@@ -404,8 +404,8 @@ def _by_label(gas: Any, data: Any) -> tuple[dict[str, Gas], dict[str, Data]]:
                 f"measurement {label!r} must be a jaxgran.CoolingCurve or a jaxgran.DropTest, "
                 f"got {type(measured).__name__}"
             )
-        checked_gas(scenes[label])
         if isinstance(measured, DropTest):
+            checked_gas(scenes[label])
             continue
         check_curve(scenes[label], measured)
         if measured.temperature_error is None and len(data) > 1:
@@ -423,10 +423,8 @@ def _numbers_by_label(name: str, given: Any, data: dict[str, Data]) -> dict[str,
         given = min(map(str, unknown))
         raise ValueError(f"{name}: no measurement {given!r}; there are {', '.join(data)}")
     for value in numbers.values():
-        if value is not None and not (isinstance(value, int | np.integer) and value >= 1):
-            if name == "replicas":
-                checked_int(name, value, 1)
-            raise ValueError(f"{name} must be a whole number >= 1, or None, got {value!r}")
+        if value is not None:
+            checked_int(name, value, 1)
     return {label: numbers.get(label) for label in data}
 
 
@@ -478,8 +476,8 @@ def _check_request(
     for gas in scenes.values():
         for name in names:
             domain_of(gas, name)
-    if max_steps is not None and not (isinstance(max_steps, int | np.integer) and max_steps >= 1):
-        raise ValueError(f"max_steps must be a whole number >= 1, or None, got {max_steps!r}")
+    if max_steps is not None:
+        checked_int("max_steps", max_steps, 1)
     size, points = sum(size_of(next(iter(scenes.values())), name) for name in free), 0
     for label, measured in data.items():
         if isinstance(measured, DropTest):
@@ -517,8 +515,6 @@ def _check_model(
             "optimistix.BFGS(rtol=1e-8, atol=1e-8), or a gradient transformation of optax, such as "
             f"optax.adam(0.05), got {solver!r:.60}"
         )
-    if isinstance(model, str):
-        raise ValueError(f"model must be a jaxgran model, got {model!r}. See jaxgran.choose_model")
     checked_model(model)
     gas, prior_names = next(iter(scenes.values())), priors[SHARED].names if SHARED in priors else ()
     if model.stochastic and not (solver is None or is_transformation(solver)):

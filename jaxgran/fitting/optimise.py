@@ -248,15 +248,12 @@ class Problem:
         return xp.concatenate([xp.zeros((whole, 0), flat.dtype), *columns], axis=1)
 
     def with_scatter_as_error(self, flat: Numbers) -> "Problem":
-        """Return the problem with the scatter of ln T as the error of curves without errors."""
-        rows, *_ = self.evaluate(flat)
-        measurements = tuple(
-            m.with_scatter_as_error([r for r in rows if r.label == m.label], self.num_free)
-            if isinstance(m, Measurement) and m.curve.temperature_error is None
-            else m
-            for m in self.measurements
-        )
-        return replace(self, measurements=measurements)
+        """Return the problem with the scatter of ln T as the error of its curve, without errors.
+
+        A curve without errors is the only measurement of a fit.
+        """
+        (m,), (rows, *_) = self.curves, self.evaluate(flat)
+        return replace(self, measurements=(m.with_scatter_as_error(rows, self.num_free),))
 
 
 def is_converged(residuals: Numbers, jacobian: Numbers) -> Numbers:
