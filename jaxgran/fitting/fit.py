@@ -350,7 +350,6 @@ def _fit_deterministic(
         problem,
         flat,
         (rows, jacobian, computed),
-        first=first,
         ends=ends,
         iterations=iterations,
         converged=converged,

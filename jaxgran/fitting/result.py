@@ -48,7 +48,6 @@ class Minima(NamedTuple):
     Attributes:
         estimates: estimates of the free parameters, SI.
         chi2: chi^2 of all residuals, including those of priors.
-        first: the first guess.
         extrapolation: difference of the estimate and the mean of the simulations near it.
         iterations: steps of all searches, or simulations by a stochastic model.
         trace: chi^2 and estimates at each step of a gradient descent, and why it ended
@@ -57,37 +56,9 @@ class Minima(NamedTuple):
 
     estimates: Numbers
     chi2: Numbers
-    first: Numbers
     extrapolation: Numbers
     iterations: Numbers
     trace: Trace | None = None
-
-    def degenerate_solutions(
-        self,
-        estimate: Float[Array, "p"],
-        standard_error: Float[Array, "p"],
-        unit: float,
-    ) -> Float[np.ndarray, "others p"]:
-        """Return the estimates at other minima that are as good as the deepest one.
-
-        There chi^2 is larger by less than `DEGENERATE_CHI2`, and a parameter differs by more than
-        the square root of that, in standard errors.
-
-        Args:
-            estimate, standard_error: estimate at the deepest minimum, and its standard error.
-            unit: unit of chi^2; above 1 if the errors of the curve are too small.
-        """
-        chi2 = np.asarray(self.chi2)
-        if len(chi2) < 2:
-            return np.zeros((0, len(estimate)))
-        as_good = chi2 - np.min(chi2) < DEGENERATE_CHI2 * unit
-        distance = np.asarray(self.estimates) - np.asarray(estimate)
-        apart = np.max(np.abs(distance) / np.asarray(standard_error), axis=1) > DEGENERATE_CHI2**0.5
-        solutions: list[np.ndarray] = []
-        for other in np.asarray(self.estimates)[as_good & apart]:
-            if not any(np.allclose(other, known, rtol=1e-3) for known in solutions):
-                solutions.append(other)
-        return np.array(solutions).reshape(-1, distance.shape[1])
 
 
 class Comparison(NamedTuple):
@@ -168,8 +139,8 @@ class Fit(eqx.Module):
         goodness: chi^2 of all weighted residuals, its degrees of freedom, and its p-value.
         converged: True if the search reached its tolerance; for a stochastic model, if the last
             step was below 0.1 in the unconstrained scale.
-        minima: the search: minima of chi^2 at which it ended from several starts, the first guess,
-            the number of iterations, the extrapolation from simulations.
+        minima: the search: minima of chi^2 at which it ended from several starts, the number of
+            iterations, the extrapolation from simulations.
         absent: effects that are known to be absent, as given to `jaxgran.fit`.
         interpret: `jaxgran.diagnose`, whose range comes first where a fit is printed.
 
@@ -316,12 +287,23 @@ class Fit(eqx.Module):
         )
 
     def degenerate_solutions(self) -> Float[np.ndarray, "others p"]:
-        """Return the estimates at other, equally good minima of chi^2.
+        """Return the estimates at other minima that are as good as the deepest one.
 
-        See `jaxgran.fitting.result.Minima.degenerate_solutions`. Not for a batch of fits.
+        There chi^2, over the reduced chi^2 if this exceeds 1, is larger by less than
+        `DEGENERATE_CHI2`, and a parameter differs by more than the square root of that, in standard
+        errors. Not for a batch of fits.
         """
-        unit = max(float(self.reduced_chi2), 1.0)
-        return self.minima.degenerate_solutions(self.estimate, self.standard_error, unit)
+        chi2, estimates = np.asarray(self.minima.chi2), np.asarray(self.minima.estimates)
+        if len(chi2) < 2:
+            return np.zeros((0, len(self.estimate)))
+        as_good = chi2 - np.min(chi2) < DEGENERATE_CHI2 * max(float(self.reduced_chi2), 1.0)
+        distance = np.abs(estimates - np.asarray(self.estimate)) / np.asarray(self.standard_error)
+        apart = np.max(distance, axis=1) > DEGENERATE_CHI2**0.5
+        solutions: list[np.ndarray] = []
+        for other in estimates[as_good & apart]:
+            if not any(np.allclose(other, known, rtol=1e-3) for known in solutions):
+                solutions.append(other)
+        return np.array(solutions).reshape(-1, estimates.shape[1])
 
     def undetermined(self) -> tuple[str, ...]:
         """Return the parameters that the data do not determine, or only in a combination.
@@ -478,7 +460,6 @@ def assemble_fit(
     flat: Numbers,
     linear: tuple[list[Rows], Numbers, dict[str, CoolingCurve]],
     *,
-    first: Numbers,
     ends: tuple[Numbers, Numbers],
     iterations: Numbers,
     converged: Numbers,
@@ -490,7 +471,6 @@ def assemble_fit(
         problem: the measurements and unknowns.
         flat: the unknowns at the end of the search.
         linear: the residuals there, their Jacobian, and the computed curves by label.
-        first: the unknowns of the first guess.
         ends: unknowns and chi^2 at the ends of all searches.
         iterations, converged: see `Fit`.
         resolution: ratio to the largest singular value of the Jacobian below which others count
@@ -550,7 +530,6 @@ def assemble_fit(
     minima = Minima(
         estimates=xp.stack([problem.estimates(x) for x in ends[0]]),
         chi2=ends[1],
-        first=problem.estimates(first),
         extrapolation=xp.zeros(p, flat.dtype),
         iterations=iterations,
     )

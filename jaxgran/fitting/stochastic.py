@@ -155,7 +155,6 @@ def fit_stochastic(
         dataclasses.replace(problem, measurements=(m,)),
         flat,
         (rows, jacobian, {"": search.computed}),
-        first=first,
         ends=(flat[None], np.sum(residuals**2)[None]),
         iterations=np.asarray(search.num_simulations),
         converged=np.asarray(search.converged),
