@@ -184,9 +184,9 @@ def compare_alternatives(
         fitted gas is driven, or for drop tests alone. None if the law cannot be computed.
     """
     gases = [curve_and_gas(result, label)[1] for label in result.comparisons]
-    problem, starts = _problem(result)
+    problem, first = _problem(result)
     kinds = _kinds(result, problem, absent) if all(gas.drive is None for gas in gases) else []
-    bases = _minima(problem, result, _first(problem, result, starts))
+    bases = _minima(problem, result, first)
     if not bases:
         return None
     scale = _scale(bases[0], result)[0]
@@ -276,7 +276,7 @@ def estimate_without(
         label: of the measurement.
         points: their indices.
     """
-    problem, starts = _problem(result)
+    problem, first = _problem(result)
     scale, measurements = 1.0, []
     for m in problem.measurements:
         if m.label == label and isinstance(m, Measurement):
@@ -287,15 +287,15 @@ def estimate_without(
             scale = np.count_nonzero(weights["temperature"]) - len(result.names)
         measurements.append(m)
     problem = dataclasses.replace(problem, measurements=tuple(measurements))
-    trial = _trial(problem, 0.0, _first(problem, result, starts))
+    trial = _trial(problem, 0.0, first)
     if trial is None:
         return None
     without_errors = result.comparisons[label].scatter is not None
     return trial.estimate, trial.error * ((trial.chi2 / scale) ** 0.5 if without_errors else 1.0)
 
 
-def _problem(result: Fit) -> tuple[Problem, dict[str, float]]:
-    """Return the problem of a fit with a free clock and kinetic theory, and t0 by label."""
+def _problem(result: Fit) -> tuple[Problem, np.ndarray]:
+    """Return the problem of a fit with a free clock and kinetic theory, and its unknowns."""
     # A model that supports all alternatives is that of the trials, too.
     is_theory = not result.model.stochastic and set(result.model.elements) >= SUPPORTED
     model: Any = result.model if is_theory else KineticTheory()
@@ -341,7 +341,8 @@ def _problem(result: Fit) -> tuple[Problem, dict[str, float]]:
     problem = Problem.of(
         tuple(measurements), model, free, tuple(separate), result.priors, clock_is_free=True
     )
-    return dataclasses.replace(problem, tolerance=THEORY_TOLERANCE), starts
+    values = {m.label: m.gas.floats | {START_TIME: starts[m.label]} for m in measurements}
+    return dataclasses.replace(problem, tolerance=THEORY_TOLERANCE), problem.flat(values)
 
 
 def _mean_position(m: Measurement) -> np.ndarray:
@@ -365,18 +366,6 @@ def _offset(m: Measurement, model: KineticTheory, comparison: Any, start: float)
     used = weights > 0
     difference = rows[0].values - np.asarray(comparison.residuals["temperature"])
     return np.where(used, difference / np.where(used, weights, 1.0), 0.0)
-
-
-def _first(problem: Problem, result: Fit, starts: dict[str, float]) -> np.ndarray:
-    """Return the unknowns of the fit."""
-    gases = {m.label: m.gas for m in problem.measurements}
-    flat, begin = np.asarray(problem.flat(gases)), 0
-    for u in problem.unknowns:
-        if u.name == START_TIME:
-            label = problem.measurements[0].label if u.label is None else u.label
-            flat[begin] = starts[label] / float(np.asarray(u.unit))
-        begin += u.size
-    return flat
 
 
 def _minima(problem: Problem, result: Fit, first: np.ndarray) -> list[Trial]:

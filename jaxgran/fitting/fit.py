@@ -31,6 +31,7 @@ from jaxgran.fitting.parameters import (
     domain_of,
     guess_from_data,
     guess_from_drops,
+    guess_start_time,
     halving_time,
     known_start_time,
     size_of,
@@ -326,11 +327,11 @@ def _fit_deterministic(
     problem = Problem.of(
         tuple(measurements), model, names, separate, priors, clock_is_free=clock_is_free
     )
-    first = problem.flat(guesses)
+    first = problem.flat(_values_of_guesses(problem, guesses))
     if start is not None:
         complete = {m.label: with_values_of(guesses[m.label], start, free) for m in measurements}
         xp = array_module(first, complete)
-        flats = xp.stack([first, problem.flat(complete)])
+        flats = xp.stack([first, problem.flat(_values_of_guesses(problem, complete))])
         costs = xp.stack([xp.sum(problem.evaluate(flat)[1] ** 2) for flat in flats])
         first = flats[xp.argmin(xp.where(xp.isnan(costs), xp.inf, costs))]
     steps = (1000 if isinstance(solver, Descent) else 100) if max_steps is None else max_steps
@@ -354,6 +355,16 @@ def _fit_deterministic(
         iterations=iterations,
         converged=converged,
     )
+
+
+def _values_of_guesses(problem: Problem, guesses: dict[str, Gas]) -> dict[str, dict[str, Any]]:
+    """Return the values of gases and a guess of t0, by label and name."""
+    values = {label: gas.floats for label, gas in guesses.items()}
+    for m in problem.curves:
+        names = tuple(u.name for u in problem.unknowns if u.label in (None, m.label))
+        known = known_start_time(problem.priors, m.label)
+        values[m.label][START_TIME] = guess_start_time(guesses[m.label], m.curve, names, known)
+    return values
 
 
 def _guess_of_kinetic_theory(

@@ -27,9 +27,7 @@ from jaxgran.fitting.parameters import (
     Priors,
     Unknown,
     domain_of,
-    guess_start_time,
     halving_time,
-    known_start_time,
 )
 from jaxgran.fitting.residuals import (
     CLOCK,
@@ -150,25 +148,20 @@ class Problem:
         known = [(m.data, m.gas) for m in self.measurements]
         return any_traced(known, self.priors)
 
-    def flat(self, guesses: dict[str, Gas]) -> Numbers:
-        """Return the unknowns of gases, by label, in their unconstrained scale, in one array."""
-        xp = jnp if self.is_traced else array_module(guesses)
-        by_label = {m.label: m for m in self.measurements}
-        parts = []
+    def flat(self, values: dict[str, dict[str, Numbers]]) -> Numbers:
+        """Return SI values, by label and name, in their unconstrained scale, in one array.
+
+        The values are those of all floats of the gases, and of `START_TIME` where it is an unknown;
+        nuisance parameters are 0.
+        """
+        xp = jnp if self.is_traced else array_module(values)
+        zero = xp.zeros((), xp.asarray(values[self.measurements[0].label]["temperature"]).dtype)
+        parts = [xp.zeros(0, zero.dtype)]
         for u in self.unknowns:
             label = self.measurements[0].label if u.label is None else u.label
-            gas = guesses[label]
-            if u.name == START_TIME:
-                names = tuple(v.name for v in self.unknowns if v.label in (None, label))
-                measurement: Any = by_label[label]
-                known = known_start_time(self.priors, label)
-                start = guess_start_time(gas, measurement.curve, names, known)
-                parts.append(xp.ravel(xp.asarray(start) / u.unit))
-            elif u.name in gas.domains:
-                parts.append(xp.ravel(u.domain.to_free(xp.asarray(gas.value(u.name)))))
-            else:
-                parts.append(xp.zeros(1, xp.asarray(gas.temperature).dtype))
-        return xp.concatenate([xp.zeros(0, xp.asarray(gas.temperature).dtype), *parts])
+            value = xp.asarray(values[label].get(u.name, zero))
+            parts.append(xp.ravel(u.domain.to_free(value) / u.unit))
+        return xp.concatenate(parts)
 
     def parts(self, flat: Numbers) -> list[tuple[Unknown, Numbers]]:
         """Return each unknown with its SI value."""
@@ -176,8 +169,7 @@ class Problem:
         for u in self.unknowns:
             free = flat[begin : begin + u.size].reshape(u.shape)
             begin += u.size
-            infinite = np.isinf(u.domain.low) and np.isinf(u.domain.high)
-            pairs.append((u, free * u.unit if infinite else u.domain.from_free(free)))
+            pairs.append((u, u.domain.from_free(free * u.unit)))
         return pairs
 
     def estimates(self, flat: Numbers) -> Numbers:

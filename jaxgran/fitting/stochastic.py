@@ -89,7 +89,7 @@ def fit_stochastic(
     m = Measurement.of("", gas, curve, model, None, replicas, use_displacement=False)
     m, curve = dataclasses.replace(m, accuracies={}), m.curve
     problem = Problem.of((m,), model, names, (), {}, clock_is_free=False)
-    first = np.asarray(problem.flat({"": guess}))
+    first = np.asarray(problem.flat({"": guess.floats}))
 
     def gas_at(flat: Any) -> Gas:
         return with_floats(gas, problem.values(flat)[""])

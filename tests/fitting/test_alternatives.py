@@ -164,8 +164,7 @@ def test_no_alternative_is_preferred_where_all_is_told():
 def test_the_last_step_of_a_trial_needs_no_further_curve(monkeypatch):
     gas = glass_beads(0.1)
     result = jaxgran.fit(gas, exact_to(gas, 0), free=BOTH)
-    problem, starts = alternatives._problem(result)
-    first = alternatives._first(problem, result, starts)
+    problem, first = alternatives._problem(result)
     flat, *_ = search(problem, first, 100)  # to its own tolerance, 1e-8
     _, residuals, jacobian, _ = problem.evaluate(flat)
     inverse = np.linalg.pinv(jacobian)
