@@ -182,7 +182,8 @@ def diagnose(
         *_describe_alternatives(result, alternatives, absent, quick),
         *notes,
         *(limitation.words for limitation in limitations),
-        *_describe_search(result),
+        *_describe_convergence(result),
+        *describe_search(result),
         *describe_derivative_bias(result),
     ]
     grade, verdict = _verdict(result, misfit, limitations, alternatives, ranges)
@@ -464,23 +465,10 @@ def _describe_outliers(result: Fit, label: str) -> Iterator[str]:
     yield words
 
 
-def describe_few_particles(model: AbstractModel) -> str:
-    """Return a clause on a particle model that is too small for its noise to be known, or ""."""
-    number = getattr(model, "num_particles", MIN_PARTICLES)
-    if number >= MIN_PARTICLES:
-        return ""
-    return (
-        f"{number} particles are too few for their noise to be known, and cool faster than a gas: "
-        f"give the model {MIN_PARTICLES} or more"
-    )
-
-
-def _describe_search(result: Fit) -> Iterator[str]:
-    """Yield clauses about convergence, noise of simulations and undetermined parameters."""
+def _describe_convergence(result: Fit) -> Iterator[str]:
+    """Yield clauses about convergence and the noise of simulations."""
     if not bool(result.converged):
         yield "the search did not converge: increase max_steps or free fewer parameters"
-    if few := describe_few_particles(result.model):
-        yield few
     noise = result.error_budget.get("simulation")
     if noise is not None:
         share = np.asarray(noise / result.standard_error)
@@ -488,11 +476,21 @@ def _describe_search(result: Fit) -> Iterator[str]:
             f"{int(result.iterations)} simulations were run; their noise is at most "
             f"{100 * float(np.max(share)):.0f} % of the standard error"
         )
-    group = result.undetermined()
-    if group:
-        yield f"this curve does not determine {' and '.join(map(symbol_of, group))}"
+
+
+def describe_search(result: Fit) -> Iterator[str]:
+    """Yield clauses on few particles, undetermined parameters and equally good minima."""
+    number = getattr(result.model, "num_particles", MIN_PARTICLES)
+    if number < MIN_PARTICLES:
+        yield (
+            f"{number} particles are too few for their noise to be known, and cool faster than a "
+            f"gas: give the model {MIN_PARTICLES} or more"
+        )
+    if group := result.undetermined():
+        names = " and ".join(map(symbol_of, group))
+        yield f"this curve does not determine {names}: free fewer parameters"
     if others := describe_minima(result.names, result.degenerate_solutions()):
-        yield others
+        yield f"{others}: this curve does not distinguish them"
 
 
 @no_type_check

@@ -18,7 +18,7 @@ from jaxgran._utils.validation import check_bool, checked_int, no_type_check
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import DropTest
 from jaxgran.fitting.descent import MAX_LINEARISED, Descent
-from jaxgran.fitting.diagnosis import checked_absent, describe_few_particles, diagnose
+from jaxgran.fitting.diagnosis import checked_absent, describe_search, diagnose
 from jaxgran.fitting.error_budget import clock_accuracy, with_scene_errors
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.optimise import Problem, best_of_starts, is_transformation, search
@@ -48,7 +48,6 @@ from jaxgran.fitting.residuals import (
 from jaxgran.fitting.result import (
     Fit,
     assemble_fit,
-    describe_minima,
     search_starts,
 )
 from jaxgran.fitting.stochastic import fit_stochastic
@@ -56,7 +55,6 @@ from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas, law_fields
-from jaxgran.scene.parameters import symbol_of
 
 START_TIME_PRIOR = 1.0
 """Standard error of the prior of t0 where T_0 is free too, over the time in which T halves."""
@@ -598,23 +596,7 @@ def _warn(result: Fit) -> None:
             'jax.config.update("jax_enable_x64", True) first',
             stacklevel=3,
         )
-    if few := describe_few_particles(result.model):
-        warnings.warn(few, stacklevel=3)
     if unvisited := describe_unvisited_knots(result):
         warnings.warn(unvisited, stacklevel=3)
-    group = result.undetermined()
-    if group:
-        why = "it hardly depends on this parameter"
-        if len(group) > 1:
-            why = "it depends only on a combination of them"
-        if any(name.endswith(START_TIME) for name in group):
-            why += " (a cooling gas forgets its initial temperature)"
-        elif {"dissipative_constant", "youngs_modulus"} <= {*group}:
-            why += " (in a gas of hard spheres A and Y enter only as A Y^(2/5))"
-        warnings.warn(
-            f"the curve does not determine {' and '.join(map(symbol_of, group))}: {why}. Free "
-            "fewer parameters",
-            stacklevel=3,
-        )
-    if others := describe_minima(result.names, result.degenerate_solutions()):
-        warnings.warn(f"{others}: the curve does not distinguish them", stacklevel=3)
+    for clause in describe_search(result):
+        warnings.warn(clause, stacklevel=3)
