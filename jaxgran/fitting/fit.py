@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.core import Tracer
 from jaxtyping import PRNGKeyArray
 
 from jaxgran._utils import status
@@ -34,7 +33,6 @@ from jaxgran.fitting.parameters import (
     guess_start_time,
     halving_time,
     known_start_time,
-    size_of,
     with_names_of_law,
 )
 from jaxgran.fitting.residuals import (
@@ -486,23 +484,6 @@ def _check_request(
             domain_of(gas, name)
     if max_steps is not None:
         checked_int("max_steps", max_steps, 1)
-    size, points = sum(size_of(next(iter(scenes.values())), name) for name in free), 0
-    for label, measured in data.items():
-        if isinstance(measured, DropTest):
-            points += np.size(measured.restitution)
-            continue
-        size += sum(size_of(scenes[label], name) for name in separate)
-        error = measured.temperature_error
-        if error is None or isinstance(error, Tracer):
-            points += measured.times.shape[-1]
-        else:
-            points += int(np.sum(np.asarray(error) > 0))
-    enough = points > size if any(isinstance(x, CoolingCurve) for x in data.values()) else points
-    if not enough:
-        raise ValueError(
-            f"{points} points (those with an error of 0 not counted) cannot determine {size} "
-            "parameters; free fewer of them"
-        )
 
 
 @no_type_check

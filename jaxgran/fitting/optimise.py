@@ -109,6 +109,9 @@ class Problem:
             free: names of shared free parameters.
             separate: names of free parameters that each curve has separately.
             clock_is_free: whether the error of the model's clock is a nuisance parameter.
+
+        Raises:
+            ValueError: if the curves have no more points with a weight than parameters.
         """
         curves = [m for m in measurements if isinstance(m, Measurement)]
         gas = measurements[0].gas
@@ -123,6 +126,12 @@ class Problem:
         unknowns = [unknown(name, None, gas) for name in free]
         unknowns += [unknown(name, m.label, m.gas) for name in separate for m in curves]
         num_free = sum(u.size for u in unknowns)
+        points = sum(m.num_points for m in measurements)
+        if curves and points <= num_free:
+            raise ValueError(
+                f"{points} points (those with an error of 0 not counted) cannot determine "
+                f"{num_free} parameters; free fewer of them"
+            )
         by_label = {SHARED: gas} | {m.label: m.gas for m in measurements}
         for label, some in priors.items():
             known = tuple(u.name for u in unknowns if u.label in (None, label))

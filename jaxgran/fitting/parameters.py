@@ -52,11 +52,6 @@ def domain_of(gas: Gas, name: str) -> Domain:
     return gas.domains[name]
 
 
-def size_of(gas: Gas, name: str) -> int:
-    """Return the number of elements of a parameter."""
-    return 1 if name == START_TIME else gas.value(name).size
-
-
 def with_names_of_law(names: Any, gas: Gas) -> Any:
     """Return names of free parameters with those of all floats of the law in place of `LAW`."""
     names = (names,) if isinstance(names, str) else names

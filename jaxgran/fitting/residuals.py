@@ -264,6 +264,12 @@ class Measurement:
         return self.curve
 
     @property
+    def num_points(self) -> int:
+        """Number of values of T with a weight; of all values under a transformation."""
+        weights = self.weights["temperature"]
+        return weights.size if any_traced(weights) else int(np.sum(weights > 0))
+
+    @property
     def nuisances(self) -> tuple[str, ...]:
         """Names of the nuisance parameters without those of the clock."""
         return tuple(FACTORS[name] for name in self.accuracies)
@@ -466,6 +472,11 @@ class DropTestRows(NamedTuple):
     def gas(self) -> Gas:
         """The gas of the spheres; it needs no further elements."""
         return self.scene
+
+    @property
+    def num_points(self) -> int:
+        """Number of impacts."""
+        return np.size(self.data.restitution)
 
     def evaluate(
         self, model: AbstractModel, values: dict[str, Numbers], *, tolerance: float = 1.0
