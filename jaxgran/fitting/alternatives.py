@@ -446,7 +446,7 @@ def _kinds(result: Fit, problem: Problem, absent: tuple[str, ...]) -> list[Kind]
         sliding = lambda x, label: {"friction": 1 / x}  # noqa: E731
         possible.append(Kind("grains that slide", ("friction",), (SLIDING,), sliding))
     known = {name.rpartition(": ")[2] for name in result.names}
-    known |= {name for some in result.priors.values() for name in some.names}
+    known |= {name for some in result.priors.values() for name in some}
     if not known & {START_TIME, "temperature"}:
         both = DELAYS, tuple(-x for x in DELAYS)
         possible.append(Kind("an error of the start time or of T_0", (START_TIME,), both, delay))

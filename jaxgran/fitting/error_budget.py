@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.tracing import as_jax_arrays, concrete_array
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.parameters import Priors, with_floats
+from jaxgran.fitting.parameters import Priors, extra_parameters, prior_residuals, with_floats
 from jaxgran.fitting.residuals import MODEL_ERROR, Measurement
 from jaxgran.fitting.result import Comparison, Fit
 from jaxgran.models.base import AbstractModel
@@ -193,7 +193,7 @@ def parameter_effects(
     Returns:
         ``d ln T/d ln t``, and for each prior the changes by one standard error of its numbers.
     """
-    model, varied, times = KineticTheory(), priors.extra_parameters(()), np.asarray(computed.times)
+    model, varied, times = KineticTheory(), extra_parameters(priors, ()), np.asarray(computed.times)
     smooth = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
     complete = with_all_elements(smooth, model)
     linear = linearise(model.for_fits(smooth), complete, times)
@@ -212,7 +212,7 @@ def parameter_effects(
         return slope, {}
     values = {name: np.asarray(gas.value(name)) for name in varied}
     by_parameter = np.concatenate([of_logarithms(linear.by_float[n]) for n in varied], axis=1)
-    rows = priors.residuals(gas, values)
+    rows = prior_residuals(priors, gas, values)
     by_residual = np.concatenate(
         [
             np.concatenate(
@@ -222,5 +222,5 @@ def parameter_effects(
         ]
     )
     changes = by_parameter @ np.linalg.pinv(by_residual)
-    ends = np.cumsum([given.size for given in priors.given])[:-1]
-    return slope, dict(zip(priors.names, np.split(changes, ends, axis=1), strict=True))
+    ends = np.cumsum([given.size for given, _ in priors.values()])[:-1]
+    return slope, dict(zip(priors, np.split(changes, ends, axis=1), strict=True))

@@ -22,11 +22,11 @@ from jaxgran.fitting.error_budget import clock_accuracy, with_scene_errors
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.optimise import Problem, best_of_starts, is_transformation, search
 from jaxgran.fitting.parameters import (
-    NO_PRIORS,
     SHARED,
     SMOOTHNESS,
     START_TIME,
     Priors,
+    checked_priors,
     domain_of,
     guess_from_data,
     guess_from_drops,
@@ -197,7 +197,8 @@ def fit(
                 f"a smoothness prior, which {type(law).__name__} has, needs KineticTheory() or a "
                 f"solver of optax, as optax.adam(0.05), got {type(model).__name__} without solver"
             )
-        all_priors[SHARED] = all_priors.get(SHARED, NO_PRIORS).add(SMOOTHNESS, 0.0, 1.0)
+        smooth = {SMOOTHNESS: (jnp.asarray(0.0), jnp.asarray(1.0))}
+        all_priors[SHARED] = all_priors.get(SHARED, {}) | smooth
     as_given = dict(curves)
     for label, curve in as_given.items():
         curve = with_errors_of_particles(scenes[label], curve, counts[label], runs[label] or 1)
@@ -205,14 +206,14 @@ def fit(
         if unused := unused_rotation(scenes[label], curve):
             warnings.warn(unused, stacklevel=2)
     _check_model(model, solver, names, separate, all_priors, scenes, several, bool(curves))
-    given = {*names, *separate, *(all_priors[SHARED].names if SHARED in all_priors else ())}
-    prior_names = {name for some in all_priors.values() for name in some.names}
+    given = {*names, *separate, *all_priors.get(SHARED, {})}
+    prior_names = {name for some in all_priors.values() for name in some}
     if {START_TIME, "temperature"} <= given and not {START_TIME, "temperature"} & prior_names:
         for label in list(curves) if START_TIME in separate else [first]:
             where = label if START_TIME in separate else SHARED
             width = START_TIME_PRIOR * halving_time(curves[label])
-            some = all_priors.get(where, NO_PRIORS)
-            all_priors[where] = some.add(START_TIME, 0.0, width)
+            start_time = {START_TIME: (jnp.asarray(0.0), jnp.asarray(width))}
+            all_priors[where] = all_priors.get(where, {}) | start_time
     descent = None
     if is_transformation(solver) and not any_traced(data, scenes, priors):
         solver = descent = Descent(solver, progress, throw)
@@ -232,7 +233,7 @@ def fit(
             jax.random.key(0) if key is None else key,
             progress,
             steps,
-            all_priors.get(SHARED, NO_PRIORS).without(SMOOTHNESS),
+            {k: x for k, x in all_priors.get(SHARED, {}).items() if k != SMOOTHNESS},
             runs[first] or 1,
             None if descent is None else descent.by_simulation,
         )
@@ -285,7 +286,7 @@ def _fit_deterministic(
     """Fit a deterministic model, starting at the best of some guesses."""
     free = (*names, *separate)
     clock_is_free = bool(priors) or len(data) > 1
-    prior_names = {name for some in priors.values() for name in some.names}
+    prior_names = {name for some in priors.values() for name in some}
     measurements: list[Measurement | DropTestRows] = []
     guesses = {}
     for label, measured in data.items():
@@ -437,16 +438,20 @@ def _numbers_by_label(name: str, given: Any, data: dict[str, Data]) -> dict[str,
 def _priors_by_label(scenes: dict[str, Gas], priors: Any) -> dict[str, Priors]:
     """Return the priors of shared parameters (`SHARED`) and of those of each measurement."""
     gas = next(iter(scenes.values()))
+    if priors is None:
+        return {}
     if not isinstance(priors, dict):
-        checked = Priors.of(gas, priors)
-        return {SHARED: checked} if checked.names else {}
+        raise ValueError(
+            f"priors must be a dictionary of names, as {{'packing_fraction': (0.05, 0.002)}}, "
+            f"got {priors!r:.60}"
+        )
     parts: dict[str, dict[str, Any]] = {}
     for name, pair in priors.items():
         label, _, short = str(name).rpartition(": ")
         if label and label not in scenes:
             raise ValueError(f"priors: no measurement {label!r}; there are {list(scenes)}")
         parts.setdefault(label, {})[short] = pair
-    return {label: Priors.of(scenes.get(label, gas), some) for label, some in parts.items()}
+    return {label: checked_priors(scenes.get(label, gas), some) for label, some in parts.items()}
 
 
 @no_type_check
@@ -505,7 +510,7 @@ def _check_model(
             f"optax.adam(0.05), got {solver!r:.60}"
         )
     checked_model(model)
-    gas, prior_names = next(iter(scenes.values())), priors[SHARED].names if SHARED in priors else ()
+    gas, prior_names = next(iter(scenes.values())), priors.get(SHARED, {})
     if model.stochastic and not (solver is None or is_transformation(solver)):
         raise ValueError(
             "a stochastic model is fitted by least squares, without a solver, or by a gradient "

@@ -27,7 +27,9 @@ from jaxgran.fitting.parameters import (
     Priors,
     Unknown,
     domain_of,
+    extra_parameters,
     halving_time,
+    prior_residuals,
 )
 from jaxgran.fitting.residuals import (
     CLOCK,
@@ -135,7 +137,7 @@ class Problem:
         by_label = {SHARED: gas} | {m.label: m.gas for m in measurements}
         for label, some in priors.items():
             known = tuple(u.name for u in unknowns if u.label in (None, label))
-            extra = some.extra_parameters(known)
+            extra = extra_parameters(some, known)
             unknowns += [unknown(name, label or None, by_label[label]) for name in extra]
         for m in curves:
             names = ((CLOCK, CLOCK_TREND) if clock_is_free else ()) + m.nuisances
@@ -226,7 +228,7 @@ class Problem:
         for label, priors in self.priors.items():
             at = label or self.measurements[0].label
             gas = next(m.gas for m in self.measurements if m.label == at)
-            parts = priors.residuals(gas, values[at])
+            parts = prior_residuals(priors, gas, values[at])
             rows += [Rows(name, label or None, *row, of_prior=True) for name, row in parts.items()]
         xp = array_module(flat, rows)
         jacobian = self._jacobian(xp, flat, rows)

@@ -192,12 +192,8 @@ _scales = eqx.filter_jit(_law_scales)
 
 def known_start_time(priors: "dict[str, Priors]", label: str) -> tuple[Numbers, Numbers]:
     """Return the t0 that priors give for a measurement and its error, s, or 0 and infinity."""
-    some = [priors.get(where, NO_PRIORS) for where in (SHARED, label)]
-    for part in some:
-        if START_TIME in part.names:
-            i = part.names.index(START_TIME)
-            return part.given[i], part.errors[i]
-    return 0.0, np.inf
+    both = {**priors.get(label, {}), **priors.get(SHARED, {})}
+    return both.get(START_TIME, (0.0, np.inf))
 
 
 def guess_start_time(
@@ -272,102 +268,71 @@ def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> dic
     return values
 
 
-class Priors(eqx.Module):
-    """Known values of floats of a gas, each with a standard error.
+Priors = dict[str, tuple[Float[Array, "..."], Float[Array, "..."]]]
+"""Known values and their standard errors, SI, by the name of a float of a gas, or "density", which
+lets the mass vary, "t0", the time at which the gas began to cool, or "smoothness", which stands for
+`jaxgran.RestitutionLaw.prior_residuals`. Each prior is Gaussian in the unconstrained scale (the
+logarithm of a positive float)."""
 
-    Each prior is Gaussian in the unconstrained scale (the logarithm of a positive float).
 
-    Attributes:
-        names: names of the floats, or "density", which lets the mass vary, or "t0", the time at
-            which the gas began to cool, or "smoothness", which stands for
-            `jaxgran.RestitutionLaw.prior_residuals`.
-        given: known values, SI.
-        errors: standard errors, SI.
+def checked_priors(gas: Gas, priors: dict[str, Any]) -> Priors:
+    """Check and convert the priors that a user gave.
+
+    Raises:
+        ValueError: for an unknown name, a value outside its range or an error that is not positive.
     """
+    for name, pair in priors.items():
+        _check_prior(gas, name, pair)
+    return {name: (jnp.asarray(pair[0]), jnp.asarray(pair[1])) for name, pair in priors.items()}
 
-    names: tuple[str, ...] = eqx.field(static=True)
-    given: tuple[Float[Array, "..."], ...]
-    errors: tuple[Float[Array, "..."], ...]
 
-    @classmethod
-    def of(cls, gas: Gas, priors: Any) -> "Priors":
-        """Check and convert the priors that a user gave.
+def extra_parameters(priors: Priors, free: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the floats that vary because of a prior and are not free parameters."""
+    varied = ("mass" if name == DENSITY else name for name in priors if name != SMOOTHNESS)
+    return tuple(dict.fromkeys(name for name in varied if name not in free))
 
-        Raises:
-            ValueError: for an unknown name, a value outside its range or an error that is not
-                positive.
-        """
-        if priors is None:
-            return NO_PRIORS
-        if not isinstance(priors, dict):
-            raise ValueError(
-                f"priors must be a dictionary of names, as {{'packing_fraction': (0.05, 0.002)}}, "
-                f"got {priors!r:.60}"
-            )
-        for name, pair in priors.items():
-            _check_prior(gas, name, pair)
-        pairs = [tuple(map(jnp.asarray, pair)) for pair in priors.values()]
-        values, errors = zip(*pairs, strict=True) if pairs else ((), ())
-        return cls(tuple(priors), tuple(values), tuple(errors))
 
-    def add(self, name: str, value: ArrayLike, error: ArrayLike) -> "Priors":
-        """Return these priors and one more."""
-        return Priors(
-            (*self.names, name),
-            (*self.given, jnp.asarray(value)),
-            (*self.errors, jnp.asarray(error)),
-        )
+def prior_residuals(
+    priors: Priors, gas: Gas, values: dict[str, Numbers]
+) -> dict[str, tuple[Numbers, dict[str, Numbers]]]:
+    """Return (value - known value) / standard error of each prior, and its derivatives.
 
-    def without(self, name: str) -> "Priors":
-        """Return these priors without one of them."""
-        rows = [x for x in zip(self.names, self.given, self.errors, strict=True) if x[0] != name]
-        return Priors(*zip(*rows, strict=True)) if rows else NO_PRIORS
+    Both are in the unconstrained scale; the derivatives are those in SI values, shape (size, size),
+    by the name of the parameter.
 
-    def extra_parameters(self, free: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the floats that vary because of a prior and are not free parameters."""
-        varied = ("mass" if n == DENSITY else n for n in self.names if n != SMOOTHNESS)
-        return tuple(dict.fromkeys(name for name in varied if name not in free))
+    Args:
+        priors: the known values.
+        gas: the scene, for floats that are not varied.
+        values: SI values of the parameters that are varied, by name.
+    """
+    xp, rows = array_module(priors, gas, values), {}
+    for name, (given, error) in priors.items():
+        if name == SMOOTHNESS:
+            floats = {n: jnp.asarray(values[n]) for n in law_fields(gas.law) if n in values}
+            row = residuals_and_slopes(_law_prior, gas, floats)
+            rows[name] = jax.tree.map(xp.asarray, row)
+            continue
+        domain, given, error = _prior_domain(gas, name), xp.asarray(given), xp.asarray(error)
+        width = error / domain.slope(given)
 
-    def residuals(
-        self, gas: Gas, values: dict[str, Numbers]
-    ) -> dict[str, tuple[Numbers, dict[str, Numbers]]]:
-        """Return (value - known value) / standard error of each prior, and its derivatives.
+        def value_of(name: str) -> Numbers:
+            return xp.asarray(values[name] if name in values else gas.value(name))
 
-        Both are in the unconstrained scale; the derivatives are those in SI values, shape (size,
-        size), by the name of the parameter.
-
-        Args:
-            gas: the scene, for floats that are not varied.
-            values: SI values of the parameters that are varied, by name.
-        """
-        xp, rows = array_module(self, gas, values), {}
-        for name, given, error in zip(self.names, self.given, self.errors, strict=True):
-            if name == SMOOTHNESS:
-                floats = {n: jnp.asarray(values[n]) for n in law_fields(gas.law) if n in values}
-                row = residuals_and_slopes(_law_prior, gas, floats)
-                rows[name] = jax.tree.map(xp.asarray, row)
-                continue
-            domain, given, error = _prior_domain(gas, name), xp.asarray(given), xp.asarray(error)
-            width = error / domain.slope(given)
-
-            def value_of(name: str) -> Numbers:
-                return xp.asarray(values[name] if name in values else gas.value(name))
-
-            if name == DENSITY:
-                mass, diameter = value_of("mass"), value_of("diameter")
-                value = 6 / np.pi * mass / diameter**3
-                slopes = {"mass": 1 / (mass * width), "diameter": -3 / (diameter * width)}
-            else:
-                value = value_of(name)
-                slopes = {name: 1 / (domain.slope(value) * width)}
-            row = xp.ravel((domain.to_free(value) - domain.to_free(given)) / width)
-            diagonal = {
-                key: xp.diag(xp.broadcast_to(xp.ravel(slope), row.shape))
-                for key, slope in slopes.items()
-                if key in values
-            }
-            rows[name] = row, diagonal
-        return rows
+        if name == DENSITY:
+            mass, diameter = value_of("mass"), value_of("diameter")
+            value = 6 / np.pi * mass / diameter**3
+            slopes = {"mass": 1 / (mass * width), "diameter": -3 / (diameter * width)}
+        else:
+            value = value_of(name)
+            slopes = {name: 1 / (domain.slope(value) * width)}
+        row = xp.ravel((domain.to_free(value) - domain.to_free(given)) / width)
+        diagonal = {
+            key: xp.diag(xp.broadcast_to(xp.ravel(slope), row.shape))
+            for key, slope in slopes.items()
+            if key in values
+        }
+        rows[name] = row, diagonal
+    return rows
 
 
 def _law_prior(gas: Gas) -> Array:
@@ -386,9 +351,6 @@ def residuals_and_slopes(
 
     slopes, values = jax.jacfwd(residuals, has_aux=True)(floats)
     return values, {name: slope.reshape(values.size, -1) for name, slope in slopes.items()}
-
-
-NO_PRIORS = Priors((), (), ())
 
 
 def _prior_domain(gas: Gas, name: str) -> Domain:

@@ -168,7 +168,7 @@ def fit_stochastic(
     return dataclasses.replace(
         result,
         covariances=result.covariances | as_jax_arrays(covariances),
-        priors={"": priors} if priors.names else {},
+        priors={"": priors} if priors else {},
         minima=result.minima._replace(extrapolation=extrapolation),
     )
 
