@@ -28,7 +28,7 @@ from jaxtyping import Array, ArrayLike, Float, Key, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils import status
-from jaxgran._utils.validation import check_bool, checked_int, checked_times, no_type_check
+from jaxgran._utils.validation import check_bool, checked_int, checked_times
 from jaxgran.data import curve as curves
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import STATUS, TIME, CoolingCurve, Particles
@@ -64,7 +64,6 @@ WALL_SIDE = "wall_side"
 """The only float that may be one number or d numbers."""
 
 
-@no_type_check
 def sweep(
     gases: Gas,
     times: ArrayLike | Sequence[float],

@@ -89,9 +89,11 @@ def _import():
     import jax
     from jaxtyping import install_import_hook
 
+    import tests.annotations  # noqa: F401
+
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_rank_promotion", "raise")
-    with install_import_hook("jaxgran", "beartype.beartype"):
+    with install_import_hook("jaxgran", "tests.annotations.check"):
         import jaxgran  # noqa: F401
         from jaxgran.cli.common import use_compilation_cache
 

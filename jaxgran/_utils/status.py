@@ -6,8 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Int
 
-from jaxgran._utils.validation import no_type_check
-
 
 class Fault(NamedTuple):
     """A fault that a run can report: one bit of its status.
@@ -115,7 +113,6 @@ def has(status: ArrayLike, fault: Fault) -> Bool[Array, "..."]:
     return (jnp.asarray(status) & fault.bit) != 0
 
 
-@no_type_check
 def explain(status: ArrayLike | None) -> str:
     """Describe the faults of a status, each with advice; "ok" for 0 and for None.
 

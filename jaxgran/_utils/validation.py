@@ -1,15 +1,13 @@
 """Validation of user input, and the map from an interval to an unconstrained parameter."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
-
-F = TypeVar("F", bound=Callable)
 
 if TYPE_CHECKING:
     UserNumber = ArrayLike | Sequence[float]
@@ -19,14 +17,6 @@ if TYPE_CHECKING:
 else:
     # With `Any` a run-time type checker accepts all values; the functions below report wrong types.
     UserNumber = UserInt = UserFloat = UserBool = Any
-
-
-def no_type_check(function: F) -> F:
-    """Mark a public function that checks its arguments itself and raises clearer errors.
-
-    `jaxtyping.install_import_hook` knows the decorator by this name.
-    """
-    return function
 
 
 class Domain(NamedTuple):

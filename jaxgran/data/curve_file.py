@@ -27,7 +27,6 @@ from jaxgran._utils.validation import (
     UserNumber,
     check_bool,
     float_array,
-    no_type_check,
 )
 from jaxgran.data import files, tracks
 from jaxgran.data.curve import MIN_POINTS, QUANTITIES, CoolingCurve, from_arrays, to_arrays
@@ -111,7 +110,6 @@ UNSUPPORTED_KEYS = {
 """Keys of effects that no model has: the value that means "no effect" (or None), and the reason."""
 
 
-@no_type_check
 def read_curve(
     path: str | Path, header: dict[str, str] | None = None
 ) -> tuple[CoolingCurve, dict[str, str]]:
@@ -245,7 +243,6 @@ def _with_temperature(table: Table, header: dict[str, str]) -> dict[str, np.ndar
     return columns
 
 
-@no_type_check
 def read_gas(header: dict[str, str]) -> Gas:
     """Return the gas that the header of a curve describes, with A = 0, which a fit estimates.
 
@@ -388,7 +385,6 @@ def read_elements(header: dict[str, str]) -> dict[str, Any]:
     return elements
 
 
-@no_type_check
 def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
     """Read standard errors from a header, in the form of the argument ``priors`` of `jaxgran.fit`.
 
@@ -432,7 +428,6 @@ def read_priors(header: dict[str, str]) -> dict[str, tuple[float, float]]:
     return priors
 
 
-@no_type_check
 def read_absent(header: dict[str, str]) -> tuple[str, ...]:
     """Read which effects a header declares absent, in the form of ``absent`` of `jaxgran.fit`.
 
@@ -457,7 +452,6 @@ def read_absent(header: dict[str, str]) -> tuple[str, ...]:
     return names
 
 
-@no_type_check
 def write_curve(
     path: str | Path, curve: CoolingCurve, header: dict[str, str], *, overwrite: bool = False
 ) -> None:
@@ -591,7 +585,6 @@ class DropTest(eqx.Module):
         return (jnp.asarray(self.restitution) - computed) / jnp.asarray(self.error)
 
 
-@no_type_check
 def read_drop_test(path: str | Path, *, onto_plate: bool = False) -> DropTest:
     """Read a drop test from a CSV file with a line of names, v,eps,eps_err, and rows of numbers.
 

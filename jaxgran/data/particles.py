@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxgran._utils.validation import checked_int, no_type_check
+from jaxgran._utils.validation import checked_int
 from jaxgran.data.curve import Particles, import_extra
 from jaxgran.data.files import MAX_COUNT, check_writable, checked_path, name_in_errors, read_bytes
 
@@ -101,7 +101,6 @@ class Frame(NamedTuple):
     step: int | None
 
 
-@no_type_check
 def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None = None) -> Particles:
     """Read the particles of one frame, as a start for `HardSpheres` or `SoftSpheres`.
 

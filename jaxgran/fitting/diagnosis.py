@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.formatting import text_table
-from jaxgran._utils.validation import POSITIVE, check_bool, no_type_check
+from jaxgran._utils.validation import POSITIVE, check_bool
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import ABSENT, DropTest
 from jaxgran.fitting.alternatives import (
@@ -106,7 +106,6 @@ class Diagnosis(NamedTuple):
         return text_table(self.headline, [*rows, *(("-", reason) for reason in self.reasons)])
 
 
-@no_type_check
 def diagnose(
     result: Fit,
     data: CoolingCurve | DropTest | dict | None = None,
@@ -493,7 +492,6 @@ def describe_search(result: Fit) -> Iterator[str]:
         yield f"{others}: this curve does not distinguish them"
 
 
-@no_type_check
 def log_likelihood(
     gas: Gas,
     curve: CoolingCurve,

@@ -13,7 +13,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, array_module
-from jaxgran._utils.validation import check_bool, checked_int, no_type_check
+from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import DropTest
 from jaxgran.fitting.descent import MAX_LINEARISED, Descent
@@ -60,7 +60,6 @@ START_TIME_PRIOR = 1.0
 Data = CoolingCurve | DropTest
 
 
-@no_type_check
 def fit(
     gas: Gas | dict[str, Gas],
     data: Data | dict[str, Data],
@@ -454,7 +453,6 @@ def _priors_by_label(scenes: dict[str, Gas], priors: Any) -> dict[str, Priors]:
     return {label: checked_priors(scenes.get(label, gas), some) for label, some in parts.items()}
 
 
-@no_type_check
 def free_by_default(gas: Gas, data: Data) -> tuple[str, ...]:
     """Return A, or a constant restitution, and T_0 if the errors of T are not known."""
     constants = [name for name in ("dissipative_constant", "coefficient") if name in gas.domains]
@@ -467,7 +465,6 @@ def free_by_default(gas: Gas, data: Data) -> tuple[str, ...]:
     return (constants[0], "temperature") if is_bare else (constants[0],)
 
 
-@no_type_check
 def _check_request(
     scenes: dict[str, Gas],
     data: dict[str, Data],
@@ -491,7 +488,6 @@ def _check_request(
         checked_int("max_steps", max_steps, 1)
 
 
-@no_type_check
 def _check_model(
     model: AbstractModel,
     solver: Any,

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from jaxgran._utils.validation import POSITIVE, no_type_check
+from jaxgran._utils.validation import POSITIVE
 from jaxgran.fitting.parameters import with_floats
 from jaxgran.fitting.result import Fit
 from jaxgran.scene.gas import Gas, law_fields
@@ -103,7 +103,6 @@ def describe_unvisited_knots(result: Fit) -> str | None:
     )
 
 
-@no_type_check
 def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
     """Return eps(v) of a fitted law with its band, from all errors of the fit.
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import any_traced, array_module, as_jax_arrays
-from jaxgran._utils.validation import float_array, no_type_check
+from jaxgran._utils.validation import float_array
 from jaxgran.data.curve import QUANTITIES, WITH_ERRORS, CoolingCurve, Run
 from jaxgran.data.curve_file import DropTest
 from jaxgran.fitting.parameters import START_TIME, Numbers, residuals_and_slopes, with_floats
@@ -35,7 +35,6 @@ MIN_ERROR = 1e-12
 """Smallest allowed relative error of a measurement."""
 
 
-@no_type_check
 def check_curve(gas: Gas, curve: CoolingCurve) -> None:
     """Raise ValueError unless `gas` is a single gas and `curve` a valid measurement."""
     checked_gas(gas)

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran._utils import status
 from jaxgran._utils.formatting import text_table
 from jaxgran._utils.tracing import any_traced, grid_size, pad_to
-from jaxgran._utils.validation import POSITIVE, checked_float, checked_times, no_type_check
+from jaxgran._utils.validation import POSITIVE, checked_float, checked_times
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import (
@@ -85,7 +85,6 @@ def default_models(num_particles: int, replicas: int = 1) -> tuple[AbstractModel
     return KineticTheory(), *(kind(num_particles, replicas=replicas) for kind in kinds)
 
 
-@no_type_check
 def choose_model(
     gas: Gas,
     times: ArrayLike | Sequence[float],

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import ArrayLike, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran._utils.validation import check_bool, checked_times, no_type_check
+from jaxgran._utils.validation import check_bool, checked_times
 from jaxgran.data.curve import CoolingCurve, Particles, Run
 from jaxgran.data.files import check_writable
 from jaxgran.models import checks
@@ -21,7 +21,6 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
 
 
-@no_type_check
 def cool(
     gas: Gas,
     times: ArrayLike | Sequence[float],

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
-from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int, no_type_check
+from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int
 from jaxgran.data.curve import DEFAULTS, CoolingCurve, Particles, Run
 from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable
 from jaxgran.models import checks
@@ -143,7 +143,6 @@ class AbstractSpheres(AbstractParticleModel):
                 f"Leave start out of {type(self).__name__}, or free other parameters."
             )
 
-    @no_type_check
     def sized_for(self: S, gas: Gas, spare: float = 2.0) -> S:
         """Return this model with fixed sizes of its arrays, for `jax.jit`.
 

@@ -23,8 +23,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran._utils.validation import no_type_check
-
 __all__ = [
     "cell_density",
     "cell_velocity",
@@ -218,7 +216,6 @@ def _speed_distribution(velocity: Float[Array, "n d"], edges: Float[Array, "e"])
     return histogram(c, edges) / (n * shell_volumes(edges, d))
 
 
-@no_type_check
 def pair_correlation(
     position: Float[Array, "particles d"],
     side: ArrayLike,
