@@ -150,17 +150,6 @@ def number_named(name: str) -> Callable[[UserNumber], Array]:
     return convert
 
 
-def check_not_subnormal(name: str, value: Array) -> None:
-    """Raise ValueError for a number in single precision that is too small to be normal."""
-    if not isinstance(value, Tracer) and value.dtype != jnp.float64:
-        numbers = np.asarray(value)
-        if np.any((numbers != 0) & (np.abs(numbers) < np.finfo(numbers.dtype).tiny)):
-            raise ValueError(
-                f"{name} is too small for {numbers.dtype}, got {numbers.min():g}. "
-                'Call jax.config.update("jax_enable_x64", True) first.'
-            )
-
-
 def _floats(value: Any) -> np.ndarray:
     """Convert to NumPy floats; raise TypeError or ValueError for strings, booleans and the like."""
     array = np.asarray(value)

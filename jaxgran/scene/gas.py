@@ -22,7 +22,6 @@ from jaxgran._utils.validation import (
     POSITIVE,
     Domain,
     UserNumber,
-    check_not_subnormal,
     checked_int,
     float_array,
     number_named,
@@ -170,9 +169,7 @@ class Gas(eqx.Module):
                 "name of a float of the gas: rename it"
             )
         for name in own:
-            value = getattr(self, name)
-            self.domains[name].check(name, value, ADVICE[name])
-            check_not_subnormal(name, value)
+            self.domains[name].check(name, getattr(self, name), ADVICE[name])
         elements.check_elements(self)
 
     def __getattr__(self, name: str) -> Any:
