@@ -371,28 +371,11 @@ def rough_impact_means(
     return [rate * x for x in (of_v, 2 * normal, of_s, of_vs, of_ss, slipping)]
 
 
+ElementBounds = tuple[ArrayLike, ArrayLike, ArrayLike | None, ArrayLike | None]
+"""Bounds of the effects of elements on T: `jaxgran.theory.equations.element_bounds`."""
+
 _SCAN_POINTS = 16
 """Temperatures at which the cooling rate is computed to determine the range of a `RateTable`."""
-
-
-class ElementBounds(NamedTuple):
-    """Bounds of the effects of a scene's elements on T, for the range of a `RateTable`.
-
-    Attributes:
-        by_speed: an upper bound of a part of ``-d ln T/dt`` over sqrt(T/T_0).
-        constant: an upper bound of the part that does not depend on T.
-        heating: d(T/T_0)/dt by a drive; None where nothing heats.
-        rotation: T/T_0 that a gas could gain from the spins; None for smooth spheres.
-    """
-
-    by_speed: ArrayLike = 0.0
-    constant: ArrayLike = 0.0
-    heating: ArrayLike | None = None
-    rotation: ArrayLike | None = None
-
-
-NO_ELEMENTS = ElementBounds()
-"""Bounds of smooth spheres without walls, drag and drive."""
 
 
 class RateTable(eqx.Module):
@@ -419,7 +402,7 @@ class RateTable(eqx.Module):
         duration: Float[Array, ""],
         dimension: int,
         num_nodes: int,
-        bounds: ElementBounds = NO_ELEMENTS,
+        bounds: ElementBounds = (0.0, 0.0, None, None),
     ) -> "RateTable":
         """Return the series for all temperatures that a gas reaches in a given time.
 
@@ -428,7 +411,8 @@ class RateTable(eqx.Module):
             duration: reduced time.
             dimension: d.
             num_nodes: number of terms; see `ReducedLaw.num_nodes`.
-            bounds: of the effects of the elements of the scene on T.
+            bounds: of the effects of the elements of the scene on T (`element_bounds`); by default
+                those of smooth spheres without walls, drag and drive.
         """
         lowest, highest = _log_temperature_range(averages, duration, dimension, bounds)
         nodes, to_coefficients = (jnp.asarray(x, lowest.dtype) for x in _chebyshev(num_nodes))

@@ -485,6 +485,11 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
 
     The bound of the cooling is that of spheres that do not rotate and that stop at walls. The
     rotation heats at most by the initial energy of the spins.
+
+    Returns:
+        the part of ``-d ln T/dt`` over sqrt(T/T_0); its part that does not depend on T; d(T/T_0)/dt
+        by a drive, None where nothing heats; T/T_0 that a gas could gain from the spins, None for
+        smooth spheres.
     """
     by_speed, constant, heating, rotation = 0.0, 0.0, None, None
     surface, walls, d, rate = scene.surface, scene.walls, dimension, collision_rate(0.0, dimension)
@@ -507,7 +512,7 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
         constant = 2 * scene.drag.rate
     if scene.drive is not None:
         heating = scene.drive
-    return ElementBounds(by_speed, constant, heating, rotation)
+    return by_speed, constant, heating, rotation
 
 
 MAX_WAVENUMBER = {2: (0.181, 3.10), 3: (0.926, 2.19)}
