@@ -191,18 +191,12 @@ def drag_decay(drag: ReducedDrag, time: Float[Array, "..."]) -> DragDecay:
     """Return the decay until a transformed time, ``s = (1 - exp(-gamma t))/gamma``."""
     velocity = 1 - drag.rate * time
     rotational_rate = 0.0 if drag.rotational_rate is None else drag.rotational_rate
-    spin = jnp.exp(-rotational_rate * true_time(drag, time))
+    spin = jnp.exp(-rotational_rate * true_duration(drag, 0.0, time))
     return DragDecay(velocity, spin / velocity, spin)
 
 
-def true_time(drag: ReducedDrag, time: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the true time at a transformed time."""
-    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
-    return jnp.where(drag.rate > 0, -jnp.log1p(-drag.rate * time) / safe, time)
-
-
 def true_duration(
-    drag: ReducedDrag, start: Float[Array, "..."], duration: Float[Array, "..."]
+    drag: ReducedDrag, start: Float[Array, "..."] | float, duration: Float[Array, "..."]
 ) -> Float[Array, "..."]:
     """Return the true duration, >= 0, of a transformed one that begins at a transformed time."""
     safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
