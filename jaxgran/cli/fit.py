@@ -28,7 +28,6 @@ from jaxgran.fitting.fit import free_by_default
 from jaxgran.fitting.residuals import unused_rotation
 from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE
 from jaxgran.models.choose import default_models
-from jaxgran.scene.laws import restitution_at
 from jaxgran.scene.parameters import BY_SYMBOL, MATERIAL, PARAMETERS, SCENE, symbol_of, unit_of
 
 JOINT_MODEL = MODELS[0]
@@ -334,7 +333,7 @@ def print_scene(label: str, gas: Any, curve: Any, header: dict[str, str]) -> Non
 @eqx.filter_jit
 def _scales(gas: jaxgran.Gas, last: Any, N: int) -> tuple[Any, ...]:
     speeds = jnp.sqrt(2 * jnp.stack([gas.temperature, jnp.asarray(last)]))
-    first, last = restitution_at(gas.law, gas.diameter, gas.mass, speeds)
+    first, last = gas.restitution(speeds)
     now = gas.packing_fraction, gas.mean_free_time, gas.contact_fraction, gas.thermal_beta
     return *now, first, last, gas.mean_free_path, gas.box_side(N)
 

@@ -13,7 +13,7 @@ from jaxgran._utils.validation import POSITIVE
 from jaxgran.fitting.parameters import with_floats
 from jaxgran.fitting.result import Fit
 from jaxgran.scene.gas import Gas, law_fields
-from jaxgran.scene.laws import RestitutionSpline, restitution_at
+from jaxgran.scene.laws import RestitutionSpline
 
 NUM_COMPARED = 9
 """Number of speeds over the visited range at which laws are compared."""
@@ -154,5 +154,5 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
 
 @eqx.filter_jit
 def _log_loss(gas: Gas, speeds: Float[Array, "speeds"]) -> Float[Array, "speeds"]:
-    eps = restitution_at(gas.law, gas.diameter, gas.mass, speeds)
+    eps = gas.restitution(speeds)
     return jnp.log(-jnp.log(eps))

@@ -347,7 +347,8 @@ class Gas(eqx.Module):
             ValueError: for a speed that is not positive.
         """
         POSITIVE.check("normal_speed", normal_speed, "Give the normal approach speed in m/s.")
-        return laws.restitution_at(self.law, self.diameter, self.mass, float_array(normal_speed))
+        law = self.law.reduced(diameter=self.diameter, mass=self.mass, speed=float_array(1.0))
+        return law.restitution(float_array(normal_speed))
 
     def _viscoelastic(self, quantity: str) -> laws.Viscoelastic:
         if not isinstance(self.law, laws.Viscoelastic):

@@ -212,14 +212,6 @@ class ScaledLaw(ReducedLaw):
         return jnp.broadcast_to(values, jnp.shape(normal_speed))
 
 
-def restitution_at(
-    law: RestitutionLaw, diameter: Array, mass: Array, normal_speed: Float[Array, "..."]
-) -> Float[Array, "..."]:
-    """Coefficient of restitution eps of given spheres at speeds in m/s."""
-    reduced = law.reduced(diameter=diameter, mass=mass, speed=float_array(1.0))
-    return reduced.restitution(normal_speed)
-
-
 def check_reduced_units(law: RestitutionLaw) -> None:
     """Check, once for each class of laws, that `reduced` returns a law in the given units.
 
