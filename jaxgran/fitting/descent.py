@@ -12,17 +12,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 from tqdm import tqdm
 
-from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.optimise import MAX_DISTANCE, Minimum, Problem, Trace, is_converged
 from jaxgran.fitting.residuals import log_temperatures
 from jaxgran.fitting.stochastic import (
-    SearchResult,
+    Search,
+    Simulations,
     average_estimates,
     run_simulation,
-    search_result,
     variance_of_mean,
 )
 
@@ -79,67 +78,40 @@ class Descent:
         best = flats[np.argmin(losses)]
         return best.astype(first.dtype), np.asarray(len(flats)), np.asarray(converged)
 
-    def by_simulation(
-        self,
-        simulate: Callable[[Array, int], CoolingCurve],
-        first: Float[np.ndarray, "p"],
-        measured: Float[np.ndarray, "points"],
-        error: Float[np.ndarray, "points"],
-        used: Bool[np.ndarray, "points"],
-        *,
-        rotation: bool = False,
-        resolution: float,
-        max_simulations: int,
-        progress: bool,
-        prior: Callable[[Array], Array],
-        estimates: Callable[[np.ndarray], np.ndarray],
-    ) -> SearchResult:
+    def by_simulation(self, sims: Simulations, max_simulations: int) -> Search:
         """Search as `jaxgran.fitting.stochastic.search_by_simulation`, by gradient descent.
 
         The residuals of each simulation are weighted by the measured error and its own noise.
         `NUM_LINEARISED` further simulations at the estimate give its errors.
-
-        Args:
-            prior: residuals of prior knowledge, a function of the parameters.
-            estimates: SI values of parameters.
         """
-        known, size, points = bool(error.any()), int(np.sum(used)), np.flatnonzero(used)
+        size, points = int(np.sum(sims.used)), np.flatnonzero(sims.used)
 
         def loss(flat: Array, number: int) -> Array:
-            curve = simulate(flat, number)
+            curve = sims.simulate(flat, number)
             weight = jnp.ones(size)
-            if known:
+            if sims.error is not None:
                 replicas: Any = jax.lax.stop_gradient(curve.replicas)
-                values = np.asarray(log_temperatures(replicas, rotation))[:, used]
-                weight = 1 / np.sqrt(error[used] ** 2 + variance_of_mean(values - values.mean(0)))
-            residuals = (log_temperatures(curve, rotation)[points] - measured[used]) * weight
-            return jnp.sum(residuals**2) + jnp.sum(prior(flat) ** 2)
+                values = np.asarray(log_temperatures(replicas, sims.rotation))[:, sims.used]
+                weight = 1 / np.sqrt(sims.error**2 + variance_of_mean(values - values.mean(0)))
+            residuals = (log_temperatures(curve, sims.rotation)[points] - sims.measured) * weight
+            return jnp.sum(residuals**2) + jnp.sum(sims.prior(flat) ** 2)
 
         def at(flat: np.ndarray, step: int) -> tuple[Any, Any, bool]:
             return *jax.value_and_grad(loss)(jnp.asarray(flat), step), False
 
         flats, losses, converged, diverged = self._descend(
-            at, first, max_simulations, size, True, estimates
+            at, sims.first, max_simulations, size, True, sims.estimates
         )
         averaged = 1 if diverged else (len(flats) + 1) // 2
         flat = np.mean(flats[-averaged:], axis=0)
         if diverged:
             flat = flats[np.argmin(losses)]
         numbers = range(len(flats), len(flats) + NUM_LINEARISED)
-        runs = [run_simulation(simulate, flat, n, used, rotation) for n in numbers]
-        near, errors = [s for s, _ in runs], error[used] if known else None
-        _, sigma, _, noise = average_estimates(near, measured[used], errors, resolution)
-        return search_result(
-            flat,
-            near,
-            measured[used],
-            sigma,
-            noise * NUM_LINEARISED / averaged,
-            used,
-            runs[-1][1],
-            len(flats) + NUM_LINEARISED,
-            converged,
-        )
+        runs = [run_simulation(sims, flat, n) for n in numbers]
+        near = [s for s, _ in runs]
+        _, sigma, _, noise = average_estimates(near, sims)
+        noise, number = noise * NUM_LINEARISED / averaged, len(flats) + NUM_LINEARISED
+        return Search(flat, near, sigma, noise, runs[-1][1], number, converged)
 
     def _descend(
         self,

@@ -38,31 +38,54 @@ NOISE_WINDOW = 9
 """Number of neighbouring times over which the variance between replicas is averaged."""
 
 
-class SearchResult(NamedTuple):
-    """Result of a search through simulations, of p parameters in their unconstrained scale.
+class Simulations(NamedTuple):
+    """Simulations that are compared with a curve, of p parameters in their unconstrained scale.
 
     The points are those of `log_temperatures`.
 
     Attributes:
+        simulate: function of the parameters and of a number that differs between simulations;
+            returns a cooling curve with replicas.
+        first: the initial guess.
+        measured: values of `log_temperatures` at the used points.
+        error: their standard errors; None if these are not known.
+        used: True for points that have a weight.
+        rotation: True if T_rot is used too.
+        resolution: ratio to the largest singular value of the sensitivity below which singular
+            values are ignored: the parameters do not change in those directions.
+        prior: residuals of prior knowledge, a function of the parameters.
+        estimates: SI values of parameters.
+    """
+
+    simulate: Callable[[Array, int], CoolingCurve]
+    first: Float[np.ndarray, "p"]
+    measured: Float[np.ndarray, "used"]
+    error: Float[np.ndarray, "used"] | None
+    used: Bool[np.ndarray, "points"]
+    rotation: bool
+    resolution: float
+    prior: Callable[[Any], Array]
+    estimates: Callable[[np.ndarray], np.ndarray]
+
+
+class Search(NamedTuple):
+    """Result of a search through simulations.
+
+    Attributes:
         flat: the estimate.
-        computed: the curve of the last simulation.
-        weights: weights of the residuals; 0 where a point is not used.
-        residuals: weighted residuals at `flat`, extrapolated linearly from the simulations; 0 where
-            a point is not used.
-        sensitivity: derivative of the weighted residuals.
-        extrapolation: `flat` minus the mean of the parameters of the simulations.
+        near: the simulations near it.
+        sigma: standard error of each residual at the used points.
         noise_covariance: covariance of `flat` due to the noise of the simulations.
+        computed: the curve of the last simulation.
         num_simulations: the number of simulations.
         converged: True if the last step was below `AVERAGING_DISTANCE`.
     """
 
     flat: Float[np.ndarray, "p"]
-    computed: CoolingCurve
-    weights: Float[np.ndarray, "points"]
-    residuals: Float[np.ndarray, "points"]
-    sensitivity: Float[np.ndarray, "points p"]
-    extrapolation: Float[np.ndarray, "p"]
+    near: "list[Simulation]"
+    sigma: Float[np.ndarray, "used"]
     noise_covariance: Float[np.ndarray, "p p"]
+    computed: CoolingCurve
     num_simulations: int
     converged: bool
 
@@ -78,13 +101,12 @@ def fit_stochastic(
     max_simulations: int,
     priors: Priors,
     replicas: int,
-    search_by: Callable[..., SearchResult] | None = None,
+    search_by: Callable[[Simulations, int], Search] | None = None,
 ) -> Fit:
     """Fit a stochastic model, starting at a guess.
 
     Arguments, result and errors are those of `jaxgran.fit`. `search_by` is another search than
-    `search_by_simulation`, which also gets the prior residuals of the law and the map to SI
-    values.
+    `search_by_simulation`, which also uses the prior residuals of the law.
     """
     m = Measurement.of("", gas, curve, model, None, replicas, use_displacement=False)
     m, curve = dataclasses.replace(m, accuracies={}), m.curve
@@ -120,21 +142,29 @@ def fit_stochastic(
     def prior(flat: Any) -> Any:
         return gas_at(flat).law.prior_residuals()
 
-    options: Any = {} if search_by is None else {"prior": prior, "estimates": problem.estimates}
-    search = (search_by or search_by_simulation)(
+    sims = Simulations(
         simulate,
         first,
-        np.asarray(log_temperatures(curve, size > 1)),
-        error,
+        np.asarray(log_temperatures(curve, size > 1))[used],
+        error[used] if np.any(error[used]) else None,
         used,
-        rotation=size > 1,
-        resolution=model.derivative_accuracy,
-        max_simulations=max_simulations,
-        progress=progress,
-        **options,
+        size > 1,
+        model.derivative_accuracy,
+        prior,
+        problem.estimates,
     )
-    flat, residuals, weights = search.flat, search.residuals, search.weights
-    sensitivity, scatter = search.sensitivity, None
+    if search_by is None:
+        search = search_by_simulation(sims, max_simulations, progress)
+    else:
+        search = search_by(sims, max_simulations)
+    flat, near, sigma, scatter = search.flat, search.near, search.sigma, None
+    weights, residuals = np.zeros(len(used)), np.zeros(len(used))
+    sensitivity = np.zeros((len(used), len(flat)))
+    weights[used] = 1 / sigma
+    # Extrapolated from each simulation, and averaged.
+    differences = [sims.measured - s.values - s.slope @ (flat - s.flat) for s in near]
+    residuals[used] = np.mean(differences, axis=0) / sigma
+    sensitivity[used] = np.mean([s.slope for s in near], axis=0) / sigma[:, None]
     if not has_errors:
         scatter = np.sqrt(np.sum(residuals**2) / (np.sum(residuals != 0) - flat.size))
         residuals, sensitivity, weights = (x / scatter for x in (residuals, sensitivity, weights))
@@ -155,7 +185,7 @@ def fit_stochastic(
         dataclasses.replace(problem, measurements=(m,)),
         flat,
         (rows, jacobian, {"": search.computed}),
-        ends=(flat[None], np.sum(residuals**2)[None]),
+        ends=(flat[None], np.asarray([np.sum(residuals**2)])),
         iterations=np.asarray(search.num_simulations),
         converged=np.asarray(search.converged),
         resolution=model.derivative_accuracy,
@@ -164,7 +194,8 @@ def fit_stochastic(
     gain = scale * np.linalg.pinv(sensitivity, rcond=model.derivative_accuracy) * weights[None]
     covariances = {"simulation": scale * search.noise_covariance * scale.T}
     covariances |= {name: gain @ x @ x.T @ gain.T for name, x in changes.items()}
-    extrapolation = as_jax_arrays(scale[:, 0] * search.extrapolation)
+    extrapolation = flat - np.mean([s.flat for s in near], axis=0)
+    extrapolation = as_jax_arrays(scale[:, 0] * extrapolation)
     return dataclasses.replace(
         result,
         covariances=result.covariances | as_jax_arrays(covariances),
@@ -183,18 +214,7 @@ class Simulation(NamedTuple):
     variance: Float[np.ndarray, "used"]  # variance of the mean over replicas
 
 
-def search_by_simulation(
-    simulate: Callable[[Array, int], CoolingCurve],
-    first: Float[np.ndarray, "p"],
-    measured: Float[np.ndarray, "points"],
-    error: Float[np.ndarray, "points"],
-    used: Bool[np.ndarray, "points"],
-    *,
-    rotation: bool = False,
-    resolution: float,
-    max_simulations: int,
-    progress: bool,
-) -> SearchResult:
+def search_by_simulation(sims: Simulations, max_simulations: int, progress: bool) -> Search:
     """Search by Gauss-Newton steps, each on one simulation and its derivatives.
 
     Each simulation has different random numbers. The simulations within `AVERAGING_DISTANCE` of the
@@ -205,31 +225,15 @@ def search_by_simulation(
     below `MAX_NOISE_SHARE` of the standard error.
 
     `jaxgran.fit` describes the effect of biased derivatives.
-
-    Args:
-        simulate: function of the parameters and of a number that differs between simulations;
-            returns a cooling curve with replicas.
-        first: the initial guess.
-        measured, error: values of `log_temperatures` and their standard errors, which are all 0 if
-            they are not known.
-        used: True for points that have a weight.
-        rotation: True if T_rot is used too.
-        resolution: ratio to the largest singular value of the sensitivity below which singular
-            values are ignored: the parameters do not change in those directions.
-        max_simulations: maximum number of simulations.
-        progress: show a progress bar.
     """
-    flat, measured, error = np.asarray(first, float), measured[used], error[used]
-    known, simulations = bool(error.any()), []
+    flat, simulations = np.asarray(sims.first, float), []
     hidden = None if progress else True  # None hides the bar where there is no terminal
     with tqdm(total=max_simulations, disable=hidden, desc="fit", unit="simulation") as bar:
         while True:
-            simulation, curve = run_simulation(simulate, flat, len(simulations), used, rotation)
+            simulation, curve = run_simulation(sims, flat, len(simulations))
             simulations.append(simulation)
             near = [s for s in simulations if np.abs(s.flat - flat).max() < AVERAGING_DISTANCE]
-            estimate, sigma, error_covariance, noise_covariance = average_estimates(
-                near, measured, error if known else None, resolution
-            )
+            estimate, sigma, error_covariance, noise_covariance = average_estimates(near, sims)
             step = estimate - flat
             step *= min(1.0, MAX_STEP / max(np.abs(step).max(), 1e-300))
             converged = bool(np.abs(step).max() < AVERAGING_DISTANCE)
@@ -239,57 +243,20 @@ def search_by_simulation(
             in_errors = np.abs(step / np.sqrt(variance)).max()
             bar.update()
             bar.set_postfix_str(f"last step {in_errors:.2g} standard errors")
-            ended = converged and len(near) > 1 and (low_noise or not known)
+            ended = converged and len(near) > 1 and (low_noise or sims.error is None)
             if ended or len(simulations) == max_simulations:
                 break
-    return search_result(
-        flat, near, measured, sigma, noise_covariance, used, curve, len(simulations), converged
-    )
-
-
-def search_result(
-    flat: Float[np.ndarray, "p"],
-    near: list[Simulation],
-    measured: Float[np.ndarray, "used"],
-    sigma: Float[np.ndarray, "used"],
-    noise_covariance: Float[np.ndarray, "p p"],
-    used: Bool[np.ndarray, "points"],
-    computed: CoolingCurve,
-    num_simulations: int,
-    converged: bool,
-) -> SearchResult:
-    """Return the result of a search from the simulations near its end."""
-    weights, residuals = np.zeros((2, len(used)))
-    sensitivity = np.zeros((len(used), len(flat)))
-    weights[used] = 1 / sigma
-    # Extrapolated from each simulation, and averaged.
-    differences = [measured - s.values - s.slope @ (flat - s.flat) for s in near]
-    residuals[used] = np.mean(differences, axis=0) / sigma
-    sensitivity[used] = np.mean([s.slope for s in near], axis=0) / sigma[:, None]
-    return SearchResult(
-        flat=flat,
-        computed=computed,
-        weights=weights,
-        residuals=residuals,
-        sensitivity=sensitivity,
-        extrapolation=flat - np.mean([s.flat for s in near], axis=0),
-        noise_covariance=noise_covariance,
-        num_simulations=num_simulations,
-        converged=converged,
-    )
+    return Search(flat, near, sigma, noise_covariance, curve, len(simulations), converged)
 
 
 def run_simulation(
-    simulate: Callable[[Array, int], CoolingCurve],
-    flat: Float[np.ndarray, "p"],
-    number: int,
-    used: Bool[np.ndarray, "points"],
-    rotation: bool,
+    sims: Simulations, flat: Float[np.ndarray, "p"], number: int
 ) -> tuple[Simulation, CoolingCurve]:
     """Run one simulation with its derivatives; return it and its curve."""
+    used, rotation = sims.used, sims.rotation
 
     def values_of(flat):
-        curve = simulate(flat, number)
+        curve = sims.simulate(flat, number)
         value = log_temperatures(curve, rotation)
         return value, (value, curve)
 
@@ -306,21 +273,15 @@ def run_simulation(
 
 
 def average_estimates(
-    near: list[Simulation],
-    measured: Float[np.ndarray, "used"],
-    error: Float[np.ndarray, "used"] | None,
-    resolution: float,
+    near: list[Simulation], sims: Simulations
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the mean of the Gauss-Newton estimates of some simulations.
 
     With it come the standard error of each residual (1 if errors are unknown), and the covariances
-    of the mean by the errors of the measurement and by the noise of the simulations.
-
-    Args:
-        near: the simulations, the newest one last.
-        measured, error: the values and their standard errors, None if these are not known.
-        resolution: see `search_by_simulation`.
+    of the mean by the errors of the measurement and by the noise of the simulations. The newest
+    simulation is the last one.
     """
+    measured, error, resolution = sims.measured, sims.error, sims.resolution
     noise = np.sqrt(np.mean([s.variance for s in near], axis=0) / len(near))
     sigma = np.ones_like(measured) if error is None else np.hypot(error, noise)
     estimates, noise_covariances = [], []
