@@ -3,19 +3,12 @@ import os
 import shutil
 import tempfile
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 PROGRAMS = "JAXGRAN_TEST_PROGRAMS"
 """An environment variable: the folder of programs compiled in this run of the tests."""
-
-FAST_BUILD = "--xla_backend_optimization_level=1"
-if tuple(map(int, version("jax").split(".")[:2])) < (0, 11):
-    FAST_BUILD += " --xla_cpu_use_fusion_emitters=false"
-"""Flags of XLA. On a CPU its emitters of fusions take more than half of the time of a compilation:
-without them it compiles a fit in 1.9 s in place of 5.1 s (jaxlib 0.10.1)."""
 
 MAX_MAPS_AFTER_A_FILE = 12_000
 """Memory maps above which a process clears its caches after a file of tests. Linux allows 65530;
@@ -69,9 +62,6 @@ def pytest_configure(config):
             os.environ.pop(name, None)
         os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxgran-tests-")
         config.add_cleanup(partial(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True))
-        if config.option.markexpr == "not slow":
-            # These tests mostly compile. The slow ones run the programs of users.
-            os.environ["XLA_FLAGS"] = f"{FAST_BUILD} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 
 @pytest.hookimpl(trylast=True)  # after what measures the coverage of lines has begun
