@@ -451,7 +451,7 @@ class TestContract:
             moved = moved - drift[None] * found[0].times[:, None, None, None]
             np.testing.assert_allclose(moved, side * np.round(moved / side), atol=1e-9 * side)
 
-    @of_models(slow=("soft spheres",))
+    @of_models(slow=("soft spheres", "DSMC"))
     def test_vmap_and_jit_are_a_loop(self, case):
         """In one program without calls to the host; a member out of range alone is nan."""
         model, times = case.model, case.times

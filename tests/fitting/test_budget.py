@@ -154,6 +154,7 @@ def test_between_walls_only_impacts_between_spheres_are_random():
     assert 0.007 < walled.mixing < 0.008 and 0.004 < elastic.mixing < 0.005
 
 
+@pytest.mark.slow
 def test_slip_makes_the_losses_of_rough_spheres_more_regular():
     gas = glass_beads(packing_fraction=0.03)
     rough = dataclasses.replace(gas, surface=jaxgran.Rough(-0.3))

@@ -102,7 +102,7 @@ def test_noise_is_that_of_runs(phi, beta, n, duration, scatter):
 def test_only_a_flow_makes_noise_besides():
     still, flowing = soft_beads(1e-4), soft_beads(1e-4, 0.5, packing_fraction=0.3)
     for gas, more in ((still, False), (flowing, True)):
-        in_box, unknown = (choose(gas, 30, num_particles=n) for n in (4000, None))
+        in_box, unknown = (choose(gas, 60, num_particles=n) for n in (4000, None))
         assert ("random amplitudes" in " ".join(in_box.reasons)) is more
         assert "random amplitudes" not in " ".join(unknown.reasons)
         # Where a flow grows its noise is more than that of shots alone, and the larger part.

@@ -154,7 +154,7 @@ def test_impact_on_a_wall_has_the_restitution_of_its_law():
     assert float(curve.collisions[-1]) == 0.0
 
 
-@pytest.mark.parametrize("on_wall", [False, True])
+@pytest.mark.parametrize("on_wall", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_sliding_impact_obeys_coulomb_and_conserves_momentum(on_wall):
     # So slippery that it slides to the end: the tangential impulse is mu times the normal one. So
     # stiff that the normal turns by 2e-5 only.

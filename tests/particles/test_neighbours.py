@@ -58,8 +58,7 @@ def awkward(dimension, replicas, side, n=30):
     [
         *((d, "scipy", fraction) for d in (2, 3) for fraction in (0.15, 0.4999, 0.5)),
         *((d, "sweep", 0.5) for d in (2, 3)),
-        (2, "jax-md", 0.15),
-        pytest.param(3, "jax-md", 0.15, marks=pytest.mark.slow),
+        *(pytest.param(d, "jax-md", 0.15, marks=pytest.mark.slow) for d in (2, 3)),
     ],
 )
 def test_pairs_are_those_of_brute_force(dimension, by, fraction):

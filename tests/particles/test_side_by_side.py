@@ -70,6 +70,7 @@ def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
         cool(gas, "DSMC", 2, checkpoint=path)
 
 
+@pytest.mark.slow
 def test_an_error_of_one_ends_the_others_and_is_raised(beads, two_devices, tmp_path):
     gas = beads(packing_fraction=0.1, dissipative_constant=0.0)
     times, model = [3e5 * gas.mean_free_time], jaxgran.DSMC(200, replicas=2)  # a minute

@@ -236,6 +236,7 @@ def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
     np.testing.assert_allclose(curve.rotational_temperature, expected[1], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_choice_of_a_model_says_how_near_walls_would_be(beads):
     gas = beads(packing_fraction=0.01)
     choice = jaxgran.choose_model(gas, [10 * float(gas.mean_free_time)], num_particles=200)

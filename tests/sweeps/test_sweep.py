@@ -1,6 +1,7 @@
 """Sweeps in one process: members, stores, saved values, failures and invalid input."""
 
 import dataclasses
+import inspect
 import re
 import shutil
 import sys
@@ -180,8 +181,9 @@ def test_other_files_and_folders_are_refused_and_left_alone(tmp_path):
 
 
 def test_members_that_fail_are_nan_and_do_not_end_the_others():
+    sweep = inspect.unwrap(jaxgran.sweep)  # which the check of its annotations calls
     with pytest.warns(UserWarning, match="members 0 to 1 .* first of them is 1") as warned:
-        curves = sweep(dense(0.05, 0.9, 0.1), **SAVED)
+        curves = sweep(dense(0.05, 0.9, 0.1), progress=False, **SAVED)
     assert np.isnan(curves.temperature[1]).all() and np.all(curves.temperature[::2] > 0)
     number = curves.replicas.saved["num"]
     assert not np.any(number[1]) and np.all(number[::2] > 0)
