@@ -68,6 +68,7 @@ def test_sonine_coefficient_of_constant_restitution():
     assert slope == pytest.approx(expected, rel=0.002 + 3 * T_SCATTER / n**0.5 / (cooling * 40))
 
 
+@pytest.mark.slow
 def test_elastic_gas_keeps_its_energy_and_its_maxwellian():
     gas, n = constant(1.0), 50_000
     curve, theory = curves_of(gas, [1.0, 10.0, 20.0], DSMC(n), THEORY)

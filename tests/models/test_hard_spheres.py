@@ -253,6 +253,7 @@ def cooled(gas, times, start=None) -> jaxgran.CoolingCurve:
     return jaxgran.cool(gas, times, model=model, save="particles")
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_its_own_particles():
     gas = contained(jaxgran.Viscoelastic(5e7, 0.22, 3e-5), sides=(1.0, 0.8, 1.25))
     whole = cooled(gas, [0.1, 0.2])  # some bounces, and few impacts that would let paths part

@@ -61,7 +61,8 @@ def test_the_steady_state_is_where_theory_comes_to_rest():
     assert float(slope(strength) * strength / steady.temperature) == pytest.approx(2 / 3, rel=1e-8)
 
 
-@pytest.mark.parametrize("beta", [-1.0, pytest.param(0.3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("beta", [-1.0, 0.3])
 def test_the_steady_spins_are_where_theory_comes_to_rest(beta):
     surface = jaxgran.Rough(beta, rotational_temperature=0.0, friction=0.3)
     gas = dataclasses.replace(constant(0.8), surface=surface)
