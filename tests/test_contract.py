@@ -576,6 +576,7 @@ class TestContract:
         curve = case.run(start=start, throw=False)
         assert int(curve.status) != 0 and np.all(np.isnan(curve.temperature[1:]))
 
+    @pytest.mark.slow
     def test_too_few_steps_are_a_failure(self):
         case = CASES["kinetic theory"]
         model = jaxgran.KineticTheory(max_steps=2)

@@ -160,6 +160,7 @@ def test_keeps_no_checkpoint_in_compiled_code():
         jax.jit(jax.grad(f))(0.6)
 
 
+@pytest.mark.slow
 def test_each_of_a_few_particles_meets_the_others():
     # At rest as a whole, N particles have relative velocities of T N/(N-1) and N - 1 partners
     # each, of which sqrt(N/(N-1)) (N-1)/N remains: 1 - .5/N. Meeting N partners it would be

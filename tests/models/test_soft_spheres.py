@@ -135,6 +135,7 @@ def check_energy(gas, curve):
     np.testing.assert_allclose(total, total[0], rtol=2e-5)  # the onset at 100 steps
 
 
+@pytest.mark.slow
 def test_impact_on_a_wall_has_the_restitution_of_its_law():
     # Another material than that of the spheres, at the corner: three walls at once.
     law = jaxgran.Viscoelastic(2e9, 0.3, 4e-6)

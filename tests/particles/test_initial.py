@@ -77,6 +77,7 @@ def test_one_point_for_all_is_parted(monkeypatch):
     assert least_distance(np.asarray(on_host(8.0, (1, 3, 3))), 8.0) >= CLOSEST
 
 
+@pytest.mark.slow
 def test_where_there_is_no_room_or_the_list_is_full_it_says_so(monkeypatch):
     monkeypatch.setattr(setup, "MAX_PUSHES", 50)
     for dimension, packing in ((3, 0.8), (2, 0.95)):

@@ -49,6 +49,7 @@ def test_the_choice_of_a_model_tells_the_error_of_a_steady_state():
     assert choice.error == pytest.approx(2 / 3 * 0.0034, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_steady_state_is_where_theory_comes_to_rest():
     gas = constant(0.5)
     steady, curve = jaxgran.steady_state(gas), theory_curve(gas, LATE, rtol=1e-10)

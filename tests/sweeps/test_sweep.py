@@ -89,6 +89,7 @@ def test_keys_of_members_do_not_depend_on_their_number():
     np.testing.assert_allclose(given.temperature, fewer.temperature, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_saved_values_are_those_of_cool_for_each_member(store_of_saved):
     curves = store_of_saved[1]
     # Round-off of the conversion of units.

@@ -85,6 +85,7 @@ def test_a_gas_of_haff_has_its_derivative_for_any_step(step):
     np.testing.assert_allclose(got, exact, rtol=1.001 * (np.sinh(step) / step - 1), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_reverse_mode_and_jit_of_it_agree_with_forward_mode():
     f = of_haff(0.3)
 
