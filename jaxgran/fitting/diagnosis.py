@@ -21,6 +21,7 @@ from jaxgran.fitting.alternatives import (
     ranges_over_alternatives,
 )
 from jaxgran.fitting.error_budget import curve_and_gas, describe_derivative_bias
+from jaxgran.fitting.parameters import START_TIME
 from jaxgran.fitting.residuals import (
     Measurement,
     check_curve,
@@ -486,8 +487,14 @@ def describe_search(result: Fit) -> Iterator[str]:
             f"gas: give the model {MIN_PARTICLES} or more"
         )
     if group := result.undetermined():
-        names = " and ".join(map(symbol_of, group))
-        yield f"this curve does not determine {names}: free fewer parameters"
+        names, why = " and ".join(map(symbol_of, group)), "it hardly depends on this parameter"
+        if len(group) > 1:
+            why = "it depends only on a combination of them"
+        if any(name.endswith(START_TIME) for name in group):
+            why += " (a cooling gas forgets its initial temperature)"
+        elif {"dissipative_constant", "youngs_modulus"} <= {*group}:
+            why += " (in a gas of hard spheres A and Y enter only as A Y^(2/5))"
+        yield f"this curve does not determine {names}: {why}; free fewer parameters"
     if others := describe_minima(result.names, result.degenerate_solutions()):
         yield f"{others}: this curve does not distinguish them"
 

@@ -323,6 +323,7 @@ def _fit_deterministic(
     problem = Problem.of(
         tuple(measurements), model, names, separate, priors, clock_is_free=clock_is_free
     )
+    problem.check_points()
     first = problem.flat(_values_of_guesses(problem, guesses))
     if start is not None:
         complete = {m.label: with_values_of(guesses[m.label], start, free) for m in measurements}

@@ -111,9 +111,6 @@ class Problem:
             free: names of shared free parameters.
             separate: names of free parameters that each curve has separately.
             clock_is_free: whether the error of the model's clock is a nuisance parameter.
-
-        Raises:
-            ValueError: if the curves have no more points with a weight than parameters.
         """
         curves = [m for m in measurements if isinstance(m, Measurement)]
         gas = measurements[0].gas
@@ -128,12 +125,6 @@ class Problem:
         unknowns = [unknown(name, None, gas) for name in free]
         unknowns += [unknown(name, m.label, m.gas) for name in separate for m in curves]
         num_free = sum(u.size for u in unknowns)
-        points = sum(m.num_points for m in measurements)
-        if curves and points <= num_free:
-            raise ValueError(
-                f"{points} points (those with an error of 0 not counted) cannot determine "
-                f"{num_free} parameters; free fewer of them"
-            )
         by_label = {SHARED: gas} | {m.label: m.gas for m in measurements}
         for label, some in priors.items():
             known = tuple(u.name for u in unknowns if u.label in (None, label))
@@ -158,6 +149,15 @@ class Problem:
         """True under a transformation of the measurements or the priors."""
         known = [(m.data, m.gas) for m in self.measurements]
         return any_traced(known, self.priors)
+
+    def check_points(self) -> None:
+        """Raise ValueError unless curves have more points with a weight than free parameters."""
+        points = sum(m.num_points for m in self.measurements)
+        if self.curves and points <= self.num_free:
+            raise ValueError(
+                f"{points} points (those with an error of 0 not counted) cannot determine "
+                f"{self.num_free} parameters; free fewer of them"
+            )
 
     def flat(self, values: dict[str, dict[str, Numbers]]) -> Numbers:
         """Return SI values, by label and name, in their unconstrained scale, in one array.

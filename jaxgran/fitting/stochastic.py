@@ -111,6 +111,7 @@ def fit_stochastic(
     m = Measurement.of("", gas, curve, model, None, replicas, use_displacement=False)
     m, curve = dataclasses.replace(m, accuracies={}), m.curve
     problem = Problem.of((m,), model, names, (), {}, clock_is_free=False)
+    problem.check_points()
     first = np.asarray(problem.flat({"": guess.floats}))
 
     def gas_at(flat: Any) -> Gas:

@@ -261,7 +261,12 @@ def _shares_of_losses(now: Gas, ratio: Float[Array, ""]) -> tuple[Array, Array]:
         element_rates(x, one, *state, gaussian_spins=True).cooling for x in (alone, scene)
     )
     impacts = normal + tangential
-    return impacts / (normal + rest), normal / impacts
+
+    def share(part, whole):  # 1 where nothing is lost
+        return jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), 1.0)
+
+    # Spins that heat the gas return more than slip takes.
+    return share(impacts, normal + rest), jnp.clip(share(normal, impacts), 0.0, 1.0)
 
 
 def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[str]:

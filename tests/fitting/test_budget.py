@@ -164,3 +164,17 @@ def test_slip_makes_the_losses_of_rough_spheres_more_regular():
     ratio = rough.chance_of_clock(250)[1] / smooth.chance_of_clock(250)[1]
     # Mean squares of a sum of two independent exponential losses, n and 1 - n, and of one.
     assert ratio == pytest.approx((1 + n**2 + (1 - n) ** 2) / 2, rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("A, beta, hotter", [(0.0, -1.0, 0.0), (0.0, 1.0, 1.0), (1e-6, -0.3, 30.0)])
+def test_rough_spheres_that_lose_nothing_or_are_heated_by_spins_have_finite_errors(A, beta, hotter):
+    gas = glass_beads(packing_fraction=0.03, dissipative_constant=A)
+    surface = jaxgran.Rough(beta, rotational_temperature=hotter * gas.temperature)
+    error_model = error_model_of(dataclasses.replace(gas, surface=surface), 0.1, 250)
+    shares = np.stack([error_model.impact_share, error_model.normal_share])
+    assert np.all((shares >= 0) & (shares <= 1))
+    # At most that of smooth spheres at the lowest temperature, which collide least.
+    slowest = float(gas.collision_frequency) * np.exp(error_model.log_temperature.min() / 2)
+    most = 4 / (250 * slowest) * error_model.time
+    assert np.all(error_model.chance_of_clock(250) <= most * (1 + 1e-12))  # round-off
