@@ -21,7 +21,7 @@ from jaxgran.fitting.optimise import Problem, search
 from jaxgran.fitting.parameters import START_TIME, domain_of
 from jaxgran.fitting.residuals import FLOOR, DropTestRows, Measurement, chi2_scale
 from jaxgran.fitting.result import SIGNIFICANCE, Fit
-from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR, WALL_ERROR
+from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR
 from jaxgran.models.kinetic_theory import KineticTheory
 
 ALLOWED_CHI2 = 3.84
@@ -72,6 +72,10 @@ MIN_SPACING = 0.05
 
 WALL_RESTITUTION = 0.5
 """Restitution of the walls of an alternative; the side of the box is its amplitude."""
+
+WALL_RATE_ERROR = 0.007
+"""Relative error of theory's mean cooling rate until T has fallen to a fifth, if walls take all of
+the energy (`jaxgran.models.error_model.WALL_ERROR`)."""
 
 MIN_WALL_SIDE = 4.0
 """Smallest side of that box, in diameters."""
@@ -422,7 +426,7 @@ def _kinds(result: Fit, problem: Problem, absent: tuple[str, ...]) -> list[Kind]
             ("wall_side",),
             (SHARES,),
             walls,
-            lambda share: WALL_ERROR * share,
+            lambda share: WALL_RATE_ERROR * share,
         ),
         Kind("linear drag, as in air", ("drag_rate",), (DRAG_SHARES,), drag),
         Kind("a noise floor in T", (FLOOR,), (SHARES,), floor),
