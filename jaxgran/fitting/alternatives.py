@@ -25,7 +25,8 @@ from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR
 from jaxgran.models.kinetic_theory import KineticTheory
 
 ALLOWED_CHI2 = 3.84
-"""Increase of chi^2 over its minimum up to which an amplitude is allowed (5 % by chance)."""
+"""Increase of chi^2 over its minimum up to which an amplitude is allowed (5 % by chance), if the
+errors are known; if they are estimated from the scatter, that of the F distribution."""
 
 EXCLUDED_CHI2 = 4 * ALLOWED_CHI2
 """Increase of chi^2 beyond which larger amplitudes are not tried."""
@@ -176,7 +177,7 @@ class Alternative(NamedTuple):
 
 def compare_alternatives(
     result: Fit, absent: tuple[str, ...] = ()
-) -> tuple[Alternative, tuple[Alternative, ...]] | None:
+) -> tuple[Alternative, tuple[Alternative, ...], float] | None:
     """Compare a fitted law with its alternatives, using T and, if it was fitted, T_rot.
 
     Args:
@@ -185,7 +186,8 @@ def compare_alternatives(
 
     Returns:
         The fitted law itself, and the alternatives to it, those that fit best first: none if the
-        fitted gas is driven, or for drop tests alone. None if the law cannot be computed.
+        fitted gas is driven, or for drop tests alone; and the increase of chi^2 up to which they
+        are allowed. None if the law cannot be computed.
     """
     gases = [curve_and_gas(result, label)[1] for label in result.comparisons]
     problem, first = _problem(result)
@@ -197,9 +199,13 @@ def compare_alternatives(
     trials = {kind: [_profile(problem, kind, base, scale) for base in bases] for kind in kinds}
     everything = [t for valleys in trials.values() for valley in valleys for t in valley]
     scale, degrees = _scale(min([*bases, *everything], key=lambda t: t.chi2), result)
-    chance = SIGNIFICANCE / max(len(kinds), 1)
-    # The quantile of the F distribution with 1 degree of freedom; scipy.stats takes .3 s to import.
-    significant = float(scipy.special.stdtrit(degrees, 1 - chance / 2) ** 2)
+
+    def quantile(chance: float) -> float:
+        """Quantile of the F distribution of one degree of freedom and those of the scatter."""
+        return float(scipy.special.stdtrit(degrees, 1 - chance / 2) ** 2)
+
+    significant = quantile(SIGNIFICANCE / max(len(kinds), 1))
+    allowed = min(quantile(0.05), EXCLUDED_CHI2)
     # Errors that the trials, which have no noise, do not include.
     parts = [result.error_budget.get(part, 0.0) for part in ("simulation", "few particles")]
     noise = np.hypot(*map(np.asarray, parts))
@@ -224,7 +230,7 @@ def compare_alternatives(
             rows.append(np.stack([np.interp(fine, known, column) for column in values.T], axis=1))
         best = min((trial for trials in valleys for trial in trials), key=lambda trial: trial.chi2)
         values = np.concatenate(rows)
-        values = values[values[:, 0] <= best.chi2 + ALLOWED_CHI2 * scale]
+        values = values[values[:, 0] <= best.chi2 + allowed * scale]
         low, high = np.min(values[:, 2:], axis=0), np.max(values[:, 2:], axis=0)
         low, high = low[: positive.size], high[positive.size :]
         low = np.where(positive, np.maximum(low, 0.0), low)
@@ -248,22 +254,22 @@ def compare_alternatives(
 
     law = summarise(None, [[base] for base in bases])
     alternatives = [summarise(kind, valleys, law) for kind, valleys in trials.items()]
-    return law, tuple(sorted(alternatives, key=lambda alternative: -alternative.improvement))
+    best_first = sorted(alternatives, key=lambda alternative: -alternative.improvement)
+    return law, tuple(best_first), allowed
 
 
 def ranges_over_alternatives(
-    result: Fit, explanations: Sequence[Alternative]
+    result: Fit, explanations: Sequence[Alternative], allowed_chi2: float
 ) -> dict[str, tuple[Float[np.ndarray, "size"], Float[np.ndarray, "size"]]]:
     """Return the 95 % range of each free parameter over all explanations that fit best.
-
-    These are those whose improvement is within `ALLOWED_CHI2` of the largest one.
 
     Args:
         result: a fit by `jaxgran.fit`.
         explanations: the fitted law and its alternatives.
+        allowed_chi2: largest difference of their improvement from that of the best one.
     """
     best = max(explanation.improvement for explanation in explanations)
-    as_good = [x for x in explanations if x.improvement >= best - ALLOWED_CHI2]
+    as_good = [x for x in explanations if x.improvement >= best - allowed_chi2]
     low = np.min([x.low for x in as_good], axis=0)
     high = np.max([x.high for x in as_good], axis=0)
     names = np.array(result._element_names)

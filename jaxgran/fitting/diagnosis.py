@@ -13,7 +13,6 @@ from jaxgran._utils.validation import POSITIVE, check_bool
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import ABSENT, DropTest
 from jaxgran.fitting.alternatives import (
-    ALLOWED_CHI2,
     DECLARABLE,
     Alternative,
     compare_alternatives,
@@ -174,8 +173,8 @@ def diagnose(
     if converged and np.isfinite(result.chi2) and not quick:
         explanations = compare_alternatives(result, absent)
     if explanations is not None:
-        law, alternatives = explanations
-        ranges = ranges_over_alternatives(result, (law, *alternatives))
+        law, alternatives, allowed_chi2 = explanations
+        ranges = ranges_over_alternatives(result, (law, *alternatives), allowed_chi2)
     reasons = [
         _describe_chi2(result),
         *_describe_measurements(result),
@@ -231,16 +230,18 @@ def _narrowing(
     result: Fit,
     law: Alternative,
     alternatives: tuple[Alternative, ...],
+    allowed_chi2: float,
     ranges: dict[str, tuple[np.ndarray, np.ndarray]],
 ) -> str:
     """Return which effects, known to be absent, would narrow the range of the first parameter."""
     wide = [x for x in alternatives if x.effect and not x.distinguishable]
     others = [law, *(x for x in alternatives if x not in wide)]
     best = max(x.improvement for x in (law, *alternatives))
-    if not wide or max(x.improvement for x in others) < best - ALLOWED_CHI2:
+    if not wide or max(x.improvement for x in others) < best - allowed_chi2:
         return ""
     name, effects = result.names[0], sorted({x.effect for x in wide})
-    low, high = (float(x[0]) for x in ranges_over_alternatives(result, others)[name])
+    narrower = ranges_over_alternatives(result, others, allowed_chi2)
+    low, high = (float(x[0]) for x in narrower[name])
     given = ", ".join(DECLARABLE[effect][1] for effect in effects)
     value = _format_range(low, high, float(np.asarray(result.estimate)[0]), unit_of(name))
     return (
