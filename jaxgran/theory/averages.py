@@ -18,9 +18,8 @@ E 69, 021301 (2004), for the second Sonine approximation of D.
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from math import pi, sqrt
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -57,26 +56,14 @@ TERMS = {2: ((0, 1, 2), (0, 0, 0)), 3: ((0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2))}
 2; 1, a_2, a_3, a_2^2, a_2 a_3, a_3^2 at order 3."""
 
 
-class _ImpactNodes(NamedTuple):
+@cache
+def _impact_nodes(dimension: int) -> tuple[Float[np.ndarray, "nodes"], ...]:
     """Velocities before impacts of one normal speed, and the weights of the average over them.
 
-    Attributes:
-        centre: velocity of the centre along the normal.
-        centre_across: square of its tangential part.
-        relative_across: square of the tangential relative velocity.
-        product: scalar product of these two tangential vectors.
-        weights: with the sum 1.
+    They are the velocity of the centre along the normal; the squares of its tangential part and of
+    the tangential relative velocity; the scalar product of these two vectors; and weights with the
+    sum 1.
     """
-
-    centre: Float[np.ndarray, "nodes"]
-    centre_across: Float[np.ndarray, "nodes"]
-    relative_across: Float[np.ndarray, "nodes"]
-    product: Float[np.ndarray, "nodes"]
-    weights: Float[np.ndarray, "nodes"]
-
-
-@cache
-def _impact_nodes(dimension: int) -> _ImpactNodes:
     along, weight = np.polynomial.hermite_e.hermegauss(_NUM_NORMAL)
     square, weight_of_square = scipy.special.roots_genlaguerre(_NUM_TANGENTIAL, (dimension - 3) / 2)
     if dimension == 2:
@@ -87,20 +74,7 @@ def _impact_nodes(dimension: int) -> _ImpactNodes:
     weights = np.einsum("a,b,c->abc", weight, weight_of_square, weight_of_square)
     weights = np.repeat(weights[..., None], cosine.size, axis=-1)
     values = (n, u, w, np.sqrt(u * w) * c, weights / weights.sum())
-    return _ImpactNodes(*(x.ravel() for x in values))
-
-
-def _squared_velocities(at: _ImpactNodes, g: float) -> tuple[np.ndarray, np.ndarray]:
-    """Squares of the two velocities, whose relative normal velocity is g."""
-    mean = at.centre**2 + at.centre_across + at.relative_across / 4 + g**2 / 4
-    half = at.centre * g + at.product
-    return mean + half, mean - half
-
-
-def _sonine_polynomials(square: np.ndarray, dimension: int, highest: int) -> np.ndarray:
-    """1, S_2, ... up to S_highest at the squares of velocities."""
-    orders = [0, *range(2, highest + 1)]
-    return np.stack([scipy.special.eval_genlaguerre(k, dimension / 2 - 1, square) for k in orders])
+    return tuple(x.ravel() for x in values)
 
 
 def _term_coefficients(bilinear: np.ndarray, dimension: int, order: int) -> np.ndarray:
@@ -124,7 +98,7 @@ def _term_coefficients(bilinear: np.ndarray, dimension: int, order: int) -> np.n
 @cache
 def collision_changes(
     dimension: int, order: int, speeds: tuple[float, ...]
-) -> Float[np.ndarray, "..."]:
+) -> Float[np.ndarray, "rows terms powers speeds"]:
     """Return the mean changes of velocity moments by impacts, as polynomial coefficients.
 
     Args:
@@ -139,44 +113,44 @@ def collision_changes(
         the change of ``(4/d) c.c' S_j(c'^2)`` with the weight ``S_k(c^2)``, S_j = L_j^(d/2), for
         (j, k) from (0, 0) to (order - 2, order - 2), row by row. Columns as in `TERMS`.
     """
-    at, epsilons = _impact_nodes(dimension), 1 - np.linspace(0, 2, NUM_RESTITUTIONS)
-    highest = 2 if order == 2 else 4
-    sampled = np.stack(
-        [
-            np.stack([_changes_at(at, g, e, dimension, order, highest) for e in epsilons], axis=-1)
-            for g in speeds
-        ],
-        axis=-1,
-    )
-    bilinear = np.moveaxis(sampled, (1, 2), (-2, -1))
-    terms = np.moveaxis(_term_coefficients(bilinear, dimension, order), -1, 1)
+    laguerre = scipy.special.eval_genlaguerre
+    centre, centre_across, relative_across, product, weights = _impact_nodes(dimension)
+
+    def squared_velocities(g: float) -> tuple[np.ndarray, np.ndarray]:
+        """Squares of the two velocities, whose relative normal velocity is g."""
+        mean = centre**2 + centre_across + relative_across / 4 + g**2 / 4
+        half = centre * g + product
+        return mean + half, mean - half
+
+    def sonine_polynomials(square: np.ndarray) -> np.ndarray:
+        """1, S_2 at the squares of velocities; at order 3 also S_3 and S_4."""
+        degrees = (0, 2) if order == 2 else (0, 2, 3, 4)
+        return np.stack([laguerre(k, dimension / 2 - 1, square) for k in degrees])
+
+    def changes_at(g: float, eps: float) -> Float[np.ndarray, "rows i j"]:
+        """Rows at one g and eps, by pairs of the two Sonine polynomials."""
+        square_1, square_2 = squared_velocities(g)
+        after_1, after_2 = squared_velocities(-eps * g)
+        losses = [square_1**p + square_2**p - after_1**p - after_2**p for p in range(1, order + 1)]
+        kept = square_1 - (1 + eps) / 2 * g * (centre + g / 2)  # velocity before times after
+        label = [partial(laguerre, j, dimension / 2) for j in range(order - 1)]
+        relaxation = [
+            4 / dimension * (square_1 * s_j(square_1) - kept * s_j(after_1)) * s_k(square_1)
+            for s_j in label
+            for s_k in label
+        ]
+        rows = np.stack(losses + relaxation)
+        first, second = sonine_polynomials(square_1), sonine_polynomials(square_2)
+        return np.einsum("rn,in,jn->rij", rows, first * weights, second, optimize=True)
+
+    epsilons = 1 - np.linspace(0, 2, NUM_RESTITUTIONS)
+    bilinear = np.array([[changes_at(g, eps) for g in speeds] for eps in epsilons])
+    terms = _term_coefficients(bilinear, dimension, order)
     inverse = np.linalg.inv(np.vander(1 - epsilons, increasing=True))
-    powers = np.einsum("ps,rtsn->rtpn", inverse, terms)
+    powers = np.einsum("ps,snrt->rtpn", inverse, terms)
     powers[0, :, 0] = 0.0  # elastic impacts conserve the energy and a Maxwellian distribution
     powers[:order, 0, 0] = 0.0
     return powers
-
-
-def _changes_at(
-    at: _ImpactNodes, g: float, eps: float, dimension: int, order: int, highest: int
-) -> Float[np.ndarray, "rows i j"]:
-    """Rows of `collision_changes` at one g and eps, by pairs of the two Sonine polynomials."""
-    square_1, square_2 = _squared_velocities(at, g)
-    after_1, after_2 = _squared_velocities(at, -eps * g)
-    weighted_1 = _sonine_polynomials(square_1, dimension, highest) * at.weights
-    polynomials_2 = _sonine_polynomials(square_2, dimension, highest)
-    losses = [square_1**p + square_2**p - after_1**p - after_2**p for p in range(1, order + 1)]
-    product = square_1 - (1 + eps) / 2 * g * (at.centre + g / 2)  # before times after
-    label_polynomials = [
-        lambda x, j=j: scipy.special.eval_genlaguerre(j, dimension / 2, x) for j in range(order - 1)
-    ]
-    relaxation = [
-        4 / dimension * (square_1 * s_j(square_1) - product * s_j(after_1)) * s_k(square_1)
-        for s_j in label_polynomials
-        for s_k in label_polynomials
-    ]
-    rows = np.stack(losses + relaxation)
-    return np.einsum("rn,in,jn->rij", rows, weighted_1, polynomials_2, optimize=True)
 
 
 @cache
@@ -204,8 +178,9 @@ def impact_moments(
 
     Returns:
         Coefficients of polynomials in a_2 (and a_3), with the columns of `TERMS`. Order 2: mu_2,
-        mu_4 and nu_v, shape (3, 3), see `Rates`. Order 3: mu_2, mu_4, mu_6 and nu_00, nu_01,
-        nu_10, nu_11, shape (7, 6), see `jaxgran.theory.equations`.
+        mu_4 and nu_v, the relaxation rate of the velocity autocorrelation, shape (3, 3). Order 3:
+        mu_2, mu_4, mu_6 and nu_00, nu_01, nu_10, nu_11, shape (7, 6). See
+        `jaxgran.theory.equations`.
 
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution; see the
     references of this module.
@@ -213,30 +188,6 @@ def impact_moments(
     loss = law.loss(jnp.asarray(NODES, speed.dtype) * speed)
     powers = jnp.stack([loss**0 * 1.0, loss, *(loss**k for k in range(2, 7))])
     return jnp.tensordot(jnp.asarray(averaging_matrix(dimension, order), speed.dtype), powers, 2)
-
-
-class Rates(NamedTuple):
-    """Rates of a gas at one temperature, per unit of reduced time and divided by sqrt(T/T_0).
-
-    Attributes:
-        cooling: mu_2, in ``d ln T/dt = -(2/d) mu_2``.
-        fourth_moment: mu_4, in ``d a_2/dt = (4/d) mu_2 (1 + a_2) - 4 mu_4 / (d (d + 2))``.
-        relaxation: nu_v, relaxation rate of the velocity autocorrelation function.
-    """
-
-    cooling: Float[Array, ""]
-    fourth_moment: Float[Array, ""]
-    relaxation: Float[Array, ""]
-
-    @classmethod
-    def from_averages(cls, averages: Float[Array, "3 3"], sonine: Float[Array, ""]) -> "Rates":
-        """Return the rates at a given a_2.
-
-        Args:
-            averages: coefficients of the polynomials in a_2, from `impact_moments` at order 2.
-            sonine: a_2.
-        """
-        return cls(*(averages[:, 0] + sonine * (averages[:, 1] + sonine * averages[:, 2])))
 
 
 def collision_rate(

@@ -161,17 +161,14 @@ def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array
     """Return the rates of change with time of all records but <dr^2>, in a Maxwell-Sonine gas."""
     theta, a2 = values["temperature"], values["sonine"]
     speed = jnp.sqrt(theta)
-
-    @jax.vmap
-    def rates_of(speed, a2):
-        return averages.Rates.from_averages(averages.impact_moments(law, speed, d), a2)
-
-    rates = rates_of(speed, a2)
-    cooling = 2 / d * rates.cooling * speed
+    moments = jax.vmap(lambda speed: averages.impact_moments(law, speed, d))(speed)
+    terms = jnp.stack([jnp.ones_like(a2), a2, a2**2])
+    mu_2, mu_4, nu_v = speed[None] * jnp.einsum("nrt,tn->rn", moments, terms)
+    cooling = 2 / d * mu_2
     return {
         "temperature": -cooling * theta,
-        "sonine": 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * rates.fourth_moment * speed,
-        "velocity_correlation": -rates.relaxation * speed * values["velocity_correlation"],
+        "sonine": 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * mu_4,
+        "velocity_correlation": -nu_v * values["velocity_correlation"],
         "collisions": averages.collision_rate(a2, d) * speed,
     }
 
