@@ -213,7 +213,7 @@ def _speed_distribution(velocity: Float[Array, "n d"], edges: Float[Array, "e"])
     n, d = velocity.shape
     v = centred(velocity)
     c = jnp.sqrt(jnp.sum(v**2, axis=-1) / (2 * temperature(v)))
-    return histogram(c, edges) / (n * shell_volumes(edges, d))
+    return jnp.histogram(c, jnp.asarray(edges, c.dtype))[0] / (n * shell_volumes(edges, d))
 
 
 def pair_correlation(
@@ -271,7 +271,7 @@ def _pair_correlation(
         apart = position - position[i][None]
         apart = apart - side * jnp.round(apart / side)
         distance = jnp.sqrt(jnp.sum(apart**2, axis=-1))
-        return histogram(distance.at[i].set(jnp.inf), edges)
+        return jnp.histogram(distance.at[i].set(jnp.inf), jnp.asarray(edges, distance.dtype))[0]
 
     counts = jax.lax.map(around, jnp.arange(centres), batch_size=min(BATCH_SIZE, centres))
     density = n / jnp.asarray(side) ** d
@@ -288,16 +288,6 @@ def checked_edges(edges: ArrayLike | Sequence[float]) -> Array | np.ndarray:
     if array.ndim != 1 or array.size < 2 or array[0] < 0 or not np.all(np.diff(array) > 0):
         raise ValueError(f"edges must be at least two increasing numbers >= 0, got {edges!r}")
     return array
-
-
-def histogram(
-    values: Float[Array, "n"], edges: Float[Array | np.ndarray, "e"]
-) -> Float[Array, "bins"]:
-    """Count the values in each bin; the last bin includes its upper edge."""
-    bins, edges = edges.size - 1, jnp.asarray(edges, values.dtype)
-    index = jnp.searchsorted(edges, values, side="right")
-    index = jnp.where(values == edges[-1], bins, index)
-    return jnp.bincount(index, length=bins + 2)[1:-1].astype(edges.dtype)
 
 
 def shell_volumes(edges: Float[Array | np.ndarray, "e"], d: int) -> Float[Array, "bins"]:
