@@ -16,7 +16,7 @@ from jaxgran.data.curve import UserParticles
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.spheres import AbstractSpheres, Plan
-from jaxgran.particles.capacity import Grid, capacities
+from jaxgran.particles.capacity import capacities, grid, round_up
 from jaxgran.particles.soft.dynamics import SoftDynamics
 from jaxgran.scene.contact import elastic_constant
 from jaxgran.scene.elements import Frictional
@@ -40,8 +40,8 @@ MAX_SPEED = 4.8
 BLOCK_FLIGHT = 0.08
 """Distance in diameters that the fastest sphere may fly in a block of steps."""
 
-BLOCK_LENGTHS = Grid(ratio=1.2, spare=1.0)
-"""Grid of the lengths of blocks, in mean contact durations: each length needs a compilation."""
+BLOCK_LENGTHS = 1.2
+"""Ratio of neighbouring lengths of blocks, each of which needs a compilation."""
 
 MAX_STORED_ENERGY = 0.5
 """Energy of the contacts of a start, over the kinetic energy, without a warning."""
@@ -227,10 +227,10 @@ class SoftSpheres(AbstractSpheres):
         t_c/tau_c = .003 to .3."""
         d, n = dimension, self.replicas * self.num_particles
         around = self.neighbourhood(scene, d)
-        duration = Grid.of(n).round_up(float(scene.contact_duration))
+        duration = round_up(float(scene.contact_duration), grid(n)[0])
         # A block lasts at most a contact, less if spheres fly far in that time.
         contacts_flown = MAX_SPEED * float(scene.contact_duration) / BLOCK_FLIGHT
-        shorter = BLOCK_LENGTHS.round_up(max(1.0, contacts_flown))
+        shorter = round_up(max(1.0, contacts_flown), BLOCK_LENGTHS)
         steps = max(round(self.steps_per_contact / shorter), 8)
         block = steps / self.steps_per_contact
         flight = MAX_SPEED * duration * block

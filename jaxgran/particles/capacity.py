@@ -1,7 +1,7 @@
 """Capacities: the fixed lengths of the arrays of a compiled run, from the expected numbers of rows.
 
 Capacities are static, so that every new set of them needs a compilation. They are computed for a
-density (and a contact duration) that is rounded up to a geometric grid (`Grid`): gases that
+density (and a contact duration) that is rounded up to a geometric grid (`grid`): gases that
 differ little share a compiled program.
 """
 
@@ -25,35 +25,28 @@ SMALL_RUN = 500
 """Number of particles of all replicas below which a run takes less time than a compilation."""
 
 
-class Grid(NamedTuple):
-    """Geometric grid of densities and contact durations for which capacities are computed.
+GROWTH = 1.3
+"""Ratio of neighbouring capacities of arrays that were enlarged."""
+
+
+def grid(num_particles: int) -> tuple[float, float]:
+    """Return the grid of densities and contact durations for which capacities are computed.
 
     The grid of a small run is coarse, and its arrays are long. In a large run unused rows cost more
     than a compilation: its grid is fine, and fewer spare rows compensate for the rounding.
 
-    Attributes:
-        ratio: ratio of neighbouring grid points.
-        spare: factor on the spare capacity.
+    Args:
+        num_particles: number of particles of all replicas.
+
+    Returns:
+        The ratio of neighbouring grid points, see `round_up`, and a factor on the spare capacity.
     """
-
-    ratio: float
-    spare: float
-
-    @classmethod
-    def of(cls, num_particles: int) -> "Grid":
-        """Return the grid for a number of particles of all replicas."""
-        if num_particles < SMALL_RUN:
-            return cls(1.5, 1.4)
-        return cls(1.03, 1.03**-0.5)
-
-    def round_up(self, value: float) -> float:
-        """Round a value > 0 up to a grid point, which is an integer power of the ratio."""
-        power = ceil(log(value) / log(self.ratio) - 1e-9)
-        return max(self.ratio**power, value)
+    return (1.5, 1.4) if num_particles < SMALL_RUN else (1.03, 1.03**-0.5)
 
 
-GROWTH = Grid(1.3, 1.0)
-"""Grid of the capacities of arrays that were enlarged."""
+def round_up(value: float, ratio: float) -> float:
+    """Round a value > 0 up to a point of a geometric grid: an integer power of a ratio."""
+    return max(ratio ** ceil(log(value) / log(ratio) - 1e-9), value)
 
 
 class Capacity(NamedTuple):
@@ -82,7 +75,7 @@ class Capacity(NamedTuple):
     def grown(self, needed: Sequence[int]) -> "Capacity":
         """Return a capacity with more rows wherever more are needed than there are."""
         pairs = zip(self, needed, strict=True)
-        return Capacity(*(r if n <= r else ceil(GROWTH.round_up(1.2 * n + 32)) for r, n in pairs))
+        return Capacity(*(r if n <= r else ceil(round_up(1.2 * n + 32, GROWTH)) for r, n in pairs))
 
 
 class Neighbourhood(NamedTuple):
@@ -118,7 +111,7 @@ class Neighbourhood(NamedTuple):
         per_volume = sphere_surface(dimension) / (2 * dimension)
         exact = per_volume * num_particles / side**dimension
         phi = exact / 2 ** (dimension - 1)
-        phi = min(Grid.of(replicas * num_particles).round_up(phi), max(phi, 0.9))
+        phi = min(round_up(phi, grid(replicas * num_particles)[0]), max(phi, 0.9))
         in_contact = phi * 2 ** (dimension - 1)
         side = (per_volume * num_particles / in_contact) ** (1 / dimension)
         skin = float(skin_for_pairs(listed_more, num_particles, side, dimension))
@@ -142,7 +135,7 @@ def capacities(
         extra: additional pairs per particle near contact at random initial positions.
         num_particles: number of particles of all replicas, the largest number of members.
     """
-    spare = max(spare * Grid.of(num_particles).spare, 1.0)
+    spare = max(spare * grid(num_particles)[1], 1.0)
     counts, spares = [num_particles * x for x in expected], (spare**0.5, spare, spare, spare)
     pairs, near, contacts, members = (
         int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
