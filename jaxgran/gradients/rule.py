@@ -229,28 +229,26 @@ def first_order_only(inputs: T) -> T:
     Raises:
         ValueError: if a derivative in these inputs is taken.
     """
-    # Concrete values stay concrete, for runs that the host drives.
-    numbers, others = eqx.partition(
-        inputs, lambda leaf: isinstance(leaf, Tracer) and eqx.is_inexact_array(leaf)
-    )
-    return eqx.combine(_first_order_identity(numbers), others)
+
+    def refuse(leaf: Any) -> Any:  # concrete values stay concrete, for runs that the host drives
+        traced = isinstance(leaf, Tracer) and eqx.is_inexact_array(leaf)
+        return _first_order_identity(leaf) if traced else leaf
+
+    return jax.tree.map(refuse, inputs)
 
 
 @jax.custom_jvp
-def _first_order_identity(numbers: Any) -> Any:
-    return numbers
+def _first_order_identity(number: Array) -> Array:
+    return number
 
 
-@partial(_first_order_identity.defjvp, symbolic_zeros=True)
+@_first_order_identity.defjvp
 def _first_order_identity_jvp(primals, tangents):
-    (numbers,), (along,) = primals, tangents
-    if _changes(along):
-        raise ValueError(
-            "no second derivative is available through a particle model. Take the difference of "
-            "two first derivatives (jax.grad, jax.jvp or jax.jacfwd at two values of the "
-            "parameter, with the same key), or use KineticTheory, which has second derivatives"
-        )
-    return numbers, jax.tree.map(jnp.zeros_like, numbers)
+    raise ValueError(
+        "no second derivative is available through a particle model. Take the difference of two "
+        "first derivatives (jax.grad, jax.jvp or jax.jacfwd at two values of the parameter, with "
+        "the same key), or use KineticTheory, which has second derivatives"
+    )
 
 
 def nan_tangent(result: Array, *changes: Float[Array, "..."]) -> Any:
@@ -290,8 +288,8 @@ def by_differences(
 
     Args:
         run: a function of inputs and `directions`, which returns the derivatives in time even for
-            zero directions. The scene of its inputs has a `material`, `with_material`, and
-            `log_loss` of a material.
+            zero directions. The scene of its inputs is a named tuple with a `material`,
+            and has `log_loss` of a material.
         shifted: a function of inputs, for the further runs.
         step: h.
     """
@@ -325,7 +323,7 @@ def by_differences(
         share = jnp.where(slope == 0, 0.0, slope / jnp.where(span == 0, jnp.nan, span))
 
         def run_at(material: Any) -> tuple[dict[str, Array], Array]:
-            other = shifted(inputs._replace(scene=scene.with_material(material)))
+            other = shifted(inputs._replace(scene=scene._replace(material=material)))
             return other.records, other.status
 
         out = run(inputs, directions=none)

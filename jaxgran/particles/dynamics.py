@@ -189,11 +189,6 @@ def initial_progress(state: State, pairs: Pairs, capacity: Capacity, internal: A
     return Progress(state, jnp.zeros((), bool), capacity.exceeded_by(needed), needed, internal)
 
 
-def accept_if(good: Array, new: State, old: State) -> State:
-    """Return the new state if a block succeeded, and the old one otherwise."""
-    return jax.tree.map(lambda new, old: jnp.where(good, new, old), new, old)
-
-
 def repeat_until(
     end: ArrayLike, block: Callable[[Progress], Progress], first: Progress
 ) -> Progress:

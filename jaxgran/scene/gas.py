@@ -658,10 +658,6 @@ class SphereScene(NamedTuple):
         """`ReducedDrag` in the unit of time of the scene; None without drag."""
         return jax.tree.map(lambda rate: rate * self.collision_frequency, self.material.drag)
 
-    def with_material(self, material: ReducedScene) -> "SphereScene":
-        """Return this scene with other numbers of its material."""
-        return self._replace(material=material)
-
     def log_loss(self, material: ReducedScene) -> Float[Array, ""]:
         """Return ln of an impact's loss up to a constant.
 

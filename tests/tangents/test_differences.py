@@ -19,16 +19,8 @@ TIMES = jnp.array([0.0, 1e-3, 0.3, 2.0, 50.0])
 class Haff(NamedTuple):
     """A gas that cools as viscoelastic spheres do, by Haff's law, of the material (alpha, A)."""
 
-    alpha: jax.Array
-    constant: jax.Array
+    material: tuple
     collision_frequency: jax.Array = jnp.ones(())
-
-    @property
-    def material(self):
-        return self.alpha, self.constant
-
-    def with_material(self, material):
-        return self._replace(alpha=material[0], constant=material[1])
 
     def log_loss(self, material):
         return 0.4 * jnp.log(material[0]) + jnp.log(material[1])
@@ -43,7 +35,7 @@ def run(inputs: Inputs, directions=None) -> Outputs:
 
     def at(t):
         T = temperature(*inputs.scene.material, t) * jnp.ones(2)
-        records = {"temperature": T, "collisions": jnp.log1p(inputs.scene.constant * t) * T**0}
+        records = {"temperature": T, "collisions": jnp.log1p(inputs.scene.material[1] * t) * T**0}
         if directions is None:
             return records
         p = len(directions[0])
@@ -59,7 +51,7 @@ def of_haff(step):
     rule = differentiable(by_differences(run, run, step), lambda scene: scene.material)
 
     def records(numbers, times=TIMES):
-        return rule(Inputs(Haff(*numbers), times, None, None)).records
+        return rule(Inputs(Haff(tuple(numbers)), times, None, None)).records
 
     return records
 
@@ -102,7 +94,7 @@ def test_a_fault_of_any_run_is_one_of_the_derivative():
         return run(inputs)._replace(status=jnp.asarray(4, jnp.int32))
 
     found = by_differences(run, failing, 0.3)
-    inputs = Inputs(Haff(*AT), TIMES, None, None)
+    inputs = Inputs(Haff(tuple(AT)), TIMES, None, None)
     assert int(found(inputs, (jnp.ones(1), jnp.zeros(1))).status) == 4
     assert int(found(inputs).status) == 0
 

@@ -22,7 +22,6 @@ from jaxgran.particles.dynamics import (
     FATAL,
     AbstractDynamics,
     Progress,
-    accept_if,
     initial_progress,
     repeat_until,
 )
@@ -128,7 +127,7 @@ class HardDynamics(AbstractDynamics):
     def elastic(self) -> "HardDynamics":
         material = self.scene.material
         drag, drive = jax.tree.map(lambda x: 0 * x, (material.drag, material.drive))
-        scene = self.scene.with_material(material._replace(drag=drag, drive=drive))
+        scene = self.scene._replace(material=material._replace(drag=drag, drive=drive))
         return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
 
     def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
@@ -227,7 +226,7 @@ class HardDynamics(AbstractDynamics):
         invalid = self.invalid_block(new, candidates.needed)
         fault = jnp.where(invalid > 0, invalid, fault)
         accepted, repeat = (fault == status.OK) & ~too_fast, too_fast & (invalid == 0)
-        state = accept_if(accepted, new, old)
+        state = jax.tree.map(partial(jnp.where, accepted), new, old)
         next_duration = jnp.minimum(state.internal.window, time_left(state, end))
         next_position = state.position + state.velocity * next_duration
         next_distance2 = jnp.max(jnp.sum((next_position - listed) ** 2, -1))
@@ -404,7 +403,7 @@ class HardDynamics(AbstractDynamics):
         if scene.material.drive is not None:
 
             def heating(material: ReducedScene) -> Array:
-                changed, start = scene.with_material(material), old.time + old.time_rest
+                changed, start = scene._replace(material=material), old.time + old.time_rest
                 first, second = (drive_variance(changed, start, duration, k) for k in (0.0, 1.0))
                 return n * d / 2 * (first + second)
 

@@ -130,7 +130,7 @@ def exchange_gains(
             speed=impact.speed * factor,
             spin=None if impact.spin is None else impact.spin * jnp.exp(spin),
         )
-        _, lost, _, gain = impact_effect(scene.with_material(material), scaled, axis)
+        _, lost, _, gain = impact_effect(scene._replace(material=material), scaled, axis)
         gain = jnp.zeros_like(lost) if gain is None else gain
         return jnp.where(happens, jnp.stack([-lost, gain]), 0.0)
 

@@ -28,7 +28,6 @@ from jaxgran.particles.dynamics import (
     FATAL,
     AbstractDynamics,
     Progress,
-    accept_if,
     initial_progress,
     repeat_until,
 )
@@ -144,7 +143,7 @@ class SoftDynamics(AbstractDynamics):
         drag = jax.tree.map(lambda x: 0.0 * x, material.drag)
         walls = material.walls and material.walls._replace(surface=None)
         material = material._replace(surface=None, walls=walls, drag=drag)
-        return dataclasses.replace(self, scene=self.scene.with_material(material))
+        return dataclasses.replace(self, scene=self.scene._replace(material=material))
 
     def with_tangents(self, state: State, directions: ReducedScene) -> State:
         spin, surface, along = state.internal.spin, self.scene.material.surface, directions.surface
@@ -242,7 +241,7 @@ class SoftDynamics(AbstractDynamics):
         accepted = (fault == status.OK) & ~repeat
         enlarged = jnp.where(too_far, 2 * internal.reach_factor, internal.reach_factor)
         return Progress(
-            state=accept_if(accepted, new, old),
+            state=jax.tree.map(partial(jnp.where, accepted), new, old),
             stale=accepted & (displacement + 2 * speed * duration > 0.5 * old.skin),
             status=fault,
             needed=jnp.maximum(now.needed, candidates.needed),

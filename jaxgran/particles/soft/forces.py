@@ -99,7 +99,7 @@ def fly(
     x, v, spin = spheres
     if material.drag is None:
         return Spheres(x + v * duration, v, spin), None
-    rate, spin_rate = scene.with_material(material).drag_rates
+    rate, spin_rate = scene._replace(material=material).drag_rates
 
     def decayed(vectors: Array, rate: Array) -> tuple[Array, Array]:
         """Return vectors after the flight, and the loss of half their square."""
