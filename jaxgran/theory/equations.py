@@ -668,9 +668,6 @@ def crowding_coefficient(gas: Gas) -> Float[Array, ""]:
 MAX_LOG_TEMPERATURE = 60.0
 """Largest |ln T/T_0| of a steady state."""
 
-_NEWTON_STEPS = 8
-"""Newton steps to a steady T_rot/T of spheres that slide, exact to rounding."""
-
 
 class SteadyState(NamedTuple):
     """Steady state of a driven gas.
@@ -733,35 +730,26 @@ def _solve_steady(gas: Gas) -> tuple[Array, Array, Array, Array]:
     def balance(x: Array, scene: ReducedScene) -> Array:
         return _steady_rates(x, scene, density, d) / jnp.exp(x[0] / 2)
 
-    guess = _balance_log_temperature(scene, gas.temperature, d)
-    start = [guess, jnp.zeros_like(guess), jnp.zeros_like(guess)]
-    if scene.surface is not None:
-        start += Spins.gaussian(_gaussian_ratio(jnp.exp(guess / 2), scene, d))
-    start = jnp.stack(start)
+    start = _at_rest(_balance_log_temperature(scene, gas.temperature, d), scene)
     tolerance = jnp.finfo(start.dtype).eps ** 0.75
     solver = optx.Newton(rtol=float(tolerance), atol=float(tolerance))
     x = optx.root_find(balance, solver, start, scene, throw=False, max_steps=32).value
     heating = scene.drive / jnp.exp(1.5 * x[0])
     imbalance = jnp.abs(balance(x, scene)[0]) / heating
-    ratio = jnp.zeros_like(guess) if scene.surface is None else x[3]
+    ratio = jnp.zeros_like(x[0]) if scene.surface is None else x[3]
     return x[0], x[1], ratio, imbalance
 
 
 def _balance_log_temperature(scene: ReducedScene, like: Array, d: int) -> Float[Array, ""]:
     """ln T/T_0 at which Maxwellian losses balance a drive, within +- `MAX_LOG_TEMPERATURE`.
 
+    Spins are at rest: impacts of rough spheres then take most, and the temperature is too low.
     Softness is left out: its first order has no meaning in a gas that is far too hot.
     """
 
     def bisect(_, ends):
         middle = (ends[0] + ends[1]) / 2
-        speed, zero = jnp.exp(middle / 2), jnp.zeros_like(middle)
-        moments = [middle, zero, zero, zero, jnp.full_like(middle, jnp.inf)]
-        if scene.surface is not None:
-            moments.append(_gaussian_ratio(speed, scene, d))
-        equations = Equations(d, 2, maxwellian=True, gaussian_spins=True)
-        rates = impact_moments(scene.law, speed, d, 2)
-        heats = equations.derivative(jnp.stack(moments), rates, (scene, Density()))[0] > 0
+        heats = _steady_rates(_at_rest(middle, scene), scene, Density(), d)[0] > 0
         return jnp.where(heats, middle, ends[0]), jnp.where(heats, ends[1], middle)
 
     bound = jnp.full((), MAX_LOG_TEMPERATURE, like.dtype)
@@ -780,6 +768,11 @@ def max_thermal_speed(gas: Gas) -> Float[Array, ""]:
     )
 
 
+def _at_rest(log_theta: Array, scene: ReducedScene) -> Float[Array, "variables"]:
+    """Variables of `_steady_rates` of a Maxwellian gas without spins."""
+    return jnp.zeros(3 if scene.surface is None else 6, log_theta.dtype).at[0].set(log_theta)
+
+
 def _steady_rates(
     x: Float[Array, "variables"], scene: ReducedScene, density: Density, d: int
 ) -> Float[Array, "variables"]:
@@ -790,24 +783,3 @@ def _steady_rates(
     change = Equations(d, 3, maxwellian=False).derivative(moments, rates, (scene, density))
     # Spins of smooth spheres, beta_t = -1, do not change: they are 0.
     return jnp.concatenate([change[:2], change[5:6], change[7:] - 1e-30 * x[3:]])
-
-
-def _gaussian_ratio(speed: Array, scene: ReducedScene, d: int) -> Array:
-    """T_rot/T at which that of Gaussian spins is steady, linear in it without friction."""
-
-    def step(ratio, _):
-        gain, slope = jax.jvp(
-            lambda r: (
-                element_rates(
-                    scene, speed, Spins.gaussian(r), jnp.zeros_like(r), d, gaussian_spins=True
-                ).spins.rotation
-            ),
-            (ratio,),
-            (jnp.ones_like(ratio),),
-        )
-        # Without a slope, at beta_t = -1, nothing turns the spheres.
-        return jnp.where(slope < 0, ratio - gain / jnp.where(slope < 0, slope, -1.0), 0.0), None
-
-    assert scene.surface is not None
-    steps = 1 if scene.surface.friction is None else _NEWTON_STEPS
-    return jax.lax.scan(step, jnp.zeros_like(speed), length=steps)[0]
