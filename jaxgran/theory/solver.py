@@ -12,7 +12,7 @@ one of them changes.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import jax
@@ -39,19 +39,6 @@ def padded_length(size: int) -> int:
     Output times are padded to it, so that few lengths are compiled.
     """
     return WINDOW * 2 ** max(0, (size - 1) // WINDOW).bit_length()
-
-
-class _Progress(NamedTuple):
-    # The next step, the state before it, the states of solver and controller, the values at output
-    # times, how many of these are known, and the number of steps made.
-    t: Float[Array, ""]
-    end: Float[Array, ""]
-    y: Array
-    solver: Any
-    control: Any
-    values: Array
-    known: Int[Array, ""]
-    steps: Int[Array, ""]
 
 
 def _fill_values(
@@ -140,33 +127,37 @@ def integrate_at(
     solver_state, control = jax.tree.map(jnp.asarray, (solver_state, control))
     values = jnp.broadcast_to(start, (times.size, *start.shape))
     none = jnp.zeros((), int)
-    progress = _Progress(zero, end, start, solver_state, control, values, none, none)
+    # The state before the next step, the output values, how many of these are known, the number of
+    # steps made, the end of the next step, and the states of the solver and the controller.
+    first_step = zero, start, values, none, none, end, solver_state, control
 
-    def unfinished(at: _Progress) -> Array:
-        return (at.t < last) & (at.steps < max_steps)
+    def unfinished(now: tuple) -> Array:
+        t, _, _, _, steps, *_ = now
+        return (t < last) & (steps < max_steps)
 
-    def step(at: _Progress) -> _Progress:
-        y, error, dense, solver_state, _ = solver.step(
-            term, at.t, at.end, at.y, None, at.solver, False
+    def step(now: tuple) -> tuple:
+        begin, y, values, known, steps, end, solver_state, control = now
+        new_y, error, dense, new_solver_state, _ = solver.step(
+            term, begin, end, y, None, solver_state, False
         )
         # An infinite error makes the controller repeat the step with a shorter one.
         error = jnp.where(jnp.isnan(error), jnp.inf, error)
-        accepted, t, end, _, control, _ = controller.adapt_step_size(
-            at.t, at.end, at.y, y, None, error, order, at.control
+        accepted, t, next_end, _, control, _ = controller.adapt_step_size(
+            begin, end, y, new_y, None, error, order, control
         )
-        piece = solver.interpolation_cls(t0=at.t, t1=at.end, **dense)
-        reached = jnp.where(accepted, at.end, -1.0)
-        values, known = _fill_values(piece.evaluate, times, reached, at.values, at.known)
+        piece = solver.interpolation_cls(t0=begin, t1=end, **dense)
+        reached = jnp.where(accepted, end, -1.0)
+        values, known = _fill_values(piece.evaluate, times, reached, values, known)
         y, solver_state = jax.tree.map(
-            lambda new, old: jnp.where(accepted, new, old), (y, solver_state), (at.y, at.solver)
+            partial(jnp.where, accepted), (new_y, new_solver_state), (y, solver_state)
         )
         # Avoid a very short last step.
-        end = jnp.where(end > last - 1e-3 * (end - t), last, end)
+        next_end = jnp.where(next_end > last - 1e-3 * (next_end - t), last, next_end)
         control = jax.tree.map(jnp.asarray, control)
-        return _Progress(jnp.asarray(t), end, y, solver_state, control, values, known, at.steps + 1)
+        return jnp.asarray(t), y, values, known, steps + 1, next_end, solver_state, control
 
-    done = jax.lax.while_loop(unfinished, step, progress)
-    return done.values, done.t >= last
+    t, _, values, *_ = jax.lax.while_loop(unfinished, step, first_step)
+    return values, t >= last
 
 
 def moments_at(
