@@ -436,11 +436,6 @@ def _wall_rates(
     between spheres, with half the eta of a wall. Walls reverse velocities: displacements are not
     those of a free gas.
     """
-    eta: Any = None
-    if surface is None or walls.surface is None:
-        surface = None
-    else:
-        eta = surface.eta_on_wall(walls.surface) / 2
 
     def axis_rates(frequency: Array) -> ElementRates:
         def share(g: Array) -> Array:
@@ -464,8 +459,9 @@ def _wall_rates(
         )
         cooling = squares / d
         a2_rate = 2 * (1 + sonine) * cooling - fourths / (d * (d + 2))
-        if surface is None:
+        if surface is None or walls.surface is None:
             return ElementRates(cooling, sonine=a2_rate)
+        eta = surface.eta_on_wall(walls.surface) / 2
         kick = mean_kick(walls.law, speed / sqrt(2))
         changes = rough_impact_rates(surface, eta, kick, spins, sonine, d, gaussian=True)
         impacts = 2 * frequency * impact_average(share, speed)
