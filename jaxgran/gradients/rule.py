@@ -340,10 +340,7 @@ def by_differences(
                 change = _record_difference(name, records[name][None], upper, lower)
                 change = jnp.where(share[:, None, None] == 0, 0.0, share[:, None, None] * change)
                 records[f"{name}.along"] = jnp.moveaxis(change, 0, 1)
-        fault = out.status
-        for shifted_status in status:
-            fault |= shifted_status
-        return out._replace(records=records, status=fault)
+        return out._replace(records=records, status=out.status | jnp.bitwise_or.reduce(status))
 
     return outputs
 
