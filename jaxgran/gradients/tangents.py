@@ -230,9 +230,7 @@ class PathTangents(NamedTuple):
     @property
     def log_displacement(self) -> Float[Array, "p replicas"]:
         """Tangents of ``ln R``; 0 at t = 0."""
-        known = self.displacement > 0
-        safe = jnp.where(known, self.displacement, 1.0)
-        return jnp.where(known[None], self.displacement_along / safe[None], 0.0)
+        return ratio_or_zero(self.displacement_along, self.displacement[None])
 
 
 def component_along(

@@ -318,9 +318,7 @@ def initial_spins(
     n, d = velocity.shape
     key = jax.random.fold_in(key, 2)  # 0 and 1 are used for positions and velocities
     shape = replicas, n // replicas, NUM_SPIN_COMPONENTS[d]
-    return maxwellian_spins(key, shape, mean_square.astype(velocity.dtype)).reshape(
-        n, NUM_SPIN_COMPONENTS[d]
-    )
+    return maxwellian_spins(key, shape, mean_square.astype(velocity.dtype)).reshape(n, shape[-1])
 
 
 def surface_direction(
