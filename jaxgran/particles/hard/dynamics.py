@@ -305,13 +305,12 @@ class HardDynamics(AbstractDynamics):
             velocity=to_members(state.velocity, paths.v),
             dissipated=state.dissipated + lost,
             collisions=state.collisions + impacts,
-            internal=HardState(
+            internal=internal._replace(
                 age=to_members(internal.age + duration, duration - paths.last),
                 regularised=regularised,
                 window=jnp.where(full_length, duration * ratio, internal.window),
                 spin=None if internal.spin is None else to_members(internal.spin, paths.spin),
                 rotational_gain=rotational_gain,
-                key=internal.key,
             ),
         )
         if state.tangents is None:
@@ -376,8 +375,11 @@ class HardDynamics(AbstractDynamics):
         lost = _sum_by_replica(work.dissipated, candidates, replicas)
         impacts = _sum_by_replica(work.impacts, candidates, replicas)
         replica = candidates.replica
+        of_gains = replica[candidates.rows.a]
+        if scene.container is not None:
+            of_gains = jnp.concatenate([of_gains, replica])
         gains = jnp.zeros((*work.gains.shape[:-1], replicas), lost.dtype)
-        gains = gains.at[..., replica[candidates.rows.a]].add(work.gains, mode="drop")
+        gains = gains.at[..., of_gains].add(work.gains, mode="drop")
         if isinstance(tangents, ImpactTangents):
             T = temperature(new.velocity, replicas)
             energy, trend = 0.5 * d * n * T, cooling_trend(scene.material.law, T, d)
@@ -398,8 +400,6 @@ class HardDynamics(AbstractDynamics):
             spins = jnp.sum(old.internal.spin.reshape(replicas, -1) ** 2, axis=1)
             before = before.at[1].set(scene.material.surface.inertia / 2 * spins)
             gained = gained.at[1].set(_sum_by_replica(work.rotational_gain, candidates, replicas))
-        if scene.container is not None:
-            gains = gains.at[..., replica].add(work.wall_gains, mode="drop")
         if scene.material.drive is not None:
 
             def heating(material: ReducedScene) -> Array:

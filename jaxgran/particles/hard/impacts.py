@@ -161,9 +161,9 @@ class ImpactWork(NamedTuple):
         max_speed2: largest squared speed of each particle.
         pending: whether the last round executed an impact.
         num_rounds: number of rounds.
-        gains: tangents of the energy gained in impacts of pairs, along directions in the material,
-            see `ImpactTangents` and `exchange_gains`; without tangents, no rows.
-        wall_gains: the corresponding tangents of impacts on walls.
+        gains: tangents of the energy gained in impacts of pairs, and of slots on walls if there are
+            walls, along directions in the material, see `ImpactTangents` and `exchange_gains`;
+            without tangents, no changes.
     """
 
     paths: Paths
@@ -177,7 +177,6 @@ class ImpactWork(NamedTuple):
     pending: Bool[Array, ""]
     num_rounds: Int[Array, ""]
     gains: Float[Array, "changes *energies rows"]
-    wall_gains: Float[Array, "wallchanges 2 slots"]
 
 
 def execute_impacts(
@@ -245,7 +244,8 @@ def execute_impacts(
         effect = impact_effect(scene, events)
         gains = work.gains
         if isinstance(tangents, ExchangeTangents):  # each of two loses half of the energy
-            gains = gains + 2 * exchange_gains(scene, tangents, events, executable)
+            more = 2 * exchange_gains(scene, tangents, events, executable)
+            gains = gains.at[..., :num_rows].add(more)
         elif tangents is not None:  # the law's unit of speed is sqrt(2)
             more = 2 * tangents.gains(scene.material.law, events.speed * 0.5**0.5)
             gains = gains + jnp.where((executable & ~too_soon & ~all_elastic)[None], more, 0.0)
@@ -258,7 +258,7 @@ def execute_impacts(
         effect = effect._replace(kick=sign[:, None] * effect.kick)
         s, too_soon = jnp.where(hit, s[row], 0.0), too_soon[row]
         x = paths.x - effect.kick * s[:, None]
-        impacts, wall_impacts, wall_gains = work.impacts + hit, work.wall_impacts, work.wall_gains
+        impacts, wall_impacts = work.impacts + hit, work.wall_impacts
         regularised = work.regularised + (hit & too_soon)
         wall_times, axis = next_impacts.wall_times, next_impacts.wall_axis
         if wall_times is not None and axis is not None and wall_impacts is not None:
@@ -275,7 +275,8 @@ def execute_impacts(
             )
             on_wall = impact_effect(scene, events, axis)
             if isinstance(tangents, ExchangeTangents):
-                wall_gains = wall_gains + exchange_gains(scene, tangents, events, at_wall, axis)
+                more = exchange_gains(scene, tangents, events, at_wall, axis)
+                gains = gains.at[..., num_rows:].add(more)
             effect = jax.tree.map(partial(_where_rows, at_wall), on_wall, effect)
             s, hit = jnp.where(at_wall, wall_s, s), hit | at_wall
             after = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
@@ -301,20 +302,18 @@ def execute_impacts(
             pending=jnp.any(hit),
             num_rounds=work.num_rounds + 1,
             gains=gains,
-            wall_gains=wall_gains,
         )
 
     def unfinished(work: ImpactWork):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
     counts, zeros = jnp.zeros_like(slots), jnp.zeros(len(slots), paths.x.dtype)
-    shape, wall_shape = (0, num_rows), (0, 2, len(slots))
+    shape = 0, num_rows
     if isinstance(tangents, ImpactTangents):
         shape = len(tangents.log_temperature) + 1, num_rows
     elif tangents is not None:
-        num_changes = len(tangents.energies) + 2
-        shape = num_changes, 2, num_rows
-        wall_shape = (0 if scene.container is None else num_changes), 2, len(slots)
+        num_walls = 0 if scene.container is None else len(slots)
+        shape = len(tangents.energies) + 2, 2, num_rows + num_walls
     work = ImpactWork(
         paths=paths,
         dissipated=zeros,
@@ -327,7 +326,6 @@ def execute_impacts(
         pending=jnp.array(True),
         num_rounds=jnp.int32(0),
         gains=jnp.zeros(shape, zeros.dtype),
-        wall_gains=jnp.zeros(wall_shape, zeros.dtype),
     )
     return jax.lax.while_loop(unfinished, one_round, work)
 
