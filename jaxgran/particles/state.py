@@ -339,20 +339,6 @@ def torque(
     return jnp.cross(normal, force)
 
 
-class TangentialImpulse(NamedTuple):
-    """Tangential part of impacts.
-
-    Attributes:
-        sideways: tangential part of the relative velocity of the centres.
-        kick: velocity change of the first partner.
-        spin_change: spin change, the same for both partners.
-    """
-
-    sideways: Float[Array, "pairs d"]
-    kick: Float[Array, "pairs d"]
-    spin_change: Float[Array, "pairs spins"]
-
-
 def tangential_impulse(
     relative: Float[Array, "pairs d"],
     spin: Float[Array, "pairs spins"],
@@ -361,7 +347,7 @@ def tangential_impulse(
     eta: Float[Array, ""],
     surface: ReducedRough,
     normal_kick: Float[Array, "pairs"],
-) -> TangentialImpulse:
+) -> tuple[Float[Array, "pairs d"], Float[Array, "pairs d"], Float[Array, "pairs spins"]]:
     """Return the tangential part of impacts, ``-eta`` times the slip: see `jaxgran.Rough`.
 
     Args:
@@ -372,6 +358,10 @@ def tangential_impulse(
         eta: share of the slip that becomes the kick of spheres that stick.
         surface: of the spheres.
         normal_kick: size of the normal part of the velocity change of the first partner.
+
+    Returns:
+        The tangential part of the relative velocity of the centres, the velocity change of the
+        first partner, and the spin change, the same for both partners.
     """
     sideways = relative - jnp.sum(relative * normal, axis=-1, keepdims=True) * normal
     slip = jnp.where(where[:, None], sideways + surface_direction(spin, normal), 0.0)
@@ -380,4 +370,4 @@ def tangential_impulse(
         square = jnp.sum(kick**2, axis=-1)
         length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
         kick = kick * jnp.minimum(surface.friction * normal_kick / length, 1.0)[:, None]
-    return TangentialImpulse(sideways, kick, torque(normal, kick) / surface.inertia)
+    return sideways, kick, torque(normal, kick) / surface.inertia

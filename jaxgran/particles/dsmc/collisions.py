@@ -267,9 +267,10 @@ def collide(
     if (surface := scene.surface) is None:
         return outcome
     normal = jnp.stack(normal, axis=-1)
-    tangential = tangential_impulse(relative, spin, normal, hit, surface.eta, surface, push)
-    kick, spin_change = tangential.kick, tangential.spin_change
-    loss = -2 * jnp.sum(kick * (tangential.sideways + kick))  # of translation alone
+    across, kick, spin_change = tangential_impulse(
+        relative, spin, normal, hit, surface.eta, surface, push
+    )
+    loss = -2 * jnp.sum(kick * (across + kick))  # of translation alone
     return outcome._replace(
         kick=outcome.kick + kick,
         loss=outcome.loss + loss,
@@ -647,10 +648,10 @@ class DSMCDynamics(eqx.Module):
                 kick, spin_change = -push[:, None] * outwards, jnp.zeros_like(spin)
                 if surface is not None and walls.surface is not None:
                     eta = surface.eta_on_wall(walls.surface)
-                    tangential = tangential_impulse(
+                    _, rub, spin_change = tangential_impulse(
                         velocity, spin, outwards, hits, eta, surface, push
                     )
-                    kick, spin_change = kick + tangential.kick, tangential.spin_change
+                    kick = kick + rub
                 # The number of impacts is not differentiable, so weights of value 1 carry its
                 # derivative.
                 weight = frequency * ratio

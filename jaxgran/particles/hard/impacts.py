@@ -92,12 +92,12 @@ def impact_effect(
             spin_factor = 1.0 if decay is None else decay.spin[:, None]
             spin = impact.spin * spin_factor
             push = -jnp.sum(kick * impact.normal, -1)
-            impulse = tangential_impulse(
+            sideways, rub, turn = tangential_impulse(
                 impact.relative, spin, impact.normal, ~impact.elastic, eta, surface, push
             )
-            with_half = impulse.sideways + 0.5 / share * impulse.kick
-            kick, lost = kick + impulse.kick, lost - share * jnp.sum(impulse.kick * with_half, -1)
-            spin_change = impulse.spin_change / spin_factor
+            with_half = sideways + 0.5 / share * rub
+            kick, lost = kick + rub, lost - share * jnp.sum(rub * with_half, -1)
+            spin_change = turn / spin_factor
             doubled = impact.spin * 2 * share + spin_change
             rotational_gain = surface.inertia / 2 * jnp.sum(spin_change * doubled, -1)
     if axis is not None:
