@@ -341,8 +341,9 @@ class ContactTangents(NamedTuple):
         c, free = self.log_temperature, self.free[:, None]
         replicas, d = c.shape[1], velocity.shape[1]
         gain = 2 * component_along(self.velocity, jnp.where(free, velocity, 0.0), replicas)
-        squares = velocity.reshape(replicas, -1) ** 2
-        temperature = jnp.mean(squares, -1)
+        temperature = jnp.mean(velocity.reshape(replicas, -1) ** 2, -1)
+        per_time = self.rates.collision(jnp.ones_like(temperature))
+        zeta = ratio_or_zero(cooling, jnp.sqrt(temperature))
         size = len(velocity) // replicas
 
         def of_particles(values: Float[Array, "p replicas"]) -> Float[Array, "p n 1"]:
@@ -361,13 +362,7 @@ class ContactTangents(NamedTuple):
             velocity=jnp.where(free[None], 0.0, rest),
             elapsed=jnp.zeros_like(self.elapsed),
             thermal_elapsed=jnp.zeros_like(self.thermal_elapsed),
-            paths=self.paths.after_impacts(
-                self.thermal_elapsed,
-                gain,
-                collision_rate=self.rates.collision(jnp.ones_like(temperature)),
-                cooling=ratio_or_zero(cooling, jnp.sqrt(temperature)),
-                dimension=d,
-            ),
+            paths=self.paths.after_impacts(self.thermal_elapsed, gain, per_time, zeta, d),
             spin=spin_tangent,
         )
 
@@ -439,19 +434,11 @@ class ImpactTangents(NamedTuple):
         half = gains[-1:] / (4 * energy[None])
         new = ((1 + half) * c + gains[:-1] / energy[None]) / (1 - half)
         speed = jnp.sqrt(temperature)
-        paths = self.paths.after_impacts(
-            speed * duration,
-            new - c,
-            collision_rate=rates.collision(jnp.ones_like(speed)),
-            cooling=rates.cooling(trend) / jnp.where(speed > 0, speed, 1.0),
-            dimension=dimension,
-        )
-        return self._replace(
-            log_temperature=new,
-            clock=self.clock - 0.25 * (c + new) * duration,
-            rates=rates,
-            paths=paths,
-        )
+        per_time = rates.collision(jnp.ones_like(speed))
+        zeta = rates.cooling(trend) / jnp.where(speed > 0, speed, 1.0)
+        paths = self.paths.after_impacts(speed * duration, new - c, per_time, zeta, dimension)
+        clock = self.clock - 0.25 * (c + new) * duration
+        return self._replace(log_temperature=new, clock=clock, rates=rates, paths=paths)
 
 
 class ExchangeTangents(NamedTuple):

@@ -384,13 +384,7 @@ class HardDynamics(AbstractDynamics):
             T = temperature(new.velocity, replicas)
             energy, trend = 0.5 * d * n * T, cooling_trend(scene.material.law, T, d)
             rates = tangents.rates.after(
-                lost=lost,
-                collisions=impacts / n,
-                energy=energy,
-                temperature=T,
-                trend=trend,
-                duration=duration,
-                collision_frequency=scene.collision_frequency,
+                lost, impacts / n, energy, T, trend, duration, scene.collision_frequency
             )
             return tangents.after(gains, energy + 0.5 * lost, T, duration, rates, trend, d)
         zero = jnp.zeros(replicas)

@@ -463,15 +463,11 @@ class SoftDynamics(AbstractDynamics):
             passed = duration * jnp.sqrt(T) * scene.collision_frequency
             ratio = ratio_or_zero(rotational_temperature(scene, spin, replicas), T)
             gain_ratio = gain_ratio.after(passed, gain, energy * passed, ratio)
+        collisions, trend = 2 * replicas / len(new.position) * begun, cooling_trend(scene, T)
+        stored, frequency = new.internal.elastic, scene.collision_frequency
         tangents = tangents._replace(
             rates=tangents.rates.after(
-                lost=lost,
-                collisions=2 * replicas / len(new.position) * begun,
-                energy=energy + new.internal.elastic,
-                temperature=T,
-                trend=cooling_trend(scene, T),
-                duration=duration,
-                collision_frequency=scene.collision_frequency,
+                lost, collisions, energy + stored, T, trend, duration, frequency
             ),
             elapsed=tangents.elapsed + duration,
             thermal_elapsed=tangents.thermal_elapsed + duration * jnp.sqrt(T),
