@@ -463,26 +463,15 @@ def compiled_for_host(
     That state must come from `copy_buffers` or from an earlier call. If the program runs for a
     `short` time, it is compiled in three fifths of the time, and runs 5 to 40 % slower.
     """
+    options = fast_compilation(jax.default_backend()) if short else {}
+    if jax.default_backend() == "cpu" and jax.local_device_count() > 1:
+        # Runs go on side by side, one on each device. XLA would divide the operations of each run
+        # among threads of all cores, which then wait for each other: two replicas of DSMC would
+        # take 15 to 20 % longer. With one device this changes the time of a run by less than 6 %.
+        options = options | {"xla_cpu_multi_thread_eigen": False}
     return jax.jit(
-        function,
-        static_argnames=static,
-        donate_argnames="state",
-        compiler_options=(fast_compilation(jax.default_backend()) if short else {})
-        | cpu_compiler_options(),
+        function, static_argnames=static, donate_argnames="state", compiler_options=options
     )
-
-
-def cpu_compiler_options() -> dict[str, Any]:
-    """Return compiler options for a program that the host calls.
-
-    With several CPU devices runs go on side by side, one on each. XLA would divide the operations
-    of each run among threads of all cores, which then wait for each other: two replicas of DSMC
-    would take 15 to 20 % longer. The program of each device takes one core instead. For one device
-    there are no options: they change the time of a single run by less than 6 %.
-    """
-    if jax.default_backend() != "cpu" or jax.local_device_count() == 1:
-        return {}
-    return {"xla_cpu_multi_thread_eigen": False}
 
 
 _COMPILED: set[Hashable] = set()
