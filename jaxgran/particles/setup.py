@@ -17,7 +17,6 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, array_module, concrete_array
 from jaxgran.data.curve import Particles, UserParticles
 from jaxgran.particles import neighbours
-from jaxgran.particles.neighbours import Pairs
 from jaxgran.particles.snapshot import box_side
 from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
@@ -189,22 +188,6 @@ def relaxed_positions(
     points = uniform_points(key, replicas * num_particles, dimension)
     points = points * (jnp.asarray(side) if region is None else region[None])
 
-    def push(x: Array, pairs: Pairs, k: Array) -> tuple[Array, Array]:
-        """Return the positions after push k of all overlapping pairs, and whether there are any."""
-        separation = x[pairs.i] - x[pairs.j] - pairs.offset
-        square = jnp.sum(separation * separation, axis=1)
-        distance = jnp.sqrt(jnp.where(square > 0, square, COINCIDENT**2))
-        # Coincident points are separated along the first axis.
-        first_axis = jnp.zeros_like(separation).at[:, 0].set(COINCIDENT)
-        separation = jnp.where((square > 0)[:, None], separation, first_axis)
-        in_use = jnp.arange(capacity[0]) < pairs.count
-        close = in_use & (distance < 1 + GAP / 2)
-        random = jax.random.uniform(jax.random.fold_in(key, k), distance.shape, x.dtype)
-        target = 1 + GAP + max_extra_gap * random
-        push = jnp.where(close, 0.5 * (target - distance) / distance, 0.0)[:, None] * separation
-        x = x.at[pairs.i].add(push).at[pairs.j].add(-push)
-        return x if region is None else jnp.clip(x, 0.0, region[None]), jnp.any(close)
-
     def push_until_stale(carry: tuple[Array, Array, Array, Array]) -> tuple:
         """Build a neighbour list, and push until it is stale or no overlap is left."""
         x, num_pushes, overlap, fault = carry
@@ -219,9 +202,23 @@ def relaxed_positions(
 
         def push_all(carry: tuple) -> tuple:
             x, num_pushes, _, _ = carry
-            x, overlap = push(x, pairs, num_pushes)
+            separation = x[pairs.i] - x[pairs.j] - pairs.offset
+            square = jnp.sum(separation * separation, axis=1)
+            distance = jnp.sqrt(jnp.where(square > 0, square, COINCIDENT**2))
+            # Coincident points are separated along the first axis.
+            first_axis = jnp.zeros_like(separation).at[:, 0].set(COINCIDENT)
+            separation = jnp.where((square > 0)[:, None], separation, first_axis)
+            in_use = jnp.arange(capacity[0]) < pairs.count
+            close = in_use & (distance < 1 + GAP / 2)
+            key_of_push = jax.random.fold_in(key, num_pushes)
+            random = jax.random.uniform(key_of_push, distance.shape, x.dtype)
+            target = 1 + GAP + max_extra_gap * random
+            size = jnp.where(close, 0.5 * (target - distance) / distance, 0.0)
+            push = size[:, None] * separation
+            x = x.at[pairs.i].add(push).at[pairs.j].add(-push)
+            x = x if region is None else jnp.clip(x, 0.0, region[None])
             moved = jnp.sqrt(jnp.max(jnp.sum((x - built) ** 2, axis=1)))
-            return x, num_pushes + 1, overlap, 2 * moved > skin - 2 * GAP
+            return x, num_pushes + 1, jnp.any(close), 2 * moved > skin - 2 * GAP
 
         first = built, num_pushes, overlap, full
         x, num_pushes, overlap, _ = jax.lax.while_loop(unfinished, push_all, first)
