@@ -17,11 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from jaxgran._utils import status
 from jaxgran.gradients import rule
-from jaxgran.gradients.tangents import (
-    ContactTangents,
-    component_along,
-    ratio_or_zero,
-)
+from jaxgran.gradients.tangents import ContactTangents, component_along, ratio_or_zero
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.capacity import Capacity, max_skin
 from jaxgran.particles.dynamics import (
@@ -421,9 +417,8 @@ class SoftDynamics(AbstractDynamics):
             internal=state.internal._replace(elastic=stored, spin=spin),
         )
         if tangents is not None:
-            tangents = tangents._replace(free=~touching)
-            tangents = self._project_if_due(tangents, state, new, lost, begun, duration)
-            new = new._replace(tangents=tangents)
+            new = new._replace(tangents=tangents._replace(free=~touching))
+            new = new._replace(tangents=self._project_if_due(state, new, lost, begun, duration))
         return new, lost_with_drag, exchanged, unexpected, jnp.max(jnp.sum(moved**2, -1))
 
     def _energy(self, state: State) -> Float[Array, "replicas"]:
@@ -434,26 +429,19 @@ class SoftDynamics(AbstractDynamics):
         return energy + state.internal.elastic
 
     def _project_if_due(
-        self,
-        tangents: ContactTangents,
-        old: State,
-        new: State,
-        lost: Array,
-        begun: Array,
-        duration: Array,
+        self, old: State, new: State, lost: Array, begun: Array, duration: Array
     ) -> ContactTangents:
         """Return the tangents after a block, projected if a projection is due.
 
         `lost` and `begun` are the energy lost in contacts, and the number of those that began.
         """
-        scene, replicas = self.scene, self.replicas
+        scene, replicas, tangents = self.scene, self.replicas, new.tangents
         velocity = peculiar_velocity(scene, new.velocity, replicas)
         T, velocity = observables.temperature(velocity), velocity.reshape(new.velocity.shape)
         energy = kinetic_energy(velocity, replicas)
         spin, gain_ratio = new.internal.spin, tangents.rotational_gain
-        if (
-            spin is not None and gain_ratio is not None
-        ):  # in contacts rotation gained its change less that by drag
+        if spin is not None and gain_ratio is not None:
+            # In contacts rotation gained its change less that by drag.
             first, last = (kinetic_energy(s, replicas) for s in (old.internal.spin, spin))
             gain = last - first
             if (drag := scene.drag_rates) is not None:
