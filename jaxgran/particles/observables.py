@@ -80,9 +80,7 @@ def third_sonine(velocity: Float[Array, "... particles d"]) -> Float[Array, "...
 
 
 @jax.jit
-def mean_square_displacement(
-    displacement: Float[Array, "... particles d"],
-) -> Float[Array, "..."]:
+def mean_square_displacement(displacement: Float[Array, "... particles d"]) -> Float[Array, "..."]:
     """Return the mean square displacement ``<dr^2>``.
 
     Args:

@@ -28,12 +28,7 @@ from jaxgran._utils.validation import (
 )
 from jaxgran.scene import elements, laws
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
-from jaxgran.scene.geometry import (
-    CLOSE_PACKING,
-    contact_value,
-    impact_average,
-    sphere_surface,
-)
+from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, impact_average, sphere_surface
 from jaxgran.scene.parameters import ADVICE, FLOAT_UNITS, PREFIXES, domains_of, fields_of
 
 

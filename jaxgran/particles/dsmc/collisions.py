@@ -562,11 +562,7 @@ class DSMCDynamics(eqx.Module):
         return state._replace(particles=particles, temperature=state.temperature + grown)
 
     def _collide(
-        self,
-        state: DSMCState,
-        key: PRNGKeyArray,
-        dt: Float[Array, ""],
-        share: Float[Array, ""],
+        self, state: DSMCState, key: PRNGKeyArray, dt: Float[Array, ""], share: Float[Array, ""]
     ) -> tuple[Float[Array, "N components"], Outcome, tuple[CandidatePairs, CandidatePairs]]:
         """Return the particles after the collisions of a step, sums over them, and candidates."""
         d, first, second = self.scheme.dimension, self.scheme.first, self.scheme.second

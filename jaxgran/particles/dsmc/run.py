@@ -21,18 +21,8 @@ from jaxgran.data.curve import Particles, Run
 from jaxgran.gradients.rule import Inputs, Outputs, with_tangents
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import observables, snapshot
-from jaxgran.particles.dsmc.collisions import (
-    DSMCDynamics,
-    DSMCState,
-    DSMCTangents,
-    advance,
-)
-from jaxgran.particles.run import (
-    block_until_ready,
-    compiled_for_host,
-    compiling,
-    run_through_times,
-)
+from jaxgran.particles.dsmc.collisions import DSMCDynamics, DSMCState, DSMCTangents, advance
+from jaxgran.particles.run import block_until_ready, compiled_for_host, compiling, run_through_times
 from jaxgran.particles.setup import maxwellian_velocities
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import (

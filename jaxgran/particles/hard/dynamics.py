@@ -26,12 +26,7 @@ from jaxgran.particles.dynamics import (
     repeat_until,
 )
 from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, execute_impacts
-from jaxgran.particles.hard.prediction import (
-    ImpactCandidates,
-    PairRows,
-    Paths,
-    first_impacts,
-)
+from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
 from jaxgran.particles.neighbours import Pairs, rows_where, select_members
 from jaxgran.particles.setup import allowed_overlap, min_distance
 from jaxgran.particles.state import (

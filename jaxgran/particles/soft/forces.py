@@ -15,12 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.particles.state import surface_direction, torque
 from jaxgran.scene.contact import contact_force, midpoint_rate
-from jaxgran.scene.gas import (
-    ReducedContact,
-    ReducedFriction,
-    ReducedScene,
-    SphereScene,
-)
+from jaxgran.scene.gas import ReducedContact, ReducedFriction, ReducedScene, SphereScene
 
 
 class ContactCandidates(NamedTuple):
