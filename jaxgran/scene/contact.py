@@ -41,24 +41,6 @@ def elastic_constant(
     return 2 * y * jnp.sqrt(sigma / 4) / (3 * (1 - nu**2))
 
 
-def stress(
-    overlap: ArrayLike, overlap_rate: ArrayLike, relaxation_time: ArrayLike
-) -> Float[Array, "..."]:
-    """Normal force divided by ``rho sqrt(xi)``, that is ``xi + (3/2) A xi_dot``.
-
-    A contact between spheres without adhesion ends when this stress is 0.
-
-    Args:
-        overlap: xi = sigma - r, any shape, positive in contact.
-        overlap_rate: xi_dot, same shape, positive while the spheres approach.
-        relaxation_time: (3/2) A.
-
-    Returns:
-        Stress in the units of `overlap`, same shape.
-    """
-    return jnp.asarray(overlap) + relaxation_time * jnp.asarray(overlap_rate)
-
-
 def contact_force(
     overlap: ArrayLike,
     overlap_rate: ArrayLike,
@@ -92,7 +74,8 @@ def contact_force(
     xi = jnp.asarray(overlap)
     touching = xi > 0
     root = jnp.sqrt(jnp.where(touching, xi, 1.0))
-    normal_stress = stress(xi, overlap_rate, 1.5 * jnp.asarray(dissipative_constant))
+    # F over rho sqrt(xi); a contact between spheres without adhesion ends where it is 0.
+    normal_stress = xi + 1.5 * jnp.asarray(dissipative_constant) * jnp.asarray(overlap_rate)
     if clipped:
         normal_stress = jnp.maximum(normal_stress, 0.0)
     return jnp.where(touching, elastic_constant * root * normal_stress, 0.0)
@@ -150,7 +133,7 @@ class Impact(NamedTuple):
 def _rates(state, beta):
     # xi = X y^2 and dt = (X/v) 2 y ds turn xi'' = -sqrt(xi) (xi + beta xi') into polynomials.
     y, w, _ = state
-    return w, -2 * y * y * stress(y * y, w, beta), 2 * y
+    return w, -2 * y * y * (y * y + beta * w), 2 * y
 
 
 def _scaled_stress(state, beta):

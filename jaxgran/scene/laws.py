@@ -460,9 +460,7 @@ class ConstantRestitution(RestitutionLaw, ReducedLaw):
     domains: ClassVar[dict[str, Domain]] = domains_of("ConstantRestitution")
     advice: ClassVar[dict[str, str]] = ADVICE
 
-    def reduced(
-        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
-    ) -> "ConstantRestitution":
+    def reduced(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> ReducedLaw:
         return self
 
     def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -527,9 +525,7 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
         powers = jnp.arange(1, num_terms + 1)
         return cls(jnp.asarray(UNCLIPPED_SERIES[:num_terms]) * beta**powers, powers / 5)
 
-    def reduced(
-        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
-    ) -> "RestitutionSeries":
+    def reduced(self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike) -> ReducedLaw:
         return RestitutionSeries(self.coefficients * speed**self.exponents, self.exponents)
 
     def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:

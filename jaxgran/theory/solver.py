@@ -48,11 +48,9 @@ def _fill_values(
 
     window = min(WINDOW, times.size)
 
-    def next_time(known):
-        return times[jnp.minimum(known, times.size - 1)]
-
     def some_left(at):
-        return (at[1] < times.size) & (next_time(at[1]) <= reached)
+        next_time = times[jnp.minimum(at[1], times.size - 1)]
+        return (at[1] < times.size) & (next_time <= reached)
 
     def fill(at):
         values, known = at
