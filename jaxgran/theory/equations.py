@@ -756,7 +756,8 @@ def _balance_log_temperature(scene: ReducedScene, like: Array, d: int) -> Float[
 def max_thermal_speed(gas: Gas) -> Float[Array, ""]:
     """Return sqrt(T/T_0) of the steady state of a driven gas that heats up, and otherwise 1.
 
-    It is 1 if the gas cools, and if no loss balances the drive.
+    It is 1 if the gas cools, and if no loss balances the drive. That of rough spheres is the one
+    without spins, which is lower.
     """
     log_theta = _balance_log_temperature(reduced_scene(gas), gas.temperature, gas.dimension)
     return jnp.where(
