@@ -1,7 +1,8 @@
 """Validation of user input, and the map from an interval to an unconstrained parameter."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +10,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-if TYPE_CHECKING:
-    UserNumber = ArrayLike | Sequence[float]
-    UserInt = int
-    UserFloat = float
-    UserBool = bool
-else:
-    # With `Any` a run-time type checker accepts all values; the functions below report wrong types.
-    UserNumber = UserInt = UserFloat = UserBool = Any
+UserNumber = ArrayLike | Sequence[float]
+"""A number of a user, or a list or an array of numbers."""
 
 
 class Domain(NamedTuple):
@@ -143,11 +138,7 @@ def float_array(value: UserNumber, name: str = "") -> Float[Array, "..."]:
 
 def number_named(name: str) -> Callable[[UserNumber], Array]:
     """Return a converter of `equinox.field` to a float array; `name` is that in messages."""
-
-    def convert(value: UserNumber) -> Array:
-        return float_array(value, name)
-
-    return convert
+    return partial(float_array, name=name)
 
 
 def _floats(value: Any) -> np.ndarray:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -100,12 +100,6 @@ class Particles(NamedTuple):
     box_side: Float[Array, "..."]
     angular_velocity: Float[Array, "replicas N spins"] | None = None
 
-
-if TYPE_CHECKING:
-    UserParticles = Particles
-else:
-    # A run-time type checker accepts everything, so that jaxgran's message reports a wrong type.
-    UserParticles = Any
 
 _number_field = partial(eqx.field, converter=list_to_array)
 

@@ -21,13 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import any_traced
-from jaxgran._utils.validation import (
-    POSITIVE,
-    UserBool,
-    UserNumber,
-    check_bool,
-    float_array,
-)
+from jaxgran._utils.validation import POSITIVE, UserNumber, check_bool, float_array
 from jaxgran.data import files, tracks
 from jaxgran.data.curve import MIN_POINTS, QUANTITIES, CoolingCurve, from_arrays, to_arrays
 from jaxgran.data.plausibility import ask_about_columns, ask_about_header
@@ -552,7 +546,7 @@ class DropTest(eqx.Module):
     speed: UserNumber = eqx.field(converter=float_array)
     restitution: UserNumber = eqx.field(converter=float_array)
     error: UserNumber = eqx.field(converter=float_array)
-    onto_plate: UserBool = eqx.field(static=True, default=False)
+    onto_plate: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         check_bool(onto_plate=self.onto_plate)

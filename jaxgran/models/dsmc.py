@@ -8,14 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran._utils.validation import (
-    Domain,
-    UserFloat,
-    UserInt,
-    checked_float,
-    checked_int,
-    python_int,
-)
+from jaxgran._utils.validation import Domain, checked_float, checked_int, python_int
 from jaxgran.data.curve import Run
 from jaxgran.gradients.rule import Inputs, Outputs, differentiable
 from jaxgran.models import checks
@@ -79,9 +72,9 @@ class DSMC(AbstractParticleModel):
     '0.005'
     """
 
-    num_particles: UserInt = eqx.field(static=True, converter=python_int)
-    replicas: UserInt = eqx.field(static=True, converter=python_int, default=1)
-    step: UserFloat = eqx.field(static=True, default=0.05)
+    num_particles: int = eqx.field(static=True, converter=python_int)
+    replicas: int = eqx.field(static=True, converter=python_int, default=1)
+    step: float = eqx.field(static=True, default=0.05)
 
     elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
     derivative_accuracy: ClassVar[float] = 0.01

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import any_traced
-from jaxgran._utils.validation import Domain, UserFloat, UserInt, checked_float, python_int
-from jaxgran.data.curve import UserParticles
+from jaxgran._utils.validation import Domain, checked_float, python_int
+from jaxgran.data.curve import Particles
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
@@ -102,12 +102,12 @@ class HardSpheres(AbstractSpheres):
     (50, True)
     """
 
-    num_particles: UserInt = eqx.field(static=True, converter=python_int)
-    replicas: UserInt = eqx.field(static=True, converter=python_int, default=1)
-    contact_time: UserFloat = eqx.field(static=True, default=1e-5)
-    start: UserParticles | None = None
+    num_particles: int = eqx.field(static=True, converter=python_int)
+    replicas: int = eqx.field(static=True, converter=python_int, default=1)
+    contact_time: float = eqx.field(static=True, default=1e-5)
+    start: Particles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
-    differences: UserFloat | None = eqx.field(static=True, default=None)
+    differences: float | None = eqx.field(static=True, default=None)
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 7.0

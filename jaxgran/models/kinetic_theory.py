@@ -84,15 +84,15 @@ class KineticTheory(AbstractModel):
     (4,)
     """
 
-    sonine: validation.UserBool = eqx.field(static=True, default=True)
-    order: validation.UserInt = eqx.field(static=True, default=3)
-    softness: validation.UserBool = eqx.field(static=True, default=True)
-    correlations: validation.UserBool = eqx.field(static=True, default=True)
-    spin_cumulants: validation.UserBool = eqx.field(static=True, default=True)
-    initial_sonine: validation.UserFloat = eqx.field(static=True, default=0.0)
-    rtol: validation.UserFloat | None = eqx.field(static=True, default=None)
+    sonine: bool = eqx.field(static=True, default=True)
+    order: int = eqx.field(static=True, default=3)
+    softness: bool = eqx.field(static=True, default=True)
+    correlations: bool = eqx.field(static=True, default=True)
+    spin_cumulants: bool = eqx.field(static=True, default=True)
+    initial_sonine: float = eqx.field(static=True, default=0.0)
+    rtol: float | None = eqx.field(static=True, default=None)
     solver: Any = eqx.field(static=True, default=diffrax.Tsit5(scan_kind="lax"))
-    max_steps: validation.UserInt = eqx.field(static=True, default=200_000)
+    max_steps: int = eqx.field(static=True, default=200_000)
 
     def __check_init__(self):
         validation.check_bool(

@@ -11,8 +11,8 @@ import numpy as np
 import scipy  # which imports scipy.spatial at its first use
 
 from jaxgran._utils.tracing import any_traced, concrete_array
-from jaxgran._utils.validation import POSITIVE, UserFloat, UserInt, checked_float, python_int
-from jaxgran.data.curve import UserParticles
+from jaxgran._utils.validation import POSITIVE, checked_float, python_int
+from jaxgran.data.curve import Particles
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.spheres import AbstractSpheres, Plan
@@ -108,13 +108,13 @@ class SoftSpheres(AbstractSpheres):
     ('soft spheres', 20)
     """
 
-    num_particles: UserInt = eqx.field(static=True, converter=python_int)
-    steps_per_contact: UserInt = eqx.field(static=True, converter=python_int, default=40)
-    replicas: UserInt = eqx.field(static=True, converter=python_int, default=1)
-    start: UserParticles | None = None
+    num_particles: int = eqx.field(static=True, converter=python_int)
+    steps_per_contact: int = eqx.field(static=True, converter=python_int, default=40)
+    replicas: int = eqx.field(static=True, converter=python_int, default=1)
+    start: Particles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
-    projection: UserFloat | None = eqx.field(static=True, default=PROJECTION)
-    differences: UserFloat | None = eqx.field(static=True, default=None)
+    projection: float | None = eqx.field(static=True, default=PROJECTION)
+    differences: float | None = eqx.field(static=True, default=None)
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 3.0

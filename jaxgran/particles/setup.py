@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, array_module, concrete_array
-from jaxgran.data.curve import Particles, UserParticles
+from jaxgran.data.curve import Particles
 from jaxgran.particles import neighbours
 from jaxgran.particles.snapshot import box_side
 from jaxgran.scene.elements import Walls
@@ -235,7 +235,7 @@ def relaxed_positions(
     return neighbours.wrap(side, x), fault
 
 
-def check_start(start: UserParticles | None, gas: Gas, replicas: int, num_particles: int) -> None:
+def check_start(start: Particles | None, gas: Gas, replicas: int, num_particles: int) -> None:
     """Raise ValueError if a start has another shape or, with known numbers, another box."""
     if start is None:
         return

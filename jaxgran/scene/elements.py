@@ -6,7 +6,7 @@ not contain it. `wall_impact_ratio` describes the gas near a wall that dissipate
 
 from collections.abc import Callable
 from math import pi, sqrt
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,13 +20,6 @@ from jaxgran.scene.parameters import ADVICE, Parameter, fields_of
 
 NUM_SPIN_COMPONENTS = {2: 1, 3: 3}
 """Number of components of the angular velocity, d_rot, by dimension."""
-
-
-if TYPE_CHECKING:
-    UserWallLaw = RestitutionLaw | float
-else:
-    # With `Any` a run-time type checker accepts all values; the converter reports wrong types.
-    UserWallLaw = Any
 
 
 def _number_or_none(name: str) -> Callable[[Any], Array | None]:
@@ -153,7 +146,7 @@ class Frictional(Element):
     )
 
 
-def _wall_law(law: UserWallLaw) -> RestitutionLaw:
+def _wall_law(law: RestitutionLaw | float) -> RestitutionLaw:
     if isinstance(law, RestitutionLaw):
         return law
     FRACTION.check("restitution of the walls", law, "Give a number or a law of restitution.")

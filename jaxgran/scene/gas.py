@@ -7,7 +7,7 @@
 """
 
 from math import gamma, pi
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -45,17 +45,10 @@ class FloatField(NamedTuple):
         return module
 
 
-if TYPE_CHECKING:
-    UserLaw = laws.RestitutionLaw
-else:
-    # With `Any` a run-time type checker accepts all values; the converter reports wrong types.
-    UserLaw = Any
-
-
 _PACKING_DOMAINS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
 
 
-def _checked_law(law: UserLaw) -> laws.RestitutionLaw:
+def _checked_law(law: laws.RestitutionLaw) -> laws.RestitutionLaw:
     if not isinstance(law, laws.RestitutionLaw):
         raise ValueError(f"law must be a restitution law such as jaxgran.Viscoelastic, got {law!r}")
     # Functions in a law, as those of a neural network, must not be leaves beside its arrays.

@@ -22,8 +22,6 @@ from jaxgran._utils.validation import (
     NON_NEGATIVE,
     POSITIVE,
     Domain,
-    UserBool,
-    UserFloat,
     UserNumber,
     check_bool,
     checked_float,
@@ -396,7 +394,7 @@ class Viscoelastic(RestitutionLaw):
     dissipative_constant: Float[Array, ""] = eqx.field(
         converter=number_named("dissipative_constant")
     )
-    clipped: UserBool = eqx.field(static=True, default=True)
+    clipped: bool = eqx.field(static=True, default=True)
 
     domains: ClassVar[dict[str, Domain]] = domains_of("Viscoelastic")
     advice: ClassVar[dict[str, str]] = ADVICE
@@ -580,7 +578,7 @@ class RestitutionSpline(RestitutionLaw):
         self,
         speeds: UserNumber,
         values: UserNumber | None = None,
-        smoothness: UserFloat = 0.3,
+        smoothness: float = 0.3,
     ):
         self.speeds = float_array(speeds, "speeds")
         knots = np.asarray(self.speeds, float)
