@@ -21,12 +21,8 @@ from jaxgran.fitting.alternatives import (
 )
 from jaxgran.fitting.error_budget import curve_and_gas, describe_derivative_bias
 from jaxgran.fitting.parameters import START_TIME
-from jaxgran.fitting.residuals import (
-    Measurement,
-    check_curve,
-    neighbour_correlation,
-)
-from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE, Comparison, Fit, describe_minima
+from jaxgran.fitting.residuals import Measurement, check_curve, neighbour_correlation
+from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE, Fit
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.checks import checked_model, describe_walls
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -149,7 +145,8 @@ def diagnose(
         correlation = float(neighbour_correlation(residuals[used]))
         correlations.append(correlation)
         if comparison.scatter is not None:
-            misfit = misfit or _is_misfit(comparison, gas, residuals[used], correlation, N)
+            scatter, expected = float(np.asarray(comparison.scatter)), _expected_scatter(gas, N)
+            misfit = misfit or _is_misfit(scatter, expected, correlation, residuals[used].size)
         for limitation in result.model.limitations(gas, N):
             if limitation.words not in {known.words for known in limitations}:
                 limitations.append(limitation)
@@ -188,7 +185,7 @@ def diagnose(
     grade, verdict = _verdict(result, misfit, limitations, alternatives, ranges)
     return Diagnosis(
         _headline(result, ranges),
-        "" if explanations is None else _narrowing(result, *explanations, ranges),
+        "" if explanations is None else _narrowing(result, *explanations),
         grade,
         verdict,
         tuple(reasons),
@@ -215,23 +212,22 @@ def _headline(result: Fit, ranges: dict[str, Any]) -> str:
     low, high = (float(x[0]) for x in ranges[name])
     is_wide = low < NEGLIGIBLE_SHARE * abs(estimate) or high > MAX_RATIO * low
     if not low <= estimate <= high or (low >= 0 and is_wide):
-        return f"{symbol} is {_format_range(low, high, estimate, unit)} (95 %)"
+        return f"{_range_of_first(result, *ranges[name])} (95 %)"
     span = f"{low:.3g} to {high:.3g} {unit}".rstrip()
     return f"{symbol} = {estimate:.3g} {unit}".rstrip() + f", 95 % range {span}"
 
 
-def _format_range(low: float, high: float, estimate: float, unit: str) -> str:
-    if 0 <= low < NEGLIGIBLE_SHARE * abs(estimate):
-        return f"below {high:.3g} {unit}".rstrip()
-    return f"between {low:.3g} and {high:.3g} {unit}".rstrip()
+def _range_of_first(result: Fit, low: np.ndarray, high: np.ndarray) -> str:
+    """Say in which range the first parameter lies; vectors begin with the ends of this range."""
+    name, estimate = result.names[0], abs(float(np.asarray(result.estimate)[0]))
+    ends = f"between {low[0]:.3g} and {high[0]:.3g}"
+    if 0 <= low[0] < NEGLIGIBLE_SHARE * estimate:
+        ends = f"below {high[0]:.3g}"
+    return f"{symbol_of(name)} is {ends} {unit_of(name)}".rstrip()
 
 
 def _narrowing(
-    result: Fit,
-    law: Alternative,
-    alternatives: tuple[Alternative, ...],
-    allowed_chi2: float,
-    ranges: dict[str, tuple[np.ndarray, np.ndarray]],
+    result: Fit, law: Alternative, alternatives: tuple[Alternative, ...], allowed_chi2: float
 ) -> str:
     """Return which effects, known to be absent, would narrow the range of the first parameter."""
     wide = [x for x in alternatives if x.effect and not x.distinguishable]
@@ -239,33 +235,30 @@ def _narrowing(
     best = max(x.improvement for x in (law, *alternatives))
     if not wide or max(x.improvement for x in others) < best - allowed_chi2:
         return ""
-    name, effects = result.names[0], sorted({x.effect for x in wide})
+    effects = sorted({x.effect for x in wide})
     narrower = ranges_over_alternatives(result, others, allowed_chi2)
-    low, high = (float(x[0]) for x in narrower[name])
+    value = _range_of_first(result, *narrower[result.names[0]])
     given = ", ".join(DECLARABLE[effect][1] for effect in effects)
-    value = _format_range(low, high, float(np.asarray(result.estimate)[0]), unit_of(name))
     return (
-        f"if there is no {' and no '.join(effects)}, {symbol_of(name)} is {value}: declare "
+        f"if there is no {' and no '.join(effects)}, {value}: declare "
         f"`absent: {', '.join(effects)}`, or give {given}"
     )
 
 
-def _is_misfit(
-    comparison: Comparison,
-    gas: Gas,
-    residuals: Float[np.ndarray, "used"],
-    correlation: float,
-    num_particles: int | None,
-) -> bool:
+def _is_misfit(scatter: float, expected: float, correlation: float, number: int) -> bool:
     """Return True if the misfit of a curve without errors is too large or systematic.
 
     Without errors chi^2 is no measure of the misfit. Fluctuations of few particles are correlated
     in time too, but N gives their size.
+
+    Args:
+        scatter: relative scatter of T about the model.
+        expected: that of N particles, 0 if N is unknown.
+        correlation: of neighbouring residuals.
+        number: of residuals.
     """
-    scatter = float(np.asarray(comparison.scatter))
-    expected = _expected_scatter(gas, num_particles) or UNKNOWN_SCATTER
-    is_systematic = correlation > SYSTEMATIC_CORRELATION / np.sqrt(residuals.size)
-    return scatter > MAX_SCATTER or bool(is_systematic and scatter > 2 * expected)
+    is_systematic = correlation > SYSTEMATIC_CORRELATION / number**0.5
+    return scatter > MAX_SCATTER or is_systematic and scatter > 2 * (expected or UNKNOWN_SCATTER)
 
 
 def _expected_scatter(gas: Gas, num_particles: int | None, replicas: int = 1) -> float:
@@ -331,10 +324,9 @@ def _verdict(
     elif not ranges:
         why = "alternatives were not compared"
     else:
-        low, high = (float(x[0]) for x in ranges[result.names[0]])
-        unit, estimate = unit_of(result.names[0]), float(np.asarray(result.estimate)[0])
-        value = f"{symbol} is {_format_range(low, high, estimate, unit)}"
-        if not possible and not (low >= 0 and high > MAX_RATIO * low):
+        low, high = ranges[result.names[0]]
+        value = _range_of_first(result, low, high)
+        if not possible and not (low[0] >= 0 and high[0] > MAX_RATIO * low[0]):
             return DETERMINED, f"{consistent}, which determines {symbol}: {value}.{edge}"
         why = f"{possible[0]} cannot be excluded, and " if possible else ""
         why += value
@@ -370,17 +362,16 @@ def _describe_alternatives(
         yield "additional loss terms were not tested: the gas is driven"
     if result.model.stochastic and alternatives:
         yield "the range over alternatives is that of kinetic theory, shifted to the fitted curve"
-    name, estimate = result.names[0], float(np.asarray(result.estimate)[0])
+    estimate = float(np.asarray(result.estimate)[0])
     for alternative in alternatives:
-        low, high = float(alternative.low[0]), float(alternative.high[0])
-        value = f"{symbol_of(name)} is then {_format_range(low, high, estimate, unit_of(name))}"
+        value = f"then {_range_of_first(result, alternative.low, alternative.high)}"
         if alternative.preferred:
             yield (
                 f"{alternative.name} added to the model decreases chi^2 by "
                 f"{alternative.improvement:.3g}, which happens by chance in less than 1 % of fits: "
                 f"{value}"
             )
-            if not low <= estimate <= high:
+            if not alternative.low[0] <= estimate <= alternative.high[0]:
                 yield (
                     f"the estimate {estimate:.3g} lies outside of this range, because it is that "
                     "without the preferred alternative"
@@ -496,8 +487,12 @@ def describe_search(result: Fit) -> Iterator[str]:
         elif {"dissipative_constant", "youngs_modulus"} <= {*group}:
             why += " (in a gas of hard spheres A and Y enter only as A Y^(2/5))"
         yield f"this curve does not determine {names}: {why}; free fewer parameters"
-    if others := describe_minima(result.names, result.degenerate_solutions()):
-        yield f"{others}: this curve does not distinguish them"
+    if len(others := result.degenerate_solutions()):
+        sets = (zip(map(symbol_of, result.names), other, strict=False) for other in others)
+        at = " and at ".join(", ".join(f"{name} = {x:.3g}" for name, x in each) for each in sets)
+        yield (
+            f"chi^2 has another, equally good minimum at {at}: this curve does not distinguish them"
+        )
 
 
 def log_likelihood(

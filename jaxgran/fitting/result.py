@@ -375,17 +375,6 @@ def _deviations(covariance: Float[Array, "p p"]) -> Float[Array, "p"]:
         return concrete_array(np.sqrt(np.diagonal(np.asarray(covariance), axis1=-2, axis2=-1)))
 
 
-def describe_minima(names: tuple[str, ...], others: Float[np.ndarray, "others p"]) -> str | None:
-    """Return a clause about other minima that are equally good; None if there are none."""
-    if not len(others):
-        return None
-    sets = (
-        ", ".join(f"{symbol_of(name)} = {x:.3g}" for name, x in zip(names, other, strict=False))
-        for other in others
-    )
-    return f"chi^2 has another, equally good minimum at {' and at '.join(sets)}"
-
-
 def search_starts(problem: Problem, first: Numbers) -> Numbers:
     """Return the starts of a search: the first guess and, if beta_t is free, several beta_t.
 
