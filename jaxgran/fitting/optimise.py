@@ -31,13 +31,7 @@ from jaxgran.fitting.parameters import (
     halving_time,
     prior_residuals,
 )
-from jaxgran.fitting.residuals import (
-    CLOCK,
-    CLOCK_TREND,
-    DropTestRows,
-    Measurement,
-    Rows,
-)
+from jaxgran.fitting.residuals import CLOCK, CLOCK_TREND, DropTestRows, Measurement, Rows
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
@@ -389,9 +383,6 @@ def best_of_starts(
         chi2 = xp.sum(problem.evaluate(minimum[0])[1] ** 2)
         return minimum, xp.where(xp.isnan(chi2), xp.inf, chi2)
 
-    if len(starts) == 1:
-        minimum, chi2 = search_from(starts[0])
-        return minimum, (minimum[0][None], chi2[None])
     if xp is jnp:
         (flats, steps, converged), chi2 = jax.lax.map(search_from, starts)
     else:

@@ -156,8 +156,7 @@ def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> Gas:
 
 def _guess_law(gas: Gas, rate: Numbers, free: tuple[str, ...]) -> dict[str, Any]:
     xp = array_module(gas, rate)
-    scales = _scales(gas) if not any_traced(gas) else _law_scales(gas)
-    mean_free_time, alpha, loss_now = map(xp.asarray, scales)
+    mean_free_time, alpha, loss_now = map(xp.asarray, _law_scales(gas))
     rate = rate * mean_free_time
     loss = xp.clip(2 * gas.dimension * rate, 1e-6, 0.99)
     if isinstance(gas.law, ConstantRestitution) and "coefficient" in free:
@@ -174,6 +173,7 @@ def _guess_law(gas: Gas, rate: Numbers, free: tuple[str, ...]) -> dict[str, Any]
     return {}
 
 
+@eqx.filter_jit
 def _law_scales(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Mean free time, alpha of viscoelastic spheres, and -ln eps of a spline at a typical impact.
 
@@ -185,9 +185,6 @@ def _law_scales(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""], Float[Arr
     if isinstance(gas.law, RestitutionSpline):
         loss = -jnp.log1p(-gas.law.loss(2 * jnp.sqrt(gas.temperature)))
     return gas.mean_free_time, alpha, loss
-
-
-_scales = eqx.filter_jit(_law_scales)
 
 
 def known_start_time(priors: "dict[str, Priors]", label: str) -> tuple[Numbers, Numbers]:

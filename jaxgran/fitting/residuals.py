@@ -347,16 +347,12 @@ class Measurement:
                 slopes[CLOCK] = (by_clock * self.clock_accuracy)[:, None]
                 slopes[CLOCK_TREND] = (by_clock * self.clock_accuracy * position)[:, None]
             rows.append(Rows(name, self.label, used * difference, slopes, by_clock))
-        rows += [
-            Rows(factor, self.label, *_of_prior(xp, values[factor], self.accuracies[name], factor))
-            for name, factor in FACTORS.items()
-            if factor in values and name in self.accuracies
-        ]
-        rows += [
-            Rows(MODEL_ERROR, self.label, *_of_prior(xp, values[name], 1.0, name))
-            for name in (CLOCK, CLOCK_TREND)
-            if name in values
-        ]
+        widths = {FACTORS[name]: width for name, width in self.accuracies.items()}
+        for name, width in (widths | {CLOCK: 1.0, CLOCK_TREND: 1.0}).items():
+            if name in values:
+                kind, slope = name if name in widths else MODEL_ERROR, xp.ones((1, 1)) / width
+                value = xp.ravel(values[name] / width)
+                rows.append(Rows(kind, self.label, value, {name: slope}))
         return rows, computed
 
     def as_curve(self, computed: dict[str, Numbers]) -> CoolingCurve:
@@ -445,13 +441,6 @@ def _log_curve(
     return logs, values
 
 
-def _of_prior(
-    xp: Any, value: Numbers, width: Numbers, name: str
-) -> tuple[Numbers, dict[str, Numbers]]:
-    """Return the residual of a nuisance parameter of mean 0, and its derivative."""
-    return xp.ravel(value / width), {name: xp.ones((1, 1)) / width}
-
-
 class DropTestRows(NamedTuple):
     """A drop test of spheres of a gas, among the measurements of a fit.
 
@@ -487,6 +476,7 @@ class DropTestRows(NamedTuple):
         return [Rows("drop test", self.label, *jax.tree.map(xp.asarray, row))], None
 
 
+@eqx.filter_jit
 def finite_size_cooling_factor(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:
     """Factor by which N particles without total momentum cool faster than many, at the same T.
 
@@ -497,11 +487,6 @@ def finite_size_cooling_factor(gas: Gas, num_particles: Float[Array, ""]) -> Flo
     """
     if gas.container is not None:
         return jnp.ones_like(gas.temperature)
-    return _finite_size_factor(gas, num_particles)
-
-
-@eqx.filter_jit
-def _finite_size_factor(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:
     hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
     one = jnp.ones_like(gas.temperature)
     loss = 1 - gas.reduced_law.restitution(one) ** 2

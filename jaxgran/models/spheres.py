@@ -26,12 +26,7 @@ from jaxgran.particles import neighbours, snapshot
 from jaxgran.particles.capacity import Capacity, Neighbourhood, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.run import Simulation, simulate_on_host, simulate_traced
-from jaxgran.particles.setup import (
-    check_inside,
-    check_start,
-    has_other_box,
-    reduced_start,
-)
+from jaxgran.particles.setup import check_inside, check_start, has_other_box, reduced_start
 from jaxgran.scene.gas import Gas, SphereScene
 
 DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
