@@ -16,7 +16,7 @@ UNCHECKED = {
     },
     "data.particles": {"read_particles"},
     "fitting.diagnosis": {"diagnose", "log_likelihood"},
-    "fitting.fit": {"_check_model", "_check_request", "fit", "free_by_default"},
+    "fitting.fit": {"fit", "free_by_default"},
     "fitting.learnt_law": {"restitution_band"},
     "fitting.residuals": {"check_curve"},
     "models.choose": {"choose_model"},

@@ -43,11 +43,7 @@ from jaxgran.fitting.residuals import (
     uses_rotation,
     with_errors_of_particles,
 )
-from jaxgran.fitting.result import (
-    Fit,
-    assemble_fit,
-    search_starts,
-)
+from jaxgran.fitting.result import Fit, assemble_fit, search_starts
 from jaxgran.fitting.stochastic import fit_stochastic
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model
@@ -171,7 +167,6 @@ def fit(
     >>> f"{float(result.estimate[0]):.3g} s"
     '3e-06 s'
     """
-    several = isinstance(data, dict)
     check_bool(progress=progress, throw=throw)
     if any_traced(gas, data):
         gas, data = _without_derivative((gas, data))
@@ -185,7 +180,9 @@ def fit(
     if free is None:
         names = tuple(x for x in free_by_default(scenes[first], data[first]) if x not in separate)
     names = with_names_of_law(names, next(iter(scenes.values())))
-    _check_request(scenes, data, names, separate, max_steps)
+    _check_request(scenes, names, separate)
+    if max_steps is not None:
+        checked_int("max_steps", max_steps, 1)
     absent = checked_absent(absent)
     names, separate, key = tuple(names), tuple(separate), checked_key(key)
     all_priors = _priors_by_label(scenes, priors)
@@ -204,7 +201,8 @@ def fit(
         curves[label] = data[label] = curve
         if unused := unused_rotation(scenes[label], curve):
             warnings.warn(unused, stacklevel=2)
-    _check_model(model, solver, names, separate, all_priors, scenes, several, bool(curves))
+    shared = all_priors.get(SHARED, {})
+    _check_model(model, solver, (*names, *separate), shared, scenes[first], [*curves])
     given = {*names, *separate, *all_priors.get(SHARED, {})}
     prior_names = {name for some in all_priors.values() for name in some}
     if {START_TIME, "temperature"} <= given and not {START_TIME, "temperature"} & prior_names:
@@ -466,18 +464,13 @@ def free_by_default(gas: Gas, data: Data) -> tuple[str, ...]:
     return (constants[0], "temperature") if is_bare else (constants[0],)
 
 
-def _check_request(
-    scenes: dict[str, Gas],
-    data: dict[str, Data],
-    free: tuple[str, ...],
-    separate: tuple[str, ...],
-    max_steps: int | None,
-) -> None:
+def _check_request(scenes: dict[str, Gas], free: Any, separate: Any) -> None:
+    """Raise ValueError unless free and separate are names of different parameters."""
     names = (free, separate)
     if any(isinstance(x, str) for x in names) or not free or len(set(free)) < len(free):
         raise ValueError(f"free must be a tuple of different names, got {free!r}")
     names = (*free, *separate)
-    if len(set(names)) < len(names) or (START_TIME in free and len(data) > 1):
+    if len(set(names)) < len(names) or (START_TIME in free and len(scenes) > 1):
         raise ValueError(
             f"free and separate must be different names, got {free} and {separate}; of several "
             f"measurements each has its own {START_TIME}: put it into separate"
@@ -485,20 +478,12 @@ def _check_request(
     for gas in scenes.values():
         for name in names:
             domain_of(gas, name)
-    if max_steps is not None:
-        checked_int("max_steps", max_steps, 1)
 
 
 def _check_model(
-    model: AbstractModel,
-    solver: Any,
-    names: tuple[str, ...],
-    separate: tuple[str, ...],
-    priors: dict[str, Priors],
-    scenes: dict[str, Gas],
-    several: bool,
-    has_curves: bool,
+    model: Any, solver: Any, names: tuple[str, ...], priors: Priors, gas: Gas, curves: list[str]
 ) -> None:
+    """Raise ValueError unless a solver can fit a model to measurements; `curves` are labels."""
     kinds = optx.AbstractLeastSquaresSolver, optx.AbstractMinimiser
     if not (solver is None or isinstance(solver, kinds) or is_transformation(solver)):
         raise ValueError(
@@ -506,43 +491,41 @@ def _check_model(
             "optimistix.BFGS(rtol=1e-8, atol=1e-8), or a gradient transformation of optax, such as "
             f"optax.adam(0.05), got {solver!r:.60}"
         )
-    checked_model(model)
-    gas, prior_names = next(iter(scenes.values())), priors.get(SHARED, {})
-    if model.stochastic and not (solver is None or is_transformation(solver)):
-        raise ValueError(
-            "a stochastic model is fitted by least squares, without a solver, or by a gradient "
-            f"transformation of optax, such as optax.adam(0.05), got {solver!r:.60}"
-        )
-    if model.stochastic and (several or not has_curves):
-        raise ValueError(
-            "several measurements and drop tests are fitted by a model without noise, got "
-            f"{type(model).__name__}. Use jaxgran.KineticTheory(), or fit the curves one by one"
-        )
-    if not has_curves and START_TIME in (*names, *separate, *prior_names):
+    name, needs_start_time = type(checked_model(model)).__name__, START_TIME in {*names, *priors}
+    if needs_start_time and not curves:
         raise ValueError(f"{START_TIME} needs a cooling curve, and there are drop tests alone")
-    if model.stochastic and START_TIME in (*names, *prior_names):
-        raise ValueError(
-            f"{START_TIME} is fitted through kinetic theory only, got {type(model).__name__}. Fit "
-            "it by kinetic theory, subtract it from the times, and leave it out of free and priors"
-        )
-    if model.stochastic and prior_names and "friction" in gas.elements:
-        raise ValueError(
-            f"priors with {type(model).__name__} are propagated by kinetic theory, which does not "
-            "support friction. Leave priors out, or add those parameters to free"
-        )
-    both = [name for name in prior_names if name in names]
-    if model.stochastic and both:
-        raise ValueError(
-            f"{both[0]} is in free and in priors, which a stochastic model does not support: "
-            f"leave {both[0]} out of free (its prior then widens the errors) or out of priors"
-        )
-    replicas = getattr(model, "replicas", None)
-    if model.stochastic and isinstance(replicas, int) and replicas < 2:
-        raise ValueError(
-            f"a fit through {type(model).__name__} needs replicas >= 2 to estimate its noise, got "
-            f"{replicas}"
-        )
-    model.check_fit((*names, *separate))
+    if model.stochastic:
+        if not (solver is None or is_transformation(solver)):
+            raise ValueError(
+                "a stochastic model is fitted by least squares, without a solver, or by a gradient "
+                f"transformation of optax, such as optax.adam(0.05), got {solver!r:.60}"
+            )
+        if curves != [""]:
+            raise ValueError(
+                "several measurements and drop tests are fitted by a model without noise, got "
+                f"{name}. Use jaxgran.KineticTheory(), or fit the curves one by one"
+            )
+        if needs_start_time:
+            raise ValueError(
+                f"{START_TIME} is fitted through kinetic theory only, got {name}. Fit it by "
+                "kinetic theory, subtract it from the times, and leave it out of free and priors"
+            )
+        if priors and "friction" in gas.elements:
+            raise ValueError(
+                f"priors with {name} are propagated by kinetic theory, which does not support "
+                "friction. Leave priors out, or add those parameters to free"
+            )
+        if both := [x for x in priors if x in names]:
+            raise ValueError(
+                f"{both[0]} is in free and in priors, which a stochastic model does not support: "
+                f"leave {both[0]} out of free (its prior then widens the errors) or out of priors"
+            )
+        replicas = getattr(model, "replicas", None)
+        if isinstance(replicas, int) and replicas < 2:
+            raise ValueError(
+                f"a fit through {name} needs replicas >= 2 to estimate its noise, got {replicas}"
+            )
+    model.check_fit(names)
 
 
 @jax.custom_jvp
