@@ -215,29 +215,25 @@ def checked_times(times: UserNumber) -> Float[Array, "times"]:
     Raises:
         ValueError: if there are no times, or if they are not finite, negative or not increasing.
     """
-    if not isinstance(times, Tracer):
-        try:
-            numbers = _floats(times)
-        except (TypeError, ValueError):
-            raise ValueError(f"times must be a list of numbers, got {times!r}") from None
-        if numbers.ndim != 1 or numbers.size == 0:
-            raise ValueError(f"times must be a list of numbers, got shape {numbers.shape}")
-        wrong = ~np.isfinite(numbers) | (numbers < 0)
-        if np.any(wrong):
-            raise ValueError(
-                f"times must be finite and not negative, got {numbers[wrong][0]:g}. "
-                "The gas starts at t = 0."
-            )
-        if np.any(np.diff(numbers) <= 0):
-            i = int(np.argmax(np.diff(numbers) <= 0)) + 1
-            raise ValueError(
-                f"times must increase, got {numbers[i]:g} after {numbers[i - 1]:g}. Sort them and "
-                "remove repeated times."
-            )
-    times = jnp.asarray(times, dtype=jnp.result_type(float))
-    if not isinstance(times, Tracer) and np.any(np.diff(np.asarray(times)) <= 0):
+    if isinstance(times, Tracer):
+        return times.astype(jnp.result_type(float))
+    try:
+        numbers = _floats(times).astype(jnp.result_type(float))
+    except (TypeError, ValueError):
+        raise ValueError(f"times must be a list of numbers, got {times!r}") from None
+    if numbers.ndim != 1 or numbers.size == 0:
+        raise ValueError(f"times must be a list of numbers, got shape {numbers.shape}")
+    wrong = ~np.isfinite(numbers) | (numbers < 0)
+    if np.any(wrong):
         raise ValueError(
-            f"two times are equal in {times.dtype}. Give fewer times, or call "
-            'jax.config.update("jax_enable_x64", True) first.'
+            f"times must be finite and not negative, got {numbers[wrong][0]:g}. "
+            "The gas starts at t = 0."
         )
-    return times
+    not_later = np.flatnonzero(np.diff(numbers) <= 0)
+    if not_later.size:
+        before, after = numbers[not_later[0] :][:2]
+        raise ValueError(
+            f"times must increase, got {after:g} after {before:g} in {numbers.dtype}. Sort them "
+            'and remove repeated times, or call jax.config.update("jax_enable_x64", True) first.'
+        )
+    return jnp.asarray(numbers)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import POSITIVE, UserNumber, check_bool, float_array
 from jaxgran.data import files, tracks
-from jaxgran.data.curve import MIN_POINTS, QUANTITIES, CoolingCurve, from_arrays, to_arrays
+from jaxgran.data.curve import QUANTITIES, CoolingCurve, from_arrays, to_arrays
 from jaxgran.data.plausibility import ask_about_columns, ask_about_header
 from jaxgran.data.tables import UNIT_KEYS, Table, header_entry, read_table
 from jaxgran.scene.elements import (
@@ -204,14 +204,8 @@ def _with_temperature(table: Table, header: dict[str, str]) -> dict[str, np.ndar
     The velocities are taken for isotropic and Maxwellian. The entry T_from is added to the header.
 
     Raises:
-        ValueError: for too few rows, a value that is not positive, or an energy of particles of
-            unknown mass.
+        ValueError: for a value that is not positive, or an energy of particles of unknown mass.
     """
-    if len(table.lines) < MIN_POINTS:
-        raise ValueError(
-            f"{len(table.lines)} rows of numbers, at least {MIN_POINTS} are needed; measure the "
-            "cooling at more times"
-        )
     columns, d, mass = dict(table.columns), files.header_count(header, "dimension") or 3, np.nan
     for name in TEMPERATURE_COLUMNS.keys() & columns.keys():
         values, error = columns.pop(name), columns.pop(f"{name}_err", None)
@@ -610,6 +604,4 @@ def read_drops(path: str | Path, onto_plate: bool) -> tuple[DropTest, dict[str, 
     path = files.checked_path(path, f"a CSV file with the columns {wanted}")
     with files.name_in_errors(path):
         header, columns, _ = read_table(path, wanted, columns_to_read)
-        if not columns["v"].size:
-            raise ValueError(f"no rows of numbers under {wanted}; add one row for each impact")
         return DropTest(columns["v"], columns["eps"], columns["eps_err"], onto_plate), header

@@ -123,7 +123,7 @@ REFUSED = {
     "line 3: T_err is 0": "t,T,T_err\n0,1,0\n1,.5,0\n2,.3,.1\n",
     "line 3: msd is -1": "t,T,msd\n0,1,0\n1,.5,-1\n2,.3,.1\n",
     "line 3: mean_speed is -1, it must be a positive number": "t,mean_speed\n0,1\n1,-1\n2,1\n",
-    "2 rows of numbers, at least 3 are needed": "t,T\n0,1\n1,.5\n",
+    "a curve needs at least 3 points, got 2": "t,T\n0,1\n1,.5\n",
 }
 """What is said of a file that is refused, and the file."""
 
@@ -263,7 +263,7 @@ def test_drop_tests_are_read_like_curves(tmp_path):
         ("v,eps,eps_err\n0.02,1.2,0.02\n", "at most 1 within its error, got 1.2 .- 0.02"),
         ("v,e\n1,2\n", "line 1: the columns are v, e; name them v,eps,eps_err"),
         ("v,eps,eps_err\n0.1,0.9\n", "line 2: expected 3 finite numbers .*, got '0.1,0.9'"),
-        ("v,eps,eps_err\n", "no rows of numbers"),
+        ("v,eps,eps_err\n", "at least one impact"),
         ("v,eps,eps_err\n0.1,0.9,0\n", "error must lie in"),
     ):
         with pytest.raises(ValueError, match=message):
