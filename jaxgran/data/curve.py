@@ -489,30 +489,3 @@ def label_of(
         return (*first, *axes), {"long_name": name.replace("_", " ")}
     quantity = QUANTITIES[group.removesuffix(OF_REPLICAS)]
     return first, {"units": quantity.unit, "long_name": quantity.label}
-
-
-def records_in_si(
-    records: dict[str, Array], *, length: Array, temperature: Array, mass: Array
-) -> dict[str, Array]:
-    """Return the quantities among the records of a run, shape (times, replicas), in SI.
-
-    Args:
-        records: in units of a length, a temperature and a mass, by field; others are left out.
-        length: m.
-        temperature: m^2/s^2.
-        mass: kg.
-
-    Returns:
-        Quantities by field, shape (replicas, times).
-    """
-    scales = {
-        "1": 1.0,
-        "m^2": length**2,
-        "m^2/s^2": temperature,
-        "J": mass * temperature,
-    }
-    return {
-        name: records[name].T * scales[QUANTITIES[name].unit]
-        for name in QUANTITIES
-        if name in records
-    }

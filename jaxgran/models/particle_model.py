@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
-from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run, records_in_si
+from jaxgran.data.curve import DEFAULTS, QUANTITIES, CoolingCurve, Run
 from jaxgran.gradients.rule import Inputs, Outputs
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
@@ -93,11 +93,13 @@ class AbstractParticleModel(AbstractModel):
         saves_particles: bool,
     ) -> CoolingCurve:
         """Return the curve of a run in SI, with nan at invalid times."""
-        others = {}
-        values = records_in_si(
-            out.records, length=units.length, temperature=gas.temperature, mass=gas.mass
-        )
-        values = {name: jnp.where(invalid[None], jnp.nan, x) for name, x in values.items()}
+        others, energy = {}, gas.mass * gas.temperature
+        scales = {"1": 1.0, "m^2": units.length**2, "m^2/s^2": gas.temperature, "J": energy}
+        values = {
+            name: jnp.where(invalid[None], jnp.nan, out.records[name].T * scales[quantity.unit])
+            for name, quantity in QUANTITIES.items()
+            if name in out.records
+        }
         if out.position is not None:
             arrays = out.position, out.velocity, out.spin
             others["particles"] = snapshot.particles(units, self.replicas, *arrays)
