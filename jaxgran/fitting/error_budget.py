@@ -6,11 +6,17 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from jaxgran._utils.tracing import as_jax_arrays, concrete_array
+from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.fitting.parameters import Priors, extra_parameters, prior_residuals, with_floats
+from jaxgran.fitting.parameters import (
+    Numbers,
+    Priors,
+    extra_parameters,
+    prior_residuals,
+    with_floats,
+)
 from jaxgran.fitting.residuals import MODEL_ERROR, Measurement
 from jaxgran.fitting.result import Comparison, Fit
 from jaxgran.models.base import AbstractModel
@@ -37,7 +43,8 @@ def with_scene_errors(result: Fit) -> Fit:
         curve, gas = curve_and_gas(result, label)
         if curve is None:
             continue
-        error_model = _error_model(curve, gas, comparison)
+        N = comparison.num_particles
+        error_model = _error_model(curve, gas, comparison.start_time, N)
         error = error_model.clock_error(result.model.rate_error(error_model))[-curve.times.size :]
         clock_error = np.asarray(error, np.asarray(comparison.clock_error).dtype)
         # The error of a free clock is that at the first guess: only what exceeds it is added.
@@ -47,9 +54,8 @@ def with_scene_errors(result: Fit) -> Fit:
         )
         clock = clock + np.outer(shift, shift)
         comparisons[label] = comparison._replace(clock_error=clock_error)
-        if comparison.num_particles is not None:
-            total = comparison.num_particles * comparison.replicas
-            noise = _collision_noise_covariance(comparison, error_model, total)
+        if N is not None:
+            noise = _collision_noise_covariance(comparison, error_model, N * comparison.replicas)
             chance = noise if chance is None else chance + noise
     covariances[MODEL_ERROR] = clock
     if result.model.stochastic:
@@ -89,26 +95,21 @@ def clock_accuracy(
     return error_model.clock_error(model.rate_error(error_model))[-size:]
 
 
-def _error_model(curve: CoolingCurve, gas: Gas, comparison: Comparison) -> ErrorModel:
+def _error_model(
+    curve: CoolingCurve, gas: Gas, start_time: Numbers, num_particles: int | None
+) -> ErrorModel:
     """Return the error model of the fitted gas, at its start and at the measured times."""
     times = np.asarray(curve.times)
     # Points before t0 have the state at t0.
-    times = np.maximum(times - np.asarray(comparison.start_time, times.dtype), 0.0)
-    before = np.zeros(int(times[0] > 0), times.dtype)
-
-    def with_start(values: ArrayLike, first: Any = 0.0) -> Array:
-        return concrete_array(np.concatenate([before + np.asarray(first), np.asarray(values)]))
-
-    curve_from_start = CoolingCurve(
-        times=with_start(times),
-        temperature=with_start(curve.temperature, gas.temperature),
-        sonine=None if curve.sonine is None else with_start(curve.sonine),
-        collisions=None if curve.collisions is None else with_start(curve.collisions),
-        rotational_temperature=None
-        if curve.rotational_temperature is None
-        else with_start(curve.rotational_temperature, gas.value("rotational_temperature")),
-    )
-    return error_model_along(gas, curve_from_start, comparison.num_particles)
+    times = np.maximum(times - np.asarray(start_time, times.dtype), 0.0)
+    names = "temperature", "sonine", "collisions", "rotational_temperature"
+    known = {name: getattr(curve, name) for name in names if getattr(curve, name) is not None}
+    if times[0] > 0:
+        firsts = {name: np.asarray(gas.floats.get(name, 0.0)) for name in known}
+        known = {name: np.append(firsts[name], x) for name, x in known.items()}
+        times = np.append(times.dtype.type(0.0), times)
+    curve = CoolingCurve(**as_jax_arrays({"times": times} | known))
+    return error_model_along(gas, curve, num_particles)
 
 
 def _collision_noise_covariance(
@@ -145,10 +146,8 @@ def mean_derivative_bias(result: Fit) -> float:
     """
     bias = result.curve.derivative_bias
     if bias is None:
-        comparison = result.comparison._replace(
-            num_particles=getattr(result.model, "num_particles", None)
-        )
-        error_model = _error_model(result.curve, result.gas, comparison)
+        N = getattr(result.model, "num_particles", None)
+        error_model = _error_model(result.curve, result.gas, 0.0, N)
         bias = np.broadcast_to(result.model.derivative_error(error_model), error_model.time.shape)
     times = result.curve.times.size
     weights = np.sum(np.asarray(result.comparison.sensitivity)[:times] ** 2, axis=1)

@@ -393,13 +393,8 @@ def search_starts(problem: Problem, first: Numbers) -> Numbers:
     return xp.stack([first, *(xp.where(np.concatenate(varied), x, first) for x in starts)])
 
 
-def goodness_of_fit(
-    parts: list[tuple[Numbers, Numbers, Numbers | None]],
-    degrees_of_freedom: Numbers,
-    *,
-    errors_known: bool,
-) -> GoodnessOfFit:
-    """Test the goodness of fit of weighted residuals.
+def goodness_of_fit(problem: Problem, rows: list[Rows], flat: Numbers) -> GoodnessOfFit:
+    """Test the goodness of fit of weighted residuals, of each quantity of each measurement.
 
     T and <dr^2> are tested separately, so that many points of one do not hide a misfit of the
     other: the p-value is that of the worse one, corrected for the choice. Residuals over estimated
@@ -410,29 +405,38 @@ def goodness_of_fit(
     below `SIGNIFICANCE`, and always if the errors are unknown.
 
     Args:
-        parts: for each observable the weighted residuals, their degrees of freedom, and the degrees
-            of freedom of their errors, None if these are exact.
-        degrees_of_freedom: degrees of freedom of all residuals.
-        errors_known: True if the errors of the curve are known.
+        problem: the measurements and unknowns.
+        rows: all residuals, also those of priors.
+        flat: the unknowns.
     """
-    xp = array_module(parts)
-    parts_chi2 = xp.stack([xp.sum(residuals**2) for residuals, *_ in parts])
-    chi2 = xp.sum(parts_chi2)
-    if not errors_known:
-        unknown = xp.full((), xp.nan)
-        return GoodnessOfFit(chi2, degrees_of_freedom, unknown, chi2 / degrees_of_freedom)
-    degrees = xp.stack([xp.maximum(number, 1) for _, number, _ in parts])
-    error_degrees = [of_errors for *_, of_errors in parts]
-    p_values = [
-        _p_value(xp, x, n, m) for x, n, m in zip(parts_chi2, degrees, error_degrees, strict=True)
-    ]
-    worst = xp.min(xp.stack(p_values))
-    p_value = (
-        -xp.expm1(len(parts) * xp.log1p(-xp.minimum(worst, 1 - 1e-12))) if len(parts) > 1 else worst
-    )
-    unexplained = p_value < SIGNIFICANCE
-    inflation = xp.where(unexplained, xp.maximum(xp.max(parts_chi2 / degrees), 1.0), 1.0)
-    return GoodnessOfFit(chi2, degrees_of_freedom, p_value, inflation)
+    xp, by_label = array_module(rows, flat), {m.label: m for m in problem.measurements}
+    factors: dict[Any, Numbers] = {(row.label, row.kind): row.values for row in rows}
+    total, squares, degrees, error_degrees = -flat.shape[0], [], [], []
+    for row in rows:
+        if row.label is None or not row.measured:
+            total = total + row.values.shape[0]
+            continue
+        m, values = by_label[row.label], row.values
+        weights = m.weights.get(row.kind)
+        number = values.shape[0] if weights is None else xp.sum(weights > 0)
+        own = problem.num_free if row.kind == "temperature" and len(by_label) == 1 else 0
+        if (factor := factors.get((row.label, FACTORS.get(row.kind)))) is not None:
+            values = xp.concatenate([values, factor])
+        total = total + number
+        squares.append(xp.sum(values**2))
+        degrees.append(xp.maximum(number - own, 1))
+        error_degrees.append(m.error_degrees.get(row.kind))
+    parts, total = xp.stack(squares), xp.asarray(total)
+    chi2 = xp.sum(parts)
+    if any(m.curve.temperature_error is None for m in problem.curves):
+        return GoodnessOfFit(chi2, total, xp.full((), xp.nan), chi2 / total)
+    tested = zip(parts, degrees, error_degrees, strict=True)
+    p_value = xp.min(xp.stack([_p_value(xp, *part) for part in tested]))
+    if len(parts) > 1:
+        p_value = -xp.expm1(len(parts) * xp.log1p(-xp.minimum(p_value, 1 - 1e-12)))
+    largest = xp.max(parts / xp.stack(degrees))
+    inflation = xp.where(p_value < SIGNIFICANCE, xp.maximum(largest, 1.0), 1.0)
+    return GoodnessOfFit(chi2, total, p_value, inflation)
 
 
 def _p_value(xp: Any, chi2: Numbers, degrees: Numbers, error_degrees: Numbers | None) -> Numbers:
@@ -476,7 +480,7 @@ def assemble_fit(
     gains = xp.split(gain, ends_of_rows, axis=1)
     jacobians = xp.split(jacobian[:, :p], ends_of_rows, axis=0)
     by_label = {m.label: m for m in problem.measurements}
-    goodness = _test_all(xp, problem, rows, flat)
+    goodness = goodness_of_fit(problem, rows, flat)
     covariances: dict[str, Numbers] = {}
     for row, part in zip(rows, gains, strict=True):
         name, part = row.kind, part * _as_row(row.share)
@@ -545,26 +549,3 @@ def assemble_fit(
 
 def _as_row(values: Numbers) -> Numbers:
     return values[None] if np.ndim(values) else values
-
-
-def _test_all(xp: Any, problem: Problem, rows: list[Rows], flat: Numbers) -> GoodnessOfFit:
-    """Test each quantity of each measurement."""
-    by_label: dict[str | None, Any] = {m.label: m for m in problem.measurements}
-    factors: dict[Any, Numbers] = {(row.label, row.kind): row.values for row in rows}
-    tested, num_priors = [], 0
-    for row in rows:
-        if not row.measured:
-            num_priors += row.values.shape[0]
-            continue
-        m, values = by_label[row.label], row.values
-        weights = m.weights.get(row.kind)
-        number = values.shape[0] if weights is None else xp.sum(weights > 0)
-        own = problem.num_free if row.kind == "temperature" and len(by_label) == 1 else 0
-        if (factor := factors.get((row.label, FACTORS.get(row.kind)))) is not None:
-            values = xp.concatenate([values, factor])
-        tested.append((values, number, own, m.error_degrees.get(row.kind)))
-    used = sum(number for _, number, *_ in tested)
-    degrees_of_freedom = xp.asarray(used + num_priors - flat.shape[0])
-    known = all(m.curve.temperature_error is not None for m in problem.curves)
-    parts = [(values, number - own, errors) for values, number, own, errors in tested]
-    return goodness_of_fit(parts, degrees_of_freedom, errors_known=known)
