@@ -73,13 +73,20 @@ def plot_curve(curve: CoolingCurve, axes: Axes | None = None, **style: Any) -> A
         from matplotlib import pyplot
 
         axes = pyplot.gca()  # a notebook displays it
-    shown = _drawn_indices(curve.times)
-    t, T = (np.asarray(x)[shown] for x in (curve.times, curve.temperature))
-    error = None if curve.temperature_error is None else np.asarray(curve.temperature_error)[shown]
-    look: dict[str, Any] = {"lw": 1.8, "elinewidth": 1.0} | style
-    axes.errorbar(t, T, error, **look)
-    axes.set(xscale="log", yscale="log", xlabel="time t (s)", ylabel=LABELS["temperature"])
+    style = {"lw": 1.8, "elinewidth": 1.0} | style
+    _draw_with_errors(axes, curve, "temperature", **style)
+    axes.set_xlabel("time t (s)")
     return axes
+
+
+def _draw_with_errors(axes: Axes, curve: CoolingCurve, name: str, **style: Any) -> None:
+    """Draw a quantity at t > 0 on logarithmic axes, with error bars if it has errors."""
+    shown = _drawn_indices(curve.times)
+    t, values = (np.asarray(x)[shown] for x in (curve.times, getattr(curve, name)))
+    error = getattr(curve, f"{name}_error")
+    error = None if error is None else np.asarray(error)[shown]
+    axes.errorbar(t, values, error, **style)
+    axes.set(xscale="log", yscale="log", ylabel=LABELS[name])
 
 
 def plot_fit(result: Fit, curve: CoolingCurve, axes: Any = None) -> np.ndarray:
@@ -174,22 +181,12 @@ def _draw_fit(axes: Any, result: Fit, curve: CoolingCurve, name: str) -> None:
     """Draw a measured quantity with error bars, the fitted one and the residuals, at t > 0."""
     top, bottom = axes
     shown = _drawn_indices(curve.times)
-    t, measured, computed, residuals = (
-        np.asarray(x)[shown]
-        for x in (
-            curve.times,
-            getattr(curve, name),
-            getattr(result.curve, name),
-            result.comparison.residuals[name],
-        )
-    )
-    error = getattr(curve, f"{name}_error")
-    error = None if error is None else np.asarray(error)[shown]
+    parts = curve.times, getattr(result.curve, name), result.comparison.residuals[name]
+    t, computed, residuals = (np.asarray(x)[shown] for x in parts)
     number, model = np.size(curve.times), result.model.name
     label = "measured" if number <= MAX_DRAWN else f"measured: {t.size} of {number}"
-    top.errorbar(t, measured, error, fmt="o", ms=3.5, color=INK, label=label, zorder=2)
+    _draw_with_errors(top, curve, name, fmt="o", ms=3.5, color=INK, label=label, zorder=2)
     top.plot(t, computed, color=colour_of(model), lw=1.8, label=f"{model}, fitted", zorder=3)
-    top.set(xscale="log", yscale="log", ylabel=LABELS[name])
     bottom.axhspan(-1, 1, color=COLOURS["guide"], alpha=0.2, lw=0)
     bottom.axhline(0, color=colour_of(model), lw=1.4)
     bottom.plot(t, residuals, "o", ms=3.5, color=INK)
