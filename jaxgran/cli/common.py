@@ -5,7 +5,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import jax
 from cyclopts import Parameter, Token
@@ -21,8 +21,6 @@ a command has set its options (`use_compilation_cache`)."""
 
 ModelOrAuto = Literal[ModelName, "auto"]
 """Models of `jaxgran fit`, which can also choose one."""
-
-MODELS: tuple[str, ...] = get_args(ModelOrAuto)
 
 Several = Parameter(consume_multiple=True)
 

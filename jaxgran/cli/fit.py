@@ -20,7 +20,7 @@ import numpy as np
 
 import jaxgran
 from jaxgran import plotting
-from jaxgran.cli.common import MODELS, FitOptions, models_by_name
+from jaxgran.cli.common import FitOptions, models_by_name
 from jaxgran.data.curve_file import GUESS, GUESSES, OPTIONAL_KEYS, PRIOR_KEYS, read_drops
 from jaxgran.data.files import header_count, header_number, write_atomically
 from jaxgran.data.tables import header_in_si
@@ -30,7 +30,7 @@ from jaxgran.fitting.result import CONDITIONAL, SIGNIFICANCE
 from jaxgran.models.choose import default_models
 from jaxgran.scene.parameters import BY_SYMBOL, MATERIAL, PARAMETERS, SCENE, symbol_of, unit_of
 
-JOINT_MODEL = MODELS[0]
+JOINT_MODEL = "kinetic-theory"
 """The only model of fits of drop tests and of several measurements: kinetic theory."""
 
 ANY_GAS = {"eta": "0.1", "T0": "1"}
@@ -95,7 +95,7 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         "priors": priors,
         "replicas": {k: header_count(h, "replicas") or 1 for k, h in headers.items()},
     }
-    label, model, reasons = next(iter(data)), models_by_name(default_models(2))[JOINT_MODEL], ()
+    label, model, reasons = next(iter(data)), jaxgran.KineticTheory(), ()
     if several:
         scene_names = [BY_SYMBOL[key].name for key in free if BY_SYMBOL[key].belongs_to == SCENE]
         arguments["separate"] = tuple(scene_names)

@@ -47,12 +47,10 @@ ALIASES = {
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "bars", " ": "blanks"}
 
-_MARKS = (
-    (codecs.BOM_UTF32_LE, "utf-32"),
-    (codecs.BOM_UTF32_BE, "utf-32"),
-    (codecs.BOM_UTF16_LE, "utf-16"),
-    (codecs.BOM_UTF16_BE, "utf-16"),
-)
+_MARKS = {
+    "utf-32": (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE),
+    "utf-16": (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE),
+}
 _BINARY = re.compile(r"[\x00-\x08\x0e-\x1f]")
 _NAME = re.compile(r"(?P<name>\w+)\s*(?:[(\[](?P<bracket>.*)[)\]]|/\s*(?P<slash>.+))?")
 _NAMES_BETWEEN_BLANKS = re.compile(r"[^\s(\[]+(?:\s*[(\[][^)\]]*[)\]])?")
@@ -85,7 +83,7 @@ def read_text(path: Path, columns: str) -> str:
         OSError: if it cannot be read.
     """
     content = read_bytes(path)
-    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8-sig")
+    encoding = next((x for x, marks in _MARKS.items() if content.startswith(marks)), "utf-8-sig")
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:
