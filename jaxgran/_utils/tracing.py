@@ -48,21 +48,15 @@ def in_compiled_code(*trees: Any) -> bool:
 
 def pad_to(values: Any, size: int) -> Array:
     """Pad an array to `size` rows by repeating its last row."""
-    missing = size - len(values)
-    if isinstance(values, Tracer):
-        last = jnp.broadcast_to(values[-1:], (missing, *values.shape[1:]))
-        return jnp.concatenate([values, last])
-    # NumPy, because JAX would compile a program for each length.
-    return concrete_array(
-        np.concatenate([values, np.repeat(np.asarray(values)[-1:], missing, axis=0)])
-    )
+    xp = array_module(values)  # by JAX a program would be compiled for each length
+    values = xp.asarray(values)
+    repeated = xp.repeat(values[-1:], size - len(values), axis=0)
+    return as_jax_arrays(xp.concatenate([values, repeated]))
 
 
 def truncate_to(values: Array, size: int) -> Array:
     """Return the first `size` rows of an array."""
-    if isinstance(values, Tracer):
-        return values[:size]
-    return concrete_array(np.asarray(values)[:size])  # NumPy: see `pad_to`
+    return as_jax_arrays(array_module(values).asarray(values)[:size])  # see `pad_to`
 
 
 def array_module(*trees: Any) -> Any:

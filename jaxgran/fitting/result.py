@@ -11,7 +11,7 @@ import scipy
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils.formatting import format_quantity, text_table
-from jaxgran._utils.tracing import any_traced, array_module, as_jax_arrays, concrete_array
+from jaxgran._utils.tracing import any_traced, array_module, as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.fitting.optimise import Problem, Trace
 from jaxgran.fitting.parameters import START_TIME, Numbers, Priors, with_floats
@@ -222,10 +222,7 @@ class Fit(eqx.Module):
     @property
     def covariance(self) -> Float[Array, "p p"]:
         """Covariance of the estimates, SI: the sum of all parts."""
-        parts = [*self.covariances.values()]
-        if any_traced(parts):
-            return sum(parts[1:], parts[0])
-        return concrete_array(np.sum(np.stack(parts), axis=0))  # by NumPy: nothing is compiled
+        return as_jax_arrays(sum(map(_by_numpy, self.covariances.values())))
 
     @property
     def standard_error(self) -> Float[Array, "p"]:
@@ -276,15 +273,9 @@ class Fit(eqx.Module):
         found = [i for i, both in enumerate(zip(elements, names, strict=True)) if name in both]
         if not found:
             raise ValueError(f"{name!r} was not free; free were {', '.join(self.names)}")
-        i: Any = found[0] if elements[found[0]] == name else found
-        estimate, error = self.estimate, self.standard_error
-        if any_traced((estimate, error)):
-            i = np.asarray(i)
-            return estimate[..., i], error[..., i]
-        return (
-            concrete_array(np.asarray(estimate)[..., i]),
-            concrete_array(np.asarray(error)[..., i]),
-        )
+        i = np.asarray(found[0] if elements[found[0]] == name else found)
+        estimate, error = (_by_numpy(x) for x in (self.estimate, self.standard_error))
+        return as_jax_arrays((estimate[..., i], error[..., i]))
 
     def degenerate_solutions(self) -> Float[np.ndarray, "others p"]:
         """Return the estimates at other minima that are as good as the deepest one.
@@ -331,14 +322,8 @@ class Fit(eqx.Module):
     @property
     def element_names(self) -> tuple[str, ...]:
         """Name of each element of `estimate`: "coefficients[0]" is the first of a vector."""
-        names: list[str] = []
-        for name, shape in self._shapes.items():
-            names += (
-                [f"{name}{[*map(int, i)]}".replace(" ", "") for i in np.ndindex(shape)]
-                if shape
-                else [name]
-            )
-        return tuple(names)
+        places = [(name, i) for name, shape in self._shapes.items() for i in np.ndindex(shape)]
+        return tuple(name + (f"[{','.join(map(str, i))}]" if i else "") for name, i in places)
 
     @property
     def _element_names(self) -> list[str]:
@@ -369,10 +354,14 @@ class Fit(eqx.Module):
 
 
 def _deviations(covariance: Float[Array, "p p"]) -> Float[Array, "p"]:
-    if any_traced(covariance):
-        return jnp.sqrt(jnp.diagonal(covariance, axis1=-2, axis2=-1))
+    xp = array_module(covariance)
     with np.errstate(invalid="ignore"):  # nan, as JAX has it
-        return concrete_array(np.sqrt(np.diagonal(np.asarray(covariance), axis1=-2, axis2=-1)))
+        return as_jax_arrays(xp.sqrt(xp.diagonal(_by_numpy(covariance), axis1=-2, axis2=-1)))
+
+
+def _by_numpy(values: Numbers) -> Numbers:
+    """Return an array of NumPy, with which nothing is compiled, or traced values unchanged."""
+    return array_module(values).asarray(values)
 
 
 def search_starts(problem: Problem, first: Numbers) -> Numbers:
