@@ -433,7 +433,7 @@ def _fit_memory(
         x = rate * np.sqrt(moved)
         for _ in range(NUM_ITERATIONS):
             x = rate * np.sqrt(moved / _displacement_factor(x))
-        h = np.sqrt(moved / _displacement_factor(x)) * _mean_memory(x)
+        h = np.sqrt(moved / _displacement_factor(x)) * scipy.special.exprel(-x)
         decay = np.exp(-gap * np.sqrt(x[i] / duration[i] * x[j] / duration[j]))
         model = unit * (h[i] * h[j] * decay - square * touch) / np.sqrt(D[i] * D[j])
         known = [] if prior is None else [(rate / prior - 1) / ENSKOG_ERROR]
@@ -476,12 +476,6 @@ def _correlations(steps: list[Step]) -> tuple[np.ndarray, ...]:
                 rows.append((k, k + lag, correlation, np.sqrt(a.size)))
     first, second, correlation, weight = np.array(rows).reshape(-1, 4).T
     return first.astype(int), second.astype(int), correlation, weight
-
-
-def _mean_memory(x: np.ndarray) -> np.ndarray:
-    """Return ``(1 - exp(-x))/x``."""
-    safe = np.where(x < 1e-6, 1.0, x)
-    return np.where(x < 1e-6, 1.0, -np.expm1(-safe) / safe)
 
 
 def _displacement_factor(x: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
