@@ -203,14 +203,12 @@ def fit(
             warnings.warn(unused, stacklevel=2)
     shared = all_priors.get(SHARED, {})
     _check_model(model, solver, (*names, *separate), shared, scenes[first], [*curves])
-    given = {*names, *separate, *all_priors.get(SHARED, {})}
-    prior_names = {name for some in all_priors.values() for name in some}
-    if {START_TIME, "temperature"} <= given and not {START_TIME, "temperature"} & prior_names:
-        for label in list(curves) if START_TIME in separate else [first]:
-            where = label if START_TIME in separate else SHARED
-            width = START_TIME_PRIOR * halving_time(curves[label])
+    known = {name for some in all_priors.values() for name in some}
+    if {START_TIME, "temperature"} <= {*names, *separate} - known:
+        for label in curves if START_TIME in separate else [SHARED]:
+            width = START_TIME_PRIOR * halving_time(curves[label or first])
             start_time = {START_TIME: (jnp.asarray(0.0), jnp.asarray(width))}
-            all_priors[where] = all_priors.get(where, {}) | start_time
+            all_priors[label] = all_priors.get(label, {}) | start_time
     descent = None
     if is_transformation(solver) and not any_traced(data, scenes, priors):
         solver = descent = Descent(solver, progress, throw)
@@ -562,7 +560,5 @@ def _warn(result: Fit) -> None:
             'jax.config.update("jax_enable_x64", True) first',
             stacklevel=3,
         )
-    if unvisited := describe_unvisited_knots(result):
-        warnings.warn(unvisited, stacklevel=3)
-    for clause in describe_search(result):
+    for clause in (*describe_unvisited_knots(result), *describe_search(result)):
         warnings.warn(clause, stacklevel=3)

@@ -1,5 +1,6 @@
 """The law of restitution that a fit has learnt: eps(v) with its band, compared with formulas."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -86,21 +87,20 @@ def visited_speeds(result: Fit) -> tuple[float, float]:
     return RestitutionSpline.visited_speeds(np.concatenate(parts))
 
 
-def describe_unvisited_knots(result: Fit) -> str | None:
-    """Return a sentence on knots of a fitted spline outside the visited speeds; None if none."""
+def describe_unvisited_knots(result: Fit) -> Iterator[str]:
+    """Yield a sentence on knots of a fitted spline outside the visited speeds, if there are any."""
     gas = next(iter(result.gas.values())) if isinstance(result.gas, dict) else result.gas
     if not isinstance(gas.law, RestitutionSpline) or "drops" not in result.names:
-        return None
+        return
     low, high = visited_speeds(result)
     knots = np.asarray(gas.law.speeds)
-    outside = [v for v in knots if not low / KNOT_MARGIN < v < high * KNOT_MARGIN]
-    if not outside:
-        return None
-    return (
-        f"the knots at {', '.join(f'{v:.2g}' for v in outside)} m/s lie outside the impact speeds "
-        f"{low:.2g} to {high:.2g} m/s that the gas visited: there eps follows from the smoothness "
-        "prior alone. Choose knots within RestitutionSpline.visited_speeds(T)"
-    )
+    outside = [f"{v:.2g}" for v in knots if not low / KNOT_MARGIN < v < high * KNOT_MARGIN]
+    if outside:
+        yield (
+            f"the knots at {', '.join(outside)} m/s lie outside the impact speeds {low:.2g} to "
+            f"{high:.2g} m/s that the gas visited: there eps follows from the smoothness prior "
+            "alone. Choose knots within RestitutionSpline.visited_speeds(T)"
+        )
 
 
 def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
