@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
-            warnings.showwarning = _print_warning
+            warnings.showwarning = lambda text, *_: print(f"check: {text}", file=sys.stderr)
             APP(words, exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()
     except KeyboardInterrupt:
@@ -63,10 +63,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
-
-
-def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
-    print(f"check: {message}", file=sys.stderr)
 
 
 @APP.command

@@ -461,9 +461,7 @@ def _nest(arrays: dict[str, Any]) -> Any:
     nested = {name: _nest(inner) for name, inner in children.items()}
     if all(name.isdigit() for name in nested):
         return tuple(nested[str(k)] for k in range(len(nested)))
-    is_particles = set(Particles._fields) - {"angular_velocity"} == nested.keys() - {
-        "angular_velocity"
-    }
+    is_particles = {*nested, "angular_velocity"} == {*Particles._fields}
     return Particles(**nested) if is_particles else nested
 
 

@@ -157,8 +157,6 @@ def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None =
 def open_frames(path: Path) -> list[Callable[[int | None], Frame]]:
     """Return a function for each frame of a file, which reads it, given its dimension or None."""
     if path.suffix == GSD:
-        if not path.exists():
-            raise FileNotFoundError
         with _import_gsd().open(str(path), "r") as file:
             return [partial(_read_gsd, path, k) for k in range(len(file))]
     text = read_bytes(path).decode("utf-8-sig")

@@ -68,12 +68,9 @@ def with_scene_errors(result: Fit) -> Fit:
 
 def curve_and_gas(result: Fit, label: str) -> tuple[CoolingCurve | None, Gas]:
     """Return the fitted curve and gas of one measurement; the curve of a drop test is None."""
-    curves, gases = result.curve, result.gas
-    if isinstance(gases, dict):
-        assert isinstance(curves, dict)
-        return curves.get(label), gases[label]
-    assert not isinstance(curves, dict)
-    return curves, gases
+    if isinstance(result.gas, dict):
+        return result.curve.get(label), result.gas[label]
+    return result.curve, result.gas
 
 
 def clock_accuracy(

@@ -223,14 +223,11 @@ class Measurement:
             weights[name] = _weights(xp, getattr(curve, name), curve.rotational_temperature_error)
             accuracies[name] = model.rotation_accuracy(gas)
         # A measured <dr^2> starts at t = 0 of the curve, not at t0.
-        has_errors = curve.displacement_error is not None or num_particles is not None
+        has_errors = T_error is not None and (
+            curve.displacement_error is not None or num_particles is not None
+        )
         accuracy = None
-        if (
-            use_displacement
-            and curve.displacement is not None
-            and has_errors
-            and T_error is not None
-        ):
+        if use_displacement and curve.displacement is not None and has_errors:
             accuracy = model.displacement_accuracy(gas)
         if accuracy is not None:
             accuracy, measured = xp.asarray(accuracy), xp.asarray(curve.displacement)
