@@ -209,12 +209,10 @@ def parameter_effects(
     values = {name: np.asarray(gas.value(name)) for name in varied}
     by_parameter = np.concatenate([of_logarithms(linear.by_float[n]) for n in varied], axis=1)
     rows = prior_residuals(priors, gas, values)
-    by_residual = np.concatenate(
+    by_residual = np.block(
         [
-            np.concatenate(
-                [row[1].get(n, np.zeros((row[0].size, values[n].size))) for n in varied], axis=1
-            )
-            for row in rows.values()
+            [slopes.get(n, np.zeros((row.size, values[n].size))) for n in varied]
+            for row, slopes in rows.values()
         ]
     )
     changes = by_parameter @ np.linalg.pinv(by_residual)

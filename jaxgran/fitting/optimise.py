@@ -229,20 +229,14 @@ class Problem:
         return rows, xp.concatenate([row.values for row in rows]), jacobian, computed
 
     def _jacobian(self, xp: Any, flat: Numbers, rows: list[Rows]) -> Numbers:
-        slopes, columns, begin = self.slopes(flat), [], 0
-        for u in self.unknowns:
-            factor = slopes[begin : begin + u.size]
-            begin += u.size
-            blocks = []
-            for row in rows:
-                applies = row.label is None or u.label is None or row.label == u.label
-                if applies and u.name in row.slopes:
-                    blocks.append(row.slopes[u.name] * factor[None])
-                else:
-                    blocks.append(xp.zeros((row.values.shape[0], u.size), flat.dtype))
-            columns.append(xp.concatenate(blocks))
-        whole = sum(row.values.shape[0] for row in rows)
-        return xp.concatenate([xp.zeros((whole, 0), flat.dtype), *columns], axis=1)
+        def slope(row: Rows, u: Unknown) -> Numbers:
+            applies = row.label is None or u.label is None or row.label == u.label
+            if applies and u.name in row.slopes:
+                return row.slopes[u.name]
+            return xp.zeros((row.values.shape[0], u.size), flat.dtype)
+
+        blocks = [[slope(row, u) for u in self.unknowns] for row in rows]
+        return xp.block(blocks) * self.slopes(flat)[None]
 
     def with_scatter_as_error(self, flat: Numbers) -> "Problem":
         """Return the problem with the scatter of ln T as the error of its curve, without errors.
