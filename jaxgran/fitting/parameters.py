@@ -279,7 +279,26 @@ def checked_priors(gas: Gas, priors: dict[str, Any]) -> Priors:
         ValueError: for an unknown name, a value outside its range or an error that is not positive.
     """
     for name, pair in priors.items():
-        _check_prior(gas, name, pair)
+        if name not in (DENSITY, START_TIME) and name not in gas.domains:
+            raise ValueError(
+                f"priors: no float {name!r} in this gas; it has {', '.join(gas.domains)}, and "
+                f"{DENSITY} and {START_TIME}"
+            )
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise ValueError(
+                f"priors: {name} needs (value, standard error), as (0.05, 0.002), got {pair!r:.60}"
+            )
+        if any_traced(pair):
+            continue
+        (value, error), domain = pair, _prior_domain(gas, name)
+        domain.check(f"priors: {name}", value, "Give the known value, in SI units.")
+        advice = "Leave out values that are known exactly."
+        POSITIVE.check(f"priors: standard error of {name}", error, advice)
+        if not np.all(np.isfinite(domain.to_free(np.asarray(value, float)))):
+            raise ValueError(
+                f"priors: {name} = {value} lies on the end of its range {domain}: give a value "
+                "inside the range"
+            )
     return {name: (jnp.asarray(pair[0]), jnp.asarray(pair[1])) for name, pair in priors.items()}
 
 
@@ -352,27 +371,3 @@ def residuals_and_slopes(
 
 def _prior_domain(gas: Gas, name: str) -> Domain:
     return POSITIVE if name == DENSITY else domain_of(gas, name)
-
-
-def _check_prior(gas: Gas, name: str, pair: object) -> None:
-    if name not in (DENSITY, START_TIME) and name not in gas.domains:
-        raise ValueError(
-            f"priors: no float {name!r} in this gas; it has {', '.join(gas.domains)}, and {DENSITY}"
-            f" and {START_TIME}"
-        )
-    if not isinstance(pair, tuple | list) or len(pair) != 2:
-        raise ValueError(
-            f"priors: {name} needs (value, standard error), as (0.05, 0.002), got {pair!r:.60}"
-        )
-    if any_traced(pair):
-        return
-    value, error = pair
-    _prior_domain(gas, name).check(f"priors: {name}", value, "Give the known value, in SI units.")
-    POSITIVE.check(
-        f"priors: standard error of {name}", error, "Leave out values that are known exactly."
-    )
-    if not np.all(np.isfinite(_prior_domain(gas, name).to_free(np.asarray(value, float)))):
-        raise ValueError(
-            f"priors: {name} = {value} lies on the end of its range {_prior_domain(gas, name)}: "
-            "give a value inside the range"
-        )
