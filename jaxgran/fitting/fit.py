@@ -219,19 +219,12 @@ def fit(
                 "a fit of a stochastic model cannot run inside jax.jit or jax.vmap: fit one curve "
                 "at a time, outside of them"
             )
-        result = fit_stochastic(
-            scenes[first],
-            curves[first],
-            model,
-            names,
-            _guess_of_kinetic_theory(scenes[first], curves[first], names, start),
-            jax.random.key(0) if key is None else key,
-            progress,
-            steps,
-            {k: x for k, x in all_priors.get(SHARED, {}).items() if k != SMOOTHNESS},
-            runs[first] or 1,
-            None if descent is None else descent.by_simulation,
-        )
+        gas, curve, key = scenes[first], curves[first], jax.random.key(0) if key is None else key
+        m = Measurement.of(first, gas, curve, model, None, runs[first] or 1, use_displacement=False)
+        guess = _guess_of_kinetic_theory(gas, curve, names, start)
+        shared = {k: x for k, x in all_priors.get(SHARED, {}).items() if k != SMOOTHNESS}
+        search_by = None if descent is None else descent.by_simulation
+        result = fit_stochastic(m, model, names, guess, key, progress, steps, shared, search_by)
     else:
         result = _fit_deterministic(
             scenes, data, model, names, separate, all_priors, start, counts, runs, solver, max_steps

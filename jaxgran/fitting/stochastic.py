@@ -91,8 +91,7 @@ class Search(NamedTuple):
 
 
 def fit_stochastic(
-    gas: Gas,
-    curve: CoolingCurve,
+    m: Measurement,
     model: AbstractModel,
     names: tuple[str, ...],
     guess: Gas,
@@ -100,22 +99,24 @@ def fit_stochastic(
     progress: bool,
     max_simulations: int,
     priors: Priors,
-    replicas: int,
     search_by: Callable[[Simulations, int], Search] | None = None,
 ) -> Fit:
     """Fit a stochastic model, starting at a guess.
 
-    Arguments, result and errors are those of `jaxgran.fit`. `search_by` is another search than
-    `search_by_simulation`, which also uses the prior residuals of the law.
+    The other arguments, result and errors are those of `jaxgran.fit`.
+
+    Args:
+        m: the curve, the only measurement.
+        search_by: another search than `search_by_simulation`, which also uses the prior residuals
+            of the law.
     """
-    m = Measurement.of("", gas, curve, model, None, replicas, use_displacement=False)
     m, curve = dataclasses.replace(m, accuracies={}), m.curve
     problem = Problem.of((m,), model, names, (), {}, clock_is_free=False)
     problem.check_points()
     first = np.asarray(problem.flat({"": guess.floats}))
 
     def gas_at(flat: Any) -> Gas:
-        return with_floats(gas, problem.values(flat)[""])
+        return with_floats(m.scene, problem.values(flat)[""])
 
     if not np.all(np.isfinite(first)):
         at = ", ".join(f"{name} = {guess.value(name)}" for name in names)
