@@ -43,7 +43,7 @@ from jaxgran.fitting.residuals import (
     uses_rotation,
     with_errors_of_particles,
 )
-from jaxgran.fitting.result import Fit, assemble_fit, search_starts
+from jaxgran.fitting.result import Fit, assemble_fit
 from jaxgran.fitting.stochastic import fit_stochastic
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model
@@ -304,14 +304,12 @@ def _fit_deterministic(
             accuracy = clock_accuracy(guesses[label], m, model, counts[label])
             m = replace(m, clock_accuracy=accuracy)
         measurements.append(m)
-    for m in measurements:  # drop tests begin at the shared values of the first curve
-        first = next((c for c in measurements if isinstance(c, Measurement)), None)
-        if isinstance(m, DropTestRows) and first is not None:
-            values = {n: guesses[first.label].value(n) for n in names if n in m.gas.domains}
-            guesses[m.label] = m.gas.replace(**values)
     problem = Problem.of(
         tuple(measurements), model, names, separate, priors, clock_is_free=clock_is_free
     )
+    for m in measurements:  # drop tests begin at the shared values of the first curve
+        if isinstance(m, DropTestRows) and problem.curves:
+            guesses[m.label] = with_values_of(m.gas, guesses[problem.curves[0].label], names)
     problem.check_points()
     first = problem.flat(_values_of_guesses(problem, guesses))
     if start is not None:
@@ -321,8 +319,7 @@ def _fit_deterministic(
         costs = xp.stack([xp.sum(problem.evaluate(flat)[1] ** 2) for flat in flats])
         first = flats[xp.argmin(xp.where(xp.isnan(costs), xp.inf, costs))]
     steps = (1000 if isinstance(solver, Descent) else 100) if max_steps is None else max_steps
-    starts = search_starts(problem, first)
-    (flat, iterations, converged), ends = best_of_starts(problem, starts, steps, solver)
+    (flat, iterations, converged), ends = best_of_starts(problem, first, steps, solver)
     if not any_traced(flat, data, scenes):
         _, fields = problem.evaluate(flat)[2:]
         _check_computed(model, free, problem.estimates(flat), fields.values())

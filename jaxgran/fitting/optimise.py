@@ -41,6 +41,10 @@ CONVERGED_STEP = 0.01
 TOLERANCE = 1e-8
 """Relative tolerance of a search, for the parameters and the sum of squares."""
 
+MULTIMODAL_PARAMETER, MULTIMODAL_STARTS = "tangential_restitution", (-0.6, 0.0, 0.6)
+"""Parameter in which chi^2 has several minima, and its start values: chi^2 has minima on both sides
+of the beta_t at which rotation takes most energy."""
+
 MAX_DISTANCE = 25.0
 """Largest change of an unconstrained parameter in a search: a factor 7e10 of a positive one."""
 
@@ -364,13 +368,19 @@ class _TrustRegion(optx.ClassicalTrustRegion):
 
 
 def best_of_starts(
-    problem: Problem, starts: Numbers, max_steps: int, solver: Any = None
+    problem: Problem, first: Numbers, max_steps: int, solver: Any = None
 ) -> tuple[Minimum, tuple[Numbers, Numbers]]:
-    """Search from several starts; return the deepest minimum, and all with their chi^2.
+    """Search from a first guess and, if beta_t is free, also with other values of beta_t.
 
-    chi^2 is infinite where it is nan. The steps are those of all searches.
+    Returns the deepest minimum, and all with their chi^2, which is infinite where it is nan. The
+    steps are those of all searches.
     """
-    xp = jnp if problem.is_traced else array_module(starts)
+    xp = jnp if problem.is_traced else array_module(first)
+    names = np.repeat([u.name for u in problem.unknowns], [u.size for u in problem.unknowns])
+    starts = [first]
+    for domain in [u.domain for u in problem.unknowns if u.name == MULTIMODAL_PARAMETER][:1]:
+        values = domain.to_free(np.asarray(MULTIMODAL_STARTS)).astype(first.dtype)
+        starts += [xp.where(names == MULTIMODAL_PARAMETER, x, first) for x in values]
 
     def search_from(start: Numbers) -> tuple[Minimum, Numbers]:
         minimum = search(problem, start, max_steps, solver)
@@ -378,7 +388,7 @@ def best_of_starts(
         return minimum, xp.where(xp.isnan(chi2), xp.inf, chi2)
 
     if xp is jnp:
-        (flats, steps, converged), chi2 = jax.lax.map(search_from, starts)
+        (flats, steps, converged), chi2 = jax.lax.map(search_from, xp.stack(starts))
     else:
         ends = [search_from(start) for start in starts]
         (flats, steps, converged), chi2 = jax.tree.map(lambda *x: np.stack(x), *ends)

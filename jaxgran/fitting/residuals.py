@@ -447,7 +447,6 @@ class DropTestRows(NamedTuple):
     label: str
     scene: Gas
     data: DropTest
-    nuisances: tuple[str, ...] = ()
     weights: dict[str, Numbers] = {}
     error_degrees: dict[str, Numbers] = {}
     clock_accuracy: float = 0.0

@@ -29,9 +29,6 @@ from jaxgran.scene.parameters import symbol_of, unit_of
 DEGENERATE_CHI2 = 9.0
 """Difference of chi^2 up to which two minima are equally good: three standard errors."""
 
-MULTIMODAL_PARAMETER, MULTIMODAL_STARTS = "tangential_restitution", (-0.6, 0.0, 0.6)
-"""Parameter in which chi^2 has several minima, and its start values."""
-
 MAX_ROWS = 20
 """Number of estimates up to which a fit lists each element of its vectors."""
 
@@ -362,24 +359,6 @@ def _deviations(covariance: Float[Array, "p p"]) -> Float[Array, "p"]:
 def _by_numpy(values: Numbers) -> Numbers:
     """Return an array of NumPy, with which nothing is compiled, or traced values unchanged."""
     return array_module(values).asarray(values)
-
-
-def search_starts(problem: Problem, first: Numbers) -> Numbers:
-    """Return the starts of a search: the first guess and, if beta_t is free, several beta_t.
-
-    chi^2 has minima on both sides of the beta_t at which rotation takes most energy.
-
-    Args:
-        problem: of the fit.
-        first: the first guess of its unknowns.
-    """
-    xp = array_module(first)
-    domains = [u.domain for u in problem.unknowns if u.name == MULTIMODAL_PARAMETER]
-    if not domains:
-        return first[None]
-    varied = [np.full(u.size, u.name == MULTIMODAL_PARAMETER) for u in problem.unknowns]
-    starts = domains[0].to_free(np.asarray(MULTIMODAL_STARTS)).astype(first.dtype)
-    return xp.stack([first, *(xp.where(np.concatenate(varied), x, first) for x in starts)])
 
 
 def goodness_of_fit(problem: Problem, rows: list[Rows], flat: Numbers) -> GoodnessOfFit:
