@@ -149,10 +149,8 @@ class AbstractSpheres(AbstractParticleModel):
                 softest of them.
             spare: capacity over the expected need.
         """
-        if not isinstance(gas, Gas):
-            raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
         checked_float("spare", spare, POSITIVE, "2 is twice the expected need.")
-        self.check_scene(gas)
+        self.check_scene(checks.checked_gas(gas))
         plan = self.planned(self.scene(gas), gas.dimension, spare)
         return dataclasses.replace(self, plan=plan)
 
