@@ -53,7 +53,6 @@ class FitOptions:
     """Options of `jaxgran fit`.
 
     Attributes:
-        curve: The first file.
         drop_test: One or more CSV files with columns v,eps,eps_err: single impacts of the spheres
             of the first curve, fitted jointly with it; without a curve their own header gives
             diameter, density, Y and nu.
@@ -76,7 +75,6 @@ class FitOptions:
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
 
-    curve: Annotated[Path, Parameter(parse=False)] = Path()
     drop_test: Annotated[tuple[Path, ...], Several] = ()
     onto_plate: bool = False
     model: ModelOrAuto = "kinetic-theory"

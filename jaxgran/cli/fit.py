@@ -45,21 +45,21 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         options: of the command.
         started: start of the job on the clock `time.perf_counter`.
     """
-    files = [path.resolve() for path in (*paths, *options.drop_test)]
-    several = len(files) > 1
-    if repeated := [str(path) for path in files if files.count(path) > 1]:
+    files = (*paths, *options.drop_test)
+    resolved, several = [path.resolve() for path in files], len(files) > 1
+    if repeated := [str(path) for path in resolved if resolved.count(path) > 1]:
         raise ValueError(f"{repeated[0]} is given twice. Give each measurement once.")
     if (several or not paths) and options.model != JOINT_MODEL:
         raise ValueError(
             f"--model {options.model}: drop tests and several measurements are fitted with "
             f"{JOINT_MODEL}. Fit the curves one by one with other models."
         )
-    picture, record = output_files(options)
+    picture, record = output_files(files[0].stem, options)
     free = options.free or (("A", "T0") if several else ())
     if free and all(BY_SYMBOL[key].belongs_to == SCENE for key in free) and several:
         raise ValueError(f"--free {' '.join(free)}: the curves share none of these. Add A.")
     gases, data, headers, priors = {}, {}, {}, {}
-    for path in (*paths, *options.drop_test):
+    for path in files:
         label = path.stem if path.stem not in data else str(path)
         if path in options.drop_test:
             data[label], header = read_drops(path, options.onto_plate)
@@ -105,7 +105,7 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         arguments |= {key: arguments[key][label] for key in ("num_particles", "replicas")}
         measured = gases[label], data[label]
         N = arguments["num_particles"]
-        model, reasons = choose_or_make_model(options, *measured, arguments["free"], N)
+        model, reasons = choose_or_make_model(options, files[0], *measured, arguments["free"], N)
     begin = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the diagnosis repeats them
@@ -176,14 +176,14 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     print(json.dumps(summary, allow_nan=False))
 
 
-def choose_or_make_model(options: Any, gas, curve, free, num_particles: int | None):
+def choose_or_make_model(options: FitOptions, path: Path, gas, curve, free, num_particles):
     """Return the model, and the reasons for it if it was chosen automatically."""
     size = num_particles if options.particles is None else options.particles
     replicas = options.replicas
     if options.model != "auto":
         model = models_by_name(default_models(2 if size is None else size, replicas))[options.model]
         if model.stochastic and size is None:
-            raise ValueError(f"{options.curve} does not give N. Add --particles.")
+            raise ValueError(f"{path} does not give N. Add --particles.")
         return model, ()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the diagnosis of the final fit repeats them
@@ -242,13 +242,17 @@ def gas_of(header: dict[str, str], free: Sequence[str]) -> jaxgran.Gas:
     return gas
 
 
-def output_files(options: Any) -> tuple[Path, Path]:
+def output_files(name: str, options: FitOptions) -> tuple[Path, Path]:
     """Return the paths of the picture and the JSON file, by default in a new folder.
+
+    Args:
+        name: of the curve.
+        options: of the command.
 
     Raises:
         ValueError: if the folder cannot be written to, or if a file exists and may not be replaced.
     """
-    stem = f"{options.curve.stem}-{options.model}"
+    stem = f"{name}-{options.model}"
     folder = options.out
     if folder is None:
         folder, i = Path("results") / stem, 2

@@ -1,6 +1,5 @@
 """The command line: `jaxgran fit`, `jaxgran cool` and `jaxgran choose`."""
 
-import dataclasses
 import os
 import sys
 import time
@@ -83,9 +82,9 @@ def fit(*curves: Path, options: common.FitOptions | None = None) -> None:
         common.use_compilation_cache()
     from jaxgran.cli.fit import run_fit
 
-    if not (files := (*curves, *options.drop_test)):
+    if not (*curves, *options.drop_test):
         raise ValueError("no curve is given. Name a file: jaxgran fit CURVE.csv.")
-    run_fit(curves, dataclasses.replace(options, curve=files[0]), started)
+    run_fit(curves, options, started)
 
 
 @APP.command
