@@ -11,7 +11,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from jaxgran._utils.validation import POSITIVE
-from jaxgran.fitting.parameters import with_floats
+from jaxgran.fitting.parameters import residuals_and_slopes, with_floats
 from jaxgran.fitting.result import Fit
 from jaxgran.scene.gas import Gas, law_fields
 from jaxgran.scene.laws import RestitutionSpline
@@ -124,19 +124,13 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
             f'no number of the law was free, only {", ".join(result.names)}. Fit with free="law"'
         )
     visited = visited_speeds(result)
-    if speeds is None:
-        speeds = np.geomspace(*visited, NUM_COMPARED)
+    grid = np.geomspace(*visited, NUM_COMPARED)
+    speeds = grid if speeds is None else speeds
     POSITIVE.check("speeds", speeds, "Give normal impact speeds in m/s.")
     v = np.asarray(speeds, float)
-
-    grid = np.geomspace(*visited, NUM_COMPARED)
-
-    def log_loss(values: dict[str, Array]) -> Array:
-        return _log_loss(with_floats(gas, values), jnp.asarray(np.append(v, grid)))
-
-    values = {name: gas.value(name) for name in own}
-    slopes = jax.jacfwd(log_loss)(values)
-    parts = [np.asarray(slopes[name]).reshape(v.size + grid.size, -1) for name in own]
+    law = jax.tree_util.Partial(_log_loss, speeds=jnp.asarray(np.append(v, grid)))
+    log, slopes = residuals_and_slopes(law, gas, {name: gas.value(name) for name in own})
+    parts = [np.asarray(slopes[name]) for name in own]
     at = [i for name in own for i, of in enumerate(result._element_names) if of == name]
     slope, covariance = np.concatenate(parts, axis=1), np.asarray(result.covariance)[np.ix_(at, at)]
     covariance = slope @ covariance @ slope.T
@@ -147,7 +141,7 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
         np.zeros(grid.size), correlation, NUM_DRAWS, method="eigh"
     )
     factor = np.quantile(np.abs(draws).max(axis=1), 0.95)
-    log, error = np.asarray(log_loss(values))[: v.size], error[: v.size]
+    log, error = np.asarray(log)[: v.size], error[: v.size]
     low, middle, high = (np.exp(-np.exp(log + x * error)) for x in (factor, 0, -factor))
     return RestitutionBand(v, middle, low, high, visited, covariance[: v.size, : v.size])
 
