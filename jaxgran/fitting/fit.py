@@ -16,7 +16,6 @@ from jaxgran._utils.tracing import any_traced, array_module
 from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.curve_file import DropTest
-from jaxgran.fitting.descent import MAX_LINEARISED, Descent
 from jaxgran.fitting.diagnosis import checked_absent, describe_search, diagnose
 from jaxgran.fitting.error_budget import clock_accuracy, with_scene_errors
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
@@ -44,7 +43,7 @@ from jaxgran.fitting.residuals import (
     with_errors_of_particles,
 )
 from jaxgran.fitting.result import Fit, assemble_fit
-from jaxgran.fitting.stochastic import fit_stochastic
+from jaxgran.fitting.stochastic import MAX_LINEARISED, Descent, fit_stochastic
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
