@@ -64,6 +64,8 @@ READ = {
     "a unit of a value": text_of(diameter="3 mm", density="1.2 g/cm^3", Y="20 MPa"),
     "per cent": text_of(eta="4 %"),
     "a late clock, told": text_of("t,T", (TIMES + 1000, T), t0=1000, t0_err=1),
+    "speeds in mm/s, T0 too": "# time_unit: ms\n# speed_unit: mm/s\n"
+    + text_of("t,T", (1e3 * TIMES, 1e6 * T), T0=2e4),
 }
 """Files that are read as the plain one, without a question."""
 
@@ -138,9 +140,8 @@ def said(read, content):
 
 def assert_plain(curve, gas, rtol=1e-7):
     np.testing.assert_allclose(curve.temperature, T, rtol=rtol)
-    for name, value in (("diameter", 0.003), ("packing_fraction", 0.04), ("youngs_modulus", 2e7)):
-        assert float(gas.value(name)) == pytest.approx(value, rel=1e-12)
-    assert float(gas.density) == pytest.approx(1200, rel=1e-12)
+    numbers = gas.diameter, gas.density, gas.packing_fraction, gas.youngs_modulus, gas.temperature
+    np.testing.assert_allclose(numbers, (0.003, 1200, 0.04, 2e7, 0.02), rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", READ)
@@ -162,16 +163,6 @@ def test_files_are_questioned(content, question, read):
 def test_files_are_refused(words, read):
     with pytest.raises(ValueError, match=f"(?s)curve.csv.*{words}"):
         read(REFUSED[words])
-
-
-def test_units_of_speeds_are_those_of_T(read):
-    """Times in ms with speeds in mm/s: T in (mm/s)^2."""
-    units = "# time_unit: ms\n# speed_unit: mm/s\n"
-    curve, gas, words = said(read, units + text_of("t,T", (1e3 * TIMES, 1e6 * T), T0=2e4))
-    assert words == ""
-    assert_plain(curve, gas)
-    np.testing.assert_allclose(curve.times, TIMES, rtol=1e-8)
-    assert float(gas.temperature) == pytest.approx(0.02)
 
 
 @pytest.mark.parametrize("error", [None, pytest.param(0.01 * T, marks=pytest.mark.slow)])
@@ -284,6 +275,26 @@ CALLS = [
     (lambda: gas_of(dimension=4), "dimension must be 2 or 3"),
     (lambda: gas_of(dimension=2.9), "dimension: must be a whole number from 1 to 1e.12, got '2.9'"),
     (lambda: gas_of(reduced_inertia=0.4), "reduced_inertia without beta_t.*# beta_t: guess"),
+    # elements, and what no gas here has
+    (lambda: gas_of(T_rot_0=1), "gives T_rot_0 without beta_t"),
+    (lambda: gas_of(container_side=0.05), "gives container_side without wall_restitution"),
+    (lambda: gas_of(friction=0.5), "gives friction without tangential_damping"),
+    (
+        lambda: gas_of(friction=0.3, tangential_damping=0.5, beta_t=0),
+        "both beta_t .* and tangential_damping.*SoftSpheres",
+    ),
+    (lambda: gas_of(friction=-1, tangential_damping=0.5), r"friction must lie in \[0, inf\)"),
+    (lambda: gas_of(gravity=9.81), "gravity: .*density and T change with height"),
+    (lambda: gas_of(diameter_2=0.004), "diameter_2: .*a temperature for each kind"),
+    (lambda: gas_of(polydispersity=0.1), "polydispersity: .*unequal temperatures"),
+    (lambda: gas_of(aspect_ratio=3), "aspect_ratio: .*rods and ellipsoids"),
+    (lambda: gas_of(cohesion=1e-6), "cohesion: .*stick"),
+    (lambda: gas_of(charge=1e-12), "charge: .*deflected without touching"),
+    (
+        lambda: gas_of(wall_restitution=0.9, container_side=0.07),
+        "N, eta and container_side contradict.*eta = 0.0824",
+    ),
+    # other headers and files
     (lambda: read_priors("eta"), "header must be a dictionary"),
     (lambda: read_priors({"eta_err": "0.01"}), "gives eta_err without eta"),
     (lambda: read_priors({"eta": "1", "eta_err": "-1"}), "eta_err: must be a positive number"),
