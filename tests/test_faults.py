@@ -17,14 +17,13 @@ import jaxgran
 from jaxgran import Run
 from jaxgran.particles import dynamics as moving
 from jaxgran.particles.run import block_until_ready, in_thread, run_through_times
-from tests.beads import glass_beads
+from tests.beads import glass_beads, spheres
 
 GAS = glass_beads(0.3, packing_fraction=0.1)
 TAU = float(GAS.mean_free_time)
 CURVE = jaxgran.CoolingCurve(times=[0.1, 0.2, 0.3, 0.4], temperature=[4e-3, 3e-3, 2e-3, 1e-3])
 SOFT, DSMC = jaxgran.SoftSpheres(20), jaxgran.DSMC(50)
 TESTS = Path(__file__).parent
-MASKED = np.ma.masked_all(1)
 
 
 def cool(gas=GAS, times=(TAU,), **options):
@@ -48,11 +47,6 @@ def test_statuses_are_explained():
     for wrong in (-1, 1.5, "x", 2**15):
         with pytest.raises(ValueError, match="status must be that of a curve"):
             jaxgran.explain_status(wrong)
-
-
-def test_particles_of_all_replicas_are_told():
-    with pytest.raises(ValueError, match=r"got \(1, 5, 3\): take particles.position\[0\]"):
-        jaxgran.observables.pair_correlation(np.zeros((1, 5, 3)), 1.0, [0.0, 0.1])
 
 
 def test_whole_numbers_of_numpy_are_taken():
@@ -172,11 +166,8 @@ def test_single_precision_has_no_trend(kind):
 
 def two_spheres(gas, distance, speed):
     """Two spheres at a distance in diameters that approach each other."""
-    side = gas.box_side(2)
-    apart = jnp.array([0.5 * distance * gas.diameter, 0.0, 0.0])
-    along = jnp.array([speed, 0.0, 0.0])
-    position, velocity = 0.5 * side + jnp.stack([apart, -apart]), jnp.stack([-along, along])
-    return jaxgran.Particles(position[None], velocity[None], side)
+    side, apart = gas.box_side(2), np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    return spheres(0.5 * (side + distance * gas.diameter * apart), -speed * apart, side)
 
 
 def test_soft_spheres_that_start_overlapping_are_told():

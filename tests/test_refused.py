@@ -12,7 +12,7 @@ import pytest
 
 import jaxgran
 from experiments.fit.own_model import HaffLaw
-from jaxgran import ReducedLaw, RestitutionLaw
+from jaxgran import ReducedLaw, RestitutionLaw, observables
 from tests.beads import SI, glass_beads, hard_gas
 
 NAN, INF = float("nan"), float("inf")
@@ -31,7 +31,8 @@ DSMC, SOFT = jaxgran.DSMC(100, replicas=2), jaxgran.SoftSpheres(20)
 SPLINE = hard_gas(jaxgran.RestitutionSpline([0.01, 0.03, 0.1, 0.3]), **SI)
 ELASTIC = GAS.replace(dissipative_constant=0.0)
 SPHERES = jaxgran.SoftSpheres(100, replicas=2)
-MASKED = np.ma.masked_all(1)
+HEATING = hard_gas(jaxgran.RestitutionSeries([0.1], [0.2]))
+POINTS = jnp.ones((10, 3))
 
 
 class NoRestitution(RestitutionLaw):
@@ -208,6 +209,11 @@ SCENES = [
         lambda: jaxgran.Domain(0.0).check("speed", "steel", "Give m/s."),
         "in .0, inf., got .* Give",
     ),
+    (
+        lambda: jaxgran.Domain(0.0, 1.0, high_allowed=True).check("share", [1.0, 0.0]),
+        r"share must lie in \(0, 1\], got 0",
+    ),
+    *((partial(jaxgran.Domain().check, "share", x), "share must lie in") for x in (NAN, INF, -INF)),
     (lambda: jaxgran.CoolingCurve(["steel"], [1.0]), "expected a number or an array of numbers"),
     (lambda: jaxgran.CoolingCurve([object()], [1.0]), "expected a number or an array of numbers"),
     (lambda: jaxgran.CoolingCurve([1.0, [2.0]], [1.0]), "expected a number or an array of numbers"),
@@ -220,8 +226,7 @@ CALLS = [
     (lambda: cool(model=SOFT, key=5), "jax.random.key.5., got 5"),
     (lambda: cool(model=SOFT, checkpoint=5), "checkpoint must be a path"),
     (lambda: cool(times=[1j]), "times must be a list of numbers"),
-    (lambda: cool(times=[1.0, -1.0]), "finite and not negative, got -1"),
-    (lambda: cool(times=[0.0, np.inf]), "finite and not negative, got inf"),
+    *((partial(cool, times=[x]), f"finite and not negative, got {x}") for x in (-1, INF, NAN)),
     (lambda: cool(times=[0.0, 2.0, 2.0]), "must increase, got 2 after 2"),
     (lambda: cool(times=[]), r"a list of numbers, got shape \(0,\)"),
     (lambda: cool(model=SOFT, save="velocity"), 'a replica, or "particles"'),
@@ -250,7 +255,7 @@ CALLS = [
     (lambda: jax.eval_shape(jax.jacfwd(jax.jit(chi2)), 1.0), "no derivative in the gas"),
     (lambda: cool(throw="no"), "throw must be True or"),
     (lambda: jaxgran.cool(GAS, [0.1], progress=5), "must be True"),
-    (lambda: jaxgran.DropTest(MASKED, [0.9], [0.01]), "are masked"),
+    (lambda: jaxgran.DropTest(np.ma.masked_all(1), [0.9], [0.01]), "are masked"),
     (lambda: jaxgran.read_particles(None), "must be the name of a file, got None"),
     (lambda: jaxgran.read_curve("a.csv", [1]), "must be a dictionary"),
     (lambda: jaxgran.read_gas({"eta": None}), "dictionary of texts"),
@@ -259,12 +264,30 @@ CALLS = [
     (lambda: cool(model=SOFT, trajectory="a.dcd"), "ends in .gsd or .xyz, got 'a.dcd'"),
     (lambda: cool(model=SOFT, trajectory=3), "must be a path, got 3"),
     (lambda: hard_gas(NotReduced()), "must return a .*ReducedLaw"),
-    (lambda: cool(times=[NAN]), "finite and not negative, got nan"),
     (lambda: cool(checkpoint="run.ckpt"), "no run to be saved"),
+    (
+        lambda: jax.jit(partial(cool, model=DSMC, checkpoint="run.ckpt"))(GAS),
+        "DSMC cannot write a checkpoint.*Set checkpoint=None",
+    ),
+    (lambda: cool(HEATING), "makes this gas heat up"),
+    (lambda: cool(HEATING, model=DSMC), "makes this gas heat up"),
+    # GPa taken for Pa
+    (lambda: cool(GAS.replace(youngs_modulus=0.05)), "Check that youngs_modulus is in Pa"),
     (lambda: slip("temperature", 2, 1e308), r"1e\+308, which cannot be measured"),
     (lambda: slip("temperature", 2, 1e-320), "e-321, which cannot be measured"),
     (lambda: slip("times", -1, 1e308), r"1e\+308, which cannot be measured"),
     (lambda: slip("temperature_error", 1, 1e-300), "1e-300, which cannot be measured"),
+    # observables
+    (partial(observables.pair_correlation, POINTS, 1.0, [0.2, 0.1]), "increasing numbers >= 0"),
+    (partial(observables.pair_correlation, POINTS, 1.0, [0.2, 0.51]), "last edge.* 0.5, got 0.51"),
+    (partial(observables.pair_correlation, POINTS, 1.0, [0.1, 0.2], 11), "from 1 to 10, got 11"),
+    (
+        partial(observables.pair_correlation, POINTS[None], 1.0, [0.0, 0.1]),
+        "got .1, 10, 3.: take particles.position.0",
+    ),
+    (partial(observables.structure_factor, POINTS, 1.0, 0), "num_shells must be a whole number"),
+    (partial(observables.cell_density, POINTS, 1.0, 0), "cells must be a whole number >= 1, got 0"),
+    (partial(observables.velocity_distribution, POINTS, [0.1]), "at least two increasing numbers"),
     # the choice of a model
     *((partial(choose, x), "tolerance must") for x in (0, -0.1, NAN, "2 %")),
     (lambda: choose(num_particles=1), "num_particles must be a whole number >= 2, an"),

@@ -151,15 +151,6 @@ def test_says_when_impacts_are_too_fast(beads, monkeypatch):
     assert "many pairs are faster" in jaxgran.explain_status(curve.status)
 
 
-def test_keeps_no_checkpoint_in_compiled_code():
-    def f(eps):
-        curve = jaxgran.cool(constant(eps), [1.0], model=DSMC(100), checkpoint="run.npz")
-        return curve.temperature[0]
-
-    with pytest.raises(ValueError, match="DSMC cannot write a checkpoint.*Set checkpoint=None"):
-        jax.jit(jax.grad(f))(0.6)
-
-
 @pytest.mark.slow
 def test_each_of_a_few_particles_meets_the_others():
     # At rest as a whole, N particles have relative velocities of T N/(N-1) and N - 1 partners

@@ -9,7 +9,7 @@ import pytest
 import jaxgran
 from experiments.support.closed_forms import paper_temperature
 from jaxgran import KineticTheory
-from tests.beads import curves_of, hard_gas
+from tests.beads import curves_of
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
 # equations, clipped restitution, Gaussian start, no softness correction.
@@ -102,18 +102,6 @@ def test_stiff_solver_for_nearly_elastic_gases(beads):
     formula = paper_temperature(tau, gas.delta)
     # The expansion is right to delta here; softness 0.8 % of the rate, a_2 less.
     np.testing.assert_allclose(curve.temperature / gas.temperature, formula, rtol=0.03)
-
-
-def test_what_is_refused(beads):
-    hot = hard_gas(jaxgran.RestitutionSeries([0.1], [0.2]))
-    for model in (KineticTheory(), jaxgran.DSMC(100)):
-        with pytest.raises(ValueError, match="makes this gas heat up"):
-            jaxgran.cool(hot, [1.0], model=model)
-    gas = beads(0.1)
-    gas = gas.replace(youngs_modulus=1e-9 * gas.value("youngs_modulus"))  # GPa taken for Pa
-    with pytest.raises(ValueError, match="Check that youngs_modulus is in Pa"):
-        jaxgran.cool(gas, [1.0])
-    assert jaxgran.cool(gas, [1.0], model=KineticTheory(softness=False)).temperature[0] > 0
 
 
 def test_another_number_of_times_compiles_nothing(beads, caplog):

@@ -191,19 +191,3 @@ def test_cells(dimension):
     clumped = (2**dimension - 1) * 2**dimension  # variance of the density, times the mean number
     assert fluctuation == pytest.approx(clumped, rel=1e-13)
     assert np.sum(np.isnan(flow[..., 0])) == 2**dimension - 1
-
-
-@pytest.mark.parametrize(
-    "function, arguments, message",
-    [
-        (obs.pair_correlation, (1.0, [0.2, 0.1]), "increasing numbers >= 0, got"),
-        (obs.pair_correlation, (1.0, [0.0, 0.25, 0.51]), r"the last edge.* 0.5, got 0.51"),
-        (obs.pair_correlation, (1.0, [0.1, 0.2], 11), "from 1 to 10, got 11"),
-        (obs.structure_factor, (1.0, 0), "num_shells must be a whole number >= 1, got 0"),
-        (obs.cell_density, (1.0, 0), "cells must be a whole number >= 1, got 0"),
-        (obs.velocity_distribution, ([0.1],), "at least two increasing numbers"),
-    ],
-)
-def test_bad_requests_are_refused(function, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        function(jnp.ones((10, 3)), *arguments)
