@@ -13,7 +13,7 @@ import pytest
 import jaxgran
 from experiments.fit.own_model import HaffLaw
 from jaxgran import ReducedLaw, RestitutionLaw, observables
-from tests.beads import SI, glass_beads, hard_gas
+from tests.beads import SI, glass_beads, hard_gas, spheres
 
 NAN, INF = float("nan"), float("inf")
 GAS, GRAINS = glass_beads(0.15), hard_gas(0.9, 0.02, **SI)
@@ -33,6 +33,13 @@ ELASTIC = GAS.replace(dissipative_constant=0.0)
 SPHERES = jaxgran.SoftSpheres(100, replicas=2)
 HEATING = hard_gas(jaxgran.RestitutionSeries([0.1], [0.2]))
 POINTS = jnp.ones((10, 3))
+SIDE = GAS.box_side(20)
+ROUGH = jaxgran.Rough(0.1)
+OF_TWO = hard_gas(0.8, 0.1)
+TOUCHING, APART = (
+    spheres([[1.0, 1.0, 1.0], [x, 1.0, 1.0]], np.zeros((2, 3)), OF_TWO.box_side(2))
+    for x in (1.5, 2.1)
+)
 
 
 class NoRestitution(RestitutionLaw):
@@ -96,8 +103,9 @@ def gas_with(**fields):
     return dataclasses.replace(GRAINS, **fields)
 
 
-def between_walls(side, **tangential):
-    return gas_with(container=jaxgran.Walls(side, restitution=0.9, **tangential))
+def between_walls(side=SIDE, restitution=GAS.law, surface=None, **tangential):
+    walls = jaxgran.Walls(side, restitution=restitution, **tangential)
+    return dataclasses.replace(GAS, container=walls, surface=surface)
 
 
 def steady_state(eps, strength):
@@ -171,7 +179,18 @@ SCENES = [
     (lambda: jaxgran.Walls(0.1, restitution="hard"), "restitution of the walls must be a num"),
     (lambda: between_walls(4.1e-3), r"walls / diameter must lie in \(2.1, inf\), got 2.05"),
     (lambda: between_walls([0.1, 0.1]), "must be one number or 3"),
-    (lambda: between_walls(0.1, tangential_restitution=0.0), "needs rough spheres: add surface"),
+    (lambda: between_walls(tangential_restitution=0.0), "needs rough spheres: add surface"),
+    (lambda: jaxgran.Frictional(0.5, -0.1), "friction must lie in"),
+    (lambda: jaxgran.Frictional(-0.5, 0.1), "tangential_damping must lie in"),
+    (lambda: between_walls(friction=0.1), "no tangential_damping.*Give"),
+    (
+        lambda: between_walls(friction=-0.1, tangential_damping=0.5),
+        "friction of the walls must lie in",
+    ),
+    (
+        lambda: between_walls(friction=0.4, tangential_damping=0.8),
+        "walls needs frictional spheres",
+    ),
     (
         lambda: gas_with(drag=jaxgran.StokesDrag(0.1, rotational_rate=0.2)),
         "rotational_rate of the drag needs spheres that rotate, got a rate of 0.2",
@@ -236,6 +255,25 @@ CALLS = [
     (lambda: SOFT.sized_for(GAS, spare=-1), "spare must lie in"),
     (lambda: jaxgran.diagnose(None, CURVE), "got NoneType and CoolingCurve"),
     (lambda: cool(model=jaxgran.SoftSpheres(20, start=(1, 2))), "Particles"),
+    (
+        lambda: cool(OF_TWO, model=jaxgran.HardSpheres(2, start=TOUCHING)),
+        "0.5 diameters apart, hard spheres must not overlap",
+    ),
+    (lambda: cool(OF_TWO, model=jaxgran.HardSpheres(3, start=APART)), "start.position has shape"),
+    (lambda: cool(hard_gas(0.8, 0.09), model=jaxgran.HardSpheres(2, start=APART)), "start.box_s"),
+    (lambda: jax.jit(partial(cool, model=SOFT))(GAS), "sized_for"),
+    (
+        lambda: SOFT.check(between_walls(surface=ROUGH, tangential_restitution=0.5)),
+        "belongs to instantaneous impacts.*tangential_damping",
+    ),
+    (
+        lambda: cool(between_walls(restitution=0.9), model=SOFT),
+        "needs walls of the Viscoelastic law.*Use HardSpheres",
+    ),
+    (
+        lambda: cool(between_walls(GAS.box_side(24)), model=SOFT),
+        "of packing_fraction 0.05 need a container 0.833",
+    ),
     (lambda: jaxgran.Viscoelastic("5e7", 0.2, 1e-6), "got '5e7'"),
     (lambda: GAS.replace(mass=True), "mass must be a number"),
     (lambda: jaxgran.KineticTheory(sonine="no"), "must be True or False"),
@@ -336,6 +374,11 @@ FITS = [
     ({"model": SPHERES, "solver": optx.BFGS(1e-8, 1e-8)}, "least squares"),
     ({"model": DSMC, "start": ELASTIC}, "cannot start at dissipative_constant = 0.0"),
     ({"model": DSMC, "gas": SPLINE, "free": "law"}, "KineticTheory.. or a solver of optax"),
+    (
+        {"gas": OF_TWO, "model": jaxgran.HardSpheres(2, replicas=2, start=APART)}
+        | {"free": ("coefficient", T_0)},
+        "temperature cannot be fitted from a given start",
+    ),
     # several measurements
     ({"data": {}}, "data is empty"),
     ({"data": TWO, "priors": {"c: mass": (1.0, 0.1)}}, "no measurement 'c'; there are"),

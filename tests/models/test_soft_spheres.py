@@ -10,10 +10,9 @@ import pytest
 from scipy.linalg import hadamard
 
 import jaxgran
-from experiments.support.scenes import hard_beads
 from jaxgran import SoftSpheres
 from jaxgran.particles.soft.forces import flight_time
-from tests.beads import curves_of, glass_beads, lattice, soft_beads, spheres, total_energy
+from tests.beads import curves_of, lattice, soft_beads, spheres, total_energy
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 
@@ -101,9 +100,8 @@ def test_single_precision():
 NUM = 100
 MODEL = SoftSpheres(NUM)
 FRICTIONLESS = {"friction": 0.0, "tangential_damping": 0.0}
-FRICTIONAL, ROUGH = {"friction": 0.4, "tangential_damping": 0.8}, {"tangential_restitution": 0.5}
+FRICTIONAL = {"friction": 0.4, "tangential_damping": 0.8}
 SLIPPERY = jaxgran.Frictional(0.0, 0.0, inertia=0.5)
-LAW = glass_beads().law
 
 
 def soft(fraction=0.05, beta=0.15, num=NUM, law=None, walls=None, **elements) -> jaxgran.Gas:
@@ -113,10 +111,6 @@ def soft(fraction=0.05, beta=0.15, num=NUM, law=None, walls=None, **elements) ->
         law = gas.law if law == "own" else law
         elements["container"] = jaxgran.Walls(gas.box_side(num), restitution=law, **(walls or {}))
     return dataclasses.replace(gas, **elements)
-
-
-def cooled(gas) -> jaxgran.CoolingCurve:
-    return jaxgran.cool(gas, [0.1], model=MODEL)
 
 
 def two_spheres(gas, position, velocity) -> jaxgran.Particles:
@@ -221,42 +215,6 @@ def test_steps_with_friction_are_of_second_order():
         ends.append(np.concatenate([end.velocity[0, 0, :2], spin]))
     # Terms of fourth order: 2 % of the error at 20 steps.
     np.testing.assert_allclose((ends[0] - ends[1]) / (ends[1] - ends[2]), 4.0, rtol=0.04)
-
-
-def start_with_spins():
-    gas = soft(num=2, surface=jaxgran.Frictional(0.5, 0.3))
-    start = two_spheres(gas, [[1e-3] * 3, [4e-3] * 3], np.zeros((2, 3)))
-    start = start._replace(angular_velocity=jnp.ones((1, 2, 3)))
-    jaxgran.cool(gas, [0.1], model=SoftSpheres(2, start=start))
-
-
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda: jaxgran.Frictional(0.5, -0.1), "friction must lie in"),
-        (lambda: jaxgran.Frictional(-0.5, 0.1), "tangential_damping must lie in"),
-        (lambda: jaxgran.Walls(0.1, restitution=LAW, friction=0.1), "no tangential_damping.*Give"),
-        (
-            lambda: jaxgran.Walls(0.1, restitution=LAW, tangential_damping=0.5, friction=-0.1),
-            "friction of the walls must lie in",
-        ),
-        (lambda: soft(law="own", walls=FRICTIONAL), "walls needs frictional spheres"),
-        (
-            lambda: MODEL.check(soft(law="own", walls=ROUGH, surface=jaxgran.Rough(0.1))),
-            "belongs to instantaneous impacts.*tangential_damping",
-        ),
-        (lambda: cooled(soft(law=0.9)), "needs walls of the Viscoelastic law.*Use HardSpheres"),
-        (
-            lambda: cooled(soft(law="own", num=120)),
-            "of packing_fraction 0.05 need a container 0.833",
-        ),
-        (lambda: cooled(hard_beads(0.1, 0.9)), "needs the Viscoelastic law"),
-        (start_with_spins, "draws the angular velocities of a start"),
-    ],
-)
-def test_what_it_cannot_take_is_refused_in_words(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
 
 
 @pytest.mark.slow  # compiles derivatives in ten floats
