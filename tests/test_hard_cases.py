@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import jaxgran
 from experiments.support.closed_forms import haff
-from experiments.support.scenes import beads
+from experiments.support.scenes import beads, cool
 from jaxgran import DSMC, HardSpheres, SoftSpheres
 from tests.beads import hard_gas, spheres
 
@@ -33,10 +33,6 @@ def either(double, single):
 
 def taus(gas, *tau):
     return np.asarray(tau) * float(gas.mean_free_time)
-
-
-def cool(gas, times, model):
-    return jaxgran.cool(gas, times, model=model, progress=False)
 
 
 def log_ratio(gas, times):

@@ -1,7 +1,6 @@
 """Curve files: what is read and written, and what is refused."""
 
 import dataclasses
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -12,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
+from experiments.support.record import DATA
 from tests.beads import glass_beads
 
-DATA = Path(__file__).parents[2] / "experiments" / "data"
 HEADER = "# eta: 0.05\n# diameter: 0.002\n# density: 2500\n# Y: 5e7\n# nu: 0.22\n# T0: 0.01\n"
 ROWS = "t,T,T_err\n0,0.01,0\n1,0.005,1e-5\n2,0.003,1e-5\n3,0.002,1e-5\n"
 

@@ -2,14 +2,13 @@
 
 import json
 import re
-from pathlib import Path
 
 import pytest
 
 import experiments.documents as documents
+from experiments.support.record import EXPERIMENTS
 
-ROOT = Path(__file__).parents[2]
-EXPERIMENTS = ROOT / "experiments"
+ROOT = EXPERIMENTS.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "jaxgran" / "README.md", *EXPERIMENTS.glob("*.md")]
 RECORDS = sorted(EXPERIMENTS.glob("figures/**/*.json"))
 ENTRY = r"^\| (.*?) ?\| (.*)<br>\[`(.*)`\]\(.*\) \| (.*?)(?: \(\[table\].*)? \| (.*) \|$"

@@ -3,13 +3,12 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from experiments.support.record import EXPERIMENTS
 from tests.experiments.scripts import run
 
-EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 TEXT = (EXPERIMENTS / "recipes.md").read_text(encoding="utf-8")
 RECIPES = dict(re.findall(r"^## (.*?)\n.*?```python\n(.*?)```", TEXT, re.DOTALL | re.MULTILINE))
 WRITTEN = {

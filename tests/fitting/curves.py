@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 import jaxgran
+from experiments.support.record import DATA
 from tests.beads import glass_beads
-from tests.data.test_curve import DATA
 
 A = "dissipative_constant"
 BOTH = (A, "temperature")

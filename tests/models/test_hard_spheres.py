@@ -3,13 +3,13 @@
 import dataclasses
 import itertools
 from functools import partial
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
 import jaxgran
+from experiments.support.scenes import of_lammps
 from jaxgran import HardSpheres
 from tests.beads import (
     SI,
@@ -21,8 +21,6 @@ from tests.beads import (
     spheres,
     total_energy,
 )
-
-DATA = Path(__file__).parents[2] / "experiments" / "data"
 
 
 def serial(gas, start, end):
@@ -163,8 +161,7 @@ def test_jit_flags_the_start_of_another_gas_and_what_it_cannot_grow():
 
 @pytest.mark.slow
 def test_lammps_curve():
-    curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
-    gas = jaxgran.read_gas(header).replace(dissipative_constant=float(header["A"]))
+    gas, curve, _ = of_lammps("dilute")
     ours = jaxgran.cool(gas, curve.times, model=HardSpheres(1000, replicas=4))
     # LAMMPS resolves contacts, whose softness slows the cooling by 0.5 %.
     soft, hard = (
