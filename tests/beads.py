@@ -1,5 +1,6 @@
 """The gases of most tests, and their particles."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,9 +12,8 @@ SI = {"diameter": 2e-3, "mass": 1e-5, "temperature": 0.01}
 
 def glass_beads(beta: float = 0.15, dimension: int = 3, **values) -> jaxgran.Gas:
     """A gas of 2 mm beads whose impacts at the thermal speed have a given beta."""
-    law = jaxgran.Viscoelastic(5e7, 0.22, 1e-6)
-    scene = SI | {"mass": jaxgran.sphere_mass(0.002, 2500.0)}
-    gas = jaxgran.Gas(law, packing_fraction=0.05, dimension=dimension, **scene)
+    gas = scenes.beads(0.05, beta, dimension=dimension)
+    gas = gas.replace(youngs_modulus=5e7, dissipative_constant=1e-6)
     return gas.replace(dissipative_constant=1e-6 * beta / gas.thermal_beta).replace(**values)
 
 
@@ -32,8 +32,7 @@ def hard_gas(law=0.9, packing_fraction=0.05, dimension=3, **values) -> jaxgran.G
 
 def theory_curve(gas, taus, **settings) -> jaxgran.CoolingCurve:
     """The curve of kinetic theory at times in mean free times."""
-    times = taus * gas.mean_free_time
-    return jaxgran.cool(gas, times, model=jaxgran.KineticTheory(**settings))
+    return jaxgran.cool(gas, taus * gas.mean_free_time, model=jaxgran.KineticTheory(**settings))
 
 
 def lattice(gas, n, replicas=1) -> jaxgran.Particles:
@@ -75,3 +74,11 @@ def total_energy(gas, curve):
         twice = twice + {2: 1, 3: 3}[gas.dimension] * curve.rotational_temperature
     parts = [curve.elastic_energy, curve.dissipated_energy]
     return np.asarray(0.5 * gas.mass * twice + sum(x for x in parts if x is not None))
+
+
+def assert_same(a, b):
+    """Check that two trees have one structure, and arrays of the same types, shapes and bits."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(map(np.asarray, jax.tree.leaves(a)), jax.tree.leaves(b), strict=True):
+        assert x.dtype == np.asarray(y).dtype and x.shape == np.shape(y)
+        assert x.tobytes() == np.asarray(y).tobytes()

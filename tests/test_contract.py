@@ -36,7 +36,9 @@ import jaxgran
 from experiments.fit.own_model import HaffLaw
 from experiments.support.scenes import hard_beads
 from jaxgran import Rough, StokesDrag, Walls, WhiteNoise
-from tests.beads import glass_beads, lattice, total_energy
+from jaxgran.data.curve import QUANTITIES
+from jaxgran.scene.parameters import FLOAT_UNITS
+from tests.beads import assert_same, glass_beads, lattice, total_energy
 
 N, REPLICAS = 64, 2
 TAUS = np.array([0.0, 0.02, 0.5, 2.0])
@@ -133,44 +135,34 @@ NO_LIMIT = 1e9
 
 HOST = re.compile(r"callback|infeed|outfeed|host_transfer|\bsend\b|\brecv\b|send-done|recv-done")
 
-UNITS = {  # powers of metre, second and kilogram
-    "diameter": (1, 0, 0),
-    "mass": (0, 0, 1),
-    "temperature": (2, -2, 0),
-    "youngs_modulus": (-1, -2, 1),
-    "dissipative_constant": (0, 1, 0),
-}
-CURVE_UNITS = {
-    "times": (0, 1, 0),
-    "temperature": (2, -2, 0),
-    "displacement": (2, 0, 0),
-    "sonine": (0, 0, 0),
-    "third_sonine": (0, 0, 0),
-    "collisions": (0, 0, 0),
-    "diffusion": (2, -1, 0),
-    "velocity_correlation": (2, -2, 0),
-    "elastic_energy": (2, -2, 1),
-    "dissipated_energy": (2, -2, 1),
-}
+METRE, SECOND, KILOGRAM = 37.0, 0.013, 8.1
+SCALES = {"m": METRE, "s": SECOND, "kg": KILOGRAM, "Pa": KILOGRAM / METRE / SECOND**2}
+SCALES |= {"J": KILOGRAM * METRE**2 / SECOND**2}
+"""How many of other units make one of the SI."""
 
 
-def known(curve, scales=(1.0, 1.0, 1.0)):
-    """The quantities of a curve, in units that are smaller by these factors."""
+def in_other_units(value, unit):
+    """A value in SI, whose unit is a product of powers as in m^2/s^2, in the other units."""
+    return value * eval(unit.replace("^", "**"), {}, SCALES)
+
+
+def known(curve, convert=lambda value, unit: value):
+    """The quantities of a curve but for errors, which are differences of replicas."""
     return {
-        name: getattr(curve, name) * np.prod(np.power(scales, powers))
-        for name, powers in CURVE_UNITS.items()
-        if getattr(curve, name) is not None
+        name: convert(getattr(curve, name), quantity.unit)
+        for name, quantity in QUANTITIES.items()
+        if getattr(curve, name) is not None and not name.endswith("_error")
     }
 
 
-def check_same(found, expected, scales=(1.0, 1.0, 1.0), slope_accuracy=1e-5):
+def check_same(found, expected, slope_accuracy=1e-5, **convert):
     """Check that two curves with their derivatives agree in all known quantities.
 
     Rounding grows some hundredfold in a mean free time; it may also let soft spheres project their
     tangents a block earlier or later.
     """
     for one, other, tolerance in zip(found, expected, (1e-9, slope_accuracy), strict=True):
-        one, other = known(one), known(other, scales)
+        one, other = known(one), known(other, **convert)
         assert one.keys() == other.keys()
         for name, values in other.items():
             size = np.nanmax(np.abs(values), initial=0.0)
@@ -417,19 +409,18 @@ class TestContract:
 
     @of_models()
     def test_units_do_not_matter(self, case):
-        scales = 37.0, 0.013, 8.1
         gas, start = case.gas, case.start
-        factors = {name: np.prod(np.power(scales, powers)) for name, powers in UNITS.items()}
-        names = UNITS.keys() & gas.domains.keys()
-        gas = gas.replace(**{name: gas.value(name) * factors[name] for name in names})
+        names = FLOAT_UNITS.keys() & gas.domains.keys()
+        floats = {name: in_other_units(gas.value(name), FLOAT_UNITS[name]) for name in names}
+        gas, times = gas.replace(**floats), in_other_units(case.times, "s")
         if start is not None:
             start = start._replace(
-                position=start.position * scales[0],
-                velocity=start.velocity * scales[0] / scales[1],
-                box_side=start.box_side * scales[0],
+                position=in_other_units(start.position, "m"),
+                velocity=in_other_units(start.velocity, "m/s"),
+                box_side=in_other_units(start.box_side, "m"),
             )
-        found = case.curve_and_slope(gas, case.times * scales[1], start)
-        check_same(found, case.reference, scales)
+        found = case.curve_and_slope(gas, times, start)
+        check_same(found, case.reference, convert=in_other_units)
 
     @pytest.mark.parametrize(
         "change", [boosted, translated, permuted, rotated], ids=lambda change: change.__name__
@@ -554,8 +545,7 @@ class TestContract:
             with pytest.raises(KeyboardInterrupt):
                 case.run(**saved)
         resumed = case.run(**saved)
-        for a, b in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):
-            np.testing.assert_array_equal(a, b)
+        assert_same(resumed, whole)
         other = {"DSMC": {"step": 0.04}, "hard spheres": {"contact_time": 1e-4}}
         setting = other.get(case.model.name, {"steps_per_contact": 50})
         for change in (

@@ -13,7 +13,7 @@ import pytest
 from matplotlib import pyplot
 
 import jaxgran
-from tests.beads import glass_beads
+from tests.beads import assert_same, glass_beads
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +46,7 @@ def test_a_dataset_has_saved_values(curve, tmp_path):
     saved = curve.with_saved({"S": (each, each[..., 0])})
     jaxgran.write_curve(tmp_path / "saved.npz", saved, {})
     same, _ = jaxgran.read_curve(tmp_path / "saved.npz")
-    assert jax.tree.structure(same) == jax.tree.structure(saved)
-    jax.tree.map(np.testing.assert_array_equal, same, saved)
+    assert_same(same, saved)
     data = saved.to_xarray()
     again = jaxgran.CoolingCurve.from_xarray(data)
     assert repr(again) == repr(saved)

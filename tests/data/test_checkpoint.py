@@ -11,6 +11,7 @@ import pytest
 
 import jaxgran
 from jaxgran.data.checkpoint import describe_run, differences
+from tests.beads import assert_same
 from tests.test_contract import CASES
 
 ODD = {
@@ -30,13 +31,6 @@ def odd(particles):
 def resumed(path):
     """The curve of a run that saves odd numbers of all types."""
     return CASES["DSMC"].run(checkpoint=path, save=odd)
-
-
-def same_bits(a, b):
-    assert jax.tree.structure(a) == jax.tree.structure(b)
-    for x, y in zip(map(np.asarray, jax.tree.leaves(a)), jax.tree.leaves(b), strict=True):
-        assert x.dtype == np.asarray(y).dtype and x.shape == np.shape(y)
-        assert x.tobytes() == np.asarray(y).tobytes()
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +57,9 @@ def test_round_trip_bit_for_bit(finished, path):
     curve, data = finished
     path.write_bytes(data)
     for name in (path, str(path)):
-        same_bits(resumed(name), curve)
+        assert_same(resumed(name), curve)
     saved = jax.tree.map(lambda x: np.asarray(x)[0, 0], curve.replicas.saved)
-    same_bits(saved, jax.tree.map(np.asarray, ODD))
+    assert_same(saved, jax.tree.map(np.asarray, ODD))
 
 
 def test_other_runs_are_refused(finished, path):
@@ -99,7 +93,7 @@ def test_damaged_files_are_told_or_harmless(finished, path):
             assert str(path) in str(error)
             told += 1
         else:  # white space of the header
-            same_bits(loaded, curve)
+            assert_same(loaded, curve)
     assert told > 93
 
 

@@ -11,7 +11,7 @@ from tqdm import tqdm
 import jaxgran
 from jaxgran.particles import run
 from jaxgran.particles.run import RunFailure, compiling, run_through_times
-from tests.beads import glass_beads
+from tests.beads import assert_same, glass_beads
 
 TIMES = np.array([0.0, 0.3, 1.0, 1.1, 2.5])
 STEPS = 2 + 3 + 1 + 6  # of at most 0.25, from time to time
@@ -59,12 +59,6 @@ def quiet(*args, **options):
     return tuple(found)
 
 
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-    kinds = [[(np.asarray(x).dtype, np.shape(x)) for x in jax.tree.leaves(t)] for t in (a, b)]
-    assert kinds[0] == kinds[1]
-
-
 @pytest.mark.parametrize(
     "error, at", [(KeyboardInterrupt, 0), (KeyboardInterrupt, STEPS - 1), (MemoryError, 7)]
 )
@@ -81,7 +75,7 @@ def test_a_run_that_ends_early_is_resumed_and_then_read_back(tmp_path, monkeypat
     assert rest.number == STEPS - at
     assert all(isinstance(leaf, jax.Array) for leaf in resumed[0])
     for found in (resumed, quiet(start(), TIMES, Calls(0), observe, **saved)):
-        same(found, whole)
+        assert_same(found, whole)
 
 
 class Terminal(io.StringIO):

@@ -13,7 +13,7 @@ import pytest
 
 import jaxgran
 from jaxgran import observables
-from tests.beads import glass_beads
+from tests.beads import assert_same, glass_beads
 from tests.sweeps.process import TIMES, members
 
 GAS, GASES = glass_beads(), members(5)
@@ -43,11 +43,6 @@ SAVED = {"times": (0.05, 0.1), "model": DSMC, "save": forward, "chunk": 2}
 
 def twice(particles):
     return 2 * observables.temperature(particles.velocity)
-
-
-def equal(a, b):
-    assert jax.tree.structure(a) == jax.tree.structure(b)
-    jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 @pytest.fixture(scope="module")
@@ -141,9 +136,9 @@ def test_only_unfinished_chunks_are_computed(store_of_saved, tmp_path):
 
 
 def test_a_finished_store_is_read(store, store_of_saved):
-    equal(sweep(store=store[0]), store[1])
+    assert_same(sweep(store=store[0]), store[1])
     path, curves = store_of_saved
-    equal(sweep(**(SAVED | {"store": path, "chunk": None})), curves)
+    assert_same(sweep(**(SAVED | {"store": path, "chunk": None})), curves)
 
 
 @pytest.mark.parametrize(
@@ -232,7 +227,7 @@ def test_particles_with_positions(tmp_path):
     assert found["saved.box_side"].dims == ("member", "time")
     T = np.mean(np.square(found["saved.velocity"].values), axis=(2, 3, 4))
     np.testing.assert_allclose(T, curves.temperature, rtol=1e-12)  # round-off of units
-    equal(sweep(**options), curves)
+    assert_same(sweep(**options), curves)
 
 
 TWO_LENGTHS = GAS.replace(temperature=jnp.ones(3), diameter=jnp.ones(2))
