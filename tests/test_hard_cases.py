@@ -218,32 +218,29 @@ def corrupted_curves():
 
 BOTH, DOUBLE, SINGLE = ("float64", "float32"), ("float64",), ("float32",)
 CASES = {
-    angles: DOUBLE,
-    own_image: DOUBLE,
-    weak_dissipation: SINGLE,
-    si_units: SINGLE,
-}
-SLOW_CASES = {
     speeds: DOUBLE,
-    angles: SINGLE,
-    own_image: SINGLE,
+    angles: BOTH,
+    own_image: BOTH,
     order_flips: BOTH,
     four_bodies: DOUBLE,
+    weak_dissipation: SINGLE,
     thin_and_dense: DOUBLE,
     deep_cold: DOUBLE,
+    si_units: SINGLE,
     corrupted_curves: DOUBLE,
 }
 """The precisions of each case; other files test the other one."""
 
+FAST = "angles-float64", "own_image-float64", "weak_dissipation-float32", "si_units-float32"
+ROWS = [(f"{case.__name__}-{name}", case, name) for case, names in CASES.items() for name in names]
+
 
 @pytest.mark.figures
 @pytest.mark.parametrize(
-    ("case", "precision"),
+    "case, precision",
     [
-        pytest.param(case, name, marks=marks, id=f"{case.__name__}-{name}")
-        for cases, marks in ((CASES, ()), (SLOW_CASES, pytest.mark.slow))
-        for case, precisions in cases.items()
-        for name in precisions
+        pytest.param(*x, id=name, marks=() if name in FAST else pytest.mark.slow)
+        for name, *x in ROWS
     ],
 )
 def test_limit(case, precision, record):

@@ -152,10 +152,7 @@ SCENES = [
     (lambda: gas_with(temperature=-1.0), "temperature"),
     (lambda: gas_with(dimension=4), "dimension must be 2 or 3, got 4"),
     (lambda: gas_with(law=0.9), "law must be a restitution law"),
-    (
-        lambda: GRAINS.replace(temprature=1.0),
-        "no float 'temprature' in this gas; it has coef",
-    ),
+    (lambda: GRAINS.replace(temprature=1.0), "no float 'temprature' in this gas; it has coef"),
     (lambda: GRAINS.replace(packing_fraction=0.9), "packing_fraction must lie in"),
     (lambda: GRAINS.delta, "delta belongs to the Viscoelastic law"),
     (lambda: jaxgran.sphere_mass(-1.0, 2500.0), "diameter"),
@@ -187,10 +184,7 @@ SCENES = [
         lambda: between_walls(friction=-0.1, tangential_damping=0.5),
         "friction of the walls must lie in",
     ),
-    (
-        lambda: between_walls(friction=0.4, tangential_damping=0.8),
-        "walls needs frictional spheres",
-    ),
+    (lambda: between_walls(friction=0.4, tangential_damping=0.8), "walls needs frictional spheres"),
     (
         lambda: gas_with(drag=jaxgran.StokesDrag(0.1, rotational_rate=0.2)),
         "rotational_rate of the drag needs spheres that rotate, got a rate of 0.2",
@@ -224,10 +218,7 @@ SCENES = [
     (lambda: jaxgran.SoftSpheres(10, projection=0.0), "projection must"),
     (lambda: jaxgran.SoftSpheres(10, steps_per_contact=5), "steps_per_contact"),
     # numbers
-    (
-        lambda: jaxgran.Domain(0.0).check("speed", "steel", "Give m/s."),
-        "in .0, inf., got .* Give",
-    ),
+    (lambda: jaxgran.Domain(0.0).check("speed", "steel", "Give m/s."), "in .0, inf., got .* Give"),
     (
         lambda: jaxgran.Domain(0.0, 1.0, high_allowed=True).check("share", [1.0, 0.0]),
         r"share must lie in \(0, 1\], got 0",

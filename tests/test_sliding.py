@@ -22,8 +22,7 @@ def sliding(friction, dimension=3, beta=0.5, T_rot=0.0, **elements) -> jaxgran.G
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "model, limits",
-    [(jaxgran.DSMC(300), (None, 1e9, 0.1)), (jaxgran.HardSpheres(100), (1e9, 0.1))],
+    "model, limits", [(jaxgran.DSMC(300), (None, 1e9, 0.1)), (jaxgran.HardSpheres(100), (1e9, 0.1))]
 )
 def test_large_friction_is_no_limit(model, limits):
     walls = jaxgran.Walls(12.0, restitution=0.8, tangential_restitution=0.3)
@@ -55,18 +54,6 @@ def test_slip_moments_are_averages_over_slips_and_normal_speeds(dimension, m):
     powers.append((0, 2, 2))
     expected = [mean(*x) for x in powers]
     np.testing.assert_allclose(slip_moments(jnp.asarray(m), dimension), expected, rtol=1e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dimension, mu, T_rot", [(2, 0.3, 0.0), (3, 0.05, 0.0), (3, 0.1, 1.0)])
-def test_theory_beside_dsmc(dimension, mu, T_rot):
-    gas = sliding(mu, dimension, T_rot=T_rot)
-    theory = theory_curve(gas, np.array([3.0, 10.0, 30.0, 100.0]), correlations=False)
-    options = {"model": jaxgran.DSMC(20_000, 2), "key": jax.random.key(0), "progress": False}
-    curve = jaxgran.cool(gas, theory.times, **options)
-    ratio, expected = (c.rotational_temperature / c.temperature for c in (theory, curve))
-    np.testing.assert_allclose(theory.temperature, curve.temperature, rtol=0.01)
-    np.testing.assert_allclose(ratio, expected, rtol=0.03)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -99,25 +98,16 @@ UNITS = "# length_unit: mm\n# time_unit: ms\n"
 TIMES, T = np.array([0.0, 1.0, 2.0, 3.0]), np.array([1e-2, 5e-3, 3e-3, 2e-3])
 
 
-def moments(dimension):
-    """Means over Maxwellian velocities of <v^2>/d = 1: speed, one and two squared components."""
-    v = np.asarray(jax.random.normal(jax.random.key(dimension), (400_000, dimension)))
-    return {
-        "mean_speed": np.mean(np.linalg.norm(v, axis=1)),
-        "vx2": np.mean(v[:, 0] ** 2),
-        "v2_xy": np.mean(v[:, 0] ** 2 + v[:, 1] ** 2),
-    }
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_what_stands_in_for_the_temperature(read, dimension):
     header = HEADER + f"# dimension: {dimension}\n"
-    for name, moment in moments(dimension).items():
+    # Of a Maxwellian gas of T = 1: the mean speed, and means of one and two squared components.
+    moments = {"mean_speed": {2: np.pi / 2, 3: 8 / np.pi}[dimension] ** 0.5, "vx2": 1, "v2_xy": 2}
+    for name, moment in moments.items():
         power = 0.5 if name == "mean_speed" else 1.0
         measured = moment * T**power
         curve, said = read(f"{header}t,{name},{name}_err\n", TIMES, measured, 0.01 * measured)
-        # Means over 400000 particles: .2 % at 1.5 standard errors of the worst of them.
-        np.testing.assert_allclose(curve.temperature, T, rtol=5e-3)
+        np.testing.assert_allclose(curve.temperature, T, rtol=1e-12)
         relative = curve.temperature_error / curve.temperature
         np.testing.assert_allclose(relative, 0.01 / power, rtol=1e-12)
         assert said["T_from"].startswith("T = ")

@@ -8,6 +8,7 @@ import pytest
 
 import jaxgran
 from experiments.support.scenes import beads as beads_of
+from jaxgran.models.choose import error_model_of
 from tests.beads import glass_beads
 from tests.fitting.curves import BOTH, cooled_beads, in_range, measured, synthetic
 
@@ -109,19 +110,6 @@ def test_the_budget_of_a_particle_fit(beads):
     assert chance == pytest.approx(expected, rel=0.1)
     assert set(result.error_budget) >= {"simulation", "model"}
     assert relative(result, "model") > 0.005  # DSMC has Enskog's rate too
-
-
-def error_model_of(gas, end, num_particles):
-    """The error model that models are asked about."""
-    asked = []
-
-    class Listener(jaxgran.KineticTheory):
-        def estimated_error(self, error_model):
-            asked.append(error_model)
-            return 0.0
-
-    jaxgran.choose_model(gas, [end], num_particles=num_particles, models=[Listener()])
-    return asked[0]
 
 
 def test_derivatives_through_a_flow_are_known_worse():

@@ -9,14 +9,7 @@ import pytest
 import jaxgran
 from jaxgran.fitting.parameters import guess_from_data
 from tests.beads import glass_beads
-from tests.fitting.curves import (
-    BOTH,
-    A,
-    cooled_beads,
-    deviation,
-    rough_beads,
-    synthetic,
-)
+from tests.fitting.curves import BOTH, A, cooled_beads, deviation, rough_beads, synthetic
 
 
 def test_exact_data_give_exact_parameters():

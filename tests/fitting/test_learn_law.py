@@ -107,11 +107,8 @@ def spline_gas(curve, num_knots=8):
     return gas_of(jaxgran.RestitutionSpline(np.geomspace(*speeds, num_knots)))
 
 
-SPEEDS, VALUES = [1e-3, 1e-2, 3e-2, 1e-1], [0.97, 0.95, 0.9, 0.85]
-
-
 def test_spline():
-    speeds, values = SPEEDS, VALUES
+    speeds, values = [1e-3, 1e-2, 3e-2, 1e-1], [0.97, 0.95, 0.9, 0.85]
     law = jaxgran.RestitutionSpline(speeds, values)
     inside, pchip = np.geomspace(1e-2, 3e-2, 5), scipy.interpolate.PchipInterpolator
     v = np.geomspace(1e-9, 1e3, 200)

@@ -81,18 +81,6 @@ def test_chi2_of_smooth_errors_has_the_F_distribution():
 
 
 @pytest.mark.slow
-def test_fits_use_them():
-    gas, curve = cooled_beads()
-    chance = np.random.default_rng(0).chisquare(2, curve.times.size) / 2
-    ragged = dataclasses.replace(curve, temperature_error=curve.temperature_error * chance**0.5)
-    taken, few = (jaxgran.fit(gas, ragged, replicas=replicas) for replicas in (1, R))
-    assert float(taken.p_value) < 1e-4 < 0.01 < float(few.p_value)
-    # The weights are even: the errors were 1 % of T everywhere.
-    weights = few.comparison.weights["temperature"]
-    assert np.min(weights) / 100 > 0.6 and np.max(weights) / 100 < 1.7
-
-
-@pytest.mark.slow
 def test_the_likelihood_is_the_chi2_of_the_fit():
     gas, curve = cooled_beads()
     result = jaxgran.fit(gas, curve, free=BOTH)

@@ -1,6 +1,6 @@
 """DSMC: cooling, collisions, rough spheres, walls and a drive."""
 
-import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +10,8 @@ import pytest
 import jaxgran
 from jaxgran import DSMC
 from jaxgran.particles.dsmc import collisions
-from jaxgran.particles.dsmc.collisions import (
-    MIN_SUBSET_SIZE,
-    Scheme,
-    change_subsets,
-    draw_pairs,
-    num_subsets,
-)
 from tests.beads import SI, curves_of, glass_beads, hard_gas
+from tests.test_sliding import sliding
 
 # Hard spheres: kinetic theory without the correction for soft contacts.
 THEORY = jaxgran.KineticTheory(softness=False, correlations=False)
@@ -85,10 +79,10 @@ def test_elastic_gas_keeps_its_energy_and_its_maxwellian():
 
 @pytest.mark.parametrize("n", [2, 64, 101])
 def test_every_pair_is_about_equally_likely(n):
-    scheme = Scheme.of(3, n, 0.1)
+    scheme = collisions.Scheme.of(3, n, 0.1)
 
     def drawn(key):
-        i, j, k = draw_pairs(jax.random.bits(key, (4,)), scheme)
+        i, j, k = collisions.draw_pairs(jax.random.bits(key, (4,)), scheme)
         one = jnp.stack([i, j])
         return jnp.concatenate([one, jnp.stack([i[: scheme.second], k])], axis=1)
 
@@ -128,17 +122,6 @@ def test_the_step_is_second_order():
 
 
 @pytest.mark.slow
-def test_cools_by_six_decades():
-    gas = constant(0.8)
-    gamma = (1 - 0.8**2) / 6
-    taus = np.geomspace(1, (1e3 - 1) / gamma, 8)
-    curve, theory = curves_of(gas, taus, DSMC(20_000), THEORY)
-    assert theory.temperature[-1] < 1.2e-6 * gas.temperature
-    # Late noise is that of the clock, which is that of T at half of its logarithm.
-    assert np.all(np.abs(curve.temperature / theory.temperature - 1) < 0.02)
-
-
-@pytest.mark.slow
 def test_says_when_impacts_are_too_fast(beads, monkeypatch):
     gas = beads(0.15)
     times = jnp.array([3.0]) * gas.mean_free_time
@@ -162,54 +145,64 @@ def test_each_of_a_few_particles_meets_the_others():
     assert abs(rate - (1 - 0.5 / n)) < 0.01
 
 
-WALLS = jaxgran.Walls([0.05, 0.06, 0.08], restitution=jaxgran.Viscoelastic(5e7, 0.22, 3e-6))
-SCENES = {
-    "viscoelastic walls": {"container": WALLS},
-    "all": {
-        "surface": jaxgran.Rough(0.3, rotational_temperature=4e-3, friction=0.3),
-        "container": jaxgran.Walls(0.05, restitution=0.8, tangential_restitution=0.2),
-        "drag": jaxgran.StokesDrag(1.0, rotational_rate=2.0),
-    },
+ALL = {
+    "surface": jaxgran.Rough(0.3, rotational_temperature=4e-3, friction=0.3),
+    "container": jaxgran.Walls(0.05, restitution=0.8, tangential_restitution=0.2),
+    "drag": jaxgran.StokesDrag(1.0, rotational_rate=2.0),
 }
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name, dimension", [("all", 3), ("viscoelastic walls", 3), ("all", 2)])
-def test_elements_cool_as_kinetic_theory_says(name, dimension):
-    gas = dataclasses.replace(glass_beads(dimension=dimension), **SCENES[name])
-    theory, curve = curves_of(gas, [1, 5, 20], jaxgran.KineticTheory(), DSMC(10_000, replicas=4))
+WALLS = jaxgran.Walls([0.05, 0.06, 0.08], restitution=jaxgran.Viscoelastic(5e7, 0.22, 3e-6))
+BEADS, EARLY = (jaxgran.KineticTheory(), DSMC(10_000, replicas=4)), (1, 5, 20)
+SLIDES, LATE = (jaxgran.KineticTheory(correlations=False), DSMC(20_000, 2)), (3, 10, 30, 100)
+DECADES = np.geomspace(1, (1e3 - 1) / ((1 - 0.8**2) / 6), 8)
+COOLING = {
+    # Late noise is that of the clock, which is that of T at half of its logarithm.
+    "six decades": (constant(0.8), (THEORY, DSMC(20_000)), DECADES, (0.02, 0.02, 0)),
     # Of rough spheres theory leaves out that spins and velocities are correlated: .7 % of T and
     # 5 % of T_rot/T at N = 1e5, 7 % in a plane; and that walls, which are far more frequent here in
     # a plane, change a_2: 1.3 % of T. The rest is noise, .8/sqrt(40 000) = .4 %, in both.
-    error, of_ratio = {2: (0.02, 0.15), 3: (0.012, 0.07)}[dimension]
-    assert np.all(np.abs(curve.temperature / theory.temperature - 1) < error + 3 * 0.004)
-    assert np.all(np.abs(curve.collisions / theory.collisions - 1) < error)
+    "walls": (replace(glass_beads(), container=WALLS), BEADS, EARLY, (0.024, 0.012, 0)),
+    "all": (replace(glass_beads(), **ALL), BEADS, EARLY, (0.024, 0.012, 0.07)),
+    "all, 2": (replace(glass_beads(dimension=2), **ALL), BEADS, EARLY, (0.032, 0.02, 0.15)),
+    "sliding, 2": (sliding(0.3, 2), SLIDES, LATE, (0.01, 0.02, 0.03)),
+    "sliding": (sliding(0.05), SLIDES, LATE, (0.01, 0.02, 0.03)),
+    "sliding, spinning": (sliding(0.1, T_rot=1.0), SLIDES, LATE, (0.01, 0.02, 0.03)),
+}
+"""A gas, theory and DSMC, mean free times; largest errors of T, of collisions and of T_rot/T."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", COOLING)
+def test_cools_as_kinetic_theory_says(scene):
+    gas, models, taus, allowed = COOLING[scene]
+    theory, curve = curves_of(gas, taus, *models)
+    assert np.all(np.abs(curve.temperature / theory.temperature - 1) < allowed[0])
+    assert np.all(np.abs(curve.collisions / theory.collisions - 1) < allowed[1])
     assert (curve.rotational_temperature_error is None) == (gas.surface is None)
     if gas.surface is not None:
         ratios = [x.rotational_temperature / x.temperature for x in (curve, theory)]
-        assert np.all(np.abs(ratios[0] / ratios[1] - 1) < of_ratio)
+        assert np.all(np.abs(ratios[0] / ratios[1] - 1) < allowed[2])
 
 
 @pytest.mark.parametrize("n", [2, 31, 1000])
 def test_every_particle_belongs_to_one_subset(n):
-    parts, sizes, one = num_subsets(n), [], jnp.ones((), int)
+    parts, sizes, one = collisions.num_subsets(n), [], jnp.ones((), int)
 
     def count(i, rows, belongs):
         return rows + belongs[:, None], jnp.sum(belongs)
 
     seen = jnp.zeros((n, 1))
     for k in range(parts):
-        seen, size = change_subsets(seen, jnp.asarray(k), one, one, count, 0 * one)
+        seen, size = collisions.change_subsets(seen, jnp.asarray(k), one, one, count, 0 * one)
         sizes.append(int(size))
     assert np.all(seen == 1)
-    assert max(sizes) - min(sizes) <= 1 and min(sizes) >= min(n, MIN_SUBSET_SIZE) - 1
+    assert max(sizes) - min(sizes) <= 1 and min(sizes) >= min(n, collisions.MIN_SUBSET_SIZE) - 1
 
 
 @pytest.mark.slow
 def test_kicks_heat_by_the_strength_and_leave_the_gas_at_rest():
     gas = hard_gas(1.0, 0.02, **SI)
     drive = jaxgran.WhiteNoise(0.01 * gas.temperature / gas.mean_free_time)
-    gas = dataclasses.replace(gas, drive=drive)  # one subset in half a step
+    gas = replace(gas, drive=drive)  # one subset in half a step
     taus = [1.0, 3.0, 10.0]
     (curve,) = curves_of(gas, taus, DSMC(20_000), save="particles")
     expected = 0.01 + gas.value("drive_strength") * curve.times

@@ -77,18 +77,6 @@ def test_a_gas_of_haff_has_its_derivative_for_any_step(step):
     np.testing.assert_allclose(got, exact, rtol=1.001 * (np.sinh(step) / step - 1), atol=1e-14)
 
 
-@pytest.mark.slow
-def test_reverse_mode_and_jit_of_it_agree_with_forward_mode():
-    f = of_haff(0.3)
-
-    def total(x):
-        return jnp.sum(f(x)["temperature"] * jnp.arange(1.0, 6.0)[:, None])
-
-    forward = jax.jit(jax.jacfwd(total))(AT)
-    for derivative in (jax.grad(total), jax.jit(jax.grad(total))):
-        np.testing.assert_allclose(derivative(AT), forward, rtol=1e-12)
-
-
 def test_a_fault_of_any_run_is_one_of_the_derivative():
     def failing(inputs):
         return run(inputs)._replace(status=jnp.asarray(4, jnp.int32))
