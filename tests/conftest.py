@@ -90,13 +90,6 @@ def _import():
     assert use_compilation_cache(Path(os.environ[PROGRAMS]))
 
 
-@pytest.fixture
-def beads():
-    from tests.beads import glass_beads
-
-    return glass_beads
-
-
 @pytest.fixture(scope="module")
 def read(tmp_path_factory):
     """A function that reads the curve of a file of given text or bytes, and rows of numbers."""

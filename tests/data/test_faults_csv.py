@@ -323,11 +323,6 @@ def test_calls_that_are_wrong_say_what_is_wanted(call, words):
         call()
 
 
-def test_an_open_file_is_not_a_path():
-    with open(__file__) as file, pytest.raises(ValueError, match="must be the name of"):
-        read_curve(file)
-
-
 def test_eta_follows_from_N_and_the_container():
     gas = gas_of(eta=None, container_side=0.09, wall_restitution=0.9)
     assert float(gas.packing_fraction) == pytest.approx(2000 * np.pi / 6 * (0.003 / 0.09) ** 3)

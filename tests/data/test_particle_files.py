@@ -8,6 +8,7 @@ import pytest
 
 import jaxgran
 from jaxgran.data.particles import Sphere, Trajectory
+from tests.beads import glass_beads
 
 gsd_hoomd = pytest.importorskip("gsd.hoomd")
 
@@ -93,8 +94,8 @@ def test_half_a_frame_is_cut_off(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_writes_its_trajectory(beads, tmp_path, monkeypatch):
-    gas, path = beads(0.15, dimension=2), tmp_path / "run.xyz"
+def test_a_run_writes_its_trajectory(tmp_path, monkeypatch):
+    gas, path = glass_beads(0.15, dimension=2), tmp_path / "run.xyz"
     t = gas.mean_free_time * jnp.array([0.5, 1.0, 1.5])
     model = jaxgran.HardSpheres(30, replicas=2)
     options = {"model": model, "progress": False}

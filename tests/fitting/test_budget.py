@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from experiments.support.scenes import beads as beads_of
 from jaxgran.models.choose import error_model_of
-from tests.beads import glass_beads
+from tests.beads import glass_beads, soft_beads
 from tests.fitting.curves import BOTH, cooled_beads, in_range, measured, synthetic
 
 
@@ -91,8 +90,8 @@ def test_the_clock_is_that_of_the_scene():
 
 
 @pytest.mark.slow
-def test_the_budget_of_a_particle_fit(beads):
-    gas = beads(0.15)
+def test_the_budget_of_a_particle_fit():
+    gas = glass_beads(0.15)
     curve = synthetic(gas, num_points=20, end=30.0)
     phi = float(gas.packing_fraction)
     priors = {"packing_fraction": (phi, 0.04 * phi)}
@@ -115,7 +114,7 @@ def test_the_budget_of_a_particle_fit(beads):
 def test_derivatives_through_a_flow_are_known_worse():
     """0 in boxes below L_c, and the measured biases of a clustering gas within a factor of 2."""
     measured = {3.0: 0.026, 10.0: 0.069, 30.0: 0.16, 100.0: 0.78}
-    gas = beads_of(0.3, 0.2, 0.05)
+    gas = soft_beads(0.05, 0.2, packing_fraction=0.3)
     end = 3000 * float(gas.mean_free_time)
     for model in (jaxgran.SoftSpheres(1000), jaxgran.HardSpheres(1000)):
         error_model = error_model_of(gas, end, 1000)

@@ -27,8 +27,8 @@ def constant(eps, dimension=3) -> jaxgran.Gas:
 @pytest.mark.parametrize(
     "beta, dimension", [(0.05, 3), pytest.param(0.15, 2, marks=pytest.mark.slow)]
 )
-def test_cools_and_spreads_as_kinetic_theory_says(beads, beta, dimension):
-    gas, n = beads(beta, dimension), 10_000
+def test_cools_and_spreads_as_kinetic_theory_says(beta, dimension):
+    gas, n = glass_beads(beta, dimension), 10_000
     taus = np.concatenate([[1.0, 10.0], np.arange(20.0, 101.0, 2.0)])
     theory, curve = curves_of(gas, taus, THEORY, DSMC(n))
     tolerance = 0.002 + 3 * T_SCATTER / n**0.5
@@ -122,8 +122,8 @@ def test_the_step_is_second_order():
 
 
 @pytest.mark.slow
-def test_says_when_impacts_are_too_fast(beads, monkeypatch):
-    gas = beads(0.15)
+def test_says_when_impacts_are_too_fast(monkeypatch):
+    gas = glass_beads(0.15)
     times = jnp.array([3.0]) * gas.mean_free_time
     monkeypatch.setattr(collisions, "CEILING", 2.0)  # many pairs are faster
     model = DSMC(1010, replicas=2)  # of a size that no program was compiled for before

@@ -9,7 +9,7 @@ import pytest
 import jaxgran
 from experiments.support.closed_forms import paper_temperature
 from jaxgran import KineticTheory
-from tests.beads import curves_of
+from tests.beads import curves_of, glass_beads
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
 # equations, clipped restitution, Gaussian start, no softness correction.
@@ -30,9 +30,9 @@ HARD = KineticTheory(softness=False, order=2, correlations=False)
 
 @pytest.mark.parametrize("row", REFERENCE.split("\n")[1:-1])
 @pytest.mark.figures
-def test_reference_table(row, beads, record):
+def test_reference_table(row, record):
     d, beta, tau, theta, maxwellian, a2, displacement = (float(x) for x in row.split())
-    gas = beads(beta, dimension=int(d))
+    gas = glass_beads(beta, dimension=int(d))
     maxwellian_model = KineticTheory(softness=False, sonine=False, correlations=False)
     curve, no_a2 = curves_of(gas, [tau], HARD, maxwellian_model)
     found = curve.temperature[0] / gas.temperature, curve.displacement[0] / gas.path_length**2
@@ -45,8 +45,8 @@ def test_reference_table(row, beads, record):
 
 
 @pytest.mark.figures
-def test_sensitivity_table(beads, record):
-    gas = beads(0.15)
+def test_sensitivity_table(record):
+    gas = glass_beads(0.15)
     times = jnp.array([1.0, 5, 10, 50, 100, 1000]) * gas.mean_free_time
 
     def log_temperature(log_a):
@@ -61,8 +61,8 @@ def test_sensitivity_table(beads, record):
     record("derivative", error=float(np.max(np.abs(found / np.array(table) - 1))))
 
 
-def test_twelve_decades_of_cooling(beads):
-    gas = beads(0.15)
+def test_twelve_decades_of_cooling():
+    gas = glass_beads(0.15)
     tau = jnp.geomspace(1e-3, 3e8, 200)
     (curve,) = curves_of(gas, tau, HARD)
     assert curve.temperature[-1] / gas.temperature < 1e-12
@@ -74,16 +74,16 @@ def test_twelve_decades_of_cooling(beads):
 
 
 @pytest.mark.slow
-def test_tolerance_is_met(beads):
-    gas = beads(0.15)
+def test_tolerance_is_met():
+    gas = glass_beads(0.15)
     taus, rtols = np.geomspace(0.01, 1e5, 50), (1e-12, 1e-4, 1e-6, 1e-9)
     exact, *curves = curves_of(gas, taus, *(KineticTheory(rtol=x) for x in rtols))
     for curve, rtol in zip(curves, rtols[1:], strict=True):
         np.testing.assert_allclose(curve.temperature, exact.temperature, rtol=10 * rtol)
 
 
-def test_ballistic_start_and_diffusive_end(beads):
-    gas = beads(0.0)
+def test_ballistic_start_and_diffusive_end():
+    gas = glass_beads(0.0)
     (curve,) = curves_of(gas, [1e-4, 1e3], KineticTheory(order=2, rtol=1e-9))
     free_flight = 3 * gas.temperature * curve.times[0] ** 2
     # Collisions take (2/9) tau of it: 7e-5... of t/tau_c = 1e-4; the solver 1e-9 of mfp^2.
@@ -95,8 +95,8 @@ def test_ballistic_start_and_diffusive_end(beads):
 
 
 @pytest.mark.slow
-def test_stiff_solver_for_nearly_elastic_gases(beads):
-    gas = beads(1e-6)
+def test_stiff_solver_for_nearly_elastic_gases():
+    gas = glass_beads(1e-6)
     tau = jnp.geomspace(1.0, 1e9, 20)
     (curve,) = curves_of(gas, tau, KineticTheory(solver=diffrax.Kvaerno5(), rtol=1e-7))
     formula = paper_temperature(tau, gas.delta)
@@ -104,8 +104,8 @@ def test_stiff_solver_for_nearly_elastic_gases(beads):
     np.testing.assert_allclose(curve.temperature / gas.temperature, formula, rtol=0.03)
 
 
-def test_another_number_of_times_compiles_nothing(beads, caplog):
-    gas = beads(0.15)
+def test_another_number_of_times_compiles_nothing(caplog):
+    gas = glass_beads(0.15)
     times = np.geomspace(0.01, 10.0, 32)
     half = jaxgran.cool(gas, times[1::2])
     whole = jaxgran.cool(gas, times)
@@ -119,8 +119,8 @@ def test_another_number_of_times_compiles_nothing(beads, caplog):
 
 
 @pytest.mark.slow
-def test_derivatives_and_batches_outside_of_jit_are_compiled_once(beads, caplog):
-    gas = beads(0.15)
+def test_derivatives_and_batches_outside_of_jit_are_compiled_once(caplog):
+    gas = glass_beads(0.15)
 
     def final(T):
         return jaxgran.cool(gas.replace(temperature=T), [1.0]).temperature[-1]
@@ -132,9 +132,9 @@ def test_derivatives_and_batches_outside_of_jit_are_compiled_once(beads, caplog)
     assert not caplog.records
 
 
-def test_displacement_accuracy_covers_dense_hard_spheres(beads):
+def test_displacement_accuracy_covers_dense_hard_spheres():
     # Speedy's D over Enskog's first Sonine order, evaluated apart; rounded, so 15 % of the excess.
     for phi, excess in ((0.05, 0.0407), (0.1, 0.0844), (0.2, 0.1883)):
-        accuracy = KineticTheory().displacement_accuracy(beads(0.1, packing_fraction=phi))
+        accuracy = KineticTheory().displacement_accuracy(glass_beads(0.1, packing_fraction=phi))
         np.testing.assert_allclose(np.sqrt(accuracy**2 - 0.017**2), excess, rtol=0.15)
-    assert KineticTheory().displacement_accuracy(beads(0.1, packing_fraction=1e-6)) < 0.0171
+    assert KineticTheory().displacement_accuracy(glass_beads(0.1, packing_fraction=1e-6)) < 0.0171

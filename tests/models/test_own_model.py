@@ -7,7 +7,7 @@ import pytest
 
 import jaxgran
 from experiments.fit.own_model import HaffLaw
-from tests.beads import SI, hard_gas
+from tests.beads import SI, glass_beads, hard_gas
 from tests.fitting.curves import synthetic
 
 MEMBERS = sorted(
@@ -59,7 +59,7 @@ def test_diagnosis_asks_the_model():
 
 
 @pytest.mark.slow
-def test_choice(beads):
+def test_choice():
     gas = gas_of(0.95)
     times, models = times_of(gas), (HaffLaw(), jaxgran.KineticTheory())
     theory = jaxgran.cool(gas, times)
@@ -73,7 +73,7 @@ def test_choice(beads):
     assert own.error == rough.error > better.error
     fine = jaxgran.choose_model(gas, times, (own.error + better.error) / 2, models=models)
     assert isinstance(fine.model, jaxgran.KineticTheory)
-    viscous = beads(0.1)
+    viscous = glass_beads(0.1)
     own, _ = jaxgran.choose_model(viscous, times_of(viscous), models=models).candidates
     assert own.error is None and "HaffLaw needs ConstantRestitution" in own.refusal
 

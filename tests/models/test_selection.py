@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.beads import hard_gas, soft_beads
+from tests.beads import glass_beads, hard_gas, soft_beads
 from tests.fitting.curves import measured
 
 
@@ -110,8 +110,8 @@ def test_only_a_flow_makes_noise_besides():
         assert (noise > 1.5 * shots) is more
 
 
-def test_each_model_has_its_scene(beads):
-    choice = choose(beads(0.15), 10)
+def test_each_model_has_its_scene():
+    choice = choose(glass_beads(0.15), 10)
     assert isinstance(choice.model, jaxgran.KineticTheory) and choice.error < 0.02
     assert "the box is unknown" in " ".join(choice.reasons)
 
@@ -151,8 +151,8 @@ def test_scenes_that_particles_cannot_run_are_left_to_the_others():
     assert "at least 2.1 are needed" in " ".join(choice.reasons)
 
 
-def test_cool_chooses(beads):
-    gas = beads(0.15)
+def test_cool_chooses():
+    gas = glass_beads(0.15)
     times = over(gas, 10)
     chosen = jaxgran.cool(gas, times, model="auto", tolerance=np.float32(0.05), num_particles=1000)
     np.testing.assert_array_equal(chosen.temperature, jaxgran.cool(gas, times).temperature)

@@ -7,22 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from jaxgran.particles.neighbours import (
-    MAX_LOOKAHEAD,
-    choose_engine,
-    search_pairs,
-    sweep,
-    with_offsets,
-    wrap,
-)
+from jaxgran.particles import neighbours
+from jaxgran.particles.neighbours import MAX_LOOKAHEAD, choose_engine, sweep, wrap
 
 
 def find_pairs(position, side, cutoff, *, replicas=1, capacity, by="scipy"):
     """All pairs with their offsets; a sweep may look ahead over all particles of a replica."""
     capacities = capacity, len(position) // replicas
-    return with_offsets(
-        position, side, search_pairs(position, side, cutoff, replicas, capacities, by)
-    )
+    pairs = neighbours.search_pairs(position, side, cutoff, replicas, capacities, by)
+    return neighbours.with_offsets(position, side, pairs)
 
 
 def brute_force(position, side, cutoff, replicas):

@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.beads import lattice
+from tests.beads import glass_beads, lattice
 
 DEVICES = "JAX_NUM_CPU_DEVICES"
 TIMES = jnp.array([0.01, 0.03])
-MODELS = {"DSMC": 200, "HardSpheres": 20}
 
 
 @pytest.fixture
@@ -29,8 +28,7 @@ def two_devices(monkeypatch):
     monkeypatch.setattr(jax, "local_devices", lambda: jax.devices()[:1] * 2)
 
 
-def cool(gas, name, replicas, **options):
-    model = getattr(jaxgran, name)(MODELS[name], replicas=replicas)
+def cool(gas, model, **options):
     return jaxgran.cool(gas, TIMES, model=model, progress=False, **options)
 
 
@@ -39,15 +37,15 @@ def fastest(particles):
 
 
 @pytest.mark.slow  # compiles for one replica, and for one on each device
-def test_a_replica_is_the_same_whatever_their_number(beads, two_devices, tmp_path):
-    gas, key, name = beads(packing_fraction=0.1), jax.random.key(4), "HardSpheres"
+def test_a_replica_is_the_same_whatever_their_number(two_devices, tmp_path):
+    gas, key = glass_beads(packing_fraction=0.1), jax.random.key(4)
     files = {"save": fastest, "trajectory": tmp_path / "run.xyz"}
-    two = cool(gas, name, 2, key=key, **files)
-    three = cool(gas, name, 3, key=key, save=fastest)
+    two = cool(gas, jaxgran.HardSpheres(20, replicas=2), key=key, **files)
+    three = cool(gas, jaxgran.HardSpheres(20, replicas=3), key=key, save=fastest)
     for field in ("temperature", "collisions", "displacement", "saved"):
         each = [np.asarray(getattr(curve.replicas, field)) for curve in (two, three)]
         np.testing.assert_array_equal(each[0], each[1][:2])
-    alone = cool(gas, name, 1, key=jax.random.fold_in(key, 1), save=fastest)
+    alone = cool(gas, jaxgran.HardSpheres(20), key=jax.random.fold_in(key, 1), save=fastest)
     np.testing.assert_array_equal(two.replicas.temperature[1], alone.temperature)
     np.testing.assert_array_equal(two.replicas.saved[1], alone.replicas.saved[0])
     np.testing.assert_array_equal(two.particles.velocity, three.particles.velocity[:2])
@@ -59,20 +57,21 @@ def test_a_replica_is_the_same_whatever_their_number(beads, two_devices, tmp_pat
 
 
 @pytest.mark.slow  # compiles for one replica
-def test_each_replica_has_a_checkpoint(beads, two_devices, tmp_path):
-    gas, path = beads(packing_fraction=0.1), tmp_path / "run.ckpt"
-    curve = cool(gas, "DSMC", 2, checkpoint=path)
+def test_each_replica_has_a_checkpoint(two_devices, tmp_path):
+    gas, path = glass_beads(packing_fraction=0.1), tmp_path / "run.ckpt"
+    model = jaxgran.DSMC(200, replicas=2)
+    curve = cool(gas, model, checkpoint=path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.ckpt.0", "run.ckpt.1"]
-    again = cool(gas, "DSMC", 2, checkpoint=path)
+    again = cool(gas, model, checkpoint=path)
     np.testing.assert_array_equal(again.temperature, curve.temperature)
     path.touch()
     with pytest.raises(ValueError, match="written by replicas in one array"):
-        cool(gas, "DSMC", 2, checkpoint=path)
+        cool(gas, model, checkpoint=path)
 
 
 @pytest.mark.slow
-def test_an_error_of_one_ends_the_others_and_is_raised(beads, two_devices, tmp_path):
-    gas = beads(packing_fraction=0.1, dissipative_constant=0.0)
+def test_an_error_of_one_ends_the_others_and_is_raised(two_devices, tmp_path):
+    gas = glass_beads(packing_fraction=0.1, dissipative_constant=0.0)
     times, model = [3e5 * gas.mean_free_time], jaxgran.DSMC(200, replicas=2)  # a minute
     (tmp_path / "run.ckpt.0").touch()
     began = time.monotonic()
@@ -96,8 +95,8 @@ MANY = 8192
 """Spheres of a replica from which on one array saves no time."""
 
 
-def test_replicas_stand_in_one_array_on_one_device_or_a_chosen_one(beads, tmp_path, request):
-    apart = partial(run_apart, beads(packing_fraction=0.1), folder=tmp_path)
+def test_replicas_stand_in_one_array_on_one_device_or_a_chosen_one(tmp_path, request):
+    apart = partial(run_apart, glass_beads(packing_fraction=0.1), folder=tmp_path)
     assert not apart(20, 2) and not apart(MANY - 1, 2) and not apart(MANY, 1)
     assert apart(MANY, 2)
     request.getfixturevalue("two_devices")
@@ -108,8 +107,8 @@ def test_replicas_stand_in_one_array_on_one_device_or_a_chosen_one(beads, tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [jaxgran.HardSpheres, jaxgran.SoftSpheres])
-def test_large_replicas_on_one_device_run_in_turn(kind, beads):
-    gas = beads(packing_fraction=0.1)
+def test_large_replicas_on_one_device_run_in_turn(kind):
+    gas = glass_beads(packing_fraction=0.1)
     start, times = lattice(gas, MANY, replicas=2), [0.1 * gas.mean_free_time]
     second = start._replace(position=start.position[1:], velocity=start.velocity[1:])
     two = jaxgran.cool(gas, times, model=kind(MANY, replicas=2, start=start))

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import jaxgran
 from jaxgran.theory.averages import impact_moments
-from tests.beads import SI, hard_gas, theory_curve
+from tests.beads import SI, glass_beads, hard_gas, theory_curve
 from tests.data.test_faults_csv import gas_of
 
 TAUS = np.geomspace(1.0, 300.0, 8)
@@ -148,7 +148,6 @@ ROUGH |= {"wall_restitution": "0.9", "wall_beta_t": "0.1", "gamma": "0.3"}
 ROUGH |= {"drive_strength": "2.5e-4"}
 ELEMENTS = ("surface", "container", "drag", "drive")
 FRICTION = {"friction": "0.3", "tangential_damping": "0.5", "T_rot_0": "2e-3"}
-NOTHING = {"gravity": "0", "aspect_ratio": "1"}
 
 
 @pytest.mark.parametrize("keys, elements", [(ROUGH, ELEMENTS), (FRICTION, ("friction",))])
@@ -160,7 +159,7 @@ def test_elements_are_read_from_a_header(keys, elements):
 
 
 def test_a_header_may_say_that_there_is_nothing_of_it():
-    assert gas_of(**NOTHING).elements == ()
+    assert gas_of(gravity=0, aspect_ratio=1).elements == ()
 
 
 def test_unknown_header_keys_are_told():
@@ -185,12 +184,12 @@ def test_rejected_steps_leave_no_values():
     np.testing.assert_allclose(curve.diffusion, expected, rtol=2e-3)  # collisions: 1e-3
 
 
-def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
+def test_spins_that_heat_the_gas_stay_within_the_table_of_rates():
     # T rises to 2 T_0 by the spins, far beyond a table that ends at T_0: beside the equations of
     # Huthmann & Zippelius without a table, integrated by another library.
     q, beta = 0.4, 0.5
     surface = jaxgran.Rough(beta, inertia=q, rotational_temperature=0.1)
-    gas, taus = dataclasses.replace(beads(0.02), surface=surface), np.array([0.3, 1.0, 3.0])
+    gas, taus = dataclasses.replace(glass_beads(0.02), surface=surface), np.array([0.3, 1.0, 3.0])
     options = {"sonine": False, "softness": False, "correlations": False}
     curve = theory_curve(gas, taus, spin_cumulants=False, **options)
     assert float(curve.temperature[2]) > 2 * float(gas.temperature)
@@ -211,8 +210,8 @@ def test_spins_that_heat_the_gas_stay_within_the_table_of_rates(beads):
 
 
 @pytest.mark.slow
-def test_the_choice_of_a_model_says_how_near_walls_would_be(beads):
-    gas = beads(packing_fraction=0.01)
+def test_the_choice_of_a_model_says_how_near_walls_would_be():
+    gas = glass_beads(packing_fraction=0.01)
     choice = jaxgran.choose_model(gas, [10 * float(gas.mean_free_time)], num_particles=200)
     long = float(gas.box_side(200) / gas.mean_free_path)
     assert any(f"is {long:.2g} mean free paths long: if it has walls" in r for r in choice.reasons)

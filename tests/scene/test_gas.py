@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.beads import hard_gas
+from tests.beads import glass_beads, hard_gas
 
 
-def test_derived_scales(beads):
+def test_derived_scales():
     # By hand for 2 mm glass beads, phi = .05, T_0 = .01 m^2/s^2, 3D.
-    gas = beads(0.0898, dissipative_constant=3e-6)
+    gas = glass_beads(0.0898, dissipative_constant=3e-6)
     n = 0.05 * 6 / (np.pi * 8e-9)
     g2 = 1.95 / (2 * 0.95**3)
     np.testing.assert_allclose(gas.number_density, n, rtol=1e-12)
@@ -37,9 +37,9 @@ def test_derived_scales(beads):
     assert float(gas.box_side(4000) / gas.diameter) == pytest.approx(34.73, abs=0.01)
 
 
-def test_contact_duration_is_the_mean_over_impacts(beads):
+def test_contact_duration_is_the_mean_over_impacts():
     # Sample impacts: normal speeds g exp(-g^2/2) in units of sqrt(2 T).
-    gas = beads(0.15)
+    gas = glass_beads(0.15)
     g = np.sqrt(-2 * np.log(np.random.default_rng(1).random(400_000)))
     x = float(gas.alpha**2 * gas.impact_speed) ** -0.2
     # 4e5 samples of g^(-1/5), relative scatter 0.2: 3e-4.

@@ -7,7 +7,7 @@ import pytest
 
 import jaxgran
 from jaxgran import viscoelastic_restitution
-from tests.beads import SI, hard_gas
+from tests.beads import SI, glass_beads, hard_gas
 from tests.scene.test_contact import REFERENCE, SLOPES
 
 C1, C2 = 1.153448858095289, 0.798266560944795
@@ -48,8 +48,8 @@ def test_fast_law_at_zero():
         np.testing.assert_allclose(curvature, 2 * C2, rtol=2e-3)
 
 
-def test_series_of_viscoelastic_spheres(beads):
-    gas = beads(0.02)
+def test_series_of_viscoelastic_spheres():
+    gas = glass_beads(0.02)
     law = jaxgran.RestitutionSeries.from_viscoelastic(
         gas.law, diameter=gas.diameter, mass=gas.mass, num_terms=5
     )

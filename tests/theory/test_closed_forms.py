@@ -9,13 +9,13 @@ import pytest
 
 import jaxgran
 from experiments.support import closed_forms as forms
-from tests.beads import hard_gas, theory_curve
+from tests.beads import glass_beads, hard_gas, theory_curve
 
 RATE = 0.831934150151502
 """Initial cooling rate of viscoelastic spheres, 1/tau_0 in units of delta/tau_c: checked value."""
 
 
-def test_constants_of_the_expansion(beads):
+def test_constants_of_the_expansion():
     # Checked values of the corrected expansion; the third series coefficient has nine digits.
     q, p, r = 2.301752786151829, 0.5661271900235634, 4.142724172222288
     np.testing.assert_allclose(forms.EXPANSION_P, p, rtol=1e-14)
@@ -24,7 +24,7 @@ def test_constants_of_the_expansion(beads):
     expected = -5 / 3 * RATE * delta * (1 - q * delta - p * delta**1.5 + r * delta**2)
     slope = jax.grad(forms.paper_temperature)(0.0, delta)
     np.testing.assert_allclose(slope, expected, rtol=1e-13)
-    gas = beads(1.5 * 2**0.1 * delta)
+    gas = glass_beads(1.5 * 2**0.1 * delta)
     rate = jaxgran.KineticTheory().cooling_rate(gas) * gas.mean_free_time
     np.testing.assert_allclose(rate, -expected, rtol=1e-5)  # 1 - eps = 2e-3 is off by 4e-9
 
@@ -59,12 +59,12 @@ def test_times_of_every_kind(taus):
 
 
 @pytest.mark.slow
-def test_expansion_is_right_to_its_order(beads):
+def test_expansion_is_right_to_its_order():
     # The first neglected term is delta^(5/2): the error must fall so, with a bounded coefficient.
     for clipped in (True, False):
         ratios = []
         for delta in (1e-3, 1e-2):
-            gas = beads(0.15)
+            gas = glass_beads(0.15)
             A = gas.value("dissipative_constant") * delta / gas.delta
             gas = dataclasses.replace(gas, law=jaxgran.Viscoelastic(5e7, 0.22, A, clipped))
             tau = jnp.geomspace(0.01, 1e4, 40) / delta
@@ -91,12 +91,12 @@ def test_displacement_of_constant_restitution():
         np.testing.assert_allclose(curve.displacement, formula, rtol=1e-6)
 
 
-def test_first_order_of_viscoelastic_gas(beads):
+def test_first_order_of_viscoelastic_gas():
     # Over six decades of u: T, a_2 and <dr^2> less their leading terms, over delta, tend to the
     # closed forms' coefficients as sqrt(delta), the order of the clipped contact's first trace.
     u = jnp.asarray([10.0, 1e2, 1e4, 1e6])
     for delta in (1e-4, 1e-3):
-        gas = beads(1.5 * 2**0.1 * delta)
+        gas = glass_beads(1.5 * 2**0.1 * delta)
         tau = (u - 1) / (RATE * delta)
         options = {"softness": False, "order": 2, "correlations": False}
         curve = theory_curve(gas, tau, rtol=1e-11, **options)
