@@ -210,13 +210,18 @@ class KineticTheory(AbstractModel):
         """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
         size = times.size
         padded = pad_to(times, padded_length(size))
-        computed = self.curve_in_fit
-        if not in_compiled_code(gas, times):  # where it would be traced twice
-            computed = eqx.filter_jit(computed)
+        # Traced twice if it were compiled within another program.
+        computed = self.curve_in_fit if in_compiled_code(gas, times) else self._compiled_curve
         curve = computed(gas, padded, 1.0)
         if gas.container is not None:  # walls would limit <dr^2>
             curve = dataclasses.replace(curve, diffusion=None, displacement=None)
         return jax.tree.map(lambda x: truncate_to(x, size) if x.ndim else x, curve)
+
+    @eqx.filter_jit
+    def _compiled_curve(
+        self, gas: Gas, times: Float[Array, "times"], tolerance: float
+    ) -> CoolingCurve:
+        return self.curve_in_fit(gas, times, tolerance)
 
     def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
