@@ -236,4 +236,5 @@ def checked_times(times: UserNumber) -> Float[Array, "times"]:
             f"times must increase, got {after:g} after {before:g} in {numbers.dtype}. Sort them "
             'and remove repeated times, or call jax.config.update("jax_enable_x64", True) first.'
         )
-    return jnp.asarray(numbers)
+    # Without a dtype JAX would compile a program for each length.
+    return jnp.asarray(numbers, dtype=numbers.dtype)
