@@ -644,10 +644,10 @@ class DSMCDynamics(eqx.Module):
                 kick, spin_change = -push[:, None] * outwards, jnp.zeros_like(spin)
                 if surface is not None and walls.surface is not None:
                     eta = surface.eta_on_wall(walls.surface)
-                    _, rub, spin_change = tangential_impulse(
+                    _, sliding_kick, spin_change = tangential_impulse(
                         velocity, spin, outwards, hits, eta, surface, push
                     )
-                    kick = kick + rub
+                    kick = kick + sliding_kick
                 # The number of impacts is not differentiable, so weights of value 1 carry its
                 # derivative.
                 weight = frequency * ratio

@@ -92,12 +92,12 @@ def impact_effect(
             spin_factor = 1.0 if decay is None else decay.spin[:, None]
             spin = impact.spin * spin_factor
             push = -jnp.sum(kick * impact.normal, -1)
-            sideways, rub, turn = tangential_impulse(
+            sideways, sliding_kick, added_spin = tangential_impulse(
                 impact.relative, spin, impact.normal, ~impact.elastic, eta, surface, push
             )
-            with_half = sideways + 0.5 / share * rub
-            kick, lost = kick + rub, lost - share * jnp.sum(rub * with_half, -1)
-            spin_change = turn / spin_factor
+            with_half = sideways + 0.5 / share * sliding_kick
+            kick, lost = kick + sliding_kick, lost - share * jnp.sum(sliding_kick * with_half, -1)
+            spin_change = added_spin / spin_factor
             doubled = impact.spin * 2 * share + spin_change
             rotational_gain = surface.inertia / 2 * jnp.sum(spin_change * doubled, -1)
     if axis is not None:
