@@ -161,6 +161,21 @@ def test_no_alternative_is_preferred_where_all_is_told():
         assert drag.distinguishable and drag.allowed[1] < 0.02
 
 
+@pytest.mark.slow
+def test_an_estimated_scatter_allows_larger_amplitudes_than_known_errors():
+    # Eight degrees of freedom: the 95 % quantile of chi^2 is 5.3 in place of 3.84.
+    gas = glass_beads(0.1)
+    curve = synthetic(gas, jax.random.key(4), num_points=10)
+    unknown = jaxgran.fit(gas, dataclasses.replace(curve, temperature_error=None), free=BOTH)
+    error = unknown.comparison.scatter * curve.temperature
+    known = jaxgran.fit(gas, dataclasses.replace(curve, temperature_error=error), free=BOTH)
+    found = []
+    for result in (known, unknown):
+        drag = [a for a in jaxgran.diagnose(result).alternatives if "drag" in a.name]
+        found.append(drag[0].allowed[1])
+    assert 1.05 < found[1] / found[0] < 1.4
+
+
 def test_the_last_step_of_a_trial_needs_no_further_curve(monkeypatch):
     gas = glass_beads(0.1)
     result = jaxgran.fit(gas, exact_to(gas, 0), free=BOTH)
