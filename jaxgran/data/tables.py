@@ -99,7 +99,10 @@ def read_text(path: Path, columns: str) -> str:
 
 
 def read_table(
-    path: Path, wanted: str, columns_to_read: Callable[[list[str]], Iterable[str]]
+    path: Path,
+    wanted: str,
+    columns_to_read: Callable[[list[str]], Iterable[str]],
+    given: dict[str, str],
 ) -> Table:
     """Read header lines, a line of names, and rows of finite numbers.
 
@@ -108,6 +111,7 @@ def read_table(
         wanted: the names of its columns, for messages.
         columns_to_read: from the names of the columns without units, those whose numbers are read;
             raises ValueError for wrong names.
+        given: entries of the header, with or without units, that replace those of the file.
 
     Raises:
         ValueError: saying what is wrong, in which line, and what to do.
@@ -129,6 +133,7 @@ def read_table(
             rows[i] = _split(line, separator, len(names))
     if not names:
         raise ValueError(f"line {i}: the file ends without columns; it needs {wanted}")
+    header |= given
     units = _pop_units(header)
     told = [_name_and_unit(name) for name in names]
     bare_names = [name for name, _ in told]

@@ -84,14 +84,14 @@ class AbstractModel(eqx.Module):
                 )
         self.check(gas)
 
-    def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
+    def solve(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve inside the compiled program of a fit: by default that of `simulate`.
 
         A model that solves equations multiplies its tolerance by `tolerance`.
         """
         return self.simulate(gas, times, Run())
 
-    def for_fits(self, *gases: Gas) -> "AbstractModel":
+    def simplified_for(self, *gases: Gas) -> "AbstractModel":
         """Return the model that computes the curves of some gases in fits: by default this one."""
         return self
 

@@ -197,7 +197,7 @@ class KineticTheory(AbstractModel):
         contacts = checks.limitations_of_instant_impacts(gas, consequence)
         return contacts + checks.limitations_of_homogeneity(gas, num_particles)
 
-    def for_fits(self, *gases: Gas) -> "KineticTheory":
+    def simplified_for(self, *gases: Gas) -> "KineticTheory":
         """Return this model, with Gaussian spins if the spheres of all gases are smooth.
 
         Then only alternative explanations of their curves rotate. Gaussian spins change T by up to
@@ -211,7 +211,7 @@ class KineticTheory(AbstractModel):
         size = times.size
         padded = pad_to(times, padded_length(size))
         # Traced twice if it were compiled within another program.
-        computed = self.curve_in_fit if in_compiled_code(gas, times) else self._compiled_curve
+        computed = self.solve if in_compiled_code(gas, times) else self._compiled_curve
         curve = computed(gas, padded, 1.0)
         if gas.container is not None:  # walls would limit <dr^2>
             curve = dataclasses.replace(curve, diffusion=None, displacement=None)
@@ -221,9 +221,9 @@ class KineticTheory(AbstractModel):
     def _compiled_curve(
         self, gas: Gas, times: Float[Array, "times"], tolerance: float
     ) -> CoolingCurve:
-        return self.curve_in_fit(gas, times, tolerance)
+        return self.solve(gas, times, tolerance)
 
-    def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
+    def solve(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
         length, sound = gas.path_length, jnp.asarray(True)
         if self.softness:  # a search may try a T_0 at which spheres are too soft: no step is made

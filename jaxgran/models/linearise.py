@@ -16,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxgran._utils.tracing import any_traced, as_jax_arrays, fast_compilation, grid_size, pad_to
+from jaxgran._utils.tracing import as_jax_arrays, fast_compilation, grid_size, pad_to
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.elements import Rough, StokesDrag, Walls
@@ -36,7 +36,7 @@ STICKING = 1e6
 
 
 class LinearisedCurve(NamedTuple):
-    """A curve and its derivatives; the arrays are those of NumPy unless they are traced.
+    """A curve and its derivatives, arrays of NumPy.
 
     Attributes:
         values: the fields of `COMPUTED` that the model computes, by name.
@@ -50,16 +50,20 @@ class LinearisedCurve(NamedTuple):
     by_time: dict[str, Any]
 
 
-def with_all_elements(gas: Gas, model: AbstractModel) -> Gas:
-    """Return a gas with each element that the model supports; those added have no effect."""
-    missing = {
-        "surface": lambda: Rough(-1.0, friction=STICKING),
-        "container": lambda: Walls(REMOTE_WALLS, restitution=1.0),
-        "drag": lambda: StokesDrag(0.0),
+def with_neutral_elements(gas: Gas, model: AbstractModel) -> Gas:
+    """Return a gas with each element that the model supports; those added have no effect.
+
+    An element of an alternative explanation is then another number of the program that computed the
+    fitted curve, and not another program, which would take seconds to compile.
+    """
+    neutral = {
+        "surface": Rough(-1.0, friction=STICKING),
+        "container": Walls(REMOTE_WALLS, restitution=1.0),
+        "drag": StokesDrag(0.0),
     }
-    added = {
-        name: make()
-        for name, make in missing.items()
+    added: dict[str, Any] = {
+        name: element
+        for name, element in neutral.items()
         if name in model.elements and getattr(gas, name) is None
     }
     if isinstance(gas.surface, Rough) and gas.surface.friction is None:
@@ -79,17 +83,13 @@ def linearise(
         tolerance: factor of the model's tolerance.
     """
     size = times.shape[-1]
-    if any_traced(gas, times):
-        values, slopes, by_time = _linearised(
-            model, gas, jnp.asarray(times), jnp.asarray(tolerance)
-        )
-    else:
-        padded = pad_to(np.asarray(times), grid_size(size))
-        computed = _compiled(jax.default_backend())(model, gas, padded, np.asarray(tolerance))
-        values, slopes, by_time = jax.tree.map(
-            lambda x: np.asarray(x)[:size] if x.ndim else np.asarray(x), computed
-        )
-    by_float, begin = {}, 0
+    padded = pad_to(np.asarray(times), grid_size(size))
+    computed = _compiled(jax.default_backend())(model, gas, padded, np.asarray(tolerance))
+    values, slopes, by_time = jax.tree.map(
+        lambda x: np.asarray(x)[:size] if x.ndim else np.asarray(x), computed
+    )
+    by_float = {}
+    begin = 0
     for name, value in gas.floats.items():
         end = begin + np.size(value)
         by_float[name] = {quantity: slope[:, begin:end] for quantity, slope in slopes.items()}
@@ -101,8 +101,8 @@ def curve_of_program(
     model: AbstractModel, gas: Gas, times: Float[np.ndarray, "times"]
 ) -> CoolingCurve:
     """Return the curve of a gas without <dr^2>, by the program that fits share."""
-    complete = with_all_elements(gas, model)
-    values = dict(linearise(model.for_fits(gas), complete, times).values)
+    complete = with_neutral_elements(gas, model)
+    values = dict(linearise(model.simplified_for(gas), complete, times).values)
     for name in ("displacement", "diffusion"):
         values.pop(name, None)
     return CoolingCurve(**as_jax_arrays({"times": times} | values))
@@ -117,14 +117,15 @@ def _linearised(
 
     def curve(flat: Array, delay: Array) -> tuple[dict, dict]:
         changed = gas.replace(**dict(zip(names, unravel(flat), strict=True)))
-        computed = model.curve_in_fit(changed, times + delay, tolerance)
+        computed = model.solve(changed, times + delay, tolerance)
         fields = {name: getattr(computed, name) for name in COMPUTED}
         known = {name: value for name, value in fields.items() if value is not None}
         return {name: known[name] for name in LINEARISED if name in known}, known
 
     delay = jnp.zeros((), times.dtype)
     slopes, values = jax.jacfwd(curve, argnums=(0, 1), has_aux=True)(flat, delay)
-    by_float, by_time = ({q: pair[i] for q, pair in slopes.items()} for i in (0, 1))
+    by_float = {quantity: pair[0] for quantity, pair in slopes.items()}
+    by_time = {quantity: pair[1] for quantity, pair in slopes.items()}
     return values, by_float, by_time
 
 

@@ -1,0 +1,435 @@
+"""The likelihood of a measured curve: one function, which `log_likelihood` and every fit call.
+
+The residuals of a run of N grains are a Gaussian process. Between two times the fluctuations about
+kinetic theory obey a linear stochastic equation (`jaxgran.theory.covariance`); its solution is
+compared with the measured values one after the other, as a Kalman filter does. Each value then has
+an innovation, its residual minus what is expected from all values before it, and the variance of
+that: ``-2 ln L = sum innovation^2/variance + ln variance``. No matrix of all points is formed, so
+that a curve of a thousand points costs no more than its points.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxgran._utils.tracing import grid_size
+from jaxgran.data.curve import DEFAULTS, CoolingCurve
+from jaxgran.data.measurement import Measurement
+from jaxgran.fitting.parameters import guess_from_data
+from jaxgran.fitting.rows import (
+    CALIBRATION,
+    ROTATION,
+    Displacement,
+    Noise,
+    Observed,
+    curve_rows,
+    with_rate_error,
+)
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.checks import checked_model
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.scene.gas import Gas
+from jaxgran.theory.covariance import NUM_RUN_VARIABLES, fluctuations
+
+RATE_ERROR, SAMPLE = NUM_RUN_VARIABLES, NUM_RUN_VARIABLES + 1
+"""Places of two variables behind those of the run: the relative error of theory's cooling rate,
+over its standard deviation, and the sampling error of T where some of the grains are tracked."""
+
+NUM_VARIABLES = NUM_RUN_VARIABLES + 2
+
+RATE_ERROR_LENGTH = 1.0
+"""Change of ln T over which the error of theory's cooling rate is correlated."""
+
+SAMPLE_MEMORY = 0.57
+"""Decay of the sampling error of T, over the collisions of a grain.
+
+Measured: 60 of 250 spheres, eps = .9, 400 replicas: correlations .75, .56, .42, .33, .26, .20 after
+.5, 1, ..., 3 collisions."""
+
+LOG_FROM, LINEAR_TO = 10.0, 5.0
+"""T over its error above which ln T is compared, and below which T itself is."""
+
+LONGEST_STEP = 0.25
+"""Longest step between two times at which a curve is computed, in ln(1 + t/tau_c): T falls by .4 in
+its logarithm."""
+
+NUM_SCATTERS = 64
+"""Number of values of N over which a likelihood is integrated where N is not known."""
+
+SMALLEST_VARIANCE = 1e-12
+"""Variance of a value that is given without an error and has none by theory, relative."""
+
+
+class Nodes(NamedTuple):
+    """Curves of some neighbouring gases at times that begin at 0 and include those of the data.
+
+    Arrays have the shape (nodes, gases): operations on small matrices are fast where the last axis
+    is long.
+
+    Attributes:
+        times: t, s, not decreasing, shape (nodes,).
+        log_temperature: ln T, T in m^2/s^2.
+        rotation: T_rot/T; 0 for smooth spheres.
+        sonine: a_2, shape (nodes,).
+        collisions: per particle.
+    """
+
+    times: Any
+    log_temperature: Any
+    rotation: Any
+    sonine: Any
+    collisions: Any
+
+
+def log_ratio(values: Array, log_computed: Array, errors: Array) -> Array:
+    """Return the residual of a measured value, relative to the computed one.
+
+    It is ln(measured/computed) where the computed value is many errors above 0, and their
+    difference over the computed value where it is within some errors of 0; in between a mean of
+    both, so that it is continuous. The choice is by the computed value alone: one by the measured
+    value would favour large ones.
+    """
+    computed = jnp.exp(log_computed)
+    ratio = values / computed
+    # Continued to small and negative ratios by its tangent.
+    low = 0.5
+    log = jnp.where(ratio > low, jnp.log(jnp.maximum(ratio, low)), jnp.log(low) + ratio / low - 1)
+    distance = computed / jnp.where(errors > 0, errors, jnp.finfo(errors.dtype).tiny)
+    share = jnp.clip((distance - LINEAR_TO) / (LOG_FROM - LINEAR_TO), 0.0, 1.0)
+    share = share**2 * (3 - 2 * share)
+    return jnp.where(share < 1, share * log + (1 - share) * (ratio - 1), log)
+
+
+def innovations(
+    gas: Gas,
+    nodes: Nodes,
+    log_computed: Float[Array, "nodes 2 gases"],
+    sensitivity: Float[Array, "nodes gases"],
+    observed: Observed,
+    noise: Noise,
+) -> tuple[Float[Array, "nodes 2 gases"], Float[Array, "nodes 2 gases"]]:
+    """Return the innovations of a measured curve about some gases, and their variances.
+
+    Args:
+        gas: neighbouring scenes: its floats have an axis (gases,).
+        nodes: their curves by kinetic theory.
+        log_computed: ln T and ln T_rot with which the measured values are compared.
+        sensitivity: derivative of the computed ln T in ln T of the gas: 1 without a noise floor.
+        observed: the measured values.
+        noise: what makes them scatter; its `scatter` has the shape (gases,).
+    """
+    values = observed.values[..., None]
+    errors = observed.errors[..., None]
+    residuals = log_ratio(values, log_computed, errors)
+    variances = (errors / jnp.exp(log_computed)) ** 2 + observed.simulation[..., None]
+    variances = variances.at[:, 0].add(noise.white**2)
+    found, spread = filtered(
+        gas, nodes, residuals[:, :, None], variances, sensitivity, observed.used, noise
+    )
+    return found[:, :, 0], spread
+
+
+def filtered(
+    gas: Gas,
+    nodes: Nodes,
+    residuals: Float[Array, "nodes 2 columns gases"],
+    variances: Float[Array, "nodes 2 gases"],
+    sensitivity: Float[Array, "nodes gases"],
+    used: Float[Array, "nodes 2"],
+    noise: Noise,
+) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
+    """Return the innovations of columns of residuals, and the variances that they share.
+
+    An innovation is 0 where nothing is used, and the variance is then that which a value would
+    have.
+
+    Args:
+        residuals: of T and of T_rot, relative.
+        variances: of their independent errors.
+        gas, nodes, sensitivity, used, noise: see `innovations`.
+    """
+    propagators, increments = _steps(gas, nodes, noise)
+    dtype = residuals.dtype
+    lanes = residuals.shape[-1]
+    first = jnp.zeros((NUM_VARIABLES, NUM_VARIABLES, lanes), dtype)
+    first = first.at[0, 0].set(noise.scatter * noise.first)
+    first = first.at[RATE_ERROR, RATE_ERROR].set(1.0)
+    first = first.at[SAMPLE, SAMPLE].set(noise.sample)
+    mean = jnp.zeros((NUM_VARIABLES, *residuals.shape[2:]), dtype)
+    variances = variances + SMALLEST_VARIANCE
+
+    def update(state, along, expected, value, variance, is_used):
+        """Return the state after a value, its innovation and its variance.
+
+        `along` are the covariances of the state with the value apart from its own error.
+        """
+        mean, covariance = state
+        spread = along[-1] + variance
+        innovation = is_used * (value - expected)
+        gain = is_used * along[:-1] / spread
+        mean = mean + gain[:, None] * innovation[None]
+        covariance = covariance - spread * gain[:, None] * gain[None]
+        return (mean, covariance), innovation, spread
+
+    def step(state, at):
+        mean, covariance = state
+        propagator, increment, share, value, variance, is_used = at
+        mean = jnp.sum(propagator[:, :, None] * mean[None], axis=1)
+        covariance = _of_quadratic_form(propagator, covariance) + increment
+        along = share * covariance[:, 0] + covariance[:, SAMPLE]
+        along = jnp.append(along, (share * along[0] + along[SAMPLE])[None], axis=0)
+        expected = share * mean[0] + mean[SAMPLE]
+        state, one, spread = update(
+            (mean, covariance), along, expected, value[0], variance[0], is_used[0]
+        )
+        mean, covariance = state
+        along = jnp.append(covariance[:, 1], covariance[1, 1][None], axis=0)
+        state, other, further = update(state, along, mean[1], value[1], variance[1], is_used[1])
+        return state, (jnp.stack([one, other]), jnp.stack([spread, further]))
+
+    at = propagators, increments, sensitivity, residuals, variances, used
+    return jax.lax.scan(step, (mean, first), at)[1]
+
+
+DOUBLINGS = 8
+"""Number of times that a step between two nodes is halved and its effect squared."""
+
+
+def _steps(gas: Gas, nodes: Nodes, noise: Noise) -> tuple[Array, Array]:
+    """Return propagators and noise from each node's predecessor to it, shape (nodes, n, n,
+    gases)."""
+    duration = jnp.diff(nodes.times, prepend=nodes.times[:1])
+
+    def middle(x: Array) -> Array:
+        return jnp.concatenate([x[:1], (x[1:] + x[:-1]) / 2])
+
+    def change(x: Array) -> Array:
+        return jnp.diff(x, prepend=x[:1], axis=0)
+
+    def of_one_gas(gas, T, collisions, rotation):
+        sonine = middle(nodes.sonine)
+        at_time = jax.vmap(lambda *state: fluctuations(gas, *state), out_axes=-1)
+        return at_time(T, sonine, collisions, rotation)
+
+    jacobian, spread = jax.vmap(of_one_gas, in_axes=(0, 1, 1, 1), out_axes=-1)(
+        gas,
+        jnp.exp(middle(nodes.log_temperature)),
+        middle(nodes.collisions),
+        middle(nodes.rotation),
+    )
+    shape = (NUM_VARIABLES, NUM_VARIABLES, *nodes.log_temperature.shape)
+    of_run = slice(0, NUM_RUN_VARIABLES)
+    drift = jnp.zeros(shape, jacobian.dtype)
+    drift = drift.at[of_run, of_run].set(jacobian * duration[:, None])
+    noises = jnp.zeros(shape, jacobian.dtype)
+    noises = noises.at[of_run, of_run].set(noise.scatter * spread * duration[:, None])
+    # An error of the rate moves ln T and ln T_rot along their mean course.
+    error = middle(noise.rate_error)[:, None]
+    of_T = change(nodes.log_temperature)
+    of_rotation = of_T + change(jnp.log(jnp.maximum(nodes.rotation, TINY_ROTATION)))
+    drift = drift.at[0, RATE_ERROR].set(error * of_T)
+    drift = drift.at[1, RATE_ERROR].set(error * of_rotation)
+    memory = jnp.abs(of_T) / RATE_ERROR_LENGTH
+    drift = drift.at[RATE_ERROR, RATE_ERROR].set(-memory)
+    noises = noises.at[RATE_ERROR, RATE_ERROR].set(2 * memory)
+    forgotten = SAMPLE_MEMORY * change(nodes.collisions)
+    drift = drift.at[SAMPLE, SAMPLE].set(-forgotten)
+    noises = noises.at[SAMPLE, SAMPLE].set(2 * forgotten * noise.sample)
+    propagators, increments = _over_step(drift, noises)
+    return jnp.moveaxis(propagators, 2, 0), jnp.moveaxis(increments, 2, 0)
+
+
+def _over_step(drift: Array, noises: Array) -> tuple[Array, Array]:
+    """Return ``exp(drift)`` and the noise that has gathered, by doubling of a small part."""
+    part = drift / 2**DOUBLINGS
+    one = jnp.eye(len(drift), dtype=drift.dtype)[:, :, None, None]
+    propagator = one + _product(part, one + part / 2)
+    noise = noises / 2**DOUBLINGS
+    half = _product(part, noise) / 2
+    noise = noise + half + jnp.swapaxes(half, 0, 1)
+
+    def double(_, both):
+        propagator, noise = both
+        return _product(propagator, propagator), noise + _of_quadratic_form(propagator, noise)
+
+    return jax.lax.fori_loop(0, DOUBLINGS, double, (propagator, noise))
+
+
+def _product(a: Float[Array, "n m ..."], b: Float[Array, "m k ..."]) -> Float[Array, "n k ..."]:
+    """Return products of matrices, whose elements are in the first two axes."""
+    return jnp.sum(a[:, :, None] * b[None], axis=1)
+
+
+def _of_quadratic_form(a: Float[Array, "n n ..."], b: Float[Array, "n n ..."]) -> Array:
+    """Return ``a b a^T``, for matrices with their elements in the first two axes."""
+    return jnp.sum(_product(a, b)[:, None] * a[None], axis=2)
+
+
+TINY_ROTATION = 1e-30
+"""Least T_rot/T whose logarithm is taken."""
+
+
+def times_with_nodes(times: np.ndarray, mean_free_time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times from 0 on that contain those given, and the places of these.
+
+    Neighbours are at most `LONGEST_STEP` apart in ``ln(1 + t/tau_c)``. They are padded to a length
+    of the grid by repeating the last one.
+    """
+    order = np.argsort(times, kind="stable")
+    known = np.append(0.0, np.log1p(times[order] / mean_free_time))
+    parts = np.maximum(np.ceil(np.diff(known) / LONGEST_STEP).astype(int), 1)
+    steps = zip(known, known[1:], parts, strict=False)
+    merged = np.concatenate([[0.0], *(np.linspace(a, b, n + 1)[1:] for a, b, n in steps)])
+    at = np.cumsum(parts)
+    merged = np.expm1(merged) * mean_free_time
+    merged[at] = times[order]
+    place = np.empty(times.size, int)
+    place[order] = at
+    padding = grid_size(merged.size) - merged.size
+    return np.append(merged, np.full(padding, merged[-1])), place
+
+
+def log_likelihood(
+    gas: Gas, measurement: Measurement, *, model: AbstractModel | None = None
+) -> Float[Array, ""]:
+    """Logarithm of the likelihood of a measured curve, up to a constant.
+
+    It is the likelihood that `jaxgran.fit` maximises, without priors: ``-(r^T C^-1 r + ln det
+    C)/2`` with the residuals r of ln T, and of ln T_rot and <dr^2> where they are compared, and
+    their covariance C by the collisions of N grains, the errors of the measurement and the error
+    of theory's cooling rate. Common factors of T_rot and of <dr^2>, the scale of T, and the
+    scatter of N grains (any N, where it is not known) are integrated out.
+
+    This is a pure function of the gas, for `jax.jit`, `jax.vmap` and `jax.grad`;
+    `experiments/fit/sample_posterior.py` adds priors and samples it.
+
+    Args:
+        gas: the scene; its values may be traced.
+        measurement: of a curve.
+        model: a model without noise, by default `jaxgran.KineticTheory()`.
+
+    Returns:
+        The logarithm; -inf if the model cannot compute the curve.
+
+    Raises:
+        ValueError: for a drop test, a scene that the model does not support, or a stochastic model,
+            whose noise differs between calls.
+
+    >>> measurement = jaxgran.Measurement(gas, curve, num_particles=1000)
+    >>> other = gas.replace(dissipative_constant=4e-6)
+    >>> likelihood = jaxgran.log_likelihood(gas, measurement)
+    >>> bool(likelihood > jaxgran.log_likelihood(other, measurement))
+    True
+    """
+    model = KineticTheory() if model is None else model
+    if checked_model(model).stochastic:
+        raise ValueError(
+            f"a likelihood needs a model without noise, got {type(model).__name__}, which is "
+            "stochastic. Use jaxgran.KineticTheory()"
+        )
+    if not isinstance(measurement, Measurement):
+        raise ValueError(f"measurement must be a jaxgran.Measurement, got {measurement!r:.60}")
+    model.check_scene(gas)
+    rows, _ = curve_rows("", measurement, model, fits_T_0=False, fits_t0=False)
+    unit = float(measurement.gas.mean_free_time)
+    times, place = times_with_nodes(np.asarray(rows.curve.times) * rows.faster, unit)
+    rows = with_rate_error(rows, model, guess_from_data(measurement.gas, rows.curve, ANY_CONSTANT))
+    computed = model.simulate(gas, jnp.asarray(times), DEFAULTS)
+    nothing = jnp.zeros_like(computed.temperature)
+    log_T = jnp.log(computed.temperature)
+    T_rot = computed.rotational_temperature
+    ratio = nothing if T_rot is None else T_rot / computed.temperature
+    speed = jnp.sqrt(computed.temperature / gas.temperature)
+    steps = jnp.diff(times) * (speed[1:] + speed[:-1]) / 2 * gas.collision_frequency
+    collisions = jnp.append(0.0, jnp.cumsum(steps))
+    collisions = collisions if computed.collisions is None else computed.collisions
+    nodes = Nodes(
+        jnp.asarray(times),
+        log_T[:, None],
+        ratio[:, None],
+        nothing if computed.sonine is None else computed.sonine,
+        collisions[:, None],
+    )
+    observed = rows.at_nodes(times.size, place)
+    logs = jnp.stack([log_T, log_T + jnp.log(jnp.maximum(ratio, TINY))], axis=1)
+    residuals = log_ratio(observed.values, logs, observed.errors)
+    variances = (observed.errors / jnp.exp(logs)) ** 2
+    columns = [residuals]
+    widths = []
+    for name, shape in ((ROTATION, (0.0, 1.0)), (CALIBRATION, (1.0, 1.0))):
+        if name in rows.nuisances:
+            columns.append(jnp.broadcast_to(jnp.asarray(shape), residuals.shape))
+            widths.append(rows.nuisances[name])
+    steps = jnp.linspace(-2.0, 2.0, NUM_SCATTERS)
+
+    def for_each(x: Array) -> Array:
+        return jnp.broadcast_to(x[..., None], (*x.shape, NUM_SCATTERS))
+
+    each = Nodes(
+        nodes.times,
+        jnp.repeat(nodes.log_temperature, NUM_SCATTERS, axis=1),
+        jnp.repeat(nodes.rotation, NUM_SCATTERS, axis=1),
+        nodes.sonine,
+        jnp.repeat(nodes.collisions, NUM_SCATTERS, axis=1),
+    )
+    values, spread = filtered(
+        jax.tree.map(lambda x: jnp.broadcast_to(x, (NUM_SCATTERS, *jnp.shape(x))), gas),
+        each,
+        for_each(jnp.stack(columns, axis=-1)),
+        for_each(variances),
+        for_each(jnp.ones_like(log_T)),
+        observed.used,
+        rows.noise(times, rows.scatter * jnp.exp(rows.scatter_error * steps)),
+    )
+    used = observed.used
+
+    def of_scatter(values: Array, spread: Array, step: Array) -> Array:
+        found = _without_factors(values, used / spread, jnp.asarray(widths))
+        return -0.5 * (found + jnp.sum(used * jnp.log(spread)) + step**2)
+
+    value = jax.scipy.special.logsumexp(
+        jax.vmap(of_scatter, in_axes=(-1, -1, 0))(values, spread, steps)
+    )
+    if rows.displacement is not None:
+        assert computed.displacement is not None
+        counts = collisions[place]
+        value = value - 0.5 * _of_displacement(rows.displacement, counts, computed, place)
+    return jnp.where(jnp.isnan(value), -jnp.inf, value)
+
+
+ANY_CONSTANT = ("dissipative_constant", "coefficient", "drops")
+"""Parameters of laws that `guess_from_data` knows."""
+
+TINY = 1e-300
+
+
+def _without_factors(values: Array, weights: Array, widths: Array) -> Array:
+    """Return the sum of weighted squares of the first column, with factors of the others
+    integrated out, which are known to be 0 within their widths."""
+    flat = values.reshape(-1, values.shape[-1])
+    weights = weights.reshape(-1)
+    square = jnp.sum(weights * flat[:, 0] ** 2)
+    if not widths.size:
+        return square
+    others = flat[:, 1:] * widths
+    projection = others.T @ (weights * flat[:, 0])
+    matrix = jnp.eye(widths.size) + others.T @ (weights[:, None] * others)
+    return (
+        square - projection @ jnp.linalg.solve(matrix, projection) + jnp.linalg.slogdet(matrix)[1]
+    )
+
+
+def _of_displacement(
+    measured: Displacement, collisions: Array, computed: CoolingCurve, place: np.ndarray
+) -> Array:
+    assert computed.displacement is not None
+    used = measured.errors > 0
+    errors = np.where(used, measured.errors, 1.0)
+    diffusive = collisions / (1 + collisions)
+    values = jnp.log(np.where(used, measured.values, 1.0))
+    difference = values - jnp.log(jnp.where(used, computed.displacement[place], 1.0))
+    columns = jnp.stack([difference, diffusive], axis=-1)
+    return _without_factors(columns, used / errors**2, jnp.asarray([measured.accuracy]))
