@@ -11,12 +11,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils import status, validation
-from jaxgran._utils.tracing import any_traced, array_module, in_compiled_code, pad_to, truncate_to
+from jaxgran._utils.tracing import (
+    any_traced,
+    array_module,
+    as_jax_arrays,
+    in_compiled_code,
+    pad_to,
+    truncate_to,
+)
 from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas, reduced_scene
+from jaxgran.theory.covariance import run_covariance
 from jaxgran.theory.equations import SUPPORTED, Density, Equations, softness_factor
 from jaxgran.theory.solver import moments_at, padded_length
 
@@ -25,6 +33,9 @@ TOLERANCES = validation.Domain(0.0, 0.1)
 
 SONINES = validation.Domain(-0.4, 1.0)
 """Values of a_2 at t = 0; that of spheres of one speed is -0.4, of disks -0.5."""
+
+NUM_GRID_TIMES = 97
+"""Number of times between which a covariance is propagated, in addition to the given ones."""
 
 SLIDING_ACCURACY = 0.2
 """Relative accuracy of T_rot/T of spheres that slide and rotated at t = 0, or have rough walls."""
@@ -166,6 +177,77 @@ class KineticTheory(AbstractModel):
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; < 0 if the law heats it."""
         return checks.first_cooling_rate(gas)[0]
+
+    def covariance(
+        self, gas: Gas, times: validation.UserNumber, num_particles: int, *, rotation: bool = False
+    ) -> Float[Array, "n n"]:
+        """Return the covariance of ln T of one run of N spheres at some times.
+
+        T of a run departs from the curve of this model because its impacts are random in number
+        and size: ``dC/dt = J C + C J^T + Q/N`` along the curve, ``C(0) = 0``, with the Jacobian J
+        of the rates and the second moments Q of what impacts take (`jaxgran.theory.covariance`).
+        For smooth spheres in a periodic box, with ``zeta = -d ln T/dt`` by impacts, omega
+        collisions per particle and time, ``r = <x^2>/<x>^2`` of their losses x (2 for constant
+        restitution), and ``Phi = d ln T(t)/d ln T_0``,
+
+            C(t_i, t_j) = (2/N) Phi_i Phi_j int_0^min(t_i, t_j) r zeta^2/(omega Phi^2) dt.
+
+        The mean over R independent runs has 1/R of it. It is the covariance of a gas that stays
+        homogeneous, at low density: `jaxgran.models.error_model` has the factors of others.
+
+        Args:
+            gas: the scene; its T_0 is that of the run itself.
+            times: t, s, shape (times,), >= 0, increasing.
+            num_particles: N, >= 1.
+            rotation: give also ln T_rot of rough spheres.
+
+        Returns:
+            C, shape (times, times); with `rotation` of ln T at all times, then of ln T_rot, shape
+            (2 times, 2 times). Differentiable in the gas.
+
+        Raises:
+            ValueError: for times out of order, N below 1, and `rotation` without rough spheres.
+            RuntimeError: if the curve cannot be computed.
+
+        >>> covariance = jaxgran.KineticTheory().covariance(gas, times, 250)
+        >>> [round(float(error), 4) for error in jnp.sqrt(jnp.diag(covariance))]
+        [0.0089, 0.0151, 0.0237, 0.0262]
+        """
+        gas, times = checks.checked_gas(gas), validation.checked_times(times)
+        num_particles = validation.checked_int("num_particles", num_particles, 1)
+        self.check_scene(gas)
+        if rotation and gas.surface is None:
+            raise ValueError(
+                "rotation=True needs spheres that rotate: add surface=jaxgran.Rough(...), or leave "
+                "rotation out."
+            )
+        xp = array_module(gas, times)
+        frequency = xp.asarray(gas.collision_frequency)
+        # T changes little between the times of a grid in ln(1 + t/tau_c).
+        grid = xp.linspace(0.0, 1.0, NUM_GRID_TIMES) * xp.log1p(frequency * times[-1])
+        grid = xp.concatenate([xp.asarray(times), xp.expm1(grid) / frequency])
+        padded = pad_to(xp.sort(grid), padded_length(grid.size))
+        place = xp.searchsorted(padded, xp.asarray(times))
+        whole, fault = self._compiled_covariance(gas, as_jax_arrays(padded), rotation)
+        if not any_traced(fault) and int(fault) != status.OK:
+            raise RuntimeError(status.explain(int(fault)))
+        rows = xp.concatenate([place, place + padded.size]) if rotation else place
+        return whole[rows][:, rows] / num_particles
+
+    @eqx.filter_jit
+    def _compiled_covariance(
+        self, gas: Gas, times: Float[Array, "times"], rotation: bool
+    ) -> tuple[Float[Array, "n n"], Any]:
+        curve = self.curve_in_fit(gas, times, 1.0)
+        return self.run_covariance(gas, curve, rotation), curve.status
+
+    def run_covariance(
+        self, gas: Gas, curve: CoolingCurve, rotation: bool = False
+    ) -> Float[Array, "n n"]:
+        """Return `jaxgran.theory.covariance.run_covariance` with the settings of this model."""
+        return run_covariance(
+            gas, curve, rotation=rotation, softness=self.softness, correlations=self.correlations
+        )
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""

@@ -131,6 +131,27 @@ class Density(NamedTuple):
             gas.packing_fraction if correlations else None,
         )
 
+    def factor(
+        self, law: ReducedLaw, speed: Array, inelasticity: Array, collisions: Array, dimension: int
+    ) -> Float[Array, ""]:
+        """Return the factor of the cooling by impacts.
+
+        Args:
+            law: law of restitution in units of the diameter and of `Gas.impact_speed`.
+            speed: sqrt(T/T_0).
+            inelasticity: <1 - eps^2>, weighted by the energy of the normal motion.
+            collisions: per particle since t = 0.
+            dimension: d.
+        """
+        factor = jnp.ones_like(speed)
+        if self.crowding is not None:
+            factor = softness_factor(law, speed, dimension)
+            factor = factor / (1 + self.crowding * law.impact_length(speed))
+        if self.packing_fraction is not None:
+            slowdown = correlation_slowdown(self.packing_fraction, inelasticity, dimension)
+            factor = factor * (1 - slowdown * correlation_build_up(collisions))
+        return factor
+
 
 SceneAndDensity = tuple[ReducedScene, Density]
 """Scene in reduced units, and the effects of its density."""
@@ -203,14 +224,8 @@ class Equations(NamedTuple):
         if order > 2:
             sixth = 8 / (d * (d + 2) * (d + 4)) * losses[2]
             a3_rate = 3 * a2_rate - 3 * impacts * (1 + 3 * a2 - a3) + sixth
-        cooling = impacts
-        if density.crowding is not None:
-            cooling = cooling * softness_factor(gas.law, speed, d)
-            cooling = cooling / (1 + density.crowding * gas.law.impact_length(speed))
-        if density.packing_fraction is not None:
-            inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
-            slowdown = correlation_slowdown(density.packing_fraction, inelasticity, d)
-            cooling = cooling * (1 - slowdown * correlation_build_up(moments.collisions))
+        inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
+        cooling = impacts * density.factor(gas.law, speed, inelasticity, moments.collisions, d)
         relaxing, rotating = zero, []
         if gas.has_elements:
             changes = element_rates(gas, speed, moments.spins, a2, d, self.gaussian_spins)
@@ -354,6 +369,23 @@ _STENCIL = np.array(
 """Steps in T and a, and weights of the differences d_TT, d_Ta, d_aa and d_Taa."""
 
 
+def coulomb_limit(
+    surface: ReducedRough, eta: Array, kick: Array, variance: Array
+) -> Float[Array, "..."] | None:
+    """Return m of `slip_moments`, ``mu (1 + eps)/2 / (eta sqrt(V/S))``; None without friction.
+
+    Args:
+        surface: in reduced units.
+        eta: coefficient of `Rough`.
+        kick: (1 + eps)/2, see `mean_kick`.
+        variance: V/S, of a component of the slip over one of the relative velocity.
+    """
+    if surface.friction is None:
+        return None
+    slip = jnp.sqrt(variance) * jnp.maximum(eta, 1e-9)
+    return jnp.minimum(surface.friction * kick / slip, MAX_STICKING)
+
+
 def rough_impact_rates(
     surface: ReducedRough,
     eta: Float[Array, ""],
@@ -396,10 +428,9 @@ def rough_impact_rates(
     size_T, size_a = 2 * _STEP, 2 * _STEP * (1 + a)
     T1, a1 = 1 + size_T * step_T, a + size_a * step_a
     T, of_spin = (jnp.concatenate([x, jnp.full_like(x, y)]) for x, y in ((T1, 1.0), (a1, a)))
-    S, V, m = 1 + T1, 1 + T1 + a + a1, None
-    if surface.friction is not None:
-        slip = jnp.sqrt(V / S) * jnp.maximum(eta, 1e-9)
-        m = jnp.minimum(surface.friction * kick / slip, MAX_STICKING)
+    S = 1 + T1
+    V = 1 + T1 + a + a1
+    m = coulomb_limit(surface, eta, kick, V / S)
     means = rough_impact_means(T, of_spin, S, V, m, kick, eta, q, d)
     weights = jnp.zeros_like(T1).at[0, 0].set(0.5)
     if not gaussian:
