@@ -112,7 +112,9 @@ class Problem:
 
     @cached_property
     def _simplified_model(self) -> AbstractModel:
-        return self.model.simplified_for(*(m.scene for m in self.measurements))
+        displacement = any(m.displacement is not None for m in self.curves)
+        scenes = [m.scene for m in self.measurements]
+        return self.model.simplified_for(*scenes, displacement=displacement)
 
     @property
     def curves(self) -> tuple[CurveRows, ...]:

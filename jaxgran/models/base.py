@@ -91,8 +91,13 @@ class AbstractModel(eqx.Module):
         """
         return self.simulate(gas, times, Run())
 
-    def simplified_for(self, *gases: Gas) -> "AbstractModel":
-        """Return the model that computes the curves of some gases in fits: by default this one."""
+    def simplified_for(self, *gases: Gas, displacement: bool = False) -> "AbstractModel":
+        """Return the model that computes the curves of some gases in fits: by default this one.
+
+        Args:
+            gases: the scenes.
+            displacement: whether <dr^2> is needed.
+        """
         return self
 
     def sized_for(self, gas: Gas, spare: float = 2.0) -> "AbstractModel":

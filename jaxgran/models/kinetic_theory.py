@@ -73,6 +73,7 @@ class KineticTheory(AbstractModel):
             spheres).
         correlations: correct for velocity correlations at finite density; with False this is
             Enskog's theory.
+        diffusion: solve for D and <dr^2>.
         spin_cumulants: solve for the cumulants of spins of rough spheres; with False spins and
             velocities stay independent and Gaussian.
         initial_sonine: a_2 at t = 0, in (-0.4, 1); that of `jaxgran.steady_state` for a gas that
@@ -99,6 +100,7 @@ class KineticTheory(AbstractModel):
     order: int = eqx.field(static=True, default=3)
     softness: bool = eqx.field(static=True, default=True)
     correlations: bool = eqx.field(static=True, default=True)
+    diffusion: bool = eqx.field(static=True, default=True)
     spin_cumulants: bool = eqx.field(static=True, default=True)
     initial_sonine: float = eqx.field(static=True, default=0.0)
     rtol: float | None = eqx.field(static=True, default=None)
@@ -110,6 +112,7 @@ class KineticTheory(AbstractModel):
             sonine=self.sonine,
             softness=self.softness,
             correlations=self.correlations,
+            diffusion=self.diffusion,
             spin_cumulants=self.spin_cumulants,
         )
         if self.order not in (2, 3) or isinstance(self.order, bool | float):
@@ -238,7 +241,7 @@ class KineticTheory(AbstractModel):
     def _compiled_covariance(
         self, gas: Gas, times: Float[Array, "times"], rotation: bool
     ) -> tuple[Float[Array, "n n"], Any]:
-        curve = self.curve_in_fit(gas, times, 1.0)
+        curve = self.solve(gas, times, 1.0)
         return self.run_covariance(gas, curve, rotation), curve.status
 
     def run_covariance(
@@ -279,14 +282,18 @@ class KineticTheory(AbstractModel):
         contacts = checks.limitations_of_instant_impacts(gas, consequence)
         return contacts + checks.limitations_of_homogeneity(gas, num_particles)
 
-    def simplified_for(self, *gases: Gas) -> "KineticTheory":
-        """Return this model, with Gaussian spins if the spheres of all gases are smooth.
+    def simplified_for(self, *gases: Gas, displacement: bool = False) -> "KineticTheory":
+        """Return this model without D, and with Gaussian spins if all spheres are smooth.
 
         Then only alternative explanations of their curves rotate. Gaussian spins change T by up to
         2 % there, and the program compiles in two thirds of the time.
         """
         smooth = all(gas.surface is None for gas in gases)
-        return dataclasses.replace(self, spin_cumulants=False) if smooth else self
+        return dataclasses.replace(
+            self,
+            spin_cumulants=self.spin_cumulants and not smooth,
+            diffusion=self.diffusion and displacement,
+        )
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
@@ -315,7 +322,12 @@ class KineticTheory(AbstractModel):
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
         order = self.order if self.sonine else 2
         equations = Equations(
-            gas.dimension, order, not self.sonine, self.initial_sonine, not self.spin_cumulants
+            gas.dimension,
+            order,
+            not self.sonine,
+            self.initial_sonine,
+            not self.spin_cumulants,
+            self.diffusion,
         )
         reduced = jnp.where(sound, times, 0.0) * gas.impact_speed / length
         state, fault = moments_at(
@@ -330,14 +342,15 @@ class KineticTheory(AbstractModel):
             optional["third_sonine"] = state.third_sonine + nan_if_failed
         if state.rotation is not None:
             optional["rotational_temperature"] = temperature * state.rotation
-        diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
+        if state.diffusion is not None and state.displacement is not None:
+            diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
+            optional["diffusion"] = diffusion + nan_if_failed
+            optional["displacement"] = state.displacement * length**2 + nan_if_failed
         return CoolingCurve(
             times=times,
             temperature=temperature,
             sonine=state.sonine + nan_if_failed,
             collisions=state.collisions + nan_if_failed,
-            diffusion=diffusion + nan_if_failed,
-            displacement=state.displacement * length**2 + nan_if_failed,
             status=fault,
             **optional,
         )

@@ -98,11 +98,19 @@ def linearise(
 
 
 def curve_of_program(
-    model: AbstractModel, gas: Gas, times: Float[np.ndarray, "times"]
+    model: AbstractModel, gas: Gas, times: Float[np.ndarray, "times"], displacement: bool = False
 ) -> CoolingCurve:
-    """Return the curve of a gas without <dr^2>, by the program that fits share."""
+    """Return the curve of a gas without <dr^2>, by the program that fits share.
+
+    Args:
+        model: without noise.
+        gas: the scene.
+        times: t, s.
+        displacement: use the program of fits that need <dr^2>.
+    """
     complete = with_neutral_elements(gas, model)
-    values = dict(linearise(model.simplified_for(gas), complete, times).values)
+    simple = model.simplified_for(gas, displacement=displacement)
+    values = dict(linearise(simple, complete, times).values)
     for name in ("displacement", "diffusion"):
         values.pop(name, None)
     return CoolingCurve(**as_jax_arrays({"times": times} | values))

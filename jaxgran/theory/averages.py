@@ -161,7 +161,11 @@ def averaging_matrix(dimension: int, order: int) -> np.ndarray:
 
 
 def impact_moments(
-    law: ReducedLaw, speed: Float[Array, ""], dimension: int, order: int = 2
+    law: ReducedLaw,
+    speed: Float[Array, ""],
+    dimension: int,
+    order: int = 2,
+    relaxation: bool = True,
 ) -> Float[Array, "rows terms"]:
     """Return averages over the impacts of a Maxwell-Sonine gas, exact in eps(v).
 
@@ -175,6 +179,7 @@ def impact_moments(
         speed: sqrt(T/T_0).
         dimension: d.
         order: of the Sonine expansion: 2 has a_2, 3 also a_3.
+        relaxation: whether the relaxation of velocities, for D, is asked for.
 
     Returns:
         Coefficients of polynomials in a_2 (and a_3), with the columns of `TERMS`. Order 2: mu_2,
@@ -187,7 +192,9 @@ def impact_moments(
     """
     loss = law.loss(jnp.asarray(NODES, speed.dtype) * speed)
     powers = jnp.stack([loss**0 * 1.0, loss, *(loss**k for k in range(2, 7))])
-    return jnp.tensordot(jnp.asarray(averaging_matrix(dimension, order), speed.dtype), powers, 2)
+    matrix = averaging_matrix(dimension, order)
+    matrix = matrix if relaxation else matrix[:order]
+    return jnp.tensordot(jnp.asarray(matrix, speed.dtype), powers, 2)
 
 
 def collision_rate(

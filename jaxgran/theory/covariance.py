@@ -102,19 +102,12 @@ def run_covariance(
         C of ln T, shape (times, times); with `rotation` of ln T, then of ln T_rot, shape (2 times,
         2 times). T_0 and T_rot_0 are those of the run: C is 0 at t = 0, and where T_rot is 0.
     """
-    d = gas.dimension
-    scene = reduced_scene(gas)
-    density = Density.from_gas(gas, softness, correlations)
     theta = curve.temperature / gas.temperature
     ratio = jnp.zeros_like(theta)
     if curve.rotational_temperature is not None:
         ratio = curve.rotational_temperature / curve.temperature
     mean = Mean(jnp.log(theta), curve.sonine, curve.collisions, ratio)
-    crossings = None
-    if gas.container is not None:
-        widths = jnp.broadcast_to(gas.container.side, (d,)) - gas.diameter
-        crossings = jnp.mean(gas.path_length / widths)
-    rates = process(scene, density, crossings, d, mean)
+    rates = run_process(gas, mean, softness, correlations)
     passed = jnp.diff(mean.collisions)
     growth, noise = propagators(*((x[..., 1:] + x[..., :-1]) / 2 * passed for x in rates))
     zero = jnp.zeros_like(ratio)
@@ -124,6 +117,19 @@ def run_covariance(
         by_rotation = (ratio + ROTATION_OFFSET) / jnp.where(turning, ratio, jnp.inf)
         outputs.append([turning + zero, by_rotation, *outputs[0][2:]])
     return covariance_at_all_times(growth, noise, jnp.stack([jnp.stack(row) for row in outputs]))
+
+
+def run_process(
+    gas: Gas, mean: Mean, softness: bool = True, correlations: bool = True
+) -> tuple[Float[Array, "k k times"], Float[Array, "k k times"]]:
+    """Return J and Q of a gas at some times of its mean, per collision: see `process`."""
+    d = gas.dimension
+    crossings = None
+    if gas.container is not None:
+        widths = jnp.broadcast_to(gas.container.side, (d,)) - gas.diameter
+        crossings = jnp.mean(gas.path_length / widths)
+    density = Density.from_gas(gas, softness, correlations)
+    return process(reduced_scene(gas), density, crossings, d, mean)
 
 
 class Impacts(NamedTuple):
@@ -263,18 +269,21 @@ def process(
 
 
 def propagators(
-    jacobian: Float[Array, "k k n"], noise: Float[Array, "k k n"]
+    jacobian: Float[Array, "k k n"],
+    noise: Float[Array, "k k n"],
+    num_doublings: Any = NUM_DOUBLINGS,
 ) -> tuple[Float[Array, "k k n"], Float[Array, "k k n"]]:
     """Return ``F - 1`` of intervals of constant J and Q, and the noise that they add.
 
-    ``F = exp(J)`` and ``int_0^1 exp(J s) Q exp(J^T s) ds``, by `NUM_DOUBLINGS` doublings of a short
-    step: two steps have ``(1 + G)^2 = 1 + 2 G + G^2`` and ``Q + F Q F^T``. G = F - 1 keeps its
-    digits where steps are short.
+    ``F = exp(J)`` and ``int_0^1 exp(J s) Q exp(J^T s) ds``, by doublings of a short step: two steps
+    have ``(1 + G)^2 = 1 + 2 G + G^2`` and ``Q + F Q F^T``. G = F - 1 keeps its digits where steps
+    are short.
 
     Args:
         jacobian, noise: J and Q times the length of each interval.
+        num_doublings: may be traced, but then has no derivatives in reverse mode.
     """
-    step = 2.0**-NUM_DOUBLINGS
+    step = jnp.exp2(-jnp.asarray(num_doublings, jacobian.dtype))
     growth = jacobian * step
     noise = noise * step
     change = product(growth, noise) / 2
@@ -286,7 +295,7 @@ def propagators(
         moved = half + product(half, transposed(growth))  # F Q F^T
         return 2 * growth + product(growth, growth), noise + moved
 
-    return jax.lax.fori_loop(0, NUM_DOUBLINGS, double, first)
+    return jax.lax.fori_loop(0, num_doublings, double, first)
 
 
 def covariance_at_all_times(

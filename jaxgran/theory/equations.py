@@ -53,9 +53,9 @@ class Moments(NamedTuple):
     Attributes:
         log_temperature: ln(T/T_0).
         sonine: a_2.
-        diffusion: D / sqrt(T/T_0), which cooling does not shrink.
-        displacement: <dr^2>.
         collisions: number of collisions per particle.
+        diffusion: D / sqrt(T/T_0), which cooling does not shrink; None where it is not asked for.
+        displacement: <dr^2>; None likewise.
         third_sonine: a_3; None at order 2.
         diffusion_shape: ``<S_1(c^2) v.dr>/d`` over sqrt(T/T_0), S_1 = d/2 + 1 - c^2; None at
             order 2.
@@ -68,20 +68,14 @@ class Moments(NamedTuple):
 
     log_temperature: Float[Array, "..."]
     sonine: Float[Array, "..."]
-    diffusion: Float[Array, "..."]
-    displacement: Float[Array, "..."]
     collisions: Float[Array, "..."]
+    diffusion: Float[Array, "..."] | None = None
+    displacement: Float[Array, "..."] | None = None
     third_sonine: Float[Array, "..."] | None = None
     diffusion_shape: Float[Array, "..."] | None = None
     rotation: Float[Array, "..."] | None = None
     spin_correlation: Float[Array, "..."] | None = None
     spin_kurtosis: Float[Array, "..."] | None = None
-
-    @classmethod
-    def from_array(cls, values: Float[Array, "moments ..."], order: int) -> "Moments":
-        """Return the moments held by the rows of an array."""
-        names = [*cls._fields[: 5 if order == 2 else 7], *cls._fields[7:]]
-        return cls(**dict(zip(names, values, strict=False)))
 
     @property
     def spins(self) -> "Spins | None":
@@ -173,6 +167,7 @@ class Equations(NamedTuple):
         maxwellian: if True, a_2 stays 0.
         initial_sonine: a_2 at t = 0.
         gaussian_spins: if True, a_11 and a_02 stay 0.
+        spreading: whether D and <dr^2> are asked for.
     """
 
     dimension: int
@@ -180,10 +175,24 @@ class Equations(NamedTuple):
     maxwellian: bool
     initial_sonine: float = 0.0
     gaussian_spins: bool = False
+    spreading: bool = True
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the `Moments`, without those of spins."""
+        names = list(Moments._fields[: 5 if self.spreading else 3])
+        if self.order > 2:
+            names += ["third_sonine"] + (["diffusion_shape"] if self.spreading else [])
+        return names
+
+    def moments(self, values: Float[Array, "moments ..."]) -> Moments:
+        """Return the moments held by the rows of an array."""
+        names = [*self.names, *Moments._fields[7:]]
+        return Moments(**dict(zip(names, values, strict=False)))
 
     def initial(self, scene: SceneAndDensity, like: Array) -> Float[Array, "moments"]:
         """Return the `Moments` at t = 0 as one array, of the dtype of `like`."""
-        start = [jnp.zeros((), like.dtype)] * (5 if self.order == 2 else 7)
+        start = [jnp.zeros((), like.dtype)] * len(self.names)
         start[1] += self.initial_sonine
         if scene[0].surface is not None:
             spins = Spins.gaussian(scene[0].surface.ratio.astype(like.dtype))
@@ -193,7 +202,9 @@ class Equations(NamedTuple):
     def table(self, scene: SceneAndDensity, duration: Array) -> RateTable:
         """Return the averages at all temperatures that the gas reaches in a time."""
         law, d = scene[0].law, self.dimension
-        averages = partial(impact_moments, law, dimension=d, order=self.order)
+        averages = partial(
+            impact_moments, law, dimension=d, order=self.order, relaxation=self.spreading
+        )
         bounds = element_bounds(scene[0], d)
         return RateTable.from_function(averages, duration, d, law.num_nodes, bounds)
 
@@ -210,14 +221,16 @@ class Equations(NamedTuple):
             rates: from `jaxgran.theory.averages.impact_moments` at this temperature.
             scene: the gas.
         """
-        moments, d, order = Moments.from_array(state, self.order), self.dimension, self.order
+        moments = self.moments(state)
+        d = self.dimension
+        order = self.order
         gas, density = scene
         a2, speed = moments.sonine, jnp.exp(moments.log_temperature / 2)
         zero = jnp.zeros_like(speed)
         a3 = zero if moments.third_sonine is None else moments.third_sonine
         # The losses mu_2, mu_4, ..., and the matrix nu_jk row by row.
         values = rates @ jnp.stack([a2**i * a3**j for i, j in zip(*TERMS[order], strict=True)])
-        losses, relaxation = values[:order] * speed, values[order:].reshape(order - 1, -1)
+        losses = values[:order] * speed
         impacts = 2 / d * losses[0]
         a2_rate = 2 * impacts * (1 + a2) - 4 / (d * (d + 2)) * losses[1]
         a3_rate = shape_decay = zero
@@ -240,17 +253,19 @@ class Equations(NamedTuple):
                 rotating = rotating[: 1 if self.gaussian_spins else 3]
         # Of the terms that cool the gas, only impacts change the shape of the velocity
         # distribution.
-        net_growth = cooling / 2 - relaxing
-        diffusing = _diffusion_rates(moments, a3, relaxation, impacts, shape_decay, d)
-        diffusion, *shape = [rate + net_growth * q for rate, q in diffusing]
         rate = [
             -cooling,
             zero if self.maxwellian else a2_rate,
-            diffusion,
-            2 * d * speed * moments.diffusion,
             collision_rate(a2, d, a3) * speed,
         ]
-        third = [] if order == 2 else [a3_rate, *shape]
+        third = [] if order == 2 else [a3_rate]
+        if self.spreading:
+            relaxation = values[order:].reshape(order - 1, -1)
+            diffusing = _diffusion_rates(moments, a3, relaxation, impacts, shape_decay, d)
+            net_growth = cooling / 2 - relaxing
+            diffusion, *shape = [change + net_growth * q for change, q in diffusing]
+            rate += [diffusion, 2 * d * speed * moments.diffusion]
+            third += shape
         return jnp.stack(rate + third + rotating)
 
 
@@ -806,8 +821,9 @@ def _steady_rates(
 ) -> Float[Array, "variables"]:
     """Rates of change of ln T, a_2, a_3 and the spins where all correlations have built up."""
     zero = jnp.zeros_like(x[:1])
-    moments = jnp.concatenate([x[:2], zero, zero, zero + jnp.inf, x[2:3], zero, x[3:]])
-    rates = impact_moments(scene.law, jnp.exp(x[0] / 2), d, 3)
-    change = Equations(d, 3, maxwellian=False).derivative(moments, rates, (scene, density))
+    moments = jnp.concatenate([x[:2], zero + jnp.inf, x[2:]])
+    equations = Equations(d, 3, maxwellian=False, spreading=False)
+    rates = impact_moments(scene.law, jnp.exp(x[0] / 2), d, 3, relaxation=False)
+    change = equations.derivative(moments, rates, (scene, density))
     # Spins of smooth spheres, beta_t = -1, do not change: they are 0.
-    return jnp.concatenate([change[:2], change[5:6], change[7:] - 1e-30 * x[3:]])
+    return jnp.concatenate([change[:2], change[3:4], change[4:] - 1e-30 * x[3:]])

@@ -179,7 +179,8 @@ def moments_at(
     Returns:
         The moments, each of shape (times,), nan unless the status is ok; and the status.
     """
-    dtype, order = times.dtype, equations.order
+    dtype = times.dtype
+    controlling = 5 if equations.spreading else 3
     leaves, structure = jax.tree.flatten(scene)
     leaves = [jnp.asarray(x, dtype) for x in leaves]
     _, unravel = ravel_pytree(structure.unflatten(leaves))
@@ -194,7 +195,7 @@ def moments_at(
         times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=dtype))
         # The state alone controls the steps: its tangents are then those of the discrete solution.
         controller = diffrax.PIDController(
-            rtol=rtol, atol=rtol, norm=lambda rows: optx.rms_norm(rows[0][:5])
+            rtol=rtol, atol=rtol, norm=lambda rows: optx.rms_norm(rows[0][:controlling])
         )
         rows, completed = integrate_at(
             # s = ln(1 + t): a power law of time takes the same number of steps each decade.
@@ -220,7 +221,7 @@ def moments_at(
             return equations.derivative(row, table(row[0]), scene)
 
         rows, fault = integrate(jax.vmap(derivative), start[None], parameters, times)
-        return Moments.from_array(rows[:, 0].T, order), fault
+        return equations.moments(rows[:, 0].T), fault
 
     @partial(solve.defjvp, symbolic_zeros=True)
     def solve_jvp(primals, tangents):
@@ -256,13 +257,13 @@ def moments_at(
         first = jnp.concatenate([start[None], jax.vmap(start_along)(directions)])
         rows, fault = integrate(rows_derivative, first, parameters, times)
         states, jacobian = rows[:, 0], rows[:, 1:].T
-        changes = jax.tree.map(lambda j: amounts @ j, Moments.from_array(jacobian, order))
+        changes = jax.tree.map(lambda j: amounts @ j, equations.moments(jacobian))
         if not _is_zero(times_along):
             rates = jax.vmap(lambda x: derivative(x, table(x[0])[0], parameters))(states)
-            rates = Moments.from_array(rates.T, order)
+            rates = equations.moments(rates.T)
             changes = jax.tree.map(lambda m, v: m + v * times_along, changes, rates)
         no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of an integer
-        return (Moments.from_array(states.T, order), fault), (changes, no_tangent)
+        return (equations.moments(states.T), fault), (changes, no_tangent)
 
     return solve(leaves, times)
 
