@@ -293,8 +293,8 @@ def predicted_curve(
     gas = with_floats(rows.gas, floats)
     elapsed = np.asarray(rows.curve.times) - float(values.get(START_TIME, 0.0))
     elapsed = elapsed * rows.faster
-    times, place = times_with_nodes(np.abs(elapsed), float(gas.mean_free_time))
-    linear = linearise(model, gas, times, tolerance)
+    times, place = times_with_nodes(np.abs(elapsed), rows.unit_time)
+    linear = linearise(model, gas, times, {e.name for e in elements}, tolerance)
     known = linear.values
     T = known["temperature"]
     nothing = np.zeros_like(T)

@@ -114,6 +114,7 @@ class CurveRows:
         scatter: 1/N over all runs; where N is not known, a value about which it is searched.
         scatter_error: standard error of the logarithm of the scatter.
         faster: factor by which the measured gas cools faster because N is small.
+        unit_time: mean free time of the scene, s.
         rate_error: times, s, and the relative error of the model's cooling rate at them.
         rotation_accuracy: relative accuracy of the model's T_rot.
         displacement: <dr^2>; None where it is not used.
@@ -133,6 +134,7 @@ class CurveRows:
     scatter: float
     scatter_error: float
     faster: float
+    unit_time: float
     rate_error: tuple[np.ndarray, np.ndarray]
     rotation_accuracy: float = 0.0
     displacement: Displacement | None = None
@@ -298,6 +300,7 @@ def curve_rows(
         scatter=1 / total,
         scatter_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
         faster=1.0 if N is None else float(finite_size_cooling_factor(gas, float_array(N))),
+        unit_time=float(gas.mean_free_time),
         rate_error=(np.zeros(1), np.zeros(1)),
         rotation_accuracy=float(model.rotation_accuracy(gas)) if uses_rotation else 0.0,
         displacement=None if fits_t0 else _displacement(measurement, model, notes),
@@ -407,7 +410,7 @@ def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRow
         gas: the scene, with values of the unknowns.
     """
     known = np.asarray(rows.curve.times) * rows.faster
-    times, _ = times_with_nodes(known, float(gas.mean_free_time))
+    times, _ = times_with_nodes(known, rows.unit_time)
     curve = curve_of_program(model, gas, times, rows.displacement is not None)
     if not np.all(np.isfinite(np.asarray(curve.temperature))):
         return rows

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils import status, validation
 from jaxgran._utils.tracing import (
@@ -25,8 +25,15 @@ from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas, reduced_scene
 from jaxgran.theory.covariance import run_covariance
-from jaxgran.theory.equations import SUPPORTED, Density, Equations, softness_factor
-from jaxgran.theory.solver import moments_at, padded_length
+from jaxgran.theory.equations import (
+    SUPPORTED,
+    Density,
+    Equations,
+    Moments,
+    SceneAndDensity,
+    softness_factor,
+)
+from jaxgran.theory.solver import MomentSolver, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
@@ -314,30 +321,80 @@ class KineticTheory(AbstractModel):
 
     def solve(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
-        length, sound = gas.path_length, jnp.asarray(True)
-        if self.softness:  # a search may try a T_0 at which spheres are too soft: no step is made
-            law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
-            sound = softness_factor(law, hottest, gas.dimension) > 0
+        scene, reduced = self._reduced(gas, times)
+        state, fault = self._solver(gas, times, tolerance).moments(scene, reduced)
+        return self._curve(gas, times, state, fault)
+
+    def solve_along(
+        self, gas: Gas, times: Float[Array, "times"], tolerance: Any, gas_along: Gas, delay: Any
+    ) -> tuple[CoolingCurve, CoolingCurve]:
+        """Return `solve`, and its derivatives along some directions of the gas and of the times.
+
+        Args:
+            gas, times, tolerance: as of `solve`.
+            gas_along: tangents of the gas, with a first axis (directions,).
+            delay: tangents of a shift of all times, shape (directions,).
+        """
+        times_along = jnp.broadcast_to(delay[:, None], (*delay.shape, times.size))
+
+        def each(function, *primals):
+            """Return values, and derivatives along each direction."""
+
+            def along(*tangents):
+                return jax.jvp(function, primals, tangents)
+
+            return jax.vmap(along, out_axes=(None, 0))
+
+        reduced = each(self._reduced, gas, times)(gas_along, times_along)
+        (scene, at), (scene_along, at_along) = reduced
+        solver = self._solver(gas, times, tolerance)
+        state, state_along, fault = solver.moments_along(scene, at, scene_along, at_along)
+
+        def curve(gas, times, state):
+            return dataclasses.replace(self._curve(gas, times, state, fault), status=None)
+
+        computed, along = each(curve, gas, times, state)(gas_along, times_along, state_along)
+        fault = self._curve(gas, times, state, fault).status
+        return dataclasses.replace(computed, status=fault), along
+
+    def _reduced(
+        self, gas: Gas, times: Float[Array, "times"]
+    ) -> tuple[SceneAndDensity, Float[Array, "times"]]:
+        """Return a gas and times in reduced units."""
+        # A search may try a T_0 at which spheres are too soft: no step is made then.
+        sound = self._is_sound(gas)
         scene = reduced_scene(gas), Density.from_gas(gas, self.softness, self.correlations)
+        return scene, jnp.where(sound, times, 0.0) * gas.impact_speed / gas.path_length
+
+    def _is_sound(self, gas: Gas) -> Bool[Array, ""]:
+        if not self.softness:
+            return jnp.asarray(True)
+        law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
+        return softness_factor(law, hottest, gas.dimension) > 0
+
+    def _solver(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> MomentSolver:
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
-        order = self.order if self.sonine else 2
         equations = Equations(
             gas.dimension,
-            order,
+            self.order if self.sonine else 2,
             not self.sonine,
             self.initial_sonine,
             not self.spin_cumulants,
             self.diffusion,
         )
-        reduced = jnp.where(sound, times, 0.0) * gas.impact_speed / length
-        state, fault = moments_at(
-            scene, reduced, equations, self.solver, rtol * tolerance, self.max_steps
-        )
-        fault |= status.flag(status.UNSUPPORTED, ~sound)
+        return MomentSolver(equations, self.solver, rtol * tolerance, self.max_steps)
+
+    def _curve(
+        self, gas: Gas, times: Float[Array, "times"], state: Moments, fault: Int[Array, ""]
+    ) -> CoolingCurve:
+        """Return the curve of moments in reduced units."""
+        length = gas.path_length
+        fault = fault | status.flag(status.UNSUPPORTED, ~self._is_sound(gas))
         theta = jnp.exp(state.log_temperature)
         # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
         nan_if_failed = jnp.where(fault == status.OK, 0.0, jnp.nan).astype(theta.dtype)
-        temperature, optional = gas.temperature * theta + nan_if_failed, {}
+        temperature = gas.temperature * theta + nan_if_failed
+        optional = {}
         if state.third_sonine is not None:
             optional["third_sonine"] = state.third_sonine + nan_if_failed
         if state.rotation is not None:
