@@ -25,7 +25,7 @@ from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas, reduced_scene
 from jaxgran.theory.covariance import run_covariance
-from jaxgran.theory.equations import SUPPORTED, Density, Equations, softness_factor
+from jaxgran.theory.equations import SUPPORTED, Density, Equations, Spins, softness_factor
 from jaxgran.theory.solver import moments_at, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
@@ -238,16 +238,15 @@ class KineticTheory(AbstractModel):
     def _compiled_covariance(
         self, gas: Gas, times: Float[Array, "times"], rotation: bool
     ) -> tuple[Float[Array, "n n"], Any]:
-        curve = self.curve_in_fit(gas, times, 1.0)
-        return self.run_covariance(gas, curve, rotation), curve.status
+        curve, spins = self.curve_and_spins(gas, times, 1.0)
+        return self.run_covariance(gas, curve, spins, rotation), curve.status
 
     def run_covariance(
-        self, gas: Gas, curve: CoolingCurve, rotation: bool = False
+        self, gas: Gas, curve: CoolingCurve, spins: Spins | None = None, rotation: bool = False
     ) -> Float[Array, "n n"]:
         """Return `jaxgran.theory.covariance.run_covariance` with the settings of this model."""
-        return run_covariance(
-            gas, curve, rotation=rotation, softness=self.softness, correlations=self.correlations
-        )
+        options = {"softness": self.softness, "correlations": self.correlations}
+        return run_covariance(gas, curve, spins, rotation=rotation, **options)
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""
@@ -307,6 +306,12 @@ class KineticTheory(AbstractModel):
 
     def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
+        return self.curve_and_spins(gas, times, tolerance)[0]
+
+    def curve_and_spins(
+        self, gas: Gas, times: Float[Array, "times"], tolerance: Any
+    ) -> tuple[CoolingCurve, Spins | None]:
+        """Return the curve of `curve_in_fit`, and the moments of the spins of rough spheres."""
         length, sound = gas.path_length, jnp.asarray(True)
         if self.softness:  # a search may try a T_0 at which spheres are too soft: no step is made
             law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
@@ -331,7 +336,7 @@ class KineticTheory(AbstractModel):
         if state.rotation is not None:
             optional["rotational_temperature"] = temperature * state.rotation
         diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
-        return CoolingCurve(
+        curve = CoolingCurve(
             times=times,
             temperature=temperature,
             sonine=state.sonine + nan_if_failed,
@@ -341,3 +346,4 @@ class KineticTheory(AbstractModel):
             status=fault,
             **optional,
         )
+        return curve, state.spins
