@@ -41,6 +41,7 @@ from jaxgran.theory.covariance import (
     run_process,
     transposed,
 )
+from jaxgran.theory.equations import Spins
 
 RATE_ERROR_LENGTH = 1.0
 """Change of ln T over which the error of theory's cooling rate is correlated."""
@@ -221,7 +222,7 @@ def _steps(
         nodes.log_temperature - first,
         jnp.broadcast_to(nodes.sonine[:, None], nodes.rotation.shape),
         nodes.collisions,
-        nodes.rotation,
+        Spins(nodes.rotation, None, None),
     )
     rates = jax.vmap(run_process, in_axes=(0, -1), out_axes=-1)
     jacobian, spread = rates(gas, jax.tree.map(_middle, means))

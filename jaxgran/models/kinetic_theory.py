@@ -248,16 +248,12 @@ class KineticTheory(AbstractModel):
     def _compiled_covariance(
         self, gas: Gas, times: Float[Array, "times"], rotation: bool
     ) -> tuple[Float[Array, "n n"], Any]:
-        curve = self.solve(gas, times, 1.0)
-        return self.run_covariance(gas, curve, rotation), curve.status
-
-    def run_covariance(
-        self, gas: Gas, curve: CoolingCurve, rotation: bool = False
-    ) -> Float[Array, "n n"]:
-        """Return `jaxgran.theory.covariance.run_covariance` with the settings of this model."""
-        return run_covariance(
-            gas, curve, rotation=rotation, softness=self.softness, correlations=self.correlations
-        )
+        scene, reduced = self._reduced(gas, times)
+        state, fault = self._solver(gas, times, 1.0).moments(scene, reduced)
+        curve = self._curve(gas, times, state, fault)
+        options = {"softness": self.softness, "correlations": self.correlations}
+        whole = run_covariance(gas, curve, state.spins, rotation=rotation, **options)
+        return whole, curve.status
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""

@@ -374,9 +374,10 @@ def rough_impact_means(
 def rough_energy_moments(
     losses: tuple[Float[Array, "..."], Float[Array, "..."]],
     m: Float[Array, "..."] | None,
-    eta: Float[Array, ""],
+    eta: Float[Array, "..."],
     inertia: Float[Array, ""],
-    spin: Float[Array, "..."],
+    S: Float[Array, "..."],
+    A: Float[Array, "..."],
     d: int,
 ) -> tuple[Float[Array, "2 ..."], Float[Array, "2 2 ..."]]:
     """Return moments of the energies that an impact of rough spheres adds, over m T and its square.
@@ -385,22 +386,22 @@ def rough_energy_moments(
     ``e' = z^2/q - z s``, with the loss x of the normal motion, the tangential velocities g of the
     centres and s of the surfaces along the slip u = g + s, and the impulse z along it, the smaller
     one of eta u and Coulomb's limit. Velocities are Gaussian: given u the means of g and s are
-    ``(S/V) u`` and ``(A/V) u``, with the variances S = 2 T of g, A of s, V of u.
+    ``(S/V) u`` and ``(A/V) u``, with V = S + A.
 
     Args:
         losses: <x> and <x^2>, see `loss_moments`.
         m: see `slip_moments`, with ``m = mu (1 + eps)/2 / eta sqrt(S/V)``; None without a limit.
         eta: coefficient of `Rough`.
         inertia: q.
-        spin: variance of the components of (sigma/2) w over T, T_rot/(q T).
+        S: variance of the components of the relative velocity over T, 2 of two Maxwellian spheres.
+        A: that of the sum of both (sigma/2) w, 2 T_rot/(q T).
         d: dimension.
 
     Returns:
         <e> and <e'>; and the matrix <e^2>, <e e'>; <e e'>, <e'^2>.
     """
     uJ, JJ, uuJJ, _, J4, uJ3, gguJ, ggJJ = slip_moments(m, d)
-    q, S, A = inertia, 2.0, 2 * spin
-    V = S + A
+    q, V = inertia, S + A
     means = -losses[0] / 2 + eta * (eta * V * JJ - S * uJ), eta * (eta / q * V * JJ - A * uJ)
     fourth = eta**4 * V**2 * J4
     third = eta**3 * V * uJ3

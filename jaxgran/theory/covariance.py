@@ -42,7 +42,7 @@ from jaxgran.theory.averages import (
     loss_nodes,
     rough_energy_moments,
 )
-from jaxgran.theory.equations import Density, coulomb_limit, mean_kick
+from jaxgran.theory.equations import Density, Spins, coulomb_limit, mean_kick
 
 WALL_MEMORY = 9.0
 """k in ``kappa = k sqrt(T)/W``, with the width W that centres have."""
@@ -52,9 +52,6 @@ WALL_NOISE = 0.1
 
 ROTATION_OFFSET = 0.01
 """c in the variable ``ln(T_rot/T + c)``."""
-
-DIFFERENCE = 0.01
-"""Step of both variables in the differences that give J: a relative error of 1e-5."""
 
 NUM_DOUBLINGS = 20
 """An interval is divided into 2^20 steps, so that it may last 1e5 relaxation times."""
@@ -67,18 +64,20 @@ class Mean(NamedTuple):
         log_temperature: ln(T/T_0).
         sonine: a_2.
         collisions: per particle since t = 0.
-        rotation: T_rot/T of rough spheres, otherwise 0.
+        spins: T_rot/T of rough spheres, 0 of smooth ones, and cumulants as in `Moments`, None
+            where spins are taken to be Gaussian.
     """
 
     log_temperature: Any
     sonine: Any
     collisions: Any
-    rotation: Any
+    spins: Spins
 
 
 def run_covariance(
     gas: Gas,
     curve: CoolingCurve,
+    spins: Spins | None = None,
     *,
     rotation: bool = False,
     softness: bool = True,
@@ -95,6 +94,8 @@ def run_covariance(
     Args:
         gas: the scene.
         curve: by kinetic theory, at times that do not decrease, from t = 0 on, shape (times,).
+        spins: T_rot/T and the cumulants of the spins at these times, as in `Moments`; without them
+            spins are taken to be Gaussian, and C of T_rot is some 7 % too low.
         rotation: return the covariance of ln T_rot, too.
         softness, correlations: as in `jaxgran.KineticTheory`.
 
@@ -106,7 +107,8 @@ def run_covariance(
     ratio = jnp.zeros_like(theta)
     if curve.rotational_temperature is not None:
         ratio = curve.rotational_temperature / curve.temperature
-    mean = Mean(jnp.log(theta), curve.sonine, curve.collisions, ratio)
+    spins = spins or Spins(ratio, None, None)
+    mean = Mean(jnp.log(theta), curve.sonine, curve.collisions, spins)
     rates = run_process(gas, mean, softness, correlations)
     passed = jnp.diff(mean.collisions)
     growth, noise = propagators(*((x[..., 1:] + x[..., :-1]) / 2 * passed for x in rates))
@@ -133,37 +135,37 @@ def run_process(
 
 
 class Impacts(NamedTuple):
-    """Impacts of one kind, at some times, or of all kinds with a first axis.
+    """Impacts of one kind, or of all kinds with a first axis.
 
     Attributes:
         rate: impacts over the number of particles and the unit of reduced time.
         loss, square: mean and mean square of the loss x, see `loss_moments`.
-        eta, kick: coefficient of `Rough` and (1 + eps)/2; any numbers where spheres are smooth.
+        eta, kick: coefficient of `Rough`, and (1 + eps)/2, if the spheres are rough.
     """
 
     rate: Any
     loss: Any
     square: Any
-    eta: Any
-    kick: Any
+    eta: Any = None
+    kick: Any = None
 
 
-def impacts_between_spheres(
-    scene: ReducedScene, density: Density, speed: Array, mean: Mean, d: int
-) -> Impacts:
-    """Return the collisions at some speeds sqrt(T/T_0), any shape."""
+def collisions(scene: ReducedScene, density: Density, speed: Array, mean: Mean, d: int) -> Impacts:
+    """Return the impacts between spheres at speeds sqrt(T/T_0), shape (..., times)."""
     loss, square = loss_moments(scene.law, speed, mean.sonine)
     factor = density.factor(scene.law, speed, loss / 2, mean.collisions, d)
     rate = collision_rate(0.0, d) / 2 * speed
-    surface = scene.surface
-    eta = speed if surface is None else jnp.broadcast_to(surface.eta, speed.shape)
-    return Impacts(rate, loss * factor, square * factor**2, eta, mean_kick(scene.law, speed))
+    impacts = Impacts(rate, loss * factor, square * factor**2)
+    if scene.surface is None:
+        return impacts
+    eta = jnp.broadcast_to(scene.surface.eta, speed.shape)
+    return impacts._replace(eta=eta, kick=mean_kick(scene.law, speed))
 
 
-def impacts_on_walls(
+def wall_impacts(
     walls: ReducedWalls, surface: ReducedRough | None, speed: Array, d: int
 ) -> Impacts:
-    """Return the impacts on all walls at some speeds sqrt(T/T_0), any shape.
+    """Return the impacts on all walls at speeds sqrt(T/T_0), shape (..., times).
 
     Friction at a wall takes from one sphere what friction between two spheres with half the eta
     takes from both (`jaxgran.theory.equations`).
@@ -175,28 +177,54 @@ def impacts_on_walls(
     weights = weights * frequency
     weights = weights * wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
     rate, loss, square = (jnp.sum(weights * x, (-2, -1)) for x in (0.5, lost, (lost * g) ** 2))
+    impacts = Impacts(rate * speed, loss / rate, square / rate)
+    if surface is None:
+        return impacts
     eta = jnp.zeros_like(speed)
-    if surface is not None and walls.surface is not None:
+    if walls.surface is not None:
         eta = eta + surface.eta_on_wall(walls.surface) / 2
-    kick = mean_kick(walls.law, speed / sqrt(2))
-    return Impacts(rate * speed, loss / rate, square / rate, eta, kick)
+    return impacts._replace(eta=eta, kick=mean_kick(walls.law, speed / sqrt(2)))
 
 
 def energy_moments(
-    impacts: Impacts, surface: ReducedRough | None, rotation: Array, d: int
+    impacts: Impacts, surface: ReducedRough | None, S: Array, A: Array, d: int
 ) -> tuple[Array, Array]:
-    """Return moments of the energies that an impact adds, over m T and its square.
+    """Return sums over the impacts of a unit of time, per particle, of the energies that they add.
+
+    Args:
+        impacts: of each kind, shape (kinds, points, times), in a Maxwellian gas.
+        surface: of rough spheres.
+        S, A: variances, see `rough_energy_moments`.
+        d: dimension.
 
     Returns:
-        <e> of the translational energy, and <e'> of the rotational one if the spheres are rough,
-        shape (energies, ...); the second moments, shape (energies, energies, ...).
+        Sums of e of the translational energy, and of e' of the rotational one if the spheres are
+        rough, over m T, shape (energies, kinds, points, times); and of their products, shape
+        (energies, energies, kinds, points, times).
     """
-    losses = impacts.loss, impacts.square
+    rate, loss, square = impacts[:3]
     if surface is None:
-        return -losses[0][None] / 2, losses[1][None, None] / 4
-    spin = rotation / surface.inertia
-    m = coulomb_limit(surface, impacts.eta, impacts.kick, 1 + spin)
-    return rough_energy_moments(losses, m, impacts.eta, surface.inertia, spin, d)
+        return (-rate * loss / 2)[None], (rate * square / 4)[None, None]
+    m = coulomb_limit(surface, impacts.eta, impacts.kick, 1 + A / S)
+    more = S / 2  # the speed of impacts grows with the root of it
+    losses = loss * more, square * more**2
+    means, squares = rough_energy_moments(losses, m, impacts.eta, surface.inertia, S, A, d)
+    rate = rate * jnp.sqrt(more)
+    return rate * means, rate * squares
+
+
+STEP = 0.02
+"""Step of the differences that give J and the effect of the cumulants of spins."""
+
+STENCIL = np.array(
+    [
+        [0, 1, -1, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 1, -1, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 0, 0, 0, 0, 1, -1, 1, -1],
+        [0, 0, 0, 0, 0, 1, -1, 1, -1, -1, 1],
+    ]
+)[..., None]
+"""Steps of ln T, y, S and A of each point."""
 
 
 def process(
@@ -217,46 +245,54 @@ def process(
         d: dimension.
         mean: at these times.
     """
-    rough, walls, drag, drive = scene.surface is not None, scene.walls, scene.drag, scene.drive
-    num_temperatures = 1 + rough
-    # The mean, then each variable a step up and down.
-    shifts = np.array([[0, 1, -1, 0, 0], [0, 0, 0, 1, -1]])[:, : 1 + 2 * num_temperatures, None]
-    shifts = jnp.asarray(DIFFERENCE * shifts, mean.rotation.dtype)
-    log_theta = mean.log_temperature + shifts[0]
-    spinning = (mean.rotation + ROTATION_OFFSET) * jnp.exp(shifts[1])
-    speed = jnp.exp(log_theta / 2)
-    at = mean._replace(rotation=spinning - ROTATION_OFFSET)
-
-    kinds = [impacts_between_spheres(scene, density, speed, at, d)]
-    if walls is not None:
-        kinds.append(impacts_on_walls(walls, scene.surface, speed, d))
+    surface, drag = scene.surface, scene.drag
+    rough, cumulants = surface is not None, mean.spins.correlation is not None
+    num_points = 11 if cumulants else 5 if rough else 3
+    steps = jnp.asarray(STEP * STENCIL[:, :num_points], mean.sonine.dtype)
+    log_theta = mean.log_temperature + steps[0]
+    spinning = (mean.spins.rotation + ROTATION_OFFSET) * jnp.exp(steps[1])
+    speed, rotation = jnp.exp(log_theta / 2), spinning - ROTATION_OFFSET
+    kinds = [collisions(scene, density, speed, mean, d)]
+    if scene.walls is not None:
+        kinds.append(wall_impacts(scene.walls, surface, speed, d))
     impacts = jax.tree.map(lambda *x: jnp.stack(x), *kinds)
-    means, squares = energy_moments(impacts, scene.surface, at.rotation, d)
-    gains = jnp.sum(impacts.rate * means, axis=1)
-    heating = jnp.zeros_like(speed) if drive is None else drive / speed**2
+    inertia = 1.0 if surface is None else surface.inertia
+    step_of_A = 2 * (1 + mean.spins.rotation / inertia)
+    S, A = 2 + 2 * steps[2], 2 * rotation / inertia + step_of_A * steps[3]
+    gains, squares = energy_moments(impacts, surface, S, A, d)
+
+    gains = jnp.sum(gains, axis=1)
+    heating = jnp.zeros_like(speed) if scene.drive is None else scene.drive / speed**2
     rates = [2 / d * gains[0] + heating]
     if drag is not None:
         rates[0] = rates[0] - 2 * drag.rate
     if rough:
-        turning = 2 / NUM_SPIN_COMPONENTS[d] * gains[1] - at.rotation * rates[0]
+        turning = 2 / NUM_SPIN_COMPONENTS[d] * gains[1] - rotation * rates[0]
         if drag is not None:
-            turning = turning - 2 * drag.rotational_rate * at.rotation
+            turning = turning - 2 * drag.rotational_rate * rotation
         rates.append(turning / spinning)
-    jacobian = jnp.stack([(x[1::2] - x[2::2]) / (2 * DIFFERENCE) for x in rates])
+    rates = jnp.stack(rates)
+    ups, downs = slice(1, 2 * len(rates), 2), slice(2, 2 * len(rates) + 1, 2)
+    jacobian = (rates[:, ups] - rates[:, downs]) / (2 * STEP)
 
+    if cumulants:
+        # Of both spheres of a collision; at a wall the pair stands for one sphere.
+        spheres = jnp.array([1.0, 2.0])[: len(kinds), None]
+        unit = STEP * step_of_A
+        of_aa = (squares[..., 5, :] + squares[..., 6, :] - 2 * squares[..., 0, :]) / unit**2
+        of_Ta = squares[..., 7, :] + squares[..., 8, :] - squares[..., 9, :] - squares[..., 10, :]
+        of_Ta = of_Ta / (4 * 2 * STEP * unit)
+        added = mean.spins.kurtosis / inertia**2 * of_aa
+        added = added + 2 * mean.spins.correlation / inertia * of_Ta
+        squares = squares.at[..., 0, :].add(spheres * added)
+    squares = squares[..., 0, :]
     # Changes of the variables by each energy that an impact adds.
-    one = jnp.ones_like(mean.rotation)
-    spinning = mean.rotation + ROTATION_OFFSET
-    by_T = jnp.stack([one, -mean.rotation / spinning][:num_temperatures])
+    by_T = jnp.stack([jnp.ones_like(speed[0]), -rotation[0] / spinning[0]][: len(rates)])
     changes = 2 / d * by_T[:, None]
     if rough:
-        by_T_rot = jnp.stack([0 * one, 2 / NUM_SPIN_COMPONENTS[d] / spinning])
-        changes = jnp.concatenate([changes, by_T_rot[:, None]], axis=1)
-
-    squares = impacts.rate[:, 0] * squares[:, :, :, 0]
-    noise = congruent(changes, squares[:, :, 0])
-    if drive is not None:
-        noise = noise + 4 / d * heating[0] * by_T[:, None] * by_T
+        by_T_rot = 2 / NUM_SPIN_COMPONENTS[d] / spinning[0]
+        changes = jnp.stack([changes[:, 0], jnp.stack([0 * by_T_rot, by_T_rot])], axis=1)
+    noise = congruent(changes, squares[:, :, 0]) + 4 / d * heating[0] * by_T[:, None] * by_T
     if crossings is not None:
         forgetting = WALL_MEMORY / sqrt(2) * crossings * speed[:1]
         column = jnp.concatenate([-by_T, -forgetting])[:, None]
@@ -275,9 +311,9 @@ def propagators(
 ) -> tuple[Float[Array, "k k n"], Float[Array, "k k n"]]:
     """Return ``F - 1`` of intervals of constant J and Q, and the noise that they add.
 
-    ``F = exp(J)`` and ``int_0^1 exp(J s) Q exp(J^T s) ds``, by doublings of a short step: two steps
-    have ``(1 + G)^2 = 1 + 2 G + G^2`` and ``Q + F Q F^T``. G = F - 1 keeps its digits where steps
-    are short.
+    ``F = exp(J)`` and ``int_0^1 exp(J s) Q exp(J^T s) ds``, by `NUM_DOUBLINGS` doublings of a short
+    step: two steps have ``(1 + G)^2 = 1 + 2 G + G^2`` and ``Q + F Q F^T``. G = F - 1 keeps its
+    digits where steps are short.
 
     Args:
         jacobian, noise: J and Q times the length of each interval.
