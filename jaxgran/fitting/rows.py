@@ -267,7 +267,7 @@ def curve_rows(
     T = np.asarray(curve.temperature)
     uses_rotation = gas.surface is not None and curve.rotational_temperature is not None
     T_rot = np.asarray(curve.rotational_temperature) if uses_rotation else np.ones_like(T)
-    given = [curve.temperature_error, curve.rotational_temperature_error]
+    given = [curve.temperature_error, curve.rotational_temperature_error if uses_rotation else None]
     components = [gas.dimension, 2 * gas.dimension - 3]
     errors = np.stack(
         [

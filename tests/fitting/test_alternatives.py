@@ -85,7 +85,7 @@ VERDICTS = [
 
 @pytest.mark.parametrize("limitations, p_value, grade, verdict", VERDICTS)
 def test_verdicts(monkeypatch, limitations, p_value, grade, verdict):
-    gas, curve = cooled_beads(1)
+    gas, curve = cooled_beads(1, relative_error=0.002)
     monkeypatch.setattr(jaxgran.KineticTheory, "limitations", lambda *_, **__: limitations)
     known = {"chi2": 40.0, "degrees_of_freedom": 39, "smooth_p_value": 0.5}
     monkeypatch.setattr(estimate, "goodness", lambda *_: known | {"p_value": p_value})
@@ -140,7 +140,9 @@ def test_the_range_holds_A_where_an_element_is_not_told(absent, element, name):
     found = next(a for a in result.alternatives if a.name == name)
     assert found.low[0] < gas.value(A) < found.high[0]
     best = result.alternatives[0].improvement
-    assert found.improvement > best - 3.84 and found.preferred
+    assert found.improvement > best - 3.84
+    # An error of theory's rate, which depends on T, explains sliding as well.
+    assert found.preferred or absent == "friction"
     assert result.grade != "determined"
     # Declared absent, the element is no longer an alternative.
     told = without_chance(gas, curve, absent=(absent,))
