@@ -111,6 +111,7 @@ def minimise(
         return Minimum(first, np.inf, 0, False)
     if has_converged(first):
         return Minimum(first, value(first), 0, True)
+
     def gradient(flat: np.ndarray) -> np.ndarray:
         return np.nan_to_num(problem.evaluate(flat).gradient)
 
