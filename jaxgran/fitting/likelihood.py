@@ -310,9 +310,11 @@ def log_likelihood(
     if not isinstance(measurement, Measurement):
         raise ValueError(f"measurement must be a jaxgran.Measurement, got {measurement!r:.60}")
     model.check_scene(gas)
-    rows, _ = curve_rows("", measurement, model, fits_T_0=False, fits_t0=False)
-    times, place = times_with_nodes(np.asarray(rows.curve.times) * rows.faster, rows.unit_time)
-    rows = with_rate_error(rows, model, guess_from_data(measurement.gas, rows.curve, ANY_CONSTANT))
+    with jax.ensure_compile_time_eval():  # the measurement is known, where the gas is traced
+        rows, _ = curve_rows("", measurement, model, fits_T_0=False, fits_t0=False)
+        times, place = times_with_nodes(np.asarray(rows.curve.times) * rows.faster, rows.unit_time)
+        guess = guess_from_data(measurement.gas, rows.curve, ANY_CONSTANT)
+        rows = with_rate_error(rows, model, guess)
     computed = model.simulate(gas, jnp.asarray(times), DEFAULTS)
     nothing = jnp.zeros_like(computed.temperature)
     log_T = jnp.log(computed.temperature)
@@ -330,7 +332,7 @@ def log_likelihood(
         collisions[:, None],
     )
     observed = rows.at_nodes(times.size, place)
-    logs = jnp.stack([log_T, log_T + jnp.log(jnp.maximum(ratio, TINY))], axis=1)
+    logs = jnp.stack([log_T, log_T + jnp.log(jnp.where(ratio > 0, ratio, 1.0))], axis=1)
     residuals = log_ratio(observed.values, logs, observed.errors)
     variances = (observed.errors / jnp.exp(logs)) ** 2
     columns = [residuals]
@@ -379,9 +381,6 @@ def log_likelihood(
 
 ANY_CONSTANT = ("dissipative_constant", "coefficient", "drops")
 """Parameters of laws that `guess_from_data` knows."""
-
-TINY = 1e-300
-
 
 def _without_factors(values: Array, weights: Array, widths: Array) -> Array:
     """Return the sum of weighted squares of the first column, with factors of the others

@@ -15,6 +15,7 @@ from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import Measurement
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import error_model_along
+from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program, with_neutral_elements
 from jaxgran.scene.gas import Gas
 
@@ -406,12 +407,14 @@ def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRow
 
     Args:
         rows: the measured curve.
-        model: without noise.
+        model: of the fit; kinetic theory gives the curve on which the error of a stochastic one
+            depends.
         gas: the scene, with values of the unknowns.
     """
     known = np.asarray(rows.curve.times) * rows.faster
     times, _ = times_with_nodes(known, rows.unit_time)
-    curve = curve_of_program(model, gas, times, rows.displacement is not None)
+    exact = KineticTheory() if model.stochastic else model
+    curve = curve_of_program(exact, gas, times, rows.displacement is not None)
     if not np.all(np.isfinite(np.asarray(curve.temperature))):
         return rows
     error_model = error_model_along(gas, curve, rows.measurement.num_particles)

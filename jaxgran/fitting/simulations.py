@@ -297,7 +297,8 @@ def fit_through_simulations(
         )
     alike = _with_gas(measurement, smooth)
     theory, _ = curve_rows("", alike, KineticTheory(), fits_T_0=fits_T_0, fits_t0=True)
-    theory = with_rate_error(replace(theory, used=rows.used), model, guess)
+    about = replace(guess, surface=None) if "friction" in gas.elements else guess
+    theory = with_rate_error(replace(theory, used=rows.used), model, about)
     sims = Simulations(problem, theory, key, progress)
     if descent is None:
         search = _by_gauss_newton(sims, first, max_simulations)
