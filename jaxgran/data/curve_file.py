@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Callable
 from math import pi
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +20,7 @@ from jaxgran._utils.validation import check_bool
 from jaxgran.data import files, tracks
 from jaxgran.data.curve import QUANTITIES, CoolingCurve, from_arrays, to_arrays
 from jaxgran.data.drop_test import DROP_TEST_COLUMNS, DropTest
-from jaxgran.data.header import checked_header, gas_or_none
+from jaxgran.data.header import checked_header, gas_or_none, header_choice
 from jaxgran.data.questions import ask_about_columns
 from jaxgran.data.tables import Table, header_entry, header_in_si, read_table
 from jaxgran.scene.geometry import sphere_mass
@@ -71,18 +71,32 @@ def read_curve(
     path = files.checked_path(path, CSV_FILE)
     given = checked_header(header)
     with files.name_in_errors(path):
-        curve, entries, questions = read_data(path, given)
-        if isinstance(curve, DropTest):
+        content = read_data(path, given)
+        if isinstance(content.data, DropTest):
             raise ValueError("the file is a drop test: read it by jaxgran.read_measurement")
-    for question in questions:
+    for question in content.questions:
         warnings.warn(f"{path}: {question}", stacklevel=2)
-    return curve, entries
+    return content.data, content.header
 
 
-def read_data(
-    path: Path, given: dict[str, str]
-) -> tuple[CoolingCurve | DropTest, dict[str, str], list[str]]:
-    """Read a file of any format: its data, its header in SI, and questions about both.
+class Content(NamedTuple):
+    """Content of a file.
+
+    Attributes:
+        data: the curve, or the drop test.
+        header: in SI.
+        questions: about both.
+        rounding: last digits of fields of the curve as they were written, SI, by field.
+    """
+
+    data: CoolingCurve | DropTest
+    header: dict[str, str]
+    questions: list[str]
+    rounding: dict[str, np.ndarray] = {}
+
+
+def read_data(path: Path, given: dict[str, str]) -> Content:
+    """Read a file of any format.
 
     Args:
         path: the file.
@@ -90,30 +104,26 @@ def read_data(
     """
     if path.suffix == ARCHIVE_SUFFIX:
         curve, header = _read_archive(path)
-        return curve, header | header_in_si(given), []
+        return Content(curve, header | header_in_si(given), [])
     if tracks.is_trajectory(path):
-        return *tracks.curve_of_trajectory(path, header_in_si(given)), []
+        return Content(*tracks.curve_of_trajectory(path, header_in_si(given)), [])
     table = read_table(path, WANTED, _columns_to_read, given)
     header = table.header
     columns = table.columns
     if "eps" in columns:
-        onto = header.get("onto", "sphere")
-        if onto not in ("sphere", "plate"):
-            raise ValueError(f"header line onto: must be sphere or plate, got {onto!r}")
-        return (
-            DropTest(columns["v"], columns["eps"], columns["eps_err"], onto == "plate"),
-            header,
-            [],
-        )
+        onto = header_choice(header, "onto", ("sphere", "plate"))
+        test = DropTest(columns["v"], columns["eps"], columns["eps_err"], onto == "plate")
+        return Content(test, header, [])
     if "x" in columns:
         gas = gas_or_none(ANY_MATERIAL | header)
         curve, questions = tracks.curve_of_tracks(columns, header, table.lines, gas)
-        return curve, header, questions
-    columns = _with_temperature(table, header)
+        return Content(curve, header, questions)
+    columns, rounding = _with_temperature(table, header)
     fields = {quantity.column: quantity.field for quantity in QUANTITIES.values()}
     curve = from_arrays({fields[name]: jnp.asarray(x) for name, x in columns.items()})
     curve.check(lambda i: f"line {table.lines[i]}")
-    return curve, header, list(ask_about_columns(curve, header, gas_or_none(header)))
+    questions = list(ask_about_columns(curve, header, gas_or_none(header), rounding))
+    return Content(curve, header, questions, rounding)
 
 
 def _columns_to_read(names: list[str]) -> list[str]:
@@ -147,17 +157,27 @@ def _columns_to_read(names: list[str]) -> list[str]:
     return names
 
 
-def _with_temperature(table: Table, header: dict[str, str]) -> dict[str, np.ndarray]:
+def _with_temperature(
+    table: Table, header: dict[str, str]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return columns with T = <v^2>/d in place of one of `TEMPERATURE_COLUMNS`.
 
     The velocities are taken for isotropic and Maxwellian. The entry T_from is added to the header.
 
+    Returns:
+        The columns, and the last digits of T and T_rot by field.
+
     Raises:
         ValueError: for a value that is not positive, or an energy of particles of unknown mass.
     """
-    columns, d, mass = dict(table.columns), files.header_count(header, "dimension") or 3, np.nan
+    columns = dict(table.columns)
+    fields = {"T": "temperature", "T_rot": "rotational_temperature"}
+    rounding = {fields[name]: table.last_digits(name) for name in fields.keys() & columns.keys()}
+    d = files.header_count(header, "dimension") or 3
+    mass = np.nan
     for name in TEMPERATURE_COLUMNS.keys() & columns.keys():
-        values, error = columns.pop(name), columns.pop(f"{name}_err", None)
+        values = columns.pop(name)
+        error = columns.pop(f"{name}_err", None)
         if np.any(values <= 0):
             i = int(np.argmax(values <= 0))
             raise ValueError(
@@ -175,9 +195,11 @@ def _with_temperature(table: Table, header: dict[str, str]) -> dict[str, np.ndar
         power, temperature, words = TEMPERATURE_COLUMNS[name]
         columns["T"] = temperature(values, d, mass)
         header["T_from"] = f"T = {words}"
+        relative = power * columns["T"] / values
+        rounding["temperature"] = relative * table.last_digits(name)
         if error is not None:
-            columns["T_err"] = power * columns["T"] * error / values
-    return columns
+            columns["T_err"] = relative * error
+    return columns, rounding
 
 
 def write_curve(

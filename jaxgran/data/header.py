@@ -22,7 +22,19 @@ from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.laws import Viscoelastic
 from jaxgran.scene.parameters import BY_SYMBOL, REQUIRED, fields_of
 
-OPTIONAL_KEYS = ("N", "dimension", "replicas", "absent", "onto", "T_from", *tracks.TRACK_KEYS)
+OPTIONAL_KEYS = (
+    "N",
+    "dimension",
+    "replicas",
+    "absent",
+    "tracked",
+    "T0_of",
+    "T_scale_err",
+    "errors",
+    "onto",
+    "T_from",
+    *tracks.TRACK_KEYS,
+)
 """Further known header keys, neither of the gas nor of its elements."""
 
 PROVENANCE_KEYS = ("units", "points", "end_tau", "melt_tau", "steps_per_contact", "source")
@@ -260,6 +272,14 @@ def priors_of_header(header: dict[str, str]) -> dict[str, tuple[float, float]]:
         density = files.header_number(header, "density")
         priors["density"] = (density, EXACT_DENSITY_ERROR * density)
     return priors
+
+
+def header_choice(header: dict[str, str], key: str, allowed: tuple[str, ...]) -> str:
+    """Return one of some words, by default the first."""
+    word = header.get(key, allowed[0])
+    if word not in allowed:
+        raise ValueError(f"header line {key}: must be {' or '.join(allowed)}, got {word!r}")
+    return word
 
 
 def guesses_of_header(header: dict[str, str]) -> tuple[str, ...]:

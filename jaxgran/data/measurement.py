@@ -13,7 +13,6 @@ from jaxgran._utils.validation import (
     NON_NEGATIVE,
     POSITIVE,
     Domain,
-    UserNumber,
     check_bool,
     checked_float,
     checked_int,
@@ -30,6 +29,7 @@ from jaxgran.data.header import (
     checked_header,
     gas_of_header,
     guesses_of_header,
+    header_choice,
     priors_of_header,
 )
 from jaxgran.scene.gas import Gas
@@ -83,8 +83,8 @@ class Measurement(eqx.Module):
         errors_measured: True if the errors of the data are those of the measurement. Errors of T of
             one run that equal ``sqrt(2/(d N)) T`` are otherwise taken for the fluctuation of
             independent samples and left out, since the fluctuations of N grains are known.
-        rounding: last digit of T as it was written, m^2/s^2, one number or one for each time; 0 if
-            it is exact.
+        rounding: last digit of a field of the curve as it was written, SI, one number or one for
+            each time, as ``{"temperature": 1e-6}``; {} if all are exact.
         guesses: parameters of the gas whose values are guesses, which a fit must estimate.
         header: header of the file from which it was read, pairs of a key and a text, in SI.
 
@@ -106,7 +106,7 @@ class Measurement(eqx.Module):
     ensemble_start: bool = eqx.field(static=True, default=False)
     calibration_error: float = eqx.field(static=True, default=0.0)
     errors_measured: bool = eqx.field(static=True, default=False)
-    rounding: Float[Array, "..."] = 0.0
+    rounding: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     guesses: tuple[str, ...] = eqx.field(static=True, default=())
     header: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
 
@@ -123,7 +123,7 @@ class Measurement(eqx.Module):
         ensemble_start: bool = False,
         calibration_error: float = 0.0,
         errors_measured: bool = False,
-        rounding: UserNumber = 0.0,
+        rounding: dict[str, Any] | None = None,
         guesses: tuple[str, ...] = (),
         header: tuple[tuple[str, str], ...] = (),
     ):
@@ -155,8 +155,7 @@ class Measurement(eqx.Module):
             "calibration_error", calibration_error, NON_NEGATIVE, "0.02 stands for 2 %."
         )
         self.errors_measured = errors_measured
-        self.rounding = float_array(rounding, "rounding")
-        NON_NEGATIVE.check("rounding", self.rounding, "Give the last digit in m^2/s^2.")
+        self.rounding = checked_rounding({} if rounding is None else rounding)
         self.guesses = tuple(guesses)
         self.header = tuple(header)
 
@@ -213,8 +212,9 @@ def read_measurement(
             `write_curve` writes are read, too.
         header: entries that count as those of the file, before anything is read; they replace
             entries with the same key. Keys are those of `jaxgran.data.header.gas_of_header` and
-            `priors_of_header`, N, replicas, absent, onto (of a drop test: "sphere" or "plate"),
-            and those of tracks.
+            `priors_of_header`, N, replicas, absent, tracked, T0_of ("run" or "ensemble"),
+            T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, onto
+            (of a drop test: "sphere" or "plate"), and those of tracks.
         gas: the gas of a drop test whose file does not describe one, such as that of a curve.
 
     Returns:
@@ -233,25 +233,47 @@ def read_measurement(
     path = files.checked_path(path, CSV_FILE)
     given = checked_header(header)
     with files.name_in_errors(path):
-        data, entries, questions = read_data(path, given)
-        if isinstance(data, DropTest):
-            entries = ANY_GAS | entries
+        content = read_data(path, given)
+        header = content.header
+        questions = content.questions
+        if isinstance(content.data, DropTest):
+            header = ANY_GAS | header
         if gas is None:
-            gas, more = gas_of_header(entries)
+            gas, more = gas_of_header(header)
             questions += more
         measurement = Measurement(
             gas,
-            data,
-            num_particles=files.header_count(entries, "N"),
-            replicas=files.header_count(entries, "replicas") or 1,
-            priors=priors_of_header(entries),
-            absent=absent_of_header(entries),
-            guesses=guesses_of_header(entries),
-            header=tuple(entries.items()),
+            content.data,
+            num_particles=files.header_count(header, "N"),
+            replicas=files.header_count(header, "replicas") or 1,
+            priors=priors_of_header(header),
+            absent=absent_of_header(header),
+            tracked=files.header_count(header, "tracked"),
+            ensemble_start=header_choice(header, "T0_of", ("run", "ensemble")) == "ensemble",
+            calibration_error=files.header_number({"T_scale_err": "0"} | header, "T_scale_err"),
+            errors_measured=header_choice(header, "errors", ("any", "measured")) == "measured",
+            rounding=content.rounding,
+            guesses=guesses_of_header(header),
+            header=tuple(header.items()),
         )
     for question in questions:
         warnings.warn(f"{path}: {question}", stacklevel=2)
     return measurement
+
+
+def checked_rounding(rounding: Any) -> dict[str, Array]:
+    """Return last digits of the fields of a curve as arrays, or raise ValueError."""
+    fields = ("temperature", "rotational_temperature")
+    if not isinstance(rounding, dict) or not set(rounding) <= set(fields):
+        raise ValueError(
+            f"rounding must be a dictionary of {' and '.join(fields)}, as "
+            f"{{'temperature': 1e-6}}, got {rounding!r:.60}"
+        )
+    converted = {}
+    for name, digit in rounding.items():
+        converted[name] = float_array(digit, f"rounding of {name}")
+        NON_NEGATIVE.check(f"rounding of {name}", converted[name], "Give the last digit, SI.")
+    return converted
 
 
 def checked_absent(absent: Any) -> tuple[str, ...]:

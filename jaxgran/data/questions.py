@@ -93,7 +93,10 @@ def _unit_question(name: str, value: float, line: str) -> str:
 
 
 def ask_about_columns(
-    curve: CoolingCurve, header: dict[str, str], gas: Gas | None
+    curve: CoolingCurve,
+    header: dict[str, str],
+    gas: Gas | None,
+    rounding: dict[str, np.ndarray],
 ) -> Iterator[str]:
     """Yield questions about unusual values of columns, and columns that contradict the header.
 
@@ -101,7 +104,9 @@ def ask_about_columns(
         curve: the columns, in SI.
         header: in SI.
         gas: of the header, if it describes one.
+        rounding: last digits as they were written, by field.
     """
+    yield from _ask_about_digits(curve, rounding)
     for quantity in QUANTITIES.values():
         values = getattr(curve, quantity.field)
         if quantity.measured and values is not None and not quantity.column.endswith("_err"):
@@ -126,6 +131,23 @@ def ask_about_columns(
                     f"{number:g} particles in {replicas:g} run(s): are N, replicas and T_err those "
                     "of this curve, and is T_err a standard error of the mean?"
                 )
+
+
+def _ask_about_digits(curve: CoolingCurve, rounding: dict[str, np.ndarray]) -> Iterator[str]:
+    for name, digit in rounding.items():
+        errors = getattr(curve, f"{name}_error")
+        column = QUANTITIES[name].column
+        if errors is None:
+            continue
+        given = np.asarray(errors) > 0
+        coarse = given & (np.asarray(errors) < digit / sqrt(12))
+        if np.sum(coarse) > np.sum(given) / 2:
+            i = int(np.argmax(coarse))
+            yield (
+                f"{column}_err, {errors[i]:.2g}, is less than the digits of {column} tell, "
+                f"{digit[i]:.2g}/sqrt(12): the rounding counts as an error in addition. Write more "
+                f"digits of {column}"
+            )
 
 
 def _ask_about_start(

@@ -82,19 +82,22 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     search = minimise if descent is None else descent
     best, minima = best_of_starts(problem, first, max_steps, search)
     check_computed(problem, best)
-    again = problem_with_rate_errors(problem, best.flat)
-    minima = [search(again, m.flat, max_steps) for m in minima if m.value < best.value + DEGENERATE]
-    end = min(minima, key=lambda minimum: minimum.value)
-    check_computed(again, end)
-    end = end._replace(steps=best.steps, converged=best.converged and end.converged)
+    if descent is None:  # a descent keeps the errors of the cooling rate that it began with
+        problem = problem_with_rate_errors(problem, best.flat)
+        near = [m.flat for m in minima if m.value < best.value + DEGENERATE]
+        minima = [minimise(problem, flat, max_steps) for flat in near]
+        end = min(minima, key=lambda minimum: minimum.value)
+        steps = best.steps + sum(m.steps for m in minima)
+        best = end._replace(steps=steps, converged=best.converged and end.converged)
+        check_computed(problem, best)
     explanations = None
-    if end.converged and not request.quick:
-        is_driven = any(m.scene.drive is not None for m in again.curves)
-        noise = np.zeros(again.num_free)
-        explanations = compare_alternatives(again, minima, noise, request.absent, is_driven)
+    if best.converged and not request.quick:
+        is_driven = any(m.scene.drive is not None for m in problem.curves)
+        noise = np.zeros(problem.num_free)
+        explanations = compare_alternatives(problem, minima, noise, request.absent, is_driven)
     trace = None if descent is None else descent.trace
-    result = assembled(request, again, end, minima, explanations, trace)
-    share = measurement_share(again, again.evaluate(end.flat))
+    result = assembled(request, problem, best, minima, explanations, trace)
+    share = measurement_share(problem, problem.evaluate(best.flat))
     return with_all_words(request, result, explanations, notes, share)
 
 
@@ -215,7 +218,7 @@ def assembled(
     parts = _information_by_source(problem, end.flat, found)
     to_si = scale[:, None] * covariance
     covariances = {name: (to_si @ part @ to_si.T)[:p, :p] for name, part in parts.items()}
-    spread = _of_other_minima(problem, end, minima)
+    spread = _of_other_minima(problem, end, minima, covariance)
     if np.any(spread > 0):
         covariances["other minima"] = spread
     values = problem.values(end.flat)
@@ -323,18 +326,20 @@ def _positive(matrix: np.ndarray) -> np.ndarray:
     return axes * np.maximum(values, 0.0) @ axes.T
 
 
-def _of_other_minima(problem: Problem, end: Minimum, minima: list[Minimum]) -> np.ndarray:
+def _of_other_minima(
+    problem: Problem, end: Minimum, minima: list[Minimum], covariance: np.ndarray
+) -> np.ndarray:
     """Return the covariance of the estimates by minima that are nearly as deep, SI."""
-    estimates = np.stack([problem.estimates(m.flat) for m in minima])
-    weights = np.exp(-np.array([m.value - end.value for m in minima]) / 2)
-    distance = estimates - problem.estimates(end.flat)
-    apart = np.max(np.abs(distance / problem.estimates(end.flat)), axis=1) > 1e-2
-    kept: list[int] = []
-    for k in np.flatnonzero(apart):
-        if not any(np.allclose(estimates[k], estimates[j], rtol=1e-2) for j in kept):
-            kept.append(int(k))
-    whole = 1 + np.sum(weights[kept])
-    return np.einsum("k,ki,kj->ij", weights[kept] / whole, distance[kept], distance[kept])
+    p = problem.num_free
+    error = np.sqrt(np.diag(covariance))[:p]
+    kept = [end]
+    for m in sorted(minima, key=lambda minimum: minimum.value):
+        nearest = min(np.max(np.abs(m.flat - x.flat)[:p] / error) for x in kept)
+        if nearest > 1:
+            kept.append(m)
+    distance = np.stack([problem.estimates(m.flat) - problem.estimates(end.flat) for m in kept])
+    weights = np.exp([(end.value - m.value) / 2 for m in kept])
+    return np.einsum("k,ki,kj->ij", weights / np.sum(weights), distance, distance)
 
 
 def _other_minima(

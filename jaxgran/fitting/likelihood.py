@@ -382,6 +382,7 @@ def log_likelihood(
 ANY_CONSTANT = ("dissipative_constant", "coefficient", "drops")
 """Parameters of laws that `guess_from_data` knows."""
 
+
 def _without_factors(values: Array, weights: Array, widths: Array) -> Array:
     """Return the sum of weighted squares of the first column, with factors of the others
     integrated out, which are known to be 0 within their widths."""

@@ -279,7 +279,9 @@ def curve_rows(
         ],
         axis=1,
     )
-    errors[:, 0] = np.hypot(errors[:, 0], np.asarray(measurement.rounding) / 12**0.5)
+    for k, name in enumerate(("temperature", "rotational_temperature")):
+        digit = np.asarray(measurement.rounding.get(name, 0.0))
+        errors[:, k] = np.hypot(errors[:, k], digit / 12**0.5)
     used = np.stack([np.ones(T.size), np.full(T.size, float(uses_rotation))], axis=1)
     if np.asarray(curve.times)[0] == 0 and not _has_error_at_first(measurement):
         used[0, 0] = float(fits_T_0)
