@@ -113,9 +113,8 @@ def checked_header(header: Any) -> dict[str, str]:
     """Return the entries that a user gave for a header as texts.
 
     Raises:
-        ValueError: unless they are a dictionary of texts and numbers, or None.
+        ValueError: unless they are a dictionary of texts and numbers.
     """
-    header = {} if header is None else header
     kinds = str, int, float, np.number
     if not isinstance(header, dict) or not all(isinstance(x, kinds) for x in header.values()):
         raise ValueError(

@@ -231,7 +231,7 @@ def read_measurement(
     ((4,), 250)
     """
     path = files.checked_path(path, CSV_FILE)
-    given = checked_header(header)
+    given = {} if header is None else checked_header(header)
     with files.name_in_errors(path):
         data, entries, questions = read_data(path, given)
         if isinstance(data, DropTest):
