@@ -119,6 +119,8 @@ REFUSED = {
     "column T: 'K' is not known as a unit of m.2/s.2": PLAIN.replace("T,", "T (K),"),
     "column t: 'px' is not known as a unit of s": PLAIN.replace("t,T", "t (px),T"),
     "length_unit: 's' is not known as a unit of m; write a unit": f"# length_unit: s\n{PLAIN}",
+    "header line N: 'many' is not a finite number": text_of(N="many"),
+    "header line replicas: must be a whole number": text_of(N=10, replicas=1.5),
     # Values.
     "line 4: t is 1 after 1; times must increase: sort the rows": "t,T\n0,1\n1,.5\n1,.3\n",
     "line 2: t is -1, it must be a positive number": "t,T\n-1,1\n2,.5\n3,.3\n",
