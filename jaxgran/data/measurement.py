@@ -33,6 +33,7 @@ from jaxgran.data.header import (
     priors_of_header,
 )
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.parameters import REQUIRED
 
 START_TIME = "t0"
 """Name of the time, on the clock of the measurement, at which the gas had its temperature T_0 and
@@ -215,7 +216,7 @@ def read_measurement(
             entries with the same key. Keys are those of `jaxgran.data.header.gas_of_header` and
             `priors_of_header`, N, replicas, absent, onto (of a drop test: "sphere" or "plate"),
             and those of tracks.
-        gas: the gas of a drop test whose file does not describe one, such as that of a curve.
+        gas: the gas in place of that of the header, such as that of a curve for a drop test.
 
     Returns:
         `Measurement`. Unusual values, and columns that contradict the header, cause warnings,
@@ -234,8 +235,13 @@ def read_measurement(
     given = {} if header is None else checked_header(header)
     with files.name_in_errors(path):
         data, entries, questions = read_data(path, given)
-        if isinstance(data, DropTest):
+        if isinstance(data, DropTest) and gas is None:
             entries = ANY_GAS | entries
+            if missing := [key for key in REQUIRED if key not in entries]:
+                raise ValueError(
+                    f"the header of this drop test lacks {', '.join(missing)}: add them, or give "
+                    "the gas of a curve, by gas=... or by jaxgran fit CURVE.csv --drop-test"
+                )
         if gas is None:
             gas, more = gas_of_header(entries)
             questions += more
