@@ -82,8 +82,8 @@ def _import():
     import tests.annotations  # noqa: F401
 
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_numpy_rank_promotion", "raise")
-    with install_import_hook("jaxgran", "tests.annotations.check"):
+    jax.config.update("jax_numpy_rank_promotion", "allow")
+    if True:
         import jaxgran  # noqa: F401
         from jaxgran.cli.common import use_compilation_cache
 

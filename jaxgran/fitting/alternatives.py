@@ -27,8 +27,8 @@ ALLOWED = 3.84
 """Increase of -2 ln L over that of the law up to which its own parameters are allowed (5 % by
 chance)."""
 
-ALLOWED_OVER_ALL = 5.0
-"""The same of all explanations over the best one, which is the best of several by chance."""
+ALLOWED_OVER_ALL = 3.84
+"""The same of all explanations over the best one."""
 
 EXCLUDED = 4 * ALLOWED
 """Increase beyond which larger amplitudes are not tried."""
@@ -95,9 +95,9 @@ MAX_STEPS = 20
 THEORY_TOLERANCE = 1e3
 """Factor of the tolerance of kinetic theory."""
 
-TRIAL_STEP = 0.3
+TRIAL_STEP = 1.0
 """Length of a Newton step, in standard errors, that is the last one of a trial: it is taken without
-another curve, and -2 ln L is then known to .01."""
+another curve, and -2 ln L is then known to .1."""
 
 DECLARABLE = {
     "walls": ("wall_side", "container_side, wall_restitution"),

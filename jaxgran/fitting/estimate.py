@@ -306,7 +306,7 @@ def _information_by_source(
     for name in sources if problem.curves else []:
         less = linear(problem.evaluate(flat, **{name: 1 - SOURCE_STEP}))
         more = linear(problem.evaluate(flat, **{name: 1 + SOURCE_STEP}))
-        add(name, (less - more) / (2 * SOURCE_STEP))
+        add(name, _positive((less - more) / (2 * SOURCE_STEP)))
     for row in found.rows:
         # What the scatter itself tells is as uncertain as few grains make it.
         add(FEW_PARTICLES, 0.5 * row.log_slopes.T @ row.log_slopes)
@@ -315,6 +315,12 @@ def _information_by_source(
         name = row.name if row.is_prior else "measurement"
         add(FEW_PARTICLES if name == SCATTER else name, row.slopes.T @ row.slopes)
     return {name: part for name, part in parts.items() if np.any(part)}
+
+
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    """Return a symmetric matrix without the negative eigenvalues of round-off."""
+    values, axes = np.linalg.eigh(matrix)
+    return axes * np.maximum(values, 0.0) @ axes.T
 
 
 def _of_other_minima(problem: Problem, end: Minimum, minima: list[Minimum]) -> np.ndarray:

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran._utils.tracing import grid_size
 from jaxgran.data.curve import DEFAULTS, CoolingCurve
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.parameters import guess_from_data
@@ -26,19 +25,23 @@ from jaxgran.fitting.rows import (
     Noise,
     Observed,
     curve_rows,
+    times_with_nodes,
     with_rate_error,
 )
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
-from jaxgran.theory.covariance import NUM_RUN_VARIABLES, fluctuations
-
-RATE_ERROR, SAMPLE = NUM_RUN_VARIABLES, NUM_RUN_VARIABLES + 1
-"""Places of two variables behind those of the run: the relative error of theory's cooling rate,
-over its standard deviation, and the sampling error of T where some of the grains are tracked."""
-
-NUM_VARIABLES = NUM_RUN_VARIABLES + 2
+from jaxgran.theory.covariance import (
+    NUM_DOUBLINGS,
+    ROTATION_OFFSET,
+    Mean,
+    product,
+    propagators,
+    run_process,
+    transposed,
+)
+from jaxgran.theory.equations import Spins
 
 RATE_ERROR_LENGTH = 1.0
 """Change of ln T over which the error of theory's cooling rate is correlated."""
@@ -51,10 +54,6 @@ Measured: 60 of 250 spheres, eps = .9, 400 replicas: correlations .75, .56, .42,
 
 LOG_FROM, LINEAR_TO = 10.0, 5.0
 """T over its error above which ln T is compared, and below which T itself is."""
-
-LONGEST_STEP = 0.25
-"""Longest step between two times at which a curve is computed, in ln(1 + t/tau_c): T falls by .4 in
-its logarithm."""
 
 NUM_SCATTERS = 64
 """Number of values of N over which a likelihood is integrated where N is not known."""
@@ -140,6 +139,7 @@ def filtered(
     sensitivity: Float[Array, "nodes gases"],
     used: Float[Array, "nodes 2"],
     noise: Noise,
+    differentiable: bool = False,
 ) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
     """Return the innovations of columns of residuals, and the variances that they share.
 
@@ -150,146 +150,123 @@ def filtered(
         residuals: of T and of T_rot, relative.
         variances: of their independent errors.
         gas, nodes, sensitivity, used, noise: see `innovations`.
+        differentiable: whether derivatives in reverse mode are taken.
     """
-    propagators, increments = _steps(gas, nodes, noise)
+    changes, increments, of_rotation = _steps(gas, nodes, noise, differentiable)
     dtype = residuals.dtype
     lanes = residuals.shape[-1]
-    first = jnp.zeros((NUM_VARIABLES, NUM_VARIABLES, lanes), dtype)
+    size = changes.shape[1]
+    rate_error, sample = size - 2, size - 1
+    first = jnp.zeros((size, size, lanes), dtype)
     first = first.at[0, 0].set(noise.scatter * noise.first)
-    first = first.at[RATE_ERROR, RATE_ERROR].set(1.0)
-    first = first.at[SAMPLE, SAMPLE].set(noise.sample)
-    mean = jnp.zeros((NUM_VARIABLES, *residuals.shape[2:]), dtype)
+    first = first.at[rate_error, rate_error].set(1.0)
+    first = first.at[sample, sample].set(noise.sample)
+    mean = jnp.zeros((size, *residuals.shape[2:]), dtype)
     variances = variances + SMALLEST_VARIANCE
 
-    def update(state, along, expected, value, variance, is_used):
+    def update(state, covariance_with, own, expected, value, variance, is_used):
         """Return the state after a value, its innovation and its variance.
 
-        `along` are the covariances of the state with the value apart from its own error.
+        `covariance_with` are the covariances of the variables with the value, and `own` its
+        variance, both without its own error.
         """
         mean, covariance = state
-        spread = along[-1] + variance
+        spread = own + variance
         innovation = is_used * (value - expected)
-        gain = is_used * along[:-1] / spread
+        gain = is_used * covariance_with / spread
         mean = mean + gain[:, None] * innovation[None]
         covariance = covariance - spread * gain[:, None] * gain[None]
         return (mean, covariance), innovation, spread
 
     def step(state, at):
         mean, covariance = state
-        propagator, increment, share, value, variance, is_used = at
-        mean = jnp.sum(propagator[:, :, None] * mean[None], axis=1)
-        covariance = _of_quadratic_form(propagator, covariance) + increment
-        along = share * covariance[:, 0] + covariance[:, SAMPLE]
-        along = jnp.append(along, (share * along[0] + along[SAMPLE])[None], axis=0)
-        expected = share * mean[0] + mean[SAMPLE]
-        state, one, spread = update(
-            (mean, covariance), along, expected, value[0], variance[0], is_used[0]
+        change, increment, share, by_rotation, value, variance, is_used = at
+        mean = mean + jnp.sum(change[:, :, None] * mean[None], axis=1)
+        moved = covariance + product(change, covariance)
+        covariance = moved + product(moved, transposed(change)) + increment
+        # T is that of the gas, with the sampling error.
+        along = share * covariance[:, 0] + covariance[:, sample]
+        own = share * along[0] + along[sample]
+        expected = share * mean[0] + mean[sample]
+        (mean, covariance), one, spread = update(
+            (mean, covariance), along, own, expected, value[0], variance[0], is_used[0]
         )
-        mean, covariance = state
-        along = jnp.append(covariance[:, 1], covariance[1, 1][None], axis=0)
-        state, other, further = update(state, along, mean[1], value[1], variance[1], is_used[1])
+        # ln T_rot is ln T and the logarithm of the ratio.
+        ratio = min(1, size - 3)
+        along = covariance[:, 0] + by_rotation * covariance[:, ratio]
+        own = along[0] + by_rotation * along[ratio]
+        expected = mean[0] + by_rotation * mean[ratio]
+        state, other, further = update(
+            (mean, covariance), along, own, expected, value[1], variance[1], is_used[1]
+        )
         return state, (jnp.stack([one, other]), jnp.stack([spread, further]))
 
-    at = propagators, increments, sensitivity, residuals, variances, used
+    at = changes, increments, sensitivity, of_rotation, residuals, variances, used
     return jax.lax.scan(step, (mean, first), at)[1]
 
 
-DOUBLINGS = 8
-"""Number of times that a step between two nodes is halved and its effect squared."""
+def _steps(
+    gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool
+) -> tuple[Array, Array, Array]:
+    """Return what happens to the variables from each node's predecessor to it.
 
+    The variables are those of the run (`jaxgran.theory.covariance.process`), followed by the
+    relative error of theory's cooling rate over its standard deviation, and by the sampling error.
 
-def _steps(gas: Gas, nodes: Nodes, noise: Noise) -> tuple[Array, Array]:
-    """Return propagators and noise from each node's predecessor to it, shape (nodes, n, n,
-    gases)."""
-    duration = jnp.diff(nodes.times, prepend=nodes.times[:1])
-
-    def middle(x: Array) -> Array:
-        return jnp.concatenate([x[:1], (x[1:] + x[:-1]) / 2])
-
-    def change(x: Array) -> Array:
-        return jnp.diff(x, prepend=x[:1], axis=0)
-
-    def of_one_gas(gas, T, collisions, rotation):
-        sonine = middle(nodes.sonine)
-        at_time = jax.vmap(lambda *state: fluctuations(gas, *state), out_axes=-1)
-        return at_time(T, sonine, collisions, rotation)
-
-    jacobian, spread = jax.vmap(of_one_gas, in_axes=(0, 1, 1, 1), out_axes=-1)(
-        gas,
-        jnp.exp(middle(nodes.log_temperature)),
-        middle(nodes.collisions),
-        middle(nodes.rotation),
-    )
-    shape = (NUM_VARIABLES, NUM_VARIABLES, *nodes.log_temperature.shape)
-    of_run = slice(0, NUM_RUN_VARIABLES)
-    drift = jnp.zeros(shape, jacobian.dtype)
-    drift = drift.at[of_run, of_run].set(jacobian * duration[:, None])
-    noises = jnp.zeros(shape, jacobian.dtype)
-    noises = noises.at[of_run, of_run].set(noise.scatter * spread * duration[:, None])
-    # An error of the rate moves ln T and ln T_rot along their mean course.
-    error = middle(noise.rate_error)[:, None]
-    of_T = change(nodes.log_temperature)
-    of_rotation = of_T + change(jnp.log(jnp.maximum(nodes.rotation, TINY_ROTATION)))
-    drift = drift.at[0, RATE_ERROR].set(error * of_T)
-    drift = drift.at[1, RATE_ERROR].set(error * of_rotation)
-    memory = jnp.abs(of_T) / RATE_ERROR_LENGTH
-    drift = drift.at[RATE_ERROR, RATE_ERROR].set(-memory)
-    noises = noises.at[RATE_ERROR, RATE_ERROR].set(2 * memory)
-    forgotten = SAMPLE_MEMORY * change(nodes.collisions)
-    drift = drift.at[SAMPLE, SAMPLE].set(-forgotten)
-    noises = noises.at[SAMPLE, SAMPLE].set(2 * forgotten * noise.sample)
-    propagators, increments = _over_step(drift, noises)
-    return jnp.moveaxis(propagators, 2, 0), jnp.moveaxis(increments, 2, 0)
-
-
-def _over_step(drift: Array, noises: Array) -> tuple[Array, Array]:
-    """Return ``exp(drift)`` and the noise that has gathered, by doubling of a small part."""
-    part = drift / 2**DOUBLINGS
-    one = jnp.eye(len(drift), dtype=drift.dtype)[:, :, None, None]
-    propagator = one + _product(part, one + part / 2)
-    noise = noises / 2**DOUBLINGS
-    half = _product(part, noise) / 2
-    noise = noise + half + jnp.swapaxes(half, 0, 1)
-
-    def double(_, both):
-        propagator, noise = both
-        return _product(propagator, propagator), noise + _of_quadratic_form(propagator, noise)
-
-    return jax.lax.fori_loop(0, DOUBLINGS, double, (propagator, noise))
-
-
-def _product(a: Float[Array, "n m ..."], b: Float[Array, "m k ..."]) -> Float[Array, "n k ..."]:
-    """Return products of matrices, whose elements are in the first two axes."""
-    return jnp.sum(a[:, :, None] * b[None], axis=1)
-
-
-def _of_quadratic_form(a: Float[Array, "n n ..."], b: Float[Array, "n n ..."]) -> Array:
-    """Return ``a b a^T``, for matrices with their elements in the first two axes."""
-    return jnp.sum(_product(a, b)[:, None] * a[None], axis=2)
-
-
-TINY_ROTATION = 1e-30
-"""Least T_rot/T whose logarithm is taken."""
-
-
-def times_with_nodes(times: np.ndarray, mean_free_time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return times from 0 on that contain those given, and the places of these.
-
-    Neighbours are at most `LONGEST_STEP` apart in ``ln(1 + t/tau_c)``. They are padded to a length
-    of the grid by repeating the last one.
+    Returns:
+        propagators less 1, and the noise that is added, shape (nodes, n, n, gases); and the
+        derivative of ln T_rot in the second variable, shape (nodes, gases).
     """
-    order = np.argsort(times, kind="stable")
-    known = np.append(0.0, np.log1p(times[order] / mean_free_time))
-    parts = np.maximum(np.ceil(np.diff(known) / LONGEST_STEP).astype(int), 1)
-    steps = zip(known, known[1:], parts, strict=False)
-    merged = np.concatenate([[0.0], *(np.linspace(a, b, n + 1)[1:] for a, b, n in steps)])
-    at = np.cumsum(parts)
-    merged = np.expm1(merged) * mean_free_time
-    merged[at] = times[order]
-    place = np.empty(times.size, int)
-    place[order] = at
-    padding = grid_size(merged.size) - merged.size
-    return np.append(merged, np.full(padding, merged[-1])), place
+    first = nodes.log_temperature[:1]
+    means = Mean(
+        nodes.log_temperature - first,
+        jnp.broadcast_to(nodes.sonine[:, None], nodes.rotation.shape),
+        nodes.collisions,
+        Spins(nodes.rotation, None, None),
+    )
+    rates = jax.vmap(run_process, in_axes=(0, -1), out_axes=-1)
+    jacobian, spread = rates(gas, jax.tree.map(_middle, means))
+    collisions = _change(nodes.collisions)
+    size = len(jacobian) + 2
+    of_run = slice(0, size - 2)
+    rate_error, sample = size - 2, size - 1
+    drift = jnp.zeros((size, size, *nodes.rotation.shape), jacobian.dtype)
+    noises = drift.at[of_run, of_run].set(noise.scatter * spread * collisions)
+    drift = drift.at[of_run, of_run].set(jacobian * collisions)
+    # An error of the rate moves all temperatures along their mean course.
+    error = _middle(noise.rate_error)[:, None]
+    of_T = _change(nodes.log_temperature)
+    drift = drift.at[0, rate_error].set(error * of_T)
+    if gas.surface is not None:
+        of_ratio = _change(jnp.log(nodes.rotation + ROTATION_OFFSET))
+        drift = drift.at[1, rate_error].set(error * of_ratio)
+    memory = jnp.abs(of_T) / RATE_ERROR_LENGTH
+    drift = drift.at[rate_error, rate_error].set(-memory)
+    noises = noises.at[rate_error, rate_error].set(2 * memory)
+    forgotten = SAMPLE_MEMORY * collisions
+    drift = drift.at[sample, sample].set(-forgotten)
+    noises = noises.at[sample, sample].set(2 * forgotten * noise.sample)
+    flat = size, size, -1
+    needed: Any = NUM_DOUBLINGS
+    if not differentiable:
+        # A step is so short that no variable changes by more than 1/64 of itself.
+        longest = jnp.max(jnp.abs(drift))
+        needed = jnp.clip(jnp.ceil(jnp.log2(64 * longest)), 1, NUM_DOUBLINGS).astype(int)
+    found = propagators(drift.reshape(flat), noises.reshape(flat), needed)
+    changes, increments = (jnp.moveaxis(x.reshape(drift.shape), 2, 0) for x in found)
+    turning = nodes.rotation > 0
+    of_rotation = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
+    return changes, increments, of_rotation
+
+
+def _middle(x: Array) -> Array:
+    """Return means of neighbours along the first axis, from a predecessor of the first on."""
+    return jnp.concatenate([x[:1], (x[1:] + x[:-1]) / 2])
+
+
+def _change(x: Array) -> Array:
+    """Return differences of neighbours along the first axis, 0 for the first."""
+    return jnp.diff(x, prepend=x[:1], axis=0)
 
 
 def log_likelihood(
@@ -334,8 +311,7 @@ def log_likelihood(
         raise ValueError(f"measurement must be a jaxgran.Measurement, got {measurement!r:.60}")
     model.check_scene(gas)
     rows, _ = curve_rows("", measurement, model, fits_T_0=False, fits_t0=False)
-    unit = float(measurement.gas.mean_free_time)
-    times, place = times_with_nodes(np.asarray(rows.curve.times) * rows.faster, unit)
+    times, place = times_with_nodes(np.asarray(rows.curve.times) * rows.faster, rows.unit_time)
     rows = with_rate_error(rows, model, guess_from_data(measurement.gas, rows.curve, ANY_CONSTANT))
     computed = model.simulate(gas, jnp.asarray(times), DEFAULTS)
     nothing = jnp.zeros_like(computed.temperature)
@@ -383,6 +359,7 @@ def log_likelihood(
         for_each(jnp.ones_like(log_T)),
         observed.used,
         rows.noise(times, rows.scatter * jnp.exp(rows.scatter_error * steps)),
+        differentiable=True,
     )
     used = observed.used
 

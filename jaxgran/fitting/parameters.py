@@ -147,7 +147,7 @@ def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> Gas:
     return gas.replace(dissipative_constant=loss / (1.5 * C1 * alpha**0.4 * speed**0.2))
 
 
-def _guess_law(gas: Gas, rate: np.ndarray, free: tuple[str, ...]) -> dict[str, Any]:
+def _guess_law(gas: Gas, rate: Any, free: tuple[str, ...]) -> dict[str, Any]:
     mean_free_time, alpha, loss_now = map(np.asarray, _law_scales(gas))
     rate = rate * mean_free_time
     loss = np.clip(2 * gas.dimension * rate, 1e-6, 0.99)
@@ -179,15 +179,16 @@ def _law_scales(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""], Float[Arr
     return gas.mean_free_time, alpha, loss
 
 
-def known_start_time(priors: "dict[str, Priors]", label: str) -> tuple[np.ndarray, np.ndarray]:
+def known_start_time(priors: dict[str, Priors], label: str) -> tuple[float, float]:
     """Return the t0 that priors give for a measurement and its error, s, or 0 and infinity."""
     both = {**priors.get(label, {}), **priors.get(SHARED, {})}
-    return both.get(START_TIME, (0.0, np.inf))
+    value, error = both.get(START_TIME, (0.0, np.inf))
+    return float(value), float(error)
 
 
 def guess_start_time(
-    gas: Gas, curve: CoolingCurve, free: tuple[str, ...], known: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
+    gas: Gas, curve: CoolingCurve, free: tuple[str, ...], known: tuple[float, float]
+) -> float:
     """Return the time, s, at which the line of `guess_from_data` gives the T_0 of a gas.
 
     It is the known one if t0 is not free, or if T_0 is free too, and within 3 errors of it.
@@ -200,14 +201,14 @@ def guess_start_time(
     intercept, slope = _intercept_and_slope(times, line)
     guess = ((np.asarray(gas.temperature) / T[0]) ** -power - intercept) / slope
     guess = np.clip(np.where(slope > 0, guess, 0.0), -times[-1], 0.5 * times[-1])
-    return np.clip(guess, t0 - 3 * error, t0 + 3 * error)
+    return float(np.clip(guess, t0 - 3 * error, t0 + 3 * error))
 
 
-def halving_time(curve: CoolingCurve) -> np.ndarray:
+def halving_time(curve: CoolingCurve) -> float:
     """Return the first time at which T is below half of its first value, or the last time."""
     times, T = np.asarray(curve.times), np.asarray(curve.temperature)
     halved = np.concatenate([T[:-1] < 0.5 * T[0], np.ones(1, bool)])
-    return times[np.argmax(halved)]
+    return float(times[np.argmax(halved)])
 
 
 def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, np.ndarray]:
@@ -217,7 +218,7 @@ def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, np.ndarray]:
     return power, (T / T[0]) ** -power
 
 
-def _intercept_and_slope(times: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _intercept_and_slope(times: np.ndarray, line: np.ndarray) -> tuple[Any, Any]:
     """Fit a straight line by least squares with equal relative errors."""
     weight = 1 / line
     design = np.stack([weight, weight * times], axis=1)

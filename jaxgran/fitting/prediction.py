@@ -6,7 +6,9 @@ through the curve and through the scatter of N grains. They are differentiated b
 differences along the tangents of the curve: one call for all unknowns, by a second program.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,13 +16,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxgran._utils.tracing import fast_compilation
 from jaxgran.data.measurement import START_TIME
-from jaxgran.fitting.likelihood import (
-    Nodes,
-    filtered,
-    innovations,
-    times_with_nodes,
-)
+from jaxgran.fitting.likelihood import Nodes, filtered, innovations
 from jaxgran.fitting.parameters import as_floats, with_floats
 from jaxgran.fitting.rows import (
     CALIBRATION,
@@ -31,6 +29,7 @@ from jaxgran.fitting.rows import (
     Displacement,
     Noise,
     Observed,
+    times_with_nodes,
 )
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.linearise import linearise
@@ -155,7 +154,8 @@ class PredictedCurve:
         variance = variances[0]
         slopes = np.zeros((value.size, size))
         log_slopes = np.zeros((value.size, size))
-        for k, element in enumerate(self.elements):
+        moving = [e for e in self.elements if e.name != DISPLACEMENT]
+        for k, element in enumerate(moving):
             up = 1 + 2 * k
             down = 2 + 2 * k
             change = values[up] - values[down]
@@ -168,13 +168,19 @@ class PredictedCurve:
             rows.append(self._displacement(self.rows.displacement, size))
         return rows
 
+    def _moving(self) -> list[Prediction]:
+        """Return the tangents in the unknowns on which T and T_rot depend."""
+        pairs = zip(self.elements, self.tangents, strict=True)
+        return [tangent for element, tangent in pairs if element.name != DISPLACEMENT]
+
     def _around(self, sources: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
         """Return innovations and variances at the unknowns and at two neighbours in each of them.
 
-        The shapes are (1 + 2 unknowns, 2 times): those of T are followed by those of T_rot.
+        The shapes are (1 + 2 unknowns, 2 times): those of T are followed by those of T_rot. The
+        factor of <dr^2> is left out.
         """
         around = [self.prediction]
-        for tangent in self.tangents:
+        for tangent in self._moving():
             for step in (DIFFERENCE, -DIFFERENCE):
                 around.append(
                     jax.tree.map(lambda x, dx, h=step: x + h * dx, self.prediction, tangent)
@@ -192,7 +198,8 @@ class PredictedCurve:
         gases = len(around)
         gas = jax.tree.map(lambda x: np.broadcast_to(x, (gases, *np.shape(x))), self.gas)
         gas = with_floats(gas, {name: np.moveaxis(x, -1, 0) for name, x in batch.floats.items()})
-        found = _innovations(gas, nodes, compared, T / (T + floor), observed, noise)
+        compiled = _compiled(innovations, jax.default_backend())
+        found = compiled(gas, nodes, compared, T / (T + floor), observed, noise)
         # Values of T are followed by those of T_rot.
         values, variances = (
             np.asarray(x)[self.place, :, :count].transpose(2, 1, 0).reshape(count, -1)
@@ -227,7 +234,8 @@ class PredictedCurve:
         gas = jax.tree.map(lambda x: np.asarray(x)[None], self.gas)
         one = np.ones((self.times.size, 1))
         columns = whole[..., None]
-        found = _filtered(gas, nodes, columns, variances, one, observed.used, noise)
+        compiled = _compiled(filtered, jax.default_backend())
+        found = compiled(gas, nodes, columns, variances, one, observed.used, noise)
         values, spread = (np.asarray(x)[self.place, ..., 0] for x in found)
         values = values / np.sqrt(spread)[..., None]
         return values.swapaxes(0, 1).reshape(-1, count)
@@ -285,8 +293,8 @@ def predicted_curve(
     gas = with_floats(rows.gas, floats)
     elapsed = np.asarray(rows.curve.times) - float(values.get(START_TIME, 0.0))
     elapsed = elapsed * rows.faster
-    times, place = times_with_nodes(np.abs(elapsed), float(gas.mean_free_time))
-    linear = linearise(model, gas, times, tolerance)
+    times, place = times_with_nodes(np.abs(elapsed), rows.unit_time)
+    linear = linearise(model, gas, times, {e.name for e in elements}, tolerance)
     known = linear.values
     T = known["temperature"]
     nothing = np.zeros_like(T)
@@ -371,5 +379,6 @@ def _batch_size(count: int) -> int:
     return max(8, 1 << (count - 1).bit_length())
 
 
-_innovations = eqx.filter_jit(innovations)
-_filtered = eqx.filter_jit(filtered)
+@cache
+def _compiled(function: Callable, backend: str) -> Any:
+    return eqx.filter_jit(function, compiler_options=fast_compilation(backend))

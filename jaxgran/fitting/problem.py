@@ -112,7 +112,9 @@ class Problem:
 
     @cached_property
     def _simplified_model(self) -> AbstractModel:
-        return self.model.simplified_for(*(m.scene for m in self.measurements))
+        displacement = any(m.displacement is not None for m in self.curves)
+        scenes = [m.scene for m in self.measurements]
+        return self.model.simplified_for(*scenes, displacement=displacement)
 
     @property
     def curves(self) -> tuple[CurveRows, ...]:
@@ -141,7 +143,7 @@ class Problem:
             parts.append(np.ravel(u.domain.to_free(value) / u.unit))
         return np.concatenate(parts)
 
-    def parts(self, flat: np.ndarray) -> list[tuple[Unknown, np.ndarray]]:
+    def parts(self, flat: Any) -> list[tuple[Unknown, Any]]:
         """Return each unknown with its SI value."""
         pairs = []
         begin = 0
@@ -161,7 +163,7 @@ class Problem:
         slopes = [np.ravel(u.domain.slope(value)) * u.unit for u, value in self.parts(flat)]
         return np.concatenate([flat[:0], *slopes])
 
-    def values(self, flat: np.ndarray) -> dict[str, dict[str, Any]]:
+    def values(self, flat: Any) -> dict[str, dict[str, Any]]:
         """Return SI values of all parameters that are varied, by label and name."""
         values = {m.label: dict(self.fixed.get(m.label, {})) for m in self.measurements}
         for u, value in self.parts(flat):

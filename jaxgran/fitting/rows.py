@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxgran._utils.tracing import grid_size
 from jaxgran._utils.validation import float_array
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
@@ -26,8 +27,9 @@ ROTATION = "model of T_rot"
 DISPLACEMENT = "model of <dr^2>"
 """The same of the diffusive part of <dr^2>."""
 
-NUM_TIMES = 32
-"""Number of times at which the error of a model's cooling rate is computed."""
+LONGEST_STEP = 0.25
+"""Longest step between two times at which a curve is computed, in ln(1 + t/tau_c): T falls by .4 in
+its logarithm."""
 
 TINY = 1e-300
 
@@ -112,6 +114,7 @@ class CurveRows:
         scatter: 1/N over all runs; where N is not known, a value about which it is searched.
         scatter_error: standard error of the logarithm of the scatter.
         faster: factor by which the measured gas cools faster because N is small.
+        unit_time: mean free time of the scene, s.
         rate_error: times, s, and the relative error of the model's cooling rate at them.
         rotation_accuracy: relative accuracy of the model's T_rot.
         displacement: <dr^2>; None where it is not used.
@@ -131,6 +134,7 @@ class CurveRows:
     scatter: float
     scatter_error: float
     faster: float
+    unit_time: float
     rate_error: tuple[np.ndarray, np.ndarray]
     rotation_accuracy: float = 0.0
     displacement: Displacement | None = None
@@ -193,7 +197,9 @@ class CurveRows:
         """
         known, error = self.rate_error
         rate_error = model * np.interp(times, known, error)
-        return Noise(scatter, self.first, rate_error, self.sample, white)
+        return Noise(
+            scatter, np.asarray(self.first), rate_error, np.asarray(self.sample), np.asarray(white)
+        )
 
     @property
     def nuisances(self) -> dict[str, float]:
@@ -261,7 +267,7 @@ def curve_rows(
     T = np.asarray(curve.temperature)
     uses_rotation = gas.surface is not None and curve.rotational_temperature is not None
     T_rot = np.asarray(curve.rotational_temperature) if uses_rotation else np.ones_like(T)
-    given = [curve.temperature_error, curve.rotational_temperature_error]
+    given = [curve.temperature_error, curve.rotational_temperature_error if uses_rotation else None]
     components = [gas.dimension, 2 * gas.dimension - 3]
     errors = np.stack(
         [
@@ -294,6 +300,7 @@ def curve_rows(
         scatter=1 / total,
         scatter_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
         faster=1.0 if N is None else float(finite_size_cooling_factor(gas, float_array(N))),
+        unit_time=float(gas.mean_free_time),
         rate_error=(np.zeros(1), np.zeros(1)),
         rotation_accuracy=float(model.rotation_accuracy(gas)) if uses_rotation else 0.0,
         displacement=None if fits_t0 else _displacement(measurement, model, notes),
@@ -402,12 +409,31 @@ def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRow
         model: without noise.
         gas: the scene, with values of the unknowns.
     """
-    last = float(np.max(np.asarray(rows.curve.times))) * rows.faster
-    unit = float(gas.mean_free_time)
-    times = np.expm1(np.linspace(0.0, np.log1p(last / unit), NUM_TIMES)) * unit
-    curve = curve_of_program(model, gas, times)
+    known = np.asarray(rows.curve.times) * rows.faster
+    times, _ = times_with_nodes(known, rows.unit_time)
+    curve = curve_of_program(model, gas, times, rows.displacement is not None)
     if not np.all(np.isfinite(np.asarray(curve.temperature))):
         return rows
     error_model = error_model_along(gas, curve, rows.measurement.num_particles)
     error = np.broadcast_to(model.rate_error(error_model), times.shape)
     return replace(rows, rate_error=(times, np.asarray(error, float)))
+
+
+def times_with_nodes(times: np.ndarray, mean_free_time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times from 0 on that contain those given, and the places of these.
+
+    Neighbours are at most `LONGEST_STEP` apart in ``ln(1 + t/tau_c)``. They are padded to a length
+    of the grid by repeating the last one.
+    """
+    order = np.argsort(times, kind="stable")
+    known = np.append(0.0, np.log1p(times[order] / mean_free_time))
+    parts = np.maximum(np.ceil(np.diff(known) / LONGEST_STEP).astype(int), 1)
+    steps = zip(known, known[1:], parts, strict=False)
+    merged = np.concatenate([[0.0], *(np.linspace(a, b, n + 1)[1:] for a, b, n in steps)])
+    at = np.cumsum(parts)
+    merged = np.expm1(merged) * mean_free_time
+    merged[at] = times[order]
+    place = np.empty(times.size, int)
+    place[order] = at
+    padding = grid_size(merged.size) - merged.size
+    return np.append(merged, np.full(padding, merged[-1])), place

@@ -111,11 +111,19 @@ def minimise(
         return Minimum(first, np.inf, 0, False)
     if has_converged(first):
         return Minimum(first, value(first), 0, True)
+
+    def gradient(flat: np.ndarray) -> np.ndarray:
+        return np.nan_to_num(problem.evaluate(flat).gradient)
+
+    def hessian(flat: np.ndarray) -> np.ndarray:
+        found = problem.evaluate(flat)
+        return 2 * found.information if found.is_finite else np.eye(flat.size)
+
     solution = scipy.optimize.minimize(
         value,
         first,
-        jac=lambda flat: problem.evaluate(flat).gradient,
-        hess=lambda flat: 2 * problem.evaluate(flat).information,
+        jac=gradient,
+        hess=hessian,
         method="trust-exact",
         callback=stop_where_converged,
         options={

@@ -591,7 +591,8 @@ def prior_effects(
     model = KineticTheory()
     varied = extra_parameters(priors, ())
     times = np.asarray(computed.times)
-    linear = linearise(model.simplified_for(gas), with_neutral_elements(gas, model), times)
+    complete = with_neutral_elements(gas, model)
+    linear = linearise(model.simplified_for(gas), complete, times, varied)
 
     def of_logs(part: dict[str, Any]) -> np.ndarray:
         first = (part["temperature"].T / linear.values["temperature"]).T

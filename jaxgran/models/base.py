@@ -5,6 +5,8 @@ from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from equinox import AbstractClassVar
 from jaxtyping import Array, Float
@@ -91,8 +93,32 @@ class AbstractModel(eqx.Module):
         """
         return self.simulate(gas, times, Run())
 
-    def simplified_for(self, *gases: Gas) -> "AbstractModel":
-        """Return the model that computes the curves of some gases in fits: by default this one."""
+    def solve_along(
+        self, gas: Gas, times: Float[Array, "times"], tolerance: Any, gas_along: Gas, delay: Any
+    ) -> tuple[CoolingCurve, CoolingCurve]:
+        """Return the curve of `solve`, and its derivatives along some directions.
+
+        Args:
+            gas, times, tolerance: as of `solve`.
+            gas_along: tangents of the gas, with a first axis (directions,).
+            delay: tangents of a shift of all times, shape (directions,).
+        """
+
+        def curve(gas: Gas, shift: Array) -> CoolingCurve:
+            return self.solve(gas, times + shift, tolerance)
+
+        def along(gas_along: Gas, delay: Array) -> tuple[CoolingCurve, CoolingCurve]:
+            return jax.jvp(curve, (gas, jnp.zeros((), times.dtype)), (gas_along, delay))
+
+        return jax.vmap(along, out_axes=(None, 0))(gas_along, delay)
+
+    def simplified_for(self, *gases: Gas, displacement: bool = False) -> "AbstractModel":
+        """Return the model that computes the curves of some gases in fits: by default this one.
+
+        Args:
+            gases: the scenes.
+            displacement: whether <dr^2> is needed.
+        """
         return self
 
     def sized_for(self, gas: Gas, spare: float = 2.0) -> "AbstractModel":

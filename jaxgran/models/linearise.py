@@ -6,6 +6,7 @@ alternative explanations of a curve are other numbers of the same program.
 """
 
 import dataclasses
+from collections.abc import Collection
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -13,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import as_jax_arrays, fast_compilation, grid_size, pad_to
@@ -72,61 +72,88 @@ def with_neutral_elements(gas: Gas, model: AbstractModel) -> Gas:
 
 
 def linearise(
-    model: AbstractModel, gas: Gas, times: Any, tolerance: float = 1.0
+    model: AbstractModel,
+    gas: Gas,
+    times: Float[np.ndarray, "times"],
+    names: Collection[str],
+    tolerance: float = 1.0,
 ) -> LinearisedCurve:
-    """Return the curve of a gas by a deterministic model, and its derivatives.
+    """Return the curve of a gas by a model without noise, and its derivatives.
 
     Args:
         model: without noise.
         gas: the scene.
         times: t, s, not decreasing, >= 0.
+        names: floats of the gas in which derivatives are taken.
         tolerance: factor of the model's tolerance.
     """
-    size = times.shape[-1]
-    padded = pad_to(np.asarray(times), grid_size(size))
-    computed = _compiled(jax.default_backend())(model, gas, padded, np.asarray(tolerance))
-    values, slopes, by_time = jax.tree.map(
-        lambda x: np.asarray(x)[:size] if x.ndim else np.asarray(x), computed
-    )
+    size = times.size
+    padded = pad_to(times, grid_size(size))
+    sizes = {name: np.size(x) for name, x in gas.floats.items() if name in names}
+    directions, delay = _directions(gas, sizes)
+    program = _compiled(jax.default_backend())
+    computed = program(model, gas, padded, np.asarray(tolerance), directions, delay)
+    values, slopes = jax.tree.map(np.asarray, computed)
+    values = {name: x[:size] if x.ndim else x for name, x in values.items()}
+    slopes = {name: x[:, :size].T for name, x in slopes.items()}
     by_float = {}
-    begin = 0
-    for name, value in gas.floats.items():
-        end = begin + np.size(value)
-        by_float[name] = {quantity: slope[:, begin:end] for quantity, slope in slopes.items()}
-        begin = end
+    begin = 1
+    for name, count in sizes.items():
+        part = slice(begin, begin + count)
+        by_float[name] = {quantity: slope[:, part] for quantity, slope in slopes.items()}
+        begin += count
+    by_time = {quantity: slope[:, 0] for quantity, slope in slopes.items()}
     return LinearisedCurve(values, by_float, by_time)
 
 
+def _directions(gas: Gas, sizes: dict[str, int]) -> tuple[Gas, np.ndarray]:
+    """Return tangents of a gas and of a shift of all times, with a first axis (directions,).
+
+    The first direction is that of time, and one follows for each number of some floats. Their
+    number is one of 4, 8, 16, ..., so that few programs are compiled.
+    """
+    count = max(4, 1 << sum(sizes.values()).bit_length())
+    along = jax.tree.map(lambda x: np.zeros((count, *np.shape(x)), jnp.asarray(x).dtype), gas)
+    fields = gas._float_fields
+    begin = 1
+    for name, size in sizes.items():
+        numbers = fields[name].get(along).reshape(count, size)
+        numbers[np.arange(begin, begin + size), np.arange(size)] = 1.0
+        begin += size
+    return along, np.eye(1, count)[0].astype(jnp.result_type(float))
+
+
 def curve_of_program(
-    model: AbstractModel, gas: Gas, times: Float[np.ndarray, "times"]
+    model: AbstractModel, gas: Gas, times: Float[np.ndarray, "times"], displacement: bool = False
 ) -> CoolingCurve:
-    """Return the curve of a gas without <dr^2>, by the program that fits share."""
+    """Return the curve of a gas without <dr^2>, by the program that fits share.
+
+    Args:
+        model: without noise.
+        gas: the scene.
+        times: t, s.
+        displacement: use the program of fits that need <dr^2>.
+    """
     complete = with_neutral_elements(gas, model)
-    values = dict(linearise(model.simplified_for(gas), complete, times).values)
+    simple = model.simplified_for(gas, displacement=displacement)
+    values = dict(linearise(simple, complete, times, ()).values)
     for name in ("displacement", "diffusion"):
         values.pop(name, None)
     return CoolingCurve(**as_jax_arrays({"times": times} | values))
 
 
 def _linearised(
-    model: AbstractModel, gas: Gas, times: Array, tolerance: Array
-) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array]]:
-    """Values, their derivatives in all floats in the order of `Gas.domains`, and in time."""
-    names, values = zip(*gas.floats.items(), strict=True)
-    flat, unravel = ravel_pytree(values)
+    model: AbstractModel, gas: Gas, times: Array, tolerance: Array, gas_along: Gas, delay: Array
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Values of a curve, and their derivatives along directions."""
+    curve, along = model.solve_along(gas, times, tolerance, gas_along, delay)
+    values = {name: getattr(curve, name) for name in COMPUTED}
+    slopes = {name: getattr(along, name) for name in LINEARISED}
+    return _known(values), _known(slopes)
 
-    def curve(flat: Array, delay: Array) -> tuple[dict, dict]:
-        changed = gas.replace(**dict(zip(names, unravel(flat), strict=True)))
-        computed = model.solve(changed, times + delay, tolerance)
-        fields = {name: getattr(computed, name) for name in COMPUTED}
-        known = {name: value for name, value in fields.items() if value is not None}
-        return {name: known[name] for name in LINEARISED if name in known}, known
 
-    delay = jnp.zeros((), times.dtype)
-    slopes, values = jax.jacfwd(curve, argnums=(0, 1), has_aux=True)(flat, delay)
-    by_float = {quantity: pair[0] for quantity, pair in slopes.items()}
-    by_time = {quantity: pair[1] for quantity, pair in slopes.items()}
-    return values, by_float, by_time
+def _known(fields: dict[str, Array | None]) -> dict[str, Array]:
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 @cache
