@@ -22,7 +22,10 @@ from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.laws import Viscoelastic
 from jaxgran.scene.parameters import BY_SYMBOL, REQUIRED, fields_of
 
-OPTIONAL_KEYS = ("N", "dimension", "replicas", "absent", "onto", "T_from", *tracks.TRACK_KEYS)
+OPTIONAL_KEYS = (
+    *("N", "dimension", "replicas", "tracked", "errors", "absent", "onto", "T_from"),
+    *tracks.TRACK_KEYS,
+)
 """Further known header keys, neither of the gas nor of its elements."""
 
 PROVENANCE_KEYS = ("units", "points", "end_tau", "melt_tau", "steps_per_contact", "source")
@@ -48,6 +51,9 @@ ABSENT = {
     "friction": ("friction",),
 }
 """Effects that the header key ``absent`` may name, and the keys that describe them."""
+
+MEASURED = "measured"
+"""Value of the header key ``errors``: T_err is the error of the measurement, whatever its size."""
 
 ANY_GAS = {"eta": "0.1", "T0": "1"}
 """Header keys that single impacts do not depend on."""
@@ -264,6 +270,20 @@ def priors_of_header(header: dict[str, str]) -> dict[str, tuple[float, float]]:
 def guesses_of_header(header: dict[str, str]) -> tuple[str, ...]:
     """Return the names of the parameters whose value in a header is "guess"."""
     return tuple(BY_SYMBOL[key].name for key in GUESSES if header.get(key) == GUESS)
+
+
+def are_errors_measured(header: dict[str, str]) -> bool:
+    """Return whether a header says ``errors: measured``.
+
+    Raises:
+        ValueError: for another text.
+    """
+    if header.get("errors", MEASURED) != MEASURED:
+        raise ValueError(
+            f"header line errors: must be {MEASURED}, if T_err is the error of the measurement "
+            f"itself, got {header['errors']!r}; otherwise leave it out"
+        )
+    return "errors" in header
 
 
 def absent_of_header(header: dict[str, str]) -> tuple[str, ...]:

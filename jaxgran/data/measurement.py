@@ -27,6 +27,7 @@ from jaxgran.data.header import (
     ABSENT,
     ANY_GAS,
     absent_of_header,
+    are_errors_measured,
     checked_header,
     gas_of_header,
     guesses_of_header,
@@ -214,8 +215,8 @@ def read_measurement(
             `write_curve` writes are read, too.
         header: entries that count as those of the file, before anything is read; they replace
             entries with the same key. Keys are those of `jaxgran.data.header.gas_of_header` and
-            `priors_of_header`, N, replicas, absent, onto (of a drop test: "sphere" or "plate"),
-            and those of tracks.
+            `priors_of_header`, N, replicas, tracked (of N particles), errors ("measured"), absent,
+            onto (of a drop test: "sphere" or "plate"), and those of tracks.
         gas: the gas in place of that of the header, such as that of a curve for a drop test.
 
     Returns:
@@ -252,6 +253,8 @@ def read_measurement(
             replicas=files.header_count(entries, "replicas") or 1,
             priors=priors_of_header(entries),
             absent=absent_of_header(entries),
+            tracked=files.header_count(entries, "tracked"),
+            errors_measured=are_errors_measured(entries),
             guesses=guesses_of_header(entries),
             header=tuple(entries.items()),
         )

@@ -336,6 +336,19 @@ def test_eta_follows_from_N_and_the_container():
     assert float(gas.packing_fraction) == pytest.approx(2000 * np.pi / 6 * (0.003 / 0.09) ** 3)
 
 
+def test_a_header_says_what_is_known_of_the_measurement(write):
+    known = {"replicas": 3, "tracked": 120, "errors": "measured", "absent": "walls, drag"}
+    measurement = read_measurement(write(text_of(**known, eta_err=0.002)), {"N": 500})
+    assert measurement.num_particles == 500 and measurement.replicas == 3
+    assert measurement.tracked == 120 and measurement.errors_measured
+    assert measurement.absent == ("walls", "drag")
+    assert measurement.priors["packing_fraction"] == pytest.approx((0.04, 0.002))
+    plain = read_measurement(write(PLAIN))
+    assert plain.tracked is None and not plain.errors_measured
+    with pytest.raises(ValueError, match="errors: must be measured, .* got 'of T'"):
+        read_measurement(write(text_of(errors="of T")))
+
+
 def test_a_guess_is_where_a_fit_starts():
     assert float(gas_of(beta_t="guess").value("tangential_restitution")) == 0
 
