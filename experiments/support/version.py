@@ -103,14 +103,14 @@ def reference(gas: Any, curve: Any, _: int) -> None:
 def lengths(gas: Any, curve: Any, _: int) -> None:
     """Fit curves of 20 lengths, with their ranges."""
     curves = [of_points(curve, count) for count in range(40, 60)]
-    step("20 lengths, fit and diagnose", lambda: [fit_with_range(gas, x) for x in curves])
+    step("20 lengths, fits with ranges", lambda: [fit_with_range(gas, x) for x in curves])
 
 
 def fit(gas: Any, curve: Any, _: int) -> None:
     """Fit a curve of 61 points and one of 47 with their ranges, and another free parameter."""
     for points, words in ((61, "first"), (47, "47 points,")):
         some = of_points(curve, points)
-        step(f"{words} fit and diagnose", partial(fit_with_range, gas, some))
+        step(f"{words} fit with its range", partial(fit_with_range, gas, some))
     step("fit again", lambda: fit_of(gas, some, free=BOTH), repeats=5)
     step("other free", lambda: fit_of(gas, some, free=BOTH[:1]))
 
