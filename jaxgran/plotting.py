@@ -100,7 +100,7 @@ def plot_fit(result: Fit, axes: Any = None) -> np.ndarray:
         Both axes, shape (2,).
 
     Raises:
-        ValueError: if `axes` are not two.
+        ValueError: if `axes` are not two, or for a fit of several measurements or of a drop test.
     """
     if axes is None:
         from matplotlib import pyplot
@@ -130,7 +130,7 @@ def save_fit(result: Fit, title: str, path: str | Path) -> None:
         path: of the file; its suffix is the format, PNG without one.
     """
     names = "rotational_temperature", "displacement"
-    further = [name for name in names if name in result.residuals[""]]
+    further = [name for name in names if name in result.residuals.get("", {})]
     width = max(8.0, 4.0 + 4.0 * len(further))
     figure = Figure(figsize=(width, 6.4))  # a constrained layout draws it twice, in half a second
     figure.subplots_adjust(0.8 / width, 0.08, 1 - 0.15 / width, 0.93, 0.25, 0.08)
@@ -176,8 +176,12 @@ def _save(figure: Figure, title: str, path: str | Path) -> None:
 
 
 def _measured(result: Fit) -> CoolingCurve:
-    (measurement,) = result.measurements.values()
-    return measurement.curve
+    if [*result.measurements] != [""]:
+        raise ValueError(
+            f"expected a fit of one curve, got one of {', '.join(result.measurements)}. Draw each "
+            "of these curves, and that of result.curve, by jaxgran.plot_curve."
+        )
+    return result.measurements[""].curve
 
 
 def _draw_fit(axes: Any, result: Fit, name: str) -> None:

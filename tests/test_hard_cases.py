@@ -207,9 +207,8 @@ def corrupted_curves():
         ("T rises", (exact * noise)[::-1], "drift"),
     ):
         wrong = jaxgran.CoolingCurve(times, T, temperature_error=0.01 * exact)
-        result = jaxgran.fit(gas, wrong, model=THEORY, free=(FREE,))
-        diagnosis = jaxgran.diagnose(result, wrong)
-        said = diagnosis.grade == "not consistent" and words in " ".join(diagnosis.reasons)
+        result = jaxgran.fit(jaxgran.Measurement(gas, wrong), model=THEORY, free=FREE)
+        said = result.grade == "not consistent" and words in " ".join(result.reasons)
         sigma = float(result.error_budget["measurement"][0])
         off = abs(float(result.estimate[0] - gas.value(FREE))) / sigma if name == "outliers" else 0
         # In standard errors.

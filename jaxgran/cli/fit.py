@@ -3,6 +3,7 @@
 Reads files, fits them, prints a report, and writes a picture and a JSON file.
 """
 
+import dataclasses
 import json
 import os
 import platform
@@ -19,8 +20,10 @@ import numpy as np
 import jaxgran
 from jaxgran import plotting
 from jaxgran.cli.common import FitOptions, models_by_name
-from jaxgran.data.header import OPTIONAL_KEYS, PRIOR_KEYS
-from jaxgran.data.tables import UNIT_KEYS
+from jaxgran.data.drop_test import DropTest
+from jaxgran.data.files import name_in_errors
+from jaxgran.data.header import OPTIONAL_KEYS, PRIOR_KEYS, absent_of_header
+from jaxgran.data.tables import UNIT_KEYS, header_in_si
 from jaxgran.fitting.report import SIGNIFICANCE, parameter_rows, report
 from jaxgran.models.choose import default_models
 from jaxgran.scene.parameters import BY_SYMBOL, SCENE
@@ -89,8 +92,6 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
 def read_all(paths: Sequence[Path], options: FitOptions) -> dict[str, jaxgran.Measurement]:
     """Return the measurements of all files, by label; that of a single one is ""."""
     given = parse_settings(options.set)
-    if options.absent:
-        given["absent"] = " ".join((given.get("absent", ""), *options.absent))
     measurements: dict[str, jaxgran.Measurement] = {}
     drops = {"onto": "plate"} if options.onto_plate else {}
     is_single = len(paths) + len(options.drop_test) == 1
@@ -99,10 +100,26 @@ def read_all(paths: Sequence[Path], options: FitOptions) -> dict[str, jaxgran.Me
         label = "" if is_single else label
         if path in paths:
             measurements[label] = jaxgran.read_measurement(path, given)
-            continue
-        gas = next(iter(measurements.values())).gas if paths else None  # of the first curve
-        measurements[label] = jaxgran.read_measurement(path, given | drops, gas=gas)
+        else:
+            gas = next(iter(measurements.values())).gas if paths else None  # of the first curve
+            measurements[label] = jaxgran.read_measurement(path, given | drops, gas=gas)
+        is_drop_test = isinstance(measurements[label].data, DropTest)
+        if is_drop_test and path in paths:
+            raise ValueError(f"{path} is a drop test. Give it as --drop-test {path}.")
+        if not is_drop_test and path not in paths:
+            raise ValueError(f"{path} is a cooling curve. Give it without --drop-test.")
+        if options.absent:
+            measurements[label] = with_absent(measurements[label], options.absent)
     return measurements
+
+
+def with_absent(measurement: jaxgran.Measurement, absent: Sequence[str]) -> jaxgran.Measurement:
+    """Return a measurement with effects that are absent in addition to those of its header."""
+    header = dict(measurement.header)
+    header["absent"] = " ".join((*measurement.absent, *absent))
+    return dataclasses.replace(
+        measurement, absent=absent_of_header(header), header=tuple(header.items())
+    )
 
 
 def parameters_of(
@@ -211,6 +228,8 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
         if not equals or key not in known:
             raise ValueError(f"--set {pair}: give KEY=VALUE with KEY one of {', '.join(known)}")
         values[key] = value
+    with name_in_errors(Path("--set")):
+        header_in_si(values)
     return values
 
 

@@ -69,7 +69,7 @@ def read_curve(
     ({'eta': '0.05'}, (4,))
     """
     path = files.checked_path(path, CSV_FILE)
-    given = checked_header(header)
+    given = {} if header is None else checked_header(header)
     with files.name_in_errors(path):
         content = read_data(path, given)
         if isinstance(content.data, DropTest):

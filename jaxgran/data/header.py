@@ -61,6 +61,9 @@ ABSENT = {
 }
 """Effects that the header key ``absent`` may name, and the keys that describe them."""
 
+MEASURED = "measured"
+"""Value of the header key ``errors``: T_err is the error of the measurement, whatever its size."""
+
 ANY_GAS = {"eta": "0.1", "T0": "1"}
 """Header keys that single impacts do not depend on."""
 
@@ -125,9 +128,8 @@ def checked_header(header: Any) -> dict[str, str]:
     """Return the entries that a user gave for a header as texts.
 
     Raises:
-        ValueError: unless they are a dictionary of texts and numbers, or None.
+        ValueError: unless they are a dictionary of texts and numbers.
     """
-    header = {} if header is None else header
     kinds = str, int, float, np.number
     if not isinstance(header, dict) or not all(isinstance(x, kinds) for x in header.values()):
         raise ValueError(

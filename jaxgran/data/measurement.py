@@ -33,6 +33,7 @@ from jaxgran.data.header import (
     priors_of_header,
 )
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.parameters import REQUIRED
 
 START_TIME = "t0"
 """Name of the time, on the clock of the measurement, at which the gas had its temperature T_0 and
@@ -215,7 +216,7 @@ def read_measurement(
             `priors_of_header`, N, replicas, absent, tracked, T0_of ("run" or "ensemble"),
             T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, onto
             (of a drop test: "sphere" or "plate"), and those of tracks.
-        gas: the gas of a drop test whose file does not describe one, such as that of a curve.
+        gas: the gas in place of that of the header, such as that of a curve for a drop test.
 
     Returns:
         `Measurement`. Unusual values, and columns that contradict the header, cause warnings,
@@ -231,30 +232,35 @@ def read_measurement(
     ((4,), 250)
     """
     path = files.checked_path(path, CSV_FILE)
-    given = checked_header(header)
+    given = {} if header is None else checked_header(header)
     with files.name_in_errors(path):
         content = read_data(path, given)
-        header = content.header
+        entries = content.header
         questions = content.questions
-        if isinstance(content.data, DropTest):
-            header = ANY_GAS | header
+        if isinstance(content.data, DropTest) and gas is None:
+            entries = ANY_GAS | entries
+            if missing := [key for key in REQUIRED if key not in entries]:
+                raise ValueError(
+                    f"the header of this drop test lacks {', '.join(missing)}: add them, or give "
+                    "the gas of a curve, by gas=... or by jaxgran fit CURVE.csv --drop-test"
+                )
         if gas is None:
-            gas, more = gas_of_header(header)
+            gas, more = gas_of_header(entries)
             questions += more
         measurement = Measurement(
             gas,
             content.data,
-            num_particles=files.header_count(header, "N"),
-            replicas=files.header_count(header, "replicas") or 1,
-            priors=priors_of_header(header),
-            absent=absent_of_header(header),
-            tracked=files.header_count(header, "tracked"),
-            ensemble_start=header_choice(header, "T0_of", ("run", "ensemble")) == "ensemble",
-            calibration_error=files.header_number({"T_scale_err": "0"} | header, "T_scale_err"),
-            errors_measured=header_choice(header, "errors", ("any", "measured")) == "measured",
+            num_particles=files.header_count(entries, "N"),
+            replicas=files.header_count(entries, "replicas") or 1,
+            priors=priors_of_header(entries),
+            absent=absent_of_header(entries),
+            tracked=files.header_count(entries, "tracked"),
+            ensemble_start=header_choice(entries, "T0_of", ("run", "ensemble")) == "ensemble",
+            calibration_error=files.header_number({"T_scale_err": "0"} | entries, "T_scale_err"),
+            errors_measured=header_choice(entries, "errors", ("any", "measured")) == "measured",
             rounding=content.rounding,
-            guesses=guesses_of_header(header),
-            header=tuple(header.items()),
+            guesses=guesses_of_header(entries),
+            header=tuple(entries.items()),
         )
     for question in questions:
         warnings.warn(f"{path}: {question}", stacklevel=2)

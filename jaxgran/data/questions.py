@@ -11,6 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
+from jaxgran.data import files
 from jaxgran.data.curve import QUANTITIES, CoolingCurve
 from jaxgran.data.tables import UNITS, unit_in
 from jaxgran.scene.gas import Gas
@@ -117,10 +118,10 @@ def ask_about_columns(
         return
     if not all(_is_usual(key, float(header[key])) for key in REQUIRED if key in header):
         return  # `ask_about_header` asks first
-    number = float(header["N"]) if "N" in header else None
+    number = files.header_count(header, "N")
     yield from _ask_about_start(curve, header, gas, number)
     if number is not None and curve.temperature_error is not None:
-        replicas = float(header.get("replicas", 1))
+        replicas = files.header_count(header, "replicas") or 1
         share = np.asarray(curve.temperature_error) / np.asarray(curve.temperature)
         expected = sqrt(2 / (gas.dimension * number * replicas))
         ratios = {"larger": share[1:].min() / expected, "smaller": expected / share.max()}
@@ -151,10 +152,11 @@ def _ask_about_digits(curve: CoolingCurve, rounding: dict[str, np.ndarray]) -> I
 
 
 def _ask_about_start(
-    curve: CoolingCurve, header: dict[str, str], gas: Gas, number: float | None
+    curve: CoolingCurve, header: dict[str, str], gas: Gas, number: int | None
 ) -> Iterator[str]:
     """Compare T at first with T0, the clock with T0, and the loss with the mean free time."""
-    times = np.asarray(curve.times) - float(header.get("t0", 0.0))
+    header = {"t0": "0", "T0_err": "0"} | header
+    times = np.asarray(curve.times) - files.header_number(header, "t0")
     T, T0 = np.asarray(curve.temperature), float(gas.temperature)
     rows = slice(0, max(4, int(np.sum(0.4 * T[0] < T))))
     line = (T[rows] / T0) ** -0.6  # straight in time for viscoelastic spheres
@@ -165,7 +167,7 @@ def _ask_about_start(
     begin = times[0] + (1 - origin) / slope  # where the line reaches T0
     halving = (2**0.6 - 1) * max(origin, 0.1) / slope
     chance = 4 * sqrt(2 / (gas.dimension * number)) if number else 0.0
-    known = 3 * float(header.get("T0_err", 0.0)) / T0
+    known = 3 * files.header_number(header, "T0_err") / T0
     at_zero = max(origin - slope * times[0], 1e-9) ** (-1 / 0.6)
     if first > MAX_RATIO + chance + known:
         yield _scale_question(first, gas, number)
@@ -196,7 +198,7 @@ def _collision_frequency(gas: Gas) -> Array:
     return gas.collision_frequency
 
 
-def _scale_question(ratio: float, gas: Gas, number: float | None) -> str:
+def _scale_question(ratio: float, gas: Gas, number: int | None) -> str:
     """Return the question for T that begins at another value than T0."""
     d, mass, T0 = gas.dimension, float(gas.mass), float(gas.temperature)
     meanings = [

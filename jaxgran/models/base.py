@@ -37,10 +37,10 @@ class Limitation(NamedTuple):
 class AbstractModel(eqx.Module):
     """A model of a cooling gas: a description, without state and without the options of a run.
 
-    A subclass defines the members below; it then works in `jaxgran.cool`, `jaxgran.fit`,
-    `jaxgran.choose_model` and `jaxgran.diagnose`, which use no other members. Numbers that a
-    user may differentiate or sweep are array fields, counts and choices are static fields. If a
-    member is missing, creating the model raises a TypeError that names it.
+    A subclass defines the members below; it then works in `jaxgran.cool`, `jaxgran.fit` and
+    `jaxgran.choose_model`, which use no other members. Numbers that a user may differentiate or
+    sweep are array fields, counts and choices are static fields. If a member is missing, creating
+    the model raises a TypeError that names it.
 
     `jaxgran.DSMC` is a short example; `experiments/fit/own_model.py` defines one in 25 lines.
 
