@@ -82,8 +82,8 @@ def _import():
     import tests.annotations  # noqa: F401
 
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_numpy_rank_promotion", "allow")
-    if True:
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    with install_import_hook("jaxgran", "tests.annotations.check"):
         import jaxgran  # noqa: F401
         from jaxgran.cli.common import use_compilation_cache
 
@@ -91,25 +91,19 @@ def _import():
 
 
 @pytest.fixture(scope="module")
-def write(tmp_path_factory):
-    """A function that writes a file of given text or bytes, and rows of numbers."""
-    path = tmp_path_factory.mktemp("file") / "curve.csv"
-
-    def write(content, *columns):
-        for row in zip(*columns, strict=True):
-            content += ",".join(f"{x:.17g}" for x in row) + "\n"
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return write
-
-
-@pytest.fixture(scope="module")
-def read(write):
+def read(tmp_path_factory):
     """A function that reads the curve of a file of given text or bytes, and rows of numbers."""
     import jaxgran
 
-    return lambda content, *columns: jaxgran.read_curve(write(content, *columns))
+    path = tmp_path_factory.mktemp("file") / "curve.csv"
+
+    def read(content, *columns):
+        for row in zip(*columns, strict=True):
+            content += ",".join(f"{x:.17g}" for x in row) + "\n"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return jaxgran.read_curve(path)
+
+    return read
 
 
 @pytest.fixture(autouse=True, scope="module")

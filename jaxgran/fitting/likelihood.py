@@ -152,7 +152,20 @@ def filtered(
         gas, nodes, sensitivity, used, noise: see `innovations`.
         differentiable: whether derivatives in reverse mode are taken.
     """
-    changes, increments, of_rotation = _steps(gas, nodes, noise, differentiable)
+    with jax.numpy_rank_promotion("allow"):  # the gases are the last axis of all arrays
+        steps = _steps(gas, nodes, noise, differentiable)
+        return _run_filter(steps, residuals, variances, sensitivity, used, noise)
+
+
+def _run_filter(
+    steps: tuple[Array, Array, Array],
+    residuals: Float[Array, "nodes 2 columns gases"],
+    variances: Float[Array, "nodes 2 gases"],
+    sensitivity: Float[Array, "nodes gases"],
+    used: Float[Array, "nodes 2"],
+    noise: Noise,
+) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
+    changes, increments, of_rotation = steps
     dtype = residuals.dtype
     lanes = residuals.shape[-1]
     size = changes.shape[1]
@@ -331,7 +344,7 @@ def log_likelihood(
         nothing if computed.sonine is None else computed.sonine,
         collisions[:, None],
     )
-    observed = rows.at_nodes(times.size, place)
+    observed = jax.tree.map(jnp.asarray, rows.at_nodes(times.size, place))
     logs = jnp.stack([log_T, log_T + jnp.log(jnp.where(ratio > 0, ratio, 1.0))], axis=1)
     residuals = log_ratio(observed.values, logs, observed.errors)
     variances = (observed.errors / jnp.exp(logs)) ** 2
@@ -360,7 +373,9 @@ def log_likelihood(
         for_each(variances),
         for_each(jnp.ones_like(log_T)),
         observed.used,
-        rows.noise(times, rows.scatter * jnp.exp(rows.scatter_error * steps)),
+        jax.tree.map(
+            jnp.asarray, rows.noise(times, rows.scatter * jnp.exp(rows.scatter_error * steps))
+        ),
         differentiable=True,
     )
     used = observed.used
@@ -391,7 +406,7 @@ def _without_factors(values: Array, weights: Array, widths: Array) -> Array:
     square = jnp.sum(weights * flat[:, 0] ** 2)
     if not widths.size:
         return square
-    others = flat[:, 1:] * widths
+    others = flat[:, 1:] * widths[None]
     projection = others.T @ (weights * flat[:, 0])
     matrix = jnp.eye(widths.size) + others.T @ (weights[:, None] * others)
     return (

@@ -131,7 +131,8 @@ def run_process(
         widths = jnp.broadcast_to(gas.container.side, (d,)) - gas.diameter
         crossings = jnp.mean(gas.path_length / widths)
     density = Density.from_gas(gas, softness, correlations)
-    return process(reduced_scene(gas), density, crossings, d, mean)
+    with jax.numpy_rank_promotion("allow"):  # the last axis of all arrays is that of the times
+        return process(reduced_scene(gas), density, crossings, d, mean)
 
 
 class Impacts(NamedTuple):

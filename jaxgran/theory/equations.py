@@ -127,7 +127,7 @@ class Density(NamedTuple):
 
     def factor(
         self, law: ReducedLaw, speed: Array, inelasticity: Array, collisions: Array, dimension: int
-    ) -> Float[Array, ""]:
+    ) -> Float[Array, "*points"]:
         """Return the factor of the cooling by impacts.
 
         Args:
@@ -356,7 +356,7 @@ TYPICAL_IMPACT = 2 * sqrt(2 / pi)
 """Mean normal speed of impacts, weighted by itself, in units of sqrt(2 T)."""
 
 
-def mean_kick(law: ReducedLaw, speed: Float[Array, ""]) -> Float[Array, ""]:
+def mean_kick(law: ReducedLaw, speed: Float[Array, "*points"]) -> Float[Array, "*points"]:
     """Return (1 + eps)/2 at the typical impact; within 2 % for sliding spheres of ice."""
     return (1 + law.restitution(TYPICAL_IMPACT * speed)) / 2
 
@@ -579,8 +579,8 @@ BUILD_UP_COLLISIONS = 4.0
 
 
 def correlation_slowdown(
-    packing_fraction: Float[Array, ""], inelasticity: Float[Array, ""], dimension: int
-) -> Float[Array, ""]:
+    packing_fraction: Float[Array, ""], inelasticity: Float[Array, "*points"], dimension: int
+) -> Float[Array, "*points"]:
     """Return the share by which velocity correlations, once built up, reduce the cooling rate.
 
     Spheres that have collided move more nearly in parallel than before, and some of them collide
@@ -664,7 +664,9 @@ def softness_coefficient(beta: Float[Array, "..."], dimension: int) -> Float[Arr
     return (dimension - 1) * MEAN_OVERLAP * fitted
 
 
-def softness_factor(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[Array, ""]:
+def softness_factor(
+    law: ReducedLaw, speed: Float[Array, "*points"], dimension: int
+) -> Float[Array, "*points"]:
     """Return ``1 - c X_T/sigma``, the factor of the cooling rate by the softness of two spheres.
 
     Args:
