@@ -10,7 +10,7 @@ The examples in the docstrings use these definitions:
 >>> cooled = jaxgran.cool(gas, times)
 >>> error = 0.01 * cooled.temperature
 >>> curve = jaxgran.CoolingCurve(times, cooled.temperature, temperature_error=error)
->>> measurement = jaxgran.Measurement(gas, curve, num_particles=1000)
+>>> measurement = jaxgran.Measurement(gas, curve, num_particles=10**6)
 >>> result = jaxgran.fit(measurement)  # estimates A
 """
 

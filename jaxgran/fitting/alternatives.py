@@ -164,6 +164,10 @@ class Alternative(NamedTuple):
             changes the first parameter by less than 10 % beyond the error of the fitted law.
         error_reduction_needed: factor by which the errors must decrease to distinguish it; 1 if it
             is distinguishable.
+
+    >>> best = result.alternatives[0]
+    >>> best.improvement < 0.01 and not best.preferred  # the curve has no noise
+    True
     """
 
     name: str

@@ -185,6 +185,11 @@ def check_computed(problem: Problem, end: Minimum) -> None:
                 f"{type(problem.model).__name__} could not compute the curve at {at}, where the "
                 f"search ended: {status.explain(fault)}"
             )
+    if not np.isfinite(end.value):
+        raise RuntimeError(
+            f"the likelihood is not a number where the search begins, at {problem.estimates(end.flat)}"
+            ": give another start, a gas nearer to the measured one"
+        )
 
 
 def inverse(information: np.ndarray) -> np.ndarray:

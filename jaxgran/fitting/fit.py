@@ -111,7 +111,7 @@ def fit(
         RuntimeError: if a descent diverges, or the model cannot compute the curve where the search
             ends.
 
-    >>> result = jaxgran.fit(jaxgran.Measurement(gas, curve, num_particles=1000))
+    >>> result = jaxgran.fit(jaxgran.Measurement(gas, curve, num_particles=10**6))
     >>> f"{float(result.estimate[0]):.3g} s"
     '3e-06 s'
     """

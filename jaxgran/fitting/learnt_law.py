@@ -43,6 +43,10 @@ class RestitutionBand(NamedTuple):
             (`RestitutionSpline.visited_speeds`); outside it eps follows from the form of the law
             and its prior.
         covariance: of ln(-ln eps) at the speeds.
+
+    >>> band = jaxgran.restitution_band(result)
+    >>> bool(band.low[0] < band.restitution[0] < band.high[0])
+    True
     """
 
     speeds: Float[np.ndarray, "speeds"]

@@ -125,7 +125,7 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         origin, slope = _intercept_and_slope(times, line)
         values["temperature"] = scale * origin ** (-1 / power)
     elif START_TIME in free:
-        _, slope = _intercept_and_slope(times, line)
+        _, slope = _intercept_and_slope(times - times[0], line)
     else:
         weight = 1 / line
         slope = np.sum(weight**2 * (line - origin) * times) / np.sum((weight * times) ** 2)
@@ -197,18 +197,19 @@ def guess_start_time(
     if START_TIME not in free or "temperature" in free:
         return t0
     times, T = np.asarray(curve.times), np.asarray(curve.temperature)
+    since = times - times[0]
     power, line = _power_and_line(gas, curve)
-    intercept, slope = _intercept_and_slope(times, line)
+    intercept, slope = _intercept_and_slope(since, line)
     guess = ((np.asarray(gas.temperature) / T[0]) ** -power - intercept) / slope
-    guess = np.clip(np.where(slope > 0, guess, 0.0), -times[-1], 0.5 * times[-1])
+    guess = times[0] + np.clip(np.where(slope > 0, guess, 0.0), -since[-1], 0.5 * since[-1])
     return float(np.clip(guess, t0 - 3 * error, t0 + 3 * error))
 
 
 def halving_time(curve: CoolingCurve) -> float:
-    """Return the first time at which T is below half of its first value, or the last time."""
+    """Return the time from the first point to that below half of its T, or to the last one."""
     times, T = np.asarray(curve.times), np.asarray(curve.temperature)
     halved = np.concatenate([T[:-1] < 0.5 * T[0], np.ones(1, bool)])
-    return float(times[np.argmax(halved)])
+    return float(times[np.argmax(halved)] - times[0])
 
 
 def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, np.ndarray]:
@@ -263,7 +264,7 @@ def extra_parameters(priors: Priors, free: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def prior_residuals(
-    priors: Priors, gas: Gas, values: dict[str, np.ndarray]
+    priors: Priors, gas: Gas, values: dict[str, Any]
 ) -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Return (value - known value) / standard error of each prior, and its derivatives.
 

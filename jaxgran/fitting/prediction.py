@@ -44,7 +44,7 @@ WHITE = "white"
 DIFFERENCE = float(np.finfo(float).eps ** 0.25)
 """Step of central differences in an unconstrained parameter."""
 
-TINY = 1e-300
+TINY = float(np.finfo(np.float32).tiny)
 
 
 class Residuals(NamedTuple):

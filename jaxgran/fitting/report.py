@@ -94,14 +94,14 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
 def _scene(result: Fit, label: str) -> Iterator[str]:
     """Yield lines on a curve, the gas that was fitted to it, and its impacts; or a drop test."""
     measurement = result.measurements[label]
+    name = f"{label}: " if label else ""
     yield ""
     if isinstance(measurement.data, DropTest):
         v = np.asarray(measurement.data.speed)
-        yield f"drops    {label}: {v.size} impacts, v = {v.min():.3g} .. {v.max():.3g} m/s"
+        yield f"drops    {name}{v.size} impacts, v = {v.min():.3g} .. {v.max():.3g} m/s"
         return
     T = np.asarray(measurement.data.temperature)
     times = np.asarray(measurement.data.times)
-    name = f"{label}: " if label else ""
     yield f"curve    {name}{T.size} points, t = {times[0]:.6g} .. {times[-1]:.6g} s,"
     yield f"         T falls to {T[-1] / T[0]:.3g} of its first value"
     header = dict(measurement.header)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.tracing import grid_size
 from jaxgran._utils.validation import float_array
@@ -387,7 +387,7 @@ def unused_rotation(measurement: Measurement) -> str | None:
 
 
 @eqx.filter_jit
-def finite_size_cooling_factor(gas: Gas, num_particles: Float[Array, ""]) -> Float[Array, ""]:
+def finite_size_cooling_factor(gas: Gas, num_particles: ArrayLike) -> Float[Array, ""]:
     """Factor by which N particles without total momentum cool faster than many, at the same T.
 
     Their relative velocities are those of the temperature ``T' = T N/(N-1)``, and each particle

@@ -110,7 +110,7 @@ def run_covariance(
     spins = spins or Spins(ratio, None, None)
     mean = Mean(jnp.log(theta), curve.sonine, curve.collisions, spins)
     rates = run_process(gas, mean, softness, correlations)
-    passed = jnp.diff(mean.collisions)
+    passed = jnp.diff(mean.collisions)[None, None]
     growth, noise = propagators(*((x[..., 1:] + x[..., :-1]) / 2 * passed for x in rates))
     zero = jnp.zeros_like(ratio)
     outputs = [[zero + 1, *[zero] * (len(growth) - 1)]]
@@ -349,6 +349,7 @@ def covariance_at_all_times(
     """
     num_outputs, size, num_times = outputs.shape
     index = jnp.arange(num_times)
+    column = index[None, None]
 
     def step(now: tuple[Array, Array], interval: tuple) -> tuple[tuple[Array, Array], Array]:
         # Covariances of the variables, and of the variables with all outputs up to now.
@@ -357,7 +358,7 @@ def covariance_at_all_times(
         matrix = (growth + jnp.eye(size))[..., None]
         variance = congruent(matrix, variance) + noise[..., None]
         new = product(variance, transposed(output[..., None]))
-        known = jnp.where(index == i, new, product(matrix, known))
+        known = jnp.where(column == i, new, product(matrix, known))
         return (variance, known), product(output[..., None], known)
 
     start = jnp.zeros((size, size, 1)), jnp.zeros((size, num_outputs, num_times))
@@ -370,7 +371,7 @@ def covariance_at_all_times(
     return whole.reshape(num_outputs * num_times, num_outputs * num_times)
 
 
-def product(a: Float[Array, "i j n"], b: Float[Array, "j k #n"]) -> Float[Array, "i k n"]:
+def product(a: Float[Array, "i j #n"], b: Float[Array, "j k #n"]) -> Float[Array, "i k n"]:
     """Products of matrices that the last axis counts."""
     return jnp.sum(a[:, :, None] * b[None], axis=1)
 

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.fitting.estimate import Request, problem_of, problem_with_rate_errors
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.rows import curve_rows
+from jaxgran.fitting.search import minimise
 from tests.beads import glass_beads
 from tests.fitting.curves import A, cooled_beads, fitted
 
@@ -63,22 +65,26 @@ def test_the_filter_is_the_dense_covariance(name):
 
 def test_the_likelihood_is_that_of_the_fit():
     gas, curve = cooled_beads()
-    result = fitted(gas, curve, num_particles=10**6)
-    measurement = result.measurements[""]
-    error = result.standard_error[0] / result.estimate[0]
+    measurement = jaxgran.Measurement(gas, curve, num_particles=10**6)
+    request = Request({"": measurement}, THEORY, (A,), (), {}, None, (), quick=True)
+    problem, first, _ = problem_of(request)
+    # The error of theory is that of the first guess of A, here as in `log_likelihood`.
+    problem = problem_with_rate_errors(problem, first)
+    best = minimise(problem, first, 100)
+    error = problem.evaluate(best.flat).information[0, 0] ** -0.5
 
     @jax.jit
     @jax.value_and_grad
     def at(shift):
-        constant = result.estimate[0] * jnp.exp(error * shift)
+        constant = jnp.exp(best.flat[0] + error * shift)
         return jaxgran.log_likelihood(gas.replace(dissipative_constant=constant), measurement)
 
-    # In standard errors the slope at the best fit is 0, and the second derivative is -1.
-    (low, lower_slope), (best, slope), (high, upper_slope) = (at(x) for x in (-0.5, 0.0, 0.5))
-    # (The scatter is integrated out here, and is a parameter of the fit.)
-    assert abs(float(slope)) < 0.1
-    assert float(upper_slope - lower_slope) == pytest.approx(-1.0, rel=0.03)
-    assert float(low + high - 2 * best) == pytest.approx(-0.25, rel=0.03)
+    most, _ = at(0.0)
+    for shift in (-2.0, -0.5, 0.0, 0.5, 2.0):
+        value, slope = at(shift)
+        found = problem.evaluate(best.flat + np.array([error * shift, 0.0]))
+        assert float(value - most) == pytest.approx((best.value - found.value) / 2, abs=0.01)
+        assert float(slope) == pytest.approx(-found.gradient[0] * error / 2, abs=0.01)
 
 
 def test_the_scatter_tells_N_where_it_is_not_known():
