@@ -140,7 +140,9 @@ def test_several_measurements_are_fitted_jointly(measured, fit):
 def test_a_contradicting_drop_test_is_reported(fit):
     # As many measurements as above, so that the program is compiled already.
     out, answer = fit("thin.csv", "dense.csv", "--drop-test", "others.csv")
-    assert not answer["agree"] and answer["p_value"] < 1e-4
+    # N is not in the files: what speaks against A is that the curves need runs of 5 grains.
+    assert not answer["agree"] and answer["p_value"] < 1e-3
+    assert "thin: the scatter is that of" in out
     assert "contradict each other, or the model" in out
 
 

@@ -24,7 +24,8 @@ from jaxgran.data.drop_test import DropTest
 from jaxgran.data.files import name_in_errors
 from jaxgran.data.header import OPTIONAL_KEYS, PRIOR_KEYS, absent_of_header
 from jaxgran.data.tables import UNIT_KEYS, header_in_si
-from jaxgran.fitting.report import SIGNIFICANCE, parameter_rows, report
+from jaxgran.fitting.messages import SIGNIFICANCE
+from jaxgran.fitting.report import parameter_rows, report
 from jaxgran.models.choose import default_models
 from jaxgran.scene.parameters import BY_SYMBOL, SCENE
 

@@ -1,6 +1,6 @@
 """The estimate of a fit, its errors by cause, and its result."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,8 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement, Priors
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
-from jaxgran.fitting.messages import with_words
+from jaxgran.fitting.messages import SIGNIFICANCE, say, with_words
+from jaxgran.fitting.outliers import without_outliers
 from jaxgran.fitting.parameters import (
     as_floats,
     guess_from_data,
@@ -33,6 +34,7 @@ from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import describe_walls
 from jaxgran.scene.gas import Gas, law_fields
+from jaxgran.scene.parameters import symbol_of
 
 DEGENERATE = 9.0
 """Difference of -2 ln L up to which two minima are equally good: three standard errors."""
@@ -79,17 +81,11 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     """Fit a model without noise, starting at the best of some guesses."""
     problem, first, notes = problem_of(request)
     problem.check_points()
-    search = minimise if descent is None else descent
-    best, minima = best_of_starts(problem, first, max_steps, search)
+    if descent is None:
+        problem, best, minima = _found_by_two_searches(problem, first, max_steps)
+    else:  # it keeps the errors of the cooling rate that it began with
+        best, minima = best_of_starts(problem, first, max_steps, descent)
     check_computed(problem, best)
-    if descent is None:  # a descent keeps the errors of the cooling rate that it began with
-        problem = problem_with_rate_errors(problem, best.flat)
-        near = [m.flat for m in minima if m.value < best.value + DEGENERATE]
-        minima = [minimise(problem, flat, max_steps) for flat in near]
-        end = min(minima, key=lambda minimum: minimum.value)
-        steps = best.steps + sum(m.steps for m in minima)
-        best = end._replace(steps=steps, converged=best.converged and end.converged)
-        check_computed(problem, best)
     explanations = None
     if best.converged and not request.quick:
         is_driven = any(m.scene.drive is not None for m in problem.curves)
@@ -98,7 +94,56 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     trace = None if descent is None else descent.trace
     result = assembled(request, problem, best, minima, explanations, trace)
     share = measurement_share(problem, problem.evaluate(best.flat))
+    if result.p_value < SIGNIFICANCE / 2 and best.converged and not request.quick:
+        notes += _of_outliers(problem, best, max_steps)
     return with_all_words(request, result, explanations, notes, share)
+
+
+def _of_outliers(problem: Problem, best: Minimum, max_steps: int) -> Iterator[str]:
+    """Yield a clause on far outliers, and the first parameter of a fit without them."""
+    rest, end, left_out = without_outliers(problem, best, max_steps)
+    found = rest.evaluate(end.flat)
+    if not left_out or goodness(rest, found)["p_value"] < SIGNIFICANCE / 2:
+        return
+    times = {m.label: np.asarray(m.curve.times) for m in problem.curves}
+    places = [
+        f"{x.label}: " * bool(x.label) + f"t = {times[x.label][x.time]:.3g} s (row {x.time + 1})"
+        for x in sorted(left_out)
+    ]
+    error = np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0]
+    without = say(
+        "without outliers",
+        symbol=symbol_of(problem.unknowns[0].name),
+        value=rest.estimates(end.flat)[0],
+        error=error,
+    )
+    yield say("outliers", places=", ".join(places)) + without
+
+
+def _found_by_two_searches(
+    problem: Problem, first: np.ndarray, max_steps: int
+) -> tuple[Problem, Minimum, list[Minimum]]:
+    """Return the deepest minimum, and those that are nearly as deep, with the problem there.
+
+    The first search has the scatter that N gives. The second one finds it, too, with the errors of
+    the model's cooling rate in the gas that the first one found.
+    """
+    held, is_left = problem.holding(SCATTER)
+    begun, minima = best_of_starts(held, first[is_left], max_steps)
+    check_computed(held, begun)
+
+    def whole(flat: np.ndarray) -> np.ndarray:
+        full = first.copy()
+        full[is_left] = flat
+        return full
+
+    problem = problem_with_rate_errors(problem, whole(begun.flat))
+    near = [whole(m.flat) for m in minima if m.value < begun.value + DEGENERATE]
+    minima = [minimise(problem, flat, max_steps) for flat in near]
+    end = min(minima, key=lambda minimum: minimum.value)
+    steps = begun.steps + sum(m.steps for m in minima)
+    best = end._replace(steps=steps)
+    return problem, best, minima
 
 
 def problem_of(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
@@ -367,7 +412,8 @@ def goodness(problem: Problem, found: Evaluation) -> dict[str, Any]:
     """Return chi^2, its degrees of freedom, and its probabilities by chance.
 
     T and T_rot, <dr^2> and each drop test are tested separately, so that many points of one do not
-    hide a misfit of the other: the p-value is that of the worst, corrected for the choice.
+    hide a misfit of the other: the p-value is that of the worst, corrected for the choice. Where N
+    is not known, its scatter explains any curve: then it is tested that N is not too small.
     """
     chi2 = sum(float(np.sum(row.values**2)) for row in found.rows)
     counts = {id(row): _count(problem, row) for row in found.rows}
@@ -382,6 +428,11 @@ def goodness(problem: Problem, found: Evaluation) -> dict[str, Any]:
         upper.append(float(scipy.stats.chi2.sf(square, number)))
         if row.name == "curve":
             lower.append(float(scipy.stats.chi2.cdf(square, number)))
+
+    unknown = [m.label for m in problem.curves if m.measurement.num_particles is None]
+    for row in found.rows:
+        if row.name == SCATTER and row.label in unknown:
+            upper.append(float(scipy.stats.norm.sf(row.values[0])))
 
     def of_worst(values: list[float]) -> float:
         if not values:

@@ -326,8 +326,8 @@ def predicted_curve(
     def tangent(element: Element) -> Prediction:
         slopes: dict[str, np.ndarray] = {}
         if element.name == START_TIME:
-            sign = np.where(before, 1.0, -1.0)
-            slopes = {name: sign * rows.faster * x for name, x in linear.by_time.items()}
+            moved = rows.faster * shift_of_nodes(times, place, rows.unit_time, before)
+            slopes = {name: moved * x for name, x in linear.by_time.items()}
         elif element.name in linear.by_float:
             by_float = linear.by_float[element.name]
             slopes = {name: x[:, element.number] for name, x in by_float.items()}
@@ -365,6 +365,21 @@ def predicted_curve(
         elements,
         {name: x[place] if np.ndim(x) else x for name, x in known.items()},
     )
+
+
+def shift_of_nodes(
+    times: np.ndarray, place: np.ndarray, unit_time: float, before: np.ndarray
+) -> np.ndarray:
+    """Return the derivative of the times of `times_with_nodes` in t0.
+
+    Data before the start move away from it, those after it move nearer. The start itself stays, and
+    nodes between are shifted in proportion to ``ln(1 + t/tau_c)``.
+    """
+    logs = np.log1p(times / unit_time)
+    data = np.sort(place)
+    shifts = np.where(before[data], 1.0, -1.0) / (unit_time + times[data])
+    shifts = np.interp(logs, np.append(0.0, logs[data]), np.append(0.0, shifts))
+    return shifts * (unit_time + times)
 
 
 def _collisions(gas: Gas, times: np.ndarray, T: np.ndarray) -> np.ndarray:

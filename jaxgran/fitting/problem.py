@@ -1,6 +1,6 @@
 """The problem of a fit: measurements, unknowns, and -2 ln L with its derivatives."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -120,6 +120,13 @@ class Problem:
     def curves(self) -> tuple[CurveRows, ...]:
         """The measured curves."""
         return tuple(m for m in self.measurements if isinstance(m, CurveRows))
+
+    def holding(self, name: str) -> tuple["Problem", np.ndarray]:
+        """Return the problem with the unknowns of a name held at 0, and which ones are left."""
+        unknowns = tuple(u for u in self.unknowns if u.name != name)
+        fixed = {m.label: self.fixed.get(m.label, {}) | {name: 0.0} for m in self.measurements}
+        names = np.repeat([u.name for u in self.unknowns], [u.size for u in self.unknowns])
+        return replace(self, unknowns=unknowns, fixed=fixed), names != name
 
     def check_points(self) -> None:
         """Raise ValueError unless curves have more points that count than free parameters."""

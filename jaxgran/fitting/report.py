@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import GUESS
+from jaxgran.fitting.messages import SIGNIFICANCE
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.scene.parameters import symbol_of, unit_of
 
@@ -20,9 +21,6 @@ BUDGET_PARTS = {
     "other minima": "other values of the parameters that fit nearly as well",
 }
 """Meaning of the parts of the error budget; other parts have the name of what is uncertain."""
-
-SIGNIFICANCE = 0.01
-"""Probability by chance below which several measurements contradict each other."""
 
 
 def report(result: Fit, *, explain: bool = False) -> str:

@@ -32,13 +32,14 @@ LONGEST_STEP = 0.25
 """Longest step between two times at which a curve is computed, in ln(1 + t/tau_c): T falls by .4 in
 its logarithm."""
 
-TINY = 1e-300
+TINY = float(np.finfo(np.float32).tiny)
 
 CALIBRATION = "calibration"
 """The logarithm of a common factor of all measured T and T_rot."""
 
-WEAK_SCATTER = 5.0
-"""Standard error of ln N where N is not known: any number from a few grains to many millions."""
+WEAK_SCATTER = 1.5
+"""Standard error of ln N where N is not known. That there are few grains, 95 % sure more than 50, is
+a misfit; more than `UNKNOWN_NUMBER` may be any number."""
 
 UNKNOWN_NUMBER = 1e3
 """N about which it is searched then."""
@@ -432,7 +433,10 @@ def times_with_nodes(times: np.ndarray, mean_free_time: float) -> tuple[np.ndarr
     """
     order = np.argsort(times, kind="stable")
     known = np.append(0.0, np.log1p(times[order] / mean_free_time))
-    parts = np.maximum(np.ceil(np.diff(known) / LONGEST_STEP).astype(int), 1)
+    # As many nodes between two times as if the first one were 0: not fewer with another t0.
+    since_first = np.log1p((times[order] - times[order[0]]) / mean_free_time)
+    lengths = np.append(known[1], np.diff(since_first))
+    parts = np.maximum(np.ceil(lengths / LONGEST_STEP).astype(int), 1)
     steps = zip(known, known[1:], parts, strict=False)
     merged = np.concatenate([[0.0], *(np.linspace(a, b, n + 1)[1:] for a, b, n in steps)])
     at = np.cumsum(parts)

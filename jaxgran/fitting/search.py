@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from jaxgran.fitting.problem import Evaluation, Problem
 
-CONVERGED_STEP = 0.01
+CONVERGED_STEP = 0.03
 """Length of a Newton step, in standard errors, below which a search has converged."""
 
 MAX_STEP = 1.0

@@ -15,7 +15,7 @@ from jaxgran.data.header import gas_of_header, priors_of_header
 from tests.beads import glass_beads
 
 HEADER = "# eta: 0.05\n# diameter: 0.002\n# density: 2500\n# Y: 5e7\n# nu: 0.22\n# T0: 0.01\n"
-ROWS = "t,T,T_err\n0,0.01,0\n1,0.005,1e-5\n2,0.003,1e-5\n3,0.002,1e-5\n"
+ROWS = "t,T,T_err\n0,0.01,0\n1,0.005,1e-3\n2,0.003,1e-3\n3,0.002,1e-3\n"
 
 
 def test_measured_curves_are_read():

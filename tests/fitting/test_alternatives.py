@@ -9,6 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting import estimate
+from jaxgran.fitting.messages import describe_search
 from jaxgran.models.linearise import with_neutral_elements
 from tests.beads import glass_beads
 from tests.fitting.curves import (
@@ -93,6 +94,12 @@ def test_verdicts(monkeypatch, limitations, p_value, grade, verdict):
     assert result.grade == grade
     assert re.fullmatch("Kinetic theory" + verdict, result.verdict)
     assert {limitation.words for limitation in limitations} <= set(result.reasons)
+
+
+def test_few_particles_are_told():
+    result = fitted(*cooled_beads(1))
+    (words,) = describe_search(dataclasses.replace(result, model=jaxgran.DSMC(10)))
+    assert words.startswith("10 particles are too few for their noise to be known")
 
 
 def test_errors_that_are_too_large_are_named():

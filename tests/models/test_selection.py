@@ -27,7 +27,7 @@ def errors(choice):
 def test_measured_curves(name, model, fitted):
     measurement = measured(name)
     gas, curve = measurement.gas, measurement.curve
-    a_true = float(measurement.header["A"])
+    a_true = float(dict(measurement.header)["A"])
     options = {"num_particles": measurement.num_particles, "replicas": measurement.replicas}
     # Nothing is known at first but the A that kinetic theory fits, 24 % low on the dense curve.
     first = gas.replace(dissipative_constant=fitted * a_true)
