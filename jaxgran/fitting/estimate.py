@@ -94,14 +94,14 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     trace = None if descent is None else descent.trace
     result = assembled(request, problem, best, minima, explanations, trace)
     share = measurement_share(problem, problem.evaluate(best.flat))
-    if result.p_value < SIGNIFICANCE / 2 and best.converged and not request.quick:
-        notes += _of_outliers(problem, best, max_steps)
+    if result.p_value < SIGNIFICANCE / 2 and not request.quick:
+        notes += _of_outliers(problem, first, max_steps)
     return with_all_words(request, result, explanations, notes, share)
 
 
-def _of_outliers(problem: Problem, best: Minimum, max_steps: int) -> Iterator[str]:
+def _of_outliers(problem: Problem, first: np.ndarray, max_steps: int) -> Iterator[str]:
     """Yield a clause on far outliers, and the first parameter of a fit without them."""
-    rest, end, left_out = without_outliers(problem, best, max_steps)
+    rest, end, left_out = without_outliers(problem, first, max_steps)
     found = rest.evaluate(end.flat)
     if not left_out or goodness(rest, found)["p_value"] < SIGNIFICANCE / 2:
         return

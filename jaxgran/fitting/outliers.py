@@ -32,20 +32,21 @@ class Value(NamedTuple):
 
 
 def without_outliers(
-    problem: Problem, end: Minimum, max_steps: int
+    problem: Problem, first: np.ndarray, max_steps: int
 ) -> tuple[Problem, Minimum, list[Value]]:
     """Leave out the values that fit worst, one by one, while their residuals are too large.
 
     Args:
         problem: of a fit.
-        end: where its search ended.
-        max_steps: of each further search.
+        first: the first guess of a fit, which far outliers lead astray.
+        max_steps: of each search.
 
     Returns:
         The problem without them, where its search ends, and the values that were left out.
     """
     count = sum(m.num_points for m in problem.curves)
     limit = float(scipy.stats.norm.isf(CHANCE / 2 / max(count, 1)))
+    end = Minimum(first, np.inf, 0, False)
     left_out: list[Value] = []
     while len(left_out) < MOST * count:
         worst, residual = _worst(problem, end.flat)
@@ -53,16 +54,12 @@ def without_outliers(
             break
         # An outlier makes the residual of its successor large, too.
         both = [worst, worst._replace(time=worst.time - 1)][: 1 + (worst.time > 0)]
-        ends = {value: _ended(_without(problem, value), end, max_steps) for value in both}
+        ends = {x: minimise(_without(problem, x), end.flat, max_steps) for x in both}
         value = min(ends, key=lambda x: ends[x].value)
         problem = _without(problem, value)
         end = ends[value]
         left_out.append(value)
     return problem, end, left_out
-
-
-def _ended(problem: Problem, end: Minimum, max_steps: int) -> Minimum:
-    return minimise(problem, end.flat, max_steps)
 
 
 def _worst(problem: Problem, flat: np.ndarray) -> tuple[Value, float]:

@@ -215,8 +215,13 @@ def halving_time(curve: CoolingCurve) -> float:
 def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, np.ndarray]:
     """Return the negative power of T that is a straight line in time, and that line, 1 at first."""
     T = np.asarray(curve.temperature)
-    power = 1 / 2 if isinstance(gas.law, ConstantRestitution) else 3 / 5
+    power = power_of_line(gas)
     return power, (T / T[0]) ** -power
+
+
+def power_of_line(gas: Gas) -> float:
+    """Return p for which T^(-p) of a cooling gas is a straight line in time."""
+    return 1 / 2 if isinstance(gas.law, ConstantRestitution) else 3 / 5
 
 
 def _intercept_and_slope(times: np.ndarray, line: np.ndarray) -> tuple[Any, Any]:

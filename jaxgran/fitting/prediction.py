@@ -19,7 +19,7 @@ from jaxtyping import Float
 from jaxgran._utils.tracing import fast_compilation
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.likelihood import Nodes, filtered, innovations
-from jaxgran.fitting.parameters import as_floats, with_floats
+from jaxgran.fitting.parameters import as_floats, power_of_line, with_floats
 from jaxgran.fitting.rows import (
     CALIBRATION,
     DISPLACEMENT,
@@ -43,6 +43,10 @@ WHITE = "white"
 
 DIFFERENCE = float(np.finfo(float).eps ** 0.25)
 """Step of central differences in an unconstrained parameter."""
+
+MOST_BEFORE = 1.9
+"""Largest ratio of the power of T that is a straight line, to that at the start, which is continued
+to times before the start: its continuation is .1 then, and T_0 over it diverges."""
 
 TINY = float(np.finfo(np.float32).tiny)
 
@@ -303,13 +307,10 @@ def predicted_curve(
     collisions = known.get("collisions")
     if collisions is None:
         collisions = _collisions(gas, times, T)
-    # Before the start T is continued to first order in time: ln T(-t) = 2 ln T_0 - ln T(t).
+    # Before the start T is continued as the power that is a straight line in time.
     before = np.zeros(times.size, bool)
     before[place] = elapsed < 0
-
-    def compared(log_T: np.ndarray, log_rotation: np.ndarray, factors: Any) -> np.ndarray:
-        logs = np.stack([log_T, log_rotation], axis=1)
-        return np.where(before[:, None], 2 * logs[:1] - logs, logs) + factors
+    power = power_of_line(gas)
 
     with np.errstate(divide="ignore", invalid="ignore"):
         log_T = np.log(T)
@@ -317,11 +318,20 @@ def predicted_curve(
         log_displacement = np.log(np.maximum(displacement, TINY))
     common = values.get(CALIBRATION, 0.0)
     factors = np.array([common, common + values.get(ROTATION, 0.0)])
-    base = compared(log_T, log_rotation, factors)
+    logs = np.stack([log_T, log_rotation], axis=1)
+    line = np.minimum(np.exp(-power * (logs - logs[:1])), MOST_BEFORE)
+    continued = logs[:1] - np.log(2 - line) / power
+    base = np.where(before[:, None], continued, logs) + factors
     base[place] += rows.offset
     prediction = Prediction(
         log_T, T_rot / T, collisions, base, log_displacement, floats, values.get(SCATTER, 0.0)
     )
+
+    def compared(of_T: np.ndarray, of_rotation: np.ndarray) -> np.ndarray:
+        """Derivative of the base in a parameter, from those of the logarithms."""
+        change = np.stack([of_T, of_rotation], axis=1)
+        of_continued = change[:1] - line / (2 - line) * (change - change[:1])
+        return np.where(before[:, None], of_continued, change)
 
     def tangent(element: Element) -> Prediction:
         slopes: dict[str, np.ndarray] = {}
@@ -347,7 +357,7 @@ def predicted_curve(
             of_T,
             T_rot / T * (of_rotation - of_T),
             change("collisions", np.ones_like(T)),
-            compared(of_T, of_rotation, element.slope * factors.get(element.name, np.zeros(2))),
+            compared(of_T, of_rotation) + element.slope * factors.get(element.name, np.zeros(2)),
             change("displacement", displacement),
             of_floats,
             element.slope if element.name == SCATTER else 0.0,

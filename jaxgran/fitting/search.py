@@ -16,11 +16,21 @@ from jaxgran.fitting.problem import Evaluation, Problem
 CONVERGED_STEP = 0.03
 """Length of a Newton step, in standard errors, below which a search has converged."""
 
+STALLED_STEP = 0.3
+"""The same where no step along it lowers -2 ln L: at a kink, where a measured point passes t0."""
+
+MAX_REJECTED = 6
+"""Number of steps in succession that do not lower -2 ln L, after which a search ends."""
+
 MAX_STEP = 1.0
 """Length of the first step of the unconstrained parameters: a factor e of a positive one."""
 
-MAX_DISTANCE = 25.0
-"""Largest change of an unconstrained parameter in a search: a factor 7e10 of a positive one."""
+MAX_DISTANCE = {"dissipative_constant": 7.0}
+"""Largest change of an unconstrained parameter in a search: a factor 1000 of A, far beyond which
+impacts lose all energy and T does not depend on it."""
+
+MAX_DISTANCE_OF_OTHERS = 25.0
+"""The same of others: a factor 7e10 of a positive one."""
 
 MULTIMODAL_PARAMETER = "tangential_restitution"
 """Parameter in which the likelihood has several maxima: on both sides of the beta_t at which
@@ -94,22 +104,30 @@ def minimise(
         tolerance: length of a Newton step, in standard errors, at which the search ends.
     """
 
+    farthest = _farthest(problem)
+
     def value(flat: np.ndarray) -> float:
-        if np.any(np.abs(flat - first) > MAX_DISTANCE):
+        if np.any(np.abs(flat - first) > farthest):
             return np.inf
         found = problem.evaluate(flat)
         return found.value if found.is_finite else np.inf
 
-    def has_converged(flat: np.ndarray) -> bool:
-        return newton_step(problem.evaluate(flat))[1] < tolerance
+    def length_of_step(flat: np.ndarray) -> float:
+        return newton_step(problem.evaluate(flat))[1]
 
-    def stop_where_converged(flat: np.ndarray) -> None:
-        if has_converged(flat):
+    latest = first
+    rejected = 0
+
+    def stop_at_minimum(flat: np.ndarray) -> None:
+        nonlocal latest, rejected
+        rejected = rejected + 1 if np.array_equal(flat, latest) else 0
+        latest = flat.copy()
+        if length_of_step(flat) < tolerance or rejected >= MAX_REJECTED:
             raise StopIteration
 
     if not np.isfinite(value(first)):
         return Minimum(first, np.inf, 0, False)
-    if has_converged(first):
+    if length_of_step(first) < tolerance:
         return Minimum(first, value(first), 0, True)
 
     def gradient(flat: np.ndarray) -> np.ndarray:
@@ -125,7 +143,7 @@ def minimise(
         jac=gradient,
         hess=hessian,
         method="trust-exact",
-        callback=stop_where_converged,
+        callback=stop_at_minimum,
         options={
             "gtol": 0.0,
             "maxiter": max_steps,
@@ -134,7 +152,13 @@ def minimise(
         },
     )
     end = np.asarray(solution.x)
-    return Minimum(end, value(end), int(solution.nit), has_converged(end))
+    limit = STALLED_STEP if rejected >= MAX_REJECTED else tolerance
+    return Minimum(end, value(end), int(solution.nit), length_of_step(end) < limit)
+
+
+def _farthest(problem: Problem) -> Float[np.ndarray, "unknowns"]:
+    limits = [MAX_DISTANCE.get(u.name, MAX_DISTANCE_OF_OTHERS) for u in problem.unknowns]
+    return np.repeat(limits, [u.size for u in problem.unknowns])
 
 
 def best_of_starts(
@@ -178,8 +202,10 @@ class Descent:
     def __call__(self, problem: Problem, first: np.ndarray, max_steps: int) -> Minimum:
         """Minimise -2 ln L of a model without noise: a search as `minimise`."""
 
+        farthest = _farthest(problem)
+
         def loss(flat: np.ndarray, step: int) -> tuple[float, np.ndarray, bool]:
-            if np.any(np.abs(flat - first) > MAX_DISTANCE):
+            if np.any(np.abs(flat - first) > farthest):
                 return np.inf, np.zeros_like(flat), False
             found = problem.evaluate(flat)
             if not found.is_finite:

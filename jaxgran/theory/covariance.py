@@ -367,7 +367,7 @@ def covariance_at_all_times(
     rows = jnp.concatenate([jnp.zeros_like(rows[:1]), rows])
     earlier = jnp.moveaxis(rows, 0, 1)  # output and time, output and time that is not later
     later = jnp.transpose(earlier, (2, 3, 0, 1))
-    whole = jnp.where(index[:, None, None] >= index, earlier, later)
+    whole = jnp.where(index[:, None, None] >= index[None, None], earlier, later)
     return whole.reshape(num_outputs * num_times, num_outputs * num_times)
 
 

@@ -181,7 +181,7 @@ def test_an_outlier_is_named_with_its_row_and_left_out_for_comparison(error):
     )
     value, uncertainty = map(float, found.groups())
     # The wave in T is .5 %; with the outlier A is 15 % too small.
-    assert abs(value / TRUE_A - 1) < 0.01 and 0 < uncertainty < 0.01 * TRUE_A
+    assert abs(value / TRUE_A - 1) < 0.01 and 0 < uncertainty < 0.02 * TRUE_A  # of 2000 grains
 
 
 ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "latin-1", "utf-32")
