@@ -19,8 +19,12 @@ CONVERGED_STEP = 0.03
 STALLED_STEP = 0.3
 """The same where no step along it lowers -2 ln L: at a kink, where a measured point passes t0."""
 
-MAX_REJECTED = 6
-"""Number of steps in succession that do not lower -2 ln L, after which a search ends."""
+MAX_STALLED = 6
+"""Number of steps in succession that lower -2 ln L by less than `LEAST_FALL`, after which a search
+ends."""
+
+LEAST_FALL = 1e-4
+"""Fall of -2 ln L that has no meaning."""
 
 MAX_STEP = 1.0
 """Length of the first step of the unconstrained parameters: a factor e of a positive one."""
@@ -115,14 +119,14 @@ def minimise(
     def length_of_step(flat: np.ndarray) -> float:
         return newton_step(problem.evaluate(flat))[1]
 
-    latest = first
-    rejected = 0
+    lowest = np.inf
+    stalled = 0
 
     def stop_at_minimum(flat: np.ndarray) -> None:
-        nonlocal latest, rejected
-        rejected = rejected + 1 if np.array_equal(flat, latest) else 0
-        latest = flat.copy()
-        if length_of_step(flat) < tolerance or rejected >= MAX_REJECTED:
+        nonlocal lowest, stalled
+        stalled = stalled + 1 if value(flat) > lowest - LEAST_FALL else 0
+        lowest = value(flat)
+        if length_of_step(flat) < tolerance or stalled >= MAX_STALLED:
             raise StopIteration
 
     if not np.isfinite(value(first)):
@@ -152,7 +156,7 @@ def minimise(
         },
     )
     end = np.asarray(solution.x)
-    limit = STALLED_STEP if rejected >= MAX_REJECTED else tolerance
+    limit = STALLED_STEP if stalled >= MAX_STALLED else tolerance
     return Minimum(end, value(end), int(solution.nit), length_of_step(end) < limit)
 
 

@@ -13,7 +13,7 @@ from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.rows import curve_rows
 from jaxgran.fitting.search import minimise
 from tests.beads import glass_beads
-from tests.fitting.curves import A, cooled_beads, fitted
+from tests.fitting.curves import A, cooled_beads
 
 THEORY = jaxgran.KineticTheory()
 NUM_PARTICLES = 250

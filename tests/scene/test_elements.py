@@ -8,9 +8,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxgran
+from jaxgran.data.header import gas_of_header
 from jaxgran.theory.averages import impact_moments
 from tests.beads import SI, glass_beads, hard_gas, theory_curve
-from jaxgran.data.header import gas_of_header
 from tests.data.test_faults_csv import gas_of, header_of
 
 TAUS = np.geomspace(1.0, 300.0, 8)
