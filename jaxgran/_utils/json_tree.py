@@ -77,8 +77,8 @@ def from_json(value: Any) -> Any:
 
 def _field_names(value: Any) -> list[str] | None:
     """Return the names of the fields of a named tuple or a dataclass; None for other objects."""
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return list(value._fields)
+    if isinstance(value, tuple) and (names := getattr(value, "_fields", None)) is not None:
+        return list(names)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return [f.name for f in dataclasses.fields(value)]
     return None

@@ -45,7 +45,7 @@ UNDETERMINED_ERROR = 1.0
 SOURCE_STEP = 0.02
 """Relative change of a variance by which its part of an error is found."""
 
-LEAST_EIGENVALUE = 1e-12
+MIN_EIGENVALUE = 1e-12
 """Least information on a combination of parameters: their error is then infinite to all ends."""
 
 FEW_PARTICLES = "few particles"
@@ -232,15 +232,15 @@ def check_computed(problem: Problem, end: Minimum) -> None:
             )
     if not np.isfinite(end.value):
         raise RuntimeError(
-            f"the likelihood is not a number where the search begins, at {problem.estimates(end.flat)}"
-            ": give another start, a gas nearer to the measured one"
+            "the likelihood is not a number where the search begins, at "
+            f"{problem.estimates(end.flat)}: give start, a gas nearer to the measured one"
         )
 
 
 def inverse(information: np.ndarray) -> np.ndarray:
     """Return the covariance of parameters of some information; very large where there is none."""
     values, axes = np.linalg.eigh(information)
-    return axes / np.maximum(values, LEAST_EIGENVALUE) @ axes.T
+    return axes / np.maximum(values, MIN_EIGENVALUE) @ axes.T
 
 
 def assembled(

@@ -424,4 +424,5 @@ def _of_displacement(
     values = jnp.log(np.where(used, measured.values, 1.0))
     difference = values - jnp.log(jnp.where(used, computed.displacement[place], 1.0))
     columns = jnp.stack([difference, diffusive], axis=-1)
-    return _without_factors(columns, used / errors**2, jnp.asarray([measured.accuracy]))
+    weights = jnp.asarray(used / errors**2)
+    return _without_factors(columns, weights, jnp.asarray([measured.accuracy]))

@@ -44,7 +44,7 @@ WHITE = "white"
 DIFFERENCE = float(np.finfo(float).eps ** 0.25)
 """Step of central differences in an unconstrained parameter."""
 
-MOST_BEFORE = 1.9
+MAX_LINE_BEFORE = 1.9
 """Largest ratio of the power of T that is a straight line, to that at the start, which is continued
 to times before the start: its continuation is .1 then, and T_0 over it diverges."""
 
@@ -319,7 +319,7 @@ def predicted_curve(
     common = values.get(CALIBRATION, 0.0)
     factors = np.array([common, common + values.get(ROTATION, 0.0)])
     logs = np.stack([log_T, log_rotation], axis=1)
-    line = np.minimum(np.exp(-power * (logs - logs[:1])), MOST_BEFORE)
+    line = np.minimum(np.exp(-power * (logs - logs[:1])), MAX_LINE_BEFORE)
     continued = logs[:1] - np.log(2 - line) / power
     base = np.where(before[:, None], continued, logs) + factors
     base[place] += rows.offset
@@ -406,4 +406,5 @@ def _batch_size(count: int) -> int:
 
 @cache
 def _compiled(function: Callable, backend: str) -> Any:
-    return eqx.filter_jit(function, compiler_options=fast_compilation(backend))
+    options: dict[str, Any] = {"compiler_options": fast_compilation(backend)}
+    return eqx.filter_jit(function, **options)

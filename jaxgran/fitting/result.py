@@ -182,8 +182,9 @@ class Fit:
         for name in self.names:
             label, _, short = name.rpartition(": ")
             gas = gases.get(label, next(iter(gases.values())))
-            is_number = short == START_TIME or gas is None
-            shapes[name] = () if is_number else np.shape(gas.value(short))
+            shapes[name] = ()
+            if short != START_TIME and gas is not None:
+                shapes[name] = np.shape(gas.value(short))
         return shapes
 
     def __repr__(self) -> str:

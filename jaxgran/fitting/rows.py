@@ -28,7 +28,7 @@ ROTATION = "model of T_rot"
 DISPLACEMENT = "model of <dr^2>"
 """The same of the diffusive part of <dr^2>."""
 
-LONGEST_STEP = 0.25
+MAX_LOG_STEP = 0.25
 """Longest step between two times at which a curve is computed, in ln(1 + t/tau_c): T falls by .4 in
 its logarithm."""
 
@@ -38,8 +38,8 @@ CALIBRATION = "calibration"
 """The logarithm of a common factor of all measured T and T_rot."""
 
 WEAK_SCATTER = 1.5
-"""Standard error of ln N where N is not known. That there are few grains, 95 % sure more than 50, is
-a misfit; more than `UNKNOWN_NUMBER` may be any number."""
+"""Standard error of ln N where N is not known. Far fewer grains than `UNKNOWN_NUMBER` are a misfit;
+more may be any number."""
 
 UNKNOWN_NUMBER = 1e3
 """N about which it is searched then."""
@@ -362,13 +362,15 @@ def _displacement(
     curve = measurement.curve
     gas = measurement.gas
     N = measurement.num_particles
-    if curve.displacement is None or (curve.displacement_error is None and N is None):
+    if curve.displacement is None:
         return None
     accuracy = model.displacement_accuracy(gas)
     if accuracy is None:
         return None
     values = np.asarray(curve.displacement)
     if curve.displacement_error is None:
+        if N is None:
+            return None
         relative = np.full(values.shape, (2 / (gas.dimension * N * measurement.replicas)) ** 0.5)
     else:
         relative = np.asarray(curve.displacement_error) / np.maximum(values, TINY)
@@ -428,7 +430,7 @@ def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRow
 def times_with_nodes(times: np.ndarray, mean_free_time: float) -> tuple[np.ndarray, np.ndarray]:
     """Return times from 0 on that contain those given, and the places of these.
 
-    Neighbours are at most `LONGEST_STEP` apart in ``ln(1 + t/tau_c)``. They are padded to a length
+    Neighbours are at most `MAX_LOG_STEP` apart in ``ln(1 + t/tau_c)``. They are padded to a length
     of the grid by repeating the last one.
     """
     order = np.argsort(times, kind="stable")
@@ -436,7 +438,7 @@ def times_with_nodes(times: np.ndarray, mean_free_time: float) -> tuple[np.ndarr
     # As many nodes between two times as if the first one were 0: not fewer with another t0.
     since_first = np.log1p((times[order] - times[order[0]]) / mean_free_time)
     lengths = np.append(known[1], np.diff(since_first))
-    parts = np.maximum(np.ceil(lengths / LONGEST_STEP).astype(int), 1)
+    parts = np.maximum(np.ceil(lengths / MAX_LOG_STEP).astype(int), 1)
     steps = zip(known, known[1:], parts, strict=False)
     merged = np.concatenate([[0.0], *(np.linspace(a, b, n + 1)[1:] for a, b, n in steps)])
     at = np.cumsum(parts)

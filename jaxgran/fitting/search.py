@@ -20,10 +20,10 @@ STALLED_STEP = 0.3
 """The same where no step along it lowers -2 ln L: at a kink, where a measured point passes t0."""
 
 MAX_STALLED = 6
-"""Number of steps in succession that lower -2 ln L by less than `LEAST_FALL`, after which a search
+"""Number of steps in succession that lower -2 ln L by less than `MIN_FALL_OF_STEP`, after which a search
 ends."""
 
-LEAST_FALL = 1e-4
+MIN_FALL_OF_STEP = 1e-4
 """Fall of -2 ln L that has no meaning."""
 
 MAX_STEP = 1.0
@@ -124,7 +124,7 @@ def minimise(
 
     def stop_at_minimum(flat: np.ndarray) -> None:
         nonlocal lowest, stalled
-        stalled = stalled + 1 if value(flat) > lowest - LEAST_FALL else 0
+        stalled = stalled + 1 if value(flat) > lowest - MIN_FALL_OF_STEP else 0
         lowest = value(flat)
         if length_of_step(flat) < tolerance or stalled >= MAX_STALLED:
             raise StopIteration

@@ -350,8 +350,8 @@ class KineticTheory(AbstractModel):
             return dataclasses.replace(self._curve(gas, times, state, fault), status=None)
 
         computed, along = each(curve, gas, times, state)(gas_along, times_along, state_along)
-        fault = self._curve(gas, times, state, fault).status
-        return dataclasses.replace(computed, status=fault), along
+        whole = self._curve(gas, times, state, fault)
+        return dataclasses.replace(computed, status=whole.status), along
 
     def _reduced(
         self, gas: Gas, times: Float[Array, "times"]

@@ -260,6 +260,7 @@ class Equations(NamedTuple):
         ]
         third = [] if order == 2 else [a3_rate]
         if self.spreading:
+            assert moments.diffusion is not None
             relaxation = values[order:].reshape(order - 1, -1)
             diffusing = _diffusion_rates(moments, a3, relaxation, impacts, shape_decay, d)
             net_growth = cooling / 2 - relaxing
@@ -282,6 +283,7 @@ def _diffusion_rates(
     the cooling rate zeta. The last term is the growth by cooling.
     """
     half, a2, speed = d / 2, moments.sonine, jnp.exp(moments.log_temperature / 2)
+    assert moments.diffusion is not None
     if moments.diffusion_shape is None:
         return [(speed / 2 - relaxation[0, 0] * speed * moments.diffusion, moments.diffusion)]
     q0, q1 = moments.diffusion, moments.diffusion_shape

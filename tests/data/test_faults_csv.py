@@ -240,7 +240,9 @@ def test_a_file_gives_the_plain_curve_or_an_error(
 def test_drop_tests_are_read_like_curves(tmp_path):
     def drops_of(text):
         (tmp_path / "drops.csv").write_text(text)
-        return read_measurement(tmp_path / "drops.csv", gas=GAS).data
+        drops = read_measurement(tmp_path / "drops.csv", gas=GAS).data
+        assert isinstance(drops, jaxgran.DropTest)
+        return drops
 
     plain = drops_of("v,eps,eps_err\n0.1,0.92,0.01\n0.3,0.9,0.01\n")
     for text in (
