@@ -20,8 +20,8 @@ STALLED_STEP = 0.3
 """The same where no step along it lowers -2 ln L: at a kink, where a measured point passes t0."""
 
 MAX_STALLED = 6
-"""Number of steps in succession that lower -2 ln L by less than `MIN_FALL_OF_STEP`, after which a search
-ends."""
+"""Number of steps in succession that lower -2 ln L by less than `MIN_FALL_OF_STEP`, after which a
+search ends."""
 
 MIN_FALL_OF_STEP = 1e-4
 """Fall of -2 ln L that has no meaning."""
