@@ -17,11 +17,13 @@ import scipy
 from jaxtyping import Float
 
 from jaxgran.data.measurement import START_TIME
+from jaxgran.fitting.parameters import as_floats, with_floats
 from jaxgran.fitting.prediction import FLOOR, WHITE
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
 from jaxgran.fitting.search import Minimum, minimise, newton_step
 from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR
+from jaxgran.scene.laws import VARIANT_SPEED, VISCOELASTIC_EXPONENT
 
 ALLOWED = 3.84
 """Increase of -2 ln L over that of the law up to which its own parameters are allowed (5 % by
@@ -61,6 +63,9 @@ Phys. Fluids 6, 1108 (1994)."""
 
 DELAYS = (0.003, 0.02, 0.1, 0.3)
 """Errors of the start of the clock, over the initial cooling time, of both signs."""
+
+SPREADS = (0.02, 0.05, 0.1, 0.15)
+"""Standard deviations of eps from impact to impact."""
 
 WHITE_ERRORS = (0.002, 0.006, 0.02, 0.06)
 """Relative standard deviations of independent errors of T."""
@@ -119,6 +124,7 @@ class Kind(NamedTuple):
         values: values of parameters at an amplitude, given the label of the measurement.
         rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.
         one_minimum: False if amplitudes beyond excluded ones may be allowed.
+        keeps_A: False if A has no meaning in it: it is no part of the range.
     """
 
     name: str
@@ -127,6 +133,7 @@ class Kind(NamedTuple):
     values: Callable[[float, str], dict[str, float]]
     rate_error: Callable[[float], float] = lambda amplitude: 0.0
     one_minimum: bool = True
+    keeps_A: bool = True
 
 
 class Trial(NamedTuple):
@@ -164,6 +171,8 @@ class Alternative(NamedTuple):
             changes the first parameter by less than 10 % beyond the error of the fitted law.
         error_reduction_needed: factor by which the errors must decrease to distinguish it; 1 if it
             is distinguishable.
+        restitution: eps of an alternative in which it is constant, so that A has no meaning; None
+            for all others. It is no part of the range.
 
     >>> best = result.alternatives[0]
     >>> best.improvement < 0.01 and not best.preferred  # the curve has no noise
@@ -181,6 +190,7 @@ class Alternative(NamedTuple):
     preferred: bool
     distinguishable: bool
     error_reduction_needed: float
+    restitution: float | None = None
 
 
 class Explanations(NamedTuple):
@@ -200,7 +210,11 @@ class Explanations(NamedTuple):
         Args:
             without: explanations that are left out.
         """
-        considered = [x for x in (self.law, *self.alternatives) if x not in without]
+        considered = [
+            x
+            for x in (self.law, *self.alternatives)
+            if x not in without and x.restitution is None
+        ]
         best = max(x.improvement for x in considered)
         allowed = [
             x
@@ -213,8 +227,8 @@ class Explanations(NamedTuple):
 
     @property
     def is_rejected(self) -> bool:
-        """Whether the data prefer an alternative to the fitted law."""
-        return any(alternative.preferred for alternative in self.alternatives)
+        """Whether the data prefer an alternative in which A has a meaning to the fitted law."""
+        return any(x.preferred and x.restitution is None for x in self.alternatives)
 
 
 def compare_alternatives(
@@ -243,10 +257,14 @@ def compare_alternatives(
         return None
     kinds = [] if is_driven else _kinds(problem, bases[0].flat, absent)
     profiles = {kind: [_profile(problem, kind, base) for base in bases] for kind in kinds}
-    best = min(
-        [*bases, *(t for found in profiles.values() for profile in found for t in profile)],
-        key=lambda trial: trial.value,
-    )
+    trials = [
+        trial
+        for kind, found in profiles.items()
+        for profile in found
+        for trial in profile
+        if kind.keeps_A
+    ]
+    best = min([*bases, *trials], key=lambda trial: trial.value)
     significant = float(scipy.stats.chi2.isf(SIGNIFICANCE / max(len(kinds), 1), 1))
     summary = _Summary(problem, bases[0], best, significant, noise)
     law = summary.of(None, [[base] for base in bases])
@@ -280,25 +298,32 @@ class _Summary(NamedTuple):
             fine = np.linspace(0, len(trials) - 1, 40 * (len(trials) - 1) + 1)
             known = np.arange(len(trials))
             rows.append(np.stack([np.interp(fine, known, column) for column in values.T], axis=1))
-        best = min(
-            (trial for trials in profiles for trial in trials), key=lambda trial: trial.value
-        )
+        # The law without an alternative is no trial of one that has no amplitudes in between.
+        ends = [trials if kind is None or kind.keeps_A else trials[1:] for trials in profiles]
+        best = min((t for trials in ends for t in trials), key=lambda t: t.value, default=self.base)
         values = np.concatenate(rows)
         limit = best.value + ALLOWED
         if kind is not None:
             limit = max(limit, self.best.value + ALLOWED_OVER_ALL)
         inside = values[values[:, 0] <= limit]
-        # At each amplitude -2 ln L is a parabola in the parameters.
+        # At each amplitude -2 ln L is a parabola in the parameters. Where one of them matters so
+        # little that its logarithm has a large error, it is a parabola in its value instead.
         half = np.sqrt(limit - inside[:, :1]) * inside[:, 2 + size :]
         middle = inside[:, 2 : 2 + size]
         low = self._in_si(np.min(middle - half, axis=0), best)
-        high = self._in_si(np.max(middle + half, axis=0), best)
+        high = self._in_si(np.max(middle + np.log1p(half + half**2 / 2), axis=0), best)
         estimate = self.problem.estimates(best.flat)
         wider = 0.0
         if law is not None:
             wider = max(law.low[0] - low[0], high[0] - law.high[0]) / abs(law.estimate[0])
         parameter = "" if kind is None else kind.parameters[0]
         improvement = self.base.value - best.value
+        restitution = None
+        if kind is not None and law is not None and not kind.keeps_A:
+            wider = 0.0
+            low = law.low
+            high = law.high
+            restitution = constant_restitution(self.problem, best)
         return Alternative(
             name="" if kind is None else kind.name,
             effect=next((name for name, x in DECLARABLE.items() if x[0] == parameter), ""),
@@ -311,6 +336,7 @@ class _Summary(NamedTuple):
             preferred=bool(improvement > self.significant),
             distinguishable=bool(wider < DISTINGUISHABLE_SHARE),
             error_reduction_needed=float(max(wider / DISTINGUISHABLE_SHARE, 1.0)),
+            restitution=restitution,
         )
 
     def _in_si(self, free: np.ndarray, best: Trial) -> np.ndarray:
@@ -391,6 +417,23 @@ def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[
         )
         possible.append(sliding)
     known = {u.name for u in problem.unknowns}
+    if all("exponent" in m.gas.domains for m in problem.curves) and scenes:
+        spread = Kind(
+            "eps that scatters from impact to impact",
+            ("spread",),
+            (SPREADS,),
+            lambda x, label: {"spread": x},
+        )
+        constant = Kind(
+            "a constant coefficient of restitution",
+            ("exponent",),
+            ((1.0,),),
+            lambda x, label: {"exponent": VISCOELASTIC_EXPONENT * (1 - x)},
+            keeps_A=False,
+        )
+        possible.append(spread)
+        if "dissipative_constant" in known:
+            possible.append(constant)
     if not known & {START_TIME, "temperature"}:
         delay = Kind(
             "an error of the start time or of T_0",
@@ -417,23 +460,38 @@ def _initial_rate(m: CurveRows, values: dict[str, Any], curve: dict[str, Any]) -
     return float(5 / 3 * cooled / max(times[at], 1e-300))
 
 
+def constant_restitution(problem: Problem, trial: Trial) -> float:
+    """Return eps of a trial in which it is constant."""
+    m = problem.curves[0]
+    values = problem.values(trial.flat)[m.label]
+    known = {name: x for name, x in values.items() if name in m.gas.domains}
+    gas = with_floats(m.gas, as_floats(known | {"exponent": 0.0}))
+    return float(gas.restitution(VARIANT_SPEED))
+
+
 def _trial(problem: Problem, amplitude: float, first: np.ndarray) -> Trial | None:
     """Fit the unknowns of a problem; None if it cannot be computed."""
     end = minimise(problem, first, MAX_STEPS, TRIAL_STEP)
     found = problem.evaluate(end.flat)
     if not found.is_finite:
         return None
-    step, length = newton_step(found)
     variances = np.diag(np.linalg.pinv(found.information, hermitian=True))
     error = np.sqrt(variances[: problem.num_free])
+    step, length = newton_step(found)
+    if length >= TRIAL_STEP:  # the search was cut short
+        return Trial(amplitude, found.value, end.flat, error)
     return Trial(amplitude, found.value - length**2, end.flat + step, error)
 
 
 def _profile(problem: Problem, kind: Kind, base: Trial) -> list[Trial]:
     """Return fits with increasing amplitudes, from 0, of an alternative."""
+    is_of_law = kind.parameters[0] in ("spread", "exponent")  # which drop tests have, too
 
     def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
-        fixed = {m.label: kind.values(amplitude, m.label) for m in problem.curves}
+        fixed = {
+            m.label: kind.values(amplitude, m.label) if is_of_law or isinstance(m, CurveRows) else {}
+            for m in problem.measurements
+        }
         error = kind.rate_error(amplitude)
 
         def with_rate_error(m: Any) -> Any:
@@ -446,6 +504,9 @@ def _profile(problem: Problem, kind: Kind, base: Trial) -> list[Trial]:
         changed = replace(problem, fixed=fixed, measurements=measurements)
         return _trial(changed, amplitude, first)
 
+    if not kind.keeps_A:
+        trial = fit_with(kind.amplitudes[0][0], base.flat)
+        return [base] if trial is None else [base, trial]
     trials = [base]
     lowest = base.value
     for sequence in kind.amplitudes:

@@ -42,6 +42,9 @@ MESSAGES = {
     "below": "{symbol} is below {high:.3g} {unit}",
     "above": "{symbol} is above {low:.3g} {unit}",
     "unknown": "{symbol} is not determined",
+    "constant": "{headline}. A constant coefficient of restitution, {eps:.3g}, explains the data "
+    "{as_well}: then A has no meaning",
+    "no meaning": "it is {eps:.3g}, and A has no meaning",
     "narrowing": "if there is no {effects}, {range}: declare `absent: {names}`, or give {given}",
     # the verdict
     "not converged": "The search did not converge: do not trust its estimates.",
@@ -171,6 +174,16 @@ def _range(result: Fit, low: float, high: float) -> str:
 
 
 def _headline(result: Fit) -> str:
+    """Return the first parameter with its range, and whether it has a meaning."""
+    headline = _first_parameter(result)
+    for alternative in result.alternatives:
+        if alternative.restitution is not None and alternative.improvement >= 0:
+            as_well = "better" if alternative.preferred else "as well"
+            return say("constant", headline=headline, eps=alternative.restitution, as_well=as_well)
+    return headline
+
+
+def _first_parameter(result: Fit) -> str:
     """Return the first parameter with its range; without it if that lies outside of the range."""
     name = result.names[0]
     estimate, error = (float(np.ravel(x)[0]) for x in result.value(name))
@@ -300,6 +313,8 @@ def _alternatives(result: Fit, absent: tuple[str, ...], quick: bool) -> Iterator
     for alternative in result.alternatives:
         low, high = float(alternative.low[0]), float(alternative.high[0])
         span = _range(result, low, high)
+        if alternative.restitution is not None:
+            span = say("no meaning", eps=alternative.restitution)
         if alternative.preferred:
             name, improvement = alternative.name, alternative.improvement
             yield say("is preferred", name=name, improvement=improvement, range=span)

@@ -173,6 +173,8 @@ def _alternatives(result: Fit) -> Iterator[str]:
         needed = f"no (needs {x.error_reduction_needed:.2g}x smaller errors)"
         answer = "preferred by the data" if x.preferred else "yes" if x.distinguishable else needed
         limits = f"{x.low[0]:.3g} .. {x.high[0]:.3g}"
+        if x.restitution is not None:
+            limits = f"none: eps = {x.restitution:.3g}"
         cells.append((x.name, f"{x.improvement:.2g}", f"{x.estimate[0]:.3g}", limits, answer))
     if cells:
         symbol = symbol_of(result.names[0])

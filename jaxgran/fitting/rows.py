@@ -16,7 +16,11 @@ from jaxgran.data.measurement import Measurement
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import error_model_along
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.linearise import curve_of_program, with_neutral_elements
+from jaxgran.models.linearise import (
+    curve_of_program,
+    with_neutral_elements,
+    with_variant_law,
+)
 from jaxgran.scene.gas import Gas
 
 SCATTER = "scatter of N"
@@ -225,12 +229,12 @@ class DropRows:
 
     @property
     def gas(self) -> Gas:
-        """The gas of the spheres; it needs no further elements."""
-        return self.measurement.gas
+        """The gas of the spheres, with the law that alternative explanations change."""
+        return with_variant_law(self.measurement.gas)
 
     @property
     def scene(self) -> Gas:
-        """The same."""
+        """The gas that was measured."""
         return self.measurement.gas
 
     @property

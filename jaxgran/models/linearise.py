@@ -21,6 +21,7 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.elements import Rough, StokesDrag, Walls
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.laws import Viscoelastic, ViscoelasticVariant
 
 LINEARISED = "temperature", "rotational_temperature", "displacement", "collisions"
 """Fields of a curve that are linearised, if the model computes them."""
@@ -66,9 +67,17 @@ def with_neutral_elements(gas: Gas, model: AbstractModel) -> Gas:
         for name, element in neutral.items()
         if name in model.elements and getattr(gas, name) is None
     }
+    gas = with_variant_law(gas)
     if isinstance(gas.surface, Rough) and gas.surface.friction is None:
         added["surface"] = dataclasses.replace(gas.surface, friction=STICKING)
     return dataclasses.replace(gas, **added)
+
+
+def with_variant_law(gas: Gas) -> Gas:
+    """Return a gas whose viscoelastic law has the floats of alternative laws, without effect."""
+    if type(gas.law) is not Viscoelastic:
+        return gas
+    return dataclasses.replace(gas, law=ViscoelasticVariant.of(gas.law))
 
 
 def linearise(

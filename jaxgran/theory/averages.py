@@ -190,8 +190,7 @@ def impact_moments(
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution; see the
     references of this module.
     """
-    loss = law.loss(jnp.asarray(NODES, speed.dtype) * speed)
-    powers = jnp.stack([loss**0 * 1.0, loss, *(loss**k for k in range(2, 7))])
+    powers = law.loss_powers(jnp.asarray(NODES, speed.dtype) * speed, NUM_RESTITUTIONS - 1)
     matrix = averaging_matrix(dimension, order)
     matrix = matrix if relaxation else matrix[:order]
     return jnp.tensordot(jnp.asarray(matrix, speed.dtype), powers, 2)
@@ -247,12 +246,13 @@ def loss_moments(
         <x> and <x^2> per impact of a Maxwellian gas; (m/2) T x is the energy of a pair.
     """
     g, weights = loss_nodes(speed)
-    loss = law.loss(g * speed[..., None])
-    share = loss * (2 - loss)
+    _, one, two, three, four = law.loss_powers(g * speed[..., None], 4)
+    share = 2 * one - two
+    square_of_share = 4 * (two - three) + four
     square = g**2
     shape = jnp.asarray(sonine)[..., None] / 16 * (square * (square - 6) + 3)
-    weights = weights * (1 + shape) * share
-    return jnp.sum(weights, -1), jnp.sum(weights * share * square, -1)
+    weights = weights * (1 + shape)
+    return jnp.sum(weights * share, -1), jnp.sum(weights * square_of_share * square, -1)
 
 
 _STEEP = 5.0

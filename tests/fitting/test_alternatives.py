@@ -11,6 +11,7 @@ import jaxgran
 from jaxgran.fitting import estimate
 from jaxgran.fitting.messages import describe_search
 from jaxgran.models.linearise import with_neutral_elements
+from jaxgran.scene.laws import ViscoelasticVariant
 from tests.beads import glass_beads
 from tests.fitting.curves import (
     BOTH,
@@ -155,6 +156,32 @@ def test_the_range_holds_A_where_an_element_is_not_told(absent, element, name):
     told = without_chance(gas, curve, absent=(absent,))
     assert name not in {a.name for a in told.alternatives}
     assert f"known to be absent: {absent}" in told.reasons
+
+
+def test_a_constant_restitution_is_named_and_A_has_no_meaning_then():
+    gas = glass_beads(0.1)
+    constant = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
+    result = without_chance(gas, exact_to(constant, 0))
+    found = next(a for a in result.alternatives if a.restitution is not None)
+    assert found.preferred and found.restitution == pytest.approx(0.9, abs=0.002)
+    assert "A constant coefficient of restitution, 0.9" in result.headline
+    assert "explains the data better: then A has no meaning" in result.headline
+    # It is no part of the range, and not named where it does not explain the curve.
+    (estimate,) = result.ranges[A][0]
+    assert estimate < result.estimate[0]
+    viscoelastic = without_chance(gas, exact_to(gas, 0))
+    assert "no meaning" not in viscoelastic.headline
+
+
+def test_eps_that_scatters_is_an_alternative():
+    gas = glass_beads(0.1)
+    variant = dataclasses.replace(ViscoelasticVariant.of(gas.law), spread=0.15)
+    curve = exact_to(dataclasses.replace(gas, law=variant), 0)
+    result = without_chance(gas, curve)
+    found = next(a for a in result.alternatives if a.name.startswith("eps that scatters"))
+    assert found.low[0] < gas.value(A) < found.high[0]
+    assert found.allowed[0] < 0.15 * 1.01 and found.allowed[1] > 0.14
+    assert in_range(result, gas.value(A))
 
 
 def test_no_alternative_is_preferred_where_all_is_told():
