@@ -63,7 +63,8 @@ fig, axes = plt.subplots(figsize=(6, 4), layout="constrained")
 laws = {a: result.gas.replace(dissipative_constant=a).restitution(v) for a in (A, low, high)}
 axes.fill_between(v, laws[low], laws[high], color="0.85", label="range over all alternatives")
 axes.semilogx(v, laws[A], color="#0072b2", label=f"A = {1e6 * A:.2f} µs")
-for T in measurement.curve.temperature[[0, -1]]:
+first, last = measurement.curve.temperature[0], measurement.curve.temperature[-1]
+for T in (first, last):
     axes.axvline((2 * float(T)) ** 0.5, color="0.5", ls=":")
 axes.set(xlabel="impact speed v (m/s)", ylabel=r"coefficient of restitution $\epsilon$")
 axes.legend(frameon=False)
