@@ -55,8 +55,9 @@ Measured: 60 of 250 spheres, eps = .9, 400 replicas: correlations .75, .56, .42,
 LOG_FROM, LINEAR_TO = 10.0, 5.0
 """T over its error above which ln T is compared, and below which T itself is."""
 
-NUM_SCATTERS = 64
-"""Number of values of N over which a likelihood is integrated where N is not known."""
+SCATTER_STEPS = {True: np.linspace(-3.0, 3.0, 7), False: np.linspace(-2.5, 2.5, 25)}
+"""Values of the logarithm of N over which a likelihood is integrated, in standard errors of its
+prior, where N is known and where it is not."""
 
 SMALLEST_VARIANCE = 1e-12
 """Variance of a value that is given without an error and has none by theory, relative."""
@@ -354,27 +355,28 @@ def log_likelihood(
         if name in rows.nuisances:
             columns.append(jnp.broadcast_to(jnp.asarray(shape), residuals.shape))
             widths.append(rows.nuisances[name])
-    steps = jnp.linspace(-2.0, 2.0, NUM_SCATTERS)
+    log_scatters = SCATTER_STEPS[measurement.num_particles is not None]
+    count = log_scatters.size
 
     def for_each(x: Array) -> Array:
-        return jnp.broadcast_to(x[..., None], (*x.shape, NUM_SCATTERS))
+        return jnp.broadcast_to(x[..., None], (*x.shape, count))
 
     each = Nodes(
         nodes.times,
-        jnp.repeat(nodes.log_temperature, NUM_SCATTERS, axis=1),
-        jnp.repeat(nodes.rotation, NUM_SCATTERS, axis=1),
+        jnp.repeat(nodes.log_temperature, count, axis=1),
+        jnp.repeat(nodes.rotation, count, axis=1),
         nodes.sonine,
-        jnp.repeat(nodes.collisions, NUM_SCATTERS, axis=1),
+        jnp.repeat(nodes.collisions, count, axis=1),
     )
     values, spread = filtered(
-        jax.tree.map(lambda x: jnp.broadcast_to(x, (NUM_SCATTERS, *jnp.shape(x))), gas),
+        jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), gas),
         each,
         for_each(jnp.stack(columns, axis=-1)),
         for_each(variances),
         for_each(jnp.ones_like(log_T)),
         observed.used,
         jax.tree.map(
-            jnp.asarray, rows.noise(times, rows.scatter * jnp.exp(rows.scatter_error * steps))
+            jnp.asarray, rows.noise(times, rows.scatter * jnp.exp(rows.scatter_error * log_scatters))
         ),
         differentiable=True,
     )
@@ -385,7 +387,7 @@ def log_likelihood(
         return -0.5 * (found + jnp.sum(used * jnp.log(spread)) + step**2)
 
     value = jax.scipy.special.logsumexp(
-        jax.vmap(of_scatter, in_axes=(-1, -1, 0))(values, spread, steps)
+        jax.vmap(of_scatter, in_axes=(-1, -1, 0))(values, spread, jnp.asarray(log_scatters))
     )
     if rows.displacement is not None:
         assert computed.displacement is not None

@@ -144,6 +144,7 @@ class PredictedCurve:
     elements: list[Element]
     fields: dict[str, Any]
 
+    @np.errstate(divide="ignore", invalid="ignore", over="ignore")
     def residuals(self, size: int, **sources: float) -> list[Residuals]:
         """Return the residuals, with derivatives in all of `size` unknowns.
 
@@ -277,6 +278,7 @@ class PredictedCurve:
         )
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # nan where a curve fails
 def predicted_curve(
     rows: CurveRows,
     model: AbstractModel,
@@ -312,10 +314,9 @@ def predicted_curve(
     before[place] = elapsed < 0
     power = power_of_line(gas)
 
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_T = np.log(T)
-        log_rotation = np.log(np.maximum(T_rot, TINY))
-        log_displacement = np.log(np.maximum(displacement, TINY))
+    log_T = np.log(T)
+    log_rotation = np.log(np.maximum(T_rot, TINY))
+    log_displacement = np.log(np.maximum(displacement, TINY))
     common = values.get(CALIBRATION, 0.0)
     factors = np.array([common, common + values.get(ROTATION, 0.0)])
     logs = np.stack([log_T, log_rotation], axis=1)

@@ -16,6 +16,9 @@ from jaxgran.fitting.problem import Evaluation, Problem
 CONVERGED_STEP = 0.03
 """Length of a Newton step, in standard errors, below which a search has converged."""
 
+DESCENT_STEP = 0.01
+"""The same of a descent, which does not take that step."""
+
 STALLED_STEP = 0.3
 """The same where no step along it lowers -2 ln L: at a kink, where a measured point passes t0."""
 
@@ -157,7 +160,10 @@ def minimise(
     )
     end = np.asarray(solution.x)
     limit = STALLED_STEP if stalled >= MAX_STALLED else tolerance
-    return Minimum(end, value(end), int(solution.nit), length_of_step(end) < limit)
+    step, length = newton_step(problem.evaluate(end))
+    if length < CONVERGED_STEP:
+        end = end + step
+    return Minimum(end, value(end), int(solution.nit), length < limit)
 
 
 def _farthest(problem: Problem) -> Float[np.ndarray, "unknowns"]:
@@ -214,7 +220,7 @@ class Descent:
             found = problem.evaluate(flat)
             if not found.is_finite:
                 return np.inf, found.gradient, False
-            return found.value, found.gradient, newton_step(found)[1] < CONVERGED_STEP
+            return found.value, found.gradient, newton_step(found)[1] < DESCENT_STEP
 
         size = sum(row.values.size for row in problem.evaluate(first).rows)
         flats, losses, converged, _ = self.descend(
