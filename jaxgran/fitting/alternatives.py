@@ -211,9 +211,7 @@ class Explanations(NamedTuple):
             without: explanations that are left out.
         """
         considered = [
-            x
-            for x in (self.law, *self.alternatives)
-            if x not in without and x.restitution is None
+            x for x in (self.law, *self.alternatives) if x not in without and x.restitution is None
         ]
         best = max(x.improvement for x in considered)
         allowed = [
@@ -489,7 +487,9 @@ def _profile(problem: Problem, kind: Kind, base: Trial) -> list[Trial]:
 
     def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
         fixed = {
-            m.label: kind.values(amplitude, m.label) if is_of_law or isinstance(m, CurveRows) else {}
+            m.label: kind.values(amplitude, m.label)
+            if is_of_law or isinstance(m, CurveRows)
+            else {}
             for m in problem.measurements
         }
         error = kind.rate_error(amplitude)

@@ -376,7 +376,8 @@ def log_likelihood(
         for_each(jnp.ones_like(log_T)),
         observed.used,
         jax.tree.map(
-            jnp.asarray, rows.noise(times, rows.scatter * jnp.exp(rows.scatter_error * log_scatters))
+            jnp.asarray,
+            rows.noise(times, rows.scatter * jnp.exp(rows.scatter_error * log_scatters)),
         ),
         differentiable=True,
     )
