@@ -155,7 +155,7 @@ def kept(scene: Scene, name: str, kind: str, options: Options) -> Runs:
     times = scene.times
     if path.exists():
         with np.load(path) as stored:
-            if np.allclose(stored["times"], times, rtol=1e-6):
+            if np.allclose(stored["times"], times, rtol=1e-5):
                 return Runs(*(stored[field] for field in Runs._fields if field in stored))
     runs = simulated(scene, times, kind, options.runs)
     path.parent.mkdir(parents=True, exist_ok=True)
