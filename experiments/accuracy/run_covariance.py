@@ -35,6 +35,7 @@ from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import cool
 
 THEORY = jaxgran.KineticTheory(softness=False)
+ENSKOG = jaxgran.KineticTheory(softness=False, correlations=False)
 STORED = DATA / "run_statistics.npz"
 DEPTH = 3.5
 """Largest ln(T_0/T) of gases that cool."""
@@ -164,10 +165,9 @@ def kept(scene: Scene, name: str, kind: str, options: Options) -> Runs:
     return runs
 
 
-def covariance_of(scene: Scene, times: np.ndarray, rotation: bool) -> np.ndarray:
-    """Return the covariance of one run by theory."""
-    n = scene.num_particles
-    return np.asarray(THEORY.covariance(scene.make(), times, n, rotation=rotation))
+def theory_of(kind: str) -> jaxgran.KineticTheory:
+    """Return theory of one kind of runs: those of DSMC have no correlated velocities."""
+    return ENSKOG if kind == "dsmc" else THEORY
 
 
 def whitened(each: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -202,9 +202,10 @@ def row_of(scene: Scene, name: str, kind: str, runs: Runs) -> dict[str, Any]:
     """Compare the runs of a scene with theory."""
     gas, times, num = scene.make(), scene.times, runs.log_T.shape[1]
     rotation = runs.log_T_rot is not None
-    covariance = covariance_of(scene, times, rotation)
+    theory = theory_of(kind)
+    covariance = np.asarray(theory.covariance(gas, times, scene.num_particles, rotation=rotation))
     quarters = np.arange(1, 5) * num // 4 - 1
-    offset = runs.log_T.mean(axis=0) - np.log(np.asarray(cool(gas, times, THEORY).temperature))
+    offset = runs.log_T.mean(axis=0) - np.log(np.asarray(cool(gas, times, theory).temperature))
     row = {"scene": name, "model": kind, "num_particles": scene.num_particles}
     row |= {"runs": len(runs.log_T)}
     row |= {"box": float(gas.box_side(scene.num_particles) / gas.critical_box)}
@@ -231,18 +232,19 @@ def store(statistics: dict[str, dict[str, Any]]) -> None:
     np.savez_compressed(STORED, **arrays)
 
 
+FIELDS = "gas", "num_particles", "runs", "times", "mean", "covariance"
+"""What `STORED` keeps of each scene: see `statistics_of`."""
+
+
 def statistics_of(scene: Scene, times: np.ndarray, runs: Runs) -> dict[str, Any]:
     """Return what `STORED` keeps of a scene."""
     joint = runs.joint
     covariance = np.cov(joint, rowvar=False)
-    return {
-        "gas": json.dumps(floats_of(scene.make())),
-        "num_particles": scene.num_particles,
-        "runs": len(joint),
-        "times": times,
-        "mean": joint.mean(axis=0).astype(np.float32),
-        "covariance": covariance[np.tril_indices(len(covariance))].astype(np.float32),
-    }
+    lower = covariance[np.tril_indices(len(covariance))].astype(np.float32)
+    floats = json.dumps(floats_of(scene.make()))
+    mean = joint.mean(axis=0).astype(np.float32)
+    values = floats, scene.num_particles, len(joint), times, mean, lower
+    return dict(zip(FIELDS, values, strict=True))
 
 
 def rows_of(scenes: dict[str, Scene], kind: str, options: Options) -> Iterator[dict]:
