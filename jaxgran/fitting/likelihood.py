@@ -159,20 +159,21 @@ def filtered(
 
 
 def _run_filter(
-    steps: tuple[Array, Array, Array],
+    steps: tuple[Array, Array, Array, Array],
     residuals: Float[Array, "nodes 2 columns gases"],
     variances: Float[Array, "nodes 2 gases"],
     sensitivity: Float[Array, "nodes gases"],
     used: Float[Array, "nodes 2"],
     noise: Noise,
 ) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
-    changes, increments, of_rotation = steps
+    start, changes, increments, of_rotation = steps
     dtype = residuals.dtype
     lanes = residuals.shape[-1]
     size = changes.shape[1]
     rate_error, sample = size - 2, size - 1
     first = jnp.zeros((size, size, lanes), dtype)
-    first = first.at[0, 0].set(noise.scatter * noise.first)
+    first = first.at[: size - 2, : size - 2].set(start)
+    first = first.at[0, 0].add(noise.scatter * noise.first)
     first = first.at[rate_error, rate_error].set(1.0)
     first = first.at[sample, sample].set(noise.sample)
     mean = jnp.zeros((size, *residuals.shape[2:]), dtype)
@@ -221,15 +222,16 @@ def _run_filter(
 
 def _steps(
     gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Return what happens to the variables from each node's predecessor to it.
 
     The variables are those of the run (`jaxgran.theory.covariance.process`), followed by the
     relative error of theory's cooling rate over its standard deviation, and by the sampling error.
 
     Returns:
-        propagators less 1, and the noise that is added, shape (nodes, n, n, gases); and the
-        derivative of ln T_rot in the second variable, shape (nodes, gases).
+        covariance of the run at its start; propagators less 1, and the noise that is added, shape
+        (nodes, n, n, gases); and the derivative of ln T_rot in the second variable, shape (nodes,
+        gases).
     """
     first = nodes.log_temperature[:1]
     means = Mean(
@@ -239,7 +241,7 @@ def _steps(
         Spins(nodes.rotation, None, None),
     )
     rates = jax.vmap(run_process, in_axes=(0, -1), out_axes=-1)
-    jacobian, spread = rates(gas, jax.tree.map(_middle, means))
+    jacobian, spread, starts = rates(gas, jax.tree.map(_middle, means))
     collisions = _change(nodes.collisions)
     size = len(jacobian) + 2
     of_run = slice(0, size - 2)
@@ -270,7 +272,7 @@ def _steps(
     changes, increments = (jnp.moveaxis(x.reshape(drift.shape), 2, 0) for x in found)
     turning = nodes.rotation > 0
     of_rotation = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
-    return changes, increments, of_rotation
+    return noise.scatter * starts[:, :, 0], changes, increments, of_rotation
 
 
 def _middle(x: Array) -> Array:

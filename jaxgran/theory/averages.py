@@ -218,7 +218,7 @@ def _loss_nodes() -> tuple[Float[np.ndarray, "nodes"], Float[np.ndarray, "nodes"
     return np.sqrt(2 * square), 2 * weight
 
 
-def loss_nodes(like: Float[Array, "..."]) -> tuple[Float[Array, "nodes"], Float[Array, "nodes"]]:
+def loss_nodes(like: Float[Array, ""]) -> tuple[Float[Array, "nodes"], Float[Array, "nodes"]]:
     """Return normal speeds g and weights of ``int_0^inf g^3 exp(-g^2/2) f(g) dg``.
 
     By Gauss and Laguerre; the arrays have the dtype of `like`.
@@ -228,8 +228,8 @@ def loss_nodes(like: Float[Array, "..."]) -> tuple[Float[Array, "nodes"], Float[
 
 
 def loss_moments(
-    law: ReducedLaw, speed: Float[Array, "..."], sonine: ArrayLike = 0.0
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    law: ReducedLaw, speed: Float[Array, ""], sonine: ArrayLike = 0.0
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the mean and the mean square of the normal energy that an impact takes.
 
     ``<x^k> = int_0^inf g exp(-g^2/2) (1 + a_2 (g^4 - 6 g^2 + 3)/16) x^k dg`` with the loss ``x = (1
@@ -239,20 +239,19 @@ def loss_moments(
 
     Args:
         law: law of restitution in units of `Gas.impact_speed`.
-        speed: sqrt(T/T_0), any shape.
+        speed: sqrt(T/T_0).
         sonine: a_2.
 
     Returns:
         <x> and <x^2> per impact of a Maxwellian gas; (m/2) T x is the energy of a pair.
     """
     g, weights = loss_nodes(speed)
-    _, one, two, three, four = law.loss_powers(g * speed[..., None], 4)
+    _, one, two, three, four = law.loss_powers(g * speed, 4)
     share = 2 * one - two
     square_of_share = 4 * (two - three) + four
     square = g**2
-    shape = jnp.asarray(sonine)[..., None] / 16 * (square * (square - 6) + 3)
-    weights = weights * (1 + shape)
-    return jnp.sum(weights * share, -1), jnp.sum(weights * square_of_share * square, -1)
+    weights = weights * (1 + sonine / 16 * (square * (square - 6) + 3))
+    return jnp.sum(weights * share), jnp.sum(weights * square_of_share * square)
 
 
 _STEEP = 5.0
@@ -372,14 +371,14 @@ def rough_impact_means(
 
 
 def rough_energy_moments(
-    losses: tuple[Float[Array, "..."], Float[Array, "..."]],
-    m: Float[Array, "..."] | None,
-    eta: Float[Array, "..."],
+    losses: tuple[Float[Array, ""], Float[Array, ""]],
+    m: Float[Array, ""] | None,
+    eta: Float[Array, ""],
     inertia: Float[Array, ""],
-    S: Float[Array, "..."],
-    A: Float[Array, "..."],
+    S: Float[Array, ""],
+    A: Float[Array, ""],
     d: int,
-) -> tuple[Float[Array, "2 ..."], Float[Array, "2 2 ..."]]:
+) -> tuple[Float[Array, "2"], Float[Array, "2 2"]]:
     """Return moments of the energies that an impact of rough spheres adds, over m T and its square.
 
     The energies are the translational one, ``e = -x/2 + z^2 - z g``, and the rotational one,
