@@ -346,8 +346,8 @@ CALLS = [
     (lambda: jaxgran.log_likelihood(GAS, CURVE), "measurement must be a jaxgran.Measurement"),
     (lambda: jaxgran.log_likelihood(GAS, measured(DROPS)), "a drop test, without a curve"),
     (lambda: jaxgran.RestitutionSpline([1.0]), "two or more increasing"),
-    (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.8, 0.9]), "that decrease"),
-    (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [1.0, 0.9]), r"in \(0, 1\)"),
+    (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.8, 0.9]), "do not increase"),
+    (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [1.1, 0.9]), r"in \(0, 1\]"),
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.9, 0.8, 0.7]), "must be 2 numbers"),
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.9, 0.8], 0.0), "smoothness"),
 ]

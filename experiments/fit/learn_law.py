@@ -5,8 +5,8 @@
 `jaxgran.fit` fits a `RestitutionSpline` to each curve, through kinetic theory. The worlds:
 
 - curves with an error of 1 %, made by direct simulation and by hard spheres, of viscoelastic beads,
-  of ice (eps = .34 (v/(1 cm/s))^-.234; Bridges, Hatzes & Lin 1984) and of a law with a yield speed,
-  .95 below it and falling as v^(-1/4) above;
+  of ice (eps = .34 (v/(1 cm/s))^-.234; Bridges, Hatzes & Lin 1984) and of two laws with a yield
+  speed: .95 below it or no loss at all, and falling as v^(-1/4) above;
 - curves measured in LAMMPS, of beads with known A;
 - a curve together with drop tests of single beads at speeds that the gas did not visit.
 
@@ -40,10 +40,18 @@ class Yielding(jaxgran.RestitutionLaw):
         return 0.95 * (1 + (normal_speed / 0.1) ** 2) ** -0.125
 
 
+class Plastic(jaxgran.RestitutionLaw):
+    """``eps = (v/v_y)^(-1/4)`` above the yield speed v_y = .1 m/s, and 1 below."""
+
+    def restitution(self, normal_speed):
+        return jnp.maximum(normal_speed / 0.1, 1.0) ** -0.25
+
+
 TRUTHS: dict[str, tuple] = {  # and T_0, m^2/s^2
     "viscoelastic": (jaxgran.Viscoelastic(5e7, 0.22, 5e-6), 0.01),
     "ice": (ice(), 4e-4),
     "yield speed": (Yielding(), 0.04),
+    "no loss below a yield speed": (Plastic(), 0.04),
 }
 
 

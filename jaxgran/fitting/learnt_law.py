@@ -26,6 +26,9 @@ NUM_DRAWS = 20_000
 KNOT_MARGIN = 1.5
 """Factor by which knots may lie outside the visited range without a warning."""
 
+RELATIVE_SPEEDS = np.linspace(0.005, 4.0, 800)
+"""Impact speeds over 2 sqrt(T)."""
+
 MIN_VARIANCE = 1e-4
 """Share of the largest variance below which a combination of these values is ignored: it is known
 only through the smoothness prior."""
@@ -38,11 +41,11 @@ class RestitutionBand(NamedTuple):
         speeds: normal impact speeds, m/s.
         restitution: eps at these speeds.
         low, high: ends of a band that contains the whole law over the visited range with a
-            probability of 95 %: some 2.5 standard errors of ln(-ln eps) to each side.
-        visited: range of speeds that determines the measured T, m/s
-            (`RestitutionSpline.visited_speeds`); outside it eps follows from the form of the law
-            and its prior.
-        covariance: of ln(-ln eps) at the speeds.
+            probability of 95 %: some 2.5 standard errors of ``L = -ln eps`` to each side, L >= 0.
+        visited: range of speeds that determines the measured T, m/s: by 5 % of the losses at the
+            lowest T and 95 % at the highest, with the learnt law; outside it eps follows from the
+            form of the law and its prior.
+        covariance: of L at the speeds.
 
     >>> band = jaxgran.restitution_band(result)
     >>> bool(band.low[0] < band.restitution[0] < band.high[0])
@@ -64,17 +67,18 @@ class RestitutionBand(NamedTuple):
             free: name of a float of this law, as "dissipative_constant" or "coefficient".
 
         Returns:
-            chi^2 of ln(-ln eps) per degree of freedom, its p-value, and the fitted gas. Values of
+            chi^2 of L per degree of freedom, its p-value, and the fitted gas. Values of
             1 or less mean that the band contains a law of this form.
         """
         variances, axes = np.linalg.eigh(self.covariance)
         known = variances > MIN_VARIANCE * variances[-1]
         whiten = axes[:, known].T / np.sqrt(variances[known])[:, None]
-        measured, domain = np.log(-np.log(self.restitution)), gas.domains[free]
+        measured = -np.log(self.restitution)
+        domain = gas.domains[free]
 
         def residuals(flat: np.ndarray) -> np.ndarray:
             changed = with_floats(gas, as_floats({free: domain.from_free(flat[0])}))
-            return whiten @ (np.asarray(_log_loss(changed, jnp.asarray(self.speeds))) - measured)
+            return whiten @ (np.asarray(_losses(changed, jnp.asarray(self.speeds))) - measured)
 
         first = np.ravel(domain.to_free(np.asarray(gas.value(free))))
         solution = scipy.optimize.least_squares(residuals, first)
@@ -84,17 +88,38 @@ class RestitutionBand(NamedTuple):
 
 
 def visited_speeds(result: Fit) -> tuple[float, float]:
-    """Return the range of impact speeds that determines the measured curves of a fit, m/s."""
+    """Return the range of impact speeds that determines the measured curves of a fit, m/s.
+
+    It is from the 5 % quantile of the losses ``(1 - eps^2) v^3 exp(-v^2/(4 T))`` at the lowest T to
+    the 95 % quantile at the highest, with the fitted law.
+    """
     data = [m.data for m in result.measurements.values()]
     parts = [np.asarray(x.temperature) for x in data if isinstance(x, CoolingCurve)]
     if not parts:
         raise ValueError("drop tests alone have no T: give a cooling curve, too")
-    return RestitutionSpline.visited_speeds(np.concatenate(parts))
+    T = np.concatenate(parts)
+    T = T[T > 0]
+    gas = first_gas(result)
+
+    def quantile(share: float, T: float) -> float:
+        relative = RELATIVE_SPEEDS
+        speeds = 2 * np.sqrt(T) * relative
+        lost = 1 - np.asarray(gas.restitution(jnp.asarray(speeds))) ** 2
+        weights = np.maximum(lost, np.finfo(float).tiny) * relative**3 * np.exp(-(relative**2))
+        sums = np.cumsum(weights)
+        return float(np.interp(share * sums[-1], sums, speeds))
+
+    return quantile(0.05, T.min()), quantile(0.95, T.max())
+
+
+def first_gas(result: Fit) -> Gas:
+    """Return the first of the fitted gases, which share their law."""
+    return next(iter(result.gas.values())) if isinstance(result.gas, dict) else result.gas
 
 
 def describe_unvisited_knots(result: Fit) -> Iterator[str]:
     """Yield a sentence on knots of a fitted spline outside the visited speeds, if there are any."""
-    gas = next(iter(result.gas.values())) if isinstance(result.gas, dict) else result.gas
+    gas = first_gas(result)
     if not isinstance(gas.law, RestitutionSpline) or "drops" not in result.names:
         return
     low, high = visited_speeds(result)
@@ -122,7 +147,7 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
     >>> bool(band.low[0] < band.restitution[0] < band.high[0])
     True
     """
-    gas = next(iter(result.gas.values())) if isinstance(result.gas, dict) else result.gas
+    gas = first_gas(result)
     own = [name for name in law_fields(gas.law) if name in result.names]
     if not own:
         raise ValueError(
@@ -133,27 +158,29 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
     speeds = grid if speeds is None else speeds
     POSITIVE.check("speeds", speeds, "Give normal impact speeds in m/s.")
     v = np.asarray(speeds, float)
-    law = jax.tree_util.Partial(_log_loss, speeds=jnp.asarray(np.append(v, grid)))
+    law = jax.tree_util.Partial(_losses, speeds=jnp.asarray(np.append(v, grid)))
     floats = {name: gas.value(name) for name in own}
-    log, slopes = residuals_and_slopes(law, gas, floats)
+    losses, slopes = residuals_and_slopes(law, gas, floats)
     parts = [np.asarray(slopes[name]) for name in own]
     at = [i for name in own for i, of in enumerate(result.names_of_elements) if of == name]
     slope = np.concatenate(parts, axis=1)
     covariance = result.covariance[np.ix_(at, at)]
     covariance = slope @ covariance @ slope.T
-    error = np.sqrt(np.diag(covariance))
+    error = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
     # Quantile of the largest of the standardised errors at the speeds of the grid.
     correlation = (covariance / np.outer(error, error))[v.size :, v.size :]
     draws = np.random.default_rng(0).multivariate_normal(
         np.zeros(grid.size), correlation, NUM_DRAWS, method="eigh"
     )
     factor = np.quantile(np.abs(draws).max(axis=1), 0.95)
-    log, error = np.asarray(log)[: v.size], error[: v.size]
-    low, middle, high = (np.exp(-np.exp(log + x * error)) for x in (factor, 0, -factor))
-    return RestitutionBand(v, middle, low, high, visited, covariance[: v.size, : v.size])
+    losses = np.asarray(losses)[: v.size]
+    wide = factor * error[: v.size]
+    low = np.exp(-(losses + wide))
+    high = np.exp(-np.maximum(losses - wide, 0.0))
+    own_covariance = covariance[: v.size, : v.size]
+    return RestitutionBand(v, np.exp(-losses), low, high, visited, own_covariance)
 
 
 @eqx.filter_jit
-def _log_loss(gas: Gas, speeds: Float[Array, "speeds"]) -> Float[Array, "speeds"]:
-    eps = gas.restitution(speeds)
-    return jnp.log(-jnp.log(eps))
+def _losses(gas: Gas, speeds: Float[Array, "speeds"]) -> Float[Array, "speeds"]:
+    return -jnp.log(gas.restitution(speeds))

@@ -154,7 +154,9 @@ def _guess_law(gas: Gas, rate: Any, free: tuple[str, ...]) -> dict[str, Any]:
     if isinstance(gas.law, ConstantRestitution) and "coefficient" in free:
         return {"coefficient": np.sqrt(1 - loss)}
     if isinstance(gas.law, RestitutionSpline) and "drops" in free:
-        return {"drops": np.asarray(gas.law.drops) * (-np.log1p(-loss) / 2 / loss_now)}
+        drops = np.asarray(gas.law.drops)
+        drops = np.maximum(drops, 1e-3 * np.max(drops))  # fits vary their logarithms
+        return {"drops": drops * (-np.log1p(-loss) / 2 / loss_now)}
     if isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free:
         delta = rate / COOLING_RATE[gas.dimension]
         # To the next order in delta the cooling rate is that of delta (1 - q delta / 2): invert it.

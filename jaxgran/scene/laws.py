@@ -8,7 +8,7 @@ import dataclasses
 import inspect
 from abc import abstractmethod
 from math import gamma, pi, sqrt
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -611,27 +611,34 @@ class RestitutionSeries(RestitutionLaw, ReducedLaw):
         return jnp.asarray(-sum(c * normal_speed**gamma for c, gamma in terms))
 
 
+SHARE_ERROR = 3.0
+"""Standard deviation of the logarithms of the drops of a `RestitutionSpline` in fits."""
+
+
 class RestitutionSpline(RestitutionLaw):
     """Law without a formula: a monotone curve through values of eps at given speeds.
 
-    ``eps(v) = exp(-L(v))``, where ln L is a monotone cubic spline of ln v (Fritsch & Butland) and a
-    straight line, ``L ~ v^p``, outside the knots. L increases with v, so that eps decreases from 1
-    and stays in (0, 1). The parameters are ``drops``: L at the first knot, and its increments from
-    each knot to the next, all positive.
+    ``eps(v) = exp(-L(v))``, where L is a monotone cubic spline of ln v (Fritsch & Butland) and a
+    straight line outside the knots, down to L = 0. L increases with v: eps decreases, and stays in
+    (0, 1]. The parameters are ``drops``: L at the first knot, and its increments from each knot to
+    the next.
 
-    In fits the exponent ``p = d ln L/d ln v`` has a smoothness prior: over a factor of ten in v it
-    changes by `smoothness` (one standard deviation of a random walk), since a curve T(t) averages
-    over speeds. Viscoelastic spheres have p = 1/5 or a little less, a constant eps has p = 0.
+    In fits ``p = (dL/d ln v)/L_last``, with L at the last knot, has a smoothness prior: over a
+    factor of ten in v it changes by `smoothness` (one standard deviation of a random walk), since a
+    curve T(t) averages over speeds. Viscoelastic spheres have p = 1/5 at the last knot and .13 at a
+    tenth of its speed, a constant eps has p = 0. A wide prior keeps drops that the data do not see
+    finite: their logarithms, over L_last, are those of ``L ~ v^(1/5)`` with a standard deviation of
+    3.
 
     Args:
         speeds: knots, normal approach speeds, m/s, > 0, increasing, two or more;
             `visited_speeds` gives the range that a measured curve determines.
-        values: eps at the knots, in (0, 1), decreasing; by default that of L = 0.1 at the last
+        values: eps at the knots, in (0, 1], not increasing; by default that of L = 0.1 at the last
             knot and p = 1/5. A fit begins with a multiple of this L that cools as the curve does.
         smoothness: standard deviation of p over a factor of ten in v, > 0.
 
     Raises:
-        ValueError: for speeds that do not increase or values that do not decrease.
+        ValueError: for speeds that do not increase or values that increase.
 
     Reference: Fritsch & Butland, SIAM J. Sci. Stat. Comput. 5, 300 (1984).
 
@@ -647,7 +654,7 @@ class RestitutionSpline(RestitutionLaw):
     drops: Float[Array, "knots"]
     smoothness: float = eqx.field(static=True)
 
-    domains: ClassVar[dict[str, Domain]] = {"drops": POSITIVE}
+    domains: ClassVar[dict[str, Domain]] = {"drops": NON_NEGATIVE}
     lists: ClassVar[tuple[str, ...]] = ("drops",)
     constants: ClassVar[tuple[str, ...]] = ("speeds",)
 
@@ -662,13 +669,13 @@ class RestitutionSpline(RestitutionLaw):
         if knots.ndim != 1 or knots.size < 2 or np.any(np.diff(knots) <= 0) or knots[0] <= 0:
             raise ValueError(f"speeds must be two or more increasing numbers > 0, got {speeds!r}")
         self.smoothness = checked_float("smoothness", smoothness, POSITIVE)
-        default = np.exp(-0.1 * (knots / knots[-1]) ** 0.2)
+        default = np.exp(-0.1 * np.cumsum(_typical_shares(knots)))
         eps = float_array(default if values is None else values, "values")
         drops = -jnp.diff(jnp.log(eps), prepend=0.0)
-        if drops.shape != knots.shape or not any_traced(drops) and not np.all(drops > 0):
+        if drops.shape != knots.shape or not any_traced(drops) and not np.all(drops >= 0):
             raise ValueError(
-                f"values must be {knots.size} numbers in (0, 1), one for each speed, that decrease "
-                f"with the speed, got {values!r}"
+                f"values must be {knots.size} numbers in (0, 1], one for each speed, that do not "
+                f"increase with the speed, got {values!r}"
             )
         self.drops = drops
 
@@ -688,33 +695,44 @@ class RestitutionSpline(RestitutionLaw):
         low, high = 2 * np.sqrt(np.array([0.35536, 4.74386]) * [T.min(), T.max()])
         return float(low), float(high)
 
-    def _log_L(self) -> Float[Array, "knots"]:
-        return jnp.log(jnp.cumsum(self.drops))
-
     def prior_residuals(self) -> Float[Array, "residuals"]:
         x = jnp.log(self.speeds)
         decades = (x[2:] - x[:-2]) / (2 * np.log(10))
-        exponents = jnp.diff(self._log_L()) / jnp.diff(x)
-        return jnp.diff(exponents) / (self.smoothness * jnp.sqrt(decades))
+        shares = self.drops / jnp.sum(self.drops)
+        slopes = shares[1:] / jnp.diff(x)
+        smooth = jnp.diff(slopes) / (self.smoothness * jnp.sqrt(decades))
+        unusual = jnp.log(shares / _typical_shares(self.speeds)) / SHARE_ERROR
+        return jnp.concatenate([smooth, unusual])
 
     def restitution(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         return 1 - self.loss(normal_speed)
 
     def loss(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        x, y = jnp.log(self.speeds), self._log_L()
+        x = jnp.log(self.speeds)
+        y = jnp.cumsum(self.drops)
         width = jnp.diff(x)
         slope = jnp.diff(y) / width
-        # Weighted harmonic means of the slopes on both sides.
-        left, right = width[:-1] + 2 * width[1:], 2 * width[:-1] + width[1:]
-        inner = (left + right) * slope[1:] * slope[:-1] / (left * slope[1:] + right * slope[:-1])
+        # Weighted harmonic means of the slopes on both sides, 0 where one of them is.
+        left = width[:-1] + 2 * width[1:]
+        right = 2 * width[:-1] + width[1:]
+        sums = left * slope[1:] + right * slope[:-1]
+        products = (left + right) * slope[1:] * slope[:-1]
+        inner = products / jnp.where(sums > 0, sums, 1.0)
         at_knots = jnp.concatenate([slope[:1], inner, slope[-1:]])
         log_speed = jnp.log(jnp.maximum(normal_speed, jnp.finfo(y.dtype).tiny))
         inside = jnp.clip(log_speed, x[0], x[-1])
         i = jnp.searchsorted(x[1:-1], inside)
         h = width[i]
         t = (inside - x[i]) / h
-        first, last = at_knots[i], at_knots[i + 1]
+        first = at_knots[i]
+        last = at_knots[i + 1]
         cubic = first + last - 2 * slope[i]
-        log_L = y[i] + h * t * (first + t * (slope[i] - first - (1 - t) * cubic))
-        outside = jnp.where(log_speed < x[0], at_knots[0], at_knots[-1]) * (log_speed - inside)
-        return -jnp.expm1(-jnp.exp(log_L + outside))
+        value = y[i] + h * t * (first + t * (slope[i] - first - (1 - t) * cubic))
+        outside = jnp.where(log_speed <= x[0], at_knots[0], at_knots[-1]) * (log_speed - inside)
+        return -jnp.expm1(-jnp.maximum(value + outside, 0.0))
+
+
+def _typical_shares(speeds: Any) -> Any:
+    """Return the drops of ``L = (v/v_last)^(1/5)`` at some speeds."""
+    xp = jnp if isinstance(speeds, jax.Array) else np
+    return xp.diff((speeds / speeds[-1]) ** 0.2, prepend=0.0)

@@ -116,16 +116,28 @@ def test_spline():
     np.testing.assert_allclose(loss, 1 - eps, atol=1e-15)
     eps, at_knots, between = np.split(eps, [200, 204])
     np.testing.assert_allclose(at_knots, values, rtol=1e-12)
-    cubic = pchip(np.log(speeds), np.log(-np.log(values)))(np.log(inside))
-    np.testing.assert_allclose(between, np.exp(-np.exp(cubic)))
-    assert np.all(np.diff(eps) < 0) and np.all((eps > 0) & (eps < 1))
+    cubic = pchip(np.log(speeds), -np.log(values))(np.log(inside))
+    np.testing.assert_allclose(between, np.exp(-cubic))
+    assert np.all(np.diff(eps) <= 0) and np.all((eps > 0) & (eps <= 1))
+    assert eps[0] == 1.0
     slope = jax.jit(jax.grad(law.restitution))
     assert jnp.isfinite(slope(0.0)) and jnp.isfinite(slope(1e-2))
-    # A power law of -ln eps is smooth.
-    power = jaxgran.RestitutionSpline(speeds, np.exp(-(np.asarray(speeds) ** 0.3)))
-    np.testing.assert_allclose(power.prior_residuals(), 0.0, atol=1e-10)
+    # A power law of eps is smooth.
+    power = jaxgran.RestitutionSpline(speeds, (np.asarray(speeds) / 5e-4) ** -0.1)
+    smoothness, of_drops = np.split(np.asarray(power.prior_residuals()), [2])
+    np.testing.assert_allclose(smoothness, 0.0, atol=1e-10)
+    assert np.max(np.abs(of_drops)) < 0.5
     eps, _ = restitution(power, np.concatenate([v, speeds, inside]))
-    np.testing.assert_allclose(eps[:200], np.exp(-(v**0.3)), rtol=1e-9)
+    np.testing.assert_allclose(eps[:200], np.minimum((v / 5e-4) ** -0.1, 1.0), rtol=1e-9)
+
+
+def test_a_spline_may_lose_nothing():
+    law = jaxgran.RestitutionSpline([1e-3, 1e-2, 3e-2, 1e-1], [1.0, 1.0, 1.0, 0.8])
+    v = np.array([1e-5, 1e-3, 2e-2, 3e-2, 1e-1, 0.2])
+    eps, slope = jax.jvp(law.restitution, (jnp.asarray(v),), (jnp.ones(6),))
+    np.testing.assert_allclose(eps[:4], 1.0, atol=1e-15)
+    assert eps[4] == pytest.approx(0.8) and 0 < eps[5] < 0.8
+    assert np.all(np.isfinite(slope))
 
 
 def test_a_law_is_learnt_from_a_curve(caplog):
@@ -144,7 +156,7 @@ def test_a_law_is_learnt_from_a_curve(caplog):
     chi2, p, _ = band.compare(gas_of(jaxgran.ConstantRestitution(0.9)), "coefficient")
     assert chi2 > 10 and p < 1e-6
     wide = jaxgran.RestitutionSpline(np.geomspace(1e-4, 1.0, 8))
-    words = r"knots at 0.0001, .* outside the impact speeds 0.0095"
+    words = r"knots at 0.0001, .* outside the impact speeds 0.01 to"
     with jax.log_compiles(), pytest.warns(UserWarning, match=words):
         fitted(gas_of(wide), curve, free="law", num_particles=10**7)
     assert "Compiling" not in caplog.text  # other knots share the programs
